@@ -1,0 +1,388 @@
+"""The frozen values that every stage exchanges; each checks its own ranges.
+
+Knows: what a value means, in which unit and range. Does not know: how it is measured, sent or stored.
+
+Every class is a frozen dataclass whose fields are plain (str, int, float, bool, enum, tuple, another value), so that
+`zsched.wire` can encode any of them and no object is ever shared with an adapter. ``None`` means "not measured" or
+"not there", never -1. A value out of range raises `ValueError` naming the field: from the wire that is a counted,
+dropped frame; from our own code it is a bug.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from enum import StrEnum
+
+NodeId = str
+"""A node's name: ``[a-z0-9][a-z0-9_-]{0,62}``, unique in the fleet."""
+TaskId = str
+"""A task's name, same alphabet."""
+
+NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}")
+MAX_COUNTER = 2**53
+"""Largest revision, epoch, incarnation or sequence number (exact in every language's float)."""
+
+
+def check_name(field: str, value: str) -> None:
+    """Raise `ValueError` unless ``value`` is a valid node, task or fleet name."""
+    if NAME.fullmatch(value) is None:
+        raise ValueError(f"{field}: {value!r} is not a name ([a-z0-9][a-z0-9_-]{{0,62}})")
+
+
+def check_range(field: str, value: float | None, low: float, high: float) -> None:
+    """Raise `ValueError` unless ``low <= value <= high`` (``None``, "not measured", passes; NaN does not)."""
+    if value is not None and not low <= value <= high:
+        raise ValueError(f"{field}: {value!r} is not in [{low:g}, {high:g}]")
+
+
+def check_counter(field: str, value: int) -> None:
+    """Raise `ValueError` unless ``0 <= value <= MAX_COUNTER``."""
+    check_range(field, value, 0, MAX_COUNTER)
+
+
+class NodeKind(StrEnum):
+    """What a node is: robots vote and have streams; edges are candidates only."""
+
+    ROBOT = "robot"
+    EDGE = "edge"
+
+
+class Aggregate(StrEnum):
+    """How a column of utilities (one per fresh voter) becomes one number (Eq. 5-6)."""
+
+    MEAN = "mean"
+    MEDIAN = "median"
+
+
+# --- what an operator sets -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Weights:
+    """The weights of Eq. 4: each in [0, 1], their sum 1 (to 1e-6)."""
+
+    cpu: float
+    memory: float
+    network: float
+
+    def __post_init__(self) -> None:
+        for field in ("cpu", "memory", "network"):
+            check_range(f"weights.{field}", getattr(self, field), 0.0, 1.0)
+        total = self.cpu + self.memory + self.network
+        if not math.isclose(total, 1.0, abs_tol=1e-6):
+            raise ValueError(f"weights: the sum is {total:g}, not 1")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tuning:
+    """What may be changed on the running fleet: agreed through the register like an allocation.
+
+    ``bonus`` is added to the owner's aggregate (APPLY_COST of Alg. 2), in utility units [0, 1];
+    ``time_to_trigger_s`` is how long another candidate must lead; ``cool_down_s`` the least stay after a move.
+    """
+
+    weights: Weights
+    bonus: float = 0.10
+    time_to_trigger_s: float = 2.0
+    cool_down_s: float = 10.0
+    aggregate: Aggregate = Aggregate.MEAN
+
+    def __post_init__(self) -> None:
+        check_range("bonus", self.bonus, 0.0, 1.0)
+        check_range("time_to_trigger_s", self.time_to_trigger_s, 0.0, 3600.0)
+        check_range("cool_down_s", self.cool_down_s, 0.0, 86400.0)
+
+
+# --- PROFILE ---------------------------------------------------------------------------------------------------------
+
+
+class LinkSource(StrEnum):
+    """Where a link's figure comes from; status shows it."""
+
+    NL80211 = "nl80211"
+    WIRELESS = "wireless"  # /proc/net/wireless
+    WIRED = "wired"
+    FIXED = "fixed"
+    TRACE = "trace"
+
+
+RSSI_MIN_DBM, RSSI_MAX_DBM = -120.0, 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Link:
+    """One radio or wired link as its node measures it.
+
+    ``peer`` is the node at the other end, or ``None`` for "the way to everybody" (the access point, the cable).
+    ``rssi_dbm`` is the smoothed signal in dBm, ``None`` when not measured; a wired link has none and counts 1.
+    """
+
+    source: LinkSource
+    peer: NodeId | None = None
+    rssi_dbm: float | None = None
+    bitrate_mbps: float | None = None
+    retry_ratio: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.peer is not None:
+            check_name("link.peer", self.peer)
+        check_range("link.rssi_dbm", self.rssi_dbm, RSSI_MIN_DBM, RSSI_MAX_DBM)
+        check_range("link.bitrate_mbps", self.bitrate_mbps, 0.0, 1e6)
+        check_range("link.retry_ratio", self.retry_ratio, 0.0, 1.0)
+
+
+class WorkerState(StrEnum):
+    """A worker process as its supervisor (and its token) show it."""
+
+    STOPPED = "stopped"  # startable: a cold standby, or between restarts
+    STARTING = "starting"
+    READY = "ready"
+    FAILED = "failed"  # too many failures in the window, or it said that it cannot: the node is not eligible
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorkerLoad:
+    """One task's worker on one node: its state and what its process tree uses now (cores, MiB)."""
+
+    task: TaskId
+    state: WorkerState
+    cpu_cores: float | None = None
+    memory_mb: float | None = None
+
+    def __post_init__(self) -> None:
+        check_name("worker.task", self.task)
+        check_range("worker.cpu_cores", self.cpu_cores, 0.0, 4096.0)
+        check_range("worker.memory_mb", self.memory_mb, 0.0, 1e8)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DeviceSample:
+    """One raw reading of this machine by the device profiler.
+
+    ``cpu_cores`` is what may be used (cgroup quota or number of CPUs), ``cpu_used_cores`` what was in use since the
+    previous sample (``None`` on the first: there is nothing to compare with), memory in MiB, ``*_used`` including
+    everything that is not available (total - MemAvailable, or the cgroup's working set against its limit).
+    ``workers`` holds one load per supervised worker (state as the supervisor knows it).
+    """
+
+    cpu_cores: float
+    cpu_used_cores: float | None
+    memory_mb: float
+    memory_used_mb: float | None
+    workers: tuple[WorkerLoad, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkSample:
+    """One raw reading of one link by a network profiler: what was read, before outliers are dropped and smoothed."""
+
+    source: LinkSource
+    peer: NodeId | None = None
+    rssi_dbm: float | None = None
+    bitrate_mbps: float | None = None
+    retry_ratio: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Profile:
+    """The smoothed state of a node that goes to every robot's gateway (Alg. 1: beta, mu, lambda).
+
+    CPU in cores: ``cpu_cores`` is Eq. 1's gamma, ``cpu_used_cores`` its beta. Memory in MiB: ``memory_mb`` is Eq. 2's
+    delta, ``memory_used_mb`` its mu. ``links`` are Eq. 3's lambda.
+    """
+
+    node: NodeId
+    incarnation: int
+    sequence: int
+    cpu_cores: float
+    cpu_used_cores: float | None
+    memory_mb: float
+    memory_used_mb: float | None
+    links: tuple[Link, ...] = ()
+    workers: tuple[WorkerLoad, ...] = ()
+    draining: bool = False
+
+    def __post_init__(self) -> None:
+        check_name("profile.node", self.node)
+        check_counter("profile.incarnation", self.incarnation)
+        check_counter("profile.sequence", self.sequence)
+        check_range("profile.cpu_cores", self.cpu_cores, 0.001, 4096.0)
+        check_range("profile.cpu_used_cores", self.cpu_used_cores, 0.0, 4096.0)
+        check_range("profile.memory_mb", self.memory_mb, 1.0, 1e8)
+        check_range("profile.memory_used_mb", self.memory_used_mb, 0.0, 1e8)
+
+    def worker(self, task: TaskId) -> WorkerLoad | None:
+        """The load of ``task``'s worker on this node, or ``None`` when the node runs none."""
+        return next((load for load in self.workers if load.task == task), None)
+
+
+# --- SCHEDULER -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Utility:
+    """What one robot thinks of one candidate: Eq. 4 and its terms, each in [0, 1] or absent (nobody measured it)."""
+
+    candidate: NodeId
+    value: float
+    cpu: float | None = None
+    memory: float | None = None
+    network: float | None = None
+    reachable: bool = True
+
+    def __post_init__(self) -> None:
+        check_name("utility.candidate", self.candidate)
+        for field in ("value", "cpu", "memory", "network"):
+            check_range(f"utility.{field}", getattr(self, field), 0.0, 1.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UtilityVector:
+    """One robot's utilities of a task's candidates, in the candidates' order, under the tuning of ``revision``."""
+
+    voter: NodeId
+    task: TaskId
+    revision: int
+    utilities: tuple[Utility, ...]
+    refused: tuple[tuple[NodeId, str], ...] = ()
+    """Candidates this voter did not score, each with its reason."""
+
+    def __post_init__(self) -> None:
+        check_name("vector.voter", self.voter)
+        check_name("vector.task", self.task)
+        check_counter("vector.revision", self.revision)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Proposal:
+    """One robot's ballot paper in Alg. 3: who should own ``task``, judged at ``base_revision``.
+
+    ``aggregate`` is the joint utility that the robot computed for the candidate (a tie-break, rounded to 1/256);
+    ``is_escape`` says that the robot holds the owner for gone, not ready or below its floor.
+    """
+
+    voter: NodeId
+    task: TaskId
+    base_revision: int
+    candidate: NodeId
+    aggregate: float
+    is_escape: bool = False
+    reason: str = ""
+
+    def __post_init__(self) -> None:
+        check_name("proposal.voter", self.voter)
+        check_name("proposal.task", self.task)
+        check_name("proposal.candidate", self.candidate)
+        check_counter("proposal.base_revision", self.base_revision)
+        check_range("proposal.aggregate", self.aggregate, 0.0, 2.0)
+
+
+# --- VOTE: the register ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Allocation:
+    """The register's value: who owns the task, and how it is tuned.
+
+    ``revision`` rises by one with every change, ``epoch`` only when ``owner`` changes. Revision 0 is "nothing agreed
+    yet": no owner, the fleet file's tuning.
+    """
+
+    task: TaskId
+    revision: int
+    epoch: int
+    owner: NodeId | None
+    tuning: Tuning
+    pinned: bool = False
+    paused: bool = False
+
+    def __post_init__(self) -> None:
+        check_name("allocation.task", self.task)
+        check_counter("allocation.revision", self.revision)
+        check_counter("allocation.epoch", self.epoch)
+        if self.owner is not None:
+            check_name("allocation.owner", self.owner)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, order=True)
+class Ballot:
+    """A proposer's attempt, totally ordered by (counter, node, incarnation)."""
+
+    counter: int
+    node: NodeId
+    incarnation: int
+
+    def __post_init__(self) -> None:
+        check_counter("ballot.counter", self.counter)
+        check_counter("ballot.incarnation", self.incarnation)
+        if self.node:
+            check_name("ballot.node", self.node)
+
+
+NO_BALLOT = Ballot(counter=0, node="", incarnation=0)
+"""Lower than every real ballot."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Acceptance:
+    """What an elector has accepted: a value under a ballot."""
+
+    ballot: Ballot
+    value: Allocation
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RegisterState:
+    """The durable part of one task's register on one node; written before any answer leaves."""
+
+    task: TaskId
+    promised: Ballot = NO_BALLOT
+    accepted: Acceptance | None = None
+    learnt: Allocation | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DurableState:
+    """Everything a node keeps across restarts (one file, `zsched.adapters.state_file`)."""
+
+    fleet: str
+    node: NodeId
+    incarnation: int
+    generation: int
+    hardware: str
+    electorate: str
+    registers: tuple[RegisterState, ...] = ()
+
+
+# --- membership ------------------------------------------------------------------------------------------------------
+
+
+class PeerState(StrEnum):
+    """A peer as this node sees it."""
+
+    UNKNOWN = "unknown"  # configured, never heard
+    ALIVE = "alive"
+    SUSPECT = "suspect"  # silent, or its token went, but in grace
+    GONE = "gone"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Beat:
+    """The heartbeat, sent from the decision loop itself (a wedged loop stops it; zenoh's own keep-alives go on)."""
+
+    node: NodeId
+    incarnation: int
+    sequence: int
+    loop_lag_s: float
+    learnt: tuple[tuple[TaskId, int, int], ...] = ()
+    """(task, revision, epoch) of every value this node has learnt."""
+    suspects: tuple[NodeId, ...] = ()
+    """Whom this node suspects or holds for gone: the second observer's word."""
+
+    def __post_init__(self) -> None:
+        check_name("beat.node", self.node)
+        check_counter("beat.incarnation", self.incarnation)
+        check_counter("beat.sequence", self.sequence)
+        check_range("beat.loop_lag_s", self.loop_lag_s, 0.0, 86400.0)

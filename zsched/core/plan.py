@@ -1,0 +1,128 @@
+"""The frozen values that pass between the executor, the route stage and the relay process.
+
+Knows: streams, routes, slots, plans, roles, counters. Does not know: zenoh, pipes, or why a task moved.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from zsched.core.model import NodeId, TaskId, check_range
+
+
+class Direction(StrEnum):
+    """Inputs go from the robot's applications to the owner's worker, outputs come back."""
+
+    INPUT = "input"
+    OUTPUT = "output"
+
+
+class StreamClass(StrEnum):
+    """What a stream needs (design: classes of streams)."""
+
+    BEST_EFFORT = "best_effort"
+    LATEST = "latest"
+    RELIABLE = "reliable"
+
+
+class HandoverRule(StrEnum):
+    """When an output switches to the new owner: at its first sample, or after the old one's last."""
+
+    LATEST = "latest"
+    ALL = "all"
+
+
+class ReadyWhen(StrEnum):
+    """How the relay knows that a worker can take its inputs."""
+
+    TOKEN = "token"  # zsched.worker's liveliness token on the data session
+    MATCHING = "matching"  # a foreign worker: a subscriber matches
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StreamSettings:
+    """How one stream is carried."""
+
+    stream_class: StreamClass = StreamClass.BEST_EFFORT
+    keep_last: int = 1
+    """Samples kept per key and replayed to a new owner (class ``latest``), 0..1000."""
+    depth: int = 16
+    """Bounded queue between subscriber and publisher, 1..100000 samples."""
+    handover: HandoverRule = HandoverRule.LATEST
+
+    def __post_init__(self) -> None:
+        check_range("keep_last", self.keep_last, 0, 1000)
+        check_range("depth", self.depth, 1, 100_000)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Route:
+    """One stream of one robot for one owner, with every placeholder filled in (concrete key expressions)."""
+
+    stream: str
+    """Stable name of the rule on this node, e.g. ``map_merge/in/0``: counters and kept values hang on it."""
+    direction: Direction
+    from_expr: str
+    to_expr: str
+    settings: StreamSettings
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Slot:
+    """The routes of one task towards one owner in one epoch."""
+
+    epoch: int
+    owner: NodeId
+    routes: tuple[Route, ...]
+    ready_when: ReadyWhen
+    ready_expr: str
+    """Liveliness key expression of the owner's worker token (ready_when ``token``)."""
+
+
+class RoutePhase(StrEnum):
+    """How far the handover to `RoutePlan.current` may go (the executor's table decides, the relay obeys)."""
+
+    PREPARE = "prepare"  # open the new slot, watch for readiness; the old slot still carries the streams
+    FLIP = "flip"  # warm up and switch; the old slot drains
+    CLOSE = "close"  # drop the old slot
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RoutePlan:
+    """What this node's relay shall do for one task; the newest plan of a task replaces the previous one whole."""
+
+    task: TaskId
+    phase: RoutePhase
+    current: Slot | None
+    predecessor: Slot | None = None
+
+
+class WorkerRole(StrEnum):
+    """What a worker is told to be."""
+
+    IDLE = "idle"
+    ACTIVE = "active"
+    DRAINING = "draining"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Role:
+    """The role of this node's worker for one task; ``epoch`` is 0 while idle."""
+
+    task: TaskId
+    role: WorkerRole
+    epoch: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StreamCount:
+    """Counters of one stream since the relay started."""
+
+    stream: str
+    messages: int = 0
+    bytes: int = 0
+    drops: tuple[tuple[str, int], ...] = ()
+    """(reason, count): ``overflow``, ``no_route``, ``stale_epoch``, ``loop``, ``stalled``..."""
+    last_seen_s: float | None = None
+    """Seconds since the newest message, ``None`` before the first."""

@@ -1,0 +1,1 @@
+"""The reference task: merging the maps of several robots."""
