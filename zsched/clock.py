@@ -1,0 +1,20 @@
+"""The one place that reads clocks: monotonic seconds for decisions, wall time for display only.
+
+CLOCK_BOOTTIME goes on while a machine sleeps, so that a laptop that was shut for a minute does not think its lease,
+its peers' beats or its samples are fresh.
+"""
+
+from __future__ import annotations
+
+import time
+from datetime import UTC, datetime
+
+
+def monotonic_s() -> float:
+    """Seconds of CLOCK_BOOTTIME; comparable only on this machine and boot."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
+
+
+def wall_time() -> str:
+    """Now as an RFC 3339 string in UTC with milliseconds, for logs and people; never for decisions."""
+    return datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")

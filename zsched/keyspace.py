@@ -1,0 +1,96 @@
+"""The address plan: every control key is built and parsed here, and nowhere else.
+
+Knows: the shape of each key. Does not know: what travels under it.
+
+All control keys start with a verbatim ``@`` chunk, which no wildcard (``*``, ``**``) matches: a user who subscribes to
+everything never receives our ballots. The chunk after the kind is the node that *owns* the key, so that an access rule
+can bind it to that node's certificate; a request carries its asker behind it. `docs/keyspace.md` is this file as a table.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from zsched.core.model import NAME, NodeId, TaskId
+
+ROOT = "@zsched"
+END_CHUNK = "@zsched/end"
+"""Suffix of the in-band end markers behind a stream's last sample: ``{to}/@zsched/end``."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ParsedKey:
+    """A control key taken apart: ``kind``, the ``owner`` node and what follows it."""
+
+    fleet: str
+    kind: str
+    owner: NodeId
+    rest: tuple[str, ...]
+
+
+def parse(key: str) -> ParsedKey | None:
+    """Take a control key apart; ``None`` when it is not one of ours or a name in it is malformed."""
+    chunks = key.split("/")
+    if len(chunks) < 4 or chunks[0] != ROOT:
+        return None
+    if not all(NAME.fullmatch(chunk) for chunk in chunks[1:]):
+        return None
+    return ParsedKey(fleet=chunks[1], kind=chunks[2], owner=chunks[3], rest=tuple(chunks[4:]))
+
+
+@dataclass(frozen=True, slots=True)
+class Keyspace:
+    """The keys of one fleet. Pass ``"*"`` for a name to get the selector over all of them."""
+
+    fleet: str
+
+    def _key(self, *chunks: str) -> str:
+        return "/".join((ROOT, self.fleet, *chunks))
+
+    def alive(self, node: NodeId, incarnation: int | str) -> str:
+        """Liveliness token of a daemon: presence, seen to go within milliseconds of a kill."""
+        return self._key("alive", node, str(incarnation))
+
+    def beat(self, node: NodeId) -> str:
+        """Put, best effort: the heartbeat out of the decision loop."""
+        return self._key("beat", node)
+
+    def profile(self, node: NodeId) -> str:
+        """Put: `Profile`."""
+        return self._key("profile", node)
+
+    def utility(self, node: NodeId, asker: NodeId) -> str:
+        """Queryable of ``node``: its utility vectors for all tasks."""
+        return self._key("utility", node, asker)
+
+    def proposal(self, node: NodeId) -> str:
+        """Put: `Proposal`."""
+        return self._key("proposal", node)
+
+    def register(self, elector: NodeId, proposer: NodeId) -> str:
+        """Queryable of ``elector``: prepare and accept."""
+        return self._key("register", elector, proposer)
+
+    def allocation(self, node: NodeId) -> str:
+        """Put and queryable: the register values that ``node`` has learnt."""
+        return self._key("allocation", node)
+
+    def worker(self, node: NodeId, task: TaskId, incarnation: int | str) -> str:
+        """Liveliness token of a worker on its data session: ready."""
+        return self._key("worker", node, task, str(incarnation))
+
+    def role(self, node: NodeId, task: TaskId) -> str:
+        """Put and queryable, to the worker from its own node: idle, active or draining."""
+        return self._key("role", node, task)
+
+    def snapshot(self, node: NodeId, task: TaskId) -> str:
+        """Queryable of a worker: its state, chunked."""
+        return self._key("snapshot", node, task)
+
+    def status(self, node: NodeId, asker: NodeId) -> str:
+        """Queryable of ``node``: what `zsched status` shows."""
+        return self._key("status", node, asker)
+
+    def command(self, node: NodeId, operator: NodeId) -> str:
+        """Queryable of ``node``: operator commands."""
+        return self._key("command", node, operator)
