@@ -1,0 +1,270 @@
+"""Bytes <-> values: MessagePack frames, versioned, size- and range-checked.
+
+Knows: the frame (``[version, kind, {field: value}]``), which classes may travel, how many bytes each may take.
+Does not know: keys, peers, what a value is for.
+
+The codec of a class is compiled once from its type hints, so that a value's fields, their types and ranges stand in one
+place only (the dataclass). Fields equal to their default are left out, unknown fields are ignored (a newer peer), a
+missing field without a default, a wrong type, a value out of range, an unknown version or kind raise `WireError`,
+whose ``reason`` is the word a counter is kept under. Nothing else ever escapes `decode`, whatever the bytes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import types
+from collections.abc import Callable
+from dataclasses import MISSING, fields, is_dataclass
+from enum import Enum
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import msgpack
+
+from zsched.core import messages, model, plan
+from zsched.errors import WireError
+
+VERSION = 1
+MAX_STRING = 512
+SMALL = 8 * 1024
+LARGE = 256 * 1024
+
+T = TypeVar("T")
+Reader = Callable[[Any], Any]
+Writer = Callable[[Any], Any]
+
+KINDS: dict[str, tuple[type, int]] = {
+    "beat": (model.Beat, SMALL),
+    "profile": (model.Profile, 4 * SMALL),
+    "proposal": (model.Proposal, SMALL),
+    "utilities": (messages.Utilities, LARGE),
+    "prepare": (messages.Prepare, SMALL),
+    "promise": (messages.Promise, SMALL),
+    "accept": (messages.Accept, SMALL),
+    "accepted": (messages.Accepted, SMALL),
+    "refused": (messages.Refused, SMALL),
+    "learnt": (messages.Learnt, LARGE),
+    "set_weights": (messages.SetWeights, SMALL),
+    "command_result": (messages.CommandResult, SMALL),
+    "state": (model.DurableState, LARGE),
+    "role": (plan.Role, SMALL),
+    "route_plan": (plan.RoutePlan, LARGE),
+}
+"""Every class that may travel between nodes, into the state file or over the relay's pipe, with its size bound."""
+
+_KIND_OF: dict[type, str] = {cls: kind for kind, (cls, _) in KINDS.items()}
+
+
+def register(kind: str, cls: type, max_bytes: int) -> None:
+    """Add a class of another module of this program (the relay's pipe) to the codec.
+
+    Raises:
+        ValueError: the kind or the class is already there.
+    """
+    if kind in KINDS or cls in _KIND_OF:
+        raise ValueError(f"wire kind {kind!r} is registered twice")
+    KINDS[kind] = (cls, max_bytes)
+    _KIND_OF[cls] = kind
+
+
+# --- compiling a class's codec -------------------------------------------------------------------------------------
+
+
+def _fail(what: str, value: object) -> WireError:
+    return WireError("type", f"{what}, not {type(value).__name__}")
+
+
+def _read_str(value: Any) -> str:
+    if type(value) is not str or len(value) > MAX_STRING:
+        raise _fail(f"expected a string of at most {MAX_STRING}", value)
+    return value
+
+
+def _read_int(value: Any) -> int:
+    if type(value) is not int:
+        raise _fail("expected an integer", value)
+    return value
+
+
+def _read_float(value: Any) -> float:
+    if type(value) is int:
+        value = float(value)
+    if type(value) is not float or not math.isfinite(value):
+        raise _fail("expected a finite number", value)
+    return value
+
+
+def _read_bool(value: Any) -> bool:
+    if type(value) is not bool:
+        raise _fail("expected a boolean", value)
+    return value
+
+
+def _same(value: Any) -> Any:
+    return value
+
+
+_SCALARS: dict[Any, Reader] = {str: _read_str, int: _read_int, float: _read_float, bool: _read_bool}
+_CODECS: dict[type, tuple[Reader, Writer]] = {}
+
+
+def _codec(hint: Any) -> tuple[Reader, Writer]:
+    """The (reader, writer) of a type hint."""
+    if hint in _SCALARS:
+        return _SCALARS[hint], _same
+    origin = get_origin(hint)
+    if origin is tuple:
+        return _tuple_codec(get_args(hint))
+    if origin in (Union, types.UnionType):
+        return _optional_codec(get_args(hint))
+    if isinstance(hint, type) and issubclass(hint, Enum):
+        return _enum_codec(hint)
+    if isinstance(hint, type) and is_dataclass(hint):
+        if hint not in _CODECS:
+            _CODECS[hint] = _dataclass_codec(hint)
+        return _CODECS[hint]
+    raise TypeError(f"no codec for {hint!r}")
+
+
+def _enum_codec(hint: type[Enum]) -> tuple[Reader, Writer]:
+    members = {member.value: member for member in hint}
+
+    def read(value: Any) -> Enum:
+        if type(value) is not str or value not in members:
+            raise _fail(f"expected one of {sorted(members)}", value)
+        return members[value]
+
+    return read, lambda value: value.value
+
+
+def _optional_codec(args: tuple[Any, ...]) -> tuple[Reader, Writer]:
+    (inner,) = [arg for arg in args if arg is not type(None)]
+    read_inner, write_inner = _codec(inner)
+    return (
+        lambda value: None if value is None else read_inner(value),
+        lambda value: None if value is None else write_inner(value),
+    )
+
+
+def _tuple_codec(args: tuple[Any, ...]) -> tuple[Reader, Writer]:
+    if len(args) == 2 and args[1] is Ellipsis:
+        read_item, write_item = _codec(args[0])
+
+        def read_many(value: Any) -> tuple[Any, ...]:
+            if type(value) is not list:
+                raise _fail("expected a list", value)
+            return tuple([read_item(item) for item in value])
+
+        return read_many, lambda value: [write_item(item) for item in value]
+    codecs = [_codec(arg) for arg in args]
+
+    def read_fixed(value: Any) -> tuple[Any, ...]:
+        if type(value) is not list or len(value) != len(codecs):
+            raise _fail(f"expected a list of {len(codecs)}", value)
+        return tuple([read(item) for (read, _), item in zip(codecs, value, strict=True)])
+
+    return read_fixed, lambda value: [write(item) for (_, write), item in zip(codecs, value, strict=True)]
+
+
+def _dataclass_codec(cls: type) -> tuple[Reader, Writer]:
+    hints = get_type_hints(cls)
+    parts = [(field.name, field.default, *_codec(hints[field.name])) for field in fields(cls)]
+
+    def read(value: Any) -> Any:
+        if type(value) is not dict:
+            raise _fail(f"expected a map ({cls.__name__})", value)
+        arguments = {}
+        for name, default, read_field, _ in parts:
+            if name in value:
+                arguments[name] = read_field(value[name])
+            elif default is MISSING:
+                raise WireError("missing", f"{cls.__name__}.{name}")
+        return cls(**arguments)
+
+    def write(value: Any) -> dict[str, Any]:
+        body = {}
+        for name, default, _, write_field in parts:
+            item = getattr(value, name)
+            if item is not default and (default is MISSING or item != default):
+                body[name] = write_field(item)
+        return body
+
+    return read, write
+
+
+# --- frames --------------------------------------------------------------------------------------------------------
+
+
+def encode(value: object) -> bytes:
+    """The frame of a value whose class is in `KINDS`.
+
+    Raises:
+        KeyError: the class may not travel.
+        WireError: the frame would be larger than its kind allows (``reason`` "size"): a bug or a fleet too large.
+    """
+    kind = _KIND_OF[type(value)]
+    cls, bound = KINDS[kind]
+    frame: bytes = msgpack.packb([VERSION, kind, _codec(cls)[1](value)], use_bin_type=True)
+    if len(frame) > bound:
+        raise WireError("size", f"{kind}: {len(frame)} bytes, at most {bound}")
+    return frame
+
+
+def decode(frame: bytes, *classes: type[T]) -> T:
+    """The value in a frame, which must be of one of ``classes``.
+
+    Raises:
+        WireError: anything at all is wrong; ``reason`` is one of size, garbage, frame, version, kind, type, missing,
+            range.
+    """
+    bound = max(KINDS[_KIND_OF[cls]][1] for cls in classes)
+    if len(frame) > bound:
+        raise WireError("size", f"{len(frame)} bytes, at most {bound}")
+    try:
+        parts = msgpack.unpackb(frame, raw=False, strict_map_key=True, timestamp=0)
+    except Exception as error:  # hostile bytes: whatever msgpack raises means the same
+        raise WireError("garbage", type(error).__name__) from error
+    if type(parts) is not list or len(parts) < 3:
+        raise WireError("frame", "expected [version, kind, body]")
+    version, kind, body = parts[:3]
+    if version != VERSION or type(version) is not int:
+        raise WireError("version", f"{version!r:.20}, this is {VERSION}")
+    for cls in classes:
+        if kind == _KIND_OF[cls]:
+            return _read_body(cls, body, len(frame))
+    raise WireError("kind", f"{kind!r:.40}")
+
+
+def _read_body(cls: type[T], body: Any, size: int) -> T:
+    bound = KINDS[_KIND_OF[cls]][1]
+    if size > bound:
+        raise WireError("size", f"{size} bytes, at most {bound}")
+    try:
+        value: T = _codec(cls)[0](body)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise WireError("range", str(error)[:200]) from error
+    return value
+
+
+# --- the state file's payload --------------------------------------------------------------------------------------
+
+
+def encode_state(state: model.DurableState) -> bytes:
+    """The state file's whole content: a magic line, the checksum, the frame."""
+    frame = encode(state)
+    return b"zsched-state/1 " + hashlib.blake2s(frame).hexdigest().encode() + b"\n" + frame
+
+
+def decode_state(content: bytes) -> model.DurableState:
+    """The state in a file's content.
+
+    Raises:
+        WireError: torn, foreign or damaged content.
+    """
+    header, newline, frame = content.partition(b"\n")
+    words = header.split(b" ")
+    if not newline or len(words) != 2 or words[0] != b"zsched-state/1":
+        raise WireError("frame", "not a zsched state file of version 1")
+    if hashlib.blake2s(frame).hexdigest().encode() != words[1]:
+        raise WireError("checksum", "the content does not match its checksum (torn or damaged)")
+    return decode(frame, model.DurableState)
