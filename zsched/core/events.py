@@ -1,0 +1,261 @@
+"""What happened: everything that may enter a node through `Node.handle`, in the past tense.
+
+Knows: the facts that adapters report. Does not know: what follows from them.
+
+``request`` is the adapter's handle of an open question; the answer's instruction carries it back.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from zsched.core.messages import Accept, Accepted, Learnt, Prepare, Promise, Refused, SetWeights, Utilities
+from zsched.core.model import Beat, DeviceSample, LinkSample, NodeId, Profile, Proposal, TaskId, WorkerState
+from zsched.core.plan import StreamCount
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DeadlineReached:
+    """The time that `Node.next_deadline` named has come (or the loop simply woke up)."""
+
+
+# --- PROFILE, GATEWAY ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProfileSampled:
+    """This machine and its links were measured."""
+
+    device: DeviceSample
+    links: tuple[LinkSample, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProfileReceived:
+    """A peer published its profile."""
+
+    profile: Profile
+
+
+# --- SCHEDULER: the gather -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UtilityAsked:
+    """A peer gathers and asks for our vectors."""
+
+    request: int
+    asker: NodeId
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UtilityReceived:
+    """A peer answered our gather."""
+
+    gather: int
+    utilities: Utilities
+
+
+# --- VOTE ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProposalReceived:
+    """A robot proposed a candidate (or to stay)."""
+
+    proposal: Proposal
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PrepareAsked:
+    """A proposer asks this elector for a promise."""
+
+    request: int
+    asker: NodeId
+    prepare: Prepare
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AcceptAsked:
+    """A proposer asks this elector to accept a value."""
+
+    request: int
+    asker: NodeId
+    accept: Accept
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ElectorAnswered:
+    """An elector answered our prepare or accept."""
+
+    answer: Promise | Accepted | Refused
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LearntReceived:
+    """A peer told what it has learnt (put after a commit, or its answer to `AskLearnt`)."""
+
+    learnt: Learnt
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LearntAsked:
+    """A peer wants to know what we have learnt."""
+
+    request: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PersistFailed:
+    """The durable state could not be written; nothing that hung on it was sent."""
+
+    reason: str
+
+
+# --- membership ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BeatReceived:
+    """A peer's decision loop is alive."""
+
+    beat: Beat
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TokenSeen:
+    """A daemon's liveliness token appeared."""
+
+    node: NodeId
+    incarnation: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TokenLost:
+    """A daemon's liveliness token went: its process closed, was killed, or its link's lease ended."""
+
+    node: NodeId
+    incarnation: int
+
+
+# --- EXECUTOR, ROUTE -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorkerChanged:
+    """Our supervisor reports a worker of this node."""
+
+    task: TaskId
+    state: WorkerState
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SlotReady:
+    """The relay sees the new owner's worker ready (or no longer) for the slot of ``epoch``."""
+
+    task: TaskId
+    epoch: int
+    is_ready: bool = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SlotFlipped:
+    """The relay switched every stream of the task to the slot of ``epoch``; ``replayed`` kept values went first."""
+
+    task: TaskId
+    epoch: int
+    replayed: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SlotDrained:
+    """The old slot's end markers have come back."""
+
+    task: TaskId
+    epoch: int
+    """Epoch of the slot that is drained (the predecessor's)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StreamsCounted:
+    """The relay's counters."""
+
+    counts: tuple[StreamCount, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RelayChanged:
+    """The relay process started or went; after a restart it has been given the newest plans again."""
+
+    is_running: bool
+    reason: str = ""
+
+
+# --- operators -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StatusAsked:
+    """An operator (here or at another node) asks for the status."""
+
+    request: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WeightsCommanded:
+    """An operator changes a task's weights."""
+
+    request: int
+    command: SetWeights
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameDropped:
+    """Bytes came that are no valid frame, or not for us: only a counter moves."""
+
+    kind: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProblemReported:
+    """An adapter has trouble (``problem``), or no longer (``None``); ``source`` names it. Shown in status."""
+
+    source: str
+    problem: str | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StopRequested:
+    """The daemon is told to stop: hand nothing new to this node, say goodbye."""
+
+
+Event = (
+    DeadlineReached
+    | ProfileSampled
+    | ProfileReceived
+    | UtilityAsked
+    | UtilityReceived
+    | ProposalReceived
+    | PrepareAsked
+    | AcceptAsked
+    | ElectorAnswered
+    | LearntReceived
+    | LearntAsked
+    | PersistFailed
+    | BeatReceived
+    | TokenSeen
+    | TokenLost
+    | WorkerChanged
+    | SlotReady
+    | SlotFlipped
+    | SlotDrained
+    | StreamsCounted
+    | RelayChanged
+    | StatusAsked
+    | WeightsCommanded
+    | FrameDropped
+    | ProblemReported
+    | StopRequested
+)

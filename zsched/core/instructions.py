@@ -1,0 +1,186 @@
+"""What to do: everything a node asks of its adapters, in the imperative.
+
+Knows: the wish. Does not know: how it is carried out, or whether it worked (that comes back as an event).
+
+The order of a batch is meaning: *persist, then send, then apply*. The shell carries a batch out in order; when one
+instruction fails, it drops the rest of the batch and reports the failure as an event. Every batch is safe when cut
+after any prefix.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from zsched.core.messages import Accept, Accepted, CommandResult, Learnt, Prepare, Promise, Refused, Utilities
+from zsched.core.model import Beat, DurableState, NodeId, Profile, Proposal, TaskId
+from zsched.core.plan import Role, RoutePlan
+from zsched.core.snapshot import Snapshot
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PersistState:
+    """Write the durable state; what follows in this batch must not happen unless it is on disk."""
+
+    state: DurableState
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PublishBeat:
+    """Send the heartbeat to everybody, best effort."""
+
+    beat: Beat
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PublishProfile:
+    """Send our profile to every gateway."""
+
+    profile: Profile
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AskUtilities:
+    """Query every robot's utilities once; answers come back as `UtilityReceived` with this number."""
+
+    gather: int
+    deadline_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AnswerUtilities:
+    """Answer a peer's gather."""
+
+    request: int
+    utilities: Utilities
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PublishProposal:
+    """Send our ballot paper to every robot."""
+
+    proposal: Proposal
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SendPrepare:
+    """Ask every elector (ourselves included) for a promise."""
+
+    prepare: Prepare
+    deadline_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SendAccept:
+    """Ask every elector (ourselves included) to accept."""
+
+    accept: Accept
+    deadline_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AnswerElection:
+    """Answer a proposer's prepare or accept."""
+
+    request: int
+    answer: Promise | Accepted | Refused
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PublishLearnt:
+    """Tell everybody what we have learnt."""
+
+    learnt: Learnt
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AskLearnt:
+    """Ask one peer what it has learnt; the answer comes back as `LearntReceived`."""
+
+    peer: NodeId
+    deadline_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AnswerLearnt:
+    """Answer a peer's `AskLearnt`."""
+
+    request: int
+    learnt: Learnt
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StartWorker:
+    """Let this node's worker for the task run (again, if it runs already: nothing happens)."""
+
+    task: TaskId
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StopWorker:
+    """Stop this node's worker for the task (a cold standby, after its drain)."""
+
+    task: TaskId
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetRole:
+    """Tell this node's worker what it is now."""
+
+    role: Role
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ApplyRoutes:
+    """Give the relay the newest plan of one task."""
+
+    plan: RoutePlan
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AnswerStatus:
+    """Answer an operator."""
+
+    request: int
+    snapshot: Snapshot
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AnswerCommand:
+    """Answer an operator's command."""
+
+    request: int
+    result: CommandResult
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordStory:
+    """One line for the journal and the decision log: a decision, a commit, a handover step, a peer's change."""
+
+    stage: str
+    """One of the six words (``profile``..``route``), or ``membership``."""
+    text: str
+    task: TaskId = ""
+    epoch: int = 0
+
+
+Instruction = (
+    PersistState
+    | PublishBeat
+    | PublishProfile
+    | AskUtilities
+    | AnswerUtilities
+    | PublishProposal
+    | SendPrepare
+    | SendAccept
+    | AnswerElection
+    | PublishLearnt
+    | AskLearnt
+    | AnswerLearnt
+    | StartWorker
+    | StopWorker
+    | SetRole
+    | ApplyRoutes
+    | AnswerStatus
+    | AnswerCommand
+    | RecordStory
+)
