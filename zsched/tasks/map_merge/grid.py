@@ -1,0 +1,104 @@
+"""The occupancy grid as a value, and its cells as three levels: unknown, free, occupied.
+
+Knows: cells, resolution, the grid's place in its map frame. Does not know: bytes (`cdr`), other robots, alignment.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from zsched.tasks.map_merge.geometry import FloatArray, Pose2
+
+Cells = npt.NDArray[np.int8]
+Mask = npt.NDArray[np.bool_]
+
+UNKNOWN, FREE, OCCUPIED = -1, 0, 100
+OCCUPIED_FROM = 65
+"""Cells from here on are walls (map_server's occupied_thresh); up to `FREE_TO` free; between: known, but neither."""
+FREE_TO = 25
+MAX_CELLS = 64_000_000
+"""Largest grid taken or published, 400 m x 400 m at 0.05 m: a wrong origin or size must not take all memory."""
+RESOLUTION_RANGE_M = (0.005, 5.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Grid:
+    """An occupancy grid as in nav_msgs/msg/OccupancyGrid.
+
+    ``data`` is int8 (height, width), row 0 at the origin: -1 unknown, 0 free .. 100 occupied. ``origin`` is the pose of
+    cell (0, 0)'s outer corner in ``frame_id``; its yaw turns the whole grid. ``resolution`` in metres per cell.
+    ``stamp_ns`` is the sender's time and only ever compared with stamps of the same sender.
+
+    Raises:
+        ValueError: a shape, resolution or origin that no map has.
+    """
+
+    data: Cells
+    resolution: float
+    origin: Pose2 = Pose2()
+    stamp_ns: int = 0
+    frame_id: str = "map"
+
+    def __post_init__(self) -> None:
+        if self.data.ndim != 2 or self.data.dtype != np.int8:
+            raise ValueError(f"grid.data: {self.data.dtype} of {self.data.ndim} dimensions is not int8 of 2")
+        if self.data.size > MAX_CELLS:
+            raise ValueError(f"grid.data: {self.data.size} cells are more than {MAX_CELLS}")
+        low, high = RESOLUTION_RANGE_M
+        if not low <= self.resolution <= high:
+            raise ValueError(f"grid.resolution: {self.resolution!r} is not in [{low:g}, {high:g}] m")
+        if not self.origin.is_finite:
+            raise ValueError("grid.origin: not a finite pose")
+
+    @property
+    def width(self) -> int:
+        """Cells per row."""
+        return int(self.data.shape[1])
+
+    @property
+    def height(self) -> int:
+        """Rows."""
+        return int(self.data.shape[0])
+
+    @property
+    def occupied(self) -> Mask:
+        """Which cells are walls."""
+        mask: Mask = self.data >= OCCUPIED_FROM
+        return mask
+
+    @property
+    def free(self) -> Mask:
+        """Which cells are free."""
+        mask: Mask = (self.data >= FREE) & (self.data <= FREE_TO)
+        return mask
+
+    @property
+    def known(self) -> Mask:
+        """Which cells were seen at all."""
+        mask: Mask = self.data >= FREE
+        return mask
+
+    @property
+    def known_area_m2(self) -> float:
+        """The seen area in square metres."""
+        return float(np.count_nonzero(self.known)) * self.resolution**2
+
+    def corners(self) -> FloatArray:
+        """The grid's four corners (4, 2) in its map frame, in metres."""
+        width, height = self.width * self.resolution, self.height * self.resolution
+        return self.origin.apply(np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]]))
+
+    def points(self, mask: Mask) -> FloatArray:
+        """The centres (N, 2) of the masked cells in the map frame, in metres."""
+        rows, columns = np.nonzero(mask)
+        local = np.stack((columns + 0.5, rows + 0.5), axis=1) * self.resolution
+        return self.origin.apply(local)
+
+
+def same_resolution(a: float, b: float) -> bool:
+    """Whether two resolutions are equal as far as a message's float32 can tell."""
+    return math.isclose(a, b, rel_tol=1e-5)
