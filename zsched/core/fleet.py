@@ -5,7 +5,9 @@ Knows: what an operator may say, with the defaults (they live here only). Does n
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import hashlib
+from collections.abc import Iterable
+from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
 
 from zsched.core.model import LinkSource, NodeId, NodeKind, TaskId, Tuning, check_range
@@ -200,3 +202,68 @@ class Fleet:
             if task.name == name:
                 return task
         raise KeyError(name)
+
+
+def dial_endpoint(endpoint: str, host: str) -> str:
+    """The zenoh endpoint under which others reach a node that listens on ``endpoint``; empty when they cannot.
+
+    A listener on every address (``0.0.0.0``, ``[::]``) is dialled at ``host``; port 0 (any) cannot be dialled.
+
+    >>> dial_endpoint("tcp/0.0.0.0:7457", "192.0.2.11")
+    'tcp/192.0.2.11:7457'
+    """
+    protocol, _, address = endpoint.partition("/")
+    for everywhere in ("0.0.0.0:", "[::]:"):
+        if address.startswith(everywhere):
+            literal = f"[{host}]" if ":" in host else host
+            address = f"{literal}:{address.removeprefix(everywhere)}" if host else ""
+    port = address.partition("#")[0].partition("?")[0].rpartition(":")[2]
+    if not address or port == "0":
+        return ""
+    return f"{protocol}/{address}"
+
+
+def fleet_hash(fleet: Fleet) -> str:
+    """16 hex digits over all that every machine of the fleet must agree on.
+
+    Left out is what a machine may have to itself: folders (of two paths only the file's name counts). Two nodes with
+    different hashes run different fleet files; they say so in their status and go on.
+    """
+    return _digest("fleet", fleet)
+
+
+def electorate_hash(fleet: Fleet) -> str:
+    """16 hex digits over the fleet's name and its electors: every prepare and accept carries it (design section 6)."""
+    return _digest("electorate", (fleet.name, fleet.electors))
+
+
+def _digest(kind: str, value: object) -> str:
+    state = hashlib.blake2s(digest_size=8, person=b"zsched1", salt=kind[:8].encode())
+    for part in _canonical(value):
+        state.update(len(part).to_bytes(4, "big") + part)
+    return state.hexdigest()
+
+
+_PATHS = frozenset({("Fleet", "zenoh_config"), ("LinkSpec", "value")})
+"""Fields that may hold a path: relative to the fleet file, hence another one on every machine."""
+
+
+def _canonical(value: object) -> Iterable[bytes]:
+    """Length-prefixed by the caller, so that no two different values have the same parts."""
+    if is_dataclass(value) and not isinstance(value, type):
+        kind = type(value).__name__
+        yield kind.encode()
+        for field in fields(value):
+            held = getattr(value, field.name)
+            yield field.name.encode()
+            yield from _canonical(held.rpartition("/")[2] if (kind, field.name) in _PATHS else held)
+        return
+    if isinstance(value, tuple):
+        yield b"%d" % len(value)
+        for item in value:
+            yield from _canonical(item)
+        return
+    if isinstance(value, float | int) and not isinstance(value, bool):
+        yield float(value).hex().encode()  # 2 and 2.0 are one setting
+        return
+    yield f"{type(value).__name__}:{value}".encode()

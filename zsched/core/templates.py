@@ -1,0 +1,163 @@
+"""Decides which concrete routes a task's rules become for one robot, one owner and one epoch.
+
+Knows: the placeholders, where each may stand, how a template becomes a key expression. Does not know: YAML, zenoh,
+other tasks (`zsched.core.rulecheck` holds rules against each other).
+
+====================  =====================================================  =============================
+place                 placeholders                                           must hold
+====================  =====================================================  =============================
+input ``from``        ``{robot} {node} {task}``                              (none: one stream for everybody)
+input ``to``          ``{robot} {node} {target} {task}``                     ``{target}``
+output ``from``       ``{robot} {node} {target} {task} {epoch}``             ``{target}``
+output ``to``         ``{robot} {node} {task}``                              ``{robot}`` or ``{node}``
+====================  =====================================================  =============================
+
+``{robot}`` and ``{node}`` are both the robot whose relay carries the stream, ``{target}`` is the owner.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Final
+
+from zsched.core import keyexpr
+from zsched.core.fleet import StreamRule, TaskSpec
+from zsched.core.model import NodeId
+from zsched.core.plan import Direction, Route
+
+PLACEHOLDERS: Final = ("robot", "node", "target", "task", "epoch")
+RESERVED_CHUNK: Final = "@zsched"
+"""Root of the control keys and of the in-band end markers; no rule of a user may touch it."""
+
+_BRACES: Final = re.compile(r"\{([^{}]*)\}")
+_EVERYWHERE: Final = frozenset({"robot", "node", "task"})
+_ALLOWED: Final[Mapping[tuple[Direction, str], frozenset[str]]] = {
+    (Direction.INPUT, "from"): _EVERYWHERE,
+    (Direction.INPUT, "to"): _EVERYWHERE | {"target"},
+    (Direction.OUTPUT, "from"): _EVERYWHERE | {"target", "epoch"},
+    (Direction.OUTPUT, "to"): _EVERYWHERE,
+}
+_WHY_NOT: Final[Mapping[tuple[Direction, str, str], str]] = {
+    (Direction.INPUT, "from", "target"): "an input comes from the robot's own applications, whoever owns the task",
+    (Direction.OUTPUT, "to", "target"): "an output keeps its key when the owner changes",
+}
+
+
+def placeholders(template: str) -> tuple[str, ...]:
+    """The names between braces, in order, known or not.
+
+    >>> placeholders("{target}/map_merge/{robot}/map")
+    ('target', 'robot')
+    """
+    return tuple(_BRACES.findall(template))
+
+
+def fill(template: str, **names: str) -> str:
+    """``template`` with every placeholder replaced. Raises `KeyError` for a placeholder without a name.
+
+    >>> fill("{robot}/map", robot="robot1")
+    'robot1/map'
+    """
+    return _BRACES.sub(lambda match: names[match.group(1)], template)
+
+
+def template_fault(template: str, direction: Direction, side: str) -> str | None:
+    """Why ``template`` may not stand as ``side`` (``from`` or ``to``) of a rule; ``None`` when it may."""
+    return (
+        _placeholder_fault(template, direction, side)
+        or _missing_fault(template, direction, side)
+        or _expression_fault(template)
+    )
+
+
+def rule_fault(rule: StreamRule) -> str | None:
+    """Why the two valid templates of ``rule`` make no stream together; ``None`` when they do."""
+    if rule.from_template == rule.to_template:
+        return "'from' and 'to' are the same key: the stream would feed itself"
+    return None
+
+
+def routes_for(task: TaskSpec, robot: NodeId, owner: NodeId, epoch: int) -> tuple[Route, ...]:
+    """The streams of ``robot`` towards ``owner`` in ``epoch``, inputs first, in the order of the fleet file.
+
+    Stream names (``<task>/in/<i>``, ``<task>/out/<i>``) depend on the rule's place only: counters and kept values that
+    hang on them outlive every move.
+    """
+    names = {"robot": robot, "node": robot, "target": owner, "task": task.name, "epoch": str(epoch)}
+    return tuple(
+        Route(
+            stream=stream,
+            direction=rule.direction,
+            from_expr=fill(rule.from_template, **names),
+            to_expr=fill(rule.to_template, **names),
+            settings=rule.settings,
+        )
+        for stream, rule in named_rules(task)
+    )
+
+
+def named_rules(task: TaskSpec) -> tuple[tuple[str, StreamRule], ...]:
+    """(stream name, rule) of ``task``: inputs first, each direction counted from 0."""
+    named: list[tuple[str, StreamRule]] = []
+    for direction, word in ((Direction.INPUT, "in"), (Direction.OUTPUT, "out")):
+        rules = [rule for rule in task.rules if rule.direction is direction]
+        named.extend((f"{task.name}/{word}/{index}", rule) for index, rule in enumerate(rules))
+    return tuple(named)
+
+
+def widened(template: str, **names: str) -> str:
+    """The key expression of everything that ``template`` may become when the placeholders not in ``names`` vary.
+
+    >>> widened("{target}/map_merge/{epoch}/tf", target="edge1")
+    'edge1/map_merge/*/tf'
+    """
+    chunks = [_widened_chunk(chunk, names) for chunk in template.split("/")]
+    return "/".join(chunks)
+
+
+def _widened_chunk(chunk: str, names: Mapping[str, str]) -> str:
+    open_names = dict.fromkeys(PLACEHOLDERS, keyexpr.ANY_RUN)
+    wide = fill(chunk, **{**open_names, **names})
+    while keyexpr.ANY_RUN * 2 in wide:
+        wide = wide.replace(keyexpr.ANY_RUN * 2, keyexpr.ANY_RUN)
+    return keyexpr.SINGLE if wide == keyexpr.ANY_RUN else wide
+
+
+def _placeholder_fault(template: str, direction: Direction, side: str) -> str | None:
+    allowed = _ALLOWED[direction, side]
+    for name in placeholders(template):
+        if name not in PLACEHOLDERS:
+            return f"there is no placeholder {{{name}}}"
+        if name in allowed:
+            continue
+        why = _WHY_NOT.get((direction, side, name), f"only the 'from' of an output has {{{name}}}")
+        return f"{{{name}}} may not stand in the '{side}' of an {direction}: {why}"
+    if "{" in _BRACES.sub("", template) or "}" in _BRACES.sub("", template):
+        return "a brace is not closed"
+    if template.count("{epoch}") > 1 or ("{epoch}" in template and "{epoch}" not in template.split("/")):
+        return "{epoch} must be one whole chunk, once: the gate subscribes to exactly one epoch"
+    return None
+
+
+def _missing_fault(template: str, direction: Direction, side: str) -> str | None:
+    held = set(placeholders(template))
+    if (direction, side) == (Direction.INPUT, "to") and "target" not in held:
+        return "it lacks {target}: an input goes to whichever node owns the task"
+    if (direction, side) == (Direction.OUTPUT, "from") and "target" not in held:
+        return "it lacks {target}: an output comes from whichever node owns the task"
+    if (direction, side) == (Direction.OUTPUT, "to") and not held & {"robot", "node"}:
+        return "it lacks {robot}: every robot would publish its copy under one key"
+    return None
+
+
+def _expression_fault(template: str) -> str | None:
+    sample = fill(template, robot="r", node="r", target="t", task="k", epoch="1")
+    if RESERVED_CHUNK in sample.split("/"):
+        return f"keys with a chunk '{RESERVED_CHUNK}' belong to zsched itself"
+    problem = keyexpr.fault(sample)
+    if problem is not None:
+        return f"it is no key expression: {problem}"
+    if keyexpr.is_wild(sample):
+        return "wildcards in a rule are not supported: write one rule per key"
+    return None
