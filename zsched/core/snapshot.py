@@ -42,7 +42,7 @@ class DecisionStatus:
     """The last round of one task at this robot."""
 
     outcome: str
-    """``stay``, ``wait`` (a better one, not long enough), ``propose`` (a vote was called), ``none`` (nobody to score)."""
+    """``stay``, ``wait`` (a better one, not long enough), ``propose`` (a vote was called), ``none`` (nobody scored)."""
     winner: NodeId | None
     reason: str
     age_s: float

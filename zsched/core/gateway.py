@@ -1,0 +1,74 @@
+"""GATEWAY: the newest profile of every node, with its age (the paper's ``edge_data``, Alg. 1).
+
+Knows: which report is newer, how old is too old, what the task costs where it runs. Does not know: who is better.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from zsched.core.fleet import Demand, Fleet, TaskSpec
+from zsched.core.model import NodeId, Profile, TaskId
+
+STARVED_CPU_RATIO = 0.9
+"""On an owner busier than this the task gets less than it wants: its measured use is no demand."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EdgeData:
+    """A node's newest profile and its age in seconds since we received it."""
+
+    profile: Profile
+    age_s: float
+
+
+class Gateway:
+    """What this node knows of every node's state, itself included."""
+
+    def __init__(self, fleet: Fleet) -> None:
+        self._names = frozenset(node.name for node in fleet.nodes)
+        self._ttl_s = fleet.timing.profile_ttl_s
+        self._profiles: dict[NodeId, tuple[Profile, float]] = {}
+        self._measured: dict[TaskId, Demand] = {}
+
+    def absorb(self, profile: Profile, now: float) -> str | None:
+        """Take a profile in; returns why it was refused (one word for a counter), or ``None``."""
+        if profile.node not in self._names:
+            return "foreign"
+        known = self._profiles.get(profile.node)
+        if known is not None and _order(profile) <= _order(known[0]):
+            return "stale"
+        self._profiles[profile.node] = (profile, now)
+        return None
+
+    def newest(self, node: NodeId, now: float) -> EdgeData | None:
+        """The newest profile of ``node`` whatever its age, or ``None`` when it never sent one."""
+        known = self._profiles.get(node)
+        return None if known is None else EdgeData(profile=known[0], age_s=max(now - known[1], 0.0))
+
+    def fresh(self, node: NodeId, now: float) -> Profile | None:
+        """The newest profile of ``node`` when it is not older than the profile's time to live, else ``None``."""
+        data = self.newest(node, now)
+        return data.profile if data is not None and data.age_s <= self._ttl_s else None
+
+    def learn_demand(self, task: TaskId, owner: NodeId, now: float) -> None:
+        """Note what the task's worker uses on its owner, unless the owner is starved (then it shows too little)."""
+        profile = self.fresh(owner, now)
+        load = None if profile is None else profile.worker(task)
+        if profile is None or load is None or profile.cpu_used_cores is None:
+            return
+        if profile.cpu_used_cores / profile.cpu_cores >= STARVED_CPU_RATIO:
+            return
+        self._measured[task] = Demand(cpu_cores=load.cpu_cores or 0.0, memory_mb=load.memory_mb or 0.0)
+
+    def demand(self, spec: TaskSpec) -> Demand:
+        """What the task will use: the larger of the fleet file's figure and the measurement on the owner."""
+        measured = self._measured.get(spec.name, spec.demand)
+        return Demand(
+            cpu_cores=max(spec.demand.cpu_cores, measured.cpu_cores),
+            memory_mb=max(spec.demand.memory_mb, measured.memory_mb),
+        )
+
+
+def _order(profile: Profile) -> tuple[int, int]:
+    return profile.incarnation, profile.sequence

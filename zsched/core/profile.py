@@ -1,0 +1,207 @@
+"""PROFILE: turns this machine's raw readings into the smoothed profile that robots decide by (Alg. 1).
+
+Knows: outlier rules, smoothing by elapsed time, when a profile is worth sending. Does not know: how anything is read,
+who receives it, or what it is worth.
+
+Smoothing stands here, at the source, and not at the receivers: samples come at 5 Hz, profiles leave at 1 Hz, and
+smoothing what was already thinned out would alias (docs/decisions/0003).
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections import deque
+
+from zsched.core.fleet import Timing
+from zsched.core.model import (
+    DeviceSample,
+    Link,
+    LinkSample,
+    LinkSource,
+    NodeId,
+    Profile,
+    TaskId,
+    WorkerLoad,
+    WorkerState,
+)
+
+RATIO_CHANGE = 0.02
+"""A CPU or memory ratio that moved by this much is worth a profile before its time."""
+RSSI_CHANGE_DB = 1.0
+RSSI_IMPOSSIBLE_ABOVE_DBM = -10.0
+RSSI_IMPOSSIBLE_BELOW_DBM = -100.0
+RSSI_OUTLIER_DB = 25.0
+RSSI_WINDOW = 5
+"""A reading further than 25 dB from the median of the last 5 is dropped (measured on real drives)."""
+LINK_STALE_S = 5.0
+"""A radio that gave no valid reading for so long counts as not measured."""
+
+
+class Ewma:
+    """Exponentially weighted mean with a time constant, for samples at uneven times.
+
+    ``alpha = 1 - exp(-dt / tau)``; the first value is taken as it is. ``tau_s`` of 0 means no smoothing.
+    """
+
+    __slots__ = ("_at", "tau_s", "value")
+
+    def __init__(self, tau_s: float) -> None:
+        self.tau_s = tau_s
+        self.value: float | None = None
+        self._at = 0.0
+
+    def update(self, sample: float, now: float) -> float:
+        """Take a sample in and return the new mean."""
+        if self.value is None or self.tau_s <= 0.0:
+            self.value = sample
+        else:
+            alpha = 1.0 - math.exp(-max(now - self._at, 0.0) / self.tau_s)
+            self.value += alpha * (sample - self.value)
+        self._at = now
+        return self.value
+
+
+class SignalFilter:
+    """Drops impossible values and outliers of one radio link, and smooths the rest in dBm."""
+
+    __slots__ = ("_mean", "_recent", "_valid_at", "dropped")
+
+    def __init__(self, tau_s: float) -> None:
+        self._mean = Ewma(tau_s)
+        self._recent: deque[float] = deque(maxlen=RSSI_WINDOW)
+        self._valid_at = -math.inf
+        self.dropped = 0
+
+    def update(self, rssi_dbm: float | None, now: float) -> float | None:
+        """Take one reading in; the smoothed signal in dBm, or ``None`` when there was none for `LINK_STALE_S`."""
+        if rssi_dbm is not None and self._is_plausible(rssi_dbm):
+            self._valid_at = now
+            self._mean.update(rssi_dbm, now)
+        elif rssi_dbm is not None:
+            self.dropped += 1
+        if now - self._valid_at > LINK_STALE_S:
+            self._mean.value = None
+        return self._mean.value
+
+    def _is_plausible(self, rssi_dbm: float) -> bool:
+        if not RSSI_IMPOSSIBLE_BELOW_DBM < rssi_dbm <= RSSI_IMPOSSIBLE_ABOVE_DBM:
+            return False
+        median = statistics.median(self._recent) if len(self._recent) == RSSI_WINDOW else rssi_dbm
+        # Kept in the window even when dropped: a lasting jump moves the median and is believed after three readings.
+        self._recent.append(rssi_dbm)
+        return abs(rssi_dbm - median) <= RSSI_OUTLIER_DB
+
+
+class Profiler:
+    """This node's own profile, built from samples."""
+
+    def __init__(self, node: NodeId, incarnation: int, timing: Timing) -> None:
+        self._node = node
+        self._incarnation = incarnation
+        self._timing = timing
+        self._cpu = Ewma(timing.smoothing_s)
+        self._memory = Ewma(timing.smoothing_s)
+        self._signals: dict[NodeId | None, SignalFilter] = {}
+        self._worker_cpu: dict[TaskId, Ewma] = {}
+        self._device: DeviceSample | None = None
+        self._links: tuple[Link, ...] = ()
+        self._workers: tuple[WorkerLoad, ...] = ()
+        self._sent: Profile | None = None
+        self._sent_at = -math.inf
+        self._sequence = 0
+
+    def absorb(self, device: DeviceSample, links: tuple[LinkSample, ...], now: float) -> None:
+        """Take one reading of the machine and its links in."""
+        self._device = device
+        if device.cpu_used_cores is not None:
+            self._cpu.update(max(device.cpu_used_cores, 0.0), now)
+        if device.memory_used_mb is not None:
+            self._memory.update(max(device.memory_used_mb, 0.0), now)
+        self._links = tuple(self._link(sample, now) for sample in links)
+        self._workers = tuple(self._worker(load, now) for load in device.workers)
+
+    def _link(self, sample: LinkSample, now: float) -> Link:
+        rssi = None
+        if sample.source is not LinkSource.WIRED:
+            signal = self._signals.setdefault(sample.peer, SignalFilter(self._timing.smoothing_s))
+            rssi = signal.update(sample.rssi_dbm, now)
+        return Link(
+            source=sample.source,
+            peer=sample.peer,
+            rssi_dbm=rssi,
+            bitrate_mbps=sample.bitrate_mbps,
+            retry_ratio=sample.retry_ratio,
+        )
+
+    def _worker(self, load: WorkerLoad, now: float) -> WorkerLoad:
+        # Smoothed like the machine's own figure: what is subtracted must be as slow as what it is subtracted from.
+        cpu = load.cpu_cores
+        if cpu is not None:
+            cpu = self._worker_cpu.setdefault(load.task, Ewma(self._timing.smoothing_s)).update(cpu, now)
+        return WorkerLoad(task=load.task, state=load.state, cpu_cores=cpu, memory_mb=load.memory_mb)
+
+    def publishable(self, states: dict[TaskId, WorkerState], *, is_draining: bool, now: float) -> Profile | None:
+        """The profile to send now, or ``None`` when nothing is due.
+
+        Args:
+            states: the workers' states as the node knows them (fresher than the sample's).
+            is_draining: the operator drains this node, or it stops.
+            now: monotonic seconds.
+        """
+        profile = self._current(states, is_draining=is_draining)
+        if profile is None:
+            return None
+        is_due = now - self._sent_at >= self._timing.publish_s
+        if not is_due and self._sent is not None and not _differs(profile, self._sent):
+            return None
+        self._sequence += 1
+        self._sent, self._sent_at = profile, now
+        return profile
+
+    def _current(self, states: dict[TaskId, WorkerState], *, is_draining: bool) -> Profile | None:
+        if self._device is None:
+            return None
+        loads = {load.task: load for load in self._workers}
+        workers = tuple(
+            WorkerLoad(
+                task=task,
+                state=states[task],
+                cpu_cores=loads[task].cpu_cores if task in loads else None,
+                memory_mb=loads[task].memory_mb if task in loads else None,
+            )
+            for task in sorted(states)
+        )
+        return Profile(
+            node=self._node,
+            incarnation=self._incarnation,
+            sequence=self._sequence,
+            cpu_cores=self._device.cpu_cores,
+            cpu_used_cores=self._cpu.value,
+            memory_mb=self._device.memory_mb,
+            memory_used_mb=self._memory.value,
+            links=self._links,
+            workers=workers,
+            draining=is_draining,
+        )
+
+
+def _differs(new: Profile, old: Profile) -> bool:
+    """Whether a robot might decide otherwise by ``new`` than by ``old``."""
+    if (new.draining, [(w.task, w.state) for w in new.workers]) != (
+        old.draining,
+        [(w.task, w.state) for w in old.workers],
+    ):
+        return True
+    if _moved(new.cpu_used_cores, old.cpu_used_cores, RATIO_CHANGE * new.cpu_cores):
+        return True
+    if _moved(new.memory_used_mb, old.memory_used_mb, RATIO_CHANGE * new.memory_mb):
+        return True
+    before = {link.peer: link.rssi_dbm for link in old.links}
+    return any(_moved(link.rssi_dbm, before.get(link.peer), RSSI_CHANGE_DB) for link in new.links)
+
+
+def _moved(new: float | None, old: float | None, threshold: float) -> bool:
+    if new is None or old is None:
+        return (new is None) != (old is None)
+    return abs(new - old) >= threshold

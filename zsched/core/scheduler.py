@@ -1,0 +1,187 @@
+"""SCHEDULER, second half: from a standing to a proposal, with stickiness.
+
+Knows: bonus, time-to-trigger, cool-down, escapes. Does not know: how utilities were computed or travel, who else
+proposes what, how anything is committed.
+
+`Judge` keeps the little memory that stickiness needs, per task, and turns a `Standing` into a `Judgement`: a candidate
+to propose, or the owner, always with the reason.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+from zsched.core.fleet import TaskSpec
+from zsched.core.model import Allocation, NodeId, PeerState, Profile, WorkerState
+from zsched.core.scoring import Standing, pick
+
+INITIAL_SETTLE_S = 3.0
+"""A task that nobody owns yet waits so long for candidates that are still starting."""
+
+
+class Outcome(StrEnum):
+    """What a robot makes of a standing."""
+
+    STAY = "stay"
+    WAIT = "wait"  # another one leads, but not for long enough
+    PROPOSE = "propose"
+    NONE = "none"  # nobody to propose
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Judgement:
+    """A decision with its reason; ``candidate`` is whom this robot would vote for (the owner when it stays)."""
+
+    outcome: Outcome
+    candidate: NodeId | None
+    aggregate: float
+    reason: str
+    is_escape: bool = False
+    aggregates: Mapping[NodeId, float] = field(default_factory=dict)
+    """With the owner's bonus."""
+
+
+@dataclass(slots=True)
+class Judge:
+    """The memory of one task's stickiness at one robot."""
+
+    spec: TaskSpec
+    beaten_since: float | None = None
+    """Since when the owner has been beaten by somebody, without a break."""
+    not_ready_since: float | None = None
+    seen_first_at: float | None = None
+    """When a first candidate could be scored (a task that nobody owns waits for the others)."""
+
+    def reset(self) -> None:
+        """The allocation changed, or a vote was lost: wait the whole time-to-trigger again."""
+        self.beaten_since = None
+        self.not_ready_since = None
+
+    def judge(
+        self,
+        standing: Standing,
+        allocation: Allocation,
+        *,
+        settled_for_s: float,
+        escape: str | None,
+        is_called: bool,
+        now: float,
+    ) -> Judgement:
+        """Decide by one standing.
+
+        Args:
+            standing: the joint view.
+            allocation: what is agreed now.
+            settled_for_s: seconds since this epoch was learnt (cool-down).
+            escape: why the owner must be left at once (`escape_reason`), or ``None``.
+            is_called: another robot called a vote: answer with today's winner, without waiting for our own timers.
+            now: monotonic seconds.
+        """
+        owner = allocation.owner
+        bonus = allocation.tuning.bonus if escape is None else 0.0
+        scored = {
+            name: value + (bonus if name == owner else 0.0)
+            for name, value in standing.aggregates.items()
+            if escape is None or name != owner
+        }
+        winner = pick(scored, owner)
+        if winner is None:
+            self.beaten_since = None
+            return Judgement(outcome=Outcome.NONE, candidate=owner, aggregate=0.0, reason="no candidate can have it")
+        outcome, reason = self._outcome(winner, scored, allocation, settled_for_s, escape, is_called, now)
+        chosen = winner if outcome is Outcome.PROPOSE else owner
+        return Judgement(
+            outcome=outcome,
+            candidate=chosen,
+            aggregate=scored.get(chosen, 0.0) if chosen is not None else 0.0,
+            reason=reason,
+            is_escape=escape is not None and outcome is Outcome.PROPOSE,
+            aggregates=scored,
+        )
+
+    def _outcome(
+        self,
+        winner: NodeId,
+        scored: Mapping[NodeId, float],
+        allocation: Allocation,
+        settled_for_s: float,
+        escape: str | None,
+        is_called: bool,
+        now: float,
+    ) -> tuple[Outcome, str]:
+        owner, tuning = allocation.owner, allocation.tuning
+        if allocation.paused or allocation.pinned:
+            return Outcome.STAY, "paused by the operator" if allocation.paused else "pinned by the operator"
+        if owner is None:
+            return self._initial(winner, scored, now)
+        if escape is not None:
+            return Outcome.PROPOSE, escape
+        if winner == owner:
+            self.beaten_since = None
+            return Outcome.STAY, "nobody better"
+        if self.beaten_since is None:
+            self.beaten_since = now
+        lead = scored[winner] - scored.get(owner, 0.0)
+        led_for = now - self.beaten_since
+        why = f"{winner} leads by {lead:.3f} over {owner} with its bonus"
+        if is_called:
+            return Outcome.PROPOSE, f"vote called; {why}"
+        if settled_for_s < tuning.cool_down_s:
+            return Outcome.WAIT, f"{why}; cool-down {settled_for_s:.1f} of {tuning.cool_down_s:g} s"
+        if led_for < tuning.time_to_trigger_s:
+            return Outcome.WAIT, f"{why}; for {led_for:.1f} of {tuning.time_to_trigger_s:g} s"
+        return Outcome.PROPOSE, f"{why} for {led_for:.1f} s"
+
+    def _initial(self, winner: NodeId, scored: Mapping[NodeId, float], now: float) -> tuple[Outcome, str]:
+        if self.seen_first_at is None:
+            self.seen_first_at = now
+        waited = now - self.seen_first_at
+        missing = [name for name in self.spec.candidates if name not in scored]
+        if missing and waited < INITIAL_SETTLE_S:
+            return Outcome.WAIT, f"first placement waits for {', '.join(missing)}"
+        return Outcome.PROPOSE, f"first placement: {winner} has the highest utility"
+
+
+def escape_reason(
+    spec: TaskSpec,
+    allocation: Allocation,
+    owner_state: PeerState,
+    profile: Profile | None,
+    standing: Standing,
+    not_ready_for_s: float,
+) -> str | None:
+    """Why the owner must be left now, without time-to-trigger or cool-down (but never without the quorum).
+
+    Args:
+        spec: the task.
+        allocation: the current one, with an owner.
+        owner_state: how this node sees the owner.
+        profile: the owner's newest fresh profile.
+        standing: the joint view (its veto of the owner is an escape).
+        not_ready_for_s: how long the owner's worker has not been ready.
+    """
+    owner = allocation.owner
+    if owner is None:
+        return None
+    if owner_state is PeerState.GONE:
+        return f"{owner} is gone"
+    if owner_state is PeerState.SUSPECT:
+        return f"{owner} is silent"
+    if owner not in spec.candidates:
+        return f"{owner} is no candidate any more"
+    if profile is not None:
+        load = profile.worker(spec.name)
+        if profile.draining:
+            return f"{owner} is draining"
+        if load is not None and load.state is WorkerState.FAILED:
+            return f"the worker on {owner} failed"
+        if not_ready_for_s > spec.worker.start_deadline_s:
+            return f"the worker on {owner} is not ready for {not_ready_for_s:.1f} s"
+        if profile.memory_used_mb is not None:
+            free_ratio = 1.0 - profile.memory_used_mb / profile.memory_mb
+            if free_ratio < spec.memory_floor_ratio:
+                return f"memory of {owner} is {max(free_ratio, 0.0) * 100:.0f} % free"
+    veto = standing.vetoed.get(owner)
+    return None if veto is None or not veto.startswith("reached by") else f"{owner} is {veto}"

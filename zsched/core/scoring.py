@@ -1,0 +1,234 @@
+"""SCHEDULER, first half: filters and scores candidates and compares the robots' scores (Alg. 2).
+
+Knows: eligibility, Eq. 1-6, vetoes. Does not know: stickiness (`zsched.core.scheduler`), how utilities travel.
+
+Two steps, both pure functions: `score` makes this robot's `UtilityVector` (Calculate_Utility); `compare` joins the
+vectors of all fresh voters into a `Standing` (Compare_Utility), and `pick` names its best.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from zsched.core.fleet import Demand, LinkLimits, Reach, Standby, TaskSpec
+from zsched.core.gateway import Gateway
+from zsched.core.model import (
+    Aggregate,
+    Allocation,
+    LinkSource,
+    NodeId,
+    PeerState,
+    Profile,
+    Utility,
+    UtilityVector,
+    WorkerState,
+)
+from zsched.core.utility import cpu_utility, memory_utility, network_utility, predicted_use, total_utility
+
+METRICS = ("cpu", "memory", "network")
+
+
+def majority(count: int) -> int:
+    """The least number that is more than half of ``count``.
+
+    >>> [majority(n) for n in (1, 2, 3, 4, 5)]
+    [1, 2, 2, 3, 3]
+    """
+    return count // 2 + 1
+
+
+def rounded(aggregate: float) -> float:
+    """An aggregate to 1/256: sums of floats differ by their order, and a difference that small decides nothing."""
+    return round(aggregate * 256) / 256
+
+
+# --- score: one robot's view (Calculate_Utility) ---------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class _Terms:
+    """Eq. 1-3 for one candidate; ``None`` where the metric is not measured."""
+
+    cpu: float | None
+    memory: float | None
+    network: float | None
+
+
+def score(
+    spec: TaskSpec,
+    allocation: Allocation,
+    voter: NodeId,
+    gateway: Gateway,
+    states: Mapping[NodeId, PeerState],
+    now: float,
+) -> UtilityVector:
+    """This robot's utilities of a task's candidates, by the tuning of ``allocation``.
+
+    A candidate that this robot cannot reach gets 0 (not: is left out, which would raise its mean); one that may not
+    have the task is refused with the reason.
+    """
+    demand = gateway.demand(spec)
+    terms: dict[NodeId, _Terms] = {}
+    unreachable: list[NodeId] = []
+    refused: list[tuple[NodeId, str]] = []
+    for candidate in spec.candidates:
+        if states.get(candidate, PeerState.UNKNOWN) is not PeerState.ALIVE:
+            unreachable.append(candidate)
+            continue
+        profile = gateway.fresh(candidate, now)
+        reason = "no fresh profile" if profile is None else _refusal(spec, allocation, profile, demand)
+        if profile is None or reason:
+            refused.append((candidate, reason))
+            continue
+        signal = _signal(voter, candidate, gateway, now)
+        if signal is not None and signal < spec.limits.nu_dbm:
+            unreachable.append(candidate)
+            continue
+        terms[candidate] = _measure(spec, profile, demand, signal)
+    measured = frozenset(name for name in METRICS if any(getattr(t, name) is not None for t in terms.values()))
+    utilities = [Utility(candidate=name, value=0.0, reachable=False) for name in unreachable]
+    for candidate, term in terms.items():
+        value = total_utility(
+            allocation.tuning.weights, cpu=term.cpu, memory=term.memory, network=term.network, measured=measured
+        )
+        if value is None:
+            refused.append((candidate, "a weighted metric is not measured"))
+            continue
+        utilities.append(
+            Utility(candidate=candidate, value=value, cpu=term.cpu, memory=term.memory, network=term.network)
+        )
+    return UtilityVector(
+        voter=voter,
+        task=spec.name,
+        revision=allocation.revision,
+        utilities=tuple(sorted(utilities, key=lambda utility: utility.candidate)),
+        refused=tuple(sorted(refused)),
+    )
+
+
+def _refusal(spec: TaskSpec, allocation: Allocation, profile: Profile, demand: Demand) -> str:
+    """Why the node may not have the task; empty when it may."""
+    if profile.draining:
+        return "draining"
+    load = profile.worker(spec.name)
+    state = None if load is None else load.state
+    if spec.worker.command and state is None:
+        return "runs no worker for it"
+    if state is WorkerState.FAILED:
+        return "worker failed"
+    is_owner = profile.node == allocation.owner
+    is_warm = spec.worker.standby is Standby.WARM
+    if spec.worker.command and is_warm and not is_owner and state is not WorkerState.READY:
+        return f"worker {state}"
+    used = _memory_use(profile, spec, demand)
+    if used is not None and used > profile.memory_mb:
+        return f"needs {demand.memory_mb:.0f} MiB, has {max(profile.memory_mb - used + demand.memory_mb, 0.0):.0f} free"
+    return ""
+
+
+def _memory_use(profile: Profile, spec: TaskSpec, demand: Demand) -> float | None:
+    if profile.memory_used_mb is None:
+        return None
+    load = profile.worker(spec.name)
+    own = (load.memory_mb or 0.0) if load is not None else 0.0
+    return predicted_use(profile.memory_used_mb, own, demand.memory_mb)
+
+
+def _measure(spec: TaskSpec, profile: Profile, demand: Demand, signal: float | None) -> _Terms:
+    load = profile.worker(spec.name)
+    cpu = memory = network = None
+    if profile.cpu_used_cores is not None:
+        own = (load.cpu_cores or 0.0) if load is not None else 0.0
+        cpu = cpu_utility(profile.cpu_cores, predicted_use(profile.cpu_used_cores, own, demand.cpu_cores))
+    used = _memory_use(profile, spec, demand)
+    if used is not None:
+        memory = memory_utility(profile.memory_mb, demand.memory_mb, used - demand.memory_mb)
+    if signal is not None:
+        network = _link_utility(signal, spec.limits)
+    return _Terms(cpu, memory, network)
+
+
+WIRED_DBM = 0.0
+"""Stands for a cable in comparisons of signals: better than any radio."""
+
+
+def _link_utility(signal: float, limits: LinkLimits) -> float:
+    return network_utility(signal, limits.nu_dbm, limits.rho_dbm)
+
+
+def _signal(voter: NodeId, candidate: NodeId, gateway: Gateway, now: float) -> float | None:
+    """Eq. 3's lambda for one (robot, candidate) pair in dBm, or ``None`` when nobody measured it.
+
+    A link measured between the two counts as it is, from either end. Else both reach each other through one access
+    point, and the weaker of the two ways counts.
+    """
+    if voter == candidate:
+        return WIRED_DBM
+    ends = (gateway.fresh(voter, now), gateway.fresh(candidate, now))
+    for end, other in ((ends[0], candidate), (ends[1], voter)):
+        direct = None if end is None else _link_signal(end, other)
+        if direct is not None:
+            return direct
+    ways = [None if end is None else _link_signal(end, None) for end in ends]
+    known = [way for way in ways if way is not None]
+    return min(known) if len(known) == len(ways) else None
+
+
+def _link_signal(profile: Profile, peer: NodeId | None) -> float | None:
+    for link in profile.links:
+        if link.peer == peer:
+            return WIRED_DBM if link.source is LinkSource.WIRED else link.rssi_dbm
+    return None
+
+
+# --- compare: all robots' views (Compare_Utility) --------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Standing:
+    """The joint view of one gather: ``aggregates`` without bonus, ``vetoed`` with reasons, and who was heard."""
+
+    aggregates: Mapping[NodeId, float]
+    vetoed: Mapping[NodeId, str]
+    vectors: tuple[UtilityVector, ...]
+    voters_heard: int
+
+
+def compare(spec: TaskSpec, allocation: Allocation, vectors: Mapping[NodeId, UtilityVector]) -> Standing:
+    """Join the fresh voters' vectors column by column (Eq. 5-6: argmax over candidates of the aggregate over robots).
+
+    Args:
+        spec: the task.
+        allocation: the current one; vectors under another revision are not counted.
+        vectors: {voter: its vector}, the fresh ones only.
+    """
+    fresh = tuple(vectors[voter] for voter in sorted(vectors) if vectors[voter].revision == allocation.revision)
+    columns: dict[NodeId, list[Utility]] = {candidate: [] for candidate in spec.candidates}
+    reasons: dict[NodeId, str] = {}
+    for vector in fresh:
+        for utility in vector.utilities:
+            columns.setdefault(utility.candidate, []).append(utility)
+        reasons.update(vector.refused)
+    mean = statistics.fmean if allocation.tuning.aggregate is Aggregate.MEAN else statistics.median
+    aggregates: dict[NodeId, float] = {}
+    vetoed: dict[NodeId, str] = {}
+    for candidate in spec.candidates:
+        column = columns[candidate]
+        reaching = sum(utility.reachable for utility in column)
+        needed = len(fresh) if spec.reach is Reach.ALL else majority(len(fresh))
+        if len(column) < majority(len(fresh)):
+            vetoed[candidate] = reasons.get(candidate, "not scored by a majority")
+        elif reaching < needed:
+            vetoed[candidate] = f"reached by {reaching} of {len(fresh)} robots"
+        else:
+            aggregates[candidate] = mean([utility.value for utility in column])
+    return Standing(aggregates=aggregates, vetoed=vetoed, vectors=fresh, voters_heard=len(fresh))
+
+
+def pick(aggregates: Mapping[NodeId, float], owner: NodeId | None) -> NodeId | None:
+    """The candidate with the highest aggregate; ties (to 1/256) go to the owner, then to the lowest name."""
+    if not aggregates:
+        return None
+    return min(aggregates, key=lambda name: (-rounded(aggregates[name]), name != owner, name))

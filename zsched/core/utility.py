@@ -1,0 +1,104 @@
+"""The paper's equations 1 to 4, by the readings of docs/decisions/0001.
+
+Knows: arithmetic. Does not know: nodes, tasks, time.
+
+The equations as printed contradict the text in places (Eq. 1 with beta "available" would pick the busiest node); here
+beta and mu are what is *in use*, predicted as if the candidate had the task, and every term is clamped to [0, 1].
+"""
+
+from __future__ import annotations
+
+from zsched.core.model import Weights
+
+
+def clamp(value: float) -> float:
+    """``value`` cut to [0, 1].
+
+    >>> clamp(1.2), clamp(-3.0)
+    (1.0, 0.0)
+    """
+    return min(max(value, 0.0), 1.0)
+
+
+def predicted_use(use: float, own_worker: float, demand: float) -> float:
+    """What would be in use if the candidate had the task: one formula for every candidate, owner or not.
+
+    Without it the owner always looks worse by the load of the task itself, and the task oscillates.
+
+    Args:
+        use: in use now (cores or MiB, >= 0).
+        own_worker: of that, by this task's worker there (idle standby or active).
+        demand: what the task will use where it runs.
+
+    >>> predicted_use(use=1.0, own_worker=0.4, demand=0.5)
+    1.1
+    """
+    return max(use - own_worker, 0.0) + demand
+
+
+def cpu_utility(gamma: float, beta: float) -> float:
+    """Eq. 1, ``eta = (gamma - beta) / gamma``: the free fraction of the CPU.
+
+    Args:
+        gamma: cores that may be used, > 0.
+        beta: cores predicted to be in use, >= 0.
+
+    >>> cpu_utility(gamma=4.0, beta=1.0)
+    0.75
+    """
+    return clamp((gamma - beta) / gamma)
+
+
+def memory_utility(delta: float, theta: float, mu: float) -> float:
+    """Eq. 2, ``sigma = (delta - theta - mu) / delta``: the free fraction of the memory once the task is there.
+
+    Args:
+        delta: memory in all, MiB, > 0.
+        theta: the task's demand, MiB, >= 0.
+        mu: in use without this task, MiB, >= 0.
+
+    >>> memory_utility(delta=4000.0, theta=400.0, mu=1600.0)
+    0.5
+    """
+    return clamp((delta - theta - mu) / delta)
+
+
+def network_utility(signal_dbm: float, nu_dbm: float, rho_dbm: float) -> float:
+    """Eq. 3, ``kappa = (lambda - nu) / (rho - nu)``: the link's share of what is achievable.
+
+    Args:
+        signal_dbm: the link's smoothed signal.
+        nu_dbm: least usable signal.
+        rho_dbm: best achievable signal, > nu.
+
+    >>> network_utility(signal_dbm=-60.0, nu_dbm=-80.0, rho_dbm=-40.0)
+    0.5
+    """
+    return clamp((signal_dbm - nu_dbm) / (rho_dbm - nu_dbm))
+
+
+def total_utility(
+    weights: Weights, *, cpu: float | None, memory: float | None, network: float | None, measured: frozenset[str]
+) -> float | None:
+    """Eq. 4, the weighted sum; weights of metrics that nobody measured are dropped and the rest renormalised.
+
+    Args:
+        weights: omega, sum 1.
+        cpu: eta, in [0, 1], or ``None`` when not measured here.
+        memory: sigma, likewise.
+        network: kappa, likewise.
+        measured: which of ``cpu``, ``memory``, ``network`` any candidate has.
+
+    Returns:
+        The utility in [0, 1]; ``None`` when a weighted metric that others have is missing here, or nothing is left.
+
+    >>> w = Weights(cpu=0.5, memory=0.25, network=0.25)
+    >>> total_utility(w, cpu=0.8, memory=0.4, network=None, measured=frozenset({"cpu", "memory"}))
+    0.6666666666666666
+    """
+    terms = (("cpu", weights.cpu, cpu), ("memory", weights.memory, memory), ("network", weights.network, network))
+    used = [(weight, term) for name, weight, term in terms if weight > 0.0 and name in measured]
+    share = sum(weight for weight, _ in used)
+    if share <= 0.0 or any(term is None for _, term in used):
+        return None
+    return clamp(sum(weight * term for weight, term in used if term is not None) / share)
