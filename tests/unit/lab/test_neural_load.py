@@ -1,0 +1,104 @@
+from __future__ import annotations
+
+import importlib.util
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from zsched.lab.neural_load import (
+    LoadOptions,
+    candidates,
+    fit,
+    frames,
+    load_network,
+    package_file,
+    parse,
+    run,
+    synthetic_network,
+)
+from zsched.lab.signals import StopFlag
+
+HAS_DETECTOR = importlib.util.find_spec("rapidocr") is not None
+
+
+@pytest.mark.skipif(not HAS_DETECTOR, reason="rapidocr (the wheel with the detector) is not installed")
+def test_the_detector_is_found_without_importing_its_package() -> None:
+    names = [name for name, _ in candidates()]
+
+    assert names[0].startswith("text detector")
+    assert "rapidocr" not in sys.modules
+
+
+@pytest.mark.skipif(not HAS_DETECTOR, reason="rapidocr (the wheel with the detector) is not installed")
+def test_the_detector_looks_at_a_whole_frame() -> None:
+    network = load_network(threads=1)
+
+    result = np.asarray(network.infer(frames(64)[0]))[0]
+
+    assert "yolo" not in network.name.lower()
+    assert result.shape[-2:] == (64, 64)
+    assert np.isfinite(result).all()
+
+
+def test_a_package_or_file_that_is_not_there_is_none() -> None:
+    assert package_file("zsched_has_no_such_package", "*.onnx") is None
+    assert package_file("zsched", "*.onnx") is None
+
+
+def test_the_last_resort_computes_and_calls_itself_synthetic() -> None:
+    network = synthetic_network()
+
+    assert "synthetic" in network.name
+    assert network.infer(frames(32)[0]) != network.infer(frames(32)[1])
+
+
+def test_frames_are_cut_and_tiled_to_a_fixed_input() -> None:
+    frame = frames(32)[0]
+
+    assert fit(frame, [0, 3, 0, 0]) is frame
+    assert fit(frame, [1, 3, 224, 224]).shape == (1, 3, 224, 224)
+    assert fit(frame, [4, 3, 16, 32]).shape == (4, 3, 16, 32)
+
+
+def test_a_set_frame_rate_is_kept() -> None:
+    start = time.monotonic()
+
+    total = run(synthetic_network(), LoadOptions(hz=20.0, side=32, duration_s=0.5), StopFlag(), lambda _: None)
+
+    assert 5 <= total <= 12
+    assert time.monotonic() - start < 2.0
+
+
+@pytest.mark.parametrize("wrong", [["--threads", "0"], ["--side", "100"], ["--hz", "-1"]])
+def test_wrong_options_exit_2(wrong: list[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        parse(wrong)
+    assert caught.value.code == 2
+
+
+def test_it_reports_each_second_and_stops_on_sigterm(tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    with output.open("wb") as file:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "zsched.lab.neural_load", "--side", "64", "--hz", "20"],
+            stdout=file,
+            stderr=subprocess.DEVNULL,
+        )
+    try:
+        deadline = time.monotonic() + 20.0
+        while not output.read_bytes().endswith(b"\n") and time.monotonic() < deadline:
+            time.sleep(0.05)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(timeout=5.0) == 0
+    finally:
+        process.kill()
+        process.wait()
+    line = json.loads(output.read_bytes().splitlines()[0])
+    assert line["frames"] >= 1
+    assert line["fps"] > 0
+    assert line["threads"] == 1
