@@ -1,0 +1,344 @@
+"""Real processes under the supervisor: start, readiness, failure, restart, stop, output, and the daemon's own death."""
+
+from __future__ import annotations
+
+import logging
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import psutil
+import pytest
+from zsched.adapters.worker_process import LINES_BURST, LineLog
+from zsched.adapters.worker_supervisor import RestartPolicy, WorkerContext, WorkerSupervisor
+from zsched.core.fleet import WorkerSpec
+from zsched.core.model import WorkerState
+
+QUICK = RestartPolicy(first_s=0.02, most_s=0.1)
+SLEEP = "import time; time.sleep(60)"
+
+
+class Recorder:
+    """Keeps what the supervisor tells."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[object, ...]] = []
+        self._changed = threading.Condition()
+
+    def on_started(self, task: str, pid: int, incarnation: int) -> None:
+        self._add("started", task, pid, incarnation)
+
+    def on_exited(self, task: str, incarnation: int, returncode: int, reason: str) -> None:
+        self._add("exited", task, incarnation, returncode, reason)
+
+    def on_failed(self, task: str, reason: str) -> None:
+        self._add("failed", task, reason)
+
+    def _add(self, *call: object) -> None:
+        with self._changed:
+            self.calls.append(call)
+            self._changed.notify_all()
+
+    def wait(self, kind: str, count: int = 1, timeout_s: float = 10.0) -> tuple[object, ...]:
+        def found() -> list[tuple[object, ...]]:
+            return [call for call in self.calls if call[0] == kind]
+
+        with self._changed:
+            assert self._changed.wait_for(lambda: len(found()) >= count, timeout_s), self.calls
+            return found()[count - 1]
+
+
+def wait_until(condition: Callable[[], bool], timeout_s: float = 10.0) -> None:
+    end_s = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < end_s, "condition not met in time"
+        time.sleep(0.005)
+
+
+def is_running(pid: int) -> bool:
+    try:
+        return bool(psutil.Process(pid).status() != psutil.STATUS_ZOMBIE)
+    except psutil.NoSuchProcess:
+        return False
+
+
+def python(code: str, **changes: object) -> WorkerSpec:
+    return WorkerSpec(command=("python", "-c", code), **{"stop_grace_s": 0.2, **changes})  # type: ignore[arg-type]
+
+
+@contextmanager
+def supervised(spec: WorkerSpec, **environment: str) -> Iterator[tuple[WorkerSupervisor, Recorder]]:
+    recorder = Recorder()
+    supervisor = WorkerSupervisor(
+        specs={"merge": spec},
+        context=WorkerContext(fleet="hall", node="edge1", incarnation=7),
+        events=recorder,
+        environment=lambda task: {"TASK_SEEN": task, **environment},
+        rng=random.Random(1),
+        policy=QUICK,
+    )
+    try:
+        yield supervisor, recorder
+    finally:
+        pids = list(supervisor.pids().values())
+        supervisor.close(within_s=0.5)
+        assert not supervisor.pids()
+        assert not [pid for pid in pids if is_running(pid)]
+
+
+def read_pid(path: Path) -> int:
+    wait_until(lambda: path.exists() and path.read_text().endswith("\n"))
+    return int(path.read_text())
+
+
+def test_start_gives_the_worker_its_environment_and_pid(tmp_path: Path) -> None:
+    out = tmp_path / "env"
+    code = (
+        "import os, time; names = ['ZSCHED_FLEET', 'ZSCHED_NODE', 'ZSCHED_TASK', 'ZSCHED_INCARNATION', 'TASK_SEEN',"
+        " 'OWN', 'NOTIFY_SOCKET', 'PYTHONUNBUFFERED']\n"
+        f"open({str(out)!r}, 'w').write(' '.join(os.environ.get(n, '-') for n in names) + '\\n'); time.sleep(60)"
+    )
+    os.environ["NOTIFY_SOCKET"] = "/nowhere"
+    try:
+        with supervised(python(code, env=(("OWN", "x"),))) as (supervisor, recorder):
+            supervisor.start("merge")
+            _, _, pid, incarnation = recorder.wait("started")
+            wait_until(lambda: out.exists() and out.read_text().endswith("\n"))
+            assert out.read_text().split() == ["hall", "edge1", "merge", "700001", "merge", "x", "-", "1"]
+            assert incarnation == 700001
+            assert supervisor.pids() == {"merge": pid}
+            assert supervisor.states() == {"merge": WorkerState.STARTING}
+    finally:
+        del os.environ["NOTIFY_SOCKET"]
+
+
+def test_ready_is_believed_only_from_the_running_incarnation() -> None:
+    with supervised(python(SLEEP)) as (supervisor, recorder):
+        supervisor.start("merge")
+        recorder.wait("started")
+        supervisor.mark_ready("merge", 699999)
+        supervisor.mark_gone("merge", 700001)
+        assert supervisor.states()["merge"] is WorkerState.STARTING
+        supervisor.mark_ready("merge", 700001)
+        wait_until(lambda: supervisor.states()["merge"] is WorkerState.READY)
+        supervisor.mark_gone("merge", 700001)
+        wait_until(lambda: supervisor.states()["merge"] is WorkerState.STARTING)
+
+
+def test_stop_uses_sigint_first_and_start_runs_it_again() -> None:
+    with supervised(python(SLEEP)) as (supervisor, recorder):
+        supervisor.start("merge")
+        recorder.wait("started")
+        supervisor.stop("merge")
+        supervisor.start("merge")
+        _, _, _, _, reason = recorder.wait("exited")
+        assert reason == "stopped by SIGINT"
+        _, _, _, incarnation = recorder.wait("started", 2)
+        assert incarnation == 700002
+        assert not [call for call in recorder.calls if call[0] == "failed"]
+
+
+def test_stop_kills_a_stubborn_worker_and_its_grandchildren(tmp_path: Path) -> None:
+    code = (
+        "import signal, subprocess, time\n"
+        "for number in (signal.SIGINT, signal.SIGTERM): signal.signal(number, signal.SIG_IGN)\n"
+        "child = subprocess.Popen(['sleep', '60'])\n"
+        f"open({str(tmp_path / 'pid')!r}, 'w').write(f'{{child.pid}}\\n')\n"
+        "while True: time.sleep(60)"
+    )
+    with supervised(python(code)) as (supervisor, recorder):
+        supervisor.start("merge")
+        grandchild = read_pid(tmp_path / "pid")
+        supervisor.stop("merge")
+        _, _, _, returncode, reason = recorder.wait("exited")
+        assert (returncode, reason) == (-signal.SIGKILL, "stopped by SIGKILL")
+        wait_until(lambda: not is_running(grandchild))
+
+
+def test_worker_that_keeps_failing_fails_for_good_until_reset() -> None:
+    with supervised(python("print('no camera'); raise SystemExit(3)")) as (supervisor, recorder):
+        supervisor.start("merge")
+        assert recorder.wait("failed") == ("failed", "merge", "exited with status 3: no camera")
+        kinds = [call[0] for call in recorder.calls]
+        assert kinds == ["started", "exited"] * 3 + ["failed"]
+        wait_until(lambda: supervisor.states()["merge"] is WorkerState.FAILED)
+        supervisor.start("merge")
+        supervisor.reset("merge")
+        recorder.wait("started", 4)
+
+
+@pytest.mark.parametrize(
+    ("command", "reason"),
+    [
+        (("python", "-c", "print('no GPU here'); raise SystemExit(78)"), "exited with status 78: no GPU here"),
+        (("no-such-program",), "exited with status 78: cannot run 'no-such-program': No such file or directory"),
+    ],
+)
+def test_worker_that_says_it_cannot_fails_at_once(command: tuple[str, ...], reason: str) -> None:
+    with supervised(WorkerSpec(command=command)) as (supervisor, recorder):
+        supervisor.start("merge")
+        assert recorder.wait("failed") == ("failed", "merge", reason)
+        assert [call[0] for call in recorder.calls] == ["started", "exited", "failed"]
+
+
+def test_crashed_worker_is_started_again_with_a_new_incarnation() -> None:
+    with supervised(python(SLEEP)) as (supervisor, recorder):
+        supervisor.start("merge")
+        pid = recorder.wait("started")[2]
+        assert isinstance(pid, int)
+        os.kill(pid, signal.SIGSEGV)
+        _, _, incarnation, returncode, reason = recorder.wait("exited")
+        assert (incarnation, returncode) == (700001, -signal.SIGSEGV)
+        assert "signal 11" in str(reason)
+        assert recorder.wait("started", 2)[3] == 700002
+
+
+def test_worker_that_is_never_ready_is_ended_and_counted() -> None:
+    with supervised(python(SLEEP, start_deadline_s=0.1, max_failures=2)) as (supervisor, recorder):
+        supervisor.start("merge")
+        assert recorder.wait("failed") == ("failed", "merge", "not ready within 0.1 s")
+        assert [call[0] for call in recorder.calls] == ["started", "exited"] * 2 + ["failed"]
+
+
+def test_hung_worker_is_ended_and_started_again() -> None:
+    with supervised(python(SLEEP)) as (supervisor, recorder):
+        supervisor.start("merge")
+        pid = recorder.wait("started")[2]
+        assert isinstance(pid, int)
+        os.kill(pid, signal.SIGSTOP)
+        supervisor.report_hung("merge", 700001, "no output for 5 s")
+        assert recorder.wait("exited")[4] == "no output for 5 s"
+        recorder.wait("started", 2)
+
+
+def test_stop_during_the_backoff_starts_nothing() -> None:
+    with supervised(python("raise SystemExit(1)", max_failures=1000)) as (supervisor, recorder):
+        supervisor.start("merge")
+        recorder.wait("exited", 3)
+        supervisor.stop("merge")
+        wait_until(lambda: not supervisor.pids())
+        time.sleep(0.15)  # longer than the longest delay
+        count = len(recorder.calls)
+        time.sleep(0.15)
+        assert len(recorder.calls) == count
+        assert supervisor.states()["merge"] is WorkerState.STOPPED
+
+
+def test_foreign_worker_is_never_started_but_may_be_ready() -> None:
+    with supervised(WorkerSpec()) as (supervisor, recorder):
+        supervisor.start("merge")
+        supervisor.mark_ready("merge", 0)
+        wait_until(lambda: supervisor.states()["merge"] is WorkerState.READY)
+        supervisor.mark_gone("merge", 0)
+        wait_until(lambda: supervisor.states()["merge"] is WorkerState.STOPPED)
+        assert recorder.calls == []
+
+
+def test_close_ends_a_stubborn_worker_in_time() -> None:
+    code = (
+        "import signal, time; [signal.signal(n, signal.SIG_IGN) for n in (2, 15)]; print('up')\nwhile 1: time.sleep(9)"
+    )
+    with supervised(python(code, stop_grace_s=30.0)) as (supervisor, recorder):
+        supervisor.start("merge")
+        recorder.wait("started")
+        begin_s = time.monotonic()
+        supervisor.close(within_s=1.0)
+        assert time.monotonic() - begin_s < 1.5
+        assert not supervisor.pids()
+        supervisor.start("merge")  # after the end: no error, no worker
+
+
+def test_handler_that_raises_does_not_stop_the_supervisor(caplog: pytest.LogCaptureFixture) -> None:
+    class Broken(Recorder):
+        def on_started(self, task: str, pid: int, incarnation: int) -> None:
+            super().on_started(task, pid, incarnation)
+            raise RuntimeError("bug")
+
+    recorder = Broken()
+    context = WorkerContext(fleet="hall", node="edge1", incarnation=1)
+    supervisor = WorkerSupervisor(specs={"merge": python(SLEEP)}, context=context, events=recorder)
+    supervisor.start("merge")
+    recorder.wait("started")
+    supervisor.stop("merge")
+    recorder.wait("exited")
+    supervisor.close()
+    assert "event_handler_failed" in caplog.text
+
+
+def test_flooding_worker_is_bounded_in_log_lines_and_cpu(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "zsched.worker.merge")
+    code = "import sys\nwhile True: sys.stdout.write('x' * 99 + '\\n')"
+    spec = WorkerSpec(command=("python", "-u", "-c", code), env=(("PYTHONUNBUFFERED", ""),))
+    with supervised(spec) as (supervisor, recorder):
+        supervisor.start("merge")
+        recorder.wait("started")
+        begin_s, cpu_s = time.monotonic(), time.process_time()
+        time.sleep(1.0)
+        used = (time.process_time() - cpu_s) / (time.monotonic() - begin_s)
+        lines = [record for record in caplog.records if record.getMessage().startswith("xxx")]
+        assert 0 < len(lines) <= LINES_BURST + 200
+        assert used < 0.3
+
+
+def test_line_log_cuts_long_lines_and_counts_suppressed_ones(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "flood")
+    lines = LineLog(logging.getLogger("flood"))
+    lines.feed(b"a" * 5000 + b"\nhalf", 0.0)
+    lines.feed(b" line\n" * 3, 0.0)
+    assert [len(caplog.messages[0]), *caplog.messages[1:]] == [2052, "half line", " line", " line"]
+    lines.feed(b"y\n" * 1000, 0.0)
+    lines.feed(b"z\n" * 1000 + b"last words\n", 0.1)
+    assert lines.last_line == "last words"
+    lines.feed(b"still muted\n", 0.9)
+    lines.feed(b"", 1.1)
+    assert caplog.messages[-1] == f"suppressed lines={2002 - int(LINES_BURST) + 4} limit_per_s=50"
+
+
+def test_restart_delays_double_up_to_the_cap_with_jitter() -> None:
+    policy, rng = RestartPolicy(first_s=0.5, most_s=10.0, jitter_ratio=0.2), random.Random(3)
+    delays = [policy.delay_s(n, rng) for n in range(1, 9)]
+    for n, delay_s in enumerate(delays, start=1):
+        assert delay_s == pytest.approx(min(10.0, 0.5 * 2 ** (n - 1)), rel=0.2)
+    assert delays == [policy.delay_s(n, again) for again in [random.Random(3)] for n in range(1, 9)]
+
+
+DAEMON = """
+import sys, time
+from zsched.adapters.worker_supervisor import WorkerContext, WorkerSupervisor
+from zsched.core.fleet import WorkerSpec
+class Events:
+    def on_started(self, task, pid, incarnation): print(pid, flush=True)
+    def on_exited(self, *call): pass
+    def on_failed(self, *call): pass
+code = '''
+import signal, subprocess, time
+for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP): signal.signal(number, signal.SIG_IGN)
+child = subprocess.Popen(["sleep", "60"])
+open("PIDFILE", "w").write(f"{child.pid}\\\\n")
+while True: time.sleep(60)
+'''
+spec = WorkerSpec(command=("python", "-c", code))
+context = WorkerContext(fleet="f", node="n", incarnation=1)
+supervisor = WorkerSupervisor(specs={"a": spec}, context=context, events=Events())
+supervisor.start("a")
+time.sleep(60)
+"""
+
+
+def test_workers_and_their_children_die_with_a_killed_daemon(tmp_path: Path) -> None:
+    code = DAEMON.replace("PIDFILE", str(tmp_path / "pid"))
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as daemon:
+        assert daemon.stdout is not None
+        worker, grandchild = int(daemon.stdout.readline()), read_pid(tmp_path / "pid")
+        guards = [child.pid for child in psutil.Process(daemon.pid).children() if child.pid != worker]
+        daemon.kill()
+        daemon.wait(timeout=5.0)
+        wait_until(lambda: not any(is_running(pid) for pid in (worker, grandchild, *guards)), timeout_s=2.0)
+    assert len(guards) == 1
