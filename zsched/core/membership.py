@@ -1,0 +1,177 @@
+"""Membership: who is alive, suspect or gone, by beats, tokens and second observers.
+
+Knows: deadlines, confirmation, incarnations, self-doubt. Does not know: what follows from a peer being gone.
+
+A beat comes out of the peer's decision loop and is the only proof of life; the liveliness token goes within
+milliseconds of a kill, but stays while a wedged process keeps its link, so it can only accuse. Silence or a lost token
+make a peer *suspect*. In fleets of more than three nodes it is *gone* when a second, living observer suspects it too,
+or when nobody speaks for it during the confirmation time; a living observer that still hears it keeps it suspect (a
+partial cut). Any beat refutes. A node whose own loop lags doubts itself first: its deadlines lengthen, at most
+threefold, and never stop (after Lifeguard, arXiv 1707.00788).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from zsched.core.fleet import Timing
+from zsched.core.model import Beat, NodeId, PeerState
+
+SMALL_FLEET = 3
+"""Up to so many nodes there is no second observer to wait for."""
+MAX_DOUBT = 3.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Transition:
+    """A peer's state changed."""
+
+    node: NodeId
+    before: PeerState
+    after: PeerState
+    reason: str
+
+
+@dataclass(slots=True)
+class _Peer:
+    state: PeerState = PeerState.UNKNOWN
+    incarnation: int = -1
+    beat_at: float = -math.inf
+    sequence: int = -1
+    suspect_since: float = math.inf
+    token_lost: bool = False
+    suspects: tuple[NodeId, ...] = ()
+
+
+class Membership:
+    """Every other configured node's state, as this node sees it."""
+
+    def __init__(self, me: NodeId, nodes: tuple[NodeId, ...], timing: Timing) -> None:
+        self._me = me
+        self._timing = timing
+        self._peers = {name: _Peer() for name in sorted(nodes) if name != me}
+        self._size = len(nodes)
+        self._doubt = 1.0
+
+    # --- queries -----------------------------------------------------------------------------------------------
+
+    def state(self, node: NodeId) -> PeerState:
+        """A node's state; this node is alive to itself, a stranger unknown."""
+        if node == self._me:
+            return PeerState.ALIVE
+        peer = self._peers.get(node)
+        return PeerState.UNKNOWN if peer is None else peer.state
+
+    def states(self) -> dict[NodeId, PeerState]:
+        """{node: state} of the whole fleet, this node included, sorted by name."""
+        return {name: self.state(name) for name in sorted((*self._peers, self._me))}
+
+    def incarnation(self, node: NodeId) -> int | None:
+        """The newest incarnation that a peer's beat showed, or ``None``."""
+        peer = self._peers.get(node)
+        return None if peer is None or peer.incarnation < 0 else peer.incarnation
+
+    def alive(self) -> tuple[NodeId, ...]:
+        """The living peers, sorted, without this node."""
+        return tuple(name for name, peer in self._peers.items() if peer.state is PeerState.ALIVE)
+
+    def suspects(self) -> tuple[NodeId, ...]:
+        """Whom this node accuses: suspect, or gone after having been there."""
+        accused = (PeerState.SUSPECT, PeerState.GONE)
+        return tuple(name for name, peer in self._peers.items() if peer.state in accused)
+
+    # --- what changes it ---------------------------------------------------------------------------------------
+
+    def note_lag(self, lag_s: float) -> None:
+        """Take in how late this node's own loop woke up (seconds, >= 0); doubt rises at once and fades by halves."""
+        wanted = min(1.0 + lag_s / self._timing.beat_s, MAX_DOUBT)
+        self._doubt = max(wanted, 1.0 + (self._doubt - 1.0) / 2)
+
+    def absorb_beat(self, beat: Beat, now: float) -> tuple[Transition, ...]:
+        """A peer's loop is alive: it refutes every accusation. Beats of an older incarnation or order are ignored."""
+        peer = self._peers.get(beat.node)
+        if peer is None or (beat.incarnation, beat.sequence) <= (peer.incarnation, peer.sequence):
+            return ()
+        restarted = 0 <= peer.incarnation < beat.incarnation
+        before = peer.state
+        peer.incarnation, peer.sequence, peer.beat_at = beat.incarnation, beat.sequence, now
+        peer.suspects, peer.token_lost = beat.suspects, False
+        changes = []
+        if before is not PeerState.ALIVE:
+            changes.append(self._change(beat.node, PeerState.ALIVE, "beats again" if restarted else "beats", now))
+        elif restarted:
+            changes.append(Transition(node=beat.node, before=before, after=before, reason="restarted"))
+        return (*changes, *self._review(now))
+
+    def absorb_token_lost(self, node: NodeId, incarnation: int, now: float) -> tuple[Transition, ...]:
+        """A peer's token went: suspect at once, if it is the token of the life we know."""
+        peer = self._peers.get(node)
+        if peer is None or peer.incarnation != incarnation or peer.state is not PeerState.ALIVE:
+            return ()
+        peer.token_lost = True
+        return (self._change(node, PeerState.SUSPECT, "its token went", now), *self._review(now))
+
+    def tick(self, now: float) -> tuple[Transition, ...]:
+        """Time has passed."""
+        changes = []
+        limit = self._timing.suspect_s * self._doubt
+        for name, peer in self._peers.items():
+            silent = now - peer.beat_at
+            if peer.state is PeerState.ALIVE and silent >= limit:
+                changes.append(self._change(name, PeerState.SUSPECT, f"silent for {silent:.2f} s", now))
+        return (*changes, *self._review(now))
+
+    def next_deadline(self) -> float:
+        """When `tick` may have something to say; infinity when never."""
+        limit = self._timing.suspect_s * self._doubt
+        return min(
+            (self._peer_deadline(peer, limit) for peer in self._peers.values()),
+            default=math.inf,
+        )
+
+    def _peer_deadline(self, peer: _Peer, limit: float) -> float:
+        if peer.state is PeerState.ALIVE:
+            return peer.beat_at + limit
+        if peer.state is PeerState.SUSPECT:
+            return peer.suspect_since + self._grace(peer)
+        return math.inf
+
+    def _grace(self, peer: _Peer) -> float:
+        """How long a suspect has before it is gone without anybody's confirmation."""
+        if self._size <= SMALL_FLEET:
+            return 1.5 * self._timing.beat_s * self._doubt if peer.token_lost else 0.0
+        return self._timing.confirm_s * self._doubt
+
+    def _review(self, now: float) -> list[Transition]:
+        """Turn suspects into gone where that is confirmed."""
+        changes = []
+        for name, peer in self._peers.items():
+            if peer.state is not PeerState.SUSPECT:
+                continue
+            reason = self._verdict(name, peer, now)
+            if reason:
+                changes.append(self._change(name, PeerState.GONE, reason, now))
+        return changes
+
+    def _verdict(self, name: NodeId, peer: _Peer, now: float) -> str:
+        observers = [(other, at) for other, at in self._peers.items() if other != name and at.state is PeerState.ALIVE]
+        if self._size > SMALL_FLEET:
+            for other, observer in observers:
+                if name in observer.suspects:
+                    return f"{other} misses it too"
+        if now < peer.suspect_since + self._grace(peer):
+            return ""
+        if self._size > SMALL_FLEET:
+            vouchers = [other for other, at in observers if at.beat_at > peer.suspect_since]
+            if vouchers:
+                # Somebody alive still hears it: a cut between it and us, not its end. Asked again with every beat.
+                peer.suspect_since = max(peer.suspect_since, now - self._grace(peer) + self._timing.beat_s)
+                return ""
+        return "nobody speaks for it"
+
+    def _change(self, node: NodeId, after: PeerState, reason: str, now: float) -> Transition:
+        peer = self._peers[node]
+        before, peer.state = peer.state, after
+        peer.suspect_since = now if after is PeerState.SUSPECT else math.inf
+        return Transition(node=node, before=before, after=after, reason=reason)

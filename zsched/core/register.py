@@ -1,0 +1,377 @@
+"""VOTE, the agreement under it: one rewritable value, agreed by a majority of electors (CASPaxos).
+
+Knows: ballots, promises, acceptances, rounds, what is learnt. Does not know: tasks' meaning, who won which vote, how
+anything travels or is stored.
+
+Synod on a register that can be rewritten (Rystsov, arXiv 1802.07000): no leader, no log. The rules that keep it safe:
+
+* an elector's promise and acceptance are persisted before the answer leaves (`Step.is_dirty`);
+* a ballot carries exactly one value: a proposer that reads an accepted value it has not learnt re-accepts that one, and
+  its own change follows under a higher ballot;
+* among accepted values "newer" means the higher ballot;
+* accepted is not learnt: an elector with an acceptance that it has not learnt runs an *identity round* (it re-accepts
+  what it reads), and so does a proposer that does not know how its round ended; it never applies its change twice;
+* every change names the revision that it is based on and is a function of the value read.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from random import Random
+
+from zsched.core.messages import Accept, Accepted, Prepare, Promise, Refusal, Refused
+from zsched.core.model import Acceptance, Allocation, Ballot, NodeId, RegisterState, Tuning
+from zsched.core.scoring import majority
+
+BACKOFF_CAP_S = 5.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MoveOwner:
+    """Change: another owner; the epoch rises with the revision."""
+
+    base_revision: int
+    owner: NodeId
+    reason: str
+
+    def apply(self, read: Allocation) -> Allocation:
+        """The new value; touches owner, epoch and revision only."""
+        return replace(read, revision=read.revision + 1, epoch=read.epoch + 1, owner=self.owner)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Retune:
+    """Change: another tuning; owner and epoch stay, so routes do not move."""
+
+    base_revision: int
+    tuning: Tuning
+    request: int | None = None
+    """The operator's question that waits for this change."""
+
+    def apply(self, read: Allocation) -> Allocation:
+        """The new value; touches tuning and revision only."""
+        return replace(read, revision=read.revision + 1, tuning=self.tuning)
+
+
+Change = MoveOwner | Retune
+
+
+class RoundOutcome(StrEnum):
+    """How a change ended."""
+
+    COMMITTED = "committed"
+    CONFLICT = "conflict"  # its base is no longer the newest revision
+    NO_QUORUM = "no_quorum"  # not started: no majority promised
+    UNKNOWN = "unknown"  # some elector may have it, and no majority could be asked
+
+
+@dataclass(slots=True)
+class Step:
+    """What one call changed and wants done, in this order: persist if dirty, send, apply what was learnt."""
+
+    is_dirty: bool = False
+    prepare: Prepare | None = None
+    accept: Accept | None = None
+    learnt: Allocation | None = None
+    finished: tuple[Change, RoundOutcome] | None = None
+    problem: str = ""
+
+
+class _Phase(StrEnum):
+    WAIT = "wait"
+    PREPARE = "prepare"
+    ACCEPT = "accept"
+
+
+@dataclass(slots=True)
+class _Round:
+    """One proposer's attempts at one change (or, without a change, an identity round)."""
+
+    change: Change | None
+    give_up_at: float
+    phase: _Phase = _Phase.WAIT
+    deadline: float = 0.0
+    ballot: Ballot | None = None
+    promises: dict[NodeId, Acceptance | None] = field(default_factory=dict)
+    yes: dict[NodeId, bool] = field(default_factory=dict)
+    no: dict[NodeId, Refusal] = field(default_factory=dict)
+    value: Allocation | None = None
+    sent: Allocation | None = None
+    """Our own new value once an accept for it left: from then on the outcome may be unknown."""
+    attempt: int = 0
+
+
+class Register:
+    """One task's register on one node: acceptor (if it is an elector), proposer and learner."""
+
+    def __init__(
+        self,
+        *,
+        me: NodeId,
+        incarnation: int,
+        electors: tuple[NodeId, ...],
+        electorate: str,
+        is_elector: bool,
+        initial: Allocation,
+        state: RegisterState,
+        ballot_s: float,
+        stagger_s: float,
+        rng: Random,
+    ) -> None:
+        self._me, self._incarnation = me, incarnation
+        self._electors, self._electorate = electors, electorate
+        self._is_elector = is_elector
+        self._initial = initial
+        self._ballot_s, self._stagger_s, self._rng = ballot_s, stagger_s, rng
+        self.state = state
+        self._counter = state.promised.counter
+        self._round: _Round | None = None
+        self._queue: list[Change] = []
+        self._settle_at = math.inf
+        self._settle_tries = 0
+
+    @property
+    def value(self) -> Allocation:
+        """The newest learnt value (revision 0 before anything was agreed)."""
+        return self.state.learnt or self._initial
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether a change of this node's is under way."""
+        return bool(self._queue) or (self._round is not None and self._round.change is not None)
+
+    def next_deadline(self) -> float:
+        """When `tick` may have something to do; infinity when never."""
+        return min(self._settle_at, math.inf if self._round is None else self._round.deadline)
+
+    def stop_electing(self) -> None:
+        """This node lost its right to be an elector (disk, duplicate name): it answers no more."""
+        self._is_elector = False
+
+    # --- acceptor ----------------------------------------------------------------------------------------------
+
+    def on_prepare(self, prepare: Prepare) -> tuple[Step, Promise | Refused]:
+        """Phase 1b. The answer must not leave before a dirty step is on disk."""
+        refusal = self._refusal(prepare.electorate)
+        if refusal is None and prepare.ballot <= self.state.promised:
+            refusal = Refusal.BALLOT
+        if refusal is not None:
+            return Step(), self._no(prepare.ballot, refusal)
+        self._set_state(promised=prepare.ballot)
+        promise = Promise(elector=self._me, task=self.state.task, ballot=prepare.ballot, accepted=self.state.accepted)
+        return Step(is_dirty=True), promise
+
+    def on_accept(self, accept: Accept, now: float) -> tuple[Step, Accepted | Refused]:
+        """Phase 2b. The answer must not leave before a dirty step is on disk."""
+        ballot = accept.acceptance.ballot
+        refusal = self._refusal(accept.electorate)
+        if refusal is None and ballot < self.state.promised:
+            refusal = Refusal.BALLOT
+        if refusal is not None:
+            return Step(), self._no(ballot, refusal)
+        self._set_state(promised=ballot, accepted=accept.acceptance)
+        if self._is_unlearnt():
+            self._settle_tries = 0
+            self._settle_at = now + 2 * self._ballot_s + self._jitter(0)
+        return Step(is_dirty=True), Accepted(elector=self._me, task=self.state.task, ballot=ballot)
+
+    def _refusal(self, electorate: str) -> Refusal | None:
+        if not self._is_elector:
+            return Refusal.NOT_ELECTOR
+        return None if electorate == self._electorate else Refusal.ELECTORATE
+
+    def _no(self, ballot: Ballot, refusal: Refusal) -> Refused:
+        return Refused(
+            elector=self._me, task=self.state.task, ballot=ballot, refusal=refusal, promised=self.state.promised
+        )
+
+    def _is_unlearnt(self) -> bool:
+        accepted = self.state.accepted
+        return accepted is not None and accepted.value.revision > self.value.revision
+
+    def _set_state(
+        self, *, promised: Ballot | None = None, accepted: Acceptance | None = None, learnt: Allocation | None = None
+    ) -> None:
+        self.state = RegisterState(
+            task=self.state.task,
+            promised=promised or self.state.promised,
+            accepted=accepted or self.state.accepted,
+            learnt=learnt or self.state.learnt,
+        )
+
+    # --- learner -----------------------------------------------------------------------------------------------
+
+    def learn(self, value: Allocation, now: float) -> Step:
+        """A committed value is known; older ones change nothing."""
+        step = Step()
+        current = self.state.learnt
+        if current is not None and value.revision <= current.revision:
+            if value.revision == current.revision and value != current:
+                step.problem = f"two values for revision {value.revision}: {current.owner} and {value.owner}"
+            return step
+        self._set_state(learnt=value)
+        step.is_dirty, step.learnt = True, value
+        if not self._is_unlearnt():
+            self._settle_at = math.inf
+        if self._is_outdated(value):
+            self._finish(step, RoundOutcome.CONFLICT, now)
+        return step
+
+    def _is_outdated(self, value: Allocation) -> bool:
+        """Whether our change under way is based on an older revision and has not been sent to anybody yet."""
+        running = self._round
+        if running is None or running.change is None or running.sent is not None:
+            return False
+        return value.revision > running.change.base_revision
+
+    # --- proposer ----------------------------------------------------------------------------------------------
+
+    def propose(self, change: Change, now: float) -> Step:
+        """Try to commit a change; its end comes as `Step.finished` of this or a later call."""
+        self._queue.append(change)
+        step = Step()
+        if self._round is None:
+            self._start_next(step, now)
+        return step
+
+    def settle(self, now: float) -> Step:
+        """Run an identity round, unless a round is under way: learn whatever was accepted before."""
+        step = Step()
+        if self._round is None:
+            self._round = _Round(change=None, give_up_at=now + 3 * self._ballot_s)
+            self._prepare(step, now)
+        return step
+
+    def _start_next(self, step: Step, now: float) -> None:
+        if not self._queue:
+            return
+        change = self._queue.pop(0)
+        self._round = _Round(change=change, give_up_at=now + 6 * self._ballot_s)
+        if change.base_revision != self.value.revision:
+            self._finish(step, RoundOutcome.CONFLICT, now)
+            return
+        self._prepare(step, now)
+
+    def _prepare(self, step: Step, now: float) -> None:
+        running = self._running()
+        self._counter = max(self._counter, self.state.promised.counter) + 1
+        running.ballot = Ballot(counter=self._counter, node=self._me, incarnation=self._incarnation)
+        running.phase, running.deadline = _Phase.PREPARE, now + self._ballot_s
+        running.promises, running.yes, running.no, running.value = {}, {}, {}, None
+        step.prepare = Prepare(task=self.state.task, ballot=running.ballot, electorate=self._electorate)
+
+    def _running(self) -> _Round:
+        assert self._round is not None
+        return self._round
+
+    def on_answer(self, answer: Promise | Accepted | Refused, now: float) -> Step:
+        """An elector answered; answers to older ballots and from strangers change nothing."""
+        step = Step()
+        running = self._round
+        if running is None or answer.ballot != running.ballot or answer.elector not in self._electors:
+            return step
+        if isinstance(answer, Refused):
+            self._on_refused(running, answer, step, now)
+        elif isinstance(answer, Promise) and running.phase is _Phase.PREPARE:
+            running.promises[answer.elector] = answer.accepted
+            if len(running.promises) >= majority(len(self._electors)):
+                self._read(running, step, now)
+        elif isinstance(answer, Accepted) and running.phase is _Phase.ACCEPT:
+            running.yes[answer.elector] = True
+            if len(running.yes) >= majority(len(self._electors)):
+                self._commit(running, step, now)
+        return step
+
+    def _read(self, running: _Round, step: Step, now: float) -> None:
+        """A majority promised: decide what this ballot carries."""
+        accepted = [acceptance for acceptance in running.promises.values() if acceptance is not None]
+        newest = max(accepted, key=lambda acceptance: acceptance.ballot, default=None)
+        read = self._initial if newest is None else newest.value
+        if read.revision < self.value.revision:
+            step.problem = f"a majority of electors has forgotten revision {self.value.revision}"
+            self._finish(step, RoundOutcome.NO_QUORUM, now)
+            return
+        is_unlearnt = read.revision > self.value.revision
+        is_identity = running.change is None or running.sent is not None
+        if is_identity and newest is None:
+            self._finish(step, RoundOutcome.COMMITTED if running.sent is None else RoundOutcome.UNKNOWN, now)
+            return
+        if is_unlearnt or running.change is None or running.sent is not None:
+            running.value = read
+        elif running.change.base_revision != read.revision:
+            self._finish(step, RoundOutcome.CONFLICT, now)
+            return
+        else:
+            running.value = running.sent = running.change.apply(read)
+        assert running.ballot is not None
+        running.phase, running.deadline = _Phase.ACCEPT, now + self._ballot_s
+        running.no = {}
+        step.accept = Accept(
+            task=self.state.task,
+            acceptance=Acceptance(ballot=running.ballot, value=running.value),
+            electorate=self._electorate,
+        )
+
+    def _commit(self, running: _Round, step: Step, now: float) -> None:
+        """A majority accepted: the value is chosen."""
+        assert running.value is not None
+        value, sent = running.value, running.sent
+        learnt = self.learn(value, now)
+        step.is_dirty |= learnt.is_dirty
+        step.learnt, step.problem = learnt.learnt, learnt.problem
+        if self._round is not running:  # learning already ended it (its base is outdated)
+            step.finished, step.prepare = learnt.finished, learnt.prepare
+            return
+        if sent is not None:
+            self._finish(step, RoundOutcome.COMMITTED if sent == value else RoundOutcome.CONFLICT, now)
+        elif running.change is not None and running.change.base_revision == value.revision:
+            self._prepare(step, now)  # the other's value is settled; ours follows under a higher ballot
+        else:
+            self._finish(step, RoundOutcome.COMMITTED if running.change is None else RoundOutcome.CONFLICT, now)
+
+    def _on_refused(self, running: _Round, answer: Refused, step: Step, now: float) -> None:
+        self._counter = max(self._counter, answer.promised.counter)
+        running.no[answer.elector] = answer.refusal
+        if len(self._electors) - len(running.no) < majority(len(self._electors)):
+            self._again(running, step, now)
+
+    def _again(self, running: _Round, step: Step, now: float) -> None:
+        """This ballot cannot win any more: wait a little and try a higher one, or give up."""
+        # Once our value was sent it may have been chosen: the next attempts only find out, they never apply it again.
+        wait = self._jitter(running.attempt)
+        if now + wait >= running.give_up_at:
+            self._finish(step, RoundOutcome.NO_QUORUM if running.sent is None else RoundOutcome.UNKNOWN, now)
+            return
+        running.attempt += 1
+        running.phase, running.deadline, running.ballot = _Phase.WAIT, now + wait, None
+
+    def _finish(self, step: Step, outcome: RoundOutcome, now: float) -> None:
+        running = self._running()
+        if running.change is not None:
+            step.finished = (running.change, outcome)
+        self._round = None
+        self._start_next(step, now)
+
+    def _jitter(self, attempt: int) -> float:
+        """Doubling back-off with jitter, so that duelling proposers part."""
+        base = min(self._stagger_s * float(2**attempt), BACKOFF_CAP_S)
+        return base * (0.5 + self._rng.random())
+
+    def tick(self, now: float) -> Step:
+        """Time has passed."""
+        step = Step()
+        running = self._round
+        if running is not None and now >= running.deadline:
+            if running.phase is _Phase.WAIT:
+                self._prepare(step, now)
+            else:
+                self._again(running, step, now)
+        elif running is None and now >= self._settle_at:
+            self._settle_tries += 1
+            self._settle_at = now + 2 * self._ballot_s + self._jitter(self._settle_tries)
+            if self._is_unlearnt():
+                return self.settle(now)
+            self._settle_at = math.inf
+        return step
