@@ -76,8 +76,6 @@ class Slot:
     owner: NodeId
     routes: tuple[Route, ...]
     ready_when: ReadyWhen
-    ready_expr: str
-    """Liveliness key expression of the owner's worker token (ready_when ``token``)."""
 
 
 class RoutePhase(StrEnum):

@@ -1,0 +1,171 @@
+"""EXECUTOR: carries a committed allocation out: the worker's role here, and the handover of this robot's streams.
+
+Knows: the handover's table, its deadlines, who is predecessor. Does not know: how streams or workers work, and why the
+task moves.
+
+Handover on a robot, make before break. A legal step is a line of this table; every prefix leaves the streams whole:
+
+===========  =======================================  ============================================  ===========
+in           when                                     do                                            then
+===========  =======================================  ============================================  ===========
+any          a newer epoch is learnt                  plan PREPARE: the new slot opens, the old     PREPARING
+                                                      one still carries
+PREPARING    the new owner's worker is ready          plan FLIP: kept values, switch, end markers   FLIPPING
+FLIPPING     the relay flipped, an old slot is left   (the old slot drains)                         DRAINING
+FLIPPING     the relay flipped, none is left          plan CLOSE                                    SETTLED
+DRAINING     drained, or the drain time is over       plan CLOSE: the old slot is dropped           SETTLED
+any          the predecessor is gone                  the same plan without the predecessor         as before
+===========  =======================================  ============================================  ===========
+
+An abort is never local: while the new owner does not get ready the old slot stays open, and giving up on it is a new
+proposal. "Predecessor" is always the last slot that was flipped to.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+from zsched.core.fleet import Standby, TaskSpec
+from zsched.core.instructions import ApplyRoutes, Instruction, RecordStory, SetRole, StartWorker, StopWorker
+from zsched.core.model import Allocation, NodeId
+from zsched.core.plan import Role, RoutePhase, Slot, WorkerRole
+from zsched.core.route import plan_for, slot_for
+
+ROLE_DRAIN_MARGIN_S = 1.0
+"""The old owner's worker goes idle this much after the robots' drain time."""
+
+
+class Phase(StrEnum):
+    """How far this node's handover is."""
+
+    IDLE = "idle"  # no owner yet, or this node has no streams of the task
+    PREPARING = "preparing"
+    FLIPPING = "flipping"
+    DRAINING = "draining"
+    SETTLED = "settled"
+
+
+@dataclass(slots=True)
+class Executor:
+    """One task's handover and role on one node."""
+
+    spec: TaskSpec
+    me: NodeId
+    has_streams: bool
+    """Robots have; edges only have workers."""
+    phase: Phase = Phase.IDLE
+    epoch: int = 0
+    owner: NodeId | None = None
+    role: Role = field(init=False)
+    _current: Slot | None = None
+    _predecessor: Slot | None = None
+    _drain_deadline: float = math.inf
+    _role_deadline: float = math.inf
+    started_at: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.role = Role(task=self.spec.name, role=WorkerRole.IDLE)
+
+    @property
+    def is_candidate(self) -> bool:
+        """Whether this node may run the task's worker."""
+        return self.me in self.spec.candidates
+
+    def next_deadline(self) -> float:
+        """When `tick` may have something to do; infinity when never."""
+        return min(self._drain_deadline, self._role_deadline)
+
+    def start(self) -> tuple[Instruction, ...]:
+        """The node starts: warm candidates start their worker."""
+        if self.is_candidate and self.spec.worker.command and self.spec.worker.standby is Standby.WARM:
+            return (StartWorker(task=self.spec.name),)
+        return ()
+
+    def execute(self, allocation: Allocation, now: float) -> tuple[Instruction, ...]:
+        """A learnt allocation: act if its epoch is newer than what is carried out."""
+        if allocation.owner is None or allocation.epoch <= self.epoch:
+            return ()
+        self.epoch, self.owner, self.started_at = allocation.epoch, allocation.owner, now
+        return (*self._change_role(allocation, now), *self._prepare(allocation.owner))
+
+    def _change_role(self, allocation: Allocation, now: float) -> tuple[Instruction, ...]:
+        if not self.is_candidate:
+            return ()
+        if allocation.owner == self.me:
+            self._role_deadline = math.inf
+            self.role = Role(task=self.spec.name, role=WorkerRole.ACTIVE, epoch=allocation.epoch)
+            start = (StartWorker(task=self.spec.name),) if self.spec.worker.command else ()
+            return (*start, SetRole(role=self.role))
+        if self.role.role is not WorkerRole.ACTIVE:
+            return ()
+        self._role_deadline = now + self.spec.drain_s + ROLE_DRAIN_MARGIN_S
+        self.role = Role(task=self.spec.name, role=WorkerRole.DRAINING, epoch=self.role.epoch)
+        return (SetRole(role=self.role),)
+
+    def _prepare(self, owner: NodeId) -> tuple[Instruction, ...]:
+        if not self.has_streams:
+            return ()
+        if self.phase in (Phase.FLIPPING, Phase.DRAINING, Phase.SETTLED):
+            self._predecessor = self._current
+        self._current = slot_for(self.spec, self.me, owner, self.epoch)
+        self._drain_deadline = math.inf
+        return self._go(Phase.PREPARING, RoutePhase.PREPARE, f"prepares {owner}")
+
+    def _go(self, phase: Phase, plan: RoutePhase | None, text: str) -> tuple[Instruction, ...]:
+        self.phase = phase
+        story = RecordStory(stage="executor", text=text, task=self.spec.name, epoch=self.epoch)
+        if plan is None or self._current is None:
+            return (story,)
+        return (ApplyRoutes(plan=plan_for(self.spec, plan, self._current, self._predecessor)), story)
+
+    def on_ready(self, epoch: int) -> tuple[Instruction, ...]:
+        """The relay sees the new owner's worker ready for the slot of ``epoch``."""
+        if epoch != self.epoch or self.phase is not Phase.PREPARING:
+            return ()
+        return self._go(Phase.FLIPPING, RoutePhase.FLIP, f"flips to {self.owner}")
+
+    def on_flipped(self, epoch: int, replayed: int, now: float) -> tuple[Instruction, ...]:
+        """The relay switched every stream to the slot of ``epoch``."""
+        if epoch != self.epoch or self.phase is not Phase.FLIPPING:
+            return ()
+        done = f"flipped to {self.owner} in {(now - self.started_at) * 1000:.0f} ms, {replayed} kept values replayed"
+        if self._predecessor is None:
+            return self._go(Phase.SETTLED, RoutePhase.CLOSE, done)
+        self._drain_deadline = now + self.spec.drain_s
+        return self._go(Phase.DRAINING, None, f"{done}; {self._predecessor.owner} drains")
+
+    def on_drained(self, epoch: int) -> tuple[Instruction, ...]:
+        """The predecessor's slot of ``epoch`` has given back all it had."""
+        if self._predecessor is None or epoch != self._predecessor.epoch or self.phase is not Phase.DRAINING:
+            return ()
+        return self._close(f"{self._predecessor.owner} drained")
+
+    def on_gone(self, node: NodeId) -> tuple[Instruction, ...]:
+        """A peer is gone: nothing will come from its slot any more."""
+        if self._predecessor is None or self._predecessor.owner != node:
+            return ()
+        if self.phase is Phase.DRAINING:
+            return self._close(f"{node} is gone")
+        self._predecessor = None
+        plan = RoutePhase.PREPARE if self.phase is Phase.PREPARING else RoutePhase.FLIP
+        return self._go(self.phase, plan, f"drops the slot of {node}, which is gone")
+
+    def _close(self, text: str) -> tuple[Instruction, ...]:
+        self._predecessor = None
+        self._drain_deadline = math.inf
+        return self._go(Phase.SETTLED, RoutePhase.CLOSE, f"settled on {self.owner}: {text}")
+
+    def tick(self, now: float) -> tuple[Instruction, ...]:
+        """Time has passed."""
+        result: tuple[Instruction, ...] = ()
+        if now >= self._drain_deadline:
+            result += self._close(f"drain time of {self.spec.drain_s:g} s over")
+        if now >= self._role_deadline:
+            self._role_deadline = math.inf
+            self.role = Role(task=self.spec.name, role=WorkerRole.IDLE)
+            result += (SetRole(role=self.role),)
+            if self.spec.worker.standby is Standby.COLD:
+                result += (StopWorker(task=self.spec.name),)
+        return result
