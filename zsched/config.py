@@ -1,0 +1,185 @@
+"""Decides whether a fleet file can be used, and what it says: YAML to `Fleet`, every fault at once with its place.
+
+Knows: how the values of the file relate to each other. Does not know: keys and ranges (`zsched.config_schema`), YAML
+(`zsched.config_reader`), this machine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from zsched.config_blocks import Located, Section
+from zsched.config_nodes import Cast, read_nodes, select, warn_missing
+from zsched.config_reader import Collector, Fault, Place, read_yaml, render_all
+from zsched.config_schema import FLEET
+from zsched.config_tasks import read_tasks
+from zsched.core.fleet import Fleet, NodeSpec, Timing, dial_endpoint
+from zsched.core.model import NodeId, NodeKind
+from zsched.core.timing import WIFI, timing_faults
+from zsched.errors import ConfigError
+
+__all__ = ["CheckResult", "Fault", "check_bytes", "check_file", "load_fleet"]
+
+_SEEDS = 2
+"""How many nodes are seeds when the file names none: one may be down."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CheckResult:
+    """What became of one fleet file: the fleet, or the faults that stand in its way; warnings with either."""
+
+    file: str
+    fleet: Fleet | None
+    faults: tuple[Fault, ...]
+    warnings: tuple[Fault, ...]
+
+    def report(self) -> str:
+        """Faults, then warnings, as a compiler shows them; empty when there are none."""
+        parts = (render_all(self.file, self.faults), render_all(self.file, self.warnings, "warning"))
+        return "\n".join(part for part in parts if part)
+
+
+def load_fleet(path: str | Path) -> Fleet:
+    """The fleet that the file at ``path`` describes.
+
+    Raises:
+        ConfigError: the file cannot be read or has faults; its text is the whole report.
+    """
+    result = check_file(path)
+    if result.fleet is None:
+        raise ConfigError(render_all(result.file, result.faults))
+    return result.fleet
+
+
+def check_file(path: str | Path) -> CheckResult:
+    """Read and check the file at ``path``; never raises for what the file holds or for its absence."""
+    file = Path(path)
+    try:
+        data = file.read_bytes()
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        fault = Fault(line=0, col=0, message=f"cannot be read: {reason}", hint="give the path of a fleet file")
+        return CheckResult(file=str(path), fleet=None, faults=(fault,), warnings=())
+    return check_bytes(data, str(path))
+
+
+def check_bytes(data: bytes, file: str = "fleet.yaml") -> CheckResult:
+    """As `check_file` for ``data``; file names in it are relative to the folder of ``file``."""
+    root, out = read_yaml(data)
+    fleet = None
+    if root is not None:
+        section = FLEET.read(root, out)
+        if section is not None:
+            fleet = _fleet(section, Path(file).absolute().parent, out)
+    is_good = fleet is not None and out.count == 0
+    return CheckResult(file=file, fleet=fleet if is_good else None, faults=out.faults, warnings=out.warnings)
+
+
+def _fleet(section: Section, folder: Path, out: Collector) -> Fleet | None:
+    cast = read_nodes(section, folder, out)
+    timing = _timing(section, out)
+    seeds = _seeds(section, cast, out)
+    electors = _electors(section, cast, out)
+    tasks = read_tasks(section, cast, out)
+    zenoh_config = _zenoh_config(section, folder, out)
+    if out.count:
+        return None
+    return Fleet(
+        name=section.get("fleet"),
+        timing=timing,
+        nodes=tuple(sorted(cast.nodes, key=lambda node: node.name)),
+        tasks=tuple(sorted(tasks, key=lambda task: task.name)),
+        electors=electors,
+        seeds=seeds,
+        zenoh_config=zenoh_config,
+    )
+
+
+# --- timing ----------------------------------------------------------------------------------------------------------
+
+
+def _timing(section: Section, out: Collector) -> Timing:
+    given = section.get("timing", WIFI)
+    if isinstance(given, Timing):
+        return given
+    base: Timing = given.get("profile", WIFI)
+    changes = {name: value for name, value in given.values.items() if name != "profile"}
+    timing = _changed(base, changes)
+    if given.is_whole:
+        for name, message in timing_faults(timing):
+            # a relation may be broken by the other of its fields: point at one that the file sets
+            place = given.places.get(name) or next(
+                (given.places[other] for other in changes if other in message), given.place
+            )
+            out.error(place, message)
+    return timing
+
+
+def _changed(base: Timing, changes: Mapping[str, float]) -> Timing:
+    values = {name: getattr(base, name) for name in base.__dataclass_fields__}
+    return Timing(**{**values, **changes})
+
+
+# --- seeds and electors ----------------------------------------------------------------------------------------------
+
+
+def _seeds(section: Section, cast: Cast, out: Collector) -> tuple[NodeId, ...]:
+    given: tuple[Located[str], ...] | None = section.get("seeds")
+    if given is None:
+        seeds = tuple(node.name for node in cast.nodes if _can_be_dialled(node))[:_SEEDS]
+        if not seeds and len(cast.names) > 1 and cast.is_whole and "seeds" not in section.places:
+            message = "no node can be dialled, so none would find another"
+            hint = "give one or two nodes `host: ADDRESS` and `listen: {control: tcp/0.0.0.0:7457, data: ...7458}`"
+            out.error(cast.place, message, hint)
+        return seeds
+    for seed in cast.known(given, out):
+        node = next((node for node in cast.nodes if node.name == seed.value), None)
+        if node is not None and not _can_be_dialled(node):
+            hint = "it needs `listen: {control: ...}` with a fixed port, and a `host:` when it listens on 0.0.0.0"
+            out.error(seed.place, f"the seed {seed.value!r} cannot be dialled", hint)
+    return tuple(dict.fromkeys(seed.value for seed in given))
+
+
+def _can_be_dialled(node: NodeSpec) -> bool:
+    return bool(node.listen_control and dial_endpoint(node.listen_control, node.host))
+
+
+def _electors(section: Section, cast: Cast, out: Collector) -> tuple[NodeId, ...]:
+    robots = cast.of_kind(NodeKind.ROBOT)
+    given = section.get("electorate")
+    electors = robots if given is None else select(given, cast, out)
+    place = section.where("electorate") if given is not None else cast.place
+    if not robots and cast.is_whole:
+        out.error(cast.place, "the fleet has no robot: nobody would vote", "give at least one node `kind: robot`")
+    elif not electors and cast.is_whole:
+        out.error(place, "no node is an elector")
+    elif electors and cast.is_whole:
+        _advise_electors(electors, cast, place, out)
+    return electors
+
+
+def _advise_electors(electors: tuple[NodeId, ...], cast: Cast, place: Place, out: Collector) -> None:
+    spare = [name for name in cast.names if name not in electors]
+    hint = f"electorate: [{', '.join(sorted((*electors, *spare[: 3 - len(electors)])))}]" if spare else ""
+    if len(electors) == 1:
+        out.warn(place, f"{electors[0]!r} is the only elector: while it is away no task can move", hint)
+    elif len(electors) == 2:
+        out.warn(place, "two electors: while either is away no task can move", hint)
+    elif len(electors) % 2 == 0:
+        count = len(electors)
+        message = f"{count} electors survive the loss of {(count - 1) // 2}, as {count - 1} would"
+        out.warn(place, message, "an odd number is better")
+
+
+# --- zenoh -----------------------------------------------------------------------------------------------------------
+
+
+def _zenoh_config(section: Section, folder: Path, out: Collector) -> str:
+    zenoh: Section | None = section.get("zenoh")
+    if zenoh is None or "config" not in zenoh.values:
+        return ""
+    path = folder / zenoh.get("config")
+    warn_missing(path, zenoh.where("config"), out)
+    return str(path)

@@ -1,0 +1,186 @@
+"""Decides what the `nodes:` of a fleet file say: machines, endpoints, links, and who is meant by a selection.
+
+Knows: how the values of one node, and the nodes among each other, relate. Does not know: tasks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from zsched.config_blocks import Located, Section
+from zsched.config_reader import Collector, Place, nearest
+from zsched.core.fleet import LinkSpec, NodeSpec, dial_endpoint
+from zsched.core.model import LinkSource, NodeId, NodeKind
+
+_SOURCES = ("wifi", "wired", "fixed", "trace")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cast:
+    """The nodes of the file: all names, and those nodes that could be read."""
+
+    place: Place
+    names: tuple[NodeId, ...]
+    nodes: tuple[NodeSpec, ...]
+    is_whole: bool
+    """Every node could be read: only then does an empty selection mean something."""
+
+    def of_kind(self, kind: NodeKind) -> tuple[NodeId, ...]:
+        """Names of all nodes of ``kind``, sorted."""
+        return tuple(sorted(node.name for node in self.nodes if node.kind is kind))
+
+    def known(self, names: tuple[Located[str], ...], out: Collector) -> Iterator[Located[str]]:
+        """Those of ``names`` that are nodes; the others, and doubles, are faults."""
+        seen: set[str] = set()
+        for name in names:
+            if name.value not in self.names:
+                out.error(name.place, f"there is no node {name.value!r}", nearest(name.value, self.names))
+            elif name.value in seen:
+                out.error(name.place, f"{name.value!r} is there twice")
+            else:
+                seen.add(name.value)
+                yield name
+
+
+def select(given: tuple[Located[str], ...] | Section, cast: Cast, out: Collector) -> tuple[NodeId, ...]:
+    """The nodes that a list of names or a selection means, sorted. An empty selection is the caller's to judge."""
+    if not isinstance(given, Section):
+        return tuple(sorted(name.value for name in cast.known(given, out)))
+    if not given.places:
+        out.error(given.place, "the selection is empty", "for example {kind: edge}, or a list of names")
+        return ()
+    kind = given.get("kind")
+    labels = {key: held.value for key, held in given.get("labels", {}).items()}
+    return tuple(
+        sorted(
+            node.name
+            for node in cast.nodes
+            if (kind is None or node.kind is kind) and labels.items() <= dict(node.labels).items()
+        )
+    )
+
+
+def read_nodes(section: Section, folder: Path, out: Collector) -> Cast:
+    """All nodes of the file, with what is wrong between them reported."""
+    entries: dict[str, Located[Section | None]] = section.get("nodes", {})
+    before = out.count
+    nodes: list[NodeSpec] = []
+    for name, entry in entries.items():
+        if entry.value is not None:
+            node = _node(name, entry.value, tuple(entries), folder, out)
+            if node is not None:
+                nodes.append(node)
+    place = section.where("nodes")
+    if not entries and "nodes" in section.values:
+        out.error(place, "the fleet has no nodes")
+    is_whole = out.count == before and len(nodes) == len(entries) > 0
+    _check_endpoints(nodes, entries, out)
+    return Cast(place=place, names=tuple(entries), nodes=tuple(nodes), is_whole=is_whole)
+
+
+def _node(name: str, given: Section, names: tuple[str, ...], folder: Path, out: Collector) -> NodeSpec | None:
+    links = tuple(_links(name, given, names, folder, out))
+    if "kind" not in given.values:
+        return None
+    listen: Section | None = given.get("listen")
+    labels = given.get("labels", {})
+    return NodeSpec(
+        name=name,
+        kind=given.get("kind"),
+        host=given.get("host", ""),
+        listen_control=listen.get("control", "") if listen is not None else "",
+        listen_data=listen.get("data", "") if listen is not None else "",
+        labels=tuple(sorted((key, held.value) for key, held in labels.items() if held.value is not None)),
+        links=links,
+    )
+
+
+# --- endpoints -------------------------------------------------------------------------------------------------------
+
+
+def _check_endpoints(nodes: list[NodeSpec], entries: dict[str, Located[Section | None]], out: Collector) -> None:
+    """No two sessions of the fleet may have one address."""
+    taken: dict[str, str] = {}
+    for node in nodes:
+        section = entries[node.name].value
+        listen: Section | None = section.get("listen") if section is not None else None
+        if listen is None:
+            continue
+        for kind, endpoint in (("control", node.listen_control), ("data", node.listen_data)):
+            # a node without a host listens "everywhere", but on its own machine
+            address = dial_endpoint(endpoint, node.host or node.name).partition("?")[0].partition("#")[0]
+            if not address:
+                continue
+            owner = taken.setdefault(address, f"{node.name}'s {kind} session")
+            if owner != f"{node.name}'s {kind} session":
+                out.error(listen.where(kind), f"{endpoint} is already {owner}", "give each session a port of its own")
+
+
+# --- links -----------------------------------------------------------------------------------------------------------
+
+
+def _links(name: str, given: Section, names: tuple[str, ...], folder: Path, out: Collector) -> Iterator[LinkSpec]:
+    own = _link(given, None, "", folder, out)
+    if own is not None:
+        yield own
+    for peer, entry in given.get("links", {}).items():
+        if peer == name or peer not in names:
+            why = f"{name!r} is this node itself" if peer == name else f"there is no node {peer!r}"
+            out.error(entry.place, why, nearest(peer, (other for other in names if other != name)))
+            continue
+        if entry.value is None:
+            continue
+        link = _link(entry.value, peer, given.get("wifi", ""), folder, out)
+        if link is not None:
+            yield link
+        elif entry.value.is_whole:
+            out.error(entry.place, f"the link to {peer!r} has no source", f"one of: {', '.join((*_SOURCES, 'mac'))}")
+
+
+def _link(given: Section, peer: str | None, interface: str, folder: Path, out: Collector) -> LinkSpec | None:
+    """The one source of a link; ``interface`` is the node's own, for a link that names only the station."""
+    sources = [source for source in _SOURCES if source in given.places]
+    if len(sources) > 1:
+        message = f"a link has one source, not {' and '.join(sources)}"
+        out.error(given.where(sources[1]), message, "delete all but one")
+        return None
+    mac: str = given.get("mac", "")
+    if mac and sources not in ([], ["wifi"]):
+        out.error(
+            given.where("mac"), f"a station is measured by `wifi`, not by `{sources[0]}`", "delete one of the two"
+        )
+        return None
+    if mac and not (given.get("wifi") or interface):
+        out.error(given.where("mac"), "this node has no `wifi` interface that hears the station", "add wifi: wlan0")
+        return None
+    if mac:
+        value = given.get("wifi") or interface
+        return LinkSpec(source=LinkSource.NL80211, peer=peer, value=value, mac=mac.lower())
+    return _plain_link(given, peer, sources[0], folder, out) if sources and sources[0] in given.values else None
+
+
+def _plain_link(given: Section, peer: str | None, source: str, folder: Path, out: Collector) -> LinkSpec:
+    value = given.get(source)
+    if source == "wifi":
+        return LinkSpec(source=LinkSource.NL80211, peer=peer, value=value)
+    if source == "wired":
+        return LinkSpec(source=LinkSource.WIRED, peer=peer)
+    if source == "fixed":
+        return LinkSpec(source=LinkSource.FIXED, peer=peer, value=f"{value:g}")
+    path = folder / value.get("file", "")
+    if "file" in value.values:
+        warn_missing(path, value.where("file"), out)
+    more = {name: value.get(name) for name in ("column", "offset_s") if name in value.values}
+    return LinkSpec(source=LinkSource.TRACE, peer=peer, value=str(path), **more)
+
+
+def warn_missing(path: Path, place: Place, out: Collector) -> None:
+    """The fleet file is the same on every machine, other files need not be: their absence is a warning."""
+    try:
+        is_there = path.is_file()
+    except (OSError, ValueError):
+        is_there = False
+    if not is_there:
+        out.warn(place, f"{path} is not on this machine")

@@ -1,0 +1,319 @@
+"""Decides which keys a fleet file has, what each takes, and says so in the reference table.
+
+Knows: every key with its kind, range and one sentence. Does not know: how the values relate (`zsched.config`), and the
+defaults, which live in `zsched.core.fleet`, `zsched.core.plan` and `zsched.core.model`.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+from collections.abc import Iterator
+from typing import Any, Final
+
+from zsched.config_blocks import (
+    NAME_BLOCK,
+    Block,
+    Choice,
+    Field,
+    Flag,
+    Forms,
+    Here,
+    ListOf,
+    MapOf,
+    Number,
+    Record,
+    Text,
+    Whole,
+)
+from zsched.core.fleet import (
+    Demand,
+    LinkLimits,
+    OnIsolation,
+    Reach,
+    Standby,
+    TaskSpec,
+    Timing,
+    WorkerLink,
+    WorkerSpec,
+)
+from zsched.core.model import RSSI_MAX_DBM, RSSI_MIN_DBM, Aggregate, NodeKind, Tuning
+from zsched.core.plan import HandoverRule, ReadyWhen, StreamClass, StreamSettings
+from zsched.core.timing import PROFILES
+
+_HOST_PORT: Final = ("tcp", "udp", "tls", "quic", "ws")
+_WITH_PATH: Final = ("unixsock-stream", "unixpipe", "serial", "vsock")
+_HOST: Final = re.compile(r"(?!-)[A-Za-z0-9_-]{1,63}(?:\.(?!-)[A-Za-z0-9_-]{1,63})*\.?")
+_MAC: Final = re.compile(r"[0-9a-fA-F]{2}(:[0-9a-fA-F]{2}){5}")
+_ENV_NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_INTERFACE: Final = re.compile(r"[^\s/]{1,15}")
+
+
+def host_fault(text: str) -> str | None:
+    """Why ``text`` is no host name, IPv4 or IPv6 address."""
+    try:
+        ipaddress.ip_address(text)
+    except ValueError:
+        is_number = re.fullmatch(r"[0-9.]+", text) is not None
+        if not is_number and len(text) <= 253 and _HOST.fullmatch(text) is not None:
+            return None
+        return "not an address" if is_number else "letters, digits, '-' and '.' only"
+    return None
+
+
+def endpoint_fault(text: str) -> str | None:
+    """Why ``text`` is no zenoh endpoint (``PROTOCOL/ADDRESS[?metadata][#config]``)."""
+    protocol, slash, rest = text.partition("/")
+    address = re.split(r"[?#]", rest, maxsplit=1)[0]
+    if not slash or protocol not in _HOST_PORT + _WITH_PATH:
+        return f"it must begin with one of {', '.join(name + '/' for name in _HOST_PORT + _WITH_PATH)}"
+    if protocol in _WITH_PATH:
+        return None if address else "nothing follows the protocol"
+    host, colon, port = address.rpartition(":")
+    if not colon or not port.isascii() or not port.isdigit() or len(port) > 5 or int(port) > 65535:
+        return "it must end with ':PORT', PORT 0..65535"
+    if host.startswith("[") and host.endswith("]"):
+        return host_fault(host[1:-1]) if ":" in host else "brackets are for IPv6 addresses"
+    return "an IPv6 address stands in brackets" if ":" in host else host_fault(host)
+
+
+def _matches(pattern: re.Pattern[str], why: str) -> Any:
+    return lambda text: None if pattern.fullmatch(text) is not None else why
+
+
+def _text_fault(text: str) -> str | None:
+    if "\0" in text or len(text) > 4096:
+        return "it holds a NUL or more than 4096 characters"
+    return None
+
+
+_SECONDS: Final = Number(0.01, 3600, "s")
+_DBM: Final = Number(RSSI_MIN_DBM, RSSI_MAX_DBM, "dBm")
+_TEXT: Final = Text("text", _text_fault)
+_FILE: Final = Text("a file name", lambda text: "it is empty" if not text else _text_fault(text))
+_ENDPOINT: Final = Text("a zenoh endpoint", endpoint_fault, 'for example "tcp/0.0.0.0:7457"')
+_INTERFACE_NAME: Final = Text("a network interface", _matches(_INTERFACE, "1 to 15 characters, no blank, no '/'"))
+_LABEL: Final = Text("a label", lambda text: None if text and len(text) <= 63 else "1 to 63 characters")
+_LABELS: Final = MapOf(_LABEL, _LABEL)
+_NAMES: Final = ListOf(Here(NAME_BLOCK), least=1)
+_TEMPLATE: Final = Text("a key template", _text_fault)
+
+
+TRACE: Final = Record(
+    "a trace",
+    {
+        "file": Field(_FILE, "CSV (or .csv.gz) of a recorded drive, relative to the fleet file.", required=True),
+        "column": Field(_TEXT, "The column that holds dBm.", default="`c_rssi`"),
+        "offset_s": Field(Number(0, 1e6, "s"), "Where in the drive to start.", default="`0`"),
+    },
+)
+
+_LINK_FIELDS: Final = {
+    "wifi": Field(_INTERFACE_NAME, "Read this interface's signal (nl80211, else /proc/net/wireless)."),
+    "wired": Field(Flag(only=True), "A cable: the link counts 1."),
+    "fixed": Field(_DBM, "A constant, for tests and for links that cannot be measured."),
+    "trace": Field(TRACE, "Replay a recorded drive (lab and tests)."),
+}
+
+PEER_LINK: Final = Record(
+    "a link",
+    {
+        **_LINK_FIELDS,
+        "mac": Field(
+            Text("a MAC address", _matches(_MAC, "six pairs of hex digits with ':' between")),
+            "The peer is this station of the node's `wifi` interface (ad hoc, mesh, or this node is the access point).",
+        ),
+    },
+)
+
+NODE: Final = Record(
+    "a node",
+    {
+        "kind": Field(Choice.of(NodeKind), "Robots vote and have streams; edges are candidates only.", required=True),
+        "host": Field(Text("a host name or IP address", host_fault), "How the others reach this machine."),
+        "listen": Field(
+            Record(
+                "a listen section",
+                {
+                    "control": Field(_ENDPOINT, "Endpoint of the control session.", default="any free port"),
+                    "data": Field(_ENDPOINT, "Endpoint of the data session, another port.", default="any free port"),
+                },
+            ),
+            "Where this node listens; the others find it by gossip from the seeds.",
+        ),
+        "labels": Field(_LABELS, "Free pairs of text that `candidates` may ask for."),
+        **_LINK_FIELDS,
+        "links": Field(MapOf(NAME_BLOCK, PEER_LINK), "Links to single peers, where they differ from the node's own."),
+    },
+)
+
+SELECTOR: Final = Record(
+    "a selection of nodes",
+    {
+        "kind": Field(Choice.of(NodeKind), "All nodes of this kind."),
+        "labels": Field(_LABELS, "All nodes that have all these labels."),
+    },
+)
+_NODES: Final = Forms(listing=_NAMES, mapping=SELECTOR)
+
+_SHARE: Final = Number(0, 1)
+WEIGHTS: Final = Record(
+    "the weights",
+    {
+        "cpu": Field(_SHARE, "Weight of free CPU (Eq. 1). The three weights sum to 1.", default="`0`"),
+        "memory": Field(_SHARE, "Weight of free memory (Eq. 2).", default="`0`"),
+        "network": Field(_SHARE, "Weight of the radio link (Eq. 3).", default="`0`"),
+    },
+)
+
+DEMAND: Final = Record(
+    "a demand",
+    {
+        "cpu_cores": Field(Number(0, 4096, "cores"), "CPU that the task needs at least."),
+        "memory_mb": Field(Number(0, 1e8, "MiB"), "Memory that the task needs at least."),
+    },
+    Demand,
+)
+
+SCHEDULING: Final = Record(
+    "a scheduling section",
+    {
+        "bonus": Field(_SHARE, "Added to the owner's joint utility: what a move must gain."),
+        "time_to_trigger_s": Field(Number(0, 3600, "s"), "How long another candidate must lead."),
+        "cool_down_s": Field(Number(0, 86400, "s"), "Least stay after a move."),
+        "aggregate": Field(Choice.of(Aggregate), "How the robots' utilities become one; `median` resists a liar."),
+        "reach": Field(Choice.of(Reach), "Who must reach a candidate.", default=f"`{Reach.MAJORITY}`"),
+        "memory_floor_ratio": Field(
+            Number(0, 0.9), "Escape: leave an owner whose free memory is below this share.", default="`0.05`"
+        ),
+    },
+    Tuning,
+)
+
+LINK_LIMITS: Final = Record(
+    "a link section",
+    {
+        "nu_dbm": Field(_DBM, "Least usable signal (Eq. 3): below it the candidate's utility is 0."),
+        "rho_dbm": Field(_DBM, "Best achievable signal (Eq. 3); above `nu_dbm`."),
+    },
+    LinkLimits,
+)
+
+WORKER: Final = Record(
+    "a worker",
+    {
+        "command": Field(
+            ListOf(Text("a word", _text_fault), least=1),
+            "Program and arguments, no shell. A first word `python` is the daemon's own interpreter. "
+            "Absent: the worker is started by somebody else.",
+        ),
+        "standby": Field(Choice.of(Standby), "`warm`: runs on every candidate; `cold`: started on the move."),
+        "ready": Field(
+            Choice.of(ReadyWhen), "`token`: zsched.worker says so; `matching`: any zenoh program.", default="`token`"
+        ),
+        "link": Field(Choice.of(WorkerLink), "How workers join the data network."),
+        "env": Field(MapOf(Text("a variable", _matches(_ENV_NAME, "letters, digits and '_'")), _TEXT), "Environment."),
+        "start_deadline_s": Field(_SECONDS, "Ready within this time, or the start has failed."),
+        "stop_grace_s": Field(_SECONDS, "Between SIGINT, SIGTERM and SIGKILL."),
+        "output_deadline_s": Field(
+            _SECONDS, "No output for so long while inputs flow counts as hung.", default="not watched"
+        ),
+        "max_failures": Field(Whole(1, 100), "So many failures in the window make the node ineligible."),
+        "failure_window_s": Field(Number(1, 86400, "s"), "The window."),
+    },
+    WorkerSpec,
+)
+
+RULE: Final = Record(
+    "a stream rule",
+    {
+        "from": Field(Here(_TEMPLATE), "Key that is subscribed to; a template.", required=True),
+        "to": Field(Here(_TEMPLATE), "Key that is published; a template.", required=True),
+        "class": Field(Choice.of(StreamClass), "What the stream needs.", default=f"`{StreamClass.BEST_EFFORT}`"),
+        "keep_last": Field(Whole(0, 1000), "Samples per key that a new owner gets at once (class `latest`)."),
+        "depth": Field(Whole(1, 100_000), "Samples that may wait between subscriber and publisher."),
+        "handover": Field(Choice.of(HandoverRule), "Outputs: switch at the new owner's first sample, or lose nothing."),
+    },
+    StreamSettings,
+)
+
+TASK: Final = Record(
+    "a task",
+    {
+        "candidates": Field(_NODES, "The nodes that may own the task: names, or a selection.", required=True),
+        "weights": Field(WEIGHTS, "Eq. 4.", required=True),
+        "demand": Field(DEMAND, "What the task needs, before it was ever measured."),
+        "scheduling": Field(SCHEDULING, "When a better candidate is worth a move."),
+        "link": Field(LINK_LIMITS, "The limits of Eq. 3."),
+        "worker": Field(WORKER, "The process that does the work."),
+        "inputs": Field(ListOf(RULE), "Streams from the robots' applications to the owner's worker."),
+        "outputs": Field(ListOf(RULE), "Streams from the owner's worker to the robots' applications."),
+        "on_isolation": Field(Choice.of(OnIsolation), "What a robot does that is cut off from the owner."),
+        "exclusive": Field(Flag(), "The work must never run twice; needs `{epoch}` in every output's `from`."),
+        "drain_s": Field(Number(0, 600, "s"), "How long the old owner may finish what it has in work."),
+    },
+    TaskSpec,
+)
+
+TIMING: Final = Record(
+    "a timing section",
+    {
+        "profile": Field(Choice(PROFILES), "The profile from which the others differ.", default="`wifi`"),
+        "beat_s": Field(_SECONDS, "Period of the heartbeat."),
+        "suspect_s": Field(_SECONDS, "Silence after which a peer is suspect."),
+        "confirm_s": Field(_SECONDS, "How long a suspect may refute before it is gone."),
+        "zenoh_lease_s": Field(_SECONDS, "zenoh's own lease."),
+        "sample_s": Field(_SECONDS, "Period of the profilers."),
+        "smoothing_s": Field(_SECONDS, "Time constant of CPU, memory and dBm."),
+        "publish_s": Field(_SECONDS, "A profile at least so often."),
+        "profile_ttl_s": Field(_SECONDS, "An older profile does not count."),
+        "decide_s": Field(_SECONDS, "A robot's own round at least so often."),
+        "gather_s": Field(_SECONDS, "Deadline for the peers' utilities."),
+        "ballot_s": Field(_SECONDS, "Deadline of one prepare or accept phase."),
+        "stagger_s": Field(Number(0, 10, "s"), "Wait per rank before a proposer starts."),
+    },
+    Timing,
+)
+
+FLEET: Final = Record(
+    "the fleet file",
+    {
+        "fleet": Field(NAME_BLOCK, "Name of the fleet; others do not see it.", required=True),
+        "timing": Field(Forms(word=Choice(PROFILES), mapping=TIMING), "Clocks of the protocol.", default="`wifi`"),
+        "seeds": Field(
+            _NAMES, "Nodes that everybody dials; gossip finds the rest.", default="the first two that can be dialled"
+        ),
+        "nodes": Field(MapOf(NAME_BLOCK, NODE), "The machines.", required=True),
+        "tasks": Field(MapOf(NAME_BLOCK, TASK), "What must run somewhere, and its streams."),
+        "electorate": Field(_NODES, "Who stores the allocations and agrees on them.", default="the robots"),
+        "zenoh": Field(
+            Record(
+                "a zenoh section",
+                {"config": Field(_FILE, "JSON5 file passed to zenoh untouched, relative to the fleet file.")},
+            ),
+            "Settings of zenoh itself.",
+        ),
+    },
+)
+
+
+def reference_rows(record: Record = FLEET, prefix: str = "") -> Iterator[tuple[str, str, str, str]]:
+    """(key, type and range, default, meaning) of every key of the file, outer ones first."""
+    for name, item in record.items.items():
+        path = f"{prefix}{name}"
+        yield path, item.block.says(), record.default_text(name), item.doc
+        for suffix, inner in _records(item.block):
+            yield from reference_rows(inner, f"{path}{suffix}.")
+
+
+def _records(block: Block[Any]) -> Iterator[tuple[str, Record]]:
+    if isinstance(block, Record):
+        yield "", block
+    elif isinstance(block, Forms):
+        for inner in (block.listing, block.mapping):
+            if inner is not None:
+                yield from _records(inner)
+    elif isinstance(block, MapOf):
+        yield from ((f".NAME{suffix}", record) for suffix, record in _records(block.item))
+    elif isinstance(block, ListOf):
+        yield from ((f"[]{suffix}", record) for suffix, record in _records(block.item))

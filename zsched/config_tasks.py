@@ -1,0 +1,215 @@
+"""Decides what the `tasks:` of a fleet file say: candidates, tuning, workers, stream rules.
+
+Knows: how the values of one task, and the rules of all tasks, relate. Does not know: YAML, timing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from zsched.config_blocks import Located, Section
+from zsched.config_nodes import Cast, select
+from zsched.config_reader import Collector, Place, nearest
+from zsched.core.fleet import Demand, LinkLimits, StreamRule, TaskSpec, WorkerSpec
+from zsched.core.model import NodeKind, Tuning, Weights
+from zsched.core.plan import Direction, HandoverRule, ReadyWhen, StreamClass, StreamSettings
+from zsched.core.rulecheck import RuleConflict, rule_conflicts
+from zsched.core.templates import PLACEHOLDERS, named_rules, placeholders, rule_fault, template_fault
+
+_Places = dict[str, Place]
+"""Where each rule stands, by stream name."""
+
+
+def read_tasks(section: Section, cast: Cast, out: Collector) -> tuple[TaskSpec, ...]:
+    """All tasks that could be read, with what is wrong in and between them reported."""
+    entries: dict[str, Located[Section | None]] = section.get("tasks", {})
+    if not entries and "tasks" not in section.places:
+        out.warn(section.where("nodes"), "the fleet has no tasks: nothing will be scheduled")
+    places: _Places = {}
+    tasks: list[TaskSpec] = []
+    for name, entry in entries.items():
+        if entry.value is None:
+            continue
+        task = _task(name, entry, entry.value, cast, places, out)
+        if task is not None:
+            tasks.append(task)
+            _advise_network(task, entry.value, cast, out)
+    for conflict in rule_conflicts(tasks, cast.of_kind(NodeKind.ROBOT)):
+        _report(conflict, places, out)
+    return tuple(tasks)
+
+
+def _task(
+    name: str, entry: Located[Section | None], given: Section, cast: Cast, places: _Places, out: Collector
+) -> TaskSpec | None:
+    candidates = _candidates(given, cast, out)
+    tuning = _tuning(given, out)
+    worker = _worker(given, out)
+    limits = _limits(given, out)
+    streams = (*_streams(given, Direction.INPUT, out), *_streams(given, Direction.OUTPUT, out))
+    _check_exclusive(given, worker, streams, out)
+    if not candidates or tuning is None:
+        return None
+    scheduling: Section | None = given.get("scheduling")
+    more = {} if scheduling is None else _of(scheduling, "reach", "memory_floor_ratio")
+    demand: Section | None = given.get("demand")
+    task = TaskSpec(
+        name=name,
+        candidates=candidates,
+        tuning=tuning,
+        demand=(demand.build(Demand, out) if demand is not None else None) or Demand(),
+        limits=limits,
+        worker=worker,
+        rules=tuple(stream.value for stream in streams),
+        **_of(given, "on_isolation", "exclusive", "drain_s"),
+        **more,
+    )
+    by_rule = {id(stream.value): stream.place for stream in streams}
+    places.update({stream: by_rule.get(id(rule), entry.place) for stream, rule in named_rules(task)})
+    return task
+
+
+def _of(section: Section, *names: str) -> dict[str, Any]:
+    return {name: section.values[name] for name in names if name in section.values}
+
+
+# --- the parts of a task ---------------------------------------------------------------------------------------------
+
+
+def _candidates(given: Section, cast: Cast, out: Collector) -> tuple[str, ...]:
+    selection = given.get("candidates")
+    if selection is None:
+        return ()
+    before = out.count
+    candidates = select(selection, cast, out)
+    if not candidates and cast.is_whole and out.count == before:
+        known = sorted({f"{key}={value}" for node in cast.nodes for key, value in node.labels})
+        hint = f"labels in this file: {', '.join(known[:12])}" if known else "no node of this file has a label"
+        out.error(given.where("candidates"), "no node is a candidate", hint)
+    return candidates
+
+
+def _tuning(given: Section, out: Collector) -> Tuning | None:
+    weights_given: Section | None = given.get("weights")
+    if weights_given is None:
+        return None
+    shares = dict.fromkeys(("cpu", "memory", "network"), 0.0)
+    weights = weights_given.build(Weights, out, **{**shares, **weights_given.values})
+    if weights is None:
+        return None
+    scheduling: Section | None = given.get("scheduling")
+    if scheduling is None:
+        return Tuning(weights=weights)
+    return scheduling.build(Tuning, out, weights=weights)
+
+
+def _limits(given: Section, out: Collector) -> LinkLimits:
+    section: Section | None = given.get("link")
+    if section is None:
+        return LinkLimits()
+    limits = section.build(LinkLimits, out) or LinkLimits()
+    if section.is_whole and limits.nu_dbm >= limits.rho_dbm:
+        place = section.where("nu_dbm" if "nu_dbm" in section.places else "rho_dbm")
+        out.error(place, f"nu_dbm ({limits.nu_dbm:g}) must be below rho_dbm ({limits.rho_dbm:g})")
+    return limits
+
+
+def _worker(given: Section, out: Collector) -> WorkerSpec:
+    section: Section | None = given.get("worker")
+    if section is None:
+        return WorkerSpec()
+    env = section.get("env", {})
+    pairs = tuple(sorted((key, held.value) for key, held in env.items() if held.value is not None))
+    ready = {"ready_when": section.get("ready")} if "ready" in section.values else {}
+    for key, held in env.items():
+        if key.startswith("ZSCHED_"):
+            out.error(held.place, f"{key} is set by zsched itself", "choose another name")
+    return section.build(WorkerSpec, out, env=pairs, **ready) or WorkerSpec()
+
+
+def _check_exclusive(
+    given: Section, worker: WorkerSpec, streams: tuple[Located[StreamRule], ...], out: Collector
+) -> None:
+    if not given.get("exclusive", False):
+        return
+    for stream in streams:
+        is_output = stream.value.direction is Direction.OUTPUT
+        if is_output and "epoch" not in placeholders(stream.value.from_template):
+            hint = 'for example from: "{target}/TASK/{epoch}/NAME"'
+            out.error(stream.place, "an exclusive task needs {epoch} in every output's 'from': it is the fence", hint)
+    if worker.ready_when is ReadyWhen.MATCHING:
+        message = "an exclusive task's worker must hold the lease: only one that uses zsched.worker (ready: token) does"
+        section: Section | None = given.get("worker")
+        out.error(section.where("ready") if section is not None else given.where("exclusive"), message)
+
+
+def _advise_network(task: TaskSpec, given: Section, cast: Cast, out: Collector) -> None:
+    if task.tuning.weights.network > 0 and not any(node.links for node in cast.nodes):
+        weights: Section = given.get("weights")
+        message = "the network has a weight, but no node says where its link figure comes from: it will not count"
+        out.warn(
+            weights.where("network"), message, "give the robots `wifi: wlan0`, `wired: true`, `fixed:` or `trace:`"
+        )
+
+
+# --- stream rules ----------------------------------------------------------------------------------------------------
+
+
+def _streams(given: Section, direction: Direction, out: Collector) -> Iterator[Located[StreamRule]]:
+    for section in given.get(f"{direction}s", ()):
+        rule = _rule(section, direction, out)
+        if rule is not None:
+            yield Located(rule, section.where("to"))
+
+
+def _rule(section: Section, direction: Direction, out: Collector) -> StreamRule | None:
+    before = out.count
+    for side in ("from", "to"):
+        held: Located[str] | None = section.get(side)
+        problem = template_fault(held.value, direction, side) if held is not None else None
+        if held is not None and problem is not None:
+            out.error(held.place, f"{held.value!r}: {problem}", _placeholder_hint(held.value))
+    _check_settings(section, direction, out)
+    if not section.is_whole or out.count > before:
+        return None
+    rule = StreamRule(
+        direction=direction,
+        from_template=section.get("from").value,
+        to_template=section.get("to").value,
+        settings=StreamSettings(
+            **{"stream_class" if name == "class" else name: value for name, value in _settings(section).items()}
+        ),
+    )
+    problem = rule_fault(rule)
+    if problem is not None:
+        out.error(section.where("to"), problem)
+        return None
+    return rule
+
+
+def _settings(section: Section) -> dict[str, Any]:
+    return _of(section, "class", "keep_last", "depth", "handover")
+
+
+def _check_settings(section: Section, direction: Direction, out: Collector) -> None:
+    if "keep_last" in section.values and section.get("class") is not StreamClass.LATEST and section.is_whole:
+        out.error(section.where("keep_last"), "only streams of class latest keep samples", "add class: latest")
+    if direction is Direction.INPUT and "handover" in section.values:
+        out.error(section.where("handover"), "only outputs have a handover: an input switches in one step", "delete it")
+    if section.get("class") is StreamClass.LATEST and section.get("handover") is HandoverRule.ALL:
+        message = "class latest keeps only the newest, handover all loses nothing"
+        out.warn(section.where("handover"), message, "class: reliable")
+
+
+def _placeholder_hint(template: str) -> str:
+    unknown = [name for name in placeholders(template) if name not in PLACEHOLDERS]
+    return nearest(unknown[0], PLACEHOLDERS) if unknown else ""
+
+
+def _report(conflict: RuleConflict, places: _Places, out: Collector) -> None:
+    """Every rule of a conflict is named with its place; the fault stands at the last of them in the file."""
+    ordered = sorted((places[name].line, places[name].col, name) for name in conflict.streams)
+    named = ", ".join(f"{name} at {line}:{col}" for line, col, name in ordered)
+    tell = out.error if conflict.is_fatal else out.warn
+    tell(places[ordered[-1][2]], conflict.message, f"rules: {named}")

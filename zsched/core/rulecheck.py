@@ -1,0 +1,274 @@
+"""Decides whether the stream rules of all tasks can live together: no loops through relays, one writer per key.
+
+Knows: rules, robots, candidates. Does not know: where in a file a rule stands, zenoh.
+
+Every rule is expanded for every robot and candidate (robots included). A relay hands what matches its ``from`` on to
+its ``to``; where one relay's ``to`` meets another's ``from``, the data goes on. A circle of relays alone would multiply
+messages for ever. A circle that passes a worker is that worker's business, but worth a word. Two relays publishing
+under one key would mix two streams that no receiver can tell apart.
+
+Rules are first compared with every placeholder left open, which is cheap and never misses; only those that could meet
+are expanded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from zsched.core import keyexpr
+from zsched.core.fleet import StreamRule, TaskSpec
+from zsched.core.model import NodeId, TaskId
+from zsched.core.plan import Direction
+from zsched.core.templates import named_rules, widened
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RuleConflict:
+    """Rules that cannot live together. ``streams`` are their names (``<task>/in/<i>``), the first is where to look."""
+
+    streams: tuple[str, ...]
+    message: str
+    is_fatal: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class _Rule:
+    stream: str
+    task: TaskSpec
+    rule: StreamRule
+
+    def open_from(self) -> str:
+        return widened(self.rule.from_template, task=self.task.name)
+
+    def open_to(self) -> str:
+        return widened(self.rule.to_template, task=self.task.name)
+
+
+@dataclass(frozen=True, slots=True)
+class _Relay:
+    """One rule for one robot and candidate."""
+
+    stream: str
+    task: TaskId
+    direction: Direction
+    robot: NodeId
+    candidate: NodeId
+    from_expr: str
+    to_expr: str
+
+
+_Graph = Mapping[str, Iterable[str]]
+_WORKER: Final = "worker "
+"""Prefix of the nodes that stand for a task's worker on a candidate."""
+
+
+def rule_conflicts(tasks: Iterable[TaskSpec], robots: Iterable[NodeId]) -> tuple[RuleConflict, ...]:
+    """Every loop and clash among the rules of ``tasks`` for ``robots``; empty when there is none."""
+    rules = [_Rule(stream, task, rule) for task in tasks for stream, rule in named_rules(task)]
+    names = tuple(robots)
+    return (*_clashes(rules, names), *_loops(rules, names))
+
+
+# --- clashes ---------------------------------------------------------------------------------------------------------
+
+
+def _clashes(rules: list[_Rule], robots: tuple[NodeId, ...]) -> Iterator[RuleConflict]:
+    """One conflict per pair of rules (or per rule that meets itself on another robot)."""
+    for index, first in enumerate(rules):
+        own = _self_clash(first, robots)
+        if own is not None:
+            yield own
+        for second in rules[index + 1 :]:
+            if keyexpr.intersects(first.open_to(), second.open_to()):
+                yield from _pair_clash(first, second, robots)
+
+
+def _self_clash(rule: _Rule, robots: tuple[NodeId, ...]) -> RuleConflict | None:
+    writers: dict[str, NodeId] = {}
+    for relay in _expand(rule, robots):
+        known = writers.setdefault(relay.to_expr, relay.robot)
+        if known != relay.robot:
+            message = f"{known} and {relay.robot} would both publish {relay.to_expr!r}: add {{robot}} to 'to'"
+            return RuleConflict(streams=(rule.stream,), message=message)
+    return None
+
+
+def _pair_clash(first: _Rule, second: _Rule, robots: tuple[NodeId, ...]) -> Iterator[RuleConflict]:
+    index = _Index(_expand(second, robots), lambda relay: relay.to_expr)
+    for relay in _expand(first, robots):
+        for other in index.meeting(relay.to_expr):
+            message = f"two rules publish {relay.to_expr!r}; a receiver could not tell their streams apart"
+            yield RuleConflict(streams=(first.stream, second.stream), message=_on(message, relay, other))
+            return
+
+
+def _on(message: str, first: _Relay, second: _Relay) -> str:
+    where = first.robot if first.robot == second.robot else f"{first.robot} and {second.robot}"
+    return f"{message} (on {where})"
+
+
+# --- loops -----------------------------------------------------------------------------------------------------------
+
+
+def _loops(rules: list[_Rule], robots: tuple[NodeId, ...]) -> Iterator[RuleConflict]:
+    relay_graph = {
+        rule.stream: [to.stream for to in rules if keyexpr.intersects(rule.open_to(), to.open_from())] for rule in rules
+    }
+    fatal: set[str] = set()
+    for part in _circles(relay_graph):
+        chain = _loop_in([rule for rule in rules if rule.stream in part], robots, with_workers=False)
+        if chain:
+            fatal.update(part)
+            yield RuleConflict(streams=_streams(chain), message=_loop_text("relays feed each other", chain))
+    whole = {rule.stream: [*relay_graph[rule.stream], *_behind_worker(rule, rules)] for rule in rules}
+    for part in _circles(whole):
+        if part & fatal:
+            continue
+        chain = _loop_in([rule for rule in rules if rule.stream in part], robots, with_workers=True)
+        if chain:
+            text = _loop_text("a worker's output comes back to it as input", chain)
+            yield RuleConflict(streams=_streams(chain), message=text, is_fatal=False)
+
+
+def _behind_worker(rule: _Rule, rules: list[_Rule]) -> list[str]:
+    if rule.rule.direction is not Direction.INPUT:
+        return []
+    return [to.stream for to in rules if to.task is rule.task and to.rule.direction is Direction.OUTPUT]
+
+
+def _loop_in(rules: list[_Rule], robots: tuple[NodeId, ...], *, with_workers: bool) -> list[_Relay]:
+    """One circle among the expanded ``rules``, in its order; empty when there is none."""
+    relays = [relay for rule in rules for relay in _expand(rule, robots)]
+    by_name = {str(number): relay for number, relay in enumerate(relays)}
+    index = _Index(relays, lambda relay: relay.from_expr)
+    name_of = {id(relay): name for name, relay in by_name.items()}
+    graph: dict[str, list[str]] = {
+        name: [name_of[id(other)] for other in index.meeting(relay.to_expr)] for name, relay in by_name.items()
+    }
+    if with_workers:
+        for name, relay in by_name.items():
+            worker = f"{_WORKER}{relay.task} {relay.candidate}"
+            if relay.direction is Direction.INPUT:
+                graph[name].append(worker)
+                graph.setdefault(worker, [])
+            else:
+                graph.setdefault(worker, []).append(name)
+    for part in _circles(graph):
+        return [by_name[name] for name in _walk(graph, part) if name in by_name]
+    return []
+
+
+def _streams(chain: list[_Relay]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(relay.stream for relay in chain))
+
+
+def _loop_text(what: str, chain: list[_Relay]) -> str:
+    steps = [f"{relay.from_expr} -> {relay.to_expr} (on {relay.robot}, owner {relay.candidate})" for relay in chain[:6]]
+    more = [f"{len(chain) - 6} more"] if len(chain) > 6 else []
+    return f"loop, {what}: {', then '.join((*steps, *more))}"
+
+
+# --- expansion, index, graph -----------------------------------------------------------------------------------------
+
+
+def _expand(rule: _Rule, robots: tuple[NodeId, ...]) -> Iterator[_Relay]:
+    for robot in robots:
+        for candidate in rule.task.candidates:
+            names = {"robot": robot, "node": robot, "target": candidate, "task": rule.task.name}
+            yield _Relay(
+                stream=rule.stream,
+                task=rule.task.name,
+                direction=rule.rule.direction,
+                robot=robot,
+                candidate=candidate,
+                from_expr=widened(rule.rule.from_template, **names),
+                to_expr=widened(rule.rule.to_template, **names),
+            )
+
+
+class _Index:
+    """Relays by one of their key expressions: those without wildcards are found by looking up, the rest by trying."""
+
+    def __init__(self, relays: Iterable[_Relay], key: Callable[[_Relay], str]) -> None:
+        self._plain: dict[str, list[_Relay]] = {}
+        self._wild: dict[str, list[_Relay]] = {}
+        for relay in relays:
+            expr = key(relay)
+            table = self._wild if keyexpr.is_wild(expr) else self._plain
+            table.setdefault(expr, []).append(relay)
+
+    def meeting(self, expr: str) -> Iterator[_Relay]:
+        """All relays whose expression shares a key with ``expr``."""
+        if keyexpr.is_wild(expr):
+            for other, relays in self._plain.items():
+                if keyexpr.intersects(expr, other):
+                    yield from relays
+        else:
+            yield from self._plain.get(expr, ())
+        for other, relays in self._wild.items():
+            if keyexpr.intersects(expr, other):
+                yield from relays
+
+
+def _circles(graph: _Graph) -> Iterator[set[str]]:
+    """Strongly connected parts of ``graph`` that hold a circle. Source: Tarjan 1972, with a stack of our own."""
+    order: dict[str, int] = {}
+    low: dict[str, int] = {}
+    held: list[str] = []
+    on_stack: set[str] = set()
+    for root in graph:
+        work = [] if root in order else [(root, iter(graph[root]))]
+        while work:
+            node, targets = work[-1]
+            if node not in order:
+                order[node] = low[node] = len(order)
+                held.append(node)
+                on_stack.add(node)
+            target = next((one for one in targets if one not in order or one in on_stack), None)
+            if target is not None and target not in order:
+                work.append((target, iter(graph[target])))
+            elif target is not None:
+                low[node] = min(low[node], order[target])
+            else:
+                work.pop()
+                if work:
+                    low[work[-1][0]] = min(low[work[-1][0]], low[node])
+                if low[node] == order[node]:
+                    part = _cut(held, node)
+                    on_stack -= part
+                    if len(part) > 1 or node in graph[node]:
+                        yield part
+
+
+def _cut(held: list[str], node: str) -> set[str]:
+    at = held.index(node)
+    part = set(held[at:])
+    del held[at:]
+    return part
+
+
+def _walk(graph: _Graph, part: set[str]) -> list[str]:
+    """A shortest circle through the first node (by name) of a strongly connected ``part``."""
+    start = min(part)
+    came_from: dict[str, str] = {}
+    row = [start]
+    while row:
+        ahead: list[str] = []
+        for node in row:
+            for target in graph[node]:
+                if target == start:
+                    return _path_back(came_from, start, node)
+                if target in part and target not in came_from:
+                    came_from[target] = node
+                    ahead.append(target)
+        row = ahead
+    return []
+
+
+def _path_back(came_from: Mapping[str, str], start: str, end: str) -> list[str]:
+    path = [end]
+    while path[-1] != start:
+        path.append(came_from[path[-1]])
+    return path[::-1]
