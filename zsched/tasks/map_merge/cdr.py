@@ -17,14 +17,13 @@ import numpy as np
 
 from zsched.errors import WireError
 from zsched.tasks.map_merge.geometry import Pose2
-from zsched.tasks.map_merge.grid import MAX_CELLS, Grid
+from zsched.tasks.map_merge.grid import MAX_CELLS, MAX_SIDE_CELLS, Grid
 
 _LITTLE, _BIG = b"\x00\x01", b"\x00\x00"
 _HEADER = b"\x00\x01\x00\x00"
 _NS = 1_000_000_000
 MAX_STRING = 4096
 MAX_TRANSFORMS = 4096
-MAX_SIDE_CELLS = 2**20
 MAX_TILT_RAD = 0.02
 """A grid whose plane is tilted more than this is no floor plan."""
 
@@ -68,10 +67,10 @@ def decode_grid(payload: bytes) -> Grid:
     width, height = reader.count(), reader.count()
     origin = reader.pose()
     count = reader.count()
-    if count != width * height or max(width, height) > MAX_SIDE_CELLS:
+    if count != width * height:
         raise CdrError("size", f"{count} cells in a grid of {width} x {height}")
-    if count > MAX_CELLS:
-        raise CdrError("size", f"{count} cells are more than {MAX_CELLS}")
+    if count > MAX_CELLS or max(width, height) > MAX_SIDE_CELLS:
+        raise CdrError("size", f"{width} x {height} cells are too many")
     cells = np.frombuffer(reader.take(count), dtype=np.int8).reshape(height, width)
     reader.end()
     try:

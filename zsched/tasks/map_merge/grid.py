@@ -6,7 +6,7 @@ Knows: cells, resolution, the grid's place in its map frame. Does not know: byte
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +22,10 @@ OCCUPIED_FROM = 65
 FREE_TO = 25
 MAX_CELLS = 64_000_000
 """Largest grid taken or published, 400 m x 400 m at 0.05 m: a wrong origin or size must not take all memory."""
+MAX_SIDE_CELLS = 30_000
+"""Longest side; OpenCV's warp indexes with 16 bits."""
+MAX_ORIGIN_M = 1e8
+"""Farther than any projected coordinate on earth."""
 RESOLUTION_RANGE_M = (0.005, 5.0)
 
 
@@ -46,13 +50,13 @@ class Grid:
     def __post_init__(self) -> None:
         if self.data.ndim != 2 or self.data.dtype != np.int8:
             raise ValueError(f"grid.data: {self.data.dtype} of {self.data.ndim} dimensions is not int8 of 2")
-        if self.data.size > MAX_CELLS:
-            raise ValueError(f"grid.data: {self.data.size} cells are more than {MAX_CELLS}")
+        if self.data.size > MAX_CELLS or max(self.data.shape) > MAX_SIDE_CELLS:
+            raise ValueError(f"grid.data: {self.data.shape[1]} x {self.data.shape[0]} cells are too many")
         low, high = RESOLUTION_RANGE_M
         if not low <= self.resolution <= high:
             raise ValueError(f"grid.resolution: {self.resolution!r} is not in [{low:g}, {high:g}] m")
-        if not self.origin.is_finite:
-            raise ValueError("grid.origin: not a finite pose")
+        if not self.origin.is_finite or max(abs(self.origin.x), abs(self.origin.y)) > MAX_ORIGIN_M:
+            raise ValueError(f"grid.origin: {self.origin} is not finite and within {MAX_ORIGIN_M:g} m")
 
     @property
     def width(self) -> int:
@@ -97,6 +101,20 @@ class Grid:
         rows, columns = np.nonzero(mask)
         local = np.stack((columns + 0.5, rows + 0.5), axis=1) * self.resolution
         return self.origin.apply(local)
+
+
+def crop_known(grid: Grid) -> Grid | None:
+    """The same grid without its unknown margins; ``None`` when nothing in it is known."""
+    known = grid.known
+    rows = np.flatnonzero(known.any(axis=1))
+    columns = np.flatnonzero(known.any(axis=0))
+    if rows.size == 0:
+        return None
+    top, left = int(rows[0]), int(columns[0])
+    corner = Pose2(x=left * grid.resolution, y=top * grid.resolution)
+    return replace(
+        grid, data=grid.data[top : int(rows[-1]) + 1, left : int(columns[-1]) + 1], origin=grid.origin.compose(corner)
+    )
 
 
 def same_resolution(a: float, b: float) -> bool:
