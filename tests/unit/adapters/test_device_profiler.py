@@ -1,0 +1,211 @@
+"""Samples of fake machines (v1, v2, broken) and of this one, against psutil and a real busy process tree."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+from zsched.adapters.cgroup import LimitedGroup
+from zsched.adapters.device_profiler import DeviceProfiler, parse_cpu_list, parse_cpu_stat, parse_process_stat
+from zsched.core.model import WorkerState
+
+MEMINFO = "MemTotal:        4096000 kB\nMemFree: 100 kB\nMemAvailable:    3072000 kB\nHugePages_Total: 0\n"
+V2 = "30 25 0:26 / /sys/fs/cgroup rw - cgroup2 cgroup2 rw\n"
+
+
+def stat(*cpus: str) -> str:
+    return (
+        "".join(f"cpu{'' if n == 0 else n - 1} {cpu}\n" for n, cpu in enumerate(("0 0 0 0 0 0 0 0 0 0", *cpus)))
+        + "intr 1\n"
+    )
+
+
+def write(root: Path, files: dict[str, str]) -> None:
+    for name, text in files.items():
+        path = root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+
+
+def machine(root: Path, **more: str) -> DeviceProfiler:
+    write(root, {"proc/stat": stat("100 0 0 100 0 0 0 0 0 0", "100 0 0 100 0 0 0 0 0 0"), "proc/meminfo": MEMINFO})
+    write(root, more)
+    return DeviceProfiler(root)
+
+
+def test_first_sample_has_no_cpu_and_iowait_is_idle_and_steal_is_not(tmp_path: Path) -> None:
+    profiler = machine(tmp_path)
+    first = profiler.sample({})
+    assert (first.cpu_cores, first.cpu_used_cores) == (2.0, None)
+    assert (first.memory_mb, first.memory_used_mb) == (4000.0, 1000.0)
+    write(tmp_path, {"proc/stat": stat("110 2 3 130 50 0 0 5 9 9", "100 0 0 200 0 0 0 0 0 0")})
+    assert profiler.sample({}).cpu_used_cores == pytest.approx(2.0 * 20 / 200)
+
+
+def test_only_allowed_cpus_count(tmp_path: Path) -> None:
+    profiler = machine(tmp_path, **{"proc/self/status": "Name:\tx\nCpus_allowed_list:\t1\nMems_allowed:\t1\n"})
+    assert profiler.sample({}).cpu_cores == 1.0
+    write(tmp_path, {"proc/stat": stat("900 0 0 100 0 0 0 0 0 0", "150 0 0 150 0 0 0 0 0 0")})
+    assert profiler.sample({}).cpu_used_cores == pytest.approx(0.5)
+
+
+def test_quota_makes_the_group_the_machine(tmp_path: Path) -> None:
+    files = {
+        "proc/self/mountinfo": V2,
+        "proc/self/cgroup": "0::/a\n",
+        "sys/fs/cgroup/a/cpu.max": "50000 100000\n",
+        "sys/fs/cgroup/a/cpu.stat": "usage_usec 1000000\n",
+        "sys/fs/cgroup/a/memory.max": str(512 * 2**20),
+        "sys/fs/cgroup/a/memory.current": str(300 * 2**20),
+        "sys/fs/cgroup/a/memory.stat": f"inactive_file {100 * 2**20}\n",
+    }
+    profiler = machine(tmp_path, **files)
+    first, begin_s = profiler.sample({}), time.monotonic()
+    assert (first.cpu_cores, first.memory_mb, first.memory_used_mb) == (0.5, 512.0, 200.0)
+    time.sleep(0.1)
+    write(tmp_path, {"sys/fs/cgroup/a/cpu.stat": "usage_usec 1030000\n"})
+    used = profiler.sample({}).cpu_used_cores
+    assert used == pytest.approx(0.03 / (time.monotonic() - begin_s), rel=0.2)
+
+
+def test_machine_with_less_memory_left_than_the_group_may_use_tells_so(tmp_path: Path) -> None:
+    files = {
+        "proc/self/mountinfo": V2,
+        "proc/self/cgroup": "0::/a\n",
+        "sys/fs/cgroup/a/memory.max": str(3500 * 2**20),
+        "sys/fs/cgroup/a/memory.current": "0",
+    }
+    sample = machine(tmp_path, **files).sample({})
+    assert (sample.memory_mb, sample.memory_used_mb) == (3500.0, 500.0)
+
+
+def test_quota_wider_than_the_machine_is_no_limit(tmp_path: Path) -> None:
+    files = {
+        "proc/self/mountinfo": V2,
+        "proc/self/cgroup": "0::/a\n",
+        "sys/fs/cgroup/a/cpu.max": "800000 100000\n",
+        "sys/fs/cgroup/a/memory.max": str(2**50),
+    }
+    sample = machine(tmp_path, **files).sample({})
+    assert (sample.cpu_cores, sample.memory_mb) == (2.0, 4000.0)
+
+
+def test_unreadable_machine_gives_none_and_never_raises(tmp_path: Path) -> None:
+    sample = DeviceProfiler(tmp_path).sample({"merge": (WorkerState.READY, 5)})
+    assert sample.cpu_used_cores is None
+    assert sample.memory_used_mb is None
+    assert sample.cpu_cores >= 1.0
+    assert sample.memory_mb > 1.0
+    assert sample.workers[0].cpu_cores is None
+
+
+def test_stat_lines_are_parsed_by_the_last_bracket_and_garbage_is_none() -> None:
+    line = b"7 (a) b (c) S 3 7 7 0 -1 4194560 9 9 0 0 100 50 30 20 20 0 4 0 500 1000 256 18446744073709551615\n"
+    times = parse_process_stat(line)
+    assert times is not None
+    assert (times.parent, times.own_s, times.waited_s, times.threads, times.start_s) == (3, 1.5, 0.5, 4, 5.0)
+    assert times.rss_mb == 1.0
+    assert parse_process_stat(b"") is None
+    assert parse_process_stat(line[:40]) is None
+    assert parse_cpu_stat(b"intr 5\n", None) is None
+    assert parse_cpu_list("0-2,8,x,4-\n") == {0, 1, 2, 8}
+
+
+def process(pid: int, parent: int, *, own: int, waited: int = 0, start: int = 100, pages: int = 256) -> dict[str, str]:
+    times = f"{own} 0 {waited} 0"
+    return {f"proc/{pid}/stat": f"{pid} (w) S {parent} 1 1 0 -1 0 0 0 0 0 {times} 20 0 1 0 {start} 0 {pages}\n"}
+
+
+def test_tree_keeps_the_time_of_a_child_that_ended(tmp_path: Path) -> None:
+    profiler = machine(tmp_path, **process(10, 1, own=100), **process(11, 10, own=50), **process(12, 1, own=7))
+    workers = {"merge": (WorkerState.READY, 10)}
+    load = profiler.sample(workers).workers[0]
+    assert (load.cpu_cores, load.memory_mb) == (None, 2.0)
+    begin_s = time.monotonic()
+    time.sleep(0.1)
+    (tmp_path / "proc/11/stat").unlink()
+    write(tmp_path, process(10, 1, own=102, waited=51))
+    load = profiler.sample(workers).workers[0]
+    elapsed_s = time.monotonic() - begin_s
+    assert load.cpu_cores == pytest.approx(0.03 / elapsed_s, rel=0.2)
+    assert load.memory_mb == 1.0
+
+
+def test_adopted_old_process_does_not_make_a_spike(tmp_path: Path) -> None:
+    profiler = machine(tmp_path, **process(10, 1, own=100))
+    workers = {"merge": (WorkerState.READY, 10)}
+    profiler.sample(workers)
+    time.sleep(0.05)
+    write(tmp_path, process(11, 10, own=100_000, start=1))  # 1000 s of CPU time, since boot
+    load = profiler.sample(workers).workers[0]
+    assert load.cpu_cores is not None
+    assert load.cpu_cores < 1000.0 / time.clock_gettime(time.CLOCK_BOOTTIME) * 2.0
+
+
+BUSY_TREE = """
+import os, subprocess, sys, time
+child = subprocess.Popen([sys.executable, "-c", "x = bytearray(64 << 20)\\nprint('up', flush=True)\\nwhile True: pass"])
+while True: time.sleep(60)
+"""
+
+
+def test_real_busy_child_is_measured_like_psutil_does() -> None:
+    profiler = DeviceProfiler()
+    with subprocess.Popen([sys.executable, "-c", BUSY_TREE], stdout=subprocess.PIPE) as worker:
+        assert worker.stdout is not None
+        child = None
+        try:
+            worker.stdout.readline()
+            child = psutil.Process(worker.pid).children()[0]
+            workers = {"merge": (WorkerState.READY, worker.pid)}
+            profiler.sample(workers)
+            before, begin_s = child.cpu_times(), time.monotonic()
+            time.sleep(0.6)
+            sample, after, elapsed_s = profiler.sample(workers), child.cpu_times(), time.monotonic() - begin_s
+            load = sample.workers[0]
+            expected = (after.user + after.system - before.user - before.system) / elapsed_s
+            rss_mb = (child.memory_info().rss + psutil.Process(worker.pid).memory_info().rss) / 2**20
+            assert load.cpu_cores == pytest.approx(expected, abs=0.1)
+            assert expected > 0.1
+            assert load.memory_mb == pytest.approx(rss_mb, abs=2.0)
+            assert sample.cpu_used_cores is not None
+            assert sample.cpu_used_cores > expected - 0.15
+            assert sample.memory_mb == pytest.approx(psutil.virtual_memory().total / 2**20, rel=0.001)
+        finally:
+            if child is not None:
+                child.kill()
+            worker.kill()
+
+
+def test_real_group_is_what_its_processes_measure() -> None:
+    if (reason := LimitedGroup.why_not()) is not None:
+        pytest.skip(reason)
+    group = LimitedGroup.create(f"zsched-test-profile-{os.getpid()}", cpu_cores=0.3, memory_mb=256)
+    try:
+        with subprocess.Popen(
+            [sys.executable, "-c", BUSY_TREE], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE
+        ) as worker:
+            assert worker.stdout is not None
+            group.add(worker.pid)
+            try:
+                worker.stdout.readline()
+                profiler = DeviceProfiler(pid=str(worker.pid))
+                profiler.sample({})
+                time.sleep(0.6)
+                sample = profiler.sample({})
+                assert (sample.cpu_cores, sample.memory_mb) == (0.3, 256.0)
+                assert sample.cpu_used_cores is not None
+                assert 0.05 < sample.cpu_used_cores < 0.4
+                assert sample.memory_used_mb is not None
+                assert 60.0 < sample.memory_used_mb < 120.0
+            finally:
+                for pid in group.pids():
+                    psutil.Process(pid).kill()
+                worker.kill()
+    finally:
+        group.remove()
