@@ -131,19 +131,21 @@ def _seeds(section: Section, cast: Cast, out: Collector) -> tuple[NodeId, ...]:
         seeds = tuple(node.name for node in cast.nodes if _can_be_dialled(node))[:_SEEDS]
         if not seeds and len(cast.names) > 1 and cast.is_whole and "seeds" not in section.places:
             message = "no node can be dialled, so none would find another"
-            hint = "give one or two nodes `host: ADDRESS` and `listen: {control: tcp/0.0.0.0:7457, data: ...7458}`"
+            hint = "give one or two nodes `host:` and `listen: {control: tcp/0.0.0.0:7457, data: tcp/0.0.0.0:7458}`"
             out.error(cast.place, message, hint)
         return seeds
     for seed in cast.known(given, out):
         node = next((node for node in cast.nodes if node.name == seed.value), None)
         if node is not None and not _can_be_dialled(node):
-            hint = "it needs `listen: {control: ...}` with a fixed port, and a `host:` when it listens on 0.0.0.0"
+            hint = "it needs `listen: {control:, data:}` with fixed ports, and a `host:` when it listens on 0.0.0.0"
             out.error(seed.place, f"the seed {seed.value!r} cannot be dialled", hint)
     return tuple(dict.fromkeys(seed.value for seed in given))
 
 
 def _can_be_dialled(node: NodeSpec) -> bool:
-    return bool(node.listen_control and dial_endpoint(node.listen_control, node.host))
+    """Control and data are meshes of their own, and both grow from the seeds."""
+    endpoints = (node.listen_control, node.listen_data)
+    return all(endpoint and dial_endpoint(endpoint, node.host) for endpoint in endpoints)
 
 
 def _electors(section: Section, cast: Cast, out: Collector) -> tuple[NodeId, ...]:

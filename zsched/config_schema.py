@@ -158,7 +158,7 @@ _NODES: Final = Forms(listing=_NAMES, mapping=SELECTOR)
 
 _SHARE: Final = Number(0, 1)
 WEIGHTS: Final = Record(
-    "the weights",
+    "the weights section",
     {
         "cpu": Field(_SHARE, "Weight of free CPU (Eq. 1). The three weights sum to 1.", default="`0`"),
         "memory": Field(_SHARE, "Weight of free memory (Eq. 2).", default="`0`"),

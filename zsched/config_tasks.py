@@ -6,17 +6,19 @@ Knows: how the values of one task, and the rules of all tasks, relate. Does not 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, Final
 
 from zsched.config_blocks import Located, Section
 from zsched.config_nodes import Cast, select
 from zsched.config_reader import Collector, Place, nearest
-from zsched.core.fleet import Demand, LinkLimits, StreamRule, TaskSpec, WorkerSpec
+from zsched.core.fleet import Demand, LinkLimits, OnIsolation, StreamRule, TaskSpec, WorkerSpec
 from zsched.core.model import NodeKind, Tuning, Weights
 from zsched.core.plan import Direction, HandoverRule, ReadyWhen, StreamClass, StreamSettings
 from zsched.core.rulecheck import RuleConflict, rule_conflicts
 from zsched.core.templates import PLACEHOLDERS, named_rules, placeholders, rule_fault, template_fault
 
+_ANY_TUNING: Final = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
+"""Stands in for a faulty one, so that the task's rules are checked in the same pass; such a file gives no fleet."""
 _Places = dict[str, Place]
 """Where each rule stands, by stream name."""
 
@@ -34,7 +36,7 @@ def read_tasks(section: Section, cast: Cast, out: Collector) -> tuple[TaskSpec, 
         task = _task(name, entry, entry.value, cast, places, out)
         if task is not None:
             tasks.append(task)
-            _advise_network(task, entry.value, cast, out)
+            _advise_network(task.tuning, entry.value, cast, out)
     for conflict in rule_conflicts(tasks, cast.of_kind(NodeKind.ROBOT)):
         _report(conflict, places, out)
     return tuple(tasks)
@@ -49,7 +51,7 @@ def _task(
     limits = _limits(given, out)
     streams = (*_streams(given, Direction.INPUT, out), *_streams(given, Direction.OUTPUT, out))
     _check_exclusive(given, worker, streams, out)
-    if not candidates or tuning is None:
+    if not candidates:
         return None
     scheduling: Section | None = given.get("scheduling")
     more = {} if scheduling is None else _of(scheduling, "reach", "memory_floor_ratio")
@@ -57,7 +59,7 @@ def _task(
     task = TaskSpec(
         name=name,
         candidates=candidates,
-        tuning=tuning,
+        tuning=tuning or _ANY_TUNING,
         demand=(demand.build(Demand, out) if demand is not None else None) or Demand(),
         limits=limits,
         worker=worker,
@@ -138,14 +140,17 @@ def _check_exclusive(
         if is_output and "epoch" not in placeholders(stream.value.from_template):
             hint = 'for example from: "{target}/TASK/{epoch}/NAME"'
             out.error(stream.place, "an exclusive task needs {epoch} in every output's 'from': it is the fence", hint)
+    if given.get("on_isolation") is OnIsolation.LOCAL:
+        message = "an exclusive task may not run on every robot that is cut off"
+        out.error(given.where("on_isolation"), message, "on_isolation: hold")
     if worker.ready_when is ReadyWhen.MATCHING:
         message = "an exclusive task's worker must hold the lease: only one that uses zsched.worker (ready: token) does"
         section: Section | None = given.get("worker")
         out.error(section.where("ready") if section is not None else given.where("exclusive"), message)
 
 
-def _advise_network(task: TaskSpec, given: Section, cast: Cast, out: Collector) -> None:
-    if task.tuning.weights.network > 0 and not any(node.links for node in cast.nodes):
+def _advise_network(tuning: Tuning, given: Section, cast: Cast, out: Collector) -> None:
+    if tuning.weights.network > 0 and not any(node.links for node in cast.nodes):
         weights: Section = given.get("weights")
         message = "the network has a weight, but no node says where its link figure comes from: it will not count"
         out.warn(
