@@ -72,11 +72,14 @@ class Extent:
 
 
 def extent_of(grid: Grid, world_t_map: Pose2, resolution: float) -> Extent:
-    """The lattice cells that ``grid`` may touch when its map frame lies at ``world_t_map``."""
-    corners = world_t_map.apply(grid.corners()) / resolution
+    """The lattice cells that the known cells of ``grid`` may touch when its map frame lies at ``world_t_map``.
+
+    A turned grid's own rectangle would claim up to twice the cells, and everybody would have to carry them.
+    """
+    outline = world_t_map.apply(grid.outline()) / resolution
     # A corner that is on the lattice up to rounding must not claim the next row of cells.
-    low = np.floor(corners.min(axis=0) + 1e-6)
-    high = np.ceil(corners.max(axis=0) - 1e-6)
+    low = np.floor(outline.min(axis=0) + 1e-6)
+    high = np.ceil(outline.max(axis=0) - 1e-6)
     return Extent(low_x=int(low[0]), low_y=int(low[1]), high_x=int(high[0]), high_y=int(high[1]))
 
 

@@ -91,10 +91,20 @@ class Grid:
         """The seen area in square metres."""
         return float(np.count_nonzero(self.known)) * self.resolution**2
 
-    def corners(self) -> FloatArray:
-        """The grid's four corners (4, 2) in its map frame, in metres."""
-        width, height = self.width * self.resolution, self.height * self.resolution
-        return self.origin.apply(np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]]))
+    def outline(self) -> FloatArray:
+        """Points (N, 2) in the map frame whose rectangle, under any transform, holds every known cell.
+
+        The outer corners of each row's first and last known cell; of cell (0, 0) when nothing is known.
+        """
+        known = self.known
+        rows = np.flatnonzero(known.any(axis=1))
+        if rows.size == 0:
+            return self.origin.apply(np.array([[0.0, 0.0], [self.resolution, self.resolution]]))
+        first = known[rows].argmax(axis=1)
+        last = self.width - known[rows, ::-1].argmax(axis=1)
+        corners = [(first, rows), (first, rows + 1), (last, rows), (last, rows + 1)]
+        local = np.concatenate([np.stack(corner, axis=1) for corner in corners]) * self.resolution
+        return self.origin.apply(local.astype(np.float64))
 
     def points(self, mask: Mask) -> FloatArray:
         """The centres (N, 2) of the masked cells in the map frame, in metres."""

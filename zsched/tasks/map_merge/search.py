@@ -3,8 +3,9 @@
 Knows: images of grids. Does not know: what is accepted (`merger`). Every candidate still has to be refined and judged.
 
 Features: ORB (Rublee et al., 2011) with ratio test and RANSAC, the scale forced to 1; about 50 ms, dependable above
-50 % overlap. Correlation: occupied cells at 0.2 m, every 2 degrees, FFT cross-correlation of one map's walls with
-the other's "walls minus 0.35 x free" (in the spirit of Carpin, "Fast and accurate map merging", 2008); about a second, dependable from 15 %.
+50 % overlap. Correlation: occupied cells at 0.2 m, every 2 degrees, FFT cross-correlation of one map's walls with the
+other's "walls minus 0.35 x free" (in the spirit of Carpin, "Fast and accurate map merging for multi-robot systems",
+Autonomous Robots 25, 2008); a third of a second to a second, dependable from 15 % overlap.
 """
 
 from __future__ import annotations
@@ -159,8 +160,7 @@ def _walls(grid: Grid) -> _Signal:
 
 
 def _signal(grid: Grid) -> _Signal:
-    signal: _Signal = _walls(grid) - np.float32(FREE_WEIGHT) * grid.free
-    return signal
+    return (_walls(grid) - FREE_WEIGHT * grid.free).astype(np.float32)
 
 
 def _turned(signal: _Signal, yaw: float, side: int) -> _Signal:

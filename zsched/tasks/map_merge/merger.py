@@ -1,0 +1,311 @@
+"""Merges the robots' newest grids: which are attached, where they lie, and the one map that comes of it.
+
+Knows: modes, the reference robot, the canvas, what every robot is told about its map. Does not know: messages, time,
+threads or zenoh.
+
+Modes: ``known`` trusts the given poses; ``track`` refines from given poses or one search; ``estimate`` searches, tracks
+by ICP and searches again as the maps grow. The world frame is the frame of the given poses where the reference robot
+has one, else the reference robot's own map frame. Only maps that are connected to the reference are published.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from enum import StrEnum
+from typing import Any
+
+from zsched.tasks.map_merge.align import Fit, prepare
+from zsched.tasks.map_merge.compose import Extent, compose, extent_of
+from zsched.tasks.map_merge.geometry import Pose2
+from zsched.tasks.map_merge.grid import Grid, crop_known
+from zsched.tasks.map_merge.pairs import Alignment, MapVersion, Pair, PairBook, Rule, broken_cycle, spanning_transforms
+
+MAX_ROBOTS = 64
+RESTART_RATIO = 0.5
+"""A map whose known area falls under this share of its last is a new map, in a new frame."""
+SNAPSHOT_SCHEMA = "zsched.map_merge.snapshot/1"
+
+
+class Mode(StrEnum):
+    """How transforms come about."""
+
+    KNOWN = "known"
+    TRACK = "track"
+    ESTIMATE = "estimate"
+
+
+class RobotState(StrEnum):
+    """What became of one robot's map in the newest merge."""
+
+    ATTACHED = "attached"
+    WAITING = "waiting"  # nothing to judge yet: no map, no pose, no attempt, or its partner is not connected
+    REFUSED = "refused"  # judged, and not accepted
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MergerSettings:
+    """What the operator sets; ``resolution`` of the merged map in metres per cell, ``poses`` of map frames."""
+
+    mode: Mode
+    resolution: float = 0.05
+    poses: Mapping[str, Pose2] = field(default_factory=dict)
+    rule: Rule = Rule()
+    world_frame: str = "world"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RobotStatus:
+    """One robot's part in the newest merge; figures are ``None`` where nothing was measured.
+
+    ``partner`` is the robot that the figures were measured against.
+    """
+
+    robot: str
+    state: RobotState
+    reason: str = ""
+    partner: str | None = None
+    score: float | None = None
+    agreeing: int | None = None
+    overlap: float | None = None
+    margin: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MergeResult:
+    """One merge: the map (``None``: nothing to publish yet), every robot's status, and the attached map frames.
+
+    ``transforms`` {robot: pose of its map frame in the world}; ``inputs`` {robot: stamp_ns} of the merged grids;
+    ``revision`` rises whenever a transform changed; ``is_search_due``: merge again soon, a search waits.
+    """
+
+    grid: Grid | None
+    statuses: tuple[RobotStatus, ...]
+    transforms: Mapping[str, Pose2]
+    inputs: Mapping[str, int]
+    reference: str | None
+    revision: int
+    is_search_due: bool
+
+
+class Merger:
+    """The state machine over grids. Not thread-safe."""
+
+    def __init__(self, settings: MergerSettings) -> None:
+        self._settings = settings
+        self._grids: dict[str, Grid | None] = {}
+        self._numbers: dict[str, int] = {}
+        self._versions: dict[str, MapVersion] = {}
+        self._areas: dict[str, float] = {}
+        hints = dict(settings.poses) if settings.mode is Mode.TRACK else {}
+        self._pairs = PairBook(
+            rule=settings.rule,
+            resolution=settings.resolution,
+            hints=hints,
+            is_rechecking=settings.mode is Mode.ESTIMATE,
+        )
+        self._reference: str | None = None
+        self._tree: frozenset[Pair] = frozenset()
+        self._extent: Extent | None = None
+        self._transforms: dict[str, Pose2] = {}
+        self._revision = 0
+
+    def update(self, robot: str, grid: Grid) -> str:
+        """Take a robot's newest grid; returns why it is not taken (empty: taken)."""
+        if robot not in self._grids and len(self._grids) >= MAX_ROBOTS:
+            return f"more than {MAX_ROBOTS} robots"
+        cropped = crop_known(grid)
+        area = 0.0 if cropped is None else cropped.known_area_m2
+        if area < RESTART_RATIO * self._areas.get(robot, 0.0):
+            self._pairs.forget(robot)
+        self._grids[robot] = cropped
+        self._areas[robot] = area
+        self._numbers[robot] = self._numbers.get(robot, 0) + 1
+        return ""
+
+    def remove(self, robot: str) -> None:
+        """Forget a robot's map and alignments (its stream was deleted)."""
+        for book in (self._grids, self._versions, self._areas):
+            book.pop(robot, None)
+        self._pairs.forget(robot)
+
+    def merge(self) -> MergeResult:
+        """Bring the alignments up to date and lay the connected maps over each other."""
+        grids = {robot: grid for robot, grid in sorted(self._grids.items()) if grid is not None}
+        if self._reference is None and self._settings.mode is not Mode.KNOWN:
+            self._reference = next(iter(grids), None)
+        is_search_due = False
+        if self._settings.mode is Mode.KNOWN:
+            transforms = {robot: self._settings.poses[robot] for robot in grids if robot in self._settings.poses}
+        else:
+            is_search_due = self._align(grids)
+            transforms = self._connected()
+        attached, oversize = self._fitting(grids, transforms)
+        grid = self._compose(grids, attached)
+        if attached != self._transforms:
+            self._transforms, self._revision = attached, self._revision + 1
+        return MergeResult(
+            grid=grid,
+            statuses=tuple(self._status(robot, attached, oversize) for robot in sorted(self._robots())),
+            transforms=attached,
+            inputs={robot: grids[robot].stamp_ns for robot in attached},
+            reference=self._reference,
+            revision=self._revision,
+            is_search_due=is_search_due,
+        )
+
+    def snapshot(self) -> bytes:
+        """The transforms as bytes, for the next owner: it then tracks instead of searching anew."""
+        edges = [{"pair": edge.pair, "margin": edge.margin, "fit": asdict(edge.fit)} for edge in self._pairs.accepted]
+        state = {
+            "schema": SNAPSHOT_SCHEMA,
+            "mode": self._settings.mode.value,
+            "resolution": self._settings.resolution,
+            "reference": self._reference,
+            "revision": self._revision,
+            "extent": None if self._extent is None else asdict(self._extent),
+            "edges": edges,
+        }
+        return json.dumps(state).encode()
+
+    def restore(self, snapshot: bytes) -> str:
+        """Take over a previous owner's transforms; returns why they are not taken (empty: taken).
+
+        Only for a merger that has no transforms of its own yet.
+        """
+        if self._reference is not None or self._extent is not None:
+            return "this merger has a map of its own"
+        try:
+            state = json.loads(snapshot)
+            if state["schema"] != SNAPSHOT_SCHEMA:
+                return f"snapshot of schema {state['schema']!r}"
+            if (state["mode"], state["resolution"]) != (self._settings.mode.value, self._settings.resolution):
+                return "snapshot of another mode or resolution"
+            edges = [_edge(raw) for raw in state["edges"]]
+            extent = None if state["extent"] is None else Extent(**{k: int(v) for k, v in state["extent"].items()})
+            reference = None if state["reference"] is None else str(state["reference"])
+            revision = int(state["revision"])
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+            return f"malformed snapshot: {error!r}"
+        if extent is not None and (extent.is_too_large or extent.width <= 0 or extent.height <= 0):
+            return "malformed snapshot: extent"
+        for edge in edges:
+            self._pairs.adopt(edge)
+        self._extent, self._reference, self._revision = extent, reference, revision
+        return ""
+
+    def _robots(self) -> set[str]:
+        return {*self._grids, *self._settings.poses}
+
+    def _align(self, grids: Mapping[str, Grid]) -> bool:
+        """Bring all pairs up to date; returns whether a search is still due."""
+        for robot, grid in grids.items():
+            number = self._numbers[robot]
+            if robot not in self._versions or self._versions[robot].number != number:
+                self._versions[robot] = MapVersion(
+                    number=number, walls=prepare(grid, self._settings.resolution), area_m2=self._areas[robot]
+                )
+        maps = {robot: self._versions[robot] for robot in grids}
+        self._pairs.refresh(maps)
+        is_search_due = self._pairs.search_one(maps)
+        while (broken := broken_cycle(self._pairs.accepted, self._centre)) is not None:
+            self._pairs.refuse(*broken)
+        return is_search_due
+
+    def _centre(self, robot: str) -> tuple[float, float]:
+        version = self._versions.get(robot)
+        return (0.0, 0.0) if version is None else version.walls.centre
+
+    def _connected(self) -> dict[str, Pose2]:
+        """The map frames of the reference's component in the world."""
+        if self._reference is None:
+            return {}
+        world_t_reference = self._settings.poses.get(self._reference, Pose2())
+        poses, self._tree = spanning_transforms(self._reference, self._pairs.accepted, self._tree)
+        return {robot: world_t_reference.compose(pose) for robot, pose in poses.items()}
+
+    def _fitting(
+        self, grids: Mapping[str, Grid], transforms: Mapping[str, Pose2]
+    ) -> tuple[dict[str, Pose2], frozenset[str]]:
+        """The transforms of the maps that fit on the canvas (grown for them), and the robots whose map does not."""
+        attached: dict[str, Pose2] = {}
+        oversize: set[str] = set()
+        for robot in sorted(transforms, key=lambda name: (name != self._reference, name)):
+            if robot not in grids:
+                continue
+            part = extent_of(grids[robot], transforms[robot], self._settings.resolution)
+            grown = part.union(self._extent).in_blocks()
+            if grown.is_too_large:
+                oversize.add(robot)
+                continue
+            self._extent, attached[robot] = grown, transforms[robot]
+        return dict(sorted(attached.items())), frozenset(oversize)
+
+    def _compose(self, grids: Mapping[str, Grid], attached: Mapping[str, Pose2]) -> Grid | None:
+        if self._extent is None or not attached:
+            return None
+        return compose(
+            [(grids[robot], pose) for robot, pose in attached.items()],
+            self._extent,
+            self._settings.resolution,
+            stamp_ns=max(grids[robot].stamp_ns for robot in attached),
+            frame_id=self._settings.world_frame,
+        )
+
+    def _status(self, robot: str, attached: Mapping[str, Pose2], oversize: frozenset[str]) -> RobotStatus:
+        if self._grids.get(robot) is None:
+            reason = "its map is empty" if robot in self._grids else "no map received yet"
+            return RobotStatus(robot=robot, state=RobotState.WAITING, reason=reason)
+        if robot in oversize:
+            reason = "the merged map would become too large with it: check its pose, origin and size"
+            return RobotStatus(robot=robot, state=RobotState.REFUSED, reason=reason)
+        if self._settings.mode is Mode.KNOWN:
+            if robot in attached:
+                return RobotStatus(robot=robot, state=RobotState.ATTACHED, reason="by the given pose")
+            return RobotStatus(robot=robot, state=RobotState.WAITING, reason="no pose given for it (--pose)")
+        if robot == self._reference:
+            return RobotStatus(robot=robot, state=RobotState.ATTACHED, reason="the reference")
+        return self._aligned_status(robot, is_attached=robot in attached)
+
+    def _aligned_status(self, robot: str, *, is_attached: bool) -> RobotStatus:
+        """The status of a robot that needs an alignment, with the figures of the one that decides."""
+        accepted = [edge for edge in self._pairs.accepted if robot in edge.pair]
+        if accepted:
+            in_tree = [edge for edge in accepted if edge.pair in self._tree]
+            edge = max(in_tree or accepted, key=lambda e: e.fit.quality)
+            state = RobotState.ATTACHED if is_attached else RobotState.WAITING
+            reason = edge.reason if is_attached else "aligned, but with no robot that is connected to the reference"
+            return _with_figures(robot, state, reason, edge)
+        refused = self._pairs.refused_with(robot)
+        if refused:
+            return _with_figures(robot, RobotState.REFUSED, refused[0].reason, refused[0])
+        return RobotStatus(robot=robot, state=RobotState.WAITING, reason="its map has too few walls so far")
+
+
+def _with_figures(robot: str, state: RobotState, reason: str, edge: Alignment) -> RobotStatus:
+    partner = edge.pair[0] if edge.pair[1] == robot else edge.pair[1]
+    return RobotStatus(
+        robot=robot,
+        state=state,
+        reason=reason,
+        partner=partner,
+        score=edge.fit.score,
+        agreeing=edge.fit.agreeing,
+        overlap=edge.fit.overlap,
+        margin=edge.margin,
+    )
+
+
+def _edge(raw: dict[str, Any]) -> Alignment:
+    """An accepted alignment out of a snapshot. Raises `ValueError`, `TypeError` or `KeyError` when it is none."""
+    a, b = (str(name) for name in raw["pair"])
+    values = raw["fit"]
+    pose = Pose2(**{name: float(value) for name, value in values["a_t_b"].items()})
+    score, agreeing, overlap = float(values["score"]), int(values["agreeing"]), float(values["overlap"])
+    if a >= b or not pose.is_finite or not 0.0 <= score <= 1.0 or agreeing < 0 or not math.isfinite(overlap):
+        raise ValueError(f"edge {a!r} - {b!r}")
+    margin = None if raw["margin"] is None else float(raw["margin"])
+    found = Fit(a_t_b=pose, score=score, agreeing=agreeing, overlap=overlap)
+    return Alignment(pair=(a, b), fit=found, margin=margin, is_accepted=True, reason="")
