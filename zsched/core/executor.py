@@ -73,6 +73,20 @@ class Executor:
         """Whether this node may run the task's worker."""
         return self.me in self.spec.candidates
 
+    @property
+    def predecessor(self) -> NodeId | None:
+        """The owner of the old slot while a handover runs."""
+        return None if self._predecessor is None else self._predecessor.owner
+
+    def again(self) -> tuple[Instruction, ...]:
+        """The newest role and plan once more, after a batch that carried them was cut off."""
+        result: tuple[Instruction, ...] = (SetRole(role=self.role),) if self.is_candidate else ()
+        if self._current is not None:
+            phases = {Phase.PREPARING: RoutePhase.PREPARE, Phase.SETTLED: RoutePhase.CLOSE}
+            plan = phases.get(self.phase, RoutePhase.FLIP)
+            result += (ApplyRoutes(plan=plan_for(self.spec, plan, self._current, self._predecessor)),)
+        return result
+
     def next_deadline(self) -> float:
         """When `tick` may have something to do; infinity when never."""
         return min(self._drain_deadline, self._role_deadline)

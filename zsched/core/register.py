@@ -26,6 +26,8 @@ from zsched.core.model import Acceptance, Allocation, Ballot, NodeId, RegisterSt
 from zsched.core.scoring import majority
 
 BACKOFF_CAP_S = 5.0
+MAX_JUMP = 2**32
+"""No honest proposer's counter is so far ahead; one frame must not use up the counters there are."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -144,7 +146,7 @@ class Register:
 
     def next_deadline(self) -> float:
         """When `tick` may have something to do; infinity when never."""
-        return min(self._settle_at, math.inf if self._round is None else self._round.deadline)
+        return self._settle_at if self._round is None else self._round.deadline
 
     def stop_electing(self) -> None:
         """This node lost its right to be an elector (disk, duplicate name): it answers no more."""
@@ -154,7 +156,7 @@ class Register:
 
     def on_prepare(self, prepare: Prepare) -> tuple[Step, Promise | Refused]:
         """Phase 1b. The answer must not leave before a dirty step is on disk."""
-        refusal = self._refusal(prepare.electorate)
+        refusal = self._refusal(prepare.electorate, prepare.ballot)
         if refusal is None and prepare.ballot <= self.state.promised:
             refusal = Refusal.BALLOT
         if refusal is not None:
@@ -166,7 +168,7 @@ class Register:
     def on_accept(self, accept: Accept, now: float) -> tuple[Step, Accepted | Refused]:
         """Phase 2b. The answer must not leave before a dirty step is on disk."""
         ballot = accept.acceptance.ballot
-        refusal = self._refusal(accept.electorate)
+        refusal = self._refusal(accept.electorate, ballot)
         if refusal is None and ballot < self.state.promised:
             refusal = Refusal.BALLOT
         if refusal is not None:
@@ -177,10 +179,12 @@ class Register:
             self._settle_at = now + 2 * self._ballot_s + self._jitter(0)
         return Step(is_dirty=True), Accepted(elector=self._me, task=self.state.task, ballot=ballot)
 
-    def _refusal(self, electorate: str) -> Refusal | None:
+    def _refusal(self, electorate: str, ballot: Ballot) -> Refusal | None:
         if not self._is_elector:
             return Refusal.NOT_ELECTOR
-        return None if electorate == self._electorate else Refusal.ELECTORATE
+        if electorate != self._electorate:
+            return Refusal.ELECTORATE
+        return Refusal.BALLOT if ballot.counter > self.state.promised.counter + MAX_JUMP else None
 
     def _no(self, ballot: Ballot, refusal: Refusal) -> Refused:
         return Refused(
@@ -206,25 +210,33 @@ class Register:
     def learn(self, value: Allocation, now: float) -> Step:
         """A committed value is known; older ones change nothing."""
         step = Step()
+        self._learn(value, step, now)
+        return step
+
+    def _learn(self, value: Allocation, step: Step, now: float) -> None:
         current = self.state.learnt
         if current is not None and value.revision <= current.revision:
             if value.revision == current.revision and value != current:
                 step.problem = f"two values for revision {value.revision}: {current.owner} and {value.owner}"
-            return step
+            return
         self._set_state(learnt=value)
         step.is_dirty, step.learnt = True, value
         if not self._is_unlearnt():
             self._settle_at = math.inf
-        if self._is_outdated(value):
-            self._finish(step, RoundOutcome.CONFLICT, now)
-        return step
+        outcome = self._outcome_by(value)
+        if outcome is not None:
+            self._finish(step, outcome, now)
 
-    def _is_outdated(self, value: Allocation) -> bool:
-        """Whether our change under way is based on an older revision and has not been sent to anybody yet."""
+    def _outcome_by(self, value: Allocation) -> RoundOutcome | None:
+        """How our change under way has ended, now that ``value`` is learnt; ``None``: it has not."""
         running = self._round
-        if running is None or running.change is None or running.sent is not None:
-            return False
-        return value.revision > running.change.base_revision
+        if running is None or running.change is None:
+            return None
+        if running.sent is None:
+            return RoundOutcome.CONFLICT if value.revision > running.change.base_revision else None
+        if value.revision > running.sent.revision:
+            return RoundOutcome.UNKNOWN  # it may have been built upon ours
+        return RoundOutcome.COMMITTED if value == running.sent else RoundOutcome.CONFLICT
 
     # --- proposer ----------------------------------------------------------------------------------------------
 
@@ -241,6 +253,8 @@ class Register:
         step = Step()
         if self._round is None:
             self._round = _Round(change=None, give_up_at=now + 3 * self._ballot_s)
+            if self._is_unlearnt() and self._settle_at == math.inf:
+                self._settle_at = now + 2 * self._ballot_s  # after a restart nobody else asks again
             self._prepare(step, now)
         return step
 
@@ -249,10 +263,16 @@ class Register:
             return
         change = self._queue.pop(0)
         self._round = _Round(change=change, give_up_at=now + 6 * self._ballot_s)
-        if change.base_revision != self.value.revision:
+        self._begin(step, now)
+
+    def _begin(self, step: Step, now: float) -> None:
+        """Prepare, unless the change is outdated; a base that is newer than what we know is read first."""
+        if self._outcome_by(self.value) is not RoundOutcome.CONFLICT or self._running().sent is not None:
+            self._prepare(step, now)
+        elif step.finished is None:
             self._finish(step, RoundOutcome.CONFLICT, now)
-            return
-        self._prepare(step, now)
+        else:
+            self._running().deadline = now  # a step reports one end; this one comes with the next tick
 
     def _prepare(self, step: Step, now: float) -> None:
         running = self._running()
@@ -291,7 +311,7 @@ class Register:
         read = self._initial if newest is None else newest.value
         if read.revision < self.value.revision:
             step.problem = f"a majority of electors has forgotten revision {self.value.revision}"
-            self._finish(step, RoundOutcome.NO_QUORUM, now)
+            self._finish(step, RoundOutcome.NO_QUORUM if running.sent is None else RoundOutcome.UNKNOWN, now)
             return
         is_unlearnt = read.revision > self.value.revision
         is_identity = running.change is None or running.sent is not None
@@ -317,22 +337,21 @@ class Register:
     def _commit(self, running: _Round, step: Step, now: float) -> None:
         """A majority accepted: the value is chosen."""
         assert running.value is not None
-        value, sent = running.value, running.sent
-        learnt = self.learn(value, now)
-        step.is_dirty |= learnt.is_dirty
-        step.learnt, step.problem = learnt.learnt, learnt.problem
-        if self._round is not running:  # learning already ended it (its base is outdated)
-            step.finished, step.prepare = learnt.finished, learnt.prepare
+        self._learn(running.value, step, now)
+        if self._round is not running:  # learning it has ended the round
             return
-        if sent is not None:
-            self._finish(step, RoundOutcome.COMMITTED if sent == value else RoundOutcome.CONFLICT, now)
-        elif running.change is not None and running.change.base_revision == value.revision:
+        if running.change is None:
+            self._finish(step, RoundOutcome.COMMITTED, now)
+        elif running.sent is None:
             self._prepare(step, now)  # the other's value is settled; ours follows under a higher ballot
         else:
-            self._finish(step, RoundOutcome.COMMITTED if running.change is None else RoundOutcome.CONFLICT, now)
+            self._finish(step, RoundOutcome.CONFLICT, now)  # a majority has closed the ballot that carried ours
 
     def _on_refused(self, running: _Round, answer: Refused, step: Step, now: float) -> None:
-        self._counter = max(self._counter, answer.promised.counter)
+        if answer.refusal is Refusal.BALLOT and answer.promised <= answer.ballot:
+            return  # the echo of a duplicated prepare: it has promised this very ballot
+        if answer.promised.counter <= self._counter + MAX_JUMP:
+            self._counter = max(self._counter, answer.promised.counter)
         running.no[answer.elector] = answer.refusal
         if len(self._electors) - len(running.no) < majority(len(self._electors)):
             self._again(running, step, now)
@@ -356,7 +375,7 @@ class Register:
 
     def _jitter(self, attempt: int) -> float:
         """Doubling back-off with jitter, so that duelling proposers part."""
-        base = min(self._stagger_s * float(2**attempt), BACKOFF_CAP_S)
+        base = min(self._stagger_s * 2.0 ** min(attempt, 16), BACKOFF_CAP_S)  # a cut may last for days
         return base * (0.5 + self._rng.random())
 
     def tick(self, now: float) -> Step:
@@ -365,7 +384,7 @@ class Register:
         running = self._round
         if running is not None and now >= running.deadline:
             if running.phase is _Phase.WAIT:
-                self._prepare(step, now)
+                self._begin(step, now)
             else:
                 self._again(running, step, now)
         elif running is None and now >= self._settle_at:

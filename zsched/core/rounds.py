@@ -1,0 +1,371 @@
+"""SCHEDULER and VOTE in motion at one robot: gather, judge, propose, count, and when to commit.
+
+Knows: the round's course and its deadlines. Does not know: how scores arise (`scoring`), stickiness (`scheduler`), the
+count's rules (`vote`), the register, bytes.
+
+A robot gathers the others' utilities every ``decide_s``, and at once when an owner is gone or another robot's proposal
+for a move arrives: the first proposal *calls* the vote, so rounds need no synchronised clocks. In a called vote every
+robot answers with today's winner, or with the owner: its own time-to-trigger and cool-down do not count, the caller's
+did (docs/decisions/0004). A proposal counts as fresh for `Rounds.vote_s`: twice a gather, since answering one may take
+a whole gather when a peer is frozen.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from random import Random
+
+from zsched.core.fleet import Fleet, TaskSpec
+from zsched.core.gateway import Gateway
+from zsched.core.instructions import AskUtilities, Instruction, PublishProposal, RecordStory
+from zsched.core.messages import Utilities
+from zsched.core.model import Allocation, NodeId, PeerState, Proposal, TaskId, UtilityVector, WorkerState
+from zsched.core.register import MoveOwner
+from zsched.core.scheduler import Judge, Judgement, Outcome, escape_reason
+from zsched.core.scoring import Standing, compare, majority, score
+from zsched.core.vote import Tally, VoteOutcome, tally
+
+VOTE_MARGIN_S = 0.1
+
+
+@dataclass(slots=True)
+class _Gather:
+    number: int
+    deadline: float
+    expected: list[NodeId]
+    vectors: dict[NodeId, tuple[UtilityVector, ...]]
+
+
+@dataclass(slots=True)
+class TaskRound:
+    """One task's standing at this robot: what it last decided, heard and counted."""
+
+    spec: TaskSpec
+    judge: Judge
+    settled_at: float
+    """When this node learnt the current epoch."""
+    is_called: bool = False
+    is_called_escape: bool = False
+    standing: Standing | None = None
+    judgement: Judgement | None = None
+    judged_at: float = -math.inf
+    silent: tuple[NodeId, ...] = ()
+    proposals: dict[NodeId, tuple[Proposal, float]] = field(default_factory=dict)
+    vote_opened_at: float | None = None
+    tally: Tally | None = None
+    tally_base: int = 0
+    tally_at: float = -math.inf
+    commit_at: float = math.inf
+    commit: MoveOwner | None = None
+    told: str = ""
+    """The last decision written to the journal; the same one again is not."""
+
+
+class Rounds:
+    """All tasks' rounds at one robot (on edges it is idle)."""
+
+    def __init__(self, fleet: Fleet, me: NodeId, gateway: Gateway, rng: Random, now: float) -> None:
+        self._fleet, self._me, self._gateway, self._rng = fleet, me, gateway, rng
+        self.is_voter = me in fleet.voters
+        self.vote_s = 2 * fleet.timing.gather_s + VOTE_MARGIN_S
+        self.tasks = {spec.name: TaskRound(spec=spec, judge=Judge(spec=spec), settled_at=now) for spec in fleet.tasks}
+        self._gather: _Gather | None = None
+        self._number = 0
+        self._round_at = now if self.is_voter else math.inf
+
+    # --- time ----------------------------------------------------------------------------------------------------
+
+    def next_deadline(self) -> float:
+        """When `tick` may have something to do."""
+        due = self._round_at if self._gather is None else self._gather.deadline
+        for task in self.tasks.values():
+            due = min(due, task.commit_at)
+            if task.vote_opened_at is not None:
+                due = min(due, task.vote_opened_at + self.vote_s)
+        return due
+
+    def hurry(self, now: float) -> None:
+        """Something happened that may need a decision: run a round now."""
+        if self.is_voter:
+            self._round_at = min(self._round_at, now)
+
+    # --- SCHEDULER: the gather -----------------------------------------------------------------------------------
+
+    def vectors(self, values: Mapping[TaskId, Allocation], states: Mapping[NodeId, PeerState], now: float) -> Utilities:
+        """This robot's vectors of all tasks (Alg. 2, Calculate_Utility); none on an edge."""
+        if not self.is_voter:
+            return Utilities(voter=self._me, vectors=())
+        return Utilities(
+            voter=self._me,
+            vectors=tuple(
+                score(task.spec, values[name], self._me, self._gateway, states, now)
+                for name, task in self.tasks.items()
+            ),
+        )
+
+    def tick(
+        self, values: Mapping[TaskId, Allocation], states: Mapping[NodeId, PeerState], now: float
+    ) -> tuple[Instruction, ...]:
+        """Time has passed: start or close a gather, close votes."""
+        out: list[Instruction] = []
+        if self._gather is not None:
+            self._forget_silent(states)
+            if not self._gather.expected or now >= self._gather.deadline:
+                out += self._close(values, states, now)
+        elif now >= self._round_at:
+            out += self._open(values, states, now)
+        for task in self.tasks.values():
+            if task.vote_opened_at is not None:
+                out += self._count(task, values[task.spec.name], states, now)
+        return tuple(out)
+
+    def _open(
+        self, values: Mapping[TaskId, Allocation], states: Mapping[NodeId, PeerState], now: float
+    ) -> list[Instruction]:
+        timing = self._fleet.timing
+        self._round_at = now + timing.decide_s * (0.9 + 0.2 * self._rng.random())
+        self._number += 1
+        own = self.vectors(values, states, now)
+        expected = [name for name in self._fleet.voters if name != self._me and states[name] is PeerState.ALIVE]
+        self._gather = _Gather(
+            number=self._number,
+            deadline=now + timing.gather_s,
+            expected=expected,
+            vectors={self._me: own.vectors},
+        )
+        if not expected:
+            return self._close(values, states, now)
+        return [AskUtilities(gather=self._number, deadline_s=timing.gather_s)]
+
+    def _forget_silent(self, states: Mapping[NodeId, PeerState]) -> None:
+        """Do not wait for a robot that is not alive any more."""
+        if self._gather is not None:
+            self._gather.expected = [name for name in self._gather.expected if states[name] is PeerState.ALIVE]
+
+    def absorb_utilities(self, gather: int, utilities: Utilities) -> bool:
+        """A robot answered; false when the answer is late, foreign or not its own."""
+        running = self._gather
+        if running is None or gather != running.number or utilities.voter not in running.expected:
+            return False
+        if any(vector.voter != utilities.voter for vector in utilities.vectors):
+            return False
+        running.expected.remove(utilities.voter)
+        running.vectors[utilities.voter] = utilities.vectors
+        return True
+
+    def _close(
+        self, values: Mapping[TaskId, Allocation], states: Mapping[NodeId, PeerState], now: float
+    ) -> list[Instruction]:
+        """Everybody alive has answered, or the deadline passed: judge every task."""
+        assert self._gather is not None
+        gathered, self._gather = self._gather, None
+        out: list[Instruction] = []
+        for name, task in self.tasks.items():
+            vectors = {
+                voter: vector
+                for voter, all_vectors in gathered.vectors.items()
+                for vector in all_vectors
+                if vector.task == name
+            }
+            task.silent = tuple(voter for voter in self._fleet.voters if voter not in vectors)
+            task.standing = compare(task.spec, values[name], vectors)
+            out += self._judge(task, task.standing, values[name], states, now)
+        return out
+
+    # --- SCHEDULER: the decision ---------------------------------------------------------------------------------
+
+    def _judge(
+        self,
+        task: TaskRound,
+        standing: Standing,
+        allocation: Allocation,
+        states: Mapping[NodeId, PeerState],
+        now: float,
+    ) -> list[Instruction]:
+        is_called, is_called_escape = task.is_called, task.is_called_escape
+        task.is_called = task.is_called_escape = False
+        escape = self._escape(task, standing, allocation, states, is_called_escape, now)
+        needed = majority(len(self._fleet.voters))
+        if escape is not None:
+            needed = max(min(needed, majority(len(self._present(states)))), 1)
+        if standing.voters_heard < needed:
+            reason = f"utilities of {standing.voters_heard} robots, {needed} needed"
+            judgement = Judgement(outcome=Outcome.NONE, candidate=None, aggregate=0.0, reason=reason)
+        else:
+            judgement = task.judge.judge(
+                standing,
+                allocation,
+                settled_for_s=now - task.settled_at,
+                escape=escape,
+                is_called=is_called,
+                now=now,
+            )
+        task.judgement, task.judged_at = judgement, now
+        out: list[Instruction] = [*self._tell(task, judgement, allocation)]
+        if task.commit is not None:
+            return out
+        if judgement.outcome is Outcome.PROPOSE or (is_called and allocation.owner is not None):
+            out += self._propose(task, judgement, allocation, states, now)
+        return out
+
+    def _escape(
+        self,
+        task: TaskRound,
+        standing: Standing,
+        allocation: Allocation,
+        states: Mapping[NodeId, PeerState],
+        is_called_escape: bool,
+        now: float,
+    ) -> str | None:
+        owner = allocation.owner
+        if owner is None:
+            return None
+        state = states.get(owner, PeerState.GONE)
+        if state is PeerState.SUSPECT and not is_called_escape:
+            state = PeerState.ALIVE  # in grace; only a peer's word makes our own suspicion enough
+        profile = self._gateway.fresh(owner, now)
+        self._gateway.learn_demand(task.spec.name, owner, now)
+        not_ready_for = self._not_ready_for(task, owner, now)
+        return escape_reason(task.spec, allocation, state, profile, standing, not_ready_for)
+
+    def _not_ready_for(self, task: TaskRound, owner: NodeId, now: float) -> float:
+        """How long the owner's worker has not been ready (or its profile has been stale)."""
+        profile = self._gateway.fresh(owner, now)
+        load = None if profile is None else profile.worker(task.spec.name)
+        if load is not None and load.state is WorkerState.READY:
+            task.judge.not_ready_since = None
+            return 0.0
+        if task.judge.not_ready_since is None:
+            task.judge.not_ready_since = now
+        return now - task.judge.not_ready_since
+
+    def _present(self, states: Mapping[NodeId, PeerState]) -> frozenset[NodeId]:
+        return frozenset(name for name in self._fleet.voters if states[name] is not PeerState.GONE)
+
+    def _tell(self, task: TaskRound, judgement: Judgement, allocation: Allocation) -> list[Instruction]:
+        text = f"{judgement.outcome} {judgement.candidate or '-'}"
+        if text == task.told:
+            return []
+        task.told = text
+        scores = " ".join(f"{name}={value:.3f}" for name, value in sorted(judgement.aggregates.items()))
+        return [
+            RecordStory(
+                stage="scheduler",
+                text=f"{text}: {judgement.reason} [{scores}]",
+                task=task.spec.name,
+                epoch=allocation.epoch,
+            )
+        ]
+
+    # --- VOTE ----------------------------------------------------------------------------------------------------
+
+    def _propose(
+        self,
+        task: TaskRound,
+        judgement: Judgement,
+        allocation: Allocation,
+        states: Mapping[NodeId, PeerState],
+        now: float,
+    ) -> list[Instruction]:
+        candidate = judgement.candidate or allocation.owner
+        if candidate is None:
+            return []
+        proposal = Proposal(
+            voter=self._me,
+            task=task.spec.name,
+            base_revision=allocation.revision,
+            candidate=candidate,
+            aggregate=judgement.aggregate,
+            is_escape=judgement.is_escape,
+            reason=judgement.reason[:200],
+        )
+        return [PublishProposal(proposal=proposal), *self.absorb_proposal(proposal, allocation, states, now)]
+
+    def absorb_proposal(
+        self, proposal: Proposal, allocation: Allocation, states: Mapping[NodeId, PeerState], now: float
+    ) -> list[Instruction]:
+        """A robot's proposal (our own enters here too). On an older or newer base it does not count."""
+        task = self.tasks[proposal.task]
+        if proposal.base_revision != allocation.revision:
+            return []
+        task.proposals[proposal.voter] = (proposal, now)
+        is_move = proposal.candidate != allocation.owner
+        if is_move and task.vote_opened_at is None and task.commit is None:
+            task.vote_opened_at = now
+        if is_move and proposal.voter != self._me and self._must_answer(task, now):
+            task.is_called = True
+            task.is_called_escape |= proposal.is_escape
+            if self._gather is None:
+                self.hurry(now)
+        return self._count(task, allocation, states, now)
+
+    def _must_answer(self, task: TaskRound, now: float) -> bool:
+        mine = task.proposals.get(self._me)
+        return self.is_voter and task.commit is None and (mine is None or now - mine[1] > self.vote_s)
+
+    def _count(
+        self, task: TaskRound, allocation: Allocation, states: Mapping[NodeId, PeerState], now: float
+    ) -> list[Instruction]:
+        if task.vote_opened_at is None:
+            return []
+        fresh = {
+            voter: proposal
+            for voter, (proposal, at) in task.proposals.items()
+            if now - at <= self.vote_s and proposal.base_revision == allocation.revision
+        }
+        is_over = now >= task.vote_opened_at + self.vote_s
+        counted = tally(
+            fresh,
+            voters=self._fleet.voters,
+            present=self._present(states),
+            owner=allocation.owner,
+            is_over=is_over,
+        )
+        task.tally, task.tally_base, task.tally_at = counted, allocation.revision, now
+        if counted.outcome is VoteOutcome.PENDING:
+            return []
+        task.vote_opened_at = None
+        if counted.outcome is VoteOutcome.STAY:
+            task.judge.reset()
+        if counted.outcome is VoteOutcome.WON and counted.winner is not None:
+            self._schedule_commit(task, counted, allocation, fresh, now)
+        text = f"{counted.outcome}: {counted.reason} ({', '.join(f'{v}->{c}' for v, c in counted.votes)})"
+        return [RecordStory(stage="vote", text=text, task=task.spec.name, epoch=allocation.epoch)]
+
+    def _schedule_commit(
+        self, task: TaskRound, counted: Tally, allocation: Allocation, fresh: Mapping[NodeId, Proposal], now: float
+    ) -> None:
+        """The winner's voters propose it to the register, staggered by rank so that one usually suffices."""
+        supporters = [voter for voter, candidate in counted.votes if candidate == counted.winner]
+        if self._me not in supporters or counted.winner is None:
+            return
+        task.commit = MoveOwner(base_revision=allocation.revision, owner=counted.winner, reason=fresh[self._me].reason)
+        task.commit_at = now + self._fleet.timing.stagger_s * supporters.index(self._me)
+
+    def due_commits(self, now: float) -> list[tuple[TaskId, MoveOwner]]:
+        """Changes whose turn has come; each is handed out once."""
+        due = []
+        for name, task in self.tasks.items():
+            if task.commit is not None and now >= task.commit_at:
+                task.commit_at = math.inf
+                due.append((name, task.commit))
+        return due
+
+    def on_commit_ended(self, name: TaskId) -> None:
+        """Our change was committed, overtaken or given up: votes may be called again."""
+        task = self.tasks[name]
+        task.commit, task.commit_at = None, math.inf
+
+    def on_learnt(self, name: TaskId, *, is_new_epoch: bool, now: float) -> None:
+        """A newer revision is known: proposals on older bases are worthless."""
+        task = self.tasks[name]
+        task.proposals.clear()
+        task.vote_opened_at = None
+        task.told = ""
+        if task.commit is not None and task.commit_at < math.inf:
+            self.on_commit_ended(name)
+        task.judge.reset()
+        if is_new_epoch:
+            task.settled_at = now

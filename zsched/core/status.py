@@ -1,0 +1,190 @@
+"""Builds the status snapshot out of a node's state.
+
+Knows: which figure stands where. Does not know: how it is shown.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+from zsched.core.executor import Executor
+from zsched.core.fleet import Fleet, NodeSpec, TaskSpec
+from zsched.core.gateway import Gateway
+from zsched.core.membership import Membership
+from zsched.core.model import Allocation, NodeId, NodeKind, PeerState, TaskId
+from zsched.core.plan import StreamCount
+from zsched.core.register import Register
+from zsched.core.rounds import Rounds, TaskRound
+from zsched.core.scoring import majority
+from zsched.core.snapshot import (
+    SCHEMA,
+    DecisionStatus,
+    NodeStatus,
+    PastAllocation,
+    QuorumStatus,
+    Snapshot,
+    TaskStatus,
+    VoteStatus,
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PastValue:
+    """A learnt value, when this node learnt it and why it came about."""
+
+    value: Allocation
+    at: float
+    reason: str
+
+
+class NodeView(Protocol):
+    """What status reads of a node (`zsched.core.node.Node` is one)."""
+
+    fleet: Fleet
+    me: NodeId
+    version: str
+    kind: NodeKind
+    incarnation: int
+    started_at: float
+    has_state: bool
+    is_elector: bool
+    loop_lag_s: float
+    counters: Counter[str]
+    problems: dict[str, str]
+    membership: Membership
+    gateway: Gateway
+    rounds: Rounds
+    registers: Mapping[TaskId, Register]
+    executors: Mapping[TaskId, Executor]
+    stream_counts: tuple[StreamCount, ...]
+    history: Mapping[TaskId, deque[PastValue]]
+
+
+def build_snapshot(node: NodeView, now: float) -> Snapshot:
+    """The whole status of ``node`` at ``now`` (monotonic seconds)."""
+    quorum = _quorum(node)
+    return Snapshot(
+        schema=SCHEMA,
+        version=node.version,
+        fleet=node.fleet.name,
+        node=node.me,
+        kind=node.kind.value,
+        incarnation=node.incarnation,
+        up_s=now - node.started_at,
+        loop_lag_s=node.loop_lag_s,
+        quorum=quorum,
+        nodes=tuple(_node_status(node, spec, now) for spec in node.fleet.nodes),
+        tasks=tuple(_task_status(node, spec, now) for spec in node.fleet.tasks),
+        counters=tuple(sorted(node.counters.items())),
+        problems=_problems(node, quorum),
+    )
+
+
+def _problems(node: NodeView, quorum: QuorumStatus) -> tuple[str, ...]:
+    problems = [f"{source}: {text}" for source, text in sorted(node.problems.items())]
+    if not quorum.ok:
+        problems.append(f"no quorum: {quorum.alive} of {quorum.electors} electors alive, {quorum.needed} needed")
+    if not node.has_state:
+        problems.append("no valid state file: this node is no elector (see `zsched init --help`)")
+    return tuple(problems)
+
+
+def _quorum(node: NodeView) -> QuorumStatus:
+    electors = node.fleet.electors
+    alive = [name for name in electors if node.membership.state(name) is PeerState.ALIVE]
+    if node.me in alive and not node.is_elector:
+        alive.remove(node.me)
+    needed = majority(len(electors))
+    role = "elector" if node.is_elector else ("lost_state" if node.me in electors else "no_elector")
+    return QuorumStatus(
+        electors=len(electors), needed=needed, alive=len(alive), ok=len(alive) >= needed, this_node=role
+    )
+
+
+def _node_status(node: NodeView, spec: NodeSpec, now: float) -> NodeStatus:
+    state = node.membership.state(spec.name)
+    incarnation = node.incarnation if spec.name == node.me else node.membership.incarnation(spec.name)
+    data = node.gateway.newest(spec.name, now)
+    if data is None:
+        return NodeStatus(name=spec.name, kind=spec.kind.value, state=state.value, age_s=None, incarnation=incarnation)
+    profile = data.profile
+    cpu, memory = profile.cpu_used_cores, profile.memory_used_mb
+    return NodeStatus(
+        name=spec.name,
+        kind=spec.kind.value,
+        state=state.value,
+        age_s=data.age_s,
+        incarnation=incarnation,
+        cpu_cores=profile.cpu_cores,
+        cpu_used_cores=cpu,
+        cpu_ratio=None if cpu is None else min(cpu / profile.cpu_cores, 1.0),
+        memory_mb=profile.memory_mb,
+        memory_used_mb=memory,
+        memory_ratio=None if memory is None else min(memory / profile.memory_mb, 1.0),
+        links=profile.links,
+        workers=profile.workers,
+        draining=profile.draining,
+    )
+
+
+def _task_status(node: NodeView, spec: TaskSpec, now: float) -> TaskStatus:
+    value = node.registers[spec.name].value
+    executor, standing = node.executors[spec.name], node.rounds.tasks[spec.name]
+    owner_state = "none" if value.owner is None else node.membership.state(value.owner).value
+    prefix = f"{spec.name}/"
+    return TaskStatus(
+        name=spec.name,
+        owner=value.owner,
+        epoch=value.epoch,
+        revision=value.revision,
+        since_s=None if value.owner is None else now - standing.settled_at,
+        owner_state=owner_state,
+        phase=executor.phase.value,
+        tuning=value.tuning,
+        candidates=spec.candidates,
+        decision=_decision(standing, now),
+        vote=_vote(standing, now),
+        streams=tuple(count for count in node.stream_counts if count.stream.startswith(prefix)),
+        history=tuple(
+            PastAllocation(
+                epoch=past.value.epoch,
+                revision=past.value.revision,
+                owner=past.value.owner,
+                age_s=now - past.at,
+                reason=past.reason,
+            )
+            for past in node.history[spec.name]
+        ),
+    )
+
+
+def _decision(standing: TaskRound, now: float) -> DecisionStatus | None:
+    judgement, joint = standing.judgement, standing.standing
+    if judgement is None or joint is None:
+        return None
+    return DecisionStatus(
+        outcome=judgement.outcome.value,
+        winner=judgement.candidate,
+        reason=judgement.reason,
+        age_s=now - standing.judged_at,
+        aggregates=tuple(sorted(judgement.aggregates.items())),
+        utilities=tuple((vector.voter, vector.utilities) for vector in joint.vectors),
+        vetoed=tuple(sorted(joint.vetoed.items())),
+        silent=standing.silent,
+    )
+
+
+def _vote(standing: TaskRound, now: float) -> VoteStatus | None:
+    counted = standing.tally
+    if counted is None:
+        return None
+    return VoteStatus(
+        base_revision=standing.tally_base,
+        votes=counted.votes,
+        outcome=counted.outcome.value,
+        winner=counted.winner,
+        age_s=now - standing.tally_at,
+    )
