@@ -6,7 +6,6 @@ Knows: which figure stands where. Does not know: how it is shown.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -57,10 +56,10 @@ class NodeView(Protocol):
     membership: Membership
     gateway: Gateway
     rounds: Rounds
-    registers: Mapping[TaskId, Register]
-    executors: Mapping[TaskId, Executor]
+    registers: dict[TaskId, Register]
+    executors: dict[TaskId, Executor]
     stream_counts: tuple[StreamCount, ...]
-    history: Mapping[TaskId, deque[PastValue]]
+    history: dict[TaskId, deque[PastValue]]
 
 
 def build_snapshot(node: NodeView, now: float) -> Snapshot:
