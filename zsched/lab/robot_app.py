@@ -25,6 +25,7 @@ from zsched.lab.mapping import GridMapper, displacements
 from zsched.lab.recorder import Record, Recorder
 from zsched.lab.signals import StopFlag
 from zsched.tasks.map_merge.cdr import CdrError, decode_grid, encode_grid
+from zsched.zenoh_config import client_config
 
 MAP_PERIOD_S = 1.0
 PROGRESS_PERIOD_S = 1.0
@@ -180,17 +181,6 @@ class Applications:
         self._recorder.write(self._options.robot, record)
 
 
-def client_config(endpoint: str) -> zenoh.Config:
-    """A client of ``endpoint`` and of nothing else: no scouting, no shared memory (its peer may be starved of CPU)."""
-    config = zenoh.Config()
-    config.insert_json5("mode", '"client"')
-    config.insert_json5("connect/endpoints", json.dumps([endpoint]))
-    config.insert_json5("scouting/multicast/enabled", "false")
-    config.insert_json5("scouting/gossip/enabled", "false")
-    config.insert_json5("transport/shared_memory/enabled", "false")
-    return config
-
-
 def connect(endpoint: str, stop: StopFlag) -> zenoh.Session | None:
     """A session with the robot's data side, tried again for `CONNECT_S`; ``None`` when stopped meanwhile.
 
@@ -200,7 +190,7 @@ def connect(endpoint: str, stop: StopFlag) -> zenoh.Session | None:
     deadline = monotonic_s() + CONNECT_S
     while not stop.is_set:
         try:
-            return zenoh.open(client_config(endpoint))
+            return zenoh.open(zenoh.Config.from_json5(client_config(connect=(endpoint,))))
         except zenoh.ZError:
             if monotonic_s() > deadline:
                 raise

@@ -1,0 +1,199 @@
+"""Runs a whole fleet on this machine: real daemons with their own state, sockets, ports and shares of the CPU.
+
+Knows: the fleet file, the command line, who is up. Does not know: robots' applications, schedules, pictures.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ruamel.yaml import YAML
+
+from zsched.core.model import NodeId, TaskId
+from zsched.errors import ConfigError, ZschedError
+from zsched.lab.children import Child, ChildError, Children
+from zsched.lab.limits import NodeLimits
+from zsched.lab.schedule import Injection
+
+CLI = (sys.executable, "-m", "zsched.cli")
+INIT_S = 20.0
+UP_S = 30.0
+POLL_S = 0.05
+
+Tree = dict[str, Any]
+"""A fleet file as plain YAML data."""
+Ask = Callable[[Path, Tree, float], Tree]
+"""`zsched.adapters.operator_socket.ask`: (socket, request, seconds) -> answer."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LabFleet:
+    """The effective fleet file of one run and what the lab must know of it."""
+
+    path: Path
+    task: TaskId
+    kinds: Mapping[NodeId, str]
+    data_endpoints: Mapping[NodeId, str]
+
+    @property
+    def robots(self) -> tuple[NodeId, ...]:
+        """Sorted."""
+        return tuple(sorted(name for name, kind in self.kinds.items() if kind == "robot"))
+
+    @property
+    def edges(self) -> tuple[NodeId, ...]:
+        """Sorted."""
+        return tuple(sorted(name for name, kind in self.kinds.items() if kind == "edge"))
+
+
+def free_ports(count: int) -> list[int]:
+    """So many different TCP ports that were free on 127.0.0.1 a moment ago."""
+    with contextlib.ExitStack() as stack:
+        sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
+        for one in sockets:
+            one.bind(("127.0.0.1", 0))
+        return [int(one.getsockname()[1]) for one in sockets]
+
+
+def read_tree(path: Path) -> Tree:
+    """A YAML file as plain data.
+
+    Raises:
+        ConfigError: it cannot be read, or holds no mapping.
+    """
+    try:
+        tree = YAML(typ="safe").load(path)
+    except Exception as error:
+        raise ConfigError(f"{path}: not readable as a fleet file: {error}") from error
+    if not isinstance(tree, dict) or not isinstance(tree.get("nodes"), dict) or not isinstance(tree.get("tasks"), dict):
+        raise ConfigError(f"{path}: no nodes or tasks in it; run `zsched check {path}`")
+    return tree
+
+
+def write_fleet(template: Path, path: Path, worker_arguments: tuple[str, ...]) -> LabFleet:
+    """Write the effective fleet file: the template on free loopback ports, its task's worker with more arguments.
+
+    Raises:
+        ConfigError: the template is no fleet file, or has not exactly one task.
+    """
+    tree = read_tree(template)
+    nodes: Tree = tree["nodes"]
+    ports = free_ports(2 * len(nodes))
+    endpoints = {}
+    for index, (name, node) in enumerate(sorted(nodes.items())):
+        control, data = (f"tcp/127.0.0.1:{port}" for port in ports[2 * index : 2 * index + 2])
+        node["host"] = "127.0.0.1"
+        node["listen"] = {"control": control, "data": data}
+        endpoints[name] = data
+    if len(tree["tasks"]) != 1:
+        raise ConfigError(f"{template}: the lab runs one task, there are {len(tree['tasks'])}")
+    ((task, spec),) = tree["tasks"].items()
+    spec["worker"]["command"] = [*spec["worker"]["command"], *worker_arguments]
+    yaml = YAML()
+    yaml.width = 120
+    with path.open("w", encoding="utf-8") as file:
+        file.write(f"# Effective fleet file of one run, made from {template.name}.\n")
+        yaml.dump(tree, file)
+    kinds = {name: str(node["kind"]) for name, node in nodes.items()}
+    return LabFleet(path=path, task=task, kinds=kinds, data_endpoints=endpoints)
+
+
+class FleetRunner:
+    """The daemons of one run; their end is the business of `Children`."""
+
+    def __init__(
+        self, fleet: LabFleet, children: Children, runtime: Path, limits: NodeLimits, cli: tuple[str, ...] = CLI
+    ) -> None:
+        """Keep state and sockets below ``runtime`` (short: a socket's path has 107 characters)."""
+        self._fleet = fleet
+        self._children = children
+        self._runtime = runtime
+        self._limits = limits
+        self._cli = cli
+        self._loads = 0
+
+    def socket(self, node: NodeId) -> Path:
+        """The operator socket of a node's daemon."""
+        return self._runtime / "run" / f"{node}.sock"
+
+    def sockets(self) -> dict[NodeId, Path]:
+        """All of them."""
+        return {node: self.socket(node) for node in self._fleet.kinds}
+
+    def init(self) -> None:
+        """Give each node its blank durable state, all at once.
+
+        Raises:
+            ChildError: one of them failed or took too long.
+        """
+        (self._runtime / "run").mkdir(parents=True, exist_ok=True)
+        started = [self._start_init(node) for node in self._fleet.kinds]
+        end = time.monotonic() + INIT_S
+        for child in started:
+            while child.is_running and time.monotonic() < end:
+                time.sleep(POLL_S)
+            if child.process.returncode != 0:
+                raise ChildError(
+                    f"{child.name} failed ({child.process.returncode}); see {child.log}\n{child.log_tail()}"
+                )
+        self._children.stop(*started)
+
+    def _start_init(self, node: NodeId) -> Child:
+        command = [*self._cli, "init", "--config", str(self._fleet.path), "--node", node]
+        return self._children.start(f"init-{node}", [*command, "--state-dir", str(self._state(node))])
+
+    def up(self) -> None:
+        """Start every daemon, the edges' inside their shares; `wait_up` tells when they answer."""
+        for node in self._fleet.kinds:
+            command = [*self._cli, "up", "--config", str(self._fleet.path), "--node", node]
+            folders = ["--state-dir", str(self._state(node)), "--runtime-dir", str(self._runtime / "run")]
+            child = self._children.start(f"daemon-{node}", [*command, *folders])
+            self._limits.put(node, child.process.pid)
+
+    def _state(self, node: NodeId) -> Path:
+        return self._runtime / "state" / node
+
+    def missing(self, ask: Ask, timeout_s: float = 0.5) -> list[NodeId]:
+        """The nodes whose daemon does not answer yet."""
+        return [node for node in sorted(self._fleet.kinds) if not self._answers(node, ask, timeout_s)]
+
+    def _answers(self, node: NodeId, ask: Ask, timeout_s: float) -> bool:
+        if not self.socket(node).exists():
+            return False
+        try:
+            ask(self.socket(node), {"verb": "status"}, timeout_s)
+        except (OSError, ValueError, ZschedError):
+            return False
+        return True
+
+    def wait_up(self, ask: Ask, between: Callable[[], None]) -> None:
+        """Wait until all daemons answer, calling ``between`` meanwhile.
+
+        Raises:
+            ChildError: one ended, or some do not answer within `UP_S`.
+        """
+        end = time.monotonic() + UP_S
+        while missing := self.missing(ask):
+            self._children.check()
+            if time.monotonic() > end:
+                first = next(child for child in self._children.running(f"daemon-{missing[0]}"))
+                raise ChildError(
+                    f"no answer within {UP_S:.0f} s from {', '.join(missing)}; see {first.log}\n{first.log_tail()}"
+                )
+            between()
+            time.sleep(POLL_S)
+
+    def inject(self, node: NodeId, injection: Injection, output: Path) -> Child:
+        """Start neural load inside the node's share; its frames per second go to ``output``."""
+        self._loads += 1
+        command = [sys.executable, "-m", "zsched.lab.neural_load", "--threads", str(injection.threads)]
+        child = self._children.start(f"load-{self._loads}-{node}", command, output=output)
+        self._limits.put(node, child.process.pid)
+        return child

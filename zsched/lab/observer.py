@@ -1,0 +1,79 @@
+"""Watches the fleet through its daemons' operator sockets, from a thread of its own: a wedged daemon stalls nothing.
+
+Knows: who answered when, and which allocations were ever told. Does not know: what is done with it.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+
+from zsched.clock import monotonic_s
+from zsched.core.model import NodeId, TaskId
+from zsched.errors import ZschedError
+from zsched.lab.fleet_runner import Ask
+from zsched.lab.fleet_view import Move, Status, merge_moves, past_allocations
+
+PERIOD_S = 0.5
+ANSWER_S = 0.5
+FORGET_S = 3.0
+"""A snapshot older than this is no longer shown as the node's own word."""
+
+
+class Observer:
+    """Asks every daemon for its status twice a second; read from any thread. A context: leaving it ends the thread."""
+
+    def __init__(self, sockets: Mapping[NodeId, Path], task: TaskId, ask: Ask) -> None:
+        self._sockets = dict(sockets)
+        self._task = task
+        self._ask = ask
+        self._lock = threading.Lock()
+        self._statuses: dict[NodeId, tuple[float, Status]] = {}
+        self._moves: dict[int, Move] = {}
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="observer", daemon=True)
+
+    def __enter__(self) -> Observer:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join(timeout=2 * ANSWER_S)
+
+    def statuses(self) -> dict[NodeId, Status]:
+        """The newest snapshot of every node that answered lately."""
+        now = monotonic_s()
+        with self._lock:
+            return {node: status for node, (at_s, status) in self._statuses.items() if now - at_s < FORGET_S}
+
+    def heard_s(self) -> dict[NodeId, float]:
+        """When each node last answered, on the daemon's clock."""
+        with self._lock:
+            return {node: at_s for node, (at_s, _) in self._statuses.items()}
+
+    def moves(self) -> list[Move]:
+        """Every allocation told so far, by epoch; times on the daemon's clock."""
+        with self._lock:
+            return [self._moves[epoch] for epoch in sorted(self._moves)]
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            started = monotonic_s()
+            for node, path in self._sockets.items():
+                self._look(node, path)
+                if self._stop.is_set():
+                    return
+            self._stop.wait(max(0.05, PERIOD_S - (monotonic_s() - started)))
+
+    def _look(self, node: NodeId, path: Path) -> None:
+        try:
+            status = self._ask(path, {"verb": "status"}, ANSWER_S)
+        except (OSError, ValueError, ZschedError):
+            return  # not up yet, or in trouble: the view shows "no answer"
+        now = monotonic_s()
+        told = past_allocations(status, self._task, now)
+        with self._lock:
+            self._statuses[node] = (now, status)
+            self._moves = merge_moves(self._moves, told)
