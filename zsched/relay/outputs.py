@@ -1,0 +1,229 @@
+"""Gates one output stream of this node: which owner's samples reach the applications, in which order.
+
+Knows: the slots of the stream (one subscription per epoch), the end markers that came. Does not know: why a handover
+happens, or when it is over for the task.
+
+A slot is *prepared* (its samples wait), *next* (flipped to, the old one still carries) or the *carrier*. With
+``handover: latest`` the next slot's first sample makes it the carrier at once; with ``all`` its samples wait, bounded,
+until the old slot has ended. The publisher outlives every slot: applications see one source.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final
+
+import zenoh
+from zenoh import Sample, Session
+
+from zsched.clock import monotonic_s
+from zsched.core.plan import HandoverRule, Route, StreamClass, StreamCount
+from zsched.core.relay_protocol import EndMarker
+from zsched.keyspace import END_CHUNK
+from zsched.relay.counter import StreamCounter
+from zsched.relay.inputs import REPEAT_AFTER_S
+from zsched.relay.outlet import Outlet
+from zsched.relay.receive import Receiver, undeclare
+from zsched.relay_pipe import decode_end
+
+HOLD_SAMPLES: Final = 10_000
+HOLD_BYTES: Final = 64 << 20
+END_GRACE_S: Final = 0.1
+"""A marker travels behind its data on one link; so long after it, what is still missing was dropped on the way."""
+
+
+@dataclass(slots=True)
+class _Key:
+    """What came on one concrete key of a slot, and what its end marker said."""
+
+    received: int = 0
+    end: EndMarker | None = None
+    end_at: float = 0.0
+    last_number: int = -1
+
+    def is_ended(self, now: float) -> bool:
+        if self.end is None:
+            return False
+        is_complete = self.received >= self.end.count or self.last_number + 1 >= self.end.count
+        return is_complete or now - self.end_at > END_GRACE_S
+
+
+@dataclass(slots=True, eq=False)
+class _OutputSlot:
+    epoch: int
+    receiver: Receiver | None = None
+    ends: zenoh.Subscriber[None] | None = None
+    keys: dict[str, _Key] = field(default_factory=dict)
+    held: deque[Sample] = field(default_factory=deque)
+    held_bytes: int = 0
+    is_flipped: bool = False
+    is_closed: bool = False
+
+
+class OutputStream:
+    """One output rule on this node; slots are named by their epoch."""
+
+    def __init__(self, session: Session, route: Route, own_ids: frozenset[str], wake: Callable[[], None]) -> None:
+        """Declare the publisher. ``wake`` is called (from any thread) when an end marker has come.
+
+        Raises:
+            ValueError, zenoh.ZError: the route makes no sense (see `Outlet`).
+        """
+        self.route = route
+        self._session = session
+        self._own_ids = own_ids
+        self._wake = wake
+        self._lock = threading.Lock()
+        self._counter = StreamCounter(route.stream)
+        self._outlet = Outlet(session, route.from_expr, route.to_expr, route.settings)
+        self._slots: dict[int, _OutputSlot] = {}
+        self._carrier: _OutputSlot | None = None
+        self._last: Sample | None = None
+        self._last_at = -REPEAT_AFTER_S
+        self._is_repeat_due = False
+
+    def open(self, epoch: int, route: Route) -> None:
+        """Subscribe to an owner's output; nothing passes yet.
+
+        Raises:
+            zenoh.ZError: ``from`` is no key expression.
+        """
+        slot = _OutputSlot(epoch=epoch)
+        with self._lock:
+            self._slots[epoch] = slot
+        has_epoch = str(epoch) in route.from_expr.split("/")
+        slot.ends = self._session.declare_subscriber(
+            f"{route.from_expr}/{END_CHUNK}",
+            lambda sample: self._end(slot, sample),
+            allowed_origin=zenoh.Locality.REMOTE,
+        )
+        slot.receiver = Receiver(
+            self._session,
+            route.from_expr,
+            route.settings,
+            lambda sample: self._carry(slot, sample),
+            with_history=has_epoch,
+        )
+
+    def flip(self, epoch: int) -> None:
+        """Let the slot's samples through, by the stream's handover rule."""
+        with self._lock:
+            slot = self._slots.get(epoch)
+            if slot is None or slot.is_flipped:
+                return
+            slot.is_flipped = True
+            if self._carrier is None or (slot.held and self.route.settings.handover is HandoverRule.LATEST):
+                self._take_over(slot)
+
+    def has_ended(self, epoch: int) -> bool:
+        """True when everything of the slot has come (end markers), it was cut, or it is not there."""
+        with self._lock:
+            slot = self._slots.get(epoch)
+            if slot is None or (self._carrier is not None and self._carrier.epoch > epoch):
+                return True
+            now = monotonic_s()
+            return bool(slot.keys) and all(key.is_ended(now) for key in slot.keys.values())
+
+    def close_slot(self, epoch: int) -> None:
+        """Unsubscribe from a slot; if it carried the stream, the flipped one takes over with what it held."""
+        with self._lock:
+            slot = self._slots.pop(epoch, None)
+            if slot is None:
+                return
+            slot.is_closed = True
+            if slot is self._carrier:
+                self._carrier = None
+                self._promote()
+        if slot.receiver is not None:
+            slot.receiver.close()
+        if slot.ends is not None:
+            undeclare(slot.ends)
+
+    def close(self) -> None:
+        """Close every slot and give the publisher back."""
+        for epoch in sorted(self._slots, reverse=True):
+            self.close_slot(epoch)
+        self._outlet.undeclare()
+
+    def repeat_if_silent(self) -> None:
+        """Put the last value once more when a burst has ended ``REPEAT_AFTER_S`` ago: it may have been dropped."""
+        with self._lock:
+            is_silent = monotonic_s() - self._last_at >= REPEAT_AFTER_S
+            if not self._is_repeat_due or self._last is None or not is_silent:
+                return
+            self._is_repeat_due = False
+            if not self._outlet.send(self._last):
+                self._counter.dropped("repeated")
+
+    def count(self) -> StreamCount:
+        """The counters now."""
+        with self._lock:
+            return self._counter.value()
+
+    # --- one sample --------------------------------------------------------------------------------------------------
+
+    def _carry(self, slot: _OutputSlot, sample: Sample) -> None:
+        with self._lock:
+            self._counter.seen(len(sample.payload))
+            source = sample.source_info
+            if source is not None and str(source.source_id.zid) in self._own_ids:
+                self._counter.dropped("loop")
+                return
+            key = slot.keys.setdefault(str(sample.key_expr), _Key())
+            key.received += 1
+            if source is not None:
+                key.last_number = source.source_sn
+            self._gate(slot, sample)
+
+    def _gate(self, slot: _OutputSlot, sample: Sample) -> None:
+        if slot is self._carrier:
+            self._forward(sample)
+        elif slot.is_closed:
+            self._counter.dropped("stale_epoch")
+        elif self._carrier is not None and slot.epoch < self._carrier.epoch:
+            self._counter.dropped("cut")
+        elif slot.is_flipped and self.route.settings.handover is HandoverRule.LATEST:
+            self._take_over(slot)
+            self._forward(sample)
+        else:
+            self._hold(slot, sample)
+
+    def _hold(self, slot: _OutputSlot, sample: Sample) -> None:
+        slot.held.append(sample)
+        slot.held_bytes += len(sample.payload)
+        while len(slot.held) > HOLD_SAMPLES or slot.held_bytes > HOLD_BYTES:
+            slot.held_bytes -= len(slot.held.popleft().payload)
+            self._counter.dropped("overflow")
+
+    def _promote(self) -> None:
+        flipped = [slot for slot in self._slots.values() if slot.is_flipped]
+        if flipped:
+            self._take_over(max(flipped, key=lambda slot: slot.epoch))
+
+    def _take_over(self, slot: _OutputSlot) -> None:
+        self._carrier = slot
+        while slot.held:
+            self._forward(slot.held.popleft())
+        slot.held_bytes = 0
+
+    def _forward(self, sample: Sample) -> None:
+        reason = self._outlet.send(sample)
+        if reason:
+            self._counter.dropped(reason)
+        if self.route.settings.stream_class is StreamClass.LATEST:
+            now = monotonic_s()
+            self._is_repeat_due = now - self._last_at < REPEAT_AFTER_S
+            self._last, self._last_at = sample, now
+
+    def _end(self, slot: _OutputSlot, sample: Sample) -> None:
+        """An end marker came (zenoh's callback thread: note it, wake the task, nothing else)."""
+        marker = decode_end(sample.payload.to_bytes())
+        if marker is None or marker.epoch != slot.epoch:
+            return
+        with self._lock:
+            key = slot.keys.setdefault(str(sample.key_expr).removesuffix(f"/{END_CHUNK}"), _Key())
+            key.end, key.end_at = marker, monotonic_s()
+        self._wake()

@@ -1,0 +1,96 @@
+"""Receives one key expression in a thread of its own: the only way samples enter the relay.
+
+Knows: zenoh subscribers, ring and fifo handlers. Does not know: what becomes of a sample.
+
+Never callbacks that work: a slow one blocks zenoh's receive pool and with it every other link of the process.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from typing import Any, Final, Protocol
+
+import zenoh
+from zenoh import Sample, Session, ext
+
+from zsched.core.plan import StreamClass, StreamSettings
+
+JOIN_S: Final = 0.3
+
+_log = logging.getLogger("zsched.relay")
+
+
+class Declared(Protocol):
+    """Anything declared on a session."""
+
+    def undeclare(self) -> Any:
+        """Take it back."""
+
+
+def undeclare(entity: Declared) -> None:
+    """Take a declaration back (zenoh's stubs leave the method untyped)."""
+    entity.undeclare()
+
+
+class Receiver:
+    """A subscriber and the thread that drains it into ``carry``; samples of this process's own session never come."""
+
+    def __init__(
+        self,
+        session: Session,
+        expr: str,
+        settings: StreamSettings,
+        carry: Callable[[Sample], None],
+        *,
+        with_history: bool,
+    ) -> None:
+        """Subscribe and start.
+
+        ``with_history`` asks the publishers of class ``latest`` for what they still hold; wrong where a key outlives
+        an owner's epoch (the old epoch's value would come back as the new one's).
+
+        Raises:
+            zenoh.ZError: ``expr`` is no key expression.
+        """
+        self._carry = carry
+        self._subscriber = _subscribe(session, expr, settings, with_history=with_history)
+        self._handler = self._subscriber.handler  # the thread's own: undeclare() refuses while recv() borrows
+        self._thread = threading.Thread(target=self._run, name=f"from {expr}", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Unsubscribe; the thread ends behind what it has in hand."""
+        undeclare(self._subscriber)
+        if self._thread is not threading.current_thread():
+            self._thread.join(JOIN_S)
+
+    def _run(self) -> None:
+        for sample in self._handler:
+            try:
+                self._carry(sample)
+            except Exception:  # noqa: BLE001 - one bad sample must not end its stream
+                _log.exception("%s: a sample could not be carried", sample.key_expr)
+
+
+_Subscriber = zenoh.Subscriber[zenoh.handlers.Handler[Sample]] | ext.AdvancedSubscriber[zenoh.handlers.Handler[Sample]]
+
+
+def _subscribe(session: Session, expr: str, settings: StreamSettings, *, with_history: bool) -> _Subscriber:
+    remote = zenoh.Locality.REMOTE
+    ring: zenoh.handlers.RingChannel[Sample] = zenoh.handlers.RingChannel(settings.depth)
+    if settings.stream_class is StreamClass.BEST_EFFORT:
+        return session.declare_subscriber(expr, ring, allowed_origin=remote)
+    if settings.stream_class is StreamClass.RELIABLE:
+        fifo: zenoh.handlers.FifoChannel[Sample] = zenoh.handlers.FifoChannel(max(settings.depth, 256))
+        return session.declare_subscriber(expr, fifo, allowed_origin=remote)
+    keep = max(1, settings.keep_last)
+    return ext.declare_advanced_subscriber(
+        session,
+        expr,
+        ring,
+        allowed_origin=remote,
+        history=ext.HistoryConfig(detect_late_publishers=True, max_samples=keep) if with_history else None,
+        recovery=ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
+    )

@@ -1,0 +1,56 @@
+"""Tells this node's workers their roles: put on change, answered on demand.
+
+Knows: the newest role per task, the role keys of this node. Does not know: who decided, what a worker does with it.
+"""
+
+from __future__ import annotations
+
+import threading
+
+import zenoh
+from zenoh import CongestionControl, Priority, Query, Session
+
+from zsched import wire
+from zsched.core.model import NodeId, TaskId
+from zsched.core.plan import Role
+from zsched.keyspace import Keyspace
+
+
+class RoleServer:
+    """Serves ``role/<node>/*`` on the data session; a worker that starts late asks and knows at once."""
+
+    def __init__(self, session: Session, keyspace: Keyspace, node: NodeId) -> None:
+        self._session = session
+        self._keyspace = keyspace
+        self._node = node
+        self._roles: dict[TaskId, Role] = {}
+        self._queryable = session.declare_queryable(keyspace.role(node, "*"), zenoh.handlers.FifoChannel(256))
+        threading.Thread(target=self._serve, args=(self._queryable.handler,), name="roles", daemon=True).start()
+
+    def set(self, role: Role) -> None:
+        """Take and tell a task's newest role."""
+        self._roles[role.task] = role
+        self.tell(role.task)
+
+    def tell(self, task: TaskId) -> None:
+        """Put the task's role again (its worker has just appeared); nothing when there is none yet."""
+        role = self._roles.get(task)
+        if role is None:
+            return
+        self._session.put(
+            self._keyspace.role(self._node, task),
+            wire.encode(role),
+            priority=Priority.INTERACTIVE_HIGH,
+            congestion_control=CongestionControl.BLOCK_FIRST,
+        )
+
+    def _serve(self, handler: zenoh.handlers.Handler[Query]) -> None:
+        for query in handler:
+            self._answer(query)
+
+    def _answer(self, query: Query) -> None:
+        with query:  # a query that is kept alive hangs its asker
+            for task, role in tuple(self._roles.items()):
+                key = self._keyspace.role(self._node, task)
+                if query.key_expr.intersects(key):
+                    query.reply(key, wire.encode(role))

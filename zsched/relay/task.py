@@ -1,0 +1,303 @@
+"""Carries out the route plans of one task: opens, warms up, flips, drains and closes its slots, in its own thread.
+
+Knows: the newest plan, which slots are open and how far they are. Does not know: why the task moves; the executor's
+table decides that and how long anything may take (a plan is obeyed even when its worker is not ready).
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import zenoh
+from zenoh import Session
+
+from zsched.clock import monotonic_s
+from zsched.core.events import ProblemReported, SlotDrained, SlotFlipped, SlotReady
+from zsched.core.model import TaskId
+from zsched.core.plan import Direction, ReadyWhen, Route, RoutePhase, RoutePlan, Slot, StreamClass, StreamCount
+from zsched.core.relay_protocol import RelayReport
+from zsched.relay.inputs import InputStream
+from zsched.relay.outputs import OutputStream
+from zsched.relay.tokens import Tokens
+
+FLIP_WAIT_S: Final = 0.3
+"""A flip waits at most so long for a worker that is not ready, or has not heard yet that it is the owner."""
+GONE_GRACE_S: Final = 0.05
+"""An old owner whose token went has sent its last; what is still in our queues gets so long."""
+BUSY_S, REPEAT_S, IDLE_S = 0.01, 0.1, 0.5
+
+_log = logging.getLogger("zsched.relay")
+
+
+@dataclass(slots=True, eq=False)
+class _OpenSlot:
+    slot: Slot
+    tokens: frozenset[str] = frozenset()
+    is_ready: bool = False
+    is_flipped: bool = False
+    is_drained: bool = False
+    gone_at: float | None = None
+
+
+class TaskRelay:
+    """One task's streams on this node. Every method may be called from any thread; none blocks."""
+
+    def __init__(
+        self,
+        session: Session,
+        task: TaskId,
+        tokens: Tokens,
+        own_ids: frozenset[str],
+        report: Callable[[RelayReport], None],
+    ) -> None:
+        self._session = session
+        self._task = task
+        self._tokens = tokens
+        self._own_ids = own_ids
+        self._report = report
+        self._queue: queue.SimpleQueue[RoutePlan | None] = queue.SimpleQueue()
+        self._plan: RoutePlan | None = None
+        self._slots: dict[int, _OpenSlot] = {}
+        self._inputs: dict[str, InputStream] = {}
+        self._outputs: dict[str, OutputStream] = {}
+        self._flip_by: float | None = None
+        threading.Thread(target=self._run, name=f"task {task}", daemon=True).start()
+
+    def apply(self, plan: RoutePlan) -> None:
+        """Take the newest plan."""
+        self._queue.put(plan)
+
+    def wake(self) -> None:
+        """Something that readiness or draining hangs on has changed."""
+        self._queue.put(None)
+
+    def counts(self) -> tuple[StreamCount, ...]:
+        """The counters of every stream, by name."""
+        streams: list[InputStream | OutputStream] = [*self._inputs.values(), *self._outputs.values()]
+        return tuple(sorted((stream.count() for stream in streams), key=lambda count: count.stream))
+
+    # --- the thread --------------------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        while True:
+            try:
+                plan = self._queue.get(timeout=self._patience())
+            except queue.Empty:
+                plan = None
+            try:
+                if plan is not None:
+                    self._take(plan)
+                self._step()
+            except Exception as error:  # noqa: BLE001 - a bad plan must not end the task's thread
+                _log.exception("task %s", self._task)
+                self._problem(f"{type(error).__name__}: {error}")
+
+    def _patience(self) -> float:
+        current = self._current()
+        if current is None:
+            return IDLE_S
+        is_moving = not current.is_ready or self._flip_by is not None or self._draining() is not None
+        if is_moving:
+            return BUSY_S
+        return REPEAT_S if self._has_latest() else IDLE_S
+
+    def _step(self) -> None:
+        for state in tuple(self._slots.values()):
+            self._refresh(state)
+        self._flip_when_due()
+        self._drain()
+        self._repeat()
+
+    def _problem(self, text: str) -> None:
+        self._report(ProblemReported(source=f"relay/{self._task}", problem=text[:400]))
+
+    # --- plans -------------------------------------------------------------------------------------------------------
+
+    def _take(self, plan: RoutePlan) -> None:
+        self._plan = plan
+        self._flip_by = None
+        keeps_old = plan.phase is not RoutePhase.CLOSE
+        old = plan.predecessor if keeps_old else None
+        wanted = {slot.epoch: slot for slot in (old, plan.current) if slot is not None}
+        if plan.phase is RoutePhase.CLOSE and plan.current is not None:
+            self._open(plan.current)
+            self._flip(self._slots[plan.current.epoch])
+        for epoch, state in tuple(self._slots.items()):
+            if wanted.get(epoch) != state.slot:
+                self._close(epoch)
+        if old is not None and old.epoch not in self._slots:  # we were not there when it opened: it carries
+            self._open(old)
+            self._flip(self._slots[old.epoch], is_reported=False)
+        if plan.current is not None:
+            self._open(plan.current)
+        current = self._current()
+        if current is not None and plan.phase is RoutePhase.FLIP:
+            self._flip_by = monotonic_s() + FLIP_WAIT_S
+        if current is not None and plan.phase is RoutePhase.PREPARE and current.is_ready:
+            self._report(SlotReady(task=self._task, epoch=current.slot.epoch))  # asked again: say it again
+        self._forget_streams()
+
+    def _open(self, slot: Slot) -> None:
+        if slot.epoch in self._slots:
+            return
+        self._slots[slot.epoch] = _OpenSlot(slot=slot)
+        for route in slot.routes:
+            try:
+                self._open_route(slot.epoch, route)
+            except (ValueError, zenoh.ZError) as error:
+                self._problem(f"{route.stream}: {route.from_expr} -> {route.to_expr}: {error}")
+
+    def _open_route(self, epoch: int, route: Route) -> None:
+        if route.direction is Direction.INPUT:
+            source = self._inputs.get(route.stream)
+            if source is None or (source.route.from_expr, source.route.settings) != (route.from_expr, route.settings):
+                if source is not None:
+                    source.close()
+                source = self._inputs[route.stream] = InputStream(self._session, route, self._own_ids)
+            source.open(epoch, route)
+            return
+        sink = self._outputs.get(route.stream)
+        if sink is None or (sink.route.to_expr, sink.route.settings) != (route.to_expr, route.settings):
+            if sink is not None:
+                sink.close()
+            sink = self._outputs[route.stream] = OutputStream(self._session, route, self._own_ids, self.wake)
+        sink.open(epoch, route)
+
+    def _close(self, epoch: int) -> None:
+        self._slots.pop(epoch, None)
+        for source in self._inputs.values():
+            source.close_slot(epoch)
+        for sink in self._outputs.values():
+            sink.close_slot(epoch)
+
+    def _forget_streams(self) -> None:
+        """Close streams that no slot names any more; without any slot they stay, and with them the kept values."""
+        names = {route.stream for state in self._slots.values() for route in state.slot.routes}
+        if not names:
+            return
+        for stream in tuple(self._inputs):
+            if stream not in names:
+                self._inputs.pop(stream).close()
+        for stream in tuple(self._outputs):
+            if stream not in names:
+                self._outputs.pop(stream).close()
+
+    # --- readiness and warm-up ---------------------------------------------------------------------------------------
+
+    def _refresh(self, state: _OpenSlot) -> None:
+        slot = state.slot
+        needs_token = slot.ready_when is ReadyWhen.TOKEN
+        tokens = self._tokens.workers(slot.owner, self._task) if needs_token else frozenset()
+        state.gone_at = None if tokens or not needs_token else state.gone_at or monotonic_s()
+        is_ready = (bool(tokens) or not needs_token) and self._is_matching(slot)
+        is_new = is_ready and (not state.is_ready or bool(tokens - state.tokens))
+        has_changed = is_ready != state.is_ready
+        state.is_ready = is_ready
+        if is_ready:
+            state.tokens = tokens
+        is_current = state is self._current()
+        if is_new and (is_current or not self._is_flipped()):
+            self._warm_up(slot.epoch)
+        if has_changed and is_current:
+            self._report(SlotReady(task=self._task, epoch=slot.epoch, is_ready=is_ready))
+
+    def _is_matching(self, slot: Slot) -> bool:
+        return all(
+            self._inputs[route.stream].is_matching(slot.epoch)
+            for route in slot.routes
+            if route.direction is Direction.INPUT and route.stream in self._inputs
+        )
+
+    def _warm_up(self, epoch: int) -> None:
+        for source in self._inputs.values():
+            source.warm_up(epoch)
+
+    # --- flip and drain ----------------------------------------------------------------------------------------------
+
+    def _flip_when_due(self) -> None:
+        current = self._current()
+        if self._flip_by is None or current is None:
+            return
+        if not current.is_flipped and monotonic_s() < self._flip_by and not self._can_flip(current):
+            return
+        self._flip_by = None
+        self._flip(current)
+
+    def _can_flip(self, state: _OpenSlot) -> bool:
+        slot = state.slot
+        is_told = slot.ready_when is not ReadyWhen.TOKEN or self._tokens.is_active(slot.owner, self._task, slot.epoch)
+        return state.is_ready and is_told
+
+    def _flip(self, state: _OpenSlot, *, is_reported: bool = True) -> None:
+        if state.is_flipped:
+            return
+        epoch = state.slot.epoch
+        for sink in self._outputs.values():
+            sink.flip(epoch)
+        replayed = sum(source.flip(epoch) for source in self._inputs.values())
+        state.is_flipped = True
+        if not is_reported:
+            return
+        self._report(SlotFlipped(task=self._task, epoch=epoch, replayed=replayed))
+        olds = [old for old in self._slots if old < epoch]
+        if olds:  # a stalled old owner may hold these up for a lease: not in this thread
+            threading.Thread(target=self._send_ends, args=(olds,), name="ends", daemon=True).start()
+
+    def _send_ends(self, epochs: list[int]) -> None:
+        for epoch in epochs:
+            for source in tuple(self._inputs.values()):
+                try:
+                    source.send_end(epoch)
+                except (zenoh.ZError, RuntimeError) as error:  # the slot was closed meanwhile
+                    _log.info("%s: no end marker for epoch %d (%s)", source.route.stream, epoch, error)
+
+    def _drain(self) -> None:
+        state = self._draining()
+        if state is None:
+            return
+        epoch = state.slot.epoch
+        is_gone = state.gone_at is not None and monotonic_s() - state.gone_at > GONE_GRACE_S
+        ended = [is_gone or sink.has_ended(epoch) for sink in self._outputs.values()]
+        for sink, has_ended in zip(tuple(self._outputs.values()), ended, strict=True):
+            if has_ended:
+                sink.close_slot(epoch)
+        if all(ended):
+            state.is_drained = True
+            self._report(SlotDrained(task=self._task, epoch=epoch))
+
+    def _draining(self) -> _OpenSlot | None:
+        """The predecessor, while the current slot carries and it has not drained yet."""
+        current = self._current()
+        if current is None or not current.is_flipped:
+            return None
+        olds = [state for epoch, state in self._slots.items() if epoch < current.slot.epoch and not state.is_drained]
+        return olds[0] if olds else None
+
+    # --- small questions ---------------------------------------------------------------------------------------------
+
+    def _current(self) -> _OpenSlot | None:
+        if self._plan is None or self._plan.current is None:
+            return None
+        return self._slots.get(self._plan.current.epoch)
+
+    def _is_flipped(self) -> bool:
+        current = self._current()
+        return current is not None and current.is_flipped
+
+    def _has_latest(self) -> bool:
+        streams: list[InputStream | OutputStream] = [*self._inputs.values(), *self._outputs.values()]
+        return any(stream.route.settings.stream_class is StreamClass.LATEST for stream in streams)
+
+    def _repeat(self) -> None:
+        """Values for receivers that are not ours are put once more (ours recover a lost one by themselves)."""
+        for sink in self._outputs.values():
+            sink.repeat_if_silent()
+        current = self._current()
+        if current is not None and current.slot.ready_when is ReadyWhen.MATCHING:
+            for source in self._inputs.values():
+                source.repeat_if_silent()

@@ -1,0 +1,63 @@
+"""Watches the workers' liveliness tokens on the data network: who is ready, who works in which epoch.
+
+Knows: token keys, their coming and going. Does not know: slots, routes, what readiness leads to.
+
+The watch runs on the relay's data session on purpose: a worker declares its token there behind its subscribers, so who
+sees the token has also learnt of the subscriptions. (Zenoh's "matching" alone is true as soon as a recorder listens.)
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+import zenoh
+from zenoh import Sample, SampleKind, Session
+
+from zsched.core.model import NodeId, TaskId
+from zsched.core.relay_protocol import WorkerSeen
+from zsched.keyspace import Keyspace, parse
+
+WORKER, ROLE = "worker", "role"
+
+
+class Tokens:
+    """The tokens that are there now. ``on_worker`` hears of every worker's, ``wake`` of any change."""
+
+    def __init__(
+        self, session: Session, keyspace: Keyspace, on_worker: Callable[[WorkerSeen], None], wake: Callable[[], None]
+    ) -> None:
+        self._keyspace = keyspace
+        self._on_worker = on_worker
+        self._wake = wake
+        self._present: frozenset[str] = frozenset()  # replaced whole: readers need no lock
+        self._lock = threading.Lock()
+        selectors = (keyspace.worker("*", "*", "*"), f"{keyspace.role('*', '*')}/*")
+        self._watches = [
+            session.liveliness().declare_subscriber(selector, zenoh.handlers.FifoChannel(1024), history=True)
+            for selector in selectors
+        ]
+        for watch in self._watches:
+            threading.Thread(target=self._run, args=(watch.handler,), name="tokens", daemon=True).start()
+
+    def workers(self, node: NodeId, task: TaskId) -> frozenset[str]:
+        """The tokens of the node's workers for the task: one, or two while one restarts."""
+        prefix = self._keyspace.worker(node, task, "")
+        return frozenset(key for key in self._present if key.startswith(prefix))
+
+    def is_active(self, node: NodeId, task: TaskId, epoch: int) -> bool:
+        """True when the node's worker says that it works in that epoch."""
+        return f"{self._keyspace.role(node, task)}/{epoch}" in self._present
+
+    def _run(self, handler: zenoh.handlers.Handler[Sample]) -> None:
+        for sample in handler:
+            self._note(str(sample.key_expr), is_present=sample.kind == SampleKind.PUT)
+
+    def _note(self, key: str, *, is_present: bool) -> None:
+        with self._lock:
+            self._present = self._present | {key} if is_present else self._present - {key}
+        parsed = parse(key)
+        if parsed is not None and parsed.kind == WORKER and len(parsed.rest) == 2:
+            task, incarnation = parsed.rest
+            self._on_worker(WorkerSeen(node=parsed.owner, task=task, incarnation=incarnation, is_present=is_present))
+        self._wake()
