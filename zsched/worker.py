@@ -1,0 +1,355 @@
+"""The library a Python worker imports: its inputs, its epoch-stamped outputs, its role, its orderly end.
+
+Knows: the worker's side of a handover (token, role, end markers). Does not know: what the task computes, who decides.
+
+    with Worker.from_env() as worker:
+        out = worker.publisher("{prefix}/{epoch}/global_map", latest=True)
+        worker.subscribe(f"{worker.prefix}/*/map", on_map)
+        worker.ready()
+        while worker.wait(1.0):
+            ...
+
+Every sample goes through one dispatch thread, in order per key; zenoh's own threads only enqueue. A warm standby takes
+and processes its inputs like an owner, but its outputs go nowhere (`Output.put` answers ``False``). When the task moves
+away, each input ends with an in-band marker behind its last sample; when all inputs seen have ended and their samples
+are processed, the worker sends the same marker behind its last output: that is how the robots know that nothing is
+missing. By hand, without a daemon: ``Worker.from_env(standalone="my_task")``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import queue
+import signal
+import threading
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Any, Final, Self
+
+import zenoh
+from zenoh import ext
+
+from zsched import wire
+from zsched.clock import monotonic_s
+from zsched.core.plan import Role, WorkerRole
+from zsched.errors import ConfigError, WireError
+from zsched.keyspace import END_CHUNK, Keyspace
+from zsched.relay_pipe import decode_end
+from zsched.worker_inputs import Dispatcher, Input, Marker, Received
+from zsched.worker_outputs import Output
+
+__all__ = ["Output", "Received", "Worker"]
+
+CLOSE_S: Final = 0.7
+"""Closing a session towards a stopped peer can take seconds; so long we wait."""
+ROLE_RETRY_S: Final = 0.5
+_ENVIRONMENT: Final = ("ZSCHED_FLEET", "ZSCHED_NODE", "ZSCHED_TASK", "ZSCHED_INCARNATION", "ZSCHED_ZENOH_CONFIG")
+
+_log = logging.getLogger("zsched.worker")
+
+
+class Worker:
+    """One worker process on the data network. Use it as a context manager: leaving it closes the session."""
+
+    def __init__(
+        self,
+        *,
+        fleet: str,
+        node: str,
+        task: str,
+        incarnation: str,
+        zenoh_config: str,
+        is_standalone: bool = False,
+        drains_itself: bool = False,
+    ) -> None:
+        """Open the session (``zenoh_config``: JSON5 text). See `from_env` for the other arguments.
+
+        Raises:
+            ConfigError: zenoh refuses the configuration.
+        """
+        self.prefix = f"{node}/{task}"
+        self._keyspace = Keyspace(fleet)
+        self._node, self._task, self._incarnation = node, task, incarnation
+        self._drains_itself = drains_itself
+        self._is_standalone = is_standalone
+        self._lock = threading.Lock()
+        idle = Role(task=task, role=WorkerRole.IDLE)
+        self._role = Role(task=task, role=WorkerRole.ACTIVE, epoch=1) if is_standalone else idle
+        self._is_role_known = is_standalone
+        self._ended_epoch = -1
+        self._stop = threading.Event()
+        self._is_signalled = False
+        self._outputs: list[Output] = []
+        self._declared: list[Any] = []
+        self._errands: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._role_token: zenoh.LivelinessToken | None = None
+        self._token: zenoh.LivelinessToken | None = None
+        self._snapshot: Callable[[], bytes] | None = None
+        self._session = _open(zenoh_config)
+        self._dispatcher = Dispatcher(self._inputs_ended)
+        self._errand_thread = threading.Thread(target=self._run_errands, name="zsched errands", daemon=True)
+        self._errand_thread.start()
+        self._dispatcher.start()
+        if not is_standalone:
+            self._watch_role()
+
+    @classmethod
+    def from_env(
+        cls,
+        env: Mapping[str, str] = os.environ,
+        *,
+        standalone: str = "",
+        drains_itself: bool = False,
+        handles_signals: bool = True,
+    ) -> Self:
+        """The worker that the daemon's environment describes.
+
+        ``standalone`` names the task of a worker started by hand: without ``ZSCHED_*`` it is then the owner on node
+        ``local``, epoch 1, on zenoh's default session. ``drains_itself`` says that outputs also leave outside of the
+        input callbacks: the end markers then wait for `drained`. SIGTERM and SIGINT end `wait` (main thread only).
+
+        Raises:
+            ConfigError: a variable is missing, or the zenoh configuration cannot be read.
+        """
+        missing = [name for name in _ENVIRONMENT if not env.get(name)]
+        if missing and not (standalone and len(missing) == len(_ENVIRONMENT)):
+            raise ConfigError(
+                f"this worker has no {', '.join(missing)} in its environment: a worker is started by its node's "
+                "daemon (zsched up); to run it by hand, say --standalone (Worker.from_env(standalone=TASK))"
+            )
+        if missing:
+            worker = cls(
+                fleet="standalone",
+                node="local",
+                task=standalone,
+                incarnation="1",
+                zenoh_config="{}",
+                is_standalone=True,
+            )
+        else:
+            worker = cls(
+                fleet=env["ZSCHED_FLEET"],
+                node=env["ZSCHED_NODE"],
+                task=env["ZSCHED_TASK"],
+                incarnation=env["ZSCHED_INCARNATION"],
+                zenoh_config=_read(env["ZSCHED_ZENOH_CONFIG"]),
+                drains_itself=drains_itself,
+            )
+        if handles_signals and threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, worker._on_signal)
+            signal.signal(signal.SIGINT, worker._on_signal)
+        return worker
+
+    # --- what a worker does ------------------------------------------------------------------------------------------
+
+    @property
+    def role(self) -> Role:
+        """The newest role that this node's daemon has told us; idle until it has."""
+        return self._role
+
+    @property
+    def session(self) -> zenoh.Session:
+        """The data session, for what this library does not offer (never block in its callbacks)."""
+        return self._session
+
+    def subscribe(
+        self, key_expr: str, on_sample: Callable[[Received], None], keep_last: int | None = 1, depth: int = 4096
+    ) -> None:
+        """Take an input; call it before `ready`. ``{prefix}`` is filled in.
+
+        ``on_sample`` runs in the dispatch thread. When it falls behind, only the ``keep_last`` newest samples per key
+        wait (``None``: all, up to ``depth``, then the oldest go); end markers are never shown to it.
+        """
+        expr = key_expr.replace("{prefix}", self.prefix)
+        source = Input(on_sample=on_sample, keep_last=keep_last, depth=depth)
+        dispatcher = self._dispatcher
+        data = ext.declare_advanced_subscriber(
+            self._session,
+            expr,
+            lambda sample: dispatcher.put(source, sample),
+            recovery=ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
+        )
+        ends = self._session.declare_subscriber(f"{expr}/{END_CHUNK}", self._on_marker)
+        self._declared += [data, ends]
+
+    def publisher(self, template: str, *, latest: bool = False, reliable: bool = False, keep_last: int = 1) -> Output:
+        """An output; ``{prefix}`` and ``{epoch}`` are filled in, the epoch anew whenever this worker becomes the owner.
+
+        ``latest``: the last ``keep_last`` values are cached for who comes late and recovered when lost. ``reliable``:
+        a put waits for a slow receiver (up to a lease) instead of dropping.
+        """
+        output = Output(
+            self._session,
+            template.replace("{prefix}", self.prefix),
+            latest=latest,
+            reliable=reliable,
+            keep_last=keep_last,
+            epoch_now=self._epoch_now,
+        )
+        with self._lock:
+            self._outputs.append(output)
+        return output
+
+    def offer_snapshot(self, snapshot: Callable[[], bytes]) -> None:
+        """Offer this worker's state to its successor. Not carried yet: the function is kept and never called."""
+        self._snapshot = snapshot
+
+    def ready(self) -> None:
+        """Say that the inputs are declared: the token that the robots' relays wait for. Call it once."""
+        if self._is_standalone or self._token is not None:
+            return
+        key = self._keyspace.worker(self._node, self._task, self._incarnation)
+        self._token = self._session.liveliness().declare_token(key)
+
+    def wait(self, timeout_s: float | None = None) -> bool:
+        """Sleep at most so long; ``False`` as soon as the worker shall end."""
+        return not self._stop.wait(timeout_s)
+
+    def drained(self) -> None:
+        """Say that everything taken so far is published (only with ``drains_itself``): ends may go out now."""
+        role = self._role
+        if self._drains_itself and role.role is WorkerRole.DRAINING:
+            self._send_ends(role.epoch)
+
+    # --- the end -----------------------------------------------------------------------------------------------------
+
+    def stop(self) -> None:
+        """Let `wait` answer ``False`` (any thread)."""
+        self._stop.set()
+
+    def close(self) -> None:
+        """Close the session, within a second; after a signal the process ends here when zenoh would hold it longer."""
+        self._stop.set()
+        self._dispatcher.close()
+        self._errands.put(None)
+        closing = threading.Thread(target=self._close_session, name="zsched close", daemon=True)
+        closing.start()
+        closing.join(CLOSE_S)
+        if closing.is_alive() and self._is_signalled:
+            logging.shutdown()
+            os._exit(0)  # a stopped peer holds zenoh's close for seconds, and its threads hold the interpreter
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _close_session(self) -> None:
+        for entity in self._declared:  # advanced subscribers hold a closed session open otherwise
+            with contextlib.suppress(zenoh.ZError):
+                entity.undeclare()
+        with contextlib.suppress(zenoh.ZError):
+            self._session.close()  # type: ignore[no-untyped-call] # zenoh's stubs leave it untyped
+
+    def _on_signal(self, _signal: int, _frame: FrameType | None) -> None:
+        self._is_signalled = True
+        self._stop.set()
+
+    # --- role --------------------------------------------------------------------------------------------------------
+
+    def _watch_role(self) -> None:
+        key = self._keyspace.role(self._node, self._task)
+        watch = self._session.declare_subscriber(key, lambda sample: self._on_role(sample.payload))
+        self._declared.append(watch)
+        self._errands.put(self._ask_role)
+
+    def _ask_role(self) -> None:
+        """Ask until the first answer: our relay may start later than we do."""
+        key = self._keyspace.role(self._node, self._task)
+        while not self._is_role_known and not self._stop.is_set():
+            replies = self._session.get(key, consolidation=zenoh.ConsolidationMode.NONE, timeout=ROLE_RETRY_S)
+            for reply in replies:
+                if reply.ok is not None and not self._is_role_known:
+                    self._on_role(reply.ok.payload)
+            if not self._is_role_known:
+                self._stop.wait(0.05)
+
+    def _on_role(self, payload: zenoh.ZBytes) -> None:
+        try:
+            role = wire.decode(payload.to_bytes(), Role)
+        except WireError as error:
+            _log.warning("an unreadable role was ignored (%s)", error)
+            return
+        with self._lock:
+            before, self._role, self._is_role_known = self._role, role, True
+        if role != before:
+            self._errands.put(lambda: self._change_role(before, role))
+
+    def _change_role(self, before: Role, role: Role) -> None:
+        """Follow a new role: the token that says in which epoch we work; the ends of an epoch that was cut short."""
+        if before.epoch and before.epoch != role.epoch:
+            self._send_ends(before.epoch)
+        if role.role is WorkerRole.IDLE and before.epoch:
+            self._dispatcher.forget(before.epoch)
+        is_active = role.role is WorkerRole.ACTIVE
+        if self._role_token is not None and (not is_active or before.epoch != role.epoch):
+            self._role_token.undeclare()  # type: ignore[no-untyped-call] # zenoh's stubs leave it untyped
+            self._role_token = None
+        if is_active and self._role_token is None:
+            self._dispatcher.begin(role.epoch)
+            key = f"{self._keyspace.role(self._node, self._task)}/{role.epoch}"
+            self._role_token = self._session.liveliness().declare_token(key)
+
+    def _epoch_now(self) -> int | None:
+        """The epoch that outputs are stamped with, ``None`` while they go nowhere."""
+        role = self._role
+        if role.role is WorkerRole.IDLE or role.epoch <= self._ended_epoch:
+            return None
+        return role.epoch
+
+    # --- ends --------------------------------------------------------------------------------------------------------
+
+    def _on_marker(self, sample: zenoh.Sample) -> None:
+        marker = decode_end(sample.payload.to_bytes())
+        source = sample.source_info
+        if marker is None or source is None:
+            return
+        key = str(sample.key_expr).removesuffix(f"/{END_CHUNK}")
+        name = (key, str(source.source_id.zid), source.source_id.eid)
+        self._dispatcher.put_marker(Marker(name=name, end=marker, came_at=monotonic_s()))
+
+    def _inputs_ended(self, epoch: int) -> None:
+        """Every input seen in ``epoch`` has ended and is processed (dispatch thread)."""
+        if not self._drains_itself:
+            self._send_ends(epoch)
+
+    def _send_ends(self, epoch: int) -> None:
+        with self._lock:
+            if epoch <= self._ended_epoch:
+                return
+            self._ended_epoch = epoch
+            outputs = tuple(self._outputs)
+        self._errands.put(lambda: _end_all(outputs, epoch))
+
+    def _run_errands(self) -> None:
+        while (errand := self._errands.get()) is not None:
+            try:
+                errand()
+            except Exception:  # noqa: BLE001 - an errand that fails (session closing) must not end the others
+                if not self._stop.is_set():
+                    _log.exception("an errand failed")
+
+
+def _end_all(outputs: tuple[Output, ...], epoch: int) -> None:
+    for output in outputs:
+        output.send_end(epoch)
+
+
+def _open(zenoh_config: str) -> zenoh.Session:
+    try:
+        return zenoh.open(zenoh.Config.from_json5(zenoh_config))
+    except (zenoh.ZError, ValueError) as error:
+        raise ConfigError(f"the worker's zenoh session cannot be opened: {error}") from error
+
+
+def _read(path: str) -> str:
+    try:
+        return Path(path).read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"ZSCHED_ZENOH_CONFIG: {path} cannot be read: {error.strerror}") from error

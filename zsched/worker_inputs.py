@@ -1,0 +1,200 @@
+"""One queue and one thread for all inputs of a worker: order, shedding, and the end of an epoch's inputs.
+
+Knows: which samples wait, which sources are open, which have ended. Does not know: zenoh sessions, roles, outputs.
+
+An end marker travels behind the data on the same link but enters through another subscriber, so it may be seen first.
+It carries its source and how many samples that source put before it: it takes effect when the last of them has been
+processed, or, should some have been dropped on the way, a grace time after it came.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final
+
+import zenoh
+
+from zsched.clock import monotonic_s
+from zsched.core.relay_protocol import EndMarker
+
+END_GRACE_S: Final = 0.1
+JOIN_S: Final = 0.2
+
+SourceName = tuple[str, str, int]
+"""(key, session id, entity id) of a publisher as zenoh names it."""
+
+_log = logging.getLogger("zsched.worker")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Received:
+    """One input sample. ``payload`` and ``attachment`` are zenoh's own bytes (``to_bytes()`` copies)."""
+
+    key: str
+    payload: zenoh.ZBytes
+    attachment: zenoh.ZBytes | None = None
+    deleted: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Marker:
+    """An end marker and the source it ends."""
+
+    name: SourceName
+    end: EndMarker
+    came_at: float
+
+
+@dataclass(slots=True, eq=False)
+class Input:
+    """One subscription: where its samples go, how many may wait."""
+
+    on_sample: Callable[[Received], None]
+    keep_last: int | None = 1
+    depth: int = 4096
+    waiting: dict[str, deque[_Waiting]] = field(default_factory=dict)
+    shed: int = 0
+    """Samples that gave way to newer ones."""
+
+
+@dataclass(slots=True, eq=False)
+class _Waiting:
+    """A sample in the queue; ``None`` once a newer one has taken its place."""
+
+    source: Input
+    sample: zenoh.Sample | None
+
+
+@dataclass(slots=True)
+class _Open:
+    """A source that has sent something: its newest number, and the epoch it was first heard in (0: standby)."""
+
+    epoch: int
+    number: int = -1
+
+
+class Dispatcher:
+    """The worker's own thread. ``on_ended(epoch)`` is called in it when every input seen in the epoch has ended."""
+
+    def __init__(self, on_ended: Callable[[int], None]) -> None:
+        self._on_ended = on_ended
+        self._wake = threading.Condition()
+        self._queue: deque[_Waiting] = deque()
+        self._markers: list[Marker] = []
+        self._open: dict[SourceName, _Open] = {}
+        self._epoch = 0
+        self._is_closed = False
+        self._thread = threading.Thread(target=self._run, name="zsched dispatch", daemon=True)
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread behind the sample it has in hand."""
+        with self._wake:
+            self._is_closed = True
+            self._wake.notify()
+        if self._thread is not threading.current_thread():
+            self._thread.join(JOIN_S)
+
+    def put(self, source: Input, sample: zenoh.Sample) -> None:
+        """Queue a sample (zenoh's thread)."""
+        waiting = _Waiting(source, sample)
+        key = str(sample.key_expr)
+        with self._wake:
+            line = source.waiting.setdefault(key, deque())
+            line.append(waiting)
+            if len(line) > (source.keep_last or source.depth):
+                line.popleft().sample = None
+                source.shed += 1
+            self._queue.append(waiting)
+            self._wake.notify()
+
+    def put_marker(self, marker: Marker) -> None:
+        """Queue an end marker (zenoh's thread)."""
+        with self._wake:
+            self._markers.append(marker)
+            self._wake.notify()
+
+    def begin(self, epoch: int) -> None:
+        """This worker is the owner from now on: sources heard first from here on belong to ``epoch``."""
+        with self._wake:
+            self._epoch = epoch
+
+    def forget(self, epoch: int) -> None:
+        """The epoch is over for this worker: what has not ended will not."""
+        with self._wake:
+            self._open = {name: state for name, state in self._open.items() if state.epoch > epoch}
+
+    # --- the thread --------------------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        while True:
+            with self._wake:
+                if not self._queue and not self._is_closed:
+                    self._wake.wait(END_GRACE_S / 2 if self._markers else None)
+                if self._is_closed:
+                    return
+                waiting = self._queue.popleft() if self._queue else None
+                sample = self._claim(waiting)
+            if waiting is not None and sample is not None:
+                self._dispatch(waiting.source, sample)
+            if self._markers:
+                self._settle()
+
+    def _claim(self, waiting: _Waiting | None) -> zenoh.Sample | None:
+        """Take a sample out of its key's line (under the lock): from here on nothing sheds it."""
+        if waiting is None or waiting.sample is None:
+            return None
+        line = waiting.source.waiting[str(waiting.sample.key_expr)]
+        line.remove(waiting)
+        return waiting.sample
+
+    def _dispatch(self, source: Input, sample: zenoh.Sample) -> None:
+        key = str(sample.key_expr)
+        received = Received(
+            key=key,
+            payload=sample.payload,
+            attachment=sample.attachment,
+            deleted=sample.kind == zenoh.SampleKind.DELETE,
+        )
+        try:
+            source.on_sample(received)
+        except Exception:  # noqa: BLE001 - the worker's own bug must not end its dispatch
+            _log.exception("%s: the worker's callback failed", key)
+        info = sample.source_info
+        if info is None:
+            return
+        name = (key, str(info.source_id.zid), info.source_id.eid)
+        with self._wake:
+            state = self._open.get(name)
+            if state is None:
+                state = self._open[name] = _Open(epoch=self._epoch)
+            state.number = max(state.number, info.source_sn)
+
+    def _settle(self) -> None:
+        """Let every marker take effect whose samples are processed, then tell which epochs are over."""
+        now = monotonic_s()
+        with self._wake:
+            done = [marker for marker in self._markers if self._is_due(marker, now)]
+            for marker in done:
+                self._markers.remove(marker)
+                self._open.pop(marker.name, None)
+            over = sorted({marker.end.epoch for marker in done if self._is_over(marker.end.epoch)})
+        for epoch in over:
+            self._on_ended(epoch)
+
+    def _is_due(self, marker: Marker, now: float) -> bool:
+        state = self._open.get(marker.name)
+        number = state.number if state is not None else -1
+        if number + 1 >= marker.end.count:
+            return True
+        return not self._queue and now - marker.came_at > END_GRACE_S
+
+    def _is_over(self, epoch: int) -> bool:
+        return all(state.epoch > epoch for state in self._open.values())
