@@ -1,0 +1,180 @@
+"""Loops through relays and clashing writers are found, worker cycles are named, chains are left alone."""
+
+import random
+import time
+
+import pytest
+from zsched.core import keyexpr
+from zsched.core.fleet import StreamRule, TaskSpec
+from zsched.core.model import Tuning, Weights
+from zsched.core.plan import Direction
+from zsched.core.rulecheck import RuleConflict, rule_conflicts
+from zsched.core.templates import named_rules, routes_for
+
+ROBOTS = ("robot1", "robot2", "robot3")
+EDGES = ("edge1", "edge2")
+
+
+def task(
+    name: str,
+    inputs: tuple[tuple[str, str], ...] = (),
+    outputs: tuple[tuple[str, str], ...] = (),
+    candidates: tuple[str, ...] = EDGES,
+) -> TaskSpec:
+    pairs = [(Direction.INPUT, pair) for pair in inputs] + [(Direction.OUTPUT, pair) for pair in outputs]
+    return TaskSpec(
+        name=name,
+        candidates=candidates,
+        tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0)),
+        rules=tuple(StreamRule(direction=way, from_template=one, to_template=two) for way, (one, two) in pairs),
+    )
+
+
+def conflicts(*tasks: TaskSpec, robots: tuple[str, ...] = ROBOTS) -> tuple[RuleConflict, ...]:
+    return rule_conflicts(tasks, robots)
+
+
+MAP_IN = ("{robot}/map", "{target}/merge/{robot}/map")
+MAP_OUT = ("{target}/merge/{epoch}/map", "{robot}/global_map")
+
+
+def test_map_merging_has_no_conflict_even_with_robots_as_candidates() -> None:
+    assert conflicts(task("merge", (MAP_IN,), (MAP_OUT,), candidates=(*EDGES, *ROBOTS))) == ()
+
+
+def test_input_that_lands_on_a_candidate_robots_own_key_is_a_loop() -> None:
+    (found,) = conflicts(
+        task("t", (("{robot}/map", "{target}/map"),), candidates=("edge1", "robot1")), robots=ROBOTS[:1]
+    )
+    assert found.is_fatal
+    assert found.streams == ("t/in/0",)
+    assert "robot1/map -> robot1/map" in found.message
+
+
+def test_the_same_rule_towards_edges_only_is_no_loop() -> None:
+    assert conflicts(task("t", (("{robot}/map", "{target}/{robot}/map"),))) == ()
+
+
+def test_output_feeding_the_input_of_another_task_is_a_chain() -> None:
+    first = task("a", (("{robot}/scan", "{target}/a/{robot}/scan"),), (("{target}/a/{epoch}/map", "{robot}/map"),))
+    second = task("b", (("{robot}/map", "{target}/b/{robot}/map"),), (("{target}/b/{epoch}/plan", "{robot}/plan"),))
+    assert conflicts(first, second) == ()
+
+
+def test_cycle_through_workers_is_a_warning_with_all_its_rules() -> None:
+    first = task("a", (("{robot}/plan", "{target}/a/{robot}/plan"),), (("{target}/a/{epoch}/map", "{robot}/map"),))
+    second = task("b", (("{robot}/map", "{target}/b/{robot}/map"),), (("{target}/b/{epoch}/plan", "{robot}/plan"),))
+    (found,) = conflicts(first, second)
+    assert not found.is_fatal
+    assert set(found.streams) == {"a/in/0", "a/out/0", "b/in/0", "b/out/0"}
+
+
+def test_loop_of_relays_across_two_tasks_is_refused_with_both_rules() -> None:
+    first = task("a", (("{robot}/x", "{target}/ping/{robot}"),))
+    second = task("b", (), (("{target}/ping/{robot}", "{robot}/x"),))
+    (found,) = conflicts(first, second)
+    assert found.is_fatal
+    assert set(found.streams) == {"a/in/0", "b/out/0"}
+
+
+def test_two_rules_into_one_key_clash() -> None:
+    first = task("a", (), (("{target}/a/{epoch}/map", "{robot}/map"),))
+    second = task("b", (), (("{target}/b/{epoch}/map", "{robot}/map"),))
+    (found,) = conflicts(first, second)
+    assert found.is_fatal
+    assert found.streams == ("a/out/0", "b/out/0")
+
+
+def test_all_robots_into_one_key_clash_but_one_robot_does_not() -> None:
+    mixed = task("a", (("{robot}/image", "{target}/a/image"),))
+    (found,) = conflicts(mixed)
+    assert "add {robot}" in found.message
+    assert conflicts(mixed, robots=("robot1",)) == ()
+
+
+def test_names_that_meet_only_by_chance_are_found() -> None:
+    """A robot may be called like a chunk of another rule."""
+    first = task("a", (("{robot}/x", "{target}/{robot}/map"),))
+    second = task("b", (("{robot}/y", "{target}/merge/map"),), candidates=EDGES)
+    assert not any(found.streams == ("a/in/0", "b/in/0") for found in conflicts(first, second))
+    found = conflicts(first, second, robots=("merge",))
+    assert [one.streams for one in found] == [("a/in/0", "b/in/0")]
+
+
+def dumb_has_relay_loop(tasks: tuple[TaskSpec, ...], robots: tuple[str, ...]) -> bool:
+    """All routes of all robots and candidates, and a walk from each; epochs stand for each other."""
+    edges = [
+        (one.from_expr.replace("/9/", "/*/"), one.to_expr)
+        for each in tasks
+        for robot in robots
+        for candidate in each.candidates
+        for one in routes_for(each, robot, candidate, 9)
+    ]
+    after = {
+        at: [to for to in range(len(edges)) if keyexpr.intersects(edges[at][1], edges[to][0])]
+        for at in range(len(edges))
+    }
+    for start, reached in after.items():
+        seen, row = set[int](), list(reached)
+        while row:
+            here = row.pop()
+            if here == start:
+                return True
+            if here not in seen:
+                seen.add(here)
+                row.extend(after[here])
+    return False
+
+
+def test_loops_agree_with_a_dumb_second_implementation() -> None:
+    random_source = random.Random(7)
+    froms_in = ("{robot}/a", "{robot}/b", "x", "edge1/t/robot1", "{robot}/t/{robot}")
+    tos_in = ("{target}/t/{robot}", "{target}/a", "{target}/{robot}/b", "{target}/t/{robot}/a", "{target}/b")
+    froms_out = ("{target}/t/{robot}", "{target}/{epoch}/a", "{target}/a", "{target}/b")
+    tos_out = ("{robot}/a", "{robot}/b", "{robot}/t/{robot}", "{robot}/9/a")
+    seen = {True: 0, False: 0}
+    for _ in range(400):
+        tasks = tuple(
+            task(
+                name,
+                tuple(
+                    (random_source.choice(froms_in), random_source.choice(tos_in))
+                    for _ in range(random_source.randint(0, 2))
+                ),
+                tuple(
+                    (random_source.choice(froms_out), random_source.choice(tos_out))
+                    for _ in range(random_source.randint(0, 2))
+                ),
+                candidates=tuple(
+                    sorted(random_source.sample(("edge1", "robot1", "robot2"), random_source.randint(1, 3)))
+                ),
+            )
+            for name in ("p", "q")
+        )
+        expected = dumb_has_relay_loop(tasks, ROBOTS[:2])
+        found = any(one.is_fatal and one.message.startswith("loop") for one in conflicts(*tasks, robots=ROBOTS[:2]))
+        assert found == expected, [(name, rule) for each in tasks for name, rule in named_rules(each)]
+        seen[expected] += 1
+    assert min(seen.values()) > 40
+
+
+def test_a_large_fleet_is_checked_quickly() -> None:
+    robots = tuple(f"robot{number}" for number in range(40))
+    everybody = (*robots, *(f"edge{number}" for number in range(10)))
+    tasks = [
+        task(
+            f"t{number}",
+            (("{robot}/map", "{target}/{task}/{robot}/map"), ("{robot}/scan", "{target}/{task}/{robot}/scan")),
+            (("{target}/{task}/{epoch}/out", "{robot}/{task}/out"),),
+            candidates=everybody,
+        )
+        for number in range(5)
+    ]
+    start = time.perf_counter()
+    assert rule_conflicts(tasks, robots) == ()
+    assert time.perf_counter() - start < 10  # typically far below one second; the bound only catches a blow-up
+
+
+@pytest.mark.parametrize("robots", [(), ("robot1",)])
+def test_few_robots_are_no_problem(robots: tuple[str, ...]) -> None:
+    assert conflicts(task("merge", (MAP_IN,), (MAP_OUT,)), robots=robots) == ()

@@ -1,0 +1,138 @@
+"""Templates become routes; every placeholder has its place."""
+
+import doctest
+
+import pytest
+import zenoh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from zsched.core import keyexpr, templates
+from zsched.core.fleet import StreamRule, TaskSpec
+from zsched.core.model import Tuning, Weights
+from zsched.core.plan import Direction, StreamClass, StreamSettings
+from zsched.core.templates import fill, named_rules, routes_for, template_fault, widened
+
+IN, OUT = Direction.INPUT, Direction.OUTPUT
+
+
+def rule(direction: Direction, source: str, target: str) -> StreamRule:
+    return StreamRule(
+        direction=direction,
+        from_template=source,
+        to_template=target,
+        settings=StreamSettings(stream_class=StreamClass.LATEST),
+    )
+
+
+def task_of(*rules: StreamRule, name: str = "map_merge", candidates: tuple[str, ...] = ("edge1", "edge2")) -> TaskSpec:
+    return TaskSpec(
+        name=name,
+        candidates=candidates,
+        tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0)),
+        rules=rules,
+    )
+
+
+MAP = rule(IN, "{robot}/map", "{target}/{task}/{robot}/map")
+GLOBAL = rule(OUT, "{target}/{task}/{epoch}/global_map", "{robot}/global_map")
+STATUS = rule(OUT, "{target}/{task}/{epoch}/status", "{node}/{task}/status")
+
+
+def test_routes_for_fills_every_placeholder() -> None:
+    routes = routes_for(task_of(GLOBAL, MAP, STATUS), "robot2", "edge1", 7)
+    assert [(route.stream, route.from_expr, route.to_expr) for route in routes] == [
+        ("map_merge/in/0", "robot2/map", "edge1/map_merge/robot2/map"),
+        ("map_merge/out/0", "edge1/map_merge/7/global_map", "robot2/global_map"),
+        ("map_merge/out/1", "edge1/map_merge/7/status", "robot2/map_merge/status"),
+    ]
+    assert all(route.settings.stream_class is StreamClass.LATEST for route in routes)
+
+
+def test_stream_names_do_not_change_with_owner_and_epoch() -> None:
+    task = task_of(MAP, GLOBAL)
+    before = [route.stream for route in routes_for(task, "robot1", "edge1", 1)]
+    after = [route.stream for route in routes_for(task, "robot1", "edge2", 2)]
+    assert before == after == [name for name, _ in named_rules(task)]
+
+
+def test_output_key_of_a_robot_does_not_change_with_the_owner() -> None:
+    keys = {routes_for(task_of(GLOBAL), "robot1", owner, epoch)[0].to_expr for owner in "ab" for epoch in (1, 2)}
+    assert keys == {"robot1/global_map"}
+
+
+names = st.from_regex(r"[a-z0-9][a-z0-9_-]{0,10}", fullmatch=True)
+
+
+@settings(max_examples=300, deadline=None)
+@given(names, names, names, st.integers(min_value=0, max_value=2**53))
+def test_filled_rules_are_valid_and_within_what_they_may_become(robot: str, owner: str, name: str, epoch: int) -> None:
+    task = task_of(MAP, GLOBAL, STATUS, name=name, candidates=(owner,))
+    for route, (_, made_from) in zip(routes_for(task, robot, owner, epoch), named_rules(task), strict=True):
+        for expr, template in ((route.from_expr, made_from.from_template), (route.to_expr, made_from.to_template)):
+            zenoh.KeyExpr(expr)
+            assert not keyexpr.is_wild(expr)
+            assert keyexpr.includes(widened(template), expr)
+            assert keyexpr.includes(widened(template, robot=robot, node=robot, target=owner, task=name), expr)
+
+
+GOOD = [
+    (IN, "from", "{robot}/map"),
+    (IN, "from", "weather/now"),
+    (IN, "from", "0/{robot}/map/nav_msgs::msg::dds_::OccupancyGrid_/RIHS01_00"),
+    (IN, "to", "{target}/{task}/{robot}/map"),
+    (IN, "to", "p_{target}/{node}"),
+    (OUT, "from", "{target}/{task}/{epoch}/tf"),
+    (OUT, "from", "{target}/{task}/{robot}/tf"),
+    (OUT, "to", "{robot}/tf"),
+    (OUT, "to", "{node}/tf"),
+]
+BAD = [
+    (IN, "from", "{target}/map", "whoever owns"),
+    (IN, "from", "{epoch}/map", "only the 'from' of an output"),
+    (IN, "to", "x/{robot}/map", "lacks {target}"),
+    (IN, "to", "{target}/{epoch}/map", "only the 'from' of an output"),
+    (OUT, "from", "global_map", "lacks {target}"),
+    (OUT, "from", "{target}/e{epoch}/map", "whole chunk"),
+    (OUT, "from", "{target}/{epoch}/{epoch}/map", "whole chunk"),
+    (OUT, "to", "global_map", "lacks {robot}"),
+    (OUT, "to", "{robot}/{target}/map", "keeps its key"),
+    (OUT, "to", "{robot}/{}/map", "no placeholder {}"),
+    (OUT, "to", "{robt}/map", "no placeholder {robt}"),
+    (OUT, "to", "{robot/map", "brace"),
+    (OUT, "to", "{robot}}/map", "brace"),
+    (IN, "from", "@zsched/x/{robot}", "belong to zsched"),
+    (OUT, "to", "{robot}/map/@zsched/end", "belong to zsched"),
+    (IN, "from", "/{robot}/map", "empty chunk"),
+    (IN, "from", "{robot}/map#1", "'#'"),
+    (IN, "from", "{robot}/*/map", "wildcards"),
+    (IN, "to", "{target}/**", "wildcards"),
+    (IN, "from", "", "empty"),
+]
+
+
+@pytest.mark.parametrize(("direction", "side", "template"), GOOD)
+def test_template_in_its_place_is_fine(direction: Direction, side: str, template: str) -> None:
+    assert template_fault(template, direction, side) is None
+
+
+@pytest.mark.parametrize(("direction", "side", "template", "said"), BAD)
+def test_template_out_of_place_is_refused_with_the_reason(
+    direction: Direction, side: str, template: str, said: str
+) -> None:
+    assert said in (template_fault(template, direction, side) or "")
+
+
+@settings(max_examples=500, deadline=None)
+@given(st.text(alphabet="{}robtagepch/*$@#a", max_size=30), st.sampled_from((IN, OUT)), st.sampled_from(("from", "to")))
+def test_any_text_is_fine_or_refused_never_an_exception(template: str, direction: Direction, side: str) -> None:
+    if template_fault(template, direction, side) is None:
+        zenoh.KeyExpr(fill(template, robot="r", node="r", target="t", task="k", epoch="1"))
+
+
+def test_fill_without_a_name_raises() -> None:
+    with pytest.raises(KeyError):
+        fill("{robot}/map", target="edge1")
+
+
+def test_examples_in_the_module_hold() -> None:
+    assert doctest.testmod(templates).failed == 0
