@@ -73,8 +73,20 @@ class Keyspace:
         return self._key("register", elector, proposer)
 
     def allocation(self, node: NodeId) -> str:
-        """Put and queryable: the register values that ``node`` has learnt."""
+        """Put: the register values that ``node`` has learnt."""
         return self._key("allocation", node)
+
+    def learnt(self, node: NodeId, asker: NodeId) -> str:
+        """Queryable of ``node``: the same values, for one asker."""
+        return self._key("allocation", node, asker)
+
+    def all_puts(self) -> str:
+        """Selector over every put of every node (beat, profile, proposal, allocation)."""
+        return self._key("*", "*")
+
+    def all_questions(self, node: NodeId) -> str:
+        """Key expression of every question to ``node``: ``<kind>/<node>/<asker>``."""
+        return self._key("*", node, "*")
 
     def worker(self, node: NodeId, task: TaskId, incarnation: int | str) -> str:
         """Liveliness token of a worker on its data session: ready."""

@@ -21,7 +21,7 @@ from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import msgpack
 
-from zsched.core import messages, model, plan
+from zsched.core import messages, model, plan, snapshot
 from zsched.errors import WireError
 
 VERSION = 1
@@ -46,6 +46,7 @@ KINDS: dict[str, tuple[type, int]] = {
     "learnt": (messages.Learnt, LARGE),
     "set_weights": (messages.SetWeights, SMALL),
     "command_result": (messages.CommandResult, SMALL),
+    "status": (snapshot.Snapshot, LARGE),
     "state": (model.DurableState, LARGE),
     "role": (plan.Role, SMALL),
     "route_plan": (plan.RoutePlan, LARGE),

@@ -1,0 +1,365 @@
+"""The control session: beats, profiles, utilities, proposals and ballots over zenoh.
+
+Knows: zenoh, the control keys, the codec. Does not know: what any of it leads to.
+
+zenoh's callbacks only decode and enqueue (work in them would stall the process), every question is answered later, from
+the loop, by its number. A frame that is malformed, or whose key names another node than its content, becomes a
+`FrameDropped` event and nothing else. One subscriber and one queryable serve all kinds: three threads in all.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import logging
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import zenoh
+
+from zsched import wire
+from zsched.clock import monotonic_s
+from zsched.core import events as ev
+from zsched.core.messages import (
+    Accept,
+    Accepted,
+    CommandResult,
+    Learnt,
+    Prepare,
+    Promise,
+    Refused,
+    SetWeights,
+    Utilities,
+)
+from zsched.core.model import NAME, Beat, NodeId, Profile, Proposal
+from zsched.core.snapshot import Snapshot
+from zsched.errors import AdapterError, WireError
+from zsched.keyspace import Keyspace, parse
+
+QUESTION_TTL_S = 5.0
+MAX_QUESTIONS = 1024
+OPERATOR_TIMEOUT_S = 3.0
+
+Post = Callable[[ev.Event], None]
+log = logging.getLogger("zsched.bus")
+
+_PUTS: dict[str, type[Beat | Profile | Proposal | Learnt]] = {
+    "beat": Beat,
+    "profile": Profile,
+    "proposal": Proposal,
+    "allocation": Learnt,
+}
+
+
+def _event_of(value: Beat | Profile | Proposal | Learnt) -> tuple[NodeId, ev.Event]:
+    """(the node that the content names, the event)."""
+    if isinstance(value, Beat):
+        return value.node, ev.BeatReceived(beat=value)
+    if isinstance(value, Profile):
+        return value.node, ev.ProfileReceived(profile=value)
+    if isinstance(value, Proposal):
+        return value.voter, ev.ProposalReceived(proposal=value)
+    return value.node, ev.LearntReceived(learnt=value)
+
+
+class Questions:
+    """Open zenoh queries by number, until they are answered or too old."""
+
+    def __init__(self) -> None:
+        self._numbers = itertools.count(1)
+        self._open: dict[int, tuple[zenoh.Query, str, float]] = {}
+        self._lock = threading.Lock()
+
+    def keep(self, query: zenoh.Query, reply_key: str) -> int:
+        """Remember a query; the oldest ones are dropped when there are too many or they are too old."""
+        now = monotonic_s()
+        with self._lock:
+            number = next(self._numbers)
+            self._open[number] = (query, reply_key, now)
+            expired = [n for n, (_, _, at) in self._open.items() if now - at > QUESTION_TTL_S]
+            expired += list(self._open)[: max(len(self._open) - MAX_QUESTIONS, 0)]
+            dropped = [self._open.pop(n)[0] for n in expired if n in self._open]
+        for old in dropped:
+            old.drop()
+        return number
+
+    def answer(self, number: int, value: object) -> None:
+        """Reply and let go; too late is no error."""
+        with self._lock:
+            entry = self._open.pop(number, None)
+        if entry is None:
+            return
+        query, reply_key, _ = entry
+        try:
+            query.reply(reply_key, wire.encode(value))
+        finally:
+            query.drop()
+
+    def clear(self) -> None:
+        """Let go of everything (the session closes)."""
+        with self._lock:
+            entries, self._open = list(self._open.values()), {}
+        for query, _, _ in entries:
+            query.drop()
+
+
+class ControlBus:
+    """One node's control session. ``post`` must only enqueue; all other methods are called from the loop."""
+
+    def __init__(self, *, fleet: str, node: NodeId, incarnation: int, zenoh_config: str, post: Post) -> None:
+        self._keys = Keyspace(fleet)
+        self._node, self._incarnation = node, incarnation
+        self._config = zenoh_config
+        self._post = post
+        self._questions = Questions()
+        self._session: zenoh.Session | None = None
+        self._kept: list[Any] = []
+        self._publishers: dict[str, zenoh.Publisher] = {}
+
+    # --- life --------------------------------------------------------------------------------------------------------
+
+    def open(self) -> None:
+        """Open the session and declare everything.
+
+        Raises:
+            AdapterError: zenoh refuses (port taken, bad operator configuration).
+        """
+        zenoh.init_log_from_env_or("error")
+        try:
+            session = zenoh.open(zenoh.Config.from_json5(self._config))
+        except zenoh.ZError as error:
+            raise AdapterError(f"cannot open the control session: {error}; is its port taken?") from error
+        self._session = session
+        keys, node = self._keys, self._node
+        self._publishers = {
+            "beat": self._publisher(session, keys.beat(node), zenoh.Priority.REAL_TIME),
+            "profile": self._publisher(session, keys.profile(node), zenoh.Priority.INTERACTIVE_LOW),
+            "proposal": self._publisher(session, keys.proposal(node), zenoh.Priority.INTERACTIVE_HIGH),
+            "allocation": self._publisher(session, keys.allocation(node), zenoh.Priority.INTERACTIVE_HIGH),
+        }
+        token = keys.alive(node, self._incarnation)
+        # The token goes last: who sees it may ask, and must find the queryable.
+        self._kept = [
+            session.declare_subscriber(keys.all_puts(), self._on_sample),
+            session.declare_queryable(keys.all_questions(node), self._on_query),
+            session.liveliness().declare_subscriber(keys.alive("*", "*"), self._on_token, history=True),
+            session.liveliness().declare_token(token),
+        ]
+
+    def _publisher(self, session: zenoh.Session, key: str, priority: zenoh.Priority) -> zenoh.Publisher:
+        return session.declare_publisher(
+            key,
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=priority,
+            express=True,  # small and rare: not worth a batch's delay
+            allowed_destination=zenoh.Locality.REMOTE,
+        )
+
+    def close(self) -> None:
+        """Withdraw the token, then close; safe to call twice."""
+        session, self._session = self._session, None
+        if session is None:
+            return
+        for entity in reversed(self._kept):
+            with contextlib.suppress(zenoh.ZError):
+                entity.undeclare()
+        self._kept, self._publishers = [], {}
+        self._questions.clear()
+        with contextlib.suppress(zenoh.ZError):
+            session.close()
+
+    def peers(self) -> int:
+        """How many zenoh peers the session has a link to."""
+        return 0 if self._session is None else len(self._session.info.peers_zid())
+
+    # --- what comes in (zenoh's threads) -----------------------------------------------------------------------------
+
+    def _on_sample(self, sample: zenoh.Sample) -> None:
+        key = parse(str(sample.key_expr))
+        if key is None or key.kind not in _PUTS:
+            self._post(ev.FrameDropped(kind="key", reason="unknown"))
+            return
+        try:
+            value = wire.decode(sample.payload.to_bytes(), _PUTS[key.kind])
+        except WireError as error:
+            self._post(ev.FrameDropped(kind=key.kind, reason=error.reason))
+            return
+        owner, event = _event_of(value)
+        if owner != key.owner:
+            event = ev.FrameDropped(kind=key.kind, reason="foreign")
+        self._post(event)
+
+    def _on_token(self, sample: zenoh.Sample) -> None:
+        key = parse(str(sample.key_expr))
+        if key is None or key.kind != "alive" or len(key.rest) != 1 or not key.rest[0].isdigit():
+            self._post(ev.FrameDropped(kind="alive", reason="key"))
+            return
+        incarnation = int(key.rest[0])
+        if sample.kind == zenoh.SampleKind.PUT:
+            self._post(ev.TokenSeen(node=key.owner, incarnation=incarnation))
+        else:
+            self._post(ev.TokenLost(node=key.owner, incarnation=incarnation))
+
+    def _on_query(self, query: zenoh.Query) -> None:
+        chunks = str(query.key_expr).split("/")
+        kind, asker = chunks[2] if len(chunks) > 2 else "", chunks[-1]
+        try:
+            event = self._question(kind, asker, query)
+        except WireError as error:
+            event = ev.FrameDropped(kind=kind if NAME.fullmatch(kind) else "key", reason=error.reason)
+            query.drop()
+        self._post(event)
+
+    def _question(self, kind: str, asker: str, query: zenoh.Query) -> ev.Event:
+        """The event of one query; whoever answers it does so by number."""
+        if not NAME.fullmatch(asker):
+            raise WireError("key", "no asker")
+        payload = b"" if query.payload is None else query.payload.to_bytes()
+        keys, node = self._keys, self._node
+        if kind == "utility":
+            number = self._questions.keep(query, keys.utility(node, asker))
+            return ev.UtilityAsked(request=number, asker=asker)
+        if kind == "register":
+            value: Prepare | Accept = wire.decode(payload, Prepare, Accept)
+            number = self._questions.keep(query, keys.register(node, asker))
+            if isinstance(value, Prepare):
+                return ev.PrepareAsked(request=number, asker=asker, prepare=value)
+            return ev.AcceptAsked(request=number, asker=asker, accept=value)
+        if kind == "allocation":
+            return ev.LearntAsked(request=self._questions.keep(query, keys.learnt(node, asker)))
+        if kind == "status":
+            return ev.StatusAsked(request=self._questions.keep(query, keys.status(node, asker)))
+        if kind == "command":
+            command = wire.decode(payload, SetWeights)
+            number = self._questions.keep(query, keys.command(node, asker))
+            return ev.WeightsCommanded(request=number, command=command)
+        raise WireError("key", "unknown kind")
+
+    # --- what goes out (the loop) ------------------------------------------------------------------------------------
+
+    def publish(self, kind: str, value: object) -> None:
+        """Put one value under our own key of that kind (``beat``, ``profile``, ``proposal``, ``allocation``).
+
+        Raises:
+            AdapterError: the session is closed or refuses.
+        """
+        publisher = self._publishers.get(kind)
+        if publisher is None:
+            return
+        try:
+            publisher.put(wire.encode(value))
+        except zenoh.ZError as error:
+            raise AdapterError(f"cannot publish {kind}: {error}") from error
+
+    def answer(self, request: int, value: object) -> None:
+        """Answer a question of a peer or an operator."""
+        try:
+            self._questions.answer(request, value)
+        except (zenoh.ZError, WireError) as error:
+            raise AdapterError(f"cannot answer question {request}: {error}") from error
+
+    def ask_utilities(self, gather: int, deadline_s: float) -> None:
+        """One query to every robot; answers are posted as they come."""
+
+        def on_answer(owner: NodeId, value: Utilities) -> None:
+            if owner == value.voter:
+                self._post(ev.UtilityReceived(gather=gather, utilities=value))
+            else:
+                self._post(ev.FrameDropped(kind="utility", reason="foreign"))
+
+        self._ask(self._keys.utility("*", self._node), None, deadline_s, (Utilities,), on_answer, is_remote=True)
+
+    def ask_electors(self, question: Prepare | Accept, deadline_s: float) -> None:
+        """One query to every elector, ourselves included; answers are posted as they come."""
+
+        def on_answer(owner: NodeId, value: Promise | Accepted | Refused) -> None:
+            if owner == value.elector:
+                self._post(ev.ElectorAnswered(answer=value))
+            else:
+                self._post(ev.FrameDropped(kind="register", reason="foreign"))
+
+        kinds = (Promise, Accepted, Refused)
+        self._ask(self._keys.register("*", self._node), wire.encode(question), deadline_s, kinds, on_answer)
+
+    def ask_learnt(self, peer: NodeId, deadline_s: float) -> None:
+        """Ask one peer for what it has learnt."""
+
+        def on_answer(owner: NodeId, value: Learnt) -> None:
+            if owner == value.node:
+                self._post(ev.LearntReceived(learnt=value))
+
+        self._ask(self._keys.learnt(peer, self._node), None, deadline_s, (Learnt,), on_answer, is_remote=True)
+
+    def _ask(
+        self,
+        selector: str,
+        payload: bytes | None,
+        deadline_s: float,
+        classes: tuple[type[Any], ...],
+        on_answer: Callable[[NodeId, Any], None],
+        *,
+        is_remote: bool = False,
+    ) -> None:
+        def on_reply(reply: zenoh.Reply) -> None:
+            sample = reply.ok
+            if sample is None:
+                return  # the deadline passed for somebody: the core counts answers, not silences
+            key = parse(str(sample.key_expr))
+            try:
+                value = wire.decode(sample.payload.to_bytes(), *classes)
+            except WireError as error:
+                self._post(ev.FrameDropped(kind=key.kind if key is not None else "key", reason=error.reason))
+                return
+            if key is not None:
+                on_answer(key.owner, value)
+
+        if self._session is None:
+            return
+        try:
+            self._session.get(
+                selector,
+                on_reply,
+                payload=payload,
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,  # the default withholds all answers for a frozen peer
+                timeout=deadline_s,
+                priority=zenoh.Priority.INTERACTIVE_HIGH,
+                express=True,
+                allowed_destination=zenoh.Locality.REMOTE if is_remote else zenoh.Locality.ANY,
+            )
+        except zenoh.ZError as error:
+            raise AdapterError(f"cannot ask {selector}: {error}") from error
+
+    # --- for operators (a thread of their own) -----------------------------------------------------------------------
+
+    def ask_node(self, node: NodeId, command: SetWeights | None) -> Snapshot | CommandResult:
+        """Ask another node for its status, or give it a command; blocks up to 3 s, never called from the loop.
+
+        Raises:
+            AdapterError: it did not answer.
+        """
+        if self._session is None:
+            raise AdapterError("the control session is closed")
+        if command is None:
+            selector, payload = self._keys.status(node, self._node), None
+        else:
+            selector, payload = self._keys.command(node, self._node), wire.encode(command)
+        answer: Snapshot | CommandResult
+        for reply in self._session.get(
+            selector,
+            payload=payload,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=OPERATOR_TIMEOUT_S,
+        ):
+            if reply.ok is None:
+                continue
+            try:
+                if command is None:
+                    answer = wire.decode(reply.ok.payload.to_bytes(), Snapshot)
+                else:
+                    answer = wire.decode(reply.ok.payload.to_bytes(), CommandResult)
+            except WireError as error:
+                raise AdapterError(f"{node} answered something else ({error}); is it another version?") from error
+            return answer
+        raise AdapterError(f"{node} did not answer within {OPERATOR_TIMEOUT_S:g} s; is it up and reachable?")
