@@ -23,6 +23,8 @@ TaskId = str
 NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}")
 MAX_COUNTER = 2**53
 """Largest revision, epoch, incarnation or sequence number (exact in every language's float)."""
+MAX_CPU_CORES, MAX_MEMORY_MB, MAX_BITRATE_MBPS = 4096.0, 1e8, 1e6
+"""What no machine or link exceeds: a larger figure is a fault of whoever measured or sent it."""
 
 
 def check_name(field: str, value: str) -> None:
@@ -129,7 +131,7 @@ class Link:
         if self.peer is not None:
             check_name("link.peer", self.peer)
         check_range("link.rssi_dbm", self.rssi_dbm, RSSI_MIN_DBM, RSSI_MAX_DBM)
-        check_range("link.bitrate_mbps", self.bitrate_mbps, 0.0, 1e6)
+        check_range("link.bitrate_mbps", self.bitrate_mbps, 0.0, MAX_BITRATE_MBPS)
         check_range("link.retry_ratio", self.retry_ratio, 0.0, 1.0)
 
 
@@ -153,8 +155,8 @@ class WorkerLoad:
 
     def __post_init__(self) -> None:
         check_name("worker.task", self.task)
-        check_range("worker.cpu_cores", self.cpu_cores, 0.0, 4096.0)
-        check_range("worker.memory_mb", self.memory_mb, 0.0, 1e8)
+        check_range("worker.cpu_cores", self.cpu_cores, 0.0, MAX_CPU_CORES)
+        check_range("worker.memory_mb", self.memory_mb, 0.0, MAX_MEMORY_MB)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -208,10 +210,10 @@ class Profile:
         check_name("profile.node", self.node)
         check_counter("profile.incarnation", self.incarnation)
         check_counter("profile.sequence", self.sequence)
-        check_range("profile.cpu_cores", self.cpu_cores, 0.001, 4096.0)
-        check_range("profile.cpu_used_cores", self.cpu_used_cores, 0.0, 4096.0)
-        check_range("profile.memory_mb", self.memory_mb, 1.0, 1e8)
-        check_range("profile.memory_used_mb", self.memory_used_mb, 0.0, 1e8)
+        check_range("profile.cpu_cores", self.cpu_cores, 0.001, MAX_CPU_CORES)
+        check_range("profile.cpu_used_cores", self.cpu_used_cores, 0.0, MAX_CPU_CORES)
+        check_range("profile.memory_mb", self.memory_mb, 1.0, MAX_MEMORY_MB)
+        check_range("profile.memory_used_mb", self.memory_used_mb, 0.0, MAX_MEMORY_MB)
 
     def worker(self, task: TaskId) -> WorkerLoad | None:
         """The load of ``task``'s worker on this node, or ``None`` when the node runs none."""

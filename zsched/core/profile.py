@@ -15,6 +15,9 @@ from collections import deque
 
 from zsched.core.fleet import Timing
 from zsched.core.model import (
+    MAX_BITRATE_MBPS,
+    MAX_CPU_CORES,
+    MAX_MEMORY_MB,
     DeviceSample,
     Link,
     LinkSample,
@@ -61,6 +64,13 @@ class Ewma:
         self._at = now
         return self.value
 
+    def share(self) -> Ewma:
+        """The mean of a part of what this one smooths, which was nothing so far."""
+        part = Ewma(self.tau_s)
+        if self.value is not None:
+            part.update(0.0, self._at)
+        return part
+
 
 class SignalFilter:
     """Drops impossible values and outliers of one radio link, and smooths the rest in dBm."""
@@ -104,6 +114,7 @@ class Profiler:
         self._memory = Ewma(timing.smoothing_s)
         self._signals: dict[NodeId | None, SignalFilter] = {}
         self._worker_cpu: dict[TaskId, Ewma] = {}
+        self._worker_memory: dict[TaskId, Ewma] = {}
         self._device: DeviceSample | None = None
         self._links: tuple[Link, ...] = ()
         self._workers: tuple[WorkerLoad, ...] = ()
@@ -114,12 +125,12 @@ class Profiler:
     def absorb(self, device: DeviceSample, links: tuple[LinkSample, ...], now: float) -> None:
         """Take one reading of the machine and its links in."""
         self._device = device
-        if device.cpu_used_cores is not None:
-            self._cpu.update(max(device.cpu_used_cores, 0.0), now)
-        if device.memory_used_mb is not None:
-            self._memory.update(max(device.memory_used_mb, 0.0), now)
+        worker_cpu = {load.task: load.cpu_cores for load in device.workers}
+        worker_memory = {load.task: load.memory_mb for load in device.workers}
+        _absorb_use(self._cpu, self._worker_cpu, device.cpu_used_cores, worker_cpu, MAX_CPU_CORES, now)
+        _absorb_use(self._memory, self._worker_memory, device.memory_used_mb, worker_memory, MAX_MEMORY_MB, now)
         self._links = tuple(self._link(sample, now) for sample in links)
-        self._workers = tuple(self._worker(load, now) for load in device.workers)
+        self._workers = tuple(self._worker(load) for load in device.workers)
 
     def _link(self, sample: LinkSample, now: float) -> Link:
         rssi = None
@@ -130,16 +141,18 @@ class Profiler:
             source=sample.source,
             peer=sample.peer,
             rssi_dbm=rssi,
-            bitrate_mbps=sample.bitrate_mbps,
-            retry_ratio=sample.retry_ratio,
+            bitrate_mbps=_possible(sample.bitrate_mbps, MAX_BITRATE_MBPS),
+            retry_ratio=_possible(sample.retry_ratio, 1.0),
         )
 
-    def _worker(self, load: WorkerLoad, now: float) -> WorkerLoad:
-        # Smoothed like the machine's own figure: what is subtracted must be as slow as what it is subtracted from.
-        cpu = load.cpu_cores
-        if cpu is not None:
-            cpu = self._worker_cpu.setdefault(load.task, Ewma(self._timing.smoothing_s)).update(cpu, now)
-        return WorkerLoad(task=load.task, state=load.state, cpu_cores=cpu, memory_mb=load.memory_mb)
+    def _worker(self, load: WorkerLoad) -> WorkerLoad:
+        cpu, memory = self._worker_cpu.get(load.task), self._worker_memory.get(load.task)
+        return WorkerLoad(
+            task=load.task,
+            state=load.state,
+            cpu_cores=None if cpu is None else cpu.value,
+            memory_mb=None if memory is None else memory.value,
+        )
 
     def publishable(self, states: dict[TaskId, WorkerState], *, is_draining: bool, now: float) -> Profile | None:
         """The profile to send now, or ``None`` when nothing is due.
@@ -186,12 +199,40 @@ class Profiler:
         )
 
 
+def _absorb_use(
+    whole: Ewma,
+    shares: dict[TaskId, Ewma],
+    used: float | None,
+    parts: dict[TaskId, float | None],
+    high: float,
+    now: float,
+) -> None:
+    """Smooth what is in use on the machine, and each worker's share of it, in step.
+
+    What is subtracted must be as slow as what it is subtracted from, and see the same samples: a worker without a
+    figure (stopped, just started) uses nothing for that sample. So whole minus share is the smoothed rest, and a
+    worker's start or end makes its node look neither better nor worse.
+    """
+    used = _possible(used, high)
+    if used is None:
+        return
+    for task in {**shares, **parts}:
+        part = _possible(parts.get(task), high)
+        if part is not None and task not in shares:
+            shares[task] = whole.share()
+        if task in shares:
+            shares[task].update(part or 0.0, now)
+    whole.update(used, now)
+
+
+def _possible(value: float | None, high: float) -> float | None:
+    """``value`` when it is in [0, ``high``], else ``None``: what a driver makes up is not measured (NaN included)."""
+    return value if value is not None and 0.0 <= value <= high else None
+
+
 def _differs(new: Profile, old: Profile) -> bool:
     """Whether a robot might decide otherwise by ``new`` than by ``old``."""
-    if (new.draining, [(w.task, w.state) for w in new.workers]) != (
-        old.draining,
-        [(w.task, w.state) for w in old.workers],
-    ):
+    if _kinds(new) != _kinds(old):
         return True
     if _moved(new.cpu_used_cores, old.cpu_used_cores, RATIO_CHANGE * new.cpu_cores):
         return True
@@ -199,6 +240,12 @@ def _differs(new: Profile, old: Profile) -> bool:
         return True
     before = {link.peer: link.rssi_dbm for link in old.links}
     return any(_moved(link.rssi_dbm, before.get(link.peer), RSSI_CHANGE_DB) for link in new.links)
+
+
+def _kinds(profile: Profile) -> tuple[object, ...]:
+    """What is no figure: every change of it counts."""
+    workers = [(load.task, load.state) for load in profile.workers]
+    return profile.draining, workers, [(link.peer, link.source) for link in profile.links]
 
 
 def _moved(new: float | None, old: float | None, threshold: float) -> bool:

@@ -1,0 +1,170 @@
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import FrozenInstanceError, fields, is_dataclass
+
+import pytest
+from zsched.core import model
+from zsched.core.model import (
+    MAX_COUNTER,
+    NO_BALLOT,
+    Allocation,
+    Ballot,
+    Beat,
+    Link,
+    LinkSource,
+    Profile,
+    Proposal,
+    Tuning,
+    Utility,
+    UtilityVector,
+    Weights,
+    WorkerLoad,
+    WorkerState,
+    check_name,
+    check_range,
+)
+
+EVEN = Weights(cpu=0.5, memory=0.25, network=0.25)
+
+
+def make_profile(
+    *, node: str = "edge1", cpu_cores: float = 4.0, cpu_used: float | None = 1.0, memory_mb: float = 4000.0
+) -> Profile:
+    return Profile(
+        node=node,
+        incarnation=1,
+        sequence=0,
+        cpu_cores=cpu_cores,
+        cpu_used_cores=cpu_used,
+        memory_mb=memory_mb,
+        memory_used_mb=None,
+        workers=(WorkerLoad(task="merge", state=WorkerState.READY),),
+    )
+
+
+def make_allocation(*, revision: int = 0, epoch: int = 0, owner: str | None = None) -> Allocation:
+    return Allocation(task="merge", revision=revision, epoch=epoch, owner=owner, tuning=Tuning(weights=EVEN))
+
+
+def make_proposal(*, voter: str = "robot1", aggregate: float = 0.5) -> Proposal:
+    return Proposal(voter=voter, task="merge", base_revision=0, candidate="edge1", aggregate=aggregate)
+
+
+def make_beat(*, node: str = "edge1", sequence: int = 0, lag: float = 0.0) -> Beat:
+    return Beat(node=node, incarnation=0, sequence=sequence, loop_lag_s=lag)
+
+
+def make_load(cpu: float | None, memory: float | None) -> WorkerLoad:
+    return WorkerLoad(task="merge", state=WorkerState.READY, cpu_cores=cpu, memory_mb=memory)
+
+
+@pytest.mark.parametrize("name", ["a", "0", "robot1", "edge-1_b", "a" * 63])
+def test_names_of_the_alphabet_pass(name: str) -> None:
+    check_name("node", name)
+
+
+@pytest.mark.parametrize("name", ["", "-a", "_a", "Edge", "a/b", "a*", "a" * 64, "edge 1", "edge1\n", "é"])
+def test_other_names_are_refused_with_the_field_named(name: str) -> None:
+    with pytest.raises(ValueError, match=r"^node: "):
+        check_name("node", name)
+
+
+def test_not_measured_passes_a_range_and_nan_does_not() -> None:
+    check_range("x", None, 0.0, 1.0)
+    check_range("x", 0.0, 0.0, 1.0)
+    check_range("x", 1.0, 0.0, 1.0)
+    for bad in (math.nan, math.inf, -math.inf, -0.1, 1.1):
+        with pytest.raises(ValueError, match=r"^x: .* is not in \[0, 1\]"):
+            check_range("x", bad, 0.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("build", "field"),
+    [
+        (lambda: Weights(cpu=1.1, memory=0.0, network=-0.1), "weights.cpu"),
+        (lambda: Weights(cpu=0.5, memory=-0.5, network=1.0), "weights.memory"),
+        (lambda: Weights(cpu=0.5, memory=0.5, network=math.nan), "weights.network"),
+        (lambda: Weights(cpu=0.5, memory=0.5, network=0.5), "weights: the sum is 1.5"),
+        (lambda: Weights(cpu=0.0, memory=0.0, network=0.0), "weights: the sum is 0"),
+        (lambda: Weights(cpu=0.5, memory=0.5, network=2e-6), "weights: the sum"),
+        (lambda: Tuning(weights=EVEN, bonus=-0.01), "bonus"),
+        (lambda: Tuning(weights=EVEN, bonus=1.01), "bonus"),
+        (lambda: Tuning(weights=EVEN, time_to_trigger_s=-1.0), "time_to_trigger_s"),
+        (lambda: Tuning(weights=EVEN, time_to_trigger_s=3601.0), "time_to_trigger_s"),
+        (lambda: Tuning(weights=EVEN, cool_down_s=-1.0), "cool_down_s"),
+        (lambda: Tuning(weights=EVEN, cool_down_s=86401.0), "cool_down_s"),
+        (lambda: Link(source=LinkSource.FIXED, rssi_dbm=1.0), "link.rssi_dbm"),
+        (lambda: Link(source=LinkSource.FIXED, rssi_dbm=-121.0), "link.rssi_dbm"),
+        (lambda: Link(source=LinkSource.FIXED, bitrate_mbps=-1.0), "link.bitrate_mbps"),
+        (lambda: Link(source=LinkSource.FIXED, retry_ratio=1.1), "link.retry_ratio"),
+        (lambda: Link(source=LinkSource.FIXED, peer="Not A Name"), "link.peer"),
+        (lambda: make_load(-1.0, None), "worker.cpu_cores"),
+        (lambda: make_load(None, -1.0), "worker.memory_mb"),
+        (lambda: make_profile(node="Edge"), "profile.node"),
+        (lambda: make_profile(cpu_cores=0.0), "profile.cpu_cores"),
+        (lambda: make_profile(cpu_used=-0.1), "profile.cpu_used_cores"),
+        (lambda: make_profile(cpu_used=math.nan), "profile.cpu_used_cores"),
+        (lambda: make_profile(memory_mb=0.5), "profile.memory_mb"),
+        (lambda: Utility(candidate="edge1", value=1.01), "utility.value"),
+        (lambda: Utility(candidate="edge1", value=0.5, network=-0.1), "utility.network"),
+        (lambda: UtilityVector(voter="", task="merge", revision=0, utilities=()), "vector.voter"),
+        (lambda: UtilityVector(voter="robot1", task="merge", revision=-1, utilities=()), "vector.revision"),
+        (lambda: make_proposal(aggregate=2.1), "proposal.aggregate"),
+        (lambda: make_proposal(voter="*"), "proposal.voter"),
+        (lambda: make_allocation(revision=-1), "allocation.revision"),
+        (lambda: make_allocation(epoch=MAX_COUNTER + 1), "allocation.epoch"),
+        (lambda: make_allocation(owner=""), "allocation.owner"),
+        (lambda: Ballot(counter=-1, node="a", incarnation=0), "ballot.counter"),
+        (lambda: Ballot(counter=0, node="A", incarnation=0), "ballot.node"),
+        (lambda: make_beat(node="a b"), "beat.node"),
+        (lambda: make_beat(sequence=-1), "beat.sequence"),
+        (lambda: make_beat(lag=math.nan), "beat.loop_lag_s"),
+    ],
+)
+def test_out_of_range_is_refused_with_the_field_named(build: Callable[[], object], field: str) -> None:
+    with pytest.raises(ValueError, match=f"^{field}"):
+        build()
+
+
+def test_weights_sum_to_one_within_float_error() -> None:
+    assert Weights(cpu=0.1, memory=0.2, network=0.7).network == 0.7
+    third = 1 / 3
+    assert Weights(cpu=third, memory=third, network=third).cpu == third
+
+
+def test_owner_with_its_bonus_may_pass_one() -> None:
+    assert make_proposal(aggregate=1.1).aggregate == 1.1
+
+
+def test_ballots_are_ordered_by_counter_then_node_then_incarnation() -> None:
+    ordered = [
+        NO_BALLOT,
+        Ballot(counter=1, node="a", incarnation=9),
+        Ballot(counter=1, node="b", incarnation=1),
+        Ballot(counter=1, node="b", incarnation=2),
+        Ballot(counter=2, node="a", incarnation=1),
+    ]
+
+    assert all(a < b for a, b in itertools.pairwise(ordered))
+
+
+def test_profile_finds_a_task_s_worker_or_none() -> None:
+    profile = make_profile()
+
+    assert profile.worker("merge") == WorkerLoad(task="merge", state=WorkerState.READY)
+    assert profile.worker("other") is None
+
+
+def test_values_are_frozen_slotted_and_keyword_only() -> None:
+    """No object is ever shared with an adapter that could change it."""
+    values = [cls for cls in vars(model).values() if isinstance(cls, type) and is_dataclass(cls)]
+    assert len(values) > 15
+    for cls in values:
+        assert "__slots__" in vars(cls), cls
+        assert all(field.kw_only for field in fields(cls)), cls
+    profile = make_profile()
+    with pytest.raises(FrozenInstanceError):
+        profile.sequence = 2  # type: ignore[misc]  # that is the point

@@ -1,0 +1,317 @@
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+from zsched.core.fleet import Timing
+from zsched.core.model import DeviceSample, LinkSample, LinkSource, Profile, WorkerLoad, WorkerState
+from zsched.core.profile import (
+    LINK_STALE_S,
+    RATIO_CHANGE,
+    RSSI_CHANGE_DB,
+    RSSI_OUTLIER_DB,
+    Ewma,
+    Profiler,
+    SignalFilter,
+)
+
+TIMING = Timing()
+READY = {"merge": WorkerState.READY}
+
+
+def load(cpu: float | None, memory: float | None = None, state: WorkerState = WorkerState.READY) -> WorkerLoad:
+    return WorkerLoad(task="merge", state=state, cpu_cores=cpu, memory_mb=memory)
+
+
+def device(cpu: float | None = 1.0, memory: float | None = 1000.0, *workers: WorkerLoad) -> DeviceSample:
+    return DeviceSample(cpu_cores=4.0, cpu_used_cores=cpu, memory_mb=4000.0, memory_used_mb=memory, workers=workers)
+
+
+def radio(rssi: float | None, peer: str | None = None) -> LinkSample:
+    return LinkSample(source=LinkSource.NL80211, peer=peer, rssi_dbm=rssi)
+
+
+def make_profiler(timing: Timing = TIMING) -> Profiler:
+    return Profiler("edge1", 3, timing)
+
+
+def taken(profiler: Profiler, now: float, states: dict[str, WorkerState] | None = None) -> Profile:
+    """A profile that is due because of its time."""
+    profile = profiler.publishable(READY if states is None else states, is_draining=False, now=now)
+    assert profile is not None
+    return profile
+
+
+# --- smoothing by elapsed time -------------------------------------------------------------------------------------
+
+
+def test_first_sample_is_taken_as_it_is() -> None:
+    assert Ewma(3.0).update(0.7, now=100.0) == 0.7
+
+
+def test_a_step_is_followed_by_63_percent_in_one_time_constant_whatever_the_rate() -> None:
+    """alpha = 1 - exp(-dt / tau): samples at uneven times give the same mean as samples at even ones."""
+    for times in ((3.0,), (0.5, 3.0), tuple(0.2 * i for i in range(1, 16)), (0.01, 2.9, 2.95, 3.0)):
+        mean = Ewma(3.0)
+        mean.update(0.0, now=0.0)
+        for at in times:
+            mean.update(1.0, now=at)
+        assert mean.value == pytest.approx(1 - math.exp(-1.0))
+
+
+def test_no_time_constant_means_no_smoothing_and_no_elapsed_time_no_weight() -> None:
+    raw = Ewma(0.0)
+    raw.update(1.0, now=0.0)
+    assert raw.update(5.0, now=0.0) == 5.0
+    smooth = Ewma(3.0)
+    smooth.update(1.0, now=1.0)
+    assert smooth.update(5.0, now=1.0) == 1.0
+    assert smooth.update(5.0, now=0.5) == 1.0, "a clock that stands is no reason for a jump"
+
+
+# --- signals -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("impossible", [-2.0, -9.9, 0.0, 12.0, -100.0, -110.0, -256.0, math.nan, math.inf])
+def test_impossible_signals_are_dropped(impossible: float) -> None:
+    signal = SignalFilter(3.0)
+
+    assert signal.update(impossible, now=0.0) is None
+    signal.update(-60.0, now=0.2)
+    assert signal.update(impossible, now=0.4) == -60.0
+    assert signal.dropped == 2
+
+
+@pytest.mark.parametrize("possible", [-10.0, -99.0])
+def test_the_edges_of_what_is_possible_pass(possible: float) -> None:
+    assert SignalFilter(3.0).update(possible, now=0.0) == possible
+
+
+def test_a_single_outlier_is_dropped_and_a_lasting_jump_believed_after_three() -> None:
+    signal = SignalFilter(0.0)
+    for tick in range(5):
+        signal.update(-70.0, now=tick * 0.2)
+
+    assert signal.update(-70.0 + RSSI_OUTLIER_DB + 1, now=1.0) == -70.0
+    assert signal.update(-70.0, now=1.2) == -70.0
+    jumps = [signal.update(-40.0, now=1.4 + tick * 0.2) for tick in range(5)]
+    assert jumps[0] == -70.0
+    assert jumps[-1] == -40.0
+    assert signal.dropped <= 1 + 3
+
+
+def test_a_change_within_25_db_is_no_outlier() -> None:
+    signal = SignalFilter(0.0)
+    for tick in range(5):
+        signal.update(-70.0, now=tick * 0.2)
+
+    assert signal.update(-70.0 + RSSI_OUTLIER_DB, now=1.0) == -45.0
+    assert signal.dropped == 0
+
+
+def test_a_radio_that_gives_nothing_is_soon_not_measured_any_more() -> None:
+    signal = SignalFilter(3.0)
+    signal.update(-60.0, now=0.0)
+
+    assert signal.update(None, now=LINK_STALE_S) == -60.0
+    assert signal.update(None, now=LINK_STALE_S + 0.1) is None
+    assert signal.update(-50.0, now=LINK_STALE_S + 0.2) == -50.0, "the old mean is worth nothing any more"
+
+
+def test_signals_are_smoothed_in_dbm_and_each_link_for_itself() -> None:
+    profiler = make_profiler()
+    profiler.absorb(device(), (radio(-60.0), radio(-40.0, "robot2")), now=0.0)
+    profiler.absorb(device(), (radio(-70.0), radio(-40.0, "robot2")), now=3.0)
+
+    way, direct = taken(profiler, 3.0).links
+    assert way.rssi_dbm == pytest.approx(-60.0 - 10.0 * (1 - math.exp(-1.0)))
+    assert direct.peer == "robot2"
+    assert direct.rssi_dbm == pytest.approx(-40.0)
+
+
+def test_a_wired_link_has_no_signal_and_says_wired() -> None:
+    profiler = make_profiler()
+    profiler.absorb(device(), (LinkSample(source=LinkSource.WIRED, rssi_dbm=-30.0),), now=0.0)
+
+    (link,) = taken(profiler, 0.0).links
+    assert (link.source, link.rssi_dbm) == (LinkSource.WIRED, None)
+
+
+def test_what_a_driver_makes_up_is_not_measured() -> None:
+    """A retry ratio above one or a negative rate must not stop the node."""
+    profiler = make_profiler()
+    sample = replace(radio(-60.0), bitrate_mbps=-1.0, retry_ratio=1.5)
+    profiler.absorb(device(), (sample,), now=0.0)
+
+    (link,) = taken(profiler, 0.0).links
+    assert (link.rssi_dbm, link.bitrate_mbps, link.retry_ratio) == (-60.0, None, None)
+
+
+# --- the machine and its workers -----------------------------------------------------------------------------------
+
+
+def test_nothing_is_published_before_the_first_sample() -> None:
+    assert make_profiler().publishable(READY, is_draining=False, now=0.0) is None
+
+
+def test_the_first_cpu_reading_is_not_measured_rather_than_zero() -> None:
+    profiler = make_profiler()
+    profiler.absorb(device(cpu=None), (), now=0.0)
+    assert taken(profiler, 0.0).cpu_used_cores is None
+
+    profiler.absorb(device(cpu=2.0), (), now=0.2)
+    assert taken(profiler, 0.2).cpu_used_cores == 2.0, "the first real one is taken as it is"
+
+
+@pytest.mark.parametrize("impossible", [-1.0, math.nan, math.inf, -math.inf, 1e12])
+def test_impossible_use_is_dropped_and_poisons_nothing(impossible: float) -> None:
+    profiler = make_profiler()
+    profiler.absorb(device(2.0, 1000.0, load(0.5, 100.0)), (), now=0.0)
+    profiler.absorb(device(impossible, impossible), (), now=0.2)
+    profiler.absorb(device(2.0, 1000.0, load(0.5, 100.0)), (), now=0.4)
+
+    profile = taken(profiler, 0.4)
+    assert profile.cpu_used_cores == pytest.approx(2.0)
+    assert profile.memory_used_mb == pytest.approx(1000.0)
+
+
+def test_cpu_and_memory_are_smoothed_with_the_time_constant() -> None:
+    profiler = make_profiler()
+    profiler.absorb(device(1.0, 1000.0), (), now=0.0)
+    profiler.absorb(device(3.0, 2000.0), (), now=TIMING.smoothing_s)
+
+    profile = taken(profiler, TIMING.smoothing_s)
+    followed = 1 - math.exp(-1.0)
+    assert profile.cpu_used_cores == pytest.approx(1.0 + 2.0 * followed)
+    assert profile.memory_used_mb == pytest.approx(1000.0 + 1000.0 * followed)
+
+
+@pytest.mark.parametrize("already_running", [True, False])
+def test_what_a_worker_starts_or_stops_to_use_never_shows_in_the_rest(*, already_running: bool) -> None:
+    """Use minus the worker's share is what the owner is judged by: at every instant the smoothed rest, exactly."""
+    rest_cpu, rest_memory = 1.0, 1000.0
+    profiler, plain = make_profiler(), Ewma(TIMING.smoothing_s)
+    for tick in range(100):
+        now = tick * 0.2
+        rest = rest_cpu + (tick % 7) * 0.1
+        is_running = already_running or tick > 30
+        is_active = 50 < tick < 80
+        cpu, memory = (1.5, 600.0) if is_active else (0.1, 200.0)
+        worker = load(cpu, memory) if is_running else load(None, None, WorkerState.STOPPED)
+        used = (worker.cpu_cores or 0.0, worker.memory_mb or 0.0)
+        profiler.absorb(device(rest + used[0], rest_memory + used[1], worker), (), now=now)
+        expected = plain.update(rest, now)
+        profile = profiler.publishable(READY, is_draining=False, now=now)
+        if profile is None:
+            continue
+        own = profile.worker("merge")
+        assert own is not None
+        assert profile.cpu_used_cores is not None
+        assert profile.memory_used_mb is not None
+        assert profile.cpu_used_cores - (own.cpu_cores or 0.0) == pytest.approx(expected)
+        assert profile.memory_used_mb - (own.memory_mb or 0.0) == pytest.approx(rest_memory)
+
+
+def test_a_worker_that_was_never_measured_has_no_figure() -> None:
+    profiler = make_profiler()
+    profiler.absorb(device(2.0, 1000.0, load(None, None)), (), now=0.0)
+    profiler.absorb(device(2.0, 1000.0, load(None, None)), (), now=0.2)
+
+    own = taken(profiler, 0.2).worker("merge")
+    assert own == load(None, None)
+
+
+def test_states_come_from_the_node_not_from_the_sample() -> None:
+    profiler = make_profiler()
+    profiler.absorb(device(2.0, 1000.0, load(0.5, 100.0, WorkerState.READY)), (), now=0.0)
+
+    profile = taken(profiler, 0.0, {"merge": WorkerState.FAILED, "alpha": WorkerState.STARTING})
+    assert [(worker.task, worker.state) for worker in profile.workers] == [
+        ("alpha", WorkerState.STARTING),
+        ("merge", WorkerState.FAILED),
+    ]
+    assert profile.worker("merge") == load(0.5, 100.0, WorkerState.FAILED)
+
+
+# --- when it is sent -----------------------------------------------------------------------------------------------
+
+
+def test_sent_every_publish_period_and_numbered() -> None:
+    profiler = make_profiler()
+    profiler.absorb(device(), (), now=0.0)
+    sent = [
+        (tick * 0.2, profile)
+        for tick in range(16)
+        if (profile := profiler.publishable(READY, is_draining=False, now=tick * 0.2)) is not None
+    ]
+
+    assert [at for at, _ in sent] == pytest.approx([0.0, 1.0, 2.0, 3.0])
+    assert [profile.sequence for _, profile in sent] == [0, 1, 2, 3]
+    assert {(profile.node, profile.incarnation) for _, profile in sent} == {("edge1", 3)}
+
+
+RAW = replace(TIMING, smoothing_s=0.0)
+
+
+@pytest.mark.parametrize(
+    ("cpu", "memory", "rssi", "is_sent"),
+    [
+        (1.0, 1000.0, -60.0, False),
+        (1.0 + 4.0 * RATIO_CHANGE * 0.9, 1000.0, -60.0, False),
+        (1.0 + 4.0 * RATIO_CHANGE * 1.1, 1000.0, -60.0, True),
+        (1.0, 1000.0 + 4000.0 * RATIO_CHANGE * 0.9, -60.0, False),
+        (1.0, 1000.0 + 4000.0 * RATIO_CHANGE * 1.1, -60.0, True),
+        (1.0, 1000.0, -60.0 - RSSI_CHANGE_DB * 0.9, False),
+        (1.0, 1000.0, -60.0 - RSSI_CHANGE_DB * 1.1, True),
+    ],
+)
+def test_sent_at_once_when_a_robot_might_decide_otherwise(
+    cpu: float, memory: float, rssi: float, *, is_sent: bool
+) -> None:
+    profiler = make_profiler(RAW)
+    profiler.absorb(device(), (radio(-60.0),), now=0.0)
+    taken(profiler, 0.0)
+    profiler.absorb(device(cpu, memory), (radio(rssi),), now=0.2)
+
+    assert (profiler.publishable(READY, is_draining=False, now=0.2) is not None) is is_sent
+
+
+def test_small_changes_add_up_until_they_are_sent() -> None:
+    """Compared with what was sent, not with the previous sample: a slow drift is not hidden until the period ends."""
+    profiler = make_profiler(replace(RAW, publish_s=60.0))
+    sent = 0
+    for tick in range(41):
+        profiler.absorb(device(1.0 + 4.0 * 0.01 * tick), (), now=tick * 0.2)
+        sent += profiler.publishable(READY, is_draining=False, now=tick * 0.2) is not None
+
+    assert 1 + 13 <= sent <= 1 + 20
+
+
+def test_sent_at_once_when_a_worker_changes_or_the_node_drains() -> None:
+    profiler = make_profiler()
+    profiler.absorb(device(), (), now=0.0)
+    taken(profiler, 0.0)
+
+    failed = {"merge": WorkerState.FAILED}
+    assert profiler.publishable(failed, is_draining=False, now=0.1) is not None
+    assert profiler.publishable(failed, is_draining=False, now=0.2) is None
+    draining = profiler.publishable(failed, is_draining=True, now=0.3)
+    assert draining is not None
+    assert draining.draining
+
+
+def test_sent_at_once_when_a_link_falls_silent_or_is_taken_away() -> None:
+    profiler = make_profiler(replace(TIMING, publish_s=60.0))
+    profiler.absorb(device(), (radio(-60.0),), now=0.0)
+    taken(profiler, 0.0)
+
+    silent = 0.1 + LINK_STALE_S
+    profiler.absorb(device(), (radio(None),), now=silent)
+    profile = profiler.publishable(READY, is_draining=False, now=silent)
+    assert profile is not None
+    assert profile.links[0].rssi_dbm is None
+    profiler.absorb(device(), (), now=silent + 0.2)
+    profile = profiler.publishable(READY, is_draining=False, now=silent + 0.2)
+    assert profile is not None
+    assert profile.links == ()
