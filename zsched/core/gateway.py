@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from zsched.core.fleet import Demand, Fleet, TaskSpec
-from zsched.core.model import NodeId, Profile, TaskId
+from zsched.core.model import NodeId, Profile, TaskId, WorkerState
 
 STARVED_CPU_RATIO = 0.9
 """On an owner busier than this the task gets less than it wants: its measured use is no demand."""
@@ -52,14 +52,22 @@ class Gateway:
         return data.profile if data is not None and data.age_s <= self._ttl_s else None
 
     def learn_demand(self, task: TaskId, owner: NodeId, now: float) -> None:
-        """Note what the task's worker uses on its owner, unless the owner is starved (then it shows too little)."""
+        """Note what the task's worker uses on its owner, unless the owner is starved (then it shows too little).
+
+        A worker that is not ready, or a figure that nobody measured, changes nothing: the task does not cost less
+        because its worker restarts.
+        """
         profile = self.fresh(owner, now)
         load = None if profile is None else profile.worker(task)
         if profile is None or load is None or profile.cpu_used_cores is None:
             return
-        if profile.cpu_used_cores / profile.cpu_cores >= STARVED_CPU_RATIO:
+        if load.state is not WorkerState.READY or profile.cpu_used_cores / profile.cpu_cores >= STARVED_CPU_RATIO:
             return
-        self._measured[task] = Demand(cpu_cores=load.cpu_cores or 0.0, memory_mb=load.memory_mb or 0.0)
+        known = self._measured.get(task, Demand())
+        self._measured[task] = Demand(
+            cpu_cores=known.cpu_cores if load.cpu_cores is None else load.cpu_cores,
+            memory_mb=known.memory_mb if load.memory_mb is None else load.memory_mb,
+        )
 
     def demand(self, spec: TaskSpec) -> Demand:
         """What the task will use: the larger of the fleet file's figure and the measurement on the owner."""

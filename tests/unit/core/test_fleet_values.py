@@ -1,0 +1,135 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from zsched.core.fleet import (
+    Demand,
+    Fleet,
+    LinkLimits,
+    LinkSpec,
+    NodeSpec,
+    StreamRule,
+    TaskSpec,
+    Timing,
+    WorkerSpec,
+    dial_endpoint,
+    electorate_hash,
+    fleet_hash,
+)
+from zsched.core.model import Aggregate, LinkSource, NodeKind, Tuning, Weights
+from zsched.core.plan import Direction
+
+TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
+TASK = TaskSpec(
+    name="merge",
+    candidates=("edge1", "edge2"),
+    tuning=TUNING,
+    rules=(StreamRule(direction=Direction.INPUT, from_template="{robot}/map", to_template="{target}/{robot}/map"),),
+)
+FLEET = Fleet(
+    name="lab",
+    timing=Timing(),
+    nodes=(
+        NodeSpec(name="edge1", kind=NodeKind.EDGE, host="192.0.2.11", labels=(("gpu", "no"),)),
+        NodeSpec(name="edge2", kind=NodeKind.EDGE),
+        NodeSpec(name="robot1", kind=NodeKind.ROBOT, links=(LinkSpec(source=LinkSource.TRACE, value="/a/drive.csv"),)),
+        NodeSpec(name="robot2", kind=NodeKind.ROBOT),
+    ),
+    tasks=(TASK,),
+    electors=("robot1", "robot2"),
+    zenoh_config="/etc/zsched/zenoh.json5",
+)
+
+
+def test_defaults_are_the_design_s_first_ones() -> None:
+    assert (TUNING.bonus, TUNING.time_to_trigger_s, TUNING.cool_down_s) == (0.10, 2.0, 10.0)
+    assert TUNING.aggregate is Aggregate.MEAN
+    assert LinkLimits() == LinkLimits(nu_dbm=-80.0, rho_dbm=-40.0)
+    timing = Timing()
+    assert (timing.sample_s, timing.smoothing_s) == (0.2, 3.0)
+    assert (timing.beat_s, timing.suspect_s) == (0.2, 1.2)
+    assert WorkerSpec().command == ()
+
+
+def test_voters_are_the_robots_only() -> None:
+    assert FLEET.voters == ("robot1", "robot2")
+
+
+def test_node_and_task_are_found_by_name_or_raise() -> None:
+    assert FLEET.node("edge2").kind is NodeKind.EDGE
+    assert FLEET.task("merge") is TASK
+    with pytest.raises(KeyError):
+        FLEET.node("edge9")
+    with pytest.raises(KeyError):
+        FLEET.task("other")
+
+
+@pytest.mark.parametrize(("cpu", "memory"), [(-1.0, 0.0), (0.0, -1.0), (5000.0, 0.0), (float("nan"), 0.0)])
+def test_impossible_demand_is_refused(cpu: float, memory: float) -> None:
+    with pytest.raises(ValueError, match=r"^demand\."):
+        Demand(cpu_cores=cpu, memory_mb=memory)
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "host", "dialled"),
+    [
+        ("tcp/0.0.0.0:7457", "192.0.2.11", "tcp/192.0.2.11:7457"),
+        ("tcp/[::]:7457", "2001:db8::1", "tcp/[2001:db8::1]:7457"),
+        ("tcp/[::]:7457", "edge1.local", "tcp/edge1.local:7457"),
+        ("tcp/127.0.0.1:27450", "192.0.2.11", "tcp/127.0.0.1:27450"),
+        ("tcp/0.0.0.0:7457", "", ""),
+        ("tcp/127.0.0.1:0", "192.0.2.11", ""),
+        ("", "192.0.2.11", ""),
+    ],
+)
+def test_endpoint_that_others_dial(endpoint: str, host: str, dialled: str) -> None:
+    assert dial_endpoint(endpoint, host) == dialled
+
+
+def _other_weights() -> Fleet:
+    tuning = replace(TUNING, weights=Weights(cpu=0.6, memory=0.4, network=0.0))
+    return replace(FLEET, tasks=(replace(TASK, tuning=tuning),))
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        replace(FLEET, name="lab2"),
+        replace(FLEET, timing=replace(Timing(), beat_s=0.1)),
+        replace(FLEET, nodes=FLEET.nodes[:3]),
+        replace(FLEET, nodes=(replace(FLEET.nodes[0], labels=(("gpu", "yes"),)), *FLEET.nodes[1:])),
+        replace(FLEET, tasks=(replace(TASK, candidates=("edge1",)),)),
+        replace(FLEET, tasks=(replace(TASK, rules=()),)),
+        replace(FLEET, electors=("edge1", "robot1", "robot2")),
+        replace(FLEET, zenoh_config="/etc/zsched/other.json5"),
+        _other_weights(),
+    ],
+)
+def test_fleet_hash_tells_different_fleets_apart(other: Fleet) -> None:
+    assert fleet_hash(other) != fleet_hash(FLEET)
+
+
+def test_fleet_hash_ignores_where_the_files_lie() -> None:
+    robot = replace(FLEET.nodes[2], links=(LinkSpec(source=LinkSource.TRACE, value="/else/where/drive.csv"),))
+    moved = replace(FLEET, nodes=(*FLEET.nodes[:2], robot, FLEET.nodes[3]), zenoh_config="zenoh.json5")
+
+    assert fleet_hash(moved) == fleet_hash(FLEET)
+    assert len(fleet_hash(FLEET)) == 16
+    assert int(fleet_hash(FLEET), 16) > 0
+
+
+def test_fleet_hash_takes_two_and_two_point_zero_for_one_setting() -> None:
+    """YAML gives an int where an operator writes 2."""
+    whole = replace(FLEET, tasks=(replace(TASK, drain_s=2),))
+
+    assert fleet_hash(whole) == fleet_hash(FLEET)
+
+
+def test_electorate_hash_depends_on_fleet_and_electors_only() -> None:
+    base = electorate_hash(FLEET)
+
+    assert electorate_hash(replace(FLEET, tasks=(), seeds=("edge1",))) == base
+    assert electorate_hash(replace(FLEET, name="lab2")) != base
+    assert electorate_hash(replace(FLEET, electors=("robot1",))) != base
+    assert electorate_hash(replace(FLEET, electors=("robot1robot2",))) != base

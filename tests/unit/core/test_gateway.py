@@ -1,0 +1,174 @@
+from __future__ import annotations
+
+import pytest
+from zsched.core.fleet import Demand, Fleet, NodeSpec, TaskSpec, Timing
+from zsched.core.gateway import STARVED_CPU_RATIO, EdgeData, Gateway
+from zsched.core.model import NodeKind, Profile, Tuning, Weights, WorkerLoad, WorkerState
+
+TASK = TaskSpec(
+    name="merge",
+    candidates=("edge1", "edge2"),
+    tuning=Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0)),
+    demand=Demand(cpu_cores=0.4, memory_mb=250.0),
+)
+FLEET = Fleet(
+    name="lab",
+    timing=Timing(),
+    nodes=(
+        NodeSpec(name="edge1", kind=NodeKind.EDGE),
+        NodeSpec(name="edge2", kind=NodeKind.EDGE),
+        NodeSpec(name="robot1", kind=NodeKind.ROBOT),
+    ),
+    tasks=(TASK,),
+    electors=("robot1",),
+)
+TTL_S = FLEET.timing.profile_ttl_s
+
+
+def profile(
+    sequence: int = 0,
+    *,
+    node: str = "edge1",
+    incarnation: int = 1,
+    cpu: float | None = 1.0,
+    state: WorkerState = WorkerState.READY,
+    used: tuple[float | None, float | None] = (0.5, 300.0),
+) -> Profile:
+    return Profile(
+        node=node,
+        incarnation=incarnation,
+        sequence=sequence,
+        cpu_cores=4.0,
+        cpu_used_cores=cpu,
+        memory_mb=4000.0,
+        memory_used_mb=1000.0,
+        workers=(WorkerLoad(task="merge", state=state, cpu_cores=used[0], memory_mb=used[1]),),
+    )
+
+
+def gateway_with(*profiles: Profile, now: float = 0.0) -> Gateway:
+    gateway = Gateway(FLEET)
+    for one in profiles:
+        assert gateway.absorb(one, now) is None
+    return gateway
+
+
+# --- newest, fresh -------------------------------------------------------------------------------------------------
+
+
+def test_newest_profile_is_kept_with_its_age_since_we_received_it() -> None:
+    gateway = gateway_with(profile(0), profile(1), now=10.0)
+
+    assert gateway.newest("edge1", now=12.5) == EdgeData(profile=profile(1), age_s=2.5)
+    assert gateway.newest("edge2", now=12.5) is None
+
+
+@pytest.mark.parametrize(
+    ("late", "is_stale"),
+    [
+        (profile(4, incarnation=2), True),
+        (profile(5, incarnation=2), True),
+        (profile(9, incarnation=1), True),
+        (profile(6, incarnation=2), False),
+        (profile(0, incarnation=3), False),
+    ],
+)
+def test_older_and_repeated_profiles_are_stale_a_restart_is_newer(late: Profile, *, is_stale: bool) -> None:
+    """Order is (incarnation, sequence): a restarted node counts from 0 again."""
+    current = profile(5, incarnation=2)
+    gateway = gateway_with(current)
+
+    assert gateway.absorb(late, 1.0) == ("stale" if is_stale else None)
+    newest = gateway.newest("edge1", 1.0)
+    assert newest is not None
+    assert newest.profile == (current if is_stale else late)
+
+
+def test_a_stale_repeat_does_not_make_the_profile_younger() -> None:
+    gateway = gateway_with(profile(5))
+    gateway.absorb(profile(5), TTL_S)
+
+    assert gateway.fresh("edge1", TTL_S + 0.1) is None
+
+
+def test_a_node_that_is_not_in_the_fleet_file_is_foreign() -> None:
+    gateway = Gateway(FLEET)
+
+    assert gateway.absorb(profile(node="edge9"), 0.0) == "foreign"
+    assert gateway.newest("edge9", 0.0) is None
+
+
+def test_fresh_up_to_its_time_to_live_and_not_longer() -> None:
+    gateway = gateway_with(profile())
+
+    assert gateway.fresh("edge1", TTL_S) == profile()
+    assert gateway.fresh("edge1", TTL_S + 0.001) is None
+    assert gateway.newest("edge1", TTL_S + 0.001) is not None
+
+
+# --- demand --------------------------------------------------------------------------------------------------------
+
+
+def learnt(*profiles: Profile) -> Demand:
+    gateway = Gateway(FLEET)
+    for one in profiles:
+        gateway.absorb(one, 0.0)
+        gateway.learn_demand("merge", one.node, 0.0)
+    return gateway.demand(TASK)
+
+
+def test_before_any_measurement_the_fleet_file_s_figure_counts() -> None:
+    assert learnt() == TASK.demand
+
+
+@pytest.mark.parametrize(
+    ("used", "demand"),
+    [
+        ((0.5, 300.0), (0.5, 300.0)),
+        ((0.1, 100.0), (0.4, 250.0)),
+        ((0.9, 100.0), (0.9, 250.0)),
+        ((None, 300.0), (0.4, 300.0)),
+        ((0.5, None), (0.5, 250.0)),
+    ],
+)
+def test_demand_is_the_larger_of_the_fleet_file_and_the_measurement(
+    used: tuple[float | None, float | None], demand: tuple[float, float]
+) -> None:
+    assert learnt(profile(used=used)) == Demand(cpu_cores=demand[0], memory_mb=demand[1])
+
+
+def test_the_newest_measurement_replaces_the_older_ones() -> None:
+    assert learnt(profile(0, used=(2.0, 900.0)), profile(1, used=(0.5, 300.0))) == Demand(cpu_cores=0.5, memory_mb=300)
+
+
+def test_a_starved_owner_shows_too_little_and_is_not_learnt_from() -> None:
+    wanted = Demand(cpu_cores=1.5, memory_mb=600.0)
+    busy = profile(1, cpu=4.0 * STARVED_CPU_RATIO, used=(0.5, 300.0))
+    nearly = profile(1, cpu=4.0 * STARVED_CPU_RATIO - 0.01, used=(0.5, 300.0))
+
+    assert learnt(profile(0, used=(1.5, 600.0)), busy) == wanted
+    assert learnt(profile(0, used=(1.5, 600.0)), nearly) == Demand(cpu_cores=0.5, memory_mb=300.0)
+    assert learnt(busy) == TASK.demand
+
+
+@pytest.mark.parametrize("state", [WorkerState.STOPPED, WorkerState.STARTING, WorkerState.FAILED])
+def test_a_task_does_not_cost_less_because_its_worker_restarts(state: WorkerState) -> None:
+    restarting = profile(1, state=state, used=(0.0, 20.0))
+
+    assert learnt(profile(0, used=(1.5, 600.0)), restarting) == Demand(cpu_cores=1.5, memory_mb=600.0)
+
+
+def test_a_figure_that_was_not_measured_leaves_the_known_one() -> None:
+    known, without = profile(0, used=(1.5, 600.0)), profile(1, used=(None, None))
+
+    assert learnt(known, without) == Demand(cpu_cores=1.5, memory_mb=600.0)
+    assert learnt(known, profile(1, cpu=None)) == Demand(cpu_cores=1.5, memory_mb=600.0)
+
+
+def test_an_owner_without_a_fresh_profile_or_worker_is_not_learnt_from() -> None:
+    gateway = gateway_with(profile(used=(1.5, 600.0)))
+    gateway.learn_demand("merge", "edge1", TTL_S + 1.0)
+    gateway.learn_demand("merge", "edge2", 0.0)
+    gateway.learn_demand("other", "edge1", 0.0)
+
+    assert gateway.demand(TASK) == TASK.demand

@@ -1,0 +1,139 @@
+from __future__ import annotations
+
+import doctest
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from zsched.core import fleet, scoring, utility
+from zsched.core.model import Weights
+from zsched.core.utility import (
+    clamp,
+    cpu_utility,
+    memory_utility,
+    network_utility,
+    predicted_use,
+    total_utility,
+)
+
+SEEDED = settings(derandomize=True, database=None, deadline=None)
+RATIO = st.floats(0.0, 1.0)
+CORES = st.floats(0.0, 4096.0)
+ALL = frozenset({"cpu", "memory", "network"})
+
+
+@st.composite
+def weights(draw: st.DrawFn) -> Weights:
+    low, high = sorted((draw(RATIO), draw(RATIO)))
+    return Weights(cpu=low, memory=high - low, network=1.0 - high)
+
+
+@pytest.mark.parametrize("module", [utility, scoring, fleet])
+def test_the_worked_examples_in_the_docstrings_hold(module: object) -> None:
+    result = doctest.testmod(module)  # type: ignore[arg-type]  # parametrisation loses the module's type
+
+    assert result.attempted > 0
+    assert result.failed == 0
+
+
+@SEEDED
+@given(st.floats(allow_nan=False))
+def test_clamp_is_in_zero_to_one_and_changes_nothing_there(value: float) -> None:
+    assert 0.0 <= clamp(value) <= 1.0
+    if 0.0 <= value <= 1.0:
+        assert clamp(value) == value
+
+
+@SEEDED
+@given(st.floats(0.001, 4096.0), CORES, CORES)
+def test_cpu_utility_falls_with_what_is_in_use(gamma: float, less: float, more: float) -> None:
+    less, more = sorted((less, more))
+
+    assert 0.0 <= cpu_utility(gamma, more) <= cpu_utility(gamma, less) <= 1.0
+
+
+@SEEDED
+@given(st.floats(1.0, 1e6), st.floats(0.0, 1e6), st.floats(0.0, 1e6), st.floats(0.0, 1e6))
+def test_memory_utility_falls_with_demand_and_use(delta: float, theta: float, mu: float, more: float) -> None:
+    base = memory_utility(delta, theta, mu)
+
+    assert 0.0 <= base <= 1.0
+    assert memory_utility(delta, theta + more, mu) <= base
+    assert memory_utility(delta, theta, mu + more) <= base
+
+
+@SEEDED
+@given(st.floats(-120.0, 0.0), st.floats(-120.0, 0.0))
+def test_network_utility_rises_with_the_signal(weak: float, strong: float) -> None:
+    weak, strong = sorted((weak, strong))
+
+    assert 0.0 <= network_utility(weak, -80.0, -40.0) <= network_utility(strong, -80.0, -40.0) <= 1.0
+
+
+@SEEDED
+@given(CORES, CORES, CORES)
+def test_predicted_use_forgets_the_task_s_own_load(rest: float, own: float, demand: float) -> None:
+    """The same rest and demand give the same prediction, whatever the worker uses there now."""
+    predicted = predicted_use(rest + own, own, demand)
+
+    assert predicted == pytest.approx(predicted_use(rest, 0.0, demand), abs=1e-6)
+
+
+def test_a_worker_that_shows_more_than_the_machine_leaves_nothing_negative() -> None:
+    assert predicted_use(use=0.3, own_worker=0.5, demand=0.4) == 0.4
+
+
+@SEEDED
+@given(weights(), RATIO, RATIO, RATIO)
+def test_total_utility_is_the_weighted_sum_in_zero_to_one(
+    omega: Weights, cpu: float, memory: float, network: float
+) -> None:
+    value = total_utility(omega, cpu=cpu, memory=memory, network=network, measured=ALL)
+
+    assert value is not None
+    assert 0.0 <= value <= 1.0
+    assert value == pytest.approx(omega.cpu * cpu + omega.memory * memory + omega.network * network, abs=1e-6)
+
+
+@SEEDED
+@given(weights(), RATIO, RATIO)
+def test_a_metric_that_nobody_measured_is_neither_zero_nor_one(omega: Weights, cpu: float, memory: float) -> None:
+    """Dropped and the rest renormalised: the result lies between the terms that are there."""
+    value = total_utility(omega, cpu=cpu, memory=memory, network=None, measured=frozenset({"cpu", "memory"}))
+
+    if omega.cpu + omega.memory == 0.0:
+        assert value is None
+        return
+    assert value is not None
+    assert min(cpu, memory) - 1e-9 <= value <= max(cpu, memory) + 1e-9
+
+
+def test_missing_here_but_measured_elsewhere_is_not_scored() -> None:
+    omega = Weights(cpu=0.5, memory=0.0, network=0.5)
+
+    assert total_utility(omega, cpu=0.8, memory=0.5, network=None, measured=ALL) is None
+    assert total_utility(omega, cpu=None, memory=0.5, network=0.8, measured=ALL) is None
+
+
+def test_a_metric_without_weight_may_be_missing() -> None:
+    omega = Weights(cpu=1.0, memory=0.0, network=0.0)
+
+    assert total_utility(omega, cpu=0.8, memory=None, network=None, measured=ALL) == 0.8
+
+
+def test_nothing_weighted_is_measured_so_there_is_no_score() -> None:
+    omega = Weights(cpu=0.0, memory=0.0, network=1.0)
+
+    assert total_utility(omega, cpu=0.8, memory=0.8, network=None, measured=frozenset({"cpu", "memory"})) is None
+
+
+def test_results_are_plain_finite_numbers_at_the_edges() -> None:
+    for value in (
+        cpu_utility(0.001, 4096.0),
+        memory_utility(1.0, 1e8, 1e8),
+        network_utility(-120.0, -80.0, -79.9),
+        network_utility(0.0, -80.0, -79.9),
+    ):
+        assert math.isfinite(value)
+        assert 0.0 <= value <= 1.0
