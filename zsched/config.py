@@ -136,7 +136,7 @@ def _seeds(section: Section, cast: Cast, out: Collector) -> tuple[NodeId, ...]:
         return seeds
     for seed in cast.known(given, out):
         node = next((node for node in cast.nodes if node.name == seed.value), None)
-        if node is not None and not _can_be_dialled(node):
+        if node is not None and node.name in cast.sound and not _can_be_dialled(node):
             hint = "it needs `listen: {control:, data:}` with fixed ports, and a `host:` when it listens on 0.0.0.0"
             out.error(seed.place, f"the seed {seed.value!r} cannot be dialled", hint)
     return tuple(dict.fromkeys(seed.value for seed in given))

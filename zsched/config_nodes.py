@@ -24,6 +24,8 @@ class Cast:
     place: Place
     names: tuple[NodeId, ...]
     nodes: tuple[NodeSpec, ...]
+    sound: frozenset[NodeId]
+    """Names of the nodes without a fault of their own: only these are judged in what refers to them."""
     is_whole: bool
     """Every node could be read: only then does an empty selection mean something."""
 
@@ -77,7 +79,8 @@ def read_nodes(section: Section, folder: Path, out: Collector) -> Cast:
         out.error(place, "the fleet has no nodes")
     is_whole = out.count == before and len(nodes) == len(entries) > 0
     _check_endpoints(nodes, entries, out)
-    return Cast(place=place, names=tuple(entries), nodes=tuple(nodes), is_whole=is_whole)
+    sound = frozenset(name for name, entry in entries.items() if entry.value is not None and entry.value.is_whole)
+    return Cast(place=place, names=tuple(entries), nodes=tuple(nodes), sound=sound, is_whole=is_whole)
 
 
 def _node(name: str, given: Section, names: tuple[str, ...], folder: Path, out: Collector) -> NodeSpec | None:
@@ -135,7 +138,7 @@ def _links(name: str, given: Section, names: tuple[str, ...], folder: Path, out:
         link = _link(entry.value, peer, given.get("wifi", ""), folder, out)
         if link is not None:
             yield link
-        elif entry.value.is_whole:
+        elif not entry.value.places:
             out.error(entry.place, f"the link to {peer!r} has no source", f"one of: {', '.join((*_SOURCES, 'mac'))}")
 
 

@@ -1,0 +1,486 @@
+"""A fleet file becomes a Fleet, or every fault in it is reported at once with its place."""
+
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from zsched.config import CheckResult, check_bytes, check_file, load_fleet
+from zsched.core.fleet import (
+    Fleet,
+    LinkSpec,
+    OnIsolation,
+    Reach,
+    Standby,
+    WorkerLink,
+    dial_endpoint,
+    electorate_hash,
+    fleet_hash,
+)
+from zsched.core.model import Aggregate, LinkSource, NodeKind
+from zsched.core.plan import Direction, HandoverRule, ReadyWhen, StreamClass
+from zsched.errors import ConfigError
+
+ROOT = Path(__file__).parents[2]
+CONFIGS = sorted((ROOT / "configs").rglob("*.yaml"))
+
+GOOD = """\
+fleet: warehouse
+timing: wifi
+seeds: [edge1, edge2]
+nodes:
+  robot1: {kind: robot, wifi: wlan0}
+  robot2: {kind: robot, fixed: -60, links: {edge1: {fixed: -55}, robot1: {mac: "aa:BB:cc:00:11:22", wifi: wlan1}}}
+  robot3: {kind: robot, wired: true, links: {edge2: {trace: {file: drive.csv, column: rssi, offset_s: 120}}}}
+  edge1: {kind: edge, host: 192.0.2.11, labels: {gpu: "no"}, listen: {control: tcp/0.0.0.0:7457, data: tcp/0.0.0.0:7458}}
+  edge2: {kind: edge, host: 192.0.2.12, labels: {gpu: yes}, listen: {control: tcp/0.0.0.0:7457, data: tcp/0.0.0.0:7458}}
+tasks:
+  map_merge:
+    candidates: {kind: edge}
+    weights: {cpu: 0.5, memory: 0.5, network: 0.0}
+    demand: {cpu_cores: 0.4, memory_mb: 250}
+    scheduling: {bonus: 0.10, time_to_trigger_s: 2, cool_down_s: 10}
+    worker: {command: [python, -m, zsched.tasks.map_merge], standby: warm}
+    inputs:   [{from: "{robot}/map", to: "{target}/map_merge/{robot}/map", class: latest, keep_last: 1}]
+    outputs:  [{from: "{target}/map_merge/global_map", to: "{robot}/global_map", class: latest}]
+zenoh: {config: zenoh.json5}
+"""  # noqa: E501 - one line per node, as operators write it
+
+
+def check(text: str) -> CheckResult:
+    return check_bytes(text.encode())
+
+
+def fleet_of(text: str) -> Fleet:
+    result = check(text)
+    assert result.fleet is not None, result.report()
+    return result.fleet
+
+
+def places(result: CheckResult) -> list[tuple[int, int]]:
+    return [(fault.line, fault.col) for fault in result.faults]
+
+
+def only_fault(text: str, said: str, at: str) -> None:
+    """The text has one fault, its message holds ``said`` and its caret stands at the (unique) text ``at``."""
+    result = check(text)
+    assert len(result.faults) == 1, result.report()
+    (fault,) = result.faults
+    assert said in fault.message, fault.message
+    assert text.count(at) == 1
+    before = text[: text.index(at)]
+    assert (fault.line, fault.col) == (before.count("\n") + 1, len(before.rpartition("\n")[2]) + 1), result.report()
+    assert result.fleet is None
+
+
+def swapped(old: str, new: str, text: str = GOOD) -> str:
+    assert text.count(old) >= 1, old
+    return text.replace(old, new, 1)
+
+
+# --- good files ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.name)
+def test_every_shipped_file_loads(path: Path) -> None:
+    fleet = load_fleet(path)
+    assert fleet.tasks[0].name == "map_merge"
+    warnings = check_file(path).warnings
+    assert bool(warnings) == (path.name == "minimal.yaml")
+
+
+def test_shipped_files_are_there() -> None:
+    assert {path.name for path in CONFIGS} >= {
+        "fleet.yaml",
+        "ros2.yaml",
+        "demo.yaml",
+        "robots-only.yaml",
+        "minimal.yaml",
+    }
+
+
+def test_the_designs_file_loads_with_every_feature() -> None:
+    fleet = fleet_of(GOOD)
+    assert fleet.name == "warehouse"
+    assert [node.name for node in fleet.nodes] == ["edge1", "edge2", "robot1", "robot2", "robot3"]
+    assert fleet.voters == fleet.electors == ("robot1", "robot2", "robot3")
+    assert fleet.seeds == ("edge1", "edge2")
+    assert fleet.node("edge1").labels == (("gpu", "no"),)
+    assert fleet.node("edge2").labels == (("gpu", "yes"),), "YAML 1.2: yes is text"
+    assert fleet.node("edge1").kind is NodeKind.EDGE
+    assert fleet.zenoh_config.endswith("/zenoh.json5")
+    task = fleet.task("map_merge")
+    assert task.candidates == ("edge1", "edge2")
+    assert (task.demand.cpu_cores, task.demand.memory_mb) == (0.4, 250)
+    assert task.worker.command == ("python", "-m", "zsched.tasks.map_merge")
+    assert [rule.direction for rule in task.rules] == [Direction.INPUT, Direction.OUTPUT]
+    assert task.rules[0].settings.stream_class is StreamClass.LATEST
+
+
+def test_links_of_every_source() -> None:
+    fleet = fleet_of(GOOD)
+    assert fleet.node("robot1").links == (LinkSpec(source=LinkSource.NL80211, value="wlan0"),)
+    assert fleet.node("robot2").links == (
+        LinkSpec(source=LinkSource.FIXED, value="-60"),
+        LinkSpec(source=LinkSource.FIXED, peer="edge1", value="-55"),
+        LinkSpec(source=LinkSource.NL80211, peer="robot1", value="wlan1", mac="aa:bb:cc:00:11:22"),
+    )
+    wired, trace = fleet.node("robot3").links
+    assert wired == LinkSpec(source=LinkSource.WIRED)
+    assert (trace.source, trace.peer, trace.column, trace.offset_s) == (LinkSource.TRACE, "edge2", "rssi", 120)
+    assert Path(trace.value).is_absolute()
+
+
+def test_every_setting_of_a_task_arrives() -> None:
+    text = swapped(
+        "    scheduling: {bonus: 0.10, time_to_trigger_s: 2, cool_down_s: 10}\n    worker: {command: "
+        "[python, -m, zsched.tasks.map_merge], standby: warm}\n",
+        """\
+    scheduling:
+      {bonus: 0.2, time_to_trigger_s: 3, cool_down_s: 4, aggregate: median, reach: all, memory_floor_ratio: 0.1}
+    link: {nu_dbm: -75, rho_dbm: -45}
+    on_isolation: local
+    drain_s: 5
+    worker:
+      command: [run, 8080, 1.10]
+      standby: cold
+      ready: matching
+      link: client
+      env: {PORT: 0x10, GREETING: "hello you"}
+      start_deadline_s: 60
+      stop_grace_s: 1
+      output_deadline_s: 9
+      max_failures: 5
+      failure_window_s: 30
+""",
+    ).replace("class: latest}]", "class: reliable, depth: 99, handover: all}]")
+    task = fleet_of(text).task("map_merge")
+    assert (task.tuning.bonus, task.tuning.time_to_trigger_s, task.tuning.cool_down_s) == (0.2, 3, 4)
+    assert (task.tuning.aggregate, task.reach, task.memory_floor_ratio) == (Aggregate.MEDIAN, Reach.ALL, 0.1)
+    assert (task.limits.nu_dbm, task.limits.rho_dbm) == (-75, -45)
+    assert (task.on_isolation, task.drain_s) == (OnIsolation.LOCAL, 5)
+    worker = task.worker
+    assert worker.command == ("run", "8080", "1.10"), "text stays as written"
+    assert (worker.standby, worker.ready_when, worker.link) == (Standby.COLD, ReadyWhen.MATCHING, WorkerLink.CLIENT)
+    assert worker.env == (("GREETING", "hello you"), ("PORT", "0x10"))
+    assert (worker.start_deadline_s, worker.stop_grace_s, worker.output_deadline_s) == (60, 1, 9)
+    assert (worker.max_failures, worker.failure_window_s) == (5, 30)
+    output = task.rules[1].settings
+    assert (output.stream_class, output.depth, output.handover) == (StreamClass.RELIABLE, 99, HandoverRule.ALL)
+
+
+@pytest.mark.parametrize(
+    ("candidates", "expected"),
+    [
+        ("{kind: edge}", ("edge1", "edge2")),
+        ("{kind: robot}", ("robot1", "robot2", "robot3")),
+        ('{labels: {gpu: "yes"}}', ("edge2",)),
+        ("{kind: edge, labels: {gpu: no}}", ("edge1",)),
+        ("[robot2, edge1]", ("edge1", "robot2")),
+    ],
+)
+def test_candidates_resolve_to_sorted_names(candidates: str, expected: tuple[str, ...]) -> None:
+    text = swapped("candidates: {kind: edge}", f"candidates: {candidates}")
+    assert fleet_of(text).tasks[0].candidates == expected
+
+
+@pytest.mark.parametrize(
+    ("timing", "expected"),
+    [
+        ("wired", ("wired", 0.1, 0.45)),
+        ("wan", ("wan", 0.5, 5.0)),
+        ("{profile: wired, suspect_s: 0.6}", ("wired", 0.1, 0.6)),
+        ("{beat_s: 0.3}", ("wifi", 0.3, 1.2)),
+    ],
+)
+def test_timing_profiles_and_overrides(timing: str, expected: tuple[str, float, float]) -> None:
+    found = fleet_of(swapped("timing: wifi", f"timing: {timing}")).timing
+    assert (found.name, found.beat_s, found.suspect_s) == expected
+
+
+def test_seeds_default_to_the_first_two_that_can_be_dialled() -> None:
+    assert fleet_of(swapped("seeds: [edge1, edge2]\n", "")).seeds == ("edge1", "edge2")
+
+
+def test_electorate_may_name_edges() -> None:
+    fleet = fleet_of(GOOD + "electorate: [robot1, robot2, edge1]\n")
+    assert fleet.electors == ("edge1", "robot1", "robot2")
+    assert fleet.voters == ("robot1", "robot2", "robot3")
+
+
+def test_few_electors_are_advised_by_warning_only() -> None:
+    one = check(swapped("tasks:", "electorate: [robot1]\ntasks:"))
+    assert one.fleet is not None
+    assert "only elector" in one.report()
+    two = check(swapped("tasks:", "electorate: [robot1, edge1]\ntasks:"))
+    assert two.fleet is not None
+    assert "hint: electorate: [edge1, robot1, robot2]" in two.report()
+    four = check(swapped("tasks:", "electorate: [robot1, robot2, robot3, edge1]\ntasks:"))
+    assert "survive the loss of 1, as 3 would" in four.report()
+
+
+def test_files_that_are_elsewhere_are_warnings() -> None:
+    warnings = [fault.message for fault in check(GOOD).warnings]
+    assert [text.rsplit("/", 1)[1] for text in warnings] == [
+        "drive.csv is not on this machine",
+        "zenoh.json5 is not on this machine",
+    ]
+
+
+def test_relative_files_are_relative_to_the_fleet_file(tmp_path: Path) -> None:
+    (tmp_path / "drive.csv").write_text("")
+    (tmp_path / "zenoh.json5").write_text("{}")
+    (tmp_path / "fleet.yaml").write_text(GOOD)
+    result = check_file(tmp_path / "fleet.yaml")
+    assert result.fleet is not None
+    assert result.warnings == ()
+    assert result.fleet.zenoh_config == str(tmp_path / "zenoh.json5")
+
+
+def test_anchors_may_share_text() -> None:
+    text = swapped('labels: {gpu: "no"}', 'labels: &l {gpu: "no"}').replace("labels: {gpu: yes}", "labels: *l")
+    assert fleet_of(text).node("edge2").labels == (("gpu", "no"),)
+
+
+# --- hashes and endpoints --------------------------------------------------------------------------------------------
+
+
+def test_hashes_ignore_the_folder_and_see_every_setting(tmp_path: Path) -> None:
+    fleet = fleet_of(GOOD)
+    elsewhere = check_bytes(GOOD.encode(), str(tmp_path / "fleet.yaml")).fleet
+    assert elsewhere is not None
+    assert elsewhere != fleet
+    assert fleet_hash(elsewhere) == fleet_hash(fleet)
+    assert re.fullmatch(r"[0-9a-f]{16}", fleet_hash(fleet))
+    for old, new in (
+        ("bonus: 0.10", "bonus: 0.11"),
+        ("wlan0", "wlan9"),
+        ("timing: wifi", "timing: wan"),
+        ('/global_map"', '/g"'),
+    ):
+        other = fleet_of(swapped(old, new))
+        assert fleet_hash(other) != fleet_hash(fleet), old
+        assert electorate_hash(other) == electorate_hash(fleet)
+
+
+def test_electorate_hash_sees_electors_and_fleet_name_only() -> None:
+    fleet = fleet_of(GOOD)
+    assert electorate_hash(replace(fleet, electors=("robot1",))) != electorate_hash(fleet)
+    assert electorate_hash(replace(fleet, name="other")) != electorate_hash(fleet)
+
+
+def test_hashes_are_the_same_in_another_process(tmp_path: Path) -> None:
+    (tmp_path / "fleet.yaml").write_text(GOOD)
+    code = (
+        "import sys; from zsched.config import load_fleet; from zsched.core.fleet import fleet_hash, electorate_hash;"
+        "f = load_fleet(sys.argv[1]); print(fleet_hash(f), electorate_hash(f))"
+    )
+    run = [sys.executable, "-c", code, str(tmp_path / "fleet.yaml")]
+    printed = subprocess.run(run, capture_output=True, text=True, check=True, timeout=30).stdout.split()
+    fleet = load_fleet(tmp_path / "fleet.yaml")
+    assert printed == [fleet_hash(fleet), electorate_hash(fleet)]
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "host", "expected"),
+    [
+        ("tcp/0.0.0.0:7457", "192.0.2.11", "tcp/192.0.2.11:7457"),
+        ("tcp/[::]:7457", "fd00::1", "tcp/[fd00::1]:7457"),
+        ("tcp/127.0.0.1:7457", "", "tcp/127.0.0.1:7457"),
+        ("tls/0.0.0.0:7457#so_sndbuf=65536", "e1.local", "tls/e1.local:7457#so_sndbuf=65536"),
+        ("tcp/0.0.0.0:7457", "", ""),
+        ("tcp/0.0.0.0:0", "h", ""),
+        ("unixsock-stream//run/z.sock", "h", "unixsock-stream//run/z.sock"),
+    ],
+)
+def test_dial_endpoint(endpoint: str, host: str, expected: str) -> None:
+    assert dial_endpoint(endpoint, host) == expected
+
+
+# --- faults ----------------------------------------------------------------------------------------------------------
+
+
+def test_five_faults_of_different_kinds_are_reported_at_once_with_their_places() -> None:
+    text = GOOD
+    for old, new in (
+        ("timing: wifi", "timing: wify"),  # an unknown word
+        ("memory: 0.5,", "memory: 1.5,"),  # out of range
+        ("standby: warm", "standby: warm, standbye: cold"),  # an unknown key
+        ("seeds: [edge1, edge2]", "seeds: [edge1, edge9]"),  # a name that is no node
+        ("{robot}/global_map", "{robo}/global_map"),  # an unknown placeholder
+    ):
+        text = swapped(old, new, text)
+    result = check_bytes(text.encode(), "fleet.yaml")
+    report = result.report()
+    assert places(result) == [(2, 9), (3, 16), (13, 33), (16, 76), (18, 60)], report
+    for line in (
+        "fleet.yaml:2:9: error: 'wify' is not `wired` or `wifi` or `wan`",
+        "fleet.yaml:13:33: error: 1.5 is not in the allowed range 0..1",
+        "fleet.yaml:16:76: error: a worker has no key 'standbye'",
+        "    hint: did you mean 'standby'?",
+        "fleet.yaml:3:16: error: there is no node 'edge9'",
+        "fleet.yaml:18:60: error: '{robo}/global_map': there is no placeholder {robo}",
+        "    hint: did you mean 'robot'?",
+    ):
+        assert line in report.split("\n"), report
+    with_caret = report.split("\n")
+    at = with_caret.index("fleet.yaml:13:33: error: 1.5 is not in the allowed range 0..1")
+    assert with_caret[at + 1 : at + 3] == ["        weights: {cpu: 0.5, memory: 1.5, network: 0.0}", " " * 36 + "^~~"]
+
+
+def test_load_fleet_raises_the_whole_report(tmp_path: Path) -> None:
+    path = tmp_path / "fleet.yaml"
+    path.write_text("fleet: X\nnodes: {}\nfoo: 1\n")
+    with pytest.raises(ConfigError) as caught:
+        load_fleet(path)
+    assert f"{path}:1:8: error" in str(caught.value)
+    assert f"{path}:3:1: error" in str(caught.value)
+
+
+def test_missing_file_is_a_fault_not_an_exception(tmp_path: Path) -> None:
+    result = check_file(tmp_path / "none.yaml")
+    assert result.fleet is None
+    assert "none.yaml: error: cannot be read: No such file or directory" in result.report()
+    assert check_file(tmp_path).fleet is None
+    assert check_file("a\0b").fleet is None
+
+
+ONE_FAULT = [
+    ("fleet: warehouse", "fleet: Ware", "is not a name", "Ware"),
+    ("  robot3: {kind", "  Robot3: {kind", "is not a name", "Robot3"),
+    ("kind: robot, wifi", "kind: robt, wifi", "'robt' is not `robot` or `edge`", "robt,"),
+    ("kind: robot, wifi: wlan0", "wifi: wlan0", "a node lacks the key 'kind'", "{wifi: wlan0}"),
+    ("wifi: wlan0", "wifi: wlan0, wired: true", "a link has one source", "true}\n  robot2"),
+    ("wired: true", "wired: yes", "expected `true`", "yes, links"),
+    ("fixed: -60", "fixed: 60", "not in the allowed range -120..0 dBm", "60, links"),
+    ("fixed: -60", "fixed: strong", "expected a number -120..0 dBm", "strong"),
+    ("{fixed: -55}", "{}", "the link to 'edge1' has no source", "edge1: {}"),
+    ('mac: "aa:BB:cc:00:11:22", wifi: wlan1', "mac: aabb", "six pairs", "aabb"),
+    (", wifi: wlan1", "", "no `wifi` interface", '"aa:BB'),
+    ("links: {edge1", "links: {robot2", "is this node itself", "robot2: {fixed"),
+    ("host: 192.0.2.11", "host: 192.0.2.311", "not an address", "192.0.2.311"),
+    ("tcp/0.0.0.0:7457", "tpc/0.0.0.0:7457", "it must begin with", "tpc/"),
+    ("tcp/0.0.0.0:7457", "tcp/0.0.0.0:77457", "PORT 0..65535", "tcp/0.0.0.0:77457"),
+    ("tcp/0.0.0.0:7457", "tcp/fd00::1:7457", "stands in brackets", "tcp/fd00"),
+    ("data: tcp/0.0.0.0:7458", "data: tcp/0.0.0.0:7457", "already edge1's control", "tcp/0.0.0.0:7457}}\n  edge2"),
+    ("host: 192.0.2.12", "host: 192.0.2.11", None, None),
+    ("host: 192.0.2.11, ", "", "cannot be dialled", "edge1, edge2]"),
+    ("seeds: [edge1", "seeds: [robot1", "cannot be dialled", "robot1, edge2]"),
+    ("seeds: [edge1", "seeds: [edge2", "is there twice", "edge2]\n"),
+    ("candidates: {kind: edge}", "candidates: {labels: {gpu: maybe}}", "no node is a cand", "{labels: {gpu: m"),
+    ("candidates: {kind: edge}", "candidates: {}", "the selection is empty", "{}"),
+    ("candidates: {kind: edge}", "candidates: []", "expected", "[]"),
+    ("candidates: {kind: edge}", "candidates: edge1", "expected", "edge1\n"),
+    ("network: 0.0", "network: 0.1", "the sum is 1.1, not 1", "{cpu: 0.5"),
+    ("network: 0.0", "network: 0.0, netwrk: 1", "has no key 'netwrk'", "netwrk"),
+    ("cpu_cores: 0.4", "cpu_cores: .nan", "expected a number", ".nan"),
+    ("cpu_cores: 0.4", 'cpu_cores: "0.4"', "expected a number", '"0.4"'),
+    ("bonus: 0.10,", "bonus: 0.10, bonus: 0.2,", "the key 'bonus' is there twice", "bonus: 0.2"),
+    ("[python, -m, zsched.tasks.map_merge]", "python -m x", "expected a list", "python -m x"),
+    ("[python, -m, zsched.tasks.map_merge]", "[]", "expected a list", "[]"),
+    ("standby: warm", "env: {ZSCHED_NODE: x}", "is set by zsched itself", "ZSCHED_NODE"),
+    ("keep_last: 1", "keep_last: 1001", "not in the allowed range 0..1000", "1001"),
+    ("keep_last: 1", "keep_last: 1.5", "expected a whole number", "1.5"),
+    ("class: latest, keep_last: 1", "keep_last: 1", "only streams of class latest", "1}]"),
+    ("keep_last: 1", "handover: all", "only outputs have a handover", "all}]"),
+    ('"{robot}/map"', '"{target}/map"', "whoever owns", '"{target}/map"'),
+    ("{target}/map_merge/{robot}/map", "{target}/map_merge/map", "would both publish", '"{target}/map_merge/map"'),
+    ('"{robot}/map"', '"@zsched/x"', "belong to zsched itself", '"@zsched/x"'),
+    ("    outputs:  ", "    exclusive: true\n    outputs:  ", "needs {epoch}", '"{robot}/global_map"'),
+    ("timing: wifi", "timing: {beat_s: 0.5, confirm_s: 0.5}", "suspect_s is 1.2 s, it must be >= 1.5", "0.5, confirm"),
+    ("timing: wifi", "timing: {zenoh_lease_s: 2.6}", "must be < 2.5 s", "2.6"),
+    ("timing: wifi", "timing: {zenoh_lease_s: 0.5}", "must be >= 1 s", "0.5}"),
+    ("timing: wifi", "timing: {gather_s: 0.6, ballot_s: 0.6}", "a round must end", "0.6, ballot"),
+    ("timing: wifi", "timing: {profile_ttl_s: 1.5}", "one lost profile", "1.5}"),
+    ("timing: wifi", "timing:", "expected", None),
+    ("zenoh: {config: zenoh.json5}", "zenoh: zenoh.json5", "expected {config}", "zenoh.json5"),
+    ("zenoh: {config: zenoh.json5}", "zenho: {config: zenoh.json5}", "no key 'zenho'", "zenho"),
+    ("zenoh: {config: zenoh.json5}", "electorate: [robot1, ghost]", "there is no node 'ghost'", "ghost"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("old", "new", "said", "at"), ONE_FAULT)
+def test_one_fault_is_reported_once_at_its_place(old: str, new: str, said: str | None, at: str | None) -> None:
+    text = swapped(old, new)
+    if said is None:  # two addresses on one machine: control and data both clash
+        assert [fault.message.split(" is ")[1] for fault in check(text).faults] == [
+            "already edge1's control session",
+            "already edge1's data session",
+        ]
+    elif at is None:
+        assert [said in fault.message for fault in check(text).faults] == [True]
+    else:
+        only_fault(text, said, at)
+
+
+def test_relay_loop_names_every_rule_with_its_place() -> None:
+    text = swapped("{target}/map_merge/{robot}/map", "{target}/map").replace(
+        "candidates: {kind: edge}", "candidates: {kind: robot}"
+    )
+    result = check(text)
+    loop = next(fault for fault in result.faults if "loop, relays feed each other" in fault.message)
+    assert (loop.line, loop.col) == (17, 42)
+    assert loop.hint == "rules: map_merge/in/0 at 17:42"
+
+
+def test_worker_cycle_is_a_warning_with_both_rules() -> None:
+    result = check(swapped('"{robot}/global_map"', '"{robot}/map"'))
+    assert result.fleet is not None
+    warning = next(fault for fault in result.warnings if "comes back to it" in fault.message)
+    assert "map_merge/in/0 at 17:42" in warning.hint
+    assert "map_merge/out/0 at 18:60" in warning.hint
+
+
+def test_clash_between_tasks_names_both_rules() -> None:
+    other = """\
+  other:
+    candidates: [edge1]
+    weights: {cpu: 1}
+    outputs: [{from: "{target}/other/{epoch}/map", to: "{robot}/global_map"}]
+"""
+    result = check(swapped("zenoh:", f"{other}zenoh:").replace("  other:", "  other:"))
+    assert [fault.hint for fault in result.faults] == ["rules: map_merge/out/0 at 18:60, other/out/0 at 22:56"]
+
+
+def test_exclusive_task_needs_a_worker_that_holds_the_lease() -> None:
+    text = swapped("{target}/map_merge/global_map", "{target}/map_merge/{epoch}/global_map")
+    text = swapped("standby: warm", "standby: warm, ready: matching", text)
+    result = check(swapped("    inputs:  ", "    exclusive: true\n    on_isolation: local\n    inputs:  ", text))
+    assert len(result.faults) == 2
+    assert "hold the lease" in result.report()
+    assert "cut off" in result.report()
+
+
+def test_fleet_without_robots_is_refused() -> None:
+    text = GOOD.replace("kind: robot", "kind: edge")
+    assert "nobody would vote" in check(text).report()
+
+
+def test_nodes_that_nobody_can_dial_are_refused() -> None:
+    text = "fleet: f\nnodes:\n  r1: {kind: robot}\n  r2: {kind: robot}\n"
+    assert "no node can be dialled" in check(text).report()
+    assert check("fleet: f\nnodes:\n  r1: {kind: robot}\n").fleet is not None
+
+
+def test_network_weight_without_any_link_is_a_warning() -> None:
+    text = """\
+fleet: f
+nodes: {r1: {kind: robot}}
+tasks: {t: {candidates: [r1], weights: {cpu: 0.5, network: 0.5}}}
+"""
+    result = check(text)
+    assert result.fleet is not None
+    assert "it will not count" in result.report()
+
+
+# --- the price -------------------------------------------------------------------------------------------------------
+
+
+def test_importing_config_loads_neither_the_yaml_reader_nor_anything_heavy() -> None:
+    code = "import sys, zsched.config; print(*sorted({name.split('.')[0] for name in sys.modules}))"
+    printed = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=30
+    ).stdout
+    assert not set(printed.split()) & {"ruamel", "pydantic", "numpy", "asyncio", "zenoh", "msgpack"}
