@@ -10,10 +10,12 @@ Knows: the worker's side of a handover (token, role, end markers). Does not know
             ...
 
 Every sample goes through one dispatch thread, in order per key; zenoh's own threads only enqueue. A warm standby takes
-and processes its inputs like an owner, but its outputs go nowhere (`Output.put` answers ``False``). When the task moves
-away, each input ends with an in-band marker behind its last sample; when all inputs seen have ended and their samples
-are processed, the worker sends the same marker behind its last output: that is how the robots know that nothing is
-missing. By hand, without a daemon: ``Worker.from_env(standalone="my_task")``.
+and processes its inputs like an owner, but its outputs go nowhere (`Output.put` answers ``False``); what it took then
+is processed once more when it becomes the owner. When the task moves away, each input ends with an in-band marker
+behind its last sample; when all inputs seen have ended and their samples are processed, the worker sends the same
+marker behind its last output: that is how the robots know that nothing is missing.
+
+By hand, without a daemon: ``Worker.from_env(standalone="my_task")``.
 """
 
 from __future__ import annotations
@@ -245,7 +247,7 @@ class Worker:
             with contextlib.suppress(zenoh.ZError):
                 entity.undeclare()
         with contextlib.suppress(zenoh.ZError):
-            self._session.close()  # type: ignore[no-untyped-call] # zenoh's stubs leave it untyped
+            self._session.close()
 
     def _on_signal(self, _signal: int, _frame: FrameType | None) -> None:
         self._is_signalled = True
@@ -289,7 +291,7 @@ class Worker:
             self._dispatcher.forget(before.epoch)
         is_active = role.role is WorkerRole.ACTIVE
         if self._role_token is not None and (not is_active or before.epoch != role.epoch):
-            self._role_token.undeclare()  # type: ignore[no-untyped-call] # zenoh's stubs leave it untyped
+            self._role_token.undeclare()
             self._role_token = None
         if is_active and self._role_token is None:
             self._dispatcher.begin(role.epoch)
@@ -299,7 +301,10 @@ class Worker:
     def _epoch_now(self) -> int | None:
         """The epoch that outputs are stamped with, ``None`` while they go nowhere."""
         role = self._role
-        if role.role is WorkerRole.IDLE or role.epoch <= self._ended_epoch:
+        if role.role is WorkerRole.IDLE:
+            self._dispatcher.note_withheld()
+            return None
+        if role.epoch <= self._ended_epoch:
             return None
         return role.epoch
 

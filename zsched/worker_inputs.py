@@ -5,6 +5,9 @@ Knows: which samples wait, which sources are open, which have ended. Does not kn
 An end marker travels behind the data on the same link but enters through another subscriber, so it may be seen first.
 It carries its source and how many samples that source put before it: it takes effect when the last of them has been
 processed, or, should some have been dropped on the way, a grace time after it came.
+
+A sample whose output was withheld because the worker was not the owner (a warm-up, or one that outran the role) is kept
+and processed again when it becomes the owner: else the newest map of a crashed owner would have no result at all.
 """
 
 from __future__ import annotations
@@ -22,6 +25,8 @@ from zsched.clock import monotonic_s
 from zsched.core.relay_protocol import EndMarker
 
 END_GRACE_S: Final = 0.1
+MAX_WITHHELD: Final = 256
+"""Samples per key of an input without ``keep_last`` that are kept for the day this worker becomes the owner."""
 JOIN_S: Final = 0.2
 
 SourceName = tuple[str, str, int]
@@ -87,6 +92,10 @@ class Dispatcher:
         self._markers: list[Marker] = []
         self._open: dict[SourceName, _Open] = {}
         self._epoch = 0
+        self._is_owner = False
+        self._has_withheld = False
+        self._withheld: dict[tuple[int, str], tuple[Input, deque[zenoh.Sample]]] = {}
+        self._again: deque[tuple[Input, zenoh.Sample]] = deque()
         self._is_closed = False
         self._thread = threading.Thread(target=self._run, name="zsched dispatch", daemon=True)
 
@@ -124,36 +133,60 @@ class Dispatcher:
     def begin(self, epoch: int) -> None:
         """This worker is the owner from now on: sources heard first from here on belong to ``epoch``."""
         with self._wake:
-            self._epoch = epoch
+            self._epoch, self._is_owner = epoch, True
+            for source, samples in self._withheld.values():
+                self._again.extend((source, sample) for sample in samples)
+            self._withheld.clear()
+            self._wake.notify()
 
     def forget(self, epoch: int) -> None:
         """The epoch is over for this worker: what has not ended will not."""
         with self._wake:
+            self._is_owner = False
             self._open = {name: state for name, state in self._open.items() if state.epoch > epoch}
+
+    def note_withheld(self) -> None:
+        """An output went nowhere because this worker is not the owner (any thread; ours means: of this sample)."""
+        if threading.current_thread() is self._thread:
+            self._has_withheld = True
 
     # --- the thread --------------------------------------------------------------------------------------------------
 
     def _run(self) -> None:
         while True:
             with self._wake:
-                if not self._queue and not self._is_closed:
+                if not self._queue and not self._again and not self._is_closed:
                     self._wake.wait(END_GRACE_S / 2 if self._markers else None)
                 if self._is_closed:
                     return
-                waiting = self._queue.popleft() if self._queue else None
-                sample = self._claim(waiting)
-            if waiting is not None and sample is not None:
-                self._dispatch(waiting.source, sample)
+                claimed = self._claim()
+            if claimed is not None:
+                self._process(*claimed)
             if self._markers:
                 self._settle()
 
-    def _claim(self, waiting: _Waiting | None) -> zenoh.Sample | None:
-        """Take a sample out of its key's line (under the lock): from here on nothing sheds it."""
+    def _claim(self) -> tuple[Input, zenoh.Sample] | None:
+        """Take the next sample out of its key's line (under the lock): from here on nothing sheds it."""
+        if self._again:
+            return self._again.popleft()
+        waiting = self._queue.popleft() if self._queue else None
         if waiting is None or waiting.sample is None:
             return None
-        line = waiting.source.waiting[str(waiting.sample.key_expr)]
-        line.remove(waiting)
-        return waiting.sample
+        waiting.source.waiting[str(waiting.sample.key_expr)].remove(waiting)
+        return waiting.source, waiting.sample
+
+    def _process(self, source: Input, sample: zenoh.Sample) -> None:
+        self._has_withheld = False
+        self._dispatch(source, sample)
+        if not self._has_withheld:
+            return
+        with self._wake:
+            if self._is_owner:  # it became one meanwhile
+                self._again.append((source, sample))
+                return
+            name = (id(source), str(sample.key_expr))
+            empty: deque[zenoh.Sample] = deque(maxlen=source.keep_last or MAX_WITHHELD)
+            self._withheld.setdefault(name, (source, empty))[1].append(sample)
 
     def _dispatch(self, source: Input, sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)

@@ -1,0 +1,373 @@
+"""Streams over real relays, real echo workers and real applications: what a move must not lose, double or reorder."""
+
+from __future__ import annotations
+
+import os
+import queue
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+from zsched.adapters.streams import RelayHandle
+from zsched.core.events import RelayChanged, SlotDrained, SlotFlipped, SlotReady, StreamsCounted
+from zsched.core.plan import (
+    Direction,
+    HandoverRule,
+    ReadyWhen,
+    Role,
+    Route,
+    RoutePhase,
+    RoutePlan,
+    Slot,
+    StreamClass,
+    StreamSettings,
+    WorkerRole,
+)
+from zsched.core.relay_protocol import HandleReport, WorkerSeen
+from zsched.zenoh_config import data_config, worker_config
+
+FLEET, ROBOT, TASK = "test", "robot1", "echo"
+DEADLINE_S = 10.0
+
+
+def until(condition: Callable[[], Any], what: str, deadline_s: float = DEADLINE_S) -> Any:
+    end = time.monotonic() + deadline_s
+    while time.monotonic() < end:
+        value = condition()
+        if value:
+            return value
+        time.sleep(0.005)
+    raise AssertionError(f"not within {deadline_s} s: {what}")
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+def slot(epoch: int, owner: str, stream_class: StreamClass, keep_last: int, ready: ReadyWhen = ReadyWhen.TOKEN) -> Slot:
+    settings = StreamSettings(stream_class=stream_class, keep_last=keep_last, depth=4000, handover=HandoverRule.ALL)
+    routes = (
+        Route(
+            stream=f"{TASK}/in/0",
+            direction=Direction.INPUT,
+            from_expr=f"{ROBOT}/in",
+            to_expr=f"{owner}/{TASK}/{ROBOT}/in",
+            settings=settings,
+        ),
+        Route(
+            stream=f"{TASK}/out/0",
+            direction=Direction.OUTPUT,
+            from_expr=f"{owner}/{TASK}/{epoch}/{ROBOT}/out",
+            to_expr=f"{ROBOT}/out",
+            settings=settings,
+        ),
+    )
+    return Slot(epoch=epoch, owner=owner, routes=routes, ready_when=ready)
+
+
+@dataclass
+class Reports:
+    """What one relay said, in order."""
+
+    items: list[tuple[float, HandleReport]] = field(default_factory=list)
+
+    def add(self, report: HandleReport) -> None:
+        self.items.append((time.monotonic(), report))
+
+    def find(self, kind: type, **fields: Any) -> HandleReport | None:
+        for _, report in tuple(self.items):
+            if isinstance(report, kind) and all(getattr(report, name) == value for name, value in fields.items()):
+                return report
+        return None
+
+    def count(self, kind: type) -> int:
+        return sum(isinstance(report, kind) for _, report in tuple(self.items))
+
+
+@dataclass
+class Rig:
+    """Three nodes' relays on loopback, echo workers, one application session beside the robot."""
+
+    folder: Path
+    ports: dict[str, int] = field(default_factory=lambda: {n: free_port() for n in (ROBOT, "edge1", "edge2")})
+    relays: dict[str, RelayHandle] = field(default_factory=dict)
+    reports: dict[str, Reports] = field(default_factory=dict)
+    workers: dict[str, subprocess.Popen[bytes]] = field(default_factory=dict)
+    incarnation: int = 0
+    owner: str = ""
+
+    def start(self) -> None:
+        seed = self.endpoint(ROBOT)
+        for node in self.ports:
+            self.reports[node] = Reports()
+            connect = () if node == ROBOT else (seed,)
+            text = data_config(listen=(self.endpoint(node),), connect=connect)
+            self.relays[node] = RelayHandle(fleet=FLEET, node=node, zenoh_config=text, on_report=self.reports[node].add)
+            self.relays[node].start()
+        until(lambda: all(r.find(RelayChanged, is_running=True) for r in self.reports.values()), "the relays run")
+        self.app = zenoh.open(zenoh.Config.from_json5(worker_config(connect=(seed,))))
+
+    def endpoint(self, node: str) -> str:
+        return f"tcp/127.0.0.1:{self.ports[node]}"
+
+    def start_worker(self, node: str, *options: str) -> subprocess.Popen[bytes]:
+        self.incarnation += 1
+        path = self.folder / f"{node}.json5"
+        path.write_text(worker_config(connect=(self.endpoint(node),)))
+        env = os.environ | {
+            "ZSCHED_FLEET": FLEET,
+            "ZSCHED_NODE": node,
+            "ZSCHED_TASK": TASK,
+            "ZSCHED_INCARNATION": str(self.incarnation),
+            "ZSCHED_ZENOH_CONFIG": str(path),
+        }
+        command = [sys.executable, "-m", "zsched.tasks.echo", *options]
+        self.workers[node] = subprocess.Popen(command, env=env)
+        seen = {"node": node, "task": TASK, "incarnation": str(self.incarnation), "is_present": True}
+        until(lambda: self.reports[ROBOT].find(WorkerSeen, **seen), f"worker of {node}")
+        return self.workers[node]
+
+    def role(self, node: str, role: WorkerRole, epoch: int = 0) -> None:
+        self.relays[node].set_role(Role(task=TASK, role=role, epoch=epoch))
+
+    def plan(self, phase: RoutePhase, current: Slot | None, predecessor: Slot | None = None) -> None:
+        self.relays[ROBOT].apply(RoutePlan(task=TASK, phase=phase, current=current, predecessor=predecessor))
+
+    def wait(self, kind: type, **fields: Any) -> HandleReport:
+        report: HandleReport = until(lambda: self.reports[ROBOT].find(kind, **fields), f"{kind.__name__} {fields}")
+        return report
+
+    def move(self, new: Slot, old: Slot | None = None, *, drains: bool = True) -> float:
+        """The executor's table, step by step; answers how long the flip took."""
+        self.role(new.owner, WorkerRole.ACTIVE, new.epoch)
+        if old is not None:
+            self.role(old.owner, WorkerRole.DRAINING, old.epoch)
+        self.plan(RoutePhase.PREPARE, new, old)
+        self.wait(SlotReady, epoch=new.epoch, is_ready=True)
+        started = time.monotonic()
+        self.plan(RoutePhase.FLIP, new, old)
+        self.wait(SlotFlipped, epoch=new.epoch)
+        took = time.monotonic() - started
+        if old is not None and drains:
+            self.wait(SlotDrained, epoch=old.epoch)
+        self.plan(RoutePhase.CLOSE, new)
+        return took
+
+    def drops(self) -> Counter[str]:
+        """The newest counters of the robot's relay, summed over its streams."""
+        reports = [report for _, report in self.reports[ROBOT].items if isinstance(report, StreamsCounted)]
+        result: Counter[str] = Counter()
+        for count in reports[-1].counts if reports else ():
+            result.update(dict(count.drops))
+        return result
+
+    def stop(self) -> None:
+        if hasattr(self, "app"):
+            self.app.close()
+        for worker in self.workers.values():
+            worker.send_signal(signal.SIGCONT)
+            worker.kill()
+            worker.wait(5)
+        for relay in self.relays.values():
+            relay.stop(2.0)
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    made = Rig(folder=tmp_path)
+    try:
+        made.start()
+        yield made
+    finally:
+        made.stop()
+
+
+class Application:
+    """Publishes numbers on the robot's own key and collects what comes back; never hears of owners."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self.back: list[int] = []
+        self.nodes: list[str] = []
+        self.sent = 0
+        self._samples: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
+        self._subscriber = session.declare_subscriber(f"{ROBOT}/out", self._take)
+        block = zenoh.CongestionControl.BLOCK
+        self._publisher = session.declare_publisher(f"{ROBOT}/in", congestion_control=block)
+        self._halt = threading.Event()
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        self.back.append(int(sample.payload.to_bytes()))
+        self.nodes.append(str(sample.encoding).rsplit(";", 1)[-1])
+        assert sample.attachment is not None
+        assert sample.attachment.to_bytes() == b"attached"
+
+    def put(self) -> bool:
+        self._publisher.put(str(self.sent).encode(), attachment=b"attached")
+        self.sent += 1
+        return False
+
+    def connected(self) -> bool:
+        status: Any = self._publisher.matching_status
+        return bool(status.matching)
+
+    def stream(self, hz: float) -> threading.Thread:
+        thread = threading.Thread(target=self._stream, args=(1 / hz,), daemon=True)
+        thread.start()
+        return thread
+
+    def _stream(self, period: float) -> None:
+        due = time.monotonic()
+        while not self._halt.is_set():
+            self.put()
+            due += period
+            time.sleep(max(0.0, due - time.monotonic()))
+
+    def halt(self, thread: threading.Thread) -> None:
+        self._halt.set()
+        thread.join(5)
+
+
+@pytest.mark.parametrize(
+    ("stream_class", "keep_last"), [(StreamClass.RELIABLE, 0), (StreamClass.LATEST, 0)], ids=["reliable", "latest"]
+)
+def test_moves_there_and_back_lose_double_and_reorder_nothing(
+    rig: Rig, stream_class: StreamClass, keep_last: int
+) -> None:
+    options = ["--latest"] if stream_class is StreamClass.LATEST else []
+    rig.start_worker("edge1", *options)
+    rig.start_worker("edge2", *options)
+    app = Application(rig.app)
+    now = slot(1, "edge1", stream_class, keep_last)
+    rig.move(now)
+    until(app.connected, "the application sees the relay's subscription")
+    thread = app.stream(200)
+    for epoch, owner in enumerate(["edge2", "edge1", "edge2", "edge1"], start=2):
+        time.sleep(0.1)  # the stream goes on for a while between two moves
+        new = slot(epoch, owner, stream_class, keep_last)
+        rig.move(new, now)
+        now = new
+    app.halt(thread)
+    until(lambda: len(app.back) >= app.sent, f"{app.sent} samples back, {len(app.back)} came")
+    assert app.back == list(range(app.sent))
+    assert set(app.nodes) == {"edge1", "edge2"}
+
+
+def test_the_last_value_reaches_a_new_owner(rig: Rig) -> None:
+    rig.start_worker("edge1", "--latest")
+    rig.start_worker("edge2", "--latest")
+    app = Application(rig.app)
+    first, second = slot(1, "edge1", StreamClass.LATEST, 1), slot(2, "edge2", StreamClass.LATEST, 1)
+    rig.move(first)
+    until(app.connected, "the application sees the relay's subscription")
+    for _ in range(3):
+        app.put()
+        time.sleep(0.02)
+    until(lambda: 2 in app.back, "the newest value through edge1")
+    rig.move(second, first)
+    until(lambda: "edge2" in app.nodes, "the kept value through edge2, with nothing new published")
+    assert app.back[app.nodes.index("edge2")] == 2
+
+
+def test_a_worker_that_restarts_in_place_gets_the_last_value_again(rig: Rig) -> None:
+    worker = rig.start_worker("edge1", "--latest")
+    app = Application(rig.app)
+    rig.move(slot(1, "edge1", StreamClass.LATEST, 1))
+    until(app.connected, "the application sees the relay's subscription")
+    app.put()
+    until(lambda: app.back == [0], "the value through the first incarnation")
+    worker.kill()
+    worker.wait(5)
+    rig.wait(SlotReady, epoch=1, is_ready=False)
+    rig.start_worker("edge1", "--latest")
+    until(lambda: app.back == [0, 0], "the value again, from the second incarnation, which asked for its role")
+
+
+def test_output_of_a_stale_epoch_never_passes(rig: Rig) -> None:
+    rig.start_worker("edge1")
+    app = Application(rig.app)
+    first = slot(1, "edge1", StreamClass.RELIABLE, 0)
+    rig.move(first)
+    until(app.connected, "the application sees the relay's subscription")
+    liar = zenoh.open(zenoh.Config.from_json5(worker_config(connect=(rig.endpoint("edge2"),))))
+    try:
+        stale = liar.declare_publisher(f"edge1/{TASK}/0/{ROBOT}/out")
+        other = liar.declare_publisher(f"edge2/{TASK}/1/{ROBOT}/out")
+        for publisher in (stale, other):
+            publisher.put(b"99", attachment=b"attached")
+        app.put()
+        until(lambda: 0 in app.back, "the owner's own output")
+        time.sleep(0.1)
+        assert app.back == [0]
+    finally:
+        liar.close()
+
+
+def test_a_killed_owner_is_replaced_within_the_goal(rig: Rig) -> None:
+    owner = rig.start_worker("edge1")
+    rig.start_worker("edge2")
+    app = Application(rig.app)
+    first, second = slot(1, "edge1", StreamClass.RELIABLE, 0), slot(2, "edge2", StreamClass.RELIABLE, 0)
+    rig.move(first)
+    until(app.connected, "the application sees the relay's subscription")
+    thread = app.stream(200)
+    until(lambda: len(app.back) > 50, "the stream through edge1")
+    owner.kill()
+    owner.wait(5)
+    rig.wait(SlotReady, epoch=1, is_ready=False)
+    rig.move(second, first)
+    until(lambda: app.nodes and app.nodes[-1] == "edge2", "the stream through edge2")
+    app.halt(thread)
+    until(lambda: app.back[-1] == app.sent - 1, "the newest sample")
+    assert app.back == sorted(set(app.back))
+
+
+def test_a_relay_that_is_killed_is_restarted_with_the_newest_plan(rig: Rig) -> None:
+    rig.start_worker("edge1")
+    app = Application(rig.app)
+    rig.move(slot(1, "edge1", StreamClass.RELIABLE, 0))
+    until(app.connected, "the application sees the relay's subscription")
+    pid = rig.relays[ROBOT].pid
+    assert pid is not None
+    os.kill(pid, signal.SIGKILL)
+    rig.wait(RelayChanged, is_running=False)
+    until(lambda: rig.reports[ROBOT].count(RelayChanged) == 3, "the relay runs again")
+    until(lambda: rig.relays[ROBOT].pid not in (None, pid), "another process")
+    before = len(app.back)
+    until(lambda: app.put() or len(app.back) > before, "the stream flows again")
+
+
+def test_a_foreign_worker_needs_only_its_subscription(rig: Rig) -> None:
+    app = Application(rig.app)
+    foreign = zenoh.open(zenoh.Config.from_json5(worker_config(connect=(rig.endpoint("edge1"),))))
+    try:
+        got: list[bytes] = []
+        target = slot(1, "edge1", StreamClass.LATEST, 1, ReadyWhen.MATCHING)
+        rig.plan(RoutePhase.PREPARE, target)
+        until(app.connected, "the application sees the relay's subscription")
+        app.put()
+        time.sleep(0.1)
+        assert not rig.reports[ROBOT].find(SlotReady, epoch=1)
+        foreign.declare_subscriber(f"edge1/{TASK}/{ROBOT}/in", lambda sample: got.append(sample.payload.to_bytes()))
+        rig.wait(SlotReady, epoch=1, is_ready=True)
+        rig.plan(RoutePhase.FLIP, target)
+        rig.wait(SlotFlipped, epoch=1)
+        until(lambda: got == [b"0"], "the kept value as warm-up")
+        app.put()
+        app.put()
+        until(lambda: got.count(b"2") == 2, "the last of a burst once more after half a second")
+        until(lambda: rig.drops()["repeated"] == 1, "the repetition is counted")
+    finally:
+        foreign.close()
