@@ -113,6 +113,7 @@ class Judge:
     ) -> tuple[Outcome, str]:
         owner, tuning = allocation.owner, allocation.tuning
         if allocation.paused or allocation.pinned:
+            self.beaten_since = None  # nobody looked meanwhile: afterwards the whole time-to-trigger counts again
             return Outcome.STAY, "paused by the operator" if allocation.paused else "pinned by the operator"
         if owner is None:
             return self._initial(winner, scored, now)
@@ -160,7 +161,8 @@ def escape_reason(
         owner_state: how this node sees the owner.
         profile: the owner's newest fresh profile.
         standing: the joint view (its veto of the owner is an escape).
-        not_ready_for_s: how long the owner's worker has not been ready.
+        not_ready_for_s: how long the owner's worker has not been ready (a foreign worker, without a command, never
+            shows whether it is).
     """
     owner = allocation.owner
     if owner is None:
@@ -177,7 +179,7 @@ def escape_reason(
             return f"{owner} is draining"
         if load is not None and load.state is WorkerState.FAILED:
             return f"the worker on {owner} failed"
-        if not_ready_for_s > spec.worker.start_deadline_s:
+        if spec.worker.command and not_ready_for_s > spec.worker.start_deadline_s:
             return f"the worker on {owner} is not ready for {not_ready_for_s:.1f} s"
         if profile.memory_used_mb is not None:
             free_ratio = 1.0 - profile.memory_used_mb / profile.memory_mb

@@ -208,8 +208,8 @@ def compare(spec: TaskSpec, allocation: Allocation, vectors: Mapping[NodeId, Uti
     columns: dict[NodeId, list[Utility]] = {candidate: [] for candidate in spec.candidates}
     reasons: dict[NodeId, str] = {}
     for vector in fresh:
-        for utility in vector.utilities:
-            columns.setdefault(utility.candidate, []).append(utility)
+        for candidate, utility in {utility.candidate: utility for utility in vector.utilities}.items():
+            columns.setdefault(candidate, []).append(utility)  # once per voter, however often its vector names it
         reasons.update(vector.refused)
     mean = statistics.fmean if allocation.tuning.aggregate is Aggregate.MEAN else statistics.median
     aggregates: dict[NodeId, float] = {}
@@ -218,8 +218,9 @@ def compare(spec: TaskSpec, allocation: Allocation, vectors: Mapping[NodeId, Uti
         column = columns[candidate]
         reaching = sum(utility.reachable for utility in column)
         needed = len(fresh) if spec.reach is Reach.ALL else majority(len(fresh))
-        if len(column) < majority(len(fresh)):
-            vetoed[candidate] = reasons.get(candidate, "not scored by a majority")
+        if len(column) < majority(len(fresh)) or len(column) == reaching < needed:
+            # Not scored is not "not reached": only the latter is a reason to flee from an owner.
+            vetoed[candidate] = reasons.get(candidate, "not scored by enough robots")
         elif reaching < needed:
             vetoed[candidate] = f"reached by {reaching} of {len(fresh)} robots"
         else:

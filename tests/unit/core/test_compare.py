@@ -1,0 +1,156 @@
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import pytest
+from zsched.core.fleet import Reach, TaskSpec
+from zsched.core.model import Aggregate, Allocation, Tuning, Utility, UtilityVector, Weights
+from zsched.core.scoring import Standing, compare, majority, pick, rounded
+
+SPEC = TaskSpec(
+    name="merge",
+    candidates=("edge1", "edge2", "edge3"),
+    tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0)),
+)
+GONE = -1.0
+"""In `vote`: this robot does not reach the candidate."""
+
+
+def vote(
+    voter: str, *, revision: int = 7, refused: Mapping[str, str] | None = None, **utilities: float
+) -> UtilityVector:
+    return UtilityVector(
+        voter=voter,
+        task="merge",
+        revision=revision,
+        utilities=tuple(
+            Utility(candidate=name, value=max(value, 0.0), reachable=value >= 0.0) for name, value in utilities.items()
+        ),
+        refused=tuple(sorted((refused or {}).items())),
+    )
+
+
+def joined(*vectors: UtilityVector, spec: TaskSpec = SPEC, aggregate: Aggregate = Aggregate.MEAN) -> Standing:
+    tuning = replace(SPEC.tuning, aggregate=aggregate)
+    allocation = Allocation(task="merge", revision=7, epoch=3, owner="edge1", tuning=tuning)
+    return compare(spec, allocation, {vector.voter: vector for vector in vectors})
+
+
+def test_columns_are_averaged_over_the_robots() -> None:
+    standing = joined(
+        vote("r1", edge1=0.9, edge2=0.1), vote("r2", edge1=0.1, edge2=0.2), vote("r3", edge1=0.2, edge2=0.3)
+    )
+
+    assert standing.aggregates == {"edge1": pytest.approx(0.4), "edge2": pytest.approx(0.2)}
+    assert standing.vetoed == {"edge3": "not scored by enough robots"}
+    assert standing.voters_heard == 3
+
+
+def test_median_is_robust_against_one_robot_that_lies_and_the_mean_is_not() -> None:
+    honest = [vote(name, edge1=0.6, edge2=0.5) for name in ("r1", "r2")]
+    liar = vote("r3", edge1=0.0, edge2=1.0)
+
+    assert pick(joined(*honest, liar).aggregates, None) == "edge2"
+    assert pick(joined(*honest, liar, aggregate=Aggregate.MEDIAN).aggregates, None) == "edge1"
+
+
+def test_a_robot_counts_once_per_candidate_however_often_it_names_it() -> None:
+    shouted = tuple(Utility(candidate="edge2", value=1.0) for _ in range(9))
+    liar = replace(vote("r3", edge1=0.0), utilities=(Utility(candidate="edge1", value=0.0), *shouted))
+    standing = joined(vote("r1", edge1=0.6, edge2=0.1), vote("r2", edge1=0.6, edge2=0.1), liar)
+
+    assert standing.aggregates == {"edge1": pytest.approx(0.4), "edge2": pytest.approx(0.4)}
+
+
+def test_vectors_under_another_revision_are_not_counted() -> None:
+    standing = joined(vote("r1", edge1=0.2), vote("r2", edge1=0.8, revision=6), vote("r3", edge1=0.8, revision=8))
+
+    assert (standing.voters_heard, standing.aggregates) == (1, {"edge1": 0.2})
+
+
+def test_unreachable_is_zero_in_the_mean_and_not_absent() -> None:
+    standing = joined(
+        vote("r1", edge1=0.9, edge2=0.5), vote("r2", edge1=0.9, edge2=0.5), vote("r3", edge1=GONE, edge2=0.5)
+    )
+
+    assert standing.aggregates == {"edge1": pytest.approx(0.6), "edge2": pytest.approx(0.5)}
+
+
+@pytest.mark.parametrize(
+    ("reach", "unreached", "is_vetoed"),
+    [
+        (Reach.MAJORITY, 0, False),
+        (Reach.MAJORITY, 1, False),
+        (Reach.MAJORITY, 2, True),
+        (Reach.MAJORITY, 3, True),
+        (Reach.ALL, 0, False),
+        (Reach.ALL, 1, True),
+    ],
+)
+def test_a_candidate_that_too_few_reach_is_vetoed(reach: Reach, unreached: int, *, is_vetoed: bool) -> None:
+    vectors = [vote(f"r{i}", edge1=GONE if i < unreached else 0.9) for i in range(3)]
+    standing = joined(*vectors, spec=replace(SPEC, reach=reach))
+
+    assert ("edge1" not in standing.aggregates) is is_vetoed
+    if is_vetoed:
+        assert standing.vetoed["edge1"] == f"reached by {3 - unreached} of 3 robots"
+
+
+def test_half_of_the_robots_is_no_majority_that_reaches() -> None:
+    standing = joined(*[vote(f"r{i}", edge1=GONE if i < 2 else 0.9) for i in range(4)])
+
+    assert standing.vetoed["edge1"] == "reached by 2 of 4 robots"
+
+
+def test_refused_by_most_is_vetoed_with_their_reason_by_one_is_not() -> None:
+    refusal = {"edge1": "draining"}
+    one = joined(vote("r1", refused=refusal), vote("r2", edge1=0.5), vote("r3", edge1=0.7))
+    two = joined(vote("r1", refused=refusal), vote("r2", refused=refusal), vote("r3", edge1=0.7))
+
+    assert one.aggregates == {"edge1": pytest.approx(0.6)}
+    assert two.vetoed["edge1"] == "draining"
+
+
+def test_reach_all_tells_not_scored_from_not_reached() -> None:
+    """One lost profile vetoes under `reach: all`, but it is no proof that the owner is out of reach."""
+    every = replace(SPEC, reach=Reach.ALL)
+    missing = vote("r1", refused={"edge1": "no fresh profile"})
+
+    assert (
+        joined(missing, vote("r2", edge1=0.5), vote("r3", edge1=0.5), spec=every).vetoed["edge1"] == "no fresh profile"
+    )
+    both = joined(missing, vote("r2", edge1=GONE), vote("r3", edge1=0.5), spec=every)
+    assert both.vetoed["edge1"] == "reached by 1 of 3 robots"
+
+
+def test_strangers_in_a_vector_change_nothing_and_nobody_heard_vetoes_all() -> None:
+    assert "edge9" not in joined(vote("r1", edge9=1.0, edge1=0.1)).aggregates
+    assert set(joined().vetoed) == set(SPEC.candidates)
+    assert joined().voters_heard == 0
+
+
+# --- pick ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("aggregates", "owner", "picked"),
+    [
+        ({}, "edge1", None),
+        ({"edge1": 0.5, "edge2": 0.6}, "edge1", "edge2"),
+        ({"edge1": 0.5, "edge2": 0.5}, "edge2", "edge2"),
+        ({"edge2": 0.5, "edge1": 0.5}, None, "edge1"),
+        ({"edge2": 0.5, "edge1": 0.5}, "edge3", "edge1"),
+        ({"edge1": 0.5, "edge2": 0.5 + 1 / 1024}, "edge1", "edge1"),
+        ({"edge1": 0.5, "edge2": 0.5 + 1 / 256}, "edge1", "edge2"),
+    ],
+)
+def test_pick_takes_the_highest_to_one_in_256_then_the_owner_then_the_name(
+    aggregates: Mapping[str, float], owner: str | None, picked: str | None
+) -> None:
+    assert pick(aggregates, owner) == picked
+
+
+def test_sums_that_differ_by_their_order_only_are_one_number() -> None:
+    assert rounded(0.1 + 0.2 + 0.3) == rounded(0.3 + 0.2 + 0.1)
+    assert [majority(count) for count in range(1, 8)] == [1, 2, 2, 3, 3, 4, 4]

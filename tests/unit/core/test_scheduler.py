@@ -1,0 +1,334 @@
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import pytest
+from zsched.core.fleet import TaskSpec, WorkerSpec
+from zsched.core.model import (
+    Allocation,
+    PeerState,
+    Profile,
+    Tuning,
+    Utility,
+    UtilityVector,
+    Weights,
+    WorkerLoad,
+    WorkerState,
+)
+from zsched.core.scheduler import INITIAL_SETTLE_S, Judge, Judgement, Outcome, escape_reason
+from zsched.core.scoring import Standing, compare
+
+TUNING = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0), bonus=0.10, time_to_trigger_s=2.0, cool_down_s=10.0)
+SPEC = TaskSpec(
+    name="merge", candidates=("edge1", "edge2", "edge3"), tuning=TUNING, worker=WorkerSpec(command=("worker",))
+)
+LONG = 1000.0
+"""Settled for so long that no cool-down counts."""
+
+
+def standing(aggregates: Mapping[str, float], vetoed: Mapping[str, str] | None = None) -> Standing:
+    return Standing(aggregates=aggregates, vetoed=vetoed or {}, vectors=(), voters_heard=3)
+
+
+def allocation(owner: str | None = "edge1", *, paused: bool = False, pinned: bool = False) -> Allocation:
+    revision = 0 if owner is None else 5
+    return Allocation(
+        task="merge", revision=revision, epoch=revision, owner=owner, tuning=TUNING, paused=paused, pinned=pinned
+    )
+
+
+def judged(
+    judge: Judge,
+    aggregates: Mapping[str, float],
+    now: float,
+    *,
+    settled: float = LONG,
+    escape: str | None = None,
+    called: bool = False,
+    agreed: Allocation | None = None,
+) -> Judgement:
+    return judge.judge(
+        standing(aggregates),
+        agreed or allocation(),
+        settled_for_s=settled,
+        escape=escape,
+        is_called=called,
+        now=now,
+    )
+
+
+BETTER = {"edge1": 0.5, "edge2": 0.65}
+EQUAL = {"edge1": 0.5, "edge2": 0.5}
+
+
+# --- bonus ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("challenger", "leads"), [(0.4, False), (0.5, False), (0.6, False), (0.6 + 1 / 1024, False), (0.61, True)]
+)
+def test_a_challenger_must_beat_the_owner_with_its_bonus(challenger: float, *, leads: bool) -> None:
+    judgement = judged(Judge(spec=SPEC), {"edge1": 0.5, "edge2": challenger}, now=0.0)
+
+    assert judgement.outcome is (Outcome.WAIT if leads else Outcome.STAY)
+    assert judgement.candidate == "edge1"
+    assert judgement.aggregates == {"edge1": pytest.approx(0.6), "edge2": challenger}
+
+
+def test_the_bonus_is_added_once_whatever_the_number_of_robots_and_rounds() -> None:
+    judge = Judge(spec=SPEC)
+    for voters in (1, 3, 9):
+        vectors = {
+            f"r{i}": UtilityVector(
+                voter=f"r{i}", task="merge", revision=5, utilities=(Utility(candidate="edge1", value=0.5),)
+            )
+            for i in range(voters)
+        }
+        joint = compare(SPEC, allocation(), vectors)
+        for now in (0.0, 1.0, 2.0):
+            judgement = judge.judge(joint, allocation(), settled_for_s=LONG, escape=None, is_called=False, now=now)
+            assert judgement.aggregate == pytest.approx(0.6)
+
+
+# --- time-to-trigger -----------------------------------------------------------------------------------------------
+
+
+def test_a_lead_is_proposed_after_the_time_to_trigger() -> None:
+    judge = Judge(spec=SPEC)
+    outcomes = [(now, judged(judge, BETTER, now).outcome) for now in (10.0, 11.0, 11.99, 12.0)]
+
+    assert outcomes == [(10.0, Outcome.WAIT), (11.0, Outcome.WAIT), (11.99, Outcome.WAIT), (12.0, Outcome.PROPOSE)]
+    proposed = judged(judge, BETTER, 12.5)
+    assert (proposed.candidate, proposed.is_escape) == ("edge2", False)
+    assert proposed.aggregate == 0.65
+    assert "edge2 leads by 0.050" in proposed.reason
+
+
+@pytest.mark.parametrize("break_", [EQUAL, {"edge1": 0.5}, {}])
+def test_a_break_in_the_lead_starts_the_time_again(break_: Mapping[str, float]) -> None:
+    judge = Judge(spec=SPEC)
+    judged(judge, BETTER, 0.0)
+    judged(judge, break_, 1.0)
+
+    assert judged(judge, BETTER, 2.0).outcome is Outcome.WAIT
+    assert judged(judge, BETTER, 3.9).outcome is Outcome.WAIT
+    assert judged(judge, BETTER, 4.0).outcome is Outcome.PROPOSE
+
+
+def test_challengers_that_take_turns_do_not_save_the_owner() -> None:
+    """It is the owner that is beaten without a break; by whom may change with the noise."""
+    judge = Judge(spec=SPEC)
+    judged(judge, {"edge1": 0.5, "edge2": 0.7, "edge3": 0.6}, 0.0)
+    judged(judge, {"edge1": 0.5, "edge2": 0.6, "edge3": 0.7}, 1.0)
+    judgement = judged(judge, {"edge1": 0.5, "edge2": 0.7, "edge3": 0.6}, 2.0)
+
+    assert (judgement.outcome, judgement.candidate) == (Outcome.PROPOSE, "edge2")
+
+
+def test_after_a_reset_the_whole_time_counts_again() -> None:
+    judge = Judge(spec=SPEC, not_ready_since=0.0)
+    judged(judge, BETTER, 0.0)
+    judge.reset()
+
+    assert judge.not_ready_since is None
+    assert judged(judge, BETTER, 2.0).outcome is Outcome.WAIT
+
+
+def test_an_owner_that_may_not_be_scored_is_left_by_the_same_timers() -> None:
+    judge = Judge(spec=SPEC)
+
+    assert judged(judge, {"edge2": 0.1}, 0.0).outcome is Outcome.WAIT
+    assert judged(judge, {"edge2": 0.1}, 2.0).outcome is Outcome.PROPOSE
+
+
+# --- cool-down -----------------------------------------------------------------------------------------------------
+
+
+def test_after_a_move_the_task_stays_for_the_cool_down() -> None:
+    judge = Judge(spec=SPEC)
+    outcomes = {now: judged(judge, BETTER, now, settled=now).outcome for now in (0.0, 2.0, 5.0, 9.9, 10.0)}
+
+    assert outcomes == {
+        0.0: Outcome.WAIT,
+        2.0: Outcome.WAIT,
+        5.0: Outcome.WAIT,
+        9.9: Outcome.WAIT,
+        10.0: Outcome.PROPOSE,
+    }
+
+
+def test_time_to_trigger_runs_during_the_cool_down_but_is_not_replaced_by_it() -> None:
+    judge = Judge(spec=SPEC)
+    judged(judge, BETTER, 9.0, settled=9.0)
+
+    assert judged(judge, BETTER, 10.0, settled=10.0).outcome is Outcome.WAIT
+    assert judged(judge, BETTER, 11.0, settled=11.0).outcome is Outcome.PROPOSE
+
+
+# --- escape --------------------------------------------------------------------------------------------------------
+
+
+def test_an_escape_skips_both_timers_and_excludes_the_owner() -> None:
+    judgement = judged(
+        Judge(spec=SPEC), {"edge1": 0.9, "edge2": 0.1, "edge3": 0.2}, 0.0, settled=0.0, escape="edge1 is gone"
+    )
+
+    assert (judgement.outcome, judgement.candidate, judgement.is_escape) == (Outcome.PROPOSE, "edge3", True)
+    assert judgement.reason == "edge1 is gone"
+    assert judgement.aggregates == {"edge2": 0.1, "edge3": 0.2}
+
+
+def test_an_escape_without_anywhere_to_go_proposes_nothing() -> None:
+    judgement = judged(Judge(spec=SPEC), {"edge1": 0.9}, 0.0, escape="edge1 is gone")
+
+    assert (judgement.outcome, judgement.candidate, judgement.is_escape) == (Outcome.NONE, "edge1", False)
+
+
+def test_nobody_scored_is_no_decision() -> None:
+    assert judged(Judge(spec=SPEC), {}, 0.0).outcome is Outcome.NONE
+
+
+# --- called votes --------------------------------------------------------------------------------------------------
+
+
+def test_a_called_vote_is_answered_with_today_s_winner_without_our_own_timers() -> None:
+    judgement = judged(Judge(spec=SPEC), BETTER, 0.0, settled=0.0, called=True)
+
+    assert (judgement.outcome, judgement.candidate, judgement.is_escape) == (Outcome.PROPOSE, "edge2", False)
+    assert judgement.reason.startswith("vote called")
+
+
+def test_a_called_vote_is_answered_with_the_owner_when_nobody_beats_its_bonus() -> None:
+    judgement = judged(Judge(spec=SPEC), {"edge1": 0.5, "edge2": 0.59}, 0.0, called=True)
+
+    assert (judgement.outcome, judgement.candidate) == (Outcome.STAY, "edge1")
+    assert judgement.aggregate == pytest.approx(0.6)
+
+
+# --- first placement -----------------------------------------------------------------------------------------------
+
+
+def test_first_placement_takes_the_best_at_once_when_all_are_there() -> None:
+    everybody = {"edge1": 0.2, "edge2": 0.7, "edge3": 0.6}
+    judgement = judged(Judge(spec=SPEC), everybody, 0.0, settled=0.0, agreed=allocation(None))
+
+    assert (judgement.outcome, judgement.candidate) == (Outcome.PROPOSE, "edge2")
+    assert judgement.aggregates == everybody, "nobody has a bonus yet"
+    assert not judgement.is_escape
+
+
+def test_first_placement_waits_a_little_for_those_that_are_still_starting() -> None:
+    judge = Judge(spec=SPEC)
+
+    assert judged(judge, {}, 0.0, agreed=allocation(None)).outcome is Outcome.NONE
+    waiting = judged(judge, BETTER, 5.0, agreed=allocation(None))
+    assert (waiting.outcome, waiting.candidate) == (Outcome.WAIT, None)
+    assert "edge3" in waiting.reason
+    assert judged(judge, BETTER, 5.0 + INITIAL_SETTLE_S - 0.1, agreed=allocation(None)).outcome is Outcome.WAIT
+    late = judged(judge, BETTER, 5.0 + INITIAL_SETTLE_S, agreed=allocation(None))
+    assert (late.outcome, late.candidate) == (Outcome.PROPOSE, "edge2")
+
+
+# --- the operator --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("escape", [None, "edge1 is gone"])
+@pytest.mark.parametrize("called", [True, False])
+@pytest.mark.parametrize("word", ["paused", "pinned"])
+def test_paused_or_pinned_tasks_stay_whatever_happens(word: str, escape: str | None, *, called: bool) -> None:
+    agreed = allocation(paused=word == "paused", pinned=word == "pinned")
+    judgement = judged(Judge(spec=SPEC), BETTER, 0.0, escape=escape, called=called, agreed=agreed)
+
+    assert (judgement.outcome, judgement.candidate, judgement.is_escape) == (Outcome.STAY, "edge1", False)
+    assert judgement.reason == f"{word} by the operator"
+
+
+def test_a_pause_does_not_count_towards_the_time_to_trigger() -> None:
+    judge = Judge(spec=SPEC)
+    judged(judge, BETTER, 0.0)
+    judged(judge, BETTER, 1.0, agreed=allocation(paused=True))
+
+    assert judged(judge, BETTER, 100.0).outcome is Outcome.WAIT
+
+
+# --- escape_reason -------------------------------------------------------------------------------------------------
+
+
+def profile(
+    *, state: WorkerState | None = WorkerState.READY, memory: float | None = 1000.0, draining: bool = False
+) -> Profile:
+    return Profile(
+        node="edge1",
+        incarnation=1,
+        sequence=0,
+        cpu_cores=4.0,
+        cpu_used_cores=4.0,
+        memory_mb=4000.0,
+        memory_used_mb=memory,
+        workers=() if state is None else (WorkerLoad(task="merge", state=state),),
+        draining=draining,
+    )
+
+
+def reason(
+    seen: Profile | None = None,
+    *,
+    state: PeerState = PeerState.ALIVE,
+    vetoed: Mapping[str, str] | None = None,
+    not_ready: float = 0.0,
+    spec: TaskSpec = SPEC,
+    owner: str | None = "edge1",
+) -> str | None:
+    return escape_reason(spec, allocation(owner), state, seen, standing({}, vetoed), not_ready)
+
+
+DEADLINE_S = SPEC.worker.start_deadline_s
+FOREIGN = TaskSpec(name="merge", candidates=SPEC.candidates, tuning=TUNING)
+
+
+def test_a_healthy_owner_is_not_left_however_busy() -> None:
+    assert reason(profile()) is None
+    assert reason(None) is None, "a lost profile is no proof"
+    assert reason(profile(), owner=None) is None
+
+
+def test_a_gone_or_silent_owner_is_left() -> None:
+    assert reason(profile(), state=PeerState.GONE) == "edge1 is gone"
+    assert reason(None, state=PeerState.SUSPECT) == "edge1 is silent"
+
+
+def test_a_draining_owner_or_one_whose_worker_failed_is_left() -> None:
+    assert reason(profile(draining=True)) == "edge1 is draining"
+    assert reason(profile(state=WorkerState.FAILED)) == "the worker on edge1 failed"
+
+
+def test_an_owner_that_is_no_candidate_any_more_is_left() -> None:
+    fewer = TaskSpec(name="merge", candidates=("edge2", "edge3"), tuning=TUNING)
+
+    assert reason(profile(), spec=fewer) == "edge1 is no candidate any more"
+
+
+@pytest.mark.parametrize("state", [WorkerState.STARTING, WorkerState.STOPPED, None])
+def test_not_ready_is_an_escape_only_after_the_start_up_deadline(state: WorkerState | None) -> None:
+    assert reason(profile(state=state), not_ready=DEADLINE_S) is None
+    assert reason(profile(state=state), not_ready=DEADLINE_S + 0.5) == "the worker on edge1 is not ready for 20.5 s"
+
+
+def test_a_foreign_worker_is_never_late() -> None:
+    """It is somebody else's process: no supervisor ever reports it ready."""
+    assert reason(profile(state=None), not_ready=DEADLINE_S + 100.0, spec=FOREIGN) is None
+
+
+def test_an_owner_below_its_memory_floor_is_left() -> None:
+    floor = 4000.0 * (1 - SPEC.memory_floor_ratio)
+
+    assert reason(profile(memory=floor - 1.0)) is None
+    assert reason(profile(memory=floor + 40.0)) == "memory of edge1 is 4 % free"
+    assert reason(profile(memory=5000.0)) == "memory of edge1 is 0 % free"
+    assert reason(profile(memory=None)) is None
+
+
+def test_an_owner_that_too_few_robots_reach_is_left_one_that_is_not_scored_is_not() -> None:
+    assert reason(profile(), vetoed={"edge1": "reached by 1 of 3 robots"}) == "edge1 is reached by 1 of 3 robots"
+    assert reason(profile(), vetoed={"edge1": "no fresh profile"}) is None
+    assert reason(profile(), vetoed={"edge2": "reached by 0 of 3 robots"}) is None

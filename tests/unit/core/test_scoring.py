@@ -1,0 +1,270 @@
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import pytest
+from zsched.core.fleet import Demand, Fleet, NodeSpec, Standby, TaskSpec, Timing, WorkerSpec
+from zsched.core.gateway import Gateway
+from zsched.core.model import (
+    Allocation,
+    Link,
+    LinkSource,
+    NodeKind,
+    PeerState,
+    Profile,
+    Tuning,
+    Utility,
+    UtilityVector,
+    Weights,
+    WorkerLoad,
+    WorkerState,
+)
+from zsched.core.scoring import score
+
+CPU = Weights(cpu=1.0, memory=0.0, network=0.0)
+HALVES = Weights(cpu=0.5, memory=0.0, network=0.5)
+WIRED = (Link(source=LinkSource.WIRED),)
+SPEC = TaskSpec(
+    name="merge",
+    candidates=("edge1", "edge2", "edge3"),
+    tuning=Tuning(weights=CPU),
+    worker=WorkerSpec(command=("worker",)),
+)
+
+
+def radio(rssi: float | None, peer: str | None = None) -> tuple[Link, ...]:
+    return (Link(source=LinkSource.NL80211, peer=peer, rssi_dbm=rssi),)
+
+
+def profile(
+    node: str,
+    *,
+    cpu: float | None = 1.0,
+    memory: float | None = 1000.0,
+    links: tuple[Link, ...] = WIRED,
+    state: WorkerState | None = WorkerState.READY,
+    own: tuple[float, float] = (0.0, 0.0),
+    draining: bool = False,
+) -> Profile:
+    load = () if state is None else (WorkerLoad(task="merge", state=state, cpu_cores=own[0], memory_mb=own[1]),)
+    return Profile(
+        node=node,
+        incarnation=1,
+        sequence=0,
+        cpu_cores=4.0,
+        cpu_used_cores=cpu,
+        memory_mb=4000.0,
+        memory_used_mb=memory,
+        links=links,
+        workers=load,
+        draining=draining,
+    )
+
+
+def allocation(weights: Weights = CPU, owner: str | None = "edge1") -> Allocation:
+    return Allocation(task="merge", revision=7, epoch=3, owner=owner, tuning=Tuning(weights=weights))
+
+
+def scored(
+    *profiles: Profile,
+    spec: TaskSpec = SPEC,
+    agreed: Allocation | None = None,
+    voter: str = "robot1",
+    states: Mapping[str, PeerState] | None = None,
+    age_s: float = 0.0,
+) -> UtilityVector:
+    names = sorted({*spec.candidates, voter, *(one.node for one in profiles)})
+    fleet = Fleet(
+        name="lab",
+        timing=Timing(),
+        nodes=tuple(NodeSpec(name=name, kind=NodeKind.EDGE) for name in names),
+        tasks=(spec,),
+        electors=(voter,),
+    )
+    gateway = Gateway(fleet)
+    for one in profiles:
+        assert gateway.absorb(one, 0.0) is None
+    seen = dict.fromkeys(names, PeerState.ALIVE) | dict(states or {})
+    return score(spec, agreed or allocation(), voter, gateway, seen, age_s)
+
+
+def values(vector: UtilityVector) -> dict[str, float]:
+    return {utility.candidate: utility.value for utility in vector.utilities}
+
+
+ROBOT = profile("robot1", links=radio(-50.0), state=None)
+EDGES = (profile("edge1", cpu=3.0), profile("edge2", cpu=2.0), profile("edge3", cpu=1.0))
+
+
+# --- who is scored -------------------------------------------------------------------------------------------------
+
+
+def test_vector_names_voter_task_and_revision_and_is_sorted() -> None:
+    vector = scored(ROBOT, *reversed(EDGES))
+
+    assert (vector.voter, vector.task, vector.revision) == ("robot1", "merge", 7)
+    assert values(vector) == {"edge1": 0.25, "edge2": 0.5, "edge3": 0.75}
+    assert list(values(vector)) == sorted(values(vector))
+    assert vector.refused == ()
+
+
+@pytest.mark.parametrize("state", [PeerState.UNKNOWN, PeerState.SUSPECT, PeerState.GONE])
+def test_a_candidate_that_is_not_alive_gets_zero_and_is_not_left_out(state: PeerState) -> None:
+    vector = scored(ROBOT, *EDGES, states={"edge2": state})
+
+    assert vector.utilities[1] == Utility(candidate="edge2", value=0.0, reachable=False)
+    assert vector.refused == ()
+
+
+def test_a_link_below_nu_is_zero_even_without_weight_at_nu_it_is_reached() -> None:
+    edges = (profile("edge1", links=radio(-80.1)), profile("edge2", links=radio(-80.0)), profile("edge3"))
+    vector = scored(ROBOT, *edges, agreed=allocation(CPU))
+
+    assert vector.utilities[0] == Utility(candidate="edge1", value=0.0, reachable=False)
+    assert (vector.utilities[1].reachable, vector.utilities[1].network) == (True, 0.0)
+    assert vector.utilities[1].value == 0.75
+
+
+@pytest.mark.parametrize(
+    ("candidate", "reason"),
+    [
+        (profile("edge2", draining=True), "draining"),
+        (profile("edge2", state=WorkerState.FAILED), "worker failed"),
+        (profile("edge2", state=WorkerState.STARTING), "worker starting"),
+        (profile("edge2", state=WorkerState.STOPPED), "worker stopped"),
+        (profile("edge2", state=None), "runs no worker for it"),
+        (profile("edge1", draining=True), "draining"),
+        (profile("edge1", state=WorkerState.FAILED), "worker failed"),
+    ],
+)
+def test_who_may_not_have_the_task_is_refused_with_the_reason(candidate: Profile, reason: str) -> None:
+    others = [edge for edge in EDGES if edge.node != candidate.node]
+    vector = scored(ROBOT, candidate, *others)
+
+    assert vector.refused == ((candidate.node, reason),)
+    assert candidate.node not in values(vector)
+
+
+@pytest.mark.parametrize("state", [WorkerState.STARTING, WorkerState.STOPPED])
+def test_the_owner_keeps_its_place_while_its_worker_restarts(state: WorkerState) -> None:
+    """Not ready is an escape only after the worker's start-up deadline."""
+    assert "edge1" in values(scored(ROBOT, profile("edge1", state=state), *EDGES[1:]))
+
+
+@pytest.mark.parametrize("state", [WorkerState.STARTING, WorkerState.STOPPED, WorkerState.READY])
+def test_a_cold_standby_is_startable_and_therefore_scored(state: WorkerState) -> None:
+    cold = replace(SPEC, worker=WorkerSpec(command=("worker",), standby=Standby.COLD))
+
+    assert "edge2" in values(scored(ROBOT, EDGES[0], profile("edge2", state=state), spec=cold))
+
+
+def test_a_foreign_worker_needs_no_process_of_ours() -> None:
+    foreign = replace(SPEC, worker=WorkerSpec())
+
+    assert "edge2" in values(scored(ROBOT, profile("edge2", state=None), spec=foreign))
+
+
+def test_no_or_old_profile_of_a_living_node_is_refused_not_guessed() -> None:
+    assert scored(ROBOT, *EDGES[:2]).refused == (("edge3", "no fresh profile"),)
+    old = scored(ROBOT, *EDGES, age_s=Timing().profile_ttl_s + 0.1)
+    assert old.refused == tuple((edge, "no fresh profile") for edge in SPEC.candidates)
+
+
+def test_memory_that_the_task_would_not_get_is_a_hard_constraint() -> None:
+    spec = replace(SPEC, demand=Demand(memory_mb=500.0))
+    vector = scored(ROBOT, profile("edge1", memory=3500.0), profile("edge2", memory=3600.0), spec=spec)
+
+    assert values(vector) == {"edge1": 0.75}
+    assert vector.refused[0] == ("edge2", "needs 500 MiB, has 400 free")
+
+
+def test_memory_that_its_own_worker_holds_counts_as_free_for_the_task() -> None:
+    spec = replace(SPEC, demand=Demand(memory_mb=500.0))
+    vector = scored(ROBOT, profile("edge1", memory=3900.0, own=(0.0, 500.0)), spec=spec)
+
+    assert "edge1" in values(vector)
+
+
+# --- demand --------------------------------------------------------------------------------------------------------
+
+
+def test_the_owner_does_not_look_worse_by_the_task_s_own_load() -> None:
+    """Two equal machines, one of them carrying the task: equal utilities, in CPU and in memory."""
+    spec = replace(SPEC, demand=Demand(cpu_cores=0.8, memory_mb=600.0))
+    owner = profile("edge1", cpu=1.8, memory=1600.0, own=(0.8, 600.0))
+    other = profile("edge2", cpu=1.0, memory=1000.0)
+    vector = scored(ROBOT, owner, other, spec=spec, agreed=allocation(Weights(cpu=0.5, memory=0.5, network=0.0)))
+    first, second = vector.utilities
+
+    assert first.value == pytest.approx(second.value)
+    assert first.cpu == pytest.approx(1 - 1.8 / 4)
+    assert first.memory == pytest.approx(1 - 1600 / 4000)
+
+
+def test_an_idle_standby_s_load_is_not_counted_twice() -> None:
+    spec = replace(SPEC, demand=Demand(cpu_cores=0.8, memory_mb=600.0))
+    vector = scored(ROBOT, profile("edge2", cpu=1.1, memory=1200.0, own=(0.1, 200.0)), spec=spec)
+
+    assert vector.utilities[0].cpu == pytest.approx(1 - 1.8 / 4)
+    assert vector.utilities[0].memory == pytest.approx(1 - 1600 / 4000)
+
+
+# --- links ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("mine", "theirs", "network"),
+    [
+        (radio(-50.0), WIRED, 0.75),
+        (radio(-50.0), radio(-60.0), 0.5),
+        (radio(-60.0), radio(-50.0), 0.5),
+        (WIRED, WIRED, 1.0),
+        (WIRED, radio(-60.0), 0.5),
+        (radio(-50.0), (), None),
+        ((), WIRED, None),
+        (radio(None), WIRED, None),
+        ((*radio(-70.0), *radio(-50.0, "edge1")), radio(-79.0), 0.75),
+        (radio(-70.0), (*radio(-79.0), *radio(-50.0, "robot1")), 0.75),
+        ((*radio(-70.0), Link(source=LinkSource.WIRED, peer="edge1")), radio(-79.0), 1.0),
+        ((*radio(-50.0), *radio(None, "edge1")), WIRED, 0.75),
+        ((*radio(-50.0), *radio(-70.0, "edge2")), WIRED, 0.75),
+    ],
+)
+def test_the_signal_of_a_pair(mine: tuple[Link, ...], theirs: tuple[Link, ...], network: float | None) -> None:
+    """Directly measured as it is, from either end; else through the access point, where the weaker way counts."""
+    vector = scored(profile("robot1", links=mine, state=None), profile("edge1", links=theirs))
+
+    assert vector.utilities[0].network == network
+
+
+def test_a_robot_that_is_a_candidate_reaches_itself() -> None:
+    spec = replace(SPEC, candidates=("robot1", "robot2"))
+    one, two = (profile(name, links=radio(-60.0)) for name in spec.candidates)
+    vector = scored(one, two, spec=spec, agreed=allocation(HALVES, owner="robot1"))
+
+    assert [utility.network for utility in vector.utilities] == [1.0, 0.5]
+
+
+# --- metrics that are missing --------------------------------------------------------------------------------------
+
+
+def test_a_metric_missing_for_every_candidate_is_dropped_and_the_rest_renormalised() -> None:
+    mute = profile("robot1", links=(), state=None)
+
+    assert values(scored(mute, *EDGES, agreed=allocation(HALVES))) == {"edge1": 0.25, "edge2": 0.5, "edge3": 0.75}
+
+
+def test_a_metric_missing_for_some_excludes_those() -> None:
+    vector = scored(ROBOT, profile("edge1", links=()), *EDGES[1:], agreed=allocation(HALVES))
+
+    assert list(values(vector)) == ["edge2", "edge3"]
+    assert vector.refused == (("edge1", "a weighted metric is not measured"),)
+
+
+def test_a_candidate_that_was_refused_does_not_make_a_metric_measured() -> None:
+    """Otherwise one broken machine with a good radio would take all others out of the race."""
+    broken = profile("edge3", state=WorkerState.FAILED)
+    vector = scored(ROBOT, profile("edge1", links=()), profile("edge2", links=()), broken, agreed=allocation(HALVES))
+
+    assert list(values(vector)) == ["edge1", "edge2"]
