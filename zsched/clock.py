@@ -18,3 +18,8 @@ def monotonic_s() -> float:
 def wall_time() -> str:
     """Now as an RFC 3339 string in UTC with milliseconds, for logs and people; never for decisions."""
     return datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def wall_seconds() -> int:
+    """Whole seconds of the wall clock: the start counter of a blank state, so that it is above an earlier life's."""
+    return int(time.time())

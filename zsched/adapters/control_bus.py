@@ -221,7 +221,7 @@ class ControlBus:
             number = self._questions.keep(query, keys.utility(node, asker))
             return ev.UtilityAsked(request=number, asker=asker)
         if kind == "register":
-            value: Prepare | Accept = wire.decode(payload, Prepare, Accept)
+            value: Any = wire.decode(payload, Prepare, Accept)
             number = self._questions.keep(query, keys.register(node, asker))
             if isinstance(value, Prepare):
                 return ev.PrepareAsked(request=number, asker=asker, prepare=value)

@@ -7,7 +7,8 @@ milliseconds of a kill, but stays while a wedged process keeps its link, so it c
 make a peer *suspect*. In fleets of more than three nodes it is *gone* when a second, living observer suspects it too,
 or when nobody speaks for it during the confirmation time; a living observer that still hears it keeps it suspect (a
 partial cut). Any beat refutes. A node whose own loop lags doubts itself first: its deadlines lengthen, at most
-threefold, and never stop (after Lifeguard, arXiv 1707.00788).
+threefold, and never stop (after Lifeguard, arXiv 1707.00788). An observer that has watched for a while without ever
+hearing a peer accuses it as well: it must not vouch for what it does not know.
 """
 
 from __future__ import annotations
@@ -40,6 +41,8 @@ class _Peer:
     beat_at: float = -math.inf
     sequence: int = -1
     suspect_since: float = math.inf
+    vouched_until: float = -math.inf
+    """A suspect for whom somebody speaks is looked at again then."""
     token_lost: bool = False
     suspects: tuple[NodeId, ...] = ()
 
@@ -53,6 +56,9 @@ class Membership:
         self._peers = {name: _Peer() for name in sorted(nodes) if name != me}
         self._size = len(nodes)
         self._doubt = 1.0
+        self._started_at = math.inf
+        self._has_watched = False
+        """Whether this node has listened for as long as silence takes to mean something."""
 
     # --- queries -----------------------------------------------------------------------------------------------
 
@@ -77,9 +83,9 @@ class Membership:
         return tuple(name for name, peer in self._peers.items() if peer.state is PeerState.ALIVE)
 
     def suspects(self) -> tuple[NodeId, ...]:
-        """Whom this node accuses: suspect, or gone after having been there."""
-        accused = (PeerState.SUSPECT, PeerState.GONE)
-        return tuple(name for name, peer in self._peers.items() if peer.state in accused)
+        """Whom this node accuses: suspect, gone, or never heard although it has listened for long enough."""
+        excused = (PeerState.ALIVE,) if self._has_watched else (PeerState.ALIVE, PeerState.UNKNOWN)
+        return tuple(name for name, peer in self._peers.items() if peer.state not in excused)
 
     # --- what changes it ---------------------------------------------------------------------------------------
 
@@ -91,7 +97,7 @@ class Membership:
     def absorb_beat(self, beat: Beat, now: float) -> tuple[Transition, ...]:
         """A peer's loop is alive: it refutes every accusation. Beats of an older incarnation or order are ignored."""
         peer = self._peers.get(beat.node)
-        if peer is None or (beat.incarnation, beat.sequence) <= (peer.incarnation, peer.sequence):
+        if peer is None or not self._is_newer(peer, beat):
             return ()
         restarted = 0 <= peer.incarnation < beat.incarnation
         before = peer.state
@@ -103,6 +109,13 @@ class Membership:
         elif restarted:
             changes.append(Transition(node=beat.node, before=before, after=before, reason="restarted"))
         return (*changes, *self._review(now))
+
+    @staticmethod
+    def _is_newer(peer: _Peer, beat: Beat) -> bool:
+        """Newer than what we know; of a peer that is gone also an older life's count (its state was made anew)."""
+        if peer.state is PeerState.GONE and beat.incarnation != peer.incarnation:
+            return True
+        return (beat.incarnation, beat.sequence) > (peer.incarnation, peer.sequence)
 
     def absorb_token_lost(self, node: NodeId, incarnation: int, now: float) -> tuple[Transition, ...]:
         """A peer's token went: suspect at once, if it is the token of the life we know."""
@@ -116,9 +129,11 @@ class Membership:
         """Time has passed."""
         changes = []
         limit = self._timing.suspect_s * self._doubt
+        self._started_at = min(self._started_at, now)
+        self._has_watched = self._has_watched or now >= self._started_at + limit
         for name, peer in self._peers.items():
-            silent = now - peer.beat_at
-            if peer.state is PeerState.ALIVE and silent >= limit:
+            if peer.state is PeerState.ALIVE and now >= peer.beat_at + limit:
+                silent = now - peer.beat_at
                 changes.append(self._change(name, PeerState.SUSPECT, f"silent for {silent:.2f} s", now))
         return (*changes, *self._review(now))
 
@@ -134,8 +149,11 @@ class Membership:
         if peer.state is PeerState.ALIVE:
             return peer.beat_at + limit
         if peer.state is PeerState.SUSPECT:
-            return peer.suspect_since + self._grace(peer)
+            return self._review_at(peer)
         return math.inf
+
+    def _review_at(self, peer: _Peer) -> float:
+        return max(peer.suspect_since + self._grace(peer), peer.vouched_until)
 
     def _grace(self, peer: _Peer) -> float:
         """How long a suspect has before it is gone without anybody's confirmation."""
@@ -160,18 +178,17 @@ class Membership:
             for other, observer in observers:
                 if name in observer.suspects:
                     return f"{other} misses it too"
-        if now < peer.suspect_since + self._grace(peer):
+        if now < self._review_at(peer):
             return ""
-        if self._size > SMALL_FLEET:
-            vouchers = [other for other, at in observers if at.beat_at > peer.suspect_since]
-            if vouchers:
-                # Somebody alive still hears it: a cut between it and us, not its end. Asked again with every beat.
-                peer.suspect_since = max(peer.suspect_since, now - self._grace(peer) + self._timing.beat_s)
-                return ""
+        if self._size > SMALL_FLEET and any(at.beat_at > peer.suspect_since for _, at in observers):
+            # Somebody alive still hears it: a cut between it and us, not its end. Whoever falls silent vouches no more.
+            peer.vouched_until = now + self._timing.beat_s
+            return ""
         return "nobody speaks for it"
 
     def _change(self, node: NodeId, after: PeerState, reason: str, now: float) -> Transition:
         peer = self._peers[node]
         before, peer.state = peer.state, after
         peer.suspect_since = now if after is PeerState.SUSPECT else math.inf
+        peer.vouched_until = -math.inf
         return Transition(node=node, before=before, after=after, reason=reason)

@@ -321,6 +321,8 @@ class Node:
         self._batch.add(do.AnswerUtilities(request=event.request, utilities=utilities))
 
     def _on_utility(self, event: ev.UtilityReceived, _now: float) -> None:
+        if event.utilities.voter not in self.fleet.voters:
+            return  # edges hear the question too and have nothing to say
         if not self.rounds.absorb_utilities(event.gather, event.utilities):
             self.counters["utility_late"] += 1
 

@@ -187,3 +187,13 @@ def _vote(standing: TaskRound, now: float) -> VoteStatus | None:
         winner=counted.winner,
         age_s=now - standing.tally_at,
     )
+
+
+def status_line(node: NodeView) -> str:
+    """One line for a service manager: role, peers, tasks with their owners and epochs."""
+    states = node.membership.states()
+    alive = sum(state is PeerState.ALIVE for state in states.values())
+    values = [register.value for register in node.registers.values()]
+    tasks = " · ".join(f"{value.task}@{value.owner or 'nobody'} epoch {value.epoch}" for value in values)
+    quorum = "" if _quorum(node).ok else " · NO QUORUM"
+    return f"{node.kind} {node.me} · {alive}/{len(states)} nodes · {tasks}{quorum}"

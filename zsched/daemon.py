@@ -1,0 +1,351 @@
+"""The composition root: builds the adapters, one queue and one loop, and runs a node until it is told to stop.
+
+Knows: which adapter exists for what, and in which order things start and stop. Does not know: how anything is decided.
+
+``python -m zsched.daemon --config FILE --node NAME``; `zsched up` becomes this process. Exit codes: 0 stopped,
+1 failed, 78 the fleet file or the node's name is wrong.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import gc
+import logging
+import os
+import random
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from zsched import __version__, places, zenoh_config
+from zsched.adapters.control_bus import ControlBus
+from zsched.adapters.device_profiler import DeviceProfiler
+from zsched.adapters.network_profiler import readers_for
+from zsched.adapters.operator_socket import OperatorSocket
+from zsched.adapters.state_file import StateFile
+from zsched.adapters.streams import RelayHandle
+from zsched.adapters.systemd import Notifier, watchdog_interval_s
+from zsched.adapters.worker_supervisor import WorkerContext, WorkerSupervisor
+from zsched.clock import monotonic_s, wall_seconds
+from zsched.config import load_fleet
+from zsched.core import events as ev
+from zsched.core.fleet import Fleet, NodeSpec, dial_endpoint, electorate_hash
+from zsched.core.model import DurableState, NodeId, TaskId
+from zsched.core.node import Node
+from zsched.core.status import status_line
+from zsched.errors import AdapterError, ConfigError
+from zsched.shell import Desk, Inbox, Shell
+
+EXIT_OK, EXIT_FAILED, EXIT_CONFIG = 0, 1, 78
+HAND_OVER_S = 0.8
+"""How long a stopping owner waits for its tasks to be moved away."""
+CLOSE_WORKERS_S = 0.7
+LOOP_MAX_WAIT_S = 1.0
+
+log = logging.getLogger("zsched.daemon")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Options:
+    """What a daemon is started with; every path is resolved already."""
+
+    config: Path
+    node: NodeId
+    state_dir: Path
+    runtime_dir: Path
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Endpoints:
+    """Where this node's sessions listen and whom they dial."""
+
+    control_listen: tuple[str, ...]
+    control_connect: tuple[str, ...]
+    data_listen: tuple[str, ...]
+    data_connect: tuple[str, ...]
+    worker_connect: tuple[str, ...]
+    worker_listen: tuple[str, ...]
+
+
+def endpoints_for(fleet: Fleet, me: NodeSpec, free_port: Callable[[], int]) -> Endpoints:
+    """The endpoints of one node: its own to listen on, its seeds' to dial (gossip finds the rest)."""
+    others = [fleet.node(name) for name in fleet.seeds if name != me.name]
+    data_listen = me.listen_data or f"tcp/0.0.0.0:{free_port()}"
+    is_loopback = "/127." in data_listen or "/[::1]" in data_listen
+    return Endpoints(
+        control_listen=(me.listen_control or "tcp/0.0.0.0:0",),
+        control_connect=_dialled(others, lambda node: node.listen_control),
+        data_listen=(data_listen,),
+        data_connect=_dialled(others, lambda node: node.listen_data),
+        worker_connect=(dial_endpoint(data_listen, "127.0.0.1"),),
+        worker_listen=(zenoh_config.LOOPBACK_LISTEN if is_loopback else "tcp/0.0.0.0:0",),
+    )
+
+
+def _dialled(nodes: list[NodeSpec], endpoint: Callable[[NodeSpec], str]) -> tuple[str, ...]:
+    dialled = (dial_endpoint(endpoint(node), node.host) for node in nodes if endpoint(node))
+    return tuple(target for target in dialled if target)
+
+
+def free_port() -> int:
+    """A TCP port that is free now (a node without a fixed data endpoint: its workers must know it)."""
+    with socket.socket() as probe:
+        probe.bind(("0.0.0.0", 0))  # noqa: S104 - only asks the kernel for a number, never listens
+        port: int = probe.getsockname()[1]
+        return port
+
+
+class Sampler:
+    """Measures the machine and its links in a thread of its own: a slow driver must not stop the beats."""
+
+    def __init__(self, spec: NodeSpec, period_s: float, shell: Shell, inbox: Inbox) -> None:
+        self._readers = readers_for(spec)
+        self._device = DeviceProfiler()
+        self._period_s, self._shell, self._inbox = period_s, shell, inbox
+        self._stop = threading.Event()
+        self._problems: dict[str, str | None] = {}
+        self._thread = threading.Thread(target=self._run, name="zsched-sampler", daemon=True)
+
+    def start(self) -> None:
+        """Begin measuring."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End measuring; the thread ends with its current reading."""
+        self._stop.set()
+        self._thread.join(timeout=0.5)
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            try:
+                self._sample()
+            except Exception as error:
+                log.exception("sample_failed")
+                self._inbox.post(ev.ProblemReported(source="profile", problem=f"cannot measure: {error}"))
+            self._stop.wait(self._period_s)
+
+    def _sample(self) -> None:
+        supervisor = self._shell.supervisor
+        states, pids = (supervisor.states(), supervisor.pids()) if supervisor is not None else ({}, {})
+        device = self._device.sample({task: (state, pids.get(task)) for task, state in states.items()})
+        links = tuple(reader.read() for reader in self._readers)
+        self._inbox.post(ev.ProfileSampled(device=device, links=links))
+        for index, reader in enumerate(self._readers):
+            source = f"profile/link{index}"
+            if self._problems.get(source) != reader.problem:
+                self._problems[source] = reader.problem
+                self._inbox.post(ev.ProblemReported(source=source, problem=reader.problem))
+
+
+class Daemon:
+    """One node's process."""
+
+    def __init__(self, options: Options) -> None:
+        self._options = options
+        self._fleet = load_fleet(options.config)
+        if all(node.name != options.node for node in self._fleet.nodes):
+            known = ", ".join(node.name for node in self._fleet.nodes)
+            raise ConfigError(
+                f"{options.config}: no node {options.node!r} under 'nodes' (there are {known}); "
+                "say which one this machine is with --node NAME or ZSCHED_NODE"
+            )
+        self._spec = self._fleet.node(options.node)
+        self._inbox = Inbox()
+        self._notify = Notifier()
+        self._next_status = 0.0
+
+    def run(self) -> int:
+        """Run until SIGTERM or SIGINT; the exit code."""
+        state_file = StateFile(self._options.state_dir, fleet=self._fleet.name, node=self._spec.name)
+        with state_file, contextlib.ExitStack() as stack:
+            durable, problem = self._restore(state_file)
+            incarnation = durable.incarnation if durable is not None else wall_seconds()
+            points = endpoints_for(self._fleet, self._spec, free_port)
+            shell = self._build(stack, state_file, incarnation, points)
+            node = Node(
+                fleet=self._fleet,
+                me=self._spec.name,
+                durable=durable,
+                incarnation=incarnation,
+                electorate=electorate_hash(self._fleet),
+                rng=random.Random(f"{self._spec.name}/{incarnation}"),
+                now=monotonic_s(),
+                version=__version__,
+            )
+            if problem is not None:
+                node.problems["state"] = problem
+            self._handle_signals(stack)
+            gc.freeze()  # what lives until the end need not be looked at again
+            self._loop(node, shell)
+        return EXIT_OK
+
+    # --- building ----------------------------------------------------------------------------------------------------
+
+    def _restore(self, state_file: StateFile) -> tuple[DurableState | None, str | None]:
+        """The durable state with this start's incarnation on disk, or why there is none."""
+        loaded = state_file.load()
+        if loaded.state is None:
+            log.warning("no_state why=%s", loaded.problem)
+            return None, loaded.problem
+        if loaded.state.electorate != electorate_hash(self._fleet):
+            return None, "the fleet file names another electorate than the state file; this node is no elector"
+        state = replace(loaded.state, incarnation=loaded.state.incarnation + 1)
+        try:
+            state_file.save(state)
+        except AdapterError as error:
+            return None, str(error)
+        return state, None
+
+    def _build(self, stack: contextlib.ExitStack, state_file: StateFile, incarnation: int, points: Endpoints) -> Shell:
+        """Open the adapters; each is closed by ``stack`` in the reverse order."""
+        fleet, me = self._fleet, self._spec.name
+        operator_json5 = Path(fleet.zenoh_config).read_text() if fleet.zenoh_config else ""
+        bus = ControlBus(
+            fleet=fleet.name,
+            node=me,
+            incarnation=incarnation,
+            zenoh_config=zenoh_config.control_config(
+                listen=points.control_listen,
+                connect=points.control_connect,
+                timing=fleet.timing,
+                operator_json5=operator_json5,
+            ),
+            post=self._inbox.post,
+        )
+        desk = Desk(me, self._inbox, bus)
+        door = OperatorSocket(places.socket_path(self._options.runtime_dir, me), desk.answer)
+        door.open()
+        stack.callback(door.close)
+        bus.open()
+        stack.callback(bus.close)
+        shell = Shell(node=me, inbox=self._inbox, bus=bus, state_file=state_file, desk=desk)
+        shell.relay = relay = RelayHandle(
+            fleet=fleet.name,
+            node=me,
+            zenoh_config=zenoh_config.data_config(
+                listen=points.data_listen,
+                connect=points.data_connect,
+                timing=fleet.timing,
+                shared_memory=False,
+                operator_json5=operator_json5,
+            ),
+            on_report=shell.on_report,
+            threads=min(max(len(fleet.nodes) + 2, 4), 16),
+        )
+        shell.supervisor = self._supervisor(stack, shell, incarnation, points, operator_json5)
+        relay.start()
+        stack.callback(relay.stop, 1.0)
+        stack.callback(shell.supervisor.close, CLOSE_WORKERS_S)
+        sampler = Sampler(self._spec, fleet.timing.sample_s, shell, self._inbox)
+        sampler.start()
+        stack.callback(sampler.stop)
+        return shell
+
+    def _supervisor(
+        self, stack: contextlib.ExitStack, shell: Shell, incarnation: int, points: Endpoints, operator_json5: str
+    ) -> WorkerSupervisor:
+        fleet, me = self._fleet, self._spec.name
+        mine = {task.name: task.worker for task in fleet.tasks if me in task.candidates}
+        folder = self._options.runtime_dir
+        paths: dict[TaskId, Path] = {}
+        for name, spec in mine.items():
+            paths[name] = folder / f"{me}-{name}.zenoh.json5"
+            paths[name].write_text(
+                zenoh_config.worker_config(
+                    connect=points.worker_connect,
+                    listen=points.worker_listen,
+                    timing=fleet.timing,
+                    link=spec.link,
+                    shared_memory=False,
+                    operator_json5=operator_json5,
+                )
+            )
+            stack.callback(paths[name].unlink, missing_ok=True)
+        return WorkerSupervisor(
+            specs=mine,
+            context=WorkerContext(fleet=fleet.name, node=me, incarnation=incarnation),
+            events=shell,
+            environment=lambda task: {"ZSCHED_ZENOH_CONFIG": str(paths[task])},
+            rng=random.Random(f"{me}/{incarnation}/workers"),
+        )
+
+    # --- the loop ----------------------------------------------------------------------------------------------------
+
+    def _handle_signals(self, stack: contextlib.ExitStack) -> None:
+        def stop(_number: int, _frame: object) -> None:
+            self._inbox.post(ev.StopRequested())
+
+        for number in (signal.SIGTERM, signal.SIGINT):
+            previous = signal.signal(number, stop)
+            stack.callback(signal.signal, number, previous)
+
+    def _loop(self, node: Node, shell: Shell) -> None:
+        """Take an event, handle it, carry the batch out; wake up in time for the node's next deadline."""
+        shell.carry_out(node.start(monotonic_s()))
+        watchdog_s = watchdog_interval_s()
+        next_ping, is_ready, stop_by = 0.0, False, float("inf")
+        while True:
+            wait = min(node.next_deadline() - monotonic_s(), LOOP_MAX_WAIT_S)
+            event = self._inbox.take(wait) or ev.DeadlineReached()
+            now = monotonic_s()
+            shell.carry_out(node.handle(event, now))
+            if not is_ready and isinstance(event, ev.ProfileSampled):
+                is_ready = True
+                self._notify.ready()
+                log.info("ready node=%s fleet=%s incarnation=%d", node.me, self._fleet.name, node.incarnation)
+            if isinstance(event, ev.StopRequested) and stop_by == float("inf"):
+                self._notify.stopping()
+                stop_by = now + (HAND_OVER_S if node.owned() else 0.0)
+            if now >= stop_by or (stop_by < float("inf") and not node.owned()):
+                log.info("stopping node=%s", node.me)
+                return
+            if watchdog_s is not None and now >= next_ping:
+                next_ping = now + min(watchdog_s, 1.0)
+                self._notify.watchdog()
+            if now >= self._next_status:
+                self._next_status = now + 1.0
+                self._notify.status(status_line(node))
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The daemon's command line; returns the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m zsched.daemon", description="zsched's daemon (see: zsched up)")
+    parser.add_argument("--config", type=Path)
+    parser.add_argument("--node")
+    parser.add_argument("--state-dir", type=Path)
+    parser.add_argument("--runtime-dir", type=Path)
+    parser.add_argument("--log-level", default="INFO", choices=["DEBUG", "INFO", "WARNING", "ERROR"])
+    given = parser.parse_args(arguments)
+    _set_up_logging(given.log_level)
+    options = Options(
+        config=places.config_path(given.config, os.environ),
+        node=places.node_name(given.node, os.environ),
+        state_dir=places.state_folder(given.state_dir, os.environ),
+        runtime_dir=places.runtime_folder(given.runtime_dir, os.environ),
+    )
+    try:
+        return Daemon(options).run()
+    except ConfigError as error:
+        print(error, file=sys.stderr)
+        return EXIT_CONFIG
+    except AdapterError as error:
+        print(f"zsched up: {error}", file=sys.stderr)
+        return EXIT_FAILED
+
+
+def _set_up_logging(level: str) -> None:
+    # journald stamps its own times; elsewhere a person wants them.
+    stamp = "" if "JOURNAL_STREAM" in os.environ else "%(asctime)s "
+    logging.basicConfig(stream=sys.stderr, level=level, format=f"{stamp}%(levelname)s %(name)s %(message)s")
+
+
+if __name__ == "__main__":
+    code = main()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)  # zenoh's threads must not be waited for once everything is closed

@@ -1,0 +1,256 @@
+"""Carries a node's instructions out: one line per instruction, in order, and the failure of one is an event.
+
+Knows: which adapter an instruction is for. Does not know: why it was given.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import queue
+import threading
+from typing import Any, assert_never
+
+from zsched.adapters.control_bus import ControlBus
+from zsched.adapters.state_file import StateFile
+from zsched.adapters.streams import RelayHandle
+from zsched.adapters.worker_supervisor import WorkerSupervisor
+from zsched.core import events as ev
+from zsched.core import instructions as do
+from zsched.core.messages import CommandResult, SetWeights
+from zsched.core.model import NodeId, TaskId, WorkerState
+from zsched.core.relay_protocol import HandleReport, RelayStarted, WorkerSeen
+from zsched.core.snapshot import Snapshot
+from zsched.errors import AdapterError
+from zsched.report import snapshot_json
+
+INBOX_LIMIT = 20_000
+ANSWER_TIMEOUT_S = 3.0
+LOCAL_REQUESTS_FROM = 1 << 40
+"""Numbers of questions that came over the operator socket; smaller ones came over the bus."""
+
+_stages = {
+    name: logging.getLogger(f"zsched.{name}")
+    for name in ("membership", "profile", "gateway", "scheduler", "vote", "executor", "route")
+}
+
+
+class Inbox:
+    """The one queue into the loop; bounded, and what does not fit is counted."""
+
+    def __init__(self) -> None:
+        self._queue: queue.SimpleQueue[ev.Event] = queue.SimpleQueue()
+        self.overflowed = 0
+
+    def post(self, event: ev.Event) -> None:
+        """Enqueue; from any thread, never blocks."""
+        if self._queue.qsize() >= INBOX_LIMIT and not isinstance(event, ev.StopRequested):
+            self.overflowed += 1
+            return
+        self._queue.put(event)
+
+    def take(self, timeout_s: float) -> ev.Event | None:
+        """The next event, waiting at most ``timeout_s`` (<= 0: not at all); ``None`` when there is none."""
+        try:
+            return self._queue.get(timeout=timeout_s) if timeout_s > 0 else self._queue.get_nowait()
+        except queue.Empty:
+            return None
+
+
+class Desk:
+    """Operators' questions from the local socket: posted into the loop, awaited in the socket's thread."""
+
+    def __init__(self, node: NodeId, inbox: Inbox, bus: ControlBus) -> None:
+        self._node, self._inbox, self._bus = node, inbox, bus
+        self._numbers = itertools.count(LOCAL_REQUESTS_FROM)
+        self._waiting: dict[int, queue.SimpleQueue[object]] = {}
+        self._lock = threading.Lock()
+
+    def answer(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Answer one request of the socket (``status``, ``weights``), for this node or, with ``node``, for another."""
+        verb, node = request["verb"], request.get("node") or self._node
+        if not isinstance(node, str):
+            return {"error": "node: expected a name"}
+        if verb == "status":
+            return self._ask(node, None)
+        if verb == "weights":
+            try:
+                command = SetWeights(
+                    task=str(request["task"]),
+                    cpu=float(request["cpu"]),
+                    memory=float(request["memory"]),
+                    network=float(request["network"]),
+                    base_revision=request.get("base_revision"),
+                )
+            except (KeyError, TypeError, ValueError) as error:
+                return {"error": f"weights: {error}"}
+            return self._ask(node, command)
+        return {"error": f"unknown verb {verb!r}; known: status, weights"}
+
+    def _ask(self, node: NodeId, command: SetWeights | None) -> dict[str, Any]:
+        if node != self._node:
+            try:
+                return _as_json(self._bus.ask_node(node, command))
+            except AdapterError as error:
+                return {"error": str(error)}
+        number = next(self._numbers)
+        slot: queue.SimpleQueue[object] = queue.SimpleQueue()
+        with self._lock:
+            self._waiting[number] = slot
+        event: ev.Event = ev.StatusAsked(request=number)
+        if command is not None:
+            event = ev.WeightsCommanded(request=number, command=command)
+        self._inbox.post(event)
+        try:
+            return _as_json(slot.get(timeout=ANSWER_TIMEOUT_S))
+        except queue.Empty:
+            return {"error": f"the decision loop of {self._node} did not answer within {ANSWER_TIMEOUT_S:g} s"}
+        finally:
+            with self._lock:
+                self._waiting.pop(number, None)
+
+    def deliver(self, number: int, value: object) -> None:
+        """The loop's answer; nobody waiting any more is no error."""
+        with self._lock:
+            slot = self._waiting.get(number)
+        if slot is not None:
+            slot.put(value)
+
+
+def _as_json(value: object) -> dict[str, Any]:
+    if isinstance(value, Snapshot):
+        return snapshot_json(value)
+    assert isinstance(value, CommandResult)
+    return {"outcome": value.outcome.value, "detail": value.detail, "revision": value.revision}
+
+
+class Shell:
+    """The adapters of one daemon, and what each instruction means for them."""
+
+    def __init__(
+        self,
+        *,
+        node: NodeId,
+        inbox: Inbox,
+        bus: ControlBus,
+        state_file: StateFile,
+        desk: Desk,
+    ) -> None:
+        self._node, self._inbox = node, inbox
+        self._bus, self._state_file, self._desk = bus, state_file, desk
+        # These two report to this shell, so they are made after it.
+        self.supervisor: WorkerSupervisor | None = None
+        self.relay: RelayHandle | None = None
+        self._lives: dict[TaskId, int] = {}
+
+    # --- instructions ------------------------------------------------------------------------------------------------
+
+    def carry_out(self, batch: tuple[do.Instruction, ...]) -> None:
+        """Carry a batch out in order; at the first failure the rest is dropped and the failure posted."""
+        for instruction in batch:
+            try:
+                self._carry_out(instruction)
+            except AdapterError as error:
+                if isinstance(instruction, do.PersistState):
+                    self._inbox.post(ev.PersistFailed(reason=str(error)))
+                    return
+                self._inbox.post(ev.ProblemReported(source=type(instruction).__name__, problem=str(error)))
+
+    def _carry_out(self, instruction: do.Instruction) -> None:
+        bus = self._bus
+        match instruction:
+            case do.PersistState(state=state):
+                self._state_file.save(state)
+            case do.PublishBeat(beat=beat):
+                bus.publish("beat", beat)
+            case do.PublishProfile(profile=profile):
+                bus.publish("profile", profile)
+            case do.PublishProposal(proposal=proposal):
+                bus.publish("proposal", proposal)
+            case do.PublishLearnt(learnt=learnt):
+                bus.publish("allocation", learnt)
+            case do.AskUtilities(gather=gather, deadline_s=deadline_s):
+                bus.ask_utilities(gather, deadline_s)
+            case do.SendPrepare(prepare=prepare, deadline_s=deadline_s):
+                bus.ask_electors(prepare, deadline_s)
+            case do.SendAccept(accept=accept, deadline_s=deadline_s):
+                bus.ask_electors(accept, deadline_s)
+            case do.AskLearnt(peer=peer, deadline_s=deadline_s):
+                bus.ask_learnt(peer, deadline_s)
+            case do.AnswerUtilities(request=request, utilities=value):
+                bus.answer(request, value)
+            case do.AnswerElection(request=request, answer=vote):
+                bus.answer(request, vote)
+            case do.AnswerLearnt(request=request, learnt=learnt):
+                bus.answer(request, learnt)
+            case do.AnswerStatus(request=request, snapshot=snapshot):
+                self._answer_operator(request, snapshot)
+            case do.AnswerCommand(request=request, result=result):
+                self._answer_operator(request, result)
+            case do.ApplyRoutes(plan=plan):
+                self._streams().apply(plan)
+            case do.SetRole(role=role):
+                self._streams().set_role(role)
+            case do.StartWorker(task=task):
+                self._workers().start(task)
+            case do.StopWorker(task=task):
+                self._workers().stop(task)
+            case do.RecordStory():
+                _tell(instruction)
+            case _:
+                assert_never(instruction)
+
+    def _workers(self) -> WorkerSupervisor:
+        assert self.supervisor is not None
+        return self.supervisor
+
+    def _streams(self) -> RelayHandle:
+        assert self.relay is not None
+        return self.relay
+
+    def _answer_operator(self, request: int, value: object) -> None:
+        if request >= LOCAL_REQUESTS_FROM:
+            self._desk.deliver(request, value)
+        else:
+            self._bus.answer(request, value)
+
+    # --- what adapters report (their threads) ------------------------------------------------------------------------
+
+    def on_report(self, report: HandleReport) -> None:
+        """The relay's handle: most reports are events; workers' tokens concern only our own workers."""
+        if isinstance(report, RelayStarted):
+            return
+        if not isinstance(report, WorkerSeen):
+            self._inbox.post(report)
+            return
+        if report.node != self._node or not report.incarnation.isdigit():
+            return
+        supervisor, life = self.supervisor, int(report.incarnation)
+        current = self._lives.get(report.task)
+        if supervisor is None or (current is not None and life != current):
+            return
+        (supervisor.mark_ready if report.is_present else supervisor.mark_gone)(report.task, life)
+        state = WorkerState.READY if report.is_present else WorkerState.STARTING
+        if not report.is_present and supervisor.pids().get(report.task) is None:
+            state = WorkerState.STOPPED
+        self._inbox.post(ev.WorkerChanged(task=report.task, state=state, reason="its token"))
+
+    def on_started(self, task: TaskId, pid: int, incarnation: int) -> None:
+        """The supervisor: a worker process runs; it is not ready yet."""
+        self._lives[task] = incarnation
+        self._inbox.post(ev.WorkerChanged(task=task, state=WorkerState.STARTING, reason=f"pid {pid}"))
+
+    def on_exited(self, task: TaskId, incarnation: int, returncode: int, reason: str) -> None:
+        """The supervisor: a worker process has ended."""
+        detail = reason or f"exit code {returncode}"
+        if self._lives.get(task) == incarnation:
+            self._inbox.post(ev.WorkerChanged(task=task, state=WorkerState.STOPPED, reason=detail))
+
+    def on_failed(self, task: TaskId, reason: str) -> None:
+        """The supervisor: the worker is not started again."""
+        self._inbox.post(ev.WorkerChanged(task=task, state=WorkerState.FAILED, reason=reason))
+
+
+def _tell(story: do.RecordStory) -> None:
+    where = f"task={story.task} epoch={story.epoch} " if story.task else ""
+    _stages[story.stage].info("%s%s", where, story.text)
