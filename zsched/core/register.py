@@ -26,8 +26,7 @@ from zsched.core.model import Acceptance, Allocation, Ballot, NodeId, RegisterSt
 from zsched.core.scoring import majority
 
 BACKOFF_CAP_S = 5.0
-MAX_JUMP = 2**32
-"""No honest proposer's counter is so far ahead; one frame must not use up the counters there are."""
+MAX_JUMP = 2**32  # no honest counter is so far ahead; one hostile frame must not use them all up
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,6 +95,7 @@ class _Round:
     phase: _Phase = _Phase.WAIT
     deadline: float = 0.0
     ballot: Ballot | None = None
+    known: int = 0  # the revision that was learnt when the prepare left
     promises: dict[NodeId, Acceptance | None] = field(default_factory=dict)
     yes: dict[NodeId, bool] = field(default_factory=dict)
     no: dict[NodeId, Refusal] = field(default_factory=dict)
@@ -234,9 +234,9 @@ class Register:
             return None
         if running.sent is None:
             return RoundOutcome.CONFLICT if value.revision > running.change.base_revision else None
-        if value.revision > running.sent.revision:
-            return RoundOutcome.UNKNOWN  # it may have been built upon ours
-        return RoundOutcome.COMMITTED if value == running.sent else RoundOutcome.CONFLICT
+        if value.revision == running.sent.revision:
+            return RoundOutcome.COMMITTED if value == running.sent else RoundOutcome.CONFLICT
+        return RoundOutcome.UNKNOWN if value.revision > running.sent.revision else None  # ours may lie under it
 
     # --- proposer ----------------------------------------------------------------------------------------------
 
@@ -267,7 +267,7 @@ class Register:
 
     def _begin(self, step: Step, now: float) -> None:
         """Prepare, unless the change is outdated; a base that is newer than what we know is read first."""
-        if self._outcome_by(self.value) is not RoundOutcome.CONFLICT or self._running().sent is not None:
+        if self._outcome_by(self.value) is None:
             self._prepare(step, now)
         elif step.finished is None:
             self._finish(step, RoundOutcome.CONFLICT, now)
@@ -280,6 +280,7 @@ class Register:
         running.ballot = Ballot(counter=self._counter, node=self._me, incarnation=self._incarnation)
         running.phase, running.deadline = _Phase.PREPARE, now + self._ballot_s
         running.promises, running.yes, running.no, running.value = {}, {}, {}, None
+        running.known = self.value.revision
         step.prepare = Prepare(task=self.state.task, ballot=running.ballot, electorate=self._electorate)
 
     def _running(self) -> _Round:
@@ -309,16 +310,18 @@ class Register:
         accepted = [acceptance for acceptance in running.promises.values() if acceptance is not None]
         newest = max(accepted, key=lambda acceptance: acceptance.ballot, default=None)
         read = self._initial if newest is None else newest.value
-        if read.revision < self.value.revision:
-            step.problem = f"a majority of electors has forgotten revision {self.value.revision}"
-            self._finish(step, RoundOutcome.NO_QUORUM if running.sent is None else RoundOutcome.UNKNOWN, now)
+        if read.revision < running.known:
+            step.problem = f"a majority of electors has forgotten revision {running.known}"
+            self._give_up(running, step, now)
             return
-        is_unlearnt = read.revision > self.value.revision
+        if read.revision < self.value.revision:  # learnt since we asked: a higher ballot has overtaken this one
+            self._again(running, step, now)
+            return
         is_identity = running.change is None or running.sent is not None
         if is_identity and newest is None:
             self._finish(step, RoundOutcome.COMMITTED if running.sent is None else RoundOutcome.UNKNOWN, now)
             return
-        if is_unlearnt or running.change is None or running.sent is not None:
+        if read.revision > self.value.revision or running.change is None or running.sent is not None:
             running.value = read
         elif running.change.base_revision != read.revision:
             self._finish(step, RoundOutcome.CONFLICT, now)
@@ -326,8 +329,7 @@ class Register:
         else:
             running.value = running.sent = running.change.apply(read)
         assert running.ballot is not None
-        running.phase, running.deadline = _Phase.ACCEPT, now + self._ballot_s
-        running.no = {}
+        running.phase, running.deadline, running.no = _Phase.ACCEPT, now + self._ballot_s, {}
         step.accept = Accept(
             task=self.state.task,
             acceptance=Acceptance(ballot=running.ballot, value=running.value),
@@ -338,14 +340,14 @@ class Register:
         """A majority accepted: the value is chosen."""
         assert running.value is not None
         self._learn(running.value, step, now)
-        if self._round is not running:  # learning it has ended the round
-            return
+        if self._round is not running:
+            return  # learning it has ended the round
         if running.change is None:
             self._finish(step, RoundOutcome.COMMITTED, now)
         elif running.sent is None:
             self._prepare(step, now)  # the other's value is settled; ours follows under a higher ballot
         else:
-            self._finish(step, RoundOutcome.CONFLICT, now)  # a majority has closed the ballot that carried ours
+            self._finish(step, RoundOutcome.CONFLICT, now)  # a majority has passed the ballot that carried ours
 
     def _on_refused(self, running: _Round, answer: Refused, step: Step, now: float) -> None:
         if answer.refusal is Refusal.BALLOT and answer.promised <= answer.ballot:
@@ -357,14 +359,16 @@ class Register:
             self._again(running, step, now)
 
     def _again(self, running: _Round, step: Step, now: float) -> None:
-        """This ballot cannot win any more: wait a little and try a higher one, or give up."""
-        # Once our value was sent it may have been chosen: the next attempts only find out, they never apply it again.
+        """This ballot cannot win: wait a little and try a higher one (only to find out, once ours was sent), or end."""
         wait = self._jitter(running.attempt)
         if now + wait >= running.give_up_at:
-            self._finish(step, RoundOutcome.NO_QUORUM if running.sent is None else RoundOutcome.UNKNOWN, now)
+            self._give_up(running, step, now)
             return
         running.attempt += 1
         running.phase, running.deadline, running.ballot = _Phase.WAIT, now + wait, None
+
+    def _give_up(self, running: _Round, step: Step, now: float) -> None:
+        self._finish(step, RoundOutcome.NO_QUORUM if running.sent is None else RoundOutcome.UNKNOWN, now)
 
     def _finish(self, step: Step, outcome: RoundOutcome, now: float) -> None:
         running = self._running()
@@ -375,8 +379,8 @@ class Register:
 
     def _jitter(self, attempt: int) -> float:
         """Doubling back-off with jitter, so that duelling proposers part."""
-        base = min(self._stagger_s * 2.0 ** min(attempt, 16), BACKOFF_CAP_S)  # a cut may last for days
-        return base * (0.5 + self._rng.random())
+        base = self._stagger_s * 2.0 ** min(attempt, 16)  # bounded: a cut may last for days
+        return min(base, BACKOFF_CAP_S) * (0.5 + self._rng.random())
 
     def tick(self, now: float) -> Step:
         """Time has passed."""

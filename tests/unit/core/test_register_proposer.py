@@ -1,0 +1,309 @@
+"""The proposing side of `zsched.core.register`: rounds, conflicts, unknown outcomes, one situation at a time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+from random import Random
+
+import pytest
+from zsched.core.messages import Accept, Prepare, Promise, Refused
+from zsched.core.model import Acceptance, Allocation, Ballot, RegisterState, Tuning, Weights
+from zsched.core.register import MoveOwner, Register, Retune, RoundOutcome, Step
+
+ELECTORS = ("r1", "r2", "r3")
+TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
+INITIAL = Allocation(task="merge", revision=0, epoch=0, owner=None, tuning=TUNING)
+BLANK = RegisterState(task="merge")
+FIRST = MoveOwner(base_revision=0, owner="e1", reason="test")
+BALLOT_S, STAGGER_S = 0.3, 0.03
+
+
+def make(
+    me: str = "r1",
+    *,
+    state: RegisterState = BLANK,
+    incarnation: int = 1,
+    electorate: str = "abc",
+    is_elector: bool | None = None,
+    electors: tuple[str, ...] = ELECTORS,
+    kind: type[Register] = Register,
+) -> Register:
+    return kind(
+        me=me,
+        incarnation=incarnation,
+        electors=electors,
+        electorate=electorate,
+        is_elector=me in electors if is_elector is None else is_elector,
+        initial=INITIAL,
+        state=state,
+        ballot_s=BALLOT_S,
+        stagger_s=STAGGER_S,
+        rng=Random(1),
+    )
+
+
+def allocation(revision: int, owner: str = "e1") -> Allocation:
+    return replace(INITIAL, revision=revision, epoch=revision, owner=owner)
+
+
+def ballot(counter: int, node: str = "r9") -> Ballot:
+    return Ballot(counter=counter, node=node, incarnation=1)
+
+
+def prepare(counter: int, node: str = "r9", electorate: str = "abc") -> Prepare:
+    return Prepare(task="merge", ballot=ballot(counter, node), electorate=electorate)
+
+
+def accept(counter: int, value: Allocation, node: str = "r9", electorate: str = "abc") -> Accept:
+    return Accept(task="merge", acceptance=Acceptance(ballot=ballot(counter, node), value=value), electorate=electorate)
+
+
+def promise_all(proposer: Register, asked: Step, acceptors: Iterable[Register], now: float = 0.0) -> Step:
+    """Hand a prepare to acceptors and their answers back; the last step that wants something."""
+    assert asked.prepare is not None
+    return last(proposer.on_answer(acceptor.on_prepare(asked.prepare)[1], now) for acceptor in acceptors)
+
+
+def accept_all(proposer: Register, asked: Step, acceptors: Iterable[Register], now: float = 0.0) -> Step:
+    assert asked.accept is not None
+    return last(proposer.on_answer(acceptor.on_accept(asked.accept, now)[1], now) for acceptor in acceptors)
+
+
+def last(steps: Iterable[Step]) -> Step:
+    """The last step that is not empty (every one is taken, as the daemon would)."""
+    wanted = [step for step in steps if step != Step()]
+    return wanted[-1] if wanted else Step()
+
+
+def commit(proposer: Register, asked: Step, acceptors: list[Register], now: float = 0.0) -> Step:
+    return accept_all(proposer, promise_all(proposer, asked, acceptors, now), acceptors, now)
+
+
+# --- proposer --------------------------------------------------------------------------------------------------------
+
+
+def test_move_commits_by_a_majority_and_is_learnt() -> None:
+    electors = [make(name) for name in ELECTORS]
+    step = commit(electors[0], electors[0].propose(FIRST, 0.0), electors[:2])
+    assert step.finished == (FIRST, RoundOutcome.COMMITTED)
+    assert step.learnt == allocation(1)
+    assert step.is_dirty
+    assert electors[0].value == allocation(1)
+    assert not electors[0].is_busy
+
+
+def test_minority_does_not_commit() -> None:
+    electors = tuple(f"r{i}" for i in range(1, 6))
+    registers = [make(name, electors=electors) for name in electors]
+    asked = promise_all(registers[0], registers[0].propose(FIRST, 0.0), registers[:3])
+    assert accept_all(registers[0], asked, registers[:2]) == Step()
+    assert registers[0].value == INITIAL
+
+
+def test_one_elector_counts_once_and_a_stranger_never() -> None:
+    proposer, other = make("r1"), make("r2")
+    asked = proposer.propose(FIRST, 0.0).prepare
+    assert asked is not None
+    _, promise = other.on_prepare(asked)
+    assert proposer.on_answer(promise, 0.0) == Step()
+    assert proposer.on_answer(promise, 0.0) == Step()
+    stranger = Promise(elector="e1", task="merge", ballot=asked.ballot)
+    assert proposer.on_answer(stranger, 0.0) == Step()
+
+
+def test_answers_to_an_older_ballot_change_nothing() -> None:
+    proposer, other = make("r1"), make("r2")
+    old = proposer.propose(FIRST, 0.0).prepare
+    assert old is not None
+    _, late = other.on_prepare(old)
+    proposer.tick(BALLOT_S)
+    again = proposer.tick(proposer.next_deadline()).prepare
+    assert again is not None
+    assert again.ballot > old.ballot
+    assert proposer.on_answer(late, 1.0) == Step()
+
+
+def test_move_raises_epoch_and_revision_retune_only_the_revision() -> None:
+    moved = FIRST.apply(INITIAL)
+    assert moved == replace(INITIAL, revision=1, epoch=1, owner="e1")
+    tuning = replace(TUNING, bonus=0.3)
+    assert Retune(base_revision=1, tuning=tuning).apply(moved) == replace(moved, revision=2, tuning=tuning)
+
+
+def test_newer_among_accepted_means_the_higher_ballot_never_the_higher_revision() -> None:
+    proposer = make("r1")
+    asked = proposer.settle(0.0).prepare
+    assert asked is not None
+    accepted = {
+        "r2": Acceptance(ballot=ballot(9), value=allocation(1)),
+        "r3": Acceptance(ballot=ballot(2), value=allocation(5)),
+    }
+    step = last(
+        proposer.on_answer(
+            Promise(elector=name, task="merge", ballot=asked.ballot, accepted=Acceptance(ballot=under, value=value)),
+            0.0,
+        )
+        for name, under, value in accepted
+    )
+    assert step.accept is not None
+    assert step.accept.acceptance == Acceptance(ballot=asked.ballot, value=allocation(1))
+
+
+def test_unlearnt_value_is_settled_first_and_our_outdated_change_ends_as_conflict() -> None:
+    electors = [make(name) for name in ELECTORS]
+    electors[2].on_accept(accept(1, allocation(1, "e2"), "r0"), 0.0)
+    asked = promise_all(electors[0], electors[0].propose(FIRST, 0.0), electors[1:])
+    assert asked.accept is not None
+    assert asked.accept.acceptance.value == allocation(1, "e2")  # a ballot carries exactly one value: not ours
+    step = accept_all(electors[0], asked, electors[1:])
+    assert step.learnt == allocation(1, "e2")
+    assert step.finished == (FIRST, RoundOutcome.CONFLICT)
+
+
+def test_change_on_a_base_that_we_have_not_learnt_follows_under_a_higher_ballot() -> None:
+    """The operator saw revision 1 at another node; here it is accepted but not learnt."""
+    electors = [make(name) for name in ELECTORS]
+    for elector in electors[1:]:
+        elector.on_accept(accept(1, allocation(1), "r0"), 0.0)
+    change = Retune(base_revision=1, tuning=replace(TUNING, bonus=0.4))
+    first = commit(electors[0], electors[0].propose(change, 0.0), electors[1:])
+    assert (first.learnt, first.finished) == (allocation(1), None)
+    assert first.prepare is not None
+    second = commit(electors[0], first, electors[1:])
+    assert second.finished == (change, RoundOutcome.COMMITTED)
+    assert electors[0].value == change.apply(allocation(1))
+
+
+def test_change_on_a_base_that_nobody_has_ends_as_conflict() -> None:
+    electors = [make(name) for name in ELECTORS]
+    change = replace(FIRST, base_revision=4)
+    step = promise_all(electors[0], electors[0].propose(change, 0.0), electors)
+    assert step.finished == (change, RoundOutcome.CONFLICT)
+
+
+def test_outdated_change_ends_at_once_without_a_ballot() -> None:
+    register = make(state=replace(BLANK, learnt=allocation(3)))
+    step = register.propose(replace(FIRST, base_revision=2), 0.0)
+    assert step.prepare is None
+    assert step.finished == (replace(FIRST, base_revision=2), RoundOutcome.CONFLICT)
+
+
+def test_every_queued_change_reports_its_own_end() -> None:
+    """One step carries one end: the second and third change, outdated by the first, must not swallow it."""
+    electors = [make(name) for name in ELECTORS]
+    changes = [replace(FIRST, owner=owner) for owner in ("e1", "e2", "e3")]
+    asked = electors[0].propose(changes[0], 0.0)
+    assert electors[0].propose(changes[1], 0.0) == Step()
+    assert electors[0].propose(changes[2], 0.0) == Step()
+    ends = [commit(electors[0], asked, electors).finished]
+    while electors[0].is_busy:
+        ends.append(electors[0].tick(electors[0].next_deadline()).finished)
+    assert ends == [
+        (changes[0], RoundOutcome.COMMITTED),
+        (changes[1], RoundOutcome.CONFLICT),
+        (changes[2], RoundOutcome.CONFLICT),
+    ]
+
+
+def test_learning_a_newer_value_ends_a_change_that_has_not_been_sent() -> None:
+    register = make()
+    register.propose(FIRST, 0.0)
+    step = register.learn(allocation(1, "e2"), 0.1)
+    assert step.finished == (FIRST, RoundOutcome.CONFLICT)
+
+
+def test_no_majority_gives_up_as_no_quorum() -> None:
+    register = make()
+    step, ends = register.propose(FIRST, 0.0), []
+    while register.next_deadline() < math.inf:
+        assert register.next_deadline() < 7 * BALLOT_S
+        step = register.tick(register.next_deadline())
+        ends.append(step.finished)
+    assert ends[-1] == (FIRST, RoundOutcome.NO_QUORUM)
+    assert ends[:-1] == [None] * (len(ends) - 1)
+
+
+def test_refused_by_a_majority_tries_above_the_promised_counter() -> None:
+    proposer, others = make("r1"), [make("r2"), make("r3")]
+    for other in others:
+        other.on_prepare(prepare(40))
+    promise_all(proposer, proposer.propose(FIRST, 0.0), others)
+    assert proposer.next_deadline() < BALLOT_S  # it need not wait for the deadline
+    again = proposer.tick(proposer.next_deadline())
+    assert again.prepare is not None
+    assert again.prepare.ballot.counter == 41
+    assert commit(proposer, again, others).finished == (FIRST, RoundOutcome.COMMITTED)
+
+
+def test_duplicated_prepare_does_not_count_as_refusal() -> None:
+    proposer, others = make("r1"), [make("r2"), make("r3")]
+    asked = proposer.propose(FIRST, 0.0)
+    assert asked.prepare is not None
+    for other in others:
+        other.on_prepare(asked.prepare)
+        _, echo = other.on_prepare(asked.prepare)
+        assert isinstance(echo, Refused)
+        proposer.on_answer(echo, 0.0)
+    assert proposer.next_deadline() == BALLOT_S  # still the same attempt
+
+
+# --- unknown outcomes ------------------------------------------------------------------------------------------------
+
+
+def sent_and_unanswered(acceptors: list[Register]) -> Register:
+    """r1 has sent its accept to ``acceptors`` and heard nothing; it waits for its next attempt."""
+    proposer = make("r1")
+    asked = promise_all(proposer, proposer.propose(FIRST, 0.0), acceptors)
+    assert asked.accept is not None
+    for acceptor in acceptors:
+        acceptor.on_accept(asked.accept, 0.0)
+    assert proposer.tick(BALLOT_S) == Step()
+    return proposer
+
+
+def test_unknown_outcome_is_found_out_by_an_identity_round_not_applied_again() -> None:
+    others = [make("r2"), make("r3")]
+    proposer = sent_and_unanswered(others)
+    step = commit(proposer, proposer.tick(proposer.next_deadline()), others)
+    assert step.finished == (FIRST, RoundOutcome.COMMITTED)
+    assert step.learnt == allocation(1)  # revision 1, not 2: applied once
+
+
+def test_unknown_outcome_that_nobody_can_tell_ends_as_unknown() -> None:
+    proposer = sent_and_unanswered([make("r2"), make("r3")])
+    end = None
+    while proposer.next_deadline() < math.inf:
+        end = proposer.tick(proposer.next_deadline()).finished or end
+    assert end == (FIRST, RoundOutcome.UNKNOWN)
+
+
+def test_lost_accept_is_not_sent_again() -> None:
+    """Nobody has our value: the identity round carries what it reads, and the change does not stand."""
+    others = [make("r2"), make("r3")]
+    for other in others:
+        other.on_accept(accept(1, allocation(1), "r0"), 0.0)
+    proposer = make("r1", state=replace(BLANK, learnt=allocation(1)))
+    change = replace(FIRST, base_revision=1, owner="e5")
+    promise_all(proposer, proposer.propose(change, 0.0), others)
+    proposer.tick(BALLOT_S)  # the accept is lost
+    asked = promise_all(proposer, proposer.tick(proposer.next_deadline()), others)
+    assert asked.accept is not None
+    assert asked.accept.acceptance.value == allocation(1)
+    step = accept_all(proposer, asked, others)
+    assert step.finished == (change, RoundOutcome.CONFLICT)
+    assert proposer.value == allocation(1)
+
+
+@pytest.mark.parametrize(
+    ("learnt", "outcome"),
+    [
+        (allocation(1), RoundOutcome.COMMITTED),
+        (allocation(1, "e2"), RoundOutcome.CONFLICT),
+        (allocation(2, "e2"), RoundOutcome.UNKNOWN),  # ours may be the revision under it
+    ],
+)
+def test_what_a_peer_learnt_ends_a_round_whose_outcome_was_unknown(learnt: Allocation, outcome: RoundOutcome) -> None:
+    proposer = sent_and_unanswered([make("r2"), make("r3")])
+    assert proposer.learn(learnt, 1.0).finished == (FIRST, outcome)
