@@ -252,7 +252,7 @@ class MapOf(Generic[T]):
 
     def says(self) -> str:
         """What keys and values are."""
-        return f"a mapping from {self.key.says()} to {self.item.says()}"
+        return f"a mapping, each key {self.key.says()}, each value {self.item.says()}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -328,7 +328,7 @@ class Record:
 
     def says(self) -> str:
         """Its keys."""
-        return f"{{{', '.join(self.items)}}}"
+        return f"a mapping {{{', '.join(self.items)}}}"
 
     def default_text(self, name: str) -> str:
         """The default of a key as the reference shows it."""

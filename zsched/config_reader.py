@@ -258,7 +258,9 @@ def _compose(text: str, out: Collector) -> Node | None:
     from ruamel.yaml.reader import ReaderError  # noqa: PLC0415 - as above
 
     try:
-        raw = YAML(typ="safe", pure=True).compose(text)
+        yaml = YAML(typ="safe", pure=True)
+        yaml.composer.warn_double_anchors = False  # YAML allows it, and a warning on stderr helps nobody
+        raw = yaml.compose(text)
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         place = Place(line=mark.line + 1, col=mark.column + 1) if mark is not None else NOWHERE

@@ -297,13 +297,22 @@ FLEET: Final = Record(
 )
 
 
-def reference_rows(record: Record = FLEET, prefix: str = "") -> Iterator[tuple[str, str, str, str]]:
-    """(key, type and range, default, meaning) of every key of the file, outer ones first."""
+def reference() -> str:
+    """The reference of every key as Markdown: one table per section, sections in the order of the file.
+
+    `docs/fleet-file.md` holds it, and a test compares the two.
+    """
+    sections: dict[int, tuple[Record, list[str]]] = {}
+    _collect(FLEET, "", sections)
+    return "\n".join(_section(record, paths) for record, paths in sections.values())
+
+
+def _collect(record: Record, path: str, sections: dict[int, tuple[Record, list[str]]]) -> None:
+    """Every record below ``record`` with all the paths where it stands (the rules of inputs and outputs are one)."""
+    sections.setdefault(id(record), (record, []))[1].append(path)
     for name, item in record.items.items():
-        path = f"{prefix}{name}"
-        yield path, item.block.says(), record.default_text(name), item.doc
         for suffix, inner in _records(item.block):
-            yield from reference_rows(inner, f"{path}{suffix}.")
+            _collect(inner, f"{path}{'.' if path else ''}{name}{suffix}", sections)
 
 
 def _records(block: Block[Any]) -> Iterator[tuple[str, Record]]:
@@ -317,3 +326,14 @@ def _records(block: Block[Any]) -> Iterator[tuple[str, Record]]:
         yield from ((f".NAME{suffix}", record) for suffix, record in _records(block.item))
     elif isinstance(block, ListOf):
         yield from ((f"[]{suffix}", record) for suffix, record in _records(block.item))
+
+
+def _section(record: Record, paths: list[str]) -> str:
+    heading = ", ".join(f"`{path}`" for path in paths) if paths != [""] else "The file"
+    rows = (
+        f"| `{name}` | {item.block.says()} | {record.default_text(name)} | {item.doc} |"
+        for name, item in record.items.items()
+    )
+    return "\n".join(
+        (f"### {heading}\n", "| key | takes | default | meaning |", "| --- | --- | --- | --- |", *rows, "")
+    )

@@ -244,6 +244,11 @@ def test_anchors_may_share_text() -> None:
     assert fleet_of(text).node("edge2").labels == (("gpu", "no"),)
 
 
+def test_an_anchor_may_be_set_again() -> None:
+    text = swapped('{gpu: "no"}', '&l {gpu: "no"}').replace("{gpu: yes}", "&l {gpu: yes}")
+    assert fleet_of(text).node("edge2").labels == (("gpu", "yes"),)
+
+
 # --- hashes and endpoints --------------------------------------------------------------------------------------------
 
 
@@ -395,7 +400,7 @@ ONE_FAULT = [
     ("timing: wifi", "timing: {gather_s: 0.6, ballot_s: 0.6}", "a round must end", "0.6, ballot"),
     ("timing: wifi", "timing: {profile_ttl_s: 1.5}", "one lost profile", "1.5}"),
     ("timing: wifi", "timing:", "expected", None),
-    ("zenoh: {config: zenoh.json5}", "zenoh: zenoh.json5", "expected {config}", "zenoh.json5"),
+    ("zenoh: {config: zenoh.json5}", "zenoh: zenoh.json5", "expected a mapping {config}", "zenoh.json5"),
     ("zenoh: {config: zenoh.json5}", "zenho: {config: zenoh.json5}", "no key 'zenho'", "zenho"),
     ("zenoh: {config: zenoh.json5}", "electorate: [robot1, ghost]", "there is no node 'ghost'", "ghost"),
 ]  # fmt: skip

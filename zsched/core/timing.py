@@ -7,8 +7,8 @@ Knows: the relations between the fields of `Timing`, each with its reason. Does 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Final
 
 from zsched.core.fleet import Timing
@@ -31,50 +31,67 @@ WAN: Final = replace(
 PROFILES: Final[Mapping[str, Timing]] = {profile.name: profile for profile in (WIRED, WIFI, WAN)}
 
 
+@dataclass(frozen=True, slots=True)
+class _Relation:
+    """``field`` must stand to ``bound`` as ``sign`` says; ``formula`` is the bound in words."""
+
+    field: str
+    sign: str
+    formula: str
+    bound: Callable[[Timing], float]
+    why: str
+
+
+_RELATIONS: Final = (
+    _Relation(
+        "suspect_s", ">=", "3 x beat_s", lambda t: 3 * t.beat_s, "two lost beats in a row are ordinary on a radio"
+    ),
+    _Relation(
+        "confirm_s", ">=", "beat_s", lambda t: t.beat_s, "a suspect refutes, and an observer confirms, by a beat"
+    ),
+    _Relation("zenoh_lease_s", ">=", "1 s", lambda _: 1.0, "below it zenoh closes links that are only busy"),
+    _Relation(
+        "zenoh_lease_s",
+        "<",
+        "suspect_s + confirm_s + 1 s",
+        lambda t: t.suspect_s + t.confirm_s + 1.0,
+        "a peer that is gone must not hold its sessions, and our puts, much longer",
+    ),
+    _Relation("publish_s", ">=", "sample_s", lambda t: t.sample_s, "there is nothing new to publish between samples"),
+    _Relation("smoothing_s", ">=", "sample_s", lambda t: t.sample_s, "a shorter time constant smooths nothing"),
+    _Relation(
+        "profile_ttl_s",
+        ">=",
+        "2 x publish_s",
+        lambda t: 2 * t.publish_s,
+        "one lost profile must not take a node out of the race",
+    ),
+    _Relation("gather_s", "<=", "decide_s", lambda t: t.decide_s, "a round must end before the next one begins"),
+    _Relation(
+        "ballot_s",
+        ">=",
+        "gather_s",
+        lambda t: t.gather_s,
+        "an elector writes to disk before it answers, a utility needs no disk",
+    ),
+    _Relation(
+        "stagger_s", "<=", "ballot_s", lambda t: t.ballot_s, "the next proposer must step in before the round is lost"
+    ),
+)
+
+
 def timing_faults(timing: Timing) -> tuple[tuple[str, str], ...]:
     """(field, what is wrong and why) for every relation that ``timing`` breaks; empty when it is safe.
 
     ``field`` is the one to change first. All values in seconds; the ranges of the single fields are the reader's.
     """
-    t = timing
-    relations = (
-        ("suspect_s", t.suspect_s, ">=", 3 * t.beat_s, "3 x beat_s", "two lost beats in a row are ordinary on a radio"),
-        ("zenoh_lease_s", t.zenoh_lease_s, ">=", 1.0, "1 s", "below it zenoh closes links that are only busy"),
-        (
-            "zenoh_lease_s",
-            t.zenoh_lease_s,
-            "<",
-            t.suspect_s + t.confirm_s + 1.0,
-            "suspect_s + confirm_s + 1 s",
-            "a peer that is gone must not hold its sessions, and our puts, much longer",
-        ),
-        ("confirm_s", t.confirm_s, ">=", t.beat_s, "beat_s", "a suspect refutes, and an observer confirms, by a beat"),
-        ("publish_s", t.publish_s, ">=", t.sample_s, "sample_s", "there is nothing new to publish between samples"),
-        ("smoothing_s", t.smoothing_s, ">=", t.sample_s, "sample_s", "a shorter time constant smooths nothing"),
-        (
-            "profile_ttl_s",
-            t.profile_ttl_s,
-            ">=",
-            2 * t.publish_s,
-            "2 x publish_s",
-            "one lost profile must not take a node out of the race",
-        ),
-        ("gather_s", t.gather_s, "<=", t.decide_s, "decide_s", "a round must end before the next one begins"),
-        (
-            "ballot_s",
-            t.ballot_s,
-            ">=",
-            t.gather_s,
-            "gather_s",
-            "an elector writes to disk before it answers; a utility needs no disk",
-        ),
-        ("stagger_s", t.stagger_s, "<=", t.ballot_s, "ballot_s", "the next proposer steps in before the round is lost"),
-    )
-    return tuple(
-        (field, f"{field} is {value:g} s, it must be {sign} {bound:g} s ({formula}): {why}")
-        for field, value, sign, bound, formula, why in relations
-        if not _holds(value, sign, bound)
-    )
+    faults: list[tuple[str, str]] = []
+    for relation in _RELATIONS:
+        value, bound = getattr(timing, relation.field), relation.bound(timing)
+        if not _holds(value, relation.sign, bound):
+            must = f"it must be {relation.sign} {bound:g} s ({relation.formula})"
+            faults.append((relation.field, f"{relation.field} is {value:g} s, {must}: {relation.why}"))
+    return tuple(faults)
 
 
 def _holds(value: float, sign: str, bound: float) -> bool:

@@ -1,0 +1,57 @@
+"""The three timing profiles are safe, and each relation can be broken."""
+
+from dataclasses import asdict, fields, replace
+
+import pytest
+from zsched.core.fleet import Timing
+from zsched.core.timing import PROFILES, WIFI, timing_faults
+
+
+def changed(field: str, value: float) -> Timing:
+    return Timing(**{**asdict(WIFI), field: value})
+
+
+@pytest.mark.parametrize("name", ["wired", "wifi", "wan"])
+def test_profiles_are_safe_and_named(name: str) -> None:
+    assert timing_faults(PROFILES[name]) == ()
+    assert PROFILES[name].name == name
+
+
+def test_wifi_is_the_default() -> None:
+    assert Timing() == WIFI
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "blamed"),
+    [
+        ("beat_s", 0.41, "suspect_s"),
+        ("suspect_s", 0.5, "suspect_s"),
+        ("confirm_s", 0.1, "confirm_s"),
+        ("zenoh_lease_s", 0.9, "zenoh_lease_s"),
+        ("zenoh_lease_s", 2.5, "zenoh_lease_s"),
+        ("publish_s", 0.1, "publish_s"),
+        ("smoothing_s", 0.1, "smoothing_s"),
+        ("profile_ttl_s", 1.9, "profile_ttl_s"),
+        ("decide_s", 0.1, "gather_s"),
+        ("ballot_s", 0.1, "ballot_s"),
+        ("stagger_s", 0.4, "stagger_s"),
+    ],
+)
+def test_a_broken_relation_is_named_with_its_bound(field: str, value: float, blamed: str) -> None:
+    faults = timing_faults(changed(field, value))
+    assert blamed in [name for name, _ in faults]
+    message = next(text for name, text in faults if name == blamed)
+    assert "it must be" in message
+    assert ": " in message
+
+
+def test_bounds_themselves_are_allowed() -> None:
+    assert timing_faults(replace(WIFI, beat_s=0.15, suspect_s=0.45, confirm_s=0.15)) == ()
+
+
+def test_every_clock_stands_in_some_relation() -> None:
+    """Setting one clock absurdly, up or down, must not pass unnoticed."""
+    for field in fields(Timing):
+        if field.name != "name":
+            absurd = [changed(field.name, value) for value in (0.01, 3000.0)]
+            assert any(timing_faults(timing) for timing in absurd), field.name

@@ -1,0 +1,57 @@
+"""docs/fleet-file.md says what the schema says, and its examples are real."""
+
+from dataclasses import MISSING, fields
+from pathlib import Path
+
+from zsched.config import check_bytes
+from zsched.config_schema import RULE, SCHEDULING, TRACE, WORKER, reference
+from zsched.core.fleet import LinkSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.plan import StreamSettings
+from zsched.core.timing import _RELATIONS, PROFILES
+
+DOC = (Path(__file__).parents[2] / "docs" / "fleet-file.md").read_text()
+
+
+def test_reference_is_the_schemas() -> None:
+    written = DOC.split("<!-- reference: begin -->\n")[1].split("<!-- reference: end -->")[0]
+    assert written == reference(), "paste the output of zsched.config_schema.reference() between the two marks"
+
+
+def test_defaults_told_by_hand_are_the_classes_own() -> None:
+    told = [
+        (TRACE, "column", LinkSpec, "column"),
+        (TRACE, "offset_s", LinkSpec, "offset_s"),
+        (SCHEDULING, "reach", TaskSpec, "reach"),
+        (SCHEDULING, "memory_floor_ratio", TaskSpec, "memory_floor_ratio"),
+        (WORKER, "ready", WorkerSpec, "ready_when"),
+        (RULE, "class", StreamSettings, "stream_class"),
+    ]
+    for record, key, kind, name in told:
+        default = next(field.default for field in fields(kind) if field.name == name)
+        assert default is not MISSING
+        shown = f"{default:g}" if isinstance(default, float) else str(default)
+        assert record.default_text(key) == f"`{shown}`", key
+
+
+def test_timing_table_and_relations_are_the_codes() -> None:
+    for field in fields(Timing):
+        if field.name != "name":
+            values = " | ".join(f"{getattr(PROFILES[name], field.name):g}" for name in ("wired", "wifi", "wan"))
+            assert f"| `{field.name}` | {values} |" in DOC
+    for relation in _RELATIONS:
+        assert f"* `{relation.field}` {relation.sign} {relation.formula}: {relation.why}." in DOC
+
+
+def test_the_shown_report_is_what_the_checker_prints() -> None:
+    """The two faults of the first example, in the same words and under the same carets."""
+    lines = [""] * 20
+    lines[12] = "    weights: {cpu: 0.5, memory: 1.5, network: 0.0}"
+    lines[15] = "    worker: {command: [python, -m, zsched.tasks.map_merge], standby: warm, standbye: cold}"
+    lines[0] = "fleet: f"
+    lines[1] = "nodes: {r1: {kind: robot}}"
+    lines[9:12] = ["tasks:", "  map_merge:", "    candidates: [r1]"]
+    text = "\n".join(lines)
+    shown = DOC.split("$ zsched check fleet.yaml\n")[1].split("```")[0].strip("\n")
+    result = check_bytes(text.encode(), "fleet.yaml")
+    report = "\n".join(fault.render("fleet.yaml") for fault in result.faults)
+    assert report == shown
