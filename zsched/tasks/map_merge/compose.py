@@ -12,14 +12,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from zsched.tasks.map_merge.geometry import FloatArray, Pose2
-from zsched.tasks.map_merge.grid import MAX_CELLS, MAX_SIDE_CELLS, Grid, same_resolution
+from zsched.tasks.map_merge.grid import MAX_CELLS, MAX_SIDE_CELLS, OCCUPIED, UNKNOWN, Cells, Grid, same_resolution
 
 BLOCK_CELLS = 64
 Levels = npt.NDArray[np.uint8]
@@ -104,7 +104,7 @@ def compose(
         region = canvas[rows, columns]
         np.maximum(region, _warp(grid, world_t_map, part, resolution), out=region)
     return Grid(
-        data=(canvas.astype(np.int16) - 1).astype(np.int8),
+        data=_cells(canvas),
         resolution=resolution,
         origin=Pose2(x=extent.low_x * resolution, y=extent.low_y * resolution),
         stamp_ns=stamp_ns,
@@ -113,34 +113,45 @@ def compose(
 
 
 def resample(grid: Grid, resolution: float) -> Grid:
-    """The same grid with cells of ``resolution``, its axes (yaw) kept; itself when nothing changes."""
-    if same_resolution(grid.resolution, resolution):
+    """The same grid with cells of ``resolution``, its axes (yaw) and outer corner kept; itself when nothing changes.
+
+    Going coarser, every cell counts in exactly one larger cell: sampling the middles would lose thin walls, or shift
+    them by half a cell.
+    """
+    if same_resolution(grid.resolution, resolution) or grid.data.size == 0:
         return grid
+    if resolution > grid.resolution:
+        cells = np.maximum(grid.data, UNKNOWN)
+        for axis in (0, 1):
+            cells = np.maximum.reduceat(cells, _first_cells(grid, resolution, axis), axis=axis)
+        return replace(grid, data=cells, resolution=resolution)
     width = max(1, math.ceil(grid.width * grid.resolution / resolution - 1e-6))
     height = max(1, math.ceil(grid.height * grid.resolution / resolution - 1e-6))
     extent = Extent(low_x=0, low_y=0, high_x=width, high_y=height)
     # Seen from its own outer corner the grid lies straight on a lattice of the new resolution.
     levels = _warp(grid, grid.origin.inverse(), extent, resolution)
-    return Grid(
-        data=(levels.astype(np.int16) - 1).astype(np.int8),
-        resolution=resolution,
-        origin=grid.origin,
-        stamp_ns=grid.stamp_ns,
-        frame_id=grid.frame_id,
-    )
+    return replace(grid, data=_cells(levels), resolution=resolution)
+
+
+def _first_cells(grid: Grid, resolution: float, axis: int) -> npt.NDArray[np.int64]:
+    """For each larger cell along ``axis`` the index of the first cell whose middle lies in it."""
+    middles = (np.arange(grid.data.shape[axis]) + 0.5) * (grid.resolution / resolution)
+    return np.flatnonzero(np.diff(np.floor(middles), prepend=-1.0))
 
 
 def _levels(grid: Grid) -> Levels:
-    return (np.clip(grid.data, -1, 100) + np.int8(1)).astype(np.uint8)
+    return (np.clip(grid.data, UNKNOWN, OCCUPIED) + np.int8(1)).astype(np.uint8)
+
+
+def _cells(levels: Levels) -> Cells:
+    return (levels.astype(np.int16) - 1).astype(np.int8)
 
 
 def _warp(grid: Grid, world_t_map: Pose2, extent: Extent, resolution: float) -> Levels:
     """The grid's levels on the lattice cells of ``extent``, by nearest cell."""
+    if resolution > grid.resolution:
+        grid = resample(grid, resolution)
     levels = _levels(grid)
-    ratio = resolution / grid.resolution
-    if ratio > 1.01:
-        side = math.ceil(ratio)
-        levels = cv2.dilate(levels, np.ones((side, side), dtype=np.uint8)).astype(np.uint8, copy=False)
     to_source = _cell_matrix(grid, world_t_map, extent, resolution)
     warped = cv2.warpAffine(
         levels,

@@ -126,10 +126,12 @@ class Merger:
         return ""
 
     def remove(self, robot: str) -> None:
-        """Forget a robot's map and alignments (its stream was deleted)."""
-        for book in (self._grids, self._versions, self._areas):
-            book.pop(robot, None)
-        self._pairs.forget(robot)
+        """Leave a robot's map out from now on (its stream was deleted).
+
+        Its alignments stay: others may be connected through it, and it may come back in the same frame.
+        """
+        self._grids.pop(robot, None)
+        self._versions.pop(robot, None)
 
     def merge(self) -> MergeResult:
         """Bring the alignments up to date and lay the connected maps over each other."""

@@ -1,0 +1,267 @@
+"""Runs a `Merger` on messages: takes map bytes, merges at a bounded rate, hands out map, transforms and status.
+
+Knows: the three outputs and their bytes, counters, ages. Does not know: zenoh or processes; bytes come in and go out
+through plain calls, so that the whole service runs in a test.
+
+Threads: `receive` and `snapshot` may be called from any thread, `step` from one only. `receive` decodes and keeps the
+newest map per robot; all the work is in `step`, so a slow merge never delays an input, and a bad message costs nothing
+but a counter.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any, Protocol
+
+from zsched.core.model import NAME
+from zsched.tasks.map_merge.cdr import CdrError, StampedTransform, decode_grid, encode_grid, encode_transforms
+from zsched.tasks.map_merge.geometry import Pose2
+from zsched.tasks.map_merge.grid import Grid
+from zsched.tasks.map_merge.merger import MAX_ROBOTS, Merger, MergeResult, MergerSettings, RobotStatus
+
+STATUS_SCHEMA = "zsched.map_merge.status/1"
+STATUS_PERIOD_S = 1.0
+"""Status at least so often while active: the ages in it go on."""
+_LOG = logging.getLogger("zsched.tasks.map_merge")
+
+
+class Output(StrEnum):
+    """What the task publishes; the value is the key's last chunk."""
+
+    GLOBAL_MAP = "global_map"
+    TF = "tf"
+    STATUS = "status"
+
+
+class Publish(Protocol):
+    """Sends one message of an output; whether it went out (an idle worker's does not)."""
+
+    def __call__(self, output: Output, payload: bytes, attachment: bytes | None = None) -> bool:
+        """Send ``payload``."""
+
+
+@dataclass(slots=True)
+class _Input:
+    """What came in for one robot."""
+
+    maps: int = 0
+    bad: int = 0
+    last_error: str | None = None
+    received_s: float | None = None
+
+
+class MapMergeService:
+    """The task without its transport. ``rate_hz`` bounds merges; ``clock`` gives monotonic seconds."""
+
+    def __init__(
+        self, settings: MergerSettings, publish: Publish, *, clock: Callable[[], float], rate_hz: float = 4.0
+    ) -> None:
+        self._settings = settings
+        self._publish = publish
+        self._clock = clock
+        self._period_s = 1.0 / rate_hz
+        self._merger = Merger(settings)
+        self._lock = threading.Lock()
+        self._pending: dict[str, Grid | None] = {}
+        self._inputs: dict[str, _Input] = {}
+        self._snapshot = self._merger.snapshot()
+        self._strangers = 0
+        self._is_due = False
+        self._was_active = False
+        self._result: MergeResult | None = None
+        self._merges = 0
+        self._merge_ms: float | None = None
+        self._next_merge_s = float("-inf")
+        self._next_status_s = float("-inf")
+
+    # --- any thread ---------------------------------------------------------------------------------------------------
+
+    def receive(self, robot: str, payload: bytes, *, is_deleted: bool = False) -> None:
+        """Take one map message of a robot, or the word that its stream was deleted. Never raises for bad bytes."""
+        with self._lock:
+            if robot not in self._inputs and (NAME.fullmatch(robot) is None or len(self._inputs) >= MAX_ROBOTS):
+                self._strangers += 1
+                return
+            book = self._inputs.setdefault(robot, _Input())
+        if is_deleted:
+            self._keep(robot, None)
+            return
+        try:
+            grid = decode_grid(payload)
+        except CdrError as error:
+            with self._lock:
+                book.bad += 1
+                book.last_error = str(error)
+                self._next_status_s = float("-inf")
+            return
+        with self._lock:
+            book.maps += 1
+            book.received_s = self._clock()
+        self._keep(robot, grid)
+
+    def snapshot(self) -> bytes:
+        """The transforms as of the newest merge, for the next owner."""
+        return self._snapshot
+
+    def _keep(self, robot: str, grid: Grid | None) -> None:
+        with self._lock:
+            self._pending[robot] = grid
+            self._is_due = True
+
+    # --- one thread ---------------------------------------------------------------------------------------------------
+
+    def restore(self, snapshot: bytes) -> None:
+        """Take over the transforms of the previous owner; one that does not fit is logged and left."""
+        refusal = self._merger.restore(snapshot)
+        if refusal:
+            _LOG.warning("snapshot_refused reason=%r", refusal)
+            return
+        self._snapshot = self._merger.snapshot()
+        _LOG.info("snapshot_restored bytes=%d", len(snapshot))
+
+    def step(self, *, is_active: bool) -> bool:
+        """Merge and publish if something changed and the rate allows it; returns whether it merged.
+
+        While idle, maps are only kept; the first step as owner merges what there is, at once.
+        """
+        if is_active and not self._was_active:
+            self._is_due = True
+            self._next_merge_s = self._next_status_s = float("-inf")
+        self._was_active = is_active
+        now = self._clock()
+        if not is_active:
+            return False
+        if self._is_due and now >= self._next_merge_s:
+            self._next_merge_s = now + self._period_s
+            self._merge()
+            return True
+        if now >= self._next_status_s:
+            self._publish_status()
+        return False
+
+    def _merge(self) -> None:
+        with self._lock:
+            pending, self._pending, self._is_due = self._pending, {}, False
+        started_s = self._clock()
+        try:
+            result = self._merged(pending)
+        except Exception:  # noqa: BLE001 - a map that trips a bug must not stop the others' merge on owner after owner
+            _LOG.exception("merge_failed left_out=%s", sorted(pending))
+            self._leave_out(pending)
+            return
+        self._merge_ms = 1e3 * (self._clock() - started_s)
+        self._merges += 1
+        self._log_changes(result)
+        self._result, self._snapshot = result, self._merger.snapshot()
+        if result.is_search_due:
+            with self._lock:
+                self._is_due = True
+        self._publish_result(result)
+
+    def _merged(self, pending: Mapping[str, Grid | None]) -> MergeResult:
+        for robot, grid in pending.items():
+            if grid is None:
+                self._merger.remove(robot)
+            elif refusal := self._merger.update(robot, grid):
+                self._inputs[robot].last_error = refusal
+        return self._merger.merge()
+
+    def _leave_out(self, pending: Mapping[str, Grid | None]) -> None:
+        with self._lock:
+            for robot in pending:
+                self._merger.remove(robot)
+                self._inputs[robot].bad += 1
+                self._inputs[robot].last_error = "a merge failed with its map (see the worker's log)"
+            self._is_due = bool(pending)
+
+    def _publish_result(self, result: MergeResult) -> None:
+        attachment = json.dumps({"merge": self._merges, "inputs": dict(result.inputs)}).encode()
+        if result.grid is not None:
+            self._publish(Output.GLOBAL_MAP, encode_grid(result.grid), attachment)
+            self._publish(Output.TF, encode_transforms(_transforms(result, self._settings.world_frame)), attachment)
+        self._publish_status()
+
+    def _publish_status(self) -> None:
+        self._next_status_s = self._clock() + STATUS_PERIOD_S
+        self._publish(Output.STATUS, json.dumps(self.status()).encode())
+
+    def status(self) -> dict[str, Any]:
+        """What the status stream carries (docs/map_merge.md lists the fields)."""
+        result = self._result
+        statuses = {} if result is None else {status.robot: status for status in result.statuses}
+        grid = None if result is None else result.grid
+        now = self._clock()
+        with self._lock:
+            robots = {
+                robot: _robot_fields(statuses.get(robot), self._inputs.get(robot, _Input()), result, now)
+                for robot in sorted({*statuses, *self._inputs})
+            }
+        return {
+            "schema": STATUS_SCHEMA,
+            "mode": self._settings.mode.value,
+            "merges": self._merges,
+            "revision": 0 if result is None else result.revision,
+            "reference": None if result is None else result.reference,
+            "is_search_due": result is not None and result.is_search_due,
+            "merge_ms": None if self._merge_ms is None else round(self._merge_ms, 2),
+            "map": None if grid is None else _map_fields(grid),
+            "strangers": self._strangers,
+            "robots": robots,
+        }
+
+    def _log_changes(self, result: MergeResult) -> None:
+        before = {} if self._result is None else {status.robot: status.state for status in self._result.statuses}
+        for status in result.statuses:
+            if before.get(status.robot) is not status.state:
+                _LOG.info(
+                    "robot_%s robot=%s score=%s agreeing=%s overlap=%s margin=%s reason=%r",
+                    status.state.value,
+                    status.robot,
+                    _rounded(status.score),
+                    status.agreeing,
+                    _rounded(status.overlap),
+                    _rounded(status.margin),
+                    status.reason,
+                )
+
+
+def _transforms(result: MergeResult, world_frame: str) -> tuple[StampedTransform, ...]:
+    return tuple(
+        StampedTransform(parent=world_frame, child=f"{robot}/map", pose=pose, stamp_ns=result.inputs[robot])
+        for robot, pose in result.transforms.items()
+    )
+
+
+def _robot_fields(status: RobotStatus | None, book: _Input, result: MergeResult | None, now: float) -> dict[str, Any]:
+    pose = None if result is None or status is None else result.transforms.get(status.robot)
+    return {
+        "state": "waiting" if status is None else status.state.value,
+        "reason": "not merged yet" if status is None else status.reason,
+        "with": None if status is None else status.partner,
+        "score": None if status is None else _rounded(status.score),
+        "agreeing": None if status is None else status.agreeing,
+        "overlap": None if status is None else _rounded(status.overlap),
+        "margin": None if status is None else _rounded(status.margin),
+        "pose": None if pose is None else _pose_fields(pose),
+        "map_age_s": None if book.received_s is None else round(now - book.received_s, 3),
+        "maps": book.maps,
+        "bad": book.bad,
+        "last_error": book.last_error,
+    }
+
+
+def _map_fields(grid: Grid) -> Mapping[str, Any]:
+    return {"width": grid.width, "height": grid.height, "resolution": grid.resolution, "stamp_ns": grid.stamp_ns}
+
+
+def _pose_fields(pose: Pose2) -> Mapping[str, float]:
+    return {"x": round(pose.x, 4), "y": round(pose.y, 4), "yaw": round(pose.yaw, 5)}
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, 3)
