@@ -78,6 +78,7 @@ class StateFile:
         with contextlib.suppress(OSError):  # on a full disk the number is missing, the lock holds all the same
             os.ftruncate(fd, 0)
             os.pwrite(fd, f"{os.getpid()}\n".encode("ascii"), 0)
+        _hand_over(fd, self.folder)
         self._lock_fd = fd
 
     def release(self) -> None:
@@ -200,9 +201,18 @@ def _write_synced(path: Path, content: bytes) -> None:
         written = 0
         while written < len(content):
             written += os.write(fd, content[written:])
+        _hand_over(fd, path.parent)
         os.fsync(fd)
     finally:
         os.close(fd)
+
+
+def _hand_over(fd: int, folder: Path) -> None:
+    """Give a file that root writes (`zsched init`) to the folder's owner: the service must be able to read it."""
+    if os.geteuid() == 0:
+        with contextlib.suppress(OSError):  # a file system without owners
+            owner = folder.stat()
+            os.fchown(fd, owner.st_uid, owner.st_gid)
 
 
 def _sync_folder(folder: Path) -> None:

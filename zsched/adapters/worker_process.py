@@ -35,16 +35,12 @@ INTAKE_WINDOW_S = 0.1
 POLL_S = 0.05
 """How often exits are looked for on kernels without pidfd."""
 
-GUARD_SCRIPT = """
-groups=' '
-while read -r sign group; do
-  case $sign in
-    +) groups="$groups$group " ;;
-    -) groups="${groups%% "$group" *} ${groups#* "$group" }" ;;
-  esac
-done
-for group in $groups; do kill -s KILL -- "-$group"; done
-"""
+GUARD_SCRIPT = (
+    "groups=' '; while read -r sign group; do case $sign in "
+    '+) groups="$groups$group ";; -) groups="${groups%% $group *} ${groups#* $group }";; esac; done; '
+    'for group in $groups; do kill -s KILL -- "-$group"; done'
+)
+"""Reads ``+ GROUP`` and ``- GROUP`` until the daemon's end of the pipe closes. On one line for `ps`."""
 
 
 class LineLog:

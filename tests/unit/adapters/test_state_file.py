@@ -177,6 +177,17 @@ def test_killed_while_saving_leaves_a_whole_state(tmp_path: Path) -> None:
 
 
 @pytest.mark.root
+def test_root_writes_for_the_folders_owner(tmp_path: Path) -> None:
+    if os.geteuid() != 0:
+        pytest.skip("only root can write for somebody else")
+    os.chown(tmp_path, 54321, 54322)
+    with state_file(tmp_path) as file:
+        file.create(STATE)
+    owners = {(path.stat().st_uid, path.stat().st_gid) for path in tmp_path.iterdir()}
+    assert owners == {(54321, 54322)}
+
+
+@pytest.mark.root
 def test_full_disk_leaves_the_old_state_whole(tmp_path: Path) -> None:
     folder = tmp_path / "small"
     folder.mkdir()

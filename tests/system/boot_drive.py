@@ -1,0 +1,111 @@
+"""Runs inside the booted machine as a one-shot unit: drives zsched.service through its life and writes what it saw.
+
+Only the standard library: this file is copied into a fresh Debian. The verdict is the test's; here is only evidence.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+UNIT = "zsched.service"
+RESULT = Path("/result/report.json")
+
+
+def run(*command: str) -> str:
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    return done.stdout + done.stderr
+
+
+def show() -> dict[str, str]:
+    names = "ActiveState,SubState,StatusText,MainPID,NRestarts,Result,ExecMainStatus,ControlGroup"
+    lines = run("systemctl", "show", UNIT, "-p", names).splitlines()
+    return dict(line.partition("=")[::2] for line in lines)
+
+
+def wait_for(condition: Callable[[dict[str, str]], bool], timeout_s: float) -> dict[str, str]:
+    end_s = time.monotonic() + timeout_s
+    while True:
+        state = show()
+        if condition(state) or time.monotonic() >= end_s:
+            return state
+        time.sleep(0.1)
+
+
+def processes(user_of: int | None = None) -> list[str]:
+    """Command lines of all processes but kernel threads, or of one user only."""
+    found = []
+    for folder in Path("/proc").iterdir():
+        try:
+            if folder.name.isdecimal() and (user_of is None or folder.stat().st_uid == user_of):
+                line = (folder / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace").strip()
+                found += [f"{folder.name} {line[:200]}"] if line else []
+        except OSError:
+            continue
+    return sorted(found)
+
+
+def timed(*command: str) -> tuple[float, str]:
+    begin_s = time.monotonic()
+    output = run(*command)
+    return time.monotonic() - begin_s, output
+
+
+def observe() -> dict[str, object]:
+    report: dict[str, object] = {}
+    start_s, start_said = timed("systemctl", "start", UNIT)
+    report["start"] = show() | {"seconds": round(start_s, 3), "said": start_said}
+    time.sleep(3.0)
+    running = report["running"] = show()
+    report["status"] = run("systemctl", "status", "--no-pager", "--lines=0", UNIT)
+    pid = int(running["MainPID"])
+    if pid == 0:
+        return report
+    user = os.stat(f"/proc/{pid}").st_uid  # noqa: PTH116 - a /proc path, nothing to gain
+    report["processes"] = processes(user)
+    report["runtime"] = {
+        path.name: path.read_text(errors="replace")[:2000] for path in Path("/run/zsched").glob("*.txt")
+    }
+    os.kill(pid, 19)  # SIGSTOP: the loop is wedged, the process lives
+    report["watchdog"] = wait_for(
+        lambda state: state["NRestarts"] != "0" and state["ActiveState"] == "active" and state["MainPID"] != str(pid),
+        30.0,
+    )
+    report["survivors"] = [line for line in processes(user) if any(line == old for old in report["processes"])]  # type: ignore[attr-defined]
+    time.sleep(1.0)
+    stop_s, stop_said = timed("systemctl", "stop", UNIT)
+    report["stop"] = show() | {"seconds": round(stop_s, 3), "said": stop_said}
+    report["left"] = processes(user)
+    report["left_folders"] = {name: Path(name).exists() for name in ("/run/zsched", "/var/lib/zsched/")}
+    return report
+
+
+def misconfigure() -> dict[str, object]:
+    """A wrong fleet file: exit 78 and no restart, however long we wait."""
+    Path("/etc/zsched/fleet.yaml").write_text("fleet: [this is no fleet\n")
+    said = run("systemctl", "start", UNIT)
+    first = wait_for(lambda state: state["ActiveState"] == "failed", 15.0)
+    time.sleep(2.5)
+    return {"said": said, "first": first, "later": show()}
+
+
+def main() -> int:
+    report: dict[str, object] = {}
+    try:
+        report = observe()
+        report["misconfigured"] = misconfigure()
+    except Exception as error:  # noqa: BLE001 - whatever happens, the report is written and the machine goes off
+        report["error"] = repr(error)
+    report["journal"] = run("journalctl", "--no-pager", "-u", UNIT, "-o", "cat", "-n", "200")
+    RESULT.write_text(json.dumps(report, indent=1))
+    run("systemctl", "poweroff", "--force")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,209 @@
+"""The unit on a real, booted systemd: a small Debian in systemd-nspawn, driven from inside by `boot_drive.py`.
+
+Needs root, debootstrap and systemd-nspawn, and once the network (about 45 s and 300 MB, kept in a cache folder:
+ZSCHED_TEST_CACHE, else ~/.cache/zsched). Skipped with the reason otherwise. Each test boots its own machine on an
+overlay over the cached one (about 15 s).
+"""
+
+from __future__ import annotations
+
+import fcntl
+import importlib.util
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import sysconfig
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+HERE, REPO = Path(__file__).parent, Path(__file__).parents[2]
+SUITE = "bookworm"
+PYTHON_IN_SUITE = (3, 11)
+PACKAGES = "systemd,systemd-sysv,dbus,python3,python3-venv"
+BOOT_TIMEOUT_S = 150.0
+pytestmark = [pytest.mark.root, pytest.mark.timeout(420)]
+
+FLEET = """
+fleet: boot
+nodes:
+  edge1: {kind: robot, wired: true, listen: {control: tcp/127.0.0.1:27357, data: tcp/127.0.0.1:27358}}
+tasks:
+  echo:
+    candidates: [edge1]
+    weights: {cpu: 0.5, memory: 0.5, network: 0.0}
+    worker: {command: [python, -m, zsched.tasks.echo], standby: warm}
+    inputs: [{from: "{robot}/ping", to: "{target}/echo/{robot}/ping"}]
+    outputs: [{from: "{target}/echo/{epoch}/pong", to: "{robot}/pong"}]
+"""
+DRIVE_UNIT = """
+[Unit]
+After=multi-user.target
+[Service]
+Type=exec
+ExecStart=/usr/bin/python3 /opt/drive.py
+[Install]
+WantedBy=multi-user.target
+"""
+PROGRAM = """#!/bin/sh
+export PYTHONPATH=/opt/zsched/src:/opt/zsched/site PYTHONDONTWRITEBYTECODE=1 ZSCHED_NODE=edge1
+exec /usr/bin/python3 {start} "$@"
+"""
+STANDIN, REAL = "/opt/standin.py", "-m zsched.cli"
+
+
+def cache_folder() -> Path:
+    return Path(os.environ.get("ZSCHED_TEST_CACHE") or Path.home() / ".cache" / "zsched")
+
+
+def why_not() -> str | None:
+    """Why a machine cannot be booted here."""
+    if os.geteuid() != 0:
+        return "booting a machine needs root"
+    missing = [tool for tool in ("debootstrap", "systemd-nspawn", "mount") if shutil.which(tool) is None]
+    if missing:
+        return f"not installed: {', '.join(missing)} (Debian: debootstrap, systemd-container)"
+    if sys.version_info[:2] != PYTHON_IN_SUITE:
+        return f"the booted Debian has Python {PYTHON_IN_SUITE}, this is {sys.version_info[:2]}: no common packages"
+    return None
+
+
+@pytest.fixture(scope="module")
+def debian() -> Path:
+    """The cached root of a minimal Debian; made when there is none."""
+    if (reason := why_not()) is not None:
+        pytest.skip(reason)
+    cache = cache_folder()
+    cache.mkdir(parents=True, exist_ok=True)
+    root, part = cache / SUITE, cache / f"{SUITE}.part"
+    with (cache / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if root.exists():
+            return root
+        shutil.rmtree(part, ignore_errors=True)
+        command = ["debootstrap", "--variant=minbase", f"--include={PACKAGES}", SUITE, str(part)]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=400, check=False)
+        if done.returncode != 0:
+            shutil.rmtree(part, ignore_errors=True)
+            pytest.skip(f"debootstrap failed (no network?): {(done.stdout + done.stderr).strip()[-300:]}")
+        part.rename(root)
+    return root
+
+
+@contextmanager
+def overlaid(debian: Path, folder: Path) -> Iterator[Path]:
+    """A writable view of ``debian`` that forgets everything afterwards."""
+    upper, work, root = (folder / name for name in ("upper", "work", "root"))
+    for path in (upper, work, root):
+        path.mkdir()
+    options = f"lowerdir={debian},upperdir={upper},workdir={work}"
+    command = ["mount", "-t", "overlay", "overlay", "-o", options, str(root)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
+    if done.returncode != 0:
+        pytest.skip(f"cannot mount an overlay: {done.stderr.strip()}")
+    try:
+        yield root
+    finally:
+        subprocess.run(["umount", "--lazy", str(root)], timeout=20, check=True)
+
+
+def furnish(root: Path, start: str) -> None:
+    """Put the unit, its program, the fleet file and the driver into the machine."""
+    unit = (REPO / "systemd" / "zsched.service").read_text()
+    files = {
+        "etc/systemd/system/zsched.service": unit,
+        "etc/systemd/system/zsched.service.d/test.conf": "[Service]\nWatchdogSec=3\n",
+        "etc/systemd/system/drive.service": DRIVE_UNIT,
+        "etc/zsched/fleet.yaml": FLEET,
+        "opt/drive.py": (HERE / "boot_drive.py").read_text(),
+        "opt/standin.py": (HERE / "service_standin.py").read_text(),
+        "opt/zsched/bin/zsched": PROGRAM.format(start=start),
+    }
+    for name, text in files.items():
+        path = root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    (root / "opt/zsched/bin/zsched").chmod(0o755)
+    for name in ("opt/zsched/src/zsched", "opt/zsched/site", "result"):
+        (root / name).mkdir(parents=True)
+    wants = root / "etc/systemd/system/multi-user.target.wants"
+    wants.mkdir(parents=True, exist_ok=True)
+    (wants / "drive.service").symlink_to("/etc/systemd/system/drive.service")
+
+
+def boot(debian: Path, folder: Path, start: str, *, init: bool = False) -> dict[str, Any]:
+    """Boot a machine with the service, let the driver run, and return its report."""
+    (folder / "result").mkdir()
+    with overlaid(debian, folder) as root:
+        furnish(root, start)
+        binds = [
+            f"--bind-ro={REPO / 'zsched'}:/opt/zsched/src/zsched",
+            f"--bind-ro={sysconfig.get_paths()['purelib']}:/opt/zsched/site",
+            f"--bind={folder / 'result'}:/result",
+        ]
+        nspawn = ["systemd-nspawn", "-q", "-D", str(root), "--register=no", "--keep-unit", *binds]
+        if init:
+            config = ["--config", "/etc/zsched/fleet.yaml"]
+            command = [*nspawn, "/opt/zsched/bin/zsched", "init", *config]
+            subprocess.run(command, timeout=60, check=True, stdin=subprocess.DEVNULL)
+        log = folder / "console.log"
+        with log.open("wb") as console:
+            command = [*nspawn, f"--machine=zsched-test-{os.getpid()}", "-b"]
+            done = subprocess.run(
+                command, stdin=subprocess.DEVNULL, stdout=console, stderr=console, timeout=BOOT_TIMEOUT_S, check=False
+            )
+        report = folder / "result" / "report.json"
+        assert report.exists(), f"no report; nspawn said {done.returncode}:\n{log.read_text(errors='replace')[-3000:]}"
+        found: dict[str, Any] = json.loads(report.read_text())
+    return found
+
+
+def check_life(report: dict[str, Any]) -> None:
+    """What the operator may expect of the unit, whatever program is in it."""
+    assert "error" not in report, report
+    journal = report["journal"]
+    assert report["start"]["ActiveState"] == "active", journal
+    assert report["running"]["StatusText"], journal
+    assert re.search(r'Status: ".+"', report["status"]), report["status"]
+    assert report["watchdog"]["NRestarts"] == "1", journal
+    assert report["watchdog"]["ActiveState"] == "active", journal
+    assert report["survivors"] == []
+    assert report["stop"]["ActiveState"] == "inactive", journal
+    assert report["stop"]["Result"] == "success", journal
+    assert report["stop"]["seconds"] < 2.5
+    assert report["left"] == []
+    assert report["left_folders"] == {"/run/zsched": False, "/var/lib/zsched/": True}
+    later = report["misconfigured"]["later"]
+    assert (later["ActiveState"], later["ExecMainStatus"]) == ("failed", "78"), journal
+
+
+def test_adapters_work_inside_the_units_sandbox(debian: Path, tmp_path: Path) -> None:
+    report = boot(debian, tmp_path, STANDIN)
+    check_life(report)
+    worker, daemon = (json.loads(report["runtime"][name]) for name in ("worker.txt", "daemon.txt"))
+    libraries = {"numpy", "cv2", "zenoh", "msgpack"} & {
+        name for name in worker if importlib.util.find_spec(name) is not None
+    }
+    assert {name: worker[name] for name in libraries} == dict.fromkeys(libraries, "ok")
+    assert worker["oom_score_adj"] == "300"
+    assert daemon["incarnation"] == 1
+    assert daemon["sample"]["cpu_used_cores"] is not None
+    assert daemon["sample"]["memory_used_mb"] > 0
+    assert daemon["sample"]["workers"][0]["cpu_cores"] is not None
+    assert any("sleep 1000" in line for line in report["processes"])
+    assert "incarnation 1" in report["running"]["StatusText"]
+    assert "incarnation 2" in report["watchdog"]["StatusText"]
+
+
+def test_daemon_lives_by_its_unit(debian: Path, tmp_path: Path) -> None:
+    if importlib.util.find_spec("zsched.cli") is None:
+        pytest.skip("zsched.cli has not landed yet")
+    report = boot(debian, tmp_path, REAL)
+    check_life(report)
+    assert any("zsched.relay" in line for line in report["processes"]), report["processes"]
