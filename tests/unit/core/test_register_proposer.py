@@ -141,11 +141,8 @@ def test_newer_among_accepted_means_the_higher_ballot_never_the_higher_revision(
         "r3": Acceptance(ballot=ballot(2), value=allocation(5)),
     }
     step = last(
-        proposer.on_answer(
-            Promise(elector=name, task="merge", ballot=asked.ballot, accepted=Acceptance(ballot=under, value=value)),
-            0.0,
-        )
-        for name, under, value in accepted
+        proposer.on_answer(Promise(elector=name, task="merge", ballot=asked.ballot, accepted=held), 0.0)
+        for name, held in accepted.items()
     )
     assert step.accept is not None
     assert step.accept.acceptance == Acceptance(ballot=asked.ballot, value=allocation(1))
