@@ -1,0 +1,345 @@
+"""Each rule of `zsched.core.membership`, with a clock that the tests hold."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from random import Random
+
+import pytest
+from zsched.core.fleet import Timing
+from zsched.core.membership import MAX_DOUBT, Membership
+from zsched.core.model import Beat, NodeId, PeerState
+from zsched.core.timing import WAN, WIFI, WIRED
+
+SMALL = ("me", "a", "b")
+LARGE = ("me", "a", "b", "c")
+ALIVE, SUSPECT, GONE, UNKNOWN = PeerState.ALIVE, PeerState.SUSPECT, PeerState.GONE, PeerState.UNKNOWN
+
+
+class Ear:
+    """A membership and the peers that beat into it."""
+
+    def __init__(self, nodes: tuple[NodeId, ...], timing: Timing = WIFI) -> None:
+        self.members = Membership("me", nodes, timing)
+        self.timing = timing
+        self.sequence = 0
+
+    def beat(
+        self, node: NodeId, now: float, *, incarnation: int = 1, suspects: tuple[NodeId, ...] = (), sequence: int = -1
+    ) -> list[PeerState]:
+        self.sequence += 1
+        beat = Beat(
+            node=node,
+            incarnation=incarnation,
+            sequence=self.sequence if sequence < 0 else sequence,
+            loop_lag_s=0.0,
+            suspects=suspects,
+        )
+        return [change.after for change in self.members.absorb_beat(beat, now)]
+
+    def run(
+        self, start: float, end: float, beating: tuple[NodeId, ...], suspects: tuple[NodeId, ...] = ()
+    ) -> list[tuple[float, NodeId, PeerState]]:
+        """Beats of ``beating`` at their period, a tick at each and at every deadline; (time, node, state) changes."""
+        seen: list[tuple[float, NodeId, PeerState]] = []
+        beats = [start + i * self.timing.beat_s for i in range(int((end - start) / self.timing.beat_s + 1e-9) + 1)]
+        now = start
+        while now < end:
+            while beats and beats[0] <= now:
+                for node in beating:
+                    seen += [(now, node, state) for state in self.beat(node, now, suspects=suspects)]
+                beats.pop(0)
+            seen += [(now, change.node, change.after) for change in self.members.tick(now)]
+            assert self.members.next_deadline() > now, "a deadline that tick does not serve spins the loop"
+            now = min(self.members.next_deadline(), beats[0] if beats else end, end)
+        return seen
+
+
+def heard(nodes: tuple[NodeId, ...], timing: Timing = WIFI) -> Ear:
+    """Everybody has just beaten, at time 0, and we have listened for long enough."""
+    ear = Ear(nodes, timing)
+    ear.members.tick(-60.0)
+    for node in nodes[1:]:
+        ear.beat(node, 0.0)
+    return ear
+
+
+def gone_at(seen: list[tuple[float, NodeId, PeerState]], node: NodeId) -> float | None:
+    return next((at for at, name, state in seen if name == node and state is GONE), None)
+
+
+# --- hearing ---------------------------------------------------------------------------------------------------------
+
+
+def test_configured_peer_is_unknown_until_it_beats() -> None:
+    ear = Ear(SMALL)
+    assert ear.members.states() == {"a": UNKNOWN, "b": UNKNOWN, "me": ALIVE}
+    assert ear.members.next_deadline() == math.inf
+    assert ear.members.incarnation("a") is None
+    assert ear.beat("a", 1.0) == [ALIVE]
+    assert ear.members.alive() == ("a",)
+    assert ear.members.incarnation("a") == 1
+
+
+def test_stranger_is_nobody() -> None:
+    ear = Ear(SMALL)
+    assert ear.beat("stranger", 0.0) == []
+    assert ear.members.state("stranger") is UNKNOWN
+    assert ear.members.absorb_token_lost("stranger", 1, 0.0) == ()
+
+
+def test_own_beat_changes_nothing() -> None:
+    ear = Ear(SMALL)
+    assert ear.beat("me", 0.0) == []
+    assert ear.members.state("me") is ALIVE
+
+
+@pytest.mark.parametrize(("incarnation", "sequence"), [(1, 5), (1, 4), (0, 99)])
+def test_repeated_older_or_former_beats_are_ignored(incarnation: int, sequence: int) -> None:
+    ear = Ear(SMALL)
+    ear.beat("a", 0.0, sequence=5)
+    assert ear.beat("a", 1.0, incarnation=incarnation, sequence=sequence) == []
+    (change,) = ear.members.tick(WIFI.suspect_s)[:1]  # the ignored beat did not prolong anything
+    assert (change.node, change.after) == ("a", SUSPECT)
+
+
+def test_old_beat_does_not_bring_a_gone_peer_back() -> None:
+    ear = heard(SMALL)
+    ear.members.tick(5.0)
+    assert ear.members.state("a") is GONE
+    assert ear.beat("a", 5.1, sequence=1) == []
+    assert ear.members.state("a") is GONE
+
+
+@pytest.mark.parametrize("state", [ALIVE, GONE])
+def test_restart_with_a_higher_incarnation_counts_from_its_first_beat(state: PeerState) -> None:
+    ear = heard(SMALL)
+    now = 0.5 if state is ALIVE else 9.0
+    ear.members.tick(now)
+    assert ear.members.state("a") is state
+    assert ear.beat("a", now, incarnation=2, sequence=0) == [ALIVE]
+    assert ear.members.incarnation("a") == 2
+
+
+# --- silence ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("timing", [WIRED, WIFI, WAN])
+def test_silence_in_a_small_fleet_is_gone_after_the_suspicion_time(timing: Timing) -> None:
+    ear = heard(SMALL, timing)
+    seen = ear.run(0.0, 3 * timing.suspect_s, ("b",))
+    assert [(node, state) for _, node, state in seen] == [("a", SUSPECT), ("a", GONE)]
+    assert seen[-1][0] == pytest.approx(timing.suspect_s)
+
+
+@pytest.mark.parametrize("timing", [WIRED, WIFI, WAN])
+def test_silence_confirmed_by_a_second_observer_is_gone_at_once(timing: Timing) -> None:
+    ear = heard(LARGE, timing)
+    ear.run(0.0, timing.suspect_s + 0.01, ("b", "c"))
+    assert ear.members.state("a") is SUSPECT
+    assert ear.beat("b", timing.suspect_s + 0.02, suspects=("a",)) == [GONE]
+
+
+def test_observer_that_accused_first_confirms_our_own_suspicion() -> None:
+    ear = heard(LARGE)
+    ear.beat("b", 0.1, suspects=("a",))
+    assert ear.members.state("a") is ALIVE  # one observer's word alone accuses nobody
+    seen = ear.run(0.2, 2.0, ("b",), suspects=("a",))
+    assert gone_at(seen, "a") == pytest.approx(WIFI.suspect_s)
+
+
+def test_accuser_that_is_not_alive_itself_does_not_confirm() -> None:
+    ear = heard(LARGE)
+    ear.beat("b", 0.0, suspects=("a",))
+    ear.run(0.0, 1.15, ("c",))
+    ear.beat("a", 1.15)
+    ear.beat("c", 1.2)
+    ear.run(1.2, 1.3, ())
+    assert ear.members.state("b") is not ALIVE
+    ear.members.absorb_token_lost("a", 1, 1.3)
+    assert ear.members.state("a") is SUSPECT
+
+
+def test_nobody_left_to_ask_is_gone_after_the_confirmation_time() -> None:
+    """The cable is pulled: all fall silent together."""
+    ear = heard(LARGE)
+    seen = ear.run(0.0, 5.0, ())
+    gone = [(at, node) for at, node, state in seen if state is GONE]
+    assert [node for _, node in gone] == ["a", "b", "c"]
+    assert [at for at, _ in gone] == [pytest.approx(WIFI.suspect_s + WIFI.confirm_s)] * 3
+
+
+def test_refutation_within_the_confirmation_time() -> None:
+    ear = heard(LARGE)
+    ear.run(0.0, WIFI.suspect_s + 0.1, ("b", "c"))
+    assert ear.members.suspects() == ("a",)
+    assert ear.beat("a", WIFI.suspect_s + 0.1) == [ALIVE]
+    assert ear.members.suspects() == ()
+
+
+def test_refutation_wins_over_standing_accusations() -> None:
+    ear = heard(LARGE)
+    ear.beat("b", 0.1, suspects=("a",))
+    ear.beat("c", 0.1, suspects=("a",))
+    assert ear.beat("a", 0.2) == []
+    assert ear.members.state("a") is ALIVE
+
+
+# --- the partial cut -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("timing", [WIRED, WIFI, WAN])
+def test_peer_that_others_still_hear_stays_suspect(timing: Timing) -> None:
+    ear = heard(LARGE, timing)
+    seen = ear.run(0.0, 20 * timing.suspect_s, ("b", "c"))
+    assert [(node, state) for _, node, state in seen] == [("a", SUSPECT)]
+
+
+def test_voucher_that_loses_some_beats_still_vouches() -> None:
+    ear = heard(LARGE)
+    rng, now = Random(3), 0.0
+    while now < 60.0:
+        now += 0.2
+        if rng.random() > 0.3 or now % 1.0 < 0.2:
+            ear.beat("b", now)
+        ear.members.tick(now)
+    assert ear.members.state("a") is SUSPECT
+
+
+def test_voucher_that_falls_silent_vouches_no_more() -> None:
+    ear = heard(LARGE)
+    ear.run(0.0, 3.0, ("b", "c"))
+    assert ear.members.state("a") is SUSPECT
+    seen = ear.run(3.0, 6.0, ())
+    assert {node for _, node, state in seen if state is GONE} == {"a", "b", "c"}
+
+
+def test_voucher_that_changes_its_mind_confirms() -> None:
+    ear = heard(LARGE)
+    ear.run(0.0, 3.0, ("b", "c"))
+    assert ear.beat("c", 3.1, suspects=("a",)) == [GONE]
+
+
+def test_observer_that_never_heard_a_peer_excuses_it_only_while_it_is_new() -> None:
+    """Else a robot that starts after a machine died would vouch for the dead for ever."""
+    ear = Ear(LARGE)
+    ear.members.tick(0.0)
+    ear.beat("b", 0.0)
+    ear.members.tick(WIFI.suspect_s - 0.01)
+    assert ear.members.suspects() == ()
+    ear.beat("b", 1.1)
+    ear.members.tick(WIFI.suspect_s)
+    assert ear.members.suspects() == ("a", "c")
+
+
+# --- the token: fast path of a kill ----------------------------------------------------------------------------------
+
+
+def test_killed_peer_is_suspect_at_once_and_gone_with_the_second_observer() -> None:
+    ear = heard(LARGE)
+    (change,) = ear.members.absorb_token_lost("a", 1, 0.05)
+    assert (change.before, change.after, change.reason) == (ALIVE, SUSPECT, "its token went")
+    assert ear.beat("b", 0.06, suspects=("a",)) == [GONE]
+
+
+def test_killed_peer_in_a_small_fleet_is_gone_after_one_and_a_half_beats() -> None:
+    ear = heard(SMALL)
+    ear.members.absorb_token_lost("a", 1, 0.05)
+    seen = ear.run(0.05, 2.0, ("b",))
+    assert gone_at(seen, "a") == pytest.approx(0.05 + 1.5 * WIFI.beat_s)
+
+
+@pytest.mark.parametrize("nodes", [SMALL, LARGE])
+def test_lost_token_is_refuted_by_a_beat(nodes: tuple[NodeId, ...]) -> None:
+    """The link broke and came back, the process lives."""
+    ear = heard(nodes)
+    ear.members.absorb_token_lost("a", 1, 0.05)
+    assert ear.beat("a", 0.2) == [ALIVE]
+    seen = ear.run(0.2, 1.3, nodes[1:])
+    assert seen == []
+
+
+def test_token_of_a_former_life_accuses_nobody() -> None:
+    ear = heard(SMALL)
+    ear.beat("a", 0.1, incarnation=2, sequence=0)
+    assert ear.members.absorb_token_lost("a", 1, 0.2) == ()
+    assert ear.members.state("a") is ALIVE
+
+
+def test_token_of_a_suspect_or_gone_peer_changes_nothing_more() -> None:
+    ear = heard(SMALL)
+    ear.members.tick(9.0)
+    assert ear.members.absorb_token_lost("a", 1, 9.1) == ()
+    assert ear.members.state("a") is GONE
+
+
+# --- self-doubt ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("lag", "factor"), [(0.0, 1.0), (0.1, 1.5), (0.2, 2.0), (0.4, MAX_DOUBT), (1000.0, MAX_DOUBT)])
+def test_lagging_node_doubts_itself_up_to_threefold(lag: float, factor: float) -> None:
+    ear = heard(LARGE)
+    ear.members.note_lag(lag)
+    assert ear.members.next_deadline() == pytest.approx(factor * WIFI.suspect_s)
+    seen = ear.run(0.0, 20.0, ())
+    assert seen[0][0] == pytest.approx(factor * WIFI.suspect_s)
+    assert gone_at(seen, "a") == pytest.approx(factor * (WIFI.suspect_s + WIFI.confirm_s))
+
+
+def test_doubt_fades_by_halves_and_never_below_trust() -> None:
+    ear = heard(LARGE)
+    ear.members.note_lag(0.4)
+    limits = []
+    for _ in range(12):
+        ear.members.note_lag(0.0)
+        limits.append(ear.members.next_deadline() / WIFI.suspect_s)
+    assert limits[:2] == [pytest.approx(2.0), pytest.approx(1.5)]
+    assert limits[-1] == pytest.approx(1.0, abs=1e-3)
+    assert min(limits) >= 1.0
+
+
+def test_doubt_lengthens_the_grace_of_who_is_suspect_already() -> None:
+    ear = heard(LARGE)
+    ear.run(0.0, WIFI.suspect_s + 0.01, ())
+    ear.members.note_lag(1.0)
+    assert ear.members.next_deadline() == pytest.approx(WIFI.suspect_s + 3 * WIFI.confirm_s)
+
+
+# --- never stuck -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("nodes", [("me", "a"), SMALL, LARGE, ("me", "a", "b", "c", "d", "e")])
+def test_random_beats_cuts_and_kills_end_where_the_truth_is(nodes: tuple[NodeId, ...]) -> None:
+    """Whatever came before: who is dead is gone in the end, who beats is alive, and no deadline is ever in the past."""
+    for seed in range(40):
+        rng = Random(seed)
+        ear = Ear(nodes, replace(rng.choice((WIRED, WIFI, WAN))))
+        now = 0.0
+        for _ in range(60):
+            now += rng.uniform(0.0, ear.timing.suspect_s / 2)
+            peer = rng.choice(nodes[1:])
+            action = rng.random()
+            if action < 0.6:
+                ear.beat(peer, now, suspects=tuple(n for n in nodes if rng.random() < 0.1))
+            elif action < 0.7:
+                ear.members.absorb_token_lost(peer, 1, now)
+            elif action < 0.8:
+                ear.members.note_lag(rng.uniform(0.0, 1.0))
+            ear.members.tick(now)
+        dead = set(nodes[1 + len(nodes) // 2 :]) | {nodes[1]}
+        living = tuple(n for n in nodes[1:] if n not in dead)
+        ear.members.note_lag(0.0)
+        ear.run(now, now + 6 * ear.timing.suspect_s, living, suspects=tuple(sorted(dead)))
+        states = ear.members.states()
+        assert all(states[n] in (GONE, UNKNOWN) for n in dead), f"seed {seed}: {states}"
+        assert all(states[n] is ALIVE for n in living), f"seed {seed}: {states}"
+
+
+def test_deadline_reached_exactly_is_served() -> None:
+    """A virtual clock jumps to the deadline itself: rounding must not leave it unserved (else the loop spins)."""
+    for seed in range(2000):
+        ear = Ear(SMALL)
+        ear.beat("a", Random(seed).uniform(0.0, 1e6))
+        now = ear.members.next_deadline()
+        assert [change.node for change in ear.members.tick(now)][:1] == ["a"]
