@@ -19,6 +19,8 @@ from typing import Final, TypeAlias
 MAX_FILE_BYTES: Final = 1 << 20
 _MAX_DEPTH: Final = 32
 _MAX_SHOWN: Final = 200
+_MAX_COMPARED: Final = 300
+"""More names than these are not searched for the nearest one: a long wrong list must not take minutes."""
 _LINE_BREAK: Final = re.compile("\r\n|[\n\r\x85\u2028\u2029]")
 """YAML's own line breaks, so that our lines are its lines."""
 
@@ -94,6 +96,7 @@ class Collector:
 
     def _fault(self, place: Place, message: str, hint: str) -> Fault:
         source = self._lines[place.line - 1] if 0 < place.line <= len(self._lines) else ""
+        source = "".join(char if char.isprintable() or char == "\t" else "\ufffd" for char in source)
         width = max(1, min(place.width, len(source) - place.col + 1))
         return Fault(line=place.line, col=place.col, message=message, hint=hint, source_line=source, width=width)
 
@@ -113,6 +116,8 @@ def render_all(file: str, faults: tuple[Fault, ...], severity: str = "error") ->
 def nearest(name: str, names: Iterable[str]) -> str:
     """A hint naming what of ``names`` was probably meant, or all of them when they are few."""
     known = sorted(names)
+    if len(known) > _MAX_COMPARED:
+        return ""
     close = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
     if close:
         return f"did you mean {close[0]!r}?"
@@ -195,7 +200,7 @@ class _Conversion:
     def _convert(self, raw: object, place: Place, depth: int) -> Node | None:
         kind, value = getattr(raw, "id", ""), getattr(raw, "value", None)
         if kind == "scalar":
-            return Scalar(text=str(value), is_plain=getattr(raw, "style", None) is None, place=place)
+            return self._scalar(str(value), getattr(raw, "style", None) is None, place)
         if kind == "sequence" and isinstance(value, list):
             items = (self.node(item, depth + 1) for item in value)
             return Sequence(items=tuple(item for item in items if item is not None), place=place)
@@ -204,6 +209,12 @@ class _Conversion:
             return Mapping(pairs=tuple(pair for pair in pairs if pair is not None), place=place)
         self.out.error(place, "cannot be read")
         return None
+
+    def _scalar(self, text: str, is_plain: bool, place: Place) -> Scalar | None:
+        if any("\ud800" <= char <= "\udfff" for char in text):
+            self.out.error(place, "half of a UTF-16 pair is no character", "write the character itself")
+            return None
+        return Scalar(text=text, is_plain=is_plain, place=place)
 
     def _pair(self, key: object, value: object, depth: int) -> tuple[Scalar, Node] | None:
         name, held = self.node(key, depth + 1), self.node(value, depth + 1)
@@ -271,7 +282,7 @@ def _compose(text: str, out: Collector) -> Node | None:
         out.error(_end_of(before), "not valid YAML: a control character", "delete it")
     except RecursionError:
         out.error(NOWHERE, "not valid YAML: nested too deeply")
-    except (YAMLError, ValueError, AttributeError, TypeError, LookupError, AssertionError) as error:
+    except (YAMLError, ValueError, ArithmeticError, AttributeError, TypeError, LookupError, AssertionError) as error:
         # the library's own slips on hostile input; an operator still gets a sentence, not a traceback
         out.error(NOWHERE, f"not valid YAML: {str(error).split(chr(10), 1)[0] or type(error).__name__}")
     else:
