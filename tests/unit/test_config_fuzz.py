@@ -90,8 +90,8 @@ def test_known_hostile_files() -> None:
         b'fleet: "\\UFFFFFFFF"',
         b'fleet: "\\uD800"',
         b"fleet: \x1b[31m",
-        b"{a: " * 3000,
-        b"- " * 3000,
+        b"{a: " * 800,
+        b"- " * 800,
         b"x" * (1 << 20) + b"y",
         b"? [a]\n: b",
         b"%YAML 1.1\n---\nfleet: yes",
@@ -102,7 +102,7 @@ def test_known_hostile_files() -> None:
         b"[a, list]",
         b"fleet: a\r\nnodes:\r\n  R: {}\r\n",
         bomb.encode(),
-        f"nodes: {{{', '.join(f'n{n}: {{kind: edge}}' for n in range(1000))}}}".encode(),
+        f"nodes: {{{', '.join(f'n{n}: {{kind: edge}}' for n in range(200))}}}".encode(),
     ):
         result = check_bytes(data)
         is_sound(result)
