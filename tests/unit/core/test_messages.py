@@ -1,0 +1,70 @@
+"""What each message refuses, and that it can be built and is frozen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import FrozenInstanceError, fields, is_dataclass, replace
+
+import pytest
+from zsched.core import messages
+from zsched.core.messages import Accept, Accepted, Learnt, Prepare, Promise, Refusal, Refused, SetWeights, Utilities
+from zsched.core.model import NO_BALLOT, Acceptance, Allocation, Ballot, Tuning, Weights
+
+TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
+BALLOT = Ballot(counter=1, node="r1", incarnation=1)
+VALUE = Allocation(task="merge", revision=1, epoch=1, owner="e1", tuning=TUNING)
+ACCEPTANCE = Acceptance(ballot=BALLOT, value=VALUE)
+BAD_NAMES = ("", "Robot", "a/b", "-a", "é", "a" * 64, "*", "a\n")
+
+BUILDERS: dict[str, Callable[[str], object]] = {
+    "prepare.task": lambda name: Prepare(task=name, ballot=BALLOT, electorate="x"),
+    "promise.elector": lambda name: Promise(elector=name, task="merge", ballot=BALLOT),
+    "accept.task": lambda name: Accept(task=name, acceptance=ACCEPTANCE, electorate="x"),
+    "accepted.elector": lambda name: Accepted(elector=name, task="merge", ballot=BALLOT),
+    "refused.elector": lambda name: Refused(
+        elector=name, task="merge", ballot=BALLOT, refusal=Refusal.BALLOT, promised=BALLOT
+    ),
+    "learnt.node": lambda name: Learnt(node=name, values=(VALUE,)),
+    "utilities.voter": lambda name: Utilities(voter=name, vectors=()),
+    "weights.task": lambda name: SetWeights(task=name, cpu=1.0, memory=0.0, network=0.0),
+}
+
+
+@pytest.mark.parametrize("name", BAD_NAMES)
+@pytest.mark.parametrize("field", BUILDERS)
+def test_message_with_a_malformed_name_is_refused_by_field(field: str, name: str) -> None:
+    with pytest.raises(ValueError, match=field):
+        BUILDERS[field](name)
+
+
+@pytest.mark.parametrize("field", BUILDERS)
+def test_message_with_a_good_name_is_a_frozen_value(field: str) -> None:
+    message = BUILDERS[field]("merge")
+    assert message == BUILDERS[field]("merge")
+    with pytest.raises(FrozenInstanceError):
+        setattr(message, field.partition(".")[2], "other")
+
+
+def test_accept_of_another_tasks_value_is_refused() -> None:
+    with pytest.raises(ValueError, match="accept: value of 'other' for task 'merge'"):
+        Accept(task="merge", acceptance=replace(ACCEPTANCE, value=replace(VALUE, task="other")), electorate="x")
+
+
+def test_ballots_are_ordered_by_counter_then_node_then_incarnation() -> None:
+    ordered = [
+        NO_BALLOT,
+        Ballot(counter=1, node="a", incarnation=9),
+        Ballot(counter=1, node="b", incarnation=1),
+        Ballot(counter=1, node="b", incarnation=2),
+        Ballot(counter=2, node="a", incarnation=1),
+    ]
+    assert sorted(ordered[::-1]) == ordered
+
+
+def test_every_message_is_frozen_and_keyword_only() -> None:
+    classes = [cls for cls in vars(messages).values() if isinstance(cls, type) and is_dataclass(cls)]
+    ours = [cls for cls in classes if cls.__module__ == messages.__name__]
+    assert len(ours) >= 9
+    for cls in ours:
+        assert cls.__dataclass_params__.frozen, cls  # type: ignore[attr-defined] # typeshed does not name it
+        assert all(field.kw_only for field in fields(cls)), cls
