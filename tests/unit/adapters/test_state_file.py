@@ -150,10 +150,12 @@ from zsched.adapters.state_file import StateFile
 folder = Path(sys.argv[1])
 with StateFile(folder, fleet="hall", node="robot1", hardware="machine:aa") as file:
     state = file.load().state
-    print("saving", flush=True)
+    first = state.incarnation
     while True:
         state = replace(state, incarnation=state.incarnation + 1, electorate="e" * (state.incarnation % 100))
         file.save(state)
+        if state.incarnation == first + 1:
+            print("saving", flush=True)
 """
 
 
