@@ -1,0 +1,319 @@
+"""The first four stages in a closed loop: what is decided changes what is measured next.
+
+A machine's load follows from whether it has the task. Quantities are design section 11's.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from random import Random
+
+import pytest
+from zsched.core.fleet import Demand, Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.gateway import Gateway
+from zsched.core.model import (
+    Allocation,
+    DeviceSample,
+    LinkSample,
+    LinkSource,
+    NodeKind,
+    PeerState,
+    Proposal,
+    Tuning,
+    Weights,
+    WorkerLoad,
+    WorkerState,
+)
+from zsched.core.profile import Profiler
+from zsched.core.scheduler import Judge, Judgement, Outcome, escape_reason
+from zsched.core.scoring import compare, score
+from zsched.core.vote import VoteOutcome, tally
+
+HOUR_S = 3600.0
+MEMORY_MB = 4000.0
+READY = {"merge": WorkerState.READY}
+BOTH = Weights(cpu=0.5, memory=0.5, network=0.0)
+NO_STEP: Callable[[float], float] = lambda _: 0.0  # noqa: E731 - a default value, not a function of its own
+
+
+@dataclass(kw_only=True)
+class Machine:
+    """One edge: a base load with steps and noise, and what the task takes where it runs."""
+
+    name: str
+    cores: float = 4.0
+    base: float = 0.4
+    """Ratio in use without the task, of CPU and memory; the signal sits at -60 dBm and falls by 0.4 dB per 1 %."""
+    step: Callable[[float], float] = NO_STEP
+    """Ratio added at a time."""
+    noise: float = 0.0
+    task_cores: float = 0.0
+    task_mb: float = 0.0
+    shows_worker: bool = True
+
+    def sample(self, now: float, rng: Random, *, is_owner: bool) -> tuple[DeviceSample, LinkSample]:
+        step = self.step(now)
+        cpu, memory = (self.base + step + rng.uniform(-self.noise, self.noise) for _ in range(2))
+        rest = max(cpu, 0.0) * self.cores
+        # A full machine gives the task what is left, half a core at least.
+        takes = min(self.task_cores, max(self.cores - rest, 0.5)) if is_owner else 0.0
+        holds = self.task_mb if is_owner else 0.0
+        load = WorkerLoad(
+            task="merge",
+            state=WorkerState.READY,
+            cpu_cores=takes if self.shows_worker else None,
+            memory_mb=holds if self.shows_worker else None,
+        )
+        device = DeviceSample(
+            cpu_cores=self.cores,
+            cpu_used_cores=min(rest + takes, self.cores),
+            memory_mb=MEMORY_MB,
+            memory_used_mb=max(memory, 0.0) * MEMORY_MB + holds,
+            workers=(load,),
+        )
+        return device, LinkSample(source=LinkSource.NL80211, rssi_dbm=-60.0 - 40.0 * step)
+
+
+@dataclass
+class Loop:
+    """Robots that profile, score, judge, vote and move one task among machines."""
+
+    machines: tuple[Machine, ...]
+    weights: Weights = BOTH
+    tuning: Tuning = field(default_factory=lambda: Tuning(weights=BOTH))
+    timing: Timing = field(default_factory=Timing)
+    robots: tuple[str, ...] = ("robot1",)
+    seed: int = 0
+    moves: list[tuple[float, str]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        names = tuple(machine.name for machine in self.machines)
+        self.spec = TaskSpec(
+            name="merge",
+            candidates=names,
+            tuning=replace(self.tuning, weights=self.weights),
+            demand=Demand(),
+            worker=WorkerSpec(command=("worker",)),
+        )
+        nodes = [NodeSpec(name=name, kind=NodeKind.EDGE) for name in names]
+        nodes += [NodeSpec(name=name, kind=NodeKind.ROBOT) for name in self.robots]
+        fleet = Fleet(
+            name="loop", timing=self.timing, nodes=tuple(nodes), tasks=(self.spec,), electors=tuple(self.robots)
+        )
+        self.allocation = Allocation(task="merge", revision=1, epoch=1, owner=names[0], tuning=self.spec.tuning)
+        self.gateways = {robot: Gateway(fleet) for robot in self.robots}
+        self.judges = {robot: Judge(spec=self.spec) for robot in self.robots}
+        self.profilers = {name: Profiler(name, 1, self.timing) for name in (*names, *self.robots)}
+        self.states = dict.fromkeys(self.profilers, PeerState.ALIVE)
+        self.rng = Random(self.seed)
+        self.settled_at = 0.0
+
+    def run(self, until_s: float) -> list[tuple[float, str]]:
+        """(when, where to) of every move."""
+        rounds = 0
+        for tick in range(int(until_s / self.timing.sample_s)):
+            now = tick * self.timing.sample_s
+            self._profile(now)
+            if now >= rounds * self.timing.decide_s:
+                rounds += 1
+                self._round(now)
+        return self.moves
+
+    def _profile(self, now: float) -> None:
+        for machine in self.machines:
+            is_owner = machine.name == self.allocation.owner
+            device, link = machine.sample(now, self.rng, is_owner=is_owner)
+            self.profilers[machine.name].absorb(device, (link,) if self.weights.network > 0.0 else (), now)
+        if self.weights.network > 0.0:
+            device = DeviceSample(cpu_cores=4.0, cpu_used_cores=1.0, memory_mb=MEMORY_MB, memory_used_mb=1000.0)
+            link = LinkSample(source=LinkSource.NL80211, rssi_dbm=-45.0)
+            for robot in self.robots:
+                self.profilers[robot].absorb(device, (link,), now)
+        for profiler in self.profilers.values():
+            profile = profiler.publishable(READY, is_draining=False, now=now)
+            if profile is not None:
+                for gateway in self.gateways.values():
+                    assert gateway.absorb(profile, now) is None
+
+    def _round(self, now: float) -> None:
+        judgements = self._judge(now, is_called=False)
+        if any(judgement.outcome is Outcome.PROPOSE for judgement in judgements.values()):
+            self._vote(self._judge(now, is_called=True), now)
+
+    def _judge(self, now: float, *, is_called: bool) -> dict[str, Judgement]:
+        owner = self.allocation.owner
+        assert owner is not None
+        for gateway in self.gateways.values():
+            gateway.learn_demand("merge", owner, now)
+        vectors = {
+            robot: score(self.spec, self.allocation, robot, gateway, self.states, now)
+            for robot, gateway in self.gateways.items()
+        }
+        standing = compare(self.spec, self.allocation, vectors)
+        profile = self.gateways[self.robots[0]].fresh(owner, now)
+        escape = escape_reason(self.spec, self.allocation, PeerState.ALIVE, profile, standing, 0.0)
+        return {
+            robot: judge.judge(
+                standing,
+                self.allocation,
+                settled_for_s=now - self.settled_at,
+                escape=escape,
+                is_called=is_called,
+                now=now,
+            )
+            for robot, judge in self.judges.items()
+        }
+
+    def _vote(self, judgements: dict[str, Judgement], now: float) -> None:
+        proposals = {
+            robot: Proposal(
+                voter=robot,
+                task="merge",
+                base_revision=self.allocation.revision,
+                candidate=judgement.candidate or "",
+                aggregate=judgement.aggregate,
+                is_escape=judgement.is_escape,
+            )
+            for robot, judgement in judgements.items()
+        }
+        owner = self.allocation.owner
+        result = tally(proposals, voters=self.robots, present=frozenset(self.robots), owner=owner, is_over=True)
+        for judge in self.judges.values():
+            judge.reset()
+        if result.outcome is not VoteOutcome.WON or result.winner is None:
+            return
+        revision = self.allocation.revision + 1
+        self.allocation = replace(self.allocation, revision=revision, epoch=revision, owner=result.winner)
+        self.settled_at = now
+        self.moves.append((now, result.winner))
+
+
+RESTLESS = Tuning(weights=BOTH, bonus=0.0, time_to_trigger_s=0.0, cool_down_s=0.0)
+
+
+# --- noise ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_two_equal_nodes_under_noise_move_at_most_once_in_an_hour(seed: int) -> None:
+    """+-15 % uniform noise in every 5 Hz sample of CPU and memory."""
+    loop = Loop((Machine(name="edge1", noise=0.15), Machine(name="edge2", noise=0.15)), seed=seed)
+
+    assert len(loop.run(HOUR_S)) <= 1
+
+
+def test_the_same_noise_without_stickiness_moves_the_task_all_the_time() -> None:
+    """The control: the harness can fail."""
+    machines = (Machine(name="edge1", noise=0.15), Machine(name="edge2", noise=0.15))
+
+    assert len(Loop(machines, tuning=RESTLESS).run(120.0)) > 10
+
+
+# --- a step --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.07, 0.1, 0.21, 0.33, 0.45])
+@pytest.mark.parametrize(
+    "weights",
+    [
+        BOTH,
+        Weights(cpu=1.0, memory=0.0, network=0.0),
+        Weights(cpu=0.0, memory=0.0, network=1.0),
+        Weights(cpu=0.4, memory=0.3, network=0.3),
+    ],
+)
+def test_a_step_of_30_percent_is_followed_in_time(weights: Weights, phase: float) -> None:
+    """Within the time-to-trigger, 0.6 time constants and one round, wherever in a round the step falls."""
+    at = 15.0 + phase
+    stepped = Machine(name="edge1", step=lambda now: 0.3 if now >= at else 0.0)
+    loop = Loop((stepped, Machine(name="edge2")), weights=weights, robots=("robot1", "robot2", "robot3"))
+    ((moved_at, where),) = loop.run(22.0)
+
+    allowed = loop.tuning.time_to_trigger_s + 0.6 * loop.timing.smoothing_s + loop.timing.decide_s
+    assert where == "edge2"
+    assert loop.tuning.time_to_trigger_s <= moved_at - at <= allowed
+
+
+def test_a_step_smaller_than_the_bonus_moves_nothing() -> None:
+    stepped = Machine(name="edge1", step=lambda now: 0.09 if now >= 30.0 else 0.0)
+
+    assert Loop((stepped, Machine(name="edge2"))).run(120.0) == []
+
+
+def test_a_spike_shorter_than_the_time_to_trigger_moves_nothing() -> None:
+    spiky = Machine(name="edge1", step=lambda now: 0.5 if now % 20.0 < 1.0 else 0.0)
+
+    assert Loop((spiky, Machine(name="edge2"))).run(200.0) == []
+
+
+def test_loads_that_follow_the_task_are_fled_no_faster_than_the_cool_down() -> None:
+    """A load that alternates between the machines: each stay lasts a cool-down at least."""
+
+    def wave(phase: int) -> Callable[[float], float]:
+        return lambda now: 0.4 if int(now / 6.0) % 2 == phase else 0.0
+
+    machines = (Machine(name="edge1", step=wave(0)), Machine(name="edge2", step=wave(1)))
+    loop = Loop(machines)
+    times = [at for at, _ in loop.run(300.0)]
+
+    assert len(times) >= 2, "the loads are large enough to follow"
+    assert all(later - earlier >= loop.tuning.cool_down_s for earlier, later in itertools.pairwise(times))
+
+
+# --- the task's own load -------------------------------------------------------------------------------------------
+
+THOUSAND_ROUNDS_S = 1000 * Timing().decide_s
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.15])
+@pytest.mark.parametrize("other_cores", [4.0, 8.0, 2.5])
+def test_a_heavy_task_does_not_chase_itself_around_in_a_thousand_rounds(other_cores: float, noise: float) -> None:
+    """It takes more than the bonus: 40 % of a machine's CPU, 30 % of its memory. It may move once to the machine that
+    is better with it; never back and forth."""
+    machines = (
+        Machine(name="edge1", base=0.2, noise=noise, task_cores=1.6, task_mb=1200.0),
+        Machine(name="edge2", cores=other_cores, base=0.2, noise=noise, task_cores=1.6, task_mb=1200.0),
+    )
+
+    assert len(Loop(machines, seed=3).run(THOUSAND_ROUNDS_S)) <= 1
+
+
+def test_without_the_demand_correction_the_same_task_oscillates() -> None:
+    """The control: workers that do not show what they use let the owner look worse by its own load."""
+    machines = tuple(
+        Machine(name=name, base=0.2, task_cores=1.6, task_mb=1200.0, shows_worker=False) for name in ("edge1", "edge2")
+    )
+
+    assert len(Loop(machines).run(THOUSAND_ROUNDS_S)) > 20
+
+
+def test_a_starved_owner_is_left_and_not_taken_back_while_the_load_lasts() -> None:
+    """The load takes the CPU from the worker, which then shows little: still its demand is what it was."""
+    loaded = Machine(name="edge1", base=0.2, step=lambda now: 0.75 if now >= 30.0 else 0.0, task_cores=1.6)
+    other = Machine(name="edge2", base=0.35, task_cores=1.6)
+    loop = Loop((loaded, other), weights=Weights(cpu=1.0, memory=0.0, network=0.0))
+
+    ((at, where),) = loop.run(300.0)
+    assert where == "edge2"
+    assert at < 40.0
+
+
+def test_a_load_that_goes_away_may_bring_the_task_back_once() -> None:
+    loaded = Machine(name="edge1", base=0.1, step=lambda now: 0.7 if 30.0 <= now < 100.0 else 0.0)
+    loop = Loop((loaded, Machine(name="edge2", base=0.4)))
+
+    assert [where for _, where in loop.run(200.0)] == ["edge2", "edge1"]
+
+
+# --- several robots ------------------------------------------------------------------------------------------------
+
+
+def test_three_robots_that_hear_the_same_move_together_and_once() -> None:
+    stepped = Machine(name="edge1", step=lambda now: 0.4 if now >= 20.0 else 0.0, noise=0.05)
+    machines = (stepped, Machine(name="edge2", noise=0.05), Machine(name="edge3", noise=0.05, base=0.3))
+    loop = Loop(machines, robots=("robot1", "robot2", "robot3"), seed=5)
+
+    assert [where for _, where in loop.run(120.0)] == ["edge3"]
+    assert loop.allocation.epoch == 2
