@@ -1,0 +1,229 @@
+"""The command line `zsched`: arguments in, exit code out.
+
+Knows: verbs, options, exit codes. Does not know: how anything is done. What a verb needs is imported inside it:
+`status` must answer within 200 ms, and a robot has no numpy.
+
+Exit codes: 0 fine, 1 failed, 2 usage, 3 daemon not reachable, 4 reachable but degraded (no quorum, a task without a
+live owner), 5 timed out, 78 bad configuration.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from zsched.cli_common import EXIT_CONFIG, EXIT_USAGE, CliError, Json, Verbs, print_json
+
+EPILOG = (
+    "Exit codes: 0 fine, 1 failed, 2 usage, 3 daemon not reachable, 4 reachable but degraded, 5 timed out, "
+    "78 bad fleet file."
+)
+
+app = typer.Typer(
+    name="zsched",
+    cls=Verbs,
+    help="Masterless scheduling of shared robot tasks: profile, score, vote, commit, reroute.",
+    epilog=EPILOG,
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,  # rich costs 60 ms of import
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+class LogLevel(StrEnum):
+    """How much the daemon says on stderr."""
+
+    DEBUG = "DEBUG"
+    INFO = "INFO"
+    WARNING = "WARNING"
+    ERROR = "ERROR"
+
+
+ConfigOption = Annotated[
+    Path | None,
+    typer.Option("--config", "-c", metavar="FILE", help="Fleet file. [ZSCHED_CONFIG, else /etc/zsched/fleet.yaml]"),
+]
+NameOption = Annotated[
+    str | None,
+    typer.Option("--node", "-n", metavar="NAME", help="This machine's name in it. [ZSCHED_NODE, else the host name]"),
+]
+StateOption = Annotated[
+    Path | None,
+    typer.Option("--state-dir", metavar="DIR", help="Durable state. [ZSCHED_STATE_DIR, else /var/lib/zsched]"),
+]
+RuntimeOption = Annotated[
+    Path | None,
+    typer.Option("--runtime-dir", metavar="DIR", help="Operator sockets. [ZSCHED_RUNTIME_DIR, else /run/zsched]"),
+]
+AskedOption = Annotated[
+    str | None, typer.Option("--node", "-n", metavar="NAME", help="Ask this node, here or anywhere in the fleet.")
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="JSON with its schema's name and version.")]
+
+
+# --- the daemon ------------------------------------------------------------------------------------------------------
+
+
+@app.command()
+def up(
+    config: ConfigOption = None,
+    node: NameOption = None,
+    state_dir: StateOption = None,
+    runtime_dir: RuntimeOption = None,
+    log_level: Annotated[LogLevel, typer.Option("--log-level", help="What goes to stderr.")] = LogLevel.INFO,
+) -> None:
+    """Run this machine's daemon in the foreground (what systemd runs)."""
+    from zsched import places  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.adapters.state_file import STATE_NAME  # noqa: PLC0415 - as above
+
+    file = places.config_path(config, os.environ)
+    _need_file(file)
+    name = _node_name(node)
+    state = places.state_folder(state_dir, os.environ)
+    runtime = places.runtime_folder(runtime_dir, os.environ)
+    if not (state / STATE_NAME).exists():
+        _say(
+            f"zsched up: no state in {state}: {name} will not be an elector. If this name never voted in this fleet, "
+            f"stop and run `zsched init --config {file} --node {name} --state-dir {state}`"
+        )
+    daemon = [sys.executable, "-m", "zsched.daemon", "--config", str(file), "--node", name]
+    daemon += ["--state-dir", str(state), "--runtime-dir", str(runtime), "--log-level", log_level.value]
+    sys.stdout.flush()
+    sys.stderr.flush()
+    # the same process id (systemd's main process), without this command line's memory
+    os.execv(sys.executable, daemon)  # noqa: S606 - no shell is wanted
+
+
+@app.command()
+def init(
+    config: ConfigOption = None,
+    node: NameOption = None,
+    state_dir: StateOption = None,
+    generation: Annotated[
+        int, typer.Option("--generation", min=0, max=2**20, help="Above 0: start anew, on every node at once.")
+    ] = 0,
+) -> None:
+    """Create this node's blank state: "this name has never voted here".
+
+    Refuses when there is a state already. It does not ask the fleet whether this name has voted: do not run it for a
+    robot whose disk was lost, unless on every node at once with a higher --generation.
+    """
+    from zsched import places  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.config import load_fleet  # noqa: PLC0415 - ruamel.yaml is slow to import
+    from zsched.lifecycle import init_state  # noqa: PLC0415 - as above
+
+    file = places.config_path(config, os.environ)
+    fleet = load_fleet(file)
+    name = _node_name(node)
+    known = [spec.name for spec in fleet.nodes]
+    if name not in known:
+        raise CliError(
+            EXIT_CONFIG,
+            f"{file}: no node {name!r} under 'nodes' (there are {', '.join(known)}); say which one this machine is "
+            "with --node NAME or ZSCHED_NODE",
+        )
+    path = init_state(fleet, name, places.state_folder(state_dir, os.environ), generation)
+    typer.echo(f"{path}: blank state of {name} in fleet {fleet.name}, generation {generation}")
+
+
+# --- questions -------------------------------------------------------------------------------------------------------
+
+
+@app.command()
+def status(
+    json_: JsonOption = False,
+    watch: Annotated[bool, typer.Option("--watch", "-w", help="Again and again; with --json one line each.")] = False,
+    interval: Annotated[float, typer.Option(min=0.1, max=3600.0, metavar="S", help="Seconds between two.")] = 1.0,
+    node: AskedOption = None,
+    runtime_dir: RuntimeOption = None,
+    no_color: Annotated[bool, typer.Option("--no-color", help="Plain text (also: NO_COLOR).")] = False,
+) -> None:
+    """Show nodes, tasks, owners, the last decision and vote, and what is wrong.
+
+    Exits with 4 while the fleet is degraded: no quorum, or a task without a live owner.
+    """
+    from zsched.cli_status import StatusView, show, watch_on  # noqa: PLC0415 - each verb imports what it needs
+
+    view = StatusView(runtime_dir=runtime_dir, node=node, is_json=json_, is_plain=no_color)
+    raise typer.Exit(watch_on(view, interval) if watch else show(view))
+
+
+# --- the fleet file --------------------------------------------------------------------------------------------------
+
+
+@app.command()
+def check(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Fleet file.")],
+    json_: JsonOption = False,
+) -> None:
+    """Check a fleet file: every fault at once, each with file:line:col; exits with 78 when there is one."""
+    from zsched.config import check_file  # noqa: PLC0415 - ruamel.yaml is slow to import
+
+    result = check_file(file)
+    fleet = result.fleet
+    counts: Json | None = None
+    if fleet is not None:
+        counts = {"nodes": len(fleet.nodes), "tasks": len(fleet.tasks), "electors": len(fleet.electors)}
+    if json_:
+        lists = {"faults": result.faults, "warnings": result.warnings}
+        keys = ("line", "col", "message", "hint", "source_line")
+        found = {name: [{key: getattr(fault, key) for key in keys} for fault in items] for name, items in lists.items()}
+        named = None if fleet is None else {"name": fleet.name, **(counts or {})}
+        print_json({"schema": "zsched.check/1", "file": result.file, "ok": fleet is not None, "fleet": named, **found})
+    elif report := result.report():
+        _say(report)
+    if counts is None:
+        raise typer.Exit(EXIT_CONFIG)
+    if not json_:
+        typer.echo("ok: " + ", ".join(_count(number, noun) for noun, number in counts.items()))
+
+
+def _count(number: int, plural: str) -> str:
+    return f"{number} {plural if number != 1 else plural.removesuffix('s')}"
+
+
+def _node_name(given: str | None) -> str:
+    """This node's name. Raises `CliError` (2) when it is no name."""
+    from zsched import places  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.core.model import NAME  # noqa: PLC0415 - as above
+
+    name = places.node_name(given, os.environ)
+    if NAME.fullmatch(name) is None:
+        where = "--node" if given else "ZSCHED_NODE" if os.environ.get("ZSCHED_NODE") else "the host name"
+        raise CliError(
+            EXIT_USAGE,
+            f"{where}: {name!r} is not a name ([a-z0-9][a-z0-9_-]{{0,62}}); give the fleet file's with --node",
+        )
+    return name
+
+
+def _need_file(file: Path) -> None:
+    """Raise `CliError` (78) unless the fleet file can be read."""
+    try:
+        with file.open("rb"):
+            return
+    except OSError as error:
+        raise CliError(
+            EXIT_CONFIG, f"{file}: cannot be read: {error.strerror}; name the fleet file with --config or ZSCHED_CONFIG"
+        ) from error
+
+
+def _say(text: str) -> None:
+    """For people, on stderr."""
+    typer.echo(text, err=True)
+
+
+def main() -> None:
+    """The console entry point."""
+    app(prog_name="zsched")
+
+
+if __name__ == "__main__":
+    main()
