@@ -69,16 +69,9 @@ class Janitor:
         )
 
     def remove(self, folder: Path) -> None:
-        """Remove ``folder`` and all in it at the end."""
-        self._order({"remove": str(folder)})
-
-    def remove_group(self, path: Path) -> None:
-        """Remove the control group at ``path`` at the end."""
-        self._order({"group": str(path)})
-
-    def _order(self, order: dict[str, str]) -> None:
+        """Remove ``folder`` and all in it at the end. Tell it before making the folder: a kill may come between."""
         assert self._process.stdin is not None
-        self._process.stdin.write(json.dumps(order) + "\n")
+        self._process.stdin.write(json.dumps({"remove": str(folder)}) + "\n")
         self._process.stdin.flush()
 
     def finish(self, timeout_s: float = 10.0) -> list[str]:

@@ -9,7 +9,7 @@ import contextlib
 import socket
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from typing import Any
 from ruamel.yaml import YAML
 
 from zsched.core.model import NodeId, TaskId
-from zsched.errors import ConfigError, ZschedError
+from zsched.errors import ConfigError
 from zsched.lab.children import Child, ChildError, Children
 from zsched.lab.limits import NodeLimits
 from zsched.lab.schedule import Injection
@@ -77,8 +77,10 @@ def read_tree(path: Path) -> Tree:
     return tree
 
 
-def write_fleet(template: Path, path: Path, worker_arguments: tuple[str, ...]) -> LabFleet:
-    """Write the effective fleet file: the template on free loopback ports, its task's worker with more arguments.
+def write_fleet(template: Path, path: Path, replaced: Mapping[str, tuple[str, ...]]) -> LabFleet:
+    """Write the effective fleet file: the template on free loopback ports, its task's worker with other options.
+
+    ``replaced`` is {option: values}: every ``option value`` in the worker's command gives way to these.
 
     Raises:
         ConfigError: the template is no fleet file, or has not exactly one task.
@@ -95,14 +97,23 @@ def write_fleet(template: Path, path: Path, worker_arguments: tuple[str, ...]) -
     if len(tree["tasks"]) != 1:
         raise ConfigError(f"{template}: the lab runs one task, there are {len(tree['tasks'])}")
     ((task, spec),) = tree["tasks"].items()
-    spec["worker"]["command"] = [*spec["worker"]["command"], *worker_arguments]
-    yaml = YAML()
-    yaml.width = 120
+    spec["worker"]["command"] = with_options(spec["worker"]["command"], replaced)
     with path.open("w", encoding="utf-8") as file:
         file.write(f"# Effective fleet file of one run, made from {template.name}.\n")
-        yaml.dump(tree, file)
+        YAML().dump(tree, file)
     kinds = {name: str(node["kind"]) for name, node in nodes.items()}
     return LabFleet(path=path, task=task, kinds=kinds, data_endpoints=endpoints)
+
+
+def with_options(command: list[str], replaced: Mapping[str, tuple[str, ...]]) -> list[str]:
+    """The command without the ``--option value`` pairs of ``replaced``, and with its values behind."""
+    kept, words = [], iter(command)
+    for word in words:
+        if word in replaced:
+            next(words, None)
+        else:
+            kept.append(word)
+    return kept + [word for option, values in replaced.items() for value in values for word in (option, value)]
 
 
 class FleetRunner:
@@ -160,35 +171,21 @@ class FleetRunner:
     def _state(self, node: NodeId) -> Path:
         return self._runtime / "state" / node
 
-    def missing(self, ask: Ask, timeout_s: float = 0.5) -> list[NodeId]:
-        """The nodes whose daemon does not answer yet."""
-        return [node for node in sorted(self._fleet.kinds) if not self._answers(node, ask, timeout_s)]
-
-    def _answers(self, node: NodeId, ask: Ask, timeout_s: float) -> bool:
-        if not self.socket(node).exists():
-            return False
-        try:
-            ask(self.socket(node), {"verb": "status"}, timeout_s)
-        except (OSError, ValueError, ZschedError):
-            return False
-        return True
-
-    def wait_up(self, ask: Ask, between: Callable[[], None]) -> None:
-        """Wait until all daemons answer, calling ``between`` meanwhile.
+    def wait_up(self, answering: Callable[[], Collection[NodeId]], between: Callable[[], None]) -> None:
+        """Wait until all daemons are among ``answering()``, calling ``between`` meanwhile.
 
         Raises:
             ChildError: one ended, or some do not answer within `UP_S`.
         """
         end = time.monotonic() + UP_S
-        while missing := self.missing(ask):
+        while missing := sorted(set(self._fleet.kinds) - set(answering())):
             self._children.check()
             if time.monotonic() > end:
-                first = next(child for child in self._children.running(f"daemon-{missing[0]}"))
+                first = self._children.running(f"daemon-{missing[0]}")[0]
                 raise ChildError(
                     f"no answer within {UP_S:.0f} s from {', '.join(missing)}; see {first.log}\n{first.log_tail()}"
                 )
             between()
-            time.sleep(POLL_S)
 
     def inject(self, node: NodeId, injection: Injection, output: Path) -> Child:
         """Start neural load inside the node's share; its frames per second go to ``output``."""

@@ -79,6 +79,15 @@ class Move:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Load:
+    """One window of injected load as it really was, in seconds since the start."""
+
+    node: NodeId
+    start_s: float
+    end_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FleetView:
     """Everything the live view shows."""
 

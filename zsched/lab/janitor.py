@@ -4,9 +4,9 @@ Knows: the run's token (an environment variable that every process of the run in
 why the lab ended: the end of its standard input is the sign, whether by exit, by Ctrl-C or by SIGKILL.
 
 Started as ``python -m zsched.lab.janitor TOKEN`` in a session of its own, it reads one JSON object per line:
-``{"remove": PATH}`` (a folder of ours) or ``{"group": PATH}`` (a control group's folder). At the end of the input it
-waits `GRACE_S` for the run's processes to go by themselves, kills the rest, removes, and prints one JSON object:
-``{"killed": [pid], "left": [path or pid]}``. Standard library only.
+``{"remove": PATH}`` (a folder of ours). At the end of the input it waits `GRACE_S` for the run's processes to go by
+themselves, kills the rest, removes the folders, every control group with the token in its name and zenoh's orphaned
+shared memory, and prints one JSON object: ``{"killed": [pid], "left": [path or pid]}``. Standard library only.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ GRACE_S = 0.5
 """For processes that are on their way out: an orderly stop waits itself, after a SIGKILL the death signal has been."""
 KILL_S = 3.0
 POLL_S = 0.05
+CONTROL_GROUPS = Path("/sys/fs/cgroup")
 SHARED_MEMORY = Path("/dev/shm")  # noqa: S108 - the very folder to clean
 
 
@@ -66,15 +67,19 @@ def end_processes(token: str) -> tuple[list[int], list[int]]:
     return stayed, tagged_processes(token)
 
 
+def groups_of(token: str) -> list[Path]:
+    """The control groups of the run, in every hierarchy: those with the token in their name, deepest first."""
+    found = [Path(folder, name) for folder, names, _ in os.walk(CONTROL_GROUPS) for name in names if token in name]
+    return sorted(found, reverse=True)
+
+
 def remove_group(path: Path) -> bool:
-    """Remove an empty control group and its children (a kernel folder: rmdir, deepest first); true when it is gone."""
+    """Remove an empty control group (a kernel folder: rmdir); true when it is gone."""
     end = time.monotonic() + 1.0
     while path.is_dir():
-        for folder in sorted((p for p in path.rglob("*") if p.is_dir()), reverse=True):
-            with contextlib.suppress(OSError):
-                folder.rmdir()
         with contextlib.suppress(OSError):
             path.rmdir()
+            break
         if time.monotonic() > end:
             break
         time.sleep(POLL_S)  # a killed process leaves its group a moment after it ends
@@ -105,10 +110,10 @@ def orphaned_segments(since: float) -> list[Path]:
     return [path for path in segments if str(path) not in mapped]
 
 
-def clean(token: str, folders: list[Path], groups: list[Path], since: float) -> dict[str, list[int] | list[str]]:
+def clean(token: str, folders: list[Path], since: float) -> dict[str, list[int] | list[str]]:
     """End the run's processes and remove what it made; returns what was killed and what could not be removed."""
     killed, alive = end_processes(token)
-    left = [str(path) for path in groups if not remove_group(path)]
+    left = [str(path) for path in groups_of(token) if not remove_group(path)]
     for folder in folders:
         shutil.rmtree(folder, ignore_errors=True)
         if folder.exists():
@@ -119,16 +124,13 @@ def clean(token: str, folders: list[Path], groups: list[Path], since: float) -> 
     return {"killed": killed, "left": [*left, *map(str, alive)]}
 
 
-def read_orders(stream: TextIO) -> tuple[list[Path], list[Path]]:
-    """Read (folders, groups) until the lab's end closes the pipe."""
+def read_orders(stream: TextIO) -> list[Path]:
+    """Read the folders to remove until the lab's end closes the pipe."""
     folders: list[Path] = []
-    groups: list[Path] = []
     for line in stream:
-        with contextlib.suppress(ValueError):  # cut off in the middle by a SIGKILL
-            order = json.loads(line)
-            folders.extend([Path(order["remove"])] if "remove" in order else [])
-            groups.extend([Path(order["group"])] if "group" in order else [])
-    return folders, groups
+        with contextlib.suppress(ValueError, KeyError):  # cut off in the middle by a SIGKILL
+            folders.append(Path(json.loads(line)["remove"]))
+    return folders
 
 
 def main() -> int:
@@ -139,8 +141,8 @@ def main() -> int:
     since = time.time() - 1.0  # file times are coarser than the clock
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
-    folders, groups = read_orders(sys.stdin)
-    outcome = clean(sys.argv[1], folders, groups, since)
+    folders = read_orders(sys.stdin)
+    outcome = clean(sys.argv[1], folders, since)
     with contextlib.suppress(OSError):  # the lab may be gone
         sys.stdout.write(json.dumps(outcome) + "\n")
         sys.stdout.flush()

@@ -12,7 +12,6 @@ import contextlib
 import os
 from collections.abc import Mapping
 from enum import StrEnum
-from pathlib import Path
 
 from zsched.adapters.cgroup import LimitedGroup
 from zsched.core.model import NodeId
@@ -61,12 +60,8 @@ class NodeLimits:
         except OSError as error:
             raise AdapterError(f"cannot bind process {pid} to CPU {cpu}: {error}") from error
 
-    def folders(self) -> list[Path]:
-        """The control groups' folders: what must be removed at the end, come what may."""
-        return [folder for group in self._groups.values() for folder in group.folders]
-
     def remove(self) -> None:
-        """Remove the groups; what is still inside one stays (the janitor comes after us)."""
+        """Remove the groups; what is still inside one stays (in the lab the janitor comes after us)."""
         for group in self._groups.values():
             with contextlib.suppress(AdapterError):
                 group.remove()

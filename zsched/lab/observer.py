@@ -8,6 +8,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Self
 
 from zsched.clock import monotonic_s
 from zsched.core.model import NodeId, TaskId
@@ -34,7 +35,7 @@ class Observer:
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="observer", daemon=True)
 
-    def __enter__(self) -> Observer:
+    def __enter__(self) -> Self:
         self._thread.start()
         return self
 
@@ -72,6 +73,8 @@ class Observer:
             status = self._ask(path, {"verb": "status"}, ANSWER_S)
         except (OSError, ValueError, ZschedError):
             return  # not up yet, or in trouble: the view shows "no answer"
+        if "error" in status:
+            return
         now = monotonic_s()
         told = past_allocations(status, self._task, now)
         with self._lock:

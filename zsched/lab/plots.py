@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from zsched.core.model import NodeId
-from zsched.lab.fleet_view import Move
+from zsched.lab.fleet_view import Load, Move
 from zsched.tasks.map_merge.compose import compose, extent_of
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid, Mask
@@ -43,15 +43,6 @@ DIFFERENCE_LEGEND = (
     (MISSING_FREE, "free, not seen"),
     (EXTRA_FREE, "free too much"),
 )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Load:
-    """One window of injected load as it really was, in seconds since the start."""
-
-    node: NodeId
-    start_s: float
-    end_s: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -184,7 +175,7 @@ def save_timeline(path: Path, timeline: Timeline) -> None:
         axis.set_xlim(0.0, timeline.duration_s)
         axis.tick_params(labelsize=9)
         axis.spines[["top", "right"]].set_visible(False)
-    rate.set_xlabel("seconds since the fleet was up", fontsize=10)
+    rate.set_xlabel("seconds since the daemons were started", fontsize=10)
     figure.suptitle(timeline.title, fontsize=12)
     write(figure, path)
 
@@ -193,7 +184,7 @@ def tenures(timeline: Timeline) -> list[tuple[Move, float]]:
     """Each allocation with the time of its end."""
     moves = sorted(timeline.moves, key=lambda move: move.epoch)
     ends = [move.t_s for move in moves[1:]] + [timeline.duration_s]
-    return list(zip(moves, ends, strict=True))
+    return list(zip(moves, ends, strict=False))  # without moves there is one end too many
 
 
 def draw_owner(axis: Axes, timeline: Timeline, colours: Mapping[NodeId, str]) -> None:

@@ -1,0 +1,70 @@
+from __future__ import annotations
+
+import os
+import secrets
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from zsched.adapters.cgroup import LimitedGroup
+from zsched.errors import AdapterError
+from zsched.lab.janitor import groups_of
+from zsched.lab.limits import LimitKind, NodeLimits, by_affinity, make_limits
+
+BUSY = [sys.executable, "-c", "while True: pass"]
+WHY_NOT = LimitedGroup.why_not(memory=False)
+
+
+def cpu_s(pid: int) -> float:
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+@pytest.mark.skipif(WHY_NOT is not None, reason=f"no control groups here: {WHY_NOT}")
+def test_a_nodes_share_is_its_own_and_is_removed() -> None:
+    token = secrets.token_hex(8)
+    limits = make_limits(f"zsched-{token}", {"edge1": 0.2, "edge2": 0.5}, 256.0)
+    busy = subprocess.Popen(BUSY)
+    try:
+        assert limits.kind is LimitKind.CGROUP
+        limits.put("edge1", busy.pid)
+        time.sleep(0.2)  # interpreter start-up
+        before = cpu_s(busy.pid)
+        time.sleep(1.0)
+        used = cpu_s(busy.pid) - before
+    finally:
+        busy.kill()
+        busy.wait()
+        limits.remove()
+    assert 0.05 <= used <= 0.35
+    assert groups_of(token) == []
+
+
+@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="one CPU only")
+def test_without_groups_each_edge_gets_a_cpu() -> None:
+    limits = by_affinity(("edge1", "edge2"), "not root")
+    busy = subprocess.Popen(BUSY)
+    try:
+        assert limits.kind is LimitKind.AFFINITY
+        assert "not root" in limits.says
+        limits.put("edge1", busy.pid)
+        first = os.sched_getaffinity(busy.pid)
+        limits.put("edge2", busy.pid)
+        second = os.sched_getaffinity(busy.pid)
+        limits.put("robot1", busy.pid)
+        assert os.sched_getaffinity(busy.pid) == second
+    finally:
+        busy.kill()
+        busy.wait()
+    assert len(first) == len(second) == 1
+    assert first != second
+
+
+def test_a_process_that_is_gone_cannot_be_put() -> None:
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    limits = NodeLimits(LimitKind.AFFINITY, "", cpus={"edge1": min(os.sched_getaffinity(0))})
+    with pytest.raises(AdapterError, match=str(gone.pid)):
+        limits.put("edge1", gone.pid)

@@ -1,0 +1,39 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from zsched.lab.recorder import Recorder
+from zsched.lab.robot_watch import RobotWatch
+
+
+def test_a_robots_records_become_rates_and_gaps(tmp_path: Path) -> None:
+    watch = RobotWatch.of("robot1", tmp_path)
+    watch.update()
+    assert watch.view(0.0).rate_hz is None
+    assert watch.mean_hz(10.0) is None
+    assert watch.longest_gap_s(10.0) is None
+    with Recorder(tmp_path) as recorder:
+        for t_s in (10.0, 11.0, 12.0, 14.5, 15.0):
+            recorder.write("robot1", {"kind": "map", "t_s": t_s})
+        recorder.write("robot1", {"kind": "progress", "t_s": 15.0, "scans": 7, "scans_total": 33})
+        recorder.write("robot1", {"kind": "status", "t_s": 15.0, "status": {"merges": 5}})
+    watch.update()
+
+    view = watch.view(16.0)
+
+    assert (view.maps, view.scans, view.scans_total, view.age_s, view.gap_max_s) == (5, 7, 33, 1.0, 2.5)
+    assert view.rate_hz == pytest.approx(3 / 5.0)
+    assert watch.status == {"merges": 5}
+    assert watch.mean_hz(20.0) == pytest.approx(0.4)
+    assert watch.longest_gap_s() == 2.5
+    assert watch.longest_gap_s(20.0) == 5.0
+    assert watch.longest_gap_s(14.0) == 2.5
+
+
+def test_one_map_has_no_gap_but_the_silence_after_it(tmp_path: Path) -> None:
+    watch = RobotWatch.of("robot1", tmp_path)
+    watch.map_times.append(3.0)
+
+    assert watch.longest_gap_s() is None
+    assert watch.longest_gap_s(7.0) == 4.0
