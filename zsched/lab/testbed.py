@@ -1,0 +1,226 @@
+"""A small real fleet for tests and benchmarks: daemons as processes on loopback, one of which can be killed or frozen.
+
+Knows: fleet files with free ports, daemon processes, signals, waiting for a condition. Does not know: what is tested.
+
+Everything that was started is gone when the context ends, whatever happened inside; workers and relays die with their
+daemons.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+import zenoh
+
+from zsched import places, zenoh_config
+from zsched.adapters.operator_socket import ask
+from zsched.config import load_fleet
+from zsched.core.fleet import Fleet
+from zsched.core.model import NodeId
+from zsched.errors import AdapterError, ZschedError
+from zsched.lab.fleet_runner import free_ports
+from zsched.lifecycle import init_state
+
+DAEMON = (sys.executable, "-m", "zsched.daemon")
+ECHO = ("python", "-m", "zsched.tasks.echo")
+TASK = "echo"
+POLL_S = 0.01
+
+Json = dict[str, Any]
+T = TypeVar("T")
+
+
+class TestbedError(ZschedError):
+    """A condition did not come true in time; the message holds what was seen."""
+
+    __test__ = False
+
+
+def echo_fleet(
+    *,
+    robots: int = 3,
+    edges: int = 3,
+    timing: str = "wifi",
+    scheduling: Mapping[str, float] | None = None,
+    worker: tuple[str, ...] = ECHO,
+    stream_class: str = "latest",
+    weights: Mapping[str, float] | None = None,
+    task: Mapping[str, Any] | None = None,
+) -> Json:
+    """A fleet file as plain data: robots and edges on loopback, one task with the echo worker on every edge."""
+    names = [f"robot{i}" for i in range(1, robots + 1)] + [f"edge{i}" for i in range(1, edges + 1)]
+    ports = iter(free_ports(2 * len(names)))
+    nodes = {
+        name: {
+            "kind": name.rstrip("0123456789"),
+            "host": "127.0.0.1",
+            "listen": {"control": f"tcp/127.0.0.1:{next(ports)}", "data": f"tcp/127.0.0.1:{next(ports)}"},
+            "wired": True,
+        }
+        for name in names
+    }
+    body: Json = {
+        "candidates": {"kind": "edge" if edges else "robot"},
+        "weights": dict(weights or {"cpu": 0.5, "memory": 0.5, "network": 0.0}),
+        "scheduling": {"bonus": 0.1, "time_to_trigger_s": 1, "cool_down_s": 0, **(scheduling or {})},
+        "worker": {"command": list(worker)},
+        "inputs": [{"from": "{robot}/in", "to": "{target}/echo/{robot}/in", "class": stream_class}],
+        "outputs": [
+            {"from": "{target}/echo/{epoch}/{robot}/out", "to": "{robot}/out", "class": stream_class},
+        ],
+        **(task or {}),
+    }
+    return {"fleet": "testbed", "timing": timing, "nodes": nodes, "tasks": {TASK: body}}
+
+
+class Testbed:
+    """The daemons of one fleet file. Use as a context manager; nothing is started until `start`."""
+
+    __test__ = False  # not a test class, whatever pytest thinks of its name
+
+    def __init__(self, folder: Path, tree: Mapping[str, Any]) -> None:
+        self.folder = folder
+        self.file = folder / "fleet.yaml"
+        self.file.write_text(json.dumps(tree, indent=1))  # JSON is YAML
+        self.fleet: Fleet = load_fleet(self.file)
+        self._processes: dict[NodeId, subprocess.Popen[bytes]] = {}
+        self._sessions: list[zenoh.Session] = []
+
+    # --- processes ---------------------------------------------------------------------------------------------------
+
+    def init(self, *nodes: NodeId) -> None:
+        """Blank durable state for ``nodes`` (default: all)."""
+        for node in nodes or self.names:
+            init_state(self.fleet, node, self.folder / node, 0)
+
+    @property
+    def names(self) -> tuple[NodeId, ...]:
+        """Every node of the fleet file, sorted."""
+        return tuple(node.name for node in self.fleet.nodes)
+
+    def start(self, *nodes: NodeId) -> None:
+        """Start daemons (default: all); their stderr goes to ``<node>.log``."""
+        for node in nodes or self.names:
+            with (self.folder / f"{node}.log").open("ab") as log:
+                self._processes[node] = subprocess.Popen(
+                    [*DAEMON, "--config", self.file, "--node", node, *self._folders(node)],
+                    stdin=subprocess.DEVNULL,
+                    stderr=log,
+                    env={**os.environ, "OMP_NUM_THREADS": "1"},
+                )
+
+    def _folders(self, node: NodeId) -> list[str | Path]:
+        return ["--state-dir", self.folder / node, "--runtime-dir", self.folder]
+
+    def send(self, node: NodeId, number: signal.Signals) -> None:
+        """Send a signal to one daemon (not to its relay or workers)."""
+        self._processes[node].send_signal(number)
+
+    def kill(self, node: NodeId) -> None:
+        """SIGKILL one daemon and reap it; its relay and workers die with it."""
+        self.send(node, signal.SIGKILL)
+        self._processes.pop(node).wait(10)
+
+    def stop(self, *nodes: NodeId, within_s: float = 5.0) -> dict[NodeId, tuple[int, float]]:
+        """SIGTERM daemons (default: all that run) and wait; {node: (exit code, seconds)}."""
+        stopping = {node: self._processes.pop(node) for node in nodes or tuple(self._processes)}
+        start = time.monotonic()
+        for process in stopping.values():
+            process.send_signal(signal.SIGCONT)
+            process.send_signal(signal.SIGTERM)
+        results = {}
+        for node, process in stopping.items():
+            try:
+                code = process.wait(max(start + within_s - time.monotonic(), 0.1))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                code = process.wait(10)
+            results[node] = (code, time.monotonic() - start)
+        return results
+
+    def pid(self, node: NodeId) -> int:
+        """The process id of a running daemon."""
+        return self._processes[node].pid
+
+    def log(self, node: NodeId) -> str:
+        """What a daemon has written to stderr so far."""
+        return (self.folder / f"{node}.log").read_text(errors="replace")
+
+    # --- looking -----------------------------------------------------------------------------------------------------
+
+    def status(self, node: NodeId, timeout_s: float = 3.0) -> Json:
+        """One daemon's status.
+
+        Raises:
+            AdapterError: it does not answer.
+        """
+        return ask(places.socket_path(self.folder, node), {"verb": "status"}, timeout_s)
+
+    def task(self, node: NodeId) -> Json:
+        """The first task's block in one daemon's status."""
+        found: Json = self.status(node)["tasks"][0]
+        return found
+
+    def owner(self, *nodes: NodeId) -> NodeId | None:
+        """The owner that ``nodes`` (default: all running) agree on, settled on every robot; else ``None``."""
+        blocks = [self.task(node) for node in nodes or tuple(self._processes)]
+        owners = {(block["owner"], block["epoch"]) for block in blocks}
+        is_settled = all(block["phase"] in {"settled", "idle"} for block in blocks)
+        return owners.pop()[0] if len(owners) == 1 and is_settled else None
+
+    def wait(self, condition: Callable[[], T], timeout_s: float, what: str) -> T:
+        """Poll until ``condition`` is truthy and return it.
+
+        Raises:
+            TestbedError: not within ``timeout_s``; the message ends with the last lines of every log.
+        """
+        deadline = time.monotonic() + timeout_s
+        while True:
+            try:
+                if result := condition():
+                    return result
+            except AdapterError:
+                pass  # not up yet: as good as false
+            if time.monotonic() > deadline:
+                tails = "\n".join(f"--- {n}\n" + "\n".join(self.log(n).splitlines()[-12:]) for n in self._processes)
+                raise TestbedError(f"waited {timeout_s:g} s for {what}\n{tails}")
+            time.sleep(POLL_S)
+
+    def wait_settled(self, timeout_s: float = 30.0) -> NodeId:
+        """Wait until all running nodes agree on a living owner and every robot's streams are settled on it."""
+
+        def settled() -> NodeId | None:
+            owner = self.owner()
+            return owner if owner in self._processes else None
+
+        return self.wait(settled, timeout_s, "an owner on all nodes") or ""
+
+    def app(self, node: NodeId) -> zenoh.Session:
+        """A plain zenoh application on ``node``: a client of its data endpoint; closed with the testbed."""
+        endpoint = self.fleet.node(node).listen_data
+        config = zenoh_config.client_config(connect=(endpoint,), timing=self.fleet.timing)
+        session = zenoh.open(zenoh.Config.from_json5(config))
+        self._sessions.append(session)
+        return session
+
+    # --- end ---------------------------------------------------------------------------------------------------------
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for session in self._sessions:
+            session.close()
+        if self._processes:
+            self.stop()
