@@ -67,7 +67,7 @@ def parse_process_stat(content: bytes) -> ProcessTimes | None:
             waited_s=(waited_user + waited_system) / TICKS_PER_S,
             threads=int(fields[17]),
             start_s=int(fields[19]) / TICKS_PER_S,
-            rss_mb=int(fields[21]) * PAGE_MB,
+            rss_mb=max(0, int(fields[21])) * PAGE_MB,
         )
     except (ValueError, IndexError):
         return None
