@@ -11,6 +11,7 @@ from zsched.tasks.map_merge.compose import compose, extent_of
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid
 
+cv2.setNumThreads(1)  # as the worker does; more only fight with the other tests
 RESOLUTION = 0.05
 View = Callable[[tuple[float, float, float, float], Pose2], Grid]
 

@@ -141,7 +141,7 @@ def test_estimate_attaches_a_chain_and_the_reference_is_the_lowest_name(view: Vi
     assert result.reference == "robot1"
     assert result.transforms["robot1"] == Pose2()
     assert set(_states(result).values()) == {RobotState.ATTACHED}
-    assert max(_errors(result).values()) < 0.02
+    assert max(_errors(result).values()) < 0.05
     status = _status(result, "robot3")
     assert status.partner == "robot2"
     assert status.score is not None
@@ -220,7 +220,7 @@ def test_track_refines_the_given_poses_without_searching(view: View) -> None:
     result = _fed(_merger(Mode.TRACK, rough), view).merge()
     assert not result.is_search_due
     assert difference(result.transforms["robot1"], _FRAMES["robot1"])[0] < 1e-9
-    assert max(_errors(result).values()) < 0.02
+    assert max(_errors(result).values()) < 0.05
 
 
 def test_track_does_not_trust_a_pose_that_the_maps_contradict(view: View) -> None:
@@ -237,7 +237,7 @@ def test_track_without_poses_searches_once(view: View) -> None:
     merger.update("robot2", view((6.0, 0.0, 22.0, 16.0), _FRAMES["robot2"]))
     result = merger.merge()
     assert not result.is_search_due
-    assert max(_errors(result).values()) < 0.02
+    assert max(_errors(result).values()) < 0.05
 
 
 # --- snapshots -------------------------------------------------------------------------------------------------------
@@ -254,7 +254,7 @@ def test_restored_merger_attaches_at_once_without_searching(view: View) -> None:
     assert after.grid is not None
     assert before.grid is not None
     assert after.grid.data.shape == before.grid.data.shape
-    assert max(_errors(after).values()) < 0.02
+    assert max(_errors(after).values()) < 0.05
 
 
 def test_reference_survives_in_the_snapshot_though_a_lower_name_comes(view: View) -> None:

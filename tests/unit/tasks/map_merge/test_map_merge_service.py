@@ -1,0 +1,194 @@
+"""The service over bytes: rate, roles, bad messages, status, and the maps that come out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import pytest
+from zsched.tasks.map_merge.cdr import decode_grid, decode_transforms, encode_grid
+from zsched.tasks.map_merge.geometry import Pose2
+from zsched.tasks.map_merge.grid import Grid
+from zsched.tasks.map_merge.merger import MAX_ROBOTS, MergerSettings, Mode
+from zsched.tasks.map_merge.service import STATUS_SCHEMA, MapMergeService, Output
+
+View = Callable[[tuple[float, float, float, float], Pose2], Grid]
+_POSES = {"robot1": Pose2(x=2.0, y=-1.0, yaw=0.4), "robot2": Pose2(x=-3.0, y=2.0, yaw=-2.2)}
+_PARTS = {"robot1": (0.0, 0.0, 14.0, 16.0), "robot2": (7.0, 0.0, 24.0, 16.0)}
+
+
+@dataclass
+class _Wire:
+    """A transport that keeps what went out, and a clock that stands until it is moved."""
+
+    now_s: float = 100.0
+    sent: list[tuple[Output, bytes, bytes | None]] = field(default_factory=list)
+
+    def publish(self, output: Output, payload: bytes, attachment: bytes | None = None) -> bool:
+        self.sent.append((output, payload, attachment))
+        return True
+
+    def clock(self) -> float:
+        return self.now_s
+
+    def last(self, output: Output) -> tuple[bytes, bytes | None]:
+        return next((payload, extra) for kind, payload, extra in reversed(self.sent) if kind is output)
+
+    def status(self) -> dict[str, Any]:
+        found: dict[str, Any] = json.loads(self.last(Output.STATUS)[0])
+        return found
+
+
+def _service(wire: _Wire, mode: Mode = Mode.KNOWN) -> MapMergeService:
+    settings = MergerSettings(mode=mode, poses=_POSES if mode is Mode.KNOWN else {})
+    return MapMergeService(settings, wire.publish, clock=wire.clock, rate_hz=4.0)
+
+
+def _feed(service: MapMergeService, view: View, *robots: str) -> None:
+    for number, robot in enumerate(robots, start=1):
+        grid = replace(view(_PARTS[robot], _POSES[robot]), stamp_ns=number * 1000)
+        service.receive(robot, encode_grid(grid))
+
+
+def test_merge_publishes_map_transforms_and_status(view: View) -> None:
+    wire = _Wire()
+    service = _service(wire)
+    _feed(service, view, "robot1", "robot2")
+    assert service.step(is_active=True)
+    payload, attachment = wire.last(Output.GLOBAL_MAP)
+    grid = decode_grid(payload)
+    assert grid.frame_id == "world"
+    assert np.count_nonzero(grid.occupied) > 1000
+    assert attachment is not None
+    assert json.loads(attachment) == {"merge": 1, "inputs": {"robot1": 1000, "robot2": 2000}}
+    transforms = decode_transforms(wire.last(Output.TF)[0])
+    assert [(one.parent, one.child) for one in transforms] == [("world", "robot1/map"), ("world", "robot2/map")]
+    assert transforms[0].pose.x == pytest.approx(2.0)
+    status = wire.status()
+    assert status["schema"] == STATUS_SCHEMA
+    assert (status["mode"], status["merges"], status["revision"]) == ("known", 1, 1)
+    assert status["robots"]["robot1"]["state"] == "attached"
+    assert status["robots"]["robot1"]["map_age_s"] == 0.0
+
+
+def test_idle_keeps_the_newest_maps_and_the_owner_merges_them_at_once(view: View) -> None:
+    wire = _Wire()
+    service = _service(wire)
+    _feed(service, view, "robot1", "robot2")
+    assert not service.step(is_active=False)
+    assert wire.sent == []
+    assert service.step(is_active=True)
+    assert decode_grid(wire.last(Output.GLOBAL_MAP)[0]).known_area_m2 > 300
+
+
+def test_owner_again_publishes_at_once_without_a_new_input(view: View) -> None:
+    wire = _Wire()
+    service = _service(wire)
+    _feed(service, view, "robot1")
+    service.step(is_active=True)
+    service.step(is_active=False)
+    assert service.step(is_active=True)
+
+
+def test_rate_bounds_merges_and_no_input_no_merge(view: View) -> None:
+    wire = _Wire()
+    service = _service(wire)
+    _feed(service, view, "robot1")
+    assert service.step(is_active=True)
+    _feed(service, view, "robot1")
+    assert not service.step(is_active=True)
+    wire.now_s += 0.26
+    assert service.step(is_active=True)
+    wire.now_s += 0.26
+    assert not service.step(is_active=True)
+
+
+def test_status_goes_on_while_nothing_comes_in(view: View) -> None:
+    wire = _Wire()
+    service = _service(wire)
+    _feed(service, view, "robot1")
+    service.step(is_active=True)
+    wire.now_s += 5.0
+    service.step(is_active=True)
+    status = wire.status()
+    assert status["robots"]["robot1"]["map_age_s"] == 5.0
+    assert "no map received" in status["robots"]["robot2"]["reason"]
+
+
+def test_bad_message_is_counted_shown_and_stalls_nobody(view: View) -> None:
+    wire = _Wire()
+    service = _service(wire)
+    _feed(service, view, "robot1")
+    service.receive("robot2", b"no map")
+    assert service.step(is_active=True)
+    status = wire.status()["robots"]
+    assert (status["robot2"]["bad"], status["robot2"]["maps"]) == (1, 0)
+    assert "encapsulation" in status["robot2"]["last_error"]
+    assert status["robot1"]["state"] == "attached"
+    _feed(service, view, "robot2")
+    wire.now_s += 1.0
+    assert service.step(is_active=True)
+    assert wire.status()["robots"]["robot2"]["state"] == "attached"
+
+
+def test_bad_message_keeps_the_last_good_map(view: View) -> None:
+    wire = _Wire()
+    service = _service(wire)
+    _feed(service, view, "robot1")
+    service.step(is_active=True)
+    service.receive("robot1", b"\x00\x01\x00\x00")
+    wire.now_s += 1.0
+    service.step(is_active=True)
+    assert wire.status()["robots"]["robot1"]["state"] == "attached"
+
+
+def test_deleted_stream_leaves_the_map_out(view: View) -> None:
+    wire = _Wire()
+    service = _service(wire)
+    _feed(service, view, "robot1", "robot2")
+    service.step(is_active=True)
+    service.receive("robot2", b"", is_deleted=True)
+    wire.now_s += 1.0
+    assert service.step(is_active=True)
+    assert wire.status()["robots"]["robot2"]["state"] == "waiting"
+
+
+def test_strangers_are_counted_not_kept(view: View) -> None:
+    wire = _Wire()
+    service = _service(wire)
+    _feed(service, view, "robot1")
+    service.receive("Not A Name", b"")
+    for number in range(MAX_ROBOTS + 5):
+        service.receive(f"r{number}", b"")
+    service.step(is_active=True)
+    status = wire.status()
+    assert status["strangers"] == 7
+    assert len(status["robots"]) <= MAX_ROBOTS + 2
+
+
+def test_snapshot_is_handed_on(view: View) -> None:
+    wire = _Wire()
+    service = _service(wire, Mode.ESTIMATE)
+    _feed(service, view, "robot1", "robot2")
+    while service.step(is_active=True):
+        wire.now_s += 1.0
+    assert wire.status()["robots"]["robot2"]["state"] == "attached"
+    heir = _service(wire, Mode.ESTIMATE)
+    heir.restore(service.snapshot())
+    _feed(heir, view, "robot1", "robot2")
+    heir.step(is_active=True)
+    status = wire.status()
+    assert status["robots"]["robot2"]["state"] == "attached"
+    assert status["merges"] == 1
+
+
+def test_broken_snapshot_changes_nothing(view: View) -> None:
+    wire = _Wire()
+    service = _service(wire, Mode.ESTIMATE)
+    service.restore(b"{")
+    _feed(service, view, "robot1")
+    assert service.step(is_active=True)
+    assert wire.status()["robots"]["robot1"]["state"] == "attached"
