@@ -229,11 +229,16 @@ def decode(frame: bytes, *classes: type[T]) -> T:
         raise WireError("frame", "expected [version, kind, body]")
     version, kind, body = parts[:3]
     if version != VERSION or type(version) is not int:
-        raise WireError("version", f"{version!r:.20}, this is {VERSION}")
+        raise WireError("version", f"{_quoted(version)}, this is {VERSION}")
     for cls in classes:
         if kind == _KIND_OF[cls]:
             return _read_body(cls, body, len(frame))
-    raise WireError("kind", f"{kind!r:.40}")
+    raise WireError("kind", _quoted(kind))
+
+
+def _quoted(value: Any) -> str:
+    """A hostile value in a few characters; containers by type only (the repr of a deep one exceeds the stack)."""
+    return f"{value!r:.40}" if isinstance(value, str | int | float) else type(value).__name__
 
 
 def _read_body(cls: type[T], body: Any, size: int) -> T:

@@ -1,0 +1,182 @@
+"""Write the golden frames that are missing; what is there is never written again.
+
+One file per kind of frame and wire version: what an older node once sent must be read for ever. Run it after a kind
+was added: ``python tests/unit/golden/make.py``. A value here is frozen with its file; a new shape gets a new entry.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from zsched import relay_pipe, wire
+from zsched.core import events, messages, model, plan, relay_protocol, snapshot
+
+HERE = Path(__file__).parent
+
+_WEIGHTS = model.Weights(cpu=0.5, memory=0.25, network=0.25)
+_TUNING = model.Tuning(
+    weights=_WEIGHTS, bonus=0.125, time_to_trigger_s=1.5, cool_down_s=7.0, aggregate=model.Aggregate.MEDIAN
+)
+_VALUE = model.Allocation(
+    task="map_merge", revision=7, epoch=4, owner="edge1", tuning=_TUNING, pinned=True, paused=True
+)
+_BALLOT = model.Ballot(counter=12, node="robot1", incarnation=3)
+_ACCEPTANCE = model.Acceptance(ballot=_BALLOT, value=_VALUE)
+_WORKER = model.WorkerLoad(task="map_merge", state=model.WorkerState.READY, cpu_cores=0.5, memory_mb=200.0)
+_LINK = model.Link(source=model.LinkSource.NL80211, peer="edge1", rssi_dbm=-61.5, bitrate_mbps=433.3, retry_ratio=0.05)
+_UTILITY = model.Utility(candidate="edge1", value=0.5, cpu=0.75, memory=0.25, network=0.5, reachable=False)
+_VECTOR = model.UtilityVector(
+    voter="robot1", task="map_merge", revision=7, utilities=(_UTILITY,), refused=(("edge2", "draining"),)
+)
+_ROUTE = plan.Route(
+    stream="map_merge/in/0",
+    direction=plan.Direction.INPUT,
+    from_expr="robot1/map",
+    to_expr="edge1/map_merge/robot1/map",
+    settings=plan.StreamSettings(
+        stream_class=plan.StreamClass.LATEST, keep_last=3, depth=32, handover=plan.HandoverRule.ALL
+    ),
+)
+_SLOT = plan.Slot(
+    epoch=4,
+    owner="edge1",
+    routes=(_ROUTE,),
+    ready_when=plan.ReadyWhen.MATCHING,
+)
+
+_COUNT = plan.StreamCount(stream="map_merge/in/0", messages=10, bytes=4096, drops=(("overflow", 2),), last_seen_s=0.5)
+_NODE_STATUS = snapshot.NodeStatus(
+    name="edge1",
+    kind="edge",
+    state="alive",
+    age_s=0.5,
+    incarnation=3,
+    cpu_cores=4.0,
+    cpu_used_cores=1.0,
+    cpu_ratio=0.25,
+    memory_mb=8000.0,
+    memory_used_mb=2000.0,
+    memory_ratio=0.25,
+    links=(_LINK,),
+    workers=(_WORKER,),
+    draining=True,
+)
+_TASK_STATUS = snapshot.TaskStatus(
+    name="map_merge",
+    owner="edge1",
+    epoch=4,
+    revision=7,
+    since_s=12.5,
+    owner_state="alive",
+    phase="settled",
+    tuning=_TUNING,
+    candidates=("edge1", "edge2"),
+    decision=snapshot.DecisionStatus(
+        outcome="wait",
+        winner="edge2",
+        reason="edge2 leads",
+        age_s=0.25,
+        aggregates=(("edge1", 0.5),),
+        utilities=(("robot1", (_UTILITY,)),),
+        vetoed=(("edge3", "out of memory"),),
+        silent=("robot3",),
+    ),
+    vote=snapshot.VoteStatus(base_revision=6, votes=(("robot1", "edge1"),), outcome="won", winner="edge1", age_s=12.5),
+    streams=(_COUNT,),
+    history=(snapshot.PastAllocation(epoch=3, revision=5, owner="edge2", age_s=60.0, reason="first placement"),),
+    problems=("edge3 has no worker",),
+)
+
+SAMPLES: dict[str, object] = {
+    "beat": model.Beat(
+        node="robot1", incarnation=3, sequence=99, loop_lag_s=0.25, learnt=(("map_merge", 7, 4),), suspects=("edge2",)
+    ),
+    "profile": model.Profile(
+        node="edge1",
+        incarnation=3,
+        sequence=99,
+        cpu_cores=4.0,
+        cpu_used_cores=1.5,
+        memory_mb=8000.0,
+        memory_used_mb=2000.0,
+        links=(_LINK,),
+        workers=(_WORKER,),
+        draining=True,
+    ),
+    "proposal": model.Proposal(
+        voter="robot1",
+        task="map_merge",
+        base_revision=7,
+        candidate="edge1",
+        aggregate=0.75,
+        is_escape=True,
+        reason="edge2 is gone",
+    ),
+    "utilities": messages.Utilities(voter="robot1", vectors=(_VECTOR,)),
+    "prepare": messages.Prepare(task="map_merge", ballot=_BALLOT, electorate="0123456789abcdef"),
+    "promise": messages.Promise(elector="robot2", task="map_merge", ballot=_BALLOT, accepted=_ACCEPTANCE),
+    "accept": messages.Accept(task="map_merge", acceptance=_ACCEPTANCE, electorate="0123456789abcdef"),
+    "accepted": messages.Accepted(elector="robot2", task="map_merge", ballot=_BALLOT),
+    "refused": messages.Refused(
+        elector="robot2", task="map_merge", ballot=_BALLOT, refusal=messages.Refusal.LEASE, promised=_BALLOT
+    ),
+    "learnt": messages.Learnt(node="robot2", values=(_VALUE,)),
+    "set_weights": messages.SetWeights(task="map_merge", cpu=0.5, memory=0.25, network=0.25, base_revision=7),
+    "command_result": messages.CommandResult(
+        outcome=messages.CommandOutcome.CONFLICT, detail="the value had changed", revision=8
+    ),
+    "state": model.DurableState(
+        fleet="lab",
+        node="robot1",
+        incarnation=3,
+        generation=1,
+        hardware="4c4c4544",
+        electorate="0123456789abcdef",
+        registers=(model.RegisterState(task="map_merge", promised=_BALLOT, accepted=_ACCEPTANCE, learnt=_VALUE),),
+    ),
+    "status": snapshot.Snapshot(
+        schema=snapshot.SCHEMA,
+        version="0.1.0",
+        fleet="lab",
+        node="robot1",
+        kind="robot",
+        incarnation=3,
+        up_s=90.0,
+        loop_lag_s=0.005,
+        quorum=snapshot.QuorumStatus(electors=3, needed=2, alive=3, ok=True, this_node="elector"),
+        nodes=(_NODE_STATUS,),
+        tasks=(_TASK_STATUS,),
+        counters=(("frames_dropped", 2),),
+        problems=("robot2 is silent",),
+    ),
+    "role": plan.Role(task="map_merge", role=plan.WorkerRole.DRAINING, epoch=4),
+    "route_plan": plan.RoutePlan(task="map_merge", phase=plan.RoutePhase.FLIP, current=_SLOT, predecessor=_SLOT),
+    "relay_stop": relay_protocol.RelayStop(),
+    "relay_started": relay_protocol.RelayStarted(pid=4711, zid="a1b2c3"),
+    "worker_seen": relay_protocol.WorkerSeen(node="edge1", task="map_merge", incarnation="3-1", is_present=True),
+    "end_marker": relay_protocol.EndMarker(epoch=4, count=1000),
+    "slot_ready": events.SlotReady(task="map_merge", epoch=4, is_ready=False),
+    "slot_flipped": events.SlotFlipped(task="map_merge", epoch=4, replayed=3),
+    "slot_drained": events.SlotDrained(task="map_merge", epoch=3),
+    "streams_counted": events.StreamsCounted(counts=(_COUNT,)),
+    "problem_reported": events.ProblemReported(source="relay", problem="target edge1 is stalled"),
+}
+
+
+def golden_path(kind: str) -> Path:
+    """Where the golden frame of ``kind`` in this wire version lies."""
+    return HERE / f"{kind}.v{wire.VERSION}.bin"
+
+
+def main() -> None:
+    """Write what is missing."""
+    assert relay_pipe.REPORTS  # imported for its kinds
+    for kind, sample in SAMPLES.items():
+        path = golden_path(kind)
+        if not path.exists():
+            path.write_bytes(wire.encode(sample))
+            print(f"wrote {path.name}")
+
+
+if __name__ == "__main__":
+    main()
