@@ -1,4 +1,4 @@
-"""The whole chain on real daemons: allocate, carry streams, move, survive a death, teach a late joiner, resist garbage."""
+"""The whole chain on real daemons: allocate, carry streams, move, survive a death, teach late joiners, shrug off garbage."""
 
 from __future__ import annotations
 
