@@ -15,6 +15,8 @@ from pathlib import Path
 
 UNIT = "zsched.service"
 RESULT = Path("/result/report.json")
+EXPECTED = Path("/opt/expected").read_text() if Path("/opt/expected").exists() else ""
+"""What the status line says once all is well."""
 
 
 def run(*command: str) -> str:
@@ -56,28 +58,30 @@ def timed(*command: str) -> tuple[float, str]:
     return time.monotonic() - begin_s, output
 
 
+def is_back(state: dict[str, str], old_pid: int) -> bool:
+    """Whether another process than ``old_pid`` has taken over and says what is expected."""
+    is_new = state["MainPID"] not in {"0", str(old_pid)} and state["ActiveState"] == "active"
+    return is_new and EXPECTED in state["StatusText"]
+
+
 def observe() -> dict[str, object]:
     report: dict[str, object] = {}
     start_s, start_said = timed("systemctl", "start", UNIT)
     report["start"] = show() | {"seconds": round(start_s, 3), "said": start_said}
-    time.sleep(3.0)
-    running = report["running"] = show()
+    running = report["running"] = wait_for(lambda state: EXPECTED in state["StatusText"], 30.0)
     report["status"] = run("systemctl", "status", "--no-pager", "--lines=0", UNIT)
     pid = int(running["MainPID"])
     if pid == 0:
         return report
     user = os.stat(f"/proc/{pid}").st_uid  # noqa: PTH116 - a /proc path, nothing to gain
-    report["processes"] = processes(user)
+    before = set(processes(user))
+    report["processes"] = sorted(before)
     report["runtime"] = {
         path.name: path.read_text(errors="replace")[:2000] for path in Path("/run/zsched").glob("*.txt")
     }
     os.kill(pid, 19)  # SIGSTOP: the loop is wedged, the process lives
-    report["watchdog"] = wait_for(
-        lambda state: state["NRestarts"] != "0" and state["ActiveState"] == "active" and state["MainPID"] != str(pid),
-        30.0,
-    )
-    report["survivors"] = [line for line in processes(user) if any(line == old for old in report["processes"])]  # type: ignore[attr-defined]
-    time.sleep(1.0)
+    report["watchdog"] = wait_for(lambda state: is_back(state, pid), 40.0)
+    report["survivors"] = sorted(set(processes(user)) & before)
     stop_s, stop_said = timed("systemctl", "stop", UNIT)
     report["stop"] = show() | {"seconds": round(stop_s, 3), "said": stop_said}
     report["left"] = processes(user)

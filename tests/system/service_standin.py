@@ -91,7 +91,8 @@ def main() -> int:
             link = reader.read()
             seen = {"incarnation": state.incarnation, "sample": sample, "link": link.source, "problem": reader.problem}
             Path(os.environ["RUNTIME_DIRECTORY"], "daemon.txt").write_text(json.dumps(seen), encoding="utf-8")
-            notifier.status(f"stand-in · incarnation {state.incarnation} · {len(supervisor.pids())} worker")
+            is_done = Path(os.environ["RUNTIME_DIRECTORY"], "worker.txt").exists()
+            notifier.status(f"stand-in · incarnation {state.incarnation} · worker {'works' if is_done else 'starts'}")
             notifier.watchdog()
             time.sleep(min(0.2, interval_s))
         notifier.stopping("stand-in stopping")

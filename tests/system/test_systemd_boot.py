@@ -11,8 +11,8 @@ import fcntl
 import importlib.util
 import json
 import os
-import re
 import shutil
+import socket
 import subprocess
 import sys
 import sysconfig
@@ -33,7 +33,7 @@ pytestmark = [pytest.mark.root, pytest.mark.timeout(420)]
 FLEET = """
 fleet: boot
 nodes:
-  edge1: {kind: robot, wired: true, listen: {control: tcp/127.0.0.1:27357, data: tcp/127.0.0.1:27358}}
+  edge1: {kind: robot, wired: true, listen: {control: tcp/127.0.0.1:CONTROL, data: tcp/127.0.0.1:DATA}}
 tasks:
   echo:
     candidates: [edge1]
@@ -56,6 +56,7 @@ export PYTHONPATH=/opt/zsched/src:/opt/zsched/site PYTHONDONTWRITEBYTECODE=1 ZSC
 exec /usr/bin/python3 {start} "$@"
 """
 STANDIN, REAL = "/opt/standin.py", "-m zsched.cli"
+MACHINE = f"zsched-test-{os.getpid()}"
 
 
 def cache_folder() -> Path:
@@ -113,14 +114,24 @@ def overlaid(debian: Path, folder: Path) -> Iterator[Path]:
         subprocess.run(["umount", "--lazy", str(root)], timeout=20, check=True)
 
 
-def furnish(root: Path, start: str) -> None:
+def fleet_file() -> str:
+    """The fleet file with ports that are free: the machine shares this one's network."""
+    with socket.socket() as control, socket.socket() as data:
+        control.bind(("127.0.0.1", 0))
+        data.bind(("127.0.0.1", 0))
+        ports = str(control.getsockname()[1]), str(data.getsockname()[1])
+    return FLEET.replace("CONTROL", ports[0]).replace("DATA", ports[1])
+
+
+def furnish(root: Path, start: str, expected: str) -> None:
     """Put the unit, its program, the fleet file and the driver into the machine."""
     unit = (REPO / "systemd" / "zsched.service").read_text()
     files = {
         "etc/systemd/system/zsched.service": unit,
         "etc/systemd/system/zsched.service.d/test.conf": "[Service]\nWatchdogSec=3\n",
         "etc/systemd/system/drive.service": DRIVE_UNIT,
-        "etc/zsched/fleet.yaml": FLEET,
+        "etc/zsched/fleet.yaml": fleet_file(),
+        "opt/expected": expected,
         "opt/drive.py": (HERE / "boot_drive.py").read_text(),
         "opt/standin.py": (HERE / "service_standin.py").read_text(),
         "opt/zsched/bin/zsched": PROGRAM.format(start=start),
@@ -137,42 +148,47 @@ def furnish(root: Path, start: str) -> None:
     (wants / "drive.service").symlink_to("/etc/systemd/system/drive.service")
 
 
-def boot(debian: Path, folder: Path, start: str, *, init: bool = False) -> dict[str, Any]:
+def boot(debian: Path, folder: Path, start: str, expected: str, *, init: bool = False) -> dict[str, Any]:
     """Boot a machine with the service, let the driver run, and return its report."""
     (folder / "result").mkdir()
     with overlaid(debian, folder) as root:
-        furnish(root, start)
+        furnish(root, start, expected)
         binds = [
             f"--bind-ro={REPO / 'zsched'}:/opt/zsched/src/zsched",
             f"--bind-ro={sysconfig.get_paths()['purelib']}:/opt/zsched/site",
             f"--bind={folder / 'result'}:/result",
         ]
-        nspawn = ["systemd-nspawn", "-q", "-D", str(root), "--register=no", "--keep-unit", *binds]
+        options = ["-q", "-D", str(root), f"--machine={MACHINE}", "--register=no", "--keep-unit", *binds]
         if init:
-            config = ["--config", "/etc/zsched/fleet.yaml"]
-            command = [*nspawn, "/opt/zsched/bin/zsched", "init", *config]
-            subprocess.run(command, timeout=60, check=True, stdin=subprocess.DEVNULL)
-        log = folder / "console.log"
-        with log.open("wb") as console:
-            command = [*nspawn, f"--machine=zsched-test-{os.getpid()}", "-b"]
-            done = subprocess.run(
-                command, stdin=subprocess.DEVNULL, stdout=console, stderr=console, timeout=BOOT_TIMEOUT_S, check=False
-            )
+            command = ["/opt/zsched/bin/zsched", "init", "--config", "/etc/zsched/fleet.yaml"]
+            done = nspawn(folder, [*options, *command], timeout_s=60.0)
+            assert done == 0, (folder / "console.log").read_text(errors="replace")
+        done = nspawn(folder, [*options, "-b"], timeout_s=BOOT_TIMEOUT_S)
         report = folder / "result" / "report.json"
-        assert report.exists(), f"no report; nspawn said {done.returncode}:\n{log.read_text(errors='replace')[-3000:]}"
+        console = (folder / "console.log").read_text(errors="replace")
+        assert report.exists(), f"no report; nspawn said {done}:\n{console[-3000:]}"
         found: dict[str, Any] = json.loads(report.read_text())
     return found
 
 
-def check_life(report: dict[str, Any]) -> None:
+def nspawn(folder: Path, arguments: list[str], timeout_s: float) -> int:
+    """Run systemd-nspawn to its end, what it prints going to the folder's console.log; its exit status."""
+    with (folder / "console.log").open("ab") as console:
+        command = ["systemd-nspawn", *arguments]
+        return subprocess.run(
+            command, stdin=subprocess.DEVNULL, stdout=console, stderr=console, timeout=timeout_s, check=False
+        ).returncode
+
+
+def check_life(report: dict[str, Any], expected: str) -> None:
     """What the operator may expect of the unit, whatever program is in it."""
     assert "error" not in report, report
     journal = report["journal"]
     assert report["start"]["ActiveState"] == "active", journal
-    assert report["running"]["StatusText"], journal
-    assert re.search(r'Status: ".+"', report["status"]), report["status"]
+    assert expected in report["running"]["StatusText"], journal
+    assert f'Status: "{report["running"]["StatusText"]}"' in report["status"], report["status"]
     assert report["watchdog"]["NRestarts"] == "1", journal
-    assert report["watchdog"]["ActiveState"] == "active", journal
+    assert expected in report["watchdog"]["StatusText"], journal
     assert report["survivors"] == []
     assert report["stop"]["ActiveState"] == "inactive", journal
     assert report["stop"]["Result"] == "success", journal
@@ -184,8 +200,8 @@ def check_life(report: dict[str, Any]) -> None:
 
 
 def test_adapters_work_inside_the_units_sandbox(debian: Path, tmp_path: Path) -> None:
-    report = boot(debian, tmp_path, STANDIN)
-    check_life(report)
+    report = boot(debian, tmp_path, STANDIN, "worker works")
+    check_life(report, "worker works")
     worker, daemon = (json.loads(report["runtime"][name]) for name in ("worker.txt", "daemon.txt"))
     libraries = {"numpy", "cv2", "zenoh", "msgpack"} & {
         name for name in worker if importlib.util.find_spec(name) is not None
@@ -201,9 +217,9 @@ def test_adapters_work_inside_the_units_sandbox(debian: Path, tmp_path: Path) ->
     assert "incarnation 2" in report["watchdog"]["StatusText"]
 
 
-def test_daemon_lives_by_its_unit(debian: Path, tmp_path: Path) -> None:
-    if importlib.util.find_spec("zsched.cli") is None:
-        pytest.skip("zsched.cli has not landed yet")
-    report = boot(debian, tmp_path, REAL)
-    check_life(report)
+def test_daemon_lives_by_its_unit_and_remembers_the_allocation(debian: Path, tmp_path: Path) -> None:
+    expected = "echo@edge1 epoch 1"  # after the watchdog's restart, too: the state was on the disk
+    report = boot(debian, tmp_path, REAL, expected, init=True)
+    check_life(report, expected)
     assert any("zsched.relay" in line for line in report["processes"]), report["processes"]
+    assert any("zsched.tasks.echo" in line for line in report["processes"]), report["processes"]
