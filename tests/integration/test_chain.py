@@ -1,4 +1,4 @@
-"""The whole chain on real daemons: allocate, carry streams, move, survive a death, teach late joiners, shrug off garbage."""
+"""The whole chain on real daemons: allocate, carry streams, move, survive a death, teach late joiners, take garbage."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 import zenoh
+
 from zsched import wire, zenoh_config
 from zsched.adapters.cgroup import LimitedGroup
 from zsched.adapters.operator_socket import ask

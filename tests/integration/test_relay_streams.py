@@ -12,12 +12,14 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import pytest
 import zenoh
+
 from zsched.adapters.streams import RelayHandle
 from zsched.core.events import RelayChanged, SlotDrained, SlotFlipped, SlotReady, StreamsCounted
 from zsched.core.plan import (
@@ -195,6 +197,15 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
         made.stop()
 
 
+BESIDE = Route(
+    stream="beside/in/0",
+    direction=Direction.INPUT,
+    from_expr=f"{ROBOT}/beside",
+    to_expr=f"edge2/beside/{ROBOT}",
+    settings=StreamSettings(stream_class=StreamClass.RELIABLE, depth=1000),
+)
+
+
 class Application:
     """Publishes numbers on the robot's own key and collects what comes back; never hears of owners."""
 
@@ -240,29 +251,66 @@ class Application:
         thread.join(5)
 
 
-@pytest.mark.parametrize(
-    ("stream_class", "keep_last"), [(StreamClass.RELIABLE, 0), (StreamClass.LATEST, 0)], ids=["reliable", "latest"]
-)
-def test_moves_there_and_back_lose_double_and_reorder_nothing(
-    rig: Rig, stream_class: StreamClass, keep_last: int
-) -> None:
+def there_and_back(rig: Rig, app: Application, stream_class: StreamClass) -> None:
+    """Five owners in turn while the application streams at 200 Hz."""
     options = ["--latest"] if stream_class is StreamClass.LATEST else []
     rig.start_worker("edge1", *options)
     rig.start_worker("edge2", *options)
-    app = Application(rig.app)
-    now = slot(1, "edge1", stream_class, keep_last)
+    now = slot(1, "edge1", stream_class, 1)
     rig.move(now)
     until(app.connected, "the application sees the relay's subscription")
     thread = app.stream(200)
     for epoch, owner in enumerate(["edge2", "edge1", "edge2", "edge1"], start=2):
         time.sleep(0.1)  # the stream goes on for a while between two moves
-        new = slot(epoch, owner, stream_class, keep_last)
+        new = slot(epoch, owner, stream_class, 1)
         rig.move(new, now)
         now = new
     app.halt(thread)
+
+
+def test_moves_of_a_reliable_stream_lose_double_and_reorder_nothing(rig: Rig) -> None:
+    app = Application(rig.app)
+    there_and_back(rig, app, StreamClass.RELIABLE)
     until(lambda: len(app.back) >= app.sent, f"{app.sent} samples back, {len(app.back)} came")
     assert app.back == list(range(app.sent))
     assert set(app.nodes) == {"edge1", "edge2"}
+
+
+def test_moves_of_a_latest_stream_end_with_the_newest_value(rig: Rig) -> None:
+    app = Application(rig.app)
+    there_and_back(rig, app, StreamClass.LATEST)
+    until(lambda: app.back and app.back[-1] == app.sent - 1, "the newest value")
+    # The value that is kept at a move reaches both owners; a value in between may give way to a newer one.
+    assert len(app.back) - len(set(app.back)) <= 2 * 4 + 1
+    assert len(set(app.back)) > 0.9 * app.sent
+
+
+def test_a_stalled_owner_delays_no_other_stream(rig: Rig) -> None:
+    stalled = rig.start_worker("edge1")
+    app = Application(rig.app)
+    rig.move(slot(1, "edge1", StreamClass.RELIABLE, 0))
+    until(app.connected, "the application sees the relay's subscription")
+    beside = replace(slot(1, "edge2", StreamClass.RELIABLE, 0, ReadyWhen.MATCHING), routes=(BESIDE,))
+    arrivals: list[float] = []
+    foreign = zenoh.open(zenoh.Config.from_json5(worker_config(connect=(rig.endpoint("edge2"),))))
+    try:
+        foreign.declare_subscriber(BESIDE.to_expr, lambda _: arrivals.append(time.monotonic()))
+        for phase in (RoutePhase.PREPARE, RoutePhase.FLIP):
+            rig.relays[ROBOT].apply(RoutePlan(task="beside", phase=phase, current=beside))
+            until(lambda: rig.reports[ROBOT].find(SlotReady, task="beside"), "the live target is ready")
+        until(lambda: rig.reports[ROBOT].find(SlotFlipped, task="beside"), "the live target is fed")
+        source = rig.app.declare_publisher(BESIDE.from_expr)
+        until(lambda: rig.app.put(BESIDE.from_expr, b"x") or arrivals, "the live stream flows")
+        stalled.send_signal(signal.SIGSTOP)
+        end = time.monotonic() + 1.5
+        while time.monotonic() < end:
+            rig.app.put(f"{ROBOT}/in", bytes(65536), attachment=b"attached")
+            source.put(b"x")
+            time.sleep(0.005)
+        gaps = [later - earlier for earlier, later in pairwise(arrivals)]
+        assert max(gaps[-200:]) < 0.4
+    finally:
+        foreign.close()
 
 
 def test_the_last_value_reaches_a_new_owner(rig: Rig) -> None:

@@ -6,6 +6,7 @@ import itertools
 import math
 
 import pytest
+
 from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing
 from zsched.core.gateway import Gateway
 from zsched.core.model import DeviceSample, LinkSample, LinkSource, NodeKind, Profile, Tuning, Weights

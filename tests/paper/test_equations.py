@@ -6,6 +6,7 @@ One test per equation and per reading. Each docstring says in short which senten
 from __future__ import annotations
 
 import pytest
+
 from zsched.core.fleet import LinkLimits, Reach, TaskSpec
 from zsched.core.model import Aggregate, Allocation, Tuning, Utility, UtilityVector, Weights
 from zsched.core.scoring import Standing, compare, pick

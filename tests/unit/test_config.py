@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+
 from zsched.config import CheckResult, check_bytes, check_file, load_fleet
 from zsched.core.fleet import (
     Fleet,

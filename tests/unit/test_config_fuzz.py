@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from zsched.config import CheckResult, check_bytes
 from zsched.config_schema import endpoint_fault, host_fault
 

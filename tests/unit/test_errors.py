@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 
 import pytest
+
 from zsched import errors
 from zsched.errors import AdapterError, ConfigError, InvariantError, WireError, ZschedError
 

@@ -15,6 +15,7 @@ import msgpack
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from zsched import relay_pipe, wire
 from zsched.core import messages, model
 from zsched.errors import WireError

@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
+
 from zsched.adapters.cgroup import CgroupTree, LimitedGroup, parse_flat, parse_membership, parse_mounts
 from zsched.errors import AdapterError
 

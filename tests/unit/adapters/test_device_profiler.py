@@ -10,6 +10,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+
 from zsched.adapters.cgroup import LimitedGroup
 from zsched.adapters.device_profiler import DeviceProfiler, parse_cpu_list, parse_cpu_stat, parse_process_stat
 from zsched.core.model import WorkerState

@@ -6,6 +6,7 @@ import gzip
 from pathlib import Path
 
 import pytest
+
 from zsched.adapters.network_profiler import (
     LinkReader,
     choose_station,

@@ -8,6 +8,7 @@ import struct
 from pathlib import Path
 
 import pytest
+
 from zsched.adapters import nl80211
 from zsched.adapters.nl80211 import GenericNetlink, Nl80211Error, Station
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+
 from zsched.adapters.state_file import StateFile, hardware_id, is_same_hardware
 from zsched.core.model import Acceptance, Allocation, Ballot, DurableState, RegisterState, Tuning, Weights
 from zsched.errors import AdapterError

@@ -11,6 +11,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
+
 from zsched.adapters.systemd import Notifier, watchdog_interval_s
 
 UNIT = Path(__file__).parents[3] / "systemd" / "zsched.service"

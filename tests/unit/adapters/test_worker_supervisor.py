@@ -16,6 +16,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+
 from zsched.adapters.worker_process import LINES_BURST, LineLog
 from zsched.adapters.worker_supervisor import RestartPolicy, WorkerContext, WorkerSupervisor
 from zsched.core.fleet import WorkerSpec

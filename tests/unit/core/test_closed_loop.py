@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from random import Random
 
 import pytest
+
 from zsched.core.fleet import Demand, Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
 from zsched.core.gateway import Gateway
 from zsched.core.model import (

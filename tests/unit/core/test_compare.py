@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import pytest
+
 from zsched.core.fleet import Reach, TaskSpec
 from zsched.core.model import Aggregate, Allocation, Tuning, Utility, UtilityVector, Weights
 from zsched.core.scoring import Standing, compare, majority, pick, rounded

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import pytest
+
 from zsched.core.fleet import Demand, Fleet, NodeSpec, TaskSpec, Timing
 from zsched.core.gateway import STARVED_CPU_RATIO, EdgeData, Gateway
 from zsched.core.model import NodeKind, Profile, Tuning, Weights, WorkerLoad, WorkerState

@@ -6,6 +6,7 @@ import pytest
 import zenoh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from zsched.core import keyexpr
 
 PIECES = ("a", "b", "ab", "*", "**", "$*", "@a", "@", "a$*", "$*a", "$*b$*", "a$*b", "$*@a", "@a$*", "é", "x y", "{r}")

@@ -7,6 +7,7 @@ from dataclasses import replace
 from random import Random
 
 import pytest
+
 from zsched.core.fleet import Timing
 from zsched.core.membership import MAX_DOUBT, Membership
 from zsched.core.model import Beat, NodeId, PeerState

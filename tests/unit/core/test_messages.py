@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import FrozenInstanceError, fields, is_dataclass, replace
 
 import pytest
+
 from zsched.core import messages
 from zsched.core.messages import Accept, Accepted, Learnt, Prepare, Promise, Refusal, Refused, SetWeights, Utilities
 from zsched.core.model import NO_BALLOT, Acceptance, Allocation, Ballot, Tuning, Weights

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import FrozenInstanceError, fields, is_dataclass
 
 import pytest
+
 from zsched.core import model
 from zsched.core.model import (
     MAX_COUNTER,

@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 
 import pytest
+
 from zsched.core.fleet import Timing
 from zsched.core.model import DeviceSample, LinkSample, LinkSource, Profile, WorkerLoad, WorkerState
 from zsched.core.profile import (

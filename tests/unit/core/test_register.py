@@ -12,6 +12,7 @@ from dataclasses import replace
 from random import Random
 
 import pytest
+
 from zsched.core.messages import Accept, Accepted, Prepare, Promise, Refusal, Refused
 from zsched.core.model import MAX_COUNTER, Acceptance, Allocation, Ballot, RegisterState, Tuning, Weights
 from zsched.core.register import BACKOFF_CAP_S, MAX_JUMP, MoveOwner, Register, RoundOutcome, Step

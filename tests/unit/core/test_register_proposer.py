@@ -8,6 +8,7 @@ from dataclasses import replace
 from random import Random
 
 import pytest
+
 from zsched.core.messages import Accept, Prepare, Promise, Refused
 from zsched.core.model import Acceptance, Allocation, Ballot, RegisterState, Tuning, Weights
 from zsched.core.register import MoveOwner, Register, Retune, RoundOutcome, Step

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from random import Random
 
 import pytest
+
 from zsched.core.messages import Accept, Accepted, Prepare, Promise, Refused
 from zsched.core.model import Acceptance, Allocation, Ballot, RegisterState, Tuning, Weights
 from zsched.core.register import Change, MoveOwner, Register, Retune, RoundOutcome, Step

@@ -4,6 +4,7 @@ import random
 import time
 
 import pytest
+
 from zsched.core import keyexpr
 from zsched.core.fleet import StreamRule, TaskSpec
 from zsched.core.model import Tuning, Weights

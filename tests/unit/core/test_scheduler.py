@@ -3,6 +3,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import pytest
+
 from zsched.core.fleet import TaskSpec, WorkerSpec
 from zsched.core.model import (
     Allocation,

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import pytest
+
 from zsched.core.fleet import Demand, Fleet, NodeSpec, Standby, TaskSpec, Timing, WorkerSpec
 from zsched.core.gateway import Gateway
 from zsched.core.model import (

@@ -6,6 +6,7 @@ import pytest
 import zenoh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from zsched.core import keyexpr, templates
 from zsched.core.fleet import StreamRule, TaskSpec
 from zsched.core.model import Tuning, Weights

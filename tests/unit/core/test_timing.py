@@ -3,6 +3,7 @@
 from dataclasses import asdict, fields, replace
 
 import pytest
+
 from zsched.core.fleet import Timing
 from zsched.core.timing import PROFILES, WIFI, timing_faults
 

@@ -6,6 +6,7 @@ import math
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from zsched.core import fleet, scoring, utility
 from zsched.core.model import Weights
 from zsched.core.utility import (

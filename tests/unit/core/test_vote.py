@@ -3,6 +3,7 @@ from __future__ import annotations
 import itertools
 
 import pytest
+
 from zsched.core.model import Proposal
 from zsched.core.scoring import majority
 from zsched.core.vote import Tally, VoteOutcome, tally

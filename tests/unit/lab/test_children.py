@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+
 from zsched.lab.children import ChildError, Children
 from zsched.lab.janitor import SHARED_MEMORY, tagged_processes
 

@@ -5,6 +5,7 @@ import signal
 from pathlib import Path
 
 import pytest
+
 from zsched.lab.demo import DemoOptions, Interrupted, interruptible, run_demo
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+
 from zsched.lab.evaluate import RunFacts, evaluate, print_summary
 from zsched.lab.fleet_view import Load, Move
 from zsched.lab.plots import Timeline, difference, on_one_canvas, save_timeline, windowed_rate

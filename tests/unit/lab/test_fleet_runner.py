@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+
 from zsched.adapters.operator_socket import ask
 from zsched.config import load_fleet
 from zsched.errors import ConfigError

@@ -3,6 +3,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+
 from zsched.lab.fleet_view import Move, merge_moves, node_views, past_allocations, problems, task_view
 
 KINDS = {"edge1": "edge", "edge2": "edge", "robot1": "robot"}

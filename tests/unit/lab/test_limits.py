@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
+
 from zsched.adapters.cgroup import LimitedGroup
 from zsched.errors import AdapterError
 from zsched.lab.janitor import groups_of

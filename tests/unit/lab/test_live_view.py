@@ -4,6 +4,7 @@ import io
 
 import pytest
 from rich.console import Console
+
 from zsched.lab.fleet_view import FleetView, MapView, NodeView, TaskView
 from zsched.lab.live_view import PlainLines, cpu_bar, make_view, render
 

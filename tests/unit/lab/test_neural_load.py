@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from zsched.lab.neural_load import (
     LoadOptions,
     candidates,

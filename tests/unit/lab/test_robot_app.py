@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import zenoh
+
 from zsched.lab.laser_log import LaserLog, load_log, malaga_path
 from zsched.lab.recorder import read_records
 from zsched.lab.robot_app import Drive, parse

@@ -3,6 +3,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+
 from zsched.lab.recorder import Recorder
 from zsched.lab.robot_watch import RobotWatch
 

@@ -3,6 +3,7 @@ from __future__ import annotations
 import itertools
 
 import pytest
+
 from zsched.lab.schedule import Injection, SchedulePolicy, make_schedule, push_schedule, random_schedule
 
 NODES = ("edge1", "edge2", "edge3")

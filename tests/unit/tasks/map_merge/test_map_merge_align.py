@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+
 from zsched.tasks.map_merge.align import fit, prepare, refine
 from zsched.tasks.map_merge.geometry import Pose2, difference
 from zsched.tasks.map_merge.grid import Grid

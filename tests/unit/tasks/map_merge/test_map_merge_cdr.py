@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
+
 from zsched.tasks.map_merge.cdr import (
     CdrError,
     StampedTransform,

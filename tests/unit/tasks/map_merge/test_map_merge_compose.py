@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+
 from zsched.tasks.map_merge.compose import Extent, compose, extent_of, resample
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid, crop_known

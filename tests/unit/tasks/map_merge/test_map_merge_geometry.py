@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from zsched.tasks.map_merge.geometry import Pose2, difference, wrap_angle
 
 _metres = st.floats(-1e3, 1e3)

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
 from zsched.tasks.map_merge.geometry import Pose2, difference
 from zsched.tasks.map_merge.grid import Grid
 from zsched.tasks.map_merge.merger import MAX_ROBOTS, Merger, MergeResult, MergerSettings, Mode, RobotState, RobotStatus

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
+
 from zsched.tasks.map_merge.align import Fit
 from zsched.tasks.map_merge.geometry import Pose2, difference
 from zsched.tasks.map_merge.pairs import Alignment, Rule, broken_cycle, spanning_transforms

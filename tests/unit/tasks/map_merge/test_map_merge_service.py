@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+
 from zsched.tasks.map_merge.cdr import decode_grid, decode_transforms, encode_grid
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid

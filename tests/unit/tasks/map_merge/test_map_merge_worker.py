@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zenoh
+
 from zsched.adapters.streams import RelayHandle
 from zsched.core.events import SlotFlipped, SlotReady
 from zsched.core.plan import (

@@ -1,0 +1,63 @@
+"""Owner killed (its daemon, SIGKILL) -> first message through the new owner, as a robot's application sees it.
+
+``python -m benchmarks.failover [--n 40] [--timing wifi|wired]``. Six daemons on loopback with echo workers and a
+cool-down of 0; the application publishes at 200 Hz on its own key. Reported is the time from the kill to the first echo
+of a message that was sent after it: detection, vote, commit, handover, and one round trip through the new worker.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+
+from benchmarks.common import Pinger, line, machine
+from zsched.lab.testbed import Testbed, echo_fleet
+
+GOAL = "p99 300 ms"
+
+
+def measure(bed: Testbed, pinger: Pinger) -> float:
+    """One cycle: kill the owner, wait for echoes, bring it back; milliseconds."""
+    owner = bed.wait_settled()
+    start = time.monotonic()
+    bed.kill(owner)
+    after = bed.wait(lambda: pinger.first_after(start), 20, "an echo after the kill")
+    bed.start(owner)
+    bed.wait(lambda: bed.status(owner), 20, f"{owner} back")
+    bed.wait(lambda: _is_ready(bed, owner), 20, f"the worker on {owner}")
+    return ((after or start) - start) * 1000
+
+
+def _is_ready(bed: Testbed, node: str) -> bool:
+    for status in bed.status("robot1")["nodes"]:
+        if status["name"] == node:
+            states = [worker["state"] for worker in status["workers"]]
+            return bool(status["state"] == "alive" and states == ["ready"] and status["age_s"] < 1.5)
+    return False
+
+
+def main() -> None:
+    """Print the distribution."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--n", type=int, default=40)
+    parser.add_argument("--timing", default="wifi", choices=["wifi", "wired"])
+    arguments = parser.parse_args()
+    print(machine())
+    with tempfile.TemporaryDirectory() as folder, Testbed(Path(folder), echo_fleet(timing=arguments.timing)) as bed:
+        bed.init()
+        bed.start()
+        bed.wait_settled()
+        pinger = Pinger(bed, "robot1", hz=200)
+        bed.wait(lambda: len(pinger.received) > 50, 20, "echoes")
+        times = []
+        for number in range(arguments.n):
+            times.append(measure(bed, pinger))
+            print(f"  {number + 1}/{arguments.n}: {times[-1]:.0f} ms", flush=True)
+        pinger.stop()
+    print(line(f"owner killed -> first message ({arguments.timing})", times, "ms", GOAL))
+
+
+if __name__ == "__main__":
+    main()

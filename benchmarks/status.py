@@ -1,0 +1,53 @@
+"""`zsched status` wall time, process start included, on a fleet of six.
+
+``python -m benchmarks.status [--n 40]``. Beside it in the same run: a bare interpreter, the floor under any Python
+command.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from benchmarks.common import line, machine
+from zsched.lab.testbed import Testbed, echo_fleet
+
+
+def wall_ms(command: list[str]) -> float:
+    """Milliseconds of one run of ``command``."""
+    start = time.monotonic()
+    subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, timeout=30, check=False)
+    return (time.monotonic() - start) * 1000
+
+
+def main() -> None:
+    """Print the distributions, measured in turns."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--n", type=int, default=40)
+    arguments = parser.parse_args()
+    print(machine())
+    with tempfile.TemporaryDirectory() as folder, Testbed(Path(folder), echo_fleet()) as bed:
+        bed.init()
+        bed.start()
+        bed.wait_settled()
+        status = [sys.executable, "-m", "zsched.cli", "status", "--runtime-dir", folder, "--node", "robot1"]
+        commands = {
+            "python -c pass": [sys.executable, "-c", "pass"],
+            "zsched status": status,
+            "zsched status --json": [*status, "--json"],
+            "zsched status --node edge3 (over the mesh)": [*status[:-1], "edge3"],
+        }
+        times: dict[str, list[float]] = {name: [] for name in commands}
+        for _ in range(arguments.n):
+            for name, command in commands.items():
+                times[name].append(wall_ms(command))
+    for name, values in times.items():
+        print(line(name, values, "ms", "200 ms" if "status" in name else "-"))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,284 @@
+"""The house's floors: who may import whom, what the pure core may use, what the daemon and the CLI never load.
+
+Read from the sources with ast, so that imports inside functions and under TYPE_CHECKING count too. A new module needs a
+line in `FLOORS` (and a place in docs/architecture.md).
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+ROOT: Final = Path(__file__).parents[2]
+PACKAGE: Final = ROOT / "zsched"
+
+FLOORS: Final[tuple[tuple[str, int, str], ...]] = (
+    # pattern of the module's name below "zsched.", floor, room ("*": each module is a room of its own)
+    (r"__init__", 0, "version"),
+    (r"core(\..+)?", 1, "core"),
+    (r"(wire|keyspace|clock|errors|report|places|zenoh_config|relay_pipe|config|config_\w+)", 2, "seams"),
+    (r"adapters\.(worker_supervisor|worker_process|launch)", 3, "adapters: worker processes"),
+    (r"adapters\.(network_profiler|nl80211)", 3, "adapters: radio"),
+    (r"adapters\.(device_profiler|cgroup)", 3, "adapters: machine"),
+    (r"adapters(\.\w+)?", 3, "*"),
+    (r"relay(\..+)?", 3, "relay"),
+    (r"(worker|worker_\w+)", 3, "worker"),
+    (r"(daemon|shell|lifecycle)", 4, "daemon"),
+    (r"tasks(\.map_merge(\..+)?)?", 4, "tasks: map_merge"),
+    (r"lab(\..+)?", 5, "lab"),
+    (r"(cli|cli_\w+)", 6, "cli"),
+)
+"""A module imports lower floors and its own room, nothing else."""
+
+CORE_MAY: Final = frozenset(
+    [
+        "__future__",
+        "bisect",
+        "collections",
+        "collections.abc",
+        "dataclasses",
+        "enum",
+        "functools",
+        "hashlib",
+        "heapq",
+        "itertools",
+        "math",
+        "operator",
+        "random",
+        "re",
+        "statistics",
+        "types",
+        "typing",
+    ]
+)
+"""Pure parts of the standard library; ``random`` only for the type `Random` (generators come in seeded)."""
+IMPURE_CALLS: Final = frozenset({"open", "print", "input", "exec", "eval", "compile", "__import__", "Random", "id"})
+
+HEAVY: Final = frozenset({"numpy", "cv2", "matplotlib", "onnxruntime", "rich", "pydantic", "asyncio"})
+OUTSIDE: Final[dict[str, str]] = {
+    # library: who alone may import it, besides lab and tasks
+    "zenoh": r"adapters\.control_bus|relay\..+|worker|worker_\w+|zenoh_config",
+    "psutil": r"adapters\.\w+",
+    "msgpack": r"wire",
+    "ruamel": r"config_reader",
+    "typer": r"cli|cli_\w+",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Module:
+    """One source file: its name below ``zsched.`` and what it imports."""
+
+    name: str
+    tree: ast.Module
+
+    @property
+    def place(self) -> tuple[int, str]:
+        """(floor, room)."""
+        for pattern, floor, room in FLOORS:
+            if re.fullmatch(pattern, self.name):
+                return floor, self.name if room == "*" else room
+        raise AssertionError(f"zsched/{self.name.replace('.', '/')}.py has no floor: add it to FLOORS in {__file__}")
+
+    def imports(self, root: ast.AST | None = None) -> Iterator[str]:
+        """Full names of what is imported anywhere below ``root``, relative imports resolved, as written."""
+        for node in ast.walk(root or self.tree):
+            if isinstance(node, ast.Import):
+                yield from (alias.name for alias in node.names)
+            elif isinstance(node, ast.ImportFrom):
+                assert node.level == 0, f"{self.name}: relative import"
+                assert node.module is not None
+                yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def read_modules() -> dict[str, Module]:
+    modules = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        parts = path.relative_to(PACKAGE).with_suffix("").parts
+        name = ".".join(parts[:-1] if parts[-1] == "__init__" and len(parts) > 1 else parts)
+        modules[name] = Module(name=name, tree=ast.parse(path.read_text(encoding="utf-8")))
+    return modules
+
+
+MODULES: Final = read_modules()
+
+
+def targets(module: Module) -> set[str]:
+    """The modules of this house that ``module`` imports (a name imported from a module counts as that module)."""
+    found = set()
+    for full in module.imports():
+        parts = full.split(".")
+        if parts[0] != "zsched":
+            continue
+        names = [".".join(parts[1:end]) for end in range(len(parts), 1, -1)]
+        found.add(next((name for name in names if name in MODULES), "__init__"))
+    return found - {module.name}
+
+
+def faults_of_floor(module: Module) -> list[str]:
+    floor, room = module.place
+    places = {name: MODULES[name].place for name in targets(module)}
+    return [
+        f"{module.name} (floor {floor}) imports {name} (floor {other})"
+        for name, (other, other_room) in sorted(places.items())
+        if other >= floor and other_room != room
+    ]
+
+
+@pytest.mark.parametrize("name", sorted(MODULES))
+def test_module_imports_only_lower_floors_and_its_own_room(name: str) -> None:
+    assert faults_of_floor(MODULES[name]) == []
+
+
+def test_planted_import_of_a_higher_floor_is_found() -> None:
+    for name, line in (
+        ("core.model", "from zsched.wire import encode"),
+        ("wire", "def late():\n    import zsched.adapters.launch"),
+        ("adapters.state_file", "from zsched.adapters import control_bus"),
+        ("daemon", "from zsched.tasks.map_merge import grid"),
+        ("adapters.systemd", "from zsched import daemon"),
+    ):
+        assert faults_of_floor(Module(name=name, tree=ast.parse(line))), (name, line)
+
+
+def find_circle(graph: dict[str, set[str]]) -> list[str]:
+    """Some circle of imports, empty when there is none."""
+    done: set[str] = set()
+
+    def visit(name: str, path: list[str]) -> list[str]:
+        if name in path:
+            return [*path[path.index(name) :], name]
+        if name in done:
+            return []
+        for target in sorted(graph[name]):
+            circle = visit(target, [*path, name])
+            if circle:
+                return circle
+        done.add(name)
+        return []
+
+    return next((circle for name in sorted(graph) if (circle := visit(name, []))), [])
+
+
+def test_there_are_no_circles() -> None:
+    assert find_circle({name: targets(module) for name, module in MODULES.items()}) == []
+
+
+def test_planted_circle_is_found() -> None:
+    assert find_circle({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == ["b", "c", "b"]
+
+
+CORE: Final = sorted(name for name in MODULES if name.partition(".")[0] == "core")
+
+
+def faults_of_purity(module: Module) -> list[str]:
+    """What a module of the core uses that is not pure."""
+    faults = []
+    for full in module.imports():
+        if full.startswith("zsched.core"):
+            continue
+        home, _, item = full.rpartition(".")
+        if full not in CORE_MAY and home not in CORE_MAY:
+            faults.append(f"imports {full}")
+        elif "random" in (full, home) and item != "Random":
+            faults.append(f"imports {full}: only the type random.Random")
+    for node in ast.walk(module.tree):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in IMPURE_CALLS:
+            faults.append(f"line {node.lineno} calls {node.func.id}")
+        if isinstance(node, ast.AsyncFunctionDef | ast.Await | ast.Global):
+            faults.append(f"line {node.lineno}: {type(node).__name__}")
+    return faults
+
+
+@pytest.mark.parametrize("name", CORE)
+def test_core_is_pure(name: str) -> None:
+    assert faults_of_purity(MODULES[name]) == []
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "import time",
+        "from datetime import datetime",
+        "import random",
+        "from random import random",
+        "from random import Random\nrng = Random()",
+        "import zenoh",
+        "import os.path",
+        "import logging",
+        "def late():\n    from zsched import clock",
+        "open('x')",
+        "async def f(): ...",
+    ],
+)
+def test_planted_impurity_is_found(line: str) -> None:
+    assert faults_of_purity(Module(name="core.model", tree=ast.parse(line)))
+
+
+@pytest.mark.parametrize("name", sorted(MODULES))
+def test_outside_libraries_have_one_window_each(name: str) -> None:
+    module = MODULES[name]
+    if module.place[1].partition(":")[0] in {"lab", "tasks"}:
+        return
+    libraries = {full.partition(".")[0] for full in module.imports()}
+    assert not libraries & HEAVY
+    strays = {lib for lib in libraries & set(OUTSIDE) if not re.fullmatch(OUTSIDE[lib], name)}
+    assert strays == set()
+
+
+@pytest.mark.parametrize("name", sorted(name for name in MODULES if name.startswith("cli")))
+def test_cli_imports_lab_and_tasks_only_inside_commands(name: str) -> None:
+    module = MODULES[name]
+    top = [node for node in module.tree.body if isinstance(node, ast.Import | ast.ImportFrom)]
+    early = [full for node in top for full in module.imports(node)]
+    assert [full for full in early if full.startswith(("zsched.lab", "zsched.tasks"))] == []
+
+
+PROGRAMS: Final[dict[str, str]] = {
+    "daemon": "import zsched.daemon",
+    "relay": "import zsched.relay.__main__, zsched.relay.process",
+    "worker": "import zsched.worker",
+    "cli": "import zsched.cli",
+    "cli check": "sys.argv[1:] = ['check', 'configs/fleet.yaml']; import zsched.cli; run(zsched.cli.main)",
+    "cli help": "sys.argv[1:] = ['--help']; import zsched.cli; run(zsched.cli.main)",
+    "cli version": "sys.argv[1:] = ['version']; import zsched.cli; run(zsched.cli.main)",
+}
+LOADER: Final = """
+import contextlib, io, json, sys
+def run(main):
+    with contextlib.suppress(SystemExit), contextlib.redirect_stdout(io.StringIO()):
+        main()
+{program}
+print(json.dumps(sorted({{name.partition(".")[0] for name in sys.modules}}
+    | {{name for name in sys.modules if name in ("zsched.lab", "zsched.tasks")}})))
+"""
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_program_never_loads_what_is_heavy(program: str) -> None:
+    """Idle memory is a feature on a robot: what is really in ``sys.modules`` after the import (and the command)."""
+    needed = {f"{name}" for name in re.findall(r"zsched\.(\w+(?:\.\w+)?)", PROGRAMS[program])} - {"cli.main"}
+    missing = [name for name in needed if name not in MODULES and not (PACKAGE / name).is_dir()]
+    if any(name.removesuffix(".__main__") not in MODULES for name in missing):
+        pytest.skip(f"not written yet: {missing}")
+    done = subprocess.run(
+        [sys.executable, "-c", LOADER.format(program=PROGRAMS[program])],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    loaded = set(json.loads(done.stdout.splitlines()[-1]))
+    assert "zsched" in loaded
+    assert loaded & (HEAVY | {"zsched.lab", "zsched.tasks"}) == set()
