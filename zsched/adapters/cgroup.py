@@ -179,13 +179,22 @@ class LimitedGroup:
         self.folders = folders
 
     @classmethod
-    def create(cls, name: str, *, cpu_cores: float | None = None, memory_mb: float | None = None) -> LimitedGroup:
+    def create(
+        cls,
+        name: str,
+        *,
+        cpu_cores: float | None = None,
+        memory_mb: float | None = None,
+        tree: CgroupTree | None = None,
+    ) -> LimitedGroup:
         """Make a group inside this process's own (v2: inside the nearest ancestor that may have children).
+
+        ``tree`` is this process's but in tests.
 
         Raises:
             AdapterError: the user may not, or the machine has no such controller; nothing is left behind.
         """
-        tree = CgroupTree()
+        tree = tree or CgroupTree()
         values = _settings(tree, cpu_cores, memory_mb)
         parents = {controller: _parent(tree, controller, tuple(values)) for controller in values}
         group = cls(tuple(dict.fromkeys(parent / name for parent in parents.values())))

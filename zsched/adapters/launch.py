@@ -9,7 +9,6 @@ Knows: prctl(2), signals, exec. Does not know: tasks, supervisors, or any other 
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
 import signal
 import sys
@@ -28,6 +27,8 @@ def tie_to_parent(parent: int) -> bool:
 
     The kernel watches the parent's *thread* (prctl(2)), so the caller must start us from one that stays.
     """
+    import ctypes  # noqa: PLC0415 - here, so that the daemon, which wants our constants only, need not load it
+
     ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     return os.getppid() == parent
 

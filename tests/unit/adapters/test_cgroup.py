@@ -123,6 +123,41 @@ def test_no_group_or_a_strange_one_is_no_limit(tmp_path: Path, membership: str) 
     assert found.memory_quota() is None
 
 
+V2_GROUPS = {
+    "cgroup.controllers": "cpu memory pids\n",
+    "cgroup.subtree_control": "memory\n",
+    "cgroup.procs": "1\n",  # the root group may have both processes and limited children
+    "user/cgroup.type": "domain\n",
+    "user/cgroup.controllers": "memory pids\n",
+    "user/cgroup.procs": "",
+    "user/session/cgroup.type": "domain\n",
+    "user/session/cgroup.controllers": "cpu memory\n",
+    "user/session/cgroup.procs": "77\n",
+}
+
+
+def test_v2_group_is_made_in_the_nearest_ancestor_that_may_have_it(tmp_path: Path) -> None:
+    found = tree(tmp_path, V2, "0::/user/session\n", V2_GROUPS)
+    top = tmp_path / "sys/fs/cgroup"
+    group = LimitedGroup.create("edge1", cpu_cores=0.5, memory_mb=64, tree=found)
+    assert group.folders == (top / "edge1",)
+    assert (top / "edge1/cpu.max").read_text() == "10000 20000"
+    assert (top / "edge1/memory.max").read_text() == str(64 * 2**20)
+    assert (top / "user/cgroup.subtree_control").exists() is False
+    only_memory = LimitedGroup.create("edge2", memory_mb=64, tree=found)
+    assert only_memory.folders == (top / "user/edge2",)
+    assert (top / "user/cgroup.subtree_control").read_text() == "+memory"
+
+
+def test_v2_group_without_a_place_is_refused_with_advice(tmp_path: Path) -> None:
+    groups = V2_GROUPS | {"cgroup.controllers": "pids\n", "user/cgroup.controllers": "pids\n"}
+    found = tree(tmp_path, V2, "0::/user/session\n", groups)
+    with pytest.raises(AdapterError, match="systemd-run --user"):
+        LimitedGroup.create("edge1", cpu_cores=0.5, tree=found)
+    with pytest.raises(AdapterError, match="no cpu control groups"):
+        LimitedGroup.create("edge1", cpu_cores=0.5, tree=CgroupTree(tmp_path / "nowhere"))
+
+
 def test_real_group_is_made_limits_a_process_and_is_removed() -> None:
     reason = LimitedGroup.why_not()
     if reason is not None:
