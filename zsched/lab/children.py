@@ -126,15 +126,18 @@ class Children:
         return child
 
     def stop(self, *children: Child, grace_s: float = STOP_GRACE_S) -> None:
-        """SIGTERM to each group at once, SIGKILL to those that stay longer than ``grace_s``; reaped when it returns."""
+        """SIGTERM to each at once, SIGKILL to their groups when they ended or after ``grace_s``; reaped on return.
+
+        The leader alone is asked to stop: what it started is its own to end, in its own order.
+        """
         for child in children:
-            send(child, signal.SIGTERM)
+            child.process.send_signal(signal.SIGTERM)
         end = time.monotonic() + grace_s
         for child in children:
             wait_unreaped(child, end)
         for child in children:
             # Also to those that ended: what they started may have stayed in their group.
-            send(child, signal.SIGKILL)
+            kill_group(child)
             child.process.wait()
             self._children.pop(child.name, None)
 
@@ -163,12 +166,12 @@ class Children:
         self.left_behind = self.janitor.finish()
 
 
-def send(child: Child, number: signal.Signals) -> None:
-    """Signal the child's whole process group, unless it was reaped (its number may then be another's)."""
+def kill_group(child: Child) -> None:
+    """SIGKILL to the child's process group, unless it was reaped (its number may then be another's)."""
     if child.process.returncode is not None:
         return
     with contextlib.suppress(ProcessLookupError, PermissionError):
-        os.killpg(child.process.pid, number)
+        os.killpg(child.process.pid, signal.SIGKILL)
 
 
 def wait_unreaped(child: Child, end: float) -> None:

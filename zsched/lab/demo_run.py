@@ -37,6 +37,8 @@ SAMPLE_S = 0.5
 DRIVE_END_RATIO = 0.86
 """The robots' drives end here, so that their last maps are merged and come back before the run ends."""
 MIN_DRIVE_S = 8.0
+REASON_S = 0.8
+"""A move is told so late, that the daemon that knows why has been asked too (the others learnt it from a peer)."""
 TRUTH_S = 90.0
 """So long the truth may still take after the run (long logs on slow machines)."""
 EDGE_CORES = (0.4, 0.5, 0.5)
@@ -83,7 +85,7 @@ class DemoRun:
         self._plan = plan
         self._children = children
         self._view = view
-        self._events: deque[str] = deque(maxlen=200)
+        self._events: deque[tuple[float, str]] = deque(maxlen=200)
         self._told_epoch = 0
         self._cpu: dict[NodeId, list[tuple[float, float]]] = {}
         self._memory: dict[NodeId, list[tuple[float, float]]] = {}
@@ -134,7 +136,7 @@ class DemoRun:
 
     def _tell(self, t_s: float, text: str) -> None:
         """Show and keep one event."""
-        self._events.append(f"{t_s:6.1f} s  {text}")
+        self._events.append((t_s, text))
         self._recorder.write("events", {"kind": "event", "t_s": self._start_s + t_s, "text": text})
         self._view.event(t_s, text)
 
@@ -171,7 +173,7 @@ class DemoRun:
     def _tell_moves(self) -> None:
         moves = self._moves()
         for index, move in enumerate(moves):
-            if move.epoch <= self._told_epoch:
+            if move.epoch <= self._told_epoch or self._now_s() - move.t_s < REASON_S:
                 continue
             self._told_epoch = move.epoch
             why = f": {move.reason}" if move.reason else ""
@@ -214,7 +216,7 @@ class DemoRun:
             task=task,
             maps=tuple(watch.view(monotonic_s()) for watch in self._robots),
             moves=max(0, self._told_epoch - 1),
-            events=tuple(self._events),
+            events=tuple(f"{t_s:6.1f} s  {text}" for t_s, text in sorted(self._events)),
             problems=faults,
         )
 

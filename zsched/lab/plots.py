@@ -219,7 +219,11 @@ def draw_cpu(axis: Axes, timeline: Timeline, colours: Mapping[NodeId, str]) -> N
     axis.set_yticks([0, 25, 50, 75, 100])
     axis.set_ylabel("CPU in use [%]", fontsize=10)
     axis.legend(loc="upper right", ncols=len(timeline.candidates), fontsize=9, framealpha=0.9)
-    axis.set_title("CPU of the candidates, of what each may use (shaded: load injected there)", fontsize=10, loc="left")
+    axis.set_title(
+        "CPU of the candidates, of what each may use, as its daemon smooths it (shaded: load injected there)",
+        fontsize=10,
+        loc="left",
+    )
 
 
 def draw_rate(axis: Axes, timeline: Timeline) -> None:
