@@ -22,7 +22,7 @@ ROOT: Final = Path(__file__).parents[2]
 PACKAGE: Final = ROOT / "zsched"
 
 FLOORS: Final[tuple[tuple[str, int, str], ...]] = (
-    # pattern of the module's name below "zsched.", floor, room ("*": each module is a room of its own)
+    # pattern of the module's name below "zsched.", floor, room ("*": each module is one of its own; \\1: the group)
     (r"__init__", 0, "version"),
     (r"core(\..+)?", 1, "core"),
     (r"(wire|keyspace|clock|errors|report|places|zenoh_config|relay_pipe|config|config_\w+)", 2, "seams"),
@@ -33,35 +33,20 @@ FLOORS: Final[tuple[tuple[str, int, str], ...]] = (
     (r"relay(\..+)?", 3, "relay"),
     (r"(worker|worker_\w+)", 3, "worker"),
     (r"(daemon|shell|lifecycle)", 4, "daemon"),
-    (r"tasks(\.map_merge(\..+)?)?", 4, "tasks: map_merge"),
+    (r"tasks(?:\.(\w+))?(?:\..+)?", 4, "tasks: \\1"),
     (r"lab(\..+)?", 5, "lab"),
     (r"(cli|cli_\w+)", 6, "cli"),
 )
 """A module imports lower floors and its own room, nothing else."""
 
 CORE_MAY: Final = frozenset(
-    [
-        "__future__",
-        "bisect",
-        "collections",
-        "collections.abc",
-        "dataclasses",
-        "enum",
-        "functools",
-        "hashlib",
-        "heapq",
-        "itertools",
-        "math",
-        "operator",
-        "random",
-        "re",
-        "statistics",
-        "types",
-        "typing",
-    ]
+    {
+        *("__future__", "bisect", "collections", "collections.abc", "dataclasses", "enum", "functools", "hashlib"),
+        *("heapq", "itertools", "math", "operator", "random", "re", "statistics", "types", "typing"),
+    }
 )
 """Pure parts of the standard library; ``random`` only for the type `Random` (generators come in seeded)."""
-IMPURE_CALLS: Final = frozenset({"open", "print", "input", "exec", "eval", "compile", "__import__", "Random", "id"})
+IMPURE_CALLS: Final = frozenset({"open", "print", "input", "exec", "eval", "compile", "__import__", "Random"})
 
 HEAVY: Final = frozenset({"numpy", "cv2", "matplotlib", "onnxruntime", "rich", "pydantic", "asyncio"})
 OUTSIDE: Final[dict[str, str]] = {
@@ -85,8 +70,9 @@ class Module:
     def place(self) -> tuple[int, str]:
         """(floor, room)."""
         for pattern, floor, room in FLOORS:
-            if re.fullmatch(pattern, self.name):
-                return floor, self.name if room == "*" else room
+            match = re.fullmatch(pattern, self.name)
+            if match is not None:
+                return floor, self.name if room == "*" else match.expand(room)
         raise AssertionError(f"zsched/{self.name.replace('.', '/')}.py has no floor: add it to FLOORS in {__file__}")
 
     def imports(self, root: ast.AST | None = None) -> Iterator[str]:
@@ -145,6 +131,7 @@ def test_planted_import_of_a_higher_floor_is_found() -> None:
         ("wire", "def late():\n    import zsched.adapters.launch"),
         ("adapters.state_file", "from zsched.adapters import control_bus"),
         ("daemon", "from zsched.tasks.map_merge import grid"),
+        ("tasks.other", "from zsched.tasks.map_merge import grid"),
         ("adapters.systemd", "from zsched import daemon"),
     ):
         assert faults_of_floor(Module(name=name, tree=ast.parse(line))), (name, line)
