@@ -11,14 +11,9 @@ thread, for everything a merge takes: preparing the changed maps, aligning, comp
 from __future__ import annotations
 
 import argparse
-import os
 import platform
-from pathlib import Path
-
-for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[_name] = "1"
-
 import time
+from pathlib import Path
 
 import cv2
 import numpy as np

@@ -46,10 +46,8 @@ def test_shipped_log_has_its_notice() -> None:
     assert "Redistribution and use" in notice
 
 
-@pytest.mark.parametrize(
-    ("beams", "step"), [(180, math.pi / 180), (181, math.pi / 180), (360, math.pi / 360), (361, math.pi / 360)]
-)
-def test_carmen_beam_step_by_number(tmp_path: Path, beams: int, step: float) -> None:
+@pytest.mark.parametrize(("beams", "degrees"), [(180, 1.0), (181, 1.0), (360, 0.5), (361, 0.5)])
+def test_carmen_beam_step_by_number(tmp_path: Path, beams: int, degrees: float) -> None:
     (scan,) = load_log(_carmen(tmp_path, _flaser(beams))).scans
     assert np.degrees(np.diff(scan.angles)) == pytest.approx(degrees)
     assert scan.angles[0] == pytest.approx(-math.pi / 2)

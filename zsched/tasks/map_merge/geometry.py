@@ -50,8 +50,10 @@ class Pose2:
     def apply(self, points: FloatArray) -> FloatArray:
         """Take points (N, 2) of this frame to the parent frame."""
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
-        rotation = np.array([[cos, sin], [-sin, cos]])
-        moved: FloatArray = points @ rotation + (self.x, self.y)
+        x, y = points[:, 0], points[:, 1]
+        moved: FloatArray = np.empty_like(points)
+        moved[:, 0] = cos * x - sin * y + self.x
+        moved[:, 1] = sin * x + cos * y + self.y
         return moved
 
     def apply_point(self, x: float, y: float) -> tuple[float, float]:

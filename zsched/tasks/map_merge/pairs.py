@@ -111,6 +111,7 @@ class PairBook:
         self._hints = hints
         self._is_rechecking = is_rechecking
         self._states: dict[Pair, _PairState] = {}
+        self.searches = 0
 
     @property
     def accepted(self) -> tuple[Alignment, ...]:
@@ -213,6 +214,7 @@ class PairBook:
 
     def _search(self, state: _PairState, pair: Pair, a: WallMap, b: WallMap) -> None:
         held = state.accepted
+        self.searches += 1
         found = estimate(a, b, None if held is None else held.fit.a_t_b)
         if found is None:
             return
