@@ -7,6 +7,7 @@ from dataclasses import replace
 from random import Random
 
 import pytest
+
 from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
 from zsched.core.gateway import Gateway
 from zsched.core.instructions import AskUtilities, Instruction, PublishProposal
@@ -38,7 +39,7 @@ SPEC = TaskSpec(
 ROBOTS = ("robot1", "robot2", "robot3")
 FLEET = Fleet(
     name="lab",
-    timing=Timing(),
+    timing=Timing(profile_ttl_s=60.0),  # one set of edge data lasts for a test
     nodes=(
         *(NodeSpec(name=name, kind=NodeKind.EDGE) for name in SPEC.candidates),
         *(NodeSpec(name=name, kind=NodeKind.ROBOT) for name in ROBOTS),
@@ -81,7 +82,7 @@ def row(robot: str, revision: int = 4, **utilities: float) -> UtilityVector:
 
 
 def answer(robot: str, **utilities: float) -> Utilities:
-    return Utilities(voter=robot, vectors=(row(robot, **utilities),))
+    return Utilities(voter=robot, vectors=(row(robot, 4, **utilities),))
 
 
 def proposals(out: tuple[Instruction, ...]) -> list[Proposal]:
@@ -203,7 +204,7 @@ def test_every_robot_with_the_same_utilities_finds_the_same_maximum() -> None:
 
 
 def decided(judge: Judge, owner: str, now: float, **aggregates: float) -> str | None:
-    rows = {robot: row(robot, **aggregates) for robot in ROBOTS}
+    rows = {robot: row(robot, 4, **aggregates) for robot in ROBOTS}
     agreed = allocation(owner)
     judgement = judge.judge(
         compare(SPEC, agreed, rows), agreed, settled_for_s=now, escape=None, is_called=False, now=now
@@ -285,13 +286,14 @@ def test_an_owner_that_is_gone_is_left_at_once() -> None:
 # --- the proposal --------------------------------------------------------------------------------------------------
 
 
-def lead_for(rounds: Rounds, seconds: float, *, heard: int = 3) -> list[Proposal]:
+def lead_for(rounds: Rounds, seconds: float, *, heard: int = 3, start: float = SETTLED_S) -> list[Proposal]:
     """Gathers in which everybody heard prefers edge2."""
     made: list[Proposal] = []
-    values, until = {"merge": allocation()}, SETTLED_S + seconds
-    now = SETTLED_S
-    while now < until:
-        for step in rounds.tick(values, ALIVE, now):
+    values, now = {"merge": allocation()}, start
+    while now < start + seconds:
+        out = rounds.tick(values, ALIVE, now)
+        made += proposals(out)
+        for step in out:
             if isinstance(step, AskUtilities):
                 for robot in ROBOTS[1:heard]:
                     rounds.absorb_utilities(step.gather, answer(robot, edge1=0.2, edge2=0.8))
@@ -302,16 +304,15 @@ def lead_for(rounds: Rounds, seconds: float, *, heard: int = 3) -> list[Proposal
 
 def robot1() -> Rounds:
     gateway = gateway_with(edge1=(0.8, 0.8), edge2=(0.2, 0.2))
-    return Rounds(replace(FLEET, timing=replace(Timing(), profile_ttl_s=60.0)), "robot1", gateway, Random(1), 0.0)
+    return Rounds(FLEET, "robot1", gateway, Random(1), 0.0)
 
 
 def test_the_scheduler_proposes_its_maximum_to_the_executors() -> None:
     """Sec. V: after determining max_e the scheduler proposes it, here with the revision that it is based on."""
     rounds = robot1()
-    rounds._gateway._ttl_s = 60.0
 
     assert lead_for(rounds, 1.5) == []
-    proposal = lead_for(rounds, 4.0)[0]
+    proposal = lead_for(rounds, 1.5, start=SETTLED_S + 1.5)[0]
     assert (proposal.voter, proposal.candidate, proposal.base_revision) == ("robot1", "edge2", 4)
     assert proposal.aggregate == pytest.approx(0.8)
     assert "leads" in proposal.reason
@@ -324,6 +325,6 @@ def test_no_proposal_with_fewer_fresh_voters_than_a_majority() -> None:
 
     call = Proposal(voter="robot2", task="merge", base_revision=4, candidate="edge2", aggregate=0.8)
     alone.absorb_proposal(call, allocation(), ALIVE, SETTLED_S + 5.0)
-    assert lead_for(alone, 6.0, heard=1) == [], "not even staying is its to propose"
+    assert lead_for(alone, 1.0, heard=1, start=SETTLED_S + 5.0) == [], "not even staying is its to propose"
     assert alone.tasks["merge"].judgement is not None
     assert alone.tasks["merge"].judgement.reason == "utilities of 1 robots, 2 needed"

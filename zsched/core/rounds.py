@@ -206,7 +206,7 @@ class Rounds:
         out: list[Instruction] = [*self._tell(task, judgement, allocation)]
         if task.commit is not None:
             return out
-        if judgement.outcome is Outcome.PROPOSE or (is_called and allocation.owner is not None):
+        if judgement.outcome is Outcome.PROPOSE or is_called:
             out += self._propose(task, judgement, allocation, states, now)
         return out
 
@@ -269,8 +269,8 @@ class Rounds:
         states: Mapping[NodeId, PeerState],
         now: float,
     ) -> list[Instruction]:
-        candidate = judgement.candidate or allocation.owner
-        if candidate is None:
+        candidate = judgement.candidate
+        if candidate is None:  # too few robots heard: not even staying is ours to propose
             return []
         proposal = Proposal(
             voter=self._me,
