@@ -35,6 +35,8 @@ INTAKE_WINDOW_S = 0.1
 POLL_S = 0.05
 """How often exits are looked for on kernels without pidfd."""
 
+CONTROLS = {code: "\N{REPLACEMENT CHARACTER}" for code in (*range(32), *range(127, 160)) if code != 9}
+
 GUARD_SCRIPT = (
     "groups=' '; while read -r sign group; do case $sign in "
     '+) groups="$groups$group ";; -) groups="${groups%% $group *} ${groups#* $group }";; esac; done; '
@@ -81,10 +83,10 @@ class LineLog:
         self._tokens -= 1.0
         self._remember(line[:MAX_LINE_BYTES])
         cut = " ..." if len(line) > MAX_LINE_BYTES else ""
-        self._logger.info("%s%s", line[:MAX_LINE_BYTES].decode(errors="replace").rstrip(), cut)
+        self._logger.info("%s%s", _printable(line[:MAX_LINE_BYTES]).rstrip(), cut)
 
     def _remember(self, line: bytes) -> None:
-        text = line.decode(errors="replace").strip()
+        text = _printable(line).strip()
         self.last_line = text or self.last_line
 
     def _refill(self, now: float) -> None:
@@ -306,6 +308,11 @@ class ProcessWatch:
         self._selector.unregister(process.output_fd)
         if is_open and resume_s is not None:
             self._paused[process] = resume_s
+
+
+def _printable(line: bytes) -> str:
+    """A line as text that cannot command the reader's terminal."""
+    return line.decode(errors="replace").rstrip("\r\n").translate(CONTROLS)
 
 
 def _own_python(command: Sequence[str]) -> tuple[str, ...]:

@@ -39,6 +39,8 @@ from zsched.core.model import NodeId, TaskId, WorkerState
 log = logging.getLogger("zsched.worker")
 
 INCARNATIONS_PER_DAEMON = 100_000
+MAX_REASON = 200
+"""Characters of a worker's last line that go into the reason of its exit."""
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
 NOT_INHERITED = frozenset({"NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID", "LISTEN_FDS", "LISTEN_PID"})
 """systemd talks to the daemon, not to its workers."""
@@ -381,5 +383,5 @@ class WorkerSupervisor:
 def _describe_exit(returncode: int, last_line: str) -> str:
     if returncode < 0:
         return f"killed by signal {-returncode} ({signal.strsignal(-returncode)})"
-    said = f": {last_line}" if last_line else ""
+    said = f": {last_line[:MAX_REASON]}" if last_line else ""
     return f"exited with status {returncode}{said}"

@@ -17,7 +17,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from zsched.adapters.worker_process import LINES_BURST, LineLog
+from zsched.adapters.worker_process import LINES_BURST, LineLog, WorkerGuard
 from zsched.adapters.worker_supervisor import RestartPolicy, WorkerContext, WorkerSupervisor
 from zsched.core.fleet import WorkerSpec
 from zsched.core.model import WorkerState
@@ -302,6 +302,14 @@ def test_line_log_cuts_long_lines_and_counts_suppressed_ones(caplog: pytest.LogC
     assert caplog.messages[-1] == f"suppressed lines={2002 - int(LINES_BURST) + 4} limit_per_s=50"
 
 
+def test_line_log_disarms_control_characters(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "flood")
+    lines = LineLog(logging.getLogger("flood"))
+    lines.feed(b"\x1b[2Jgone\tbad: \xff\r\n", 0.0)
+    assert caplog.messages == ["\ufffd[2Jgone\tbad: \ufffd"]
+    assert lines.last_line == caplog.messages[0]
+
+
 def test_restart_delays_double_up_to_the_cap_with_jitter() -> None:
     policy, rng = RestartPolicy(first_s=0.5, most_s=10.0, jitter_ratio=0.2), random.Random(3)
     delays = [policy.delay_s(n, rng) for n in range(1, 9)]
@@ -343,3 +351,54 @@ def test_workers_and_their_children_die_with_a_killed_daemon(tmp_path: Path) -> 
         daemon.wait(timeout=5.0)
         wait_until(lambda: not any(is_running(pid) for pid in (worker, grandchild, *guards)), timeout_s=2.0)
     assert len(guards) == 1
+
+
+def test_environment_that_cannot_be_made_is_a_failure_of_that_worker() -> None:
+    def broken(task: str) -> dict[str, str]:
+        raise OSError(f"no folder for {task}")
+
+    recorder = Recorder()
+    supervisor = WorkerSupervisor(
+        specs={"merge": python(SLEEP)},
+        context=WorkerContext(fleet="hall", node="edge1", incarnation=1),
+        events=recorder,
+        environment=broken,
+        policy=QUICK,
+    )
+    supervisor.start("merge")
+    assert recorder.wait("failed") == ("failed", "merge", "cannot start: no folder for merge")
+    assert [call[0] for call in recorder.calls] == ["failed"]
+    supervisor.close()
+
+
+def test_kernel_without_pidfd_is_polled(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(_pid: int) -> int:
+        raise OSError(38, "Function not implemented")
+
+    monkeypatch.setattr(os, "pidfd_open", refused)
+    with supervised(python("raise SystemExit(5)")) as (supervisor, recorder):
+        supervisor.start("merge")
+        assert recorder.wait("failed")[2] == "exited with status 5"
+
+
+def test_guard_that_was_killed_is_replaced_and_knows_all_groups() -> None:
+    with (
+        subprocess.Popen(["sleep", "60"], start_new_session=True) as first,
+        subprocess.Popen(["sleep", "60"], start_new_session=True) as second,
+        subprocess.Popen(["sleep", "60"], start_new_session=True) as forgotten,
+    ):
+        try:
+            guard = WorkerGuard()
+            guard.add(first.pid)
+            (shell,) = (child for child in psutil.Process().children() if "zsched-guard" in child.cmdline())
+            shell.kill()
+            shell.wait(timeout=5)
+            guard.add(forgotten.pid)
+            guard.add(second.pid)
+            guard.discard(forgotten.pid)
+            guard.close()
+            assert (first.wait(timeout=5), second.wait(timeout=5)) == (-signal.SIGKILL, -signal.SIGKILL)
+            assert forgotten.poll() is None
+        finally:
+            for process in (first, second, forgotten):
+                process.kill()
