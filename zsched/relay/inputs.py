@@ -81,6 +81,14 @@ class InputStream:
             slot.sent = 0  # whatever went there before, this worker has not had it
             return self._catch_up(slot)
 
+    def is_behind(self, epoch: int) -> bool:
+        """True when a kept value has changed since the slot was warmed up: what it made of the old one is stale."""
+        with self._lock:
+            slot = self._slots.get(epoch)
+            return slot is not None and any(
+                number > slot.sent for values in self._kept.values() for number, _ in values
+            )
+
     def flip(self, epoch: int) -> int:
         """Feed the slot from now on, behind the kept values it has not had; answers how many those were."""
         with self._lock:

@@ -108,12 +108,19 @@ class OutputStream:
             with_history=has_epoch,
         )
 
-    def flip(self, epoch: int) -> None:
-        """Let the slot's samples through, by the stream's handover rule."""
+    def flip(self, epoch: int, *, drops_held: bool) -> None:
+        """Let the slot's samples through, by the stream's handover rule.
+
+        ``drops_held``: what it made of warm-up values is older than what the carrier has let through meanwhile.
+        """
         with self._lock:
             slot = self._slots.get(epoch)
             if slot is None or slot.is_flipped:
                 return
+            if drops_held:
+                self._counter.dropped("superseded", len(slot.held))
+                slot.held.clear()
+                slot.held_bytes = 0
             slot.is_flipped = True
             if self._carrier is None or (slot.held and self.route.settings.handover is HandoverRule.LATEST):
                 self._take_over(slot)

@@ -85,12 +85,13 @@ def _subscribe(session: Session, expr: str, settings: StreamSettings, *, with_hi
     if settings.stream_class is StreamClass.RELIABLE:
         fifo: zenoh.handlers.FifoChannel[Sample] = zenoh.handlers.FifoChannel(max(settings.depth, 256))
         return session.declare_subscriber(expr, fifo, allowed_origin=remote)
-    keep = max(1, settings.keep_last)
+    # While history is being asked for, zenoh holds at most ``max_samples`` live ones: as many as the ring, or some go.
+    history = ext.HistoryConfig(detect_late_publishers=True, max_samples=max(settings.depth, settings.keep_last))
     return ext.declare_advanced_subscriber(
         session,
         expr,
         ring,
         allowed_origin=remote,
-        history=ext.HistoryConfig(detect_late_publishers=True, max_samples=keep) if with_history else None,
+        history=history if with_history and settings.keep_last else None,
         recovery=ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
     )

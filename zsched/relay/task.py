@@ -237,8 +237,9 @@ class TaskRelay:
         if state.is_flipped:
             return
         epoch = state.slot.epoch
+        is_behind = any(source.is_behind(epoch) for source in self._inputs.values())
         for sink in self._outputs.values():
-            sink.flip(epoch)
+            sink.flip(epoch, drops_held=is_behind)
         replayed = sum(source.flip(epoch) for source in self._inputs.values())
         state.is_flipped = True
         if not is_reported:

@@ -1,0 +1,81 @@
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+import zenoh
+
+from zsched.core.fleet import Timing, WorkerLink
+from zsched.zenoh_config import client_config, control_config, data_config, worker_config
+
+HERE, THERE = "tcp/127.0.0.1:7457", "tcp/127.0.0.1:7458"
+TIMING = Timing(zenoh_lease_s=1.25)
+
+
+def read(text: str, path: str) -> Any:
+    value = zenoh.Config.from_json5(text).get_json(path)
+    return json.loads(value) if isinstance(value, str) else value
+
+
+ALL = {
+    "control": control_config(listen=(HERE,), connect=(THERE,), timing=TIMING),
+    "data": data_config(listen=(HERE,), connect=(THERE,), timing=TIMING),
+    "worker": worker_config(connect=(THERE,), timing=TIMING),
+    "worker by client": worker_config(connect=(THERE,), timing=TIMING, link=WorkerLink.CLIENT),
+    "client": client_config(connect=(THERE,), timing=TIMING),
+}
+
+
+@pytest.mark.parametrize("text", ALL.values(), ids=ALL.keys())
+def test_every_session_scouts_nowhere_and_has_our_lease(text: str) -> None:
+    assert read(text, "scouting/multicast/enabled") is False
+    assert read(text, "transport/link/tx/lease") == 1250
+    assert read(text, "timestamping/enabled") is False
+    assert read(text, "id") is None  # random: a fixed one keeps a restarted node out for a lease
+
+
+@pytest.mark.parametrize("name", ["control", "data", "worker"])
+def test_peers_gossip_and_retry_quickly(name: str) -> None:
+    assert read(ALL[name], "mode") == "peer"
+    assert read(ALL[name], "scouting/gossip/enabled") is True
+    assert read(ALL[name], "connect/retry")["period_init_ms"] == 200
+    assert read(ALL[name], "connect/exit_on_failure") is False
+
+
+def test_only_data_has_small_buffers_and_shared_memory() -> None:
+    assert read(ALL["control"], "listen/endpoints") == [HERE]
+    assert read(ALL["data"], "listen/endpoints") == [f"{HERE}#so_sndbuf=65536"]
+    assert read(ALL["control"], "transport/shared_memory/enabled") is False
+    assert read(ALL["control"], "transport/link/rx/max_message_size") == 1 << 20
+    assert read(ALL["data"], "transport/shared_memory/enabled") is True
+    assert read(ALL["data"], "transport/shared_memory/transport_optimization/messages") == ["put"]
+    off = data_config(listen=(HERE,), connect=(), shared_memory=False)
+    assert read(off, "transport/shared_memory/enabled") is False
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "expected"),
+    [
+        ("tcp/[::]:1#iface=wlan0", "tcp/[::]:1#iface=wlan0;so_sndbuf=65536"),
+        ("tcp/[::]:1#so_sndbuf=9000", "tcp/[::]:1#so_sndbuf=9000"),
+        ("unixsock-stream/tmp/z", "unixsock-stream/tmp/z"),
+    ],
+)
+def test_an_endpoint_keeps_what_the_operator_said(endpoint: str, expected: str) -> None:
+    assert json.loads(data_config(listen=(endpoint,), connect=()))["listen"]["endpoints"] == [expected]
+
+
+def test_the_operators_file_lies_underneath() -> None:
+    theirs = (
+        "{ /* ours wins */ mode: 'router', transport: {link: {tx: {queue: {size: {data: 4}}}}}, namespace: 'site' }"
+    )
+    text = data_config(listen=(HERE,), connect=(), operator_json5=theirs)
+    assert read(text, "transport/link/tx/queue/size/data") == 4
+    assert read(text, "namespace") == "site"
+    assert read(text, "mode") == "peer"
+
+
+def test_an_operators_file_that_is_none_is_refused_in_words() -> None:
+    with pytest.raises(ValueError, match="not a zenoh configuration"):
+        control_config(listen=(), connect=(), operator_json5="{ nonsense: 1 }")
