@@ -17,7 +17,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from zsched.adapters.worker_process import LINES_BURST, LineLog, WorkerGuard
+from zsched.adapters.worker_process import LINES_BURST
 from zsched.adapters.worker_supervisor import RestartPolicy, WorkerContext, WorkerSupervisor
 from zsched.core.fleet import WorkerSpec
 from zsched.core.model import WorkerState
@@ -288,28 +288,6 @@ def test_flooding_worker_is_bounded_in_log_lines_and_cpu(caplog: pytest.LogCaptu
         assert used < 0.3
 
 
-def test_line_log_cuts_long_lines_and_counts_suppressed_ones(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO, "flood")
-    lines = LineLog(logging.getLogger("flood"))
-    lines.feed(b"a" * 5000 + b"\nhalf", 0.0)
-    lines.feed(b" line\n" * 3, 0.0)
-    assert [len(caplog.messages[0]), *caplog.messages[1:]] == [2052, "half line", " line", " line"]
-    lines.feed(b"y\n" * 1000, 0.0)
-    lines.feed(b"z\n" * 1000 + b"last words\n", 0.1)
-    assert lines.last_line == "last words"
-    lines.feed(b"still muted\n", 0.9)
-    lines.feed(b"", 1.1)
-    assert caplog.messages[-1] == f"suppressed lines={2002 - int(LINES_BURST) + 4} limit_per_s=50"
-
-
-def test_line_log_disarms_control_characters(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO, "flood")
-    lines = LineLog(logging.getLogger("flood"))
-    lines.feed(b"\x1b[2Jgone\tbad: \xff\r\n", 0.0)
-    assert caplog.messages == ["\ufffd[2Jgone\tbad: \ufffd"]
-    assert lines.last_line == caplog.messages[0]
-
-
 def test_restart_delays_double_up_to_the_cap_with_jitter() -> None:
     policy, rng = RestartPolicy(first_s=0.5, most_s=10.0, jitter_ratio=0.2), random.Random(3)
     delays = [policy.delay_s(n, rng) for n in range(1, 9)]
@@ -379,26 +357,3 @@ def test_kernel_without_pidfd_is_polled(monkeypatch: pytest.MonkeyPatch) -> None
     with supervised(python("raise SystemExit(5)")) as (supervisor, recorder):
         supervisor.start("merge")
         assert recorder.wait("failed")[2] == "exited with status 5"
-
-
-def test_guard_that_was_killed_is_replaced_and_knows_all_groups() -> None:
-    with (
-        subprocess.Popen(["sleep", "60"], start_new_session=True) as first,
-        subprocess.Popen(["sleep", "60"], start_new_session=True) as second,
-        subprocess.Popen(["sleep", "60"], start_new_session=True) as forgotten,
-    ):
-        try:
-            guard = WorkerGuard()
-            guard.add(first.pid)
-            (shell,) = (child for child in psutil.Process().children() if "zsched-guard" in child.cmdline())
-            shell.kill()
-            shell.wait(timeout=5)
-            guard.add(forgotten.pid)
-            guard.add(second.pid)
-            guard.discard(forgotten.pid)
-            guard.close()
-            assert (first.wait(timeout=5), second.wait(timeout=5)) == (-signal.SIGKILL, -signal.SIGKILL)
-            assert forgotten.poll() is None
-        finally:
-            for process in (first, second, forgotten):
-                process.kill()

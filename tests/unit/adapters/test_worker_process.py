@@ -1,0 +1,82 @@
+"""A worker's output as log lines, the guard over process groups, and the launcher: each by itself."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import subprocess
+import sys
+
+import psutil
+import pytest
+
+from zsched.adapters.worker_process import LAUNCHER, LINES_BURST, LineLog, WorkerGuard
+
+
+def test_line_log_cuts_long_lines_and_counts_suppressed_ones(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "flood")
+    lines = LineLog(logging.getLogger("flood"))
+    lines.feed(b"a" * 5000 + b"\nhalf", 0.0)
+    lines.feed(b" line\n" * 3, 0.0)
+    assert [len(caplog.messages[0]), *caplog.messages[1:]] == [2052, "half line", " line", " line"]
+    lines.feed(b"y\n" * 1000, 0.0)
+    lines.feed(b"z\n" * 1000 + b"last words\n", 0.1)
+    assert lines.last_line == "last words"
+    lines.feed(b"still muted\n", 0.9)
+    lines.feed(b"", 1.1)
+    assert caplog.messages[-1] == f"suppressed lines={2002 - int(LINES_BURST) + 4} limit_per_s=50"
+
+
+def test_line_log_disarms_control_characters(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "flood")
+    lines = LineLog(logging.getLogger("flood"))
+    lines.feed(b"\x1b[2Jgone\tbad: \xff\r\n", 0.0)
+    assert caplog.messages == ["\ufffd[2Jgone\tbad: \ufffd"]
+    assert lines.last_line == caplog.messages[0]
+
+
+def test_guard_that_was_killed_is_replaced_and_knows_all_groups() -> None:
+    with (
+        subprocess.Popen(["sleep", "60"], start_new_session=True) as first,
+        subprocess.Popen(["sleep", "60"], start_new_session=True) as second,
+        subprocess.Popen(["sleep", "60"], start_new_session=True) as forgotten,
+    ):
+        try:
+            guard = WorkerGuard()
+            guard.add(first.pid)
+            (shell,) = (child for child in psutil.Process().children() if "zsched-guard" in child.cmdline())
+            shell.kill()
+            shell.wait(timeout=5)
+            guard.add(forgotten.pid)
+            guard.add(second.pid)
+            guard.discard(forgotten.pid)
+            guard.close()
+            assert (first.wait(timeout=5), second.wait(timeout=5)) == (-signal.SIGKILL, -signal.SIGKILL)
+            assert forgotten.poll() is None
+        finally:
+            for process in (first, second, forgotten):
+                process.kill()
+
+
+def launch(parent: int, *command: str) -> subprocess.CompletedProcess[str]:
+    arguments = [sys.executable, "-I", "-S", LAUNCHER, str(parent), *command]
+    return subprocess.run(arguments, capture_output=True, text=True, timeout=20, check=False)
+
+
+def test_launcher_becomes_the_command_with_default_signals() -> None:
+    done = launch(os.getpid(), "grep", "-E", "SigIgn|SigBlk", "/proc/self/status")
+    assert done.returncode == 0
+    masks = dict(line.split(":\t") for line in done.stdout.splitlines())
+    assert masks == {"SigBlk": "0" * 16, "SigIgn": "0" * 16}
+
+
+def test_launcher_whose_parent_has_gone_runs_nothing() -> None:
+    done = launch(1, "echo", "still here")
+    assert (done.returncode, done.stdout) == (1, "")
+
+
+def test_launcher_says_what_it_cannot_run() -> None:
+    done = launch(os.getpid(), "/no/such/program")
+    assert done.returncode == 78
+    assert done.stderr == "cannot run '/no/such/program': No such file or directory\n"
