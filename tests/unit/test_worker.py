@@ -1,0 +1,288 @@
+"""The worker's library against a hand-made relay: real sessions on loopback, one per side."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from zsched import wire
+from zsched.core.plan import Role, WorkerRole
+from zsched.core.relay_protocol import EndMarker
+from zsched.errors import ConfigError
+from zsched.keyspace import END_CHUNK, Keyspace
+from zsched.relay_pipe import decode_end, encode_end
+from zsched.worker import Output, Received, Worker
+from zsched.zenoh_config import data_config, worker_config
+
+KEYS = Keyspace("test")
+ROLE_KEY = KEYS.role("edge1", "t")
+INPUT = "edge1/t/robot1/in"
+
+
+def until(condition: Callable[[], Any], what: str, deadline_s: float = 5.0) -> Any:
+    end = time.monotonic() + deadline_s
+    while time.monotonic() < end:
+        value = condition()
+        if value:
+            return value
+        time.sleep(0.002)
+    raise AssertionError(f"not within {deadline_s} s: {what}")
+
+
+class Relay:
+    """What a relay shows to one worker: its role, inputs with numbers, end markers; what it hears back."""
+
+    def __init__(self) -> None:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            self.endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        self.session = zenoh.open(zenoh.Config.from_json5(data_config(listen=(self.endpoint,), connect=())))
+        self.role = Role(task="t", role=WorkerRole.IDLE)
+        self.tokens: set[str] = set()
+        self.outputs: list[tuple[str, bytes]] = []
+        self.ends: list[tuple[str, EndMarker]] = []
+        self._kept = [
+            self.session.declare_queryable(KEYS.role("edge1", "*"), self._answer),
+            self.session.liveliness().declare_subscriber("@zsched/test/**", self._token, history=True),
+            self.session.declare_subscriber("edge1/t/*/*/out", self._output),
+            self.session.declare_subscriber(f"edge1/t/*/*/out/{END_CHUNK}", self._end),
+        ]
+        self.publisher = self.session.declare_publisher(INPUT)
+        self.count = 0
+
+    def _answer(self, query: zenoh.Query) -> None:
+        with query:
+            query.reply(ROLE_KEY, wire.encode(self.role))
+
+    def _token(self, sample: zenoh.Sample) -> None:
+        act = self.tokens.add if sample.kind == zenoh.SampleKind.PUT else self.tokens.discard
+        act(str(sample.key_expr))
+
+    def _output(self, sample: zenoh.Sample) -> None:
+        self.outputs.append((str(sample.key_expr), sample.payload.to_bytes()))
+
+    def _end(self, sample: zenoh.Sample) -> None:
+        marker = decode_end(sample.payload.to_bytes())
+        assert marker is not None
+        self.ends.append((str(sample.key_expr), marker))
+
+    def tell(self, role: WorkerRole, epoch: int = 0) -> None:
+        self.role = Role(task="t", role=role, epoch=epoch)
+        self.session.put(ROLE_KEY, wire.encode(self.role))
+
+    def put(self, payload: bytes) -> None:
+        self.publisher.put(payload, source_info=zenoh.SourceInfo(self.publisher.id, self.count))
+        self.count += 1
+
+    def end(self, epoch: int, count: int | None = None) -> None:
+        number = self.count if count is None else count
+        payload = encode_end(EndMarker(epoch=epoch, count=number))
+        source = zenoh.SourceInfo(self.publisher.id, number)
+        self.session.put(f"{INPUT}/{END_CHUNK}", payload, source_info=source)
+
+
+@pytest.fixture
+def relay() -> Iterator[Relay]:
+    made = Relay()
+    try:
+        yield made
+    finally:
+        made.session.close()
+
+
+def environment(relay: Relay, folder: Path) -> dict[str, str]:
+    path = folder / "worker.json5"
+    path.write_text(worker_config(connect=(relay.endpoint,)))
+    return {
+        "ZSCHED_FLEET": "test",
+        "ZSCHED_NODE": "edge1",
+        "ZSCHED_TASK": "t",
+        "ZSCHED_INCARNATION": "3",
+        "ZSCHED_ZENOH_CONFIG": str(path),
+    }
+
+
+class Echo:
+    """A worker in this process that answers every input under its epoch."""
+
+    def __init__(self, worker: Worker) -> None:
+        self.worker = worker
+        self.taken: list[Received] = []
+        self.output: Output = worker.publisher("{prefix}/{epoch}/robot1/out", reliable=True)
+        worker.subscribe("{prefix}/*/in", self._take, keep_last=None)
+        worker.ready()
+
+    def _take(self, received: Received) -> None:
+        self.taken.append(received)
+        self.output.put(received.payload, attachment=received.attachment)
+
+    def payloads(self) -> list[bytes]:
+        return [received.payload.to_bytes() for received in self.taken]
+
+
+@pytest.fixture
+def echo(relay: Relay, tmp_path: Path) -> Iterator[Echo]:
+    with Worker.from_env(environment(relay, tmp_path), handles_signals=False) as worker:
+        made = Echo(worker)
+        until(lambda: KEYS.worker("edge1", "t", 3) in relay.tokens, "the ready token")
+        status: Any = relay.publisher.matching_status
+        assert status.matching  # the token was declared behind the subscribers
+        yield made
+
+
+def test_it_is_idle_until_told_and_withholds_its_outputs(relay: Relay, echo: Echo) -> None:
+    assert echo.worker.prefix == "edge1/t"
+    relay.put(b"warm-up")
+    until(lambda: echo.payloads() == [b"warm-up"], "the input")
+    until(lambda: echo.output.withheld == 1, "the withheld output")
+    assert echo.output.put(b"direct") is False
+    assert relay.outputs == []
+
+
+def test_an_owner_stamps_its_epoch_and_says_so(relay: Relay, echo: Echo) -> None:
+    relay.tell(WorkerRole.ACTIVE, 7)
+    until(lambda: f"{ROLE_KEY}/7" in relay.tokens, "the token of the epoch")
+    relay.put(b"x")
+    until(lambda: relay.outputs == [("edge1/t/7/robot1/out", b"x")], "the output")
+    relay.tell(WorkerRole.IDLE)
+    until(lambda: f"{ROLE_KEY}/7" not in relay.tokens, "the token goes")
+    assert echo.output.put(b"late") is False
+
+
+def test_what_was_withheld_is_processed_again_by_the_owner(relay: Relay, echo: Echo) -> None:
+    relay.put(b"the last map")
+    until(lambda: echo.output.withheld == 1, "the warm-up")
+    relay.tell(WorkerRole.ACTIVE, 2)
+    until(lambda: relay.outputs == [("edge1/t/2/robot1/out", b"the last map")], "its result")
+
+
+def test_the_end_marker_comes_behind_the_last_output(relay: Relay, echo: Echo) -> None:
+    relay.tell(WorkerRole.ACTIVE, 4)
+    until(lambda: echo.worker.role.epoch == 4, "the role")
+    for number in range(50):
+        relay.put(str(number).encode())
+    relay.end(4)
+    until(lambda: relay.ends, "the end marker")
+    assert relay.ends == [(f"edge1/t/4/robot1/out/{END_CHUNK}", EndMarker(epoch=4, count=50))]
+    until(lambda: len(relay.outputs) == 50, "every output")
+    assert all(b"@zsched" not in received.key.encode() for received in echo.taken)
+    assert echo.output.put(b"after the end") is False
+
+
+def test_an_end_that_overtakes_its_data_waits_for_it(relay: Relay, echo: Echo) -> None:
+    relay.tell(WorkerRole.ACTIVE, 4)
+    until(lambda: echo.worker.role.epoch == 4, "the role")
+    relay.put(b"0")
+    until(lambda: len(relay.outputs) == 1, "the first")
+    relay.end(4, count=2)
+    relay.put(b"1")
+    until(lambda: relay.ends, "the end marker")
+    assert relay.ends[0][1].count == 2
+
+
+def test_an_end_whose_data_was_dropped_comes_after_a_grace_time(relay: Relay, echo: Echo) -> None:
+    relay.tell(WorkerRole.ACTIVE, 4)
+    until(lambda: echo.worker.role.epoch == 4, "the role")
+    relay.put(b"0")
+    relay.end(4, count=9)
+    until(lambda: relay.ends, "the end marker all the same", deadline_s=1.0)
+
+
+def test_draining_sends_what_is_in_work(relay: Relay, echo: Echo) -> None:
+    relay.tell(WorkerRole.ACTIVE, 4)
+    until(lambda: echo.worker.role.epoch == 4, "the role")
+    relay.tell(WorkerRole.DRAINING, 4)
+    until(lambda: echo.worker.role.role is WorkerRole.DRAINING, "the role")
+    relay.put(b"in work")
+    until(lambda: relay.outputs == [("edge1/t/4/robot1/out", b"in work")], "the output")
+    relay.end(4)
+    until(lambda: relay.ends, "the end marker")
+
+
+def test_a_late_worker_learns_its_role_at_once(relay: Relay, tmp_path: Path) -> None:
+    relay.role = Role(task="t", role=WorkerRole.ACTIVE, epoch=9)
+    with Worker.from_env(environment(relay, tmp_path), handles_signals=False) as worker:
+        until(lambda: worker.role.epoch == 9, "the role", deadline_s=2.0)
+
+
+def test_a_slow_worker_keeps_the_newest(relay: Relay, tmp_path: Path) -> None:
+    gate, seen = threading.Event(), list[bytes]()
+
+    def slow(received: Received) -> None:
+        seen.append(received.payload.to_bytes())
+        gate.wait(5)
+
+    with Worker.from_env(environment(relay, tmp_path), handles_signals=False) as worker:
+        worker.subscribe("{prefix}/*/in", slow, keep_last=1)
+        worker.ready()
+        until(lambda: relay.tokens, "the ready token")
+        relay.put(b"0")
+        until(lambda: seen == [b"0"], "the first")
+        for number in range(1, 10):
+            relay.put(str(number).encode())
+        time.sleep(0.1)
+        gate.set()
+        until(lambda: seen[-1] == b"9", "the newest")
+        assert len(seen) <= 3
+
+
+def test_without_a_daemon_it_says_how_to_run_by_hand() -> None:
+    with pytest.raises(ConfigError, match=r"ZSCHED_NODE.*--standalone"):
+        Worker.from_env({"ZSCHED_FLEET": "test"}, standalone="t")
+    with pytest.raises(ConfigError, match="zsched up"):
+        Worker.from_env({})
+
+
+def test_by_hand_it_is_the_owner() -> None:
+    with Worker.from_env({}, standalone="t", handles_signals=False) as worker:
+        assert (worker.prefix, worker.role.role, worker.role.epoch) == ("local/t", WorkerRole.ACTIVE, 1)
+        assert worker.publisher("{prefix}/{epoch}/out", latest=True).put(b"x") is True
+
+
+@pytest.mark.parametrize("is_relay_stopped", [False, True], ids=["relay alive", "relay stopped"])
+def test_a_signalled_worker_is_gone_within_a_second(tmp_path: Path, is_relay_stopped: bool) -> None:
+    script = (
+        "import sys, time, zenoh\n"
+        "session = zenoh.open(zenoh.Config.from_json5(sys.argv[1]))\n"
+        "seen = lambda sample: print('seen', flush=True)\n"
+        "kept = session.liveliness().declare_subscriber('@zsched/**', seen, history=True)\n"
+        "time.sleep(60)\n"
+    )
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    text = data_config(listen=(endpoint,), connect=())
+    (tmp_path / "worker.json5").write_text(worker_config(connect=(endpoint,)))
+    env = os.environ | {
+        "ZSCHED_FLEET": "test",
+        "ZSCHED_NODE": "edge1",
+        "ZSCHED_TASK": "echo",
+        "ZSCHED_INCARNATION": "1",
+        "ZSCHED_ZENOH_CONFIG": str(tmp_path / "worker.json5"),
+    }
+    peer = subprocess.Popen([sys.executable, "-c", script, text], stdout=subprocess.PIPE)
+    worker = subprocess.Popen([sys.executable, "-m", "zsched.tasks.echo"], env=env)
+    try:
+        assert peer.stdout is not None
+        assert peer.stdout.readline() == b"seen\n"
+        if is_relay_stopped:
+            peer.send_signal(signal.SIGSTOP)
+        worker.send_signal(signal.SIGTERM)
+        assert worker.wait(1.5) == 0
+    finally:
+        for process in (peer, worker):
+            process.kill()
+            process.wait(5)
+        if peer.stdout is not None:
+            peer.stdout.close()
