@@ -17,7 +17,7 @@ from typing import Annotated
 
 import typer
 
-from zsched.cli_common import EXIT_CONFIG, EXIT_USAGE, CliError, Json, Verbs, print_json
+from zsched.cli_common import EXIT_CONFIG, EXIT_USAGE, CliError, Json, Verb, Verbs, print_json
 
 EPILOG = (
     "Exit codes: 0 fine, 1 failed, 2 usage, 3 daemon not reachable, 4 reachable but degraded, 5 timed out, "
@@ -71,7 +71,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="JSON with its schema's
 # --- the daemon ------------------------------------------------------------------------------------------------------
 
 
-@app.command()
+@app.command(cls=Verb)
 def up(
     config: ConfigOption = None,
     node: NameOption = None,
@@ -101,7 +101,7 @@ def up(
     os.execv(sys.executable, daemon)  # noqa: S606 - no shell is wanted
 
 
-@app.command()
+@app.command(cls=Verb)
 def init(
     config: ConfigOption = None,
     node: NameOption = None,
@@ -136,7 +136,7 @@ def init(
 # --- questions -------------------------------------------------------------------------------------------------------
 
 
-@app.command()
+@app.command(cls=Verb)
 def status(
     json_: JsonOption = False,
     watch: Annotated[bool, typer.Option("--watch", "-w", help="Again and again; with --json one line each.")] = False,
@@ -158,7 +158,7 @@ def status(
 # --- the fleet file --------------------------------------------------------------------------------------------------
 
 
-@app.command()
+@app.command(cls=Verb)
 def check(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Fleet file.")],
     json_: JsonOption = False,

@@ -1,6 +1,7 @@
-"""A status snapshot as JSON values and as text (pure).
+"""A status snapshot as JSON values (pure).
 
-Knows: the schema ``zsched.status/1`` as JSON. Does not know: terminals, sockets, where the snapshot came from.
+Knows: the schema ``zsched.status/1`` as JSON. Does not know: text for people (`zsched.report_text`), sockets, where the
+snapshot came from.
 """
 
 from __future__ import annotations
@@ -60,29 +61,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Enum):
         return value.value
     return value
-
-
-# --- text ------------------------------------------------------------------------------------------------------------
-
-
-def degradations(status: Json) -> tuple[str, ...]:
-    """Why the fleet is degraded, as this node sees it: no quorum, or a task without a live owner; empty when fine."""
-    quorum = status["quorum"]
-    reasons = []
-    if not quorum["ok"]:
-        reasons.append(f"no quorum: {quorum['alive']} of {quorum['electors']} electors, {quorum['needed']} needed")
-    for task in status["tasks"]:
-        if task["owner"] is None:
-            reasons.append(f"{task['name']} has no owner")
-        elif task["owner_state"] not in ("alive", "suspect"):
-            reasons.append(f"{task['name']}: its owner {task['owner']} is {task['owner_state']}")
-    return tuple(reasons)
-
-
-def render_status(status: Json, width: int, color: bool) -> str:
-    """The status for people."""
-    del width, color
-    lines = [f"{status['fleet']} {status['node']}"]
-    lines += [f"{node['name']} {node['state']}" for node in status["nodes"]]
-    lines += [f"{task['name']} {task['owner']} epoch {task['epoch']}" for task in status["tasks"]]
-    return "\n".join(lines) + "\n"

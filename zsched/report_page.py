@@ -1,0 +1,89 @@
+"""Lines of text for a terminal: tables, blocks that wrap, and styles that take no room (pure).
+
+Knows: columns, cutting, ANSI styles, how figures are written. Does not know: what is shown.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from typing import TypeAlias
+
+STYLES = {"bold": "1", "dim": "2", "red": "31", "green": "32", "yellow": "33", "stage": "1;36", "alarm": "1;31"}
+
+Cell: TypeAlias = tuple[str, str]
+"""A text and its style ("" for none)."""
+
+
+class Page:
+    """Lines that are never longer than ``width``; ``indent`` is where a block's text begins."""
+
+    def __init__(self, width: int, color: bool) -> None:
+        self.width, self.indent, self._color = width, 11, color
+        self.lines: list[str] = []
+
+    def paint(self, text: str, style: str) -> str:
+        """``text`` in a style, when there is colour."""
+        return f"\x1b[{STYLES[style]}m{text}\x1b[0m" if style and text and self._color else text
+
+    def row(self, *cells: tuple[str, int, str], indent: int = 0) -> None:
+        """One line of a table: (text, columns, style) each; negative columns align right, what is too long is cut."""
+        line, used = " " * indent, indent
+        for text, columns, style in cells:
+            room = min(abs(columns), self.width - used)
+            if room <= 0:
+                break
+            shown = cut(text, room)
+            blanks = " " * (room - len(shown))
+            line += blanks + self.paint(shown, style) if columns < 0 else self.paint(shown, style) + blanks
+            line += " "
+            used += room + 1
+        self.lines.append(line.rstrip())
+
+    def block(self, title: str, *parts: Cell) -> None:
+        """A title and behind it the parts, joined by dots and broken between them (in them only when need be)."""
+        used = max(self.indent, len(title) + 2)
+        line = self.paint(title, "stage") + " " * (used - len(title))
+        is_first = True
+        for text, style in parts:
+            for index, piece in enumerate(textwrap.wrap(text, self.width - self.indent) or [""]):
+                joint = "" if is_first or index else " · "
+                if index or (not is_first and used + len(joint) + len(piece) > self.width):
+                    self.lines.append(line.rstrip())
+                    line, used, joint = " " * self.indent, self.indent, ""
+                line += joint + self.paint(piece, style)
+                used += len(joint) + len(piece)
+                is_first = False
+        self.lines.append(line.rstrip())
+
+
+def cut(text: str, width: int) -> str:
+    """At most ``width`` characters; a dot at the end shows that there were more."""
+    return text if len(text) <= width else text[: max(width - 1, 0)] + "…"[:width]
+
+
+def span(seconds: float | None) -> str:
+    """A duration in at most five characters or so: ``0.3s 42s 5m03s 3h05m 2d04h``; ``-`` when there is none."""
+    if seconds is None:
+        return "-"
+    if seconds < 9.95:
+        return f"{max(seconds, 0.0):.1f}s"
+    whole = round(seconds)
+    for unit, smaller, big, small in (("d", "h", 86400, 3600), ("h", "m", 3600, 60), ("m", "s", 60, 1)):
+        if whole >= big:
+            return f"{whole // big}{unit}{whole % big // small:02d}{smaller}"
+    return f"{whole}s"
+
+
+def memory(mib: float) -> str:
+    """Memory given in MiB: ``98M``, ``23.5G``."""
+    return f"{mib:.0f}M" if mib < 1000 else f"{mib / 1024:.1f}G"
+
+
+def size(count: int) -> str:
+    """Bytes: ``512 B``, ``1.2 MiB``."""
+    value, units = float(count), ("B", "KiB", "MiB", "GiB")
+    for unit in units:
+        if value < 1000 or unit == units[-1]:
+            return f"{value:.0f} {unit}" if unit == "B" else f"{value:.1f} {unit}"
+        value /= 1024
+    raise AssertionError

@@ -1,0 +1,315 @@
+"""A status, as JSON values, as text for people: 80 columns suffice, 100 show more (pure).
+
+Knows: what stands where, in the order of the six stages. Does not know: terminals, sockets; it imports nothing of the
+core, so that `zsched status` starts quickly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from zsched.report_page import Cell, Page, cut, memory, size, span
+
+Json = dict[str, Any]
+
+BUSY, FULL = 0.6, 0.85
+"""From here a bar is yellow, from here red."""
+MAX_CANDIDATES, MAX_HISTORY = 12, 3
+STATE_STYLES = {"alive": "green", "ready": "green", "suspect": "yellow", "unknown": "yellow", "starting": "yellow"}
+
+
+def degradations(status: Json) -> tuple[str, ...]:
+    """Why the fleet is degraded, as this node sees it: no quorum, or a task without a live owner; empty when fine."""
+    quorum, reasons = status["quorum"], []
+    if not quorum["ok"]:
+        reasons.append(
+            f"no quorum: {quorum['alive']} of {quorum['electors']} electors alive, {quorum['needed']} needed"
+        )
+    for task in status["tasks"]:
+        if task["owner"] is None:
+            reasons.append(f"{task['name']} has no owner")
+        elif task["owner_state"] not in ("alive", "suspect"):
+            reasons.append(f"{task['name']}: its owner {task['owner']} is {task['owner_state']}")
+    return tuple(reasons)
+
+
+def render_status(status: Json, width: int, color: bool) -> str:
+    """The status for people, in the order of the stages; problems come last.
+
+    ``width`` in columns, from 60 (of more robots than fit, the table shows the first); ``color``: with ANSI colours.
+    Text that came from other nodes cannot steer the terminal.
+    """
+    page, shown = Page(width, color), printable(status)
+    _header(page, shown)
+    _nodes(page, shown)
+    _gateway(page, shown["nodes"])
+    for task in shown["tasks"]:
+        page.lines.append("")
+        _task(page, shown, task)
+    _troubles(page, shown)
+    return "\n".join(page.lines) + "\n"
+
+
+def printable(value: Any) -> Any:
+    """The JSON value with every character that a terminal would obey replaced by ``?``."""
+    if isinstance(value, str):
+        return value if value.isprintable() else "".join(char if char.isprintable() else "?" for char in value)
+    if isinstance(value, list):
+        return [printable(item) for item in value]
+    if isinstance(value, dict):
+        return {printable(key): printable(item) for key, item in value.items()}
+    return value
+
+
+def _header(page: Page, status: Json) -> None:
+    quorum, troubles = status["quorum"], _problems(status)
+    health, style = (f"{len(troubles)} problem{'s'[: len(troubles) != 1]}", "yellow") if troubles else ("ok", "green")
+    if degradations(status):
+        health, style = "DEGRADED", "alarm"
+    role = "" if quorum["this_node"] == "no_elector" else ", " + quorum["this_node"].replace("_", " ")
+    parts = [f"fleet {status['fleet']}", f"{status['node']} ({status['kind']}{role})", f"up {span(status['up_s'])}"]
+    parts.append(f"quorum {quorum['alive']} of {quorum['electors']}, needs {quorum['needed']}")
+    version = f"zsched {status['version']}"
+    if len(" · ".join([*parts, version])) + len(health) < page.width:
+        parts.append(version)
+    page.row((" · ".join(parts), page.width - len(health) - 1, "bold"), (health, len(health), style))
+    page.lines.append("")
+
+
+# --- PROFILE, GATEWAY ------------------------------------------------------------------------------------------------
+
+
+def _nodes(page: Page, status: Json) -> None:
+    nodes: list[Json] = status["nodes"]
+    name = min(max([page.indent - 1, *(len(node["name"]) + 1 for node in nodes)]), 20)
+    bar = 8 if page.width >= 96 else 4
+    columns = (name, 5, 8, -5, bar, -4, 6, 9, 7, page.width)
+    titles = ("PROFILE", "kind", "state", "age", "cpu", "", "", "memory", "link", "workers")
+    styles = ("stage", *["dim"] * (len(titles) - 1))
+    page.row(*zip(titles, columns, styles, strict=True))
+    room = page.width - sum(abs(width) + 1 for width in columns[:-1])
+    for node in nodes:
+        workers = _workers(node["workers"], room, is_single=len(status["tasks"]) == 1)
+        texts = [*_node_cells(node, bar, is_me=node["name"] == status["node"]), workers]
+        page.row(*((text, width, style) for (text, style), width in zip(texts, columns, strict=True)))
+
+
+def _node_cells(node: Json, bar: int, *, is_me: bool) -> list[tuple[str, str]]:
+    state = "draining" if node["draining"] else node["state"]
+    cpu, cores = node["cpu_ratio"], node["cpu_cores"]
+    level = "" if cpu is None else "red" if cpu >= FULL else "yellow" if cpu >= BUSY else "green"
+    filled = 0 if cpu is None else round(cpu * bar)
+    is_tight = node["memory_ratio"] is not None and node["memory_ratio"] >= FULL
+    return [
+        (node["name"] + ("*" if is_me else ""), "bold" if is_me else ""),
+        (node["kind"], ""),
+        (state, STATE_STYLES.get(state, "red")),
+        (span(node["age_s"]), ""),
+        ("" if cpu is None else "█" * filled + "░" * (bar - filled), level),
+        (_percent(cpu), ""),
+        ("" if cores is None else f"of {cores:.3g}", "dim"),
+        (_memory(node), "red" if is_tight else ""),
+        (_link(node["links"]), ""),
+    ]
+
+
+def _memory(node: Json) -> str:
+    total = node["memory_mb"]
+    return "-" if total is None else f"{_percent(node['memory_ratio'])} {memory(total)}"
+
+
+def _percent(ratio: float | None) -> str:
+    return "-" if ratio is None else f"{ratio:.0%}"
+
+
+def _link(links: Sequence[Json]) -> str:
+    """The link to everybody, else the weakest one; its source when it has no signal."""
+    if not links:
+        return "-"
+    common = [link for link in links if link["peer"] is None]
+    measured = [link["rssi_dbm"] for link in (common or links) if link["rssi_dbm"] is not None]
+    return f"{min(measured):.0f} dBm" if measured else str(links[0]["source"])
+
+
+def _workers(workers: Sequence[Json], room: int, *, is_single: bool) -> Cell:
+    """The workers' states, with as much beside as there is room for."""
+    if not workers:
+        return "-", "dim"
+    states = [worker["state"] for worker in workers]
+    styles = [STATE_STYLES.get(state, "red") for state in states]
+    style = next((style for style in ("red", "yellow") if style in styles), "green")
+    full = ", ".join(f"{worker['task']} {worker['state']}" for worker in workers)
+    short = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(states))
+    if is_single:
+        (worker,) = workers[:1]
+        load = [] if worker["cpu_cores"] is None else [f"{worker['cpu_cores']:.2f} cores"]
+        load += [] if worker["memory_mb"] is None else [memory(worker["memory_mb"])]
+        full, short = " ".join([worker["state"], *load]), worker["state"]
+    return (full if len(full) <= room else short), style
+
+
+def _gateway(page: Page, nodes: Sequence[Json]) -> None:
+    held = [node for node in nodes if node["age_s"] is not None]
+    parts: list[Cell] = [(f"{len(held)} of {len(nodes)} profiles held", "")]
+    if held:
+        oldest = max(held, key=lambda node: float(node["age_s"]))
+        parts.append((f"oldest {span(oldest['age_s'])} ({oldest['name']})", ""))
+    missing = ", ".join(node["name"] for node in nodes if node["age_s"] is None)
+    page.block("GATEWAY", *parts, *([(f"none of {missing}", "yellow")] if missing else []))
+
+
+# --- one task: SCHEDULER, VOTE, EXECUTOR, ROUTE ----------------------------------------------------------------------
+
+
+def _task(page: Page, status: Json, task: Json) -> None:
+    owner, state = task["owner"], task["owner_state"]
+    parts: list[Cell] = [("no owner yet", "red")]
+    if owner is not None:
+        since = "" if task["since_s"] is None else f" since {span(task['since_s'])}"
+        parts = [(f"{owner} owns it{since}", "bold"), (state, STATE_STYLES.get(state, "red"))]
+    counts = [(f"epoch {task['epoch']}", ""), (f"revision {task['revision']}", "")]
+    page.block(f"TASK {task['name']}", *parts, *counts)
+    _scheduler(page, status, task)
+    _vote(page, task)
+    is_quiet = task["phase"] in ("idle", "settled")
+    page.block("EXECUTOR", (str(task["phase"]), "" if is_quiet else "yellow"))
+    _route(page, task)
+
+
+def _scheduler(page: Page, status: Json, task: Json) -> None:
+    tuning, decision = task["tuning"], task["decision"]
+    weights = " ".join(f"{name} {value:g}" for name, value in tuning["weights"].items())
+    page.block(
+        "SCHEDULER",
+        (f"weights {weights}", ""),
+        (f"bonus {tuning['bonus']:g}", ""),
+        (f"trigger {tuning['time_to_trigger_s']:g} s", ""),
+        (f"cool-down {tuning['cool_down_s']:g} s", ""),
+        (tuning["aggregate"], ""),
+    )
+    if decision is None:
+        why = "edges do not decide: ask a robot with --node" if status["kind"] == "edge" else "no round yet"
+        page.block("", (why, "dim"))
+        return
+    winner = f" {decision['winner']}" if decision["winner"] else ""
+    outcome = {"stay": "green", "none": "red"}.get(decision["outcome"], "yellow")
+    parts: list[Cell] = [
+        (f"{decision['outcome']}{winner}", outcome),
+        (decision["reason"], ""),
+        (f"{span(decision['age_s'])} ago", "dim"),
+    ]
+    silent = ", ".join(decision["silent"])
+    page.block("", *parts, *([(f"silent: {silent}", "yellow")] if silent else []))
+    _candidates(page, task, decision)
+
+
+def _candidates(page: Page, task: Json, decision: Json) -> None:
+    """Candidate by candidate: the joint utility, each robot's, the mean of its terms, and why it cannot be."""
+    joint, voters = decision["aggregates"], list(decision["utilities"])
+    names = sorted({*task["candidates"], *joint}, key=lambda name: (-joint.get(name, -1.0), name))
+    if not names:
+        return
+    first = min(max([9, *map(len, names)]), 20)
+    widths = [max(len(voter), 5) for voter in voters]
+    room = page.width - page.indent - first - 7 - 3 * 6 - 16  # joint, three terms, a short note
+    while widths and sum(widths) + len(widths) > room:
+        widths.pop()
+    hidden = len(voters) - len(widths)
+    more = f"+{hidden}" if hidden else ""
+    columns = [first, -6, *(-width for width in widths), -5, -5, -5, page.width]
+    titles = ["candidate", "joint", *voters[: len(widths)], "cpu", "mem", "net", more]
+    page.row(*((title, width, "dim") for title, width in zip(titles, columns, strict=True)), indent=page.indent)
+    for name in names[:MAX_CANDIDATES]:
+        cells = _candidate_cells(name, task["owner"], decision, voters[: len(widths)])
+        page.row(
+            *((text, width, style) for (text, style), width in zip(cells, columns, strict=True)), indent=page.indent
+        )
+    if len(names) > MAX_CANDIDATES:
+        page.block("", (f"and {len(names) - MAX_CANDIDATES} more candidates: see --json", "dim"))
+
+
+def _candidate_cells(name: str, owner: str | None, decision: Json, voters: Sequence[str]) -> list[Cell]:
+    columns: dict[str, Json] = decision["utilities"]
+    found = [column[name] for column in columns.values() if name in column]
+    joint, veto = decision["aggregates"].get(name), decision["vetoed"].get(name)
+    best = max(decision["aggregates"].values(), default=None)
+    notes = ["owner, with bonus"] if name == owner and joint is not None else ["owner"] if name == owner else []
+    notes += [f"vetoed: {veto}"] if veto else []
+    style = "red" if veto else "bold" if joint is not None and joint == best else ""
+    return [
+        (name, style),
+        (_number(joint, 3), style),
+        *((_opinion(columns[voter].get(name)), "") for voter in voters),
+        *((_number(_mean([utility[term] for utility in found]), 2), "dim") for term in ("cpu", "memory", "network")),
+        (" " + ", ".join(notes), "red" if veto else "dim"),
+    ]
+
+
+def _opinion(utility: Json | None) -> str:
+    """One robot's utility of one candidate; ``cut`` when it does not reach it."""
+    if utility is None:
+        return "-"
+    return f"{utility['value']:.2f}" if utility["reachable"] else "cut"
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known else None
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _vote(page: Page, task: Json) -> None:
+    vote = task["vote"]
+    if vote is None:
+        page.block("VOTE", ("none seen by this node", "dim"))
+    else:
+        camps: dict[str, list[str]] = {}
+        for voter, choice in vote["votes"].items():
+            camps.setdefault(choice, []).append(voter)
+        winner = f" {vote['winner']}" if vote["winner"] else ""
+        page.block(
+            "VOTE",
+            (f"{vote['outcome'].replace('_', ' ')}{winner}", "green" if vote["outcome"] == "won" else "yellow"),
+            *((f"{choice}: {', '.join(voters)}", "") for choice, voters in camps.items()),
+            (f"on revision {vote['base_revision']}", "dim"),
+            (f"{span(vote['age_s'])} ago", "dim"),
+        )
+    for past in reversed(task["history"][-MAX_HISTORY:]):
+        what = f"{span(past['age_s']):>6} ago  epoch {past['epoch']}  {past['owner'] or 'nobody'}: {past['reason']}"
+        page.lines.append(" " * page.indent + page.paint(cut(what, page.width - page.indent), "dim"))
+
+
+def _route(page: Page, task: Json) -> None:
+    prefix, parts = f"{task['name']}/", []
+    for stream in task["streams"]:
+        name, drops = stream["stream"].removeprefix(prefix), stream["drops"]
+        seen = "nothing yet" if stream["last_seen_s"] is None else f"last {span(stream['last_seen_s'])} ago"
+        text = f"{name} {stream['messages']} msg {size(stream['bytes'])}, {seen}"
+        if drops:
+            text += ", dropped " + " ".join(f"{count} {reason}" for reason, count in drops.items())
+        parts.append((text, "yellow" if drops else ""))
+    page.block("ROUTE", *(parts or [("no streams here", "dim")]))
+
+
+# --- problems --------------------------------------------------------------------------------------------------------
+
+
+def _problems(status: Json) -> list[str]:
+    found = [*degradations(status), *status["problems"]]
+    found += [f"{task['name']}: {problem}" for task in status["tasks"] for problem in task["problems"]]
+    return list(dict.fromkeys(found))
+
+
+def _troubles(page: Page, status: Json) -> None:
+    dropped = [f"{name.removeprefix('dropped_')} {n}" for name, n in status["counters"].items() if "dropped_" in name]
+    problems = _problems(status)
+    if dropped or problems:
+        page.lines.append("")
+    if dropped:
+        page.block("dropped", *((text, "") for text in dropped))
+    for number, problem in enumerate(problems):
+        page.block("" if number else "PROBLEMS", (problem, "alarm"))
