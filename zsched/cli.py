@@ -17,7 +17,7 @@ from typing import Annotated
 
 import typer
 
-from zsched.cli_common import EXIT_CONFIG, EXIT_USAGE, CliError, Json, Verb, Verbs, print_json
+from zsched.cli_common import EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, CliError, Json, Verb, Verbs, print_json
 
 EPILOG = (
     "Exit codes: 0 fine, 1 failed, 2 usage, 3 daemon not reachable, 4 reachable but degraded, 5 timed out, "
@@ -35,6 +35,14 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+
+class MergeMode(StrEnum):
+    """How the demo's worker learns where the robots' maps lie."""
+
+    KNOWN = "known"
+    TRACK = "track"
+    ESTIMATE = "estimate"
 
 
 class LogLevel(StrEnum):
@@ -155,6 +163,36 @@ def status(
     raise typer.Exit(watch_on(view, interval) if watch else show(view))
 
 
+@app.command(cls=Verb)
+def weights(
+    task: Annotated[str, typer.Argument(metavar="TASK", help="A task of the fleet file.")],
+    pairs: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[cpu=X memory=Y network=Z]", help="New weights; what is left out is 0, the sum is 1."),
+    ] = None,
+    revision: Annotated[
+        int | None, typer.Option("--revision", min=0, metavar="N", help="Only if this is still the task's revision.")
+    ] = None,
+    json_: JsonOption = False,
+    node: AskedOption = None,
+    runtime_dir: RuntimeOption = None,
+) -> None:
+    """Show a task's weights, or change them on the whole running fleet.
+
+    A change is agreed like an allocation: it holds for every robot, or for none (exit 4 without a quorum).
+    """
+    from zsched.cli_ask import find_door  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.cli_weights import change_weights, parse_weights, show_weights  # noqa: PLC0415 - as above
+
+    if not pairs:
+        if revision is not None:
+            raise CliError(EXIT_USAGE, "--revision goes with new weights, e.g. cpu=0.6 memory=0.4")
+        show_weights(find_door(runtime_dir, node), task, is_json=json_)
+        return
+    wanted = parse_weights(pairs)
+    raise typer.Exit(change_weights(find_door(runtime_dir, node), task, wanted, revision, is_json=json_))
+
+
 # --- the fleet file --------------------------------------------------------------------------------------------------
 
 
@@ -183,6 +221,51 @@ def check(
         raise typer.Exit(EXIT_CONFIG)
     if not json_:
         typer.echo("ok: " + ", ".join(_count(number, noun) for noun, number in counts.items()))
+
+
+# --- everything else -------------------------------------------------------------------------------------------------
+
+
+@app.command(cls=Verb)
+def demo(
+    headless: Annotated[bool, typer.Option("--headless", help="Plain lines instead of the live view.")] = False,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for pictures and figures.")] = None,
+    log: Annotated[Path | None, typer.Option(metavar="FILE", help="CARMEN laser log. [Malaga, shipped]")] = None,
+    duration: Annotated[float, typer.Option(metavar="S", help="Seconds to run.")] = 60.0,
+    mode: Annotated[MergeMode, typer.Option(help="Where the robots' poses come from.")] = MergeMode.KNOWN,
+    seed: Annotated[int, typer.Option(min=0, metavar="N", help="Of poses and injected loads.")] = 1,
+) -> None:
+    """Run a whole fleet on this machine: three robots and three edges merge real laser maps."""
+    try:
+        from zsched.lab.demo import DemoOptions, run_demo  # noqa: PLC0415 - the lab is an extra
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] == "zsched":
+            raise
+        raise CliError(
+            EXIT_FAILED, f"the lab needs {error.name}, which is not installed; run `pip install 'zsched[lab]'`"
+        ) from error
+    options = DemoOptions(headless=headless, out=out, log=log, duration_s=duration, mode=mode.value, seed=seed)
+    raise typer.Exit(run_demo(options))
+
+
+@app.command(cls=Verb)
+def version(json_: JsonOption = False) -> None:
+    """Show the versions of zsched, its wire format, zenoh and Python."""
+    import platform  # noqa: PLC0415 - each verb imports what it needs
+    from importlib.metadata import PackageNotFoundError  # noqa: PLC0415 - as above
+    from importlib.metadata import version as installed  # noqa: PLC0415 - as above
+
+    from zsched import __version__, wire  # noqa: PLC0415 - as above
+
+    try:
+        zenoh = installed("eclipse-zenoh")
+    except PackageNotFoundError:
+        zenoh = "not installed"
+    found = {"zsched": __version__, "wire": wire.VERSION, "zenoh": zenoh, "python": platform.python_version()}
+    if json_:
+        print_json({"schema": "zsched.version/1", **found})
+    else:
+        typer.echo("\n".join(f"{name} {text}" for name, text in found.items()))
 
 
 def _count(number: int, plural: str) -> str:

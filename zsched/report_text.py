@@ -85,7 +85,7 @@ def _nodes(page: Page, status: Json) -> None:
     name = min(max([page.indent - 1, *(len(node["name"]) + 1 for node in nodes)]), 20)
     bar = 8 if page.width >= 96 else 4
     columns = (name, 5, 8, -5, bar, -4, 6, 9, 7, page.width)
-    titles = ("PROFILE", "kind", "state", "age", "cpu", "", "", "memory", "link", "workers")
+    titles = ("PROFILE", "kind", "state", "age", "cpu", "", "cores", "memory", "link", "workers")
     styles = ("stage", *["dim"] * (len(titles) - 1))
     page.row(*zip(titles, columns, styles, strict=True))
     room = page.width - sum(abs(width) + 1 for width in columns[:-1])
@@ -212,7 +212,7 @@ def _candidates(page: Page, task: Json, decision: Json) -> None:
         return
     first = min(max([9, *map(len, names)]), 20)
     widths = [max(len(voter), 5) for voter in voters]
-    room = page.width - page.indent - first - 7 - 3 * 6 - 16  # joint, three terms, a short note
+    room = page.width - page.indent - first - 7 - 3 * 6 - 11  # joint, three terms, a short note
     while widths and sum(widths) + len(widths) > room:
         widths.pop()
     hidden = len(voters) - len(widths)
@@ -221,7 +221,11 @@ def _candidates(page: Page, task: Json, decision: Json) -> None:
     titles = ["candidate", "joint", *voters[: len(widths)], "cpu", "mem", "net", more]
     page.row(*((title, width, "dim") for title, width in zip(titles, columns, strict=True)), indent=page.indent)
     for name in names[:MAX_CANDIDATES]:
-        cells = _candidate_cells(name, task["owner"], decision, voters[: len(widths)])
+        veto = decision["vetoed"].get(name)
+        if veto and not any(name in column for column in decision["utilities"].values()):
+            page.row((name, first, "red"), (f"     - {veto}", page.width, "red"), indent=page.indent)
+            continue
+        cells = _candidate_cells(name, task, decision, voters[: len(widths)])
         page.row(
             *((text, width, style) for (text, style), width in zip(cells, columns, strict=True)), indent=page.indent
         )
@@ -229,20 +233,19 @@ def _candidates(page: Page, task: Json, decision: Json) -> None:
         page.block("", (f"and {len(names) - MAX_CANDIDATES} more candidates: see --json", "dim"))
 
 
-def _candidate_cells(name: str, owner: str | None, decision: Json, voters: Sequence[str]) -> list[Cell]:
+def _candidate_cells(name: str, task: Json, decision: Json, voters: Sequence[str]) -> list[Cell]:
     columns: dict[str, Json] = decision["utilities"]
     found = [column[name] for column in columns.values() if name in column]
     joint, veto = decision["aggregates"].get(name), decision["vetoed"].get(name)
     best = max(decision["aggregates"].values(), default=None)
-    notes = ["owner, with bonus"] if name == owner and joint is not None else ["owner"] if name == owner else []
-    notes += [f"vetoed: {veto}"] if veto else []
     style = "red" if veto else "bold" if joint is not None and joint == best else ""
+    note = f"owner +{task['tuning']['bonus']:g}" if name == task["owner"] else ""
     return [
         (name, style),
         (_number(joint, 3), style),
         *((_opinion(columns[voter].get(name)), "") for voter in voters),
         *((_number(_mean([utility[term] for utility in found]), 2), "dim") for term in ("cpu", "memory", "network")),
-        (" " + ", ".join(notes), "red" if veto else "dim"),
+        (veto or note, "red" if veto else "dim"),
     ]
 
 
