@@ -9,6 +9,7 @@ live owner), 5 timed out, 78 bad configuration.
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 from enum import StrEnum
@@ -115,7 +116,8 @@ def init(
     node: NameOption = None,
     state_dir: StateOption = None,
     generation: Annotated[
-        int, typer.Option("--generation", min=0, max=2**20, help="Above 0: start anew, on every node at once.")
+        int,
+        typer.Option("--generation", metavar="G", min=0, max=2**20, help="Above 0: start anew, on every node at once."),
     ] = 0,
 ) -> None:
     """Create this node's blank state: "this name has never voted here".
@@ -168,7 +170,7 @@ def weights(
     task: Annotated[str, typer.Argument(metavar="TASK", help="A task of the fleet file.")],
     pairs: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[cpu=X memory=Y network=Z]", help="New weights; what is left out is 0, the sum is 1."),
+        typer.Argument(metavar="[NAME=NUMBER]", help="New weights: cpu, memory, network; left out is 0, the sum is 1."),
     ] = None,
     revision: Annotated[
         int | None, typer.Option("--revision", min=0, metavar="N", help="Only if this is still the task's revision.")
@@ -305,6 +307,8 @@ def _say(text: str) -> None:
 
 def main() -> None:
     """The console entry point."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # bars in a terminal without UTF-8
     app(prog_name="zsched")
 
 

@@ -12,10 +12,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from zsched.cli_ask import Door, ask_door, find_door
-from zsched.cli_common import EXIT_DEGRADED, EXIT_OK, CliError, Json, print_json, wants_color
+from zsched.cli_common import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK, CliError, Json, print_json, wants_color
 from zsched.report_text import degradations, render_status
 
 MIN_WIDTH, DEFAULT_WIDTH, MAX_WIDTH = 60, 100, 160
+MAJOR = "1"
+"""Of the status's schema: within it fields are only added."""
 HOME, CLEAR, REST_OF_LINE, REST_OF_SCREEN = "\x1b[H", "\x1b[2J", "\x1b[K", "\x1b[J"
 
 
@@ -40,58 +42,74 @@ def show(view: StatusView) -> int:
 
 
 def watch_on(view: StatusView, interval_s: float) -> int:
-    """Print a status every ``interval_s`` until Ctrl-C; a daemon that goes away is waited for.
+    """Print a status every ``interval_s`` until Ctrl-C; a daemon that goes away meanwhile is waited for.
 
     Returns the exit code of the last status.
 
     Raises:
         CliError: already the first question found nobody.
     """
-    door, code = find_door(view.runtime_dir, view.node), EXIT_OK
-    status: Json | None = _ask(door)
-    screen = sys.stdout.isatty() and not view.is_json
-    if screen:
-        sys.stdout.write(CLEAR)
+    door = find_door(view.runtime_dir, view.node)
+    status: Json | CliError = _ask(door)
+    is_screen = sys.stdout.isatty() and not view.is_json
+    code = EXIT_OK
     try:
+        sys.stdout.write(CLEAR if is_screen else "")
         while True:
-            if status is not None:
-                code = _code(status)
-                _print_next(view, status, screen)
+            code = status.code if isinstance(status, CliError) else _code(status)
+            _print_next(view, status, is_screen=is_screen)
             time.sleep(interval_s)
             status = _ask_again(door)
     except KeyboardInterrupt:
         return code
 
 
-def _ask_again(door: Door) -> Json | None:
+def _ask_again(door: Door) -> Json | CliError:
     try:
         return _ask(door)
     except CliError as error:
-        print(f"zsched status: {error}", file=sys.stderr)
-        return None
+        return error
 
 
-def _print_next(view: StatusView, status: Json, screen: bool) -> None:
-    if view.is_json:
+def _print_next(view: StatusView, status: Json | CliError, *, is_screen: bool) -> None:
+    if isinstance(status, CliError):
+        text = f"zsched status: {status}\n"
+        if not is_screen:
+            sys.stderr.write(text)
+            return
+        text += "asking again until Ctrl-C\n"
+    elif view.is_json:
         print_json(status, is_line=True)
         return
-    text = render_status(status, _width(), wants_color(view.is_plain))
-    sys.stdout.write(_fitted(text) if screen else f"{text}\n")
+    else:
+        text = render_status(status, _width(), wants_color(view.is_plain))
+    sys.stdout.write(_fitted(text) if is_screen else f"{text}\n")
     sys.stdout.flush()
 
 
 def _fitted(text: str) -> str:
-    """The text from the top of the screen, cut to its height; what was there before is overwritten, not cleared."""
+    """The text from the top of the screen, fitted to its height; what was there is overwritten, so nothing flickers.
+
+    Of a text that is too high the last block stays, if it is small: that is where problems stand.
+    """
     height = shutil.get_terminal_size((DEFAULT_WIDTH, 30)).lines
     lines = text.splitlines()
     if len(lines) > height:
-        hidden = len(lines) - height + 1
-        lines = [*lines[: height - 1], f"... {hidden} more lines: a higher window shows them"]
+        last = len(lines) - 1 - lines[::-1].index("") if "" in lines else len(lines)
+        tail = lines[last:] if len(lines) - last <= height // 3 else []
+        room = height - 1 - len(tail)
+        note = f"... {len(lines) - len(tail) - room} more lines: a higher window shows them"
+        lines = [*lines[:room], note, *tail]
     return HOME + f"{REST_OF_LINE}\n".join(lines) + REST_OF_LINE + REST_OF_SCREEN
 
 
 def _ask(door: Door) -> Json:
-    return ask_door(door, {"verb": "status"})
+    status = ask_door(door, {"verb": "status"})
+    if str(status.get("schema")).partition("/")[2].partition(".")[0] != MAJOR:
+        found = status.get("schema")
+        text = f"the daemon's status is {found!r}, this zsched reads zsched.status/{MAJOR}; update the older of the two"
+        raise CliError(EXIT_FAILED, text)
+    return status
 
 
 def _code(status: Json) -> int:

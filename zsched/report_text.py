@@ -182,11 +182,10 @@ def _scheduler(page: Page, status: Json, task: Json) -> None:
     weights = " ".join(f"{name} {value:g}" for name, value in tuning["weights"].items())
     page.block(
         "SCHEDULER",
-        (f"weights {weights}", ""),
+        (weights, ""),
         (f"bonus {tuning['bonus']:g}", ""),
-        (f"trigger {tuning['time_to_trigger_s']:g} s", ""),
-        (f"cool-down {tuning['cool_down_s']:g} s", ""),
-        (tuning["aggregate"], ""),
+        (f"trigger {tuning['time_to_trigger_s']:g}s", ""),
+        (f"cool-down {tuning['cool_down_s']:g}s", ""),
     )
     if decision is None:
         why = "edges do not decide: ask a robot with --node" if status["kind"] == "edge" else "no round yet"
@@ -218,7 +217,7 @@ def _candidates(page: Page, task: Json, decision: Json) -> None:
     hidden = len(voters) - len(widths)
     more = f"+{hidden}" if hidden else ""
     columns = [first, -6, *(-width for width in widths), -5, -5, -5, page.width]
-    titles = ["candidate", "joint", *voters[: len(widths)], "cpu", "mem", "net", more]
+    titles = ["candidate", task["tuning"]["aggregate"], *voters[: len(widths)], "cpu", "mem", "net", more]
     page.row(*((title, width, "dim") for title, width in zip(titles, columns, strict=True)), indent=page.indent)
     for name in names[:MAX_CANDIDATES]:
         veto = decision["vetoed"].get(name)
