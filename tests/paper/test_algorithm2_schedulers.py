@@ -302,9 +302,9 @@ def lead_for(rounds: Rounds, seconds: float, *, heard: int = 3, start: float = S
     return made
 
 
-def robot1() -> Rounds:
+def robot1(seed: int = 1) -> Rounds:
     gateway = gateway_with(edge1=(0.8, 0.8), edge2=(0.2, 0.2))
-    return Rounds(FLEET, "robot1", gateway, Random(1), 0.0)
+    return Rounds(FLEET, "robot1", gateway, Random(seed), 0.0)
 
 
 def test_the_scheduler_proposes_its_maximum_to_the_executors() -> None:
@@ -328,3 +328,16 @@ def test_no_proposal_with_fewer_fresh_voters_than_a_majority() -> None:
     assert lead_for(alone, 1.0, heard=1, start=SETTLED_S + 5.0) == [], "not even staying is its to propose"
     assert alone.tasks["merge"].judgement is not None
     assert alone.tasks["merge"].judgement.reason == "utilities of 1 robots, 2 needed"
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_lead_is_proposed_when_its_time_is_up_and_not_a_round_later(seed: int) -> None:
+    """Reading: the time-to-trigger is the price of stickiness; the phase of a robot's rounds adds nothing to it."""
+    rounds = robot1(seed)
+    made: list[Proposal] = []
+    steps = 0
+    while not made:
+        made += lead_for(rounds, 0.01, start=SETTLED_S + steps * 0.01)
+        steps += 1
+
+    assert TUNING.time_to_trigger_s <= steps * 0.01 <= TUNING.time_to_trigger_s + 0.1

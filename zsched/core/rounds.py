@@ -28,6 +28,8 @@ from zsched.core.scoring import Standing, compare, majority, score
 from zsched.core.vote import Tally, VoteOutcome, tally
 
 VOTE_MARGIN_S = 0.1
+TIMER_MARGIN_S = 0.001
+"""Sums of floats: a timer has certainly ended this much later."""
 
 
 @dataclass(slots=True)
@@ -203,6 +205,7 @@ class Rounds:
                 now=now,
             )
         task.judgement, task.judged_at = judgement, now
+        self._wake_when_due(task, judgement, allocation, now)
         out: list[Instruction] = [*self._tell(task, judgement, allocation)]
         if task.commit is not None:
             return out
@@ -229,6 +232,17 @@ class Rounds:
         self._gateway.learn_demand(task.spec.name, owner, now)
         not_ready_for = self._not_ready_for(task, owner, now)
         return escape_reason(task.spec, allocation, state, profile, standing, not_ready_for)
+
+    def _wake_when_due(self, task: TaskRound, judgement: Judgement, allocation: Allocation, now: float) -> None:
+        """A lead that only waits for its timers is judged again when they end, not up to a whole round later."""
+        if judgement.outcome is not Outcome.WAIT or task.judge.beaten_since is None:
+            return
+        tuning = allocation.tuning
+        due = TIMER_MARGIN_S + max(
+            task.judge.beaten_since + tuning.time_to_trigger_s, task.settled_at + tuning.cool_down_s
+        )
+        if due > now:
+            self._round_at = min(self._round_at, due)
 
     def _not_ready_for(self, task: TaskRound, owner: NodeId, now: float) -> float:
         """How long the owner's worker has not been ready (or its profile has been stale)."""
