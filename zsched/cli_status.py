@@ -13,7 +13,7 @@ from pathlib import Path
 
 from zsched.cli_ask import Door, ask_door, find_door
 from zsched.cli_common import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK, CliError, Json, print_json, wants_color
-from zsched.report_text import degradations, render_status
+from zsched.cli_report import degradations, render_status
 
 MIN_WIDTH, DEFAULT_WIDTH, MAX_WIDTH = 60, 100, 160
 MAJOR = "1"

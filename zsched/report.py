@@ -1,6 +1,6 @@
 """A status snapshot as JSON values (pure).
 
-Knows: the schema ``zsched.status/1`` as JSON. Does not know: text for people (`zsched.report_text`), sockets, where the
+Knows: the schema ``zsched.status/1`` as JSON. Does not know: text for people (`zsched.cli_report`), sockets, where the
 snapshot came from.
 """
 

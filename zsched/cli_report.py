@@ -9,14 +9,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from zsched.report_page import Cell, Page, cut, memory, size, span
+from zsched.cli_page import Cell, Page, cut, memory, size, span
 
 Json = dict[str, Any]
 
 BUSY, FULL = 0.6, 0.85
 """From here a bar is yellow, from here red."""
 MAX_CANDIDATES, MAX_HISTORY = 12, 3
-STATE_STYLES = {"alive": "green", "ready": "green", "suspect": "yellow", "unknown": "yellow", "starting": "yellow"}
+STATE_STYLES = {"alive": "green", "ready": "green"} | dict.fromkeys(
+    ("draining", "starting", "stopped", "suspect", "unknown"), "yellow"
+)
+"""All others are red."""
 
 
 def degradations(status: Json) -> tuple[str, ...]:
@@ -68,12 +71,12 @@ def _header(page: Page, status: Json) -> None:
     if degradations(status):
         health, style = "DEGRADED", "alarm"
     role = "" if quorum["this_node"] == "no_elector" else ", " + quorum["this_node"].replace("_", " ")
-    parts = [f"fleet {status['fleet']}", f"{status['node']} ({status['kind']}{role})", f"up {span(status['up_s'])}"]
+    parts = [f"fleet {status['fleet']}", f"{status['node']} ({status['kind']}{role})"]
     parts.append(f"quorum {quorum['alive']} of {quorum['electors']}, needs {quorum['needed']}")
-    version = f"zsched {status['version']}"
-    if len(" · ".join([*parts, version])) + len(health) < page.width:
-        parts.append(version)
-    page.row((" · ".join(parts), page.width - len(health) - 1, "bold"), (health, len(health), style))
+    room = page.width - len(health) - 1
+    for extra in (f"up {span(status['up_s'])}", f"zsched {status['version']}"):
+        parts += [extra] if len(" · ".join([*parts, extra])) <= room else []
+    page.row((" · ".join(parts), room, "bold"), (health, len(health), style))
     page.lines.append("")
 
 
@@ -96,7 +99,7 @@ def _nodes(page: Page, status: Json) -> None:
 
 
 def _node_cells(node: Json, bar: int, *, is_me: bool) -> list[tuple[str, str]]:
-    state = "draining" if node["draining"] else node["state"]
+    state = "draining" if node["draining"] and node["state"] == "alive" else node["state"]
     cpu, cores = node["cpu_ratio"], node["cpu_cores"]
     level = "" if cpu is None else "red" if cpu >= FULL else "yellow" if cpu >= BUSY else "green"
     filled = 0 if cpu is None else round(cpu * bar)
