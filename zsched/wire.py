@@ -105,12 +105,21 @@ def _same(value: Any) -> Any:
     return value
 
 
-_SCALARS: dict[Any, Reader] = {str: _read_str, int: _read_int, float: _read_float, bool: _read_bool}
+def _write_str(value: str) -> str:
+    """Names never get near the bound; a reason for people that does is cut rather than refused by the receiver."""
+    if len(value) > MAX_STRING:
+        value = value[: MAX_STRING - 1] + "…"
+    return value if value.isascii() else value.encode("utf-8", "replace").decode()
+
+
+_SCALARS: dict[Any, Reader] = {int: _read_int, float: _read_float, bool: _read_bool}
 _CODECS: dict[type, tuple[Reader, Writer]] = {}
 
 
 def _codec(hint: Any) -> tuple[Reader, Writer]:
     """The (reader, writer) of a type hint."""
+    if hint is str:
+        return _read_str, _write_str
     if hint in _SCALARS:
         return _SCALARS[hint], _same
     origin = get_origin(hint)

@@ -22,6 +22,8 @@ from zsched.core.model import Beat, NodeId, PeerState
 SMALL_FLEET = 3
 """Up to so many nodes there is no second observer to wait for."""
 MAX_DOUBT = 3.0
+IN_FLIGHT_S = 0.03
+"""A beat that arrives so soon after its sender's token went was on its way before: it refutes nothing."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,6 +46,7 @@ class _Peer:
     vouched_until: float = -math.inf
     """A suspect for whom somebody speaks is looked at again then."""
     token_lost: bool = False
+    token_lost_at: float = -math.inf
     suspects: tuple[NodeId, ...] = ()
 
 
@@ -90,9 +93,12 @@ class Membership:
     # --- what changes it ---------------------------------------------------------------------------------------
 
     def note_lag(self, lag_s: float) -> None:
-        """Take in how late this node's own loop woke up (seconds, >= 0); doubt rises at once and fades by halves."""
-        wanted = min(1.0 + lag_s / self._timing.beat_s, MAX_DOUBT)
-        self._doubt = max(wanted, 1.0 + (self._doubt - 1.0) / 2)
+        """Take in how late this node's own loop woke up (seconds, >= 0), before it judges anybody."""
+        self._doubt = max(self._doubt, min(1.0 + lag_s / self._timing.beat_s, MAX_DOUBT))
+
+    def fade_doubt(self) -> None:
+        """A beat was sent: doubt fades by halves."""
+        self._doubt = 1.0 + (self._doubt - 1.0) / 2
 
     def absorb_beat(self, beat: Beat, now: float) -> tuple[Transition, ...]:
         """A peer's loop is alive: it refutes every accusation. Beats of an older incarnation or order are ignored."""
@@ -100,6 +106,9 @@ class Membership:
         if peer is None or not self._is_newer(peer, beat):
             return ()
         restarted = 0 <= peer.incarnation < beat.incarnation
+        if peer.token_lost and not restarted and now < peer.token_lost_at + IN_FLIGHT_S:
+            peer.sequence = beat.sequence
+            return ()
         before = peer.state
         peer.incarnation, peer.sequence, peer.beat_at = beat.incarnation, beat.sequence, now
         peer.suspects, peer.token_lost = beat.suspects, False
@@ -122,7 +131,7 @@ class Membership:
         peer = self._peers.get(node)
         if peer is None or peer.incarnation != incarnation or peer.state is not PeerState.ALIVE:
             return ()
-        peer.token_lost = True
+        peer.token_lost, peer.token_lost_at = True, now
         return (self._change(node, PeerState.SUSPECT, "its token went", now), *self._review(now))
 
     def tick(self, now: float) -> tuple[Transition, ...]:

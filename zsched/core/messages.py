@@ -43,6 +43,7 @@ class Promise:
 
     def __post_init__(self) -> None:
         check_name("promise.elector", self.elector)
+        check_name("promise.task", self.task)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,6 +70,7 @@ class Accepted:
 
     def __post_init__(self) -> None:
         check_name("accepted.elector", self.elector)
+        check_name("accepted.task", self.task)
 
 
 class Refusal(StrEnum):
@@ -94,6 +96,7 @@ class Refused:
 
     def __post_init__(self) -> None:
         check_name("refused.elector", self.elector)
+        check_name("refused.task", self.task)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -201,7 +201,9 @@ class Node:
         )
 
     def _note_lag(self, now: float) -> None:
-        self.loop_lag_s = max(self.loop_lag_s, now - self._promised, 0.0)
+        lag_s = max(now - self._promised, 0.0)
+        self.loop_lag_s = max(self.loop_lag_s, lag_s)
+        self.membership.note_lag(lag_s)
 
     def _advance(self, now: float) -> None:
         """Let every stage act on the time that has passed, in the data's order."""
@@ -238,7 +240,7 @@ class Node:
 
     def _beat(self, now: float) -> None:
         self._beat_sequence += 1
-        self.membership.note_lag(self.loop_lag_s)
+        self.membership.fade_doubt()
         beat = Beat(
             node=self.me,
             incarnation=self.incarnation,

@@ -293,7 +293,7 @@ def test_doubt_fades_by_halves_and_never_below_trust() -> None:
     ear.members.note_lag(0.4)
     limits = []
     for _ in range(12):
-        ear.members.note_lag(0.0)
+        ear.members.fade_doubt()
         limits.append(ear.members.next_deadline() / WIFI.suspect_s)
     assert limits[:2] == [pytest.approx(2.0), pytest.approx(1.5)]
     assert limits[-1] == pytest.approx(1.0, abs=1e-3)
@@ -330,7 +330,7 @@ def test_random_beats_cuts_and_kills_end_where_the_truth_is(nodes: tuple[NodeId,
             ear.members.tick(now)
         dead = set(nodes[1 + len(nodes) // 2 :]) | {nodes[1]}
         living = tuple(n for n in nodes[1:] if n not in dead)
-        ear.members.note_lag(0.0)
+        ear.members.fade_doubt()
         ear.run(now, now + 6 * ear.timing.suspect_s, living, suspects=tuple(sorted(dead)))
         states = ear.members.states()
         assert all(states[n] in (GONE, UNKNOWN) for n in dead), f"seed {seed}: {states}"
