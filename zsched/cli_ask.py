@@ -6,13 +6,13 @@ Knows: which of several sockets is meant, what each refusal means as an exit cod
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from zsched import places
 from zsched.adapters.operator_socket import ask
-from zsched.cli_common import EXIT_FAILED, EXIT_TIMED_OUT, EXIT_UNREACHABLE, EXIT_USAGE, CliError, Json
+from zsched.cli_common import EXIT_FAILED, EXIT_TIMED_OUT, EXIT_UNREACHABLE, EXIT_USAGE, CliError, Json, nearest
 from zsched.errors import AdapterError
 
 ASK_TIMEOUT_S = 5.0
@@ -47,13 +47,31 @@ def find_door(runtime_dir: Path | None, node: str | None, env: Mapping[str, str]
     if node is not None:
         if node in sockets:
             return Door(socket=sockets[node])
-        return Door(socket=sockets.get(own) or next(iter(sockets.values())), node=node)
+        nearer = sorted(sockets, key=lambda name: name != own)
+        return _through([sockets[name] for name in nearer], node)
     if len(sockets) == 1:
         return Door(socket=next(iter(sockets.values())))
     if own in sockets:
         return Door(socket=sockets[own])
     names = ", ".join(sockets)
     raise CliError(EXIT_USAGE, f"several daemons in {runtime}: {names}; say which one with --node or ZSCHED_NODE")
+
+
+def _through(sockets: Sequence[Path], node: str) -> Door:
+    """The first daemon here that answers, to ask it for ``node``, which must be in its fleet."""
+    failures = []
+    for path in sockets:
+        door = Door(socket=path)
+        try:
+            status = ask_door(door, {"verb": "status"})
+        except CliError as error:
+            failures.append(error)
+            continue
+        names = [str(known["name"]) for known in status["nodes"]]
+        if node not in names:
+            raise CliError(EXIT_USAGE, f"fleet {status['fleet']} has no node {node!r}{nearest(node, names)}")
+        return Door(socket=path, node=node)
+    raise failures[0]
 
 
 def ask_door(door: Door, request: Json, timeout_s: float = ASK_TIMEOUT_S) -> Json:

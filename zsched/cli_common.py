@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -95,6 +95,14 @@ def print_json(body: Mapping[str, Any], *, is_line: bool = False) -> None:
     text = json.dumps(body, ensure_ascii=False, indent=None if is_line else 2)
     sys.stdout.write(f"{text}\n")
     sys.stdout.flush()
+
+
+def nearest(name: str, known: Sequence[str]) -> str:
+    """How a refusal of ``name`` goes on: ``; did you mean ...?`` or, when nothing is near, what there is."""
+    import difflib  # noqa: PLC0415 - only when something is wrong
+
+    close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    return f"; did you mean {close[0]}?" if close else f"; there are {', '.join(known) or 'none'}"
 
 
 def wants_color(is_refused: bool, env: Mapping[str, str] = os.environ) -> bool:

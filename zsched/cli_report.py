@@ -34,7 +34,14 @@ def degradations(status: Json) -> tuple[str, ...]:
             reasons.append(f"{task['name']} has no owner")
         elif task["owner_state"] not in ("alive", "suspect"):
             reasons.append(f"{task['name']}: its owner {task['owner']} is {task['owner_state']}")
+        elif _has_failed_worker(status, task):
+            reasons.append(f"{task['name']}: its worker on {task['owner']} has failed")
     return tuple(reasons)
+
+
+def _has_failed_worker(status: Json, task: Json) -> bool:
+    workers = (worker for node in status["nodes"] if node["name"] == task["owner"] for worker in node["workers"])
+    return any(worker["task"] == task["name"] and worker["state"] == "failed" for worker in workers)
 
 
 def render_status(status: Json, width: int, color: bool) -> str:

@@ -5,10 +5,9 @@ Knows: the weights' names, ranges and sum, outcomes as exit codes. Does not know
 
 from __future__ import annotations
 
-import difflib
 import math
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 from zsched.cli_ask import Door, ask_door
 from zsched.cli_common import (
@@ -19,6 +18,7 @@ from zsched.cli_common import (
     EXIT_USAGE,
     CliError,
     Json,
+    nearest,
     print_json,
 )
 
@@ -68,12 +68,6 @@ def parse_weights(pairs: Iterable[str]) -> dict[str, float]:
         zeros = f" ({', '.join(left_out)} left out: 0)" if left_out else ""
         raise CliError(EXIT_USAGE, f"the weights' sum is {total:g}{zeros}, not 1; change one of them")
     return {name: found.get(name, 0.0) for name in NAMES}
-
-
-def nearest(name: str, known: Sequence[str]) -> str:
-    """``; did you mean ...?`` or, when nothing is near, what there is."""
-    close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-    return f"; did you mean {close[0]}?" if close else f"; there are {', '.join(known) or 'none'}"
 
 
 def show_weights(door: Door, task: str, *, is_json: bool) -> None:
