@@ -20,10 +20,22 @@ from typing import Any
 from zsched.tasks.map_merge.align import Fit, prepare
 from zsched.tasks.map_merge.compose import Extent, compose, extent_of
 from zsched.tasks.map_merge.geometry import Pose2
-from zsched.tasks.map_merge.grid import Grid, crop_known
-from zsched.tasks.map_merge.pairs import Alignment, MapVersion, Pair, PairBook, Rule, broken_cycle, spanning_transforms
+from zsched.tasks.map_merge.grid import MAX_CELLS, MAX_SIDE_CELLS, Grid, crop_known
+from zsched.tasks.map_merge.pairs import (
+    Alignment,
+    MapVersion,
+    Pair,
+    PairBook,
+    Rule,
+    SearchJob,
+    broken_cycle,
+    spanning_transforms,
+)
+from zsched.tasks.map_merge.search import Estimate
 
 MAX_ROBOTS = 64
+MAX_ALIGNED_CELLS = 16_000_000
+"""Largest map that is aligned, 200 m x 200 m at 0.05 m: its lookups take 20 bytes per cell."""
 RESTART_RATIO = 0.5
 """A map whose known area falls under this share of its last is a new map, in a new frame."""
 SNAPSHOT_SCHEMA = "zsched.map_merge.snapshot/1"
@@ -91,10 +103,15 @@ class MergeResult:
 
 
 class Merger:
-    """The state machine over grids. Not thread-safe."""
+    """The state machine over grids. Not thread-safe.
 
-    def __init__(self, settings: MergerSettings) -> None:
+    With ``searches_itself`` each merge runs at most one search that is due; else the caller takes `next_search`, runs
+    it wherever it likes and brings the outcome back with `finish_search`.
+    """
+
+    def __init__(self, settings: MergerSettings, *, searches_itself: bool = True) -> None:
         self._settings = settings
+        self._searches_itself = searches_itself
         self._grids: dict[str, Grid | None] = {}
         self._numbers: dict[str, int] = {}
         self._versions: dict[str, MapVersion] = {}
@@ -122,6 +139,8 @@ class Merger:
         if robot not in self._grids and len(self._grids) >= MAX_ROBOTS:
             return f"more than {MAX_ROBOTS} robots"
         cropped = crop_known(grid)
+        if cropped is not None and (refusal := self._too_large(cropped)):
+            return refusal
         area = 0.0 if cropped is None else cropped.known_area_m2
         if area < RESTART_RATIO * self._areas.get(robot, 0.0):
             self._pairs.forget(robot)
@@ -129,6 +148,16 @@ class Merger:
         self._areas[robot] = area
         self._numbers[robot] = self._numbers.get(robot, 0) + 1
         return ""
+
+    def _too_large(self, grid: Grid) -> str:
+        """Why the grid is too large for this merger at its own resolution, empty when it is not."""
+        most = MAX_CELLS if self._settings.mode is Mode.KNOWN else MAX_ALIGNED_CELLS
+        ratio = grid.resolution / self._settings.resolution
+        cells = grid.width * grid.height * ratio**2
+        if cells <= most and max(grid.width, grid.height) * ratio <= MAX_SIDE_CELLS:
+            return ""
+        size = f"{grid.width * grid.resolution:.0f} m x {grid.height * grid.resolution:.0f} m"
+        return f"its map of {size} is too large at {self._settings.resolution:g} m per cell (see --resolution)"
 
     def remove(self, robot: str) -> None:
         """Leave a robot's map out from now on (its stream was deleted).
@@ -162,6 +191,15 @@ class Merger:
             revision=self._revision,
             is_search_due=is_search_due,
         )
+
+    def next_search(self) -> SearchJob | None:
+        """The search that is due most, as of the newest merge; ``None`` when none is."""
+        maps = {robot: version for robot, version in self._versions.items() if self._grids.get(robot) is not None}
+        return self._pairs.next_search(maps)
+
+    def finish_search(self, job: SearchJob, found: Estimate | None) -> None:
+        """Bring back what a search found; the next merge uses it."""
+        self._pairs.finish_search(job, found)
 
     def snapshot(self) -> bytes:
         """The transforms as bytes, for the next owner: it then tracks instead of searching anew."""
@@ -216,10 +254,11 @@ class Merger:
                 )
         maps = {robot: self._versions[robot] for robot in grids}
         self._pairs.refresh(maps)
-        is_search_due = self._pairs.search_one(maps)
+        if self._searches_itself and (job := self._pairs.next_search(maps)) is not None:
+            self._pairs.finish_search(job, job.run())
         while (broken := broken_cycle(self._pairs.accepted, self._centre)) is not None:
             self._pairs.refuse(*broken)
-        return is_search_due
+        return self._pairs.is_search_due(maps)
 
     def _centre(self, robot: str) -> tuple[float, float]:
         version = self._versions.get(robot)

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 
 from zsched.tasks.map_merge.align import Fit, WallMap, fit, refine
 from zsched.tasks.map_merge.geometry import Pose2, difference
-from zsched.tasks.map_merge.search import estimate
+from zsched.tasks.map_merge.search import Estimate, estimate
 
 Pair = tuple[str, str]
 """Two robots, sorted by name."""
@@ -86,6 +86,8 @@ class _PairState:
     versions: tuple[int, int] = (0, 0)
     """Versions of the two maps that `alignment` was last held against."""
     searched_areas: tuple[float, float] | None = None
+    job: int = 0
+    """Number of the newest search."""
     contradictions: int = 0
 
     @property
@@ -100,6 +102,21 @@ class MapVersion:
     number: int
     walls: WallMap
     area_m2: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SearchJob:
+    """One search to run: pure, so it may run in any thread while merging goes on."""
+
+    number: int
+    pair: Pair
+    a: WallMap
+    b: WallMap
+    held: Pose2 | None
+
+    def run(self) -> Estimate | None:
+        """Search; takes up to a second."""
+        return estimate(self.a, self.b, self.held)
 
 
 class PairBook:
@@ -154,20 +171,40 @@ class PairBook:
             elif (start := self._hint(pair)) is not None:
                 state.alignment = self._from_start(pair, start, a, b)
 
-    def search_one(self, maps: dict[str, MapVersion]) -> bool:
-        """Search the one pair that waits longest for it; returns whether more are due.
+    def is_search_due(self, maps: dict[str, MapVersion]) -> bool:
+        """Whether `next_search` would give one."""
+        return any(self._is_due(pair, maps) for pair in _pairs(maps))
 
-        One at a time: a search takes up to a second, and the other robots' merge must not wait for all of them.
+    def next_search(self, maps: dict[str, MapVersion]) -> SearchJob | None:
+        """The search of the pair that waits longest for one, ``None`` when none is due.
+
+        One at a time: a search takes up to a second, and the merge must not wait for all of them.
         """
         due = [pair for pair in _pairs(maps) if self._is_due(pair, maps)]
         if not due:
-            return False
+            return None
         due.sort(key=lambda pair: self._searched_area(pair) / (maps[pair[0]].area_m2 + maps[pair[1]].area_m2))
         pair = due[0]
+        a, b = maps[pair[0]], maps[pair[1]]
         state = self._states.setdefault(pair, _PairState())
-        state.searched_areas = (maps[pair[0]].area_m2, maps[pair[1]].area_m2)
-        self._search(state, pair, maps[pair[0]].walls, maps[pair[1]].walls)
-        return len(due) > 1
+        state.searched_areas = (a.area_m2, b.area_m2)
+        self.searches += 1
+        state.job = self.searches
+        held = None if state.accepted is None else state.accepted.fit.a_t_b
+        return SearchJob(number=self.searches, pair=pair, a=a.walls, b=b.walls, held=held)
+
+    def finish_search(self, job: SearchJob, found: Estimate | None) -> None:
+        """Take in what a search found; nothing when the pair was forgotten meanwhile."""
+        state = self._states.get(job.pair)
+        if state is None or state.job != job.number or found is None:
+            return
+        reason = self._rule.refusal(found.best, self._resolution, found.margin)
+        if reason and state.accepted is not None:
+            return  # nothing better is accepted: what was accepted stays
+        state.alignment = Alignment(
+            pair=job.pair, fit=found.best, margin=found.margin, is_accepted=not reason, reason=reason
+        )
+        state.contradictions = 0
 
     def _hint(self, pair: Pair) -> Pose2 | None:
         a, b = (self._hints.get(robot) for robot in pair)
@@ -211,20 +248,6 @@ class PairBook:
     def _searched_area(self, pair: Pair) -> float:
         state = self._states.get(pair)
         return 0.0 if state is None or state.searched_areas is None else sum(state.searched_areas)
-
-    def _search(self, state: _PairState, pair: Pair, a: WallMap, b: WallMap) -> None:
-        held = state.accepted
-        self.searches += 1
-        found = estimate(a, b, None if held is None else held.fit.a_t_b)
-        if found is None:
-            return
-        reason = self._rule.refusal(found.best, self._resolution, found.margin)
-        if held is not None and reason:
-            return  # nothing better is accepted: what was accepted stays
-        state.alignment = Alignment(
-            pair=pair, fit=found.best, margin=found.margin, is_accepted=not reason, reason=reason
-        )
-        state.contradictions = 0
 
 
 def _pairs(robots: Iterable[str]) -> list[Pair]:

@@ -11,6 +11,8 @@ Knows: keys, the worker's life. Does not know: how maps are merged.
 from __future__ import annotations
 
 import argparse
+import logging
+import os
 
 import cv2
 
@@ -55,6 +57,9 @@ def run(options: argparse.Namespace) -> None:
         worker.ready()
         while worker.wait(POLL_S):
             service.step(is_active=worker.role.role is not WorkerRole.IDLE)
+    if service.is_searching:
+        logging.shutdown()
+        os._exit(0)  # a thread inside OpenCV would delay the interpreter's end, or abort it
 
 
 def _settings(options: argparse.Namespace) -> MergerSettings:

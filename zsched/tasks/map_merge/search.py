@@ -24,11 +24,15 @@ from zsched.tasks.map_merge.geometry import FloatArray, Pose2, difference
 from zsched.tasks.map_merge.grid import Grid
 
 COARSE_M = 0.2
+MAX_COARSE_CELLS = 600
+"""Longest side of a map in the correlation: over 120 m it is searched more coarsely, so that a search stays short."""
 STEP_RAD = math.radians(2.0)
 FREE_WEIGHT = 0.35
 PEAKS = 6
 PEAKS_PER_ANGLE = 2
 FEATURES = 3000
+MIN_FEATURE_CELLS = 64
+"""ORB shrinks the image eight times by 1.2 and fails on what is then under a pixel; a patch alone takes 31."""
 RATIO = 0.75
 DISTINCT_M = 1.0
 DISTINCT_RAD = math.radians(10.0)
@@ -111,13 +115,16 @@ def _rigid_part(affine: FloatArray, centre: FloatArray) -> list[Pose2]:
 
 def _features(grid: Grid) -> tuple[FloatArray, npt.NDArray[np.uint8]]:
     """Key points (N, 2) in the map frame in metres, and their descriptors."""
+    nothing = np.zeros((0, 2)), np.zeros((0, 32), dtype=np.uint8)
+    if min(grid.data.shape) < MIN_FEATURE_CELLS:
+        return nothing
     image = np.full(grid.data.shape, 127, dtype=np.uint8)
     image[grid.free] = 254
     image[grid.occupied] = 0
     orb = cv2.ORB_create(nfeatures=FEATURES)  # type: ignore[attr-defined]  # missing in OpenCV's stubs
     keys, descriptors = orb.detectAndCompute(image, None)
     if descriptors is None:
-        return np.zeros((0, 2)), np.zeros((0, 32), dtype=np.uint8)
+        return nothing
     pixels = np.array([key.pt for key in keys], dtype=np.float64)
     return grid.origin.apply((pixels + 0.5) * grid.resolution), descriptors
 
@@ -133,25 +140,28 @@ class _Peak:
 
 def correlation_candidates(a: Grid, b: Grid) -> list[Pose2]:
     """Up to `PEAKS` distinct candidates over all rotations, the strongest first."""
-    fine_a, fine_b = resample(a, COARSE_M), resample(b, COARSE_M)
+    longest = max(max(grid.width, grid.height) * grid.resolution for grid in (a, b))
+    cell = max(COARSE_M, longest / MAX_COARSE_CELLS)
+    coarse_a, coarse_b = resample(a, cell), resample(b, cell)
     # Only b's walls are correlated: with its free space too, two wide open maps agree best where they hide each other.
-    signal_a, signal_b = _signal(fine_a), _walls(fine_b)
+    signal_a, signal_b = _signal(coarse_a), _walls(coarse_b)
     side_b = math.ceil(math.hypot(*signal_b.shape)) + 2
     shape = (
         cv2.getOptimalDFTSize(signal_a.shape[0] + side_b),
         cv2.getOptimalDFTSize(signal_a.shape[1] + side_b),
     )
     spectrum_a = np.fft.rfft2(signal_a, shape)
+    radius = max(1, round(DISTINCT_M / cell))
     peaks: list[_Peak] = []
     for turn in range(round(math.tau / STEP_RAD)):
         yaw = turn * STEP_RAD
         turned = _turned(signal_b, yaw, side_b)
         correlation = np.fft.irfft2(spectrum_a * np.conj(np.fft.rfft2(turned, shape)), shape)
         peaks.extend(
-            _Peak(value, _pose(fine_a, fine_b, yaw, shift, side_b))
-            for value, shift in _maxima(correlation, signal_a.shape)
+            _Peak(value, _pose(coarse_a, coarse_b, yaw, shift, side_b))
+            for value, shift in _maxima(correlation, signal_a.shape, radius)
         )
-    centre = fine_b.origin.apply_point(fine_b.width * COARSE_M / 2, fine_b.height * COARSE_M / 2)
+    centre = coarse_b.origin.apply_point(coarse_b.width * cell / 2, coarse_b.height * cell / 2)
     return _distinct(peaks, centre)
 
 
@@ -177,11 +187,12 @@ def _turned(signal: _Signal, yaw: float, side: int) -> _Signal:
     return cv2.warpAffine(signal, matrix, (side, side), flags=cv2.INTER_LINEAR).astype(np.float32, copy=False)
 
 
-def _maxima(correlation: npt.NDArray[np.floating], size_a: tuple[int, ...]) -> Iterable[tuple[float, tuple[int, int]]]:
-    """The strongest shifts (columns, rows) of one rotation, at least `DISTINCT_M` apart; shifts may be negative."""
+def _maxima(
+    correlation: npt.NDArray[np.floating], size_a: tuple[int, ...], radius: int
+) -> Iterable[tuple[float, tuple[int, int]]]:
+    """The strongest shifts (columns, rows) of one rotation, over ``radius`` cells apart; shifts may be negative."""
     image = np.ascontiguousarray(correlation, dtype=np.float32)
     rows, columns = image.shape
-    radius = round(DISTINCT_M / COARSE_M)
     for _ in range(PEAKS_PER_ANGLE):
         _low, value, _where, (column, row) = cv2.minMaxLoc(image)
         if value <= 0.0:
@@ -194,8 +205,8 @@ def _maxima(correlation: npt.NDArray[np.floating], size_a: tuple[int, ...]) -> I
 
 def _pose(a: Grid, b: Grid, yaw: float, shift: tuple[int, int], side_b: int) -> Pose2:
     """The pose of b's map frame in a's when b's turned square lies at ``shift`` cells in a's grid."""
-    middle_a = ((shift[0] + side_b / 2) * COARSE_M, (shift[1] + side_b / 2) * COARSE_M)
-    middle_b = Pose2(x=b.width * COARSE_M / 2, y=b.height * COARSE_M / 2)
+    middle_a = ((shift[0] + side_b / 2) * a.resolution, (shift[1] + side_b / 2) * a.resolution)
+    middle_b = Pose2(x=b.width * b.resolution / 2, y=b.height * b.resolution / 2)
     grid_a_t_grid_b = Pose2(x=middle_a[0], y=middle_a[1], yaw=yaw).compose(middle_b.inverse())
     return a.origin.compose(grid_a_t_grid_b).compose(b.origin.inverse())
 

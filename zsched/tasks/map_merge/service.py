@@ -4,14 +4,15 @@ Knows: the three outputs and their bytes, counters, ages. Does not know: zenoh o
 through plain calls, so that the whole service runs in a test.
 
 Threads: `receive` and `snapshot` may be called from any thread, `step` from one only. `receive` decodes and keeps the
-newest map per robot; all the work is in `step`, so a slow merge never delays an input, and a bad message costs nothing
-but a counter.
+newest map per robot; merging is in `step`, so a slow merge never delays an input, and a bad message costs nothing but a
+counter. A search runs in a thread of its own, one at a time, so that merged maps keep coming.
 """
 
 from __future__ import annotations
 
 import json
 import logging
+import queue
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -23,6 +24,8 @@ from zsched.tasks.map_merge.cdr import CdrError, StampedTransform, decode_grid, 
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid
 from zsched.tasks.map_merge.merger import MAX_ROBOTS, Merger, MergeResult, MergerSettings, RobotStatus
+from zsched.tasks.map_merge.pairs import SearchJob
+from zsched.tasks.map_merge.search import Estimate
 
 STATUS_SCHEMA = "zsched.map_merge.status/1"
 STATUS_PERIOD_S = 1.0
@@ -36,6 +39,18 @@ class Output(StrEnum):
     GLOBAL_MAP = "global_map"
     TF = "tf"
     STATUS = "status"
+
+
+def _in_thread(work: Callable[[], None]) -> None:
+    threading.Thread(target=work, name="map search", daemon=True).start()  # daemon: it must not delay the exit
+
+
+def _outcome(job: SearchJob) -> Estimate | None:
+    try:
+        return job.run()
+    except Exception:  # noqa: BLE001 - a pair of maps that trips a bug is a pair that is not aligned
+        _LOG.exception("search_failed pair=%s", job.pair)
+        return None
 
 
 class Publish(Protocol):
@@ -59,13 +74,22 @@ class MapMergeService:
     """The task without its transport. ``rate_hz`` bounds merges; ``clock`` gives monotonic seconds."""
 
     def __init__(
-        self, settings: MergerSettings, publish: Publish, *, clock: Callable[[], float], rate_hz: float = 4.0
+        self,
+        settings: MergerSettings,
+        publish: Publish,
+        *,
+        clock: Callable[[], float],
+        rate_hz: float = 4.0,
+        spawn: Callable[[Callable[[], None]], None] = _in_thread,
     ) -> None:
         self._settings = settings
         self._publish = publish
         self._clock = clock
         self._period_s = 1.0 / rate_hz
-        self._merger = Merger(settings)
+        self._spawn = spawn
+        self._merger = Merger(settings, searches_itself=False)
+        self._found: queue.SimpleQueue[tuple[SearchJob, Estimate | None]] = queue.SimpleQueue()
+        self._is_searching = False
         self._lock = threading.Lock()
         self._pending: dict[str, Grid | None] = {}
         self._inputs: dict[str, _Input] = {}
@@ -104,6 +128,11 @@ class MapMergeService:
             book.received_s = self._clock()
         self._keep(robot, grid)
 
+    @property
+    def is_searching(self) -> bool:
+        """Whether a search runs, or its outcome waits to be taken in."""
+        return self._is_searching
+
     def snapshot(self) -> bytes:
         """The transforms as of the newest merge, for the next owner."""
         return self._snapshot
@@ -136,6 +165,7 @@ class MapMergeService:
         now = self._clock()
         if not is_active:
             return False
+        self._take_found()
         if self._is_due and now >= self._next_merge_s:
             self._next_merge_s = now + self._period_s
             self._merge()
@@ -158,10 +188,8 @@ class MapMergeService:
         self._merges += 1
         self._log_changes(result)
         self._result, self._snapshot = result, self._merger.snapshot()
-        if result.is_search_due:
-            with self._lock:
-                self._is_due = True
         self._publish_result(result)
+        self._search()
 
     def _merged(self, pending: Mapping[str, Grid | None]) -> MergeResult:
         for robot, grid in pending.items():
@@ -178,6 +206,21 @@ class MapMergeService:
                 self._inputs[robot].bad += 1
                 self._inputs[robot].last_error = "a merge failed with its map (see the worker's log)"
             self._is_due = bool(pending)
+
+    def _search(self) -> None:
+        """Start the search that is due, unless one runs: a search takes up to a second, and maps go on meanwhile."""
+        job = None if self._is_searching else self._merger.next_search()
+        if job is None:
+            return
+        self._is_searching = True
+        self._spawn(lambda: self._found.put((job, _outcome(job))))
+
+    def _take_found(self) -> None:
+        while not self._found.empty():
+            self._merger.finish_search(*self._found.get())
+            self._is_searching = False
+            with self._lock:
+                self._is_due = True
 
     def _publish_result(self, result: MergeResult) -> None:
         attachment = json.dumps({"merge": self._merges, "inputs": dict(result.inputs)}).encode()
@@ -207,7 +250,7 @@ class MapMergeService:
             "merges": self._merges,
             "revision": 0 if result is None else result.revision,
             "reference": None if result is None else result.reference,
-            "is_search_due": result is not None and result.is_search_due,
+            "is_searching": self._is_searching,
             "merge_ms": None if self._merge_ms is None else round(self._merge_ms, 2),
             "map": None if grid is None else _map_fields(grid),
             "strangers": self._strangers,

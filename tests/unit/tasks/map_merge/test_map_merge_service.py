@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -45,7 +46,7 @@ class _Wire:
 
 def _service(wire: _Wire, mode: Mode = Mode.KNOWN) -> MapMergeService:
     settings = MergerSettings(mode=mode, poses=_POSES if mode is Mode.KNOWN else {})
-    return MapMergeService(settings, wire.publish, clock=wire.clock, rate_hz=4.0)
+    return MapMergeService(settings, wire.publish, clock=wire.clock, rate_hz=4.0, spawn=lambda work: work())
 
 
 def _feed(service: MapMergeService, view: View, *robots: str) -> None:
@@ -193,3 +194,53 @@ def test_broken_snapshot_changes_nothing(view: View) -> None:
     _feed(service, view, "robot1")
     assert service.step(is_active=True)
     assert wire.status()["robots"]["robot1"]["state"] == "attached"
+
+
+def test_search_runs_beside_the_merge_and_is_taken_in_later(view: View) -> None:
+    wire = _Wire()
+    started: list[Callable[[], None]] = []
+    settings = MergerSettings(mode=Mode.ESTIMATE)
+    service = MapMergeService(settings, wire.publish, clock=wire.clock, spawn=started.append)
+    _feed(service, view, "robot1", "robot2")
+    assert service.step(is_active=True)
+    for _ in range(3):  # merges go on, and no second search starts
+        _feed(service, view, "robot1")
+        wire.now_s += 1.0
+        assert service.step(is_active=True)
+    assert len(started) == 1
+    assert wire.status()["is_searching"]
+    assert wire.status()["robots"]["robot2"]["state"] == "waiting"
+    started[0]()
+    wire.now_s += 1.0
+    assert service.step(is_active=True)
+    assert wire.status()["robots"]["robot2"]["state"] == "attached"
+    assert not wire.status()["is_searching"]
+
+
+def test_search_in_its_own_thread_comes_back(view: View) -> None:
+    wire = _Wire()
+    service = MapMergeService(MergerSettings(mode=Mode.ESTIMATE), wire.publish, clock=wire.clock)
+    _feed(service, view, "robot1", "robot2")
+    deadline = time.monotonic() + 20.0
+    while time.monotonic() < deadline:
+        wire.now_s += 1.0
+        service.step(is_active=True)
+        if wire.status()["robots"]["robot2"]["state"] == "attached":
+            return
+        time.sleep(0.01)
+    raise AssertionError("the search never came back")
+
+
+def test_search_outcome_of_a_map_that_started_anew_is_dropped(view: View) -> None:
+    wire = _Wire()
+    started: list[Callable[[], None]] = []
+    service = MapMergeService(MergerSettings(mode=Mode.ESTIMATE), wire.publish, clock=wire.clock, spawn=started.append)
+    _feed(service, view, "robot1", "robot2")
+    service.step(is_active=True)
+    service.receive("robot2", encode_grid(view((7.0, 0.0, 9.0, 2.0), Pose2())))
+    wire.now_s += 1.0
+    service.step(is_active=True)
+    started[0]()
+    wire.now_s += 1.0
+    service.step(is_active=True)
+    assert wire.status()["robots"]["robot2"]["state"] != "attached"
