@@ -19,12 +19,7 @@ import pytest
 
 from zsched.lab.janitor import TOKEN_VARIABLE, groups_of, tagged_processes
 
-RUN = """
-import sys
-from pathlib import Path
-from zsched.lab.demo import DemoOptions, run_demo
-sys.exit(run_demo(DemoOptions(headless=True, out=Path(sys.argv[1]), duration_s=float(sys.argv[2]))))
-"""
+DEMO = (sys.executable, "-m", "zsched.cli", "demo", "--headless")
 
 
 class Run:
@@ -34,7 +29,7 @@ class Run:
         self.out = out
         self.output = out.with_suffix(".txt")
         with self.output.open("wb") as output:
-            command = [sys.executable, "-c", RUN, str(out), str(duration_s)]
+            command = [*DEMO, "--out", str(out), "--duration", str(duration_s)]
             self.process = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT)
         self.tokens: set[str] = set()
 
