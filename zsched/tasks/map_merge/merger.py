@@ -130,6 +130,11 @@ class Merger:
         self._revision = 0
 
     @property
+    def needs_reference(self) -> bool:
+        """Whether the next merge chooses the reference robot: worth waiting a moment for the lowest name."""
+        return self._reference is None and self._settings.mode is not Mode.KNOWN
+
+    @property
     def searches(self) -> int:
         """How many searches ran so far: merges with one take a hundred times longer."""
         return self._pairs.searches
@@ -327,7 +332,7 @@ class Merger:
         refused = self._pairs.refused_with(robot)
         if refused:
             return _with_figures(robot, RobotState.REFUSED, refused[0].reason, refused[0])
-        return RobotStatus(robot=robot, state=RobotState.WAITING, reason="its map has too few walls so far")
+        return RobotStatus(robot=robot, state=RobotState.WAITING, reason=self._pairs.pending_reason(robot))
 
 
 def _with_figures(robot: str, state: RobotState, reason: str, edge: Alignment) -> RobotStatus:

@@ -86,8 +86,10 @@ class _PairState:
     versions: tuple[int, int] = (0, 0)
     """Versions of the two maps that `alignment` was last held against."""
     searched_areas: tuple[float, float] | None = None
-    job: int = 0
-    """Number of the newest search."""
+    job: int | None = None
+    """Number of the search that runs."""
+    has_few_walls: bool = False
+    """The newest search had nothing to judge."""
     contradictions: int = 0
 
     @property
@@ -141,6 +143,15 @@ class PairBook:
         found = [state.alignment for pair, state in self._states.items() if robot in pair and state.accepted is None]
         attempts = [alignment for alignment in found if alignment is not None]
         return tuple(sorted(attempts, key=lambda alignment: -alignment.fit.quality))
+
+    def pending_reason(self, robot: str) -> str:
+        """Why a robot with a map has no judged alignment yet."""
+        states = [state for pair, state in self._states.items() if robot in pair]
+        if any(state.job is not None for state in states):
+            return "its search is under way"
+        if any(state.has_few_walls for state in states):
+            return "the maps have too few walls so far"
+        return "its map waits for a search"
 
     def adopt(self, alignment: Alignment) -> None:
         """Take over an alignment that a previous owner had accepted."""
@@ -196,7 +207,11 @@ class PairBook:
     def finish_search(self, job: SearchJob, found: Estimate | None) -> None:
         """Take in what a search found; nothing when the pair was forgotten meanwhile."""
         state = self._states.get(job.pair)
-        if state is None or state.job != job.number or found is None:
+        if state is None or state.job != job.number:
+            return
+        state.job = None
+        if found is None:
+            state.has_few_walls = True
             return
         reason = self._rule.refusal(found.best, self._resolution, found.margin)
         if reason and state.accepted is not None:

@@ -28,6 +28,11 @@ from zsched.tasks.map_merge.pairs import SearchJob
 from zsched.tasks.map_merge.search import Estimate
 
 STATUS_SCHEMA = "zsched.map_merge.status/1"
+REFERENCE_GRACE_S = 0.3
+"""How long the first merge waits for more maps when it has to choose the reference robot.
+
+A new owner gets all kept maps within milliseconds; the one that happens to be first must not decide the world frame.
+"""
 STATUS_PERIOD_S = 1.0
 """Status at least so often while active: the ages in it go on."""
 _LOG = logging.getLogger("zsched.tasks.map_merge")
@@ -90,6 +95,7 @@ class MapMergeService:
         self._merger = Merger(settings, searches_itself=False)
         self._found: queue.SimpleQueue[tuple[SearchJob, Estimate | None]] = queue.SimpleQueue()
         self._is_searching = False
+        self._first_map_s: float | None = None
         self._lock = threading.Lock()
         self._pending: dict[str, Grid | None] = {}
         self._inputs: dict[str, _Input] = {}
@@ -126,6 +132,8 @@ class MapMergeService:
         with self._lock:
             book.maps += 1
             book.received_s = self._clock()
+            if self._first_map_s is None:
+                self._first_map_s = book.received_s
         self._keep(robot, grid)
 
     @property
@@ -166,13 +174,17 @@ class MapMergeService:
         if not is_active:
             return False
         self._take_found()
-        if self._is_due and now >= self._next_merge_s:
+        if self._is_due and now >= self._next_merge_s and not self._awaits_reference(now):
             self._next_merge_s = now + self._period_s
             self._merge()
             return True
         if now >= self._next_status_s:
             self._publish_status()
         return False
+
+    def _awaits_reference(self, now: float) -> bool:
+        first_s = self._first_map_s
+        return self._merger.needs_reference and first_s is not None and now < first_s + REFERENCE_GRACE_S
 
     def _merge(self) -> None:
         with self._lock:

@@ -55,6 +55,27 @@ def _feed(service: MapMergeService, view: View, *robots: str) -> None:
         service.receive(robot, encode_grid(grid))
 
 
+def test_first_merge_waits_a_moment_so_that_the_lowest_name_becomes_the_reference(view: View) -> None:
+    wire = _Wire()
+    service = _service(wire, Mode.ESTIMATE)
+    _feed(service, view, "robot2")
+    assert not service.step(is_active=True)
+    wire.now_s += 0.1
+    _feed(service, view, "robot1")
+    assert not service.step(is_active=True)
+    wire.now_s += 0.25
+    assert service.step(is_active=True)
+    assert wire.status()["reference"] == "robot1"
+
+
+def test_maps_that_waited_while_idle_are_merged_at_once(view: View) -> None:
+    wire = _Wire()
+    service = _service(wire, Mode.ESTIMATE)
+    _feed(service, view, "robot2", "robot1")
+    wire.now_s += 0.4
+    assert service.step(is_active=True)
+
+
 def test_merge_publishes_map_transforms_and_status(view: View) -> None:
     wire = _Wire()
     service = _service(wire)
@@ -175,13 +196,14 @@ def test_snapshot_is_handed_on(view: View) -> None:
     wire = _Wire()
     service = _service(wire, Mode.ESTIMATE)
     _feed(service, view, "robot1", "robot2")
+    wire.now_s += 1.0
     while service.step(is_active=True):
         wire.now_s += 1.0
     assert wire.status()["robots"]["robot2"]["state"] == "attached"
     heir = _service(wire, Mode.ESTIMATE)
     heir.restore(service.snapshot())
     _feed(heir, view, "robot1", "robot2")
-    heir.step(is_active=True)
+    assert heir.step(is_active=True)  # it knows the reference: nothing to wait for
     status = wire.status()
     assert status["robots"]["robot2"]["state"] == "attached"
     assert status["merges"] == 1
@@ -192,6 +214,7 @@ def test_broken_snapshot_changes_nothing(view: View) -> None:
     service = _service(wire, Mode.ESTIMATE)
     service.restore(b"{")
     _feed(service, view, "robot1")
+    wire.now_s += 1.0
     assert service.step(is_active=True)
     assert wire.status()["robots"]["robot1"]["state"] == "attached"
 
@@ -202,6 +225,7 @@ def test_search_runs_beside_the_merge_and_is_taken_in_later(view: View) -> None:
     settings = MergerSettings(mode=Mode.ESTIMATE)
     service = MapMergeService(settings, wire.publish, clock=wire.clock, spawn=started.append)
     _feed(service, view, "robot1", "robot2")
+    wire.now_s += 1.0
     assert service.step(is_active=True)
     for _ in range(3):  # merges go on, and no second search starts
         _feed(service, view, "robot1")
@@ -210,6 +234,7 @@ def test_search_runs_beside_the_merge_and_is_taken_in_later(view: View) -> None:
     assert len(started) == 1
     assert wire.status()["is_searching"]
     assert wire.status()["robots"]["robot2"]["state"] == "waiting"
+    assert "under way" in wire.status()["robots"]["robot2"]["reason"]
     started[0]()
     wire.now_s += 1.0
     assert service.step(is_active=True)
@@ -236,6 +261,7 @@ def test_search_outcome_of_a_map_that_started_anew_is_dropped(view: View) -> Non
     started: list[Callable[[], None]] = []
     service = MapMergeService(MergerSettings(mode=Mode.ESTIMATE), wire.publish, clock=wire.clock, spawn=started.append)
     _feed(service, view, "robot1", "robot2")
+    wire.now_s += 1.0
     service.step(is_active=True)
     service.receive("robot2", encode_grid(view((7.0, 0.0, 9.0, 2.0), Pose2())))
     wire.now_s += 1.0
