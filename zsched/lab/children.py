@@ -158,7 +158,11 @@ class Children:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.close()
+        try:
+            self.close()
+        except BaseException:
+            self.close()  # Ctrl-C hit the clean-up itself (see `interruptible`: it hits once)
+            raise
 
     def close(self) -> None:
         """End everything; idempotent. `left_behind` says what could not be removed (empty: nothing is left)."""

@@ -138,7 +138,7 @@ def summarise(facts: RunFacts, merged: MergedMap, score: MapScore) -> dict[str, 
         "gap_max_s": round(max(gaps), 3) if gaps else None,
         **{name: round(value, 4) for name, value in asdict(score).items()},
         "map_robot": merged.robot,
-        "allocations": [asdict(move) | {"t_s": round(move.t_s, 3)} for move in facts.moves],
+        "allocations": [allocation_figures(facts, move) for move in facts.moves],
         "loads": [
             {"node": load.node, "start_s": round(load.start_s, 3), "end_s": round(load.end_s, 3)}
             for load in facts.loads
@@ -146,6 +146,12 @@ def summarise(facts: RunFacts, merged: MergedMap, score: MapScore) -> dict[str, 
         "nodes": {name: node_figures(facts, name) for name in sorted(facts.kinds)},
         "robots": {watch.robot: robot_figures(facts, watch) for watch in facts.robots},
     }
+
+
+def allocation_figures(facts: RunFacts, move: Move) -> dict[str, Any]:
+    """One allocation; ``gap_s`` is the longest silence at any robot from its last map before the move to the next."""
+    gaps = [gap for watch in facts.robots if (gap := watch.gap_around_s(facts.start_s + move.t_s)) is not None]
+    return asdict(move) | {"t_s": round(move.t_s, 3), "gap_s": round(max(gaps), 3) if gaps else None}
 
 
 def node_figures(facts: RunFacts, node: NodeId) -> dict[str, Any]:
@@ -250,10 +256,11 @@ def number(value: float | None, digits: int = 2) -> str:
 def allocation_table(summary: Mapping[str, Any]) -> Table:
     """Who owned the task, from when, and why."""
     table = Table(title="allocations", title_justify="left", box=None, header_style="dim", padding=(0, 2, 0, 0))
-    for column in ("epoch", "from", "node", "why"):
+    for column in ("epoch", "from", "node", "map gap", "why"):
         table.add_column(column)
     for move in summary["allocations"]:
-        table.add_row(str(move["epoch"]), f"{number(move['t_s'], 1)} s", str(move["node"]), str(move["reason"]))
+        since, gap = f"{number(move['t_s'], 1)} s", "-" if move["gap_s"] is None else f"{move['gap_s']:.2f} s"
+        table.add_row(str(move["epoch"]), since, str(move["node"]), gap, str(move["reason"]))
     return table
 
 

@@ -5,6 +5,7 @@ Knows: the records of `zsched.lab.robot_app`. Does not know: the fleet, pictures
 
 from __future__ import annotations
 
+import bisect
 import itertools
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -76,3 +77,10 @@ class RobotWatch:
             return None
         times = [*self.map_times, *([] if end_s is None else [max(end_s, self.map_times[-1])])]
         return max((b - a for a, b in itertools.pairwise(times)), default=None)
+
+    def gap_around_s(self, t_s: float) -> float | None:
+        """From the last map before ``t_s`` to the next one; ``None`` when there is none on either side."""
+        index = bisect.bisect_right(self.map_times, t_s)
+        if index in {0, len(self.map_times)}:
+            return None
+        return self.map_times[index] - self.map_times[index - 1]

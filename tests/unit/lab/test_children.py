@@ -37,6 +37,24 @@ with Children(folder / "logs") as children:
 """
 
 
+# A lab that ends by itself, with a stubborn child that makes it last, and tells when it begins to clean up.
+ENDING = f"""
+import sys
+from pathlib import Path
+from zsched.lab.children import Children
+from zsched.lab.demo import Interrupted, interruptible
+folder = Path(sys.argv[1])
+try:
+    with interruptible(), Children(folder / "logs") as children:
+        children.start("stubborn", [sys.executable, "-c", {STUBBORN!r}], output=folder / "up")
+        while not (folder / "up").exists() or not (folder / "up").read_bytes():
+            pass
+        print(children.token, flush=True)
+except Interrupted:
+    sys.exit(130)
+"""
+
+
 def wait_for(condition: Callable[[], bool], deadline_s: float = 15.0) -> bool:
     end = time.monotonic() + deadline_s
     while not condition():
@@ -91,6 +109,21 @@ def test_a_killed_lab_leaves_no_process_and_no_folder(tmp_path: Path, number: si
 
     assert wait_for(lambda: not tagged_processes(token))
     assert wait_for(lambda: not runtime.exists())
+
+
+def test_a_signal_into_the_clean_up_does_not_cut_it(tmp_path: Path) -> None:
+    lab = subprocess.Popen([sys.executable, "-c", ENDING, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+    assert lab.stdout is not None
+    with lab.stdout:
+        token = lab.stdout.readline().strip()
+    time.sleep(0.3)  # it waits for the stubborn child now
+    assert tagged_processes(token)
+    lab.send_signal(signal.SIGINT)
+    time.sleep(0.1)
+    lab.send_signal(signal.SIGINT)
+
+    assert lab.wait(timeout=15) == 130
+    assert tagged_processes(token) == []
 
 
 def test_check_names_the_child_that_failed_with_the_end_of_its_log(tmp_path: Path) -> None:

@@ -94,7 +94,7 @@ def test_a_perfect_run_is_summarised_and_drawn(tmp_path: Path, capsys: pytest.Ca
     assert summary["merge_hz"] == pytest.approx(17 / 18, abs=1e-3)
     assert (summary["coverage"], summary["wall_f1"], summary["ssim_rebased"]) == (1.0, 1.0, 1.0)
     assert summary["allocations"][1] == {
-        "task": "map_merge", "epoch": 2, "node": "edge2", "t_s": 9.0, "reason": "edge1 is busy",
+        "task": "map_merge", "epoch": 2, "node": "edge2", "t_s": 9.0, "reason": "edge1 is busy", "gap_s": 1.0,
     }  # fmt: skip
     assert summary["nodes"]["edge1"]["cpu_peak"] == 1.0
     assert summary["nodes"]["edge1"]["owned_s"] == 8.0

@@ -30,6 +30,7 @@ def test_a_robots_records_become_rates_and_gaps(tmp_path: Path) -> None:
     assert watch.longest_gap_s() == 2.5
     assert watch.longest_gap_s(20.0) == 5.0
     assert watch.longest_gap_s(14.0) == 2.5
+    assert [watch.gap_around_s(t_s) for t_s in (9.0, 10.5, 13.0, 15.0)] == [None, 1.0, 2.5, None]
 
 
 def test_one_map_has_no_gap_but_the_silence_after_it(tmp_path: Path) -> None:
