@@ -13,17 +13,17 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from random import Random
 from typing import Any
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
+from zsched.core.agreement import Agreement, Effects
 from zsched.core.executor import Executor
 from zsched.core.fleet import Fleet
 from zsched.core.gateway import Gateway
 from zsched.core.membership import Membership, Transition
-from zsched.core.messages import CommandOutcome, CommandResult, Learnt
 from zsched.core.model import (
     Allocation,
     Beat,
@@ -31,20 +31,16 @@ from zsched.core.model import (
     NodeId,
     NodeKind,
     PeerState,
-    RegisterState,
     TaskId,
     Weights,
     WorkerState,
 )
 from zsched.core.plan import ReadyWhen, StreamCount
 from zsched.core.profile import Profiler
-from zsched.core.register import Change, MoveOwner, Register, Retune, RoundOutcome, Step
 from zsched.core.rounds import Rounds
 from zsched.core.status import PastValue, build_snapshot
 
 HISTORY = 32
-SETTLE_AFTER_START_S = 0.3
-ASK_LEARNT_EVERY_S = 0.3
 
 
 @dataclass(slots=True)
@@ -96,38 +92,28 @@ class Node:
         self.incarnation = incarnation
         self.started_at = now
         self.has_state = durable is not None
-        self._durable = durable
-        self.is_elector = self.has_state and me in fleet.electors
         self.counters: Counter[str] = Counter()
         self.problems: dict[str, str] = {}
         self.is_draining = False
         self.worker_states = self._initial_workers()
         self.stream_counts: tuple[StreamCount, ...] = ()
         self.history: dict[TaskId, deque[PastValue]] = {task.name: deque(maxlen=HISTORY) for task in fleet.tasks}
-        self._reasons: dict[TaskId, str] = {}
 
         names = tuple(node.name for node in fleet.nodes)
         self.membership = Membership(me, names, fleet.timing)
         self.profiler = Profiler(me, incarnation, fleet.timing)
         self.gateway = Gateway(fleet)
         self.rounds = Rounds(fleet, me, self.gateway, rng, now)
-        stored = {} if durable is None else {state.task: state for state in durable.registers}
-        self.registers = {
-            task.name: Register(
-                me=me,
-                incarnation=incarnation,
-                electors=fleet.electors,
-                electorate=electorate,
-                is_elector=self.is_elector,
-                initial=Allocation(task=task.name, revision=0, epoch=0, owner=None, tuning=task.tuning),
-                state=stored.get(task.name, RegisterState(task=task.name)),
-                ballot_s=fleet.timing.ballot_s,
-                stagger_s=fleet.timing.stagger_s,
-                rng=rng,
-            )
-            for task in fleet.tasks
-        }
-        self._foreign_registers = tuple(stored[name] for name in sorted(stored) if name not in self.registers)
+        self.agreement = Agreement(
+            fleet=fleet,
+            me=me,
+            durable=durable,
+            incarnation=incarnation,
+            electorate=electorate,
+            rng=rng,
+            now=now,
+        )
+        self.registers = self.agreement.registers
         self.executors = {
             task.name: Executor(spec=task, me=me, has_streams=self.kind is NodeKind.ROBOT) for task in fleet.tasks
         }
@@ -135,8 +121,6 @@ class Node:
         self._beat_sequence = 0
         self.loop_lag_s = 0.0
         self._promised = math.inf
-        self._settle_at = now + SETTLE_AFTER_START_S if self.is_elector else math.inf
-        self._asked_at: dict[NodeId, float] = {}
         self._batch = _Batch(False, [], [])
         self._handlers = self._table()
 
@@ -156,8 +140,7 @@ class Node:
             self._batch.add(*executor.start())
             value = self.registers[name].value
             if value.revision > 0:
-                self._reasons[name] = "known from before the restart"
-                self._apply(value, now)
+                self._apply(value, "known from before the restart", now)
         return self._finish(now)
 
     def handle(self, event: ev.Event, now: float) -> tuple[do.Instruction, ...]:
@@ -179,24 +162,16 @@ class Node:
         self._advance(now)
         batch, self._batch = self._batch, _Batch(False, [], [])
         self._promised = self._next_deadline()
-        first: tuple[do.Instruction, ...] = ()
-        if batch.is_dirty and self._durable is not None:
-            self._durable = self._to_persist()
-            first = (do.PersistState(state=self._durable),)
+        state = self.agreement.to_persist() if batch.is_dirty else None
+        first: tuple[do.Instruction, ...] = () if state is None else (do.PersistState(state=state),)
         return (*first, *batch.send, *batch.apply)
-
-    def _to_persist(self) -> DurableState:
-        assert self._durable is not None
-        states = tuple(self.registers[name].state for name in sorted(self.registers))
-        return replace(self._durable, registers=(*states, *self._foreign_registers))
 
     def _next_deadline(self) -> float:
         return min(
             self._beat_at,
-            self._settle_at,
             self.membership.next_deadline(),
             self.rounds.next_deadline(),
-            *(register.next_deadline() for register in self.registers.values()),
+            self.agreement.next_deadline(),
             *(executor.next_deadline() for executor in self.executors.values()),
         )
 
@@ -212,25 +187,16 @@ class Node:
         self._publish_profile(now)
         self._batch.add(*self.rounds.tick(self.values(), self.membership.states(), now))
         for task, commit in self.rounds.due_commits(now):
-            self._take(task, self.registers[task].propose(commit, now), now)
-        self._tick_registers(now)
+            self._agree(self.agreement.propose(task, commit, now), now)
+        self._agree(self.agreement.tick(now), now)
         for executor in self.executors.values():
             self._batch.add(*executor.tick(now))
         if now >= self._beat_at:
             self._beat(now)
 
-    def _tick_registers(self, now: float) -> None:
-        for name, register in self.registers.items():
-            if now >= self._settle_at:
-                self._take(name, register.settle(now), now)
-            if now >= register.next_deadline():
-                self._take(name, register.tick(now), now)
-        if now >= self._settle_at:
-            self._settle_at = math.inf
-
     def values(self) -> dict[TaskId, Allocation]:
         """{task: the newest learnt register value}."""
-        return {name: register.value for name, register in self.registers.items()}
+        return self.agreement.values()
 
     def owned(self) -> tuple[TaskId, ...]:
         """The tasks that this node owns, as far as it has learnt."""
@@ -261,17 +227,7 @@ class Node:
             return
         for change in self.membership.absorb_beat(beat, now):
             self._on_transition(change, now)
-        self._compare_revisions(beat, now)
-
-    def _compare_revisions(self, beat: Beat, now: float) -> None:
-        """A peer has learnt more than we: ask it."""
-        is_behind = any(
-            task in self.registers and revision > self.registers[task].value.revision
-            for task, revision, _ in beat.learnt
-        )
-        if is_behind and now - self._asked_at.get(beat.node, -math.inf) >= ASK_LEARNT_EVERY_S:
-            self._asked_at[beat.node] = now
-            self._batch.add(do.AskLearnt(peer=beat.node, deadline_s=self.fleet.timing.ballot_s))
+        self._agree(self.agreement.compare(beat, now), now)
 
     def _on_token_lost(self, event: ev.TokenLost, now: float) -> None:
         for change in self.membership.absorb_token_lost(event.node, event.incarnation, now):
@@ -339,101 +295,30 @@ class Node:
         if self.rounds.is_voter and proposal.candidate in self.fleet.task(proposal.task).candidates:
             self._batch.add(*self.rounds.absorb_proposal(proposal, value, self.membership.states(), now))
 
-    def _on_prepare(self, event: ev.PrepareAsked, now: float) -> None:
-        register = self.registers.get(event.prepare.task)
-        if register is None or event.prepare.ballot.node != event.asker:
-            self.counters["prepare_foreign"] += 1
-            return
-        step, answer = register.on_prepare(event.prepare)
-        self._take(event.prepare.task, step, now)
-        self._batch.add(do.AnswerElection(request=event.request, answer=answer))
-
-    def _on_accept(self, event: ev.AcceptAsked, now: float) -> None:
-        register = self.registers.get(event.accept.task)
-        if register is None or event.accept.acceptance.ballot.node != event.asker:
-            self.counters["accept_foreign"] += 1
-            return
-        step, answer = register.on_accept(event.accept, now)
-        self._take(event.accept.task, step, now)
-        self._batch.add(do.AnswerElection(request=event.request, answer=answer))
-
-    def _on_elector_answer(self, event: ev.ElectorAnswered, now: float) -> None:
-        register = self.registers.get(event.answer.task)
-        if register is not None:
-            self._take(event.answer.task, register.on_answer(event.answer, now), now)
-
-    def _on_learnt(self, event: ev.LearntReceived, now: float) -> None:
-        if event.learnt.node == self.me:
-            return
-        for value in event.learnt.values:
-            register = self.registers.get(value.task)
-            if register is None:
-                self.counters["learnt_foreign"] += 1
-                continue
-            self._take(value.task, register.learn(value, now), now)
+    def _agree(self, effects: Effects, now: float) -> None:
+        """Carry out what the registers ask for."""
+        self._batch.is_dirty |= effects.is_dirty
+        self._batch.add(*effects.send)
+        for task in effects.ended:
+            self.rounds.on_commit_ended(task)
+        for value, reason in effects.learnt:
+            self._apply(value, reason, now)
 
     def _on_learnt_asked(self, event: ev.LearntAsked, _now: float) -> None:
-        self._batch.add(do.AnswerLearnt(request=event.request, learnt=self._learnt()))
-
-    def _learnt(self) -> Learnt:
-        return Learnt(node=self.me, values=tuple(value for value in self.values().values() if value.revision > 0))
-
-    def _take(self, task: TaskId, step: Step, now: float) -> None:
-        """Carry out what a register's step asks for."""
-        self._batch.is_dirty |= step.is_dirty
-        if step.problem:
-            self.problems[f"register/{task}"] = step.problem
-        deadline_s = self.fleet.timing.ballot_s
-        if step.prepare is not None:
-            self._batch.add(do.SendPrepare(prepare=step.prepare, deadline_s=deadline_s))
-        if step.accept is not None:
-            self._batch.add(do.SendAccept(accept=step.accept, deadline_s=deadline_s))
-        if step.finished is not None:
-            self._on_finished(task, *step.finished, step.learnt)
-        if step.learnt is not None:
-            self._apply(step.learnt, now)
-
-    def _on_finished(self, task: TaskId, change: Change, outcome: RoundOutcome, learnt: Allocation | None) -> None:
-        """A change that this node proposed has ended."""
-        if outcome is RoundOutcome.COMMITTED:
-            self._reasons[task] = change.reason if isinstance(change, MoveOwner) else "retuned by an operator"
-            self._batch.add(do.PublishLearnt(learnt=self._learnt()))
-        if isinstance(change, MoveOwner):
-            self.rounds.on_commit_ended(task)
-            text = f"move to {change.owner} on revision {change.base_revision}: {outcome}"
-            epoch = learnt.epoch if learnt is not None else self.registers[task].value.epoch
-            self._batch.add(do.RecordStory(stage="vote", text=text, task=task, epoch=epoch))
-        elif change.request is not None:
-            self._answer_retune(task, change.request, outcome)
-
-    def _answer_retune(self, task: TaskId, request: int, outcome: RoundOutcome) -> None:
-        words = {
-            RoundOutcome.COMMITTED: (CommandOutcome.OK, "committed by a majority of the electors"),
-            RoundOutcome.CONFLICT: (CommandOutcome.CONFLICT, "another change came first; look and try again"),
-            RoundOutcome.NO_QUORUM: (CommandOutcome.NO_QUORUM, "no majority of the electors answered"),
-            RoundOutcome.UNKNOWN: (CommandOutcome.UNKNOWN, "the electors fell silent; `zsched status` tells"),
-        }
-        kind, detail = words[outcome]
-        revision = self.registers[task].value.revision
-        result = CommandResult(outcome=kind, detail=f"{task}: {detail}", revision=revision)
-        self._batch.add(do.AnswerCommand(request=request, result=result))
+        self._batch.add(do.AnswerLearnt(request=event.request, learnt=self.agreement.learnt()))
 
     def _on_persist_failed(self, event: ev.PersistFailed, _now: float) -> None:
-        """The disk refused: no elector any more, but routes and workers go on (what was cut off is given again)."""
-        self.problems["state"] = f"{event.reason}; this node is no elector until it is restarted"
-        self._durable, self.is_elector = None, False
-        for register in self.registers.values():
-            register.stop_electing()
+        """The disk refused: routes and workers go on (what was cut off is given again)."""
+        self.agreement.on_persist_failed(event.reason)
         for executor in self.executors.values():
             self._batch.add(*executor.again())
 
     # --- EXECUTOR, ROUTE ---------------------------------------------------------------------------------------------
 
-    def _apply(self, value: Allocation, now: float) -> None:
+    def _apply(self, value: Allocation, reason: str, now: float) -> None:
         """A newer value is learnt (and will be on disk before this batch does anything)."""
         task, executor = value.task, self.executors[value.task]
         is_new_epoch = value.epoch > executor.epoch
-        reason = self._reasons.pop(task, "learnt from a peer")
         self.history[task].append(PastValue(value=value, at=now, reason=reason))
         self.rounds.on_learnt(task, is_new_epoch=is_new_epoch, now=now)
         text = f"learnt revision {value.revision}: owner {value.owner}, weights {_weights(value.tuning.weights)}"
@@ -478,30 +363,6 @@ class Node:
     def _on_status(self, event: ev.StatusAsked, now: float) -> None:
         self._batch.add(do.AnswerStatus(request=event.request, snapshot=build_snapshot(self, now)))
 
-    def _on_weights(self, event: ev.WeightsCommanded, now: float) -> None:
-        command = event.command
-        register = self.registers.get(command.task)
-        try:
-            weights = Weights(cpu=command.cpu, memory=command.memory, network=command.network)
-        except ValueError as error:
-            return self._refuse(event.request, CommandOutcome.INVALID, str(error))
-        if register is None:
-            known = ", ".join(sorted(self.registers))
-            return self._refuse(event.request, CommandOutcome.INVALID, f"no task {command.task!r}; tasks: {known}")
-        value = register.value
-        if command.base_revision not in (None, value.revision):
-            detail = f"revision is {value.revision}, not {command.base_revision}"
-            return self._refuse(event.request, CommandOutcome.CONFLICT, detail)
-        if weights == value.tuning.weights:
-            return self._refuse(event.request, CommandOutcome.UNCHANGED, "these are the weights in force")
-        change = Retune(
-            base_revision=value.revision, tuning=replace(value.tuning, weights=weights), request=event.request
-        )
-        return self._take(command.task, register.propose(change, now), now)
-
-    def _refuse(self, request: int, outcome: CommandOutcome, detail: str) -> None:
-        self._batch.add(do.AnswerCommand(request=request, result=CommandResult(outcome=outcome, detail=detail)))
-
     def _on_dropped(self, event: ev.FrameDropped, _now: float) -> None:
         self.counters[f"dropped_{event.kind}_{event.reason}"] += 1
 
@@ -526,10 +387,10 @@ class Node:
             ev.UtilityAsked: self._on_utility_asked,
             ev.UtilityReceived: self._on_utility,
             ev.ProposalReceived: self._on_proposal,
-            ev.PrepareAsked: self._on_prepare,
-            ev.AcceptAsked: self._on_accept,
-            ev.ElectorAnswered: self._on_elector_answer,
-            ev.LearntReceived: self._on_learnt,
+            ev.PrepareAsked: lambda event, now: self._agree(self.agreement.on_prepare(event), now),
+            ev.AcceptAsked: lambda event, now: self._agree(self.agreement.on_accept(event, now), now),
+            ev.ElectorAnswered: lambda event, now: self._agree(self.agreement.on_answer(event, now), now),
+            ev.LearntReceived: lambda event, now: self._agree(self.agreement.on_learnt(event.learnt, now), now),
             ev.LearntAsked: self._on_learnt_asked,
             ev.PersistFailed: self._on_persist_failed,
             ev.BeatReceived: self._on_beat,
@@ -542,7 +403,7 @@ class Node:
             ev.StreamsCounted: self._on_counted,
             ev.RelayChanged: self._on_relay,
             ev.StatusAsked: self._on_status,
-            ev.WeightsCommanded: self._on_weights,
+            ev.WeightsCommanded: lambda event, now: self._agree(self.agreement.retune(event, now), now),
             ev.FrameDropped: self._on_dropped,
             ev.ProblemReported: self._on_problem,
             ev.StopRequested: self._on_stop,

@@ -37,8 +37,8 @@ RSSI_IMPOSSIBLE_BELOW_DBM = -100.0
 RSSI_OUTLIER_DB = 25.0
 RSSI_WINDOW = 5
 """A reading further than 25 dB from the median of the last 5 is dropped (measured on real drives)."""
-LINK_STALE_S = 5.0
-"""A radio that gave no valid reading for so long counts as not measured."""
+STALE_S = 5.0
+"""What gave no valid reading for so long (a radio, or the whole sampler) counts as not measured."""
 
 
 class Ewma:
@@ -84,13 +84,13 @@ class SignalFilter:
         self.dropped = 0
 
     def update(self, rssi_dbm: float | None, now: float) -> float | None:
-        """Take one reading in; the smoothed signal in dBm, or ``None`` when there was none for `LINK_STALE_S`."""
+        """Take one reading in; the smoothed signal in dBm, or ``None`` when there was none for `STALE_S`."""
         if rssi_dbm is not None and self._is_plausible(rssi_dbm):
             self._valid_at = now
             self._mean.update(rssi_dbm, now)
         elif rssi_dbm is not None:
             self.dropped += 1
-        if now - self._valid_at > LINK_STALE_S:
+        if now - self._valid_at > STALE_S:
             self._mean.value = None
         return self._mean.value
 
@@ -116,6 +116,7 @@ class Profiler:
         self._worker_cpu: dict[TaskId, Ewma] = {}
         self._worker_memory: dict[TaskId, Ewma] = {}
         self._device: DeviceSample | None = None
+        self._sampled_at = -math.inf
         self._links: tuple[Link, ...] = ()
         self._workers: tuple[WorkerLoad, ...] = ()
         self._sent: Profile | None = None
@@ -124,7 +125,7 @@ class Profiler:
 
     def absorb(self, device: DeviceSample, links: tuple[LinkSample, ...], now: float) -> None:
         """Take one reading of the machine and its links in."""
-        self._device = device
+        self._device, self._sampled_at = device, now
         worker_cpu = {load.task: load.cpu_cores for load in device.workers}
         worker_memory = {load.task: load.memory_mb for load in device.workers}
         _absorb_use(self._cpu, self._worker_cpu, device.cpu_used_cores, worker_cpu, MAX_CPU_CORES, now)
@@ -162,7 +163,7 @@ class Profiler:
             is_draining: the operator drains this node, or it stops.
             now: monotonic seconds.
         """
-        profile = self._current(states, is_draining=is_draining)
+        profile = self._current(states, is_draining=is_draining, now=now)
         if profile is None:
             return None
         is_due = now - self._sent_at >= self._timing.publish_s
@@ -172,9 +173,10 @@ class Profiler:
         self._sent, self._sent_at = profile, now
         return profile
 
-    def _current(self, states: dict[TaskId, WorkerState], *, is_draining: bool) -> Profile | None:
+    def _current(self, states: dict[TaskId, WorkerState], *, is_draining: bool, now: float) -> Profile | None:
         if self._device is None:
             return None
+        is_measured = now - self._sampled_at <= STALE_S
         loads = {load.task: load for load in self._workers}
         workers = tuple(
             WorkerLoad(
@@ -190,9 +192,9 @@ class Profiler:
             incarnation=self._incarnation,
             sequence=self._sequence,
             cpu_cores=self._device.cpu_cores,
-            cpu_used_cores=self._cpu.value,
+            cpu_used_cores=self._cpu.value if is_measured else None,
             memory_mb=self._device.memory_mb,
-            memory_used_mb=self._memory.value,
+            memory_used_mb=self._memory.value if is_measured else None,
             links=self._links,
             workers=workers,
             draining=is_draining,

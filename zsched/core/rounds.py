@@ -380,6 +380,6 @@ class Rounds:
         task.told = ""
         if task.commit is not None and task.commit_at < math.inf:
             self.on_commit_ended(name)
-        task.judge.reset()
+        task.judge.reset(is_new_owner=is_new_epoch)
         if is_new_epoch:
             task.settled_at = now

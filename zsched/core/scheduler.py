@@ -54,10 +54,11 @@ class Judge:
     seen_first_at: float | None = None
     """When a first candidate could be scored (a task that nobody owns waits for the others)."""
 
-    def reset(self) -> None:
-        """The allocation changed, or a vote was lost: wait the whole time-to-trigger again."""
+    def reset(self, *, is_new_owner: bool = False) -> None:
+        """A vote was lost or the value changed: wait the whole time-to-trigger again."""
         self.beaten_since = None
-        self.not_ready_since = None
+        if is_new_owner:
+            self.not_ready_since = None
 
     def judge(
         self,

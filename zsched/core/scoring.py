@@ -74,7 +74,11 @@ def score(
     unreachable: list[NodeId] = []
     refused: list[tuple[NodeId, str]] = []
     for candidate in spec.candidates:
-        if states.get(candidate, PeerState.UNKNOWN) is not PeerState.ALIVE:
+        state = states.get(candidate, PeerState.UNKNOWN)
+        if state is PeerState.UNKNOWN:
+            refused.append((candidate, "not heard yet"))  # we may have just started: that says nothing about it
+            continue
+        if state is not PeerState.ALIVE:
             unreachable.append(candidate)
             continue
         profile = gateway.fresh(candidate, now)

@@ -9,6 +9,7 @@ from collections import Counter, deque
 from dataclasses import dataclass
 from typing import Protocol
 
+from zsched.core.agreement import Agreement
 from zsched.core.executor import Executor
 from zsched.core.fleet import Fleet, NodeSpec, TaskSpec
 from zsched.core.gateway import Gateway
@@ -49,7 +50,7 @@ class NodeView(Protocol):
     incarnation: int
     started_at: float
     has_state: bool
-    is_elector: bool
+    agreement: Agreement
     loop_lag_s: float
     counters: Counter[str]
     problems: dict[str, str]
@@ -77,13 +78,13 @@ def build_snapshot(node: NodeView, now: float) -> Snapshot:
         quorum=quorum,
         nodes=tuple(_node_status(node, spec, now) for spec in node.fleet.nodes),
         tasks=tuple(_task_status(node, spec, now) for spec in node.fleet.tasks),
-        counters=tuple(sorted(node.counters.items())),
+        counters=tuple(sorted((node.counters + node.agreement.counters).items())),
         problems=_problems(node, quorum),
     )
 
 
 def _problems(node: NodeView, quorum: QuorumStatus) -> tuple[str, ...]:
-    problems = [f"{source}: {text}" for source, text in sorted(node.problems.items())]
+    problems = [f"{source}: {text}" for source, text in sorted({**node.problems, **node.agreement.problems}.items())]
     if not quorum.ok:
         problems.append(f"no quorum: {quorum.alive} of {quorum.electors} electors alive, {quorum.needed} needed")
     if not node.has_state:
@@ -94,10 +95,10 @@ def _problems(node: NodeView, quorum: QuorumStatus) -> tuple[str, ...]:
 def _quorum(node: NodeView) -> QuorumStatus:
     electors = node.fleet.electors
     alive = [name for name in electors if node.membership.state(name) is PeerState.ALIVE]
-    if node.me in alive and not node.is_elector:
+    if node.me in alive and not node.agreement.is_elector:
         alive.remove(node.me)
     needed = majority(len(electors))
-    role = "elector" if node.is_elector else ("lost_state" if node.me in electors else "no_elector")
+    role = "elector" if node.agreement.is_elector else ("lost_state" if node.me in electors else "no_elector")
     return QuorumStatus(
         electors=len(electors), needed=needed, alive=len(alive), ok=len(alive) >= needed, this_node=role
     )

@@ -8,10 +8,10 @@ import pytest
 from zsched.core.fleet import Timing
 from zsched.core.model import DeviceSample, LinkSample, LinkSource, Profile, WorkerLoad, WorkerState
 from zsched.core.profile import (
-    LINK_STALE_S,
     RATIO_CHANGE,
     RSSI_CHANGE_DB,
     RSSI_OUTLIER_DB,
+    STALE_S,
     Ewma,
     Profiler,
     SignalFilter,
@@ -115,9 +115,9 @@ def test_a_radio_that_gives_nothing_is_soon_not_measured_any_more() -> None:
     signal = SignalFilter(3.0)
     signal.update(-60.0, now=0.0)
 
-    assert signal.update(None, now=LINK_STALE_S) == -60.0
-    assert signal.update(None, now=LINK_STALE_S + 0.1) is None
-    assert signal.update(-50.0, now=LINK_STALE_S + 0.2) == -50.0, "the old mean is worth nothing any more"
+    assert signal.update(None, now=STALE_S) == -60.0
+    assert signal.update(None, now=STALE_S + 0.1) is None
+    assert signal.update(-50.0, now=STALE_S + 0.2) == -50.0, "the old mean is worth nothing any more"
 
 
 def test_signals_are_smoothed_in_dbm_and_each_link_for_itself() -> None:
@@ -307,7 +307,7 @@ def test_sent_at_once_when_a_link_falls_silent_or_is_taken_away() -> None:
     profiler.absorb(device(), (radio(-60.0),), now=0.0)
     taken(profiler, 0.0)
 
-    silent = 0.1 + LINK_STALE_S
+    silent = 0.1 + STALE_S
     profiler.absorb(device(), (radio(None),), now=silent)
     profile = profiler.publishable(READY, is_draining=False, now=silent)
     assert profile is not None
@@ -316,3 +316,14 @@ def test_sent_at_once_when_a_link_falls_silent_or_is_taken_away() -> None:
     profile = profiler.publishable(READY, is_draining=False, now=silent + 0.2)
     assert profile is not None
     assert profile.links == ()
+
+
+def test_a_sampler_that_died_leaves_nothing_measured() -> None:
+    """Its last figures must not stand for ever."""
+    profiler = Profiler("edge1", 1, Timing())
+    profiler.absorb(DeviceSample(cpu_cores=4.0, cpu_used_cores=1.0, memory_mb=4000.0, memory_used_mb=1000.0), (), 0.0)
+    first = profiler.publishable({}, is_draining=False, now=0.0)
+    later = profiler.publishable({}, is_draining=False, now=STALE_S + 0.1)
+    assert first is not None
+    assert later is not None
+    assert (first.cpu_used_cores, later.cpu_used_cores, later.memory_used_mb) == (1.0, None, None)

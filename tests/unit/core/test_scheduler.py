@@ -131,8 +131,15 @@ def test_after_a_reset_the_whole_time_counts_again() -> None:
     judged(judge, BETTER, 0.0)
     judge.reset()
 
-    assert judge.not_ready_since is None
+    assert judge.not_ready_since == 0.0, "a lost vote does not make the owner's worker ready"
     assert judged(judge, BETTER, 2.0).outcome is Outcome.WAIT
+
+
+def test_a_new_owner_has_its_own_start_up_time() -> None:
+    judge = Judge(spec=SPEC, not_ready_since=0.0)
+    judge.reset(is_new_owner=True)
+
+    assert judge.not_ready_since is None
 
 
 def test_an_owner_that_may_not_be_scored_is_left_by_the_same_timers() -> None:

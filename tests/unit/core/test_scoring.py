@@ -110,7 +110,14 @@ def test_vector_names_voter_task_and_revision_and_is_sorted() -> None:
     assert vector.refused == ()
 
 
-@pytest.mark.parametrize("state", [PeerState.UNKNOWN, PeerState.SUSPECT, PeerState.GONE])
+def test_a_candidate_never_heard_is_left_out_for_the_listener_may_have_just_started() -> None:
+    vector = scored(ROBOT, *EDGES, states={"edge2": PeerState.UNKNOWN})
+
+    assert "edge2" not in values(vector)
+    assert vector.refused == (("edge2", "not heard yet"),)
+
+
+@pytest.mark.parametrize("state", [PeerState.SUSPECT, PeerState.GONE])
 def test_a_candidate_that_is_not_alive_gets_zero_and_is_not_left_out(state: PeerState) -> None:
     vector = scored(ROBOT, *EDGES, states={"edge2": state})
 

@@ -1,0 +1,257 @@
+"""VOTE, where the registers meet the node: one register per task, the durable state they share, and who is told.
+
+Knows: which messages a register's step becomes, what an operator's change is, what goes to disk. Does not know: the
+rules of a round (`zsched.core.register`), what a learnt allocation leads to (the node applies it).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass, field, replace
+from random import Random
+
+from zsched.core import events as ev
+from zsched.core import instructions as do
+from zsched.core.fleet import Fleet
+from zsched.core.messages import CommandOutcome, CommandResult, Learnt
+from zsched.core.model import Allocation, Beat, DurableState, NodeId, RegisterState, TaskId, Weights
+from zsched.core.register import Change, MoveOwner, Register, Retune, RoundOutcome, Step
+
+SETTLE_AFTER_START_S = 0.3
+"""A starting elector learns first what was accepted before (an identity round), once its peers are connected."""
+ASK_LEARNT_EVERY_S = 0.3
+
+_RETUNED = {
+    RoundOutcome.COMMITTED: (CommandOutcome.OK, "committed by a majority of the electors"),
+    RoundOutcome.CONFLICT: (CommandOutcome.CONFLICT, "another change came first; look and try again"),
+    RoundOutcome.NO_QUORUM: (CommandOutcome.NO_QUORUM, "no majority of the electors answered"),
+    RoundOutcome.UNKNOWN: (CommandOutcome.UNKNOWN, "the electors fell silent; `zsched status` tells"),
+}
+
+
+@dataclass(slots=True)
+class Effects:
+    """What one call leads to: ``is_dirty`` first to disk, then ``send``, then every ``learnt`` value is applied."""
+
+    is_dirty: bool = False
+    send: list[do.Instruction] = field(default_factory=list)
+    learnt: list[tuple[Allocation, str]] = field(default_factory=list)
+    """(value, why it came about)."""
+    ended: list[TaskId] = field(default_factory=list)
+    """Tasks whose move, proposed by this node, was committed, overtaken or given up."""
+
+
+class Agreement:
+    """All registers of one node.
+
+    Args:
+        fleet: the validated fleet file.
+        me: this node's name.
+        durable: what the state file holds; ``None``: this node is no elector.
+        incarnation: this start's number, part of every ballot.
+        electorate: hash of the electorate in force.
+        rng: for back-off.
+        now: monotonic seconds.
+    """
+
+    def __init__(
+        self,
+        *,
+        fleet: Fleet,
+        me: NodeId,
+        durable: DurableState | None,
+        incarnation: int,
+        electorate: str,
+        rng: Random,
+        now: float,
+    ) -> None:
+        self._fleet, self._me = fleet, me
+        self._durable = durable
+        self.is_elector = durable is not None and me in fleet.electors
+        self.problems: dict[str, str] = {}
+        self.counters: Counter[str] = Counter()
+        stored = {} if durable is None else {state.task: state for state in durable.registers}
+        self.registers = {
+            task.name: Register(
+                me=me,
+                incarnation=incarnation,
+                electors=fleet.electors,
+                electorate=electorate,
+                is_elector=self.is_elector,
+                initial=Allocation(task=task.name, revision=0, epoch=0, owner=None, tuning=task.tuning),
+                state=stored.get(task.name, RegisterState(task=task.name)),
+                ballot_s=fleet.timing.ballot_s,
+                stagger_s=fleet.timing.stagger_s,
+                rng=rng,
+            )
+            for task in fleet.tasks
+        }
+        # A task that left the fleet file may come back: its promises must not be forgotten.
+        self._foreign = tuple(stored[name] for name in sorted(stored) if name not in self.registers)
+        self._settle_at = now + SETTLE_AFTER_START_S if self.is_elector else math.inf
+        self._asked_at: dict[NodeId, float] = {}
+
+    # --- queries -----------------------------------------------------------------------------------------------------
+
+    def values(self) -> dict[TaskId, Allocation]:
+        """{task: the newest learnt value}."""
+        return {name: register.value for name, register in self.registers.items()}
+
+    def learnt(self) -> Learnt:
+        """What this node tells others: learnt values only, never accepted ones."""
+        return Learnt(node=self._me, values=tuple(value for value in self.values().values() if value.revision > 0))
+
+    def next_deadline(self) -> float:
+        """When `tick` may have something to do."""
+        return min(self._settle_at, *(register.next_deadline() for register in self.registers.values()), math.inf)
+
+    def to_persist(self) -> DurableState | None:
+        """The state to write now, or ``None`` when this node keeps none."""
+        if self._durable is None:
+            return None
+        states = tuple(self.registers[name].state for name in sorted(self.registers))
+        self._durable = replace(self._durable, registers=(*states, *self._foreign))
+        return self._durable
+
+    # --- electors ----------------------------------------------------------------------------------------------------
+
+    def on_prepare(self, event: ev.PrepareAsked) -> Effects:
+        """A proposer asks for a promise; only for its own ballots."""
+        register = self.registers.get(event.prepare.task)
+        if register is None or event.prepare.ballot.node != event.asker:
+            self.counters["prepare_foreign"] += 1
+            return Effects()
+        step, answer = register.on_prepare(event.prepare)
+        return Effects(is_dirty=step.is_dirty, send=[do.AnswerElection(request=event.request, answer=answer)])
+
+    def on_accept(self, event: ev.AcceptAsked, now: float) -> Effects:
+        """A proposer asks to accept a value; only under its own ballots."""
+        register = self.registers.get(event.accept.task)
+        if register is None or event.accept.acceptance.ballot.node != event.asker:
+            self.counters["accept_foreign"] += 1
+            return Effects()
+        step, answer = register.on_accept(event.accept, now)
+        return Effects(is_dirty=step.is_dirty, send=[do.AnswerElection(request=event.request, answer=answer)])
+
+    def on_answer(self, event: ev.ElectorAnswered, now: float) -> Effects:
+        """An elector answered our prepare or accept."""
+        effects = Effects()
+        register = self.registers.get(event.answer.task)
+        if register is not None:
+            self._take(event.answer.task, register.on_answer(event.answer, now), effects)
+        return effects
+
+    # --- learners ----------------------------------------------------------------------------------------------------
+
+    def on_learnt(self, learnt: Learnt, now: float) -> Effects:
+        """A peer told what it has learnt."""
+        effects = Effects()
+        if learnt.node == self._me:
+            return effects
+        for value in learnt.values:
+            register = self.registers.get(value.task)
+            if register is None:
+                self.counters["learnt_foreign"] += 1
+                continue
+            self._take(value.task, register.learn(value, now), effects)
+        return effects
+
+    def compare(self, beat: Beat, now: float) -> Effects:
+        """A peer's beat may show that it has learnt more than we: then ask it."""
+        is_behind = any(
+            task in self.registers and revision > self.registers[task].value.revision
+            for task, revision, _ in beat.learnt
+        )
+        if not is_behind or now - self._asked_at.get(beat.node, -math.inf) < ASK_LEARNT_EVERY_S:
+            return Effects()
+        self._asked_at[beat.node] = now
+        return Effects(send=[do.AskLearnt(peer=beat.node, deadline_s=self._fleet.timing.ballot_s)])
+
+    # --- proposers ---------------------------------------------------------------------------------------------------
+
+    def propose(self, task: TaskId, change: Change, now: float) -> Effects:
+        """Try to commit a change."""
+        effects = Effects()
+        self._take(task, self.registers[task].propose(change, now), effects)
+        return effects
+
+    def retune(self, event: ev.WeightsCommanded, now: float) -> Effects:
+        """An operator changes a task's weights; the answer comes when the change has ended."""
+        command = event.command
+        register = self.registers.get(command.task)
+        if register is None:
+            known = ", ".join(sorted(self.registers))
+            return _refusal(event.request, CommandOutcome.INVALID, f"no task {command.task!r}; tasks: {known}")
+        try:
+            weights = Weights(cpu=command.cpu, memory=command.memory, network=command.network)
+        except ValueError as error:
+            return _refusal(event.request, CommandOutcome.INVALID, str(error))
+        value = register.value
+        if command.base_revision not in (None, value.revision):
+            detail = f"revision is {value.revision}, not {command.base_revision}"
+            return _refusal(event.request, CommandOutcome.CONFLICT, detail)
+        if weights == value.tuning.weights:
+            return _refusal(event.request, CommandOutcome.UNCHANGED, "these are the weights in force")
+        change = Retune(
+            base_revision=value.revision, tuning=replace(value.tuning, weights=weights), request=event.request
+        )
+        return self.propose(command.task, change, now)
+
+    def tick(self, now: float) -> Effects:
+        """Time has passed."""
+        effects = Effects()
+        for name, register in self.registers.items():
+            if now >= self._settle_at:
+                self._take(name, register.settle(now), effects)
+            if now >= register.next_deadline():
+                self._take(name, register.tick(now), effects)
+        if now >= self._settle_at:
+            self._settle_at = math.inf
+        return effects
+
+    def on_persist_failed(self, reason: str) -> None:
+        """The disk refused: no elector any more, and nothing is written any more."""
+        self.problems["state"] = f"{reason}; this node is no elector until it is restarted"
+        self._durable, self.is_elector = None, False
+        for register in self.registers.values():
+            register.stop_electing()
+
+    # --- steps -------------------------------------------------------------------------------------------------------
+
+    def _take(self, task: TaskId, step: Step, effects: Effects) -> None:
+        effects.is_dirty |= step.is_dirty
+        if step.problem:
+            self.problems[f"register/{task}"] = step.problem
+        deadline_s = self._fleet.timing.ballot_s
+        if step.prepare is not None:
+            effects.send.append(do.SendPrepare(prepare=step.prepare, deadline_s=deadline_s))
+        if step.accept is not None:
+            effects.send.append(do.SendAccept(accept=step.accept, deadline_s=deadline_s))
+        reason = "learnt from a peer"
+        if step.finished is not None:
+            reason = self._end(task, *step.finished, effects) or reason
+        if step.learnt is not None:
+            effects.learnt.append((step.learnt, reason))
+
+    def _end(self, task: TaskId, change: Change, outcome: RoundOutcome, effects: Effects) -> str:
+        """A change that this node proposed has ended; why the value is what it is, if it was committed."""
+        value = self.registers[task].value
+        reason = ""
+        if outcome is RoundOutcome.COMMITTED:
+            reason = change.reason if isinstance(change, MoveOwner) else "retuned by an operator"
+            effects.send.append(do.PublishLearnt(learnt=self.learnt()))
+        if isinstance(change, MoveOwner):
+            effects.ended.append(task)
+            text = f"move to {change.owner} on revision {change.base_revision}: {outcome}"
+            effects.send.append(do.RecordStory(stage="vote", text=text, task=task, epoch=value.epoch))
+        elif change.request is not None:
+            kind, detail = _RETUNED[outcome]
+            result = CommandResult(outcome=kind, detail=f"{task}: {detail}", revision=value.revision)
+            effects.send.append(do.AnswerCommand(request=change.request, result=result))
+        return reason
+
+
+def _refusal(request: int, outcome: CommandOutcome, detail: str) -> Effects:
+    result = CommandResult(outcome=outcome, detail=detail)
+    return Effects(send=[do.AnswerCommand(request=request, result=result)])
