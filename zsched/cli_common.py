@@ -33,7 +33,7 @@ class CliError(ZschedError):
 class PlainValue:
     """Reads one option's text without pydantic, whose import takes longer than all the rest of `zsched status`.
 
-    A value that has its type already, and a path, need no coercion; all others still go typer's own way.
+    A value that has its type already, words and a path need no coercion; all others still go typer's own way.
     """
 
     def __init__(self, param: Any) -> None:
@@ -42,6 +42,8 @@ class PlainValue:
     def coerce(self, value: Any, param: Any, ctx: Any) -> Any:
         """The value as the verb wants it, as typer's own coercion does it."""
         annotation = self._annotation
+        if annotation == list[str] and isinstance(value, tuple):
+            return list(value)
         if param.nargs == 1 and not param.multiple and isinstance(annotation, type):
             if value is None or isinstance(value, annotation):
                 return value

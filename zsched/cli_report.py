@@ -102,6 +102,8 @@ def _nodes(page: Page, status: Json) -> None:
     for node in nodes:
         workers = _workers(node["workers"], room, is_single=len(status["tasks"]) == 1)
         texts = [*_node_cells(node, bar, is_me=node["name"] == status["node"]), workers]
+        if node["state"] in ("gone", "unknown"):  # its last figures are no news
+            texts = [(text, style if index == 2 else "dim") for index, (text, style) in enumerate(texts)]
         page.row(*((text, width, style) for (text, style), width in zip(texts, columns, strict=True)))
 
 

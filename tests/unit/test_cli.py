@@ -1,0 +1,501 @@
+"""The command line: arguments, exit codes, what goes to stdout and what to stderr, and what is never imported.
+
+The daemon's side is its real operator socket; what stands behind it answers with recorded statuses.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Self
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from zsched import __version__
+from zsched.adapters.operator_socket import OperatorSocket
+from zsched.cli import app
+from zsched.cli_ask import ask_door, find_door
+from zsched.cli_common import CliError, nearest
+from zsched.cli_status import _fitted
+from zsched.cli_weights import parse_weights
+
+RECORDED = Path(__file__).parent / "recorded_status"
+CLI = (sys.executable, "-m", "zsched.cli")
+Json = dict[str, Any]
+
+FLEET = """
+fleet: hall
+nodes:
+  robot1: {kind: robot, host: 127.0.0.1, listen: {control: tcp/127.0.0.1:7457, data: tcp/127.0.0.1:7458}}
+  robot2: {kind: robot}
+  robot3: {kind: robot}
+tasks:
+  merge:
+    candidates: {kind: robot}
+    weights: {cpu: 0.5, memory: 0.5}
+    inputs: [{from: "{robot}/map", to: "{target}/merge/{robot}/map"}]
+"""
+
+
+class Daemon:
+    """An operator socket in ``folder`` that answers like a daemon, and remembers what it was asked."""
+
+    def __init__(self, folder: Path, node: str = "robot1", status: str = "healthy") -> None:
+        self.status: Json = json.loads((RECORDED / f"{status}.json").read_text())
+        self.result: Json = {"outcome": "ok", "detail": "committed", "revision": 2}
+        self.asked: list[Json] = []
+        self.delay_s = 0.0
+        self._socket = OperatorSocket(folder / f"{node}.sock", self._answer)
+
+    def _answer(self, request: Json) -> Json:
+        self.asked.append(request)
+        time.sleep(self.delay_s)
+        if request["verb"] == "weights":
+            return self.result
+        if "error" in self.status:
+            return self.status
+        return {**self.status, "node": request.get("node", self.status["node"])}
+
+    def __enter__(self) -> Self:
+        self._socket.open()
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self._socket.close()
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty runtime folder that the verbs look into, and no other word from the environment."""
+    for name in ("ZSCHED_NODE", "ZSCHED_CONFIG", "ZSCHED_STATE_DIR", "STATE_DIRECTORY", "RUNTIME_DIRECTORY", "COLUMNS"):
+        monkeypatch.delenv(name, raising=False)
+    runtime = tmp_path / "run"
+    runtime.mkdir()
+    monkeypatch.setenv("ZSCHED_RUNTIME_DIR", str(runtime))
+    return runtime
+
+
+@pytest.fixture
+def daemon(folder: Path) -> Iterator[Daemon]:
+    with Daemon(folder) as running:
+        yield running
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+# --- status ----------------------------------------------------------------------------------------------------------
+
+
+def test_status_shows_the_only_daemon_without_colour_off_a_terminal(daemon: Daemon) -> None:
+    result = run("status")
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert "edge1 owns it" in result.stdout
+    assert "\x1b" not in result.stdout
+    assert daemon.asked == [{"verb": "status"}]
+
+
+def test_status_as_json_is_the_answer_itself(daemon: Daemon) -> None:
+    result = run("status", "--json")
+    assert json.loads(result.stdout) == daemon.status
+    assert daemon.status["schema"] == "zsched.status/1"
+
+
+@pytest.mark.parametrize("flags", [(), ("--json",)])
+def test_degraded_fleet_is_shown_and_exits_with_4(folder: Path, flags: tuple[str, ...]) -> None:
+    with Daemon(folder, status="degraded"):
+        result = run("status", *flags)
+    assert result.exit_code == 4
+    assert "echo" in result.stdout
+
+
+def test_status_without_a_daemon_exits_with_3_and_says_where_it_looked(folder: Path) -> None:
+    result = run("status", "--json")
+    assert (result.exit_code, result.stdout) == (3, "")
+    assert str(folder) in result.stderr
+    assert "zsched up" in result.stderr
+
+
+def test_status_at_a_socket_nobody_listens_on_exits_with_3(folder: Path) -> None:
+    with Daemon(folder) as left_behind:
+        path = folder / "robot1.sock"
+        kept = path.with_name("kept")
+        path.rename(kept)
+    kept.rename(path)
+    assert left_behind.asked == []
+    result = run("status")
+    assert result.exit_code == 3
+    assert str(path) in result.stderr
+
+
+def test_status_of_a_daemon_that_refuses_exits_with_1(daemon: Daemon) -> None:
+    daemon.status = {"error": "something broke"}
+    result = run("status")
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert "something broke" in result.stderr
+
+
+def test_status_of_a_wedged_loop_exits_with_5(daemon: Daemon) -> None:
+    daemon.status = {"error": "the decision loop of robot1 did not answer within 3 s"}
+    assert run("status").exit_code == 5
+
+
+def test_daemon_that_does_not_answer_in_time_is_told_from_one_that_is_not_there(daemon: Daemon, folder: Path) -> None:
+    daemon.delay_s = 0.5
+    with pytest.raises(CliError, match=r"did not answer within 0\.1 s") as raised:
+        ask_door(find_door(folder, None), {"verb": "status"}, timeout_s=0.1)
+    assert raised.value.code == 5
+
+
+def test_status_of_another_major_version_is_refused_with_advice(daemon: Daemon) -> None:
+    daemon.status["schema"] = "zsched.status/2"
+    result = run("status")
+    assert result.exit_code == 1
+    assert "update" in result.stderr
+
+
+def test_status_of_several_daemons_needs_a_name(daemon: Daemon, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with Daemon(folder, "robot2") as other:
+        refused = run("status")
+        assert refused.exit_code == 2
+        assert "robot1, robot2" in refused.stderr
+        monkeypatch.setenv("ZSCHED_NODE", "robot2")
+        assert run("status").exit_code == 0
+        assert len(other.asked) == 1
+        assert run("status", "--node", "robot1").exit_code == 0
+        assert daemon.asked == [{"verb": "status"}]
+
+
+def test_status_of_a_node_elsewhere_goes_through_a_daemon_here(daemon: Daemon) -> None:
+    result = run("status", "--node", "robot3", "--json")
+    assert result.exit_code == 0
+    assert json.loads(result.stdout)["node"] == "robot3"
+    assert daemon.asked[-1] == {"verb": "status", "node": "robot3"}
+
+
+def test_status_of_a_node_that_the_fleet_has_not_is_refused_with_the_nearest_name(daemon: Daemon) -> None:
+    result = run("status", "--node", "robo2")
+    assert result.exit_code == 2
+    assert "did you mean robot" in result.stderr
+    assert [asked for asked in daemon.asked if "node" in asked] == []
+
+
+def test_status_of_a_silent_node_elsewhere_exits_with_3(daemon: Daemon) -> None:
+    answer = daemon._answer
+    silent = {"error": "robot3 did not answer within 3 s; is it up and reachable?"}
+    daemon._socket._answer = lambda request: silent if "node" in request else answer(request)
+    result = run("status", "--node", "robot3")
+    assert result.exit_code == 3
+    assert "robot3 did not answer" in result.stderr
+
+
+def test_status_is_not_asked_twice_a_second_without_watch(daemon: Daemon) -> None:
+    run("status", "--interval", "0.1")
+    assert len(daemon.asked) == 1
+
+
+@pytest.mark.parametrize("interval", ["0", "soon"])
+def test_impossible_interval_is_a_usage_error(daemon: Daemon, interval: str) -> None:
+    result = run("status", "--watch", "--interval", interval)
+    assert result.exit_code == 2
+    assert "--interval" in result.stderr
+    assert daemon.asked == []
+
+
+def watch(folder: Path, *arguments: str) -> subprocess.Popen[str]:
+    environment = {**os.environ, "ZSCHED_RUNTIME_DIR": str(folder)}
+    command = [*CLI, "status", "--watch", "--interval", "0.1", *arguments]
+    return subprocess.Popen(command, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+
+
+def test_watch_with_json_gives_a_line_each_until_interrupted(folder: Path) -> None:
+    """NDJSON through a pipe, line by line, and the last status's exit code at Ctrl-C."""
+    with Daemon(folder, status="degraded"), watch(folder, "--json") as process:
+        assert process.stdout is not None
+        lines = [json.loads(process.stdout.readline()) for _ in range(3)]
+        process.send_signal(signal.SIGINT)
+        _, error = process.communicate(timeout=10)
+    assert {line["schema"] for line in lines} == {"zsched.status/1"}
+    assert (process.returncode, error) == (4, "")
+
+
+def test_watch_outlives_a_restart_of_the_daemon(folder: Path) -> None:
+    with Daemon(folder), watch(folder, "--json") as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.readline()
+        (folder / "robot1.sock").rename(folder / "away")
+        assert "no daemon answers" in process.stderr.readline()
+        (folder / "away").rename(folder / "robot1.sock")
+        for _ in range(100):
+            if json.loads(process.stdout.readline())["node"] == "robot1":
+                break
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=10)
+    assert process.returncode == 0
+
+
+def test_watch_into_a_closed_pipe_ends_quietly(folder: Path) -> None:
+    with Daemon(folder), watch(folder, "--json") as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.readline()
+        process.stdout.close()
+        error = process.stderr.read()
+        process.wait(10)
+    assert "Traceback" not in error
+
+
+def test_screen_that_is_too_low_keeps_the_problems(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LINES", "10")
+    text = "\n".join([*(f"line {i}" for i in range(20)), "", "PROBLEMS no quorum"])
+    shown = _fitted(text).replace("\x1b[K", "").replace("\x1b[H", "").replace("\x1b[J", "").split("\n")
+    assert len(shown) == 10
+    assert shown[-1] == "PROBLEMS no quorum"
+    assert shown[6] == "line 6"
+    assert shown[7].startswith("... 13 more lines")
+
+
+def test_screen_that_is_high_enough_shows_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LINES", "10")
+    assert _fitted("\n".join("abcdefghij")).count("\n") == 9
+
+
+# --- weights ---------------------------------------------------------------------------------------------------------
+
+
+def test_weights_without_values_shows_those_in_force(daemon: Daemon) -> None:
+    assert run("weights", "echo").stdout == "echo: cpu=0.3 memory=0.3 network=0.4 (revision 1)\n"
+    assert json.loads(run("weights", "echo", "--json").stdout) == {
+        "schema": "zsched.weights/1",
+        "task": "echo",
+        "weights": {"cpu": 0.3, "memory": 0.3, "network": 0.4},
+        "revision": 1,
+    }
+    assert {asked["verb"] for asked in daemon.asked} == {"status"}
+
+
+def test_weights_of_an_unknown_task_is_a_usage_error(daemon: Daemon) -> None:
+    result = run("weights", "ehco")
+    assert result.exit_code == 2
+    assert "did you mean echo?" in result.stderr
+    assert daemon.asked
+
+
+def test_new_weights_are_sent_and_the_revision_is_shown(daemon: Daemon) -> None:
+    result = run("weights", "echo", "cpu=0.6", "memory=0.4", "--revision", "1")
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert result.stdout == "echo: cpu=0.6 memory=0.4 network=0 (revision 2)\n"
+    expected = {"verb": "weights", "task": "echo", "cpu": 0.6, "memory": 0.4, "network": 0.0, "base_revision": 1}
+    assert daemon.asked == [expected]
+
+
+@pytest.mark.parametrize(
+    ("outcome", "code"),
+    [("ok", 0), ("unchanged", 0), ("conflict", 1), ("invalid", 2), ("no_quorum", 4), ("unknown", 5), ("new_word", 1)],
+)
+def test_outcome_of_a_change_is_the_exit_code(daemon: Daemon, outcome: str, code: int) -> None:
+    daemon.result = {"outcome": outcome, "detail": "because", "revision": None}
+    text, as_json = run("weights", "echo", "cpu=1"), run("weights", "echo", "cpu=1", "--json")
+    assert (text.exit_code, as_json.exit_code) == (code, code)
+    body = json.loads(as_json.stdout)
+    assert (body["schema"], body["outcome"], body["detail"]) == ("zsched.weights/1", outcome, "because")
+    assert bool(text.stdout) is (code == 0)
+    assert ("because" in text.stderr) is (code != 0)
+
+
+@pytest.mark.parametrize(
+    ("pairs", "said"),
+    [
+        (["cpu"], "write them like cpu=0.6"),
+        (["memroy=1"], "did you mean memory?"),
+        (["speed=1"], "there are cpu, memory, network"),
+        (["cpu=x"], "is not a number"),
+        (["cpu=nan"], "not in [0, 1]"),
+        (["cpu=1.5"], "not in [0, 1]"),
+        (["cpu=-1"], "not in [0, 1]"),
+        (["cpu=0.5", "cpu=0.5"], "given twice"),
+        (["cpu=0.6"], "sum is 0.6 (memory, network left out: 0), not 1"),
+        (["cpu=0.6", "memory=0.6", "network=0"], "sum is 1.2, not 1"),
+    ],
+)
+def test_wrong_weights_are_a_usage_error_before_anybody_is_asked(daemon: Daemon, pairs: list[str], said: str) -> None:
+    with pytest.raises(CliError, match=re.escape(said)) as raised:
+        parse_weights(pairs)
+    assert raised.value.code == 2
+    assert run("weights", "echo", *pairs).exit_code == 2
+    assert daemon.asked == []
+
+
+def test_weights_add_up_as_people_write_them() -> None:
+    thirds = {"cpu": 0.3333333, "memory": 0.3333333, "network": 0.3333334}
+    assert parse_weights([f"{name}={value}" for name, value in thirds.items()]) == thirds
+    assert parse_weights(["network=0.1", "cpu=0.7", "memory=0.2"])["network"] == 0.1
+
+
+def test_revision_without_new_weights_is_a_usage_error(daemon: Daemon) -> None:
+    assert run("weights", "echo", "--revision", "3").exit_code == 2
+    assert daemon.asked == []
+
+
+def test_nearest_name_or_all_names() -> None:
+    assert nearest("robo1", ["edge1", "robot1"]) == "; did you mean robot1?"
+    assert nearest("x", ["edge1", "robot1"]) == "; there are edge1, robot1"
+
+
+# --- check, init, up, version, demo ----------------------------------------------------------------------------------
+
+
+def test_check_of_a_good_file_counts_what_is_in_it(tmp_path: Path) -> None:
+    file = tmp_path / "fleet.yaml"
+    file.write_text(FLEET)
+    result = run("check", file)
+    assert (result.exit_code, result.stdout) == (0, "ok: 3 nodes, 1 task, 3 electors\n")
+    body = json.loads(run("check", file, "--json").stdout)
+    assert (body["schema"], body["ok"], body["faults"]) == ("zsched.check/1", True, [])
+    assert body["fleet"] == {"name": "hall", "nodes": 3, "tasks": 1, "electors": 3}
+
+
+def test_check_of_a_bad_file_reports_every_fault_with_its_place_and_exits_with_78(tmp_path: Path) -> None:
+    file = tmp_path / "fleet.yaml"
+    file.write_text(FLEET.replace("kind: robot}\n  robot3", "kind: rowboat}\n  robot3").replace("cpu: 0.5", "cpu: 5"))
+    text, as_json = run("check", file), run("check", file, "--json")
+    assert (text.exit_code, as_json.exit_code) == (78, 78)
+    assert (text.stdout, as_json.stderr) == ("", "")
+    assert f"{file}:5:" in text.stderr
+    assert f"{file}:10:" in text.stderr
+    body = json.loads(as_json.stdout)
+    assert (body["ok"], body["fleet"]) == (False, None)
+    assert [fault["line"] for fault in body["faults"]] == [5, 10]
+    assert {"line", "col", "message", "hint", "source_line"} == set(body["faults"][0])
+
+
+def test_check_warns_on_stderr_and_still_exits_with_0(tmp_path: Path) -> None:
+    file = tmp_path / "fleet.yaml"
+    file.write_text(FLEET.replace("  robot3: {kind: robot}\n", ""))
+    result = run("check", file)
+    assert result.exit_code == 0
+    assert "warning" in result.stderr
+    assert result.stdout.startswith("ok: ")
+
+
+def test_check_of_a_missing_file_exits_with_78(tmp_path: Path) -> None:
+    result = run("check", tmp_path / "none.yaml")
+    assert result.exit_code == 78
+    assert "cannot be read" in result.stderr
+
+
+def test_init_creates_the_state_once(tmp_path: Path, folder: Path) -> None:
+    file, state = tmp_path / "fleet.yaml", tmp_path / "state"
+    file.write_text(FLEET)
+    arguments = ("init", "--config", file, "--node", "robot1", "--state-dir", state)
+    first, second = run(*arguments), run(*arguments)
+    assert first.exit_code == 0
+    assert first.stdout == f"{state}/state: blank state of robot1 in fleet hall, generation 0\n"
+    assert (second.exit_code, second.stdout) == (1, "")
+    assert "exists already" in second.stderr
+    assert "--generation 1" in second.stderr
+    assert run(*arguments, "--generation", 1).exit_code == 0
+    assert folder.exists()
+
+
+def test_init_of_a_name_that_is_not_in_the_file_exits_with_78(tmp_path: Path) -> None:
+    file = tmp_path / "fleet.yaml"
+    file.write_text(FLEET)
+    result = run("init", "--config", file, "--node", "robot9", "--state-dir", tmp_path / "state")
+    assert result.exit_code == 78
+    assert "there are robot1, robot2, robot3" in result.stderr
+    assert not (tmp_path / "state").exists()
+
+
+@pytest.mark.parametrize("verb", ["up", "init"])
+def test_word_that_is_no_name_is_a_usage_error(tmp_path: Path, verb: str) -> None:
+    file = tmp_path / "fleet.yaml"
+    file.write_text(FLEET)
+    result = run(verb, "--config", file, "--node", "Robot 1")
+    assert result.exit_code == 2
+    assert "--node" in result.stderr
+
+
+def test_up_without_a_fleet_file_exits_with_78_and_says_which(tmp_path: Path) -> None:
+    result = run("up", "--config", tmp_path / "none.yaml", "--node", "robot1")
+    assert result.exit_code == 78
+    assert str(tmp_path / "none.yaml") in result.stderr
+    assert "--config" in result.stderr
+
+
+def test_version_names_what_a_bug_report_needs() -> None:
+    body = json.loads(run("version", "--json").stdout)
+    assert body["schema"] == "zsched.version/1"
+    assert body["zsched"] == __version__
+    assert {"wire", "zenoh", "python"} < set(body)
+    assert run("version").stdout.splitlines()[0] == f"zsched {__version__}"
+
+
+@pytest.mark.parametrize("arguments", [("fly",), ("status", "--jsn"), ("check",), ("demo", "--mode", "guess")])
+def test_wrong_usage_exits_with_2_and_explains_on_stderr(arguments: tuple[str, ...]) -> None:
+    result = run(*arguments)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert "zsched" in result.stderr or "Usage" in result.stderr
+
+
+@pytest.mark.parametrize("verb", ["up", "init", "status", "weights", "check", "demo", "version"])
+def test_help_of_every_verb_fits_a_small_terminal(verb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    result = run(verb, "--help")
+    assert result.exit_code == 0
+    assert result.stdout.startswith("Usage: ")
+    assert max(map(len, result.stdout.splitlines())) <= 80
+    assert verb in run("--help").stdout
+
+
+# --- what is imported ------------------------------------------------------------------------------------------------
+
+FOREIGN = ("zenoh", "numpy", "cv2", "pydantic", "rich", "asyncio", "psutil", "ruamel", "msgpack", "matplotlib")
+LOADED = """
+import sys
+sys.argv = ["zsched", *{arguments!r}]
+try:
+    from zsched.cli import main
+    main()
+finally:
+    print("LOADED", *sorted({{name.partition(".")[0] for name in sys.modules}}), file=sys.stderr)
+"""
+
+
+def loaded_by(folder: Path, *arguments: str) -> tuple[int, set[str]]:
+    """(exit code, top packages) of one run in an interpreter of its own."""
+    code = LOADED.format(arguments=[*arguments, "--runtime-dir", str(folder)])
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30, check=False)
+    (line,) = [line for line in done.stderr.splitlines() if line.startswith("LOADED")]
+    return done.returncode, set(line.split()[1:])
+
+
+def test_status_loads_nothing_heavy_even_when_nobody_answers(folder: Path) -> None:
+    code, loaded = loaded_by(folder, "status")
+    assert code == 3
+    assert loaded & set(FOREIGN) == set()
+    assert "typer" in loaded
+
+
+def test_status_and_weights_load_nothing_heavy(daemon: Daemon, folder: Path) -> None:
+    for arguments in (("status",), ("status", "--json", "--node", "robot1"), ("weights", "echo")):
+        code, loaded = loaded_by(folder, *arguments)
+        assert code == 0
+        assert loaded & set(FOREIGN) == set()
+    assert daemon.asked
+
+
+def test_command_line_has_no_side_effect_on_import() -> None:
+    command = [sys.executable, "-c", "import zsched.cli"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=30, check=True)
+    assert (done.stdout, done.stderr) == ("", "")

@@ -1,0 +1,100 @@
+"""`zsched init`'s blank state on a real disk: what it states, what it refuses, what a new generation starts at."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from zsched.adapters.state_file import StateFile, hardware_id
+from zsched.config import check_bytes
+from zsched.core.fleet import Fleet, electorate_hash
+from zsched.core.model import MAX_COUNTER, NO_BALLOT, DurableState
+from zsched.errors import AdapterError
+from zsched.lifecycle import GENERATION_STEP, init_state
+
+TEXT = b"""
+fleet: hall
+nodes:
+  robot1: {kind: robot, host: 127.0.0.1, listen: {control: tcp/127.0.0.1:7457, data: tcp/127.0.0.1:7458}}
+  robot2: {kind: robot}
+  robot3: {kind: robot}
+tasks:
+  merge: {candidates: {kind: robot}, weights: {cpu: 0.7, memory: 0.3}}
+  slam: {candidates: {kind: robot}, weights: {cpu: 1.0}}
+"""
+
+
+@pytest.fixture
+def fleet() -> Fleet:
+    found = check_bytes(TEXT).fleet
+    assert found is not None
+    return found
+
+
+def load(fleet: Fleet, folder: Path) -> DurableState:
+    with StateFile(folder, fleet=fleet.name, node="robot1") as file:
+        state = file.load().state
+    assert state is not None
+    return state
+
+
+def test_blank_state_says_that_this_name_never_voted(fleet: Fleet, tmp_path: Path) -> None:
+    path = init_state(fleet, "robot1", tmp_path / "state", 0)
+    assert path == tmp_path / "state" / "state"
+    state = load(fleet, tmp_path / "state")
+    assert (state.fleet, state.node, state.generation) == ("hall", "robot1", 0)
+    assert state.registers == ()
+    assert state.electorate == electorate_hash(fleet)
+    assert state.hardware == hardware_id()
+
+
+def test_second_blank_state_is_refused_and_the_first_one_stays(fleet: Fleet, tmp_path: Path) -> None:
+    path = init_state(fleet, "robot1", tmp_path, 0)
+    before = path.read_bytes()
+    with pytest.raises(AdapterError, match="exists already"):
+        init_state(fleet, "robot1", tmp_path, 0)
+    assert path.read_bytes() == before
+
+
+def test_damaged_state_is_not_taken_for_none(fleet: Fleet, tmp_path: Path) -> None:
+    init_state(fleet, "robot1", tmp_path, 0).write_bytes(b"\xc1 no state")
+    with pytest.raises(AdapterError, match="damaged"):
+        init_state(fleet, "robot1", tmp_path, 0)
+
+
+def test_new_generation_starts_above_every_older_revision_and_epoch(fleet: Fleet, tmp_path: Path) -> None:
+    init_state(fleet, "robot1", tmp_path, 0)
+    first = load(fleet, tmp_path).incarnation
+    init_state(fleet, "robot1", tmp_path, 2)
+    state = load(fleet, tmp_path)
+    assert (state.generation, state.incarnation >= first) == (2, True)
+    assert [register.task for register in state.registers] == ["merge", "slam"]
+    for register in state.registers:
+        assert (register.promised, register.accepted) == (NO_BALLOT, None)
+        assert register.learnt is not None
+        assert (register.learnt.revision, register.learnt.epoch) == (2 * GENERATION_STEP, 2 * GENERATION_STEP)
+        assert register.learnt.owner is None
+        assert register.learnt.tuning == fleet.task(register.task).tuning
+
+
+def test_generation_that_is_not_newer_is_refused(fleet: Fleet, tmp_path: Path) -> None:
+    init_state(fleet, "robot1", tmp_path, 3)
+    for generation in (0, 2, 3):
+        with pytest.raises(AdapterError, match="generation"):
+            init_state(fleet, "robot1", tmp_path, generation)
+
+
+def test_highest_generation_of_the_command_line_leaves_room_to_count(fleet: Fleet, tmp_path: Path) -> None:
+    init_state(fleet, "robot1", tmp_path, 2**20)
+    (learnt, _) = (register.learnt for register in load(fleet, tmp_path).registers)
+    assert learnt is not None
+    assert learnt.revision + GENERATION_STEP <= MAX_COUNTER
+
+
+def test_state_folder_of_a_running_daemon_is_refused(fleet: Fleet, tmp_path: Path) -> None:
+    with (
+        StateFile(tmp_path, fleet=fleet.name, node="robot1"),
+        pytest.raises(AdapterError, match="in use by process"),
+    ):
+        init_state(fleet, "robot1", tmp_path, 0)

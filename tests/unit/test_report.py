@@ -1,0 +1,298 @@
+"""Status as JSON and as text: recorded snapshots of real fleets at 80 and 100 columns, and what text must never do.
+
+The recorded answers lie in ``recorded_status/`` with the text they give; ``UPDATE_GOLDEN=1 pytest ...`` writes the text
+anew (look at the difference before you commit it).
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from zsched.cli_page import Page, cut, memory, size, span
+from zsched.cli_report import degradations, printable, render_status
+from zsched.core.model import Link, LinkSource, Tuning, Utility, Weights, WorkerLoad, WorkerState
+from zsched.core.plan import StreamCount
+from zsched.core.snapshot import (
+    DecisionStatus,
+    NodeStatus,
+    PastAllocation,
+    QuorumStatus,
+    Snapshot,
+    TaskStatus,
+    VoteStatus,
+)
+from zsched.report import snapshot_json
+
+RECORDED = Path(__file__).parent / "recorded_status"
+NAMES = ("healthy", "edge", "degraded")
+STAGES = ("PROFILE", "GATEWAY", "SCHEDULER", "VOTE", "EXECUTOR", "ROUTE")
+
+
+def recorded(name: str) -> dict[str, Any]:
+    status: dict[str, Any] = json.loads((RECORDED / f"{name}.json").read_text())
+    return status
+
+
+def snapshot() -> Snapshot:
+    edge = NodeStatus(
+        name="edge1",
+        kind="edge",
+        state="alive",
+        age_s=0.4,
+        links=(Link(source=LinkSource.WIRED),),
+        workers=(WorkerLoad(task="merge", state=WorkerState.READY, cpu_cores=0.1, memory_mb=90.0),),
+    )
+    task = TaskStatus(
+        name="merge",
+        owner="edge1",
+        epoch=3,
+        revision=5,
+        since_s=12.0,
+        owner_state="alive",
+        phase="settled",
+        tuning=Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0)),
+        candidates=("edge1",),
+        decision=DecisionStatus(
+            outcome="stay",
+            winner="edge1",
+            reason="nobody better",
+            age_s=0.2,
+            aggregates=(("edge1", 0.7),),
+            utilities=(("robot1", (Utility(candidate="edge1", value=0.6, cpu=0.2),)),),
+            vetoed=(("edge2", "worker failed"),),
+        ),
+        vote=VoteStatus(base_revision=4, votes=(("robot1", "edge1"),), outcome="won", winner="edge1", age_s=12.0),
+        streams=(StreamCount(stream="merge/in/0", messages=7, bytes=70, drops=(("overflow", 2),), last_seen_s=0.1),),
+        history=(PastAllocation(epoch=3, revision=5, owner="edge1", age_s=12.0, reason="first placement"),),
+    )
+    quorum = QuorumStatus(electors=1, needed=1, alive=1, ok=True, this_node="elector")
+    return Snapshot(
+        schema="zsched.status/1",
+        version="0.1.0",
+        fleet="hall",
+        node="robot1",
+        kind="robot",
+        incarnation=7,
+        up_s=60.0,
+        loop_lag_s=0.0,
+        quorum=quorum,
+        nodes=(edge,),
+        tasks=(task,),
+        counters=(("dropped_beat_stale", 3),),
+    )
+
+
+# --- JSON ------------------------------------------------------------------------------------------------------------
+
+
+def test_snapshot_as_json_has_objects_for_pairs_and_null_for_what_is_not_measured() -> None:
+    body = json.loads(json.dumps(snapshot_json(snapshot())))
+    assert body["schema"] == "zsched.status/1"
+    assert body["counters"] == {"dropped_beat_stale": 3}
+    assert body["nodes"][0]["cpu_ratio"] is None
+    assert body["nodes"][0]["links"][0] == {
+        "source": "wired",
+        "peer": None,
+        "rssi_dbm": None,
+        "bitrate_mbps": None,
+        "retry_ratio": None,
+    }
+    (task,) = body["tasks"]
+    assert task["decision"]["utilities"]["robot1"]["edge1"]["value"] == 0.6
+    assert task["decision"]["vetoed"] == {"edge2": "worker failed"}
+    assert task["vote"]["votes"] == {"robot1": "edge1"}
+    assert task["streams"][0]["drops"] == {"overflow": 2}
+
+
+def test_fields_of_the_recorded_schema_are_all_still_there() -> None:
+    """Within a major version fields are only added: what a script reads today it can read tomorrow."""
+    assert missing(recorded("healthy"), snapshot_json(snapshot()), "") == []
+
+
+def missing(old: Any, new: Any, where: str) -> list[str]:
+    """Paths of keys that ``old`` has and ``new`` has not; keys that are names are not compared."""
+    by_name = ("utilities", "aggregates", "vetoed", "votes", "drops", "counters")
+    if isinstance(old, dict) and isinstance(new, dict):
+        gone = [f"{where}.{key}" for key in old if key not in new]
+        shared = [key for key in old if key in new and key not in by_name]
+        return gone + [path for key in shared for path in missing(old[key], new[key], f"{where}.{key}")]
+    if isinstance(old, list) and isinstance(new, list) and old and new:
+        return missing(old[0], new[0], f"{where}[]")
+    return []
+
+
+# --- text ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("width", [80, 100])
+@pytest.mark.parametrize("name", NAMES)
+def test_recorded_status_looks_as_agreed(name: str, width: int) -> None:
+    golden = RECORDED / f"{name}.{width}.txt"
+    text = render_status(recorded(name), width, color=False)
+    if os.environ.get("UPDATE_GOLDEN"):
+        golden.write_text(text)
+    assert text == golden.read_text()
+
+
+@pytest.mark.parametrize("width", [60, 73, 80, 100, 160])
+@pytest.mark.parametrize("name", NAMES)
+def test_no_line_is_longer_than_the_terminal(name: str, width: int) -> None:
+    status = recorded(name)
+    status["problems"] = ["a problem told at length " * 8, "x" * 300]
+    status["tasks"][0]["history"][0]["reason"] = "y" * 300
+    assert max(map(len, render_status(status, width, color=False).splitlines())) <= width
+
+
+def test_stages_stand_in_the_order_of_the_design() -> None:
+    text = render_status(recorded("healthy"), 100, color=False)
+    starts = [re.search(rf"^{stage}\b", text, re.MULTILINE) for stage in STAGES]
+    places = [match.start() for match in starts if match]
+    assert len(places) == 6
+    assert places == sorted(places)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_colour_changes_nothing_but_colour(name: str) -> None:
+    plain = render_status(recorded(name), 100, color=False)
+    coloured = render_status(recorded(name), 100, color=True)
+    assert "\x1b[" in coloured
+    assert "\x1b" not in plain
+    assert re.sub(r"\x1b\[[0-9;]*m", "", coloured) == plain
+
+
+def test_text_of_another_node_cannot_steer_the_terminal() -> None:
+    status = recorded("healthy")
+    status["tasks"][0]["decision"]["reason"] = "\x1b]0;owned\x07\x1b[2Jnice\r\nPROBLEMS none\u202e"
+    status["tasks"][0]["decision"]["vetoed"] = {"\x1b[31medge2": "\u009b31m"}
+    text = render_status(status, 80, color=False)
+    assert not [char for char in text if not char.isprintable() and char != "\n"]
+    assert "?]0;owned??[2Jnice??PROBLEMS none?" in text.replace("\n", " ")
+    assert printable({"a\x00": ["\x7f", 1, None]}) == {"a?": ["?", 1, None]}
+
+
+def test_more_robots_than_fit_are_counted() -> None:
+    status = recorded("healthy")
+    utilities = status["tasks"][0]["decision"]["utilities"]
+    column = utilities["robot1"]
+    utilities.update({f"robot{i}": copy.deepcopy(column) for i in range(4, 21)})
+    lines = render_status(status, 80, color=False).splitlines()
+    (head,) = [line for line in lines if "candidate" in line]
+    shown = head.count("robot")
+    assert 0 < shown < 20
+    assert f"+{20 - shown}" in head
+
+
+def test_several_tasks_and_workers_are_told_apart() -> None:
+    status = recorded("healthy")
+    status["tasks"].append({**copy.deepcopy(status["tasks"][0]), "name": "slam", "streams": []})
+    status["nodes"][0]["workers"].append({"task": "slam", "state": "failed", "cpu_cores": None, "memory_mb": None})
+    wide, narrow = render_status(status, 120, color=False), render_status(status, 80, color=False)
+    assert "echo ready, slam failed" in wide
+    assert "1 ready, 1 failed" in render_status(status, 84, color=False)
+    assert narrow.count("TASK ") == 2
+
+
+def test_nothing_known_yet_is_shown_as_such() -> None:
+    status = recorded("healthy")
+    for node in status["nodes"]:
+        unknown = dict.fromkeys(node, None) | {"name": node["name"], "kind": node["kind"], "state": "unknown"}
+        node.update(unknown, links=[], workers=[], draining=False)
+    (task,) = status["tasks"]
+    task.update(owner=None, owner_state="none", since_s=None, decision=None, vote=None, history=[], streams=[])
+    text = render_status(status, 80, color=False)
+    assert "0 of 5 profiles held" in text
+    assert "no owner yet" in text
+    assert "no round yet" in text
+    assert "None" not in text
+
+
+# --- degraded --------------------------------------------------------------------------------------------------------
+
+
+def test_healthy_fleet_is_not_degraded() -> None:
+    assert degradations(recorded("healthy")) == ()
+    assert degradations(recorded("edge")) == ()
+
+
+def test_lost_quorum_and_lost_owner_are_degraded() -> None:
+    assert degradations(recorded("degraded")) == (
+        "no quorum: 1 of 3 electors alive, 2 needed",
+        "echo: its owner edge1 is gone",
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"owner": None, "owner_state": "none"}, ("echo has no owner",)),
+        ({"owner_state": "unknown"}, ("echo: its owner edge1 is unknown",)),
+        ({"owner_state": "suspect"}, ()),  # in grace: it may still refute
+    ],
+)
+def test_owner_that_is_not_there_is_degraded(change: dict[str, Any], expected: tuple[str, ...]) -> None:
+    status = recorded("healthy")
+    status["tasks"][0].update(change)
+    assert degradations(status) == expected
+
+
+def test_failed_worker_of_the_owner_is_degraded_and_one_elsewhere_is_not() -> None:
+    status = recorded("healthy")
+    status["nodes"][1]["workers"][0]["state"] = "failed"
+    assert degradations(status) == ()
+    status["nodes"][0]["workers"][0]["state"] = "failed"
+    assert degradations(status) == ("echo: its worker on edge1 has failed",)
+
+
+# --- figures and lines -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (None, "-"),
+        (-0.2, "0.0s"),
+        (0.04, "0.0s"),
+        (9.94, "9.9s"),
+        (9.96, "10s"),
+        (59.4, "59s"),
+        (59.6, "1m00s"),
+        (3599.9, "1h00m"),
+        (86400.0 * 2 + 3600 * 4, "2d04h"),
+    ],
+)
+def test_durations(seconds: float | None, text: str) -> None:
+    assert span(seconds) == text
+
+
+def test_sizes() -> None:
+    assert [size(0), size(999), size(1000), size(1 << 20), size(5 << 40)] == [
+        "0 B",
+        "999 B",
+        "1.0 KiB",
+        "1.0 MiB",
+        "5120.0 GiB",
+    ]
+    assert [memory(98.4), memory(1000.0), memory(24064.0)] == ["98M", "1.0G", "23.5G"]
+
+
+def test_cut_shows_that_something_was_cut() -> None:
+    assert [cut("abcd", 4), cut("abcde", 4), cut("abc", 1), cut("abc", 0)] == ["abcd", "abc…", "…", ""]
+
+
+def test_block_breaks_between_its_parts_and_aligns_them() -> None:
+    page = Page(30, color=False)
+    page.block("VOTE", ("one two", ""), ("three four", ""), ("five", ""))
+    assert page.lines == ["VOTE       one two", "           three four · five"]
+
+
+def test_block_with_a_long_title_pushes_its_text_along() -> None:
+    page = Page(40, color=False)
+    page.block("TASK a_long_name", ("owned", ""))
+    assert page.lines == ["TASK a_long_name  owned"]
