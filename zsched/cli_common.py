@@ -42,8 +42,8 @@ class PlainValue:
     def coerce(self, value: Any, param: Any, ctx: Any) -> Any:
         """The value as the verb wants it, as typer's own coercion does it."""
         annotation = self._annotation
-        if annotation == list[str] and isinstance(value, tuple):
-            return list(value)
+        if annotation == list[str] and (value is None or isinstance(value, tuple)):
+            return list(value or ())
         if param.nargs == 1 and not param.multiple and isinstance(annotation, type):
             if value is None or isinstance(value, annotation):
                 return value
