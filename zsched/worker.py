@@ -45,8 +45,10 @@ from zsched.worker_outputs import Output
 
 __all__ = ["Output", "Received", "Worker"]
 
-CLOSE_S: Final = 0.7
+CLOSE_S: Final = 0.6
 """Closing a session towards a stopped peer can take seconds; so long we wait."""
+ALARM_S: Final = 0.9
+"""...and should zenoh hold Python's global lock meanwhile, the kernel ends a process that was told to stop."""
 ROLE_RETRY_S: Final = 0.5
 _ENVIRONMENT: Final = ("ZSCHED_FLEET", "ZSCHED_NODE", "ZSCHED_TASK", "ZSCHED_INCARNATION", "ZSCHED_ZENOH_CONFIG")
 
@@ -225,6 +227,10 @@ class Worker:
     def close(self) -> None:
         """Close the session, within a second; after a signal the process ends here when zenoh would hold it longer."""
         self._stop.set()
+        has_alarm = self._is_signalled and threading.current_thread() is threading.main_thread()
+        if has_alarm:
+            signal.signal(signal.SIGALRM, signal.SIG_DFL)
+            signal.setitimer(signal.ITIMER_REAL, ALARM_S)
         self._dispatcher.close()
         self._errands.put(None)
         closing = threading.Thread(target=self._close_session, name="zsched close", daemon=True)
@@ -233,6 +239,8 @@ class Worker:
         if closing.is_alive() and self._is_signalled:
             logging.shutdown()
             os._exit(0)  # a stopped peer holds zenoh's close for seconds, and its threads hold the interpreter
+        if has_alarm:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
 
     def __enter__(self) -> Self:
         return self

@@ -97,7 +97,8 @@ class Output:
             publisher = self._session.declare_publisher(key, congestion_control=self._congestion)
         stamped = self._epochs[epoch] = _Stamped(key=key, publisher=publisher)
         for old in sorted(self._epochs)[:-KEPT_EPOCHS]:
-            self._epochs.pop(old).publisher.undeclare()  # type: ignore[no-untyped-call] # the union hides that it is zenoh's
+            # Long unused, so its heartbeat is idle: else this would wait for a stalled receiver, see `relay.inputs`.
+            self._epochs.pop(old).publisher.undeclare()  # type: ignore[no-untyped-call] # zenoh's stubs
         return stamped
 
     def _put(self, stamped: _Stamped, payload: Any, attachment: Any, encoding: Any) -> None:

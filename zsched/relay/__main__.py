@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import ctypes
+import faulthandler
 import logging
 import os
 import signal
@@ -26,6 +27,7 @@ def main() -> None:
     _die_with(arguments.parent)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the daemon stops us in order
     signal.signal(signal.SIGTERM, _stop)
+    faulthandler.register(signal.SIGUSR1)  # where every thread stands, for whoever has to ask
     # One stalled target holds one transmit thread: there must be more threads than targets may stall. Read once, when
     # zenoh's runtime starts.
     pools = f"(tx: (worker_threads: {arguments.threads}), rx: (worker_threads: {arguments.threads}))"

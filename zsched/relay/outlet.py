@@ -141,10 +141,20 @@ class Outlet:
             self._queue.items.append(EndMarker(epoch=epoch, count=0))
             self._queue.wake.notify()
 
-    def undeclare(self) -> None:
-        """Give the publishers back; a reliable queue's thread does it for its own."""
+    def discard(self) -> int:
+        """Forget what waits for a target that is none any more; answers how many samples those were."""
         if self._queue is None:
-            self._undeclare()
+            return 0
+        with self._queue.wake:
+            count = sum(not isinstance(item, EndMarker) for item in self._queue.items)
+            self._queue.items.clear()
+            self._queue.size = 0
+            return count
+
+    def undeclare(self) -> None:
+        """Give the publishers back, in another thread; not while a receiver may be stalled (see `relay.inputs`)."""
+        if self._queue is None:
+            threading.Thread(target=self._undeclare, name=f"close {self._to}", daemon=True).start()
             return
         with self._queue.wake:
             self._queue.is_closed = True
@@ -204,10 +214,12 @@ class Outlet:
             )
 
     def _undeclare(self) -> None:
-        for lane in self._lanes.values():
-            undeclare(lane.publisher)
-        self._lanes.clear()
-        undeclare(self._probe)
+        try:
+            for lane in self._lanes.values():
+                undeclare(lane.publisher)
+            undeclare(self._probe)
+        except zenoh.ZError:
+            _log.debug("%s: the session closed first", self._to)
 
     # --- the queue of class reliable ---------------------------------------------------------------------------------
 
@@ -233,10 +245,7 @@ class Outlet:
                 if not isinstance(item, EndMarker):
                     queue.size -= len(item[1].payload)
             self._put_queued(item)
-        try:
-            self._undeclare()
-        except zenoh.ZError:
-            _log.debug("%s: the session closed first", self._to)
+        self._undeclare()
 
     def _put_queued(self, item: tuple[_Lane, Sample] | EndMarker) -> None:
         try:

@@ -10,6 +10,7 @@ import contextlib
 import logging
 import os
 import queue
+import signal
 import threading
 from typing import Final
 
@@ -30,8 +31,10 @@ from zsched.relay_pipe import COMMANDS, read_frame, write_frame
 
 COUNT_S: Final = 1.0
 """Period of the counters, which are also this process's sign of life."""
-CLOSE_S: Final = 0.7
+CLOSE_S: Final = 0.6
 """Closing a session towards a stopped peer can take seconds: so long we wait, then the process ends anyway."""
+ALARM_S: Final = 0.9
+"""...and should zenoh hold Python's global lock meanwhile, the kernel ends it."""
 MAX_REPORTS: Final = 4096
 
 _log = logging.getLogger("zsched.relay")
@@ -150,6 +153,8 @@ def run(fleet: str, node: NodeId, commands: int, reports: int) -> int:
     try:
         RelayProcess(session, fleet, node, reporter).obey(commands)
     finally:
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
+        signal.setitimer(signal.ITIMER_REAL, ALARM_S)
         reporter.flush(0.1)
         closing = threading.Thread(target=session.close, name="close", daemon=True)
         closing.start()

@@ -29,7 +29,7 @@ FLIP_WAIT_S: Final = 0.3
 """A flip waits at most so long for a worker that is not ready, or has not heard yet that it is the owner."""
 GONE_GRACE_S: Final = 0.05
 """An old owner whose token went has sent its last; what is still in our queues gets so long."""
-BUSY_S, REPEAT_S, IDLE_S = 0.01, 0.1, 0.5
+BUSY_S, REPEAT_S, IDLE_S = 0.01, 0.2, 0.5
 
 _log = logging.getLogger("zsched.relay")
 

@@ -18,7 +18,7 @@ from zsched.core.model import NodeId, TaskId
 from zsched.core.relay_protocol import WorkerSeen
 from zsched.keyspace import Keyspace, parse
 
-WORKER, ROLE = "worker", "role"
+WORKER = "worker"
 
 
 class Tokens:
@@ -31,14 +31,10 @@ class Tokens:
         self._on_worker = on_worker
         self._wake = wake
         self._present: frozenset[str] = frozenset()  # replaced whole: readers need no lock
-        self._lock = threading.Lock()
-        selectors = (keyspace.worker("*", "*", "*"), f"{keyspace.role('*', '*')}/*")
-        self._watches = [
-            session.liveliness().declare_subscriber(selector, zenoh.handlers.FifoChannel(1024), history=True)
-            for selector in selectors
-        ]
-        for watch in self._watches:
-            threading.Thread(target=self._run, args=(watch.handler,), name="tokens", daemon=True).start()
+        # one watch for both kinds: a waiting receiver costs ten wake-ups a second
+        selector = keyspace.worker("*", "*", "*").replace(f"/{WORKER}/", "/*/")
+        self._watch = session.liveliness().declare_subscriber(selector, zenoh.handlers.FifoChannel(1024), history=True)
+        threading.Thread(target=self._run, args=(self._watch.handler,), name="tokens", daemon=True).start()
 
     def workers(self, node: NodeId, task: TaskId) -> frozenset[str]:
         """The tokens of the node's workers for the task: one, or two while one restarts."""
@@ -54,8 +50,7 @@ class Tokens:
             self._note(str(sample.key_expr), is_present=sample.kind == SampleKind.PUT)
 
     def _note(self, key: str, *, is_present: bool) -> None:
-        with self._lock:
-            self._present = self._present | {key} if is_present else self._present - {key}
+        self._present = self._present | {key} if is_present else self._present - {key}
         parsed = parse(key)
         if parsed is not None and parsed.kind == WORKER and len(parsed.rest) == 2:
             task, incarnation = parsed.rest
