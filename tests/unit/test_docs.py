@@ -1,0 +1,305 @@
+"""The documentation says what the code says: links, key and wire tables, commands, decisions, no foreign paths."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import types
+from collections.abc import Iterator
+from dataclasses import MISSING, fields, is_dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any, Final, Union, get_args, get_origin, get_type_hints
+
+import pytest
+import typer.main
+
+from zsched import relay_pipe, wire  # the pipe's kinds are registered with the codec when its module is imported
+from zsched.cli import app
+from zsched.core.timing import PROFILES
+from zsched.keyspace import Keyspace
+
+ROOT: Final = Path(__file__).parents[2]
+DOCS: Final = sorted(
+    path
+    for path in (*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"))
+    if ".venv" not in path.parts  # a virtual environment below docs/ is nobody's document
+)
+NAMES: Final = [str(path.relative_to(ROOT)) for path in DOCS]
+AWAITED: Final = frozenset(
+    {
+        *("docs/img/demo-map.png", "docs/img/demo-timeline.png"),  # a run of the demo makes them
+        *("docs/cli.md", "docs/streams.md"),
+    }
+)
+"""Announced, not there yet."""
+
+LINK: Final = re.compile(r"!?\[[^\]]*\]\(([^()\s]+)\)")
+FENCE: Final = re.compile(r"^```[^\n]*\n(.*?)^```", re.MULTILINE | re.DOTALL)
+COMMAND: Final = re.compile(r"(?:^|[\s`(/])zsched ([a-z]+)((?: [^\s`#;|&)]+)*)", re.MULTILINE)
+
+
+def text_of(name: str) -> str:
+    return (ROOT / name).read_text(encoding="utf-8")
+
+
+# --- links -----------------------------------------------------------------------------------------------------------
+
+
+def anchor(heading: str) -> str:
+    """A heading's anchor, as GitHub makes it."""
+    words = re.sub(r"[^\w\- ]", "", heading.replace("`", "").strip().lower())
+    return words.replace(" ", "-")
+
+
+def broken_links(path: Path, text: str) -> Iterator[str]:
+    for target in LINK.findall(FENCE.sub("", text)):
+        if re.match(r"[a-z]+:", target):
+            continue
+        place, _, fragment = target.partition("#")
+        file = (path.parent / place).resolve() if place else path
+        if not file.is_relative_to(ROOT):
+            yield f"{target}: outside the repository"
+        elif not file.exists():
+            if str(file.relative_to(ROOT)) not in AWAITED:
+                yield f"{target}: not there"
+        elif fragment and fragment not in {anchor(h) for h in re.findall(r"^#+ (.*)$", file.read_text(), re.MULTILINE)}:
+            yield f"{target}: no such heading"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_links_resolve(name: str) -> None:
+    assert list(broken_links(ROOT / name, text_of(name))) == []
+
+
+def test_planted_broken_links_are_found() -> None:
+    text = "[a](nowhere.md) [b](README.md#no-such-heading) [c](../secret) [d](https://example.org) [e](LICENSE)"
+    found = list(broken_links(ROOT / "x.md", text))
+    assert [line.split(":")[0] for line in found] == ["nowhere.md", "README.md#no-such-heading", "../secret"]
+
+
+def test_every_document_is_in_the_index() -> None:
+    index = ROOT / "docs" / "README.md"
+    linked = {(index.parent / target.partition("#")[0]).resolve() for target in LINK.findall(index.read_text())}
+    assert [
+        name for path, name in zip(DOCS, NAMES, strict=True) if path != index and path.resolve() not in linked
+    ] == []
+
+
+# --- what is named must exist ----------------------------------------------------------------------------------------
+
+
+def missing_files(text: str) -> list[str]:
+    """Files of the repository named in backticks that are not there (``{a,b}`` and ``*`` are expanded)."""
+    missing = []
+    for name in re.findall(r"`((?:zsched|core|adapters|relay|tests|benchmarks|configs|systemd|docs)/[^\s`]+)`", text):
+        alternatives = re.search(r"\{([^}]*)\}", name)
+        parts = alternatives.group(1).split(",") if alternatives else [""]
+        for part in parts:
+            one = name.replace(alternatives.group(0), part) if alternatives else name
+            one = one.partition("::")[0].rstrip("/")
+            if not any(any(base.glob(one)) for base in (ROOT, ROOT / "zsched")):
+                missing.append(one)
+    return missing
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_named_files_exist(name: str) -> None:
+    assert missing_files(text_of(name)) == []
+
+
+def test_planted_missing_file_is_found() -> None:
+    assert missing_files("`core/node.py` `tests/unit/core/test_{vote,nothing}.py` `core/absent.py`") == [
+        "tests/unit/core/test_nothing.py",
+        "core/absent.py",
+    ]
+
+
+def test_named_tests_exist() -> None:
+    """Every ``test_...`` function that a document names is in the suite."""
+    code = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("test_*.py"))
+    defined = set(re.findall(r"def (test_\w+)", code))
+    modules = {path.stem for path in (ROOT / "tests").rglob("test_*.py")}
+    named = {word for name in NAMES for word in re.findall(r"`(test_\w+)`", text_of(name))}
+    assert sorted(named - defined - modules) == []
+
+
+ABSOLUTE: Final = re.compile(r"(?<![\w.}*<>:/@-])/([A-Za-z][\w.-]*)/[\w.*<-]")
+PLACES: Final = frozenset({"opt", "etc", "var", "run", "proc", "sys", "dev", "path"})
+"""Folders that every Linux machine has (and ``/path/to``)."""
+
+
+def foreign_paths(text: str) -> list[str]:
+    return [match.group(0) for match in ABSOLUTE.finditer(text) if match.group(1) not in PLACES]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_document_names_a_path_of_somebody_s_machine(name: str) -> None:
+    assert foreign_paths(text_of(name)) == []
+
+
+def test_planted_foreign_path_is_found() -> None:
+    assert foreign_paths("see /home/me/notes and `/etc/zsched/fleet.yaml`, not robot1/map or {robot}/map") == [
+        "/home/m"
+    ]
+
+
+# --- keyspace.md -----------------------------------------------------------------------------------------------------
+
+
+def rendered_keys() -> dict[str, str]:
+    """{method of `Keyspace`: its key, every argument as ``<name>``}."""
+    keys = Keyspace("<fleet>")
+    found = {}
+    for name, method in inspect.getmembers(keys, inspect.ismethod):
+        if not name.startswith("_"):
+            found[name] = method(*(f"<{argument}>" for argument in inspect.signature(method).parameters))
+    return found
+
+
+def between(text: str, mark: str) -> str:
+    return text.partition(f"<!-- {mark}: begin -->\n")[2].partition(f"<!-- {mark}: end -->")[0].strip("\n")
+
+
+def test_key_table_is_the_code_s() -> None:
+    rows = re.findall(r"^\| `(\w+)` \| `([^`]+)` \|", between(text_of("docs/keyspace.md"), "keys"), re.MULTILINE)
+    assert len(rows) == len(dict(rows))
+    assert dict(rows) == rendered_keys()
+
+
+# --- wire.md ---------------------------------------------------------------------------------------------------------
+
+
+def parts_of(hint: Any) -> Iterator[type]:
+    """The frozen values inside a type hint, at every depth."""
+    if get_origin(hint) in (tuple, Union, types.UnionType):
+        for inner in get_args(hint):
+            yield from parts_of(inner)
+    elif isinstance(hint, type) and is_dataclass(hint):
+        yield hint
+        for inner in get_type_hints(hint).values():
+            yield from parts_of(inner)
+
+
+def shown(hint: Any) -> str:
+    """A type hint in a reader's words."""
+    if get_origin(hint) is tuple:
+        arguments = get_args(hint)
+        if arguments[-1] is Ellipsis:
+            return f"list of {shown(arguments[0])}"
+        return f"({', '.join(shown(argument) for argument in arguments)})"
+    if get_origin(hint) in (Union, types.UnionType):
+        return " or ".join("nil" if part is type(None) else shown(part) for part in get_args(hint))
+    if isinstance(hint, type) and issubclass(hint, Enum):
+        return "one of " + " ".join(str(member.value) for member in hint)
+    return hint.__name__ if isinstance(hint, type) else str(hint)
+
+
+def fields_of(cls: type) -> str:
+    hints = get_type_hints(cls)
+    parts = [f"`{f.name}{'' if f.default is MISSING else '?'}` {shown(hints[f.name])}" for f in fields(cls)]
+    return "; ".join(parts) or "none"
+
+
+def kinds_table() -> str:
+    assert relay_pipe.REPORTS  # imported for its registrations
+    lines = ["| kind | value | at most, bytes | fields |", "| --- | --- | --- | --- |"]
+    for kind, (cls, bound) in wire.KINDS.items():
+        if cls.__module__.startswith("zsched."):
+            lines.append(f"| `{kind}` | `{cls.__name__}` | {bound} | {fields_of(cls)} |")
+    return "\n".join(lines)
+
+
+def parts_table() -> str:
+    inner = {part for cls, _ in wire.KINDS.values() for hint in get_type_hints(cls).values() for part in parts_of(hint)}
+    lines = ["| value | fields |", "| --- | --- |"]
+    lines += [f"| `{cls.__name__}` | {fields_of(cls)} |" for cls in sorted(inner, key=lambda cls: cls.__name__)]
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize(("mark", "table"), [("kinds", kinds_table), ("parts", parts_table)])
+def test_wire_tables_are_the_codec_s(mark: str, table: Any) -> None:
+    assert between(text_of("docs/wire.md"), mark) == table(), f"paste the output of test_docs.{table.__name__}()"
+
+
+def test_wire_version_told_is_the_codec_s() -> None:
+    assert f"This is version {wire.VERSION}." in text_of("docs/wire.md")
+
+
+# --- timing.md -------------------------------------------------------------------------------------------------------
+
+
+def test_profiles_are_told_as_the_code_s_differences() -> None:
+    rows = {}
+    for line in between(text_of("docs/timing.md"), "profiles").splitlines()[2:]:
+        name, *cells = [cell.strip(" `") for cell in line.strip("|").split("|")]
+        rows[name] = cells[:3]
+    base, expected = PROFILES["wifi"], {}
+    for field in fields(base):
+        if field.name != "name":
+            usual = getattr(base, field.name)
+            others = [getattr(PROFILES[name], field.name) for name in ("wired", "wan")]
+            expected[field.name] = [f"{usual:g}", *("" if value == usual else f"{value:g}" for value in others)]
+    assert rows == expected
+
+
+# --- commands --------------------------------------------------------------------------------------------------------
+
+VERBS: Final[dict[str, Any]] = dict(getattr(typer.main.get_command(app), "commands", {}))
+
+
+def wrong_commands(text: str) -> list[str]:
+    """Commands of the command line in ``text`` whose verb, or an option of it, does not exist."""
+    wrong = []
+    for verb, rest in COMMAND.findall(text):
+        command = VERBS.get(verb)
+        if command is None:
+            wrong.append(f"zsched {verb}")
+            continue
+        known = {"--help", "-h"} | {name for param in command.params for name in (*param.opts, *param.secondary_opts)}
+        given = [word.partition("=")[0] for word in rest.split() if word.startswith("-")]
+        wrong += [f"zsched {verb} {name}" for name in given if name not in known]
+    return wrong
+
+
+def code_of(text: str) -> str:
+    return "\n".join((*FENCE.findall(text), *re.findall(r"`(zsched [^`\n]+)`", FENCE.sub("", text))))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_commands_are_the_command_line_s(name: str) -> None:
+    if name == "CHANGELOG.md":
+        return  # tells of commands as they were
+    text = text_of(name)
+    announced = set(re.findall(r"no `(zsched [a-z]+)`", text))  # what does not exist may be named as such
+    assert [command for command in wrong_commands(code_of(text)) if command not in announced] == []
+
+
+def test_planted_wrong_commands_are_found() -> None:
+    text = "sudo bin/zsched ini --node x\nzsched status --jsno | less\nzsched check fleet.yaml   # fine"
+    assert wrong_commands(text) == ["zsched ini", "zsched status --jsno"]
+
+
+# --- decisions -------------------------------------------------------------------------------------------------------
+
+DECISIONS: Final = [name for name in NAMES if name.startswith("docs/decisions/")]
+
+
+def test_decisions_are_numbered_without_a_gap() -> None:
+    numbers = [int(Path(name).name[:4]) for name in DECISIONS]
+    assert numbers == list(range(1, len(numbers) + 1))
+
+
+@pytest.mark.parametrize("name", DECISIONS)
+def test_decision_has_its_four_parts(name: str) -> None:
+    headings = re.findall(r"^## (.*)$", text_of(name), re.MULTILINE)
+    assert headings == ["Context", "Decision", "Consequences", "Alternatives refused"]
+
+
+def test_decisions_that_the_code_cites_exist() -> None:
+    cited = {
+        number
+        for path in (ROOT / "zsched").rglob("*.py")
+        for number in re.findall(r"decisions/(\d{4})", path.read_text(encoding="utf-8"))
+    }
+    assert cited <= {Path(name).name[:4] for name in DECISIONS}
