@@ -1,0 +1,245 @@
+"""The command line against real daemons that it started itself, each verb as the process an operator would run."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from zsched.lab.testbed import echo_fleet
+
+CLI = (sys.executable, "-m", "zsched.cli")
+VERB_S, UP_S = 20.0, 30.0
+STOP_S = 4.0
+"""The goal is 2 s; tests share their machine."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Site:
+    """One machine of the fleet: its name in the fleet file and its folders."""
+
+    file: Path
+    node: str
+    state: Path
+    runtime: Path
+
+    def environment(self) -> dict[str, str]:
+        words = {"ZSCHED_CONFIG": self.file, "ZSCHED_NODE": self.node, "ZSCHED_STATE_DIR": self.state}
+        words["ZSCHED_RUNTIME_DIR"] = self.runtime
+        kept = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "NO_COLOR")}
+        return kept | {name: str(value) for name, value in words.items()}
+
+    def zsched(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        """Run one verb to its end."""
+        command = [*CLI, *arguments]
+        return subprocess.run(
+            command, env=self.environment(), capture_output=True, text=True, timeout=VERB_S, check=False
+        )
+
+    def status(self, *arguments: str) -> dict[str, Any]:
+        """``zsched status --json``, empty while nobody answers."""
+        out = self.zsched("status", "--json", *arguments).stdout
+        body: dict[str, Any] = json.loads(out) if out else {}
+        return body
+
+    @contextlib.contextmanager
+    def up(self) -> Iterator[subprocess.Popen[bytes]]:
+        """``zsched up`` while the block runs; its stderr goes to ``up.log`` beside the state."""
+        with (
+            self.state.with_suffix(".log").open("ab") as log,
+            subprocess.Popen([*CLI, "up"], env=self.environment(), stdin=subprocess.DEVNULL, stderr=log) as process,
+        ):
+            try:
+                yield process
+            finally:
+                if process.poll() is None:
+                    process.terminate()
+                    with contextlib.suppress(subprocess.TimeoutExpired):
+                        process.wait(STOP_S)
+                process.kill()
+
+    def log(self) -> str:
+        return self.state.with_suffix(".log").read_text()
+
+    def wait_owner(self) -> dict[str, Any]:
+        """The first status in which the task has its owner."""
+        end = time.monotonic() + UP_S
+        while time.monotonic() < end:
+            status = self.status()
+            if status and status["tasks"][0]["owner"] and status["quorum"]["ok"]:
+                return status
+        raise AssertionError(f"no owner within {UP_S:g} s\n{self.log()}")
+
+
+def sites(folder: Path, robots: int = 1, edges: int = 0) -> list[Site]:
+    """The machines of a fleet whose daemons share no folder, so that no socket but its own is at hand."""
+    tree = echo_fleet(robots=robots, edges=edges)
+    file = folder / "fleet.yaml"
+    file.write_text(json.dumps(tree))
+    found = []
+    for number, node in enumerate(tree["nodes"]):
+        runtime = folder / f"r{number}"
+        runtime.mkdir()
+        found.append(Site(file=file, node=node, state=folder / f"{node}.state", runtime=runtime))
+    return found
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
+    """A fleet of one robot, initialised and up, whose task has its owner."""
+    (only,) = sites(tmp_path_factory.mktemp("one"))
+    done = only.zsched("init")
+    assert done.returncode == 0, done.stderr
+    with only.up():
+        only.wait_owner()
+        yield only
+
+
+# --- a running daemon ------------------------------------------------------------------------------------------------
+
+
+def test_status_of_a_running_fleet_for_people_and_for_scripts(site: Site) -> None:
+    text, as_json = site.zsched("status"), site.zsched("status", "--json")
+    assert (text.returncode, as_json.returncode) == (0, 0), text.stderr
+    assert "robot1 owns it" in text.stdout
+    for stage in ("PROFILE", "GATEWAY", "SCHEDULER", "VOTE", "EXECUTOR", "ROUTE"):
+        assert f"\n{stage} " in text.stdout
+    assert "\x1b" not in text.stdout
+    body = json.loads(as_json.stdout)
+    assert (body["schema"], body["fleet"], body["node"]) == ("zsched.status/1", "testbed", "robot1")
+
+
+def test_status_on_a_terminal_has_colour_unless_told_otherwise(site: Site) -> None:
+    assert "\x1b[" in on_terminal(site)
+    assert "\x1b[" not in on_terminal(site, NO_COLOR="1")
+    assert "\x1b[" not in on_terminal(site, TERM="dumb")
+
+
+def on_terminal(site: Site, **environment: str) -> str:
+    """What ``zsched status`` writes when its stdout is a terminal."""
+    controller, terminal = os.openpty()
+    try:
+        words = {**site.environment(), "TERM": "xterm", **environment}
+        subprocess.run([*CLI, "status"], env=words, stdout=terminal, timeout=VERB_S, check=True)
+        return os.read(controller, 1 << 16).decode()
+    finally:
+        os.close(controller)
+        os.close(terminal)
+
+
+def test_watch_gives_newer_and_newer_statuses(site: Site) -> None:
+    command = [*CLI, "status", "--watch", "--json", "--interval", "0.2"]
+    with subprocess.Popen(command, env=site.environment(), stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        ages = [json.loads(process.stdout.readline())["up_s"] for _ in range(3)]
+        process.send_signal(signal.SIGINT)
+        assert process.wait(VERB_S) == 0
+    assert ages == sorted(set(ages))
+
+
+def test_weights_are_agreed_shown_and_refused_on_an_old_revision(site: Site) -> None:
+    before = json.loads(site.zsched("weights", "echo", "--json").stdout)
+    changed = site.zsched("weights", "echo", "cpu=0.6", "memory=0.4", "--json")
+    assert changed.returncode == 0, changed.stderr
+    body = json.loads(changed.stdout)
+    assert body["outcome"] == "ok"
+    assert body["revision"] > before["revision"]
+    assert site.status()["tasks"][0]["tuning"]["weights"] == {"cpu": 0.6, "memory": 0.4, "network": 0.0}
+
+    again = site.zsched("weights", "echo", "cpu=0.6", "memory=0.4")
+    assert (again.returncode, again.stdout) == (0, "echo: cpu=0.6 memory=0.4 network=0 (unchanged)\n")
+    old = site.zsched("weights", "echo", "cpu=1", "--revision", str(before["revision"]))
+    assert (old.returncode, old.stdout) == (1, "")
+    assert "conflict" in old.stderr
+    unknown = site.zsched("weights", "ecko", "cpu=1")
+    assert unknown.returncode == 2
+    assert "echo" in unknown.stderr
+
+
+def test_second_daemon_in_the_same_folders_is_refused(site: Site) -> None:
+    second = site.zsched("up")
+    assert second.returncode == 1
+    assert "in use by process" in second.stderr
+    assert "Traceback" not in second.stderr
+
+
+def test_init_under_a_running_daemon_is_refused(site: Site) -> None:
+    refused = site.zsched("init", "--generation", "1")
+    assert refused.returncode == 1
+    assert "stop that daemon first" in refused.stderr
+
+
+# --- start and stop --------------------------------------------------------------------------------------------------
+
+
+def test_up_keeps_its_process_id_and_ends_cleanly_on_sigterm(tmp_path: Path) -> None:
+    """What systemd started is what it stops: the command line became the daemon, which takes its children along."""
+    (only,) = sites(tmp_path)
+    assert only.zsched("init").returncode == 0
+    with only.up() as process:
+        only.wait_owner()
+        words = Path(f"/proc/{process.pid}/cmdline").read_bytes().split(b"\0")
+        assert b"zsched.daemon" in words
+        start = time.monotonic()
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(10) == 0
+        assert time.monotonic() - start < STOP_S
+    gone = only.zsched("status")
+    assert gone.returncode == 3
+    assert "zsched up" in gone.stderr
+    assert "Traceback" not in only.log()
+
+
+def test_up_without_state_starts_and_says_how_to_make_it_an_elector(tmp_path: Path) -> None:
+    (only,) = sites(tmp_path)
+    with only.up():
+        end = time.monotonic() + UP_S
+        while not (status := only.status()):
+            assert time.monotonic() < end, only.log()
+        assert status["quorum"]["this_node"] == "lost_state"
+        shown = only.zsched("status")
+    assert shown.returncode == 4
+    assert "DEGRADED" in shown.stdout
+    assert "no quorum" in shown.stdout
+    assert f"zsched init --config {only.file} --node robot1" in only.log()
+
+
+def test_up_with_faults_in_the_fleet_file_ends_with_78_and_names_them(tmp_path: Path) -> None:
+    (only,) = sites(tmp_path)
+    only.file.write_text("fleet: hall\nnodes: {robot1: {kind: rowboat}}\ntasks: {}\n")
+    done = only.zsched("up")
+    assert (done.returncode, done.stdout) == (78, "")
+    assert f"{only.file}:2:" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+# --- more than one node ----------------------------------------------------------------------------------------------
+
+
+def test_any_node_of_the_fleet_can_be_asked_through_the_one_here(tmp_path: Path) -> None:
+    here, there = sites(tmp_path, robots=1, edges=1)[::-1]
+    with contextlib.ExitStack() as stack:
+        for site in (here, there):
+            assert site.zsched("init").returncode == 0
+            stack.enter_context(site.up())
+        there.wait_owner()
+        here.wait_owner()
+        assert (here.node, there.node) == ("edge1", "robot1")
+        asked = here.status("--node", there.node)
+        assert asked["node"] == there.node
+        assert asked["tasks"][0]["decision"] is not None, "an edge does not decide, the robot does"
+        changed = here.zsched("weights", "echo", "cpu=0.7", "memory=0.3", "--node", there.node)
+        assert changed.returncode == 0, changed.stderr
+        nowhere = here.zsched("status", "--node", "robot9")
+        assert nowhere.returncode == 2
+        assert "robot1" in nowhere.stderr
