@@ -124,6 +124,22 @@ def test_named_tests_exist() -> None:
     assert sorted(named - defined - modules) == []
 
 
+def test_glossary_s_python_names_are_the_code_s() -> None:
+    """The last part of every name in the third column is a word of the sources."""
+    words = {word for path in (ROOT / "zsched").rglob("*.py") for word in re.findall(r"\w+", path.read_text())}
+    words |= {path.stem for path in (ROOT / "zsched").rglob("*")} | {"FLOORS", "py"}
+    cells = [line.split(" | ")[2] for line in text_of("docs/glossary.md").splitlines() if line.count(" | ") == 3]
+    names = {name for cell in cells for name in re.findall(r"`([^`]+)`", cell)}
+    assert len(names) > 50
+    assert sorted(name for name in names if re.findall(r"\w+", name)[-1] not in words) == []
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_python_examples_compile(name: str) -> None:
+    for number, code in enumerate(re.findall(r"^```python\n(.*?)^```", text_of(name), re.MULTILINE | re.DOTALL)):
+        compile(code, f"{name}, example {number}", "exec")
+
+
 ABSOLUTE: Final = re.compile(r"(?<![\w.}*<>:/@-])/([A-Za-z][\w.-]*)/[\w.*<-]")
 PLACES: Final = frozenset({"opt", "etc", "var", "run", "proc", "sys", "dev", "path"})
 """Folders that every Linux machine has (and ``/path/to``)."""
