@@ -211,10 +211,11 @@ def draw_cpu(axis: Axes, timeline: Timeline, colours: Mapping[NodeId, str]) -> N
     """CPU in use per candidate, each load's window in its node's colour."""
     for load in timeline.loads:
         axis.axvspan(load.start_s, load.end_s, color=colours.get(load.node, "#888888"), alpha=0.13, linewidth=0)
-    for node in timeline.candidates:
+    for index, node in enumerate(timeline.candidates):
         points = timeline.cpu.get(node, ())
         times, ratios = [t_s for t_s, _ in points], [100.0 * ratio for _, ratio in points]
-        axis.plot(times, ratios, color=colours[node], linewidth=1.8, label=node)
+        # Edges that share a CPU draw the same line: the later ones are thinner.
+        axis.plot(times, ratios, color=colours[node], linewidth=(3.0, 2.2, 1.4)[index % 3], label=node)
     axis.set_ylim(0.0, 128.0)
     axis.set_yticks([0, 25, 50, 75, 100])
     axis.set_ylabel("CPU in use [%]", fontsize=10)

@@ -104,8 +104,9 @@ class Applications:
 
     def run(self, stop: StopFlag) -> None:
         """Drive, map, publish and listen until stopped."""
-        start = monotonic_s()
-        next_map = next_progress = start
+        start = next_progress = monotonic_s()
+        # Robots are not in step; spread evenly, runs can be compared (maps that come together are merged together).
+        next_map = start + MAP_PERIOD_S * self._options.index / self._options.robots
         while not stop.is_set:
             now = monotonic_s()
             scan = self._drive.due(now - start)
