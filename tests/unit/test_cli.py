@@ -1,4 +1,4 @@
-"""The command line: arguments, exit codes, what goes to stdout and what to stderr, and what is never imported.
+"""Verbs that ask a daemon: exit codes, what goes to stdout and what to stderr, and what is never imported.
 
 The daemon's side is its real operator socket; what stands behind it answers with recorded statuses.
 """
@@ -19,7 +19,6 @@ from typing import Any, Self
 import pytest
 from typer.testing import CliRunner, Result
 
-from zsched import __version__
 from zsched.adapters.operator_socket import OperatorSocket
 from zsched.cli import app
 from zsched.cli_ask import ask_door, find_door
@@ -30,19 +29,6 @@ from zsched.cli_weights import parse_weights
 RECORDED = Path(__file__).parent / "recorded_status"
 CLI = (sys.executable, "-m", "zsched.cli")
 Json = dict[str, Any]
-
-FLEET = """
-fleet: hall
-nodes:
-  robot1: {kind: robot, host: 127.0.0.1, listen: {control: tcp/127.0.0.1:7457, data: tcp/127.0.0.1:7458}}
-  robot2: {kind: robot}
-  robot3: {kind: robot}
-tasks:
-  merge:
-    candidates: {kind: robot}
-    weights: {cpu: 0.5, memory: 0.5}
-    inputs: [{from: "{robot}/map", to: "{target}/merge/{robot}/map"}]
-"""
 
 
 class Daemon:
@@ -350,112 +336,6 @@ def test_revision_without_new_weights_is_a_usage_error(daemon: Daemon) -> None:
 def test_nearest_name_or_all_names() -> None:
     assert nearest("robo1", ["edge1", "robot1"]) == "; did you mean robot1?"
     assert nearest("x", ["edge1", "robot1"]) == "; there are edge1, robot1"
-
-
-# --- check, init, up, version, demo ----------------------------------------------------------------------------------
-
-
-def test_check_of_a_good_file_counts_what_is_in_it(tmp_path: Path) -> None:
-    file = tmp_path / "fleet.yaml"
-    file.write_text(FLEET)
-    result = run("check", file)
-    assert (result.exit_code, result.stdout) == (0, "ok: 3 nodes, 1 task, 3 electors\n")
-    body = json.loads(run("check", file, "--json").stdout)
-    assert (body["schema"], body["ok"], body["faults"]) == ("zsched.check/1", True, [])
-    assert body["fleet"] == {"name": "hall", "nodes": 3, "tasks": 1, "electors": 3}
-
-
-def test_check_of_a_bad_file_reports_every_fault_with_its_place_and_exits_with_78(tmp_path: Path) -> None:
-    file = tmp_path / "fleet.yaml"
-    file.write_text(FLEET.replace("kind: robot}\n  robot3", "kind: rowboat}\n  robot3").replace("cpu: 0.5", "cpu: 5"))
-    text, as_json = run("check", file), run("check", file, "--json")
-    assert (text.exit_code, as_json.exit_code) == (78, 78)
-    assert (text.stdout, as_json.stderr) == ("", "")
-    assert f"{file}:5:" in text.stderr
-    assert f"{file}:10:" in text.stderr
-    body = json.loads(as_json.stdout)
-    assert (body["ok"], body["fleet"]) == (False, None)
-    assert [fault["line"] for fault in body["faults"]] == [5, 10]
-    assert {"line", "col", "message", "hint", "source_line"} == set(body["faults"][0])
-
-
-def test_check_warns_on_stderr_and_still_exits_with_0(tmp_path: Path) -> None:
-    file = tmp_path / "fleet.yaml"
-    file.write_text(FLEET.replace("  robot3: {kind: robot}\n", ""))
-    result = run("check", file)
-    assert result.exit_code == 0
-    assert "warning" in result.stderr
-    assert result.stdout.startswith("ok: ")
-
-
-def test_check_of_a_missing_file_exits_with_78(tmp_path: Path) -> None:
-    result = run("check", tmp_path / "none.yaml")
-    assert result.exit_code == 78
-    assert "cannot be read" in result.stderr
-
-
-def test_init_creates_the_state_once(tmp_path: Path, folder: Path) -> None:
-    file, state = tmp_path / "fleet.yaml", tmp_path / "state"
-    file.write_text(FLEET)
-    arguments = ("init", "--config", file, "--node", "robot1", "--state-dir", state)
-    first, second = run(*arguments), run(*arguments)
-    assert first.exit_code == 0
-    assert first.stdout == f"{state}/state: blank state of robot1 in fleet hall, generation 0\n"
-    assert (second.exit_code, second.stdout) == (1, "")
-    assert "exists already" in second.stderr
-    assert "--generation 1" in second.stderr
-    assert run(*arguments, "--generation", 1).exit_code == 0
-    assert folder.exists()
-
-
-def test_init_of_a_name_that_is_not_in_the_file_exits_with_78(tmp_path: Path) -> None:
-    file = tmp_path / "fleet.yaml"
-    file.write_text(FLEET)
-    result = run("init", "--config", file, "--node", "robot9", "--state-dir", tmp_path / "state")
-    assert result.exit_code == 78
-    assert "there are robot1, robot2, robot3" in result.stderr
-    assert not (tmp_path / "state").exists()
-
-
-@pytest.mark.parametrize("verb", ["up", "init"])
-def test_word_that_is_no_name_is_a_usage_error(tmp_path: Path, verb: str) -> None:
-    file = tmp_path / "fleet.yaml"
-    file.write_text(FLEET)
-    result = run(verb, "--config", file, "--node", "Robot 1")
-    assert result.exit_code == 2
-    assert "--node" in result.stderr
-
-
-def test_up_without_a_fleet_file_exits_with_78_and_says_which(tmp_path: Path) -> None:
-    result = run("up", "--config", tmp_path / "none.yaml", "--node", "robot1")
-    assert result.exit_code == 78
-    assert str(tmp_path / "none.yaml") in result.stderr
-    assert "--config" in result.stderr
-
-
-def test_version_names_what_a_bug_report_needs() -> None:
-    body = json.loads(run("version", "--json").stdout)
-    assert body["schema"] == "zsched.version/1"
-    assert body["zsched"] == __version__
-    assert {"wire", "zenoh", "python"} < set(body)
-    assert run("version").stdout.splitlines()[0] == f"zsched {__version__}"
-
-
-@pytest.mark.parametrize("arguments", [("fly",), ("status", "--jsn"), ("check",), ("demo", "--mode", "guess")])
-def test_wrong_usage_exits_with_2_and_explains_on_stderr(arguments: tuple[str, ...]) -> None:
-    result = run(*arguments)
-    assert (result.exit_code, result.stdout) == (2, "")
-    assert "zsched" in result.stderr or "Usage" in result.stderr
-
-
-@pytest.mark.parametrize("verb", ["up", "init", "status", "weights", "check", "demo", "version"])
-def test_help_of_every_verb_fits_a_small_terminal(verb: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "80")
-    result = run(verb, "--help")
-    assert result.exit_code == 0
-    assert result.stdout.startswith("Usage: ")
-    assert max(map(len, result.stdout.splitlines())) <= 80
-    assert verb in run("--help").stdout
 
 
 # --- what is imported ------------------------------------------------------------------------------------------------
