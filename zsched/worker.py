@@ -50,6 +50,7 @@ CLOSE_S: Final = 0.6
 ALARM_S: Final = 0.9
 """...and should zenoh hold Python's global lock meanwhile, the kernel ends a process that was told to stop."""
 ROLE_RETRY_S: Final = 0.5
+REPEAT_POLL_S: Final = 0.25
 _ENVIRONMENT: Final = ("ZSCHED_FLEET", "ZSCHED_NODE", "ZSCHED_TASK", "ZSCHED_INCARNATION", "ZSCHED_ZENOH_CONFIG")
 
 _log = logging.getLogger("zsched.worker")
@@ -195,6 +196,7 @@ class Worker:
         )
         with self._lock:
             self._outputs.append(output)
+        self._errands.put(_nothing)  # the errands' thread looks at the outputs anew
         return output
 
     def offer_snapshot(self, snapshot: Callable[[], bytes]) -> None:
@@ -340,13 +342,30 @@ class Worker:
             outputs = tuple(self._outputs)
         self._errands.put(lambda: _end_all(outputs, epoch))
 
+    def _has_latest(self) -> bool:
+        return any(output.is_latest for output in self._outputs)
+
+    def _repeat(self) -> None:
+        for output in tuple(self._outputs):
+            output.repeat_if_silent()
+
     def _run_errands(self) -> None:
-        while (errand := self._errands.get()) is not None:
+        while True:
+            try:
+                errand = self._errands.get(timeout=REPEAT_POLL_S if self._has_latest() else None)
+            except queue.Empty:
+                errand = self._repeat
+            if errand is None:
+                return
             try:
                 errand()
             except Exception:  # noqa: BLE001 - an errand that fails (session closing) must not end the others
                 if not self._stop.is_set():
                     _log.exception("an errand failed")
+
+
+def _nothing() -> None:
+    """Wake the errands' thread."""
 
 
 def _end_all(outputs: tuple[Output, ...], epoch: int) -> None:

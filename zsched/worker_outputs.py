@@ -13,11 +13,14 @@ from typing import Any, Final
 import zenoh
 from zenoh import CongestionControl, ext
 
+from zsched.clock import monotonic_s
 from zsched.core.relay_protocol import EndMarker
 from zsched.keyspace import END_CHUNK
 from zsched.relay_pipe import encode_end
 
-HEARTBEAT_S: Final = 0.2
+REPEAT_AFTER_S: Final = 0.5
+"""Silence after which a ``latest`` value that came in a burst is put once more: under congestion the newest of a burst
+is the one that is dropped. (No heartbeats for that: see `zsched.relay.outlet`.)"""
 KEPT_EPOCHS: Final = 2
 """Publishers of older epochs are given back: nobody admits them any more."""
 
@@ -46,12 +49,15 @@ class Output:
     ) -> None:
         self._session = session
         self._template = template
-        self._is_latest = latest
+        self.is_latest = latest
+        """Whether the last value is kept for who comes late."""
         self._keep_last = keep_last
         self._congestion = CongestionControl.BLOCK if reliable else CongestionControl.BLOCK_FIRST
         self._epoch_now = epoch_now
         self._lock = threading.Lock()
         self._epochs: dict[int, _Stamped] = {}
+        self._last: tuple[Any, Any, Any] | None = None
+        self._last_at = -REPEAT_AFTER_S
         self.sent = 0
         """Samples that went out."""
         self.withheld = 0
@@ -66,9 +72,22 @@ class Output:
                 return False
             stamped = self._epochs.get(epoch) or self._declare(epoch)
             self._put(stamped, payload, attachment, encoding)
-            stamped.count += 1
             self.sent += 1
+            now = monotonic_s()
+            is_burst = self.is_latest and now - self._last_at < REPEAT_AFTER_S
+            self._last = (payload, attachment, encoding) if is_burst else None
+            self._last_at = now
             return True
+
+    def repeat_if_silent(self) -> None:
+        """Put the last value once more when a burst has ended a while ago (class ``latest``)."""
+        with self._lock:
+            if self._last is None or monotonic_s() - self._last_at < REPEAT_AFTER_S:
+                return
+            last, self._last = self._last, None
+            epoch = self._epoch_now()
+            if epoch in self._epochs:
+                self._put(self._epochs[epoch], *last)
 
     def send_end(self, epoch: int) -> None:
         """Put the end marker behind the last sample of an epoch (also when there was none)."""
@@ -84,20 +103,19 @@ class Output:
     def _declare(self, epoch: int) -> _Stamped:
         key = self._template.replace("{epoch}", str(epoch))
         publisher: zenoh.Publisher | ext.AdvancedPublisher
-        if self._is_latest:
+        if self.is_latest:
             publisher = ext.declare_advanced_publisher(
                 self._session,
                 key,
                 congestion_control=self._congestion,
                 cache=ext.CacheConfig(max(1, self._keep_last)),
-                sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=HEARTBEAT_S),
+                sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),
                 publisher_detection=True,
             )
         else:
             publisher = self._session.declare_publisher(key, congestion_control=self._congestion)
         stamped = self._epochs[epoch] = _Stamped(key=key, publisher=publisher)
         for old in sorted(self._epochs)[:-KEPT_EPOCHS]:
-            # Long unused, so its heartbeat is idle: else this would wait for a stalled receiver, see `relay.inputs`.
             self._epochs.pop(old).publisher.undeclare()  # type: ignore[no-untyped-call] # zenoh's stubs
         return stamped
 
@@ -108,3 +126,4 @@ class Output:
             publisher.put(payload, attachment=attachment, encoding=encoding, source_info=source)
         else:
             publisher.put(payload, attachment=attachment, encoding=encoding)
+        stamped.count += 1

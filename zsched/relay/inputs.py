@@ -5,10 +5,6 @@ Knows: which slots are open and which one the stream feeds. Does not know: why o
 Everything happens under the stream's lock, the sample that just came included: between the kept values that a flip
 sends and the first sample behind it there is no gap. A kept value reaches a new owner at least once; it may have
 reached the old one too.
-
-Outlets outlive their slots and serve again when the task returns to the same owner. Undeclaring them at a move would be
-wrong, not only wasteful: zenoh 1.10 holds Python's global lock while an advanced publisher's ``undeclare`` waits for a
-heartbeat that is stuck at a frozen receiver (measured: 4 s at a lease of 8 s), and with it the whole process.
 """
 
 from __future__ import annotations
@@ -29,10 +25,8 @@ from zsched.relay.receive import Receiver
 
 MAX_KEYS: Final = 4096
 """Concrete keys of one wildcard stream whose values are kept; the oldest give way."""
-MAX_OUTLETS: Final = 32
-"""Targets of one stream whose publishers are kept; the longest unused give way."""
 REPEAT_AFTER_S: Final = 0.5
-"""Silence after which a ``latest`` value that came in a burst is put once more to a foreign receiver."""
+"""Silence after which a ``latest`` value that came in a burst is put once more."""
 
 _Kept = tuple[int, Sample]
 
@@ -53,7 +47,6 @@ class InputStream:
         self._own_ids = own_ids
         self._lock = threading.Lock()
         self._counter = StreamCounter(route.stream)
-        self._outlets: dict[str, Outlet] = {}
         self._slots: dict[int, _InputSlot] = {}
         self._active: _InputSlot | None = None
         self._number = 0
@@ -70,16 +63,9 @@ class InputStream:
         Raises:
             ValueError, zenoh.ZError: the route makes no sense (see `Outlet`).
         """
-        outlet = self._outlets.pop(route.to_expr, None)
-        if outlet is None:
-            outlet = Outlet(self._session, route.from_expr, route.to_expr, route.settings)
-        self._outlets[route.to_expr] = outlet  # the newest goes to the end
+        outlet = Outlet(self._session, route.from_expr, route.to_expr, route.settings)
         with self._lock:
             self._slots[epoch] = _InputSlot(outlet=outlet)
-            in_use = [slot.outlet for slot in self._slots.values()]
-        oldest = next(iter(self._outlets))
-        if len(self._outlets) > MAX_OUTLETS and self._outlets[oldest] not in in_use:
-            self._outlets.pop(oldest).undeclare()
 
     def is_matching(self, epoch: int) -> bool:
         """True when somebody subscribes to the slot's keys."""
@@ -127,16 +113,13 @@ class InputStream:
                 return
             if slot is self._active:
                 self._active = None
-            self._counter.dropped("closed", slot.outlet.discard())
+            self._counter.dropped("closed", slot.outlet.undeclare())
 
     def close(self) -> None:
         """Unsubscribe and close every slot."""
         self._receiver.close()
         for epoch in tuple(self._slots):
             self.close_slot(epoch)
-        for outlet in self._outlets.values():
-            outlet.undeclare()
-        self._outlets.clear()
 
     def repeat_if_silent(self) -> None:
         """Put the last values once more ``REPEAT_AFTER_S`` behind a burst: its newest may have been dropped."""

@@ -6,6 +6,11 @@ Payloads are passed on as they came (reference counted, never turned into ``byte
 timestamp, kind, priority and express. The source info becomes the publisher's own, numbered from 0 without a gap: that
 number is what the next hop checks. ``reliable`` has a queue and a thread of its own, so that only this target waits
 when its receiver stalls; the other classes never block.
+
+Advanced publishers (``latest``) have a cache and numbers, but no heartbeat: towards a frozen receiver a heartbeat
+blocks zenoh's own runtime (tokens and samples of every other peer came more than 0.3 s late) and makes ``undeclare``
+hold Python's global lock until the receiver's lease ends (measured with zenoh 1.10.2: 4 s of an 8 s lease). What a
+heartbeat is for, a lost *newest* value, is mended by putting it once more (`InputStream.repeat_if_silent`).
 """
 
 from __future__ import annotations
@@ -27,8 +32,6 @@ from zsched.relay.receive import undeclare
 from zsched.relay.rewrite import rewriter
 from zsched.relay_pipe import encode_end
 
-HEARTBEAT_S: Final = 0.2
-"""Period of the sporadic heartbeat behind a ``latest`` value: how late its loss is noticed."""
 QUEUE_BYTES: Final = 64 << 20
 """Bound of a reliable outlet's queue beside its depth."""
 QUEUE_DEPTH: Final = 1024
@@ -141,24 +144,15 @@ class Outlet:
             self._queue.items.append(EndMarker(epoch=epoch, count=0))
             self._queue.wake.notify()
 
-    def discard(self) -> int:
-        """Forget what waits for a target that is none any more; answers how many samples those were."""
+    def undeclare(self) -> int:
+        """Give the publishers back (a reliable queue's thread its own); answers how many samples still waited."""
         if self._queue is None:
+            self._undeclare()
             return 0
-        with self._queue.wake:
-            count = sum(not isinstance(item, EndMarker) for item in self._queue.items)
-            self._queue.items.clear()
-            self._queue.size = 0
-            return count
-
-    def undeclare(self) -> None:
-        """Give the publishers back, in another thread; not while a receiver may be stalled (see `relay.inputs`)."""
-        if self._queue is None:
-            threading.Thread(target=self._undeclare, name=f"close {self._to}", daemon=True).start()
-            return
         with self._queue.wake:
             self._queue.is_closed = True
             self._queue.wake.notify()
+            return sum(not isinstance(item, EndMarker) for item in self._queue.items)
 
     # --- lanes -------------------------------------------------------------------------------------------------------
 
@@ -186,7 +180,7 @@ class Outlet:
                 express=is_express,
                 reliability=Reliability.RELIABLE,
                 cache=ext.CacheConfig(max(1, self._settings.keep_last)),
-                sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=HEARTBEAT_S),
+                sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),
                 publisher_detection=True,
             )
         else:

@@ -295,10 +295,8 @@ class TaskRelay:
         return any(stream.route.settings.stream_class is StreamClass.LATEST for stream in streams)
 
     def _repeat(self) -> None:
-        """Values for receivers that are not ours are put once more (ours recover a lost one by themselves)."""
+        """A ``latest`` value that ended a burst may have been dropped: it is put once more."""
         for sink in self._outputs.values():
             sink.repeat_if_silent()
-        current = self._current()
-        if current is not None and current.slot.ready_when is ReadyWhen.MATCHING:
-            for source in self._inputs.values():
-                source.repeat_if_silent()
+        for source in self._inputs.values():
+            source.repeat_if_silent()
