@@ -40,7 +40,7 @@ def fleet(folder: Path) -> dict[str, Any]:
     trace = folder / "links.csv"
     write_trace(trace)
     tree = echo_fleet(
-        scheduling={"time_to_trigger_s": 0, "bonus": 0, "cool_down_s": 0},
+        scheduling={"time_to_trigger_s": 0, "bonus": 0, "cool_down_s": 0, "max_moves_per_minute": 1000},
         weights={"cpu": 0.0, "memory": 0.0, "network": 1.0},
     )
     tree["timing"] = {"profile": "wifi", "smoothing_s": 0.2}

@@ -186,6 +186,9 @@ SCHEDULING: Final = Record(
         "memory_floor_ratio": Field(
             Number(0, 0.9), "Escape: leave an owner whose free memory is below this share.", default="`0.05`"
         ),
+        "max_moves_per_minute": Field(
+            Whole(1, 100_000), "Hard cap of planned moves; escapes are bounded too, at 60.", default="`6`"
+        ),
     },
     Tuning,
 )

@@ -54,7 +54,7 @@ def _task(
     if not candidates:
         return None
     scheduling: Section | None = given.get("scheduling")
-    more = {} if scheduling is None else _of(scheduling, "reach", "memory_floor_ratio")
+    more = {} if scheduling is None else _of(scheduling, "reach", "memory_floor_ratio", "max_moves_per_minute")
     demand: Section | None = given.get("demand")
     task = TaskSpec(
         name=name,

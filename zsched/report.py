@@ -35,6 +35,7 @@ def _decision(decision: DecisionStatus) -> Json:
         "aggregates": dict(decision.aggregates),
         "utilities": {voter: {u.candidate: _utility(u) for u in column} for voter, column in decision.utilities},
         "vetoed": dict(decision.vetoed),
+        "penalties": dict(decision.penalties),
     }
 
 

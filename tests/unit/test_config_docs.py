@@ -23,6 +23,7 @@ def test_defaults_told_by_hand_are_the_classes_own() -> None:
         (TRACE, "offset_s", LinkSpec, "offset_s"),
         (SCHEDULING, "reach", TaskSpec, "reach"),
         (SCHEDULING, "memory_floor_ratio", TaskSpec, "memory_floor_ratio"),
+        (SCHEDULING, "max_moves_per_minute", TaskSpec, "max_moves_per_minute"),
         (WORKER, "ready", WorkerSpec, "ready_when"),
         (RULE, "class", StreamSettings, "stream_class"),
     ]

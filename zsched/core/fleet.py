@@ -135,6 +135,8 @@ class TaskSpec:
     reach: Reach = Reach.MAJORITY
     memory_floor_ratio: float = 0.05
     """Escape: the owner's free memory under this fraction."""
+    max_moves_per_minute: int = 6
+    """Hard cap of planned moves; escapes have their own (`zsched.core.damping`)."""
     on_isolation: OnIsolation = OnIsolation.HOLD
     exclusive: bool = False
     drain_s: float = 2.0

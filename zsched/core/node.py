@@ -320,6 +320,8 @@ class Node:
         task, executor = value.task, self.executors[value.task]
         is_new_epoch = value.epoch > executor.epoch
         self.history[task].append(PastValue(value=value, at=now, reason=reason))
+        if is_new_epoch:
+            self.rounds.on_moved(task, executor.owner, has_failed=self._has_failed(task, executor.owner, now), now=now)
         self.rounds.on_learnt(task, is_new_epoch=is_new_epoch, now=now)
         text = f"learnt revision {value.revision}: owner {value.owner}, weights {_weights(value.tuning.weights)}"
         self._batch.add(do.RecordStory(stage="vote", text=text, task=task, epoch=value.epoch))
@@ -328,6 +330,16 @@ class Node:
         if old is not None and self.membership.state(old) is PeerState.GONE:
             self._batch.add(*executor.on_gone(old))
         self._beat_at = now
+
+    def _has_failed(self, task: TaskId, node: NodeId | None, now: float) -> bool:
+        """Whether an owner was fled from: it is not there, or its worker has failed."""
+        if node is None or node == self.me:
+            return False
+        if self.membership.state(node) in (PeerState.SUSPECT, PeerState.GONE):
+            return True
+        profile = self.gateway.fresh(node, now)
+        load = None if profile is None else profile.worker(task)
+        return load is not None and load.state is WorkerState.FAILED
 
     def _on_worker(self, event: ev.WorkerChanged, now: float) -> None:
         if self.worker_states.get(event.task) is event.state:

@@ -17,6 +17,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from random import Random
 
+from zsched.core.damping import Damping
 from zsched.core.fleet import Fleet, TaskSpec
 from zsched.core.gateway import Gateway
 from zsched.core.instructions import AskUtilities, Instruction, PublishProposal, RecordStory
@@ -61,6 +62,7 @@ class TaskRound:
     tally_at: float = -math.inf
     commit_at: float = math.inf
     commit: MoveOwner | None = None
+    damping: Damping = field(default_factory=Damping)
     told: str = ""
     """The last decision written to the journal; the same one again is not."""
 
@@ -203,6 +205,7 @@ class Rounds:
                 escape=escape,
                 is_called=is_called,
                 now=now,
+                damping=task.damping,
             )
         task.judgement, task.judged_at = judgement, now
         self._wake_when_due(task, judgement, allocation, now)
@@ -371,6 +374,10 @@ class Rounds:
         """Our change was committed, overtaken or given up: votes may be called again."""
         task = self.tasks[name]
         task.commit, task.commit_at = None, math.inf
+
+    def on_moved(self, name: TaskId, left: NodeId | None, *, has_failed: bool, now: float) -> None:
+        """A new owner is known: ``left`` is the one before, ``has_failed`` whether it was fled from."""
+        self.tasks[name].damping.note_move(left, has_failed=has_failed, now=now)
 
     def on_learnt(self, name: TaskId, *, is_new_epoch: bool, now: float) -> None:
         """A newer revision is known: proposals on older bases are worthless."""

@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 
+from zsched.core.damping import ESCAPES_PER_MINUTE, WINDOW_S, Damping
 from zsched.core.fleet import TaskSpec
 from zsched.core.model import Allocation, NodeId, PeerState, Profile, WorkerState
 from zsched.core.scoring import Standing, pick
@@ -69,6 +70,7 @@ class Judge:
         escape: str | None,
         is_called: bool,
         now: float,
+        damping: Damping | None = None,
     ) -> Judgement:
         """Decide by one standing.
 
@@ -79,11 +81,13 @@ class Judge:
             escape: why the owner must be left at once (`escape_reason`), or ``None``.
             is_called: another robot called a vote: answer with today's winner, without waiting for our own timers.
             now: monotonic seconds.
+            damping: the task's record of moves: penalties, and the cap.
         """
         owner = allocation.owner
         bonus = allocation.tuning.bonus if escape is None else 0.0
+        penalties = {} if damping is None else damping.penalties(now)
         scored = {
-            name: value + (bonus if name == owner else 0.0)
+            name: max(value + (bonus if name == owner else 0.0) - penalties.get(name, 0.0), 0.0)
             for name, value in standing.aggregates.items()
             if escape is None or name != owner
         }
@@ -92,6 +96,9 @@ class Judge:
             self.beaten_since = None
             return Judgement(outcome=Outcome.NONE, candidate=owner, aggregate=0.0, reason="no candidate can have it")
         outcome, reason = self._outcome(winner, scored, allocation, settled_for_s, escape, is_called, now)
+        cap = None if damping is None or owner is None else self._cap(damping, is_escape=escape is not None, now=now)
+        if outcome is Outcome.PROPOSE and cap is not None:
+            outcome, reason = Outcome.WAIT, f"{reason}; {cap}"
         chosen = winner if outcome is Outcome.PROPOSE else owner
         return Judgement(
             outcome=outcome,
@@ -101,6 +108,12 @@ class Judge:
             is_escape=escape is not None and outcome is Outcome.PROPOSE,
             aggregates=scored,
         )
+
+    def _cap(self, damping: Damping, *, is_escape: bool, now: float) -> str | None:
+        """Why no further move is allowed in this minute, or ``None``."""
+        limit = ESCAPES_PER_MINUTE if is_escape else self.spec.max_moves_per_minute
+        done = damping.moves_within(WINDOW_S, now, escapes=is_escape)
+        return None if done < limit else f"{done} moves in the last minute, at most {limit}"
 
     def _outcome(
         self,

@@ -51,6 +51,8 @@ class DecisionStatus:
     utilities: tuple[tuple[NodeId, tuple[Utility, ...]], ...] = ()
     """(voter, its utilities)."""
     vetoed: tuple[tuple[NodeId, str], ...] = ()
+    penalties: tuple[tuple[NodeId, float], ...] = ()
+    """What nodes that failed or were left often pay, in utility units."""
     silent: tuple[NodeId, ...] = ()
     """Robots whose utilities did not come in time."""
 

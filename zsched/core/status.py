@@ -173,6 +173,7 @@ def _decision(standing: TaskRound, now: float) -> DecisionStatus | None:
         aggregates=tuple(sorted(judgement.aggregates.items())),
         utilities=tuple((vector.voter, vector.utilities) for vector in joint.vectors),
         vetoed=tuple(sorted(joint.vetoed.items())),
+        penalties=tuple(standing.damping.penalties(now).items()),
         silent=standing.silent,
     )
 

@@ -33,6 +33,7 @@ from zsched.lifecycle import init_state
 DAEMON = (sys.executable, "-m", "zsched.daemon")
 ECHO = ("python", "-m", "zsched.tasks.echo")
 TASK = "echo"
+SCHEDULING = {"bonus": 0.1, "time_to_trigger_s": 1, "cool_down_s": 0, "max_moves_per_minute": 1000}
 POLL_S = 0.01
 
 Json = dict[str, Any]
@@ -71,7 +72,7 @@ def echo_fleet(
     body: Json = {
         "candidates": {"kind": "edge" if edges else "robot"},
         "weights": dict(weights or {"cpu": 0.5, "memory": 0.5, "network": 0.0}),
-        "scheduling": {"bonus": 0.1, "time_to_trigger_s": 1, "cool_down_s": 0, **(scheduling or {})},
+        "scheduling": {**SCHEDULING, **(scheduling or {})},
         "worker": {"command": list(worker)},
         "inputs": [{"from": "{robot}/in", "to": "{target}/echo/{robot}/in", "class": stream_class}],
         "outputs": [

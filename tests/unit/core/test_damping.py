@@ -1,0 +1,96 @@
+"""Restraint under faults: penalties that grow and decay, probation, caps."""
+
+from __future__ import annotations
+
+import pytest
+
+from zsched.core.damping import MAX_PENALTY, PROBATION_S, STEP, WINDOW_S, Damping
+from zsched.core.fleet import TaskSpec
+from zsched.core.model import Allocation, Tuning, Weights
+from zsched.core.scheduler import Judge, Outcome
+from zsched.core.scoring import Standing
+
+SPEC = TaskSpec(
+    name="merge",
+    candidates=("edge1", "edge2"),
+    tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0), time_to_trigger_s=0.0, cool_down_s=0.0),
+    max_moves_per_minute=2,
+)
+OWNED = Allocation(task="merge", revision=1, epoch=1, owner="edge1", tuning=SPEC.tuning)
+
+
+def standing(**aggregates: float) -> Standing:
+    return Standing(aggregates=aggregates, vetoed={}, vectors=(), voters_heard=3)
+
+
+def test_first_placement_is_no_move() -> None:
+    damping = Damping()
+    damping.note_move(None, has_failed=False, now=10.0)
+    assert damping.penalties(10.0) == {}
+    assert damping.moves_within(WINDOW_S, 10.0, escapes=False) == 0
+
+
+def test_penalty_grows_with_every_failure_and_is_bounded() -> None:
+    damping, seen = Damping(), []
+    for number in range(6):
+        damping.note_move("edge1", has_failed=True, now=100.0 + number)
+        seen.append(damping.penalty("edge1", 100.0 + number))
+    assert seen == sorted(seen)
+    assert seen[1] > 2 * seen[0]
+    assert seen[-1] == MAX_PENALTY
+
+
+def test_penalty_halves_its_points_with_the_half_life_and_is_forgotten() -> None:
+    damping = Damping()
+    damping.note_move("edge1", has_failed=False, now=1000.0)
+    assert damping.points("edge1", 1000.0) == 1.0
+    assert damping.points("edge1", 1060.0) == pytest.approx(0.5)
+    assert damping.penalties(1000.0 + 600.0) == {}
+
+
+def test_being_left_on_probation_costs_more_than_later() -> None:
+    early, late = Damping(), Damping()
+    for damping, stay in ((early, PROBATION_S / 2), (late, PROBATION_S * 2)):
+        damping.note_move(None, has_failed=False, now=0.0)
+        damping.note_move("edge1", has_failed=False, now=stay)
+    assert early.points("edge1", PROBATION_S / 2) == 2.0
+    assert late.points("edge1", PROBATION_S * 2) == 1.0
+    assert late.penalty("edge1", PROBATION_S * 2) == pytest.approx(STEP)
+
+
+def test_a_node_that_failed_is_not_chosen_again_at_once() -> None:
+    """Slightly better, but it has just been fled from: the other one keeps the task until the points have decayed."""
+    damping, judge = Damping(), Judge(spec=SPEC)
+    damping.note_move("edge2", has_failed=True, now=100.0)
+    joint = standing(edge1=0.5, edge2=0.65)
+    now = judge.judge(joint, OWNED, settled_for_s=99, escape=None, is_called=False, now=101.0, damping=damping)
+    assert now.outcome is Outcome.STAY
+    judge.judge(joint, OWNED, settled_for_s=99, escape=None, is_called=False, now=900.0, damping=damping)
+    later = judge.judge(joint, OWNED, settled_for_s=99, escape=None, is_called=False, now=901.0, damping=damping)
+    assert (later.outcome, later.candidate) == (Outcome.PROPOSE, "edge2")
+
+
+def test_a_penalised_node_serves_when_it_is_the_only_one() -> None:
+    damping = Damping()
+    for number in range(5):
+        damping.note_move("edge2", has_failed=True, now=100.0 + number)
+    judgement = Judge(spec=SPEC).judge(
+        standing(edge2=0.1), OWNED, settled_for_s=0, escape="edge1 is gone", is_called=False, now=106.0, damping=damping
+    )
+    assert (judgement.outcome, judgement.candidate) == (Outcome.PROPOSE, "edge2")
+
+
+def test_planned_moves_are_capped_per_minute_and_escapes_are_not_by_that_cap() -> None:
+    damping, judge = Damping(), Judge(spec=SPEC)
+    for at in (100.0, 110.0):
+        damping.note_move("edge3", has_failed=False, now=at)
+    joint = standing(edge1=0.2, edge2=0.9)
+    capped = judge.judge(joint, OWNED, settled_for_s=99, escape=None, is_called=True, now=120.0, damping=damping)
+    assert capped.outcome is Outcome.WAIT
+    assert "2 moves in the last minute, at most 2" in capped.reason
+    fled = judge.judge(
+        joint, OWNED, settled_for_s=99, escape="edge1 is gone", is_called=False, now=120.0, damping=damping
+    )
+    assert fled.outcome is Outcome.PROPOSE
+    free = judge.judge(joint, OWNED, settled_for_s=99, escape=None, is_called=False, now=175.0, damping=damping)
+    assert free.outcome is Outcome.PROPOSE
