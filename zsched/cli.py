@@ -38,6 +38,10 @@ app = typer.Typer(
 )
 
 
+LAB_NEEDS = ("cv2", "matplotlib", "numpy", "onnxruntime", "rich")
+"""What the extra ``lab`` installs."""
+
+
 class MergeMode(StrEnum):
     """How the demo's worker learns where the robots' maps lie."""
 
@@ -238,14 +242,15 @@ def demo(
     seed: Annotated[int, typer.Option(min=0, metavar="N", help="Of poses and injected loads.")] = 1,
 ) -> None:
     """Run a whole fleet on this machine: three robots and three edges merge real laser maps."""
-    try:
-        from zsched.lab.demo import DemoOptions, run_demo  # noqa: PLC0415 - the lab is an extra
-    except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] == "zsched":
-            raise
+    from importlib.util import find_spec  # noqa: PLC0415 - each verb imports what it needs
+
+    missing = [name for name in LAB_NEEDS if find_spec(name) is None]
+    if missing:
         raise CliError(
-            EXIT_FAILED, f"the lab needs {error.name}, which is not installed; run `pip install 'zsched[lab]'`"
-        ) from error
+            EXIT_FAILED, f"the lab needs {', '.join(missing)}, not installed here; run `pip install 'zsched[lab]'`"
+        )
+    from zsched.lab.demo import DemoOptions, run_demo  # noqa: PLC0415 - the lab is an extra
+
     options = DemoOptions(headless=headless, out=out, log=log, duration_s=duration, mode=mode.value, seed=seed)
     raise typer.Exit(run_demo(options))
 

@@ -15,6 +15,7 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from zsched.cli_page import harmless
 from zsched.errors import AdapterError, ConfigError, ZschedError
 
 EXIT_OK, EXIT_FAILED, EXIT_USAGE, EXIT_UNREACHABLE, EXIT_DEGRADED, EXIT_TIMED_OUT, EXIT_CONFIG = 0, 1, 2, 3, 4, 5, 78
@@ -88,7 +89,7 @@ class Verbs(TyperGroup):
             code, text = EXIT_FAILED, str(error)
         # a fleet file's faults start with its name, like a compiler's: nothing goes in front of them
         prefix = "" if code == EXIT_CONFIG else f"zsched {ctx.invoked_subcommand}: "
-        typer.echo(f"{prefix}{text}", err=True)
+        typer.echo(f"{prefix}{harmless(text)}", err=True)
         raise typer.Exit(code)
 
 

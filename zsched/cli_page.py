@@ -56,6 +56,11 @@ class Page:
         self.lines.append(line.rstrip())
 
 
+def harmless(text: str) -> str:
+    """The text with every character that a terminal would obey, but line ends and tabs, replaced by ``?``."""
+    return text if text.isprintable() else "".join(c if c.isprintable() or c in "\n\t" else "?" for c in text)
+
+
 def cut(text: str, width: int) -> str:
     """At most ``width`` characters; a dot at the end shows that there were more."""
     return text if len(text) <= width else text[: max(width - 1, 0)] + "…"[:width]

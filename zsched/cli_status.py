@@ -13,6 +13,7 @@ from pathlib import Path
 
 from zsched.cli_ask import Door, ask_door, find_door
 from zsched.cli_common import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK, CliError, Json, print_json, wants_color
+from zsched.cli_page import harmless
 from zsched.cli_report import degradations, render_status
 
 MIN_WIDTH, DEFAULT_WIDTH, MAX_WIDTH = 60, 100, 160
@@ -73,7 +74,7 @@ def _ask_again(door: Door) -> Json | CliError:
 
 def _print_next(view: StatusView, status: Json | CliError, *, is_screen: bool) -> None:
     if isinstance(status, CliError):
-        text = f"zsched status: {status}\n"
+        text = f"zsched status: {harmless(str(status))}\n"
         if not is_screen:
             sys.stderr.write(text)
             return

@@ -124,10 +124,10 @@ def test_status_at_a_socket_nobody_listens_on_exits_with_3(folder: Path) -> None
 
 
 def test_status_of_a_daemon_that_refuses_exits_with_1(daemon: Daemon) -> None:
-    daemon.status = {"error": "something broke"}
+    daemon.status = {"error": "something \x1b[2Jbroke"}
     result = run("status")
     assert (result.exit_code, result.stdout) == (1, "")
-    assert "something broke" in result.stderr
+    assert "something ?[2Jbroke" in result.stderr, "as text: it may be another node's"
 
 
 def test_status_of_a_wedged_loop_exits_with_5(daemon: Daemon) -> None:
