@@ -250,13 +250,15 @@ def _candidate_cells(name: str, task: Json, decision: Json, voters: Sequence[str
     joint, veto = decision["aggregates"].get(name), decision["vetoed"].get(name)
     best = max(decision["aggregates"].values(), default=None)
     style = "red" if veto else "bold" if joint is not None and joint == best else ""
-    note = f"owner +{task['tuning']['bonus']:g}" if name == task["owner"] else ""
+    notes = [f"owner +{task['tuning']['bonus']:g}"] if name == task["owner"] else []
+    penalty = decision.get("penalties", {}).get(name)  # a later field of the schema's major version
+    notes += [f"penalty -{penalty:.2g}"] if penalty else []
     return [
         (name, style),
         (_number(joint, 3), style),
         *((_opinion(columns[voter].get(name)), "") for voter in voters),
         *((_number(_mean([utility[term] for utility in found]), 2), "dim") for term in ("cpu", "memory", "network")),
-        (veto or note, "red" if veto else "dim"),
+        (veto or ", ".join(notes), "red" if veto else "dim"),
     ]
 
 

@@ -189,6 +189,14 @@ def test_more_robots_than_fit_are_counted() -> None:
     assert f"+{20 - shown}" in head
 
 
+def test_bonus_and_penalty_stand_beside_the_candidate_they_change() -> None:
+    status = recorded("healthy")
+    status["tasks"][0]["decision"]["penalties"] = {"edge2": 0.05, "edge1": 0.0}
+    lines = {line.split()[0]: line for line in render_status(status, 100, color=False).splitlines()[12:] if line}
+    assert lines["edge1"].endswith("owner +0.1")
+    assert lines["edge2"].endswith("penalty -0.05")
+
+
 def test_several_tasks_and_workers_are_told_apart() -> None:
     status = recorded("healthy")
     status["tasks"].append({**copy.deepcopy(status["tasks"][0]), "name": "slam", "streams": []})
