@@ -62,6 +62,7 @@ def watch_on(view: StatusView, interval_s: float) -> int:
             time.sleep(interval_s)
             status = _ask_again(door)
     except KeyboardInterrupt:
+        sys.stdout.write("\n" if is_screen else "")
         return code
 
 
