@@ -419,6 +419,25 @@ def test_a_relay_that_is_killed_is_restarted_with_the_newest_plan(rig: Rig) -> N
     until(lambda: app.put() or len(app.back) > before, "the stream flows again")
 
 
+def test_a_stream_does_not_hang_on_the_relay_beside_the_worker(rig: Rig) -> None:
+    rig.start_worker("edge1")
+    rig.start_worker("edge2")
+    app = Application(rig.app)
+    slots = [slot(epoch, f"edge{2 - epoch % 2}", StreamClass.RELIABLE, 0) for epoch in (1, 2, 3)]
+    rig.move(slots[0])
+    until(app.connected, "the application sees the relay's subscription")
+    thread = app.stream(200)
+    until(lambda: len(app.back) > 20, "the stream through edge1")
+    os.kill(rig.relays["edge1"].pid or 0, signal.SIGKILL)
+    until(lambda: rig.reports["edge1"].count(RelayChanged) == 3, "edge1's relay runs again")
+    rig.move(slots[1], slots[0])
+    rig.move(slots[2], slots[1])  # edge1's worker hears its roles from the new relay
+    until(lambda: app.nodes[-1] == "edge1", "the stream through edge1 again")
+    app.halt(thread)
+    until(lambda: len(app.back) >= app.sent, f"{app.sent} samples back, {len(app.back)} came")
+    assert app.back == list(range(app.sent))
+
+
 def test_a_foreign_worker_needs_only_its_subscription(rig: Rig) -> None:
     app = Application(rig.app)
     foreign = zenoh.open(zenoh.Config.from_json5(worker_config(connect=(rig.endpoint("edge1"),))))
