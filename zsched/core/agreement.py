@@ -15,7 +15,7 @@ from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.fleet import Fleet
 from zsched.core.messages import CommandOutcome, CommandResult, Learnt
-from zsched.core.model import Allocation, Beat, DurableState, NodeId, RegisterState, TaskId, Weights
+from zsched.core.model import Allocation, Ballot, Beat, DurableState, NodeId, RegisterState, TaskId, Weights
 from zsched.core.register import Change, MoveOwner, Register, Retune, RoundOutcome, Step
 
 SETTLE_AFTER_START_S = 0.3
@@ -67,6 +67,7 @@ class Agreement:
         now: float,
     ) -> None:
         self._fleet, self._me = fleet, me
+        self._nodes = frozenset(node.name for node in fleet.nodes)
         self._durable = durable
         self.is_elector = durable is not None and me in fleet.electors
         self.problems: dict[str, str] = {}
@@ -119,7 +120,7 @@ class Agreement:
     def on_prepare(self, event: ev.PrepareAsked) -> Effects:
         """A proposer asks for a promise; only for its own ballots."""
         register = self.registers.get(event.prepare.task)
-        if register is None or event.prepare.ballot.node != event.asker:
+        if register is None or not self._is_its_own(event.prepare.ballot, event.asker):
             self.counters["prepare_foreign"] += 1
             return Effects()
         step, answer = register.on_prepare(event.prepare)
@@ -128,7 +129,7 @@ class Agreement:
     def on_accept(self, event: ev.AcceptAsked, now: float) -> Effects:
         """A proposer asks to accept a value; only under its own ballots."""
         register = self.registers.get(event.accept.task)
-        if register is None or event.accept.acceptance.ballot.node != event.asker:
+        if register is None or not self._is_its_own(event.accept.acceptance.ballot, event.asker):
             self.counters["accept_foreign"] += 1
             return Effects()
         step, answer = register.on_accept(event.accept, now)
@@ -138,9 +139,14 @@ class Agreement:
         """An elector answered our prepare or accept."""
         effects = Effects()
         register = self.registers.get(event.answer.task)
-        if register is not None:
+        if register is None or event.answer.elector not in self._fleet.electors:
+            self.counters["answer_foreign"] += 1
+        else:
             self._take(event.answer.task, register.on_answer(event.answer, now), effects)
         return effects
+
+    def _is_its_own(self, ballot: Ballot, asker: NodeId) -> bool:
+        return ballot.node == asker and asker in self._nodes
 
     # --- learners ----------------------------------------------------------------------------------------------------
 
@@ -148,6 +154,9 @@ class Agreement:
         """A peer told what it has learnt."""
         effects = Effects()
         if learnt.node == self._me:
+            return effects
+        if learnt.node not in self._nodes:
+            self.counters["learnt_foreign"] += 1
             return effects
         for value in learnt.values:
             register = self.registers.get(value.task)

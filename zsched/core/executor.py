@@ -34,7 +34,7 @@ from zsched.core.plan import Role, RoutePhase, Slot, WorkerRole
 from zsched.core.route import plan_for, slot_for
 
 ROLE_DRAIN_MARGIN_S = 1.0
-"""The old owner's worker goes idle this much after the robots' drain time."""
+"""The old owner's worker goes idle this much after the robots' drain time (a cold standby's start comes on top)."""
 
 
 class Phase(StrEnum):
@@ -79,8 +79,12 @@ class Executor:
         return None if self._predecessor is None else self._predecessor.owner
 
     def again(self) -> tuple[Instruction, ...]:
-        """The newest role and plan once more, after a batch that carried them was cut off."""
-        result: tuple[Instruction, ...] = (SetRole(role=self.role),) if self.is_candidate else ()
+        """The newest worker's state, role and plan once more, after a batch that carried them was cut off."""
+        result: tuple[Instruction, ...] = ()
+        if self.is_candidate:
+            result = (*self.start(), *self._wake_worker(), SetRole(role=self.role))
+            if self.spec.worker.standby is Standby.COLD and self.role.role is WorkerRole.IDLE:
+                result += (StopWorker(task=self.spec.name),)
         if self._current is not None:
             phases = {Phase.PREPARING: RoutePhase.PREPARE, Phase.SETTLED: RoutePhase.CLOSE}
             plan = phases.get(self.phase, RoutePhase.FLIP)
@@ -110,13 +114,20 @@ class Executor:
         if allocation.owner == self.me:
             self._role_deadline = math.inf
             self.role = Role(task=self.spec.name, role=WorkerRole.ACTIVE, epoch=allocation.epoch)
-            start = (StartWorker(task=self.spec.name),) if self.spec.worker.command else ()
-            return (*start, SetRole(role=self.role))
+            return (*self._wake_worker(), SetRole(role=self.role))
         if self.role.role is not WorkerRole.ACTIVE:
             return ()
-        self._role_deadline = now + self.spec.drain_s + ROLE_DRAIN_MARGIN_S
+        worker = self.spec.worker
+        # A cold new owner only starts its worker now, and the robots stay here until it is ready.
+        starts_s = worker.start_deadline_s if worker.standby is Standby.COLD else 0.0
+        self._role_deadline = now + starts_s + self.spec.drain_s + ROLE_DRAIN_MARGIN_S
         self.role = Role(task=self.spec.name, role=WorkerRole.DRAINING, epoch=self.role.epoch)
         return (SetRole(role=self.role),)
+
+    def _wake_worker(self) -> tuple[Instruction, ...]:
+        """An owner's worker must run, cold standby or not."""
+        is_needed = self.role.role is WorkerRole.ACTIVE and self.spec.worker.command
+        return (StartWorker(task=self.spec.name),) if is_needed else ()
 
     def _prepare(self, owner: NodeId) -> tuple[Instruction, ...]:
         if not self.has_streams:

@@ -72,6 +72,10 @@ class Membership:
         peer = self._peers.get(node)
         return PeerState.UNKNOWN if peer is None else peer.state
 
+    def is_known(self, node: NodeId) -> bool:
+        """Whether the fleet file names ``node``."""
+        return node == self._me or node in self._peers
+
     def states(self) -> dict[NodeId, PeerState]:
         """{node: state} of the whole fleet, this node included, sorted by name."""
         return {name: self.state(name) for name in sorted((*self._peers, self._me))}

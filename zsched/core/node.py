@@ -31,6 +31,7 @@ from zsched.core.model import (
     NodeId,
     NodeKind,
     PeerState,
+    Proposal,
     TaskId,
     Weights,
     WorkerState,
@@ -161,7 +162,8 @@ class Node:
     def _finish(self, now: float) -> tuple[do.Instruction, ...]:
         self._advance(now)
         batch, self._batch = self._batch, _Batch(False, [], [])
-        self._promised = self._next_deadline()
+        # A limit that shrank may lie in the past already; that is no lag of this loop.
+        self._promised = max(self._next_deadline(), now)
         state = self.agreement.to_persist() if batch.is_dirty else None
         first: tuple[do.Instruction, ...] = () if state is None else (do.PersistState(state=state),)
         return (*first, *batch.send, *batch.apply)
@@ -225,11 +227,16 @@ class Node:
             if beat.incarnation != self.incarnation:
                 self.problems["membership"] = f"another daemon calls itself {self.me!r}"
             return
+        if not self.membership.is_known(beat.node):
+            self.counters["beat_foreign"] += 1
+            return
         for change in self.membership.absorb_beat(beat, now):
             self._on_transition(change, now)
         self._agree(self.agreement.compare(beat, now), now)
 
     def _on_token_lost(self, event: ev.TokenLost, now: float) -> None:
+        if event.node == self.me and event.incarnation != self.incarnation:
+            self.problems.pop("membership", None)  # the other one, or what was left of our earlier life, is gone
         for change in self.membership.absorb_token_lost(event.node, event.incarnation, now):
             self._on_transition(change, now)
 
@@ -279,21 +286,30 @@ class Node:
         self._batch.add(do.AnswerUtilities(request=event.request, utilities=utilities))
 
     def _on_utility(self, event: ev.UtilityReceived, _now: float) -> None:
-        if event.utilities.voter not in self.fleet.voters:
+        voter = event.utilities.voter
+        if not self.membership.is_known(voter):
+            self.counters["utility_foreign"] += 1
+            return
+        if voter not in self.fleet.voters:
             return  # edges hear the question too and have nothing to say
         if not self.rounds.absorb_utilities(event.gather, event.utilities):
             self.counters["utility_late"] += 1
 
     def _on_proposal(self, event: ev.ProposalReceived, now: float) -> None:
         proposal = event.proposal
-        if proposal.task not in self.registers or proposal.voter not in self.fleet.voters:
+        if proposal.voter == self.me or not self._is_ours(proposal):
             self.counters["proposal_foreign"] += 1
             return
         value = self.registers[proposal.task].value
         if proposal.base_revision != value.revision:
             self.counters["proposal_stale" if proposal.base_revision < value.revision else "proposal_ahead"] += 1
-        if self.rounds.is_voter and proposal.candidate in self.fleet.task(proposal.task).candidates:
+        if self.rounds.is_voter:
             self._batch.add(*self.rounds.absorb_proposal(proposal, value, self.membership.states(), now))
+
+    def _is_ours(self, proposal: Proposal) -> bool:
+        if proposal.task not in self.registers or proposal.voter not in self.fleet.voters:
+            return False
+        return proposal.candidate in self.fleet.task(proposal.task).candidates
 
     def _agree(self, effects: Effects, now: float) -> None:
         """Carry out what the registers ask for."""
@@ -342,7 +358,7 @@ class Node:
         return load is not None and load.state is WorkerState.FAILED
 
     def _on_worker(self, event: ev.WorkerChanged, now: float) -> None:
-        if self.worker_states.get(event.task) is event.state:
+        if self.worker_states.get(event.task, event.state) is event.state:
             return
         self.worker_states[event.task] = event.state
         text = f"worker {event.state}{': ' if event.reason else ''}{event.reason}"
@@ -387,9 +403,11 @@ class Node:
         else:
             self.problems[source] = problem
 
-    def _on_stop(self, _event: ev.StopRequested, _now: float) -> None:
+    def _on_stop(self, _event: ev.StopRequested, now: float) -> None:
         """Drain: the profile says so, and the robots move what this node owns."""
         self.is_draining = True
+        if self.owned():
+            self.rounds.hurry(now)
 
     def _table(self) -> dict[type[Any], Callable[[Any, float], None]]:
         return {
