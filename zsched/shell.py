@@ -1,5 +1,8 @@
 """Carries a node's instructions out: one line per instruction, in order, and the failure of one is an event.
 
+Only a failed `PersistState` cuts its batch off: nothing after it may happen unless the state is on disk. Any other
+failure is shown in the status until the same instruction works again, at most `PROBLEM_TTL_S`.
+
 Knows: which adapter an instruction is for. Does not know: why it was given.
 """
 
@@ -7,6 +10,7 @@ from __future__ import annotations
 
 import itertools
 import logging
+import math
 import queue
 import threading
 from typing import Any, assert_never
@@ -15,17 +19,20 @@ from zsched.adapters.control_bus import ControlBus
 from zsched.adapters.state_file import StateFile
 from zsched.adapters.streams import RelayHandle
 from zsched.adapters.worker_supervisor import WorkerSupervisor
+from zsched.clock import monotonic_s
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.messages import CommandResult, SetWeights
-from zsched.core.model import NodeId, TaskId, WorkerState
+from zsched.core.model import NAME, NodeId, TaskId, WorkerState
 from zsched.core.relay_protocol import HandleReport, RelayStarted, WorkerSeen
 from zsched.core.snapshot import Snapshot
-from zsched.errors import AdapterError
+from zsched.errors import AdapterError, WireError
 from zsched.report import snapshot_json
 
 INBOX_LIMIT = 20_000
 ANSWER_TIMEOUT_S = 3.0
+PROBLEM_TTL_S = 60.0
+"""An instruction that failed and was never tried again is no problem any more after so long."""
 LOCAL_REQUESTS_FROM = 1 << 40
 """Numbers of questions that came over the operator socket; smaller ones came over the bus."""
 
@@ -69,23 +76,19 @@ class Desk:
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
         """Answer one request of the socket (``status``, ``weights``), for this node or, with ``node``, for another."""
         verb, node = request["verb"], request.get("node") or self._node
-        if not isinstance(node, str):
-            return {"error": "node: expected a name"}
+        if not isinstance(node, str) or not NAME.fullmatch(node):
+            return {"error": f"node: {node!r:.80} is not a name"}
         if verb == "status":
             return self._ask(node, None)
         if verb == "weights":
             try:
-                command = SetWeights(
-                    task=str(request["task"]),
-                    cpu=float(request["cpu"]),
-                    memory=float(request["memory"]),
-                    network=float(request["network"]),
-                    base_revision=request.get("base_revision"),
-                )
-            except (KeyError, TypeError, ValueError) as error:
+                command = _weights_of(request)
+            except KeyError as error:
+                return {"error": f"weights: {error} is missing"}
+            except (TypeError, ValueError) as error:
                 return {"error": f"weights: {error}"}
             return self._ask(node, command)
-        return {"error": f"unknown verb {verb!r}; known: status, weights"}
+        return {"error": f"unknown verb {verb!r:.80}; known: status, weights"}
 
     def _ask(self, node: NodeId, command: SetWeights | None) -> dict[str, Any]:
         if node != self._node:
@@ -117,6 +120,16 @@ class Desk:
             slot.put(value)
 
 
+def _weights_of(request: dict[str, Any]) -> SetWeights:
+    base = request.get("base_revision")
+    if base is not None and type(base) is not int:
+        raise ValueError(f"base_revision: expected a whole number, not {base!r:.80}")
+    cpu, memory, network = (float(request[name]) for name in ("cpu", "memory", "network"))
+    if not all(map(math.isfinite, (cpu, memory, network))):
+        raise ValueError("expected finite numbers")
+    return SetWeights(task=str(request["task"]), cpu=cpu, memory=memory, network=network, base_revision=base)
+
+
 def _as_json(value: object) -> dict[str, Any]:
     if isinstance(value, Snapshot):
         return snapshot_json(value)
@@ -141,20 +154,36 @@ class Shell:
         # These two report to this shell, so they are made after it.
         self.supervisor: WorkerSupervisor | None = None
         self.relay: RelayHandle | None = None
+        self._failed_at: dict[str, float] = {}
         self._lives: dict[TaskId, int] = {}
+        """{task: the running process's incarnation}, 0 once it has ended; none for somebody else's worker."""
+        self._lives_lock = threading.Lock()  # an end and a token's end come from two threads
 
     # --- instructions ------------------------------------------------------------------------------------------------
 
     def carry_out(self, batch: tuple[do.Instruction, ...]) -> None:
-        """Carry a batch out in order; at the first failure the rest is dropped and the failure posted."""
+        """Carry a batch out in order; a failed write drops the rest, any other failure is only reported."""
         for instruction in batch:
+            kind = type(instruction).__name__
             try:
                 self._carry_out(instruction)
-            except AdapterError as error:
+            except (AdapterError, WireError) as error:
                 if isinstance(instruction, do.PersistState):
                     self._inbox.post(ev.PersistFailed(reason=str(error)))
                     return
-                self._inbox.post(ev.ProblemReported(source=type(instruction).__name__, problem=str(error)))
+                self._failed_at[kind] = monotonic_s()
+                self._inbox.post(ev.ProblemReported(source=kind, problem=str(error)))
+            else:
+                if self._failed_at:
+                    self._forget(kind)
+
+    def _forget(self, works: str) -> None:
+        """End the problem of an instruction that works again, and those that are too old to mean anything."""
+        now = monotonic_s()
+        for kind, at in tuple(self._failed_at.items()):
+            if kind == works or now - at > PROBLEM_TTL_S:
+                del self._failed_at[kind]
+                self._inbox.post(ev.ProblemReported(source=kind, problem=None))
 
     def _carry_out(self, instruction: do.Instruction) -> None:
         bus = self._bus
@@ -225,26 +254,34 @@ class Shell:
             return
         if report.node != self._node or not report.incarnation.isdigit():
             return
-        supervisor, life = self.supervisor, int(report.incarnation)
-        current = self._lives.get(report.task)
-        if supervisor is None or (current is not None and life != current):
-            return
-        (supervisor.mark_ready if report.is_present else supervisor.mark_gone)(report.task, life)
-        state = WorkerState.READY if report.is_present else WorkerState.STARTING
-        if not report.is_present and supervisor.pids().get(report.task) is None:
-            state = WorkerState.STOPPED
-        self._inbox.post(ev.WorkerChanged(task=report.task, state=state, reason="its token"))
+        supervisor = self.supervisor
+        if supervisor is not None and report.task in supervisor.states():
+            self._on_token(supervisor, report.task, int(report.incarnation), is_present=report.is_present)
+
+    def _on_token(self, supervisor: WorkerSupervisor, task: TaskId, life: int, *, is_present: bool) -> None:
+        """A token of a worker here; one of a process that has ended says nothing (its end was reported)."""
+        with self._lives_lock:
+            current = self._lives.get(task)
+            if current is not None and life != current:
+                return
+            (supervisor.mark_ready if is_present else supervisor.mark_gone)(task, life)
+            absent = WorkerState.STOPPED if current is None else WorkerState.STARTING
+            state = WorkerState.READY if is_present else absent
+            self._inbox.post(ev.WorkerChanged(task=task, state=state, reason="its token"))
 
     def on_started(self, task: TaskId, pid: int, incarnation: int) -> None:
         """The supervisor: a worker process runs; it is not ready yet."""
-        self._lives[task] = incarnation
-        self._inbox.post(ev.WorkerChanged(task=task, state=WorkerState.STARTING, reason=f"pid {pid}"))
+        with self._lives_lock:
+            self._lives[task] = incarnation
+            self._inbox.post(ev.WorkerChanged(task=task, state=WorkerState.STARTING, reason=f"pid {pid}"))
 
     def on_exited(self, task: TaskId, incarnation: int, returncode: int, reason: str) -> None:
         """The supervisor: a worker process has ended."""
         detail = reason or f"exit code {returncode}"
-        if self._lives.get(task) == incarnation:
-            self._inbox.post(ev.WorkerChanged(task=task, state=WorkerState.STOPPED, reason=detail))
+        with self._lives_lock:
+            if self._lives.get(task) == incarnation:
+                self._lives[task] = 0
+                self._inbox.post(ev.WorkerChanged(task=task, state=WorkerState.STOPPED, reason=detail))
 
     def on_failed(self, task: TaskId, reason: str) -> None:
         """The supervisor: the worker is not started again."""

@@ -50,6 +50,7 @@ _PUTS: dict[str, type[Beat | Profile | Proposal | Learnt]] = {
     "proposal": Proposal,
     "allocation": Learnt,
 }
+_QUESTIONS = frozenset({"utility", "register", "allocation", "status", "command"})
 
 
 def _event_of(value: Beat | Profile | Proposal | Learnt) -> tuple[NodeId, ev.Event]:
@@ -207,7 +208,7 @@ class ControlBus:
         try:
             event = self._question(kind, asker, query)
         except WireError as error:
-            event = ev.FrameDropped(kind=kind if NAME.fullmatch(kind) else "key", reason=error.reason)
+            event = ev.FrameDropped(kind=kind if kind in _QUESTIONS else "key", reason=error.reason)
             query.drop()
         self._post(event)
 
@@ -249,7 +250,7 @@ class ControlBus:
             return
         try:
             publisher.put(wire.encode(value))
-        except zenoh.ZError as error:
+        except (zenoh.ZError, WireError) as error:
             raise AdapterError(f"cannot publish {kind}: {error}") from error
 
     def answer(self, request: int, value: object) -> None:
@@ -288,6 +289,8 @@ class ControlBus:
         def on_answer(owner: NodeId, value: Learnt) -> None:
             if owner == value.node:
                 self._post(ev.LearntReceived(learnt=value))
+            else:
+                self._post(ev.FrameDropped(kind="allocation", reason="foreign"))
 
         self._ask(self._keys.learnt(peer, self._node), None, deadline_s, (Learnt,), on_answer, is_remote=True)
 

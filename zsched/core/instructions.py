@@ -2,9 +2,9 @@
 
 Knows: the wish. Does not know: how it is carried out, or whether it worked (that comes back as an event).
 
-The order of a batch is meaning: *persist, then send, then apply*. The shell carries a batch out in order; when one
-instruction fails, it drops the rest of the batch and reports the failure as an event. Every batch is safe when cut
-after any prefix.
+The order of a batch is meaning: *persist, then send, then apply*. The shell carries a batch out in order; when the
+state cannot be written it drops the rest of the batch, any other failure it only reports as an event. Every batch is
+safe when cut after any prefix.
 """
 
 from __future__ import annotations
