@@ -1,0 +1,296 @@
+"""One stream at a time, inputs and outputs, on real sessions: a relay's, and one for applications and workers."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+import zenoh
+
+from zsched.core.plan import Direction, HandoverRule, Route, StreamClass, StreamSettings
+from zsched.core.relay_protocol import EndMarker
+from zsched.keyspace import END_CHUNK
+from zsched.relay import outputs
+from zsched.relay.inputs import InputStream
+from zsched.relay.outputs import OutputStream
+from zsched.relay_pipe import decode_end, encode_end
+from zsched.zenoh_config import data_config, worker_config
+
+
+def until(condition: Callable[[], Any], what: str, deadline_s: float = 5.0) -> Any:
+    end = time.monotonic() + deadline_s
+    while time.monotonic() < end:
+        value = condition()
+        if value:
+            return value
+        time.sleep(0.002)
+    raise AssertionError(f"not within {deadline_s} s: {what}")
+
+
+@dataclass
+class Bench:
+    relay: zenoh.Session
+    outside: zenoh.Session
+    own_ids: frozenset[str] = frozenset()
+    streams: list[InputStream | OutputStream] = field(default_factory=list)
+
+    def input(self, route: Route) -> InputStream:
+        stream = InputStream(self.relay, route, self.own_ids | {str(self.relay.zid())})
+        self.streams.append(stream)
+        return stream
+
+    def output(self, route: Route, wake: Callable[[], None] = lambda: None) -> OutputStream:
+        stream = OutputStream(self.relay, route, self.own_ids | {str(self.relay.zid())}, wake)
+        self.streams.append(stream)
+        return stream
+
+    def publisher(self, key: str, **options: Any) -> zenoh.Publisher:
+        publisher = self.outside.declare_publisher(key, **options)
+        until(lambda: matches(publisher), f"the relay subscribes to {key}")
+        return publisher
+
+
+def matches(publisher: zenoh.Publisher) -> bool:
+    status: Any = publisher.matching_status
+    return bool(status.matching)
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    relay = zenoh.open(zenoh.Config.from_json5(data_config(listen=(endpoint,), connect=())))
+    outside = zenoh.open(zenoh.Config.from_json5(worker_config(connect=(endpoint,))))
+    made = Bench(relay=relay, outside=outside)
+    try:
+        yield made
+    finally:
+        for stream in made.streams:
+            stream.close()
+        outside.close()
+        relay.close()
+
+
+def way_in(
+    stream_class: StreamClass, from_expr: str = "robot1/in", to_expr: str = "edge1/t/in", keep_last: int = 1
+) -> Route:
+    settings = StreamSettings(stream_class=stream_class, keep_last=keep_last, depth=500)
+    return Route(stream="t/in/0", direction=Direction.INPUT, from_expr=from_expr, to_expr=to_expr, settings=settings)
+
+
+def way_out(epoch: int, handover: HandoverRule) -> Route:
+    settings = StreamSettings(stream_class=StreamClass.RELIABLE, depth=500, handover=handover)
+    return Route(
+        stream="t/out/0",
+        direction=Direction.OUTPUT,
+        from_expr=f"edge{epoch}/t/{epoch}/out",
+        to_expr="robot1/out",
+        settings=settings,
+    )
+
+
+def drops(stream: InputStream | OutputStream) -> dict[str, int]:
+    return dict(stream.count().drops)
+
+
+# --- inputs ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stream_class", list(StreamClass))
+def test_everything_of_a_sample_goes_on(bench: Bench, stream_class: StreamClass) -> None:
+    got: list[zenoh.Sample] = []
+    kept = bench.outside.declare_subscriber("edge1/t/in", got.append)
+    stream = bench.input(way_in(stream_class))
+    stream.open(1, way_in(stream_class))
+    until(lambda: stream.is_matching(1), "the target subscribes")
+    stream.flip(1)
+    stamp = bench.outside.new_timestamp()
+    publisher = bench.publisher("robot1/in", priority=zenoh.Priority.DATA_HIGH, express=True)
+    publisher.put(b"\x00\xff", encoding="image/png;7", attachment=b"\x01\x02", timestamp=stamp)
+    publisher.delete(attachment=b"gone")
+    until(lambda: len(got) == 2, "both samples")
+    first, second = got
+    assert first.payload.to_bytes() == b"\x00\xff"
+    assert str(first.encoding) == "image/png;7"
+    assert first.attachment is not None
+    assert first.attachment.to_bytes() == b"\x01\x02"
+    assert str(first.timestamp) == str(stamp)
+    assert first.priority == zenoh.Priority.DATA_HIGH
+    assert first.express is True
+    assert second.kind == zenoh.SampleKind.DELETE
+    assert second.attachment is not None
+    assert second.attachment.to_bytes() == b"gone"
+    sources = [sample.source_info for sample in got]
+    assert [source.source_sn for source in sources if source is not None] == [0, 1]
+    assert {str(source.source_id.zid) for source in sources if source is not None} == {str(bench.relay.zid())}
+    kept.undeclare()
+
+
+def test_kept_values_warm_up_a_slot_key_by_key(bench: Bench) -> None:
+    route = way_in(StreamClass.LATEST, "robot1/*/map", "edge1/t/*/map", keep_last=2)
+    stream = bench.input(route)
+    for name in ("a", "b"):
+        publisher = bench.publisher(f"robot1/{name}/map")
+        for number in range(3):
+            publisher.put(f"{name}{number}")
+    until(lambda: stream.count().messages == 6, "six values")
+    got: list[tuple[str, str]] = []
+    kept = bench.outside.declare_subscriber(
+        "edge1/**", lambda sample: got.append((str(sample.key_expr), sample.payload.to_string()))
+    )
+    stream.open(1, route)
+    until(lambda: stream.is_matching(1), "the target subscribes")
+    assert stream.warm_up(1) == 4
+    until(lambda: len(got) == 4, "the two newest of either key")
+    assert got == [("edge1/t/a/map", "a1"), ("edge1/t/a/map", "a2"), ("edge1/t/b/map", "b1"), ("edge1/t/b/map", "b2")]
+    assert not stream.is_behind(1)
+    bench.publisher("robot1/a/map").put("a3")
+    until(lambda: stream.is_behind(1), "a value that the slot has not had")
+    assert stream.flip(1) == 1
+    until(lambda: got[-1] == ("edge1/t/a/map", "a3"), "only that one again")
+    assert drops(stream) == {"replayed": 5}
+    kept.undeclare()
+
+
+def test_the_end_marker_names_its_source_and_the_number_behind_it(bench: Bench) -> None:
+    ends: list[zenoh.Sample] = []
+    kept = bench.outside.declare_subscriber(f"edge1/t/in/{END_CHUNK}", ends.append)
+    data = bench.outside.declare_subscriber("edge1/t/in", lambda _: None)
+    stream = bench.input(way_in(StreamClass.RELIABLE))
+    stream.open(1, way_in(StreamClass.RELIABLE))
+    stream.open(2, way_in(StreamClass.RELIABLE, to_expr="edge2/t/in"))
+    until(lambda: stream.is_matching(1), "the target subscribes")
+    stream.flip(1)
+    publisher = bench.publisher("robot1/in")
+    for _ in range(5):
+        publisher.put(b"x")
+    until(lambda: stream.count().messages == 5, "five samples")
+    stream.send_end(1)  # still active: nothing
+    stream.flip(2)
+    stream.send_end(1)
+    until(lambda: ends, "the marker")
+    assert [decode_end(sample.payload.to_bytes()) for sample in ends] == [EndMarker(epoch=1, count=5)]
+    kept.undeclare()
+    data.undeclare()
+
+
+def test_without_an_owner_the_loss_is_counted_and_kept_values_are_none(bench: Bench) -> None:
+    best, latest = bench.input(way_in(StreamClass.BEST_EFFORT)), bench.input(way_in(StreamClass.LATEST))
+    publisher = bench.publisher("robot1/in")
+    until(lambda: publisher.put(b"x") or (best.count().messages and latest.count().messages), "a sample in both")
+    assert drops(best)["no_route"] == best.count().messages
+    assert drops(latest) == {}
+
+
+def test_what_this_process_put_does_not_come_back(bench: Bench) -> None:
+    bench.own_ids = frozenset({str(bench.outside.zid())})  # as if that session were ours too
+    stream = bench.input(way_in(StreamClass.BEST_EFFORT))
+    publisher = bench.publisher("robot1/in")
+    publisher.put(b"x", source_info=zenoh.SourceInfo(publisher.id, 0))
+    until(lambda: drops(stream) == {"loop": 1}, "the loop is cut and counted")
+
+
+# --- outputs ---------------------------------------------------------------------------------------------------------
+
+
+class Handover:
+    """An output between the owner of epoch 1 (the carrier) and that of epoch 2 (prepared)."""
+
+    def __init__(self, bench: Bench, rule: HandoverRule) -> None:
+        self.got: list[str] = []
+        self.wakes: list[int] = []
+        self.bench = bench
+        self.kept = bench.outside.declare_subscriber("robot1/out", lambda s: self.got.append(s.payload.to_string()))
+        self.stream = bench.output(way_out(1, rule), lambda: self.wakes.append(1))
+        for epoch in (1, 2):
+            self.stream.open(epoch, way_out(epoch, rule))
+        self.old, self.new = (bench.publisher(way_out(epoch, rule).from_expr) for epoch in (1, 2))
+        self.stream.flip(1, drops_held=False)
+        self.count = 0
+
+    def put(self, publisher: zenoh.Publisher, text: str) -> None:
+        publisher.put(text)
+        self.count += 1
+        until(lambda: self.stream.count().messages == self.count, f"{text} came")
+
+    def end(self, epoch: int, count: int) -> None:
+        marker = encode_end(EndMarker(epoch=epoch, count=count))
+        before = len(self.wakes)
+        self.bench.outside.put(f"edge{epoch}/t/{epoch}/out/{END_CHUNK}", marker)
+        until(lambda: len(self.wakes) > before, "the marker")
+
+    def is_through(self, *texts: str) -> bool:
+        return bool(until(lambda: self.got == list(texts), f"{texts}, not {self.got}"))
+
+
+def test_the_first_sample_of_the_new_owner_cuts(bench: Bench) -> None:
+    move = Handover(bench, HandoverRule.LATEST)
+    move.put(move.old, "old 1")
+    move.stream.flip(2, drops_held=False)
+    move.put(move.old, "old 2")
+    move.put(move.new, "new 1")
+    move.put(move.old, "old 3")
+    move.put(move.new, "new 2")
+    assert move.is_through("old 1", "old 2", "new 1", "new 2")
+    assert drops(move.stream) == {"cut": 1}
+    assert move.stream.has_ended(1)
+
+
+def test_with_all_the_new_owner_waits_for_the_old_ones_last(bench: Bench) -> None:
+    move = Handover(bench, HandoverRule.ALL)
+    move.put(move.old, "old 1")
+    move.stream.flip(2, drops_held=False)
+    move.put(move.new, "new 1")
+    move.end(1, count=2)
+    assert not move.stream.has_ended(1)
+    move.put(move.old, "old 2")
+    assert move.stream.has_ended(1)
+    assert move.is_through("old 1", "old 2")
+    move.stream.close_slot(1)
+    assert move.is_through("old 1", "old 2", "new 1")
+    move.put(move.new, "new 2")
+    assert move.is_through("old 1", "old 2", "new 1", "new 2")
+    assert drops(move.stream) == {}
+
+
+def test_an_end_whose_samples_were_dropped_counts_after_a_grace_time(bench: Bench) -> None:
+    move = Handover(bench, HandoverRule.ALL)
+    move.stream.flip(2, drops_held=False)
+    move.end(1, count=9)
+    assert not move.stream.has_ended(1)
+    until(lambda: move.stream.has_ended(1), "the grace time", deadline_s=1.0)
+
+
+def test_a_marker_of_another_epoch_ends_nothing(bench: Bench) -> None:
+    move = Handover(bench, HandoverRule.ALL)
+    move.stream.flip(2, drops_held=False)
+    bench.outside.put(f"edge1/t/1/out/{END_CHUNK}", encode_end(EndMarker(epoch=7, count=0)))
+    bench.outside.put(f"edge1/t/1/out/{END_CHUNK}", b"no marker")
+    time.sleep(2 * outputs.END_GRACE_S)
+    assert not move.stream.has_ended(1)
+
+
+def test_answers_to_warm_up_values_that_have_changed_are_dropped(bench: Bench) -> None:
+    move = Handover(bench, HandoverRule.ALL)
+    move.put(move.new, "stale")
+    move.stream.flip(2, drops_held=True)
+    move.put(move.new, "fresh")
+    move.stream.close_slot(1)
+    assert move.is_through("fresh")
+    assert drops(move.stream) == {"superseded": 1}
+
+
+def test_what_waits_is_bounded(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(outputs, "HOLD_SAMPLES", 2)
+    move = Handover(bench, HandoverRule.ALL)
+    move.stream.flip(2, drops_held=False)
+    for number in range(4):
+        move.put(move.new, f"new {number}")
+    move.stream.close_slot(1)
+    assert move.is_through("new 2", "new 3")
+    assert drops(move.stream) == {"overflow": 2}
