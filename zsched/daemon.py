@@ -126,8 +126,16 @@ class Sampler:
                 self._sample()
             except Exception as error:
                 log.exception("sample_failed")
-                self._inbox.post(ev.ProblemReported(source="profile", problem=f"cannot measure: {error}"))
+                self._report("profile", f"cannot measure: {error}")
+            else:
+                self._report("profile", None)
             self._stop.wait(self._period_s)
+
+    def _report(self, source: str, problem: str | None) -> None:
+        """Report a problem, or its end, when it is news."""
+        if self._problems.get(source) != problem:
+            self._problems[source] = problem
+            self._inbox.post(ev.ProblemReported(source=source, problem=problem))
 
     def _sample(self) -> None:
         supervisor = self._shell.supervisor
@@ -136,10 +144,7 @@ class Sampler:
         links = tuple(reader.read() for reader in self._readers)
         self._inbox.post(ev.ProfileSampled(device=device, links=links))
         for index, reader in enumerate(self._readers):
-            source = f"profile/link{index}"
-            if self._problems.get(source) != reader.problem:
-                self._problems[source] = reader.problem
-                self._inbox.post(ev.ProblemReported(source=source, problem=reader.problem))
+            self._report(f"profile/link{index}", reader.problem)
 
 
 class Daemon:
@@ -166,6 +171,7 @@ class Daemon:
             durable, problem = self._restore(state_file)
             incarnation = durable.incarnation if durable is not None else wall_seconds()
             points = endpoints_for(self._fleet, self._spec, free_port)
+            self._handle_signals(stack)  # first: a stop that comes while things open is an orderly one, too
             shell = self._build(stack, state_file, incarnation, points)
             node = Node(
                 fleet=self._fleet,
@@ -179,7 +185,6 @@ class Daemon:
             )
             if problem is not None:
                 node.problems["state"] = problem
-            self._handle_signals(stack)
             gc.freeze()  # what lives until the end need not be looked at again
             self._loop(node, shell)
         return EXIT_OK

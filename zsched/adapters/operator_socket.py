@@ -64,9 +64,11 @@ class OperatorSocket:
             probe.settimeout(0.5)
             try:
                 probe.connect(str(self.path))
-            except OSError:
-                self.path.unlink()
+            except (ConnectionRefusedError, FileNotFoundError):
+                self.path.unlink(missing_ok=True)
                 return
+            except TimeoutError:
+                pass  # somebody listens, and is busy
         raise AdapterError(f"a daemon answers on {self.path} already; stop it or choose another --runtime-dir")
 
     def close(self) -> None:
@@ -97,6 +99,9 @@ class OperatorSocket:
             with connection, connection.makefile("rb") as lines:
                 connection.settimeout(IDLE_S)
                 while line := lines.readline(MAX_LINE):
+                    if not line.endswith(b"\n"):  # half a request, or longer than any: not ours to guess at
+                        connection.sendall(b'{"error": "expected one line of less than 1 MiB"}\n')
+                        return
                     connection.sendall(json.dumps(self._respond(line)).encode() + b"\n")
         except OSError:
             pass  # the operator went away
@@ -106,7 +111,7 @@ class OperatorSocket:
     def _respond(self, line: bytes) -> Json:
         try:
             request = json.loads(line)
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             return {"error": f"not a JSON object on one line: {error}"}
         if not isinstance(request, dict) or not isinstance(request.get("verb"), str):
             return {"error": "expected an object with a verb"}

@@ -25,6 +25,8 @@ from zsched.errors import InvariantError
 
 Load = Callable[[NodeId, float], tuple[float, float]]
 """(node, time) -> (CPU cores in use, MiB in use), the raw reading of the device profiler."""
+Cut = Callable[[NodeId, tuple[do.Instruction, ...]], int | None]
+"""(node, batch) -> after how many instructions the node crashes; ``None``: it carries out all of them and lives."""
 
 CORES, MEMORY_MB = 4.0, 4000.0
 TICK_S = 0.0005
@@ -32,6 +34,8 @@ TICK_S = 0.0005
 WORKER_START_S = 0.4
 TOKEN_DELAY_S = 0.005
 FLIP_S = 0.005
+RESTART_S = 0.3
+"""A node that crashed in the middle of a batch comes back this much later."""
 
 
 def idle(_node: NodeId, _now: float) -> tuple[float, float]:
@@ -62,6 +66,9 @@ class Simulator:
     now: float = 100.0
     cuts: set[tuple[NodeId, NodeId]] = field(default_factory=set)
     """(from, to) pairs that deliver nothing."""
+    cut_batch: Cut | None = None
+    broken_disks: set[NodeId] = field(default_factory=set)
+    """Nodes that cannot write their state."""
     learnt: dict[tuple[TaskId, int], Allocation] = field(default_factory=dict)
     """{(task, revision): the one value}."""
     owners: dict[tuple[TaskId, int], NodeId] = field(default_factory=dict)
@@ -147,6 +154,11 @@ class Simulator:
         values = {self.node(name).registers[task].value for name in names or self.running()}
         return values.pop().owner if len(values) == 1 else None
 
+    def disk(self, name: NodeId) -> DurableState | None:
+        """What a node would find if it started now."""
+        content = self._machines[name].disk
+        return None if content is None else wire.decode_state(content)
+
     # --- machines ----------------------------------------------------------------------------------------------------
 
     def _start(self, machine: _Machine) -> None:
@@ -212,9 +224,20 @@ class Simulator:
     # --- instructions ------------------------------------------------------------------------------------------------
 
     def _carry_out(self, machine: _Machine, batch: tuple[do.Instruction, ...]) -> None:
-        for instruction in batch:
+        end = None if self.cut_batch is None else self.cut_batch(machine.name, batch)
+        for instruction in batch[:end]:
+            if isinstance(instruction, do.PersistState) and machine.name in self.broken_disks:
+                self._refuse_write(machine)
+                break
             self._one(machine, instruction)
         self._check(machine)
+        if end is not None:
+            self.crash(machine.name)
+            self._later(RESTART_S, lambda: self._start(machine) if machine.node is None else None)
+
+    def _refuse_write(self, machine: _Machine) -> None:
+        life, failed = machine.life, ev.PersistFailed(reason="no space left on device")
+        self._later(TICK_S, lambda: self._deliver(machine.name, failed) if machine.life == life else None)
 
     def _one(self, machine: _Machine, instruction: do.Instruction) -> None:
         me = machine.name
@@ -312,7 +335,7 @@ class Simulator:
     def _apply(self, machine: _Machine, plan: RoutePlan) -> None:
         before = self.plans.get((machine.name, plan.task))
         newest = plan.current.epoch if plan.current is not None else 0
-        if before is not None and before.current is not None and newest < before.current.epoch and machine.life == 1:
+        if before is not None and before.current is not None and newest < before.current.epoch:
             raise InvariantError(f"{machine.name}: an older token moves a route: {before.current.epoch} -> {newest}")
         self.plans[machine.name, plan.task] = plan
         life = machine.life
