@@ -274,6 +274,7 @@ TIMING: Final = Record(
         "gather_s": Field(_SECONDS, "Deadline for the peers' utilities."),
         "ballot_s": Field(_SECONDS, "Deadline of one prepare or accept phase."),
         "stagger_s": Field(Number(0, 10, "s"), "Wait per rank before a proposer starts."),
+        "lease_s": Field(_SECONDS, "Exclusive tasks: how long an owner may work on the echoes of one beat."),
     },
     Timing,
 )

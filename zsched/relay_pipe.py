@@ -29,6 +29,7 @@ _REGISTERED: Final[tuple[tuple[str, type, int], ...]] = (
     ("slot_ready", events.SlotReady, _SMALL),
     ("slot_flipped", events.SlotFlipped, _SMALL),
     ("slot_drained", events.SlotDrained, _SMALL),
+    ("role_ended", events.RoleEnded, _SMALL),
     ("streams_counted", events.StreamsCounted, wire.LARGE),
     ("problem_reported", events.ProblemReported, _SMALL),
 )
@@ -42,6 +43,7 @@ REPORTS: Final[tuple[type[Any], ...]] = (
     events.SlotReady,
     events.SlotFlipped,
     events.SlotDrained,
+    events.RoleEnded,
     events.StreamsCounted,
     events.ProblemReported,
 )

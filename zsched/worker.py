@@ -303,6 +303,8 @@ class Worker:
         if self._role_token is not None and (not is_active or before.epoch != role.epoch):
             self._role_token.undeclare()
             self._role_token = None
+        if is_active and role.lease_until_s is not None and self._ended_epoch == role.epoch:
+            self._ended_epoch = role.epoch - 1  # asked to leave, but the move failed: it works on in its epoch
         if is_active and self._role_token is None:
             self._dispatcher.begin(role.epoch)
             key = f"{self._keyspace.role(self._node, self._task)}/{role.epoch}"
@@ -315,6 +317,9 @@ class Worker:
             self._dispatcher.note_withheld()
             return None
         if role.epoch <= self._ended_epoch:
+            return None
+        if role.lease_until_s is not None and monotonic_s() >= role.lease_until_s:
+            self._dispatcher.note_withheld()
             return None
         return role.epoch
 

@@ -92,7 +92,7 @@ class Dispatcher:
         self._markers: list[Marker] = []
         self._open: dict[SourceName, _Open] = {}
         self._epoch = 0
-        self._is_owner = False
+        self._begun = 0
         self._has_withheld = False
         self._withheld: dict[tuple[int, str], tuple[Input, deque[zenoh.Sample]]] = {}
         self._again: deque[tuple[Input, zenoh.Sample]] = deque()
@@ -133,7 +133,8 @@ class Dispatcher:
     def begin(self, epoch: int) -> None:
         """This worker is the owner from now on: sources heard first from here on belong to ``epoch``."""
         with self._wake:
-            self._epoch, self._is_owner = epoch, True
+            self._epoch = epoch
+            self._begun += 1
             for source, samples in self._withheld.values():
                 self._again.extend((source, sample) for sample in samples)
             self._withheld.clear()
@@ -142,7 +143,6 @@ class Dispatcher:
     def forget(self, epoch: int) -> None:
         """The epoch is over for this worker: what has not ended will not."""
         with self._wake:
-            self._is_owner = False
             self._open = {name: state for name, state in self._open.items() if state.epoch > epoch}
 
     def note_withheld(self) -> None:
@@ -177,11 +177,12 @@ class Dispatcher:
 
     def _process(self, source: Input, sample: zenoh.Sample) -> None:
         self._has_withheld = False
+        begun = self._begun
         self._dispatch(source, sample)
         if not self._has_withheld:
             return
         with self._wake:
-            if self._is_owner:  # it became one meanwhile
+            if self._begun != begun:  # it became the owner meanwhile
                 self._again.append((source, sample))
                 return
             name = (id(source), str(sample.key_expr))

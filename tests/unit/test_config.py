@@ -395,7 +395,7 @@ ONE_FAULT = [
     ("{target}/map_merge/{robot}/map", "{target}/map_merge/map", "would both publish", '"{target}/map_merge/map"'),
     ('"{robot}/map"', '"@zsched/x"', "belong to zsched itself", '"@zsched/x"'),
     ("    outputs:  ", "    exclusive: true\n    outputs:  ", "needs {epoch}", '"{robot}/global_map"'),
-    ("timing: wifi", "timing: {beat_s: 0.5, confirm_s: 0.5}", "suspect_s is 1.2 s, it must be >= 1.5", "0.5, confirm"),
+    ("timing: wifi", "timing: {confirm_s: 0.1}", "it must be >= 0.2 s (beat_s)", "0.1}"),
     ("timing: wifi", "timing: {zenoh_lease_s: 2.6}", "must be < 2.5 s", "2.6"),
     ("timing: wifi", "timing: {zenoh_lease_s: 0.5}", "must be >= 1 s", "0.5}"),
     ("timing: wifi", "timing: {gather_s: 0.6, ballot_s: 0.6}", "a round must end", "0.6, ballot"),

@@ -14,13 +14,16 @@ from random import Random
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.fleet import Fleet
-from zsched.core.messages import CommandOutcome, CommandResult, Learnt
+from zsched.core.lease import Leases
+from zsched.core.messages import CommandOutcome, CommandResult, Learnt, Refusal, Refused
 from zsched.core.model import Allocation, Ballot, Beat, DurableState, NodeId, RegisterState, TaskId, Weights
 from zsched.core.register import Change, MoveOwner, Register, Retune, RoundOutcome, Step
 
 SETTLE_AFTER_START_S = 0.3
 """A starting elector learns first what was accepted before (an identity round), once its peers are connected."""
 ASK_LEARNT_EVERY_S = 0.3
+PARK_SHARE = 0.8
+"""An accept that a lease forbids waits for the release so long (of a ballot's deadline) before it is refused."""
 
 _RETUNED = {
     RoundOutcome.COMMITTED: (CommandOutcome.OK, "committed by a majority of the electors"),
@@ -38,6 +41,8 @@ class Effects:
     send: list[do.Instruction] = field(default_factory=list)
     learnt: list[tuple[Allocation, str]] = field(default_factory=list)
     """(value, why it came about)."""
+    is_urgent: bool = False
+    """Beat at once: an owner must hear that it is asked to leave."""
     ended: list[TaskId] = field(default_factory=list)
     """Tasks whose move, proposed by this node, was committed, overtaken or given up."""
 
@@ -92,6 +97,14 @@ class Agreement:
         self._foreign = tuple(stored[name] for name in sorted(stored) if name not in self.registers)
         self._settle_at = now + SETTLE_AFTER_START_S if self.is_elector else math.inf
         self._asked_at: dict[NodeId, float] = {}
+        self.leases = Leases(
+            fleet=fleet,
+            me=me,
+            incarnation=incarnation,
+            standing={name: _owner(register) for name, register in self.registers.items()} if self.is_elector else {},
+            now=now,
+        )
+        self._parked: dict[tuple[TaskId, NodeId], tuple[ev.AcceptAsked, float]] = {}
 
     # --- queries -----------------------------------------------------------------------------------------------------
 
@@ -105,7 +118,18 @@ class Agreement:
 
     def next_deadline(self) -> float:
         """When `tick` may have something to do."""
-        return min(self._settle_at, *(register.next_deadline() for register in self.registers.values()), math.inf)
+        parked = (deadline for _, deadline in self._parked.values())
+        registers = (register.next_deadline() for register in self.registers.values())
+        return min(self._settle_at, *registers, *parked, math.inf)
+
+    def accepted(self) -> dict[TaskId, tuple[NodeId, int]]:
+        """{task: (owner, epoch)} of the value that this elector last accepted."""
+        found = {}
+        for name, register in self.registers.items():
+            acceptance = register.state.accepted
+            if acceptance is not None and acceptance.value.owner is not None:
+                found[name] = (acceptance.value.owner, acceptance.value.epoch)
+        return found
 
     def to_persist(self) -> DurableState | None:
         """The state to write now, or ``None`` when this node keeps none."""
@@ -132,8 +156,43 @@ class Agreement:
         if register is None or not self._is_its_own(event.accept.acceptance.ballot, event.asker):
             self.counters["accept_foreign"] += 1
             return Effects()
-        step, answer = register.on_accept(event.accept, now)
-        return Effects(is_dirty=step.is_dirty, send=[do.AnswerElection(request=event.request, answer=answer)])
+        effects = Effects()
+        self._accept_or_park(event, now + PARK_SHARE * self._fleet.timing.ballot_s, effects, now)
+        return effects
+
+    def _accept_or_park(self, event: ev.AcceptAsked, deadline: float, effects: Effects, now: float) -> None:
+        """Accept, refuse, or let the question wait while an exclusive task's owner is asked to leave."""
+        accept = event.accept
+        register = self.registers[accept.task]
+        key = (accept.task, event.asker)
+        older = self._parked.pop(key, None)
+        if older is not None and older[0] != event:
+            effects.send.append(do.AnswerElection(request=older[0].request, answer=self._leased(older[0])))
+        is_free = not register.would_accept(accept) or self.leases.may_accept(
+            accept.task, accept.acceptance.value.owner, now
+        )
+        if is_free:
+            step, answer = register.on_accept(accept, now)
+            if step.is_dirty:
+                self.leases.on_newer_value(accept.task)
+            effects.is_dirty |= step.is_dirty
+            effects.send.append(do.AnswerElection(request=event.request, answer=answer))
+        elif now >= deadline:
+            effects.send.append(do.AnswerElection(request=event.request, answer=self._leased(event)))
+        else:
+            self._parked[key] = (event, deadline)
+            effects.is_urgent = older is None
+
+    def _leased(self, event: ev.AcceptAsked) -> Refused:
+        register = self.registers[event.accept.task]
+        return register.refuse(event.accept.acceptance.ballot, Refusal.LEASE)
+
+    def retry_parked(self, now: float) -> Effects:
+        """A lease may have been released or run out, or a parked question may have waited long enough."""
+        effects = Effects()
+        for event, deadline in tuple(self._parked.values()):
+            self._accept_or_park(event, deadline, effects, now)
+        return effects
 
     def on_answer(self, event: ev.ElectorAnswered, now: float) -> Effects:
         """An elector answered our prepare or accept."""
@@ -163,7 +222,10 @@ class Agreement:
             if register is None:
                 self.counters["learnt_foreign"] += 1
                 continue
-            self._take(value.task, register.learn(value, now), effects)
+            step = register.learn(value, now)
+            if step.learnt is not None:
+                self.leases.on_newer_value(value.task)
+            self._take(value.task, step, effects)
         return effects
 
     def compare(self, beat: Beat, now: float) -> Effects:
@@ -223,6 +285,7 @@ class Agreement:
         """The disk refused: no elector any more, and nothing is written any more."""
         self.problems["state"] = f"{reason}; this node is no elector until it is restarted"
         self._durable, self.is_elector = None, False
+        self.leases.stop_granting()
         for register in self.registers.values():
             register.stop_electing()
 
@@ -264,3 +327,8 @@ class Agreement:
 def _refusal(request: int, outcome: CommandOutcome, detail: str) -> Effects:
     result = CommandResult(outcome=outcome, detail=detail)
     return Effects(send=[do.AnswerCommand(request=request, result=result)])
+
+
+def _owner(register: Register) -> NodeId | None:
+    accepted = register.state.accepted
+    return None if accepted is None else accepted.value.owner

@@ -178,6 +178,14 @@ class SlotDrained:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class RoleEnded:
+    """This node's worker says that it does not work in ``epoch`` any more, or it is dead."""
+
+    task: TaskId
+    epoch: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class StreamsCounted:
     """The relay's counters."""
 
@@ -251,6 +259,7 @@ Event = (
     | SlotReady
     | SlotFlipped
     | SlotDrained
+    | RoleEnded
     | StreamsCounted
     | RelayChanged
     | StatusAsked

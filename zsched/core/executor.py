@@ -113,16 +113,37 @@ class Executor:
             return ()
         if allocation.owner == self.me:
             self._role_deadline = math.inf
-            self.role = Role(task=self.spec.name, role=WorkerRole.ACTIVE, epoch=allocation.epoch)
+            # An exclusive task's worker may run at once, but works only from its first lease on.
+            lease = 0.0 if self.spec.exclusive else None
+            self.role = Role(task=self.spec.name, role=WorkerRole.ACTIVE, epoch=allocation.epoch, lease_until_s=lease)
             return (*self._wake_worker(), SetRole(role=self.role))
         if self.role.role is not WorkerRole.ACTIVE:
             return ()
+        if self.spec.exclusive:
+            # Whoever owns it now may be working already: nothing of the old epoch may leave any more.
+            self._role_deadline = now
+            return self.leave()
         worker = self.spec.worker
         # A cold new owner only starts its worker now, and the robots stay here until it is ready.
         starts_s = worker.start_deadline_s if worker.standby is Standby.COLD else 0.0
         self._role_deadline = now + starts_s + self.spec.drain_s + ROLE_DRAIN_MARGIN_S
         self.role = Role(task=self.spec.name, role=WorkerRole.DRAINING, epoch=self.role.epoch)
         return (SetRole(role=self.role),)
+
+    def set_lease(self, until_s: float, now: float) -> tuple[Instruction, ...]:
+        """Exclusive tasks: this node's worker may work until ``until_s`` (again, after it had to stop)."""
+        if self.owner != self.me or until_s <= now or until_s == self.role.lease_until_s:
+            return ()
+        self.role = Role(task=self.spec.name, role=WorkerRole.ACTIVE, epoch=self.epoch, lease_until_s=until_s)
+        return (SetRole(role=self.role),)
+
+    def leave(self) -> tuple[Instruction, ...]:
+        """Exclusive tasks: another owner waits; the worker stops now, before the move is committed."""
+        if self.role.role is WorkerRole.IDLE:
+            return ()
+        self.role = Role(task=self.spec.name, role=WorkerRole.IDLE)
+        story = RecordStory(stage="executor", text="the worker stops", task=self.spec.name, epoch=self.epoch)
+        return (SetRole(role=self.role), story)
 
     def _wake_worker(self) -> tuple[Instruction, ...]:
         """An owner's worker must run, cold standby or not."""

@@ -168,6 +168,8 @@ class Timing:
     """Deadline of one prepare or accept phase."""
     stagger_s: float = 0.03
     """Wait per rank before a proposer starts."""
+    lease_s: float = 1.0
+    """Exclusive tasks: how long an owner may work on the echoes of one beat."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

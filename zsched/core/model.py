@@ -371,6 +371,26 @@ class PeerState(StrEnum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Grant:
+    """An exclusive task's lease in numbers: beat ``number`` of ``owner``'s life ``incarnation``, working in ``epoch``.
+
+    In an elector's beat it is the grant (an echo); in the owner's, a release of all numbers up to this one.
+    """
+
+    task: TaskId
+    owner: NodeId
+    incarnation: int
+    epoch: int
+    number: int
+
+    def __post_init__(self) -> None:
+        check_name("grant.task", self.task)
+        check_name("grant.owner", self.owner)
+        for field in ("incarnation", "epoch", "number"):
+            check_counter(f"grant.{field}", getattr(self, field))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Beat:
     """The heartbeat, sent from the decision loop itself (a wedged loop stops it; zenoh's own keep-alives go on)."""
 
@@ -382,6 +402,12 @@ class Beat:
     """(task, revision, epoch) of every value this node has learnt."""
     suspects: tuple[NodeId, ...] = ()
     """Whom this node suspects or holds for gone: the second observer's word."""
+    echoes: tuple[Grant, ...] = ()
+    """Exclusive tasks: what this elector grants."""
+    released: tuple[Grant, ...] = ()
+    """Exclusive tasks: what this owner has given back."""
+    asked_to_leave: tuple[tuple[TaskId, NodeId, int], ...] = ()
+    """(task, owner, epoch): this elector has refused another owner for their sake."""
 
     def __post_init__(self) -> None:
         check_name("beat.node", self.node)

@@ -115,6 +115,8 @@ class Node:
             now=now,
         )
         self.registers = self.agreement.registers
+        self._leases = self.agreement.leases
+        self._exclusive = tuple(task.name for task in fleet.tasks if task.exclusive)
         self.executors = {
             task.name: Executor(spec=task, me=me, has_streams=self.kind is NodeKind.ROBOT) for task in fleet.tasks
         }
@@ -163,17 +165,18 @@ class Node:
         self._advance(now)
         batch, self._batch = self._batch, _Batch(False, [], [])
         # A limit that shrank may lie in the past already; that is no lag of this loop.
-        self._promised = max(self._next_deadline(), now)
+        self._promised = max(self._next_deadline(now), now)
         state = self.agreement.to_persist() if batch.is_dirty else None
         first: tuple[do.Instruction, ...] = () if state is None else (do.PersistState(state=state),)
         return (*first, *batch.send, *batch.apply)
 
-    def _next_deadline(self) -> float:
+    def _next_deadline(self, now: float) -> float:
         return min(
             self._beat_at,
             self.membership.next_deadline(),
             self.rounds.next_deadline(),
             self.agreement.next_deadline(),
+            self._leases.next_deadline(now),
             *(executor.next_deadline() for executor in self.executors.values()),
         )
 
@@ -191,6 +194,7 @@ class Node:
         for task, commit in self.rounds.due_commits(now):
             self._agree(self.agreement.propose(task, commit, now), now)
         self._agree(self.agreement.tick(now), now)
+        self._tend_leases(now)
         for executor in self.executors.values():
             self._batch.add(*executor.tick(now))
         if now >= self._beat_at:
@@ -209,6 +213,7 @@ class Node:
     def _beat(self, now: float) -> None:
         self._beat_sequence += 1
         self.membership.fade_doubt()
+        parts = self._leases.on_sent(self._beat_sequence, now)
         beat = Beat(
             node=self.me,
             incarnation=self.incarnation,
@@ -216,10 +221,14 @@ class Node:
             loop_lag_s=min(self.loop_lag_s, 86400.0),
             learnt=tuple((name, value.revision, value.epoch) for name, value in self.values().items()),
             suspects=self.membership.suspects(),
+            echoes=parts.echoes,
+            released=parts.released,
+            asked_to_leave=parts.asked_to_leave,
         )
         self.loop_lag_s = 0.0
         self._beat_at = now + self.fleet.timing.beat_s
         self._batch.add(do.PublishBeat(beat=beat))
+        self._hear_leases(beat, now)
 
     def _on_beat(self, event: ev.BeatReceived, now: float) -> None:
         beat = event.beat
@@ -233,6 +242,35 @@ class Node:
         for change in self.membership.absorb_beat(beat, now):
             self._on_transition(change, now)
         self._agree(self.agreement.compare(beat, now), now)
+        self._hear_leases(beat, now)
+
+    # --- exclusive tasks ---------------------------------------------------------------------------------------------
+
+    def _hear_leases(self, beat: Beat, now: float) -> None:
+        """A beat (our own too) may grant, echo, release, or ask us to leave."""
+        if not self._exclusive:
+            return
+        if self._leases.on_beat(beat, self.agreement.accepted(), now):
+            self._beat_at = now  # a first grant: the new owner waits for its echo
+        if beat.released:
+            self._agree(self.agreement.retry_parked(now), now)
+
+    def _tend_leases(self, now: float) -> None:
+        """Prolong our workers' leases; stop who is asked to leave, and give back what has stopped or run out."""
+        for task in self._exclusive:
+            executor, until = self.executors[task], self._leases.until(task)
+            if task not in self._leases.leaving():
+                self._batch.add(*executor.set_lease(until, now))
+                continue
+            self._batch.add(*executor.leave())
+            if now >= until:
+                self._on_role_ended(ev.RoleEnded(task=task, epoch=executor.epoch), now)
+        if self._exclusive:
+            self._agree(self.agreement.retry_parked(now), now)
+
+    def _on_role_ended(self, event: ev.RoleEnded, now: float) -> None:
+        if self._leases.on_stopped(event.task, event.epoch, self._beat_sequence):
+            self._beat_at = now
 
     def _on_token_lost(self, event: ev.TokenLost, now: float) -> None:
         if event.node == self.me and event.incarnation != self.incarnation:
@@ -315,6 +353,8 @@ class Node:
         """Carry out what the registers ask for."""
         self._batch.is_dirty |= effects.is_dirty
         self._batch.add(*effects.send)
+        if effects.is_urgent:
+            self._beat_at = now
         for task in effects.ended:
             self.rounds.on_commit_ended(task)
         for value, reason in effects.learnt:
@@ -342,10 +382,19 @@ class Node:
         text = f"learnt revision {value.revision}: owner {value.owner}, weights {_weights(value.tuning.weights)}"
         self._batch.add(do.RecordStory(stage="vote", text=text, task=task, epoch=value.epoch))
         self._batch.add(*executor.execute(value, now))
+        if is_new_epoch and task in self._exclusive:
+            self._hold(task, value)
         old = executor.predecessor
         if old is not None and self.membership.state(old) is PeerState.GONE:
             self._batch.add(*executor.on_gone(old))
         self._beat_at = now
+
+    def _hold(self, task: TaskId, value: Allocation) -> None:
+        """Begin or end this node's side of an exclusive task's lease."""
+        if value.owner == self.me:
+            self._leases.begin(task, value.epoch, self._beat_sequence + 1)
+        else:
+            self._leases.end(task, self._beat_sequence)
 
     def _has_failed(self, task: TaskId, node: NodeId | None, now: float) -> bool:
         """Whether an owner was fled from: it is not there, or its worker has failed."""
@@ -430,6 +479,7 @@ class Node:
             ev.SlotReady: self._on_slot_ready,
             ev.SlotFlipped: self._on_slot_flipped,
             ev.SlotDrained: self._on_slot_drained,
+            ev.RoleEnded: self._on_role_ended,
             ev.StreamsCounted: self._on_counted,
             ev.RelayChanged: self._on_relay,
             ev.StatusAsked: self._on_status,

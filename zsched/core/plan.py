@@ -106,11 +106,16 @@ class WorkerRole(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Role:
-    """The role of this node's worker for one task; ``epoch`` is 0 while idle."""
+    """The role of this node's worker for one task; ``epoch`` is 0 while idle.
+
+    ``lease_until_s`` is set for exclusive tasks only: the worker publishes nothing from then on (seconds of this
+    machine's CLOCK_BOOTTIME; 0: it has no lease yet).
+    """
 
     task: TaskId
     role: WorkerRole
     epoch: int = 0
+    lease_until_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

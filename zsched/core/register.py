@@ -165,6 +165,15 @@ class Register:
         promise = Promise(elector=self._me, task=self.state.task, ballot=prepare.ballot, accepted=self.state.accepted)
         return Step(is_dirty=True), promise
 
+    def would_accept(self, accept: Accept) -> bool:
+        """Whether `on_accept` would say yes now."""
+        ballot = accept.acceptance.ballot
+        return self._refusal(accept.electorate, ballot) is None and ballot >= self.state.promised
+
+    def refuse(self, ballot: Ballot, refusal: Refusal) -> Refused:
+        """A no for a reason that lies outside the register (an exclusive task's lease)."""
+        return self._no(ballot, refusal)
+
     def on_accept(self, accept: Accept, now: float) -> tuple[Step, Accepted | Refused]:
         """Phase 2b. The answer must not leave before a dirty step is on disk."""
         ballot = accept.acceptance.ballot

@@ -4,8 +4,8 @@ Knows: what the daemon and its relay tell each other beside plans, roles and the
 end marker says. Does not know: pipes, frames, zenoh.
 
 Commands (daemon to relay): `RoutePlan`, `Role`, `RelayStop`. Reports (relay to daemon): `RelayStarted`, `WorkerSeen`
-and the events `SlotReady`, `SlotFlipped`, `SlotDrained`, `StreamsCounted`, `ProblemReported`. The handle adds
-`RelayChanged`.
+and the events `SlotReady`, `SlotFlipped`, `SlotDrained`, `RoleEnded`, `StreamsCounted`, `ProblemReported`. The handle
+adds `RelayChanged`.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from zsched.core.events import (
     ProblemReported,
     RelayChanged,
+    RoleEnded,
     SlotDrained,
     SlotFlipped,
     SlotReady,
@@ -64,6 +65,8 @@ class EndMarker:
 
 
 RelayCommand = RoutePlan | Role | RelayStop
-RelayReport = RelayStarted | WorkerSeen | SlotReady | SlotFlipped | SlotDrained | StreamsCounted | ProblemReported
+RelayReport = (
+    RelayStarted | WorkerSeen | SlotReady | SlotFlipped | SlotDrained | RoleEnded | StreamsCounted | ProblemReported
+)
 HandleReport = RelayReport | RelayChanged
 """What `zsched.adapters.streams.RelayHandle` hands to the daemon."""

@@ -14,7 +14,7 @@ from typing import Final
 from zsched.core.fleet import Timing
 
 WIFI: Final = Timing()
-WIRED: Final = replace(WIFI, name="wired", beat_s=0.1, suspect_s=0.45, confirm_s=0.15, zenoh_lease_s=1.0)
+WIRED: Final = replace(WIFI, name="wired", beat_s=0.1, suspect_s=0.45, confirm_s=0.15, zenoh_lease_s=1.0, lease_s=0.4)
 WAN: Final = replace(
     WIFI,
     name="wan",
@@ -27,6 +27,7 @@ WAN: Final = replace(
     gather_s=0.5,
     ballot_s=1.0,
     stagger_s=0.05,
+    lease_s=4.0,
 )
 PROFILES: Final[Mapping[str, Timing]] = {profile.name: profile for profile in (WIRED, WIFI, WAN)}
 
@@ -76,6 +77,16 @@ _RELATIONS: Final = (
     ),
     _Relation(
         "stagger_s", "<=", "ballot_s", lambda t: t.ballot_s, "the next proposer must step in before the round is lost"
+    ),
+    _Relation(
+        "lease_s", ">=", "3 x beat_s", lambda t: 3 * t.beat_s, "an exclusive owner must live through two lost beats"
+    ),
+    _Relation(
+        "lease_s",
+        "<=",
+        "suspect_s",
+        lambda t: t.suspect_s,
+        "a silent owner's lease must not outlast the time in which it is found to be silent",
     ),
 )
 

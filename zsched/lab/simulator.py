@@ -20,7 +20,7 @@ from zsched.core import instructions as do
 from zsched.core.fleet import Fleet, electorate_hash
 from zsched.core.model import Allocation, DeviceSample, DurableState, NodeId, PeerState, TaskId, WorkerState
 from zsched.core.node import Node
-from zsched.core.plan import RoutePhase, RoutePlan
+from zsched.core.plan import Role, RoutePhase, RoutePlan, WorkerRole
 from zsched.errors import InvariantError
 
 Load = Callable[[NodeId, float], tuple[float, float]]
@@ -34,6 +34,7 @@ TICK_S = 0.0005
 WORKER_START_S = 0.4
 TOKEN_DELAY_S = 0.005
 FLIP_S = 0.005
+WORKER_STOP_S = 0.002
 RESTART_S = 0.3
 """A node that crashed in the middle of a batch comes back this much later."""
 
@@ -52,6 +53,7 @@ class _Machine:
     wake_at: float = math.inf
     workers: dict[TaskId, int] = field(default_factory=dict)
     """{task: the life of this machine in which its worker became ready}."""
+    roles: dict[TaskId, Role] = field(default_factory=dict)
 
 
 @dataclass(slots=True)
@@ -74,6 +76,8 @@ class Simulator:
     owners: dict[tuple[TaskId, int], NodeId] = field(default_factory=dict)
     """{(task, epoch): the one owner}."""
     plans: dict[tuple[NodeId, TaskId], RoutePlan] = field(default_factory=dict)
+    working: dict[TaskId, tuple[NodeId, float]] = field(default_factory=dict)
+    """{exclusive task: (who works, until when at most)}."""
     stories: list[str] = field(default_factory=list)
     _rng: Random = field(init=False)
     _queue: list[tuple[float, int, Callable[[], None]]] = field(default_factory=list)
@@ -110,6 +114,7 @@ class Simulator:
         incarnation, machine.node = machine.node.incarnation, None
         machine.life += 1
         machine.workers.clear()
+        machine.roles.clear()
         for other in self._others(name):
             event = ev.TokenLost(node=name, incarnation=incarnation)
             self._later(TOKEN_DELAY_S, lambda o=other, e=event: self._deliver(o, e))  # type: ignore[misc]
@@ -273,6 +278,8 @@ class Simulator:
                 self._start_worker(machine, task)
             case do.ApplyRoutes(plan=plan):
                 self._apply(machine, plan)
+            case do.SetRole(role=role):
+                self._set_role(machine, role)
             case do.RecordStory():
                 where = f"{instruction.task}#{instruction.epoch} " if instruction.task else ""
                 self.stories.append(f"{self.now:9.3f} {me} {instruction.stage} {where}{instruction.text}")
@@ -331,6 +338,34 @@ class Simulator:
                 self._deliver(machine.name, ev.WorkerChanged(task=task, state=WorkerState.READY))
 
         self._later(WORKER_START_S, ready)
+
+    def _set_role(self, machine: _Machine, role: Role) -> None:
+        """The worker follows its role; an exclusive one works only under its lease, and says when it has stopped."""
+        before = machine.roles.get(role.task)
+        machine.roles[role.task] = role
+        if role.lease_until_s is not None and role.lease_until_s > self.now:
+            self._check_exclusive(machine, role, role.lease_until_s)
+        if before is None or before.role is not WorkerRole.ACTIVE or role.role is WorkerRole.ACTIVE:
+            return
+        life = machine.life
+
+        def stopped() -> None:
+            working = self.working.get(role.task)
+            if working is not None and working[0] == machine.name and machine.life == life:
+                self.working[role.task] = (machine.name, self.now)
+            if machine.life == life:
+                self._deliver(machine.name, ev.RoleEnded(task=role.task, epoch=before.epoch))
+
+        self._later(WORKER_STOP_S, stopped)
+
+    def _check_exclusive(self, machine: _Machine, role: Role, until: float) -> None:
+        """Nobody else may still be working: a crashed owner's worker counts until its lease ends."""
+        other = self.working.get(role.task)
+        if other is not None and other[0] != machine.name and other[1] > self.now:
+            raise InvariantError(
+                f"seed {self.seed}: {other[0]} and {machine.name} both work on {role.task} at {self.now:.3f}"
+            )
+        self.working[role.task] = (machine.name, until)
 
     def _apply(self, machine: _Machine, plan: RoutePlan) -> None:
         before = self.plans.get((machine.name, plan.task))

@@ -18,7 +18,7 @@ import zenoh
 
 from zsched import wire
 from zsched.clock import monotonic_s
-from zsched.core.events import ProblemReported, StreamsCounted
+from zsched.core.events import ProblemReported, RoleEnded, StreamsCounted
 from zsched.core.model import NodeId, TaskId
 from zsched.core.plan import Role, RoutePlan
 from zsched.core.relay_protocol import RelayReport, RelayStarted, RelayStop, WorkerSeen
@@ -85,7 +85,7 @@ class RelayProcess:
         self._own_ids = frozenset({str(session.zid())})
         keyspace = Keyspace(fleet)
         self._roles = RoleServer(session, keyspace, node)
-        self._tokens = Tokens(session, keyspace, self._worker_seen, self._wake)
+        self._tokens = Tokens(session, keyspace, self._worker_seen, self._role_ended, self._wake)
         reporter.report(RelayStarted(pid=os.getpid(), zid=str(session.zid())))
         threading.Thread(target=self._count, name="counters", daemon=True).start()
 
@@ -122,6 +122,10 @@ class RelayProcess:
         self._reporter.report(seen)
         if seen.is_present and seen.node == self._node:
             self._roles.tell(seen.task)
+
+    def _role_ended(self, node: NodeId, ended: RoleEnded) -> None:
+        if node == self._node:
+            self._reporter.report(ended)
 
     def _wake(self) -> None:
         for task in tuple(self._tasks.values()):

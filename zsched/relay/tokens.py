@@ -14,21 +14,29 @@ from collections.abc import Callable
 import zenoh
 from zenoh import Sample, SampleKind, Session
 
+from zsched.core.events import RoleEnded
 from zsched.core.model import NodeId, TaskId
 from zsched.core.relay_protocol import WorkerSeen
 from zsched.keyspace import Keyspace, parse
 
 WORKER = "worker"
+ROLE = "role"
 
 
 class Tokens:
-    """The tokens that are there now. ``on_worker`` hears of every worker's, ``wake`` of any change."""
+    """The tokens that are there now. ``on_worker`` hears of every worker's, ``on_role_ended`` of epochs left."""
 
     def __init__(
-        self, session: Session, keyspace: Keyspace, on_worker: Callable[[WorkerSeen], None], wake: Callable[[], None]
+        self,
+        session: Session,
+        keyspace: Keyspace,
+        on_worker: Callable[[WorkerSeen], None],
+        on_role_ended: Callable[[NodeId, RoleEnded], None],
+        wake: Callable[[], None],
     ) -> None:
         self._keyspace = keyspace
         self._on_worker = on_worker
+        self._on_role_ended = on_role_ended
         self._wake = wake
         self._present: frozenset[str] = frozenset()  # replaced whole: readers need no lock
         # one watch for both kinds: a waiting receiver costs ten wake-ups a second
@@ -55,4 +63,8 @@ class Tokens:
         if parsed is not None and parsed.kind == WORKER and len(parsed.rest) == 2:
             task, incarnation = parsed.rest
             self._on_worker(WorkerSeen(node=parsed.owner, task=task, incarnation=incarnation, is_present=is_present))
+        if parsed is not None and parsed.kind == ROLE and len(parsed.rest) == 2 and not is_present:
+            task, epoch = parsed.rest
+            if epoch.isdigit():
+                self._on_role_ended(parsed.owner, RoleEnded(task=task, epoch=int(epoch)))
         self._wake()

@@ -203,7 +203,7 @@ def test_full_disk_leaves_the_old_state_whole(tmp_path: Path) -> None:
             file.save(STATE)
             (folder / "filler").write_bytes(b"x" * 50_000)
             with pytest.raises(AdapterError, match="No space left"):
-                file.save(replace(STATE, electorate="e" * 20_000))
+                file.save(replace(STATE, registers=tuple(RegisterState(task=f"t{i}") for i in range(2_000))))
             assert file.load().state == STATE
             assert not (folder / "state.new").exists()
         remount = ["mount", "-o", "remount,ro", str(folder)]

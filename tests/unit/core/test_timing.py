@@ -47,7 +47,7 @@ def test_a_broken_relation_is_named_with_its_bound(field: str, value: float, bla
 
 
 def test_bounds_themselves_are_allowed() -> None:
-    assert timing_faults(replace(WIFI, beat_s=0.15, suspect_s=0.45, confirm_s=0.15)) == ()
+    assert timing_faults(replace(WIFI, beat_s=0.15, suspect_s=0.45, confirm_s=0.15, lease_s=0.45)) == ()
 
 
 def test_every_clock_stands_in_some_relation() -> None:

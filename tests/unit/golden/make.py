@@ -158,6 +158,7 @@ SAMPLES: dict[str, object] = {
     "slot_ready": events.SlotReady(task="map_merge", epoch=4, is_ready=False),
     "slot_flipped": events.SlotFlipped(task="map_merge", epoch=4, replayed=3),
     "slot_drained": events.SlotDrained(task="map_merge", epoch=3),
+    "role_ended": events.RoleEnded(task="map_merge", epoch=3),
     "streams_counted": events.StreamsCounted(counts=(_COUNT,)),
     "problem_reported": events.ProblemReported(source="relay", problem="target edge1 is stalled"),
 }

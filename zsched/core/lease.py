@@ -1,0 +1,342 @@
+"""Exclusive tasks: the lease that makes two active owners impossible, held by a majority's echoes of the owner's beats.
+
+Knows: grants, echoes, releases and their clocks. Does not know: how a worker is stopped, ballots, bytes.
+
+L is the lease, rho the bound on how far two clocks' rates differ. Nobody compares clocks: each side counts on its own.
+
+* The owner's beats are numbered. An elector echoes a number, per task, only to the owner and epoch of the value that it
+  last *accepted*; the echo is the grant.
+* The owner is active only while a majority has echoed a number that it sent *after learning this epoch*; the lease ends
+  L after the *sending* of the largest number that a majority has echoed or exceeded.
+* An elector that granted refuses an accept for another owner until L(1+rho)/(1-rho) after its last grant on its own
+  clock, or until the owner released; one that has just started refuses every owner but that of its own persisted
+  accepted value for as long.
+* When it refuses, it stops echoing the owner for whose sake it refused (at most twice that time, or until it accepts or
+  learns a newer revision), and its beats ask that owner to leave; the owner drains and releases all numbers up to now,
+  which are never granted again. Without this a planned move would never happen.
+
+Source: Gray & Cheriton 1989 (leases), with the epoch as fencing token.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from zsched.core.fleet import Fleet
+from zsched.core.model import Beat, Grant, NodeId, TaskId
+from zsched.core.scoring import majority
+
+RHO = 1e-3
+"""Bound on the relative difference of two clocks' rates (a crystal is within 1e-4)."""
+SENT_KEPT = 128
+
+
+def hold_s(lease_s: float) -> float:
+    """How long after its last grant an elector must refuse others, on its own clock.
+
+    >>> round(hold_s(1.0), 4)
+    1.002
+    """
+    return lease_s * (1 + RHO) / (1 - RHO)
+
+
+@dataclass(slots=True)
+class Granter:
+    """One elector's side of one exclusive task.
+
+    Args:
+        task: the task.
+        lease_s: L.
+        started_at: when this elector started (monotonic seconds).
+        standing: owner of the persisted accepted value at the start (``None``: there was none).
+    """
+
+    task: TaskId
+    lease_s: float
+    started_at: float
+    standing: NodeId | None
+    _last: Grant | None = None
+    _granted_at: float = -math.inf
+    _released: dict[tuple[NodeId, int], int] = field(default_factory=dict)
+    """{(owner, incarnation): the largest released number}."""
+    _silent_for: tuple[NodeId, int] | None = None
+    """(owner, epoch) that is not echoed any more because another one waits."""
+    _silent_until: float = -math.inf
+
+    def on_beat(self, beat: Beat, accepted: tuple[NodeId, int] | None, now: float) -> bool:
+        """Take a beat in: grant it if its sender is the accepted owner. Whether this begins a new grant.
+
+        Args:
+            beat: of any node.
+            accepted: (owner, epoch) of the value that this elector last accepted.
+            now: monotonic seconds.
+        """
+        for grant in beat.released:
+            if grant.task == self.task and grant.owner == beat.node:
+                self._release(grant)
+        if accepted is None or accepted[0] != beat.node:
+            return False
+        epoch = next((epoch for task, _, epoch in beat.learnt if task == self.task), None)
+        if epoch != accepted[1] or self._is_silenced(beat.node, epoch, now):
+            return False
+        if beat.sequence <= self._released.get((beat.node, beat.incarnation), -1):
+            return False
+        if self._is_other_life(beat, now):
+            return False
+        is_new = self._last is None or (self._last.owner, self._last.incarnation, self._last.epoch) != (
+            beat.node,
+            beat.incarnation,
+            epoch,
+        )
+        if not is_new and self._last is not None and beat.sequence <= self._last.number:
+            return False
+        self._last = Grant(
+            task=self.task, owner=beat.node, incarnation=beat.incarnation, epoch=epoch, number=beat.sequence
+        )
+        self._granted_at = now
+        return is_new
+
+    def _is_other_life(self, beat: Beat, now: float) -> bool:
+        """Whether an earlier life of the same owner may still hold our grant: its worker might outlive it."""
+        last = self._last
+        if last is None or last.owner != beat.node or last.incarnation == beat.incarnation:
+            return False
+        return now < self._granted_at + hold_s(self.lease_s)
+
+    def _release(self, grant: Grant) -> None:
+        key = (grant.owner, grant.incarnation)
+        self._released[key] = max(self._released.get(key, -1), grant.number)
+        last = self._last
+        if last is not None and (last.owner, last.incarnation) == key and last.number <= grant.number:
+            self._last, self._granted_at = None, -math.inf
+
+    def _is_silenced(self, owner: NodeId, epoch: int, now: float) -> bool:
+        return self._silent_for == (owner, epoch) and now < self._silent_until
+
+    def may_accept(self, owner: NodeId | None, now: float) -> bool:
+        """Whether a value with this owner may be accepted now; a no begins the silence towards the present owner."""
+        hold = hold_s(self.lease_s)
+        if now < self.started_at + hold and owner != self.standing:
+            return False
+        last = self._last
+        if last is None or last.owner == owner or now >= self._granted_at + hold:
+            return True
+        if not self._is_silenced(last.owner, last.epoch, now):
+            self._silent_for = (last.owner, last.epoch)
+            self._silent_until = now + 2 * hold
+        return False
+
+    def on_newer_value(self) -> None:
+        """A newer revision was accepted or learnt: nobody is waited for any more."""
+        self._silent_for, self._silent_until = None, -math.inf
+
+    def echo(self, now: float) -> Grant | None:
+        """What this elector's beat echoes, or ``None``."""
+        last = self._last
+        if last is None or self._is_silenced(last.owner, last.epoch, now) or now >= self._granted_at + self.lease_s:
+            return None
+        return last
+
+    def asked_to_leave(self, now: float) -> tuple[TaskId, NodeId, int] | None:
+        """(task, owner, epoch) that this elector's beats ask to leave, or ``None``."""
+        if self._silent_for is None or now >= self._silent_until:
+            return None
+        return self.task, *self._silent_for
+
+    def next_deadline(self, now: float) -> float:
+        """When `may_accept` may change its mind; infinity when never."""
+        times = [self.started_at + hold_s(self.lease_s), self._granted_at + hold_s(self.lease_s)]
+        return min((at for at in times if at > now), default=math.inf)
+
+
+@dataclass(slots=True)
+class Holder:
+    """One owner's side of one exclusive task in one epoch.
+
+    Args:
+        task: the task.
+        epoch: the epoch in which this node is the owner.
+        me: this node.
+        incarnation: of this daemon.
+        electors: the configured electors.
+        lease_s: L.
+        first_number: the first beat that will be sent after this epoch was learnt.
+    """
+
+    task: TaskId
+    epoch: int
+    me: NodeId
+    incarnation: int
+    electors: tuple[NodeId, ...]
+    lease_s: float
+    first_number: int
+    is_leaving: bool = False
+    released: int = -1
+    """The largest number that was given back."""
+    _sent: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=SENT_KEPT))
+    _echoed: dict[NodeId, int] = field(default_factory=dict)
+
+    def on_sent(self, number: int, now: float) -> None:
+        """A beat leaves."""
+        self._sent.append((number, now))
+
+    def on_echo(self, elector: NodeId, grant: Grant) -> None:
+        """An elector echoed one of our numbers; of another life or epoch, or from a stranger, it counts nothing."""
+        if elector not in self.electors or (grant.task, grant.owner) != (self.task, self.me):
+            return
+        if (grant.incarnation, grant.epoch) != (self.incarnation, self.epoch):
+            return
+        if grant.number >= self.first_number and grant.number > self.released:
+            self._echoed[elector] = max(self._echoed.get(elector, -1), grant.number)
+
+    def lease_until(self) -> float:
+        """When the lease ends (monotonic seconds on this machine); minus infinity when there is none."""
+        needed = majority(len(self.electors))
+        numbers = sorted((number for number in self._echoed.values() if number > self.released), reverse=True)
+        if len(numbers) < needed:
+            return -math.inf
+        number = numbers[needed - 1]
+        at = next((at for sent, at in self._sent if sent == number), None)
+        return -math.inf if at is None else at + self.lease_s
+
+    def newest(self) -> int:
+        """The largest number that was echoed by anybody, -1 without one."""
+        return max(self._echoed.values(), default=-1)
+
+    def release(self, number: int) -> Grant:
+        """Give back every number up to ``number``: the worker has stopped."""
+        self.released = max(self.released, number)
+        self.is_leaving = False
+        return Grant(
+            task=self.task, owner=self.me, incarnation=self.incarnation, epoch=self.epoch, number=self.released
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BeatParts:
+    """What this node's beat says about leases."""
+
+    echoes: tuple[Grant, ...]
+    released: tuple[Grant, ...]
+    asked_to_leave: tuple[tuple[TaskId, NodeId, int], ...]
+
+
+@dataclass(slots=True)
+class Leases:
+    """Both sides of every exclusive task at one node.
+
+    Args:
+        fleet: the fleet file.
+        me: this node.
+        incarnation: of this daemon.
+        standing: {task: owner of the persisted accepted value, or ``None``}; empty when this node is no elector.
+        now: monotonic seconds.
+    """
+
+    fleet: Fleet
+    me: NodeId
+    incarnation: int
+    standing: Mapping[TaskId, NodeId | None]
+    now: float
+    _granters: dict[TaskId, Granter] = field(init=False)
+    _holders: dict[TaskId, Holder] = field(default_factory=dict)
+    _releases: dict[TaskId, Grant] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        lease_s = self.fleet.timing.lease_s
+        self._granters = {
+            task.name: Granter(task=task.name, lease_s=lease_s, started_at=self.now, standing=self.standing[task.name])
+            for task in self.fleet.tasks
+            if task.exclusive and task.name in self.standing
+        }
+
+    # --- electors ----------------------------------------------------------------------------------------------------
+
+    def may_accept(self, task: TaskId, owner: NodeId | None, now: float) -> bool:
+        """Whether this elector may accept a value with ``owner`` now (always, for tasks that are not exclusive)."""
+        granter = self._granters.get(task)
+        return granter is None or granter.may_accept(owner, now)
+
+    def on_newer_value(self, task: TaskId) -> None:
+        """A newer revision was accepted or learnt."""
+        if task in self._granters:
+            self._granters[task].on_newer_value()
+
+    def stop_granting(self) -> None:
+        """This node is no elector any more: what it granted runs out."""
+        self._granters.clear()
+
+    # --- owners ------------------------------------------------------------------------------------------------------
+
+    def begin(self, task: TaskId, epoch: int, first_number: int) -> None:
+        """This node learnt that it owns the task in ``epoch``; ``first_number`` is its next beat's."""
+        self._holders[task] = Holder(
+            task=task,
+            epoch=epoch,
+            me=self.me,
+            incarnation=self.incarnation,
+            electors=self.fleet.electors,
+            lease_s=self.fleet.timing.lease_s,
+            first_number=first_number,
+        )
+        self._releases.pop(task, None)
+
+    def end(self, task: TaskId, number: int) -> None:
+        """Another owner was learnt: whatever this node still holds is given back."""
+        holder = self._holders.pop(task, None)
+        if holder is not None:
+            self._releases[task] = holder.release(number)
+
+    def until(self, task: TaskId) -> float:
+        """When this node's lease of the task ends; minus infinity without one."""
+        holder = self._holders.get(task)
+        return -math.inf if holder is None else holder.lease_until()
+
+    def leaving(self) -> tuple[TaskId, ...]:
+        """Tasks whose worker here is asked to stop and has not yet."""
+        return tuple(task for task, holder in self._holders.items() if holder.is_leaving)
+
+    def on_stopped(self, task: TaskId, epoch: int, number: int) -> bool:
+        """The worker has stopped (or its lease ran out): give everything back; false when nobody asked."""
+        holder = self._holders.get(task)
+        if holder is None or holder.epoch != epoch or not holder.is_leaving:
+            return False
+        self._releases[task] = holder.release(number)
+        return True
+
+    # --- beats -------------------------------------------------------------------------------------------------------
+
+    def on_sent(self, number: int, now: float) -> BeatParts:
+        """This node's beat ``number`` leaves: what it says."""
+        for holder in self._holders.values():
+            holder.on_sent(number, now)
+        echoes = [granter.echo(now) for granter in self._granters.values()]
+        asked = [granter.asked_to_leave(now) for granter in self._granters.values()]
+        return BeatParts(
+            echoes=tuple(echo for echo in echoes if echo is not None),
+            released=tuple(self._releases.values()),
+            asked_to_leave=tuple(ask for ask in asked if ask is not None),
+        )
+
+    def on_beat(self, beat: Beat, accepted: Mapping[TaskId, tuple[NodeId, int]], now: float) -> bool:
+        """A beat came, or our own left: grant, count echoes, hear who must leave. Whether to beat at once."""
+        is_new = False
+        for task, granter in self._granters.items():
+            is_new |= granter.on_beat(beat, accepted.get(task), now)
+        for grant in beat.echoes:
+            if grant.task in self._holders:
+                self._holders[grant.task].on_echo(beat.node, grant)
+        for task, owner, epoch in beat.asked_to_leave:
+            holder = self._holders.get(task)
+            if holder is not None and owner == self.me and epoch == holder.epoch and holder.released < holder.newest():
+                holder.is_leaving = True
+        return is_new
+
+    def next_deadline(self, now: float) -> float:
+        """When an elector may accept what it refused, or a leaving owner's lease ends."""
+        times = [granter.next_deadline(now) for granter in self._granters.values()]
+        times += [holder.lease_until() for holder in self._holders.values() if holder.is_leaving]
+        return min((at for at in times if at > now), default=math.inf)
