@@ -305,8 +305,10 @@ class Worker:
             self._role_token = None
         if is_active and role.lease_until_s is not None and self._ended_epoch == role.epoch:
             self._ended_epoch = role.epoch - 1  # asked to leave, but the move failed: it works on in its epoch
+        was_held = before.lease_until_s is not None and monotonic_s() >= before.lease_until_s
+        if is_active and (self._role_token is None or was_held):
+            self._dispatcher.begin(role.epoch)  # also what was withheld for want of a lease
         if is_active and self._role_token is None:
-            self._dispatcher.begin(role.epoch)
             key = f"{self._keyspace.role(self._node, self._task)}/{role.epoch}"
             self._role_token = self._session.liveliness().declare_token(key)
 
@@ -318,10 +320,10 @@ class Worker:
             return None
         if role.epoch <= self._ended_epoch:
             return None
-        if role.lease_until_s is not None and monotonic_s() >= role.lease_until_s:
+        has_lease = role.lease_until_s is None or monotonic_s() < role.lease_until_s
+        if not has_lease:
             self._dispatcher.note_withheld()
-            return None
-        return role.epoch
+        return role.epoch if has_lease else None
 
     # --- ends --------------------------------------------------------------------------------------------------------
 

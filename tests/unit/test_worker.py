@@ -17,6 +17,7 @@ import pytest
 import zenoh
 
 from zsched import wire
+from zsched.clock import monotonic_s
 from zsched.core.plan import Role, WorkerRole
 from zsched.core.relay_protocol import EndMarker
 from zsched.errors import ConfigError
@@ -165,6 +166,21 @@ def test_what_was_withheld_is_processed_again_by_the_owner(relay: Relay, echo: E
     until(lambda: echo.output.withheld == 1, "the warm-up")
     relay.tell(WorkerRole.ACTIVE, 2)
     until(lambda: relay.outputs == [("edge1/t/2/robot1/out", b"the last map")], "its result")
+
+
+def test_without_a_lease_an_exclusive_owner_waits_and_then_answers(relay: Relay, echo: Echo) -> None:
+    def tell(lease_until_s: float) -> None:
+        relay.role = Role(task="t", role=WorkerRole.ACTIVE, epoch=3, lease_until_s=lease_until_s)
+        relay.session.put(ROLE_KEY, wire.encode(relay.role))
+        until(lambda: echo.worker.role == relay.role, "the role")
+
+    tell(0.0)
+    relay.put(b"early")
+    until(lambda: echo.output.withheld == 1, "the withheld output")
+    time.sleep(0.05)
+    assert len(echo.taken) == 1  # it is not tried again and again
+    tell(monotonic_s() + 5.0)
+    until(lambda: relay.outputs == [("edge1/t/3/robot1/out", b"early")], "the output under the lease")
 
 
 def test_the_end_marker_comes_behind_the_last_output(relay: Relay, echo: Echo) -> None:
