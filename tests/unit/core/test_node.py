@@ -1,0 +1,393 @@
+"""The door: what one node makes of what it is told, by itself (whole fleets: tests/sim, test_node_prefixes)."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import fields, is_dataclass, replace
+from random import Random
+from typing import Any, TypeVar
+
+import pytest
+
+from zsched.core import events as ev
+from zsched.core import instructions as do
+from zsched.core.fleet import Fleet, NodeSpec, StreamRule, TaskSpec, Timing, WorkerSpec, electorate_hash
+from zsched.core.messages import Accept, Learnt, Prepare, Promise, Refusal, Refused, Utilities
+from zsched.core.model import (
+    Acceptance,
+    Allocation,
+    Ballot,
+    Beat,
+    DeviceSample,
+    DurableState,
+    NodeKind,
+    PeerState,
+    Profile,
+    Proposal,
+    RegisterState,
+    Tuning,
+    UtilityVector,
+    Weights,
+    WorkerState,
+)
+from zsched.core.node import Node
+from zsched.core.plan import Direction, RoutePhase, WorkerRole
+from zsched.core.status import build_snapshot
+
+T = TypeVar("T")
+ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
+TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
+RULE = StreamRule(direction=Direction.INPUT, from_template="{robot}/map", to_template="{target}/merge/{robot}/map")
+FLEET = Fleet(
+    name="test",
+    timing=Timing(),
+    nodes=tuple(
+        NodeSpec(name=name, kind=NodeKind.ROBOT if name in ROBOTS else NodeKind.EDGE)
+        for name in sorted((*ROBOTS, *EDGES))
+    ),
+    tasks=(
+        TaskSpec(name="merge", candidates=EDGES, tuning=TUNING, worker=WorkerSpec(command=("merge",)), rules=(RULE,)),
+    ),
+    electors=ROBOTS,
+)
+ELECTORATE = electorate_hash(FLEET)
+SAMPLE = DeviceSample(cpu_cores=4.0, cpu_used_cores=1.0, memory_mb=4000.0, memory_used_mb=1000.0)
+
+
+def value(revision: int, owner: str | None, epoch: int | None = None) -> Allocation:
+    return Allocation(
+        task="merge", revision=revision, epoch=revision if epoch is None else epoch, owner=owner, tuning=TUNING
+    )
+
+
+def durable(me: str, *registers: RegisterState) -> DurableState:
+    return DurableState(
+        fleet="test",
+        node=me,
+        incarnation=7,
+        generation=0,
+        hardware="",
+        electorate=ELECTORATE,
+        registers=registers,
+    )
+
+
+def make(me: str = "robot1", *, has_state: bool = True, learnt: Allocation | None = None, now: float = 100.0) -> Node:
+    state = durable(me, RegisterState(task="merge", learnt=learnt)) if learnt is not None else durable(me)
+    return Node(
+        fleet=FLEET,
+        me=me,
+        durable=state if has_state else None,
+        incarnation=7,
+        electorate=ELECTORATE,
+        rng=Random(1),
+        now=now,
+    )
+
+
+def started(me: str = "robot1", *, has_state: bool = True, learnt: Allocation | None = None) -> Node:
+    """A node that has heard everybody and its own first sample, at 100 s."""
+    node = make(me, has_state=has_state, learnt=learnt)
+    node.start(100.0)
+    for name in (*ROBOTS, *EDGES):
+        if name != me:
+            node.handle(ev.BeatReceived(beat=beat(name)), 100.0)
+    node.handle(ev.ProfileSampled(device=SAMPLE), 100.0)
+    return node
+
+
+def beat(node: str, sequence: int = 1, *, incarnation: int = 3, revision: int = 0) -> Beat:
+    learnt = (("merge", revision, revision),) if revision else ()
+    return Beat(node=node, incarnation=incarnation, sequence=sequence, loop_lag_s=0.0, learnt=learnt)
+
+
+def ballot(counter: int, node: str) -> Ballot:
+    return Ballot(counter=counter, node=node, incarnation=1)
+
+
+def prepare(counter: int, node: str, *, task: str = "merge", asker: str | None = None) -> ev.PrepareAsked:
+    asked = Prepare(task=task, ballot=ballot(counter, node), electorate=ELECTORATE)
+    return ev.PrepareAsked(request=counter, asker=asker or node, prepare=asked)
+
+
+def accept(counter: int, node: str, allocation: Allocation, *, asker: str | None = None) -> ev.AcceptAsked:
+    acceptance = Acceptance(ballot=ballot(counter, node), value=allocation)
+    asked = Accept(task=allocation.task, acceptance=acceptance, electorate=ELECTORATE)
+    return ev.AcceptAsked(request=counter, asker=asker or node, accept=asked)
+
+
+def profile(node: str, *, draining: bool = False) -> ev.ProfileReceived:
+    return ev.ProfileReceived(
+        profile=Profile(
+            node=node,
+            incarnation=3,
+            sequence=1,
+            cpu_cores=4.0,
+            cpu_used_cores=1.0,
+            memory_mb=4000.0,
+            memory_used_mb=1.0,
+            draining=draining,
+        )
+    )
+
+
+def proposal(voter: str, candidate: str, *, task: str = "merge", base: int = 0) -> ev.ProposalReceived:
+    paper = Proposal(voter=voter, task=task, base_revision=base, candidate=candidate, aggregate=0.5)
+    return ev.ProposalReceived(proposal=paper)
+
+
+def of(batch: tuple[do.Instruction, ...], kind: type[T]) -> list[T]:
+    return [one for one in batch if isinstance(one, kind)]
+
+
+def digest(thing: Any, seen: frozenset[int] = frozenset()) -> Any:
+    """Every field of every object that hangs on ``thing``, but the counters and what only refers to code."""
+    if isinstance(thing, Random):
+        return thing.getstate()
+    if isinstance(thing, str | int | float | bool | None):
+        return thing
+    if id(thing) in seen:
+        return "..."
+    seen |= {id(thing)}
+    if isinstance(thing, dict):
+        return {str(key): digest(item, seen) for key, item in thing.items()}
+    if isinstance(thing, list | tuple | deque | set | frozenset):
+        return [digest(item, seen) for item in thing]
+    names = [field.name for field in fields(thing)] if is_dataclass(thing) else list(getattr(thing, "__dict__", ()))
+    names += [name for name in getattr(type(thing), "__slots__", ()) if hasattr(thing, name)]
+    skipped = {"counters", "_handlers", "fleet", "_fleet"}
+    return {name: digest(getattr(thing, name), seen) for name in names if name not in skipped}
+
+
+# --- strangers -------------------------------------------------------------------------------------------------------
+
+STRANGER_VALUE = replace(value(9, "edge1"), task="other")
+STRANGERS: dict[str, ev.Event] = {
+    "beat of a node that the file does not name": ev.BeatReceived(beat=beat("ghost", revision=99)),
+    "token of it": ev.TokenSeen(node="ghost", incarnation=1),
+    "lost token of it": ev.TokenLost(node="ghost", incarnation=1),
+    "lost token of a life we do not know": ev.TokenLost(node="edge1", incarnation=99),
+    "profile of it": profile("ghost"),
+    "prepare of it": prepare(5, "ghost"),
+    "accept of it": accept(5, "ghost", value(1, "edge1")),
+    "learnt value of it": ev.LearntReceived(learnt=Learnt(node="ghost", values=(value(5, "edge2"),))),
+    "its utilities": ev.UtilityReceived(gather=1, utilities=Utilities(voter="ghost", vectors=())),
+    "proposal of it": proposal("ghost", "edge1"),
+    "proposal of an edge": proposal("edge1", "edge1"),
+    "proposal in our own name": proposal("robot1", "edge1"),
+    "proposal for an unknown task": proposal("robot2", "edge1", task="other"),
+    "proposal for a robot, which is no candidate": proposal("robot2", "robot3"),
+    "prepare for an unknown task": prepare(5, "robot2", task="other"),
+    "prepare under another's ballot": prepare(5, "robot2", asker="robot3"),
+    "accept for an unknown task": accept(5, "robot2", STRANGER_VALUE),
+    "accept under another's ballot": accept(5, "robot2", value(1, "edge1"), asker="robot3"),
+    "answer for an unknown task": ev.ElectorAnswered(
+        answer=Promise(elector="robot2", task="other", ballot=ballot(1, "robot1"))
+    ),
+    "answer of a node that is no elector": ev.ElectorAnswered(
+        answer=Promise(elector="edge1", task="merge", ballot=ballot(1, "robot1"))
+    ),
+    "learnt value of an unknown task": ev.LearntReceived(learnt=Learnt(node="robot2", values=(STRANGER_VALUE,))),
+    "vectors that are another's": ev.UtilityReceived(
+        gather=1,
+        utilities=Utilities(
+            voter="robot2", vectors=(UtilityVector(voter="robot3", task="merge", revision=0, utilities=()),)
+        ),
+    ),
+    "late utilities": ev.UtilityReceived(gather=77, utilities=Utilities(voter="robot2", vectors=())),
+    "frame that the bus dropped": ev.FrameDropped(kind="beat", reason="size"),
+    "stale profile": ev.ProfileReceived(profile=replace(profile("edge2").profile, sequence=0)),
+    "slot of an unknown task": ev.SlotReady(task="other", epoch=1),
+    "flip of an unknown task": ev.SlotFlipped(task="other", epoch=1),
+    "drain of an unknown task": ev.SlotDrained(task="other", epoch=1),
+}
+UNCOUNTED = {
+    "lost token of it",
+    "lost token of a life we do not know",
+    "slot of an unknown task",
+    "flip of an unknown task",
+    "drain of an unknown task",
+}
+"""What comes from our own machine, or is ordinary."""
+
+
+@pytest.mark.parametrize("name", STRANGERS)
+def test_strangers_frame_raises_a_counter_and_changes_nothing(name: str) -> None:
+    node = started()
+    node.handle(profile("edge2"), 100.0)
+    while node.next_deadline() <= 100.0:
+        node.handle(ev.DeadlineReached(), 100.0)
+    before, counted = digest(node), node.counters + node.agreement.counters
+
+    batch = node.handle(STRANGERS[name], 100.0)
+
+    assert batch == ()
+    assert digest(node) == before
+    raised = (node.counters + node.agreement.counters).total() - counted.total()
+    assert raised == (0 if name in UNCOUNTED else 1)
+
+
+def test_digest_sees_a_change_deep_inside() -> None:
+    """The test above can fail: an ordinary frame changes the digest."""
+    node = started()
+    before = digest(node)
+    node.handle(prepare(5, "robot2"), 100.0)
+    assert digest(node) != before
+
+
+# --- the disk --------------------------------------------------------------------------------------------------------
+
+
+def test_promise_is_persisted_in_front_of_its_answer() -> None:
+    batch = started().handle(prepare(5, "robot2"), 100.0)
+    assert isinstance(batch[0], do.PersistState)
+    assert batch[0].state.registers[0].promised == ballot(5, "robot2")
+    (answer,) = of(batch, do.AnswerElection)
+    assert isinstance(answer.answer, Promise)
+
+
+def test_node_whose_disk_refused_is_no_elector_and_says_so() -> None:
+    node = started()
+    node.handle(prepare(5, "robot2"), 100.0)
+    node.handle(ev.PersistFailed(reason="no space left on device"), 100.0)
+
+    batch = node.handle(prepare(6, "robot3"), 100.0)
+
+    assert not of(batch, do.PersistState)
+    (answer,) = of(batch, do.AnswerElection)
+    assert isinstance(answer.answer, Refused)
+    assert answer.answer.refusal is Refusal.NOT_ELECTOR
+    snapshot = build_snapshot(node, 100.0)
+    assert snapshot.quorum.this_node == "lost_state"
+    assert snapshot.quorum.alive == 2
+    assert any("no space left" in text and "restarted" in text for text in snapshot.problems)
+
+
+def test_refused_disk_loses_no_route() -> None:
+    """The batch that carried the plan was cut off; the plan comes again with the failure."""
+    node = started()
+    first = node.handle(ev.LearntReceived(learnt=Learnt(node="robot2", values=(value(1, "edge1"),))), 100.0)
+    again = node.handle(ev.PersistFailed(reason="read-only"), 100.0)
+    assert [one.plan for one in of(again, do.ApplyRoutes)] == [one.plan for one in of(first, do.ApplyRoutes)]
+    assert of(again, do.ApplyRoutes)[0].plan.phase is RoutePhase.PREPARE
+
+
+def test_refused_disk_loses_no_role_and_no_worker_start() -> None:
+    node = started("edge1")
+    node.handle(ev.LearntReceived(learnt=Learnt(node="robot2", values=(value(1, "edge1"),))), 100.0)
+    again = node.handle(ev.PersistFailed(reason="read-only"), 100.0)
+    assert do.StartWorker(task="merge") in again
+    assert [one.role.role for one in of(again, do.SetRole)] == [WorkerRole.ACTIVE]
+
+
+def test_learnt_values_apply_on_a_node_without_state_too() -> None:
+    node = started(has_state=False)
+    batch = node.handle(ev.LearntReceived(learnt=Learnt(node="robot2", values=(value(1, "edge1"),))), 100.0)
+    assert not of(batch, do.PersistState)
+    assert of(batch, do.ApplyRoutes)
+    (answer,) = of(node.handle(prepare(9, "robot2"), 100.0), do.AnswerElection)
+    assert isinstance(answer.answer, Refused)
+    assert answer.answer.refusal is Refusal.NOT_ELECTOR
+
+
+def test_restart_carries_out_again_what_was_learnt() -> None:
+    batch = make("edge1", learnt=value(4, "edge1", 2)).start(100.0)
+    assert of(batch, do.StartWorker)
+    assert [one.role.epoch for one in of(batch, do.SetRole)] == [2]
+    (plan,) = of(make("robot1", learnt=value(4, "edge1", 2)).start(100.0), do.ApplyRoutes)
+    assert plan.plan.phase is RoutePhase.PREPARE
+
+
+# --- own events like peers' ------------------------------------------------------------------------------------------
+
+
+def test_own_profile_enters_the_gateway_as_it_leaves() -> None:
+    node = make()
+    batch = node.handle(ev.ProfileSampled(device=SAMPLE), 100.0)
+    (published,) = of(batch, do.PublishProfile)
+    data = node.gateway.newest("robot1", 100.0)
+    assert data is not None
+    assert data.profile == published.profile
+    assert node.handle(ev.ProfileReceived(profile=replace(published.profile, cpu_used_cores=4.0)), 100.0) == ()
+    assert node.gateway.newest("robot1", 100.0) == data, "nobody speaks for us"
+
+
+def test_draining_is_told_in_the_same_batch() -> None:
+    node = started("edge1", learnt=value(1, "edge1"))
+    (published,) = of(node.handle(ev.StopRequested(), 100.1), do.PublishProfile)
+    assert published.profile.draining
+
+
+def test_stopped_worker_is_told_in_the_same_batch_and_once() -> None:
+    node = started("edge1")
+    batch = node.handle(ev.WorkerChanged(task="merge", state=WorkerState.FAILED, reason="exit code 1"), 100.1)
+    (published,) = of(batch, do.PublishProfile)
+    assert [load.state for load in published.profile.workers] == [WorkerState.FAILED]
+    assert [one.text for one in of(batch, do.RecordStory)] == ["worker failed: exit code 1"]
+    assert node.handle(ev.WorkerChanged(task="merge", state=WorkerState.FAILED), 100.1) == ()
+
+
+@pytest.mark.parametrize("task", ["merge", "other"])
+def test_worker_of_a_task_that_does_not_run_here_is_ignored(task: str) -> None:
+    node = started("robot1")
+    assert not of(node.handle(ev.WorkerChanged(task=task, state=WorkerState.READY), 100.0), do.RecordStory)
+    assert node.worker_states == {}
+
+
+# --- what people are told --------------------------------------------------------------------------------------------
+
+
+def test_relay_that_is_down_is_a_problem_until_it_is_up() -> None:
+    node = started()
+    node.handle(ev.RelayChanged(is_running=False, reason="exit code 1"), 100.0)
+    assert "relay: the relay is down: exit code 1" in build_snapshot(node, 100.0).problems
+    node.handle(ev.RelayChanged(is_running=True), 100.0)
+    assert build_snapshot(node, 100.0).problems == ()
+    assert node.counters["relay_exits"] == 1
+
+
+@pytest.mark.parametrize(
+    "event",
+    [ev.BeatReceived(beat=beat("robot1", incarnation=8)), ev.TokenSeen(node="robot1", incarnation=8)],
+    ids=["beat", "token"],
+)
+def test_our_own_name_elsewhere_is_a_problem_until_its_token_goes(event: ev.Event) -> None:
+    node = started()
+    node.handle(event, 100.0)
+    assert node.problems == {"membership": "another daemon calls itself 'robot1'"}
+    node.handle(ev.TokenLost(node="robot1", incarnation=7), 100.0)
+    assert node.problems, "our own token, seen from outside, says nothing about the other's"
+    node.handle(ev.TokenLost(node="robot1", incarnation=8), 100.0)
+    assert node.problems == {}
+
+
+def test_our_own_token_is_no_problem() -> None:
+    node = started()
+    node.handle(ev.TokenSeen(node="robot1", incarnation=7), 100.0)
+    node.handle(ev.BeatReceived(beat=beat("robot1", incarnation=7)), 100.0)
+    assert node.problems == {}
+
+
+def test_adapters_problem_comes_and_goes_by_its_source() -> None:
+    node = started()
+    node.handle(ev.ProblemReported(source="PublishBeat", problem="closed"), 100.0)
+    node.handle(ev.ProblemReported(source="profile", problem="no /proc"), 100.0)
+    node.handle(ev.ProblemReported(source="PublishBeat", problem=None), 100.0)
+    assert node.problems == {"profile": "no /proc"}
+
+
+# --- peers -----------------------------------------------------------------------------------------------------------
+
+
+def test_beat_that_knows_more_is_asked() -> None:
+    batch = started().handle(ev.BeatReceived(beat=beat("edge2", 2, revision=1)), 100.0)
+    assert [one.peer for one in of(batch, do.AskLearnt)] == ["edge2"]
+
+
+def test_changes_of_peers_are_told_at_once() -> None:
+    """The others may wait for a second observer: the beat leaves in the same batch, with the accusation."""
+    node = started()
+    batch = node.handle(ev.TokenLost(node="edge1", incarnation=3), 100.1)
+    (told,) = of(batch, do.PublishBeat)
+    assert told.beat.suspects == ("edge1",)
+    assert node.membership.state("edge1") is PeerState.SUSPECT
