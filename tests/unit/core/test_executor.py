@@ -1,0 +1,346 @@
+"""EXECUTOR: the handover's table line by line, what is not in it, and the worker's role."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TypeVar
+
+import pytest
+
+from zsched.core.executor import ROLE_DRAIN_MARGIN_S, Executor, Phase
+from zsched.core.fleet import Standby, StreamRule, TaskSpec, WorkerSpec
+from zsched.core.instructions import ApplyRoutes, Instruction, RecordStory, SetRole, StartWorker, StopWorker
+from zsched.core.model import Allocation, Tuning, Weights
+from zsched.core.plan import Direction, RoutePlan, WorkerRole
+
+T = TypeVar("T")
+TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
+SPEC = TaskSpec(
+    name="merge",
+    candidates=("edge1", "edge2", "edge3"),
+    tuning=TUNING,
+    drain_s=2.0,
+    worker=WorkerSpec(command=("merge",), start_deadline_s=20.0),
+    rules=(
+        StreamRule(direction=Direction.INPUT, from_template="{robot}/map", to_template="{target}/merge/{robot}/map"),
+    ),
+)
+COLD = replace(SPEC, worker=replace(SPEC.worker, standby=Standby.COLD))
+FOREIGN = replace(SPEC, worker=WorkerSpec())
+
+
+def allocation(owner: str | None, epoch: int) -> Allocation:
+    return Allocation(task="merge", revision=epoch, epoch=epoch, owner=owner, tuning=TUNING)
+
+
+def robot() -> Executor:
+    return Executor(spec=SPEC, me="robot1", has_streams=True)
+
+
+def edge(name: str = "edge1", spec: TaskSpec = SPEC) -> Executor:
+    return Executor(spec=spec, me=name, has_streams=False)
+
+
+def plan(out: tuple[Instruction, ...]) -> tuple[str, int, int | None] | None:
+    """(phase, epoch, the predecessor's epoch) of the one plan in a batch, or ``None``."""
+    plans = [one.plan for one in out if isinstance(one, ApplyRoutes)]
+    assert len(plans) <= 1
+    return short(plans[0]) if plans else None
+
+
+def short(plan: RoutePlan) -> tuple[str, int, int | None]:
+    assert plan.current is not None
+    return plan.phase.value, plan.current.epoch, None if plan.predecessor is None else plan.predecessor.epoch
+
+
+def roles(out: tuple[Instruction, ...]) -> list[tuple[WorkerRole, int]]:
+    return [(one.role.role, one.role.epoch) for one in out if isinstance(one, SetRole)]
+
+
+def of(out: tuple[Instruction, ...], kind: type[T]) -> list[T]:
+    return [one for one in out if isinstance(one, kind)]
+
+
+def at(phase: Phase) -> Executor:
+    """A robot's executor in a phase of its second handover: edge1 (epoch 1) to edge2 (epoch 2), at 10 s."""
+    one = robot()
+    one.execute(allocation("edge1", 1), 0.0)
+    one.on_ready(1)
+    one.on_flipped(1, 0, 0.0)
+    if phase is Phase.SETTLED:
+        return one
+    one.execute(allocation("edge2", 2), 10.0)
+    if phase is Phase.PREPARING:
+        return one
+    one.on_ready(2)
+    if phase is Phase.FLIPPING:
+        return one
+    one.on_flipped(2, 3, 10.0)
+    assert one.phase is Phase.DRAINING
+    return one
+
+
+# --- the table, line by line -----------------------------------------------------------------------------------------
+
+
+def test_first_owner_is_prepared_flipped_and_closed_without_a_predecessor() -> None:
+    one = robot()
+    assert plan(one.execute(allocation("edge1", 1), 0.0)) == ("prepare", 1, None)
+    phases = [one.phase]
+    assert plan(one.on_ready(1)) == ("flip", 1, None)
+    phases.append(one.phase)
+    assert plan(one.on_flipped(1, 2, 0.5)) == ("close", 1, None)
+    assert [*phases, one.phase] == [Phase.PREPARING, Phase.FLIPPING, Phase.SETTLED]
+
+
+def test_move_goes_through_every_phase_and_keeps_the_old_slot_until_it_is_drained() -> None:
+    one = at(Phase.SETTLED)
+    assert plan(one.execute(allocation("edge2", 2), 1.0)) == ("prepare", 2, 1)
+    assert plan(one.on_ready(2)) == ("flip", 2, 1)
+    assert plan(one.on_flipped(2, 1, 1.1)) is None, "the flip's plan stands while the old slot drains"
+    assert (one.phase, one.predecessor) == (Phase.DRAINING, "edge1")
+    assert plan(one.on_drained(1)) == ("close", 2, None)
+    assert (one.phase, one.predecessor) == (Phase.SETTLED, None)
+
+
+def test_drain_time_closes_the_old_slot() -> None:
+    one = at(Phase.DRAINING)
+    assert one.next_deadline() == 12.0
+    assert one.tick(11.99) == ()
+    assert plan(one.tick(12.0)) == ("close", 2, None)
+    assert (one.phase, one.next_deadline()) == (Phase.SETTLED, math.inf)
+
+
+@pytest.mark.parametrize(
+    ("phase", "expected", "after"),
+    [
+        (Phase.PREPARING, ("prepare", 2, None), Phase.PREPARING),
+        (Phase.FLIPPING, ("flip", 2, None), Phase.FLIPPING),
+        (Phase.DRAINING, ("close", 2, None), Phase.SETTLED),
+        (Phase.SETTLED, None, Phase.SETTLED),
+    ],
+)
+def test_gone_predecessor_leaves_the_plan_in_every_phase(
+    phase: Phase, expected: tuple[str, int, int | None] | None, after: Phase
+) -> None:
+    one = at(phase)
+    assert plan(one.on_gone("edge1")) == expected
+    assert (one.phase, one.predecessor) == (after, None)
+
+
+@pytest.mark.parametrize("phase", [Phase.PREPARING, Phase.FLIPPING, Phase.DRAINING, Phase.SETTLED])
+def test_other_nodes_that_go_change_nothing(phase: Phase) -> None:
+    one = at(phase)
+    assert one.on_gone("edge3") == ()
+    assert one.on_gone("edge2") == (), "giving up on the new owner is a new proposal, never local"
+    assert one.phase is phase
+
+
+@pytest.mark.parametrize(
+    ("phase", "expected"),
+    [
+        (Phase.PREPARING, ("prepare", 3, 1)),  # edge2 was never flipped to
+        (Phase.FLIPPING, ("prepare", 3, 2)),
+        (Phase.DRAINING, ("prepare", 3, 2)),
+        (Phase.SETTLED, ("prepare", 3, 1)),
+    ],
+)
+def test_newer_epoch_in_any_phase_prepares_and_keeps_the_last_slot_flipped_to(
+    phase: Phase, expected: tuple[str, int, int | None]
+) -> None:
+    one = at(phase)
+    assert plan(one.execute(allocation("edge3", 3), 11.0)) == expected
+    assert one.phase is Phase.PREPARING
+    assert one.next_deadline() == math.inf, "the old drain time is no longer waited for"
+
+
+def test_there_and_back_ends_on_the_first_owner_with_its_own_old_slot_to_drain() -> None:
+    """A -> B -> A before B was ready: the old slot of A stays open beside A's new one."""
+    one = at(Phase.PREPARING)
+    assert plan(one.execute(allocation("edge1", 3), 11.0)) == ("prepare", 3, 1)
+    assert one.predecessor == one.owner == "edge1"
+    assert plan(one.on_ready(3)) == ("flip", 3, 1)
+    one.on_flipped(3, 0, 11.1)
+    assert plan(one.on_drained(1)) == ("close", 3, None)
+
+
+# --- what is not in the table ----------------------------------------------------------------------------------------
+
+EVENTS: dict[str, Callable[[Executor, int], tuple[Instruction, ...]]] = {
+    "ready": lambda one, epoch: one.on_ready(epoch),
+    "flipped": lambda one, epoch: one.on_flipped(epoch, 0, 10.5),
+    "drained": lambda one, epoch: one.on_drained(epoch),
+}
+LEGAL = {("ready", Phase.PREPARING, 2), ("flipped", Phase.FLIPPING, 2), ("drained", Phase.DRAINING, 1)}
+
+
+@pytest.mark.parametrize("phase", [Phase.PREPARING, Phase.FLIPPING, Phase.DRAINING, Phase.SETTLED])
+@pytest.mark.parametrize("name", EVENTS)
+@pytest.mark.parametrize("epoch", [0, 1, 2, 3])
+def test_every_other_report_is_ignored(name: str, phase: Phase, epoch: int) -> None:
+    one, twin = at(phase), at(phase)
+    out = EVENTS[name](one, epoch)
+    if (name, phase, epoch) in LEGAL:
+        assert out != ()
+    else:
+        assert out == ()
+        assert one == twin
+
+
+def test_idle_executor_ignores_reports_and_needs_no_time() -> None:
+    one = robot()
+    for act in EVENTS.values():
+        assert act(one, 0) == ()
+    assert one.on_gone("edge1") == ()
+    assert (one.phase, one.next_deadline(), one.again()) == (Phase.IDLE, math.inf, ())
+
+
+@pytest.mark.parametrize("late", [allocation("edge3", 1), allocation("edge3", 2), allocation(None, 3)])
+def test_older_equal_and_empty_allocations_are_not_carried_out(late: Allocation) -> None:
+    one = at(Phase.DRAINING)
+    assert one.execute(late, 11.0) == ()
+    assert one.phase is Phase.DRAINING
+
+
+@pytest.mark.parametrize(
+    ("phase", "expected"),
+    [
+        (Phase.PREPARING, ("prepare", 2, 1)),
+        (Phase.FLIPPING, ("flip", 2, 1)),
+        (Phase.DRAINING, ("flip", 2, 1)),
+        (Phase.SETTLED, ("close", 1, None)),
+    ],
+)
+def test_again_repeats_the_plan_that_stands(phase: Phase, expected: tuple[str, int, int | None]) -> None:
+    one, twin = at(phase), at(phase)
+    assert plan(one.again()) == expected
+    assert one == twin
+
+
+def test_every_step_says_what_it_did() -> None:
+    one = at(Phase.SETTLED)
+    steps = (
+        one.execute(allocation("edge2", 2), 10.0),
+        one.on_ready(2),
+        one.on_flipped(2, 7, 10.25),
+        one.on_drained(1),
+    )
+    told = [story.text for out in steps for story in of(out, RecordStory)]
+    assert told == [
+        "prepares edge2",
+        "flips to edge2",
+        "flipped to edge2 in 250 ms, 7 kept values replayed; edge1 drains",
+        "settled on edge2: edge1 drained",
+    ]
+    assert {(story.task, story.epoch) for out in steps for story in of(out, RecordStory)} == {("merge", 2)}
+
+
+# --- the worker ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("one", "expected"),
+    [
+        (edge(), (StartWorker(task="merge"),)),
+        (edge(spec=COLD), ()),
+        (edge(spec=FOREIGN), ()),
+        (edge("edge9"), ()),
+        (robot(), ()),
+    ],
+    ids=["warm", "cold", "foreign", "no candidate", "robot"],
+)
+def test_only_warm_candidates_with_a_command_start_their_worker_at_once(
+    one: Executor, expected: tuple[Instruction, ...]
+) -> None:
+    assert one.start() == expected
+
+
+def test_role_goes_from_idle_over_active_and_draining_to_idle() -> None:
+    one = edge()
+    assert one.role.role is WorkerRole.IDLE
+    assert roles(one.execute(allocation("edge1", 1), 0.0)) == [(WorkerRole.ACTIVE, 1)]
+    assert roles(one.execute(allocation("edge2", 2), 10.0)) == [(WorkerRole.DRAINING, 1)]
+    assert one.next_deadline() == 10.0 + SPEC.drain_s + ROLE_DRAIN_MARGIN_S
+    out = one.tick(one.next_deadline())
+    assert roles(out) == [(WorkerRole.IDLE, 0)]
+    assert not of(out, StopWorker), "a warm standby keeps running"
+    assert one.next_deadline() == math.inf
+
+
+def test_owner_that_is_chosen_again_while_it_drains_stays_active() -> None:
+    one = edge()
+    one.execute(allocation("edge1", 1), 0.0)
+    one.execute(allocation("edge2", 2), 1.0)
+    assert roles(one.execute(allocation("edge1", 3), 1.5)) == [(WorkerRole.ACTIVE, 3)]
+    assert one.next_deadline() == math.inf
+    assert one.tick(100.0) == ()
+
+
+def test_moves_between_others_do_not_touch_the_role() -> None:
+    one = edge("edge3")
+    assert one.execute(allocation("edge1", 1), 0.0) == ()
+    assert one.execute(allocation("edge2", 2), 0.0) == ()
+    drained = edge()
+    drained.execute(allocation("edge1", 1), 0.0)
+    drained.execute(allocation("edge2", 2), 10.0)
+    deadline = drained.next_deadline()
+    assert drained.execute(allocation("edge3", 3), 11.0) == ()
+    assert drained.next_deadline() == deadline
+
+
+def test_cold_standby_is_started_by_its_allocation_and_stopped_after_its_drain() -> None:
+    one = edge(spec=COLD)
+    assert of(one.execute(allocation("edge1", 1), 0.0), StartWorker)
+    assert not of(one.execute(allocation("edge2", 2), 10.0), StopWorker)
+    out = one.tick(one.next_deadline())
+    assert out[-1] == StopWorker(task="merge")
+    assert roles(out) == [(WorkerRole.IDLE, 0)]
+
+
+def test_cold_standbys_old_owner_works_until_the_new_one_can_have_started() -> None:
+    """Make before break: the robots stay with the old owner while the new one's worker starts."""
+    one = edge(spec=COLD)
+    one.execute(allocation("edge1", 1), 0.0)
+    one.execute(allocation("edge2", 2), 10.0)
+    assert one.tick(10.0 + COLD.worker.start_deadline_s + COLD.drain_s) == ()
+    assert one.role.role is WorkerRole.DRAINING
+
+
+def test_foreign_worker_is_told_its_role_and_never_started() -> None:
+    one = edge(spec=FOREIGN)
+    out = one.execute(allocation("edge1", 1), 0.0)
+    assert roles(out) == [(WorkerRole.ACTIVE, 1)]
+    assert not of(out, StartWorker)
+
+
+def test_robot_that_is_candidate_and_has_streams_gets_both() -> None:
+    spec = replace(SPEC, candidates=("robot1",))
+    one = Executor(spec=spec, me="robot1", has_streams=True)
+    out = one.execute(allocation("robot1", 1), 0.0)
+    assert [type(step) for step in out] == [StartWorker, SetRole, ApplyRoutes, RecordStory]
+
+
+@pytest.mark.parametrize(
+    ("spec", "moves", "expected"),
+    [
+        (SPEC, [], [StartWorker, SetRole]),
+        (SPEC, ["edge1"], [StartWorker, StartWorker, SetRole]),
+        (COLD, [], [SetRole, StopWorker]),
+        (COLD, ["edge1"], [StartWorker, SetRole]),
+        (COLD, ["edge1", "edge2"], [SetRole]),  # it drains
+        (FOREIGN, ["edge1"], [SetRole]),
+    ],
+    ids=["warm", "warm owner", "cold", "cold owner", "cold draining", "foreign"],
+)
+def test_again_repeats_the_workers_wish_and_role(
+    spec: TaskSpec, moves: list[str], expected: list[type[Instruction]]
+) -> None:
+    """A batch that was cut off may have held any of them; each may be given twice."""
+    one = edge(spec=spec)
+    for epoch, owner in enumerate(moves, 1):
+        one.execute(allocation(owner, epoch), 0.0)
+    out = one.again()
+    assert [type(step) for step in out] == expected
+    assert roles(out) == [(one.role.role, one.role.epoch)]
