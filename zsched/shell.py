@@ -47,6 +47,7 @@ class Inbox:
 
     def __init__(self) -> None:
         self._queue: queue.SimpleQueue[ev.Event] = queue.SimpleQueue()
+        self._first: ev.Event | None = None
         self.overflowed = 0
 
     def post(self, event: ev.Event) -> None:
@@ -56,8 +57,15 @@ class Inbox:
             return
         self._queue.put(event)
 
+    def put_first(self, event: ev.Event) -> None:
+        """Let ``event`` be the next one taken; from the loop only."""
+        self._first = event
+
     def take(self, timeout_s: float) -> ev.Event | None:
         """The next event, waiting at most ``timeout_s`` (<= 0: not at all); ``None`` when there is none."""
+        event, self._first = self._first, None
+        if event is not None:
+            return event
         try:
             return self._queue.get(timeout=timeout_s) if timeout_s > 0 else self._queue.get_nowait()
         except queue.Empty:
@@ -169,7 +177,8 @@ class Shell:
                 self._carry_out(instruction)
             except (AdapterError, WireError) as error:
                 if isinstance(instruction, do.PersistState):
-                    self._inbox.post(ev.PersistFailed(reason=str(error)))
+                    # Before anything else: what the node believes to be on disk must not lead to a beat or an answer.
+                    self._inbox.put_first(ev.PersistFailed(reason=str(error)))
                     return
                 self._failed_at[kind] = monotonic_s()
                 self._inbox.post(ev.ProblemReported(source=kind, problem=str(error)))

@@ -232,17 +232,13 @@ class Simulator:
         end = None if self.cut_batch is None else self.cut_batch(machine.name, batch)
         for instruction in batch[:end]:
             if isinstance(instruction, do.PersistState) and machine.name in self.broken_disks:
-                self._refuse_write(machine)
+                self._deliver(machine.name, ev.PersistFailed(reason="no space left on device"))
                 break
             self._one(machine, instruction)
         self._check(machine)
         if end is not None:
             self.crash(machine.name)
             self._later(RESTART_S, lambda: self._start(machine) if machine.node is None else None)
-
-    def _refuse_write(self, machine: _Machine) -> None:
-        life, failed = machine.life, ev.PersistFailed(reason="no space left on device")
-        self._later(TICK_S, lambda: self._deliver(machine.name, failed) if machine.life == life else None)
 
     def _one(self, machine: _Machine, instruction: do.Instruction) -> None:
         me = machine.name
