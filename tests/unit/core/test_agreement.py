@@ -1,0 +1,348 @@
+"""Agreement: operators' commands, who is asked and told, what goes to disk."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from random import Random
+from typing import TypeVar
+
+import pytest
+
+from zsched.core import events as ev
+from zsched.core import instructions as do
+from zsched.core.agreement import ASK_LEARNT_EVERY_S, SETTLE_AFTER_START_S, Agreement, Effects
+from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing
+from zsched.core.messages import (
+    Accepted,
+    CommandOutcome,
+    CommandResult,
+    Learnt,
+    Prepare,
+    Promise,
+    Refusal,
+    Refused,
+    SetWeights,
+)
+from zsched.core.model import (
+    NO_BALLOT,
+    Acceptance,
+    Allocation,
+    Ballot,
+    Beat,
+    DurableState,
+    NodeKind,
+    RegisterState,
+    Tuning,
+    Weights,
+)
+from zsched.core.register import MoveOwner
+
+T = TypeVar("T")
+ROBOTS = ("robot1", "robot2", "robot3")
+TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
+FLEET = Fleet(
+    name="test",
+    timing=Timing(),
+    nodes=tuple(
+        NodeSpec(name=name, kind=NodeKind.ROBOT if name in ROBOTS else NodeKind.EDGE) for name in ("edge1", *ROBOTS)
+    ),
+    tasks=tuple(TaskSpec(name=name, candidates=("edge1",), tuning=TUNING) for name in ("merge", "plan")),
+    electors=ROBOTS,
+)
+
+
+def value(revision: int, owner: str | None = "edge1", *, task: str = "merge") -> Allocation:
+    return Allocation(task=task, revision=revision, epoch=revision, owner=owner, tuning=TUNING)
+
+
+def make(*registers: RegisterState, me: str = "robot1", has_state: bool = True) -> Agreement:
+    state = DurableState(
+        fleet="test",
+        node=me,
+        incarnation=7,
+        generation=0,
+        hardware="h",
+        electorate="e",
+        registers=registers,
+    )
+    return Agreement(
+        fleet=FLEET,
+        me=me,
+        durable=state if has_state else None,
+        incarnation=7,
+        electorate="e",
+        rng=Random(1),
+        now=100.0,
+    )
+
+
+def command(
+    cpu: float = 0.75, *, memory: float | None = None, base: int | None = None, task: str = "merge"
+) -> ev.WeightsCommanded:
+    weights = SetWeights(
+        task=task, cpu=cpu, memory=1.0 - cpu if memory is None else memory, network=0.0, base_revision=base
+    )
+    return ev.WeightsCommanded(request=42, command=weights)
+
+
+def of(effects: Effects, kind: type[T]) -> list[T]:
+    return [one for one in effects.send if isinstance(one, kind)]
+
+
+def told(effects: Effects) -> CommandResult | None:
+    answers = of(effects, do.AnswerCommand)
+    assert len(answers) <= 1
+    if not answers:
+        return None
+    assert answers[0].request == 42
+    return answers[0].result
+
+
+def promises(agreement: Agreement, effects: Effects, *, held: Acceptance | None = None) -> Effects:
+    """A majority promises what was asked."""
+    (asked,) = of(effects, do.SendPrepare)
+    for elector in ROBOTS[:2]:
+        promise = Promise(elector=elector, task=asked.prepare.task, ballot=asked.prepare.ballot, accepted=held)
+        effects = agreement.on_answer(ev.ElectorAnswered(answer=promise), 100.0)
+    return effects
+
+
+def accepts(agreement: Agreement, effects: Effects) -> Effects:
+    (asked,) = of(effects, do.SendAccept)
+    for elector in ROBOTS[:2]:
+        accepted = Accepted(elector=elector, task=asked.accept.task, ballot=asked.accept.acceptance.ballot)
+        effects = agreement.on_answer(ev.ElectorAnswered(answer=accepted), 100.0)
+    return effects
+
+
+def run_dry(agreement: Agreement, effects: Effects) -> CommandResult:
+    """Nobody answers any more: time passes until the command has ended."""
+    for _ in range(200):
+        result = told(effects)
+        if result is not None:
+            return result
+        effects = agreement.tick(agreement.next_deadline())
+    raise AssertionError("the command never ends")
+
+
+# --- commands --------------------------------------------------------------------------------------------------------
+
+
+def test_command_that_a_majority_accepts_is_ok_learnt_and_published() -> None:
+    agreement = make()
+    effects = accepts(agreement, promises(agreement, agreement.retune(command(), 100.0)))
+
+    result = told(effects)
+    assert result is not None
+    assert (result.outcome, result.revision) == (CommandOutcome.OK, 1)
+    ((learnt, reason),) = effects.learnt
+    assert (learnt.tuning.weights.cpu, learnt.epoch, reason) == (0.75, 0, "retuned by an operator")
+    assert effects.is_dirty
+    assert [one.learnt for one in of(effects, do.PublishLearnt)] == [agreement.learnt()]
+
+
+def test_weights_in_force_are_unchanged_without_a_round() -> None:
+    agreement = make()
+    effects = agreement.retune(command(0.5), 100.0)
+    result = told(effects)
+    assert result is not None
+    assert result.outcome is CommandOutcome.UNCHANGED
+    assert len(effects.send) == 1
+
+
+@pytest.mark.parametrize(
+    ("asked", "outcome", "says"),
+    [
+        (command(base=3), CommandOutcome.CONFLICT, "revision is 0, not 3"),
+        (command(0.9, memory=0.9), CommandOutcome.INVALID, "the sum is 1.8, not 1"),
+        (command(1.5, memory=-0.5), CommandOutcome.INVALID, "weights.cpu: 1.5 is not in [0, 1]"),
+        (command(task="other"), CommandOutcome.INVALID, "no task 'other'; tasks: merge, plan"),
+    ],
+)
+def test_command_that_cannot_be_is_refused_at_once(
+    asked: ev.WeightsCommanded, outcome: CommandOutcome, says: str
+) -> None:
+    agreement = make()
+    effects = agreement.retune(asked, 100.0)
+    result = told(effects)
+    assert result is not None
+    assert result.outcome is outcome
+    assert says in result.detail
+    assert not effects.is_dirty
+    assert len(effects.send) == 1, "no round was started"
+
+
+def test_command_on_the_revision_that_is_current_starts_a_round() -> None:
+    assert of(make().retune(command(base=0), 100.0), do.SendPrepare)
+
+
+def test_command_that_another_change_overtakes_is_a_conflict() -> None:
+    agreement = make()
+    agreement.retune(command(), 100.0)
+    result = told(agreement.on_learnt(Learnt(node="robot2", values=(value(1),)), 100.1))
+    assert result is not None
+    assert (result.outcome, result.revision) == (CommandOutcome.CONFLICT, 1)
+
+
+def test_command_without_a_majority_of_promises_ends_as_no_quorum() -> None:
+    agreement = make()
+    effects = agreement.retune(command(), 100.0)
+    (asked,) = of(effects, do.SendPrepare)
+    promise = Promise(elector="robot1", task="merge", ballot=asked.prepare.ballot)
+    effects = agreement.on_answer(ev.ElectorAnswered(answer=promise), 100.0)
+    assert run_dry(agreement, effects).outcome is CommandOutcome.NO_QUORUM
+
+
+def test_command_whose_accept_left_and_was_not_answered_ends_as_unknown() -> None:
+    agreement = make()
+    effects = promises(agreement, agreement.retune(command(), 100.0))
+    assert of(effects, do.SendAccept)
+    assert run_dry(agreement, effects).outcome is CommandOutcome.UNKNOWN
+
+
+def test_answers_of_strangers_are_counted_and_complete_no_majority() -> None:
+    agreement = make()
+    (asked,) = of(agreement.retune(command(), 100.0), do.SendPrepare)
+    for name in ("edge1", "ghost", "ghost2"):
+        promise = Promise(elector=name, task="merge", ballot=asked.prepare.ballot)
+        assert agreement.on_answer(ev.ElectorAnswered(answer=promise), 100.0) == Effects()
+    assert agreement.counters == {"answer_foreign": 3}
+
+
+# --- asking and telling ----------------------------------------------------------------------------------------------
+
+
+def beat(node: str, revision: int, *, task: str = "merge") -> Beat:
+    return Beat(node=node, incarnation=1, sequence=1, loop_lag_s=0.0, learnt=((task, revision, revision),))
+
+
+def test_peer_that_knows_more_is_asked_at_most_every_so_often() -> None:
+    agreement = make()
+    assert [one.peer for one in of(agreement.compare(beat("robot2", 1), 100.0), do.AskLearnt)] == ["robot2"]
+    assert agreement.compare(beat("robot2", 2), 100.0 + ASK_LEARNT_EVERY_S - 0.01) == Effects()
+    assert of(agreement.compare(beat("robot3", 2), 100.0), do.AskLearnt), "the limit is per peer"
+    assert of(agreement.compare(beat("robot2", 2), 100.01 + ASK_LEARNT_EVERY_S), do.AskLearnt)
+
+
+@pytest.mark.parametrize("heard", [beat("robot2", 3), beat("robot2", 2), beat("robot2", 9, task="other")])
+def test_peer_that_knows_no_more_is_not_asked(heard: Beat) -> None:
+    agreement = make(RegisterState(task="merge", learnt=value(3)))
+    assert agreement.compare(heard, 100.0) == Effects()
+
+
+def test_only_learnt_values_are_told_never_accepted_ones() -> None:
+    held = Acceptance(ballot=Ballot(counter=5, node="robot2", incarnation=1), value=value(4))
+    agreement = make(RegisterState(task="merge", promised=held.ballot, accepted=held, learnt=value(3)))
+    assert agreement.learnt() == Learnt(node="robot1", values=(value(3),))
+    assert make().learnt().values == (), "the fleet file's tuning is not agreed"
+
+
+def test_values_of_several_tasks_are_learnt_from_one_message() -> None:
+    agreement = make()
+    both = Learnt(node="edge1", values=(value(2), value(5, task="plan"), value(1, task="gone")))
+    effects = agreement.on_learnt(both, 100.0)
+    assert [one.task for one, _ in effects.learnt] == ["merge", "plan"]
+    assert {reason for _, reason in effects.learnt} == {"learnt from a peer"}
+    assert agreement.counters == {"learnt_foreign": 1}
+    assert agreement.on_learnt(both, 100.0) == Effects(), "the same again changes nothing"
+
+
+def test_two_values_for_one_revision_are_a_problem_that_is_shown() -> None:
+    agreement = make(RegisterState(task="merge", learnt=value(3)))
+    assert agreement.on_learnt(Learnt(node="robot2", values=(value(3, "robot2"),)), 100.0).learnt == []
+    assert "two values for revision 3" in agreement.problems["register/merge"]
+
+
+# --- settling at the start -------------------------------------------------------------------------------------------
+
+
+def test_starting_elector_asks_what_was_accepted_once_per_task() -> None:
+    agreement = make()
+    assert agreement.next_deadline() == 100.0 + SETTLE_AFTER_START_S
+    assert agreement.tick(100.1) == Effects()
+    asked = of(agreement.tick(100.0 + SETTLE_AFTER_START_S), do.SendPrepare)
+    assert [one.prepare.task for one in asked] == ["merge", "plan"]
+    assert agreement.tick(100.0 + SETTLE_AFTER_START_S) == Effects()
+
+
+def test_starting_elector_learns_what_a_majority_had_accepted() -> None:
+    held = Acceptance(ballot=Ballot(counter=5, node="robot2", incarnation=1), value=value(4))
+    agreement = make()
+    asked = agreement.tick(100.0 + SETTLE_AFTER_START_S)
+    merge = Effects(send=[one for one in of(asked, do.SendPrepare) if one.prepare.task == "merge"])
+    effects = accepts(agreement, promises(agreement, merge, held=held))
+    assert [one for one, _ in effects.learnt] == [value(4)]
+
+
+@pytest.mark.parametrize(("me", "has_state"), [("edge1", True), ("robot1", False)])
+def test_who_is_no_elector_does_not_ask_at_its_start(me: str, has_state: bool) -> None:
+    agreement = make(me=me, has_state=has_state)
+    assert not agreement.is_elector
+    assert agreement.tick(200.0) == Effects()
+
+
+# --- the disk --------------------------------------------------------------------------------------------------------
+
+
+def test_registers_of_tasks_that_left_the_file_stay_on_disk() -> None:
+    """The task may come back: its promises must not be forgotten."""
+    gone = RegisterState(task="gone", promised=Ballot(counter=9, node="robot2", incarnation=1), learnt=value(3))
+    agreement = make(gone, RegisterState(task="merge", learnt=value(2)))
+    agreement.on_learnt(Learnt(node="robot2", values=(value(3),)), 100.0)
+    state = agreement.to_persist()
+    assert state is not None
+    by_task = {one.task: one for one in state.registers}
+    assert sorted(by_task) == ["gone", "merge", "plan"]
+    assert by_task["gone"] == gone
+    assert by_task["merge"].learnt == value(3)
+    assert (state.incarnation, state.hardware, state.electorate) == (7, "h", "e")
+
+
+def test_without_a_state_nothing_is_written() -> None:
+    agreement = make(has_state=False)
+    assert agreement.on_learnt(Learnt(node="robot2", values=(value(1),)), 100.0).is_dirty
+    assert agreement.to_persist() is None
+
+
+def test_refused_write_ends_the_electorship_and_the_writing() -> None:
+    agreement = make()
+    agreement.on_persist_failed("disk full")
+    assert not agreement.is_elector
+    assert agreement.to_persist() is None
+    assert agreement.problems == {"state": "disk full; this node is no elector until it is restarted"}
+    ballot = Ballot(counter=1, node="robot2", incarnation=1)
+    effects = agreement.on_prepare(
+        ev.PrepareAsked(request=1, asker="robot2", prepare=replace(_prepare(agreement), ballot=ballot))
+    )
+    assert [one.answer for one in of(effects, do.AnswerElection)] == [
+        Refused(elector="robot1", task="merge", ballot=ballot, refusal=Refusal.NOT_ELECTOR, promised=NO_BALLOT)
+    ]
+    assert not effects.is_dirty
+
+
+def _prepare(agreement: Agreement) -> Prepare:
+    (sent, *_) = of(
+        agreement.propose("merge", MoveOwner(base_revision=0, owner="edge1", reason=""), 100.0), do.SendPrepare
+    )
+    return sent.prepare
+
+
+# --- moves -----------------------------------------------------------------------------------------------------------
+
+
+def test_end_of_a_move_is_told_to_the_rounds_and_to_the_journal() -> None:
+    agreement = make()
+    move = MoveOwner(base_revision=0, owner="edge1", reason="edge1 leads")
+    effects = accepts(agreement, promises(agreement, agreement.propose("merge", move, 100.0)))
+    assert effects.ended == ["merge"]
+    assert effects.learnt == [(value(1), "edge1 leads")]
+    (story,) = of(effects, do.RecordStory)
+    assert story.text == "move to edge1 on revision 0: committed"
+    assert told(effects) is None
+
+
+def test_move_on_an_outdated_revision_ends_as_a_conflict_without_a_message() -> None:
+    agreement = make(RegisterState(task="merge", learnt=value(3)))
+    effects = agreement.propose("merge", MoveOwner(base_revision=2, owner="edge1", reason=""), 100.0)
+    assert effects.ended == ["merge"]
+    assert [type(one) for one in effects.send] == [do.RecordStory]
