@@ -1,0 +1,397 @@
+"""Rounds at one robot: gather, judge, call and answer votes, hand the commit out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from random import Random
+from typing import TypeVar
+
+import pytest
+
+from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.gateway import Gateway
+from zsched.core.instructions import AskUtilities, Instruction, PublishProposal, RecordStory
+from zsched.core.messages import Utilities
+from zsched.core.model import (
+    Allocation,
+    NodeKind,
+    PeerState,
+    Profile,
+    Proposal,
+    Tuning,
+    Utility,
+    UtilityVector,
+    Weights,
+    WorkerLoad,
+    WorkerState,
+)
+from zsched.core.rounds import TIMER_MARGIN_S, Rounds, TaskRound
+from zsched.core.scheduler import Outcome
+from zsched.core.vote import VoteOutcome
+
+T = TypeVar("T")
+ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
+TUNING = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0), time_to_trigger_s=2.0, cool_down_s=0.0)
+FLEET = Fleet(
+    name="test",
+    timing=Timing(),
+    nodes=tuple(
+        NodeSpec(name=name, kind=NodeKind.ROBOT if name in ROBOTS else NodeKind.EDGE)
+        for name in sorted((*ROBOTS, *EDGES))
+    ),
+    tasks=(TaskSpec(name="merge", candidates=EDGES, tuning=TUNING, worker=WorkerSpec(command=("merge",))),),
+    electors=ROBOTS,
+)
+GATHER_S, STAGGER_S = FLEET.timing.gather_s, FLEET.timing.stagger_s
+
+
+class Robot:
+    """One robot's rounds with what surrounds them: peers, profiles, the register's value."""
+
+    def __init__(self, me: str = "robot1", *, owner: str | None = "edge1", owner_cpu: float = 1.0) -> None:
+        self.me, self.now = me, 100.0
+        self.states = dict.fromkeys((*ROBOTS, *EDGES), PeerState.ALIVE)
+        self.gateway = Gateway(FLEET)
+        self.rounds = Rounds(FLEET, me, self.gateway, Random(1), self.now)
+        revision = 0 if owner is None else 5
+        self.value = Allocation(task="merge", revision=revision, epoch=revision, owner=owner, tuning=TUNING)
+        self.sequence = 0
+        self.profiles({"edge1": owner_cpu})
+
+    @property
+    def task(self) -> TaskRound:
+        return self.rounds.tasks["merge"]
+
+    def outcome(self) -> Outcome | None:
+        return None if self.task.judgement is None else self.task.judgement.outcome
+
+    def profiles(self, cpu: dict[str, float], **changes: object) -> None:
+        """Fresh profiles of everybody; ``cpu`` in cores, 1 of 4 by default."""
+        self.sequence += 1
+        for name in (*ROBOTS, *EDGES):
+            profile = Profile(
+                node=name,
+                incarnation=1,
+                sequence=self.sequence,
+                cpu_cores=4.0,
+                cpu_used_cores=cpu.get(name, 1.0),
+                memory_mb=4000.0,
+                memory_used_mb=1000.0,
+                workers=(WorkerLoad(task="merge", state=WorkerState.READY),),
+            )
+            self.gateway.absorb(replace(profile, **changes) if name == "edge1" else profile, self.now)  # type: ignore[arg-type]
+
+    def tick(self, seconds: float = 0.0) -> tuple[Instruction, ...]:
+        self.now += seconds
+        return self.rounds.tick({"merge": self.value}, self.states, self.now)
+
+    def hear(self, voter: str, gather: int, revision: int | None = None, /, **values: float) -> bool:
+        return self.rounds.absorb_utilities(gather, self.answer(voter, revision, **values))
+
+    def answer(self, voter: str, revision: int | None = None, /, **values: float) -> Utilities:
+        column = tuple(Utility(candidate=name, value=values.get(name, 0.75)) for name in EDGES)
+        base = self.value.revision if revision is None else revision
+        return Utilities(
+            voter=voter, vectors=(UtilityVector(voter=voter, task="merge", revision=base, utilities=column),)
+        )
+
+    def round(self, seconds: float = 0.0, **values: float) -> tuple[Instruction, ...]:
+        """A whole gather in which everybody answers with ``values``."""
+        self.now = max(self.now + seconds, self.rounds.next_deadline())
+        out = self.tick()
+        for ask in of(out, AskUtilities):
+            for name in ROBOTS:
+                if name != self.me:
+                    self.hear(name, ask.gather, **values)
+        return (*out, *self.tick())
+
+    def paper(
+        self, voter: str, candidate: str, *, base: int | None = None, is_escape: bool = False
+    ) -> list[Instruction]:
+        proposal = Proposal(
+            voter=voter,
+            task="merge",
+            base_revision=self.value.revision if base is None else base,
+            candidate=candidate,
+            aggregate=0.5,
+            is_escape=is_escape,
+        )
+        return self.rounds.absorb_proposal(proposal, self.value, self.states, self.now)
+
+
+def of(out: tuple[Instruction, ...] | list[Instruction], kind: type[T]) -> list[T]:
+    return [one for one in out if isinstance(one, kind)]
+
+
+def proposed(out: tuple[Instruction, ...] | list[Instruction]) -> list[str]:
+    return [one.proposal.candidate for one in of(out, PublishProposal)]
+
+
+# --- the gather ------------------------------------------------------------------------------------------------------
+
+
+def test_gather_closes_as_soon_as_all_living_robots_have_answered() -> None:
+    robot = Robot()
+    (ask,) = robot.tick()
+    assert ask == AskUtilities(gather=1, deadline_s=GATHER_S)
+    assert robot.rounds.next_deadline() == robot.now + GATHER_S
+    assert robot.hear("robot2", 1)
+    robot.tick(0.01)
+    assert robot.task.judgement is None, "robot3 is still awaited"
+    assert robot.hear("robot3", 1)
+    robot.tick(0.01)
+    assert robot.task.judged_at == robot.now
+    assert robot.task.silent == ()
+
+
+def test_gather_closes_at_its_deadline_and_names_the_silent() -> None:
+    robot = Robot()
+    robot.tick()
+    robot.hear("robot3", 1)
+    robot.tick(GATHER_S)
+    assert robot.outcome() is Outcome.STAY, "two of three robots are a majority"
+    assert robot.task.silent == ("robot2",)
+
+
+def test_gather_does_not_wait_for_a_robot_that_goes_meanwhile() -> None:
+    robot = Robot()
+    robot.tick()
+    robot.hear("robot3", 1)
+    robot.states["robot2"] = PeerState.SUSPECT
+    robot.tick(0.01)
+    assert robot.task.judged_at == robot.now
+
+
+def test_late_foreign_doubled_and_forged_answers_do_not_count() -> None:
+    robot = Robot()
+    assert not robot.hear("robot2", 1), "nothing was asked yet"
+    robot.tick()
+    assert not robot.hear("robot2", 0)
+    assert not robot.hear("robot2", 2)
+    assert not robot.hear("edge1", 1)
+    assert not robot.hear("robot1", 1)
+    forged = replace(robot.answer("robot3"), voter="robot2")
+    assert not robot.rounds.absorb_utilities(1, forged)
+    assert robot.hear("robot2", 1)
+    assert not robot.hear("robot2", 1), "once per gather"
+    robot.tick(GATHER_S)
+    assert not robot.hear("robot3", 1), "closed"
+
+
+def test_vectors_on_another_revision_are_not_counted() -> None:
+    robot = Robot()
+    robot.tick()
+    robot.hear("robot2", 1, 4)
+    robot.hear("robot3", 1, 6)
+    robot.tick()
+    assert robot.outcome() is Outcome.NONE
+
+
+def test_rounds_come_by_themselves_about_every_decide_s() -> None:
+    robot = Robot()
+    starts = []
+    for _ in range(20):
+        robot.round()
+        starts.append(robot.rounds.next_deadline() - robot.now)
+    assert all(0.9 * FLEET.timing.decide_s <= wait <= 1.1 * FLEET.timing.decide_s for wait in starts)
+    assert len(set(starts)) > 10, "jitter keeps the robots' rounds apart"
+
+
+def test_hurry_brings_the_next_round_forward_and_never_back() -> None:
+    robot = Robot()
+    robot.round()
+    later = robot.rounds.next_deadline()
+    robot.rounds.hurry(later + 1.0)
+    assert robot.rounds.next_deadline() == later
+    robot.rounds.hurry(robot.now)
+    assert of(robot.tick(), AskUtilities)
+
+
+def test_hurry_during_a_gather_runs_another_round_after_it() -> None:
+    robot = Robot()
+    robot.tick()
+    robot.rounds.hurry(robot.now)
+    robot.hear("robot2", 1)
+    robot.hear("robot3", 1)
+    robot.tick()
+    assert of(robot.tick(), AskUtilities)
+
+
+def test_lead_that_waits_for_its_time_to_trigger_is_judged_when_it_ends() -> None:
+    robot = Robot(owner_cpu=3.9)
+    robot.round(edge1=0.02)
+    assert robot.outcome() is Outcome.WAIT
+    began = robot.now
+    while robot.outcome() is Outcome.WAIT:
+        robot.profiles({"edge1": 3.9})
+        out = robot.round(edge1=0.02)
+        assert robot.now <= began + TUNING.time_to_trigger_s + 2 * TIMER_MARGIN_S
+    assert robot.now == pytest.approx(began + TUNING.time_to_trigger_s, abs=2 * TIMER_MARGIN_S)
+    assert proposed(out) == ["edge2"]
+
+
+def test_gone_owner_is_left_in_one_round_by_whoever_is_there() -> None:
+    robot = Robot()
+    robot.states.update(edge1=PeerState.GONE, robot2=PeerState.GONE, robot3=PeerState.GONE)
+    assert proposed(robot.tick()) == ["edge2"]
+    assert robot.task.judgement is not None
+    assert robot.task.judgement.is_escape
+
+
+def test_suspect_owner_is_left_only_when_another_robot_calls_an_escape() -> None:
+    robot = Robot()
+    robot.states["edge1"] = PeerState.SUSPECT
+    assert proposed(robot.round(edge1=0.0)) == []
+    robot.paper("robot2", "edge2", is_escape=True)
+    assert proposed(robot.round(edge1=0.0)) == ["edge2"]
+
+
+# --- called votes ----------------------------------------------------------------------------------------------------
+
+
+def test_called_vote_is_answered_at_once_with_the_owner_when_nobody_is_better() -> None:
+    robot = Robot()
+    robot.round()
+    robot.paper("robot2", "edge2")
+    assert robot.rounds.next_deadline() == robot.now
+    assert proposed(robot.round()) == ["edge1"]
+
+
+def test_called_vote_is_answered_with_todays_winner_without_waiting() -> None:
+    robot = Robot(owner_cpu=3.9)
+    robot.round(edge1=0.02)
+    assert robot.outcome() is Outcome.WAIT
+    robot.paper("robot2", "edge2")
+    assert proposed(robot.round(edge1=0.02)) == ["edge2"]
+
+
+def test_called_vote_is_not_answered_by_a_robot_that_hears_too_few() -> None:
+    robot = Robot()
+    robot.round()
+    robot.states["robot3"] = PeerState.GONE
+    robot.paper("robot2", "edge2")
+    robot.tick()
+    assert proposed(robot.tick(GATHER_S)) == [], "robot2 did not answer the gather"
+
+
+def test_one_paper_per_vote_however_often_it_is_called() -> None:
+    robot = Robot()
+    robot.paper("robot2", "edge2")
+    assert proposed(robot.round()) == ["edge1"]
+    robot.paper("robot3", "edge2")
+    assert proposed(robot.round()) == []
+
+
+def test_a_proposal_to_stay_calls_nobody() -> None:
+    robot = Robot()
+    robot.round()
+    assert robot.paper("robot2", "edge1") == []
+    assert robot.task.vote_opened_at is None
+    assert proposed(robot.round()) == []
+
+
+@pytest.mark.parametrize("base", [4, 6])
+def test_proposal_on_an_older_or_newer_base_does_not_count(base: int) -> None:
+    robot = Robot()
+    robot.round()
+    assert robot.paper("robot2", "edge2", base=base) == []
+    assert robot.task.proposals == {}
+    assert proposed(robot.round()) == []
+
+
+def test_vote_that_is_not_completed_ends_without_a_quorum() -> None:
+    robot = Robot()
+    robot.round()
+    robot.states.update(robot2=PeerState.SUSPECT, robot3=PeerState.SUSPECT)
+    robot.paper("robot2", "edge2")
+    opened = robot.now
+    while robot.task.vote_opened_at is not None:
+        robot.now = max(robot.rounds.next_deadline(), robot.now)
+        robot.tick()
+    assert robot.now == pytest.approx(opened + robot.rounds.vote_s)
+    assert robot.task.tally is not None
+    assert robot.task.tally.outcome is VoteOutcome.NO_QUORUM
+
+
+# --- the commit ------------------------------------------------------------------------------------------------------
+
+
+def won(me: str, other: str) -> Robot:
+    """``me`` has called a vote for edge2, and ``other``'s paper has just made the majority."""
+    robot = Robot(me, owner_cpu=3.9)
+    out = robot.round(edge1=0.02)
+    while not proposed(out):
+        robot.profiles({"edge1": 3.9})
+        out = robot.round(edge1=0.02)
+    assert robot.task.commit is None, "one paper of three is no majority"
+    robot.paper(other, "edge2")
+    assert robot.task.tally is not None
+    assert robot.task.tally.outcome is VoteOutcome.WON
+    return robot
+
+
+@pytest.mark.parametrize(
+    ("me", "other", "rank"), [("robot1", "robot2", 0), ("robot2", "robot1", 1), ("robot2", "robot3", 0)]
+)
+def test_winners_voters_commit_staggered_by_rank_and_once(me: str, other: str, rank: int) -> None:
+    robot = won(me, other)
+    wait = rank * STAGGER_S
+    if rank:
+        assert robot.rounds.due_commits(robot.now + wait - 0.001) == []
+        assert robot.rounds.next_deadline() <= robot.now + wait
+    ((name, change),) = robot.rounds.due_commits(robot.now + wait)
+    assert (name, change.owner, change.base_revision) == ("merge", "edge2", 5)
+    assert "edge2 leads" in change.reason, "its own reason goes into the history"
+    assert robot.rounds.due_commits(robot.now + 9.0) == [], "handed out once"
+
+
+def test_who_voted_otherwise_does_not_commit_the_winner() -> None:
+    robot = Robot()
+    robot.paper("robot2", "edge2")
+    assert proposed(robot.round()) == ["edge1"]
+    robot.paper("robot3", "edge2")
+    assert robot.task.tally is not None
+    assert robot.task.tally.winner == "edge2"
+    assert robot.rounds.due_commits(robot.now + 9.0) == []
+
+
+def test_no_vote_is_called_or_answered_while_a_commit_is_under_way() -> None:
+    robot = won("robot1", "robot2")
+    robot.rounds.due_commits(robot.now)
+    assert proposed(robot.round(edge1=0.02)) == []
+    robot.paper("robot3", "edge2")
+    assert robot.task.vote_opened_at is None
+    robot.rounds.on_commit_ended("merge")
+    robot.paper("robot3", "edge2")
+    assert robot.task.vote_opened_at == robot.now
+
+
+def test_learnt_value_ends_the_vote_and_a_commit_that_was_not_handed_out() -> None:
+    robot = won("robot2", "robot1")
+    robot.rounds.on_learnt("merge", is_new_epoch=True, now=robot.now)
+    assert robot.rounds.due_commits(robot.now + 9.0) == []
+    assert (robot.task.commit, robot.task.proposals, robot.task.settled_at) == (None, {}, robot.now)
+
+
+def test_learnt_value_leaves_a_handed_out_commit_to_the_register() -> None:
+    """The register ends it (it knows whether it was ours): no second one may start meanwhile."""
+    robot = won("robot1", "robot2")
+    robot.rounds.due_commits(robot.now)
+    robot.rounds.on_learnt("merge", is_new_epoch=False, now=robot.now)
+    under_way = robot.task.commit
+    robot.rounds.on_commit_ended("merge")
+    assert under_way is not None
+    assert (robot.task.commit, robot.task.commit_at) == (None, math.inf)
+
+
+# --- edges -----------------------------------------------------------------------------------------------------------
+
+
+def test_edges_have_no_rounds() -> None:
+    robot = Robot("edge1")
+    assert robot.rounds.next_deadline() == math.inf
+    robot.rounds.hurry(robot.now)
+    assert robot.rounds.next_deadline() == math.inf
+    assert robot.tick(1.0) == ()
+    assert robot.rounds.vectors({"merge": robot.value}, robot.states, robot.now) == Utilities(voter="edge1", vectors=())
