@@ -11,7 +11,7 @@ import pytest
 
 from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
 from zsched.core.gateway import Gateway
-from zsched.core.instructions import AskUtilities, Instruction, PublishProposal, RecordStory
+from zsched.core.instructions import AskUtilities, Instruction, PublishProposal
 from zsched.core.messages import Utilities
 from zsched.core.model import (
     Allocation,

@@ -1,0 +1,275 @@
+"""Status: a node's state as a snapshot, the words for a quorum, the line for a service manager, the JSON's keys."""
+
+from __future__ import annotations
+
+from random import Random
+from typing import Any
+
+import pytest
+
+from zsched.core import events as ev
+from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, electorate_hash
+from zsched.core.messages import Learnt
+from zsched.core.model import (
+    Allocation,
+    Beat,
+    DeviceSample,
+    DurableState,
+    LinkSample,
+    LinkSource,
+    NodeKind,
+    Profile,
+    Proposal,
+    Tuning,
+    Weights,
+    WorkerLoad,
+    WorkerState,
+)
+from zsched.core.node import Node
+from zsched.core.plan import StreamCount
+from zsched.core.snapshot import SCHEMA, Snapshot
+from zsched.core.status import build_snapshot, status_line
+from zsched.lab.simulator import Simulator
+from zsched.report import snapshot_json
+
+ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
+TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
+FLEET = Fleet(
+    name="test",
+    timing=Timing(),
+    nodes=tuple(
+        NodeSpec(name=name, kind=NodeKind.ROBOT if name in ROBOTS else NodeKind.EDGE)
+        for name in sorted((*ROBOTS, *EDGES))
+    ),
+    tasks=tuple(
+        TaskSpec(name=name, candidates=EDGES, tuning=TUNING, worker=WorkerSpec(command=("work",)))
+        for name in ("merge", "merge2")
+    ),
+    electors=ROBOTS,
+)
+
+
+def make(me: str = "robot1", *, has_state: bool = True, alive: tuple[str, ...] = ROBOTS) -> Node:
+    """A node at 100 s that has heard the beats of ``alive``."""
+    hashed = electorate_hash(FLEET)
+    state = DurableState(fleet="test", node=me, incarnation=7, generation=0, hardware="", electorate=hashed)
+    node = Node(
+        fleet=FLEET,
+        me=me,
+        durable=state if has_state else None,
+        incarnation=7,
+        electorate=hashed,
+        rng=Random(1),
+        now=100.0,
+        version="1.2.3",
+    )
+    for name in alive:
+        if name != me:
+            beat = Beat(node=name, incarnation=3, sequence=1, loop_lag_s=0.0)
+            node.handle(ev.BeatReceived(beat=beat), 100.0)
+    return node
+
+
+def learn(node: Node, revision: int, owner: str | None, now: float = 100.0, *, epoch: int | None = None) -> None:
+    value = Allocation(
+        task="merge", revision=revision, epoch=revision if epoch is None else epoch, owner=owner, tuning=TUNING
+    )
+    node.handle(ev.LearntReceived(learnt=Learnt(node="robot2", values=(value,))), now)
+
+
+# --- the quorum ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("me", "has_state", "alive", "expected"),
+    [
+        ("robot1", True, ROBOTS, (3, True, "elector")),
+        ("robot1", True, ("robot2",), (2, True, "elector")),
+        ("robot1", True, (), (1, False, "elector")),
+        ("robot1", False, ROBOTS, (2, True, "lost_state")),
+        ("robot1", False, ("robot2",), (1, False, "lost_state")),
+        ("edge1", True, ROBOTS, (3, True, "no_elector")),
+        ("edge1", True, ("robot2", "edge2"), (1, False, "no_elector")),
+    ],
+)
+def test_quorum_counts_the_living_electors_and_says_what_this_node_is(
+    me: str, has_state: bool, alive: tuple[str, ...], expected: tuple[int, bool, str]
+) -> None:
+    node = make(me, has_state=has_state, alive=alive)
+    quorum = build_snapshot(node, 100.0).quorum
+    assert (quorum.electors, quorum.needed) == (3, 2)
+    assert (quorum.alive, quorum.ok, quorum.this_node) == expected
+    assert status_line(node).endswith("NO QUORUM") is not expected[1]
+
+
+def test_problems_say_what_is_missing_in_words() -> None:
+    node = make(has_state=False, alive=())
+    node.handle(ev.ProblemReported(source="profile", problem="no /proc"), 100.0)
+    assert build_snapshot(node, 100.0).problems == (
+        "profile: no /proc",
+        "no quorum: 0 of 3 electors alive, 2 needed",
+        "no valid state file: this node is no elector (see `zsched init --help`)",
+    )
+    assert build_snapshot(make(), 100.0).problems == ()
+
+
+# --- the line --------------------------------------------------------------------------------------------------------
+
+
+def test_line_names_role_peers_and_owners() -> None:
+    node = make()
+    learn(node, 3, "edge2")
+    assert status_line(node) == "robot robot1 · 3/5 nodes · merge@edge2 epoch 3 · merge2@nobody epoch 0"
+
+
+# --- tasks -----------------------------------------------------------------------------------------------------------
+
+
+def test_task_without_an_owner_says_none_and_has_no_age() -> None:
+    task = build_snapshot(make(), 130.0).tasks[0]
+    assert (task.owner, task.owner_state, task.since_s, task.phase) == (None, "none", None, "idle")
+    assert (task.revision, task.epoch, task.history) == (0, 0, ())
+
+
+def test_task_shows_its_owner_how_it_is_seen_since_when_and_the_handover() -> None:
+    node = make()
+    learn(node, 3, "edge2", 100.0)
+    task = build_snapshot(node, 101.5).tasks[0]
+    assert (task.owner, task.owner_state, task.since_s, task.phase) == ("edge2", "unknown", 1.5, "preparing")
+    assert [(past.revision, past.owner, past.age_s, past.reason) for past in task.history] == [
+        (3, "edge2", 1.5, "learnt from a peer")
+    ]
+
+
+def test_new_weights_are_history_and_no_move() -> None:
+    node = make()
+    learn(node, 3, "edge2", 100.0)
+    learn(node, 4, "edge2", 101.0, epoch=3)
+    task = build_snapshot(node, 101.0).tasks[0]
+    assert (task.revision, task.epoch, task.since_s) == (4, 3, 1.0)
+    assert [(past.revision, past.epoch) for past in task.history] == [(3, 3), (4, 3)]
+
+
+def test_history_is_bounded() -> None:
+    node = make()
+    for revision in range(1, 101):
+        learn(node, revision, "edge1")
+    history = build_snapshot(node, 100.0).tasks[0].history
+    assert len(history) <= 32
+    assert history[-1].revision == 100
+
+
+def test_streams_stand_under_their_own_task_only() -> None:
+    node = make()
+    counts = tuple(StreamCount(stream=name) for name in ("merge/in/0", "merge2/in/0", "merge/out/0", "other/in/0"))
+    node.handle(ev.StreamsCounted(counts=counts), 100.0)
+    merge, merge2 = build_snapshot(node, 100.0).tasks
+    assert [count.stream for count in merge.streams] == ["merge/in/0", "merge/out/0"]
+    assert [count.stream for count in merge2.streams] == ["merge2/in/0"]
+
+
+def test_vote_shows_who_proposed_whom() -> None:
+    node = make()
+    paper = Proposal(voter="robot2", task="merge", base_revision=0, candidate="edge1", aggregate=0.5)
+    node.handle(ev.ProposalReceived(proposal=paper), 100.0)
+    vote = build_snapshot(node, 100.5).tasks[0].vote
+    assert vote is not None
+    assert (vote.votes, vote.outcome, vote.winner) == ((("robot2", "edge1"),), "pending", None)
+    assert vote.age_s == pytest.approx(0.5)
+
+
+# --- nodes -----------------------------------------------------------------------------------------------------------
+
+
+def test_nodes_never_heard_are_listed_without_figures() -> None:
+    snapshot = build_snapshot(make(alive=("robot2",)), 100.0)
+    by_name = {node.name: node for node in snapshot.nodes}
+    assert list(by_name) == sorted((*ROBOTS, *EDGES))
+    edge = by_name["edge1"]
+    assert (edge.state, edge.age_s, edge.incarnation, edge.cpu_ratio) == ("unknown", None, None, None)
+    assert (by_name["robot2"].state, by_name["robot2"].incarnation) == ("alive", 3)
+    assert (by_name["robot1"].state, by_name["robot1"].incarnation) == ("alive", 7)
+
+
+def test_ratios_are_bounded_and_none_when_not_measured() -> None:
+    node = make()
+    profile = Profile(
+        node="edge1", incarnation=3, sequence=1, cpu_cores=2.0, cpu_used_cores=2.5, memory_mb=1000, memory_used_mb=None
+    )
+    node.handle(ev.ProfileReceived(profile=profile), 100.0)
+    edge = build_snapshot(node, 100.25).nodes[0]
+    assert (edge.cpu_ratio, edge.memory_ratio, edge.age_s) == (1.0, None, 0.25)
+
+
+def test_counters_of_all_parts_stand_in_one_sorted_list() -> None:
+    node = make()
+    node.handle(ev.FrameDropped(kind="beat", reason="size"), 100.0)
+    node.handle(ev.LearntReceived(learnt=Learnt(node="ghost", values=())), 100.0)
+    assert build_snapshot(node, 100.0).counters == (("dropped_beat_size", 1), ("learnt_foreign", 1))
+
+
+# --- the JSON --------------------------------------------------------------------------------------------------------
+
+
+def full() -> Snapshot:
+    """A robot in a running fleet, with every part of the status there."""
+    sim = Simulator(fleet=FLEET, seed=1)
+    sim.start()
+    assert sim.run_until(lambda: all(sim.agreed(task.name) for task in FLEET.tasks), 10)
+    sim.run(2.0)
+    node = sim.node("robot1")
+    count = StreamCount(stream="merge/in/0", messages=1, bytes=2, drops=(("loop", 1),), last_seen_s=0.1)
+    node.handle(ev.StreamsCounted(counts=(count,)), sim.now)
+    load = WorkerLoad(task="merge", state=WorkerState.READY, cpu_cores=0.1, memory_mb=10.0)
+    device = DeviceSample(cpu_cores=4, cpu_used_cores=1, memory_mb=4000, memory_used_mb=100, workers=(load,))
+    link = LinkSample(source=LinkSource.WIRELESS, rssi_dbm=-50.0)
+    node.handle(ev.ProfileSampled(device=device, links=(link,)), sim.now + 2)
+    return build_snapshot(node, sim.now + 2)
+
+
+def keys(value: Any, path: str = "") -> set[str]:
+    """The paths of all keys; what a node, a task or a counter is called counts as ``*``."""
+    if isinstance(value, list):
+        return {found for item in value for found in keys(item, f"{path}[]")}
+    if not isinstance(value, dict):
+        return set()
+    found = set()
+    for name, item in value.items():
+        is_name = path in {"counters", "tasks[].streams[].drops"} or name in (*ROBOTS, *EDGES)
+        here = f"{path}.{'*' if is_name else name}".lstrip(".")
+        found |= {here} | keys(item, here)
+    return found
+
+
+GOLDEN = {
+    "": "schema version fleet node kind incarnation up_s loop_lag_s quorum nodes tasks counters problems",
+    "counters": "*",
+    "quorum": "electors needed alive ok this_node",
+    "nodes[]": "name kind state age_s incarnation cpu_cores cpu_used_cores cpu_ratio memory_mb memory_used_mb "
+    "memory_ratio links workers draining",
+    "nodes[].links[]": "source peer rssi_dbm bitrate_mbps retry_ratio",
+    "nodes[].workers[]": "task state cpu_cores memory_mb",
+    "tasks[]": "name owner epoch revision since_s owner_state phase tuning candidates decision vote streams history "
+    "problems",
+    "tasks[].tuning": "weights bonus time_to_trigger_s cool_down_s aggregate",
+    "tasks[].tuning.weights": "cpu memory network",
+    "tasks[].decision": "outcome winner reason age_s aggregates utilities vetoed silent",
+    "tasks[].decision.aggregates": "*",
+    "tasks[].decision.utilities": "*",
+    "tasks[].decision.utilities.*": "*",
+    "tasks[].decision.utilities.*.*": "value cpu memory network reachable",
+    "tasks[].vote": "base_revision votes outcome winner age_s",
+    "tasks[].vote.votes": "*",
+    "tasks[].streams[]": "stream messages bytes drops last_seen_s",
+    "tasks[].streams[].drops": "*",
+    "tasks[].history[]": "epoch revision owner age_s reason",
+}
+
+
+def test_keys_of_the_json_only_grow_within_a_version() -> None:
+    """Who reads version 1 finds every key that has ever been there; new ones are welcome."""
+    assert SCHEMA == "zsched.status/1"
+    body = snapshot_json(full())
+    body["counters"]["profile_stale"] = 1
+    expected = {f"{path}.{name}".lstrip(".") for path, names in GOLDEN.items() for name in names.split()}
+    assert expected - keys(body) == set()
