@@ -27,7 +27,7 @@ WAN: Final = replace(
     gather_s=0.5,
     ballot_s=1.0,
     stagger_s=0.05,
-    lease_s=4.0,
+    lease_s=3.0,
 )
 PROFILES: Final[Mapping[str, Timing]] = {profile.name: profile for profile in (WIRED, WIFI, WAN)}
 
@@ -87,6 +87,13 @@ _RELATIONS: Final = (
         "suspect_s",
         lambda t: t.suspect_s,
         "a silent owner's lease must not outlast the time in which it is found to be silent",
+    ),
+    _Relation(
+        "lease_s",
+        "<=",
+        "0.75 x zenoh_lease_s",
+        lambda t: 0.75 * t.zenoh_lease_s,
+        "a frozen worker's token goes after that; what it might still send must be past its lease by then",
     ),
 )
 
