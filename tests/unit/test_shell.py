@@ -1,0 +1,390 @@
+"""The shell: each instruction reaches its adapter in order, failures become events, operators get answers."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from zsched import shell as shell_module
+from zsched.adapters.state_file import StateFile
+from zsched.adapters.worker_supervisor import WorkerContext, WorkerSupervisor
+from zsched.core import events as ev
+from zsched.core import instructions as do
+from zsched.core.fleet import WorkerSpec
+from zsched.core.messages import (
+    Accept,
+    Accepted,
+    CommandOutcome,
+    CommandResult,
+    Learnt,
+    Prepare,
+    SetWeights,
+    Utilities,
+)
+from zsched.core.model import (
+    Acceptance,
+    Allocation,
+    Ballot,
+    Beat,
+    DurableState,
+    Profile,
+    Proposal,
+    Tuning,
+    Weights,
+    WorkerState,
+)
+from zsched.core.plan import Role, RoutePhase, RoutePlan, WorkerRole
+from zsched.core.relay_protocol import RelayStarted, WorkerSeen
+from zsched.errors import AdapterError, WireError
+from zsched.shell import INBOX_LIMIT, LOCAL_REQUESTS_FROM, PROBLEM_TTL_S, Desk, Inbox, Shell
+
+TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
+BALLOT = Ballot(counter=1, node="robot1", incarnation=1)
+VALUE = Allocation(task="merge", revision=1, epoch=1, owner="edge1", tuning=TUNING)
+BEAT = Beat(node="robot1", incarnation=1, sequence=1, loop_lag_s=0.0)
+PROFILE = Profile(
+    node="robot1", incarnation=1, sequence=1, cpu_cores=1, cpu_used_cores=None, memory_mb=10, memory_used_mb=None
+)
+PROPOSAL = Proposal(voter="robot1", task="merge", base_revision=0, candidate="edge1", aggregate=0.5)
+PREPARE = Prepare(task="merge", ballot=BALLOT, electorate="e")
+ACCEPT = Accept(task="merge", acceptance=Acceptance(ballot=BALLOT, value=VALUE), electorate="e")
+LEARNT = Learnt(node="robot1", values=(VALUE,))
+UTILITIES = Utilities(voter="robot1", vectors=())
+ANSWER = Accepted(elector="robot1", task="merge", ballot=BALLOT)
+RESULT = CommandResult(outcome=CommandOutcome.OK, detail="done", revision=4)
+PLAN = RoutePlan(task="merge", phase=RoutePhase.CLOSE, current=None)
+ROLE = Role(task="merge", role=WorkerRole.IDLE)
+STATE = DurableState(fleet="f", node="robot1", incarnation=3, generation=0, hardware="", electorate="e")
+
+
+def until(condition: Callable[[], Any], what: str, deadline_s: float = 10.0) -> Any:
+    end = time.monotonic() + deadline_s
+    while time.monotonic() < end:
+        if value := condition():
+            return value
+        time.sleep(0.002)
+    raise AssertionError(f"not within {deadline_s} s: {what}")
+
+
+class Adapter:
+    """Stands for the bus, the relay's handle and the supervisor, none of which can be made to fail: notes every call,
+    and raises what ``broken`` holds for its name."""
+
+    def __init__(self, calls: list[tuple[Any, ...]]) -> None:
+        self.calls = calls
+        self.broken: dict[str, Exception] = {}
+
+    def __getattr__(self, name: str) -> Callable[..., None]:
+        def call(*arguments: object) -> None:
+            self.calls.append((name, *arguments))
+            if name in self.broken:
+                raise self.broken[name]
+
+        return call
+
+
+class House:
+    """A shell with stand-in adapters, a real state file and a real inbox."""
+
+    def __init__(self, folder: Path) -> None:
+        self.calls: list[tuple[Any, ...]] = []
+        self.adapter = cast("Any", Adapter(self.calls))
+        self.inbox = Inbox()
+        self.state_file = StateFile(folder, fleet="f", node="robot1", hardware="")
+        self.desk = Desk("robot1", self.inbox, self.adapter)
+        self.shell = Shell(
+            node="robot1", inbox=self.inbox, bus=self.adapter, state_file=self.state_file, desk=self.desk
+        )
+        self.shell.relay = self.shell.supervisor = self.adapter
+
+    def events(self) -> list[ev.Event]:
+        found = []
+        while (event := self.inbox.take(0)) is not None:
+            found.append(event)
+        return found
+
+
+@pytest.fixture
+def house(tmp_path: Path) -> Iterator[House]:
+    made = House(tmp_path)
+    with made.state_file:
+        yield made
+
+
+# --- instructions ----------------------------------------------------------------------------------------------------
+
+EVERY: dict[do.Instruction, tuple[Any, ...]] = {
+    do.PublishBeat(beat=BEAT): ("publish", "beat", BEAT),
+    do.PublishProfile(profile=PROFILE): ("publish", "profile", PROFILE),
+    do.PublishProposal(proposal=PROPOSAL): ("publish", "proposal", PROPOSAL),
+    do.PublishLearnt(learnt=LEARNT): ("publish", "allocation", LEARNT),
+    do.AskUtilities(gather=3, deadline_s=0.1): ("ask_utilities", 3, 0.1),
+    do.SendPrepare(prepare=PREPARE, deadline_s=0.2): ("ask_electors", PREPARE, 0.2),
+    do.SendAccept(accept=ACCEPT, deadline_s=0.2): ("ask_electors", ACCEPT, 0.2),
+    do.AskLearnt(peer="edge1", deadline_s=0.2): ("ask_learnt", "edge1", 0.2),
+    do.AnswerUtilities(request=1, utilities=UTILITIES): ("answer", 1, UTILITIES),
+    do.AnswerElection(request=2, answer=ANSWER): ("answer", 2, ANSWER),
+    do.AnswerLearnt(request=3, learnt=LEARNT): ("answer", 3, LEARNT),
+    do.AnswerCommand(request=4, result=RESULT): ("answer", 4, RESULT),
+    do.StartWorker(task="merge"): ("start", "merge"),
+    do.StopWorker(task="merge"): ("stop", "merge"),
+    do.SetRole(role=ROLE): ("set_role", ROLE),
+    do.ApplyRoutes(plan=PLAN): ("apply", PLAN),
+}
+
+
+def test_every_instruction_reaches_its_adapter_in_order(house: House) -> None:
+    house.shell.carry_out((do.PersistState(state=STATE), *EVERY))
+    assert house.calls == list(EVERY.values())
+    assert house.state_file.load().state == STATE
+    assert house.events() == []
+
+
+def test_stories_go_to_the_logger_of_their_stage(house: House, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    house.shell.carry_out(
+        (
+            do.RecordStory(stage="vote", text="won", task="merge", epoch=3),
+            do.RecordStory(stage="membership", text="edge1 alive -> gone"),
+        )
+    )
+    assert [(line.name, line.getMessage()) for line in caplog.records] == [
+        ("zsched.vote", "task=merge epoch=3 won"),
+        ("zsched.membership", "edge1 alive -> gone"),
+    ]
+
+
+# --- failures --------------------------------------------------------------------------------------------------------
+
+
+def test_refused_write_drops_the_rest_and_is_the_very_next_event(house: House) -> None:
+    house.inbox.post(ev.StatusAsked(request=1))
+    house.state_file.release()  # a save without the lock is refused
+    house.shell.carry_out((do.PersistState(state=STATE), *EVERY))
+    assert house.calls == []
+    first, second = house.events()
+    assert isinstance(first, ev.PersistFailed)
+    assert "lock" in first.reason
+    assert second == ev.StatusAsked(request=1)
+
+
+def test_state_too_large_to_write_is_a_refused_write(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
+    def too_large(_state: DurableState) -> None:
+        raise WireError("size", "state: too many bytes")
+
+    monkeypatch.setattr(house.state_file, "save", too_large)
+    house.shell.carry_out((do.PersistState(state=STATE), *EVERY))
+    assert house.calls == []
+    assert house.events() == [ev.PersistFailed(reason="size: state: too many bytes")]
+
+
+@pytest.mark.parametrize("error", [AdapterError("session is closed"), WireError("size", "beat")])
+def test_other_failures_are_reported_and_the_rest_goes_on(house: House, error: Exception) -> None:
+    house.adapter.broken["publish"] = error
+    house.shell.carry_out((do.PublishBeat(beat=BEAT), do.StartWorker(task="merge")))
+    assert house.calls[-1] == ("start", "merge")
+    assert house.events() == [ev.ProblemReported(source="PublishBeat", problem=str(error))]
+
+
+def test_problem_ends_when_the_same_instruction_works_again(house: House) -> None:
+    house.adapter.broken["publish"] = AdapterError("closed")
+    house.shell.carry_out((do.PublishBeat(beat=BEAT),))
+    house.events()
+    house.shell.carry_out((do.StartWorker(task="merge"),))
+    assert house.events() == [], "another one's success says nothing"
+    house.adapter.broken.clear()
+    house.shell.carry_out((do.PublishBeat(beat=BEAT), do.PublishBeat(beat=BEAT)))
+    assert house.events() == [ev.ProblemReported(source="PublishBeat", problem=None)]
+
+
+def test_problem_of_an_instruction_that_never_comes_again_ends_by_its_age(
+    house: House, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = 100.0
+    monkeypatch.setattr(shell_module, "monotonic_s", lambda: now)
+    house.adapter.broken["answer"] = AdapterError("gone")
+    house.shell.carry_out((do.AnswerCommand(request=4, result=RESULT),))
+    now += PROBLEM_TTL_S - 1
+    house.shell.carry_out((do.PublishBeat(beat=BEAT),))
+    assert len(house.events()) == 1
+    now += 2
+    house.shell.carry_out((do.PublishBeat(beat=BEAT),))
+    assert house.events() == [ev.ProblemReported(source="AnswerCommand", problem=None)]
+
+
+def test_inbox_is_bounded_and_always_takes_a_stop() -> None:
+    inbox = Inbox()
+    for number in range(INBOX_LIMIT + 5):
+        inbox.post(ev.StatusAsked(request=number))
+    inbox.post(ev.StopRequested())
+    assert inbox.overflowed == 5
+    taken = [inbox.take(0) for _ in range(INBOX_LIMIT + 1)]
+    assert taken[0] == ev.StatusAsked(request=0)
+    assert taken[-1] == ev.StopRequested()
+    assert inbox.take(0) is None
+    assert inbox.take(-1.0) is None
+
+
+# --- workers ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def supervised(house: House) -> Iterator[House]:
+    """With a real supervisor: ``merge`` is a process that ends when it is told, ``foreign`` somebody else's."""
+    command = (sys.executable, "-c", "import sys; sys.stdin.close(); import time; time.sleep(600)")
+    supervisor = WorkerSupervisor(
+        specs={"merge": WorkerSpec(command=command), "foreign": WorkerSpec()},
+        context=WorkerContext(fleet="f", node="robot1", incarnation=1),
+        events=house.shell,
+    )
+    house.shell.supervisor = supervisor
+    try:
+        yield house
+    finally:
+        supervisor.close(1.0)
+
+
+def seen(task: str, life: int | str, *, is_present: bool = True, node: str = "robot1") -> WorkerSeen:
+    return WorkerSeen(node=node, task=task, incarnation=str(life), is_present=is_present)
+
+
+def states(house: House) -> list[WorkerState]:
+    return [event.state for event in house.events() if isinstance(event, ev.WorkerChanged)]
+
+
+def test_token_of_the_running_worker_makes_it_ready_and_its_end_starting(supervised: House) -> None:
+    shell = supervised.shell
+    shell.carry_out((do.StartWorker(task="merge"),))
+    life = until(lambda: shell._lives.get("merge"), "the worker runs")
+    shell.on_report(seen("merge", life))
+    shell.on_report(seen("merge", life, is_present=False))
+    assert states(supervised) == [WorkerState.STARTING, WorkerState.READY, WorkerState.STARTING]
+
+
+def test_real_end_of_a_worker_is_stopped_and_its_late_token_says_nothing(supervised: House) -> None:
+    shell = supervised.shell
+    shell.carry_out((do.StartWorker(task="merge"),))
+    life = until(lambda: shell._lives.get("merge"), "the worker runs")
+    shell.carry_out((do.StopWorker(task="merge"),))
+    until(lambda: shell._lives.get("merge") == 0, "the worker has ended")
+    shell.on_report(seen("merge", life))
+    shell.on_report(seen("merge", life, is_present=False))
+    assert states(supervised) == [WorkerState.STARTING, WorkerState.STOPPED]
+
+
+def test_token_that_goes_after_the_worker_failed_leaves_it_failed(supervised: House) -> None:
+    """Else a broken worker would look startable, and its node would be eligible again."""
+    shell = supervised.shell
+    shell.on_started("merge", 1, 100001)
+    shell.on_exited("merge", 100001, 1, "")
+    shell.on_failed("merge", "exit code 1")
+    shell.on_report(seen("merge", 100001, is_present=False))
+    assert states(supervised) == [WorkerState.STARTING, WorkerState.STOPPED, WorkerState.FAILED]
+
+
+def test_lives_of_an_earlier_process_are_ignored(supervised: House) -> None:
+    shell = supervised.shell
+    shell.on_started("merge", 1, 100002)
+    shell.on_report(seen("merge", 100001))
+    shell.on_report(seen("merge", 100001, is_present=False))
+    shell.on_exited("merge", 100001, 0, "late")
+    assert states(supervised) == [WorkerState.STARTING]
+
+
+@pytest.mark.parametrize("report", [seen("merge", 5, node="robot2"), seen("merge", "x"), seen("unknown", 5)])
+def test_tokens_that_are_not_ours_are_ignored_and_do_no_harm(supervised: House, report: WorkerSeen) -> None:
+    """A token of an unknown task must not end the supervisor's thread."""
+    shell = supervised.shell
+    shell.on_report(report)
+    shell.carry_out((do.StartWorker(task="merge"),))
+    until(lambda: shell._lives.get("merge"), "the supervisor still starts workers")
+    assert states(supervised) == [WorkerState.STARTING]
+
+
+def test_foreign_worker_comes_and_goes_by_its_token(supervised: House) -> None:
+    supervised.shell.on_report(seen("foreign", 1))
+    supervised.shell.on_report(seen("foreign", 1, is_present=False))
+    assert states(supervised) == [WorkerState.READY, WorkerState.STOPPED]
+
+
+def test_relays_other_reports_are_events_as_they_are(house: House) -> None:
+    house.shell.on_report(RelayStarted(pid=1, zid="z"))
+    house.shell.on_report(ev.SlotReady(task="merge", epoch=1))
+    assert house.events() == [ev.SlotReady(task="merge", epoch=1)]
+
+
+# --- the desk --------------------------------------------------------------------------------------------------------
+
+
+def test_desk_refuses_what_is_no_request(house: House) -> None:
+    weights = {"verb": "weights", "task": "merge", "cpu": 1, "memory": 0, "network": 0}
+    for request, says in (
+        ({"verb": "fly"}, "unknown verb 'fly'; known: status, weights"),
+        ({"verb": "status", "node": 5}, "node: 5 is not a name"),
+        ({"verb": "status", "node": "*"}, "node: '*' is not a name"),
+        ({"verb": "status", "node": "a/b"}, "node: 'a/b' is not a name"),
+        ({"verb": "weights"}, "weights: 'cpu' is missing"),
+        ({**weights, "task": "No Name"}, "weights: weights.task: 'No Name' is not a name"),
+        ({**weights, "cpu": "much"}, "weights: could not convert"),
+        ({**weights, "cpu": float("nan")}, "weights: expected finite numbers"),
+        ({**weights, "cpu": [1]}, "weights: float() argument"),
+        ({**weights, "base_revision": "3"}, "weights: base_revision: expected a whole number, not '3'"),
+        ({**weights, "base_revision": True}, "weights: base_revision: expected a whole number, not True"),
+    ):
+        answer = house.desk.answer(request)
+        assert answer["error"].startswith(says), answer
+    assert house.events() == []
+    assert house.calls == []
+
+
+def test_desk_answers_several_at_once_each_with_its_own(house: House) -> None:
+    answers: dict[int, dict[str, Any]] = {}
+
+    def ask(number: int) -> None:
+        weights = {"cpu": 1.0, "memory": 0.0, "network": 0.0, "base_revision": number}
+        answers[number] = house.desk.answer({"verb": "weights", "task": "merge", **weights})
+
+    threads = [threading.Thread(target=ask, args=(number,)) for number in range(8)]
+    for thread in threads:
+        thread.start()
+    asked = [until(lambda: house.inbox.take(0.1), "a question") for _ in threads]
+    for event in reversed(asked):
+        assert event.request >= LOCAL_REQUESTS_FROM
+        result = CommandResult(outcome=CommandOutcome.OK, detail="done", revision=event.command.base_revision)
+        house.shell.carry_out((do.AnswerCommand(request=event.request, result=result),))
+    for thread in threads:
+        thread.join(5)
+    assert answers == {number: {"outcome": "ok", "detail": "done", "revision": number} for number in range(8)}
+    assert house.calls == [], "nothing went over the bus"
+
+
+def test_desk_gives_up_on_a_loop_that_does_not_answer(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shell_module, "ANSWER_TIMEOUT_S", 0.05)
+    assert house.desk.answer({"verb": "status"}) == {
+        "error": "the decision loop of robot1 did not answer within 0.05 s"
+    }
+    (asked,) = house.events()
+    assert isinstance(asked, ev.StatusAsked)
+    house.shell.carry_out((do.AnswerCommand(request=asked.request, result=RESULT),))  # too late: no error
+    assert house.events() == []
+
+
+def test_desk_asks_other_nodes_over_the_bus_and_hands_its_errors_on(house: House) -> None:
+    def ask_node(node: str, command: SetWeights | None) -> CommandResult:
+        if node == "edge2":
+            raise AdapterError("edge2 did not answer within 3 s; is it up and reachable?")
+        assert command is not None
+        return RESULT
+
+    house.desk._bus = SimpleNamespace(ask_node=ask_node)  # type: ignore[assignment]
+    weights = {"verb": "weights", "task": "merge", "cpu": 1, "memory": 0, "network": 0}
+    assert house.desk.answer({**weights, "node": "edge1"})["outcome"] == "ok"
+    assert "edge2 did not answer" in house.desk.answer({"verb": "status", "node": "edge2"})["error"]
+    assert house.events() == [], "the loop is not asked for another node"
