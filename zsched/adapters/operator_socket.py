@@ -67,7 +67,7 @@ class OperatorSocket:
             except (ConnectionRefusedError, FileNotFoundError):
                 self.path.unlink(missing_ok=True)
                 return
-            except TimeoutError:
+            except (BlockingIOError, TimeoutError):
                 pass  # somebody listens, and is busy
         raise AdapterError(f"a daemon answers on {self.path} already; stop it or choose another --runtime-dir")
 
