@@ -135,7 +135,7 @@ def ask(path: Path, request: Json, timeout_s: float = 5.0) -> Json:
             connection.sendall(json.dumps(request).encode() + b"\n")
             with connection.makefile("rb") as lines:
                 answer = json.loads(lines.readline())
-    except TimeoutError as error:
+    except (BlockingIOError, TimeoutError) as error:  # the first: its queue of connections is full
         raise AdapterError(f"the daemon at {path} did not answer within {timeout_s:g} s; is it wedged?") from error
     except (OSError, ValueError) as error:
         detail = getattr(error, "strerror", None) or error
