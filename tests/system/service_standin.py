@@ -87,11 +87,13 @@ def main() -> int:
         sample: dict[str, object] = {}
         while not stop:
             pid = supervisor.pids().get("merge")
-            sample = asdict(profiler.sample({"merge": (WorkerState.READY, pid)}))
+            measured = profiler.sample({"merge": (WorkerState.READY, pid)})
+            sample = asdict(measured)
             link = reader.read()
             seen = {"incarnation": state.incarnation, "sample": sample, "link": link.source, "problem": reader.problem}
             Path(os.environ["RUNTIME_DIRECTORY"], "daemon.txt").write_text(json.dumps(seen), encoding="utf-8")
-            is_done = Path(os.environ["RUNTIME_DIRECTORY"], "worker.txt").exists()
+            has_load = any(load.cpu_cores is not None for load in measured.workers)  # there is none on a first look
+            is_done = has_load and Path(os.environ["RUNTIME_DIRECTORY"], "worker.txt").exists()
             notifier.status(f"stand-in · incarnation {state.incarnation} · worker {'works' if is_done else 'starts'}")
             notifier.watchdog()
             time.sleep(min(0.2, interval_s))

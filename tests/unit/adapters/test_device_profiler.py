@@ -188,11 +188,15 @@ def test_real_group_is_what_its_processes_measure() -> None:
         pytest.skip(reason)
     group = LimitedGroup.create(f"zsched-test-profile-{os.getpid()}", cpu_cores=0.3, memory_mb=256)
     try:
+        waits = "import sys\nsys.stdin.readline()\n"  # its child must not be born before it is in the group
         with subprocess.Popen(
-            [sys.executable, "-c", BUSY_TREE], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE
+            [sys.executable, "-c", waits + BUSY_TREE], stdin=subprocess.PIPE, stdout=subprocess.PIPE
         ) as worker:
+            assert worker.stdin is not None
             assert worker.stdout is not None
             group.add(worker.pid)
+            worker.stdin.write(b"go\n")
+            worker.stdin.flush()
             try:
                 worker.stdout.readline()
                 profiler = DeviceProfiler(pid=str(worker.pid))
