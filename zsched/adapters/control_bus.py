@@ -40,6 +40,7 @@ from zsched.keyspace import Keyspace, parse
 QUESTION_TTL_S = 5.0
 MAX_QUESTIONS = 1024
 OPERATOR_TIMEOUT_S = 3.0
+CLOSE_S = 0.5
 
 Post = Callable[[ev.Event], None]
 log = logging.getLogger("zsched.bus")
@@ -158,14 +159,24 @@ class ControlBus:
         )
 
     def close(self) -> None:
-        """Withdraw the token, then close; safe to call twice."""
+        """Withdraw the token, then close; safe to call twice, returns within `CLOSE_S`.
+
+        zenoh waits ten seconds for a frozen peer whose buffers are full; the thread that does ends with the process.
+        """
         session, self._session = self._session, None
         if session is None:
             return
-        for entity in reversed(self._kept):
+        kept, self._kept, self._publishers = self._kept, [], {}
+        closing = threading.Thread(target=self._close, args=(session, kept), name="zsched-bus-close", daemon=True)
+        closing.start()
+        closing.join(CLOSE_S)
+        if closing.is_alive():
+            log.warning("close_abandoned why=a peer does not read")
+
+    def _close(self, session: zenoh.Session, kept: list[Any]) -> None:
+        for entity in reversed(kept):
             with contextlib.suppress(zenoh.ZError):
                 entity.undeclare()
-        self._kept, self._publishers = [], {}
         self._questions.clear()
         with contextlib.suppress(zenoh.ZError):
             session.close()
@@ -348,7 +359,7 @@ class ControlBus:
             selector, payload = self._keys.status(node, self._node), None
         else:
             selector, payload = self._keys.command(node, self._node), wire.encode(command)
-        answer: Snapshot | CommandResult
+        kind: type[Snapshot | CommandResult] = Snapshot if command is None else CommandResult
         for reply in self._session.get(
             selector,
             payload=payload,
@@ -358,11 +369,32 @@ class ControlBus:
             if reply.ok is None:
                 continue
             try:
-                if command is None:
-                    answer = wire.decode(reply.ok.payload.to_bytes(), Snapshot)
-                else:
-                    answer = wire.decode(reply.ok.payload.to_bytes(), CommandResult)
+                return wire.decode(reply.ok.payload.to_bytes(), kind)
             except WireError as error:
                 raise AdapterError(f"{node} answered something else ({error}); is it another version?") from error
-            return answer
         raise AdapterError(f"{node} did not answer within {OPERATOR_TIMEOUT_S:g} s; is it up and reachable?")
+
+
+def ask_fleet(fleet: str, asker: NodeId, zenoh_config: str, timeout_s: float = 1.0) -> tuple[Snapshot, ...]:
+    """The status of every node that can be reached, asked from outside of any daemon (`zsched init`).
+
+    ``zenoh_config`` is a client's; when nobody listens there, nobody answers. Blocks up to ``timeout_s`` and the time
+    that connecting takes.
+    """
+    zenoh.init_log_from_env_or("off")
+    found = []
+    try:
+        with zenoh.open(zenoh.Config.from_json5(zenoh_config)) as session:
+            replies = session.get(
+                Keyspace(fleet).status("*", asker),
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                timeout=timeout_s,
+            )
+            for reply in replies:
+                if reply.ok is not None:
+                    with contextlib.suppress(WireError):
+                        found.append(wire.decode(reply.ok.payload.to_bytes(), Snapshot))
+    except zenoh.ZError:
+        return ()  # nobody listens
+    return tuple(found)

@@ -1,0 +1,349 @@
+"""The control session over real zenoh on loopback: every put and question arrives as its event, nothing hangs."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any, TypeVar
+
+import pytest
+import zenoh
+
+from zsched import wire
+from zsched.adapters import control_bus
+from zsched.adapters.control_bus import ControlBus, Questions
+from zsched.core import events as ev
+from zsched.core.fleet import Timing
+from zsched.core.messages import (
+    Accept,
+    Accepted,
+    CommandOutcome,
+    CommandResult,
+    Learnt,
+    Prepare,
+    Promise,
+    Refusal,
+    Refused,
+    SetWeights,
+    Utilities,
+)
+from zsched.core.model import Acceptance, Allocation, Ballot, Beat, Profile, Proposal, Tuning, Weights
+from zsched.core.snapshot import QuorumStatus, Snapshot
+from zsched.errors import AdapterError
+from zsched.zenoh_config import control_config
+
+T = TypeVar("T")
+TIMING = Timing()
+TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
+VALUE = Allocation(task="merge", revision=1, epoch=1, owner="edge1", tuning=TUNING)
+BALLOT = Ballot(counter=1, node="a", incarnation=1)
+PREPARE = Prepare(task="merge", ballot=BALLOT, electorate="e")
+ACCEPT = Accept(task="merge", acceptance=Acceptance(ballot=BALLOT, value=VALUE), electorate="e")
+BEAT = Beat(node="a", incarnation=1, sequence=1, loop_lag_s=0.0)
+PROFILE = Profile(
+    node="a", incarnation=1, sequence=1, cpu_cores=1, cpu_used_cores=None, memory_mb=10, memory_used_mb=None
+)
+PROPOSAL = Proposal(voter="a", task="merge", base_revision=0, candidate="edge1", aggregate=0.5)
+LEARNT = Learnt(node="a", values=(VALUE,))
+SNAPSHOT = Snapshot(
+    schema="zsched.status/1",
+    version="1",
+    fleet="f",
+    node="b",
+    kind="robot",
+    incarnation=1,
+    up_s=1.0,
+    loop_lag_s=0.0,
+    quorum=QuorumStatus(electors=3, needed=2, alive=3, ok=True, this_node="elector"),
+    nodes=(),
+    tasks=(),
+)
+RESULT = CommandResult(outcome=CommandOutcome.OK, detail="done", revision=4)
+COMMAND = SetWeights(task="merge", cpu=1.0, memory=0.0, network=0.0)
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+def until(condition: Callable[[], Any], what: str, deadline_s: float = 10.0) -> Any:
+    end = time.monotonic() + deadline_s
+    while time.monotonic() < end:
+        if value := condition():
+            return value
+        time.sleep(0.002)
+    raise AssertionError(f"not within {deadline_s} s: {what}")
+
+
+class Peer:
+    """One bus and the events it posted."""
+
+    def __init__(self, name: str, port: int, hub: int | None, incarnation: int = 1) -> None:
+        self.events: list[ev.Event] = []
+        listen, connect = f"tcp/127.0.0.1:{port}", () if hub is None else (f"tcp/127.0.0.1:{hub}",)
+        config = control_config(listen=(listen,), connect=connect, timing=TIMING)
+        self.port, self.name = port, name
+        self.bus = ControlBus(
+            fleet="f", node=name, incarnation=incarnation, zenoh_config=config, post=self.events.append
+        )
+
+    def of(self, kind: type[T]) -> list[T]:
+        return [event for event in tuple(self.events) if isinstance(event, kind)]
+
+    def next(self, kind: type[T]) -> T:
+        """The next event of a kind, taken out."""
+        event: T = until(lambda: next(iter(self.of(kind)), None), f"{kind.__name__} at {self.name}: {self.events}")
+        self.events.remove(event)  # type: ignore[arg-type]
+        return event
+
+    def sees(self, *names: str) -> bool:
+        return set(names) <= {event.node for event in self.of(ev.TokenSeen)}
+
+
+@pytest.fixture(scope="module")
+def trio() -> Iterator[tuple[Peer, Peer, Peer]]:
+    """Three buses, meshed by gossip over the first."""
+    hub = free_port()
+    peers = (Peer("a", hub, None), Peer("b", free_port(), hub), Peer("c", free_port(), hub))
+    try:
+        for peer in peers:
+            peer.bus.open()
+        until(lambda: all(peer.sees("a", "b", "c") for peer in peers), "everybody's token everywhere")
+        until(lambda: all(peer.bus.peers() == 2 for peer in peers), "a full mesh")
+        yield peers
+    finally:
+        for peer in peers:
+            peer.bus.close()
+
+
+@pytest.fixture
+def mesh(trio: tuple[Peer, Peer, Peer]) -> tuple[Peer, Peer, Peer]:
+    for peer in trio:
+        peer.events.clear()
+    return trio
+
+
+@pytest.fixture(scope="module")
+def stranger(trio: tuple[Peer, Peer, Peer]) -> Iterator[zenoh.Session]:
+    """A plain session on the same network that says what it likes."""
+    hub = f"tcp/127.0.0.1:{trio[0].port}"
+    session = zenoh.open(zenoh.Config.from_json5(control_config(listen=(), connect=(hub,), timing=TIMING)))
+    try:
+        until(lambda: all(peer.bus.peers() == 3 for peer in trio), "the stranger is in the mesh")
+        yield session
+    finally:
+        session.close()
+
+
+# --- puts ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "event"),
+    [
+        ("beat", BEAT, ev.BeatReceived(beat=BEAT)),
+        ("profile", PROFILE, ev.ProfileReceived(profile=PROFILE)),
+        ("proposal", PROPOSAL, ev.ProposalReceived(proposal=PROPOSAL)),
+        ("allocation", LEARNT, ev.LearntReceived(learnt=LEARNT)),
+    ],
+)
+def test_every_put_arrives_everywhere_but_at_its_sender(
+    mesh: tuple[Peer, Peer, Peer], kind: str, value: object, event: ev.Event
+) -> None:
+    a, b, c = mesh
+    a.bus.publish(kind, value)
+    assert b.next(type(event)) == event
+    assert c.next(type(event)) == event
+    assert a.events == []
+
+
+def test_frame_that_is_too_large_to_send_is_an_error_of_the_adapter(mesh: tuple[Peer, Peer, Peer]) -> None:
+    large = replace(BEAT, suspects=tuple("x" * 63 for _ in range(300)))
+    with pytest.raises(AdapterError, match="cannot publish beat: size"):
+        mesh[0].bus.publish("beat", large)
+
+
+@pytest.mark.parametrize(
+    ("key", "payload", "dropped"),
+    [
+        ("beat/b", wire.encode(BEAT), ("beat", "foreign")),
+        ("profile/b", wire.encode(PROFILE), ("profile", "foreign")),
+        ("proposal/b", wire.encode(PROPOSAL), ("proposal", "foreign")),
+        ("allocation/b", wire.encode(LEARNT), ("allocation", "foreign")),
+        ("beat/a", wire.encode(PROFILE), ("beat", "kind")),
+        ("beat/a", b"\xff\x00garbage", ("beat", "garbage")),
+        ("beat/a", b"", ("beat", "garbage")),
+        ("beat/a", b"\x00" * 9000, ("beat", "size")),
+        ("nonsense/a", wire.encode(BEAT), ("key", "unknown")),
+        ("beat/No.Name", wire.encode(BEAT), ("key", "unknown")),
+    ],
+)
+def test_bad_put_is_dropped_with_its_reason_and_nothing_else(
+    mesh: tuple[Peer, Peer, Peer], stranger: zenoh.Session, key: str, payload: bytes, dropped: tuple[str, str]
+) -> None:
+    _, b, _ = mesh
+    stranger.put(f"@zsched/f/{key}", payload)
+    frame = b.next(ev.FrameDropped)
+    assert (frame.kind, frame.reason) == dropped
+    assert b.events == []
+
+
+# --- questions -------------------------------------------------------------------------------------------------------
+
+
+def test_gather_asks_every_other_node_and_brings_their_answers(mesh: tuple[Peer, Peer, Peer]) -> None:
+    a, b, c = mesh
+    a.bus.ask_utilities(7, 2.0)
+    for peer in (b, c):
+        asked = peer.next(ev.UtilityAsked)
+        assert asked.asker == "a"
+        peer.bus.answer(asked.request, Utilities(voter=peer.name, vectors=()))
+    answers = [a.next(ev.UtilityReceived) for _ in range(2)]
+    assert {answer.utilities.voter for answer in answers} == {"b", "c"}
+    assert {answer.gather for answer in answers} == {7}
+    assert a.of(ev.UtilityAsked) == [], "not ourselves"
+
+
+@pytest.mark.parametrize("question", [PREPARE, ACCEPT])
+def test_electors_are_asked_ourselves_included(mesh: tuple[Peer, Peer, Peer], question: Prepare | Accept) -> None:
+    a = mesh[0]
+    a.bus.ask_electors(question, 2.0)
+    answers: dict[str, Any] = {
+        "a": Promise(elector="a", task="merge", ballot=BALLOT),
+        "b": Accepted(elector="b", task="merge", ballot=BALLOT),
+        "c": Refused(elector="c", task="merge", ballot=BALLOT, refusal=Refusal.BALLOT, promised=BALLOT),
+    }
+    for peer in mesh:
+        asked: Any = peer.next(ev.PrepareAsked if isinstance(question, Prepare) else ev.AcceptAsked)
+        assert asked.asker == "a"
+        assert (asked.prepare if isinstance(question, Prepare) else asked.accept) == question
+        peer.bus.answer(asked.request, answers[peer.name])
+    heard = [a.next(ev.ElectorAnswered).answer for _ in mesh]
+    assert sorted(heard, key=lambda answer: answer.elector) == list(answers.values())
+
+
+def test_one_peer_is_asked_for_what_it_has_learnt(mesh: tuple[Peer, Peer, Peer]) -> None:
+    a, b, c = mesh
+    b.bus.ask_learnt("a", 2.0)
+    a.bus.answer(a.next(ev.LearntAsked).request, LEARNT)
+    assert b.next(ev.LearntReceived).learnt == LEARNT
+    assert c.events == []
+
+
+def test_operator_asks_and_commands_another_node(mesh: tuple[Peer, Peer, Peer]) -> None:
+    a, b, _ = mesh
+    answers: list[object] = []
+    for command, kind, answer in ((None, ev.StatusAsked, SNAPSHOT), (COMMAND, ev.WeightsCommanded, RESULT)):
+        asking = threading.Thread(target=lambda c=command: answers.append(a.bus.ask_node("b", c)))
+        asking.start()
+        asked: Any = b.next(kind)
+        b.bus.answer(asked.request, answer)
+        asking.join(5)
+    assert answers == [SNAPSHOT, RESULT]
+
+
+def test_operator_hears_that_a_node_does_not_answer(
+    mesh: tuple[Peer, Peer, Peer], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(control_bus, "OPERATOR_TIMEOUT_S", 0.1)
+    with pytest.raises(AdapterError, match=r"ghost did not answer within 0\.1 s"):
+        mesh[0].bus.ask_node("ghost", None)
+
+
+def test_answer_in_another_s_name_is_foreign(mesh: tuple[Peer, Peer, Peer]) -> None:
+    a, b, _ = mesh
+    a.bus.ask_utilities(1, 1.0)
+    b.bus.answer(b.next(ev.UtilityAsked).request, Utilities(voter="c", vectors=()))
+    a.bus.ask_learnt("b", 1.0)
+    b.bus.answer(b.next(ev.LearntAsked).request, LEARNT)
+    a.bus.ask_electors(PREPARE, 1.0)
+    b.bus.answer(b.next(ev.PrepareAsked).request, Promise(elector="c", task="merge", ballot=BALLOT))
+    dropped = [a.next(ev.FrameDropped) for _ in range(3)]
+    assert [(frame.kind, frame.reason) for frame in dropped] == [
+        ("utility", "foreign"),
+        ("allocation", "foreign"),
+        ("register", "foreign"),
+    ]
+
+
+def test_answer_of_another_kind_is_dropped(mesh: tuple[Peer, Peer, Peer]) -> None:
+    a, b, _ = mesh
+    a.bus.ask_learnt("b", 1.0)
+    b.bus.answer(b.next(ev.LearntAsked).request, RESULT)
+    frame = a.next(ev.FrameDropped)
+    assert (frame.kind, frame.reason) == ("allocation", "kind")
+
+
+@pytest.mark.parametrize(
+    ("key", "payload", "dropped"),
+    [
+        ("register/b/x", b"garbage", ("register", "garbage")),
+        ("register/b/x", None, ("register", "garbage")),
+        ("register/b/x", wire.encode(BEAT), ("register", "kind")),
+        ("command/b/x", wire.encode(RESULT), ("command", "kind")),
+        ("command/b/x", b"\x00" * 9000, ("command", "size")),
+        ("made-up/b/x", None, ("key", "key")),
+        ("utility/b/No.Name", None, ("utility", "key")),
+    ],
+)
+def test_bad_question_is_dropped_at_once_with_its_reason(
+    mesh: tuple[Peer, Peer, Peer],
+    stranger: zenoh.Session,
+    key: str,
+    payload: bytes | None,
+    dropped: tuple[str, str],
+) -> None:
+    """The asker is not left to its timeout, and no name of its choice becomes a counter."""
+    _, b, _ = mesh
+    start = time.monotonic()
+    assert list(stranger.get(f"@zsched/f/{key}", payload=payload, timeout=5.0)) == []
+    assert time.monotonic() - start < 2.0
+    frame = b.next(ev.FrameDropped)
+    assert (frame.kind, frame.reason) == dropped
+    assert b.events == []
+
+
+def test_question_is_answered_once_and_late_answers_are_harmless(
+    mesh: tuple[Peer, Peer, Peer], stranger: zenoh.Session
+) -> None:
+    _, b, _ = mesh
+    replies = stranger.get("@zsched/f/allocation/b/x", timeout=0.3)
+    number = b.next(ev.LearntAsked).request
+    b.bus.answer(number, LEARNT)
+    b.bus.answer(number, LEARNT)
+    b.bus.answer(number + 1000, LEARNT)
+    assert len(list(replies)) == 1
+    late = stranger.get("@zsched/f/allocation/b/x", timeout=0.1)
+    number = b.next(ev.LearntAsked).request
+    assert all(reply.ok is None for reply in late)
+    b.bus.answer(number, LEARNT)
+
+
+class Query:
+    """Stands for a zenoh query: whether it was let go."""
+
+    def __init__(self) -> None:
+        self.is_dropped = False
+
+    def drop(self) -> None:
+        self.is_dropped = True
+
+
+def test_open_questions_are_bounded_in_number_and_age(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 100.0
+    monkeypatch.setattr(control_bus, "monotonic_s", lambda: now)
+    questions: Any = Questions()
+    queries = [Query() for _ in range(control_bus.MAX_QUESTIONS + 10)]
+    for query in queries:
+        questions.keep(query, "key")
+    assert [query.is_dropped for query in queries] == [True] * 10 + [False] * control_bus.MAX_QUESTIONS
+    now += control_bus.QUESTION_TTL_S + 0.1
+    questions.keep(Query(), "key")
+    assert all(query.is_dropped for query in queries)
+    assert len(questions._open) == 1
