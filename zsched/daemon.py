@@ -75,7 +75,10 @@ class Endpoints:
 def endpoints_for(fleet: Fleet, me: NodeSpec, free_port: Callable[[], int]) -> Endpoints:
     """The endpoints of one node: its own to listen on, its seeds' to dial (gossip finds the rest)."""
     others = [fleet.node(name) for name in fleet.seeds if name != me.name]
-    data_listen = me.listen_data or f"tcp/0.0.0.0:{free_port()}"
+    data_listen = me.listen_data or "tcp/0.0.0.0:0"
+    if not dial_endpoint(data_listen, "127.0.0.1"):  # any port will do, but workers must know which
+        address, _, rest = data_listen.rpartition(":")
+        data_listen = f"{address}:{free_port()}{rest.removeprefix('0')}"
     is_loopback = "/127." in data_listen or "/[::1]" in data_listen
     return Endpoints(
         control_listen=(me.listen_control or "tcp/0.0.0.0:0",),

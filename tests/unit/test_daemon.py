@@ -1,0 +1,271 @@
+"""The composition root: endpoints, exit codes, logs, an orderly end from its first moment on."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from zsched import daemon
+from zsched.adapters.operator_socket import ask
+from zsched.adapters.state_file import StateFile
+from zsched.core import events as ev
+from zsched.core.fleet import Fleet, NodeSpec, Timing
+from zsched.core.model import NodeKind
+from zsched.daemon import EXIT_CONFIG, EXIT_FAILED, EXIT_OK, Endpoints, Sampler, endpoints_for, free_port
+from zsched.errors import AdapterError
+from zsched.lab.testbed import echo_fleet
+from zsched.places import socket_path
+from zsched.shell import Inbox
+
+Json = dict[str, Any]
+
+
+# --- endpoints -------------------------------------------------------------------------------------------------------
+
+
+def spec(name: str, *, host: str = "", control: str = "", data: str = "") -> NodeSpec:
+    return NodeSpec(name=name, kind=NodeKind.EDGE, host=host, listen_control=control, listen_data=data)
+
+
+def fleet(*nodes: NodeSpec, seeds: tuple[str, ...] = ()) -> Fleet:
+    return Fleet(name="f", timing=Timing(), nodes=nodes, tasks=(), electors=(), seeds=seeds)
+
+
+def endpoints(me: NodeSpec, *others: NodeSpec, seeds: tuple[str, ...] = ()) -> Endpoints:
+    return endpoints_for(fleet(me, *others, seeds=seeds), me, lambda: 50000)
+
+
+def test_node_listens_where_the_file_says_and_its_workers_dial_it_on_this_machine() -> None:
+    found = endpoints(spec("a", host="192.0.2.1", control="tcp/0.0.0.0:7457", data="tcp/0.0.0.0:7458"))
+    assert found == Endpoints(
+        control_listen=("tcp/0.0.0.0:7457",),
+        control_connect=(),
+        data_listen=("tcp/0.0.0.0:7458",),
+        data_connect=(),
+        worker_connect=("tcp/127.0.0.1:7458",),
+        worker_listen=("tcp/0.0.0.0:0",),
+    )
+
+
+def test_node_without_endpoints_takes_free_ports_and_knows_the_one_that_its_workers_need() -> None:
+    found = endpoints(spec("a"))
+    assert found.control_listen == ("tcp/0.0.0.0:0",)
+    assert found.data_listen == ("tcp/0.0.0.0:50000",)
+    assert found.worker_connect == ("tcp/127.0.0.1:50000",)
+
+
+@pytest.mark.parametrize(
+    ("data", "connect", "listen"),
+    [
+        ("tcp/127.0.0.1:7458", "tcp/127.0.0.1:7458", "tcp/127.0.0.1:0"),
+        ("tcp/127.0.0.2:7458", "tcp/127.0.0.2:7458", "tcp/127.0.0.1:0"),
+        ("tcp/[::1]:7458", "tcp/[::1]:7458", "tcp/127.0.0.1:0"),
+        ("tcp/192.0.2.1:7458", "tcp/192.0.2.1:7458", "tcp/0.0.0.0:0"),
+        ("tcp/[::]:7458", "tcp/127.0.0.1:7458", "tcp/0.0.0.0:0"),
+        ("tls/0.0.0.0:7458", "tls/127.0.0.1:7458", "tcp/0.0.0.0:0"),
+    ],
+)
+def test_workers_listen_on_loopback_only_when_the_fleet_does(data: str, connect: str, listen: str) -> None:
+    found = endpoints(spec("a", data=data))
+    assert (found.worker_connect, found.worker_listen) == ((connect,), (listen,))
+
+
+def test_port_zero_is_replaced_by_a_port_that_workers_can_dial() -> None:
+    found = endpoints(spec("a", data="tcp/0.0.0.0:0"))
+    assert found.data_listen == ("tcp/0.0.0.0:50000",)
+    assert found.worker_connect == ("tcp/127.0.0.1:50000",)
+
+
+def test_seeds_are_dialled_at_their_host_except_ourselves_and_who_cannot_be() -> None:
+    me = spec("a", host="192.0.2.1", control="tcp/0.0.0.0:7457", data="tcp/0.0.0.0:7458")
+    both = spec("b", host="192.0.2.2", control="tcp/0.0.0.0:7457", data="tcp/0.0.0.0:7458")
+    six = spec("c", host="2001:db8::3", control="tcp/[::]:7457", data="tcp/192.0.2.3:1")
+    nowhere = spec("d", control="tcp/0.0.0.0:7457", data="tcp/0.0.0.0:7458")
+    any_port = spec("e", host="192.0.2.5", control="tcp/0.0.0.0:0")
+    no_seed = spec("g", host="192.0.2.7", control="tcp/0.0.0.0:7457", data="tcp/0.0.0.0:7458")
+    found = endpoints(me, both, six, nowhere, any_port, no_seed, seeds=("a", "b", "c", "d", "e"))
+    assert found.control_connect == ("tcp/192.0.2.2:7457", "tcp/[2001:db8::3]:7457")
+    assert found.data_connect == ("tcp/192.0.2.2:7458", "tcp/192.0.2.3:1")
+
+
+def test_free_port_can_be_bound() -> None:
+    assert 1024 <= free_port() <= 65535
+
+
+# --- the sampler -----------------------------------------------------------------------------------------------------
+
+
+def test_samplers_problem_is_told_once_and_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A driver that fails for a while: one problem, one end, and samples again."""
+    inbox, shell = Inbox(), SimpleNamespace(supervisor=None)
+    sampler = Sampler(spec("a"), 0.001, shell, inbox)  # type: ignore[arg-type]
+    sample, failures = sampler._device.sample, iter([True] * 3)
+
+    def fails_at_first(workers: Any) -> Any:
+        if next(failures, False):
+            raise OSError("no /proc")
+        return sample(workers)
+
+    monkeypatch.setattr(sampler._device, "sample", fails_at_first)
+    sampler.start()
+    events: list[ev.Event] = []
+    end = time.monotonic() + 10
+    while time.monotonic() < end and sum(isinstance(event, ev.ProfileSampled) for event in events) < 3:
+        event = inbox.take(0.1)
+        events += [event] if event is not None else []
+    sampler.stop()
+    problems = [event.problem for event in events if isinstance(event, ev.ProblemReported)]
+    assert problems == ["cannot measure: no /proc", None]
+
+
+# --- the process -----------------------------------------------------------------------------------------------------
+
+
+class Place:
+    """A fleet file and folders of its own; runs the daemon's command line in a process."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.file = folder / "fleet.yaml"
+        self.file.write_text(json.dumps(echo_fleet(robots=1, edges=1)))
+        self.processes: list[subprocess.Popen[str]] = []
+
+    def start(self, *arguments: str, node: str | None = "edge1", env: Mapping[str, str] | None = None) -> Any:
+        places = ["--state-dir", str(self.folder / "state"), "--runtime-dir", str(self.folder)]
+        named = [] if node is None else ["--node", node]
+        process = subprocess.Popen(
+            [sys.executable, "-m", "zsched.daemon", "--config", str(self.file), *named, *places, *arguments],
+            stderr=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env={**{k: v for k, v in os.environ.items() if k != "JOURNAL_STREAM"}, **(env or {})},
+        )
+        self.processes.append(process)
+        return process
+
+    def run(self, *arguments: str, node: str | None = "edge1", env: Mapping[str, str] | None = None) -> tuple[int, str]:
+        process = self.start(*arguments, node=node, env=env)
+        out, error = process.communicate(timeout=20)
+        assert out == "", "stdout is data"
+        return process.returncode, error
+
+    def status(self) -> Json | None:
+        try:
+            return ask(socket_path(self.folder, "edge1"), {"verb": "status"}, 1.0)
+        except AdapterError:
+            return None
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Iterator[Place]:
+    made = Place(tmp_path)
+    yield made
+    for process in made.processes:
+        if process.poll() is None:
+            process.kill()
+        process.communicate(timeout=10)
+
+
+def until(condition: Callable[[], Any], what: str, deadline_s: float = 20.0) -> Any:
+    end = time.monotonic() + deadline_s
+    while time.monotonic() < end:
+        if value := condition():
+            return value
+        time.sleep(0.01)
+    raise AssertionError(f"not within {deadline_s} s: {what}")
+
+
+def test_help_goes_to_stdout_and_is_fine(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        daemon.main(["--help"])
+    assert stopped.value.code == EXIT_OK
+    assert "--runtime-dir" in capsys.readouterr().out
+
+
+def test_unknown_argument_is_a_usage_error(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        daemon.main(["--nonsense"])
+    assert stopped.value.code == 2
+    assert "--nonsense" in capsys.readouterr().err
+
+
+def test_wrong_file_and_wrong_name_end_with_78_and_say_why(place: Place) -> None:
+    code, error = place.run(node="ghost")
+    assert code == EXIT_CONFIG
+    assert "no node 'ghost' under 'nodes' (there are edge1, robot1)" in error
+    place.file.write_text("fleet: [")
+    code, error = place.run()
+    assert code == EXIT_CONFIG
+    assert "fleet.yaml:1:" in error
+    assert "Traceback" not in error
+
+
+def test_folder_in_use_ends_with_1_and_names_the_process(place: Place) -> None:
+    with StateFile(place.folder / "state", fleet="testbed", node="edge1"):
+        code, error = place.run()
+    assert code == EXIT_FAILED
+    assert f"in use by process {os.getpid()}" in error
+    assert "Traceback" not in error
+
+
+def test_node_comes_from_the_environment_and_logs_carry_times_outside_the_journal(place: Place) -> None:
+    """Also: no state is a warning, the node works, its status says what is wrong, SIGTERM ends it with 0 in time."""
+    process = place.start(node=None, env={"ZSCHED_NODE": "edge1"})
+    status = until(place.status, "its status")
+    assert status["node"] == "edge1"
+    assert any("does not exist: run `zsched init`" in problem for problem in status["problems"])
+    start = time.monotonic()
+    process.send_signal(signal.SIGTERM)
+    _, error = process.communicate(timeout=10)
+    assert time.monotonic() - start < 2.0
+    assert process.returncode == EXIT_OK
+    lines = error.splitlines()
+    assert all(line[:2] == "20" and line[4] == "-" for line in lines), error
+    assert any("WARNING zsched.daemon no_state" in line for line in lines)
+    assert any("INFO zsched.daemon stopping node=edge1" in line for line in lines)
+    assert not socket_path(place.folder, "edge1").exists()
+    assert not list(place.folder.glob("*.zenoh.json5"))
+
+
+def test_journal_stamps_its_own_times_and_an_early_stop_is_an_orderly_one(place: Place) -> None:
+    """SIGTERM while the adapters still open: the sockets, files and processes that there are go all the same."""
+    process = place.start("--log-level", "DEBUG", env={"JOURNAL_STREAM": "1:2"})
+    until(lambda: socket_path(place.folder, "edge1").exists(), "the first thing that it opens")
+    process.send_signal(signal.SIGTERM)
+    _, error = process.communicate(timeout=10)
+    assert process.returncode == EXIT_OK, error
+    assert not socket_path(place.folder, "edge1").exists()
+    assert {line.split()[0] for line in error.splitlines()} <= {"DEBUG", "INFO", "WARNING"}, error
+
+
+def test_options_are_found_in_arguments_and_environment(
+    place: Place, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    seen: list[daemon.Options] = []
+
+    class Recorder:
+        def __init__(self, options: daemon.Options) -> None:
+            seen.append(options)
+
+        def run(self) -> int:
+            return 0
+
+    monkeypatch.setattr(daemon, "Daemon", Recorder)
+    for name in ("CONFIG", "NODE", "STATE_DIR", "RUNTIME_DIR"):
+        monkeypatch.setenv(f"ZSCHED_{name}", str(tmp_path / name))
+    assert daemon.main([]) == 0
+    assert daemon.main(["--node", "robot1", "--config", str(place.file)]) == 0
+    folders = {"state_dir": tmp_path / "STATE_DIR", "runtime_dir": tmp_path / "RUNTIME_DIR"}
+    expected = daemon.Options(config=tmp_path / "CONFIG", node=str(tmp_path / "NODE"), **folders)
+    assert seen == [expected, replace(expected, node="robot1", config=place.file)]
