@@ -1,0 +1,207 @@
+"""The simulator's own promises: delivery, faults, disks, and invariants that do go off."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from zsched.core import instructions as do
+from zsched.core.fleet import Fleet, NodeSpec, StreamRule, TaskSpec, Timing, WorkerSpec
+from zsched.core.model import Allocation, NodeId, NodeKind, PeerState, Tuning, Weights
+from zsched.core.plan import Direction, Role, WorkerRole
+from zsched.errors import InvariantError
+from zsched.lab.simulator import RESTART_S, TOKEN_DELAY_S, Simulator
+
+TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
+RULE = StreamRule(direction=Direction.INPUT, from_template="{robot}/map", to_template="{target}/merge/{robot}/map")
+FLEET = Fleet(
+    name="sim",
+    timing=Timing(),
+    nodes=tuple(
+        NodeSpec(name=name, kind=NodeKind.ROBOT if name.startswith("robot") else NodeKind.EDGE)
+        for name in ("edge1", "edge2", "robot1", "robot2", "robot3")
+    ),
+    tasks=(
+        TaskSpec(
+            name="merge",
+            candidates=("edge1", "edge2"),
+            tuning=TUNING,
+            worker=WorkerSpec(command=("true",)),
+            rules=(RULE,),
+        ),
+    ),
+    electors=("robot1", "robot2", "robot3"),
+)
+
+
+def make(seed: int = 1, *, loss: float = 0.0, delay_s: tuple[float, float] = (0.0005, 0.003)) -> Simulator:
+    return Simulator(fleet=FLEET, seed=seed, loss=loss, delay_s=delay_s)
+
+
+def settled(seed: int = 1) -> Simulator:
+    sim = make(seed)
+    sim.start()
+    assert sim.run_until(lambda: sim.agreed("merge") is not None, 10)
+    sim.run(1)
+    return sim
+
+
+def value(owner: str, revision: int = 1, epoch: int = 1) -> Allocation:
+    return Allocation(task="merge", revision=revision, epoch=epoch, owner=owner, tuning=TUNING)
+
+
+# --- time and delivery -----------------------------------------------------------------------------------------------
+
+
+def test_time_passes_to_the_condition_or_to_the_end() -> None:
+    sim = make()
+    sim.start()
+    assert not sim.run_until(lambda: False, 0.5)
+    assert sim.now == pytest.approx(100.5)
+    assert sim.run_until(lambda: sim.now >= 101.0, 5)
+    assert 101.0 <= sim.now < 101.3, "it stops at the event that made it true"
+
+
+def test_messages_take_their_delay() -> None:
+    sim = make(delay_s=(0.4, 0.5))
+    sim.start()
+    sim.run(0.39)
+    assert sim.sees("robot1", "edge1") is PeerState.UNKNOWN
+    sim.run(0.2)
+    assert sim.sees("robot1", "edge1") is PeerState.ALIVE
+
+
+def test_everything_lost_is_nothing_heard() -> None:
+    sim = make(loss=1.0)
+    sim.start()
+    sim.run(2)
+    assert {sim.sees("robot1", name) for name in ("robot2", "edge1")} == {PeerState.UNKNOWN}
+
+
+def test_cut_parts_the_groups_in_both_directions_and_keeps_what_is_inside() -> None:
+    sim = settled()
+    sim.cut(("robot1", "edge1"), ("robot2", "robot3", "edge2"))
+    sim.run(5)
+    assert sim.sees("robot1", "edge1") is PeerState.ALIVE
+    assert sim.sees("robot2", "edge2") is PeerState.ALIVE
+    assert sim.sees("robot1", "robot2") is not PeerState.ALIVE
+    assert sim.sees("robot2", "robot1") is not PeerState.ALIVE
+    sim.heal()
+    sim.run(1)
+    assert sim.sees("robot1", "robot2") is PeerState.ALIVE
+
+
+# --- crashes and disks -----------------------------------------------------------------------------------------------
+
+
+def test_crash_is_seen_by_the_token_and_restart_counts_from_the_disk() -> None:
+    sim = settled()
+    sim.crash("robot3")
+    assert sim.running() == ("edge1", "edge2", "robot1", "robot2")
+    with pytest.raises(KeyError):
+        sim.node("robot3")
+    sim.run(TOKEN_DELAY_S + 0.001)
+    assert sim.sees("robot1", "robot3") is not PeerState.ALIVE
+    disk = sim.disk("robot3")
+    assert disk is not None
+    assert disk.registers[0].learnt == sim.node("robot1").registers["merge"].value
+    sim.start("robot3")
+    assert sim.node("robot3").incarnation == disk.incarnation + 1
+    assert sim.node("robot3").registers["merge"].value == disk.registers[0].learnt
+
+
+@pytest.mark.parametrize("keep", [0, 1])
+def test_cut_batch_is_carried_out_so_far_and_the_node_comes_back(keep: int) -> None:
+    """The hook sees every batch; what it cuts off has no effect, the disk holds what was written before."""
+    sim = settled()
+    cuts: list[tuple[do.Instruction, ...]] = []
+
+    def cut(name: NodeId, batch: tuple[do.Instruction, ...]) -> int | None:
+        if cuts or name != "robot1" or not batch or not isinstance(batch[0], do.PersistState):
+            return None
+        cuts.append(batch)
+        return keep
+
+    before = sim.disk("robot1")
+    sim.cut_batch = cut
+    sim.crash(sim.agreed("merge") or "")
+    assert sim.run_until(lambda: bool(cuts), 3)
+    assert "robot1" not in sim.running()
+    written = cuts[0][0]
+    assert isinstance(written, do.PersistState)
+    assert sim.disk("robot1") == (before if keep == 0 else written.state)
+    sim.run(RESTART_S + 0.01)
+    assert "robot1" in sim.running()
+
+
+def test_broken_disk_keeps_its_old_content_and_tells_the_node() -> None:
+    sim = settled()
+    sim.broken_disks.add("robot1")
+    before = sim.disk("robot1")
+    sim.crash(sim.agreed("merge") or "")
+    assert sim.run_until(lambda: not sim.node("robot1").agreement.is_elector, 3)
+    assert sim.disk("robot1") == before
+
+
+# --- invariants that go off ------------------------------------------------------------------------------------------
+
+
+def learn(sim: Simulator, name: NodeId, allocation: Allocation) -> None:
+    """Put a learnt value into a node, past all rules."""
+    register = sim.node(name).registers["merge"]
+    register.state = replace(register.state, learnt=allocation)
+
+
+def test_two_values_for_one_revision_are_found() -> None:
+    sim = settled()
+    known = sim.node("robot1").registers["merge"].value
+    learn(sim, "robot2", replace(known, pinned=True))
+    with pytest.raises(InvariantError, match="two values for merge revision 1"):
+        sim.run(1)
+
+
+def test_two_owners_in_one_epoch_are_found() -> None:
+    sim = settled()
+    known = sim.node("robot1").registers["merge"].value
+    other = "edge1" if known.owner == "edge2" else "edge2"
+    learn(sim, "robot2", replace(known, revision=9, owner=other))
+    with pytest.raises(InvariantError, match="two owners for merge epoch 1"):
+        sim.run(1)
+
+
+def test_route_that_an_older_epoch_moves_is_found_after_a_restart_too() -> None:
+    """A disk that forgets: the node comes back with an older allocation and carries it out."""
+    sim = settled()
+    old = sim._machines["robot3"].disk
+    owner = sim.agreed("merge") or ""
+    sim.crash(owner)
+    assert sim.run_until(lambda: sim.agreed("merge") not in (None, owner), 5)
+    sim.crash("robot3")
+    sim._machines["robot3"].disk = old
+    with pytest.raises(InvariantError, match="an older token moves a route"):
+        sim.start("robot3")
+
+
+def test_two_that_work_on_an_exclusive_task_are_found() -> None:
+    sim = settled()
+    for name, is_found in (("edge1", False), ("edge2", True)):
+        role = Role(task="merge", role=WorkerRole.ACTIVE, epoch=1, lease_until_s=sim.now + 1.0)
+        machine = sim._machines[name]
+        if not is_found:
+            sim._carry_out(machine, (do.SetRole(role=role),))
+            continue
+        with pytest.raises(InvariantError, match="edge1 and edge2 both work"):
+            sim._carry_out(machine, (do.SetRole(role=role),))
+
+
+def test_node_is_woken_at_its_own_deadlines() -> None:
+    """Not polled: between two deadlines nothing is queued for it but messages and samples."""
+    sim = settled()
+    node = sim.node("edge1")
+    for _ in range(50):
+        due = node.next_deadline()
+        assert due < math.inf
+        sim.run_until(lambda due=due: node.next_deadline() > due, 2)  # type: ignore[misc]
+        assert sim.now <= due + 0.01
