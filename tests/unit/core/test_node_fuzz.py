@@ -20,6 +20,7 @@ from zsched.core.model import (
     Beat,
     DeviceSample,
     DurableState,
+    Grant,
     NodeKind,
     Profile,
     Proposal,
@@ -37,7 +38,7 @@ from zsched.report import snapshot_json
 
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
 NAMES = (*ROBOTS, *EDGES, "ghost")
-TASKS = ("cold", "merge", "other")
+TASKS = ("alone", "cold", "merge", "other")
 TUNINGS = tuple(
     Tuning(weights=Weights(cpu=cpu, memory=1.0 - cpu, network=0.0), time_to_trigger_s=0.1, cool_down_s=0.0)
     for cpu in (0.25, 0.75)
@@ -45,9 +46,15 @@ TUNINGS = tuple(
 RULE = StreamRule(direction=Direction.INPUT, from_template="{robot}/{task}", to_template="{target}/{task}/{robot}/map")
 
 
-def task(name: str, standby: Standby, candidates: tuple[str, ...]) -> TaskSpec:
-    worker = WorkerSpec(command=("work",), standby=standby, start_deadline_s=1.0)
-    return TaskSpec(name=name, candidates=candidates, tuning=TUNINGS[0], worker=worker, rules=(RULE,))
+def task(name: str, candidates: tuple[str, ...], *, standby: Standby, exclusive: bool = False) -> TaskSpec:
+    return TaskSpec(
+        name=name,
+        candidates=candidates,
+        tuning=TUNINGS[0],
+        worker=WorkerSpec(command=("work",), standby=standby, start_deadline_s=1.0),
+        rules=(RULE,),
+        exclusive=exclusive,
+    )
 
 
 FLEET = Fleet(
@@ -57,7 +64,11 @@ FLEET = Fleet(
         NodeSpec(name=name, kind=NodeKind.ROBOT if name in ROBOTS else NodeKind.EDGE)
         for name in sorted((*ROBOTS, *EDGES))
     ),
-    tasks=(task("cold", Standby.COLD, (*EDGES, "robot1")), task("merge", Standby.WARM, EDGES)),
+    tasks=(
+        task("alone", (*EDGES, "robot1"), standby=Standby.WARM, exclusive=True),
+        task("cold", (*EDGES, "robot1"), standby=Standby.COLD),
+        task("merge", EDGES, standby=Standby.WARM),
+    ),
     electors=ROBOTS,
 )
 ELECTORATE = electorate_hash(FLEET)
@@ -208,6 +219,16 @@ class Storm:
     def beat(self) -> ev.Event:
         learnt = tuple((name, self.number(), self.number()) for name in TASKS)
         suspects = tuple(self.rng.sample(NAMES, self.rng.randrange(3)))
+        grants = tuple(
+            Grant(
+                task=name,
+                owner=self.rng.choice((self.me, self.name())),
+                incarnation=self.rng.choice((3, 7)),
+                epoch=self.rng.randrange(20),
+                number=self.rng.randrange(200),
+            )
+            for name in ("alone", "alone", "other")
+        )
         return ev.BeatReceived(
             beat=Beat(
                 node=self.name(),
@@ -216,6 +237,9 @@ class Storm:
                 loop_lag_s=self.rng.random(),
                 learnt=learnt,
                 suspects=suspects,
+                echoes=grants,
+                released=grants[: self.rng.randrange(2)],
+                asked_to_leave=(("alone", self.me, self.rng.randrange(20)),),
             )
         )
 
@@ -233,7 +257,8 @@ class Storm:
         epoch = self.number() if current is None or current.current is None else current.current.epoch
         if current is not None and current.predecessor is not None and self.rng.random() < 0.3:
             return ev.SlotDrained(task=name, epoch=current.predecessor.epoch)
-        return self.rng.choice((ev.SlotReady(task=name, epoch=epoch), ev.SlotFlipped(task=name, epoch=epoch)))
+        kind = self.rng.choice((ev.SlotReady, ev.SlotFlipped, ev.RoleEnded))
+        return kind(task=name, epoch=epoch)
 
     def counted(self) -> ev.Event:
         return ev.StreamsCounted(counts=(StreamCount(stream="merge/in/0", messages=self.number()),))

@@ -23,20 +23,28 @@ from zsched.lab.simulator import Simulator
 TASK = "merge"
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
 APPLIED = (do.ApplyRoutes, do.SetRole, do.StartWorker, do.StopWorker, do.RecordStory)
-SLICES = range(14)
+SLICES = range(9)
 
 
-def fleet() -> Fleet:
+def fleet(*, exclusive: bool = False) -> Fleet:
     nodes = tuple(
         NodeSpec(name=name, kind=NodeKind.ROBOT if name in ROBOTS else NodeKind.EDGE)
         for name in sorted((*ROBOTS, *EDGES))
     )
     tuning = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0), time_to_trigger_s=0.2, cool_down_s=0.0)
-    task = TaskSpec(name=TASK, candidates=EDGES, tuning=tuning, worker=WorkerSpec(command=("true",)), drain_s=0.2)
+    task = TaskSpec(
+        name=TASK,
+        candidates=EDGES,
+        tuning=tuning,
+        worker=WorkerSpec(command=("true",)),
+        drain_s=0.2,
+        exclusive=exclusive,
+        max_moves_per_minute=1000,
+    )
     return Fleet(name="sim", timing=Timing(), nodes=nodes, tasks=(task,), electors=ROBOTS)
 
 
-FLEET = fleet()
+FLEET, EXCLUSIVE = fleet(), fleet(exclusive=True)
 
 
 def register(state: DurableState | None, task: TaskId) -> RegisterState:
@@ -71,6 +79,11 @@ def check_backed(instruction: do.Instruction, state: DurableState | None) -> Non
         if isinstance(answer, Accepted):
             assert held.accepted is not None, f"answered without its acceptance on disk: {answer}"
             assert held.accepted.ballot >= answer.ballot
+    if isinstance(instruction, do.PublishBeat):
+        for grant in instruction.beat.echoes:
+            accepted = register(state, grant.task).accepted
+            assert accepted is not None, f"granted by what is not on disk: {instruction}"
+            assert (accepted.value.owner, accepted.value.epoch) == (grant.owner, grant.epoch), "granted to another one"
     for task, revision in told_values(instruction):
         learnt = register(state, task).learnt
         assert learnt is not None, f"told what is not on disk: {instruction}"
@@ -179,6 +192,15 @@ def test_every_prefix_of_every_dirty_batch_of_a_move_is_safe(part: int) -> None:
         watch = Watch(Simulator(fleet=FLEET, seed=1), at=at, keep=keep)
         run(watch)
         assert watch.cuts == 1, (at, keep)
+
+
+@pytest.mark.parametrize("part", range(3))
+def test_crashes_in_the_middle_of_any_batch_never_let_two_owners_work(part: int) -> None:
+    """An exclusive task: its leases live in memory, and a restart must not forget that it granted one."""
+    for seed in range(part * 10, part * 10 + 10):
+        rng = Random(seed)
+        sim = Simulator(fleet=EXCLUSIVE, seed=seed, loss=rng.choice([0.0, 0.05]))
+        run(Watch(sim, rng=rng))
 
 
 @pytest.mark.parametrize("part", SLICES)
