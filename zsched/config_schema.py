@@ -38,7 +38,7 @@ from zsched.core.fleet import (
     WorkerSpec,
 )
 from zsched.core.model import RSSI_MAX_DBM, RSSI_MIN_DBM, Aggregate, NodeKind, Tuning
-from zsched.core.plan import HandoverRule, ReadyWhen, StreamClass, StreamSettings
+from zsched.core.plan import HandoverRule, ReadyWhen, ServiceSettings, StreamClass, StreamSettings
 from zsched.core.timing import PROFILES
 
 _HOST_PORT: Final = ("tcp", "udp", "tls", "quic", "ws")
@@ -240,6 +240,18 @@ RULE: Final = Record(
     StreamSettings,
 )
 
+SERVICE: Final = Record(
+    "a service rule",
+    {
+        "from": Field(Here(_TEMPLATE), "Key under which the robot's applications ask; a template.", required=True),
+        "to": Field(Here(_TEMPLATE), "Key under which the owner's worker answers; a template.", required=True),
+        "retry": Field(Flag(), "Ask the next owner when the old one did not answer: it may be done twice."),
+        "timeout_s": Field(Number(0.05, 3600, "s"), "Every request is answered within this time."),
+        "max_pending": Field(Whole(1, 256), "Requests at the owner at one time; the next one is answered `busy`."),
+    },
+    ServiceSettings,
+)
+
 TASK: Final = Record(
     "a task",
     {
@@ -251,6 +263,7 @@ TASK: Final = Record(
         "worker": Field(WORKER, "The process that does the work."),
         "inputs": Field(ListOf(RULE), "Streams from the robots' applications to the owner's worker."),
         "outputs": Field(ListOf(RULE), "Streams from the owner's worker to the robots' applications."),
+        "services": Field(ListOf(SERVICE), "Requests of the robots' applications that the owner's worker answers."),
         "on_isolation": Field(Choice.of(OnIsolation), "What a robot does that is cut off from the owner."),
         "exclusive": Field(Flag(), "The work must never run twice; needs `{epoch}` in every output's `from`."),
         "drain_s": Field(Number(0, 600, "s"), "How long the old owner may finish what it has in work."),

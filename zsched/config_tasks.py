@@ -13,7 +13,7 @@ from zsched.config_nodes import Cast, select
 from zsched.config_reader import Collector, Place, nearest
 from zsched.core.fleet import Demand, LinkLimits, OnIsolation, StreamRule, TaskSpec, WorkerSpec
 from zsched.core.model import NodeKind, Tuning, Weights
-from zsched.core.plan import Direction, HandoverRule, ReadyWhen, StreamClass, StreamSettings
+from zsched.core.plan import Direction, HandoverRule, ReadyWhen, ServiceSettings, StreamClass, StreamSettings
 from zsched.core.rulecheck import RuleConflict, rule_conflicts
 from zsched.core.templates import PLACEHOLDERS, named_rules, placeholders, rule_fault, template_fault
 
@@ -49,7 +49,7 @@ def _task(
     tuning = _tuning(given, out)
     worker = _worker(given, out)
     limits = _limits(given, out)
-    streams = (*_streams(given, Direction.INPUT, out), *_streams(given, Direction.OUTPUT, out))
+    streams = tuple(stream for direction in Direction for stream in _streams(given, direction, out))
     _check_exclusive(given, worker, streams, out)
     if not candidates:
         return None
@@ -185,6 +185,7 @@ def _rule(section: Section, direction: Direction, out: Collector) -> StreamRule 
         settings=StreamSettings(
             **{"stream_class" if name == "class" else name: value for name, value in _settings(section).items()}
         ),
+        service=ServiceSettings(**_of(section, "retry", "timeout_s", "max_pending")),
     )
     problem = rule_fault(rule)
     if problem is not None:

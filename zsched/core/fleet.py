@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
 
 from zsched.core.model import LinkSource, NodeId, NodeKind, TaskId, Tuning, check_range
-from zsched.core.plan import Direction, ReadyWhen, StreamSettings
+from zsched.core.plan import Direction, ReadyWhen, ServiceSettings, StreamSettings
 
 
 class Standby(StrEnum):
@@ -106,12 +106,14 @@ class WorkerSpec:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StreamRule:
-    """One line of `inputs:` or `outputs:`: templates with ``{robot} {node} {target} {task} {epoch}``."""
+    """One line of `inputs:`, `outputs:` or `services:`: templates with ``{robot} {node} {target} {task} {epoch}``."""
 
     direction: Direction
     from_template: str
     to_template: str
     settings: StreamSettings = StreamSettings()
+    service: ServiceSettings = ServiceSettings()
+    """Services only."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

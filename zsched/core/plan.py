@@ -12,10 +12,11 @@ from zsched.core.model import NodeId, TaskId, check_range
 
 
 class Direction(StrEnum):
-    """Inputs go from the robot's applications to the owner's worker, outputs come back."""
+    """Inputs go from the robot's applications to the owner's worker, outputs come back; services are asked."""
 
     INPUT = "input"
     OUTPUT = "output"
+    SERVICE = "service"
 
 
 class StreamClass(StrEnum):
@@ -57,6 +58,22 @@ class StreamSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ServiceSettings:
+    """How the requests of one service are carried."""
+
+    retry: bool = False
+    """Ask the next owner when the old one did not answer: the work may then be done twice."""
+    timeout_s: float = 10.0
+    """A request is answered within this time, with an error if need be; 0.05..3600."""
+    max_pending: int = 16
+    """Requests at the owner at one time, 1..256; the next one is answered "busy"."""
+
+    def __post_init__(self) -> None:
+        check_range("timeout_s", self.timeout_s, 0.05, 3600.0)
+        check_range("max_pending", self.max_pending, 1, 256)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Route:
     """One stream of one robot for one owner, with every placeholder filled in (concrete key expressions)."""
 
@@ -66,6 +83,8 @@ class Route:
     from_expr: str
     to_expr: str
     settings: StreamSettings
+    service: ServiceSettings = ServiceSettings()
+    """Services only."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -108,6 +127,9 @@ class WorkerRole(StrEnum):
 class Role:
     """The role of this node's worker for one task; ``epoch`` is 0 while idle.
 
+    ``predecessor`` is the owner of the epoch before, whose worker may still have a snapshot of its state; ``None`` when
+    there was none, or it is known to be gone.
+
     ``lease_until_s`` is set for exclusive tasks only: the worker publishes nothing from then on (seconds of this
     machine's CLOCK_BOOTTIME; 0: it has no lease yet).
     """
@@ -116,6 +138,7 @@ class Role:
     role: WorkerRole
     epoch: int = 0
     lease_until_s: float | None = None
+    predecessor: NodeId | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -7,12 +7,16 @@ its ``to``; where one relay's ``to`` meets another's ``from``, the data goes on.
 messages for ever. A circle that passes a worker is that worker's business, but worth a word. Two relays publishing
 under one key would mix two streams that no receiver can tell apart.
 
+Requests flow like samples from ``from`` to ``to``, but never become samples: services are held against each other only.
+There a clash is one key that two rules answer.
+
 Rules are first compared with every placeholder left open, which is cheap and never misses; only those that could meet
 are expanded.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final
@@ -68,7 +72,14 @@ def rule_conflicts(tasks: Iterable[TaskSpec], robots: Iterable[NodeId]) -> tuple
     """Every loop and clash among the rules of ``tasks`` for ``robots``; empty when there is none."""
     rules = [_Rule(stream, task, rule) for task in tasks for stream, rule in named_rules(task)]
     names = tuple(robots)
-    return (*_clashes(rules, names), *_loops(rules, names))
+    services = [rule for rule in rules if rule.rule.direction is Direction.SERVICE]
+    streams = [rule for rule in rules if rule.rule.direction is not Direction.SERVICE]
+    return (
+        *_clashes(streams, names),
+        *_loops(streams, names),
+        *_service_clashes(services, names),
+        *_loops(services, names),
+    )
 
 
 # --- clashes ---------------------------------------------------------------------------------------------------------
@@ -102,6 +113,18 @@ def _pair_clash(first: _Rule, second: _Rule, robots: tuple[NodeId, ...]) -> Iter
             message = f"two rules publish {relay.to_expr!r}; a receiver could not tell their streams apart"
             yield RuleConflict(streams=(first.stream, second.stream), message=_on(message, relay, other))
             return
+
+
+def _service_clashes(rules: list[_Rule], robots: tuple[NodeId, ...]) -> Iterator[RuleConflict]:
+    for first, second in itertools.combinations(rules, 2):
+        if not keyexpr.intersects(first.open_from(), second.open_from()):
+            continue
+        index = _Index(_expand(second, robots), lambda relay: relay.from_expr)
+        both = ((relay, other) for relay in _expand(first, robots) for other in index.meeting(relay.from_expr))
+        relay, other = next(both, (None, None))
+        if relay is not None and other is not None:
+            message = f"two services answer {relay.from_expr!r}: one request would be carried out twice"
+            yield RuleConflict(streams=(first.stream, second.stream), message=_on(message, relay, other))
 
 
 def _on(message: str, first: _Relay, second: _Relay) -> str:

@@ -10,6 +10,8 @@ input ``from``        ``{robot} {node} {task}``                              (no
 input ``to``          ``{robot} {node} {target} {task}``                     ``{target}``
 output ``from``       ``{robot} {node} {target} {task} {epoch}``             ``{target}``
 output ``to``         ``{robot} {node} {task}``                              ``{robot}`` or ``{node}``
+service ``from``      ``{robot} {node} {task}``                              ``{robot}`` or ``{node}``
+service ``to``        ``{robot} {node} {target} {task}``                     ``{target}``
 ====================  =====================================================  =============================
 
 ``{robot}`` and ``{node}`` are both the robot whose relay carries the stream, ``{target}`` is the owner.
@@ -30,17 +32,43 @@ PLACEHOLDERS: Final = ("robot", "node", "target", "task", "epoch")
 RESERVED_CHUNK: Final = "@zsched"
 """Root of the control keys and of the in-band end markers; no rule of a user may touch it."""
 
+_NEEDED: Final[Mapping[tuple[Direction, str], tuple[frozenset[str], str]]] = {
+    (Direction.INPUT, "to"): (
+        frozenset({"target"}),
+        "it lacks {target}: an input goes to whichever node owns the task",
+    ),
+    (Direction.OUTPUT, "from"): (
+        frozenset({"target"}),
+        "it lacks {target}: an output comes from whichever node owns the task",
+    ),
+    (Direction.OUTPUT, "to"): (
+        frozenset({"robot", "node"}),
+        "it lacks {robot}: every robot would publish its copy under one key",
+    ),
+    (Direction.SERVICE, "from"): (
+        frozenset({"robot", "node"}),
+        "it lacks {robot}: every robot would take the same request, and it would be carried out once for each",
+    ),
+    (Direction.SERVICE, "to"): (
+        frozenset({"target"}),
+        "it lacks {target}: a request goes to whichever node owns the task",
+    ),
+}
 _BRACES: Final = re.compile(r"\{([^{}]*)\}")
+_A: Final = {Direction.INPUT: "an input", Direction.OUTPUT: "an output", Direction.SERVICE: "a service"}
 _EVERYWHERE: Final = frozenset({"robot", "node", "task"})
 _ALLOWED: Final[Mapping[tuple[Direction, str], frozenset[str]]] = {
     (Direction.INPUT, "from"): _EVERYWHERE,
     (Direction.INPUT, "to"): _EVERYWHERE | {"target"},
     (Direction.OUTPUT, "from"): _EVERYWHERE | {"target", "epoch"},
     (Direction.OUTPUT, "to"): _EVERYWHERE,
+    (Direction.SERVICE, "from"): _EVERYWHERE,
+    (Direction.SERVICE, "to"): _EVERYWHERE | {"target"},
 }
 _WHY_NOT: Final[Mapping[tuple[Direction, str, str], str]] = {
     (Direction.INPUT, "from", "target"): "an input comes from the robot's own applications, whoever owns the task",
     (Direction.OUTPUT, "to", "target"): "an output keeps its key when the owner changes",
+    (Direction.SERVICE, "from", "target"): "a service keeps its key when the owner changes",
 }
 
 
@@ -81,8 +109,8 @@ def rule_fault(rule: StreamRule) -> str | None:
 def routes_for(task: TaskSpec, robot: NodeId, owner: NodeId, epoch: int) -> tuple[Route, ...]:
     """The streams of ``robot`` towards ``owner`` in ``epoch``, inputs first, in the order of the fleet file.
 
-    Stream names (``<task>/in/<i>``, ``<task>/out/<i>``) depend on the rule's place only: counters and kept values that
-    hang on them outlive every move.
+    Stream names (``<task>/in/<i>``, ``<task>/out/<i>``, ``<task>/srv/<i>``) depend on the rule's place only: counters
+    and kept values that hang on them outlive every move.
     """
     names = {"robot": robot, "node": robot, "target": owner, "task": task.name, "epoch": str(epoch)}
     return tuple(
@@ -92,15 +120,16 @@ def routes_for(task: TaskSpec, robot: NodeId, owner: NodeId, epoch: int) -> tupl
             from_expr=fill(rule.from_template, **names),
             to_expr=fill(rule.to_template, **names),
             settings=rule.settings,
+            service=rule.service,
         )
         for stream, rule in named_rules(task)
     )
 
 
 def named_rules(task: TaskSpec) -> tuple[tuple[str, StreamRule], ...]:
-    """(stream name, rule) of ``task``: inputs first, each direction counted from 0."""
+    """(stream name, rule) of ``task``: inputs, outputs, services, each counted from 0."""
     named: list[tuple[str, StreamRule]] = []
-    for direction, word in ((Direction.INPUT, "in"), (Direction.OUTPUT, "out")):
+    for direction, word in ((Direction.INPUT, "in"), (Direction.OUTPUT, "out"), (Direction.SERVICE, "srv")):
         rules = [rule for rule in task.rules if rule.direction is direction]
         named.extend((f"{task.name}/{word}/{index}", rule) for index, rule in enumerate(rules))
     return tuple(named)
@@ -132,7 +161,7 @@ def _placeholder_fault(template: str, direction: Direction, side: str) -> str | 
         if name in allowed:
             continue
         why = _WHY_NOT.get((direction, side, name), f"only the 'from' of an output has {{{name}}}")
-        return f"{{{name}}} may not stand in the '{side}' of an {direction}: {why}"
+        return f"{{{name}}} may not stand in the '{side}' of {_A[direction]}: {why}"
     if "{" in _BRACES.sub("", template) or "}" in _BRACES.sub("", template):
         return "a brace is not closed"
     if template.count("{epoch}") > 1 or ("{epoch}" in template and "{epoch}" not in template.split("/")):
@@ -141,14 +170,9 @@ def _placeholder_fault(template: str, direction: Direction, side: str) -> str | 
 
 
 def _missing_fault(template: str, direction: Direction, side: str) -> str | None:
-    held = set(placeholders(template))
-    if (direction, side) == (Direction.INPUT, "to") and "target" not in held:
-        return "it lacks {target}: an input goes to whichever node owns the task"
-    if (direction, side) == (Direction.OUTPUT, "from") and "target" not in held:
-        return "it lacks {target}: an output comes from whichever node owns the task"
-    if (direction, side) == (Direction.OUTPUT, "to") and not held & {"robot", "node"}:
-        return "it lacks {robot}: every robot would publish its copy under one key"
-    return None
+    needed, why = _NEEDED.get((direction, side), (frozenset(), ""))
+    is_there = not needed or needed & set(placeholders(template))
+    return None if is_there else why
 
 
 def _expression_fault(template: str) -> str | None:
