@@ -123,15 +123,18 @@ def init(
         int,
         typer.Option("--generation", metavar="G", min=0, max=2**20, help="Above 0: start anew, on every node at once."),
     ] = 0,
+    settle: Annotated[
+        bool, typer.Option("--settle", help="The other machine of this name is gone: be an elector again.")
+    ] = False,
 ) -> None:
     """Create this node's blank state: "this name has never voted here".
 
-    Refuses when there is a state already. It does not ask the fleet whether this name has voted: do not run it for a
-    robot whose disk was lost, unless on every node at once with a higher --generation.
+    Refuses when there is a state already, or when a node that can be reached knows this name as an elector that has
+    voted. If too many states are lost to agree, run it on every node at once with a higher --generation.
     """
     from zsched import places  # noqa: PLC0415 - each verb imports what it needs
     from zsched.config import load_fleet  # noqa: PLC0415 - ruamel.yaml is slow to import
-    from zsched.lifecycle import init_state  # noqa: PLC0415 - as above
+    from zsched.lifecycle import check_never_voted, init_state, settle_dispute  # noqa: PLC0415 - imports zenoh
 
     file = places.config_path(config, os.environ)
     fleet = load_fleet(file)
@@ -143,7 +146,14 @@ def init(
             f"{file}: no node {name!r} under 'nodes' (there are {', '.join(known)}); say which one this machine is "
             "with --node NAME or ZSCHED_NODE",
         )
-    path = init_state(fleet, name, places.state_folder(state_dir, os.environ), generation)
+    folder = places.state_folder(state_dir, os.environ)
+    if settle:
+        done = settle_dispute(fleet, name, folder)
+        typer.echo(f"{name}: {'settled; restart its daemon' if done else 'there was no dispute'}")
+        return
+    asked = check_never_voted(fleet, name) if generation == 0 else 0
+    path = init_state(fleet, name, folder, generation)
+    typer.echo(f"asked {asked} nodes: none remembers a vote of {name}" if asked else "no other node reached", err=True)
     typer.echo(f"{path}: blank state of {name} in fleet {fleet.name}, generation {generation}")
 
 

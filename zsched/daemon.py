@@ -302,6 +302,8 @@ class Daemon:
             event = self._inbox.take(wait) or ev.DeadlineReached()
             now = monotonic_s()
             shell.carry_out(node.handle(event, now))
+            if shell.stand_down:
+                raise ConfigError(f"{node.me}: {shell.stand_down}")
             if not is_ready and isinstance(event, ev.ProfileSampled):
                 is_ready = True
                 self._notify.ready()

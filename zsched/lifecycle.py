@@ -1,16 +1,20 @@
 """`zsched init`: creates a node's blank durable state, which states "this name has never voted here".
 
-Knows: what a blank state holds. Does not know: how daemons use it.
+Knows: what a blank state holds, and whom to ask whether that is true. Does not know: how daemons use it.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+from zsched import zenoh_config
+from zsched.adapters.control_bus import ask_fleet
 from zsched.adapters.state_file import StateFile, hardware_id
 from zsched.clock import wall_seconds
-from zsched.core.fleet import Fleet, electorate_hash
+from zsched.core.fleet import Fleet, dial_endpoint, electorate_hash
 from zsched.core.model import Allocation, DurableState, NodeId, RegisterState
+from zsched.errors import AdapterError
 
 GENERATION_STEP = 2**32
 """Revision and epoch of generation G start at G times this, so they only rise."""
@@ -46,3 +50,45 @@ def init_state(fleet: Fleet, node: NodeId, folder: Path, generation: int) -> Pat
     with StateFile(folder, fleet=fleet.name, node=node) as file:
         file.create(state)
         return file.path
+
+
+def check_never_voted(fleet: Fleet, node: NodeId) -> int:
+    """Ask every node that can be reached whether ``node`` is known as an elector that has voted.
+
+    Returns:
+        How many nodes answered; 0 when none could be reached (then nothing is known).
+
+    Raises:
+        AdapterError: somebody remembers its votes: a blank state would make it break its promises.
+    """
+    others = [spec for spec in fleet.nodes if spec.name != node and spec.listen_control]
+    endpoints = tuple(filter(None, (dial_endpoint(spec.listen_control, spec.host) for spec in others)))
+    if not endpoints or node not in fleet.electors:
+        return 0
+    answers = ask_fleet(fleet.name, node, zenoh_config.client_config(connect=endpoints, timing=fleet.timing))
+    for answer in answers:
+        if node in answer.quorum.voted and answer.node != node:
+            raise AdapterError(
+                f"{answer.node} knows {node} as an elector that has voted; a blank state would let it vote twice. "
+                "Restore its state folder, or start a new generation on every node with `zsched init --generation G`"
+            )
+    return len(answers)
+
+
+def settle_dispute(fleet: Fleet, node: NodeId, folder: Path) -> bool:
+    """The operator has removed the other machine of this name: let this one be an elector again.
+
+    Returns:
+        Whether there was anything to settle.
+
+    Raises:
+        AdapterError: no valid state, or it cannot be written.
+    """
+    with StateFile(folder, fleet=fleet.name, node=node) as file:
+        loaded = file.load()
+        if loaded.state is None:
+            raise AdapterError(f"nothing to settle: {loaded.problem}")
+        if not loaded.state.disputed:
+            return False
+        file.save(replace(loaded.state, disputed=""))
+        return True

@@ -162,6 +162,8 @@ class Shell:
         # These two report to this shell, so they are made after it.
         self.supervisor: WorkerSupervisor | None = None
         self.relay: RelayHandle | None = None
+        self.stand_down = ""
+        """Why this daemon must end with the exit code of a wrong configuration; empty: it need not."""
         self._failed_at: dict[str, float] = {}
         self._lives: dict[TaskId, int] = {}
         """{task: the running process's incarnation}, 0 once it has ended; none for somebody else's worker."""
@@ -233,6 +235,8 @@ class Shell:
                 self._workers().start(task)
             case do.StopWorker(task=task):
                 self._workers().stop(task)
+            case do.StandDown(reason=reason):
+                self.stand_down = reason
             case do.RecordStory():
                 _tell(instruction)
             case _:

@@ -15,13 +15,16 @@ from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.fleet import Fleet
 from zsched.core.lease import Leases
-from zsched.core.messages import CommandOutcome, CommandResult, Learnt, Refusal, Refused
-from zsched.core.model import Allocation, Ballot, Beat, DurableState, NodeId, RegisterState, TaskId, Weights
+from zsched.core.messages import CommandOutcome, CommandResult, Learnt, Promise, Refusal, Refused
+from zsched.core.model import NO_BALLOT, Allocation, Ballot, Beat, DurableState, NodeId, RegisterState, TaskId, Weights
 from zsched.core.register import Change, MoveOwner, Register, Retune, RoundOutcome, Step
 
 SETTLE_AFTER_START_S = 0.3
 """A starting elector learns first what was accepted before (an identity round), once its peers are connected."""
 ASK_LEARNT_EVERY_S = 0.3
+PREPARES_PER_S = 20.0
+PREPARE_BURST = 40.0
+"""What one peer may cost an elector: proposers back off to far less, only a broken one comes near."""
 PARK_SHARE = 0.8
 """An accept that a lease forbids waits for the release so long (of a ballot's deadline) before it is refused."""
 
@@ -74,9 +77,18 @@ class Agreement:
         self._fleet, self._me = fleet, me
         self._nodes = frozenset(node.name for node in fleet.nodes)
         self._durable = durable
-        self.is_elector = durable is not None and me in fleet.electors
+        self.generation = None if durable is None else durable.generation
+        """``None``: this node has no state, and goes by whatever it is told."""
+        if self.generation:
+            electorate = f"{electorate}/{self.generation}"  # generations refuse each other's ballots
+        self._disputed = "" if durable is None else durable.disputed
+        self.voted = set() if durable is None else set(durable.voted)
+        self.is_elector = durable is not None and me in fleet.electors and not self._disputed
         self.problems: dict[str, str] = {}
+        if self._disputed:
+            self.problems["state"] = f"{self._disputed}; no elector until `zsched init --settle`"
         self.counters: Counter[str] = Counter()
+        self._buckets: dict[NodeId, tuple[float, float]] = {}
         stored = {} if durable is None else {state.task: state for state in durable.registers}
         self.registers = {
             task.name: Register(
@@ -114,7 +126,8 @@ class Agreement:
 
     def learnt(self) -> Learnt:
         """What this node tells others: learnt values only, never accepted ones."""
-        return Learnt(node=self._me, values=tuple(value for value in self.values().values() if value.revision > 0))
+        values = tuple(value for value in self.values().values() if value.revision > 0)
+        return Learnt(node=self._me, values=values, generation=self.generation or 0)
 
     def next_deadline(self) -> float:
         """When `tick` may have something to do."""
@@ -136,19 +149,40 @@ class Agreement:
         if self._durable is None:
             return None
         states = tuple(self.registers[name].state for name in sorted(self.registers))
-        self._durable = replace(self._durable, registers=(*states, *self._foreign))
+        self._durable = replace(
+            self._durable,
+            registers=(*states, *self._foreign),
+            voted=tuple(sorted(self.voted)),
+            disputed=self._disputed,
+        )
         return self._durable
+
+    @property
+    def has_voted(self) -> bool:
+        """Whether this elector has ever promised anything (in any life that its state remembers)."""
+        return any(register.state.promised != NO_BALLOT for register in self.registers.values())
 
     # --- electors ----------------------------------------------------------------------------------------------------
 
-    def on_prepare(self, event: ev.PrepareAsked) -> Effects:
-        """A proposer asks for a promise; only for its own ballots."""
+    def on_prepare(self, event: ev.PrepareAsked, now: float) -> Effects:
+        """A proposer asks for a promise; only for its own ballots, and not too often (each promise costs an fsync)."""
         register = self.registers.get(event.prepare.task)
         if register is None or not self._is_its_own(event.prepare.ballot, event.asker):
             self.counters["prepare_foreign"] += 1
             return Effects()
+        if not self._may_ask(event.asker, now):
+            self.counters["prepare_rate"] += 1
+            answer: Promise | Refused = register.refuse(event.prepare.ballot, Refusal.RATE)
+            return Effects(send=[do.AnswerElection(request=event.request, answer=answer)])
         step, answer = register.on_prepare(event.prepare)
         return Effects(is_dirty=step.is_dirty, send=[do.AnswerElection(request=event.request, answer=answer)])
+
+    def _may_ask(self, asker: NodeId, now: float) -> bool:
+        """One token of the asker's bucket (`PREPARES_PER_S`, at most `PREPARE_BURST` saved)."""
+        tokens, at = self._buckets.get(asker, (PREPARE_BURST, now))
+        tokens = min(tokens + (now - at) * PREPARES_PER_S, PREPARE_BURST)
+        self._buckets[asker] = (max(tokens - 1.0, 0.0), now)
+        return tokens >= 1.0
 
     def on_accept(self, event: ev.AcceptAsked, now: float) -> Effects:
         """A proposer asks to accept a value; only under its own ballots."""
@@ -217,6 +251,8 @@ class Agreement:
         if learnt.node not in self._nodes:
             self.counters["learnt_foreign"] += 1
             return effects
+        if not self._is_our_generation(learnt.node, learnt.generation):
+            return effects
         for value in learnt.values:
             register = self.registers.get(value.task)
             if register is None:
@@ -228,8 +264,35 @@ class Agreement:
             self._take(value.task, step, effects)
         return effects
 
+    def _is_our_generation(self, node: NodeId, generation: int) -> bool:
+        """Whether a node's learnt values mean anything here; the difference is shown."""
+        source = f"generation/{node}"
+        if self.generation is None or generation == self.generation:
+            self.problems.pop(source, None)
+            return True
+        self.problems[source] = f"{node} is of generation {generation}, this node of {self.generation}: init them alike"
+        return False
+
+    def note_voter(self, beat: Beat) -> Effects:
+        """A peer's beat says that it has voted: remembered on disk, for the day its disk is lost."""
+        if not beat.has_voted or beat.node in self.voted or beat.node not in self._fleet.electors:
+            return Effects()
+        self.voted.add(beat.node)
+        return Effects(is_dirty=self._durable is not None)
+
+    def dispute(self, reason: str) -> Effects:
+        """Our name is used by somebody else too: no elector any more, on disk, until the operator settles it."""
+        if self._disputed:
+            return Effects()
+        self._disputed = reason
+        self.problems["state"] = f"{reason}; no elector until `zsched init --settle`"
+        self._stop_electing()
+        return Effects(is_dirty=self._durable is not None)
+
     def compare(self, beat: Beat, now: float) -> Effects:
         """A peer's beat may show that it has learnt more than we: then ask it."""
+        if not self._is_our_generation(beat.node, beat.generation):
+            return Effects()
         is_behind = any(
             task in self.registers and revision > self.registers[task].value.revision
             for task, revision, _ in beat.learnt
@@ -284,7 +347,11 @@ class Agreement:
     def on_persist_failed(self, reason: str) -> None:
         """The disk refused: no elector any more, and nothing is written any more."""
         self.problems["state"] = f"{reason}; this node is no elector until it is restarted"
-        self._durable, self.is_elector = None, False
+        self._durable = None
+        self._stop_electing()
+
+    def _stop_electing(self) -> None:
+        self.is_elector = False
         self.leases.stop_granting()
         for register in self.registers.values():
             register.stop_electing()

@@ -153,6 +153,13 @@ class AnswerCommand:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class StandDown:
+    """End this daemon with the exit code of a wrong configuration: its name is alive elsewhere."""
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RecordStory:
     """One line for the journal and the decision log: a decision, a commit, a handover step, a peer's change."""
 
@@ -182,5 +189,6 @@ Instruction = (
     | ApplyRoutes
     | AnswerStatus
     | AnswerCommand
+    | StandDown
     | RecordStory
 )

@@ -15,6 +15,7 @@ from zsched.core.model import (
     NodeId,
     TaskId,
     UtilityVector,
+    check_counter,
     check_name,
 )
 
@@ -105,9 +106,11 @@ class Learnt:
 
     node: NodeId
     values: tuple[Allocation, ...]
+    generation: int = 0
 
     def __post_init__(self) -> None:
         check_name("learnt.node", self.node)
+        check_counter("learnt.generation", self.generation)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -356,6 +356,10 @@ class DurableState:
     hardware: str
     electorate: str
     registers: tuple[RegisterState, ...] = ()
+    voted: tuple[NodeId, ...] = ()
+    """Electors that this node has heard to have voted: such a name must not be initialised anew."""
+    disputed: str = ""
+    """Why this node stands down as elector until the operator settles it; empty: it does not."""
 
 
 # --- membership ------------------------------------------------------------------------------------------------------
@@ -408,9 +412,16 @@ class Beat:
     """Exclusive tasks: what this owner has given back."""
     asked_to_leave: tuple[tuple[TaskId, NodeId, int], ...] = ()
     """(task, owner, epoch): this elector has refused another owner for their sake."""
+    fleet_file: str = ""
+    """Hash of the fleet file that this node goes by."""
+    has_voted: bool = False
+    """Whether this elector has ever promised anything."""
+    generation: int = 0
+    """Of this node's state; what nodes of another generation have learnt means nothing here."""
 
     def __post_init__(self) -> None:
         check_name("beat.node", self.node)
         check_counter("beat.incarnation", self.incarnation)
         check_counter("beat.sequence", self.sequence)
         check_range("beat.loop_lag_s", self.loop_lag_s, 0.0, 86400.0)
+        check_counter("beat.generation", self.generation)

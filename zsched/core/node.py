@@ -21,7 +21,7 @@ from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.agreement import Agreement, Effects
 from zsched.core.executor import Executor
-from zsched.core.fleet import Fleet
+from zsched.core.fleet import Fleet, fleet_hash
 from zsched.core.gateway import Gateway
 from zsched.core.membership import Membership, Transition
 from zsched.core.model import (
@@ -42,6 +42,10 @@ from zsched.core.rounds import Rounds
 from zsched.core.status import PastValue, build_snapshot
 
 HISTORY = 32
+TWIN_YOUNG_S = 3.0
+"""A daemon that finds its own name alive so soon after its start leaves again."""
+TWIN_STAYS_S = 5.0
+"""A twin that stays so long disputes the name."""
 
 
 @dataclass(slots=True)
@@ -56,7 +60,8 @@ class _Batch:
         """Sort instructions into sending (other nodes see it) and applying (this machine does it)."""
         for instruction in instructions:
             is_local = isinstance(
-                instruction, do.ApplyRoutes | do.SetRole | do.StartWorker | do.StopWorker | do.RecordStory
+                instruction,
+                do.ApplyRoutes | do.SetRole | do.StartWorker | do.StopWorker | do.RecordStory | do.StandDown,
             )
             (self.apply if is_local else self.send).append(instruction)
 
@@ -120,6 +125,9 @@ class Node:
         self.executors = {
             task.name: Executor(spec=task, me=me, has_streams=self.kind is NodeKind.ROBOT) for task in fleet.tasks
         }
+        self.fleet_file = fleet_hash(fleet)
+        self._twin: tuple[int, int, float] | None = None
+        """(incarnation, first sequence, since when) of another daemon with our name."""
         self._beat_at = now
         self._beat_sequence = 0
         self.loop_lag_s = 0.0
@@ -224,6 +232,9 @@ class Node:
             echoes=parts.echoes,
             released=parts.released,
             asked_to_leave=parts.asked_to_leave,
+            fleet_file=self.fleet_file,
+            has_voted=self.agreement.has_voted,
+            generation=self.agreement.generation or 0,
         )
         self.loop_lag_s = 0.0
         self._beat_at = now + self.fleet.timing.beat_s
@@ -233,8 +244,7 @@ class Node:
     def _on_beat(self, event: ev.BeatReceived, now: float) -> None:
         beat = event.beat
         if beat.node == self.me:
-            if beat.incarnation != self.incarnation:
-                self.problems["membership"] = f"another daemon calls itself {self.me!r}"
+            self._on_twin(beat, now)
             return
         if not self.membership.is_known(beat.node):
             self.counters["beat_foreign"] += 1
@@ -242,7 +252,33 @@ class Node:
         for change in self.membership.absorb_beat(beat, now):
             self._on_transition(change, now)
         self._agree(self.agreement.compare(beat, now), now)
+        self._agree(self.agreement.note_voter(beat), now)
+        self._compare_files(beat)
         self._hear_leases(beat, now)
+
+    def _compare_files(self, beat: Beat) -> None:
+        """Everybody must go by the same fleet file; who does not is shown."""
+        differs = beat.fleet_file not in ("", self.fleet_file)
+        text = f"{beat.node} goes by another fleet file ({beat.fleet_file}, here {self.fleet_file})"
+        self._set_problem(f"fleet/{beat.node}", text if differs else None)
+
+    def _on_twin(self, beat: Beat, now: float) -> None:
+        """A beat in our own name that is not ours. The younger one leaves; if both stay, neither may be an elector."""
+        if beat.incarnation == self.incarnation:
+            return
+        reason = f"another daemon calls itself {self.me!r}"
+        self.problems["membership"] = reason
+        if self._twin is None or self._twin[0] != beat.incarnation:
+            self._twin = (beat.incarnation, beat.sequence, now)
+            return
+        if beat.sequence <= self._twin[1]:
+            return  # an echo of an earlier life, not a life
+        # Beats are as many as a life is old: who has sent fewer came later.
+        is_younger = (self._beat_sequence, -self.incarnation) < (beat.sequence, -beat.incarnation)
+        if is_younger and now - self.started_at < TWIN_YOUNG_S:
+            self._batch.add(do.StandDown(reason=f"{reason}; stop it, or give this machine a name of its own"))
+        elif now - self._twin[2] >= TWIN_STAYS_S:
+            self._agree(self.agreement.dispute(reason), now)
 
     # --- exclusive tasks ---------------------------------------------------------------------------------------------
 
@@ -466,7 +502,7 @@ class Node:
             ev.UtilityAsked: self._on_utility_asked,
             ev.UtilityReceived: self._on_utility,
             ev.ProposalReceived: self._on_proposal,
-            ev.PrepareAsked: lambda event, now: self._agree(self.agreement.on_prepare(event), now),
+            ev.PrepareAsked: lambda event, now: self._agree(self.agreement.on_prepare(event, now), now),
             ev.AcceptAsked: lambda event, now: self._agree(self.agreement.on_accept(event, now), now),
             ev.ElectorAnswered: lambda event, now: self._agree(self.agreement.on_answer(event, now), now),
             ev.LearntReceived: lambda event, now: self._agree(self.agreement.on_learnt(event.learnt, now), now),

@@ -111,6 +111,8 @@ class QuorumStatus:
     ok: bool
     this_node: str
     """``elector``, ``no_elector`` (not in the electorate) or ``lost_state``."""
+    voted: tuple[NodeId, ...] = ()
+    """Electors that this node knows to have voted (they must not be initialised anew)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -128,5 +130,7 @@ class Snapshot:
     quorum: QuorumStatus
     nodes: tuple[NodeStatus, ...]
     tasks: tuple[TaskStatus, ...]
+    fleet_file: str = ""
+    """Hash of the fleet file that the answering node goes by."""
     counters: tuple[tuple[str, int], ...] = ()
     problems: tuple[str, ...] = ()

@@ -46,6 +46,7 @@ class NodeView(Protocol):
     fleet: Fleet
     me: NodeId
     version: str
+    fleet_file: str
     kind: NodeKind
     incarnation: int
     started_at: float
@@ -78,6 +79,7 @@ def build_snapshot(node: NodeView, now: float) -> Snapshot:
         quorum=quorum,
         nodes=tuple(_node_status(node, spec, now) for spec in node.fleet.nodes),
         tasks=tuple(_task_status(node, spec, now) for spec in node.fleet.tasks),
+        fleet_file=node.fleet_file,
         counters=tuple(sorted((node.counters + node.agreement.counters).items())),
         problems=_problems(node, quorum),
     )
@@ -100,7 +102,12 @@ def _quorum(node: NodeView) -> QuorumStatus:
     needed = majority(len(electors))
     role = "elector" if node.agreement.is_elector else ("lost_state" if node.me in electors else "no_elector")
     return QuorumStatus(
-        electors=len(electors), needed=needed, alive=len(alive), ok=len(alive) >= needed, this_node=role
+        electors=len(electors),
+        needed=needed,
+        alive=len(alive),
+        ok=len(alive) >= needed,
+        this_node=role,
+        voted=tuple(sorted(node.agreement.voted)),
     )
 
 

@@ -312,7 +312,7 @@ def test_refused_write_ends_the_electorship_and_the_writing() -> None:
     assert agreement.problems == {"state": "disk full; this node is no elector until it is restarted"}
     ballot = Ballot(counter=1, node="robot2", incarnation=1)
     effects = agreement.on_prepare(
-        ev.PrepareAsked(request=1, asker="robot2", prepare=replace(_prepare(agreement), ballot=ballot))
+        ev.PrepareAsked(request=1, asker="robot2", prepare=replace(_prepare(agreement), ballot=ballot)), 100.0
     )
     assert [one.answer for one in of(effects, do.AnswerElection)] == [
         Refused(elector="robot1", task="merge", ballot=ballot, refusal=Refusal.NOT_ELECTOR, promised=NO_BALLOT)
@@ -346,3 +346,80 @@ def test_move_on_an_outdated_revision_ends_as_a_conflict_without_a_message() -> 
     effects = agreement.propose("merge", MoveOwner(base_revision=2, owner="edge1", reason=""), 100.0)
     assert effects.ended == ["merge"]
     assert [type(one) for one in effects.send] == [do.RecordStory]
+
+
+# --- identity --------------------------------------------------------------------------------------------------------
+
+
+def test_prepares_of_one_peer_are_rate_limited_and_others_are_not() -> None:
+    """Each promise costs an fsync: a broken proposer must not wear out the disk."""
+    agreement = make()
+    answers = []
+    for number in range(60):
+        prepare = Prepare(task="merge", ballot=Ballot(counter=number + 1, node="robot2", incarnation=1), electorate="e")
+        effects = agreement.on_prepare(ev.PrepareAsked(request=number, asker="robot2", prepare=prepare), 100.0)
+        answers += [i.answer for i in of(effects, do.AnswerElection)]
+    refused = [answer for answer in answers if isinstance(answer, Refused)]
+    assert len(answers) == 60
+    assert len(refused) == 20
+    assert {answer.refusal for answer in refused} == {Refusal.RATE}
+    other = Prepare(task="merge", ballot=Ballot(counter=99, node="robot3", incarnation=1), electorate="e")
+    (answer,) = of(
+        agreement.on_prepare(ev.PrepareAsked(request=1, asker="robot3", prepare=other), 100.0), do.AnswerElection
+    )
+    assert isinstance(answer.answer, Promise)
+    again = Prepare(task="merge", ballot=Ballot(counter=100, node="robot2", incarnation=1), electorate="e")
+    (later,) = of(
+        agreement.on_prepare(ev.PrepareAsked(request=1, asker="robot2", prepare=again), 101.0), do.AnswerElection
+    )
+    assert isinstance(later.answer, Promise)
+
+
+def test_who_has_voted_is_remembered_on_disk_once() -> None:
+    agreement = make()
+    heard = replace(beat("robot2", 0), has_voted=True)
+    assert agreement.note_voter(heard).is_dirty
+    assert not agreement.note_voter(heard).is_dirty
+    assert not agreement.note_voter(replace(beat("edge1", 0), has_voted=True)).is_dirty, "no elector"
+    state = agreement.to_persist()
+    assert state is not None
+    assert state.voted == ("robot2",)
+
+
+def test_disputed_name_is_no_elector_in_this_life_and_the_next() -> None:
+    agreement = make()
+    assert agreement.dispute("another daemon calls itself 'robot1'").is_dirty
+    assert not agreement.is_elector
+    state = agreement.to_persist()
+    assert state is not None
+    assert "another daemon" in state.disputed
+    again = Agreement(fleet=FLEET, me="robot1", durable=state, incarnation=8, electorate="e", rng=Random(1), now=0.0)
+    assert not again.is_elector
+    assert "--settle" in again.problems["state"]
+
+
+def test_another_generation_teaches_nothing_and_is_shown_until_it_is_gone() -> None:
+    agreement = make()
+    told_by = Learnt(node="robot2", values=(value(2**32, None),), generation=1)
+    assert agreement.on_learnt(told_by, 100.0) == Effects()
+    assert agreement.registers["merge"].value.revision == 0
+    assert "generation 1" in agreement.problems["generation/robot2"]
+    agreement.on_learnt(Learnt(node="robot2", values=(value(3),)), 100.0)
+    assert "generation/robot2" not in agreement.problems
+    assert agreement.registers["merge"].value.revision == 3
+
+
+def test_generations_refuse_each_others_ballots() -> None:
+    agreement = make()
+    stranger = Prepare(task="merge", ballot=Ballot(counter=1, node="robot2", incarnation=1), electorate="e/1")
+    (said,) = of(
+        agreement.on_prepare(ev.PrepareAsked(request=1, asker="robot2", prepare=stranger), 0.0), do.AnswerElection
+    )
+    assert isinstance(said.answer, Refused)
+    assert said.answer.refusal is Refusal.ELECTORATE
+
+
+def test_node_without_state_believes_whatever_generation_it_is_told() -> None:
+    agreement = make(has_state=False)
+    agreement.on_learnt(Learnt(node="robot2", values=(value(2**32 + 1),), generation=1), 100.0)
+    assert agreement.registers["merge"].value.revision == 2**32 + 1

@@ -361,6 +361,41 @@ def test_our_own_name_elsewhere_is_a_problem_until_its_token_goes(event: ev.Even
     assert node.problems == {}
 
 
+def test_younger_twin_leaves_and_the_older_one_stays() -> None:
+    """Who has beaten less often came later; one beat alone may be an echo of an earlier life."""
+    young = started()
+    young.handle(ev.BeatReceived(beat=beat("robot1", 50, incarnation=8)), 100.5)
+    batch = young.handle(ev.BeatReceived(beat=beat("robot1", 51, incarnation=8)), 100.7)
+    assert len(of(batch, do.StandDown)) == 1
+    old = started()
+    for step in range(40):
+        old.handle(ev.DeadlineReached(), 100.0 + step * 0.2)
+    batch = old.handle(ev.BeatReceived(beat=beat("robot1", 1, incarnation=8)), 108.0)
+    batch += old.handle(ev.BeatReceived(beat=beat("robot1", 2, incarnation=8)), 108.2)
+    assert of(batch, do.StandDown) == []
+    assert old.agreement.is_elector
+
+
+def test_twin_that_stays_disputes_the_name_on_disk() -> None:
+    node = started()
+    batch: tuple[do.Instruction, ...] = ()
+    for step in range(40):
+        now = 110.0 + step * 0.2
+        batch += node.handle(ev.BeatReceived(beat=beat("robot1", 100 + step, incarnation=8)), now)
+    assert not node.agreement.is_elector
+    assert any(one.state.disputed for one in of(batch, do.PersistState))
+    assert of(batch, do.StandDown) == []
+
+
+def test_another_fleet_file_is_a_problem_until_it_is_the_same() -> None:
+    node = started()
+    strange = replace(beat("robot2", 1), fleet_file="0123456789abcdef")
+    node.handle(ev.BeatReceived(beat=strange), 100.0)
+    assert "another fleet file" in node.problems["fleet/robot2"]
+    node.handle(ev.BeatReceived(beat=replace(beat("robot2", 2), fleet_file=node.fleet_file)), 100.2)
+    assert node.problems == {}
+
+
 def test_our_own_token_is_no_problem() -> None:
     node = started()
     node.handle(ev.TokenSeen(node="robot1", incarnation=7), 100.0)

@@ -1,0 +1,90 @@
+"""Who may call itself an elector: lost state, twins, foreign fleet files, on real daemons."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from zsched.lab.testbed import DAEMON, Testbed, echo_fleet
+from zsched.lifecycle import init_state
+
+pytestmark = pytest.mark.timeout(90)
+
+
+@pytest.fixture
+def bed(tmp_path: Path) -> Iterator[Testbed]:
+    with Testbed(tmp_path, echo_fleet(edges=1)) as testbed:
+        testbed.init()
+        testbed.start()
+        testbed.wait_settled()
+        yield testbed
+
+
+def run_init(bed: Testbed, node: str, folder: Path, *more: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "zsched.cli", "init", "--config", str(bed.file), "--node", node]
+    command += ["--state-dir", str(folder), *more]
+    return subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
+
+
+def test_init_refuses_a_name_that_the_fleet_remembers_as_a_voter(bed: Testbed) -> None:
+    """robot3's disk is lost after it has voted: a blank state is refused, a new generation is not."""
+    bed.wait(lambda: "robot3" in bed.status("robot1")["quorum"]["voted"], 10, "robot1 to remember robot3's vote")
+    bed.kill("robot3")
+    shutil.rmtree(bed.folder / "robot3")
+    refused = run_init(bed, "robot3", bed.folder / "robot3")
+    assert refused.returncode == 1
+    assert "knows robot3 as an elector that has voted" in refused.stderr
+    assert not (bed.folder / "robot3" / "state").exists()
+    edge = run_init(bed, "edge1", bed.folder / "edge1-again")
+    assert edge.returncode == 0, edge.stderr
+
+
+def test_init_without_a_reachable_node_goes_on(tmp_path: Path) -> None:
+    """A fleet's first machine has nobody to ask, and does not wait long."""
+    bed = Testbed(tmp_path, echo_fleet())
+    done = run_init(bed, "robot1", tmp_path / "robot1")
+    assert done.returncode == 0
+    assert "no other node reached" in done.stderr
+
+
+def test_second_machine_of_a_name_leaves_again_with_78(bed: Testbed) -> None:
+    """A daemon that finds its own name alive elsewhere exits 78; the one that was there stays an elector."""
+    tree = json.loads(bed.file.read_text())
+    other = dict(tree["nodes"]["robot2"])
+    other["listen"] = {"control": "tcp/127.0.0.1:0", "data": "tcp/127.0.0.1:0"}
+    twin_file = bed.folder / "twin.yaml"
+    del other["listen"]
+    tree["nodes"]["robot2"] = other
+    twin_file.write_text(json.dumps(tree))
+    init_state(bed.fleet, "robot2", bed.folder / "twin", 0)  # an operator who does not ask the fleet
+    folders = ("--state-dir", str(bed.folder / "twin"), "--runtime-dir", str(bed.folder / "twin-run"))
+    twin = subprocess.run(
+        [*DAEMON, "--config", str(twin_file), "--node", "robot2", *folders],
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=False,
+    )
+    assert twin.returncode == 78, twin.stderr[-2000:]
+    assert "another daemon calls itself 'robot2'" in twin.stderr
+    assert bed.status("robot2")["quorum"]["this_node"] == "elector"
+
+
+def test_another_fleet_file_is_shown(bed: Testbed) -> None:
+    """One machine was forgotten when the file was changed: the others say so."""
+    tree = json.loads(bed.file.read_text())
+    tree["tasks"]["echo"]["scheduling"]["bonus"] = 0.2
+    bed.stop("edge1")
+    bed.file.write_text(json.dumps(tree))
+    bed.start("edge1")
+
+    def told() -> bool:
+        return any("another fleet file" in problem for problem in bed.status("robot1")["problems"])
+
+    bed.wait(told, 15, "robot1 to notice")
