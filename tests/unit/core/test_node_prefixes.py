@@ -7,16 +7,31 @@ nothing leaves which is not on disk, and says where it is cut. The simulator che
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from random import Random
 
 import pytest
 
+from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.executor import Phase
-from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.messages import Accepted, Promise
-from zsched.core.model import NO_BALLOT, DurableState, NodeId, NodeKind, RegisterState, TaskId, Tuning, Weights
+from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, electorate_hash
+from zsched.core.lease import hold_s
+from zsched.core.messages import Accept, Accepted, Promise
+from zsched.core.model import (
+    NO_BALLOT,
+    Acceptance,
+    Allocation,
+    Ballot,
+    DurableState,
+    NodeId,
+    NodeKind,
+    RegisterState,
+    TaskId,
+    Tuning,
+    Weights,
+)
+from zsched.core.node import Node
 from zsched.core.plan import WorkerRole
 from zsched.lab.simulator import Simulator
 
@@ -238,3 +253,45 @@ def test_a_disk_that_refuses_costs_the_electorate_one_and_nobody_the_task(name: 
         assert "no elector" in node.agreement.problems["state"]
         assert sim.disk(name) == before
         assert name not in ROBOTS or node.executors[TASK].phase is Phase.SETTLED
+
+
+@pytest.mark.parametrize(("owner", "is_free_at_once"), [("edge1", True), ("edge2", False)])
+def test_elector_that_has_just_started_grants_nobody_new_before_its_old_grant_has_run_out(
+    owner: NodeId, is_free_at_once: bool
+) -> None:
+    """Grants live in memory: a crash forgets when the last one was, so the whole lease is waited for."""
+    old = Allocation(task=TASK, revision=1, epoch=1, owner="edge1", tuning=EXCLUSIVE.tasks[0].tuning)
+    accepted = Acceptance(ballot=Ballot(counter=5, node="robot2", incarnation=1), value=old)
+    held = RegisterState(task=TASK, promised=accepted.ballot, accepted=accepted, learnt=old)
+    electorate = electorate_hash(EXCLUSIVE)
+
+    def is_accepted(after_s: float) -> bool:
+        state = DurableState(
+            fleet="sim",
+            node="robot1",
+            incarnation=2,
+            generation=0,
+            hardware="",
+            electorate=electorate,
+            registers=(held,),
+        )
+        node = Node(
+            fleet=EXCLUSIVE,
+            me="robot1",
+            durable=state,
+            incarnation=2,
+            electorate=electorate,
+            rng=Random(1),
+            now=100.0,
+        )
+        node.start(100.0)
+        ballot = Ballot(counter=6, node="robot2", incarnation=1)
+        value = replace(old, revision=2, epoch=2 if owner != "edge1" else 1, owner=owner)
+        asked = Accept(task=TASK, acceptance=Acceptance(ballot=ballot, value=value), electorate=electorate)
+        batch = node.handle(ev.AcceptAsked(request=1, asker="robot2", accept=asked), 100.0 + after_s)
+        return any(isinstance(one, do.AnswerElection) and isinstance(one.answer, Accepted) for one in batch)
+
+    hold = hold_s(EXCLUSIVE.timing.lease_s)
+    assert is_accepted(0.01) is is_free_at_once
+    assert is_accepted(hold - 0.01) is is_free_at_once
+    assert is_accepted(hold + 0.01)
