@@ -34,8 +34,8 @@ from zsched.adapters.worker_supervisor import WorkerContext, WorkerSupervisor
 from zsched.clock import monotonic_s, wall_seconds
 from zsched.config import load_fleet
 from zsched.core import events as ev
-from zsched.core.fleet import Fleet, NodeSpec, dial_endpoint, electorate_hash
-from zsched.core.model import DurableState, NodeId, TaskId
+from zsched.core.fleet import Fleet, NodeSpec, OnIsolation, TaskSpec, dial_endpoint, electorate_hash
+from zsched.core.model import DurableState, NodeId, NodeKind, TaskId
 from zsched.core.node import Node
 from zsched.core.status import status_line
 from zsched.errors import AdapterError, ConfigError
@@ -163,6 +163,8 @@ class Daemon:
                 "say which one this machine is with --node NAME or ZSCHED_NODE"
             )
         self._spec = self._fleet.node(options.node)
+        # Read once, when zenoh's runtime starts; the workers inherit it. An operator's own setting wins.
+        os.environ.setdefault("ZENOH_RUNTIME", zenoh_config.runtime_pools(len(self._fleet.nodes)))
         self._inbox = Inbox()
         self._notify = Notifier()
         self._next_status = 0.0
@@ -243,7 +245,7 @@ class Daemon:
                 operator_json5=operator_json5,
             ),
             on_report=shell.on_report,
-            threads=min(max(len(fleet.nodes) + 2, 4), 16),
+            threads=zenoh_config.pool_threads(len(fleet.nodes)),
         )
         shell.supervisor = self._supervisor(stack, shell, incarnation, points, operator_json5)
         relay.start()
@@ -258,7 +260,7 @@ class Daemon:
         self, stack: contextlib.ExitStack, shell: Shell, incarnation: int, points: Endpoints, operator_json5: str
     ) -> WorkerSupervisor:
         fleet, me = self._fleet, self._spec.name
-        mine = {task.name: task.worker for task in fleet.tasks if me in task.candidates}
+        mine = {task.name: task.worker for task in fleet.tasks if self._runs_worker(task)}
         folder = self._options.runtime_dir
         paths: dict[TaskId, Path] = {}
         for name, spec in mine.items():
@@ -281,6 +283,10 @@ class Daemon:
             environment=lambda task: {"ZSCHED_ZENOH_CONFIG": str(paths[task])},
             rng=random.Random(f"{me}/{incarnation}/workers"),
         )
+
+    def _runs_worker(self, task: TaskSpec) -> bool:
+        is_alone = self._spec.kind is NodeKind.ROBOT and task.on_isolation is OnIsolation.LOCAL
+        return self._spec.name in task.candidates or is_alone
 
     # --- the loop ----------------------------------------------------------------------------------------------------
 

@@ -111,6 +111,23 @@ def client_config(
     return _render(settings, operator_json5)
 
 
+# --- threads ---------------------------------------------------------------------------------------------------------
+
+
+def pool_threads(nodes: int) -> int:
+    """How many threads zenoh's receive pool of one process needs in a fleet of so many nodes (4..64).
+
+    A link that falls silent holds one of them for about a second when its lease ends. With the default pool of two, a
+    split that takes several links at once also silences those that still work: beats stop, the living look dead.
+    """
+    return min(max(nodes + 2, 4), 64)
+
+
+def runtime_pools(nodes: int) -> str:
+    """The value of ``ZENOH_RUNTIME`` for a process with links to so many nodes (zenoh reads it once)."""
+    return f"(rx: (worker_threads: {pool_threads(nodes)}), tx: (worker_threads: 4))"
+
+
 # --- parts -----------------------------------------------------------------------------------------------------------
 
 

@@ -7,7 +7,14 @@ import pytest
 import zenoh
 
 from zsched.core.fleet import Timing, WorkerLink
-from zsched.zenoh_config import client_config, control_config, data_config, worker_config
+from zsched.zenoh_config import (
+    client_config,
+    control_config,
+    data_config,
+    pool_threads,
+    runtime_pools,
+    worker_config,
+)
 
 HERE, THERE = "tcp/127.0.0.1:7457", "tcp/127.0.0.1:7458"
 TIMING = Timing(zenoh_lease_s=1.25)
@@ -79,3 +86,8 @@ def test_the_operators_file_lies_underneath() -> None:
 def test_an_operators_file_that_is_none_is_refused_in_words() -> None:
     with pytest.raises(ValueError, match="not a zenoh configuration"):
         control_config(listen=(), connect=(), operator_json5="{ nonsense: 1 }")
+
+
+def test_a_process_has_a_receive_thread_for_every_link_that_may_fall_silent_at_once() -> None:
+    assert [pool_threads(nodes) for nodes in (1, 6, 48, 1000)] == [4, 8, 50, 64]
+    assert runtime_pools(6) == "(rx: (worker_threads: 8), tx: (worker_threads: 4))"
