@@ -1,0 +1,223 @@
+"""Network namespaces for tests: one per node on a bridge of their own, with loss, cuts and narrow links on demand.
+
+Knows: ip, nft, tc, nsenter; whose namespaces are left over. Does not know: fleets, daemons, what is tested.
+
+Nothing touches the machine's own network: the bridge lives in a namespace, too. Names hold the pid of the process that
+made them; what a killed test has left is removed by the next one (`sweep`). A process started through `Network.wrap`
+dies with the thread that started it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import re
+import shutil
+import signal
+import subprocess
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Self
+
+from zsched.errors import ZschedError
+
+PREFIX: Final = "zsched-net"
+NET: Final = "198.18.0"
+"""RFC 2544's range for benchmarks: nobody's network."""
+TOOLS: Final = ("ip", "nft", "tc", "nsenter", "setpriv", "unshare")
+INTERFACE: Final = "eth0"
+COMMAND_S: Final = 20.0
+
+_numbers = itertools.count(1)
+
+
+class NetworkError(ZschedError):
+    """A namespace, link or rule could not be made."""
+
+
+def run(*command: str, text: str = "") -> str:
+    """Run a tool; its standard output.
+
+    Raises:
+        NetworkError: it failed or took longer than `COMMAND_S`.
+    """
+    try:
+        done = subprocess.run(command, input=text, capture_output=True, text=True, timeout=COMMAND_S, check=False)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise NetworkError(f"{' '.join(command)}: {error}") from error
+    if done.returncode != 0:
+        raise NetworkError(f"{' '.join(command)}: {done.stderr.strip() or done.returncode}")
+    return done.stdout
+
+
+def why_not() -> str | None:
+    """Why this user cannot make namespaces with rules here; ``None`` when they can (found out by making one)."""
+    if os.geteuid() != 0:
+        return "not root"
+    missing = [tool for tool in TOOLS if shutil.which(tool) is None]
+    if missing:
+        return f"not installed: {', '.join(missing)}"
+    try:
+        with Network(("probe",)) as network:
+            network.lose(1, "probe")
+    except NetworkError as error:
+        return str(error)
+    return None
+
+
+def sweep() -> list[str]:
+    """Remove the namespaces of processes that live no more, with whatever runs inside; their names."""
+    removed = []
+    for line in run("ip", "netns", "list").splitlines():
+        name = line.split()[0] if line.split() else ""
+        owner = re.fullmatch(rf"{PREFIX}-(\d+)-.*", name)
+        if owner is None or Path(f"/proc/{owner[1]}").exists():
+            continue
+        _remove(name)
+        removed.append(name)
+    return removed
+
+
+def _remove(name: str) -> None:
+    """Kill what runs in a namespace of ours, then delete it."""
+    with contextlib.suppress(NetworkError):
+        for pid in run("ip", "netns", "pids", name).split():
+            with contextlib.suppress(OSError):
+                os.kill(int(pid), signal.SIGKILL)
+        run("ip", "netns", "delete", name)
+
+
+class Network:
+    """Namespaces on one bridge. Use as a context manager: afterwards they are gone, and what still ran inside."""
+
+    def __init__(self, names: Iterable[str]) -> None:
+        """Make one namespace per name, each with an address.
+
+        Raises:
+            NetworkError: the user may not, or a tool fails; nothing is left behind.
+        """
+        sweep()
+        self._prefix = f"{PREFIX}-{os.getpid()}-{next(_numbers)}"
+        self._hub = f"{self._prefix}-hub"
+        self._addresses: dict[str, str] = {}
+        self._rules: dict[str, dict[str, tuple[str, ...]]] = {}
+        try:
+            run("ip", "netns", "add", self._hub)
+            run("ip", "-n", self._hub, "link", "add", "bridge", "type", "bridge")
+            run("ip", "-n", self._hub, "link", "set", "bridge", "up")
+            for name in names:
+                self.add(name)
+        except NetworkError:
+            self.close()
+            raise
+
+    def add(self, name: str) -> None:
+        """One more namespace on the bridge.
+
+        Raises:
+            NetworkError: a tool fails.
+        """
+        space, port = self._space(name), f"port{len(self._addresses) + 1}"
+        address = f"{NET}.{len(self._addresses) + 1}"
+        self._addresses[name] = address
+        run("ip", "netns", "add", space)
+        batch = "\n".join(
+            (
+                f"link add {port} type veth peer name {INTERFACE} netns {space}",
+                f"link set {port} master bridge",
+                f"link set {port} up",
+            )
+        )
+        run("ip", "-n", self._hub, "-batch", "-", text=batch)
+        inside = "\n".join((f"address add {address}/24 dev {INTERFACE}", f"link set {INTERFACE} up", "link set lo up"))
+        run("ip", "-n", space, "-batch", "-", text=inside)
+
+    def _space(self, name: str) -> str:
+        return f"{self._prefix}-{name}"
+
+    def address(self, name: str) -> str:
+        """The IPv4 address of a namespace."""
+        return self._addresses[name]
+
+    def wrap(self, name: str, command: Sequence[str | Path]) -> list[str | Path]:
+        """``command`` as it must be started to run in a namespace (same pid, dies with the thread that starts it)."""
+        enter = ("nsenter", f"--net=/run/netns/{self._space(name)}")
+        return [*enter, "setpriv", "--pdeathsig", "KILL", "--", *command]
+
+    # --- faults ------------------------------------------------------------------------------------------------------
+
+    def cut(self, *names: str) -> None:
+        """Nothing goes in or out any more; nobody is told (packets vanish)."""
+        for name in names:
+            self._set(name, "cut", f"in iifname {INTERFACE} drop", f"out oifname {INTERFACE} drop")
+
+    def deafen(self, name: str) -> None:
+        """Nothing comes in; what it sends arrives."""
+        self._set(name, "cut", f"in iifname {INTERFACE} drop")
+
+    def mute(self, name: str) -> None:
+        """Nothing goes out; what others send arrives."""
+        self._set(name, "cut", f"out oifname {INTERFACE} drop")
+
+    def separate(self, ours: Iterable[str], theirs: Iterable[str]) -> None:
+        """No packet passes between the two sides (each goes on within itself)."""
+        addresses = ", ".join(self._addresses[name] for name in theirs)
+        for name in ours:
+            self._set(name, "split", f"in ip saddr {{ {addresses} }} drop", f"out ip daddr {{ {addresses} }} drop")
+
+    def lose(self, percent: int, *names: str) -> None:
+        """So many of 100 packets that come to each of ``names`` are lost, at random."""
+        for name in names:
+            self._set(name, "loss", f"in iifname {INTERFACE} numgen random mod 100 < {percent} drop")
+
+    def narrow(self, name: str, mbit: float | None) -> None:
+        """Limit what leaves a namespace to so many Mbit/s (``None``: no limit) behind a queue of 100 ms."""
+        if mbit is None:
+            with contextlib.suppress(NetworkError):
+                run("tc", "-n", self._space(name), "qdisc", "del", "dev", INTERFACE, "root")
+            return
+        limit = ("rate", f"{mbit}mbit", "burst", "16kb", "latency", "100ms")
+        run("tc", "-n", self._space(name), "qdisc", "replace", "dev", INTERFACE, "root", "tbf", *limit)
+
+    def link(self, name: str, *, is_up: bool) -> None:
+        """Pull or plug a namespace's cable at the bridge's end."""
+        number = list(self._addresses).index(name) + 1
+        run("ip", "-n", self._hub, "link", "set", f"port{number}", "up" if is_up else "down")
+
+    def heal(self, *names: str) -> None:
+        """End cuts and losses of ``names`` (default: of all)."""
+        for name in names or tuple(self._rules):
+            if self._rules.pop(name, None):
+                self._render(name)
+
+    def _set(self, name: str, kind: str, *rules: str) -> None:
+        self._rules.setdefault(name, {})[kind] = rules
+        self._render(name)
+
+    def _render(self, name: str) -> None:
+        """Replace a namespace's whole rule set at once."""
+        rules = [rule for kind in self._rules.get(name, {}).values() for rule in kind]
+        lines = ["add table inet zsched", "delete table inet zsched", "add table inet zsched"]
+        for chain, hook in (("in", "input"), ("out", "output")):
+            lines.append(f"add chain inet zsched c_{chain} {{ type filter hook {hook} priority 0; policy accept; }}")
+        lines += [f"add rule inet zsched c_{rule}" for rule in rules]
+        run("nsenter", f"--net=/run/netns/{self._space(name)}", "nft", "-f", "-", text="\n".join(lines) + "\n")
+
+    # --- end ---------------------------------------------------------------------------------------------------------
+
+    def close(self) -> None:
+        """Kill what still runs inside and remove everything; safe to call twice."""
+        for name in (*map(self._space, self._addresses), self._hub):
+            if Path("/run/netns", name).exists():
+                _remove(name)
+        self._addresses.clear()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
