@@ -42,8 +42,9 @@ from zsched.keyspace import END_CHUNK, Keyspace
 from zsched.relay_pipe import decode_end
 from zsched.worker_inputs import Dispatcher, Input, Marker, Received
 from zsched.worker_outputs import Output
+from zsched.worker_services import Answer, Handler, Request, Service
 
-__all__ = ["Output", "Received", "Worker"]
+__all__ = ["Answer", "Output", "Received", "Request", "Worker"]
 
 CLOSE_S: Final = 0.6
 """Closing a session towards a stopped peer can take seconds; so long we wait."""
@@ -199,6 +200,16 @@ class Worker:
         self._errands.put(_nothing)  # the errands' thread looks at the outputs anew
         return output
 
+    def serve(self, key_expr: str, handler: Handler, depth: int = 16) -> None:
+        """Answer requests under a key; call it before `ready`. ``{prefix}`` is filled in.
+
+        ``handler`` runs in a thread of its own per service, one request after another; at most ``depth`` wait, the next
+        one is answered "busy". What it raises becomes an error reply. It is only called while this worker is the owner.
+        """
+        expr = key_expr.replace("{prefix}", self.prefix)
+        service = Service(self._session, expr, handler, is_owner=self._is_owner, later=self._errands.put, depth=depth)
+        self._declared.append(service)
+
     def offer_snapshot(self, snapshot: Callable[[], bytes]) -> None:
         """Offer this worker's state to its successor. Not carried yet: the function is kept and never called."""
         self._snapshot = snapshot
@@ -303,14 +314,19 @@ class Worker:
         if self._role_token is not None and (not is_active or before.epoch != role.epoch):
             self._role_token.undeclare()
             self._role_token = None
-        if is_active and role.lease_until_s is not None and self._ended_epoch == role.epoch:
-            self._ended_epoch = role.epoch - 1  # asked to leave, but the move failed: it works on in its epoch
+        if is_active and self._ended_epoch == role.epoch:
+            self._ended_epoch = role.epoch - 1  # it was told to stop, and works on in the same epoch after all
         was_held = before.lease_until_s is not None and monotonic_s() >= before.lease_until_s
         if is_active and (self._role_token is None or was_held):
             self._dispatcher.begin(role.epoch)  # also what was withheld for want of a lease
         if is_active and self._role_token is None:
             key = f"{self._keyspace.role(self._node, self._task)}/{role.epoch}"
             self._role_token = self._session.liveliness().declare_token(key)
+
+    def _is_owner(self) -> bool:
+        role = self._role
+        has_lease = role.lease_until_s is None or monotonic_s() < role.lease_until_s
+        return role.role is not WorkerRole.IDLE and has_lease
 
     def _epoch_now(self) -> int | None:
         """The epoch that outputs are stamped with, ``None`` while they go nowhere."""

@@ -15,6 +15,11 @@ FLIPPING     the relay flipped, an old slot is left   (the old slot drains)     
 FLIPPING     the relay flipped, none is left          plan CLOSE                                    SETTLED
 DRAINING     drained, or the drain time is over       plan CLOSE: the old slot is dropped           SETTLED
 any          the predecessor is gone                  the same plan without the predecessor         as before
+any          isolated (`on_isolation: local`)         the worker here is active; plan PREPARE of    PREPARING
+                                                      a slot to this robot itself, the other
+                                                      one is closed
+PREPARING..  the owner is back (`rejoin`)             the worker here is idle; plan PREPARE of the  PREPARING
+(local)                                               owner's slot, the local one is closed
 ===========  =======================================  ============================================  ===========
 
 An abort is never local: while the new owner does not get ready the old slot stays open, and giving up on it is a new
@@ -27,7 +32,7 @@ import math
 from dataclasses import dataclass, field
 from enum import StrEnum
 
-from zsched.core.fleet import Standby, TaskSpec
+from zsched.core.fleet import OnIsolation, Standby, TaskSpec
 from zsched.core.instructions import ApplyRoutes, Instruction, RecordStory, SetRole, StartWorker, StopWorker
 from zsched.core.model import Allocation, NodeId
 from zsched.core.plan import Role, RoutePhase, Slot, WorkerRole
@@ -59,6 +64,8 @@ class Executor:
     epoch: int = 0
     owner: NodeId | None = None
     role: Role = field(init=False)
+    is_local: bool = False
+    """Cut off from the owner and from a quorum, this robot works alone; its output is degraded."""
     _current: Slot | None = None
     _predecessor: Slot | None = None
     _drain_deadline: float = math.inf
@@ -69,9 +76,10 @@ class Executor:
         self.role = Role(task=self.spec.name, role=WorkerRole.IDLE)
 
     @property
-    def is_candidate(self) -> bool:
-        """Whether this node may run the task's worker."""
-        return self.me in self.spec.candidates
+    def runs_worker(self) -> bool:
+        """Whether this node keeps a worker of the task: candidates do, and robots that work alone when cut off."""
+        is_alone = self.has_streams and self.spec.on_isolation is OnIsolation.LOCAL
+        return self.me in self.spec.candidates or is_alone
 
     @property
     def predecessor(self) -> NodeId | None:
@@ -81,7 +89,7 @@ class Executor:
     def again(self) -> tuple[Instruction, ...]:
         """The newest worker's state, role and plan once more, after a batch that carried them was cut off."""
         result: tuple[Instruction, ...] = ()
-        if self.is_candidate:
+        if self.runs_worker:
             result = (*self.start(), *self._wake_worker(), SetRole(role=self.role))
             if self.spec.worker.standby is Standby.COLD and self.role.role is WorkerRole.IDLE:
                 result += (StopWorker(task=self.spec.name),)
@@ -97,7 +105,7 @@ class Executor:
 
     def start(self) -> tuple[Instruction, ...]:
         """The node starts: warm candidates start their worker."""
-        if self.is_candidate and self.spec.worker.command and self.spec.worker.standby is Standby.WARM:
+        if self.runs_worker and self.spec.worker.command and self.spec.worker.standby is Standby.WARM:
             return (StartWorker(task=self.spec.name),)
         return ()
 
@@ -105,11 +113,12 @@ class Executor:
         """A learnt allocation: act if its epoch is newer than what is carried out."""
         if allocation.owner is None or allocation.epoch <= self.epoch:
             return ()
+        back = self._end_local()  # the local slot closes before a committed owner's opens
         self.epoch, self.owner, self.started_at = allocation.epoch, allocation.owner, now
-        return (*self._change_role(allocation, now), *self._prepare(allocation.owner))
+        return (*back, *self._change_role(allocation, now), *self._prepare(allocation.owner))
 
     def _change_role(self, allocation: Allocation, now: float) -> tuple[Instruction, ...]:
-        if not self.is_candidate:
+        if not self.runs_worker:
             return ()
         if allocation.owner == self.me:
             self._role_deadline = math.inf
@@ -128,6 +137,33 @@ class Executor:
         starts_s = worker.start_deadline_s if worker.standby is Standby.COLD else 0.0
         self._role_deadline = now + starts_s + self.spec.drain_s + ROLE_DRAIN_MARGIN_S
         self.role = Role(task=self.spec.name, role=WorkerRole.DRAINING, epoch=self.role.epoch)
+        return (SetRole(role=self.role),)
+
+    def isolate(self) -> tuple[Instruction, ...]:
+        """Nobody can be asked and the owner is not heard: this robot's own worker serves its own streams."""
+        can = self.has_streams and self.spec.on_isolation is OnIsolation.LOCAL and self.epoch > 0
+        if self.is_local or not can or self.owner == self.me:
+            return ()
+        self.is_local, self._predecessor = True, None
+        self._drain_deadline = self._role_deadline = math.inf
+        self.role = Role(task=self.spec.name, role=WorkerRole.ACTIVE, epoch=self.epoch)
+        self._current = slot_for(self.spec, self.me, self.me, self.epoch)
+        plan = self._go(Phase.PREPARING, RoutePhase.PREPARE, f"cut off from {self.owner}: works alone (degraded)")
+        return (*self._wake_worker(), SetRole(role=self.role), *plan)
+
+    def rejoin(self) -> tuple[Instruction, ...]:
+        """The committed owner is heard again: back to its slot."""
+        if not self.is_local or self.owner is None:
+            return ()
+        back = self._end_local()
+        self._current = slot_for(self.spec, self.me, self.owner, self.epoch)
+        return (*back, *self._go(Phase.PREPARING, RoutePhase.PREPARE, f"back to {self.owner}"))
+
+    def _end_local(self) -> tuple[Instruction, ...]:
+        if not self.is_local:
+            return ()
+        self.is_local, self._current, self.phase = False, None, Phase.IDLE
+        self.role = Role(task=self.spec.name, role=WorkerRole.IDLE)
         return (SetRole(role=self.role),)
 
     def set_lease(self, until_s: float, now: float) -> tuple[Instruction, ...]:

@@ -21,7 +21,7 @@ from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.agreement import Agreement, Effects
 from zsched.core.executor import Executor
-from zsched.core.fleet import Fleet, fleet_hash
+from zsched.core.fleet import Fleet, OnIsolation, TaskSpec, fleet_hash
 from zsched.core.gateway import Gateway
 from zsched.core.membership import Membership, Transition
 from zsched.core.model import (
@@ -39,9 +39,12 @@ from zsched.core.model import (
 from zsched.core.plan import ReadyWhen, StreamCount
 from zsched.core.profile import Profiler
 from zsched.core.rounds import Rounds
+from zsched.core.scoring import majority
 from zsched.core.status import PastValue, build_snapshot
 
 HISTORY = 32
+ALONE_AFTER_S = 0.5
+"""So long cut off from the owner and from a quorum, a robot with `on_isolation: local` works alone."""
 TWIN_YOUNG_S = 3.0
 """A daemon that finds its own name alive so soon after its start leaves again."""
 TWIN_STAYS_S = 5.0
@@ -126,6 +129,7 @@ class Node:
             task.name: Executor(spec=task, me=me, has_streams=self.kind is NodeKind.ROBOT) for task in fleet.tasks
         }
         self.fleet_file = fleet_hash(fleet)
+        self._alone_since: dict[TaskId, float] = {}
         self._twin: tuple[int, int, float] | None = None
         """(incarnation, first sequence, since when) of another daemon with our name."""
         self._beat_at = now
@@ -138,10 +142,13 @@ class Node:
     def _initial_workers(self) -> dict[TaskId, WorkerState]:
         states = {}
         for task in self.fleet.tasks:
-            if self.me in task.candidates:
+            if self.me in task.candidates or self._is_standby(task):
                 is_foreign = not task.worker.command and task.worker.ready_when is ReadyWhen.MATCHING
                 states[task.name] = WorkerState.READY if is_foreign else WorkerState.STOPPED
         return states
+
+    def _is_standby(self, task: TaskSpec) -> bool:
+        return self.kind is NodeKind.ROBOT and task.on_isolation is OnIsolation.LOCAL
 
     # --- the door ----------------------------------------------------------------------------------------------------
 
@@ -185,6 +192,7 @@ class Node:
             self.rounds.next_deadline(),
             self.agreement.next_deadline(),
             self._leases.next_deadline(now),
+            *(at + ALONE_AFTER_S for name, at in self._alone_since.items() if not self.executors[name].is_local),
             *(executor.next_deadline() for executor in self.executors.values()),
         )
 
@@ -203,6 +211,7 @@ class Node:
             self._agree(self.agreement.propose(task, commit, now), now)
         self._agree(self.agreement.tick(now), now)
         self._tend_leases(now)
+        self._tend_isolation(now)
         for executor in self.executors.values():
             self._batch.add(*executor.tick(now))
         if now >= self._beat_at:
@@ -279,6 +288,28 @@ class Node:
             self._batch.add(do.StandDown(reason=f"{reason}; stop it, or give this machine a name of its own"))
         elif now - self._twin[2] >= TWIN_STAYS_S:
             self._agree(self.agreement.dispute(reason), now)
+
+    # --- isolation ---------------------------------------------------------------------------------------------------
+
+    def _is_cut_off(self) -> bool:
+        """Whether no majority of the robots can be asked: nothing can be voted on from here."""
+        voters = self.fleet.voters
+        heard = sum(self.membership.state(name) is PeerState.ALIVE for name in voters)
+        return heard < majority(len(voters))
+
+    def _tend_isolation(self, now: float) -> None:
+        """`on_isolation: local`: work alone while cut off from the owner and from a quorum, and not a moment longer."""
+        is_cut_off = None
+        for name, executor in self.executors.items():
+            if executor.spec.on_isolation is not OnIsolation.LOCAL or executor.owner is None:
+                continue
+            is_cut_off = self._is_cut_off() if is_cut_off is None else is_cut_off
+            is_heard = self.membership.state(executor.owner) is PeerState.ALIVE
+            if is_heard or not is_cut_off:
+                self._alone_since.pop(name, None)
+                self._batch.add(*executor.rejoin())
+            elif now >= self._alone_since.setdefault(name, now) + ALONE_AFTER_S:
+                self._batch.add(*executor.isolate())
 
     # --- exclusive tasks ---------------------------------------------------------------------------------------------
 

@@ -11,6 +11,8 @@ adds `RelayChanged`.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
 
 from zsched.core.events import (
     ProblemReported,
@@ -62,6 +64,22 @@ class EndMarker:
     def __post_init__(self) -> None:
         check_counter("end.epoch", self.epoch)
         check_counter("end.count", self.count)
+
+
+ERROR_ENCODING: Final = "text/plain;zsched.error"
+"""Of an error reply that zsched gives in place of the owner's answer."""
+REFUSED_ENCODING: Final = "text/plain;zsched.refused"
+"""Of a worker's word that it is not the owner and has done nothing."""
+
+
+class ServiceProblem(StrEnum):
+    """Why a request was not answered: the first words of an error reply."""
+
+    BUSY = "busy"
+    NO_OWNER = "no owner"
+    OWNER_GONE = "owner gone"
+    MOVED = "moved"
+    TIMEOUT = "timeout"
 
 
 RelayCommand = RoutePlan | Role | RelayStop

@@ -154,6 +154,7 @@ def _task_status(node: NodeView, spec: TaskSpec, now: float) -> TaskStatus:
         candidates=spec.candidates,
         decision=_decision(standing, now),
         vote=_vote(standing, now),
+        problems=(f"cut off from {value.owner}: this robot works alone, degraded",) if executor.is_local else (),
         streams=tuple(count for count in node.stream_counts if count.stream.startswith(prefix)),
         history=tuple(
             PastAllocation(
