@@ -23,6 +23,7 @@ from zsched.core.agreement import Agreement, Effects
 from zsched.core.executor import Executor
 from zsched.core.fleet import Fleet, OnIsolation, TaskSpec, fleet_hash
 from zsched.core.gateway import Gateway
+from zsched.core.identity import Identity, Verdict
 from zsched.core.membership import Membership, Transition
 from zsched.core.model import (
     Allocation,
@@ -39,16 +40,10 @@ from zsched.core.model import (
 from zsched.core.plan import ReadyWhen, StreamCount
 from zsched.core.profile import Profiler
 from zsched.core.rounds import Rounds
-from zsched.core.scoring import majority
 from zsched.core.status import PastValue, build_snapshot
+from zsched.core.tenure import Tenure
 
 HISTORY = 32
-ALONE_AFTER_S = 0.5
-"""So long cut off from the owner and from a quorum, a robot with `on_isolation: local` works alone."""
-TWIN_YOUNG_S = 3.0
-"""A daemon that finds its own name alive so soon after its start leaves again."""
-TWIN_STAYS_S = 5.0
-"""A twin that stays so long disputes the name."""
 
 
 @dataclass(slots=True)
@@ -123,15 +118,12 @@ class Node:
             now=now,
         )
         self.registers = self.agreement.registers
-        self._leases = self.agreement.leases
-        self._exclusive = tuple(task.name for task in fleet.tasks if task.exclusive)
         self.executors = {
             task.name: Executor(spec=task, me=me, has_streams=self.kind is NodeKind.ROBOT) for task in fleet.tasks
         }
         self.fleet_file = fleet_hash(fleet)
-        self._alone_since: dict[TaskId, float] = {}
-        self._twin: tuple[int, int, float] | None = None
-        """(incarnation, first sequence, since when) of another daemon with our name."""
+        self._identity = Identity(me, incarnation, self.fleet_file, now)
+        self._tenure = Tenure(fleet, me, self.agreement.leases, self.executors)
         self._beat_at = now
         self._beat_sequence = 0
         self.loop_lag_s = 0.0
@@ -191,8 +183,7 @@ class Node:
             self.membership.next_deadline(),
             self.rounds.next_deadline(),
             self.agreement.next_deadline(),
-            self._leases.next_deadline(now),
-            *(at + ALONE_AFTER_S for name, at in self._alone_since.items() if not self.executors[name].is_local),
+            self._tenure.next_deadline(now),
             *(executor.next_deadline() for executor in self.executors.values()),
         )
 
@@ -210,8 +201,7 @@ class Node:
         for task, commit in self.rounds.due_commits(now):
             self._agree(self.agreement.propose(task, commit, now), now)
         self._agree(self.agreement.tick(now), now)
-        self._tend_leases(now)
-        self._tend_isolation(now)
+        self._tend(now)
         for executor in self.executors.values():
             self._batch.add(*executor.tick(now))
         if now >= self._beat_at:
@@ -230,7 +220,7 @@ class Node:
     def _beat(self, now: float) -> None:
         self._beat_sequence += 1
         self.membership.fade_doubt()
-        parts = self._leases.on_sent(self._beat_sequence, now)
+        parts = self.agreement.leases.on_sent(self._beat_sequence, now)
         beat = Beat(
             node=self.me,
             incarnation=self.incarnation,
@@ -253,7 +243,7 @@ class Node:
     def _on_beat(self, event: ev.BeatReceived, now: float) -> None:
         beat = event.beat
         if beat.node == self.me:
-            self._on_twin(beat, now)
+            self._on_own_name(beat, now)
             return
         if not self.membership.is_known(beat.node):
             self.counters["beat_foreign"] += 1
@@ -262,81 +252,39 @@ class Node:
             self._on_transition(change, now)
         self._agree(self.agreement.compare(beat, now), now)
         self._agree(self.agreement.note_voter(beat), now)
-        self._compare_files(beat)
+        self._set_problem(f"fleet/{beat.node}", self._identity.file_complaint(beat))
         self._hear_leases(beat, now)
 
-    def _compare_files(self, beat: Beat) -> None:
-        """Everybody must go by the same fleet file; who does not is shown."""
-        differs = beat.fleet_file not in ("", self.fleet_file)
-        text = f"{beat.node} goes by another fleet file ({beat.fleet_file}, here {self.fleet_file})"
-        self._set_problem(f"fleet/{beat.node}", text if differs else None)
-
-    def _on_twin(self, beat: Beat, now: float) -> None:
-        """A beat in our own name that is not ours. The younger one leaves; if both stay, neither may be an elector."""
-        if beat.incarnation == self.incarnation:
+    def _on_own_name(self, beat: Beat, now: float) -> None:
+        """A beat in our own name that may not be ours."""
+        verdict = self._identity.on_own_name(beat, self._beat_sequence, now)
+        if verdict is Verdict.OURS:
             return
-        reason = f"another daemon calls itself {self.me!r}"
-        self.problems["membership"] = reason
-        if self._twin is None or self._twin[0] != beat.incarnation:
-            self._twin = (beat.incarnation, beat.sequence, now)
-            return
-        if beat.sequence <= self._twin[1]:
-            return  # an echo of an earlier life, not a life
-        # Beats are as many as a life is old: who has sent fewer came later.
-        is_younger = (self._beat_sequence, -self.incarnation) < (beat.sequence, -beat.incarnation)
-        if is_younger and now - self.started_at < TWIN_YOUNG_S:
-            self._batch.add(do.StandDown(reason=f"{reason}; stop it, or give this machine a name of its own"))
-        elif now - self._twin[2] >= TWIN_STAYS_S:
-            self._agree(self.agreement.dispute(reason), now)
-
-    # --- isolation ---------------------------------------------------------------------------------------------------
-
-    def _is_cut_off(self) -> bool:
-        """Whether no majority of the robots can be asked: nothing can be voted on from here."""
-        voters = self.fleet.voters
-        heard = sum(self.membership.state(name) is PeerState.ALIVE for name in voters)
-        return heard < majority(len(voters))
-
-    def _tend_isolation(self, now: float) -> None:
-        """`on_isolation: local`: work alone while cut off from the owner and from a quorum, and not a moment longer."""
-        is_cut_off = None
-        for name, executor in self.executors.items():
-            if executor.spec.on_isolation is not OnIsolation.LOCAL or executor.owner is None:
-                continue
-            is_cut_off = self._is_cut_off() if is_cut_off is None else is_cut_off
-            is_heard = self.membership.state(executor.owner) is PeerState.ALIVE
-            if is_heard or not is_cut_off:
-                self._alone_since.pop(name, None)
-                self._batch.add(*executor.rejoin())
-            elif now >= self._alone_since.setdefault(name, now) + ALONE_AFTER_S:
-                self._batch.add(*executor.isolate())
-
-    # --- exclusive tasks ---------------------------------------------------------------------------------------------
+        complaint = self._identity.complaint
+        self.problems["membership"] = complaint
+        if verdict is Verdict.LEAVE:
+            self._batch.add(do.StandDown(reason=f"{complaint}; stop it, or give this machine a name of its own"))
+        elif verdict is Verdict.DISPUTE:
+            self._agree(self.agreement.dispute(complaint), now)
 
     def _hear_leases(self, beat: Beat, now: float) -> None:
-        """A beat (our own too) may grant, echo, release, or ask us to leave."""
-        if not self._exclusive:
-            return
-        if self._leases.on_beat(beat, self.agreement.accepted(), now):
+        if self._tenure.hear(beat, self.agreement.accepted(), now):
             self._beat_at = now  # a first grant: the new owner waits for its echo
         if beat.released:
             self._agree(self.agreement.retry_parked(now), now)
 
-    def _tend_leases(self, now: float) -> None:
-        """Prolong our workers' leases; stop who is asked to leave, and give back what has stopped or run out."""
-        for task in self._exclusive:
-            executor, until = self.executors[task], self._leases.until(task)
-            if task not in self._leases.leaving():
-                self._batch.add(*executor.set_lease(until, now))
-                continue
-            self._batch.add(*executor.leave())
-            if now >= until:
-                self._on_role_ended(ev.RoleEnded(task=task, epoch=executor.epoch), now)
-        if self._exclusive:
+    def _tend(self, now: float) -> None:
+        """Who may work here right now: leases of exclusive tasks, and whether we are cut off."""
+        if self._tenure.exclusive:
+            instructions, has_released = self._tenure.tend_leases(self._beat_sequence, now)
+            self._batch.add(*instructions)
+            if has_released:
+                self._beat_at = now
             self._agree(self.agreement.retry_parked(now), now)
+        self._batch.add(*self._tenure.tend_isolation(self.membership, now))
 
     def _on_role_ended(self, event: ev.RoleEnded, now: float) -> None:
-        if self._leases.on_stopped(event.task, event.epoch, self._beat_sequence):
+        if self.agreement.leases.on_stopped(event.task, event.epoch, self._beat_sequence):
             self._beat_at = now
 
     def _on_token_lost(self, event: ev.TokenLost, now: float) -> None:
@@ -449,19 +397,12 @@ class Node:
         text = f"learnt revision {value.revision}: owner {value.owner}, weights {_weights(value.tuning.weights)}"
         self._batch.add(do.RecordStory(stage="vote", text=text, task=task, epoch=value.epoch))
         self._batch.add(*executor.execute(value, now))
-        if is_new_epoch and task in self._exclusive:
-            self._hold(task, value)
+        if is_new_epoch:
+            self._tenure.hold(value, self._beat_sequence + 1)
         old = executor.predecessor
         if old is not None and self.membership.state(old) is PeerState.GONE:
             self._batch.add(*executor.on_gone(old))
         self._beat_at = now
-
-    def _hold(self, task: TaskId, value: Allocation) -> None:
-        """Begin or end this node's side of an exclusive task's lease."""
-        if value.owner == self.me:
-            self._leases.begin(task, value.epoch, self._beat_sequence + 1)
-        else:
-            self._leases.end(task, self._beat_sequence)
 
     def _has_failed(self, task: TaskId, node: NodeId | None, now: float) -> bool:
         """Whether an owner was fled from: it is not there, or its worker has failed."""

@@ -1,0 +1,98 @@
+"""EXECUTOR, beside the handover: who may work right now. Leases of exclusive tasks, and robots that are cut off.
+
+Knows: when a worker here must stop, may go on, or works alone. Does not know: grants and echoes (`zsched.core.lease`),
+the handover's table (`zsched.core.executor`), how a worker is told.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from zsched.core.executor import Executor
+from zsched.core.fleet import Fleet, OnIsolation
+from zsched.core.instructions import Instruction
+from zsched.core.lease import Leases
+from zsched.core.membership import Membership
+from zsched.core.model import Allocation, Beat, NodeId, PeerState, TaskId
+from zsched.core.scoring import majority
+
+ALONE_AFTER_S = 0.5
+"""So long cut off from the owner and from a quorum, a robot with `on_isolation: local` works alone."""
+
+
+@dataclass(slots=True)
+class Tenure:
+    """One node's right to work, for all tasks."""
+
+    fleet: Fleet
+    me: NodeId
+    leases: Leases
+    executors: Mapping[TaskId, Executor]
+    exclusive: tuple[TaskId, ...] = field(init=False)
+    _alone_since: dict[TaskId, float] = field(default_factory=dict)
+    _local: tuple[TaskId, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.exclusive = tuple(task.name for task in self.fleet.tasks if task.exclusive)
+        self._local = tuple(task.name for task in self.fleet.tasks if task.on_isolation is OnIsolation.LOCAL)
+
+    def next_deadline(self, now: float) -> float:
+        """When `tend` may have something to do."""
+        alone = (at + ALONE_AFTER_S for name, at in self._alone_since.items() if not self.executors[name].is_local)
+        return min(self.leases.next_deadline(now), *alone, math.inf)
+
+    # --- exclusive tasks ---------------------------------------------------------------------------------------------
+
+    def hold(self, value: Allocation, next_number: int) -> None:
+        """A new epoch was learnt: begin or end this node's side of an exclusive task's lease."""
+        if value.task not in self.exclusive:
+            return
+        if value.owner == self.me:
+            self.leases.begin(value.task, value.epoch, next_number)
+        else:
+            self.leases.end(value.task, next_number - 1)
+
+    def hear(self, beat: Beat, accepted: Mapping[TaskId, tuple[NodeId, int]], now: float) -> bool:
+        """A beat (our own too) may grant, echo, release, or ask us to leave. Whether to beat at once."""
+        return bool(self.exclusive) and self.leases.on_beat(beat, accepted, now)
+
+    def tend_leases(self, number: int, now: float) -> tuple[tuple[Instruction, ...], bool]:
+        """Prolong our workers' leases; stop who is asked to leave, and give back what has stopped or run out.
+
+        Returns:
+            (what to do, whether something was given back: beat at once). ``number`` is our newest beat's.
+        """
+        result: list[Instruction] = []
+        has_released = False
+        for task in self.exclusive:
+            executor, until = self.executors[task], self.leases.until(task)
+            if task not in self.leases.leaving():
+                result += executor.set_lease(until, now)
+                continue
+            result += executor.leave()
+            if now >= until:
+                has_released |= self.leases.on_stopped(task, executor.epoch, number)
+        return tuple(result), has_released
+
+    # --- isolation ---------------------------------------------------------------------------------------------------
+
+    def tend_isolation(self, membership: Membership, now: float) -> tuple[Instruction, ...]:
+        """Work alone while cut off from the owner and from a quorum, and not a moment longer."""
+        if not self._local:
+            return ()
+        voters = self.fleet.voters
+        heard = sum(membership.state(name) is PeerState.ALIVE for name in voters)
+        is_cut_off = heard < majority(len(voters))
+        result: list[Instruction] = []
+        for name in self._local:
+            executor = self.executors[name]
+            if executor.owner is None:
+                continue
+            if not is_cut_off or membership.state(executor.owner) is PeerState.ALIVE:
+                self._alone_since.pop(name, None)
+                result += executor.rejoin()
+            elif now >= self._alone_since.setdefault(name, now) + ALONE_AFTER_S:
+                result += executor.isolate()
+        return tuple(result)
