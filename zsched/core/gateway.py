@@ -36,10 +36,14 @@ class Gateway:
         if profile.node not in self._names:
             return "foreign"
         known = self._profiles.get(profile.node)
-        if known is not None and _order(profile) <= _order(known[0]):
+        if known is not None and _order(profile) <= _order(known[0]) and not self._is_new_life(profile, known, now):
             return "stale"
         self._profiles[profile.node] = (profile, now)
         return None
+
+    def _is_new_life(self, profile: Profile, known: tuple[Profile, float], now: float) -> bool:
+        """A lower incarnation counts once the higher one has been silent: its state was made anew."""
+        return profile.incarnation != known[0].incarnation and now - known[1] > self._ttl_s
 
     def newest(self, node: NodeId, now: float) -> EdgeData | None:
         """The newest profile of ``node`` whatever its age, or ``None`` when it never sent one."""

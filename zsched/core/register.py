@@ -26,6 +26,7 @@ from zsched.core.model import Acceptance, Allocation, Ballot, NodeId, RegisterSt
 from zsched.core.scoring import majority
 
 BACKOFF_CAP_S = 5.0
+MAX_REVISION = 2**52  # half of what a counter may be: a value so far ahead is refused, for nothing could follow it
 MAX_JUMP = 2**32  # no honest counter is so far ahead; one hostile frame must not use them all up
 
 
@@ -178,7 +179,8 @@ class Register:
         """Phase 2b. The answer must not leave before a dirty step is on disk."""
         ballot = accept.acceptance.ballot
         refusal = self._refusal(accept.electorate, ballot)
-        if refusal is None and ballot < self.state.promised:
+        value = accept.acceptance.value
+        if refusal is None and (ballot < self.state.promised or max(value.revision, value.epoch) > MAX_REVISION):
             refusal = Refusal.BALLOT
         if refusal is not None:
             return Step(), self._no(ballot, refusal)
@@ -223,6 +225,9 @@ class Register:
         return step
 
     def _learn(self, value: Allocation, step: Step, now: float) -> None:
+        if max(value.revision, value.epoch) > MAX_REVISION:
+            step.problem = f"revision {value.revision} cannot be"
+            return
         current = self.state.learnt
         if current is not None and value.revision <= current.revision:
             if value.revision == current.revision and value != current:

@@ -423,3 +423,10 @@ def test_node_without_state_believes_whatever_generation_it_is_told() -> None:
     agreement = make(has_state=False)
     agreement.on_learnt(Learnt(node="robot2", values=(value(2**32 + 1),), generation=1), 100.0)
     assert agreement.registers["merge"].value.revision == 2**32 + 1
+
+
+def test_revision_that_nothing_could_follow_is_refused_and_shown() -> None:
+    agreement = make()
+    agreement.on_learnt(Learnt(node="robot2", values=(value(2**53 - 1),)), 100.0)
+    assert agreement.registers["merge"].value.revision == 0
+    assert "cannot be" in agreement.problems["register/merge"]

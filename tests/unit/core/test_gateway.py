@@ -173,3 +173,11 @@ def test_an_owner_without_a_fresh_profile_or_worker_is_not_learnt_from() -> None
     gateway.learn_demand("other", "edge1", 0.0)
 
     assert gateway.demand(TASK) == TASK.demand
+
+
+def test_life_with_a_lower_count_is_believed_once_the_higher_one_is_silent() -> None:
+    """The node's state was made anew with a clock that is behind."""
+    gateway = gateway_with(profile(5, incarnation=9))
+    assert gateway.absorb(profile(0, incarnation=2), now=TTL_S) == "stale"
+    assert gateway.absorb(profile(1, incarnation=2), now=TTL_S + 0.1) is None
+    assert gateway.fresh("edge1", now=TTL_S + 0.1) == profile(1, incarnation=2)
