@@ -1,8 +1,8 @@
-"""A fleet of real `Node`s on a fake network, clock and disk: deterministic by seed, thousands of times real time.
+"""A fleet of real `Node`s on a fake network, clock and disk: deterministic by seed, hundreds of times real time.
 
-Knows: delivery (delay, loss, cuts), crashes and restarts from what was persisted, a stand-in for workers and relays,
-the invariants that every event is checked against. Does not know: how a node decides; it runs the production core,
-the production codec and the production state format.
+Knows: delivery, the loop of each machine (pauses, slow events and disks included), lives, a stand-in for workers and
+relays. Does not know: how a node decides (it runs the production core, codec and state format), which faults a
+schedule has (`zsched.lab.sim_faults`), what must hold (`zsched.lab.sim_checks`).
 """
 
 from __future__ import annotations
@@ -13,47 +13,42 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from random import Random
+from typing import Any
 
 from zsched import wire
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.fleet import Fleet, electorate_hash
-from zsched.core.model import Allocation, DeviceSample, DurableState, NodeId, PeerState, TaskId, WorkerState
+from zsched.core.model import Allocation, DeviceSample, DurableState, NodeId, PeerState, RegisterState, TaskId
 from zsched.core.node import Node
-from zsched.core.plan import Role, RoutePhase, RoutePlan, WorkerRole
+from zsched.core.plan import RoutePlan
 from zsched.errors import InvariantError
+from zsched.lab.sim_checks import GENERATION_STEP, Invariants, unsettled
+from zsched.lab.sim_network import Message, Weather
+from zsched.lab.sim_parts import Machine
+from zsched.lab.sim_work import Work
 
 Load = Callable[[NodeId, float], tuple[float, float]]
 """(node, time) -> (CPU cores in use, MiB in use), the raw reading of the device profiler."""
 Cut = Callable[[NodeId, tuple[do.Instruction, ...]], int | None]
 """(node, batch) -> after how many instructions the node crashes; ``None``: it carries out all of them and lives."""
+Make = Callable[[Any], ev.Event]
 
 CORES, MEMORY_MB = 4.0, 4000.0
 TICK_S = 0.0005
 """A deadline that lies in the past is served this much later: the loop's own time."""
-WORKER_START_S = 0.4
 TOKEN_DELAY_S = 0.005
-FLIP_S = 0.005
-WORKER_STOP_S = 0.002
+SELF_DELAY_S = 0.0001
 RESTART_S = 0.3
 """A node that crashed in the middle of a batch comes back this much later."""
+WALL_S = 1_700_000_000
+"""A daemon without a state takes the wall clock's seconds for its incarnation."""
+QUESTIONS_KEPT = 4000
 
 
 def idle(_node: NodeId, _now: float) -> tuple[float, float]:
     """Every machine a quarter busy, for ever."""
     return 1.0, 1000.0
-
-
-@dataclass(slots=True)
-class _Machine:
-    name: NodeId
-    disk: bytes | None = None
-    node: Node | None = None
-    life: int = 0
-    wake_at: float = math.inf
-    workers: dict[TaskId, int] = field(default_factory=dict)
-    """{task: the life of this machine in which its worker became ready}."""
-    roles: dict[TaskId, Role] = field(default_factory=dict)
 
 
 @dataclass(slots=True)
@@ -71,53 +66,76 @@ class Simulator:
     cut_batch: Cut | None = None
     broken_disks: set[NodeId] = field(default_factory=set)
     """Nodes that cannot write their state."""
-    learnt: dict[tuple[TaskId, int], Allocation] = field(default_factory=dict)
-    """{(task, revision): the one value}."""
-    owners: dict[tuple[TaskId, int], NodeId] = field(default_factory=dict)
-    """{(task, epoch): the one owner}."""
-    plans: dict[tuple[NodeId, TaskId], RoutePlan] = field(default_factory=dict)
-    working: dict[TaskId, tuple[NodeId, float]] = field(default_factory=dict)
-    """{exclusive task: (who works, until when at most)}."""
+    weather: Weather = field(default_factory=Weather)
     stories: list[str] = field(default_factory=list)
-    _rng: Random = field(init=False)
-    _queue: list[tuple[float, int, Callable[[], None]]] = field(default_factory=list)
+    machines: dict[str, Machine] = field(default_factory=dict)
+    """{key: machine}; a twin has a key of its own."""
+    invariants: Invariants = field(init=False)
+    work: Work = field(init=False)
+    events: int = 0
+    answers: list[do.AnswerCommand] = field(default_factory=list)
+    """What operators were told."""
+    rng: Random = field(init=False)
+    _queue: list[tuple[float, int, Callable[..., None], tuple[Any, ...]]] = field(default_factory=list)
     _order: Iterator[int] = field(default_factory=itertools.count)
-    _machines: dict[NodeId, _Machine] = field(default_factory=dict)
-    _asked: dict[int, Callable[[object], None]] = field(default_factory=dict)
+    _asked: dict[int, tuple[Machine, Machine, Make]] = field(default_factory=dict)
     _requests: Iterator[int] = field(default_factory=lambda: itertools.count(1))
 
     def __post_init__(self) -> None:
-        self._rng = Random(self.seed)
+        self.rng = Random(self.seed)
+        self.invariants = Invariants(self.fleet)
+        self.work = Work(self)
         for spec in self.fleet.nodes:
-            blank = DurableState(
-                fleet=self.fleet.name,
-                node=spec.name,
-                incarnation=0,
-                generation=0,
-                hardware="",
-                electorate=electorate_hash(self.fleet),
-            )
-            self._machines[spec.name] = _Machine(name=spec.name, disk=wire.encode_state(blank))
+            machine = self.machines[spec.name] = Machine(key=spec.name, name=spec.name, fleet=self.fleet)
+            self.initialise(machine)
+
+    def initialise(self, machine: Machine, *, incarnation: int = 0, generation: int = 0) -> None:
+        """`zsched init`: a blank durable state, which says that this name has never voted."""
+        machine.disk.write(_blank_state(machine, incarnation, generation))
+        machine.disk.sync()
 
     # --- what a test does --------------------------------------------------------------------------------------------
 
+    @property
+    def learnt(self) -> dict[tuple[TaskId, int], Allocation]:
+        """{(task, revision): the one value}."""
+        return self.invariants.told
+
+    @property
+    def owners(self) -> dict[tuple[TaskId, int], NodeId]:
+        """{(task, epoch): the one owner}."""
+        return {key: first.owner for key, first in self.invariants.checker.epochs.items() if first.owner is not None}
+
+    @property
+    def plans(self) -> dict[tuple[NodeId, TaskId], RoutePlan]:
+        """{(node, task): the newest plan}."""
+        return self.work.plans
+
+    @property
+    def working(self) -> dict[TaskId, tuple[NodeId, float]]:
+        """{exclusive task: (who works, until when at most)}."""
+        return self.work.working
+
     def start(self, *names: NodeId) -> None:
         """Start nodes (default: all) from what their disks hold."""
-        for name in names or tuple(self._machines):
-            self._start(self._machines[name])
+        for name in names or tuple(self.machines):
+            if self.machines[name].node is None:
+                self._start(self.machines[name])
 
-    def crash(self, name: NodeId) -> None:
-        """A node's process and its worker end at once; its token goes at the others a little later."""
-        machine = self._machines[name]
+    def crash(self, name: NodeId, *, is_power_lost: bool = False) -> None:
+        """A node's process and its worker end at once.
+
+        Its token goes at the others a little later; when the power is lost, only with their links' lease, and what was
+        written and not synced may be lost.
+        """
+        machine = self.machines[name]
         if machine.node is None:
             return
-        incarnation, machine.node = machine.node.incarnation, None
-        machine.life += 1
-        machine.workers.clear()
-        machine.roles.clear()
-        for other in self._others(name):
-            event = ev.TokenLost(node=name, incarnation=incarnation)
-            self._later(TOKEN_DELAY_S, lambda o=other, e=event: self._deliver(o, e))  # type: ignore[misc]
+        incarnation = machine.node.incarnation
+        machine.end()
+        machine.disk.lose_power(self.rng)
+        delay_s = self.fleet.timing.zenoh_lease_s if is_power_lost else TOKEN_DELAY_S
+        self._tell_token(machine, ev.TokenLost(node=machine.name, incarnation=incarnation), delay_s)
 
     def cut(self, *sides: tuple[NodeId, ...]) -> None:
         """Nothing passes between the groups any more, in either direction; groups inside stay connected."""
@@ -135,9 +153,10 @@ class Simulator:
     def run_until(self, condition: Callable[[], bool], seconds: float) -> bool:
         """Let time pass until ``condition``, at most ``seconds``; whether it came true."""
         end = self.now + seconds
-        while self._queue and self._queue[0][0] <= end:
-            self.now, _, action = heapq.heappop(self._queue)
-            action()
+        queue, pop = self._queue, heapq.heappop
+        while queue and queue[0][0] <= end:
+            self.now, _, action, arguments = pop(queue)
+            action(*arguments)
             if condition():
                 return True
         self.now = end
@@ -145,14 +164,14 @@ class Simulator:
 
     def node(self, name: NodeId) -> Node:
         """A running node. Raises `KeyError` when it is down."""
-        node = self._machines[name].node
+        node = self.machines[name].node
         if node is None:
             raise KeyError(name)
         return node
 
     def running(self) -> tuple[NodeId, ...]:
         """The nodes that are up, sorted."""
-        return tuple(name for name, machine in sorted(self._machines.items()) if machine.node is not None)
+        return tuple(key for key, machine in sorted(self.machines.items()) if machine.node is not None)
 
     def agreed(self, task: TaskId, *names: NodeId) -> NodeId | None:
         """The owner that ``names`` (default: all running) have learnt, when it is one and the same; else ``None``."""
@@ -161,90 +180,202 @@ class Simulator:
 
     def disk(self, name: NodeId) -> DurableState | None:
         """What a node would find if it started now."""
-        content = self._machines[name].disk
-        return None if content is None else wire.decode_state(content)
+        return self.machines[name].disk.state
 
-    # --- machines ----------------------------------------------------------------------------------------------------
+    def sees(self, observer: NodeId, target: NodeId) -> PeerState:
+        """How one running node sees another."""
+        return self.node(observer).membership.state(target)
 
-    def _start(self, machine: _Machine) -> None:
-        state = None if machine.disk is None else wire.decode_state(machine.disk)
+    def unsettled(self) -> str:
+        """Why the fleet is not at rest, empty when it is (see `zsched.lab.sim_checks.unsettled`)."""
+        return unsettled(self.fleet, self.machines, self.work.working, self.now)
+
+    def later(self, seconds: float, action: Callable[..., None], *arguments: Any) -> None:
+        """Do something ``seconds`` from now."""
+        heapq.heappush(self._queue, (self.now + seconds, next(self._order), action, arguments))
+
+    # --- lives -------------------------------------------------------------------------------------------------------
+
+    def _start(self, machine: Machine) -> None:
+        """As the daemon starts: read the state, check it, count the life, persist that, build the node."""
+        electorate = electorate_hash(machine.fleet)
+        kept, local = machine.is_durable, machine.clock.local(self.now)
+        is_first = machine.life == 0
+        state = machine.disk.read()
+        if state is not None and (state.electorate != electorate or self._is_refused(machine)):
+            state = None
         if state is not None:
             state = replace(state, incarnation=state.incarnation + 1)
-            machine.disk = wire.encode_state(state)
+            machine.disk.write(state)
+            machine.disk.sync()
         machine.life += 1
+        machine.is_durable = state is not None
+        machine.is_elector = state is not None and machine.name in machine.fleet.electors
+        self.invariants.on_started(machine, self.now, has_state=state is not None and (kept or is_first))
         machine.node = Node(
-            fleet=self.fleet,
+            fleet=machine.fleet,
             me=machine.name,
             durable=state,
-            incarnation=state.incarnation if state is not None else machine.life,
-            electorate=electorate_hash(self.fleet),
-            rng=Random(self._rng.random()),
-            now=self.now,
+            incarnation=state.incarnation if state is not None else WALL_S + int(self.now * 1000),
+            electorate=electorate,
+            rng=Random(self.rng.random()),
+            now=local,
         )
-        self._carry_out(machine, machine.node.start(self.now))
-        life = machine.life
-        self._later(self._rng.uniform(0, self.fleet.timing.sample_s), lambda: self._sample(machine, life))
-        machine.wake_at = math.inf
+        self._tell_token(machine, ev.TokenSeen(node=machine.name, incarnation=machine.node.incarnation), TOKEN_DELAY_S)
+        self._carry_out(machine, machine.node.start(local), 0)
+        self.later(self.rng.uniform(0, machine.fleet.timing.sample_s), self._sample, machine, machine.life)
         self._arm(machine)
 
-    def _later(self, seconds: float, action: Callable[[], None]) -> None:
-        heapq.heappush(self._queue, (self.now + seconds, next(self._order), action))
+    def _is_refused(self, machine: Machine) -> bool:
+        return machine.disk.is_broken or machine.key in self.broken_disks
 
-    def _sample(self, machine: _Machine, life: int) -> None:
+    def _tell_token(self, machine: Machine, event: ev.Event, delay_s: float) -> None:
+        for other in self.machines.values():
+            if other is not machine and (machine.name, other.name) not in self.cuts:
+                self.later(delay_s, self.deliver, other, event)
+
+    def _sample(self, machine: Machine, life: int) -> None:
         if machine.life != life or machine.node is None:
             return
         cpu, memory = self.load(machine.name, self.now)
         sample = DeviceSample(cpu_cores=CORES, cpu_used_cores=cpu, memory_mb=MEMORY_MB, memory_used_mb=memory)
-        self._later(self.fleet.timing.sample_s, lambda: self._sample(machine, life))
-        self._deliver(machine.name, ev.ProfileSampled(device=sample))
+        self.later(self.fleet.timing.sample_s, self._sample, machine, life)
+        self.deliver(machine, ev.ProfileSampled(device=sample))
 
-    def _arm(self, machine: _Machine) -> None:
-        """Make sure that the node is woken at its next deadline."""
-        node, life = machine.node, machine.life
-        if node is None:
-            return
-        due = max(node.next_deadline(), self.now + TICK_S)
-        if due < machine.wake_at:
-            machine.wake_at = due
-            self._later(due - self.now, lambda: self._wake(machine, life))
+    # --- one machine's loop ------------------------------------------------------------------------------------------
 
-    def _wake(self, machine: _Machine, life: int) -> None:
-        if machine.life != life:
-            return
+    def rearm(self, machine: Machine) -> None:
+        """The machine's clock has changed: its next deadline lies elsewhere in true time."""
         machine.wake_at = math.inf
-        node = machine.node
-        if node is not None and node.next_deadline() <= self.now:
-            self._deliver(machine.name, ev.DeadlineReached())
         self._arm(machine)
 
-    def _deliver(self, name: NodeId, event: ev.Event) -> None:
-        machine = self._machines[name]
-        if machine.node is not None:
-            self._carry_out(machine, machine.node.handle(event, self.now))
-            self._arm(machine)
+    def _arm(self, machine: Machine) -> None:
+        """Make sure that the node is woken at its next deadline."""
+        node = machine.node
+        if node is None:
+            return
+        due = max(machine.clock.true(node.next_deadline()), self.now + TICK_S)
+        if due < machine.wake_at:
+            machine.wake_at = due
+            heapq.heappush(self._queue, (due, next(self._order), self._wake, (machine, machine.life, due)))
 
-    def _others(self, name: NodeId) -> list[NodeId]:
-        return [other for other in self._machines if other != name]
+    def _wake(self, machine: Machine, life: int, at: float) -> None:
+        if machine.life != life or machine.wake_at != at:
+            return  # another life, or an earlier wake-up has come since
+        machine.wake_at = math.inf
+        node = machine.node
+        if node is not None and node.next_deadline() <= machine.clock.local(self.now):
+            self.invariants.on_woken(machine, self.now)
+            self.deliver(machine, ev.DeadlineReached())
+        self._arm(machine)
+
+    def deliver(self, machine: Machine, event: ev.Event) -> None:
+        """An event reaches a machine: handled at once, or when its loop comes to it."""
+        if machine.node is None:
+            return
+        if machine.is_paused or machine.inbox or machine.busy_until > self.now:
+            machine.inbox.append(event)
+            self._pump_later(machine)
+            return
+        self._handle(machine, event)
+
+    def pause(self, machine: Machine, seconds: float) -> None:
+        """The loop stands still (SIGSTOP); what comes queues up, and the clock goes on."""
+        if machine.node is not None:
+            machine.is_paused = True
+            self.later(seconds, self.unpause, machine, machine.life)
+
+    def unpause(self, machine: Machine, life: int) -> None:
+        """The loop goes on with what has queued up."""
+        if machine.life == life and machine.is_paused:
+            machine.is_paused = False
+            self._pump_later(machine)
+
+    def _pump_later(self, machine: Machine) -> None:
+        if not machine.is_pumping and not machine.is_paused:
+            machine.is_pumping = True
+            self.later(max(machine.busy_until - self.now, 0.0), self._pump, machine, machine.life)
+
+    def _pump(self, machine: Machine, life: int) -> None:
+        machine.is_pumping = False
+        while machine.life == life and machine.inbox and not machine.is_paused and machine.busy_until <= self.now:
+            self._handle(machine, machine.inbox.popleft())
+        if machine.inbox and not machine.is_paused:
+            self._pump_later(machine)
+
+    def _handle(self, machine: Machine, event: ev.Event) -> None:
+        node = machine.node
+        assert node is not None
+        self.events += 1
+        local = machine.clock.local(self.now)
+        try:
+            batch = node.handle(event, local)
+        except Exception as error:
+            raise InvariantError(f"{machine.key} raised {error!r} on {event}") from error
+        self.invariants.on_handled(machine, self.now, local)
+        if machine.event_s:
+            machine.busy_until = self.now + machine.event_s
+        if batch:
+            self._carry_out(machine, batch, 0)
+        self._arm(machine)
 
     # --- instructions ------------------------------------------------------------------------------------------------
 
-    def _carry_out(self, machine: _Machine, batch: tuple[do.Instruction, ...]) -> None:
+    def _carry_out(self, machine: Machine, batch: tuple[do.Instruction, ...], first: int) -> None:
         end = None if self.cut_batch is None else self.cut_batch(machine.name, batch)
-        for instruction in batch[:end]:
-            if isinstance(instruction, do.PersistState) and machine.name in self.broken_disks:
-                self._deliver(machine.name, ev.PersistFailed(reason="no space left on device"))
-                break
-            self._one(machine, instruction)
-        self._check(machine)
-        if end is not None:
-            self.crash(machine.name)
-            self._later(RESTART_S, lambda: self._start(machine) if machine.node is None else None)
+        self._do(machine, machine.life, batch, first, end)
 
-    def _one(self, machine: _Machine, instruction: do.Instruction) -> None:
-        me = machine.name
+    def _do(self, machine: Machine, life: int, batch: tuple[do.Instruction, ...], first: int, end: int | None) -> None:
+        """Carry out ``batch[first:end]``; a slow disk holds the rest of it up, a refused write ends it."""
+        if machine.life != life:
+            return
+        for index in range(first, len(batch) if end is None else min(end, len(batch))):
+            instruction = batch[index]
+            if isinstance(instruction, do.PersistState):
+                if self._is_refused(machine):
+                    machine.is_durable = False
+                    self._handle(machine, ev.PersistFailed(reason="no space left on device"))
+                    break
+                machine.disk.write(instruction.state)
+                if machine.disk_s[1] > 0.0:
+                    machine.busy_until = self.now + self.rng.uniform(*machine.disk_s)
+                    self.later(machine.busy_until - self.now, self._synced, machine, life, batch, index, end)
+                    return
+                self._sync(machine, instruction.state)
+                continue
+            self.invariants.on_leaving(machine, instruction)
+            self._one(machine, instruction)
+        if end is not None:
+            self.crash(machine.key)
+            self.later(RESTART_S, self._restart, machine)
+
+    def _restart(self, machine: Machine) -> None:
+        if machine.node is None and machine.key in self.machines:
+            self._start(machine)
+
+    def _sync(self, machine: Machine, state: DurableState) -> None:
+        self.invariants.on_synced(machine, state, self.now)
+        machine.disk.sync()
+
+    def _synced(
+        self, machine: Machine, life: int, batch: tuple[do.Instruction, ...], index: int, end: int | None
+    ) -> None:
+        if machine.life != life:
+            return
+        persist = batch[index]
+        assert isinstance(persist, do.PersistState)
+        if machine.is_paused:  # the write is done, the process is not there to go on
+            self.later(TICK_S, self._synced, machine, life, batch, index, end)
+            machine.busy_until = self.now + TICK_S
+            return
+        self._sync(machine, persist.state)
+        machine.busy_until = self.now
+        self._do(machine, life, batch, index + 1, end)
+        self._pump_later(machine)
+        self._arm(machine)
+
+    def _one(self, me: Machine, instruction: do.Instruction) -> None:
         match instruction:
-            case do.PersistState(state=state):
-                machine.disk = wire.encode_state(state)
             case do.PublishBeat(beat=beat):
                 self._put(me, beat, lambda value: ev.BeatReceived(beat=value))
             case do.PublishProfile(profile=profile):
@@ -256,162 +387,117 @@ class Simulator:
             case do.AskUtilities(gather=gather):
                 self._gather(me, gather)
             case do.SendPrepare(prepare=prepare):
-                self._elect(
-                    me, prepare, lambda request, value: ev.PrepareAsked(request=request, asker=me, prepare=value)
-                )
+                self._elect(me, prepare, lambda n, value: ev.PrepareAsked(request=n, asker=me.name, prepare=value))
             case do.SendAccept(accept=accept):
-                self._elect(me, accept, lambda request, value: ev.AcceptAsked(request=request, asker=me, accept=value))
+                self._elect(me, accept, lambda n, value: ev.AcceptAsked(request=n, asker=me.name, accept=value))
             case do.AskLearnt(peer=peer):
-                request = self._question(peer, me, lambda value: ev.LearntReceived(learnt=value))
-                self._send(me, peer, lambda: ev.LearntAsked(request=request))
-            case do.AnswerUtilities(request=request, utilities=answer):
-                self._answer(request, answer)
+                for other in self._named(peer):
+                    number = self._question(other, me, lambda value: ev.LearntReceived(learnt=value))
+                    self._send(me, other, Message(ev.LearntAsked(request=number)))
+            case do.AnswerUtilities(request=request, utilities=value):
+                self._answer(request, value)
             case do.AnswerElection(request=request, answer=vote):
                 self._answer(request, vote)
             case do.AnswerLearnt(request=request, learnt=learnt):
                 self._answer(request, learnt)
-            case do.StartWorker(task=task):
-                self._start_worker(machine, task)
-            case do.ApplyRoutes(plan=plan):
-                self._apply(machine, plan)
-            case do.SetRole(role=role):
-                self._set_role(machine, role)
+            case do.AnswerCommand(result=result):
+                wire.encode(result)
+                self.answers.append(instruction)
+            case do.AnswerStatus(snapshot=snapshot):
+                wire.encode(snapshot)
             case do.RecordStory():
                 where = f"{instruction.task}#{instruction.epoch} " if instruction.task else ""
-                self.stories.append(f"{self.now:9.3f} {me} {instruction.stage} {where}{instruction.text}")
+                self.stories.append(f"{self.now:9.3f} {me.key} {instruction.stage} {where}{instruction.text}")
+            case do.StandDown():
+                self.stories.append(f"{self.now:9.3f} {me.key} stands down: {instruction.reason}")
+                self.crash(me.key)
             case _:
-                pass  # status and commands go to whoever called; roles and stops concern real workers only
+                self.work.do(me, instruction)
 
-    def _send(self, source: NodeId, target: NodeId, make: Callable[[], ev.Event]) -> None:
-        """One message on its way: maybe lost, cut or late, never changed."""
-        if source != target and ((source, target) in self.cuts or self._rng.random() < self.loss):
+    # --- the network -------------------------------------------------------------------------------------------------
+
+    def _named(self, name: NodeId) -> list[Machine]:
+        """Every machine that calls itself so (one, unless it has a twin)."""
+        return [machine for machine in self.machines.values() if machine.name == name]
+
+    def _send(self, source: Machine, target: Machine, message: Message) -> None:
+        """One message on its way: maybe lost, cut or late; in bad weather worse."""
+        if source is target:
+            self.later(SELF_DELAY_S, self.deliver, target, message.event)
             return
-        delay = 0.0001 if source == target else self._rng.uniform(*self.delay_s)
-        self._later(delay, lambda: None if (source, target) in self.cuts else self._deliver(target, make()))
+        pair = (source.name, target.name)
+        if pair in self.cuts or (self.loss and self.rng.random() < self.loss):
+            return
+        low, high = self.delay_s
+        if self.weather.is_calm:
+            self.later(low + (high - low) * self.rng.random(), self._arrive, pair, target, message.event)
+            return
+        for sender, receiver, extra_s, event in self.weather.through(*pair, message, self.rng):
+            for machine in [target] if receiver == target.name else self._named(receiver):
+                delay_s = low + (high - low) * self.rng.random() + extra_s
+                self.later(delay_s, self._arrive, (sender, receiver), machine, event)
 
-    def _put(self, me: NodeId, value: object, make: Callable[..., ev.Event]) -> None:
+    def _arrive(self, pair: tuple[NodeId, NodeId], target: Machine, event: ev.Event) -> None:
+        if pair not in self.cuts:
+            self.deliver(target, event)
+
+    def _put(self, me: Machine, value: object, make: Make) -> None:
         frame, kind = wire.encode(value), type(value)
-        for other in self._others(me):
-            self._send(me, other, lambda: make(wire.decode(frame, kind)))
+        message = Message(make(wire.decode(frame, kind)), frame, kind)
+        for other in self.machines.values():
+            if other is not me:
+                self._send(me, other, message)
 
-    def _question(self, asked: NodeId, asker: NodeId, make: Callable[..., ev.Event]) -> int:
-        """A request number whose answer travels back from ``asked`` to ``asker``."""
+    def _question(self, asked: Machine, asker: Machine, make: Make) -> int:
+        """A request number whose answers travel back from ``asked`` to ``asker`` (a repeated question's, too)."""
         number = next(self._requests)
-
-        def answer(value: object) -> None:
-            frame, kind = wire.encode(value), type(value)
-            self._send(asked, asker, lambda: make(wire.decode(frame, kind)))
-
-        self._asked[number] = answer
+        self._asked[number] = (asked, asker, make)
+        if len(self._asked) > QUESTIONS_KEPT:
+            del self._asked[next(iter(self._asked))]
         return number
 
     def _answer(self, request: int, value: object) -> None:
-        answer = self._asked.pop(request, None)
-        if answer is not None:
-            answer(value)
+        question = self._asked.get(request)
+        if question is None:
+            return
+        asked, asker, make = question
+        frame, kind = wire.encode(value), type(value)
+        self._send(asked, asker, Message(make(wire.decode(frame, kind)), frame, kind))
 
-    def _gather(self, me: NodeId, gather: int) -> None:
-        for other in self.fleet.voters:
-            if other != me:
-                number = self._question(other, me, lambda value: ev.UtilityReceived(gather=gather, utilities=value))
-                self._send(me, other, lambda n=number: ev.UtilityAsked(request=n, asker=me))  # type: ignore[misc]
+    def _gather(self, me: Machine, gather: int) -> None:
+        def make(value: Any) -> ev.Event:
+            return ev.UtilityReceived(gather=gather, utilities=value)
 
-    def _elect(self, me: NodeId, question: object, make: Callable[..., ev.Event]) -> None:
+        for name in self.fleet.voters:
+            for other in self._named(name) if name != me.name else ():
+                number = self._question(other, me, make)
+                self._send(me, other, Message(ev.UtilityAsked(request=number, asker=me.name)))
+
+    def _elect(self, me: Machine, question: object, make: Callable[[int, Any], ev.Event]) -> None:
         frame, kind = wire.encode(question), type(question)
-        for elector in self.fleet.electors:
-            number = self._question(elector, me, lambda value: ev.ElectorAnswered(answer=value))
-            self._send(me, elector, lambda n=number: make(n, wire.decode(frame, kind)))  # type: ignore[misc]
+        value = wire.decode(frame, kind)
+        for elector in me.fleet.electors:
+            for other in self._named(elector):
+                number = self._question(other, me, lambda answer: ev.ElectorAnswered(answer=answer))
+                self._send(me, other, Message(make(number, value), frame, kind))
 
-    # --- stand-ins for workers and relays ----------------------------------------------------------------------------
 
-    def _start_worker(self, machine: _Machine, task: TaskId) -> None:
-        if task in machine.workers:
-            return
-        life = machine.workers[task] = machine.life
-
-        def ready() -> None:
-            if machine.life == life:
-                self._deliver(machine.name, ev.WorkerChanged(task=task, state=WorkerState.READY))
-
-        self._later(WORKER_START_S, ready)
-
-    def _set_role(self, machine: _Machine, role: Role) -> None:
-        """The worker follows its role; an exclusive one works only under its lease, and says when it has stopped."""
-        before = machine.roles.get(role.task)
-        machine.roles[role.task] = role
-        if role.lease_until_s is not None and role.lease_until_s > self.now:
-            self._check_exclusive(machine, role, role.lease_until_s)
-        if before is None or before.role is not WorkerRole.ACTIVE or role.role is WorkerRole.ACTIVE:
-            return
-        life = machine.life
-
-        def stopped() -> None:
-            working = self.working.get(role.task)
-            if working is not None and working[0] == machine.name and machine.life == life:
-                self.working[role.task] = (machine.name, self.now)
-            if machine.life == life:
-                self._deliver(machine.name, ev.RoleEnded(task=role.task, epoch=before.epoch))
-
-        self._later(WORKER_STOP_S, stopped)
-
-    def _check_exclusive(self, machine: _Machine, role: Role, until: float) -> None:
-        """Nobody else may still be working: a crashed owner's worker counts until its lease ends."""
-        other = self.working.get(role.task)
-        if other is not None and other[0] != machine.name and other[1] > self.now:
-            raise InvariantError(
-                f"seed {self.seed}: {other[0]} and {machine.name} both work on {role.task} at {self.now:.3f}"
-            )
-        self.working[role.task] = (machine.name, until)
-
-    def _apply(self, machine: _Machine, plan: RoutePlan) -> None:
-        before = self.plans.get((machine.name, plan.task))
-        newest = plan.current.epoch if plan.current is not None else 0
-        if before is not None and before.current is not None and newest < before.current.epoch:
-            raise InvariantError(f"{machine.name}: an older token moves a route: {before.current.epoch} -> {newest}")
-        self.plans[machine.name, plan.task] = plan
-        life = machine.life
-        if plan.phase is RoutePhase.PREPARE:
-            self._watch_ready(machine, plan, life)
-        elif plan.phase is RoutePhase.FLIP:
-            self._later(FLIP_S, lambda: self._flipped(machine, plan, life))
-
-    def _watch_ready(self, machine: _Machine, plan: RoutePlan, life: int) -> None:
-        """Report readiness once the owner's worker is up and reachable; ask again as long as the plan stands."""
-        if machine.life != life or self.plans.get((machine.name, plan.task)) != plan or plan.current is None:
-            return
-        owner = self._machines[plan.current.owner]
-        is_up = owner.node is not None and owner.node.worker_states.get(plan.task) is WorkerState.READY
-        if is_up and (owner.name, machine.name) not in self.cuts:
-            self._deliver(machine.name, ev.SlotReady(task=plan.task, epoch=plan.current.epoch))
-            return
-        self._later(0.05, lambda: self._watch_ready(machine, plan, life))
-
-    def _flipped(self, machine: _Machine, plan: RoutePlan, life: int) -> None:
-        if machine.life != life or plan.current is None:
-            return
-        self._deliver(machine.name, ev.SlotFlipped(task=plan.task, epoch=plan.current.epoch))
-        if plan.predecessor is not None and self._machines[plan.predecessor.owner].node is not None:
-            self._deliver(machine.name, ev.SlotDrained(task=plan.task, epoch=plan.predecessor.epoch))
-
-    # --- invariants --------------------------------------------------------------------------------------------------
-
-    def _check(self, machine: _Machine) -> None:
-        """One value per revision, one owner per epoch, over all nodes and lives."""
-        if machine.node is None:
-            return
-        for task, register in machine.node.registers.items():
-            value = register.value
-            if value.revision == 0:
-                continue
-            known = self.learnt.setdefault((task, value.revision), value)
-            if known != value:
-                raise InvariantError(f"seed {self.seed}: two values for {task} revision {value.revision}")
-            if value.owner is None:
-                continue
-            owner = self.owners.setdefault((task, value.epoch), value.owner)
-            if owner != value.owner:
-                raise InvariantError(f"seed {self.seed}: two owners for {task} epoch {value.epoch}")
-
-    def sees(self, observer: NodeId, target: NodeId) -> PeerState:
-        """How one running node sees another."""
-        return self.node(observer).membership.state(target)
+def _blank_state(machine: Machine, incarnation: int, generation: int) -> DurableState:
+    start = generation * GENERATION_STEP
+    registers = tuple(
+        RegisterState(
+            task=task.name,
+            learnt=Allocation(task=task.name, revision=start, epoch=start, owner=None, tuning=task.tuning),
+        )
+        for task in machine.fleet.tasks
+        if generation > 0
+    )
+    return DurableState(
+        fleet=machine.fleet.name,
+        node=machine.name,
+        incarnation=incarnation,
+        generation=generation,
+        hardware="",
+        electorate=electorate_hash(machine.fleet),
+        registers=registers,
+    )

@@ -1,0 +1,201 @@
+"""The invariants that every event of a simulated fleet is checked against (docs/testing.md lists them).
+
+Knows: what must hold, over all nodes and all their lives. Does not know: what happens next, how a node decides.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from zsched.core import instructions as do
+from zsched.core.damping import ESCAPES_PER_MINUTE
+from zsched.core.executor import Phase
+from zsched.core.fleet import Fleet
+from zsched.core.messages import Accepted, Promise
+from zsched.core.model import Allocation, DurableState, NodeId, RegisterState, TaskId, WorkerState
+from zsched.core.plan import RoutePlan, WorkerRole
+from zsched.errors import InvariantError
+from zsched.lab.history import Checker, Learnt, Record, Routed, Started, Stored, Worked
+from zsched.lab.sim_parts import Machine
+
+GENERATION_STEP = 2**32
+MAX_WAKES = 50
+"""So often in a row a node may want to be woken without time passing."""
+
+
+@dataclass(slots=True)
+class Invariants:
+    """Watches one simulated fleet; raises `InvariantError` as soon as something impossible happens."""
+
+    fleet: Fleet
+    checker: Checker = field(init=False)
+    told: dict[tuple[TaskId, int], Allocation] = field(default_factory=dict)
+    """{(task, revision): the one value}."""
+
+    def __post_init__(self) -> None:
+        limits = {task.name: task.max_moves_per_minute + ESCAPES_PER_MINUTE for task in self.fleet.tasks}
+        self.checker = Checker(electors=self.fleet.electors, moves_per_minute=limits)
+
+    def take(self, record: Record) -> None:
+        """Check one record of the history."""
+        found = self.checker.take(record)
+        if found:
+            raise InvariantError(found[0])
+
+    # --- lives and disks ---------------------------------------------------------------------------------------------
+
+    def on_started(self, machine: Machine, now: float, *, has_state: bool) -> None:
+        """A daemon starts; one without state may know less than before."""
+        self.take(Started(at=now, node=machine.key, has_state=has_state))
+        machine.woken_at, machine.wakes = now, 0
+
+    def on_synced(self, machine: Machine, state: DurableState, now: float) -> None:
+        """A state reached the disk: promises only rise, and what it holds is history from now on."""
+        before = machine.disk.state
+        old = {} if before is None else {register.task: register for register in before.registers}
+        for register in state.registers:
+            known = old.get(register.task)
+            if known is register:
+                continue
+            if known is not None and register.promised < known.promised:
+                raise InvariantError(f"{machine.key} promised {register.promised} after {known.promised}")
+            accepted = register.accepted
+            if accepted is not None and (known is None or known.accepted != accepted):
+                ballot, revision = str(accepted), accepted.value.revision
+                self.take(Stored(at=now, node=machine.key, task=register.task, revision=revision, ballot=ballot))
+            if register.learnt is not None and (known is None or known.learnt != register.learnt):
+                self.on_learnt(machine, register.learnt, now)
+
+    def on_learnt(self, machine: Machine, value: Allocation, now: float) -> None:
+        """A node knows a committed value, for good (or, without a state file, for this life)."""
+        if value.revision == 0:
+            return
+        if value.revision % GENERATION_STEP:  # a generation's first value was made by the operator, nobody chose it
+            detail = f"{value.tuning} {value.pinned} {value.paused}"
+            self.take(
+                Learnt(
+                    at=now,
+                    node=machine.key,
+                    task=value.task,
+                    revision=value.revision,
+                    epoch=value.epoch,
+                    owner=value.owner,
+                    detail=detail,
+                )
+            )
+        self.told.setdefault((value.task, value.revision), value)
+
+    # --- what a batch says -------------------------------------------------------------------------------------------
+
+    def on_leaving(self, machine: Machine, instruction: do.Instruction) -> None:
+        """What others will see, and what workers and relays do, must stand on this machine's disk."""
+        match instruction:
+            case do.AnswerElection(answer=Promise() | Accepted() as answer):
+                self._check_answer(machine, answer)
+            case do.PublishBeat(beat=beat):
+                for task, revision, _ in beat.learnt:
+                    self._check_told(machine, task, revision)
+            case do.PublishLearnt(learnt=learnt) | do.AnswerLearnt(learnt=learnt):
+                for value in learnt.values:
+                    self._check_told(machine, value.task, value.revision)
+            case do.SetRole(role=role) if role.role is WorkerRole.ACTIVE:
+                self._check_epoch(machine, role.task, role.epoch)
+            case _:
+                pass
+
+    @staticmethod
+    def _register(machine: Machine, task: TaskId) -> RegisterState:
+        state = machine.disk.state
+        registers = () if state is None else state.registers
+        return next((one for one in registers if one.task == task), RegisterState(task=task))
+
+    def _check_answer(self, machine: Machine, answer: Promise | Accepted) -> None:
+        if not machine.is_elector:
+            raise InvariantError(f"{machine.key} is no elector and answered {answer}")
+        held = self._register(machine, answer.task)
+        if held.promised < answer.ballot:
+            raise InvariantError(f"{machine.key} answered without its promise on disk: {answer}")
+        if isinstance(answer, Accepted) and (held.accepted is None or held.accepted.ballot < answer.ballot):
+            raise InvariantError(f"{machine.key} answered without its acceptance on disk: {answer}")
+        if isinstance(answer, Promise) and held.promised == answer.ballot and held.accepted != answer.accepted:
+            raise InvariantError(f"{machine.key} promised and told another acceptance than it has: {answer}")
+
+    def _check_told(self, machine: Machine, task: TaskId, revision: int) -> None:
+        if not revision or not _keeps_state(machine):
+            return
+        learnt = self._register(machine, task).learnt
+        if learnt is None or learnt.revision < revision:
+            raise InvariantError(f"{machine.key} told of {task} revision {revision}, which is not on its disk")
+
+    def _check_epoch(self, machine: Machine, task: TaskId, epoch: int) -> None:
+        if not _keeps_state(machine):
+            return
+        learnt = self._register(machine, task).learnt
+        if learnt is None or learnt.epoch < epoch:
+            raise InvariantError(f"{machine.key} carried out {task} epoch {epoch}, which is not on its disk")
+
+    def on_plan(self, machine: Machine, plan: RoutePlan, now: float) -> None:
+        """A relay is given a plan."""
+        if plan.current is not None:
+            epoch, owner = plan.current.epoch, plan.current.owner
+            self._check_epoch(machine, plan.task, epoch)
+            self.take(Routed(at=now, node=machine.key, task=plan.task, epoch=epoch, owner=owner))
+
+    def on_worked(self, machine: Machine, task: TaskId, epoch: int, now: float, until: float) -> None:
+        """An exclusive worker may work until a true time."""
+        self.take(Worked(at=now, node=machine.key, task=task, epoch=epoch, until=until))
+
+    # --- the loop ----------------------------------------------------------------------------------------------------
+
+    def on_handled(self, machine: Machine, now: float, local: float) -> None:
+        """An event was handled: the next deadline lies ahead, and a node without a disk has learnt for this life."""
+        node = machine.node
+        assert node is not None
+        if node.next_deadline() < local:
+            raise InvariantError(f"{machine.key}: next deadline {node.next_deadline():.6f} in the past of {local:.6f}")
+        if not _keeps_state(machine):
+            for register in node.registers.values():
+                self.on_learnt(machine, register.value, now)
+
+    @staticmethod
+    def on_woken(machine: Machine, now: float) -> None:
+        """A node wanted to be woken: it must let time pass."""
+        machine.wakes = machine.wakes + 1 if now - machine.woken_at < 0.01 else 0
+        machine.woken_at = now if machine.wakes == 0 else machine.woken_at
+        if machine.wakes > MAX_WAKES:
+            raise InvariantError(f"{machine.key}: woken {machine.wakes} times within 10 ms, its loop spins")
+
+
+def _keeps_state(machine: Machine) -> bool:
+    return machine.disk.state is not None and not machine.disk.is_broken and machine.is_durable
+
+
+def unsettled(fleet: Fleet, machines: dict[str, Machine], works: dict[TaskId, tuple[NodeId, float]], now: float) -> str:
+    """Why the fleet has not come to rest: every task must have a living, ready owner that all nodes and streams know.
+
+    Args:
+        fleet: the fleet file.
+        machines: all of them; those that are down are not asked.
+        works: {exclusive task: (who works, until when)}.
+        now: true time.
+    """
+    running = [machine for machine in machines.values() if machine.node is not None]
+    for task in fleet.tasks:
+        values = {machine.node.registers[task.name].value for machine in running if machine.node is not None}
+        if len(values) != 1:
+            return f"{task.name}: nodes know different revisions {sorted({value.revision for value in values})}"
+        value = values.pop()
+        owner = machines.get(value.owner or "")
+        if owner is None or owner.node is None:
+            return f"{task.name}: owner {value.owner} is not alive"
+        if owner.node.worker_states.get(task.name) is not WorkerState.READY:
+            return f"{task.name}: the worker of {value.owner} is not ready"
+        for machine in running:
+            executor = machine.node.executors[task.name] if machine.node is not None else None
+            if executor is None or not executor.has_streams:
+                continue
+            if (executor.phase, executor.owner) != (Phase.SETTLED, value.owner):
+                return f"{task.name}: streams of {machine.key} are {executor.phase} towards {executor.owner}"
+        if task.exclusive and (works.get(task.name, ("", 0.0))[0] != value.owner or works[task.name][1] <= now):
+            return f"{task.name}: {value.owner} has no lease"
+    return ""

@@ -1,0 +1,145 @@
+"""The parts of a simulated machine: a clock that may run wrong, a disk that may lose or damage what was written.
+
+Knows: what a machine keeps and forgets. Does not know: the network, when anything happens, what a node decides.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+from random import Random
+
+from zsched import wire
+from zsched.core import events as ev
+from zsched.core.fleet import Fleet
+from zsched.core.model import DurableState, NodeId, TaskId
+from zsched.core.node import Node
+from zsched.core.plan import Role
+from zsched.errors import WireError
+
+
+@dataclass(slots=True)
+class Clock:
+    """A machine's CLOCK_BOOTTIME against true time; it may run fast, slow or jump forward, never back."""
+
+    rate: float = 1.0
+    _true: float = 0.0
+    _local: float = 0.0
+
+    @property
+    def is_true(self) -> bool:
+        """Whether both are the same number (so that nothing is rounded)."""
+        return self.rate == 1.0 and self._true == self._local
+
+    def local(self, true: float) -> float:
+        """What the machine reads at a true time."""
+        return true if self.is_true else self._local + (true - self._true) * self.rate
+
+    def true(self, local: float) -> float:
+        """When the machine reads ``local``, as things are now."""
+        if self.is_true or math.isinf(local):
+            return local
+        return self._true + (local - self._local) / self.rate
+
+    def change(self, true: float, *, rate: float | None = None, jump_s: float = 0.0) -> None:
+        """From now on run at another rate, or a little later at once (``jump_s`` >= 0)."""
+        self._local, self._true = self.local(true) + jump_s, true
+        self.rate = self.rate if rate is None else rate
+
+
+@dataclass(slots=True)
+class Disk:
+    """One state file: a write is a whole new file, on disk only once it is synced."""
+
+    state: DurableState | None = None
+    """What is on disk, decoded (``None``: no valid file)."""
+    content: bytes | None = None
+    is_broken: bool = False
+    """Full or read-only: it refuses every write."""
+    _unsynced: DurableState | None = None
+
+    def write(self, state: DurableState) -> None:
+        """The new file is written and renamed, but not synced yet."""
+        self._unsynced = state
+
+    def sync(self) -> None:
+        """What was written survives a power cut from now on."""
+        if self._unsynced is not None:
+            self.state, self._unsynced = self._unsynced, None
+            self.content = wire.encode_state(self.state)
+
+    def lose_power(self, rng: Random) -> None:
+        """What was not synced is there or not: the old file or the new one, each whole."""
+        if rng.random() < 0.5:
+            self._unsynced = None
+        self.sync()
+
+    def damage(self, rng: Random) -> None:
+        """The card is worn out: the file is cut short, or one of its bits is another one."""
+        self._unsynced = None
+        if not self.content:
+            return
+        if rng.random() < 0.5:
+            content = self.content[: rng.randrange(len(self.content))]
+        else:
+            at, bit = rng.randrange(len(self.content)), 1 << rng.randrange(8)
+            content = self.content[:at] + bytes([self.content[at] ^ bit]) + self.content[at + 1 :]
+        self.content = content
+        self.state = self.read()
+
+    def wipe(self) -> None:
+        """The disk is new."""
+        self.state = self.content = self._unsynced = None
+
+    def read(self) -> DurableState | None:
+        """What a starting daemon finds, through the production format."""
+        if self.content is None:
+            return None
+        try:
+            return wire.decode_state(self.content)
+        except WireError:
+            return None
+
+
+@dataclass(slots=True)
+class Machine:
+    """One simulated computer with its daemon."""
+
+    key: str
+    """Unique; a twin (a second machine that calls itself the same) has a key of its own."""
+    name: NodeId
+    fleet: Fleet
+    """As this machine's fleet file says."""
+    disk: Disk = field(default_factory=Disk)
+    clock: Clock = field(default_factory=Clock)
+    node: Node | None = None
+    life: int = 0
+    is_elector: bool = False
+    """Whether this life started as an elector, with a valid state of this electorate."""
+    is_durable: bool = False
+    """Whether this life keeps a state (and its disk has not refused yet)."""
+    wake_at: float = math.inf
+    workers: dict[TaskId, int] = field(default_factory=dict)
+    """{task: the life of this machine in which its worker became ready}."""
+    roles: dict[TaskId, Role] = field(default_factory=dict)
+    inbox: deque[ev.Event] = field(default_factory=deque)
+    busy_until: float = -math.inf
+    is_paused: bool = False
+    is_pumping: bool = False
+    event_s: float = 0.0
+    """What handling one event costs."""
+    disk_s: tuple[float, float] = (0.0, 0.0)
+    """How long a synced write takes, from and to."""
+    woken_at: float = -math.inf
+    wakes: int = 0
+    """How often in a row the loop woke up at the same time: a loop that spins."""
+
+    def end(self) -> None:
+        """The process is gone, and what it held in memory; its worker with it."""
+        self.node = None
+        self.life += 1
+        self.workers.clear()
+        self.roles.clear()
+        self.inbox.clear()
+        self.busy_until, self.is_paused, self.wake_at = -math.inf, False, math.inf

@@ -1,0 +1,232 @@
+"""Schedules by seed: each seed enables its own random subset of faults, sizes and fleets (swarm testing).
+
+Knows: which fleets and faults there are, and how a seed becomes a `Plan`. Does not know: how a fault is carried out
+(`zsched.lab.sim_faults`), what must hold.
+
+A plan does not depend on what happens in it: leaving faults out (shrinking) leaves the others as they are.
+Swarm testing: Groce et al., ISSTA 2012.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from random import Random
+
+from zsched.core.fleet import Fleet, NodeSpec, Standby, TaskSpec, WorkerSpec
+from zsched.core.model import Aggregate, NodeId, NodeKind, Tuning, Weights
+from zsched.core.timing import WAN, WIFI, WIRED
+
+SECONDS = 30.0
+"""Virtual seconds of one schedule: faults in the first half, then quiet."""
+SAMPLE_S = 0.5
+MIN_NODES, MAX_NODES = 3, 7
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fault:
+    """One fault: from ``at`` on (seconds after the start) for ``seconds``, on ``nodes``, ``size`` strong."""
+
+    at: float
+    kind: str
+    nodes: tuple[NodeId, ...] = ()
+    seconds: float = 0.0
+    size: float = 0.0
+
+    def __str__(self) -> str:
+        return f"{self.at:6.2f} {self.kind} {','.join(self.nodes)} for {self.seconds:.2f} s, size {self.size:.4g}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """One schedule: the fleet, what goes wrong in it, and how long it takes."""
+
+    seed: int
+    fleet: Fleet
+    faults: tuple[Fault, ...]
+    seconds: float = SECONDS
+
+
+def plan(seed: int, *, nodes: int | None = None, seconds: float = SECONDS) -> Plan:
+    """The schedule of a seed.
+
+    Args:
+        seed: any whole number.
+        nodes: the fleet's size, 3 to 7 (``None``: by seed).
+        seconds: virtual seconds; faults begin in the first half only.
+    """
+    rng = Random(f"schedule {seed}")
+    fleet = _fleet(rng, nodes or rng.randint(MIN_NODES, MAX_NODES))
+    return Plan(seed=seed, fleet=fleet, faults=_faults(rng, fleet, seconds / 2), seconds=seconds)
+
+
+# --- fleets ----------------------------------------------------------------------------------------------------------
+
+
+def _fleet(rng: Random, size: int) -> Fleet:
+    robots = size if rng.random() < 0.3 else rng.randint(2, size - 1)
+    names = {f"robot{i}": NodeKind.ROBOT for i in range(1, robots + 1)}
+    names |= {f"edge{i}": NodeKind.EDGE for i in range(1, size - robots + 1)}
+    voters = tuple(name for name, kind in names.items() if kind is NodeKind.ROBOT)
+    edges = tuple(name for name in names if name not in voters)
+    spare = 3 - robots if robots < 3 else (1 if edges and rng.random() < 0.15 else 0)
+    timing = rng.choices((WIFI, WIRED, WAN), (14, 4, 2))[0]
+    tasks = tuple(
+        _task(rng, name, voters, edges) for name in (("guard", "merge") if rng.random() < 0.25 else ("merge",))
+    )
+    return Fleet(
+        name="sim",
+        timing=replace(timing, sample_s=SAMPLE_S),
+        nodes=tuple(NodeSpec(name=name, kind=kind) for name, kind in sorted(names.items())),
+        tasks=tasks,
+        electors=tuple(sorted((*voters, *edges[:spare]))),
+    )
+
+
+def _task(rng: Random, name: str, voters: tuple[NodeId, ...], edges: tuple[NodeId, ...]) -> TaskSpec:
+    candidates = edges if len(edges) >= 2 and rng.random() < 0.8 else (*voters, *edges)
+    is_cold = rng.random() < 0.1
+    return TaskSpec(
+        name=name,
+        candidates=tuple(sorted(candidates)),
+        tuning=Tuning(
+            weights=Weights(cpu=0.5, memory=0.5, network=0.0),
+            bonus=rng.choice((0.0, 0.1)),
+            time_to_trigger_s=rng.choice((0.0, 0.2, 1.0)),
+            cool_down_s=rng.choice((0.0, 0.0, 2.0)),
+            aggregate=rng.choice(tuple(Aggregate)),
+        ),
+        worker=WorkerSpec(command=("work",), standby=Standby.COLD if is_cold else Standby.WARM, start_deadline_s=3.0),
+        exclusive=rng.random() < 0.4,
+        drain_s=rng.choice((0.1, 1.0)),
+        max_moves_per_minute=rng.choice((6, 60)),
+    )
+
+
+# --- faults ----------------------------------------------------------------------------------------------------------
+
+Maker = Callable[[Random, Fleet, float], list[Fault]]
+"""(chance, fleet, how long faults may begin) -> some faults of one kind."""
+
+
+def _faults(rng: Random, fleet: Fleet, until: float) -> tuple[Fault, ...]:
+    """A random subset of the kinds, each a few times; in about one schedule of twenty nothing goes wrong."""
+    share = rng.choice((0.0, 0.15, 0.3, 0.3, 0.5, 0.7))
+    found: list[Fault] = []
+    for make in MAKERS.values():
+        if rng.random() < share:
+            found += make(rng, fleet, until)
+    found += _load(rng, fleet, until)
+    return tuple(sorted(found, key=lambda fault: (fault.at, fault.kind, fault.nodes)))
+
+
+def _names(fleet: Fleet) -> list[NodeId]:
+    return [node.name for node in fleet.nodes]
+
+
+def _air(kind: str, sizes: tuple[float, ...]) -> Maker:
+    """Something about every message, for a while or from the start."""
+
+    def make(rng: Random, _fleet: Fleet, until: float) -> list[Fault]:
+        at = rng.choice((0.0, rng.uniform(0.0, until)))
+        return [Fault(at=at, kind=kind, seconds=rng.uniform(1.0, until), size=rng.choice(sizes))]
+
+    return make
+
+
+def _one_node(kind: str, most: int, longest: float, sizes: tuple[float, ...] = (0.0,)) -> Maker:
+    """One to ``most`` times something about one node, each for up to ``longest`` seconds."""
+
+    def make(rng: Random, fleet: Fleet, until: float) -> list[Fault]:
+        return [
+            Fault(
+                at=rng.uniform(0.0, until),
+                kind=kind,
+                nodes=(rng.choice(_names(fleet)),),
+                seconds=10 ** rng.uniform(-1.5, 0.0) * longest,
+                size=rng.choice(sizes),
+            )
+            for _ in range(rng.randint(1, most))
+        ]
+
+    return make
+
+
+def _cuts(kind: str, fewest: int, most: int) -> Maker:
+    """Cuts that concern some nodes, for up to 6 s."""
+
+    def make(rng: Random, fleet: Fleet, until: float) -> list[Fault]:
+        names = _names(fleet)
+        return [
+            Fault(
+                at=rng.uniform(0.0, until),
+                kind=kind,
+                nodes=tuple(rng.sample(names, rng.randint(fewest, min(most, len(names) - 1)))),
+                seconds=rng.uniform(0.1, 6.0),
+                size=rng.random(),
+            )
+            for _ in range(rng.randint(1, 3))
+        ]
+
+    return make
+
+
+def _clocks(rng: Random, fleet: Fleet, until: float) -> list[Fault]:
+    """Every clock runs at its own rate: within the lease's bound, or far beyond it where nothing is exclusive."""
+    is_leased = any(task.exclusive for task in fleet.tasks)
+    bound = 0.0009 if is_leased else rng.choice((0.001, 0.2))
+    found = [
+        Fault(at=0.0, kind="clock_rate", nodes=(name,), size=1.0 + rng.uniform(-bound, bound)) for name in _names(fleet)
+    ]
+    jumps = 0 if is_leased else rng.randint(0, 2)
+    for _ in range(jumps):
+        jump_s = 10 ** rng.uniform(-2.0, 3.0)
+        found.append(
+            Fault(at=rng.uniform(0.0, until), kind="clock_jump", nodes=(rng.choice(_names(fleet)),), size=jump_s)
+        )
+    return found
+
+
+def _load(rng: Random, fleet: Fleet, until: float) -> list[Fault]:
+    """Machines get busier or idler, so that robots want to move the tasks."""
+    return [
+        Fault(
+            at=rng.uniform(0.0, until),
+            kind="load",
+            nodes=(rng.choice(_names(fleet)),),
+            size=rng.choice((0.05, 0.3, 0.6, 0.95)),
+        )
+        for _ in range(rng.randint(0, 4))
+    ]
+
+
+MAKERS: dict[str, Maker] = {
+    "loss": _air("loss", (0.02, 0.1, 0.3)),
+    "delay": _air("delay", (0.02, 0.1, 0.3)),
+    "duplicate": _air("duplicate", (0.05, 0.3)),
+    "spike": _air("spike", (0.3, 1.0, 3.0)),
+    "mutate": _air("mutate", (0.02, 0.2)),
+    "forge": _air("forge", (0.02, 0.1)),
+    "replay": _air("replay", (0.02, 0.1)),
+    "cut": _cuts("cut", 1, 4),
+    "one_way": _cuts("one_way", 1, 2),
+    "partial": _cuts("partial", 2, 2),
+    "version": _cuts("version", 1, 2),
+    "pause": _one_node("pause", 3, 5.0),
+    "kill": _one_node("kill", 4, 5.0),
+    "power": _one_node("power", 3, 5.0),
+    "blackout": _one_node("blackout", 1, 3.0),
+    "damage": _one_node("damage", 2, 2.0),
+    "wipe": _one_node("wipe", 2, 2.0),
+    "storm": _one_node("storm", 2, 4.0),
+    "prefix": _air("prefix", (0.02, 0.1, 0.3)),
+    "slow": _one_node("slow", 2, 6.0, (0.001, 0.005, 0.02)),
+    "slow_disk": _one_node("slow_disk", 3, 10.0, (0.005, 0.02, 0.1)),
+    "full_disk": _one_node("full_disk", 2, 5.0),
+    "clock": _clocks,
+    "twin": _one_node("twin", 1, 8.0),
+    "electorate": _one_node("electorate", 1, 5.0),
+    "worker": _one_node("worker", 4, 3.0, (0.0, 1.0)),
+    "retune": _one_node("retune", 6, 1.0, (0.2, 0.4, 0.6, 0.8)),
+    "drain": _one_node("drain", 2, 3.0),
+}

@@ -1,0 +1,130 @@
+"""Stand-ins for workers and relays on simulated machines: they start, get ready, flip, drain and stop in fixed times.
+
+Knows: what supervisor, relay and worker report back, and when an exclusive worker may be working. Does not know: who
+decides that, or how streams really move.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from zsched.core import events as ev
+from zsched.core import instructions as do
+from zsched.core.model import NodeId, TaskId, WorkerState
+from zsched.core.plan import Role, RoutePhase, RoutePlan, WorkerRole
+from zsched.lab.sim_parts import Machine
+
+if TYPE_CHECKING:
+    from zsched.lab.simulator import Simulator
+
+WORKER_START_S = 0.4
+FLIP_S = 0.005
+WORKER_STOP_S = 0.002
+LOOK_AGAIN_S = 0.05
+
+
+class Work:
+    """All workers and relays of one simulated fleet."""
+
+    def __init__(self, sim: Simulator) -> None:
+        self._sim = sim
+        self.plans: dict[tuple[NodeId, TaskId], RoutePlan] = {}
+        self.working: dict[TaskId, tuple[NodeId, float]] = {}
+        """{exclusive task: (who works, until when at most)}."""
+
+    def do(self, machine: Machine, instruction: do.Instruction) -> None:
+        """Carry out what concerns workers and relays; anything else is nobody's."""
+        match instruction:
+            case do.StartWorker(task=task):
+                self._start(machine, task)
+            case do.StopWorker(task=task):
+                self._stop(machine, task)
+            case do.ApplyRoutes(plan=plan):
+                self._apply(machine, plan)
+            case do.SetRole(role=role):
+                self._set_role(machine, role)
+            case _:
+                pass
+
+    # --- workers -----------------------------------------------------------------------------------------------------
+
+    def _start(self, machine: Machine, task: TaskId) -> None:
+        if task not in machine.workers:
+            machine.workers[task] = machine.life
+            self._sim.later(WORKER_START_S, self._ready, machine, task, machine.life)
+
+    def _ready(self, machine: Machine, task: TaskId, life: int) -> None:
+        if machine.life == life and task in machine.workers:
+            self._sim.deliver(machine, ev.WorkerChanged(task=task, state=WorkerState.READY))
+
+    def _stop(self, machine: Machine, task: TaskId) -> None:
+        if machine.workers.pop(task, None) is not None:
+            self._sim.deliver(machine, ev.WorkerChanged(task=task, state=WorkerState.STOPPED))
+
+    def fail(self, machine: Machine, task: TaskId, *, is_final: bool) -> None:
+        """A worker exits: started again by its supervisor, or (``is_final``) given up."""
+        if machine.node is None or task not in machine.workers:
+            return
+        state = WorkerState.FAILED if is_final else WorkerState.STARTING
+        self._sim.deliver(machine, ev.WorkerChanged(task=task, state=state, reason="exit code 1"))
+        if not is_final:
+            self._sim.later(WORKER_START_S, self._ready, machine, task, machine.life)
+
+    def mend(self, machine: Machine, task: TaskId, life: int) -> None:
+        """The operator has put a worker right that was given up."""
+        self._ready(machine, task, life)
+
+    def _set_role(self, machine: Machine, role: Role) -> None:
+        """The worker follows its role; an exclusive one works only under its lease, and says when it has stopped."""
+        now = self._sim.now
+        before = machine.roles.get(role.task)
+        machine.roles[role.task] = role
+        until = 0.0 if role.lease_until_s is None else machine.clock.true(role.lease_until_s)
+        if until > now:
+            self._sim.invariants.on_worked(machine, role.task, role.epoch, now, until)
+            self.working[role.task] = (machine.key, until)
+        if before is None or before.role is not WorkerRole.ACTIVE or role.role is WorkerRole.ACTIVE:
+            return
+        self._sim.later(WORKER_STOP_S, self._stopped, machine, machine.life, before)
+
+    def _stopped(self, machine: Machine, life: int, role: Role) -> None:
+        if machine.life != life:
+            return
+        if machine.roles[role.task].role is not WorkerRole.ACTIVE:
+            self._sim.invariants.checker.stop_working(machine.key, role.task, self._sim.now)
+            working = self.working.get(role.task)
+            if working is not None and working[0] == machine.key:
+                self.working[role.task] = (machine.key, min(working[1], self._sim.now))
+        self._sim.deliver(machine, ev.RoleEnded(task=role.task, epoch=role.epoch))
+
+    # --- relays ------------------------------------------------------------------------------------------------------
+
+    def _apply(self, machine: Machine, plan: RoutePlan) -> None:
+        self._sim.invariants.on_plan(machine, plan, self._sim.now)
+        self.plans[machine.key, plan.task] = plan
+        if plan.phase is RoutePhase.PREPARE:
+            self._watch_ready(machine, plan, machine.life)
+        elif plan.phase is RoutePhase.FLIP:
+            self._sim.later(FLIP_S, self._flipped, machine, plan, machine.life)
+
+    def _watch_ready(self, machine: Machine, plan: RoutePlan, life: int) -> None:
+        """Report readiness once the owner's worker is up and reachable; ask again as long as the plan stands."""
+        if machine.life != life or self.plans.get((machine.key, plan.task)) != plan or plan.current is None:
+            return
+        owner = self._sim.machines.get(plan.current.owner)
+        node = None if owner is None else owner.node
+        is_ready = node is not None and node.worker_states.get(plan.task) is WorkerState.READY
+        if is_ready and (plan.current.owner, machine.name) not in self._sim.cuts:
+            self._sim.deliver(machine, ev.SlotReady(task=plan.task, epoch=plan.current.epoch))
+            return
+        self._sim.later(LOOK_AGAIN_S, self._watch_ready, machine, plan, life)
+
+    def _flipped(self, machine: Machine, plan: RoutePlan, life: int) -> None:
+        if machine.life != life or plan.current is None:
+            return
+        self._sim.deliver(machine, ev.SlotFlipped(task=plan.task, epoch=plan.current.epoch))
+        if plan.predecessor is None:
+            return
+        predecessor = self._sim.machines.get(plan.predecessor.owner)
+        if predecessor is not None and predecessor.node is not None:
+            self._sim.deliver(machine, ev.SlotDrained(task=plan.task, epoch=plan.predecessor.epoch))
