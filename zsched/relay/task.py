@@ -23,6 +23,7 @@ from zsched.core.plan import Direction, ReadyWhen, Route, RoutePhase, RoutePlan,
 from zsched.core.relay_protocol import RelayReport
 from zsched.relay.inputs import InputStream
 from zsched.relay.outputs import OutputStream
+from zsched.relay.services import Services
 from zsched.relay.tokens import Tokens
 
 FLIP_WAIT_S: Final = 0.3
@@ -65,6 +66,7 @@ class TaskRelay:
         self._slots: dict[int, _OpenSlot] = {}
         self._inputs: dict[str, InputStream] = {}
         self._outputs: dict[str, OutputStream] = {}
+        self._services = Services(session)
         self._flip_by: float | None = None
         threading.Thread(target=self._run, name=f"task {task}", daemon=True).start()
 
@@ -79,7 +81,8 @@ class TaskRelay:
     def counts(self) -> tuple[StreamCount, ...]:
         """The counters of every stream, by name."""
         streams: list[InputStream | OutputStream] = [*self._inputs.values(), *self._outputs.values()]
-        return tuple(sorted((stream.count() for stream in streams), key=lambda count: count.stream))
+        counts = [*(stream.count() for stream in streams), *self._services.counts()]
+        return tuple(sorted(counts, key=lambda count: count.stream))
 
     # --- the thread --------------------------------------------------------------------------------------------------
 
@@ -153,6 +156,9 @@ class TaskRelay:
                 self._problem(f"{route.stream}: {route.from_expr} -> {route.to_expr}: {error}")
 
     def _open_route(self, epoch: int, route: Route) -> None:
+        if route.direction is Direction.SERVICE:
+            self._services.open(epoch, route)
+            return
         if route.direction is Direction.INPUT:
             source = self._inputs.get(route.stream)
             if source is None or (source.route.from_expr, source.route.settings) != (route.from_expr, route.settings):
@@ -174,6 +180,7 @@ class TaskRelay:
             source.close_slot(epoch)
         for sink in self._outputs.values():
             sink.close_slot(epoch)
+        self._services.close_slot(epoch)
 
     def _forget_streams(self) -> None:
         """Close streams that no slot names any more; without any slot they stay, and with them the kept values."""
@@ -186,6 +193,7 @@ class TaskRelay:
         for stream in tuple(self._outputs):
             if stream not in names:
                 self._outputs.pop(stream).close()
+        self._services.keep(names)
 
     # --- readiness and warm-up ---------------------------------------------------------------------------------------
 
@@ -194,7 +202,9 @@ class TaskRelay:
         needs_token = slot.ready_when is ReadyWhen.TOKEN
         tokens = self._tokens.workers(slot.owner, self._task) if needs_token else frozenset()
         state.gone_at = None if tokens or not needs_token else state.gone_at or monotonic_s()
-        is_ready = (bool(tokens) or not needs_token) and self._is_matching(slot)
+        # a worker with a token has declared its services before it; of a foreign one only the match tells
+        has_services = needs_token or self._services.is_matching(slot.epoch)
+        is_ready = (bool(tokens) or not needs_token) and has_services and self._is_matching(slot)
         is_new = is_ready and (not state.is_ready or bool(tokens - state.tokens))
         has_changed = is_ready != state.is_ready
         state.is_ready = is_ready
@@ -241,6 +251,7 @@ class TaskRelay:
         for sink in self._outputs.values():
             sink.flip(epoch, drops_held=is_behind)
         replayed = sum(source.flip(epoch) for source in self._inputs.values())
+        self._services.flip(epoch)
         state.is_flipped = True
         if not is_reported:
             return
@@ -267,7 +278,7 @@ class TaskRelay:
         for sink, has_ended in zip(tuple(self._outputs.values()), ended, strict=True):
             if has_ended:
                 sink.close_slot(epoch)
-        if all(ended):
+        if all(ended) and (is_gone or self._services.has_ended(epoch)):
             state.is_drained = True
             self._report(SlotDrained(task=self._task, epoch=epoch))
 

@@ -1,0 +1,416 @@
+"""Services through real relays and real workers: one answer or one error for each request, never two runs unasked."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from zsched.adapters.streams import RelayHandle
+from zsched.core.events import RelayChanged, SlotDrained, SlotFlipped, SlotReady, StreamsCounted
+from zsched.core.plan import (
+    Direction,
+    ReadyWhen,
+    Role,
+    Route,
+    RoutePhase,
+    RoutePlan,
+    ServiceSettings,
+    Slot,
+    StreamSettings,
+    WorkerRole,
+)
+from zsched.core.relay_protocol import HandleReport, WorkerSeen
+from zsched.zenoh_config import data_config, worker_config
+
+FLEET, ROBOT, TASK = "test", "robot1", "jobs"
+SERVICE = f"{ROBOT}/job"
+DEADLINE_S = 10.0
+
+WORKER = """
+import sys, time
+from zsched.worker import Answer, Worker
+
+def handle(request):
+    with open(sys.argv[1], "a") as log:
+        log.write(request.payload.to_bytes().decode() + "\\n")
+    words = request.payload.to_bytes().decode().split()
+    if words[0] == "sleep":
+        time.sleep(float(words[1]))
+    if words[0] == "raise":
+        raise ValueError("no such job")
+    text = f"{worker.prefix} did {' '.join(words)} with {request.parameters}"
+    return Answer(payload=text.encode(), attachment=request.attachment, encoding=request.encoding)
+
+with Worker.from_env() as worker:
+    worker.serve("{prefix}/robot1/job", handle, depth=4)
+    worker.ready()
+    while worker.wait(1.0):
+        pass
+"""
+
+
+def until(condition: Callable[[], Any], what: str, deadline_s: float = DEADLINE_S) -> Any:
+    end = time.monotonic() + deadline_s
+    while time.monotonic() < end:
+        value = condition()
+        if value:
+            return value
+        time.sleep(0.005)
+    raise AssertionError(f"not within {deadline_s} s: {what}")
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+def slot(epoch: int, owner: str, service: ServiceSettings) -> Slot:
+    route = Route(
+        stream=f"{TASK}/srv/0",
+        direction=Direction.SERVICE,
+        from_expr=SERVICE,
+        to_expr=f"{owner}/{TASK}/{ROBOT}/job",
+        settings=StreamSettings(),
+        service=service,
+    )
+    return Slot(epoch=epoch, owner=owner, routes=(route,), ready_when=ReadyWhen.TOKEN)
+
+
+@dataclass
+class Asked:
+    """What one request came to."""
+
+    answers: list[str] = field(default_factory=list)
+    errors: list[str] = field(default_factory=list)
+    attachments: list[bytes] = field(default_factory=list)
+    encodings: list[str] = field(default_factory=list)
+    took_s: float = 0.0
+    thread: threading.Thread | None = None
+
+    def wait(self) -> Asked:
+        assert self.thread is not None
+        self.thread.join(DEADLINE_S)
+        assert not self.thread.is_alive(), "the request was never answered"
+        return self
+
+
+@dataclass
+class Rig:
+    """Three nodes' relays on loopback, workers with a service, an application beside the robot."""
+
+    folder: Path
+    ports: dict[str, int] = field(default_factory=lambda: {n: free_port() for n in (ROBOT, "edge1", "edge2")})
+    relays: dict[str, RelayHandle] = field(default_factory=dict)
+    reports: dict[str, list[HandleReport]] = field(default_factory=dict)
+    workers: dict[str, subprocess.Popen[bytes]] = field(default_factory=dict)
+    incarnation: int = 0
+
+    def start(self) -> None:
+        (self.folder / "worker.py").write_text(WORKER)
+        seed = self.endpoint(ROBOT)
+        for node in self.ports:
+            self.reports[node] = []
+            connect = () if node == ROBOT else (seed,)
+            text = data_config(listen=(self.endpoint(node),), connect=connect, shared_memory=False)
+            relay = RelayHandle(fleet=FLEET, node=node, zenoh_config=text, on_report=self.reports[node].append)
+            self.relays[node] = relay
+            relay.start()
+        until(lambda: all(self.find(RelayChanged, node, is_running=True) for node in self.ports), "the relays run")
+        self.app = zenoh.open(zenoh.Config.from_json5(worker_config(connect=(seed,), shared_memory=False)))
+
+    def endpoint(self, node: str) -> str:
+        return f"tcp/127.0.0.1:{self.ports[node]}"
+
+    def find(self, kind: type, node: str = ROBOT, **fields: Any) -> HandleReport | None:
+        for report in tuple(self.reports[node]):
+            if isinstance(report, kind) and all(getattr(report, name) == value for name, value in fields.items()):
+                return report
+        return None
+
+    def start_worker(self, node: str) -> subprocess.Popen[bytes]:
+        self.incarnation += 1
+        path = self.folder / f"{node}.json5"
+        path.write_text(worker_config(connect=(self.endpoint(node),), shared_memory=False))
+        env = os.environ | {
+            "ZSCHED_FLEET": FLEET,
+            "ZSCHED_NODE": node,
+            "ZSCHED_TASK": TASK,
+            "ZSCHED_INCARNATION": str(self.incarnation),
+            "ZSCHED_ZENOH_CONFIG": str(path),
+        }
+        command = [sys.executable, str(self.folder / "worker.py"), str(self.folder / f"{node}.log")]
+        self.workers[node] = subprocess.Popen(command, env=env)
+        seen = {"node": node, "task": TASK, "incarnation": str(self.incarnation), "is_present": True}
+        until(lambda: self.find(WorkerSeen, **seen), f"worker of {node}")
+        return self.workers[node]
+
+    def done_by(self, node: str) -> list[str]:
+        """The requests that the node's workers have begun, in order."""
+        path = self.folder / f"{node}.log"
+        return path.read_text().splitlines() if path.exists() else []
+
+    def plan(self, phase: RoutePhase, current: Slot | None, predecessor: Slot | None = None) -> None:
+        self.relays[ROBOT].apply(RoutePlan(task=TASK, phase=phase, current=current, predecessor=predecessor))
+
+    def wait(self, kind: type, **fields: Any) -> None:
+        until(lambda: self.find(kind, **fields), f"{kind.__name__} {fields}")
+
+    def flip(self, new: Slot, old: Slot | None = None) -> None:
+        """The executor's table up to the flip; the old slot still drains."""
+        self.relays[new.owner].set_role(Role(task=TASK, role=WorkerRole.ACTIVE, epoch=new.epoch))
+        if old is not None:
+            self.relays[old.owner].set_role(Role(task=TASK, role=WorkerRole.DRAINING, epoch=old.epoch))
+        self.plan(RoutePhase.PREPARE, new, old)
+        self.wait(SlotReady, epoch=new.epoch, is_ready=True)
+        self.plan(RoutePhase.FLIP, new, old)
+        self.wait(SlotFlipped, epoch=new.epoch)
+
+    def ask(self, text: str, key: str = SERVICE, timeout_s: float = DEADLINE_S) -> Asked:
+        """Send a request in a thread of its own."""
+        asked = Asked()
+
+        def run() -> None:
+            started = time.monotonic()
+            for reply in self.app.get(
+                f"{key}?a=1;b=2",
+                payload=text.encode(),
+                attachment=b"\x01\x02",
+                encoding="text/plain;x",
+                timeout=timeout_s,
+            ):
+                if reply.err is not None:
+                    asked.errors.append(reply.err.payload.to_string())
+                    continue
+                assert reply.ok is not None
+                assert str(reply.ok.key_expr) == SERVICE
+                asked.answers.append(reply.ok.payload.to_string())
+                asked.encodings.append(str(reply.ok.encoding))
+                if reply.ok.attachment is not None:
+                    asked.attachments.append(reply.ok.attachment.to_bytes())
+            asked.took_s = time.monotonic() - started
+
+        asked.thread = threading.Thread(target=run, daemon=True)
+        asked.thread.start()
+        return asked
+
+    def drops(self) -> dict[str, int]:
+        reports = [report for report in self.reports[ROBOT] if isinstance(report, StreamsCounted)]
+        return dict(reports[-1].counts[0].drops) if reports and reports[-1].counts else {}
+
+    def stop(self) -> None:
+        if hasattr(self, "app"):
+            self.app.close()
+        for worker in self.workers.values():
+            worker.send_signal(signal.SIGCONT)
+            worker.kill()
+            worker.wait(5)
+        for relay in self.relays.values():
+            relay.stop(2.0)
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    made = Rig(folder=tmp_path)
+    try:
+        made.start()
+        yield made
+    finally:
+        made.stop()
+
+
+ONCE = ServiceSettings(timeout_s=5.0, max_pending=8)
+RETRY = ServiceSettings(timeout_s=5.0, max_pending=8, retry=True)
+
+
+def begin(rig: Rig, settings: ServiceSettings) -> Slot:
+    """edge1 owns the task; edge2 stands by."""
+    rig.start_worker("edge1")
+    rig.start_worker("edge2")
+    first = slot(1, "edge1", settings)
+    rig.flip(first)
+    rig.plan(RoutePhase.CLOSE, first)
+    return first
+
+
+def test_a_request_passes_with_all_that_belongs_to_it_both_ways(rig: Rig) -> None:
+    begin(rig, ONCE)
+    asked = rig.ask("hello").wait()
+    assert asked.answers == [f"edge1/{TASK} did hello with a=1;b=2"]
+    assert asked.attachments == [b"\x01\x02"]
+    assert asked.encodings == ["text/plain;x"]
+    assert asked.errors == []
+
+
+def test_a_handler_that_fails_is_an_error_reply(rig: Rig) -> None:
+    begin(rig, ONCE)
+    asked = rig.ask("raise").wait()
+    assert asked.answers == []
+    assert asked.errors == ["failed: ValueError: no such job"]
+
+
+def test_requests_in_a_stream_of_moves_are_each_done_once(rig: Rig) -> None:
+    """There and back; nobody is told of owners, nobody gets an error, nothing is done twice."""
+    now = begin(rig, ONCE)
+    asked: list[Asked] = []
+    for epoch, owner in enumerate(["edge2", "edge1", "edge2", "edge1"], start=2):
+        asked += [rig.ask(f"{epoch}-{number}") for number in range(3)]
+        new = slot(epoch, owner, ONCE)
+        rig.flip(new, now)
+        rig.wait(SlotDrained, epoch=now.epoch)
+        rig.plan(RoutePhase.CLOSE, new)
+        now = new
+    for one in asked:
+        one.wait()
+    assert [one.errors for one in asked] == [[]] * len(asked)
+    done = rig.done_by("edge1") + rig.done_by("edge2")
+    assert sorted(done) == sorted(f"{epoch}-{number}" for epoch in range(2, 6) for number in range(3))
+
+
+def test_the_old_owner_answers_what_it_has_in_hand_within_its_drain_time(rig: Rig) -> None:
+    first = begin(rig, ONCE)
+    asked = rig.ask("sleep 0.6")
+    until(lambda: rig.done_by("edge1"), "the old owner has begun")
+    second = slot(2, "edge2", ONCE)
+    rig.flip(second, first)
+    assert rig.find(SlotDrained, epoch=1) is None, "drained with a request in hand"
+    assert rig.ask("new").wait().answers == [f"edge2/{TASK} did new with a=1;b=2"]
+    rig.wait(SlotDrained, epoch=1)
+    assert asked.wait().answers == [f"edge1/{TASK} did sleep 0.6 with a=1;b=2"]
+    assert rig.done_by("edge2") == ["new"]
+
+
+def test_what_the_old_owner_has_not_answered_by_then_is_an_error_and_not_done_again(rig: Rig) -> None:
+    first = begin(rig, ONCE)
+    asked = rig.ask("sleep 3")
+    until(lambda: rig.done_by("edge1"), "the old owner has begun")
+    second = slot(2, "edge2", ONCE)
+    rig.flip(second, first)
+    rig.plan(RoutePhase.CLOSE, second)
+    asked.wait()
+    assert asked.took_s < 2.0
+    assert asked.answers == []
+    (error,) = asked.errors
+    assert error.startswith("moved: ")
+    assert rig.done_by("edge2") == []
+
+
+def test_with_retry_the_new_owner_is_asked_instead(rig: Rig) -> None:
+    first = begin(rig, RETRY)
+    asked = rig.ask("sleep 0.9")
+    until(lambda: rig.done_by("edge1"), "the old owner has begun")
+    second = slot(2, "edge2", RETRY)
+    rig.flip(second, first)
+    rig.plan(RoutePhase.CLOSE, second)
+    assert asked.wait().answers == [f"edge2/{TASK} did sleep 0.9 with a=1;b=2"]
+    assert asked.errors == []
+
+
+def test_a_killed_owner_is_an_error_at_once(rig: Rig) -> None:
+    begin(rig, ONCE)
+    asked = rig.ask("sleep 5")
+    until(lambda: rig.done_by("edge1"), "the owner has begun")
+    killed_at = time.monotonic()
+    rig.workers["edge1"].kill()
+    (error,) = asked.wait().errors
+    assert time.monotonic() - killed_at < 1.0
+    assert error.startswith("owner gone: ")
+    assert rig.done_by("edge2") == []
+
+
+def test_a_request_that_nobody_has_taken_waits_for_the_next_owner(rig: Rig) -> None:
+    first = begin(rig, ONCE)
+    rig.workers["edge1"].kill()
+    rig.workers["edge1"].wait(5)
+    rig.wait(SlotReady, epoch=1, is_ready=False)
+    asked = rig.ask("hello")
+    rig.flip(slot(2, "edge2", ONCE), first)
+    assert asked.wait().answers == [f"edge2/{TASK} did hello with a=1;b=2"]
+
+
+def test_without_any_owner_there_is_an_error_within_a_second_or_so(rig: Rig) -> None:
+    begin(rig, ONCE)
+    rig.workers["edge1"].kill()
+    rig.wait(SlotReady, epoch=1, is_ready=False)
+    asked = rig.ask("hello").wait()
+    (error,) = asked.errors
+    assert error.startswith("no owner: ")
+    assert asked.took_s < 2.0
+
+
+def test_a_frozen_owner_is_an_error_not_a_silence(rig: Rig) -> None:
+    """Its link's lease ends before the service's own time."""
+    begin(rig, ONCE)
+    rig.workers["edge1"].send_signal(signal.SIGSTOP)
+    asked = rig.ask("hello").wait()
+    (error,) = asked.errors
+    assert error.startswith("owner gone: ")
+    assert asked.took_s < 4.0
+
+
+def test_a_frozen_owner_with_retry_costs_the_move_only(rig: Rig) -> None:
+    first = begin(rig, RETRY)
+    rig.workers["edge1"].send_signal(signal.SIGSTOP)
+    asked = rig.ask("hello")
+    second = slot(2, "edge2", RETRY)
+    rig.flip(second, first)
+    rig.plan(RoutePhase.CLOSE, second)
+    asked.wait()
+    assert asked.answers == [f"edge2/{TASK} did hello with a=1;b=2"]
+    assert asked.took_s < 2.0
+
+
+def test_an_owner_that_takes_too_long_is_an_error_in_time(rig: Rig) -> None:
+    begin(rig, ServiceSettings(timeout_s=0.4, retry=True))
+    asked = rig.ask("sleep 2").wait()
+    (error,) = asked.errors
+    assert error.startswith("timeout: ")
+    assert 0.35 < asked.took_s < 1.5
+    assert rig.done_by("edge1") == ["sleep 2"]
+
+
+def test_one_request_too_many_is_answered_busy(rig: Rig) -> None:
+    begin(rig, ServiceSettings(timeout_s=5.0, max_pending=2))
+    asked = [rig.ask("sleep 0.5") for _ in range(4)]
+    for one in asked:
+        one.wait()
+    errors = [error for one in asked for error in one.errors]
+    assert len(errors) == 2
+    assert all(error.startswith("busy: ") for error in errors)
+    assert sum(len(one.answers) for one in asked) == 2
+    until(lambda: rig.drops().get("busy") == 2, "the counter")
+
+
+def test_a_standby_refuses_and_does_nothing(rig: Rig) -> None:
+    begin(rig, ONCE)
+    replies = list(rig.app.get(f"edge2/{TASK}/{ROBOT}/job", payload=b"sneaky", timeout=3.0))
+    (error,) = [reply.err for reply in replies]
+    assert error is not None
+    assert error.payload.to_string().startswith("not owner")
+    assert rig.done_by("edge2") == []
+
+
+def test_a_slow_request_delays_no_other_service_and_no_role(rig: Rig) -> None:
+    """The worker's own queue is per service; a fifth waiting request is busy, the rest are answered in order."""
+    begin(rig, ServiceSettings(timeout_s=5.0, max_pending=16))
+    first = rig.ask("sleep 0.5")
+    until(lambda: rig.done_by("edge1"), "the owner has begun")
+    others = [rig.ask(f"job{number}") for number in range(6)]
+    first.wait()
+    for one in others:
+        one.wait()
+    assert sum(error.startswith("busy: ") for one in others for error in one.errors) == 2
+    assert sum(len(one.answers) for one in others) == 4

@@ -1,0 +1,328 @@
+"""Carries one service of this node to the task's owner: each request goes to one owner, and always gets an answer.
+
+Knows: which slots are open, which one is asked, which requests are at the owner. Does not know: why a task moves.
+
+A request that reached an owner is never sent again, unless its rule says ``retry: true``: an owner that did not answer
+may have done the work. Only when it is certain that nobody took the request (no queryable matches, or the worker says
+that it is not the owner) does it wait a moment for the next owner. What the application gets instead of an answer is an
+error reply, its first words one of `ServiceProblem`:
+
+=============  =======================================================================================================
+busy           ``max_pending`` requests are at the owner already
+no owner       nobody has taken the request within `HOLD_S`: it was not carried out
+owner gone     the owner died, or its link did, before it answered
+moved          the task moved and the old owner's drain time ended before it answered
+timeout        the owner did not answer within ``timeout_s``
+=============  =======================================================================================================
+
+A thread per request, at most ``max_pending`` of them: a plain callback would serialise all requests, and a stalled
+asker may block its own thread only.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Final
+
+import zenoh
+from zenoh import Query, Reply, Sample, SampleKind, Session
+
+from zsched.clock import monotonic_s
+from zsched.core.plan import Route, StreamCount
+from zsched.core.relay_protocol import ERROR_ENCODING, REFUSED_ENCODING, ServiceProblem
+from zsched.relay.counter import StreamCounter
+from zsched.relay.receive import undeclare
+from zsched.relay.replies import Replies
+
+HOLD_S: Final = 1.0
+"""How long a request that nobody has taken waits for an owner (with ``retry``: as long as its time lasts)."""
+LOOK_AGAIN_S: Final = 0.02
+"""How often a waiting request looks for an owner; a flip wakes it at once."""
+JOIN_S: Final = 0.3
+
+_log = logging.getLogger("zsched.relay")
+
+
+class _Outcome(Enum):
+    ANSWERED = "answered"
+    REFUSED = "refused"
+    NO_ANSWER = "no answer"
+    TIMED_OUT = "timed out"
+
+
+@dataclass(slots=True, eq=False)
+class _ServiceSlot:
+    """One owner of the service. The querier only tells whether anybody is there: requests have their own time."""
+
+    owner_key: str
+    querier: zenoh.Querier
+    pending: set[Replies] = field(default_factory=set)
+    is_closed: bool = False
+
+    @property
+    def is_matching(self) -> bool:
+        return bool(getattr(self.querier.matching_status, "matching", False))  # the object itself is always true
+
+
+class ServiceStream:
+    """One service rule on this node; slots are named by their epoch. Every method may be called from any thread."""
+
+    def __init__(self, session: Session, route: Route) -> None:
+        """Declare the queryable under the robot's own key.
+
+        Raises:
+            zenoh.ZError: ``from`` is no key expression.
+        """
+        self.route = route
+        self._session = session
+        self._lock = threading.Condition()
+        self._counter = StreamCounter(route.stream)
+        self._slots: dict[int, _ServiceSlot] = {}
+        self._active: _ServiceSlot | None = None
+        self._running = 0
+        self._queryable = session.declare_queryable(
+            route.from_expr, zenoh.handlers.FifoChannel(256), complete=True, allowed_origin=zenoh.Locality.REMOTE
+        )
+        handler = self._queryable.handler
+        self._thread = threading.Thread(target=self._run, args=(handler,), name=f"asked {route.from_expr}", daemon=True)
+        self._thread.start()
+
+    def open(self, epoch: int, route: Route) -> None:
+        """Make a slot ready; it is not asked yet.
+
+        Raises:
+            zenoh.ZError: ``to`` is no key expression.
+        """
+        slot = _ServiceSlot(owner_key=route.to_expr, querier=self._session.declare_querier(route.to_expr))
+        with self._lock:
+            self._slots[epoch] = slot
+
+    def is_matching(self, epoch: int) -> bool:
+        """True when somebody answers under the slot's key."""
+        slot = self._slots.get(epoch)
+        return slot is not None and slot.is_matching
+
+    def flip(self, epoch: int) -> None:
+        """Ask this slot from now on; what is at the old owner stays there until it is answered or its slot closes."""
+        with self._lock:
+            self._active = self._slots.get(epoch, self._active)
+            self._lock.notify_all()
+
+    def has_ended(self, epoch: int) -> bool:
+        """True when the slot has answered every request."""
+        slot = self._slots.get(epoch)
+        return slot is None or not slot.pending
+
+    def close_slot(self, epoch: int) -> None:
+        """Forget a slot; requests it has not answered get an error, or go to the next owner (``retry``)."""
+        with self._lock:
+            slot = self._slots.pop(epoch, None)
+            if slot is None:
+                return
+            slot.is_closed = True
+            if slot is self._active:
+                self._active = None
+            for replies in slot.pending:
+                replies.stop()
+        undeclare(slot.querier)
+
+    def close(self) -> None:
+        """Take no more requests and close every slot."""
+        undeclare(self._queryable)
+        for epoch in tuple(self._slots):
+            self.close_slot(epoch)
+        self._thread.join(JOIN_S)
+
+    def count(self) -> StreamCount:
+        """The counters now: requests, their bytes, and how many ended otherwise than with the owner's answer."""
+        with self._lock:
+            return self._counter.value()
+
+    # --- requests ----------------------------------------------------------------------------------------------------
+
+    def _run(self, handler: zenoh.handlers.Handler[Query]) -> None:
+        for query in handler:
+            try:
+                self._take(query)
+            except Exception:  # noqa: BLE001 - one bad request must not end its service
+                _log.exception("%s: a request could not be taken", self.route.stream)
+
+    def _take(self, query: Query) -> None:
+        with self._lock:
+            self._counter.seen(len(query.payload) if query.payload is not None else 0)
+            is_full = self._running >= self.route.service.max_pending
+            self._running += not is_full
+        if is_full:
+            with query:
+                self._fail(query, ServiceProblem.BUSY, f"{self.route.service.max_pending} requests are being answered")
+            return
+        threading.Thread(target=self._serve, args=(query,), name=self.route.stream, daemon=True).start()
+
+    def _serve(self, query: Query) -> None:
+        try:
+            with query:  # a query that is kept alive hangs its asker
+                self._answer(query)
+        except zenoh.ZError as error:
+            _log.info("%s: an answer could not be given (%s)", self.route.stream, error)
+        finally:
+            with self._lock:
+                self._running -= 1
+
+    def _answer(self, query: Query) -> None:
+        """Ask one owner after the other, as far as that is allowed, until there is an answer or an error."""
+        settings = self.route.service
+        until = monotonic_s() + settings.timeout_s
+        hold_until = until if settings.retry else min(until, monotonic_s() + HOLD_S)
+        while True:
+            slot = self._await_owner(hold_until)
+            if slot is None:
+                self._fail(query, ServiceProblem.NO_OWNER, f"nobody serves {self.route.from_expr}: it was not done")
+                return
+            outcome = self._ask(query, slot, max(0.01, until - monotonic_s()))
+            if outcome is _Outcome.ANSWERED:
+                return
+            may_go_on = outcome is _Outcome.REFUSED or settings.retry
+            if not may_go_on or outcome is _Outcome.TIMED_OUT or monotonic_s() >= hold_until:
+                self._fail(query, *_problem(outcome, slot))
+                return
+            with self._lock:
+                self._counter.dropped("retried")
+                self._lock.wait(LOOK_AGAIN_S)
+
+    def _await_owner(self, until: float) -> _ServiceSlot | None:
+        """The slot to ask, as soon as there is somebody in it."""
+        with self._lock:
+            while True:
+                slot = self._active
+                if slot is not None and slot.is_matching:
+                    return slot
+                left = until - monotonic_s()
+                if left <= 0:
+                    return None
+                self._lock.wait(min(left, LOOK_AGAIN_S))
+
+    def _ask(self, query: Query, slot: _ServiceSlot, timeout_s: float) -> _Outcome:
+        """Send the request to one owner and hand its answers on."""
+        selector = zenoh.Selector(slot.owner_key, query.parameters)
+        replies = Replies(timeout_s)
+        with self._lock:  # a slot that closes from here on stops it
+            if slot.is_closed:
+                return _Outcome.REFUSED
+            slot.pending.add(replies)
+        try:
+            replies.send(
+                self._session,
+                selector,
+                payload=query.payload,
+                encoding=query.encoding,
+                attachment=query.attachment,
+            )
+            return self._hand_on(query, replies, slot)
+        finally:
+            with self._lock:
+                slot.pending.remove(replies)
+
+    def _hand_on(self, query: Query, replies: Replies, slot: _ServiceSlot) -> _Outcome:
+        answers = 0
+        for reply in replies:
+            error = reply.err
+            if error is not None and str(error.encoding) == REFUSED_ENCODING and not answers:
+                return _Outcome.REFUSED
+            self._pass_on(query, reply)
+            answers += 1
+        outcome = _Outcome.TIMED_OUT if replies.has_timed_out else _Outcome.NO_ANSWER
+        if not answers:
+            return outcome
+        if replies.has_timed_out or replies.is_stopped:
+            self._fail(query, *_problem(outcome, slot))  # the rest of a long answer
+        elif replies.has_overflowed:
+            self._fail(query, ServiceProblem.BUSY, "the asker is slower than the answers, some of them are missing")
+        return _Outcome.ANSWERED
+
+    def _pass_on(self, query: Query, reply: Reply) -> None:
+        key, error, sample = self.route.from_expr, reply.err, reply.ok
+        if error is not None:
+            query.reply_err(error.payload, encoding=error.encoding)
+        elif sample is not None and sample.kind == SampleKind.DELETE:
+            query.reply_del(key, attachment=sample.attachment, timestamp=sample.timestamp, express=sample.express)
+        elif sample is not None:
+            _reply(query, key, sample)
+
+    def _fail(self, query: Query, problem: ServiceProblem, text: str) -> None:
+        with self._lock:
+            self._counter.dropped(problem.name.lower())
+        query.reply_err(f"{problem.value}: {text}", encoding=ERROR_ENCODING)
+
+
+def _reply(query: Query, key: str, sample: Sample) -> None:
+    query.reply(
+        key,
+        sample.payload,
+        encoding=sample.encoding,
+        attachment=sample.attachment,
+        timestamp=sample.timestamp,
+        express=sample.express,
+    )
+
+
+def _problem(outcome: _Outcome, slot: _ServiceSlot) -> tuple[ServiceProblem, str]:
+    where = slot.owner_key
+    if outcome is _Outcome.REFUSED:
+        return ServiceProblem.NO_OWNER, f"the worker at {where} is not the owner: it was not done"
+    if outcome is _Outcome.TIMED_OUT:
+        return ServiceProblem.TIMEOUT, f"no answer from {where}; it may have been done"
+    if slot.is_closed:
+        return ServiceProblem.MOVED, f"the task has left {where}, which had not answered; it may have been done"
+    return ServiceProblem.OWNER_GONE, f"no answer from {where}; it may have been done"
+
+
+class Services:
+    """All services of one task on this node."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._streams: dict[str, ServiceStream] = {}
+
+    def open(self, epoch: int, route: Route) -> None:
+        """Open a slot of one service, which begins to take requests if it is new.
+
+        Raises:
+            zenoh.ZError: an expression is none.
+        """
+        stream = self._streams.get(route.stream)
+        if stream is None or (stream.route.from_expr, stream.route.service) != (route.from_expr, route.service):
+            if stream is not None:
+                stream.close()
+            stream = self._streams[route.stream] = ServiceStream(self._session, route)
+        stream.open(epoch, route)
+
+    def is_matching(self, epoch: int) -> bool:
+        """True when every service that has a slot of the epoch would be answered there."""
+        return all(stream.is_matching(epoch) for stream in self._streams.values())
+
+    def flip(self, epoch: int) -> None:
+        """Ask the slots of this epoch from now on."""
+        for stream in self._streams.values():
+            stream.flip(epoch)
+
+    def has_ended(self, epoch: int) -> bool:
+        """True when the epoch's owner has answered every request."""
+        return all(stream.has_ended(epoch) for stream in self._streams.values())
+
+    def close_slot(self, epoch: int) -> None:
+        """Close the slots of one epoch."""
+        for stream in self._streams.values():
+            stream.close_slot(epoch)
+
+    def keep(self, names: set[str]) -> None:
+        """Close the services whose stream is not among ``names``."""
+        for name in tuple(self._streams):
+            if name not in names:
+                self._streams.pop(name).close()
+
+    def counts(self) -> list[StreamCount]:
+        """The counters of every service."""
+        return [stream.count() for stream in tuple(self._streams.values())]
