@@ -11,7 +11,7 @@ from pathlib import Path
 
 from zsched.config_blocks import Located, Section
 from zsched.config_reader import Collector, Place, nearest
-from zsched.core.fleet import LinkSpec, NodeSpec, dial_endpoint
+from zsched.core.fleet import LinkSpec, LocalMode, LocalSide, NodeSpec, dial_endpoint
 from zsched.core.model import LinkSource, NodeId, NodeKind
 
 _SOURCES = ("wifi", "wired", "fixed", "trace")
@@ -97,7 +97,38 @@ def _node(name: str, given: Section, names: tuple[str, ...], folder: Path, out: 
         listen_data=listen.get("data", "") if listen is not None else "",
         labels=tuple(sorted((key, held.value) for key, held in labels.items() if held.value is not None)),
         links=links,
+        local=_local(given, out),
     )
+
+
+def _local(given: Section, out: Collector) -> LocalSide | None:
+    """The local side, checked against the node's own endpoints."""
+    section: Section | None = given.get("local")
+    if section is None:
+        return None
+    if given.get("kind") is NodeKind.EDGE:
+        out.warn(given.where("local"), "an edge has no streams of its own: its local side carries nothing")
+    mode = section.get("mode", LocalMode.CLIENT)
+    connect, listen = section.get("connect", ()), section.get("listen", ())
+    if mode is LocalMode.CLIENT and "listen" in section.places:
+        out.error(section.where("listen"), "a client does not listen", "mode: peer, or delete it")
+    elif mode is LocalMode.CLIENT and "connect" not in section.places:
+        out.error(section.place, "a client needs somebody to dial", 'for example connect: ["tcp/127.0.0.1:7447"]')
+    elif not connect and not listen and section.is_whole:
+        out.error(section.place, "it neither dials nor listens: nobody would be on it", "add connect or listen")
+    own: Section | None = given.get("listen")
+    ports = {_port(own.get(kind)): kind for kind in ("control", "data") if kind in own.values} if own else {}
+    for endpoint in (*connect, *listen):
+        is_here = any(word in endpoint.value for word in ("/127.", "/localhost:", "/[::1]:", "/0.0.0.0:", "/[::]:"))
+        kind = ports.get(_port(endpoint.value)) if is_here else None
+        if kind is not None:
+            hint = "the local side is another network: a router or port of its own"
+            out.error(endpoint.place, f"{endpoint.value} is this node's own {kind} session", hint)
+    return LocalSide(mode=mode, connect=tuple(one.value for one in connect), listen=tuple(one.value for one in listen))
+
+
+def _port(endpoint: str) -> str:
+    return endpoint.partition("#")[0].partition("?")[0].rpartition(":")[2]
 
 
 # --- endpoints -------------------------------------------------------------------------------------------------------

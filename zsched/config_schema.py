@@ -26,9 +26,12 @@ from zsched.config_blocks import (
     Text,
     Whole,
 )
+from zsched.config_ros2 import ros2_record
 from zsched.core.fleet import (
     Demand,
     LinkLimits,
+    LocalMode,
+    LocalSide,
     OnIsolation,
     Reach,
     Standby,
@@ -126,6 +129,16 @@ PEER_LINK: Final = Record(
     },
 )
 
+LOCAL: Final = Record(
+    "a local side",
+    {
+        "mode": Field(Choice.of(LocalMode), "`client`: of the host's router; `peer`: among the host's peers."),
+        "connect": Field(ListOf(Here(_ENDPOINT), least=1), "Whom to dial, such as the host's `rmw_zenohd`."),
+        "listen": Field(ListOf(Here(_ENDPOINT), least=1), "Where the host's applications dial us (`peer` only)."),
+    },
+    LocalSide,
+)
+
 NODE: Final = Record(
     "a node",
     {
@@ -141,6 +154,7 @@ NODE: Final = Record(
             ),
             "Where this node listens; the others find it by gossip from the seeds.",
         ),
+        "local": Field(LOCAL, "A network of its own for the host's applications: their keys stay on this machine."),
         "labels": Field(_LABELS, "Free pairs of text that `candidates` may ask for."),
         **_LINK_FIELDS,
         "links": Field(MapOf(NAME_BLOCK, PEER_LINK), "Links to single peers, where they differ from the node's own."),
@@ -264,6 +278,7 @@ TASK: Final = Record(
         "inputs": Field(ListOf(RULE), "Streams from the robots' applications to the owner's worker."),
         "outputs": Field(ListOf(RULE), "Streams from the owner's worker to the robots' applications."),
         "services": Field(ListOf(SERVICE), "Requests of the robots' applications that the owner's worker answers."),
+        "ros2": Field(ros2_record(RULE, SERVICE), "The same three by ROS 2 names; they become rules like the others."),
         "on_isolation": Field(Choice.of(OnIsolation), "What a robot does that is cut off from the owner."),
         "exclusive": Field(Flag(), "The work must never run twice; needs `{epoch}` in every output's `from`."),
         "drain_s": Field(Number(0, 600, "s"), "How long the old owner may finish what it has in work."),

@@ -11,11 +11,20 @@ from typing import Any, Final
 from zsched.config_blocks import Located, Section
 from zsched.config_nodes import Cast, select
 from zsched.config_reader import Collector, Place, nearest
+from zsched.config_ros2 import ros2_rules
 from zsched.core.fleet import Demand, LinkLimits, OnIsolation, StreamRule, TaskSpec, WorkerSpec
 from zsched.core.model import NodeKind, Tuning, Weights
-from zsched.core.plan import Direction, HandoverRule, ReadyWhen, ServiceSettings, StreamClass, StreamSettings
+from zsched.core.plan import Direction, HandoverRule, ReadyWhen, RosGraph, ServiceSettings, StreamClass, StreamSettings
 from zsched.core.rulecheck import RuleConflict, rule_conflicts
-from zsched.core.templates import PLACEHOLDERS, named_rules, placeholders, rule_fault, template_fault
+from zsched.core.templates import (
+    PLACEHOLDERS,
+    merges_keys,
+    named_rules,
+    placeholders,
+    rule_fault,
+    shared_key_fault,
+    template_fault,
+)
 
 _ANY_TUNING: Final = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
 """Stands in for a faulty one, so that the task's rules are checked in the same pass; such a file gives no fleet."""
@@ -37,7 +46,8 @@ def read_tasks(section: Section, cast: Cast, out: Collector) -> tuple[TaskSpec, 
         if task is not None:
             tasks.append(task)
             _advise_network(task.tuning, entry.value, cast, out)
-    for conflict in rule_conflicts(tasks, cast.of_kind(NodeKind.ROBOT)):
+    split = frozenset(node.name for node in cast.nodes if node.local is not None)
+    for conflict in rule_conflicts(tasks, cast.of_kind(NodeKind.ROBOT), split):
         _report(conflict, places, out)
     return tuple(tasks)
 
@@ -49,7 +59,7 @@ def _task(
     tuning = _tuning(given, out)
     worker = _worker(given, out)
     limits = _limits(given, out)
-    streams = tuple(stream for direction in Direction for stream in _streams(given, direction, out))
+    streams = tuple(_streams(given, cast, candidates, out))
     _check_exclusive(given, worker, streams, out)
     if not candidates:
         return None
@@ -161,11 +171,32 @@ def _advise_network(tuning: Tuning, given: Section, cast: Cast, out: Collector) 
 # --- stream rules ----------------------------------------------------------------------------------------------------
 
 
-def _streams(given: Section, direction: Direction, out: Collector) -> Iterator[Located[StreamRule]]:
-    for section in given.get(f"{direction}s", ()):
+def _streams(given: Section, cast: Cast, candidates: tuple[str, ...], out: Collector) -> Iterator[Located[StreamRule]]:
+    """Every rule of a task: those written as keys first, then those written as ROS names."""
+    named = [(direction, section) for direction in Direction for section in given.get(f"{direction}s", ())]
+    ros2: Section | None = given.get("ros2")
+    if ros2 is not None:
+        named += ros2_rules(ros2, cast.of_kind(NodeKind.ROBOT), candidates, out)
+    for direction, section in named:
         rule = _rule(section, direction, out)
-        if rule is not None:
-            yield Located(rule, section.where("to"))
+        if rule is None:
+            continue
+        _check_keys(rule, section, cast, out)
+        yield Located(rule, section.where("to"))
+
+
+def _check_keys(rule: StreamRule, section: Section, cast: Cast, out: Collector) -> None:
+    """What depends on the robots' local sides, and what is worth a word."""
+    robots = [node for node in cast.nodes if node.kind is NodeKind.ROBOT]
+    without = [node.name for node in robots if node.local is None]
+    problem = shared_key_fault(rule)
+    if problem is not None and without and cast.is_whole:
+        held: Located[str] = section.get("to" if rule.direction is Direction.OUTPUT else "from")
+        hint = f"add {{robot}}, or give every robot a `local:` side ({', '.join(without[:4])} has none)"
+        out.error(held.place, f"{held.value!r}: {problem}", hint)
+    if merges_keys(rule) and rule.settings.graph is RosGraph.NONE:
+        message = "'to' has fewer wildcards than 'from': several keys become one, and nobody can tell them apart"
+        out.warn(section.where("to"), message)
 
 
 def _rule(section: Section, direction: Direction, out: Collector) -> StreamRule | None:
@@ -195,7 +226,7 @@ def _rule(section: Section, direction: Direction, out: Collector) -> StreamRule 
 
 
 def _settings(section: Section) -> dict[str, Any]:
-    return _of(section, "class", "keep_last", "depth", "handover")
+    return _of(section, "class", "keep_last", "depth", "handover", "graph")
 
 
 def _check_settings(section: Section, direction: Direction, out: Collector) -> None:

@@ -60,6 +60,23 @@ class LinkSpec:
     """nl80211: the station that ``peer`` is (empty: the access point)."""
 
 
+class LocalMode(StrEnum):
+    """How a relay joins its host's own zenoh network."""
+
+    CLIENT = "client"
+    PEER = "peer"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LocalSide:
+    """A network of the host's applications apart from the fleet's: inputs come from it, outputs go to it."""
+
+    mode: LocalMode = LocalMode.CLIENT
+    connect: tuple[str, ...] = ()
+    """zenoh endpoints, e.g. that of the host's `rmw_zenohd`."""
+    listen: tuple[str, ...] = ()
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NodeSpec:
     """One machine of the fleet file."""
@@ -72,6 +89,8 @@ class NodeSpec:
     listen_data: str = ""
     labels: tuple[tuple[str, str], ...] = ()
     links: tuple[LinkSpec, ...] = ()
+    local: LocalSide | None = None
+    """``None``: the host's applications are on the fleet's data network."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -52,6 +52,23 @@ def is_wild(expr: str) -> bool:
     return "*" in expr
 
 
+def canonical(expr: str) -> str:
+    """The canonical spelling of ``expr``, whose chunks are valid by themselves: ``**`` behind ``*``, and once.
+
+    >>> canonical("a/**/*/**/b")
+    'a/*/**/b'
+    """
+    chunks: list[str] = []
+    for chunk in expr.split("/"):
+        if chunk == DOUBLE and chunks[-1:] == [DOUBLE]:
+            continue
+        if chunk == SINGLE and chunks[-1:] == [DOUBLE]:
+            chunks.insert(len(chunks) - 1, SINGLE)
+            continue
+        chunks.append(chunk)
+    return "/".join(chunks)
+
+
 def intersects(first: str, second: str) -> bool:
     """True when some key matches both expressions (both valid).
 

@@ -34,6 +34,14 @@ class HandoverRule(StrEnum):
     ALL = "all"
 
 
+class RosGraph(StrEnum):
+    """In which ROS graph a stream's endpoints are announced (`zsched.core.ros2`)."""
+
+    NONE = "none"
+    RMW_ZENOH = "rmw_zenoh"
+    ROS2DDS = "ros2dds"
+
+
 class ReadyWhen(StrEnum):
     """How the relay knows that a worker can take its inputs."""
 
@@ -51,6 +59,8 @@ class StreamSettings:
     depth: int = 16
     """Bounded queue between subscriber and publisher, 1..100000 samples."""
     handover: HandoverRule = HandoverRule.LATEST
+    graph: RosGraph = RosGraph.NONE
+    """Set by the fleet file's `ros2:` sections."""
 
     def __post_init__(self) -> None:
         check_range("keep_last", self.keep_last, 0, 1000)

@@ -10,6 +10,9 @@ under one key would mix two streams that no receiver can tell apart.
 Requests flow like samples from ``from`` to ``to``, but never become samples: services are held against each other only.
 There a clash is one key that two rules answer.
 
+A robot with a local side keeps its applications' keys to itself: its inputs' ``from`` and its outputs' ``to`` are in a
+room of their own (here: behind a verbatim chunk with the robot's name), so that three robots may all publish ``map``.
+
 Rules are first compared with every placeholder left open, which is cheap and never misses; only those that could meet
 are expanded.
 """
@@ -17,7 +20,7 @@ are expanded.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -63,29 +66,51 @@ class _Relay:
     to_expr: str
 
 
+_LOCAL: Final = "@local"
+"""First chunk of the keys in a robot's own room."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Robots:
+    names: tuple[NodeId, ...]
+    split: frozenset[NodeId]
+    """Those with a local side."""
+
+    def place(self, expr: str, robot: NodeId) -> str:
+        """A key of the robot's applications, in the robot's own room if it has one."""
+        return f"{_LOCAL}/{robot}/{expr}" if robot in self.split else expr
+
+
+def _shown(expr: str) -> str:
+    """As the file's reader knows it: without the room."""
+    return expr.split("/", 2)[2] if expr.startswith(f"{_LOCAL}/") else expr
+
+
 _Graph = Mapping[str, Iterable[str]]
 _WORKER: Final = "worker "
 """Prefix of the nodes that stand for a task's worker on a candidate."""
 
 
-def rule_conflicts(tasks: Iterable[TaskSpec], robots: Iterable[NodeId]) -> tuple[RuleConflict, ...]:
+def rule_conflicts(
+    tasks: Iterable[TaskSpec], robots: Iterable[NodeId], with_local_side: Collection[NodeId] = ()
+) -> tuple[RuleConflict, ...]:
     """Every loop and clash among the rules of ``tasks`` for ``robots``; empty when there is none."""
     rules = [_Rule(stream, task, rule) for task in tasks for stream, rule in named_rules(task)]
-    names = tuple(robots)
+    cast = _Robots(names=tuple(robots), split=frozenset(with_local_side))
     services = [rule for rule in rules if rule.rule.direction is Direction.SERVICE]
     streams = [rule for rule in rules if rule.rule.direction is not Direction.SERVICE]
     return (
-        *_clashes(streams, names),
-        *_loops(streams, names),
-        *_service_clashes(services, names),
-        *_loops(services, names),
+        *_clashes(streams, cast),
+        *_loops(streams, cast),
+        *_service_clashes(services, cast),
+        *_loops(services, cast),
     )
 
 
 # --- clashes ---------------------------------------------------------------------------------------------------------
 
 
-def _clashes(rules: list[_Rule], robots: tuple[NodeId, ...]) -> Iterator[RuleConflict]:
+def _clashes(rules: list[_Rule], robots: _Robots) -> Iterator[RuleConflict]:
     """One conflict per pair of rules (or per rule that meets itself on another robot)."""
     for index, first in enumerate(rules):
         own = _self_clash(first, robots)
@@ -96,26 +121,30 @@ def _clashes(rules: list[_Rule], robots: tuple[NodeId, ...]) -> Iterator[RuleCon
                 yield from _pair_clash(first, second, robots)
 
 
-def _self_clash(rule: _Rule, robots: tuple[NodeId, ...]) -> RuleConflict | None:
-    writers: dict[str, NodeId] = {}
-    for relay in _expand(rule, robots):
-        known = writers.setdefault(relay.to_expr, relay.robot)
-        if known != relay.robot:
-            message = f"{known} and {relay.robot} would both publish {relay.to_expr!r}: add {{robot}} to 'to'"
+def _self_clash(rule: _Rule, robots: _Robots) -> RuleConflict | None:
+    relays = list(_expand(rule, robots))
+    index = _Index(relays, lambda relay: relay.to_expr)
+    for relay in relays:
+        for other in index.meeting(relay.to_expr):
+            if other.robot == relay.robot:
+                continue
+            message = (
+                f"{relay.robot} and {other.robot} would both publish {_shown(relay.to_expr)!r}: add {{robot}} to 'to'"
+            )
             return RuleConflict(streams=(rule.stream,), message=message)
     return None
 
 
-def _pair_clash(first: _Rule, second: _Rule, robots: tuple[NodeId, ...]) -> Iterator[RuleConflict]:
+def _pair_clash(first: _Rule, second: _Rule, robots: _Robots) -> Iterator[RuleConflict]:
     index = _Index(_expand(second, robots), lambda relay: relay.to_expr)
     for relay in _expand(first, robots):
         for other in index.meeting(relay.to_expr):
-            message = f"two rules publish {relay.to_expr!r}; a receiver could not tell their streams apart"
+            message = f"two rules publish {_shown(relay.to_expr)!r}; a receiver could not tell their streams apart"
             yield RuleConflict(streams=(first.stream, second.stream), message=_on(message, relay, other))
             return
 
 
-def _service_clashes(rules: list[_Rule], robots: tuple[NodeId, ...]) -> Iterator[RuleConflict]:
+def _service_clashes(rules: list[_Rule], robots: _Robots) -> Iterator[RuleConflict]:
     for first, second in itertools.combinations(rules, 2):
         if not keyexpr.intersects(first.open_from(), second.open_from()):
             continue
@@ -123,7 +152,7 @@ def _service_clashes(rules: list[_Rule], robots: tuple[NodeId, ...]) -> Iterator
         both = ((relay, other) for relay in _expand(first, robots) for other in index.meeting(relay.from_expr))
         relay, other = next(both, (None, None))
         if relay is not None and other is not None:
-            message = f"two services answer {relay.from_expr!r}: one request would be carried out twice"
+            message = f"two services answer {_shown(relay.from_expr)!r}: one request would be carried out twice"
             yield RuleConflict(streams=(first.stream, second.stream), message=_on(message, relay, other))
 
 
@@ -135,7 +164,7 @@ def _on(message: str, first: _Relay, second: _Relay) -> str:
 # --- loops -----------------------------------------------------------------------------------------------------------
 
 
-def _loops(rules: list[_Rule], robots: tuple[NodeId, ...]) -> Iterator[RuleConflict]:
+def _loops(rules: list[_Rule], robots: _Robots) -> Iterator[RuleConflict]:
     relay_graph = {
         rule.stream: [to.stream for to in rules if keyexpr.intersects(rule.open_to(), to.open_from())] for rule in rules
     }
@@ -161,7 +190,7 @@ def _behind_worker(rule: _Rule, rules: list[_Rule]) -> list[str]:
     return [to.stream for to in rules if to.task is rule.task and to.rule.direction is Direction.OUTPUT]
 
 
-def _loop_in(rules: list[_Rule], robots: tuple[NodeId, ...], *, with_workers: bool) -> list[_Relay]:
+def _loop_in(rules: list[_Rule], robots: _Robots, *, with_workers: bool) -> list[_Relay]:
     """One circle among the expanded ``rules``, in its order; empty when there is none."""
     relays = [relay for rule in rules for relay in _expand(rule, robots)]
     by_name = {str(number): relay for number, relay in enumerate(relays)}
@@ -188,7 +217,10 @@ def _streams(chain: list[_Relay]) -> tuple[str, ...]:
 
 
 def _loop_text(what: str, chain: list[_Relay]) -> str:
-    steps = [f"{relay.from_expr} -> {relay.to_expr} (on {relay.robot}, owner {relay.candidate})" for relay in chain[:6]]
+    steps = [
+        f"{_shown(relay.from_expr)} -> {_shown(relay.to_expr)} (on {relay.robot}, owner {relay.candidate})"
+        for relay in chain[:6]
+    ]
     more = [f"{len(chain) - 6} more"] if len(chain) > 6 else []
     return f"loop, {what}: {', then '.join((*steps, *more))}"
 
@@ -196,18 +228,20 @@ def _loop_text(what: str, chain: list[_Relay]) -> str:
 # --- expansion, index, graph -----------------------------------------------------------------------------------------
 
 
-def _expand(rule: _Rule, robots: tuple[NodeId, ...]) -> Iterator[_Relay]:
-    for robot in robots:
+def _expand(rule: _Rule, robots: _Robots) -> Iterator[_Relay]:
+    is_output = rule.rule.direction is Direction.OUTPUT
+    for robot in robots.names:
         for candidate in rule.task.candidates:
             names = {"robot": robot, "node": robot, "target": candidate, "task": rule.task.name}
+            from_expr, to_expr = widened(rule.rule.from_template, **names), widened(rule.rule.to_template, **names)
             yield _Relay(
                 stream=rule.stream,
                 task=rule.task.name,
                 direction=rule.rule.direction,
                 robot=robot,
                 candidate=candidate,
-                from_expr=widened(rule.rule.from_template, **names),
-                to_expr=widened(rule.rule.to_template, **names),
+                from_expr=from_expr if is_output else robots.place(from_expr, robot),
+                to_expr=robots.place(to_expr, robot) if is_output else to_expr,
             )
 
 

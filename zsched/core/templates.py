@@ -6,15 +6,20 @@ other tasks (`zsched.core.rulecheck` holds rules against each other).
 ====================  =====================================================  =============================
 place                 placeholders                                           must hold
 ====================  =====================================================  =============================
-input ``from``        ``{robot} {node} {task}``                              (none: one stream for everybody)
+input ``from``        ``{robot} {node} {task}``                              (without ``{robot}``: see below)
 input ``to``          ``{robot} {node} {target} {task}``                     ``{target}``
 output ``from``       ``{robot} {node} {target} {task} {epoch}``             ``{target}``
-output ``to``         ``{robot} {node} {task}``                              ``{robot}`` or ``{node}``
-service ``from``      ``{robot} {node} {task}``                              ``{robot}`` or ``{node}``
+output ``to``         ``{robot} {node} {task}``                              (without ``{robot}``: see below)
+service ``from``      ``{robot} {node} {task}``                              (without ``{robot}``: see below)
 service ``to``        ``{robot} {node} {target} {task}``                     ``{target}``
 ====================  =====================================================  =============================
 
 ``{robot}`` and ``{node}`` are both the robot whose relay carries the stream, ``{target}`` is the owner.
+
+A robot's own side without ``{robot}``: an input is then one stream for everybody, or, on a robot that has a local side,
+that robot's own; outputs and services make sense on local sides only (`shared_key_fault`).
+
+Wildcards (``*``, ``**``, ``$*``) of ``from`` are captured and fill those of ``to`` in order (`zsched.core.capture`).
 """
 
 from __future__ import annotations
@@ -23,7 +28,7 @@ import re
 from collections.abc import Mapping
 from typing import Final
 
-from zsched.core import keyexpr
+from zsched.core import capture, keyexpr
 from zsched.core.fleet import StreamRule, TaskSpec
 from zsched.core.model import NodeId
 from zsched.core.plan import Direction, Route
@@ -40,14 +45,6 @@ _NEEDED: Final[Mapping[tuple[Direction, str], tuple[frozenset[str], str]]] = {
     (Direction.OUTPUT, "from"): (
         frozenset({"target"}),
         "it lacks {target}: an output comes from whichever node owns the task",
-    ),
-    (Direction.OUTPUT, "to"): (
-        frozenset({"robot", "node"}),
-        "it lacks {robot}: every robot would publish its copy under one key",
-    ),
-    (Direction.SERVICE, "from"): (
-        frozenset({"robot", "node"}),
-        "it lacks {robot}: every robot would take the same request, and it would be carried out once for each",
     ),
     (Direction.SERVICE, "to"): (
         frozenset({"target"}),
@@ -103,7 +100,12 @@ def rule_fault(rule: StreamRule) -> str | None:
     """Why the two valid templates of ``rule`` make no stream together; ``None`` when they do."""
     if rule.from_template == rule.to_template:
         return "'from' and 'to' are the same key: the stream would feed itself"
-    return None
+    return capture.capture_fault(rule.from_template, rule.to_template)
+
+
+def merges_keys(rule: StreamRule) -> bool:
+    """True when several keys of ``from`` become one key of ``to``: a receiver cannot tell them apart any more."""
+    return len(capture.wildcards(rule.to_template)) < len(capture.wildcards(rule.from_template))
 
 
 def routes_for(task: TaskSpec, robot: NodeId, owner: NodeId, epoch: int) -> tuple[Route, ...]:
@@ -142,7 +144,7 @@ def widened(template: str, **names: str) -> str:
     'edge1/map_merge/*/tf'
     """
     chunks = [_widened_chunk(chunk, names) for chunk in template.split("/")]
-    return "/".join(chunks)
+    return keyexpr.canonical("/".join(chunks))
 
 
 def _widened_chunk(chunk: str, names: Mapping[str, str]) -> str:
@@ -175,6 +177,21 @@ def _missing_fault(template: str, direction: Direction, side: str) -> str | None
     return None if is_there else why
 
 
+def shared_key_fault(rule: StreamRule) -> str | None:
+    """Why ``rule`` needs a local side on every robot (its applications' key has no ``{robot}``); ``None``: it does not.
+
+    An input may do without: it is then one stream that every robot forwards.
+    """
+    if rule.direction is Direction.INPUT:
+        return None
+    is_output = rule.direction is Direction.OUTPUT
+    if {"robot", "node"} & set(placeholders(rule.to_template if is_output else rule.from_template)):
+        return None
+    if is_output:
+        return "it lacks {robot}: every robot would publish its copy under one key"
+    return "it lacks {robot}: every robot would take the same request, and it would be carried out once for each"
+
+
 def _expression_fault(template: str) -> str | None:
     sample = fill(template, robot="r", node="r", target="t", task="k", epoch="1")
     if RESERVED_CHUNK in sample.split("/"):
@@ -182,6 +199,4 @@ def _expression_fault(template: str) -> str | None:
     problem = keyexpr.fault(sample)
     if problem is not None:
         return f"it is no key expression: {problem}"
-    if keyexpr.is_wild(sample):
-        return "wildcards in a rule are not supported: write one rule per key"
-    return None
+    return capture.ambiguity(template)

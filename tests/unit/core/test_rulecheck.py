@@ -31,8 +31,10 @@ def task(
     )
 
 
-def conflicts(*tasks: TaskSpec, robots: tuple[str, ...] = ROBOTS) -> tuple[RuleConflict, ...]:
-    return rule_conflicts(tasks, robots)
+def conflicts(
+    *tasks: TaskSpec, robots: tuple[str, ...] = ROBOTS, split: tuple[str, ...] = ()
+) -> tuple[RuleConflict, ...]:
+    return rule_conflicts(tasks, robots, split)
 
 
 MAP_IN = ("{robot}/map", "{target}/merge/{robot}/map")
@@ -100,6 +102,58 @@ def test_names_that_meet_only_by_chance_are_found() -> None:
     assert not any(found.streams == ("a/in/0", "b/in/0") for found in conflicts(first, second))
     found = conflicts(first, second, robots=("merge",))
     assert [one.streams for one in found] == [("a/in/0", "b/in/0")]
+
+
+def test_wildcards_find_the_loop_that_single_keys_would_miss() -> None:
+    all_in = ("{robot}/**", "{target}/t/{robot}/**")
+    (found,) = conflicts(task("t", (all_in,), candidates=("edge1", "robot1")), robots=ROBOTS[:1])
+    assert found.is_fatal
+    assert "robot1/** -> robot1/t/robot1/**" in found.message
+    assert conflicts(task("t", (all_in,))) == ()
+
+
+def test_wildcards_that_meet_in_to_clash() -> None:
+    first = task("a", (("{robot}/x/**", "{target}/in/{robot}/**"),))
+    second = task("b", (("{robot}/y", "{target}/in/{robot}/y"),))
+    (found,) = conflicts(first, second)
+    assert found.is_fatal
+    assert set(found.streams) == {"a/in/0", "b/in/0"}
+
+
+def test_robots_whose_wild_keys_meet_clash() -> None:
+    """robot1's cam*, and robot10's: no equal key, but common ones."""
+    mixed = task("a", (("{robot}/cam$*", "{target}/a/{robot}$*"),))
+    (found,) = conflicts(mixed, robots=("robot1", "robot10"))
+    assert "would both publish" in found.message
+
+
+PLAIN_IN = ("map", "{target}/merge/{robot}/map")
+PLAIN_OUT = ("{target}/merge/{epoch}/map", "global_map")
+
+
+def test_robots_with_local_sides_may_all_publish_the_same_key() -> None:
+    merge = task("merge", (PLAIN_IN,), (PLAIN_OUT,))
+    assert conflicts(merge, split=ROBOTS) == ()
+    (found,) = conflicts(merge)
+    assert "would both publish 'global_map'" in found.message
+    (found,) = conflicts(merge, split=ROBOTS[:1])
+    assert "robot2 and robot3" in found.message
+
+
+def test_a_clash_within_one_local_side_is_found_and_shown_without_its_room() -> None:
+    first = task("a", (), (("{target}/a/{epoch}/map", "map"),))
+    second = task("b", (), (("{target}/b/{epoch}/map", "map"),))
+    (found,) = conflicts(first, second, split=ROBOTS)
+    assert "two rules publish 'map'" in found.message
+    assert "on robot1" in found.message
+
+
+def test_a_loop_between_the_sides_is_found() -> None:
+    first = task("a", (("x", "{target}/ping/{robot}"),))
+    second = task("b", (), (("{target}/ping/{robot}", "x"),))
+    (found,) = conflicts(first, second, split=ROBOTS)
+    assert found.is_fatal
+    assert "@local" not in found.message
 
 
 def dumb_has_relay_loop(tasks: tuple[TaskSpec, ...], robots: tuple[str, ...]) -> bool:

@@ -11,7 +11,16 @@ from zsched.core import keyexpr, templates
 from zsched.core.fleet import StreamRule, TaskSpec
 from zsched.core.model import Tuning, Weights
 from zsched.core.plan import Direction, StreamClass, StreamSettings
-from zsched.core.templates import fill, named_rules, routes_for, template_fault, widened
+from zsched.core.templates import (
+    fill,
+    merges_keys,
+    named_rules,
+    routes_for,
+    rule_fault,
+    shared_key_fault,
+    template_fault,
+    widened,
+)
 
 IN, OUT = Direction.INPUT, Direction.OUTPUT
 
@@ -86,6 +95,11 @@ GOOD = [
     (OUT, "from", "{target}/{task}/{robot}/tf"),
     (OUT, "to", "{robot}/tf"),
     (OUT, "to", "{node}/tf"),
+    (OUT, "to", "global_map"),
+    (IN, "from", "{robot}/sensors/**"),
+    (IN, "from", "{robot}/cam$*/*/raw"),
+    (IN, "to", "{target}/{task}/{robot}/sensors/**"),
+    (OUT, "from", "{target}/{task}/{epoch}/**"),
 ]
 BAD = [
     (IN, "from", "{target}/map", "whoever owns"),
@@ -95,7 +109,6 @@ BAD = [
     (OUT, "from", "global_map", "lacks {target}"),
     (OUT, "from", "{target}/e{epoch}/map", "whole chunk"),
     (OUT, "from", "{target}/{epoch}/{epoch}/map", "whole chunk"),
-    (OUT, "to", "global_map", "lacks {robot}"),
     (OUT, "to", "{robot}/{target}/map", "keeps its key"),
     (OUT, "to", "{robot}/{}/map", "no placeholder {}"),
     (OUT, "to", "{robt}/map", "no placeholder {robt}"),
@@ -105,8 +118,9 @@ BAD = [
     (OUT, "to", "{robot}/map/@zsched/end", "belong to zsched"),
     (IN, "from", "/{robot}/map", "empty chunk"),
     (IN, "from", "{robot}/map#1", "'#'"),
-    (IN, "from", "{robot}/*/map", "wildcards"),
-    (IN, "to", "{target}/**", "wildcards"),
+    (IN, "from", "{robot}/**/x/**", "more than one '**'"),
+    (IN, "to", "{target}/a$*b$*", "more than one '$*'"),
+    (IN, "to", "{target}/**/*", "'*/**'"),
     (IN, "from", "", "empty"),
 ]
 
@@ -128,6 +142,27 @@ def test_template_out_of_place_is_refused_with_the_reason(
 def test_any_text_is_fine_or_refused_never_an_exception(template: str, direction: Direction, side: str) -> None:
     if template_fault(template, direction, side) is None:
         zenoh.KeyExpr(fill(template, robot="r", node="r", target="t", task="k", epoch="1"))
+
+
+def test_wildcards_of_a_rule_must_fit() -> None:
+    assert rule_fault(rule(IN, "{robot}/s/**", "{target}/{robot}/**")) is None
+    assert "more wildcards" in (rule_fault(rule(IN, "{robot}/s", "{target}/{robot}/*")) or "")
+    assert "'**'" in (rule_fault(rule(IN, "{robot}/*", "{target}/{robot}/**")) or "")
+
+
+def test_a_dropped_wildcard_and_a_missing_robot_are_seen() -> None:
+    assert merges_keys(rule(IN, "0/{robot}/map/*/*", "{target}/{robot}/map"))
+    assert not merges_keys(rule(IN, "{robot}/*", "{target}/{robot}/*"))
+    assert "lacks {robot}" in (shared_key_fault(rule(OUT, "{target}/m/{epoch}/map", "global_map")) or "")
+    assert "once for each" in (shared_key_fault(rule(Direction.SERVICE, "merge", "{target}/{robot}/merge")) or "")
+    assert shared_key_fault(rule(OUT, "{target}/m/{epoch}/map", "{node}/global_map")) is None
+    assert shared_key_fault(rule(IN, "map", "{target}/{robot}/map")) is None
+
+
+def test_wildcards_stay_in_routes_and_widened_templates_stay_canonical() -> None:
+    (route,) = routes_for(task_of(rule(IN, "{robot}/s/**", "{target}/t/{robot}/**")), "robot1", "edge1", 3)
+    assert (route.from_expr, route.to_expr) == ("robot1/s/**", "edge1/t/robot1/**")
+    assert widened("{target}/**/{robot}", target="edge1") == "edge1/*/**"
 
 
 def test_fill_without_a_name_raises() -> None:

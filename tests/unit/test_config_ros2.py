@@ -1,0 +1,167 @@
+"""`ros2:` sections become ordinary rules, `local:` sides make room for equal keys; faults stand where they belong."""
+
+from __future__ import annotations
+
+import pytest
+
+from zsched.config import CheckResult, check_bytes
+from zsched.core.fleet import Fleet, LocalMode, LocalSide
+from zsched.core.plan import Direction, RosGraph, StreamClass
+from zsched.core.templates import routes_for
+
+HASH = "RIHS01_8d348150c12913a31ee0ec170fbf25089e4745d17035792a1ba94d6f0bc0cfc7"
+GRID = "nav_msgs::msg::dds_::OccupancyGrid_"
+FILE = """\
+fleet: f
+nodes:
+  robot1: {kind: robot, wired: true, host: 192.0.2.1LOCAL, listen: {control: tcp/0.0.0.0:7457, data: tcp/0.0.0.0:7458}}
+  robot2: {kind: robot, wired: trueLOCAL}
+  robot3: {kind: robot, wired: trueLOCAL}
+  edge1: {kind: edge}
+tasks:
+  merge:
+    candidates: {kind: edge}
+    weights: {cpu: 1}
+    RULES
+"""
+SIDE = ', local: {connect: ["tcp/127.0.0.1:7447"]}'
+
+
+def check(rules: str, local: str = "") -> CheckResult:
+    return check_bytes(FILE.replace("LOCAL", local).replace("RULES", rules).encode())
+
+
+def fleet_of(rules: str, local: str = "") -> Fleet:
+    result = check(rules, local)
+    assert result.fleet is not None, result.report()
+    return result.fleet
+
+
+def faults(rules: str, local: str = "") -> str:
+    result = check(rules, local)
+    assert result.fleet is None
+    return result.report()
+
+
+TOPICS = """ros2:
+      inputs: [{topic: "/{robot}/map", type: nav_msgs/msg/OccupancyGrid, worker_key: "{target}/merge/{robot}/map", class: latest}]
+      outputs: [{topic: "/{robot}/merged", worker_topic: "/{target}/merge/map", class: latest, keep_last: 2}]
+      services: [{service: "/{robot}/merge_now", worker_service: "/{target}/merge/now", type: std_srvs/srv/Trigger, timeout_s: 3}]
+"""  # noqa: E501 - one line per entry, as operators write it
+
+
+def test_names_become_rules_with_every_setting() -> None:
+    task = fleet_of(TOPICS).tasks[0]
+    routes = routes_for(task, "robot1", "edge1", 7)
+    assert [(route.stream, route.from_expr, route.to_expr) for route in routes] == [
+        ("merge/in/0", f"0/robot1/map/{GRID}/*", "edge1/merge/robot1/map"),
+        ("merge/out/0", "0/edge1/merge/map/*/*", "0/robot1/merged/*/*"),
+        (
+            "merge/srv/0",
+            "0/robot1/merge_now/std_srvs::srv::dds_::Trigger_/*",
+            "0/edge1/merge/now/std_srvs::srv::dds_::Trigger_/*",
+        ),
+    ]
+    assert all(route.settings.graph is RosGraph.RMW_ZENOH for route in routes)
+    assert routes[0].settings.stream_class is StreamClass.LATEST
+    assert routes[1].settings.keep_last == 2
+    assert routes[2].service.timeout_s == 3
+
+
+def test_ros_entries_stand_behind_plain_rules() -> None:
+    plain = 'inputs: [{from: "{robot}/scan", to: "{target}/merge/{robot}/scan"}]\n    '
+    names = [route.from_expr for route in routes_for(fleet_of(plain + TOPICS).tasks[0], "robot1", "edge1", 1)]
+    assert names[:2] == ["robot1/scan", f"0/robot1/map/{GRID}/*"]
+
+
+def test_domain_and_bridge_shape_the_keys() -> None:
+    entry = '[{topic: "/{robot}/map", worker_topic: "/{target}/merge/{robot}/map"}]'
+    (rmw,) = fleet_of(f"ros2: {{domain: 5, inputs: {entry}}}").tasks[0].rules
+    assert rmw.from_template == "5/{robot}/map/*/*"
+    (dds,) = fleet_of(f"ros2: {{bridge: ros2dds, inputs: {entry}}}").tasks[0].rules
+    assert (dds.from_template, dds.to_template) == ("{robot}/map", "{target}/merge/{robot}/map")
+    assert dds.settings.graph is RosGraph.ROS2DDS
+
+
+def test_robots_that_all_publish_map_need_their_local_sides() -> None:
+    rules = """ros2:
+      inputs: [{topic: /map, worker_key: "{target}/merge/{robot}/map"}]
+      outputs: [{topic: /merged, type: nav_msgs/msg/OccupancyGrid, hash: HASH, worker_key: "{target}/m/{epoch}/map"}]
+""".replace("HASH", HASH)
+    fleet = fleet_of(rules, SIDE)
+    assert fleet.node("robot2").local == LocalSide(mode=LocalMode.CLIENT, connect=("tcp/127.0.0.1:7447",))
+    assert fleet.tasks[0].rules[1].to_template == f"0/merged/{GRID}/{HASH}"
+    report = faults(rules)
+    assert "it lacks {robot}: every robot would publish its copy under one key" in report
+    assert "robot1, robot2, robot3 has none" in report
+
+
+@pytest.mark.parametrize(
+    ("entry", "said", "line_col"),
+    [
+        ('{topic: "map", worker_key: "{target}/x"}', "it must begin with '/'", "11:29"),
+        ('{topic: "/{robot}/7up", worker_key: "{target}/x"}', "'7up' is no part of a ROS name", "11:29"),
+        ('{topic: "/{robot}/map"}', "say one of worker_topic and worker_key", "11:21"),
+        ('{topic: "/{robot}/m", worker_key: "{target}/x", worker_topic: "/{target}/x"}', "say one of", "11:21"),
+        ('{topic: "/{robot}/m", worker_key: "{target}/{robot}", type: nav_msgs/Odometry}', "PACKAGE/msg/NAME", ""),
+        ('{topic: "/{robot}/m", worker_key: "{target}/{robot}", type: a/action/B}', "an action is made of", ""),
+        ('{topic: "/{robot}/m", worker_key: "{target}/{robot}", hash: abc}', "64 hex digits", ""),
+        ('{topic: "/{robt}/m", worker_key: "{target}/{robot}"}', "no placeholder {robt}", "11:29"),
+        ('{topic: "/{robot}/m", worker_key: "x/{robot}"}', "lacks {target}", "11:55"),
+        ('{topic: "/{robot}/m", worker_topic: "/{target}/{epoch}/m"}', "an epoch is a number", "11:57"),
+    ],
+)
+def test_a_fault_stands_at_the_name(entry: str, said: str, line_col: str) -> None:
+    report = faults(f"ros2: {{inputs: [{entry}]}}")
+    assert said in report
+    assert line_col in report
+
+
+def test_an_output_from_a_plain_key_needs_type_and_hash() -> None:
+    report = faults('ros2: {outputs: [{topic: "/{robot}/m", worker_key: "{target}/m"}]}')
+    assert "a plain key has neither type nor hash" in report
+
+
+def test_a_bridge_has_no_types_and_no_domain() -> None:
+    entry = '{topic: "/{robot}/m", worker_key: "{target}/{robot}", hash: any}'
+    assert "the bridge's keys have none" in faults(f"ros2: {{bridge: ros2dds, inputs: [{entry}]}}")
+    assert "belongs to one" in faults("ros2: {bridge: ros2dds, domain: 1}")
+
+
+def test_node_names_must_be_fit_for_ros_names() -> None:
+    text = FILE.replace("LOCAL", "").replace("robot2", "robot-2")
+    entry = 'ros2: {inputs: [{topic: "/{robot}/m", worker_key: "{target}/{robot}"}]}'
+    result = check_bytes(text.replace("RULES", entry).encode())
+    assert "the node 'robot-2' would stand in a ROS name" in result.report()
+
+
+def test_wildcards_are_captured_loops_with_them_refused() -> None:
+    rule = 'inputs: [{from: "{robot}/sensors/**", to: "{target}/merge/{robot}/sensors/**"}]'
+    assert [one.direction for one in fleet_of(rule).tasks[0].rules] == [Direction.INPUT]
+    assert "wildcard 1 of 'to' is '*'" in faults('inputs: [{from: "{robot}/**", to: "{target}/{robot}/*"}]')
+    assert "more wildcards" in faults('inputs: [{from: "{robot}/x", to: "{target}/{robot}/*"}]')
+    loop = 'inputs: [{from: "{robot}/**", to: "{target}/{robot}/**"}]'
+    text = FILE.replace("LOCAL", "").replace("RULES", loop).replace("{kind: edge}\n    w", "[robot1]\n    w")
+    assert "loop, relays feed each other: robot1/** -> robot1/robot1/**" in check_bytes(text.encode()).report()
+
+
+def test_keys_that_become_one_are_warned_of() -> None:
+    result = check('inputs: [{from: "{robot}/*", to: "{target}/{robot}/all"}]')
+    assert result.fleet is not None
+    assert "several keys become one" in result.report()
+    assert check(TOPICS).report() == ""
+
+
+@pytest.mark.parametrize(
+    ("local", "said"),
+    [
+        (", local: {mode: client}", "a client needs somebody to dial"),
+        (", local: {}", "a client needs somebody to dial"),
+        (", local: {mode: peer}", "it neither dials nor listens"),
+        (', local: {connect: ["tcp/127.0.0.1:7447"], listen: ["tcp/0.0.0.0:1"]}', "a client does not listen"),
+        (', local: {connect: ["tcp/127.0.0.1:7458"]}', "this node's own data session"),
+        (', local: {mode: peer, listen: ["tcp/0.0.0.0:7457"]}', "this node's own control session"),
+    ],
+)
+def test_a_local_side_must_lead_somewhere_else(local: str, said: str) -> None:
+    assert said in faults("drain_s: 1", local)
