@@ -117,6 +117,8 @@ class Profiler:
         self._worker_memory: dict[TaskId, Ewma] = {}
         self._device: DeviceSample | None = None
         self._sampled_at = -math.inf
+        self._is_new = False
+        self._flags: tuple[object, ...] = ()
         self._links: tuple[Link, ...] = ()
         self._workers: tuple[WorkerLoad, ...] = ()
         self._sent: Profile | None = None
@@ -125,7 +127,7 @@ class Profiler:
 
     def absorb(self, device: DeviceSample, links: tuple[LinkSample, ...], now: float) -> None:
         """Take one reading of the machine and its links in."""
-        self._device, self._sampled_at = device, now
+        self._device, self._sampled_at, self._is_new = device, now, True
         worker_cpu = {load.task: load.cpu_cores for load in device.workers}
         worker_memory = {load.task: load.memory_mb for load in device.workers}
         _absorb_use(self._cpu, self._worker_cpu, device.cpu_used_cores, worker_cpu, MAX_CPU_CORES, now)
@@ -163,10 +165,14 @@ class Profiler:
             is_draining: the operator drains this node, or it stops.
             now: monotonic seconds.
         """
+        is_due = now - self._sent_at >= self._timing.publish_s
+        flags = (is_draining, *states.values())
+        if not is_due and not self._is_new and flags == self._flags:
+            return None  # nothing was measured since the last look
+        self._is_new, self._flags = False, flags
         profile = self._current(states, is_draining=is_draining, now=now)
         if profile is None:
             return None
-        is_due = now - self._sent_at >= self._timing.publish_s
         if not is_due and self._sent is not None and not _differs(profile, self._sent):
             return None
         self._sequence += 1
