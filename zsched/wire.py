@@ -214,7 +214,8 @@ def encode(value: object) -> bytes:
     """
     kind = _KIND_OF[type(value)]
     cls, bound = KINDS[kind]
-    frame: bytes = msgpack.packb([VERSION, kind, _codec(cls)[1](value)], use_bin_type=True)
+    _, write = _CODECS.get(cls) or _codec(cls)
+    frame: bytes = msgpack.packb([VERSION, kind, write(value)], use_bin_type=True)
     if len(frame) > bound:
         raise WireError("size", f"{kind}: {len(frame)} bytes, at most {bound}")
     return frame
@@ -255,7 +256,8 @@ def _read_body(cls: type[T], body: Any, size: int) -> T:
     if size > bound:
         raise WireError("size", f"{size} bytes, at most {bound}")
     try:
-        value: T = _codec(cls)[0](body)
+        reader, _ = _CODECS.get(cls) or _codec(cls)
+        value: T = reader(body)
     except (ValueError, TypeError, OverflowError) as error:
         raise WireError("range", str(error)[:200]) from error
     return value

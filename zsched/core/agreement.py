@@ -50,6 +50,10 @@ class Effects:
     """Tasks whose move, proposed by this node, was committed, overtaken or given up."""
 
 
+NOTHING = Effects()
+"""Most calls lead to nothing: one shared value, never changed."""
+
+
 class Agreement:
     """All registers of one node.
 
@@ -131,9 +135,12 @@ class Agreement:
 
     def next_deadline(self) -> float:
         """When `tick` may have something to do."""
-        parked = (deadline for _, deadline in self._parked.values())
-        registers = (register.next_deadline() for register in self.registers.values())
-        return min(self._settle_at, *registers, *parked, math.inf)
+        due = self._settle_at
+        for register in self.registers.values():
+            due = min(due, register.next_deadline())
+        for _, deadline in self._parked.values():
+            due = min(due, deadline)
+        return due
 
     def accepted(self) -> dict[TaskId, tuple[NodeId, int]]:
         """{task: (owner, epoch)} of the value that this elector last accepted."""
@@ -223,6 +230,8 @@ class Agreement:
 
     def retry_parked(self, now: float) -> Effects:
         """A lease may have been released or run out, or a parked question may have waited long enough."""
+        if not self._parked:
+            return NOTHING
         effects = Effects()
         for event, deadline in tuple(self._parked.values()):
             self._accept_or_park(event, deadline, effects, now)
@@ -276,7 +285,7 @@ class Agreement:
     def note_voter(self, beat: Beat) -> Effects:
         """A peer's beat says that it has voted: remembered on disk, for the day its disk is lost."""
         if not beat.has_voted or beat.node in self.voted or beat.node not in self._fleet.electors:
-            return Effects()
+            return NOTHING
         self.voted.add(beat.node)
         return Effects(is_dirty=self._durable is not None)
 
@@ -292,13 +301,13 @@ class Agreement:
     def compare(self, beat: Beat, now: float) -> Effects:
         """A peer's beat may show that it has learnt more than we: then ask it."""
         if not self._is_our_generation(beat.node, beat.generation):
-            return Effects()
-        is_behind = any(
-            task in self.registers and revision > self.registers[task].value.revision
-            for task, revision, _ in beat.learnt
-        )
+            return NOTHING
+        is_behind = False
+        for task, revision, _ in beat.learnt:
+            register = self.registers.get(task)
+            is_behind |= register is not None and revision > register.value.revision
         if not is_behind or now - self._asked_at.get(beat.node, -math.inf) < ASK_LEARNT_EVERY_S:
-            return Effects()
+            return NOTHING
         self._asked_at[beat.node] = now
         return Effects(send=[do.AskLearnt(peer=beat.node, deadline_s=self._fleet.timing.ballot_s)])
 

@@ -9,6 +9,7 @@ import hashlib
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
+from functools import lru_cache
 
 from zsched.core.model import LinkSource, NodeId, NodeKind, TaskId, Tuning, check_range
 from zsched.core.plan import Direction, ReadyWhen, ServiceSettings, StreamSettings
@@ -248,6 +249,7 @@ def dial_endpoint(endpoint: str, host: str) -> str:
     return f"{protocol}/{address}"
 
 
+@lru_cache(maxsize=8)
 def fleet_hash(fleet: Fleet) -> str:
     """16 hex digits over all that every machine of the fleet must agree on.
 

@@ -337,6 +337,8 @@ class Leases:
 
     def next_deadline(self, now: float) -> float:
         """When an elector may accept what it refused, or a leaving owner's lease ends."""
+        if not self._granters and not self._holders:
+            return math.inf
         times = [granter.next_deadline(now) for granter in self._granters.values()]
         times += [holder.lease_until() for holder in self._holders.values() if holder.is_leaving]
         return min((at for at in times if at > now), default=math.inf)

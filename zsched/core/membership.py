@@ -60,6 +60,9 @@ class Membership:
         self._size = len(nodes)
         self._doubt = 1.0
         self._started_at = math.inf
+        self._deadline: float | None = None
+        """`next_deadline`, until something changes it."""
+        self._states = dict.fromkeys(sorted(nodes), PeerState.UNKNOWN) | {me: PeerState.ALIVE}
         self._has_watched = False
         """Whether this node has listened for as long as silence takes to mean something."""
 
@@ -78,7 +81,7 @@ class Membership:
 
     def states(self) -> dict[NodeId, PeerState]:
         """{node: state} of the whole fleet, this node included, sorted by name."""
-        return {name: self.state(name) for name in sorted((*self._peers, self._me))}
+        return self._states
 
     def incarnation(self, node: NodeId) -> int | None:
         """The newest incarnation that a peer's beat showed, or ``None``."""
@@ -98,11 +101,15 @@ class Membership:
 
     def note_lag(self, lag_s: float) -> None:
         """Take in how late this node's own loop woke up (seconds, >= 0), before it judges anybody."""
-        self._doubt = max(self._doubt, min(1.0 + lag_s / self._timing.beat_s, MAX_DOUBT))
+        if lag_s > 0.0:
+            self._doubt = max(self._doubt, min(1.0 + lag_s / self._timing.beat_s, MAX_DOUBT))
+            self._deadline = None
 
     def fade_doubt(self) -> None:
         """A beat was sent: doubt fades by halves."""
-        self._doubt = 1.0 + (self._doubt - 1.0) / 2
+        if self._doubt > 1.0:
+            self._doubt = 1.0 + (self._doubt - 1.0) / 2
+            self._deadline = None
 
     def absorb_beat(self, beat: Beat, now: float) -> tuple[Transition, ...]:
         """A peer's loop is alive: it refutes every accusation. Beats of an older incarnation or order are ignored."""
@@ -114,6 +121,7 @@ class Membership:
             peer.sequence = beat.sequence
             return ()
         before = peer.state
+        self._deadline = None
         peer.incarnation, peer.sequence, peer.beat_at = beat.incarnation, beat.sequence, now
         peer.suspects, peer.token_lost = beat.suspects, False
         changes = []
@@ -144,6 +152,9 @@ class Membership:
         limit = self._timing.suspect_s * self._doubt
         self._started_at = min(self._started_at, now)
         self._has_watched = self._has_watched or now >= self._started_at + limit
+        if now < self.next_deadline():
+            return ()  # silence and reviews have their times; a peer's word is reviewed when it comes
+        self._deadline = None
         for name, peer in self._peers.items():
             if peer.state is PeerState.ALIVE and now >= peer.beat_at + limit:
                 silent = now - peer.beat_at
@@ -152,11 +163,12 @@ class Membership:
 
     def next_deadline(self) -> float:
         """When `tick` may have something to say; infinity when never."""
-        limit = self._timing.suspect_s * self._doubt
-        return min(
-            (self._peer_deadline(peer, limit) for peer in self._peers.values()),
-            default=math.inf,
-        )
+        if self._deadline is None:
+            limit, due = self._timing.suspect_s * self._doubt, math.inf
+            for peer in self._peers.values():
+                due = min(due, self._peer_deadline(peer, limit))
+            self._deadline = due
+        return self._deadline
 
     def _peer_deadline(self, peer: _Peer, limit: float) -> float:
         if peer.state is PeerState.ALIVE:
@@ -202,6 +214,8 @@ class Membership:
     def _change(self, node: NodeId, after: PeerState, reason: str, now: float) -> Transition:
         peer = self._peers[node]
         before, peer.state = peer.state, after
+        self._states = {**self._states, node: after}  # a new one: whoever holds the old one sees one moment
+        self._deadline = None
         peer.suspect_since = now if after is PeerState.SUSPECT else math.inf
         peer.vouched_until = -math.inf
         return Transition(node=node, before=before, after=after, reason=reason)

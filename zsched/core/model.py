@@ -41,7 +41,8 @@ def check_range(field: str, value: float | None, low: float, high: float) -> Non
 
 def check_counter(field: str, value: int) -> None:
     """Raise `ValueError` unless ``0 <= value <= MAX_COUNTER``."""
-    check_range(field, value, 0, MAX_COUNTER)
+    if not 0 <= value <= MAX_COUNTER:
+        check_range(field, value, 0, MAX_COUNTER)
 
 
 class NodeKind(StrEnum):

@@ -19,7 +19,7 @@ from typing import Any
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.agreement import Agreement, Effects
+from zsched.core.agreement import NOTHING, Agreement, Effects
 from zsched.core.executor import Executor
 from zsched.core.fleet import Fleet, OnIsolation, TaskSpec, fleet_hash
 from zsched.core.gateway import Gateway
@@ -190,32 +190,38 @@ class Node:
         return (*first, *batch.send, *batch.apply)
 
     def _next_deadline(self, now: float) -> float:
-        return min(
+        due = min(
             self._beat_at,
             self.membership.next_deadline(),
             self.rounds.next_deadline(),
             self.agreement.next_deadline(),
             self._tenure.next_deadline(now),
-            *(executor.next_deadline() for executor in self.executors.values()),
         )
+        for executor in self.executors.values():
+            due = min(due, executor.next_deadline())
+        return due
 
     def _note_lag(self, now: float) -> None:
-        lag_s = max(now - self._promised, 0.0)
-        self.loop_lag_s = max(self.loop_lag_s, lag_s)
-        self.membership.note_lag(lag_s)
+        if now > self._promised:
+            lag_s = now - self._promised
+            self.loop_lag_s = max(self.loop_lag_s, lag_s)
+            self.membership.note_lag(lag_s)
 
     def _advance(self, now: float) -> None:
         """Let every stage act on the time that has passed, in the data's order."""
         for change in self.membership.tick(now):
             self._on_transition(change, now)
         self._publish_profile(now)
-        self._batch.add(*self.rounds.tick(self.values(), self.membership.states(), now))
+        if not self.rounds.is_idle(now):
+            self._batch.add(*self.rounds.tick(self.values(), self.membership.states(), now))
         for task, commit in self.rounds.due_commits(now):
             self._agree(self.agreement.propose(task, commit, now), now)
-        self._agree(self.agreement.tick(now), now)
+        if now >= self.agreement.next_deadline():
+            self._agree(self.agreement.tick(now), now)
         self._tend(now)
         for executor in self.executors.values():
-            self._batch.add(*executor.tick(now))
+            if now >= executor.next_deadline():
+                self._batch.add(*executor.tick(now))
         if now >= self._beat_at:
             self._beat(now)
 
@@ -378,6 +384,8 @@ class Node:
 
     def _agree(self, effects: Effects, now: float) -> None:
         """Carry out what the registers ask for."""
+        if effects is NOTHING:
+            return
         self._batch.is_dirty |= effects.is_dirty
         self._batch.add(*effects.send)
         if effects.is_urgent:

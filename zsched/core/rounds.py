@@ -90,6 +90,12 @@ class Rounds:
                 due = min(due, task.vote_opened_at + self.vote_s)
         return due
 
+    def is_idle(self, now: float) -> bool:
+        """Whether `tick` has nothing to do: no gather runs, none is due, no vote is open."""
+        if self._gather is not None or now >= self._round_at:
+            return False
+        return all(task.vote_opened_at is None for task in self.tasks.values())
+
     def hurry(self, now: float) -> None:
         """Something happened that may need a decision: run a round now."""
         if self.is_voter:
