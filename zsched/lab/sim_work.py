@@ -6,16 +6,15 @@ decides that, or how streams really move.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import Any, Protocol
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.model import NodeId, TaskId, WorkerState
 from zsched.core.plan import Role, RoutePhase, RoutePlan, WorkerRole
+from zsched.lab.sim_checks import Invariants
 from zsched.lab.sim_parts import Machine
-
-if TYPE_CHECKING:
-    from zsched.lab.simulator import Simulator
 
 WORKER_START_S = 0.4
 FLIP_S = 0.005
@@ -23,10 +22,25 @@ WORKER_STOP_S = 0.002
 LOOK_AGAIN_S = 0.05
 
 
+class World(Protocol):
+    """What workers and relays need of the simulator."""
+
+    now: float
+    machines: dict[str, Machine]
+    cuts: set[tuple[NodeId, NodeId]]
+    invariants: Invariants
+
+    def later(self, seconds: float, action: Callable[..., None], *arguments: Any) -> None:
+        """Do something ``seconds`` from now."""
+
+    def deliver(self, machine: Machine, event: ev.Event) -> None:
+        """An event reaches a machine."""
+
+
 class Work:
     """All workers and relays of one simulated fleet."""
 
-    def __init__(self, sim: Simulator) -> None:
+    def __init__(self, sim: World) -> None:
         self._sim = sim
         self.plans: dict[tuple[NodeId, TaskId], RoutePlan] = {}
         self.working: dict[TaskId, tuple[NodeId, float]] = {}

@@ -252,9 +252,9 @@ class Simulator:
     def _arm(self, machine: Machine) -> None:
         """Make sure that the node is woken at its next deadline."""
         node = machine.node
-        if node is None:
+        if node is None or machine.is_paused:
             return
-        due = max(machine.clock.true(node.next_deadline()), self.now + TICK_S)
+        due = max(machine.clock.true(node.next_deadline()), self.now + TICK_S, machine.busy_until)
         if due < machine.wake_at:
             machine.wake_at = due
             heapq.heappush(self._queue, (due, next(self._order), self._wake, (machine, machine.life, due)))
@@ -264,7 +264,9 @@ class Simulator:
             return  # another life, or an earlier wake-up has come since
         machine.wake_at = math.inf
         node = machine.node
-        if node is not None and node.next_deadline() <= machine.clock.local(self.now):
+        if node is None or machine.is_paused or machine.inbox or machine.busy_until > self.now:
+            return  # its loop comes to it after what it is at
+        if node.next_deadline() <= machine.clock.local(self.now):
             self.invariants.on_woken(machine, self.now)
             self.deliver(machine, ev.DeadlineReached())
         self._arm(machine)
@@ -300,8 +302,10 @@ class Simulator:
         machine.is_pumping = False
         while machine.life == life and machine.inbox and not machine.is_paused and machine.busy_until <= self.now:
             self._handle(machine, machine.inbox.popleft())
-        if machine.inbox and not machine.is_paused:
+        if machine.inbox:
             self._pump_later(machine)
+        else:
+            self._arm(machine)
 
     def _handle(self, machine: Machine, event: ev.Event) -> None:
         node = machine.node
