@@ -34,10 +34,11 @@ from zsched.adapters.worker_supervisor import WorkerContext, WorkerSupervisor
 from zsched.clock import monotonic_s, wall_seconds
 from zsched.config import load_fleet
 from zsched.core import events as ev
-from zsched.core.fleet import Fleet, NodeSpec, OnIsolation, TaskSpec, dial_endpoint, electorate_hash
-from zsched.core.model import DurableState, NodeId, NodeKind, TaskId
+from zsched.core.fleet import Fleet, NodeSpec, dial_endpoint, electorate_hash
+from zsched.core.model import DurableState, NodeId, TaskId
 from zsched.core.node import Node
 from zsched.core.status import status_line
+from zsched.core.workers import runs_worker
 from zsched.errors import AdapterError, ConfigError
 from zsched.shell import Desk, Inbox, Shell
 
@@ -260,7 +261,7 @@ class Daemon:
         self, stack: contextlib.ExitStack, shell: Shell, incarnation: int, points: Endpoints, operator_json5: str
     ) -> WorkerSupervisor:
         fleet, me = self._fleet, self._spec.name
-        mine = {task.name: task.worker for task in fleet.tasks if self._runs_worker(task)}
+        mine = {task.name: task.worker for task in fleet.tasks if runs_worker(task, me, self._spec.kind)}
         folder = self._options.runtime_dir
         paths: dict[TaskId, Path] = {}
         for name, spec in mine.items():
@@ -283,10 +284,6 @@ class Daemon:
             environment=lambda task: {"ZSCHED_ZENOH_CONFIG": str(paths[task])},
             rng=random.Random(f"{me}/{incarnation}/workers"),
         )
-
-    def _runs_worker(self, task: TaskSpec) -> bool:
-        is_alone = self._spec.kind is NodeKind.ROBOT and task.on_isolation is OnIsolation.LOCAL
-        return self._spec.name in task.candidates or is_alone
 
     # --- the loop ----------------------------------------------------------------------------------------------------
 

@@ -34,9 +34,10 @@ from enum import StrEnum
 
 from zsched.core.fleet import OnIsolation, Standby, TaskSpec
 from zsched.core.instructions import ApplyRoutes, Instruction, RecordStory, SetRole, StartWorker, StopWorker
-from zsched.core.model import Allocation, NodeId
+from zsched.core.model import Allocation, NodeId, NodeKind
 from zsched.core.plan import Role, RoutePhase, Slot, WorkerRole
 from zsched.core.route import plan_for, slot_for
+from zsched.core.workers import runs_worker
 
 ROLE_DRAIN_MARGIN_S = 1.0
 """The old owner's worker goes idle this much after the robots' drain time (a cold standby's start comes on top)."""
@@ -66,6 +67,8 @@ class Executor:
     role: Role = field(init=False)
     is_local: bool = False
     """Cut off from the owner and from a quorum, this robot works alone; its output is degraded."""
+    _is_owner_gone: bool = False
+    """The owner went during its epoch: its worker's state is not asked for."""
     _current: Slot | None = None
     _predecessor: Slot | None = None
     _drain_deadline: float = math.inf
@@ -77,9 +80,8 @@ class Executor:
 
     @property
     def runs_worker(self) -> bool:
-        """Whether this node keeps a worker of the task: candidates do, and robots that work alone when cut off."""
-        is_alone = self.has_streams and self.spec.on_isolation is OnIsolation.LOCAL
-        return self.me in self.spec.candidates or is_alone
+        """Whether this node keeps a worker of the task."""
+        return runs_worker(self.spec, self.me, NodeKind.ROBOT if self.has_streams else NodeKind.EDGE)
 
     @property
     def predecessor(self) -> NodeId | None:
@@ -114,17 +116,24 @@ class Executor:
         if allocation.owner is None or allocation.epoch <= self.epoch:
             return ()
         back = self._end_local()  # the local slot closes before a committed owner's opens
-        self.epoch, self.owner, self.started_at = allocation.epoch, allocation.owner, now
-        return (*back, *self._change_role(allocation, now), *self._prepare(allocation.owner))
+        before = None if self._is_owner_gone else self.owner
+        self.epoch, self.owner, self.started_at, self._is_owner_gone = allocation.epoch, allocation.owner, now, False
+        return (*back, *self._change_role(allocation, before, now), *self._prepare(allocation.owner))
 
-    def _change_role(self, allocation: Allocation, now: float) -> tuple[Instruction, ...]:
+    def _change_role(self, allocation: Allocation, before: NodeId | None, now: float) -> tuple[Instruction, ...]:
         if not self.runs_worker:
             return ()
         if allocation.owner == self.me:
             self._role_deadline = math.inf
             # An exclusive task's worker may run at once, but works only from its first lease on.
             lease = 0.0 if self.spec.exclusive else None
-            self.role = Role(task=self.spec.name, role=WorkerRole.ACTIVE, epoch=allocation.epoch, lease_until_s=lease)
+            self.role = Role(
+                task=self.spec.name,
+                role=WorkerRole.ACTIVE,
+                epoch=allocation.epoch,
+                lease_until_s=lease,
+                predecessor=None if before == self.me else before,
+            )
             return (*self._wake_worker(), SetRole(role=self.role))
         if self.role.role is not WorkerRole.ACTIVE:
             return ()
@@ -170,7 +179,14 @@ class Executor:
         """Exclusive tasks: this node's worker may work until ``until_s`` (again, after it had to stop)."""
         if self.owner != self.me or until_s <= now or until_s == self.role.lease_until_s:
             return ()
-        self.role = Role(task=self.spec.name, role=WorkerRole.ACTIVE, epoch=self.epoch, lease_until_s=until_s)
+        came_from = self.role.predecessor
+        self.role = Role(
+            task=self.spec.name,
+            role=WorkerRole.ACTIVE,
+            epoch=self.epoch,
+            lease_until_s=until_s,
+            predecessor=came_from,
+        )
         return (SetRole(role=self.role),)
 
     def leave(self) -> tuple[Instruction, ...]:
@@ -226,6 +242,7 @@ class Executor:
 
     def on_gone(self, node: NodeId) -> tuple[Instruction, ...]:
         """A peer is gone: nothing will come from its slot any more."""
+        self._is_owner_gone = self._is_owner_gone or node == self.owner
         if self._predecessor is None or self._predecessor.owner != node:
             return ()
         if self.phase is Phase.DRAINING:

@@ -13,15 +13,15 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from random import Random
 from typing import Any
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.agreement import NOTHING, Agreement, Effects
+from zsched.core.batch import Batch
 from zsched.core.executor import Executor
-from zsched.core.fleet import Fleet, OnIsolation, TaskSpec, fleet_hash
+from zsched.core.fleet import Fleet, fleet_hash
 from zsched.core.gateway import Gateway
 from zsched.core.identity import Identity, Verdict
 from zsched.core.membership import Membership, Transition
@@ -35,34 +35,16 @@ from zsched.core.model import (
     Proposal,
     TaskId,
     Weights,
-    WorkerState,
 )
-from zsched.core.plan import ReadyWhen, StreamCount
+from zsched.core.plan import StreamCount
 from zsched.core.profile import Profiler
 from zsched.core.rounds import Rounds
 from zsched.core.status import PastValue, build_snapshot
 from zsched.core.tenure import Tenure
+from zsched.core.workers import Workers, failed_workers
 
 HISTORY = 32
 _OFTEN_QUIET = frozenset({ev.BeatReceived, ev.ProfileReceived, ev.TokenSeen, ev.StreamsCounted, ev.FrameDropped})
-
-
-@dataclass(slots=True)
-class _Batch:
-    """One call's instructions, sorted into the order that makes every prefix safe."""
-
-    is_dirty: bool
-    send: list[do.Instruction]
-    apply: list[do.Instruction]
-
-    def add(self, *instructions: do.Instruction) -> None:
-        """Sort instructions into sending (other nodes see it) and applying (this machine does it)."""
-        for instruction in instructions:
-            is_local = isinstance(
-                instruction,
-                do.ApplyRoutes | do.SetRole | do.StartWorker | do.StopWorker | do.RecordStory | do.StandDown,
-            )
-            (self.apply if is_local else self.send).append(instruction)
 
 
 class Node:
@@ -100,7 +82,8 @@ class Node:
         self.counters: Counter[str] = Counter()
         self.problems: dict[str, str] = {}
         self.is_draining = False
-        self.worker_states = self._initial_workers()
+        self._workers = Workers.of(fleet, me)
+        self.worker_states = self._workers.states
         self.stream_counts: tuple[StreamCount, ...] = ()
         self.history: dict[TaskId, deque[PastValue]] = {task.name: deque(maxlen=HISTORY) for task in fleet.tasks}
 
@@ -129,19 +112,8 @@ class Node:
         self._beat_sequence = 0
         self.loop_lag_s = 0.0
         self._promised = math.inf
-        self._batch = _Batch(False, [], [])
+        self._batch = Batch()
         self._handlers = self._table()
-
-    def _initial_workers(self) -> dict[TaskId, WorkerState]:
-        states = {}
-        for task in self.fleet.tasks:
-            if self.me in task.candidates or self._is_standby(task):
-                is_foreign = not task.worker.command and task.worker.ready_when is ReadyWhen.MATCHING
-                states[task.name] = WorkerState.READY if is_foreign else WorkerState.STOPPED
-        return states
-
-    def _is_standby(self, task: TaskSpec) -> bool:
-        return self.kind is NodeKind.ROBOT and task.on_isolation is OnIsolation.LOCAL
 
     # --- the door ----------------------------------------------------------------------------------------------------
 
@@ -182,7 +154,7 @@ class Node:
 
     def _finish(self, now: float) -> tuple[do.Instruction, ...]:
         self._advance(now)
-        batch, self._batch = self._batch, _Batch(False, [], [])
+        batch, self._batch = self._batch, Batch()
         # A limit that shrank may lie in the past already; that is no lag of this loop.
         self._promised = max(self._next_deadline(now), now)
         state = self.agreement.to_persist() if batch.is_dirty else None
@@ -345,7 +317,7 @@ class Node:
         if reason is not None:
             self.counters[f"profile_{reason}"] += 1
             return
-        failed = {load.task for load in profile.workers if load.state is WorkerState.FAILED}
+        failed = failed_workers(profile)
         owned = {name for name, value in self.values().items() if value.owner == profile.node}
         if owned and (profile.draining or owned & failed):
             self.rounds.hurry(now)
@@ -431,17 +403,14 @@ class Node:
         if self.membership.state(node) in (PeerState.SUSPECT, PeerState.GONE):
             return True
         profile = self.gateway.fresh(node, now)
-        load = None if profile is None else profile.worker(task)
-        return load is not None and load.state is WorkerState.FAILED
+        return profile is not None and task in failed_workers(profile)
 
     def _on_worker(self, event: ev.WorkerChanged, now: float) -> None:
-        if self.worker_states.get(event.task, event.state) is event.state:
-            return
-        self.worker_states[event.task] = event.state
-        text = f"worker {event.state}{': ' if event.reason else ''}{event.reason}"
-        self._batch.add(do.RecordStory(stage="executor", text=text, task=event.task))
-        if event.task in self.owned():
-            self.rounds.hurry(now)
+        story = self._workers.on_changed(event)
+        if story is not None:
+            self._batch.add(story)
+            if event.task in self.owned():
+                self.rounds.hurry(now)
 
     def _on_slot_ready(self, event: ev.SlotReady, _now: float) -> None:
         if event.task in self.executors and event.is_ready:
