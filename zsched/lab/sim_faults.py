@@ -45,17 +45,18 @@ class Result:
     """How long it took to come to rest; ``None``: too few electors have kept their state, nothing can be agreed."""
 
 
-def play(plan: Plan, keep: frozenset[int] | None = None) -> Result:
+def play(plan: Plan, keep: frozenset[int] | None = None, calm_at: float | None = None) -> Result:
     """Play a schedule.
 
     Args:
         plan: which one.
         keep: the indices of the faults to carry out (``None``: all); shrinking leaves the others out.
+        calm_at: when the faults end, seconds after the start (``None``: after half the time).
     """
     stage = Stage(plan)
     violation, settled_s = "", None
     try:
-        settled_s = stage.play(keep)
+        settled_s = stage.play(keep, plan.seconds / 2 if calm_at is None else calm_at)
     except InvariantError as error:
         violation = str(error)
     sim = stage.sim
@@ -88,14 +89,14 @@ class Stage:
         )
         self._rng = Random(f"stage {self.plan.seed}")
 
-    def play(self, keep: frozenset[int] | None) -> float | None:
+    def play(self, keep: frozenset[int] | None, calm_at: float) -> float | None:
         """Run it all; how long the fleet took to come to rest."""
         sim = self.sim
         sim.start()
         for index, fault in enumerate(self.plan.faults):
             if keep is None or index in keep:
                 sim.later(fault.at, self._begin, fault)
-        sim.run(self.plan.seconds / 2)
+        sim.run(calm_at)
         self.calm()
         at = sim.now
         if not self.can_agree():
