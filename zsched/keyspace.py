@@ -96,6 +96,10 @@ class Keyspace:
         """Put and queryable, to the worker from its own node: idle, active or draining."""
         return self._key("role", node, task)
 
+    def ack(self, node: NodeId, task: TaskId, incarnation: int | str, relay: str) -> str:
+        """Put of a worker, to the relay with that zenoh id: how far it has processed that relay's samples."""
+        return self._key("ack", node, task, str(incarnation), relay)
+
     def snapshot(self, node: NodeId, task: TaskId) -> str:
         """Queryable of a worker: its state, chunked."""
         return self._key("snapshot", node, task)

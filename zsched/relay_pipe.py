@@ -26,6 +26,8 @@ _REGISTERED: Final[tuple[tuple[str, type, int], ...]] = (
     ("relay_started", relay_protocol.RelayStarted, _SMALL),
     ("worker_seen", relay_protocol.WorkerSeen, _SMALL),
     ("end_marker", relay_protocol.EndMarker, 256),
+    ("stream_acks", relay_protocol.StreamAcks, wire.LARGE),
+    ("slot_lost", relay_protocol.SlotLost, _SMALL),
     ("slot_ready", events.SlotReady, _SMALL),
     ("slot_flipped", events.SlotFlipped, _SMALL),
     ("slot_drained", events.SlotDrained, _SMALL),
@@ -40,6 +42,7 @@ COMMANDS: Final[tuple[type[Any], ...]] = (RoutePlan, Role, relay_protocol.RelayS
 REPORTS: Final[tuple[type[Any], ...]] = (
     relay_protocol.RelayStarted,
     relay_protocol.WorkerSeen,
+    relay_protocol.SlotLost,
     events.SlotReady,
     events.SlotFlipped,
     events.SlotDrained,

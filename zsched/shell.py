@@ -24,7 +24,7 @@ from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.messages import CommandResult, SetWeights
 from zsched.core.model import NAME, NodeId, TaskId, WorkerState
-from zsched.core.relay_protocol import HandleReport, RelayStarted, WorkerSeen
+from zsched.core.relay_protocol import HandleReport, RelayStarted, SlotLost, WorkerSeen
 from zsched.core.snapshot import Snapshot
 from zsched.errors import AdapterError, WireError
 from zsched.report import snapshot_json
@@ -261,6 +261,10 @@ class Shell:
     def on_report(self, report: HandleReport) -> None:
         """The relay's handle: most reports are events; workers' tokens concern only our own workers."""
         if isinstance(report, RelayStarted):
+            return
+        if isinstance(report, SlotLost):
+            text = f"{report.owner} left {report.samples} samples unacknowledged: at most so many had no result"
+            _tell(do.RecordStory(stage="route", text=text, task=report.task, epoch=report.epoch))
             return
         if not isinstance(report, WorkerSeen):
             self._inbox.post(report)

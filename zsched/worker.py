@@ -32,14 +32,15 @@ from types import FrameType, TracebackType
 from typing import Any, Final, Self
 
 import zenoh
-from zenoh import ext
 
 from zsched import wire
 from zsched.clock import monotonic_s
 from zsched.core.plan import Role, WorkerRole
+from zsched.core.relay_protocol import StreamAcks
 from zsched.errors import ConfigError, WireError
 from zsched.keyspace import END_CHUNK, Keyspace
 from zsched.relay_pipe import decode_end
+from zsched.worker_acks import Acknowledger
 from zsched.worker_inputs import Dispatcher, Input, Marker, Received
 from zsched.worker_outputs import Output
 from zsched.worker_services import Answer, Handler, Request, Service
@@ -51,7 +52,6 @@ CLOSE_S: Final = 0.6
 ALARM_S: Final = 0.9
 """...and should zenoh hold Python's global lock meanwhile, the kernel ends a process that was told to stop."""
 ROLE_RETRY_S: Final = 0.5
-REPEAT_POLL_S: Final = 0.25
 _ENVIRONMENT: Final = ("ZSCHED_FLEET", "ZSCHED_NODE", "ZSCHED_TASK", "ZSCHED_INCARNATION", "ZSCHED_ZENOH_CONFIG")
 
 _log = logging.getLogger("zsched.worker")
@@ -95,7 +95,8 @@ class Worker:
         self._token: zenoh.LivelinessToken | None = None
         self._snapshot: Callable[[], bytes] | None = None
         self._session = _open(zenoh_config)
-        self._dispatcher = Dispatcher(self._inputs_ended)
+        self._acks = Acknowledger(self._send_acks)
+        self._dispatcher = Dispatcher(self._inputs_ended, self._acks)
         self._errand_thread = threading.Thread(target=self._run_errands, name="zsched errands", daemon=True)
         self._errand_thread.start()
         self._dispatcher.start()
@@ -172,20 +173,15 @@ class Worker:
         expr = key_expr.replace("{prefix}", self.prefix)
         source = Input(on_sample=on_sample, keep_last=keep_last, depth=depth)
         dispatcher = self._dispatcher
-        data = ext.declare_advanced_subscriber(
-            self._session,
-            expr,
-            lambda sample: dispatcher.put(source, sample),
-            recovery=ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
-        )
+        data = self._session.declare_subscriber(expr, lambda sample: dispatcher.put(source, sample))
         ends = self._session.declare_subscriber(f"{expr}/{END_CHUNK}", self._on_marker)
         self._declared += [data, ends]
 
     def publisher(self, template: str, *, latest: bool = False, reliable: bool = False, keep_last: int = 1) -> Output:
         """An output; ``{prefix}`` and ``{epoch}`` are filled in, the epoch anew whenever this worker becomes the owner.
 
-        ``latest``: the last ``keep_last`` values are cached for who comes late and recovered when lost. ``reliable``:
-        a put waits for a slow receiver (up to a lease) instead of dropping.
+        ``latest``: the last ``keep_last`` values are cached for who comes late; a put never waits, behind a stalled
+        receiver the newest wait. ``reliable``: a put waits for a slow receiver (up to a lease) instead of dropping.
         """
         output = Output(
             self._session,
@@ -194,10 +190,10 @@ class Worker:
             reliable=reliable,
             keep_last=keep_last,
             epoch_now=self._epoch_now,
+            stamp_now=self._dispatcher.stamp,
         )
         with self._lock:
             self._outputs.append(output)
-        self._errands.put(_nothing)  # the errands' thread looks at the outputs anew
         return output
 
     def serve(self, key_expr: str, handler: Handler, depth: int = 16) -> None:
@@ -245,6 +241,9 @@ class Worker:
             signal.signal(signal.SIGALRM, signal.SIG_DFL)
             signal.setitimer(signal.ITIMER_REAL, ALARM_S)
         self._dispatcher.close()
+        self._acks.close()
+        for output in tuple(self._outputs):
+            output.close()
         self._errands.put(None)
         closing = threading.Thread(target=self._close_session, name="zsched close", daemon=True)
         closing.start()
@@ -324,7 +323,7 @@ class Worker:
             self._role_token = self._session.liveliness().declare_token(key)
 
     def _is_owner(self) -> bool:
-        role = self._role
+        role = self.role
         has_lease = role.lease_until_s is None or monotonic_s() < role.lease_until_s
         return role.role is not WorkerRole.IDLE and has_lease
 
@@ -340,6 +339,15 @@ class Worker:
         if not has_lease:
             self._dispatcher.note_withheld()
         return role.epoch if has_lease else None
+
+    def _send_acks(self, relay: str, frame: StreamAcks) -> None:
+        """Tell a relay how far its samples are; what is dropped here is mended by the next one."""
+        self._session.put(
+            self._keyspace.ack(self._node, self._task, self._incarnation, relay),
+            wire.encode(frame),
+            priority=zenoh.Priority.INTERACTIVE_HIGH,
+            congestion_control=zenoh.CongestionControl.DROP,
+        )
 
     # --- ends --------------------------------------------------------------------------------------------------------
 
@@ -365,19 +373,9 @@ class Worker:
             outputs = tuple(self._outputs)
         self._errands.put(lambda: _end_all(outputs, epoch))
 
-    def _has_latest(self) -> bool:
-        return any(output.is_latest for output in self._outputs)
-
-    def _repeat(self) -> None:
-        for output in tuple(self._outputs):
-            output.repeat_if_silent()
-
     def _run_errands(self) -> None:
         while True:
-            try:
-                errand = self._errands.get(timeout=REPEAT_POLL_S if self._has_latest() else None)
-            except queue.Empty:
-                errand = self._repeat
+            errand = self._errands.get()
             if errand is None:
                 return
             try:
@@ -385,10 +383,6 @@ class Worker:
             except Exception:  # noqa: BLE001 - an errand that fails (session closing) must not end the others
                 if not self._stop.is_set():
                     _log.exception("an errand failed")
-
-
-def _nothing() -> None:
-    """Wake the errands' thread."""
 
 
 def _end_all(outputs: tuple[Output, ...], epoch: int) -> None:

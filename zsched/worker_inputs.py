@@ -23,14 +23,12 @@ import zenoh
 
 from zsched.clock import monotonic_s
 from zsched.core.relay_protocol import EndMarker
+from zsched.worker_acks import GIVE_UP_S, Acknowledger, SourceName
 
 END_GRACE_S: Final = 0.1
 MAX_WITHHELD: Final = 256
 """Samples per key of an input without ``keep_last`` that are kept for the day this worker becomes the owner."""
 JOIN_S: Final = 0.2
-
-SourceName = tuple[str, str, int]
-"""(key, session id, entity id) of a publisher as zenoh names it."""
 
 _log = logging.getLogger("zsched.worker")
 
@@ -72,6 +70,8 @@ class _Waiting:
 
     source: Input
     sample: zenoh.Sample | None
+    name: SourceName | None = None
+    number: int = 0
 
 
 @dataclass(slots=True)
@@ -80,13 +80,18 @@ class _Open:
 
     epoch: int
     number: int = -1
+    in_turn: bool = False
+    """Its publisher sends again what is missing: worth waiting for."""
 
 
 class Dispatcher:
     """The worker's own thread. ``on_ended(epoch)`` is called in it when every input seen in the epoch has ended."""
 
-    def __init__(self, on_ended: Callable[[int], None]) -> None:
+    def __init__(self, on_ended: Callable[[int], None], acks: Acknowledger) -> None:
         self._on_ended = on_ended
+        self._acks = acks
+        self._stamp: zenoh.Timestamp | None = None
+        self._newest_stamp: zenoh.Timestamp | None = None
         self._wake = threading.Condition()
         self._queue: deque[_Waiting] = deque()
         self._markers: list[Marker] = []
@@ -113,8 +118,15 @@ class Dispatcher:
 
     def put(self, source: Input, sample: zenoh.Sample) -> None:
         """Queue a sample (zenoh's thread)."""
-        waiting = _Waiting(source, sample)
         key = str(sample.key_expr)
+        waiting = _Waiting(source, sample)
+        info = sample.source_info
+        if info is not None:
+            waiting.name = (key, str(info.source_id.zid), info.source_id.eid)
+            waiting.number = info.source_sn
+            in_turn = source.keep_last is None and sample.congestion_control == zenoh.CongestionControl.BLOCK
+            if not self._acks.admit(waiting.name, waiting.number, in_turn=in_turn):
+                return
         with self._wake:
             line = source.waiting.setdefault(key, deque())
             line.append(waiting)
@@ -126,9 +138,16 @@ class Dispatcher:
 
     def put_marker(self, marker: Marker) -> None:
         """Queue an end marker (zenoh's thread)."""
+        if marker.end.epoch == 0:  # it ends nothing: what is below its number was given up by the relay
+            self._acks.skip(marker.name, marker.end.count)
+            return
         with self._wake:
             self._markers.append(marker)
             self._wake.notify()
+
+    def stamp(self) -> zenoh.Timestamp | None:
+        """The timestamp for an output: of the input in hand (in the dispatch thread), else of the newest processed."""
+        return self._stamp if threading.current_thread() is self._thread else self._newest_stamp
 
     def begin(self, epoch: int) -> None:
         """This worker is the owner from now on: sources heard first from here on belong to ``epoch``."""
@@ -161,24 +180,29 @@ class Dispatcher:
                     return
                 claimed = self._claim()
             if claimed is not None:
-                self._process(*claimed)
+                self._process(claimed)
             if self._markers:
                 self._settle()
 
-    def _claim(self) -> tuple[Input, zenoh.Sample] | None:
+    def _claim(self) -> _Waiting | None:
         """Take the next sample out of its key's line (under the lock): from here on nothing sheds it."""
         if self._again:
-            return self._again.popleft()
+            return _Waiting(*self._again.popleft())
         waiting = self._queue.popleft() if self._queue else None
         if waiting is None or waiting.sample is None:
             return None
         waiting.source.waiting[str(waiting.sample.key_expr)].remove(waiting)
-        return waiting.source, waiting.sample
+        return waiting
 
-    def _process(self, source: Input, sample: zenoh.Sample) -> None:
+    def _process(self, waiting: _Waiting) -> None:
+        source, sample = waiting.source, waiting.sample
+        if sample is None:
+            return
         self._has_withheld = False
         begun = self._begun
         self._dispatch(source, sample)
+        if waiting.name is not None:
+            self._note(waiting.name, waiting.number, sample)
         if not self._has_withheld:
             return
         with self._wake:
@@ -197,19 +221,24 @@ class Dispatcher:
             attachment=sample.attachment,
             deleted=sample.kind == zenoh.SampleKind.DELETE,
         )
+        self._stamp = sample.timestamp
         try:
             source.on_sample(received)
         except Exception:  # noqa: BLE001 - the worker's own bug must not end its dispatch
             _log.exception("%s: the worker's callback failed", key)
-        info = sample.source_info
-        if info is None:
-            return
-        name = (key, str(info.source_id.zid), info.source_id.eid)
+        newest = self._newest_stamp
+        if self._stamp is not None and (newest is None or newest < self._stamp):  # type: ignore[operator] # zenoh's stubs
+            self._newest_stamp = self._stamp
+
+    def _note(self, name: SourceName, number: int, sample: zenoh.Sample) -> None:
+        """A numbered sample is processed."""
         with self._wake:
             state = self._open.get(name)
             if state is None:
-                state = self._open[name] = _Open(epoch=self._epoch)
-            state.number = max(state.number, info.source_sn)
+                in_turn = sample.congestion_control == zenoh.CongestionControl.BLOCK
+                state = self._open[name] = _Open(epoch=self._epoch, in_turn=in_turn)
+            state.number = max(state.number, number)
+        self._acks.processed(name, number, len(sample.payload))
 
     def _settle(self) -> None:
         """Let every marker take effect whose samples are processed, then tell which epochs are over."""
@@ -220,6 +249,8 @@ class Dispatcher:
                 self._markers.remove(marker)
                 self._open.pop(marker.name, None)
             over = sorted({marker.end.epoch for marker in done if self._is_over(marker.end.epoch)})
+        if over:
+            self._acks.flush()  # so that what is processed is known to be when the ends arrive
         for epoch in over:
             self._on_ended(epoch)
 
@@ -228,7 +259,8 @@ class Dispatcher:
         number = state.number if state is not None else -1
         if number + 1 >= marker.end.count:
             return True
-        return not self._queue and now - marker.came_at > END_GRACE_S
+        grace_s = GIVE_UP_S if state is not None and state.in_turn else END_GRACE_S
+        return not self._queue and now - marker.came_at > grace_s
 
     def _is_over(self, epoch: int) -> bool:
         return all(state.epoch > epoch for state in self._open.values())

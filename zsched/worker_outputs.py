@@ -13,14 +13,13 @@ from typing import Any, Final
 import zenoh
 from zenoh import CongestionControl, ext
 
-from zsched.clock import monotonic_s
 from zsched.core.relay_protocol import EndMarker
 from zsched.keyspace import END_CHUNK
 from zsched.relay_pipe import encode_end
+from zsched.send_queue import SendQueue
 
-REPEAT_AFTER_S: Final = 0.5
-"""Silence after which a ``latest`` value that came in a burst is put once more: under congestion the newest of a burst
-is the one that is dropped. (No heartbeats for that: see `zsched.relay.outlet`.)"""
+LATEST_DEPTH: Final = 16
+"""Values of class ``latest`` that may wait for a receiver that keeps up; behind a stalled one, ``keep_last`` do."""
 KEPT_EPOCHS: Final = 2
 """Publishers of older epochs are given back: nobody admits them any more."""
 
@@ -46,59 +45,71 @@ class Output:
         reliable: bool,
         keep_last: int,
         epoch_now: Callable[[], int | None],
+        stamp_now: Callable[[], zenoh.Timestamp | None],
     ) -> None:
         self._session = session
         self._template = template
         self.is_latest = latest
         """Whether the last value is kept for who comes late."""
-        self._keep_last = keep_last
-        self._congestion = CongestionControl.BLOCK if reliable else CongestionControl.BLOCK_FIRST
+        self._keep_last = max(1, keep_last)
+        self._congestion = CongestionControl.BLOCK if latest or reliable else CongestionControl.DROP
         self._epoch_now = epoch_now
+        self._stamp_now = stamp_now
         self._lock = threading.Lock()
         self._epochs: dict[int, _Stamped] = {}
-        self._last: tuple[Any, Any, Any] | None = None
-        self._last_at = -REPEAT_AFTER_S
+        self._queue: SendQueue | None = None
+        if latest:
+            depth = max(LATEST_DEPTH, self._keep_last)
+            self._queue = SendQueue(f"out {template}", depth=depth, sheds=True, keep_last=self._keep_last)
         self.sent = 0
-        """Samples that went out."""
+        """Samples that went out, or wait for their receiver."""
         self.withheld = 0
         """Samples that went nowhere, since this worker is not the owner."""
+        self.shed = 0
+        """Samples that gave way to newer ones behind a stalled receiver (class ``latest``)."""
 
-    def put(self, payload: Any, *, attachment: Any = None, encoding: Any = None) -> bool:
-        """Publish (``bytes`` or ``zenoh.ZBytes``); ``False``, and counted, while this worker is not the owner."""
+    def put(self, payload: Any, *, attachment: Any = None, encoding: Any = None, timestamp: Any = None) -> bool:
+        """Publish (``bytes`` or ``zenoh.ZBytes``); ``False``, and counted, while this worker is not the owner.
+
+        Without ``timestamp`` the value inherits that of the input it was made of, if that had one: gates tell by it
+        that a new owner's first values are older than the old owner's last.
+        """
         with self._lock:
             epoch = self._epoch_now()
             if epoch is None:
                 self.withheld += 1
                 return False
             stamped = self._epochs.get(epoch) or self._declare(epoch)
-            self._put(stamped, payload, attachment, encoding)
+            stamp = timestamp or self._stamp_now()
             self.sent += 1
-            now = monotonic_s()
-            is_burst = self.is_latest and now - self._last_at < REPEAT_AFTER_S
-            self._last = (payload, attachment, encoding) if is_burst else None
-            self._last_at = now
+            if self._queue is None:
+                self._put(stamped, payload, attachment, encoding, stamp)
+                return True
+            action = lambda: self._put(stamped, payload, attachment, encoding, stamp)  # noqa: E731 - named for its type
+            self.shed += self._queue.send(stamped.key, action, len(payload) if hasattr(payload, "__len__") else 0)
             return True
-
-    def repeat_if_silent(self) -> None:
-        """Put the last value once more when a burst has ended a while ago (class ``latest``)."""
-        with self._lock:
-            if self._last is None or monotonic_s() - self._last_at < REPEAT_AFTER_S:
-                return
-            last, self._last = self._last, None
-            epoch = self._epoch_now()
-            if epoch in self._epochs:
-                self._put(self._epochs[epoch], *last)
 
     def send_end(self, epoch: int) -> None:
         """Put the end marker behind the last sample of an epoch (also when there was none)."""
         with self._lock:
             stamped = self._epochs.get(epoch) or self._declare(epoch)
-            self._session.put(
-                f"{stamped.key}/{END_CHUNK}",
-                encode_end(EndMarker(epoch=epoch, count=stamped.count)),
-                congestion_control=CongestionControl.BLOCK,
-                source_info=zenoh.SourceInfo(stamped.publisher.id, stamped.count),
-            )
+            if self._queue is None:
+                self._put_end(stamped, epoch)
+            else:
+                self._queue.then(lambda: self._put_end(stamped, epoch))
+
+    def close(self) -> None:
+        """End the thread of a class ``latest`` output."""
+        if self._queue is not None:
+            self._queue.close()
+
+    def _put_end(self, stamped: _Stamped, epoch: int) -> None:
+        self._session.put(
+            f"{stamped.key}/{END_CHUNK}",
+            encode_end(EndMarker(epoch=epoch, count=stamped.count)),
+            congestion_control=CongestionControl.BLOCK,
+            source_info=zenoh.SourceInfo(stamped.publisher.id, stamped.count),
+        )
 
     def _declare(self, epoch: int) -> _Stamped:
         key = self._template.replace("{epoch}", str(epoch))
@@ -108,7 +119,7 @@ class Output:
                 self._session,
                 key,
                 congestion_control=self._congestion,
-                cache=ext.CacheConfig(max(1, self._keep_last)),
+                cache=ext.CacheConfig(self._keep_last),
                 sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),
                 publisher_detection=True,
             )
@@ -119,11 +130,11 @@ class Output:
             self._epochs.pop(old).publisher.undeclare()  # type: ignore[no-untyped-call] # zenoh's stubs
         return stamped
 
-    def _put(self, stamped: _Stamped, payload: Any, attachment: Any, encoding: Any) -> None:
+    def _put(self, stamped: _Stamped, payload: Any, attachment: Any, encoding: Any, timestamp: Any) -> None:
         publisher = stamped.publisher
         if isinstance(publisher, zenoh.Publisher):
             source = zenoh.SourceInfo(publisher.id, stamped.count)
-            publisher.put(payload, attachment=attachment, encoding=encoding, source_info=source)
+            publisher.put(payload, attachment=attachment, encoding=encoding, timestamp=timestamp, source_info=source)
         else:
-            publisher.put(payload, attachment=attachment, encoding=encoding)
+            publisher.put(payload, attachment=attachment, encoding=encoding, timestamp=timestamp)
         stamped.count += 1

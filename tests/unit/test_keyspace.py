@@ -28,6 +28,7 @@ for _method, _arguments in {
     "learnt": ("edge1", "robot1"),
     "worker": ("edge1", "map_merge", "7"),
     "role": ("edge1", "map_merge"),
+    "ack": ("edge1", "map_merge", "7", "a1b2c3"),
     "snapshot": ("edge1", "map_merge"),
     "status": ("edge1", "robot1"),
     "command": ("edge1", "robot1"),

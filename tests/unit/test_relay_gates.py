@@ -83,8 +83,8 @@ def way_in(
     return Route(stream="t/in/0", direction=Direction.INPUT, from_expr=from_expr, to_expr=to_expr, settings=settings)
 
 
-def way_out(epoch: int, handover: HandoverRule) -> Route:
-    settings = StreamSettings(stream_class=StreamClass.RELIABLE, depth=500, handover=handover)
+def way_out(epoch: int, handover: HandoverRule, stream_class: StreamClass = StreamClass.RELIABLE) -> Route:
+    settings = StreamSettings(stream_class=stream_class, depth=500, handover=handover)
     return Route(
         stream="t/out/0",
         direction=Direction.OUTPUT,
@@ -153,7 +153,7 @@ def test_kept_values_warm_up_a_slot_key_by_key(bench: Bench) -> None:
     until(lambda: stream.is_behind(1), "a value that the slot has not had")
     assert stream.flip(1) == 1
     until(lambda: got[-1] == ("edge1/t/a/map", "a3"), "only that one again")
-    assert drops(stream) == {"replayed": 5}
+    assert stream.count().replayed == 5
     kept.undeclare()
 
 
@@ -294,3 +294,37 @@ def test_what_waits_is_bounded(bench: Bench, monkeypatch: pytest.MonkeyPatch) ->
     move.stream.close_slot(1)
     assert move.is_through("new 2", "new 3")
     assert drops(move.stream) == {"overflow": 2}
+
+
+@pytest.mark.parametrize("rule", list(HandoverRule))
+def test_a_new_owners_answer_to_an_older_value_never_follows_a_newer_one(bench: Bench, rule: HandoverRule) -> None:
+    got: list[str] = []
+    kept = bench.outside.declare_subscriber("robot1/out", lambda s: got.append(s.payload.to_string()))
+    routes = [way_out(epoch, rule, StreamClass.LATEST) for epoch in (1, 2)]
+    stream = bench.output(routes[0])
+    for epoch, route in enumerate(routes, start=1):
+        stream.open(epoch, route)
+    old, new = (bench.publisher(route.from_expr) for route in routes)
+    stamps = [bench.relay.new_timestamp() for _ in range(4)]
+    stream.flip(1, drops_held=False)
+    old.put("old 1", timestamp=stamps[1])
+    until(lambda: stream.count().messages == 1, "the old owner's")
+    stream.flip(2, drops_held=False)
+    for number in (0, 1, 3, 2):
+        new.put(f"new {number}", timestamp=stamps[number])
+    until(lambda: stream.count().messages == 5, "the new owner's")
+    stream.close_slot(1)
+    until(lambda: got == ["old 1", "new 1", "new 3"], f"{got}")
+    assert drops(stream) == {"superseded": 2}
+    kept.undeclare()
+
+
+def test_numbers_that_do_not_fit_are_counted_and_old_ones_dropped(bench: Bench) -> None:
+    move = Handover(bench, HandoverRule.ALL)
+    source = move.old.id
+    for number in (0, 1, 4, 4, 3, 5):
+        move.old.put(str(number), source_info=zenoh.SourceInfo(source, number))
+    until(lambda: move.stream.count().messages == 6, "all of them")
+    assert move.is_through("0", "1", "4", "5")
+    count = move.stream.count()
+    assert (count.lost, count.doubled, count.reordered) == (2, 1, 1)

@@ -162,3 +162,17 @@ class StreamCount:
     """(reason, count): ``overflow``, ``no_route``, ``stale_epoch``, ``loop``, ``stalled``..."""
     last_seen_s: float | None = None
     """Seconds since the newest message, ``None`` before the first."""
+    acknowledged: int | None = None
+    """Inputs: samples that workers have processed; ``None``: no worker counts them (a foreign one)."""
+    in_flight: int | None = None
+    """Inputs: samples sent and not processed yet."""
+    lost: int = 0
+    """Numbers that never came over the numbered hop."""
+    doubled: int = 0
+    """Numbers that came twice and were dropped."""
+    reordered: int = 0
+    """Numbers that came behind newer ones and were dropped."""
+    replayed: int = 0
+    """Kept values sent once more to a new owner, and samples sent again for want of an acknowledgement."""
+    at_most_lost: int = 0
+    """Inputs: in flight to workers that died, so at most so many had no result."""

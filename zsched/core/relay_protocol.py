@@ -3,9 +3,9 @@
 Knows: what the daemon and its relay tell each other beside plans, roles and the events of `zsched.core.events`; what an
 end marker says. Does not know: pipes, frames, zenoh.
 
-Commands (daemon to relay): `RoutePlan`, `Role`, `RelayStop`. Reports (relay to daemon): `RelayStarted`, `WorkerSeen`
-and the events `SlotReady`, `SlotFlipped`, `SlotDrained`, `RoleEnded`, `StreamsCounted`, `ProblemReported`. The handle
-adds `RelayChanged`.
+Commands (daemon to relay): `RoutePlan`, `Role`, `RelayStop`. Reports (relay to daemon): `RelayStarted`, `WorkerSeen`,
+`SlotLost` and the events `SlotReady`, `SlotFlipped`, `SlotDrained`, `RoleEnded`, `StreamsCounted`, `ProblemReported`.
+The handle adds `RelayChanged`. Between workers and relays: `EndMarker`, `StreamAcks`.
 """
 
 from __future__ import annotations
@@ -82,9 +82,57 @@ class ServiceProblem(StrEnum):
     TIMEOUT = "timeout"
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StreamAck:
+    """What a worker has had of one publisher of a relay; numbers are those of the hop, 0, 1, 2..."""
+
+    eid: int
+    """The publisher's entity id in the relay's session."""
+    first: int
+    """The first number this worker has seen."""
+    arrived: int
+    """The number it waits for: everything from `first` up to it has come, or is given up."""
+    processed: int
+    """Everything below this number is processed (or gave way to something newer)."""
+    lost: int = 0
+    doubled: int = 0
+    reordered: int = 0
+    has_gap: bool = False
+    """Something newer than `arrived` has come and was refused: it wants the rest again."""
+
+    def __post_init__(self) -> None:
+        for name in ("eid", "first", "arrived", "processed", "lost", "doubled", "reordered"):
+            check_counter(f"ack.{name}", getattr(self, name))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StreamAcks:
+    """A worker's acknowledgements for one relay, those that changed."""
+
+    acks: tuple[StreamAck, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SlotLost:
+    """A slot closed with samples that its worker had not acknowledged: at most so many had no result."""
+
+    task: TaskId
+    epoch: int
+    owner: NodeId
+    samples: int
+
+
 RelayCommand = RoutePlan | Role | RelayStop
 RelayReport = (
-    RelayStarted | WorkerSeen | SlotReady | SlotFlipped | SlotDrained | RoleEnded | StreamsCounted | ProblemReported
+    RelayStarted
+    | WorkerSeen
+    | SlotReady
+    | SlotFlipped
+    | SlotDrained
+    | SlotLost
+    | RoleEnded
+    | StreamsCounted
+    | ProblemReported
 )
 HandleReport = RelayReport | RelayChanged
 """What `zsched.adapters.streams.RelayHandle` hands to the daemon."""

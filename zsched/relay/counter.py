@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from zsched.clock import monotonic_s
 from zsched.core.plan import StreamCount
+from zsched.relay.tally import Tally
 
 
 class StreamCounter:
@@ -18,6 +19,10 @@ class StreamCounter:
         self._bytes = 0
         self._drops: dict[str, int] = {}
         self._last_seen: float | None = None
+        self.lost = 0
+        self.doubled = 0
+        self.reordered = 0
+        self.replayed = 0
 
     def seen(self, size: int) -> None:
         """A sample of ``size`` bytes came in."""
@@ -26,12 +31,13 @@ class StreamCounter:
         self._last_seen = monotonic_s()
 
     def dropped(self, reason: str, count: int = 1) -> None:
-        """``count`` samples did not go on, because of ``reason`` (or went on once more: ``repeated``, ``replayed``)."""
+        """``count`` samples did not go on, because of ``reason``."""
         if count:
             self._drops[reason] = self._drops.get(reason, 0) + count
 
-    def value(self) -> StreamCount:
-        """The counters now; ``last_seen_s`` is an age in seconds."""
+    def value(self, tally: Tally | None = None) -> StreamCount:
+        """The counters now, with what the receivers said; ``last_seen_s`` is an age in seconds."""
+        said = tally or Tally()
         age = None if self._last_seen is None else round(max(0.0, monotonic_s() - self._last_seen), 3)
         return StreamCount(
             stream=self.stream,
@@ -39,4 +45,11 @@ class StreamCounter:
             bytes=self._bytes,
             drops=tuple(sorted(self._drops.items())),
             last_seen_s=age,
+            acknowledged=None if tally is None else said.acknowledged,
+            in_flight=None if tally is None else said.in_flight,
+            lost=self.lost + said.lost,
+            doubled=self.doubled + said.doubled,
+            reordered=self.reordered + said.reordered,
+            replayed=self.replayed + said.resent,
+            at_most_lost=said.at_most_lost,
         )

@@ -15,25 +15,25 @@ from dataclasses import dataclass
 from typing import Final
 
 import zenoh
-from zenoh import Sample, Session
+from zenoh import Sample, Session, Timestamp
 
-from zsched.clock import monotonic_s
 from zsched.core.plan import Route, StreamClass, StreamCount
+from zsched.relay.acks import Acks
 from zsched.relay.counter import StreamCounter
 from zsched.relay.outlet import Outlet
 from zsched.relay.receive import Receiver
+from zsched.relay.tally import Tally
 
 MAX_KEYS: Final = 4096
 """Concrete keys of one wildcard stream whose values are kept; the oldest give way."""
-REPEAT_AFTER_S: Final = 0.5
-"""Silence after which a ``latest`` value that came in a burst is put once more."""
 
-_Kept = tuple[int, Sample]
+_Kept = tuple[int, Sample, Timestamp | None]
 
 
 @dataclass(slots=True)
 class _InputSlot:
     outlet: Outlet
+    is_counted: bool
     sent: int = 0
     """Number of the newest sample that went into this slot; kept values above it are still owed."""
 
@@ -53,19 +53,20 @@ class InputStream:
         is_latest = route.settings.stream_class is StreamClass.LATEST
         self._keep_last = route.settings.keep_last if is_latest else 0
         self._kept: OrderedDict[str, deque[_Kept]] = OrderedDict()
-        self._last_at = -REPEAT_AFTER_S
-        self._is_repeat_due = False
+        self._closed = Tally()  # what slots that are closed have counted
+        self._is_counted = False
         self._receiver = Receiver(session, route.from_expr, route.settings, self._carry, with_history=True)
 
-    def open(self, epoch: int, route: Route) -> None:
-        """Declare the publishers of a slot; it carries nothing yet.
+    def open(self, epoch: int, route: Route, acks: Acks | None = None) -> None:
+        """Declare the publishers of a slot; it carries nothing yet. With ``acks`` its worker counts what it gets.
 
         Raises:
             ValueError, zenoh.ZError: the route makes no sense (see `Outlet`).
         """
-        outlet = Outlet(self._session, route.from_expr, route.to_expr, route.settings)
+        outlet = Outlet(self._session, route.from_expr, route.to_expr, route.settings, acks)
         with self._lock:
-            self._slots[epoch] = _InputSlot(outlet=outlet)
+            self._is_counted |= acks is not None
+            self._slots[epoch] = _InputSlot(outlet=outlet, is_counted=acks is not None)
 
     def is_matching(self, epoch: int) -> bool:
         """True when somebody subscribes to the slot's keys."""
@@ -86,7 +87,7 @@ class InputStream:
         with self._lock:
             slot = self._slots.get(epoch)
             return slot is not None and any(
-                number > slot.sent for values in self._kept.values() for number, _ in values
+                number > slot.sent for values in self._kept.values() for number, _, _ in values
             )
 
     def flip(self, epoch: int) -> int:
@@ -105,15 +106,25 @@ class InputStream:
         if slot is not None and slot is not self._active:
             slot.outlet.send_end(epoch)
 
-    def close_slot(self, epoch: int) -> None:
-        """Forget a slot."""
+    def close_slot(self, epoch: int, *, is_drained: bool = False) -> int:
+        """Forget a slot; answers how many samples its worker had not processed when it was last heard of.
+
+        A drained slot has none: the end markers came, they only overtook the acknowledgement.
+        """
         with self._lock:
             slot = self._slots.pop(epoch, None)
             if slot is None:
-                return
+                return 0
             if slot is self._active:
                 self._active = None
+            said = slot.outlet.counted()
+            left, said.in_flight = said.in_flight, 0
+            if is_drained:
+                said.acknowledged, left = said.acknowledged + left, 0
+            said.at_most_lost += left
+            self._closed.add(said)
             self._counter.dropped("closed", slot.outlet.undeclare())
+            return left
 
     def close(self) -> None:
         """Unsubscribe and close every slot."""
@@ -121,20 +132,19 @@ class InputStream:
         for epoch in tuple(self._slots):
             self.close_slot(epoch)
 
-    def repeat_if_silent(self) -> None:
-        """Put the last values once more ``REPEAT_AFTER_S`` behind a burst: its newest may have been dropped."""
-        with self._lock:
-            if not self._is_repeat_due or self._active is None or monotonic_s() - self._last_at < REPEAT_AFTER_S:
-                return
-            self._is_repeat_due = False
-            for values in self._kept.values():
-                if values and not self._active.outlet.send(values[-1][1]):
-                    self._counter.dropped("repeated")
+    def look_after(self) -> None:
+        """Have sent again what workers have not acknowledged in time; call it now and then."""
+        for slot in tuple(self._slots.values()):
+            slot.outlet.look_after()
 
     def count(self) -> StreamCount:
         """The counters now."""
         with self._lock:
-            return self._counter.value()
+            total = Tally()
+            total.add(self._closed)
+            for slot in self._slots.values():
+                total.add(slot.outlet.counted())
+            return self._counter.value(total if self._is_counted else None)
 
     # --- one sample --------------------------------------------------------------------------------------------------
 
@@ -145,39 +155,34 @@ class InputStream:
                 self._counter.dropped("loop")
                 return
             self._number += 1
-            if self._keep_last:
-                self._keep(sample)
+            stamp = self._keep(sample) if self._keep_last else None
             slot = self._active
             if slot is not None:
                 slot.sent = self._number
-                self._counter_drop(slot.outlet.send(sample))
+                self._counter.dropped(*slot.outlet.send(sample, stamp))
             elif not self._keep_last:
                 self._counter.dropped("no_route")
 
-    def _counter_drop(self, reason: str) -> None:
-        if reason:
-            self._counter.dropped(reason)
-
-    def _keep(self, sample: Sample) -> None:
+    def _keep(self, sample: Sample) -> Timestamp | None:
+        """Keep a value, with a timestamp of ours where it has none: outputs made of it inherit that, for the gate."""
+        stamp = sample.timestamp or self._session.new_timestamp()
         key = str(sample.key_expr)
         values = self._kept.get(key)
         if values is None:
             values = self._kept[key] = deque(maxlen=self._keep_last)
             if len(self._kept) > MAX_KEYS:
                 self._kept.popitem(last=False)
-        values.append((self._number, sample))
-        now = monotonic_s()
-        self._is_repeat_due = now - self._last_at < REPEAT_AFTER_S
-        self._last_at = now
+        values.append((self._number, sample, stamp))
+        return stamp
 
     def _catch_up(self, slot: _InputSlot) -> int:
         owed = sorted(
             (kept for values in self._kept.values() for kept in values if kept[0] > slot.sent), key=lambda kept: kept[0]
         )
-        for _, sample in owed:
-            self._counter_drop(slot.outlet.send(sample))
+        for _, sample, stamp in owed:
+            self._counter.dropped(*slot.outlet.send(sample, stamp))
         slot.sent = self._number
-        self._counter.dropped("replayed", len(owed))
+        self._counter.replayed += len(owed)
         return len(owed)
 
 

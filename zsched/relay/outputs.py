@@ -11,26 +11,28 @@ until the old slot has ended. The publisher outlives every slot: applications se
 from __future__ import annotations
 
 import threading
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
 import zenoh
-from zenoh import Sample, Session
+from zenoh import Sample, Session, Timestamp
 
 from zsched.clock import monotonic_s
 from zsched.core.plan import HandoverRule, Route, StreamClass, StreamCount
 from zsched.core.relay_protocol import EndMarker
 from zsched.keyspace import END_CHUNK
 from zsched.relay.counter import StreamCounter
-from zsched.relay.inputs import REPEAT_AFTER_S
 from zsched.relay.outlet import Outlet
 from zsched.relay.receive import Receiver, undeclare
 from zsched.relay_pipe import decode_end
 
 HOLD_SAMPLES: Final = 10_000
 HOLD_BYTES: Final = 64 << 20
+FENCE_S: Final = 2.0
+"""So long after a new owner took over, its answers to values older than what has passed are dropped."""
+MAX_STAMPS: Final = 4096
 END_GRACE_S: Final = 0.1
 """A marker travels behind its data on one link; so long after it, what is still missing was dropped on the way."""
 
@@ -43,6 +45,8 @@ class _Key:
     end: EndMarker | None = None
     end_at: float = 0.0
     last_number: int = -1
+    numbers: dict[tuple[str, int], int] = field(default_factory=dict)
+    """{publisher: its newest number}; a worker that restarted in place is another publisher."""
 
     def is_ended(self, now: float) -> bool:
         if self.end is None:
@@ -81,9 +85,8 @@ class OutputStream:
         self._outlet = Outlet(session, route.from_expr, route.to_expr, route.settings)
         self._slots: dict[int, _OutputSlot] = {}
         self._carrier: _OutputSlot | None = None
-        self._last: Sample | None = None
-        self._last_at = -REPEAT_AFTER_S
-        self._is_repeat_due = False
+        self._stamps: OrderedDict[str, Timestamp] = OrderedDict()  # newest that has passed, by the owner's relative key
+        self._fence_until = 0.0
 
     def open(self, epoch: int, route: Route) -> None:
         """Subscribe to an owner's output; nothing passes yet.
@@ -155,16 +158,6 @@ class OutputStream:
             self.close_slot(epoch)
         self._outlet.undeclare()
 
-    def repeat_if_silent(self) -> None:
-        """Put the last value once more when a burst has ended ``REPEAT_AFTER_S`` ago: it may have been dropped."""
-        with self._lock:
-            is_silent = monotonic_s() - self._last_at >= REPEAT_AFTER_S
-            if not self._is_repeat_due or self._last is None or not is_silent:
-                return
-            self._is_repeat_due = False
-            if not self._outlet.send(self._last):
-                self._counter.dropped("repeated")
-
     def count(self) -> StreamCount:
         """The counters now."""
         with self._lock:
@@ -176,14 +169,26 @@ class OutputStream:
         with self._lock:
             self._counter.seen(len(sample.payload))
             source = sample.source_info
-            if source is not None and str(source.source_id.zid) in self._own_ids:
+            zid = "" if source is None else str(source.source_id.zid)
+            if zid in self._own_ids:
                 self._counter.dropped("loop")
                 return
             key = slot.keys.setdefault(str(sample.key_expr), _Key())
             key.received += 1
-            if source is not None:
-                key.last_number = source.source_sn
-            self._gate(slot, sample)
+            if source is None or self._is_next(key, (zid, source.source_id.eid), source.source_sn):
+                self._gate(slot, sample)
+
+    def _is_next(self, key: _Key, publisher: tuple[str, int], number: int) -> bool:
+        """Count what does not fit the numbers of the hop; an old one is dropped."""
+        last = key.numbers.get(publisher, -1)
+        key.last_number = key.numbers[publisher] = max(number, last)
+        if number == last:
+            self._counter.doubled += 1
+        elif number < last:
+            self._counter.reordered += 1
+        elif last >= 0:
+            self._counter.lost += number - last - 1
+        return number > last
 
     def _gate(self, slot: _OutputSlot, sample: Sample) -> None:
         if slot is self._carrier:
@@ -211,19 +216,33 @@ class OutputStream:
             self._take_over(max(flipped, key=lambda slot: slot.epoch))
 
     def _take_over(self, slot: _OutputSlot) -> None:
+        if self._carrier is not None or self._stamps:
+            self._fence_until = monotonic_s() + FENCE_S
         self._carrier = slot
         while slot.held:
             self._forward(slot.held.popleft())
         slot.held_bytes = 0
 
     def _forward(self, sample: Sample) -> None:
-        reason = self._outlet.send(sample)
-        if reason:
-            self._counter.dropped(reason)
-        if self.route.settings.stream_class is StreamClass.LATEST:
-            now = monotonic_s()
-            self._is_repeat_due = now - self._last_at < REPEAT_AFTER_S
-            self._last, self._last_at = sample, now
+        stamp = sample.timestamp
+        is_ordered = stamp is not None and self.route.settings.stream_class is StreamClass.LATEST
+        if is_ordered and not self._is_newest(self._outlet.key_of(sample), stamp):
+            self._counter.dropped("superseded")
+            return
+        self._counter.dropped(*self._outlet.send(sample))
+
+    def _is_newest(self, key: str, stamp: Timestamp | None) -> bool:
+        """True unless a newer value has passed; asked about a new owner's first answers only (an owner may go back)."""
+        newest = self._stamps.get(key)
+        if stamp is None:
+            return True
+        is_older = newest is not None and stamp < newest  # type: ignore[operator] # zenoh's stubs
+        if is_older and monotonic_s() < self._fence_until:
+            return False
+        self._stamps[key] = stamp
+        if len(self._stamps) > MAX_STAMPS:
+            self._stamps.popitem(last=False)
+        return True
 
     def _end(self, slot: _OutputSlot, sample: Sample) -> None:
         """An end marker came (zenoh's callback thread: note it, wake the task, nothing else)."""

@@ -24,6 +24,7 @@ from zsched.core.plan import Role, RoutePlan
 from zsched.core.relay_protocol import RelayReport, RelayStarted, RelayStop, WorkerSeen
 from zsched.errors import WireError
 from zsched.keyspace import Keyspace
+from zsched.relay.acks import Acks
 from zsched.relay.roles import RoleServer
 from zsched.relay.task import TaskRelay
 from zsched.relay.tokens import Tokens
@@ -84,6 +85,7 @@ class RelayProcess:
         self._tasks: dict[TaskId, TaskRelay] = {}
         self._own_ids = frozenset({str(session.zid())})
         keyspace = Keyspace(fleet)
+        self._acks = Acks(session, keyspace)
         self._roles = RoleServer(session, keyspace, node)
         self._tokens = Tokens(session, keyspace, self._worker_seen, self._role_ended, self._wake)
         reporter.report(RelayStarted(pid=os.getpid(), zid=str(session.zid())))
@@ -114,7 +116,9 @@ class RelayProcess:
             return
         task = self._tasks.get(command.task)
         if task is None:
-            task = TaskRelay(self._session, command.task, self._tokens, self._own_ids, self._reporter.report)
+            task = TaskRelay(
+                self._session, command.task, self._tokens, self._acks, self._own_ids, self._reporter.report
+            )
             self._tasks[command.task] = task
         task.apply(command)
 

@@ -13,9 +13,10 @@ from collections.abc import Callable
 from typing import Any, Final, Protocol
 
 import zenoh
-from zenoh import Sample, Session, ext
+from zenoh import Sample, Session
 
 from zsched.core.plan import StreamClass, StreamSettings
+from zsched.relay.history import History
 
 JOIN_S: Final = 0.3
 
@@ -54,15 +55,23 @@ class Receiver:
         Raises:
             zenoh.ZError: ``expr`` is no key expression.
         """
-        self._carry = carry
-        self._subscriber = _subscribe(session, expr, settings, with_history=with_history)
+        is_latest = settings.stream_class is StreamClass.LATEST
+        self._history: History | None = None
+        if with_history and is_latest and settings.keep_last:
+            self._history = History(session, expr, settings.keep_last, carry)
+        self._carry = carry if self._history is None else self._history.live
+        self._subscriber = _subscribe(session, expr, settings)
         self._handler = self._subscriber.handler  # the thread's own: undeclare() refuses while recv() borrows
         self._thread = threading.Thread(target=self._run, name=f"from {expr}", daemon=True)
         self._thread.start()
+        if self._history is not None:
+            self._history.start()
 
     def close(self) -> None:
         """Unsubscribe; the thread ends behind what it has in hand."""
         undeclare(self._subscriber)
+        if self._history is not None:
+            self._history.close()
         if self._thread is not threading.current_thread():
             self._thread.join(JOIN_S)
 
@@ -74,24 +83,13 @@ class Receiver:
                 _log.exception("%s: a sample could not be carried", sample.key_expr)
 
 
-_Subscriber = zenoh.Subscriber[zenoh.handlers.Handler[Sample]] | ext.AdvancedSubscriber[zenoh.handlers.Handler[Sample]]
+_Subscriber = zenoh.Subscriber[zenoh.handlers.Handler[Sample]]
 
 
-def _subscribe(session: Session, expr: str, settings: StreamSettings, *, with_history: bool) -> _Subscriber:
+def _subscribe(session: Session, expr: str, settings: StreamSettings) -> _Subscriber:
     remote = zenoh.Locality.REMOTE
-    ring: zenoh.handlers.RingChannel[Sample] = zenoh.handlers.RingChannel(settings.depth)
-    if settings.stream_class is StreamClass.BEST_EFFORT:
-        return session.declare_subscriber(expr, ring, allowed_origin=remote)
     if settings.stream_class is StreamClass.RELIABLE:
         fifo: zenoh.handlers.FifoChannel[Sample] = zenoh.handlers.FifoChannel(max(settings.depth, 256))
         return session.declare_subscriber(expr, fifo, allowed_origin=remote)
-    # While history is being asked for, zenoh holds at most ``max_samples`` live ones: as many as the ring, or some go.
-    history = ext.HistoryConfig(detect_late_publishers=True, max_samples=max(settings.depth, settings.keep_last))
-    return ext.declare_advanced_subscriber(
-        session,
-        expr,
-        ring,
-        allowed_origin=remote,
-        history=history if with_history and settings.keep_last else None,
-        recovery=ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
-    )
+    ring: zenoh.handlers.RingChannel[Sample] = zenoh.handlers.RingChannel(settings.depth)
+    return session.declare_subscriber(expr, ring, allowed_origin=remote)

@@ -20,7 +20,8 @@ from zsched.clock import monotonic_s
 from zsched.core.events import ProblemReported, SlotDrained, SlotFlipped, SlotReady
 from zsched.core.model import TaskId
 from zsched.core.plan import Direction, ReadyWhen, Route, RoutePhase, RoutePlan, Slot, StreamClass, StreamCount
-from zsched.core.relay_protocol import RelayReport
+from zsched.core.relay_protocol import RelayReport, SlotLost
+from zsched.relay.acks import Acks
 from zsched.relay.inputs import InputStream
 from zsched.relay.outputs import OutputStream
 from zsched.relay.services import Services
@@ -30,7 +31,7 @@ FLIP_WAIT_S: Final = 0.3
 """A flip waits at most so long for a worker that is not ready, or has not heard yet that it is the owner."""
 GONE_GRACE_S: Final = 0.05
 """An old owner whose token went has sent its last; what is still in our queues gets so long."""
-BUSY_S, REPEAT_S, IDLE_S = 0.01, 0.2, 0.5
+BUSY_S, CARE_S, IDLE_S = 0.01, 0.2, 0.5
 
 _log = logging.getLogger("zsched.relay")
 
@@ -53,12 +54,14 @@ class TaskRelay:
         session: Session,
         task: TaskId,
         tokens: Tokens,
+        acks: Acks,
         own_ids: frozenset[str],
         report: Callable[[RelayReport], None],
     ) -> None:
         self._session = session
         self._task = task
         self._tokens = tokens
+        self._acks = acks
         self._own_ids = own_ids
         self._report = report
         self._queue: queue.SimpleQueue[RoutePlan | None] = queue.SimpleQueue()
@@ -107,14 +110,15 @@ class TaskRelay:
         is_moving = not current.is_ready or self._flip_by is not None or self._draining() is not None
         if is_moving:
             return BUSY_S
-        return REPEAT_S if self._has_latest() else IDLE_S
+        return CARE_S if self._is_counted() else IDLE_S
 
     def _step(self) -> None:
         for state in tuple(self._slots.values()):
             self._refresh(state)
         self._flip_when_due()
         self._drain()
-        self._repeat()
+        for source in self._inputs.values():
+            source.look_after()
 
     def _problem(self, text: str) -> None:
         self._report(ProblemReported(source=f"relay/{self._task}", problem=text[:400]))
@@ -151,11 +155,12 @@ class TaskRelay:
         self._slots[slot.epoch] = _OpenSlot(slot=slot)
         for route in slot.routes:
             try:
-                self._open_route(slot.epoch, route)
+                self._open_route(slot, route)
             except (ValueError, zenoh.ZError) as error:
                 self._problem(f"{route.stream}: {route.from_expr} -> {route.to_expr}: {error}")
 
-    def _open_route(self, epoch: int, route: Route) -> None:
+    def _open_route(self, slot: Slot, route: Route) -> None:
+        epoch = slot.epoch
         if route.direction is Direction.SERVICE:
             self._services.open(epoch, route)
             return
@@ -165,7 +170,7 @@ class TaskRelay:
                 if source is not None:
                     source.close()
                 source = self._inputs[route.stream] = InputStream(self._session, route, self._own_ids)
-            source.open(epoch, route)
+            source.open(epoch, route, self._acks if slot.ready_when is ReadyWhen.TOKEN else None)
             return
         sink = self._outputs.get(route.stream)
         if sink is None or (sink.route.to_expr, sink.route.settings) != (route.to_expr, route.settings):
@@ -175,9 +180,11 @@ class TaskRelay:
         sink.open(epoch, route)
 
     def _close(self, epoch: int) -> None:
-        self._slots.pop(epoch, None)
-        for source in self._inputs.values():
-            source.close_slot(epoch)
+        state = self._slots.pop(epoch, None)
+        is_drained = state is not None and state.is_drained and state.gone_at is None
+        lost = sum(source.close_slot(epoch, is_drained=is_drained) for source in self._inputs.values())
+        if lost and state is not None:
+            self._report(SlotLost(task=self._task, epoch=epoch, owner=state.slot.owner, samples=lost))
         for sink in self._outputs.values():
             sink.close_slot(epoch)
         self._services.close_slot(epoch)
@@ -301,13 +308,8 @@ class TaskRelay:
         current = self._current()
         return current is not None and current.is_flipped
 
-    def _has_latest(self) -> bool:
-        streams: list[InputStream | OutputStream] = [*self._inputs.values(), *self._outputs.values()]
-        return any(stream.route.settings.stream_class is StreamClass.LATEST for stream in streams)
-
-    def _repeat(self) -> None:
-        """A ``latest`` value that ended a burst may have been dropped: it is put once more."""
-        for sink in self._outputs.values():
-            sink.repeat_if_silent()
-        for source in self._inputs.values():
-            source.repeat_if_silent()
+    def _is_counted(self) -> bool:
+        """True when something may have to be sent again."""
+        return any(
+            source.route.settings.stream_class is not StreamClass.BEST_EFFORT for source in self._inputs.values()
+        )

@@ -155,6 +155,14 @@ SAMPLES: dict[str, object] = {
     "relay_started": relay_protocol.RelayStarted(pid=4711, zid="a1b2c3"),
     "worker_seen": relay_protocol.WorkerSeen(node="edge1", task="map_merge", incarnation="3-1", is_present=True),
     "end_marker": relay_protocol.EndMarker(epoch=4, count=1000),
+    "stream_acks": relay_protocol.StreamAcks(
+        acks=(
+            relay_protocol.StreamAck(
+                eid=7, first=3, arrived=40, processed=38, lost=1, doubled=2, reordered=1, has_gap=True
+            ),
+        )
+    ),
+    "slot_lost": relay_protocol.SlotLost(task="map_merge", epoch=3, owner="edge1", samples=12),
     "slot_ready": events.SlotReady(task="map_merge", epoch=4, is_ready=False),
     "slot_flipped": events.SlotFlipped(task="map_merge", epoch=4, replayed=3),
     "slot_drained": events.SlotDrained(task="map_merge", epoch=3),

@@ -1,0 +1,177 @@
+"""What late subscribers get from caches, and that a frozen publisher never holds up a live one."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+from zenoh import ext
+
+from zsched.core.plan import StreamClass, StreamSettings
+from zsched.relay.receive import Receiver
+from zsched.zenoh_config import data_config, worker_config
+
+KEY = "robot1/map"
+SETTINGS = StreamSettings(stream_class=StreamClass.LATEST, keep_last=2, depth=100)
+PUBLISHER = """
+import sys, zenoh
+from pathlib import Path
+from zenoh import ext
+session = zenoh.open(zenoh.Config.from_json5(Path(sys.argv[1]).read_text()))
+options = dict(
+    cache=ext.CacheConfig(2),
+    sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.1),
+    publisher_detection=True,
+)
+publisher = ext.declare_advanced_publisher(session, "robot1/map", **options)
+for number in range(3):
+    publisher.put(f"frozen {number}")
+print("up", flush=True)
+sys.stdin.read()
+"""
+
+
+def until(condition: Callable[[], Any], what: str, deadline_s: float = 5.0) -> Any:
+    end = time.monotonic() + deadline_s
+    while time.monotonic() < end:
+        value = condition()
+        if value:
+            return value
+        time.sleep(0.002)
+    raise AssertionError(f"not within {deadline_s} s: {what}")
+
+
+class Net:
+    """The relay's session and an application's."""
+
+    def __init__(self) -> None:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            self.endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        self.relay = zenoh.open(zenoh.Config.from_json5(data_config(listen=(self.endpoint,), connect=())))
+        self.app = zenoh.open(zenoh.Config.from_json5(worker_config(connect=(self.endpoint,))))
+        self.got: list[str] = []
+        self.receivers: list[Receiver] = []
+
+    def receive(self, key: str = KEY) -> None:
+        take = lambda sample: self.got.append(sample.payload.to_string())  # noqa: E731 - named for its use below
+        self.receivers.append(Receiver(self.relay, key, SETTINGS, take, with_history=True))
+
+    def advanced(self, key: str = KEY) -> ext.AdvancedPublisher:
+        return ext.declare_advanced_publisher(
+            self.app,
+            key,
+            cache=ext.CacheConfig(2),
+            sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),
+            publisher_detection=True,
+        )
+
+    def close(self) -> None:
+        for receiver in self.receivers:
+            receiver.close()
+        self.app.close()
+        self.relay.close()
+
+
+@pytest.fixture
+def net() -> Iterator[Net]:
+    made = Net()
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+def test_a_late_subscriber_gets_what_the_cache_holds_then_the_live_ones_once(net: Net) -> None:
+    publisher = net.advanced()
+    for number in range(4):
+        publisher.put(str(number))
+    net.receive()
+    until(lambda: net.got == ["2", "3"], "the two that are kept")
+    publisher.put("4")
+    until(lambda: net.got == ["2", "3", "4"], "the live one")
+
+
+def test_a_publisher_that_comes_late_is_asked_too(net: Net, tmp_path: Path) -> None:
+    net.receive()
+    with publisher(net, tmp_path):
+        until(lambda: "frozen 2" in net.got, "the cache of a publisher that put before it was connected")
+    assert net.got == sorted(set(net.got))
+
+
+def test_wild_keys_have_caches_each(net: Net) -> None:
+    publishers = {name: net.advanced(f"robot1/{name}/map") for name in "ab"}
+    for name, one in publishers.items():
+        one.put(name)
+    net.receive("robot1/*/map")
+    until(lambda: sorted(net.got) == ["a", "b"], "both caches")
+
+
+def test_a_publisher_without_numbers_is_not_taken_for_double(net: Net) -> None:
+    net.receive()
+    plain = net.app.declare_publisher(KEY)
+    until(lambda: matches(plain), "the relay subscribes")
+    for _ in range(3):
+        plain.put("same")
+    until(lambda: net.got == ["same"] * 3, "all three")
+
+
+def matches(publisher: zenoh.Publisher) -> bool:
+    status: Any = publisher.matching_status
+    return bool(status.matching)
+
+
+class publisher:  # noqa: N801 - reads as a verb in a with statement
+    """A process that holds values of the key."""
+
+    def __init__(self, net: Net, folder: Path) -> None:
+        path = folder / "config.json5"
+        path.write_text(worker_config(connect=(net.endpoint,)))
+        command = [sys.executable, "-c", PUBLISHER, str(path)]
+        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+
+    def __enter__(self) -> subprocess.Popen[bytes]:
+        assert self.process.stdout is not None
+        assert self.process.stdout.readline() == b"up\n"
+        return self.process
+
+    def __exit__(self, *_: object) -> None:
+        self.process.kill()
+        self.process.communicate(timeout=5)
+
+
+@pytest.mark.parametrize("fault", [signal.SIGSTOP, signal.SIGKILL])
+def test_a_publisher_that_dies_with_a_query_open_holds_no_stream(net: Net, tmp_path: Path, fault: int) -> None:
+    """The stream of another publisher goes on although a cache that is being asked never answers."""
+    live = net.app.declare_publisher(KEY)
+    arrivals: list[float] = []
+    halt = threading.Event()
+
+    def stream() -> None:
+        while not halt.wait(0.01):
+            live.put("live")
+
+    thread = threading.Thread(target=stream)
+    with publisher(net, tmp_path) as process:
+        until(lambda: str(process.pid) and net.relay.info.links(), "links")
+        thread.start()
+        process.send_signal(fault)
+        take = lambda _sample: arrivals.append(time.monotonic())  # noqa: E731 - used once
+        started = time.monotonic()
+        net.receivers.append(Receiver(net.relay, KEY, SETTINGS, take, with_history=True))
+        time.sleep(2.5)
+        halt.set()
+        thread.join(3)
+    gaps = [later - earlier for earlier, later in pairwise([started, *arrivals])]
+    assert len(arrivals) > 100
+    assert max(gaps) < 0.5

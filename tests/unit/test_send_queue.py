@@ -1,0 +1,111 @@
+"""The queue in front of a put that may block: order, bounds, what gives way."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+import pytest
+
+from zsched import send_queue
+from zsched.send_queue import SendQueue
+
+
+def until(condition: Callable[[], object], what: str, deadline_s: float = 3.0) -> None:
+    end = time.monotonic() + deadline_s
+    while not condition():
+        assert time.monotonic() < end, f"not within {deadline_s} s: {what}"
+        time.sleep(0.002)
+
+
+class Receiver:
+    """Takes samples; stalls while `gate` is closed."""
+
+    def __init__(self) -> None:
+        self.got: list[object] = []
+        self.gate = threading.Event()
+        self.gate.set()
+
+    def take(self, value: object) -> Callable[[], None]:
+        def put() -> None:
+            self.gate.wait(5)
+            self.got.append(value)
+
+        return put
+
+
+def test_everything_goes_through_in_order_and_markers_keep_their_place() -> None:
+    receiver = Receiver()
+    queue = SendQueue("t", depth=1000, sheds=False)
+    for number in range(100):
+        assert queue.send("a", receiver.take(number), 10) == 0
+    queue.then(receiver.take("end"))
+    until(lambda: len(receiver.got) == 101, "all of it")
+    assert receiver.got == [*range(100), "end"]
+    queue.close()
+
+
+def test_a_full_queue_that_sheds_nothing_refuses_the_newest() -> None:
+    receiver = Receiver()
+    receiver.gate.clear()
+    queue = SendQueue("t", depth=3, sheds=False)
+    queue.send("a", receiver.take(0), 1)
+    until(lambda: queue.is_stalled, "the put blocks")
+    assert [queue.send("a", receiver.take(number), 1) for number in range(1, 6)] == [0, 0, 0, 1, 1]
+    assert queue.send("a", receiver.take(9), send_queue.MAX_BYTES) == 1
+    receiver.gate.set()
+    until(lambda: len(receiver.got) == 4, "what was taken")
+    assert receiver.got == [0, 1, 2, 3]
+    assert queue.close() == 0
+
+
+def test_behind_a_stalled_receiver_only_the_newest_of_each_lane_wait() -> None:
+    receiver = Receiver()
+    receiver.gate.clear()
+    queue = SendQueue("t", depth=100, sheds=True, keep_last=2)
+    queue.send("a", receiver.take(("a", 0)), 1)
+    until(lambda: queue.is_stalled, "the put blocks")
+    dropped = sum(queue.send(lane, receiver.take((lane, n)), 1) for n in range(1, 6) for lane in "ab")
+    assert dropped == 6
+    receiver.gate.set()
+    until(lambda: len(receiver.got) == 5, "the newest")
+    assert receiver.got == [("a", 0), ("a", 4), ("b", 4), ("a", 5), ("b", 5)]
+    queue.close()
+
+
+def test_while_it_is_shut_samples_wait_and_a_kick_looks_again() -> None:
+    receiver, is_open, looks = Receiver(), threading.Event(), []
+    queue = SendQueue("t", depth=10, sheds=False, is_open=is_open.is_set, before_each=lambda: looks.append(1))
+    queue.send("a", receiver.take(1), 1)
+    until(lambda: looks, "it looked")
+    assert receiver.got == []
+    is_open.set()
+    queue.kick()
+    until(lambda: receiver.got == [1], "the sample")
+    queue.close()
+
+
+def test_closing_says_what_still_waited_and_does_the_last_thing() -> None:
+    receiver, ended = Receiver(), threading.Event()
+    receiver.gate.clear()
+    queue = SendQueue("t", depth=10, sheds=False)
+    for number in range(3):
+        queue.send("a", receiver.take(number), 1)
+    until(lambda: queue.is_stalled, "the put blocks")
+    assert queue.close(ended.set) == 2
+    receiver.gate.set()
+    assert ended.wait(3)
+    queue.join(3)
+    assert receiver.got == [0]
+    assert queue.send("a", receiver.take(9), 1) == 1
+
+
+def test_a_failing_put_does_not_end_the_stream(caplog: pytest.LogCaptureFixture) -> None:
+    receiver = Receiver()
+    queue = SendQueue("t", depth=10, sheds=False)
+    queue.send("a", lambda: 1 / 0, 1)  # type: ignore[arg-type, return-value] # it raises
+    queue.send("a", receiver.take(1), 1)
+    until(lambda: receiver.got == [1], "the next one")
+    assert "division by zero" in caplog.text
+    queue.close()

@@ -1,0 +1,62 @@
+"""Receives the workers' acknowledgements: how far each of this relay's publishers has been processed.
+
+Knows: the key they come on, who waits for which publisher's. Does not know: what is sent again.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+
+import zenoh
+from zenoh import Sample, Session
+
+from zsched import wire
+from zsched.core.relay_protocol import StreamAck, StreamAcks
+from zsched.errors import WireError
+from zsched.keyspace import Keyspace
+
+_log = logging.getLogger("zsched.relay")
+
+Listener = Callable[[StreamAck, str], None]
+"""Takes (acknowledgement, incarnation of the worker)."""
+
+
+class Acks:
+    """One subscription and one thread per relay process; listeners are called in that thread."""
+
+    def __init__(self, session: Session, keyspace: Keyspace) -> None:
+        """Subscribe and start."""
+        self._listeners: dict[int, Listener] = {}
+        key = keyspace.ack("*", "*", "*", str(session.zid()))
+        self._subscriber = session.declare_subscriber(key, zenoh.handlers.FifoChannel(1024))
+        threading.Thread(target=self._run, args=(self._subscriber.handler,), name="acks", daemon=True).start()
+
+    def expect(self, eid: int, listener: Listener) -> None:
+        """Hand the acknowledgements for our publisher ``eid`` to ``listener``."""
+        self._listeners[eid] = listener
+
+    def forget(self, eid: int) -> None:
+        """The publisher is given back."""
+        self._listeners.pop(eid, None)
+
+    def _run(self, handler: zenoh.handlers.Handler[Sample]) -> None:
+        for sample in handler:
+            try:
+                acks = wire.decode(sample.payload.to_bytes(), StreamAcks)
+            except WireError as error:
+                _log.warning("an unreadable acknowledgement was ignored (%s)", error)
+                continue
+            incarnation = str(sample.key_expr).split("/")[-2]
+            for ack in acks.acks:
+                self._tell(ack, incarnation)
+
+    def _tell(self, ack: StreamAck, incarnation: str) -> None:
+        listener = self._listeners.get(ack.eid)
+        if listener is None:
+            return
+        try:
+            listener(ack, incarnation)
+        except Exception:  # noqa: BLE001 - one stream's trouble must not stop the others' acknowledgements
+            _log.exception("an acknowledgement failed")

@@ -1,0 +1,138 @@
+"""Fetches what publishers still hold of a key: the cached values that a late subscriber has missed.
+
+Knows: the tokens and caches of advanced publishers, how long to wait for an answer. Does not know: streams, slots.
+
+Zenoh's own advanced subscriber would do it too, but holds back every live sample of the stream while such a query is
+open, for 10 s when the publisher is frozen (1.10.2; the time has no parameter in Python). Here live samples never wait:
+a query lasts `TIMEOUT_S` at most, in a thread of its own, and what it brings is let in only where it is newer than what
+has come live.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from typing import Final
+
+import zenoh
+from zenoh import Sample, SampleKind, Session
+
+TIMEOUT_S: Final = 0.5
+MAX_FETCHES: Final = 8
+"""Queries at one time in this process; further ones wait."""
+MAX_PENDING: Final = 256
+MAX_SOURCES: Final = 4096
+ADVANCED: Final = "@adv"
+
+_log = logging.getLogger("zsched.relay")
+_turn = threading.BoundedSemaphore(MAX_FETCHES)
+
+_Source = tuple[str, str, int]
+
+
+class History:
+    """The caches behind one key expression. ``deliver`` is called under `History.lock`, from several threads."""
+
+    def __init__(self, session: Session, expr: str, depth: int, deliver: Callable[[Sample], None]) -> None:
+        """Watch for publishers; `start` begins to ask.
+
+        Raises:
+            zenoh.ZError: ``expr`` is no key expression.
+        """
+        self._session = session
+        self._expr = expr
+        self._depth = max(1, depth)
+        self._deliver = deliver
+        self._own_id = str(session.zid())
+        self._pending = 0
+        self._is_closed = False
+        self.lock = threading.Lock()
+        self._newest: dict[_Source, int] = {}  # numbers that came either way
+        self._fetched: dict[_Source, int] = {}  # numbers that caches brought
+        self._live: set[str] = set()
+        self._tokens: zenoh.Subscriber[None] | None = None
+
+    def start(self) -> None:
+        """Ask every cache there is, and later those of publishers that appear."""
+        self._ask(f"{self._expr}/{ADVANCED}/**")
+        watch = f"{self._expr}/{ADVANCED}/pub/**"
+        self._tokens = self._session.liveliness().declare_subscriber(watch, self._token, history=False)
+
+    def close(self) -> None:
+        """Ask nobody any more; answers on their way are dropped."""
+        self._is_closed = True
+        if self._tokens is not None:
+            self._tokens.undeclare()
+
+    def live(self, sample: Sample) -> None:
+        """A sample came the usual way: deliver it, unless the cache has brought it already."""
+        with self.lock:
+            info = sample.source_info
+            if info is None:
+                self._live.add(str(sample.key_expr))
+            else:
+                source = _source(sample, info)
+                self._note(self._newest, source, info.source_sn)
+                if self._fetched and info.source_sn <= self._fetched.get(source, -1):
+                    return
+            self._deliver(sample)
+
+    def _note(self, numbers: dict[_Source, int], source: _Source, number: int) -> None:
+        if len(numbers) >= MAX_SOURCES and source not in numbers:
+            numbers.pop(next(iter(numbers)))
+        numbers[source] = max(number, numbers.get(source, -1))
+
+    # --- asking ------------------------------------------------------------------------------------------------------
+
+    def _token(self, sample: Sample) -> None:
+        """A publisher with a cache came (zenoh's callback thread: start a thread, nothing else)."""
+        key = str(sample.key_expr)
+        if sample.kind == SampleKind.PUT and self._own_id not in key.split("/"):
+            self._ask(key)
+
+    def _ask(self, key: str) -> None:
+        if self._is_closed or self._pending >= MAX_PENDING:
+            return
+        self._pending += 1
+        threading.Thread(target=self._fetch, args=(key,), name=f"history {key}", daemon=True).start()
+
+    def _fetch(self, key: str) -> None:
+        try:
+            with _turn:
+                self._take_answers(key)
+        except zenoh.ZError as error:  # the session closes
+            _log.debug("%s: %s", key, error)
+        finally:
+            self._pending -= 1
+
+    def _take_answers(self, key: str) -> None:
+        answers = self._session.get(
+            f"{key}?_max={self._depth}",
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            accept_replies=zenoh.ReplyKeyExpr.ANY,
+            allowed_destination=zenoh.Locality.REMOTE,
+            timeout=TIMEOUT_S,
+        )
+        for answer in answers:
+            if answer.ok is not None and not self._is_closed:
+                self._cached(answer.ok)
+
+    def _cached(self, sample: Sample) -> None:
+        with self.lock:
+            info = sample.source_info
+            if info is None:
+                if str(sample.key_expr) in self._live:
+                    return
+            else:
+                source = _source(sample, info)
+                if info.source_sn <= self._newest.get(source, -1):
+                    return
+                for numbers in (self._newest, self._fetched):
+                    self._note(numbers, source, info.source_sn)
+            self._deliver(sample)
+
+
+def _source(sample: Sample, info: zenoh.SourceInfo) -> _Source:
+    return str(sample.key_expr), str(info.source_id.zid), info.source_id.eid

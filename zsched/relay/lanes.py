@@ -1,0 +1,136 @@
+"""One publisher of a stream: numbers what it puts, and remembers what the receiver has not acknowledged.
+
+Knows: how a sample is put on with everything it had, its number, what was sent and what came of it. Does not know:
+queues, slots, when to send again. Its outlet's lock guards what `acknowledge` and `keep` touch.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Final
+
+import zenoh
+from zenoh import CongestionControl, Sample, SampleKind, Session, Timestamp, ext
+
+from zsched.core.relay_protocol import StreamAck
+
+KEPT_SAMPLES: Final = 2048
+KEPT_BYTES: Final = 16 << 20
+"""Bounds of what one publisher keeps until it is acknowledged."""
+
+_DELETE: Final = SampleKind.DELETE
+
+
+@dataclass(frozen=True, slots=True)
+class Sent:
+    """A sample that went out under ``number`` and is kept."""
+
+    number: int
+    sample: Sample
+    stamp: Timestamp | None
+    size: int
+
+
+@dataclass(slots=True, eq=False)
+class Lane:
+    """A concrete key with one priority and express flag."""
+
+    key: str
+    publisher: zenoh.Publisher | ext.AdvancedPublisher
+    source_id: zenoh.EntityGlobalId
+    eid: int
+    count: int = 0
+    """Samples put so far, and the number of the next one."""
+    ack: StreamAck | None = None
+    incarnation: str = ""
+    kept: deque[Sent] = field(default_factory=deque)
+    kept_bytes: int = 0
+    resend_from: int | None = None
+    moved_at: float = 0.0
+    """When something was last sent or newly acknowledged (monotonic seconds)."""
+
+    def put(self, sample: Sample, stamp: Timestamp | None) -> None:
+        """Put a sample on under the next number, with everything that zenoh lets us keep."""
+        publisher = self.publisher
+        if sample.kind == _DELETE:
+            self._delete(sample, stamp)
+        elif isinstance(publisher, zenoh.Publisher):
+            publisher.put(
+                sample.payload,
+                encoding=sample.encoding,
+                attachment=sample.attachment,
+                timestamp=stamp,
+                source_info=zenoh.SourceInfo(self.source_id, self.count),
+            )
+        else:
+            publisher.put(sample.payload, encoding=sample.encoding, attachment=sample.attachment, timestamp=stamp)
+        self.count += 1
+
+    def _delete(self, sample: Sample, stamp: Timestamp | None) -> None:
+        publisher = self.publisher
+        if isinstance(publisher, zenoh.Publisher):
+            source = zenoh.SourceInfo(self.source_id, self.count)
+            publisher.delete(attachment=sample.attachment, timestamp=stamp, source_info=source)
+        else:
+            publisher.delete(attachment=sample.attachment, timestamp=stamp)
+
+    def put_again(self, session: Session, sent: Sent) -> None:
+        """Put a kept sample on under the number it had (never into a cache a second time)."""
+        sample, publisher = sent.sample, self.publisher
+        source = zenoh.SourceInfo(self.source_id, sent.number)
+        if sample.kind == _DELETE:
+            session.delete(
+                self.key,
+                attachment=sample.attachment,
+                timestamp=sent.stamp,
+                source_info=source,
+                congestion_control=CongestionControl.BLOCK,
+                priority=publisher.priority,
+            )
+            return
+        session.put(
+            self.key,
+            sample.payload,
+            encoding=sample.encoding,
+            attachment=sample.attachment,
+            timestamp=sent.stamp,
+            source_info=source,
+            congestion_control=CongestionControl.BLOCK,
+            priority=publisher.priority,
+        )
+
+    # --- what came of it ---------------------------------------------------------------------------------------------
+
+    def keep(self, sample: Sample, stamp: Timestamp | None, size: int, limit: int) -> None:
+        """Keep what was just put, at most ``limit`` samples and `KEPT_BYTES`; the oldest go."""
+        self.kept.append(Sent(self.count - 1, sample, stamp, size))
+        self.kept_bytes += size
+        while len(self.kept) > limit or (self.kept_bytes > KEPT_BYTES and len(self.kept) > 1):
+            self.kept_bytes -= self.kept.popleft().size
+
+    def acknowledge(self, ack: StreamAck, incarnation: str) -> bool:
+        """Take an acknowledgement; ``True`` when it is of another life of the worker, which starts anew."""
+        is_other = bool(self.incarnation) and incarnation != self.incarnation
+        self.incarnation = incarnation
+        if is_other or self.ack is None or ack.processed >= self.ack.processed:
+            self.ack = ack
+        while self.kept and self.kept[0].number < ack.arrived:
+            self.kept_bytes -= self.kept.popleft().size
+        return is_other
+
+    @property
+    def arrived(self) -> int:
+        """Number of the sample the receiver waits for; everything, while it never acknowledged."""
+        return self.count if self.ack is None else min(self.ack.arrived, self.count)
+
+    @property
+    def in_flight(self) -> int:
+        """Samples sent and not processed yet, as far as we know."""
+        return 0 if self.ack is None else max(0, self.count - self.ack.processed)
+
+    def is_full(self) -> bool:
+        """True when nothing more may be sent before an acknowledgement (class ``reliable``)."""
+        if self.ack is None:
+            return False
+        return self.count - self.ack.processed >= KEPT_SAMPLES or self.kept_bytes >= KEPT_BYTES

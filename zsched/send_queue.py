@@ -1,0 +1,192 @@
+"""A bounded queue and a thread in front of a put that may block: only its own receiver's slowness is felt here.
+
+Knows: order, bounds, which sample gives way to a newer one. Does not know: zenoh, keys, what a sample is.
+
+Every stream that may wait for its receiver (classes ``latest`` and ``reliable``) has one per place it goes to. With
+``sheds`` the oldest samples of a lane give way: beyond ``depth``, or, once a put has blocked for `STALL_S`, beyond
+``keep_last``. Without it a full queue refuses the newest. What gave way was never numbered, so receivers see no gap.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass
+from typing import Final
+
+from zsched.clock import monotonic_s
+
+MAX_BYTES: Final = 64 << 20
+STALL_S: Final = 0.1
+"""A put that takes so long means a stalled receiver or a slow radio: from then on only the newest samples wait."""
+POLL_S: Final = 0.05
+JOIN_S: Final = 0.3
+
+_log = logging.getLogger("zsched.streams")
+
+Action = Callable[[], None]
+
+
+@dataclass(slots=True, eq=False)
+class _Waiting:
+    """One entry; ``action`` is ``None`` once a newer one has taken its place."""
+
+    lane: Hashable
+    action: Action | None
+    size: int
+
+
+class SendQueue:
+    """Runs actions one after the other in a thread of its own; every method may be called from any thread."""
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        depth: int,
+        sheds: bool,
+        keep_last: int = 1,
+        is_open: Callable[[], bool] | None = None,
+        before_each: Action | None = None,
+    ) -> None:
+        """Start the thread.
+
+        ``is_open`` is asked before each sample: while it answers false, samples wait (markers too, they keep their
+        place). ``before_each`` runs in the thread whenever it wakes (`kick` wakes it).
+        """
+        self._depth = depth
+        self._sheds = sheds
+        self._keep_last = max(1, keep_last)
+        self._is_open = is_open or _always
+        self._before_each = before_each
+        self._wake = threading.Condition()
+        self._items: deque[_Waiting] = deque()
+        self._lines: dict[Hashable, deque[_Waiting]] = {}
+        self._count = 0
+        self._bytes = 0
+        self._is_kicked = False
+        self._is_closed = False
+        self._at_end: Action | None = None
+        self._busy_since: float | None = None
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    @property
+    def is_stalled(self) -> bool:
+        """True while a put has been blocked for `STALL_S`."""
+        since = self._busy_since
+        return since is not None and monotonic_s() - since > STALL_S
+
+    def send(self, lane: Hashable, action: Action, size: int) -> int:
+        """Queue a sample of ``size`` bytes; answers how many samples were dropped for it (itself: 1)."""
+        with self._wake:
+            if self._is_closed:
+                return 1
+            if not self._sheds and (self._count >= self._depth or self._bytes + size > MAX_BYTES):
+                return 1
+            waiting = _Waiting(lane, action, size)
+            self._items.append(waiting)
+            self._count += 1
+            self._bytes += size
+            dropped = self._shed(waiting) if self._sheds else 0
+            self._wake.notify()
+            return dropped
+
+    def then(self, action: Action) -> None:
+        """Run ``action`` behind everything that waits now; it is never dropped but by `close`."""
+        with self._wake:
+            self._items.append(_Waiting(None, action, 0))
+            self._wake.notify()
+
+    def kick(self) -> None:
+        """Look at ``is_open`` again, and run ``before_each``."""
+        with self._wake:
+            self._is_kicked = True
+            self._wake.notify()
+
+    def close(self, at_end: Action | None = None) -> int:
+        """End the thread behind what it has in hand, ``at_end`` last; answers how many samples still waited."""
+        with self._wake:
+            self._is_closed = True
+            self._at_end = at_end
+            self._wake.notify()
+            return self._count
+
+    def join(self, timeout_s: float = JOIN_S) -> None:
+        """Wait at most so long for the thread's end."""
+        if self._thread is not threading.current_thread():
+            self._thread.join(timeout_s)
+
+    # --- the thread --------------------------------------------------------------------------------------------------
+
+    def _shed(self, newest: _Waiting) -> int:
+        line = self._lines.setdefault(newest.lane, deque())
+        line.append(newest)
+        limit = self._keep_last if self.is_stalled else max(self._depth, self._keep_last)
+        dropped = 0
+        while len(line) > limit or (self._bytes > MAX_BYTES and len(line) > 1):
+            old = line.popleft()
+            old.action = None
+            self._forget(old)
+            dropped += 1
+        return dropped
+
+    def _forget(self, waiting: _Waiting) -> None:
+        self._count -= 1
+        self._bytes -= waiting.size
+
+    def _run(self) -> None:
+        while True:
+            action = self._next()
+            if action is None:
+                break
+            self._do(action)
+        if self._at_end is not None:
+            self._do(self._at_end)
+
+    def _next(self) -> Action | None:
+        """The next action, waiting for one; ``None`` once closed."""
+        while True:
+            with self._wake:
+                while not self._items and not self._is_closed and not self._is_kicked:
+                    self._wake.wait()
+                if self._is_closed:
+                    return None
+                self._is_kicked = False
+            if self._before_each is not None:
+                self._do(self._before_each)
+            if not self._items:
+                continue
+            if not self._is_open():
+                with self._wake:
+                    if not self._is_kicked and not self._is_closed:
+                        self._wake.wait(POLL_S)
+                continue
+            action = self._take()
+            if action is not None:
+                return action
+
+    def _take(self) -> Action | None:
+        with self._wake:
+            waiting = self._items.popleft()
+            if waiting.action is None or waiting.lane is None:
+                return waiting.action
+            self._forget(waiting)
+            if self._sheds:
+                self._lines[waiting.lane].popleft()
+            return waiting.action
+
+    def _do(self, action: Action) -> None:
+        self._busy_since = monotonic_s()
+        try:
+            action()
+        except Exception as error:  # noqa: BLE001 - one bad sample must not end its stream
+            _log.warning("%s: %s", self._thread.name, error)
+        finally:
+            self._busy_since = None
+
+
+def _always() -> bool:
+    return True

@@ -1,0 +1,204 @@
+"""A worker's side of the numbered hop: what came, what is missing, and telling each relay how far it is.
+
+Knows: numbers per publisher, when an acknowledgement is due. Does not know: what a sample is, roles, zenoh sessions.
+
+A publisher that waits for its receivers (congestion control BLOCK: classes ``latest`` and ``reliable``) keeps what is
+not acknowledged. Where an input keeps everything, a number that is out of turn is refused and the missing ones are
+asked for, at most for `GIVE_UP_S`: then what is missing is lost and the stream goes on. An input that keeps only the
+newest takes any newer one. Numbers that came before are dropped and counted either way.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final
+
+from zsched.clock import monotonic_s
+from zsched.core.relay_protocol import StreamAck, StreamAcks
+
+ACK_S: Final = 0.05
+"""Acknowledgements leave so often while anything changes (20 Hz)..."""
+ACK_SAMPLES: Final = 256
+ACK_BYTES: Final = 1 << 20
+"""...or when so much was processed."""
+GIVE_UP_S: Final = 1.0
+MAX_MISSING: Final = 256
+MAX_SOURCES: Final = 8192
+MAX_PER_FRAME: Final = 500
+
+SourceName = tuple[str, str, int]
+"""(key, session id, entity id) of a publisher as zenoh names it."""
+
+_log = logging.getLogger("zsched.worker")
+
+
+@dataclass(slots=True)
+class _Source:
+    first: int
+    arrived: int
+    processed: int
+    lost: int = 0
+    doubled: int = 0
+    reordered: int = 0
+    gap_since: float | None = None
+    missing: deque[int] = field(default_factory=lambda: deque(maxlen=MAX_MISSING))
+    """The newest of the numbers given up, to tell a late sample from a double one."""
+
+    def ack(self, eid: int) -> StreamAck:
+        return StreamAck(
+            eid=eid,
+            first=self.first,
+            arrived=self.arrived,
+            processed=self.processed,
+            lost=self.lost,
+            doubled=self.doubled,
+            reordered=self.reordered,
+            has_gap=self.gap_since is not None,
+        )
+
+
+class Acknowledger:
+    """The numbers of every publisher heard, and a thread that sends what changed: ``send(relay, frame)``."""
+
+    def __init__(self, send: Callable[[str, StreamAcks], None]) -> None:
+        """``send`` puts a frame for the session with that zenoh id; it must not block long."""
+        self._send = send
+        self._sources: dict[SourceName, _Source] = {}
+        self._dirty: set[SourceName] = set()
+        self._wake = threading.Condition()
+        self._samples = 0
+        self._bytes = 0
+        self._is_closed = False
+        self._thread = threading.Thread(target=self._run, name="zsched acks", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Send what changed, then end."""
+        with self._wake:
+            self._is_closed = True
+            self._wake.notify()
+
+    def admit(self, name: SourceName, number: int, *, in_turn: bool) -> bool:
+        """A sample came; ``False``: drop it. ``in_turn``: nothing may be missing before it."""
+        with self._wake:
+            source = self._sources.get(name)
+            if source is None:
+                self._sources[name] = source = _Source(first=number, arrived=number, processed=number)
+                if len(self._sources) > MAX_SOURCES:
+                    self._sources.pop(next(iter(self._sources)))
+            is_admitted = self._judge(source, number, in_turn=in_turn)
+            if not is_admitted:
+                self._mark(name)
+            return is_admitted
+
+    def skip(self, name: SourceName, number: int) -> None:
+        """Nothing below ``number`` will come any more."""
+        with self._wake:
+            source = self._sources.get(name)
+            if source is not None and number > source.arrived:
+                self._jump(source, number)
+                self._mark(name)
+
+    def arrived(self, name: SourceName) -> int:
+        """The number that the source comes to next."""
+        source = self._sources.get(name)
+        return 0 if source is None else source.arrived
+
+    def processed(self, name: SourceName, number: int, size: int) -> None:
+        """A sample's callback has returned, or it gave way to a newer one that is processed now."""
+        with self._wake:
+            source = self._sources.get(name)
+            if source is None or number < source.processed:
+                return
+            source.processed = number + 1
+            self._samples += 1
+            self._bytes += size
+            self._mark(name)
+
+    def flush(self) -> None:
+        """Send what changed at once (the caller's thread)."""
+        with self._wake:
+            frames = self._frames()
+        self._send_all(frames)
+
+    # --- numbers -----------------------------------------------------------------------------------------------------
+
+    def _judge(self, source: _Source, number: int, *, in_turn: bool) -> bool:
+        if number == source.arrived:
+            source.arrived += 1
+            source.gap_since = None
+            return True
+        if number < source.arrived:
+            if number in source.missing:
+                source.reordered += 1
+            else:
+                source.doubled += 1
+            return False
+        if in_turn and not self._is_given_up(source):
+            return False
+        self._jump(source, number)
+        source.arrived += 1
+        return True
+
+    def _is_given_up(self, source: _Source) -> bool:
+        now = monotonic_s()
+        source.gap_since = source.gap_since or now
+        return now - source.gap_since > GIVE_UP_S
+
+    def _jump(self, source: _Source, number: int) -> None:
+        source.lost += number - source.arrived
+        source.missing.extend(range(max(source.arrived, number - MAX_MISSING), number))
+        source.arrived = number
+        source.gap_since = None
+
+    # --- the thread --------------------------------------------------------------------------------------------------
+
+    def _mark(self, name: SourceName) -> None:
+        is_first = not self._dirty
+        self._dirty.add(name)
+        if is_first or self._is_urgent():
+            self._wake.notify()
+
+    def _is_urgent(self) -> bool:
+        return self._samples >= ACK_SAMPLES or self._bytes >= ACK_BYTES
+
+    def _frames(self) -> list[tuple[str, StreamAcks]]:
+        changed: dict[str, list[StreamAck]] = {}
+        for name in self._dirty:
+            source = self._sources.get(name)
+            if source is not None:
+                changed.setdefault(name[1], []).append(source.ack(name[2]))
+        self._dirty.clear()
+        self._samples = self._bytes = 0
+        return [
+            (relay, StreamAcks(acks=tuple(acks[at : at + MAX_PER_FRAME])))
+            for relay, acks in changed.items()
+            for at in range(0, len(acks), MAX_PER_FRAME)
+        ]
+
+    def _send_all(self, frames: list[tuple[str, StreamAcks]]) -> None:
+        for relay, frame in frames:
+            try:
+                self._send(relay, frame)
+            except Exception as error:  # noqa: BLE001 - the session closes, or one frame is wrong: the next one goes on
+                _log.debug("an acknowledgement was not sent (%s)", error)
+
+    def _run(self) -> None:
+        due = 0.0
+        while True:
+            with self._wake:
+                while not self._dirty and not self._is_closed:
+                    self._wake.wait()
+                rest = due - monotonic_s()
+                if rest > 0 and not self._is_closed and not self._is_urgent():
+                    self._wake.wait(rest)
+                is_last = self._is_closed
+                frames = self._frames()
+            self._send_all(frames)
+            if is_last:
+                return
+            due = monotonic_s() + ACK_S
