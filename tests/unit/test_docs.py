@@ -29,9 +29,6 @@ DOCS: Final = sorted(
     if ".venv" not in path.parts  # a virtual environment below docs/ is nobody's document
 )
 NAMES: Final = [str(path.relative_to(ROOT)) for path in DOCS]
-AWAITED: Final = frozenset({"docs/img/demo-map.png", "docs/img/demo-timeline.png"})
-"""Announced, not there yet: a run of the demo makes them."""
-
 LINK: Final = re.compile(r"!?\[[^\]]*\]\(([^()\s]+)\)")
 FENCE: Final = re.compile(r"^```[^\n]*\n(.*?)^```", re.MULTILINE | re.DOTALL)
 COMMAND: Final = re.compile(r"(?:^|[\s`(/])zsched ([a-z]+)((?: [^\s`#;|&)]+)*)", re.MULTILINE)
@@ -59,8 +56,7 @@ def broken_links(path: Path, text: str) -> Iterator[str]:
         if not file.is_relative_to(ROOT):
             yield f"{target}: outside the repository"
         elif not file.exists():
-            if str(file.relative_to(ROOT)) not in AWAITED:
-                yield f"{target}: not there"
+            yield f"{target}: not there"
         elif fragment and fragment not in {anchor(h) for h in re.findall(r"^#+ (.*)$", file.read_text(), re.MULTILINE)}:
             yield f"{target}: no such heading"
 
