@@ -1,0 +1,185 @@
+"""The owner fails in four ways -> detected -> committed -> first message through the new owner; and a cut that heals.
+
+``python -m benchmarks.detection [--timing wired|wifi] [--case killed worker frozen cut heal] [--n N] [--kills N]``.
+Needs root: six daemons in network namespaces with echo workers and a cool-down of 0, an application on robot1 that
+publishes at 200 Hz on its own key.
+
+* detected: the first robot holds the owner for gone (``worker``: its daemon sees the process end);
+* committed: the first node learns a newer epoch (``worker``: no move, the worker restarts in place);
+* first message: the first echo of a message that was sent after the fault;
+* heal: one robot and the owner cut off for 20 s; from the end of the cut until all nodes agree on one revision, and
+  until everybody is alive to everybody again.
+
+Detection and commit are read from the daemons' logs (one host, one clock, whole milliseconds).
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+from benchmarks.common import line, machine
+from zsched.clock import monotonic_s
+from zsched.core.model import NodeId
+from zsched.lab import netns
+from zsched.lab.netbed import Netbed, Probe, descendants, stamped, stop_group
+from zsched.lab.testbed import TASK, echo_fleet
+
+GOALS = {
+    ("killed", "wifi"): "p99 300 ms",
+    ("killed", "wired"): "p99 300 ms",
+    ("frozen", "wifi"): "p90 2000 ms",
+    ("cut", "wifi"): "p90 2000 ms",
+    ("frozen", "wired"): "p90 900 ms",
+    ("cut", "wired"): "p90 900 ms",
+}
+CUT_S = 20.0
+CASES = ("killed", "worker", "frozen", "cut", "heal")
+
+
+class Cycle:
+    """What the logs say since one fault."""
+
+    def __init__(self, bed: Netbed) -> None:
+        self._bed = bed
+        self._sizes = {node: (bed.folder / f"{node}.log").stat().st_size for node in bed.names}
+        self.at = monotonic_s()
+
+    def first_ms(self, nodes: tuple[NodeId, ...], *words: str) -> float | None:
+        """When one of ``nodes`` first wrote a line with all ``words``: milliseconds after the fault."""
+        found = []
+        for node in nodes:
+            with (self._bed.folder / f"{node}.log").open("rb") as file:
+                file.seek(self._sizes[node])
+                text = file.read().decode(errors="replace")
+            found += [at for at, one in stamped(text) if all(word in one for word in words)]
+        return (min(found) - self.at) * 1000 if found else None
+
+
+class Cases:
+    """One fleet and the faults it goes through."""
+
+    def __init__(self, bed: Netbed, probe: Probe) -> None:
+        self.bed, self.probe = bed, probe
+
+    def is_ready(self) -> bool:
+        """Whether everybody is alive, every worker ready, and messages flow."""
+        nodes = self.bed.status("robot1")["nodes"]
+        is_up = all(
+            node["state"] == "alive"
+            and (node["age_s"] or 0.0) < 1.5
+            and all(load["state"] == "ready" for load in node["workers"])
+            for node in nodes
+        )
+        return is_up and self.bed.owner() is not None and self.probe.is_flowing()
+
+    def kill(self, owner: NodeId) -> Callable[[], None]:
+        """SIGKILL the daemon; its relay and workers die with it."""
+        self.bed.kill(owner)
+        return lambda: self.bed.start(owner)
+
+    def freeze(self, owner: NodeId) -> Callable[[], None]:
+        """SIGSTOP everything of the owner: the machine stands still."""
+        stop_group(self.bed.pid(owner), signal.SIGSTOP)
+        return lambda: stop_group(self.bed.pid(owner), signal.SIGCONT)
+
+    def cut(self, owner: NodeId) -> Callable[[], None]:
+        """No packet in or out any more."""
+        self.bed.network.cut(owner)
+        return self.bed.network.heal
+
+    def kill_worker(self, owner: NodeId) -> Callable[[], None]:
+        """SIGKILL the worker process; its daemon starts another."""
+        for pid in descendants(self.bed.pid(owner)):
+            if b"zsched.tasks.echo" in Path(f"/proc/{pid}/cmdline").read_bytes():
+                os.kill(pid, signal.SIGKILL)
+        return lambda: None
+
+    def run(self, name: str, fault: Callable[[NodeId], Callable[[], None]]) -> dict[str, float]:
+        """One cycle; {step: milliseconds} of the steps that were seen."""
+        self.bed.wait(self.is_ready, 40, "a calm fleet")
+        owner = self.bed.owner() or ""
+        others = tuple(node for node in self.bed.names if node != owner)
+        epoch = self.bed.task("robot1")["epoch"]
+        cycle = Cycle(self.bed)
+        mend = fault(owner)
+        first = self.bed.wait(lambda: self.probe.first_after(cycle.at), 30, "an echo after the fault")
+        if name == "worker":
+            steps = {"detected": cycle.first_ms((owner,), "worker stopped")}
+        else:
+            self.bed.wait(lambda: self.bed.owner(*others) not in (None, owner), 30, "a new owner")
+            steps = {
+                "detected": cycle.first_ms(self.bed.fleet.voters, f"membership {owner} ", "-> gone"),
+                "committed": cycle.first_ms(others, f"task={TASK} epoch={epoch + 1} learnt"),
+            }
+        mend()
+        steps["first message"] = (first.at - cycle.at) * 1000 if first is not None else None
+        return {step: value for step, value in steps.items() if value is not None}
+
+    def heal(self) -> dict[str, float]:
+        """Cut robot3 and the owner off together, heal, and wait."""
+        self.bed.wait(self.is_ready, 40, "a calm fleet")
+        owner = self.bed.owner() or ""
+        ours = {"robot3", owner}
+        theirs = tuple(node for node in self.bed.names if node not in ours)
+        self.bed.network.separate(ours, theirs)
+        start = monotonic_s()
+        self.bed.wait(lambda: monotonic_s() > start + CUT_S, CUT_S + 5, "the cut")
+        self.bed.network.heal()
+        healed = monotonic_s()
+        self.bed.wait(lambda: self._revisions() == 1, 30, "one revision")
+        agreed = (monotonic_s() - healed) * 1000
+        self.bed.wait(self._is_whole, 60, "everybody alive to everybody")
+        return {"one revision": agreed, "all alive": (monotonic_s() - healed) * 1000}
+
+    def _revisions(self) -> int:
+        return len({self.bed.task(node)["revision"] for node in self.bed.names})
+
+    def _is_whole(self) -> bool:
+        return all(peer["state"] == "alive" for node in self.bed.names for peer in self.bed.status(node)["nodes"])
+
+
+def measure(cases: Cases, name: str, count: int, timing: str) -> None:
+    """Run one case ``count`` times and print its lines."""
+    faults = {"killed": cases.kill, "worker": cases.kill_worker, "frozen": cases.freeze, "cut": cases.cut}
+    steps: dict[str, list[float]] = {}
+    for _ in range(count):
+        found = cases.heal() if name == "heal" else cases.run(name, faults[name])
+        for step, value in found.items():
+            steps.setdefault(step, []).append(value)
+    for step, values in steps.items():
+        goal = GOALS.get((name, timing), "-") if step == "first message" else "-"
+        print(line(f"{name} -> {step} ({timing})", values, "ms", goal), flush=True)
+
+
+def main() -> int:
+    """Print the distributions; the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--timing", default="wifi", choices=["wifi", "wired"])
+    parser.add_argument("--case", nargs="+", default=list(CASES), choices=CASES)
+    parser.add_argument("--n", type=int, default=40)
+    parser.add_argument("--kills", type=int, default=200)
+    parser.add_argument("--heals", type=int, default=5)
+    given = parser.parse_args()
+    reason = netns.why_not()
+    if reason is not None:
+        print(f"no network namespaces here: {reason}", file=sys.stderr)
+        return 1
+    print(machine(), flush=True)
+    counts = {"killed": given.kills, "heal": given.heals}
+    for name in given.case:
+        with tempfile.TemporaryDirectory() as folder, Netbed(Path(folder), echo_fleet(timing=given.timing)) as bed:
+            bed.init()
+            bed.start()
+            probe = bed.probe("robot1", put="robot1/in", hz=200, watch=["robot1/out"])
+            measure(Cases(bed, probe), name, counts.get(name, given.n), given.timing)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,289 @@
+"""Trigger -> committed with 3, 6, 12, 24 and 48 nodes, and how messages and CPU grow with their number.
+
+``python -m benchmarks.scale [--nodes 3 6 12 24 48] [--n 20] [--timing wifi]``. Half of the nodes are robots (voters and
+electors; of three nodes one is, and all elect), half edges; every pair has a zenoh link on loopback.
+
+What runs: the real `Node`, `ControlBus` (a zenoh session per node, meshed by gossip), codec and state file (fsync
+included), one loop thread per node, as many processes as there are cores. What is left out: relays, workers (reported
+ready as soon as they shall start), profilers (a fixed sample per period), the operator's socket. Node loops of one
+process share one GIL, so the figures of large fleets on few cores are upper bounds.
+
+A trigger is a failure of the owner's worker, told by its profile: from the first robot's proposal to the first node
+that learns the newer epoch (committed), and to the last (everywhere).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import queue
+import random
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+from typing import IO, Any
+
+from benchmarks.common import line, machine, mean
+from zsched import zenoh_config
+from zsched.adapters.control_bus import ControlBus
+from zsched.adapters.state_file import StateFile
+from zsched.clock import monotonic_s
+from zsched.config import load_fleet
+from zsched.core import events as ev
+from zsched.core import instructions as do
+from zsched.core.fleet import Fleet, electorate_hash
+from zsched.core.model import DeviceSample, NodeId, WorkerState
+from zsched.core.node import Node
+from zsched.daemon import endpoints_for, free_port
+from zsched.lab.testbed import TASK, echo_fleet
+from zsched.lifecycle import init_state
+
+GOAL = "p99 50 ms at 6"
+IDLE_S = 5.0
+SETTLED_S = 1.0
+SAMPLE = DeviceSample(cpu_cores=4.0, cpu_used_cores=1.0, memory_mb=4096.0, memory_used_mb=1024.0)
+
+
+class Loop:
+    """One node: its loop in a thread, what it tells on ``lines``."""
+
+    def __init__(self, fleet: Fleet, name: NodeId, folder: Path, lines: queue.SimpleQueue[dict[str, Any]]) -> None:
+        self._fleet, self._name, self._lines = fleet, name, lines
+        self._events: queue.SimpleQueue[ev.Event] = queue.SimpleQueue()
+        self._file = StateFile(folder / name, fleet=fleet.name, node=name)
+        self._file.acquire()
+        durable = self._file.load().state
+        incarnation = durable.incarnation if durable is not None else 1
+        points = endpoints_for(fleet, fleet.node(name), free_port)
+        config = zenoh_config.control_config(
+            listen=points.control_listen, connect=points.control_connect, timing=fleet.timing
+        )
+        self._bus = ControlBus(
+            fleet=fleet.name, node=name, incarnation=incarnation, zenoh_config=config, post=self._events.put
+        )
+        self._node = Node(
+            fleet=fleet,
+            me=name,
+            durable=durable,
+            incarnation=incarnation,
+            electorate=electorate_hash(fleet),
+            rng=random.Random(name),
+            now=monotonic_s(),
+        )
+        self.received = self.sent = 0
+        threading.Thread(target=self._run, name=name, daemon=True).start()
+
+    def tell(self, state: WorkerState) -> None:
+        """The worker's state changes."""
+        self._events.put(ev.WorkerChanged(task=TASK, state=state))
+
+    def _run(self) -> None:
+        self._bus.open()
+        self._carry_out(self._node.start(monotonic_s()))
+        sample_at = 0.0
+        while True:
+            wait = min(self._node.next_deadline(), sample_at) - monotonic_s()
+            try:
+                event = self._events.get(timeout=wait) if wait > 0 else self._events.get_nowait()
+                self.received += 1
+            except queue.Empty:
+                event = ev.DeadlineReached()
+            now = monotonic_s()
+            self._carry_out(self._node.handle(event, now))
+            if now >= sample_at:
+                sample_at = now + self._fleet.timing.sample_s
+                self._carry_out(self._node.handle(ev.ProfileSampled(device=SAMPLE), now))
+
+    def _carry_out(self, batch: tuple[do.Instruction, ...]) -> None:
+        bus = self._bus
+        for one in batch:
+            self.sent += isinstance(one, do.PublishBeat | do.PublishProfile | do.PublishProposal | do.PublishLearnt)
+            match one:
+                case do.PersistState(state=state):
+                    self._file.save(state)
+                case do.PublishBeat(beat=value):
+                    bus.publish("beat", value)
+                case do.PublishProfile(profile=value):
+                    bus.publish("profile", value)
+                case do.PublishProposal(proposal=value):
+                    bus.publish("proposal", value)
+                case do.PublishLearnt(learnt=value):
+                    bus.publish("allocation", value)
+                case do.AskUtilities(gather=gather, deadline_s=deadline_s):
+                    bus.ask_utilities(gather, deadline_s)
+                case do.SendPrepare(prepare=question, deadline_s=deadline_s):
+                    bus.ask_electors(question, deadline_s)
+                case do.SendAccept(accept=question, deadline_s=deadline_s):
+                    bus.ask_electors(question, deadline_s)
+                case do.AskLearnt(peer=peer, deadline_s=deadline_s):
+                    bus.ask_learnt(peer, deadline_s)
+                case do.AnswerUtilities(request=request, utilities=answer):
+                    bus.answer(request, answer)
+                case do.AnswerElection(request=request, answer=answer):
+                    bus.answer(request, answer)
+                case do.AnswerLearnt(request=request, learnt=answer):
+                    bus.answer(request, answer)
+                case do.StartWorker():
+                    self.tell(WorkerState.READY)
+                case do.RecordStory(stage=stage, text=text):
+                    self._lines.put({"at": monotonic_s(), "node": self._name, "stage": stage, "text": text})
+                case _:
+                    pass  # routes, roles, operators: left out
+
+
+def child(config: Path, folder: Path, names: list[NodeId]) -> None:
+    """Run some of the nodes; commands on standard input, one JSON object a line; stories on standard output."""
+    fleet = load_fleet(config)
+    os.environ.setdefault("ZENOH_RUNTIME", zenoh_config.runtime_pools(len(fleet.nodes)))
+    lines: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+    threading.Thread(target=_write, args=(lines,), daemon=True).start()
+    loops = {name: Loop(fleet, name, folder, lines) for name in names}
+    for text in sys.stdin:
+        command = json.loads(text)
+        if command["do"] == "count":
+            times = os.times()
+            counts = {"received": sum(loop.received for loop in loops.values())}
+            counts["sent"] = sum(loop.sent for loop in loops.values())
+            lines.put({"count": counts, "cpu_s": times.user + times.system, "at": monotonic_s()})
+        elif command["node"] in loops:
+            loops[command["node"]].tell(WorkerState(command["do"]))
+    os._exit(0)
+
+
+def _write(lines: queue.SimpleQueue[dict[str, Any]]) -> None:
+    while True:
+        print(json.dumps(lines.get()), flush=True)
+
+
+class Group:
+    """The processes of one fleet size."""
+
+    def __init__(self, nodes: int, timing: str, folder: Path) -> None:
+        edges = max(nodes // 2, 2)  # with one there is nowhere to go
+        tree = echo_fleet(robots=nodes - edges, edges=edges, timing=timing)
+        if nodes - edges < 3:
+            tree["electorate"] = sorted(tree["nodes"])
+        tree["tasks"][TASK]["weights"] = {"cpu": 1.0, "memory": 0.0, "network": 0.0}
+        self.file = folder / "fleet.yaml"
+        self.file.write_text(json.dumps(tree))
+        self.names = sorted(tree["nodes"])
+        fleet = load_fleet(self.file)
+        for name in self.names:
+            init_state(fleet, name, folder / name, 0)
+        self.stories: list[dict[str, Any]] = []
+        self.counts: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+        self._children = []
+        count = min(os.cpu_count() or 1, nodes)
+        for index in range(count):
+            command = [sys.executable, "-m", "benchmarks.scale", "--child", str(self.file), str(folder)]
+            process = subprocess.Popen(
+                [*command, *self.names[index::count]], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+            )
+            assert process.stdout is not None
+            self._children.append(process)
+            threading.Thread(target=self._read, args=(process.stdout,), daemon=True).start()
+
+    def _read(self, stdout: IO[bytes]) -> None:
+        for text in stdout:
+            if not text.startswith(b"{"):
+                continue
+            told = json.loads(text)
+            self.counts.put(told) if "count" in told else self.stories.append(told)
+
+    def tell(self, **command: str) -> None:
+        """Send a command to every process."""
+        for process in self._children:
+            assert process.stdin is not None
+            process.stdin.write(json.dumps(command).encode() + b"\n")
+            process.stdin.flush()
+
+    def told(self, since: int, *words: str) -> list[dict[str, Any]]:
+        """Stories from number ``since`` on that hold all words."""
+        return [one for one in self.stories[since:] if all(word in one["text"] for word in words)]
+
+    def wait(self, since: int, count: int, *words: str) -> list[dict[str, Any]]:
+        """Until ``count`` nodes have told it."""
+        end = time.monotonic() + 60
+        while time.monotonic() < end:
+            found = self.told(since, *words)
+            if len({one["node"] for one in found}) >= count:
+                return found
+            time.sleep(0.005)
+        raise SystemExit(f"only {len(self.told(since, *words))} of {count} nodes told {words}")
+
+    def owner(self) -> NodeId:
+        """The newest learnt owner."""
+        last = self.told(0, "learnt revision")[-1]["text"]
+        return str(last.split("owner ")[1].split(",")[0])
+
+    def snapshot(self) -> dict[str, float]:
+        """Messages and CPU seconds of all processes so far."""
+        self.tell(do="count", node="")
+        found = [self.counts.get(timeout=30) for _ in self._children]
+        totals = {key: float(sum(one["count"][key] for one in found)) for key in ("sent", "received")}
+        return {**totals, "cpu_s": sum(one["cpu_s"] for one in found), "at": mean([one["at"] for one in found])}
+
+    def close(self) -> None:
+        """End every process."""
+        for process in self._children:
+            process.kill()
+            process.wait(10)
+
+
+def measure(group: Group, count: int, timing: str) -> None:
+    """The idle load, then ``count`` triggers; prints the lines of one size."""
+    nodes = len(group.names)
+    group.wait(0, nodes, "learnt revision 1:")
+    time.sleep(2 * SETTLED_S)
+    before = group.snapshot()
+    time.sleep(IDLE_S)
+    after = group.snapshot()
+    seconds = after["at"] - before["at"]
+    rates = {key: (after[key] - before[key]) / seconds / nodes for key in ("sent", "received", "cpu_s")}
+    committed, everywhere = [], []
+    for _ in range(count):
+        since, owner = len(group.stories), group.owner()
+        group.tell(do="failed", node=owner)
+        learnt = group.wait(since, nodes, "learnt revision")
+        proposed = group.told(since, "propose ")
+        start = min(one["at"] for one in proposed)
+        committed.append((min(one["at"] for one in learnt) - start) * 1000)
+        everywhere.append((max(one["at"] for one in learnt) - start) * 1000)
+        group.tell(do="ready", node=owner)
+        time.sleep(SETTLED_S)
+    print(line(f"{nodes} nodes: trigger -> committed ({timing})", committed, "ms", GOAL))
+    print(line(f"{nodes} nodes: trigger -> known everywhere ({timing})", everywhere, "ms", "-"))
+    print(
+        f"{nodes} nodes: idle, per node: {rates['sent']:.1f} puts/s, {rates['received']:.1f} frames/s in, "
+        f"{100 * rates['cpu_s']:.1f} % of a core",
+        flush=True,
+    )
+
+
+def main() -> None:
+    """Print the lines of every size."""
+    if "--child" in sys.argv:
+        _, _, config, folder, *names = sys.argv
+        child(Path(config), Path(folder), list(names))
+        return
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--nodes", type=int, nargs="+", default=[3, 6, 12, 24, 48])
+    parser.add_argument("--n", type=int, default=20)
+    parser.add_argument("--timing", default="wifi", choices=["wifi", "wired"])
+    given = parser.parse_args()
+    print(machine(), flush=True)
+    for nodes in given.nodes:
+        with tempfile.TemporaryDirectory() as folder:
+            group = Group(nodes, given.timing, Path(folder))
+            try:
+                measure(group, given.n, given.timing)
+            finally:
+                group.close()
+
+
+if __name__ == "__main__":
+    main()
