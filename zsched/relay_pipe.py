@@ -26,6 +26,7 @@ _REGISTERED: Final[tuple[tuple[str, type, int], ...]] = (
     ("relay_started", relay_protocol.RelayStarted, _SMALL),
     ("worker_seen", relay_protocol.WorkerSeen, _SMALL),
     ("end_marker", relay_protocol.EndMarker, 256),
+    ("snapshot_chunk", relay_protocol.SnapshotChunk, 256),
     ("stream_acks", relay_protocol.StreamAcks, wire.LARGE),
     ("slot_lost", relay_protocol.SlotLost, _SMALL),
     ("slot_ready", events.SlotReady, _SMALL),
@@ -90,6 +91,19 @@ def decode_end(payload: bytes) -> relay_protocol.EndMarker | None:
     """The end marker in a payload, or ``None`` when it is none."""
     try:
         return wire.decode(payload, relay_protocol.EndMarker)
+    except WireError:
+        return None
+
+
+def encode_chunk(chunk: relay_protocol.SnapshotChunk) -> bytes:
+    """The attachment of one piece of a worker's snapshot."""
+    return wire.encode(chunk)
+
+
+def decode_chunk(attachment: bytes) -> relay_protocol.SnapshotChunk | None:
+    """The word about a piece in its attachment, or ``None`` when it is none."""
+    try:
+        return wire.decode(attachment, relay_protocol.SnapshotChunk)
     except WireError:
         return None
 

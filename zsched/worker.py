@@ -27,6 +27,7 @@ import queue
 import signal
 import threading
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any, Final, Self
@@ -44,6 +45,7 @@ from zsched.worker_acks import Acknowledger
 from zsched.worker_inputs import Dispatcher, Input, Marker, Received
 from zsched.worker_outputs import Output
 from zsched.worker_services import Answer, Handler, Request, Service
+from zsched.worker_snapshot import TIMEOUT_S, Offer, Restorer, fetch
 
 __all__ = ["Answer", "Output", "Received", "Request", "Worker"]
 
@@ -93,10 +95,10 @@ class Worker:
         self._errands: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._role_token: zenoh.LivelinessToken | None = None
         self._token: zenoh.LivelinessToken | None = None
-        self._snapshot: Callable[[], bytes] | None = None
         self._session = _open(zenoh_config)
         self._acks = Acknowledger(self._send_acks)
         self._dispatcher = Dispatcher(self._inputs_ended, self._acks)
+        self._restorer = Restorer(self._fetch_snapshot, node, self._dispatcher)
         self._errand_thread = threading.Thread(target=self._run_errands, name="zsched errands", daemon=True)
         self._errand_thread.start()
         self._dispatcher.start()
@@ -154,8 +156,8 @@ class Worker:
 
     @property
     def role(self) -> Role:
-        """The newest role that this node's daemon has told us; idle until it has."""
-        return self._role
+        """The newest role that this node's daemon has told us; idle until it has, and while a snapshot is awaited."""
+        return Role(task=self._task, role=WorkerRole.IDLE) if self._restorer.is_pending else self._role
 
     @property
     def session(self) -> zenoh.Session:
@@ -207,8 +209,23 @@ class Worker:
         self._declared.append(service)
 
     def offer_snapshot(self, snapshot: Callable[[], bytes]) -> None:
-        """Offer this worker's state to its successor. Not carried yet: the function is kept and never called."""
-        self._snapshot = snapshot
+        """Offer this worker's state to its successor, at most `MAX_SNAPSHOT` bytes; call it before `ready`.
+
+        ``snapshot`` is called in a thread of its own whenever the next owner asks, usually while this one still works.
+        """
+        key = self._keyspace.snapshot(self._node, self._task)
+        self._declared.append(Offer(self._session, key, snapshot))
+
+    def on_snapshot(self, restore: Callable[[bytes], None], timeout_s: float = TIMEOUT_S) -> None:
+        """Take the predecessor's state over when this worker becomes the owner; call it before `subscribe`.
+
+        ``restore`` runs in the dispatch thread before any input of the new epoch, at most ``timeout_s`` (0.3 s if the
+        predecessor is silent) after the role came; until then `role` is idle. Without a snapshot it is not called.
+        """
+        self._restorer.register(restore, timeout_s)
+        role = self._role
+        self._restorer.note(role)
+        self._errands.put(lambda: self._begin(role))
 
     def ready(self) -> None:
         """Say that the inputs are declared: the token that the robots' relays wait for. Call it once."""
@@ -299,6 +316,7 @@ class Worker:
             _log.warning("an unreadable role was ignored (%s)", error)
             return
         with self._lock:
+            self._restorer.note(role)  # first: from the moment that we are the owner, inputs wait for the snapshot
             before, self._role, self._is_role_known = self._role, role, True
         if role != before:
             self._errands.put(lambda: self._change_role(before, role))
@@ -317,10 +335,27 @@ class Worker:
             self._ended_epoch = role.epoch - 1  # it was told to stop, and works on in the same epoch after all
         was_held = before.lease_until_s is not None and monotonic_s() >= before.lease_until_s
         if is_active and (self._role_token is None or was_held):
-            self._dispatcher.begin(role.epoch)  # also what was withheld for want of a lease
-        if is_active and self._role_token is None:
-            key = f"{self._keyspace.role(self._node, self._task)}/{role.epoch}"
+            self._begin(role)  # also what was withheld for want of a lease
+
+    def _begin(self, role: Role) -> None:
+        """Work in the role's epoch from now on, behind the predecessor's snapshot if there is one to be had."""
+        then = partial(self._errands.put, lambda: self._begin(role))
+        now = self._role
+        is_stale = now.role is not WorkerRole.ACTIVE or now.epoch != role.epoch
+        if not is_stale and self._restorer.begin(role, then):
+            return
+        if not is_stale:
+            self._dispatcher.begin(role.epoch)
+            self._show_role(role.epoch)
+        self._restorer.deliver()
+
+    def _show_role(self, epoch: int) -> None:
+        if self._role_token is None and not self._is_standalone:
+            key = f"{self._keyspace.role(self._node, self._task)}/{epoch}"
             self._role_token = self._session.liveliness().declare_token(key)
+
+    def _fetch_snapshot(self, predecessor: str, timeout_s: float) -> bytes | str:
+        return fetch(self._session, self._keyspace.snapshot(predecessor, self._task), timeout_s)
 
     def _is_owner(self) -> bool:
         role = self.role
@@ -330,7 +365,7 @@ class Worker:
     def _epoch_now(self) -> int | None:
         """The epoch that outputs are stamped with, ``None`` while they go nowhere."""
         role = self._role
-        if role.role is WorkerRole.IDLE:
+        if role.role is WorkerRole.IDLE or self._restorer.is_pending:
             self._dispatcher.note_withheld()
             return None
         if role.epoch <= self._ended_epoch:

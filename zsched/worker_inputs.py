@@ -102,6 +102,8 @@ class Dispatcher:
         self._withheld: dict[tuple[int, str], tuple[Input, deque[zenoh.Sample]]] = {}
         self._again: deque[tuple[Input, zenoh.Sample]] = deque()
         self._is_closed = False
+        self._is_held = False
+        self._first: Callable[[], None] | None = None
         self._thread = threading.Thread(target=self._run, name="zsched dispatch", daemon=True)
 
     def start(self) -> None:
@@ -164,6 +166,17 @@ class Dispatcher:
         with self._wake:
             self._open = {name: state for name, state in self._open.items() if state.epoch > epoch}
 
+    def hold(self) -> None:
+        """Process no input until `release`: a predecessor's state comes first."""
+        with self._wake:
+            self._is_held = True
+
+    def release(self, first: Callable[[], None]) -> None:
+        """Call ``first`` in the dispatch thread, then process what has come."""
+        with self._wake:
+            self._is_held, self._first = False, first
+            self._wake.notify()
+
     def note_withheld(self) -> None:
         """An output went nowhere because this worker is not the owner (any thread; ours means: of this sample)."""
         if threading.current_thread() is self._thread:
@@ -174,15 +187,21 @@ class Dispatcher:
     def _run(self) -> None:
         while True:
             with self._wake:
-                if not self._queue and not self._again and not self._is_closed:
+                if not self._has_work() and not self._is_closed:
                     self._wake.wait(END_GRACE_S / 2 if self._markers else None)
                 if self._is_closed:
                     return
-                claimed = self._claim()
+                first, self._first = self._first, None
+                claimed = None if self._is_held or first is not None else self._claim()
+            if first is not None:
+                first()
             if claimed is not None:
                 self._process(claimed)
             if self._markers:
                 self._settle()
+
+    def _has_work(self) -> bool:
+        return self._first is not None or bool(not self._is_held and (self._queue or self._again))
 
     def _claim(self) -> _Waiting | None:
         """Take the next sample out of its key's line (under the lock): from here on nothing sheds it."""

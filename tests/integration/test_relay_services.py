@@ -403,10 +403,10 @@ def test_a_standby_refuses_and_does_nothing(rig: Rig) -> None:
     assert rig.done_by("edge2") == []
 
 
-def test_a_slow_request_delays_no_other_service_and_no_role(rig: Rig) -> None:
-    """The worker's own queue is per service; a fifth waiting request is busy, the rest are answered in order."""
+def test_the_queue_of_a_worker_is_bounded_too(rig: Rig) -> None:
+    """One in hand, four wait, two are told at once."""
     begin(rig, ServiceSettings(timeout_s=5.0, max_pending=16))
-    first = rig.ask("sleep 0.5")
+    first = rig.ask("sleep 1.5")
     until(lambda: rig.done_by("edge1"), "the owner has begun")
     others = [rig.ask(f"job{number}") for number in range(6)]
     first.wait()

@@ -66,6 +66,20 @@ class EndMarker:
         check_counter("end.count", self.count)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SnapshotChunk:
+    """Beside each piece of a worker's snapshot: its place, and by what the whole is known (blake2s, 16 bytes, hex)."""
+
+    index: int
+    count: int
+    size: int
+    checksum: str
+
+    def __post_init__(self) -> None:
+        for name in ("index", "count", "size"):
+            check_counter(f"snapshot.{name}", getattr(self, name))
+
+
 ERROR_ENCODING: Final = "text/plain;zsched.error"
 """Of an error reply that zsched gives in place of the owner's answer."""
 REFUSED_ENCODING: Final = "text/plain;zsched.refused"

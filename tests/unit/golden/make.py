@@ -155,6 +155,9 @@ SAMPLES: dict[str, object] = {
     "relay_started": relay_protocol.RelayStarted(pid=4711, zid="a1b2c3"),
     "worker_seen": relay_protocol.WorkerSeen(node="edge1", task="map_merge", incarnation="3-1", is_present=True),
     "end_marker": relay_protocol.EndMarker(epoch=4, count=1000),
+    "snapshot_chunk": relay_protocol.SnapshotChunk(
+        index=1, count=3, size=600_000, checksum="00112233445566778899aabbccddeeff"
+    ),
     "stream_acks": relay_protocol.StreamAcks(
         acks=(
             relay_protocol.StreamAck(

@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import logging
 import os
+import queue
 
 import cv2
 
@@ -52,11 +53,16 @@ def run(options: argparse.Namespace) -> None:
             robot = received.key.removeprefix(f"{worker.prefix}/").removesuffix("/map")
             service.receive(robot, received.payload.to_bytes(), is_deleted=received.deleted)
 
+        restored: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        worker.on_snapshot(restored.put)  # `restore` and `step` share a thread
         worker.subscribe("{prefix}/*/map", on_map, keep_last=1)
-        worker.offer_snapshot(service.snapshot)  # `service.restore` takes it, once the library hands it over
+        worker.offer_snapshot(service.snapshot)
         worker.ready()
         while worker.wait(POLL_S):
-            service.step(is_active=worker.role.role is not WorkerRole.IDLE)
+            is_active = worker.role.role is not WorkerRole.IDLE  # read first: what comes before it is in the queue
+            while not restored.empty():
+                service.restore(restored.get())
+            service.step(is_active=is_active)
     if service.is_searching:
         logging.shutdown()
         os._exit(0)  # a thread inside OpenCV would delay the interpreter's end, or abort it

@@ -1,0 +1,252 @@
+"""A worker's state moves with its task: real worker processes, told their roles as a relay tells them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from zsched import wire
+from zsched.core.plan import Role, WorkerRole
+from zsched.keyspace import Keyspace
+from zsched.zenoh_config import data_config, worker_config
+
+TASK, FLEET = "sum", "test"
+KEYS = Keyspace(FLEET)
+
+WORKER = '''
+"""Adds up; its state is the total, padded so that it takes several chunks."""
+import sys, time
+from zsched.worker import Worker
+
+total, size, mode = 0, int(sys.argv[1]), sys.argv[2]
+
+def add(received):
+    global total
+    total += int(received.payload.to_bytes())
+    out.put(str(total).encode())
+
+def snapshot():
+    if mode == "slow":
+        time.sleep(3)
+    return str(total).encode().rjust(size)
+
+def restore(content):
+    global total
+    total = int(content)
+
+with Worker.from_env() as worker:
+    out = worker.publisher("{prefix}/{epoch}/total")
+    worker.on_snapshot(restore)
+    worker.subscribe("{prefix}/in", add, keep_last=None)
+    if mode != "none":
+        worker.offer_snapshot(snapshot)
+    worker.ready()
+    while worker.wait(1.0):
+        pass
+'''
+
+
+def until(condition: Callable[[], Any], what: str, deadline_s: float = 10.0) -> Any:
+    end = time.monotonic() + deadline_s
+    while time.monotonic() < end:
+        value = condition()
+        if value:
+            return value
+        time.sleep(0.005)
+    raise AssertionError(f"not within {deadline_s} s: {what}")
+
+
+@dataclass
+class Hub:
+    """One session that all workers join: it tells roles, feeds inputs, hears outputs and tokens."""
+
+    folder: Path
+    roles: dict[str, Role] = field(default_factory=dict)
+    tokens: set[str] = field(default_factory=set)
+    totals: list[tuple[str, int]] = field(default_factory=list)
+    workers: dict[str, subprocess.Popen[str]] = field(default_factory=dict)
+    lives: int = 0
+
+    def start(self) -> None:
+        (self.folder / "worker.py").write_text(WORKER)
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            self.endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        text = data_config(listen=(self.endpoint,), connect=(), shared_memory=False)
+        self.session = zenoh.open(zenoh.Config.from_json5(text))
+        self._kept = [
+            self.session.declare_queryable(KEYS.role("*", "*"), self._answer),
+            self.session.liveliness().declare_subscriber(f"@zsched/{FLEET}/**", self._token, history=True),
+            self.session.declare_subscriber(f"*/{TASK}/*/total", self._total),
+        ]
+
+    def _answer(self, query: zenoh.Query) -> None:
+        with query:
+            for key, role in tuple(self.roles.items()):
+                if query.key_expr.intersects(key):
+                    query.reply(key, wire.encode(role))
+
+    def _token(self, sample: zenoh.Sample) -> None:
+        act = self.tokens.add if sample.kind == zenoh.SampleKind.PUT else self.tokens.discard
+        act(str(sample.key_expr))
+
+    def _total(self, sample: zenoh.Sample) -> None:
+        node, _, epoch, _ = str(sample.key_expr).split("/")
+        self.totals.append((f"{node}@{epoch}", int(sample.payload.to_bytes())))
+
+    def start_worker(self, node: str, size: int = 600_000, mode: str = "offers") -> subprocess.Popen[str]:
+        self.lives += 1
+        path = self.folder / f"{node}.json5"
+        path.write_text(worker_config(connect=(self.endpoint,), shared_memory=False))
+        env = os.environ | {
+            "ZSCHED_FLEET": FLEET,
+            "ZSCHED_NODE": node,
+            "ZSCHED_TASK": TASK,
+            "ZSCHED_INCARNATION": str(self.lives),
+            "ZSCHED_ZENOH_CONFIG": str(path),
+        }
+        command = [sys.executable, str(self.folder / "worker.py"), str(size), mode]
+        worker = subprocess.Popen(command, env=env, stderr=subprocess.PIPE, text=True)
+        self.workers[node] = worker
+        until(lambda: KEYS.worker(node, TASK, self.lives) in self.tokens, f"worker of {node}")
+        return worker
+
+    def tell(self, node: str, role: WorkerRole, epoch: int = 0, predecessor: str | None = None) -> None:
+        value = Role(task=TASK, role=role, epoch=epoch, predecessor=predecessor)
+        key = KEYS.role(node, TASK)
+        self.roles[key] = value
+        self.session.put(key, wire.encode(value), congestion_control=zenoh.CongestionControl.BLOCK)
+
+    def feed(self, node: str, number: int) -> None:
+        key = f"{node}/{TASK}/in"
+        self.session.put(key, str(number).encode(), congestion_control=zenoh.CongestionControl.BLOCK)
+
+    def shows(self, node: str, epoch: int) -> bool:
+        return f"{KEYS.role(node, TASK)}/{epoch}" in self.tokens
+
+    def said_by(self, node: str) -> str:
+        """All that a worker wrote on stderr; ends it."""
+        worker = self.workers[node]
+        worker.kill()
+        _, text = worker.communicate(timeout=10)
+        return text
+
+    def stop(self) -> None:
+        for worker in self.workers.values():
+            worker.send_signal(signal.SIGCONT)
+            worker.kill()
+            worker.communicate(timeout=10)
+        self.session.close()
+
+
+@pytest.fixture
+def hub(tmp_path: Path) -> Iterator[Hub]:
+    made = Hub(folder=tmp_path)
+    made.start()
+    try:
+        yield made
+    finally:
+        made.stop()
+
+
+def owned_by_edge1(hub: Hub, mode: str = "offers") -> None:
+    """edge1 has added up to 10 in epoch 1; edge2 stands by."""
+    hub.start_worker("edge1", mode=mode)
+    hub.start_worker("edge2")
+    hub.tell("edge1", WorkerRole.ACTIVE, 1)
+    until(lambda: hub.shows("edge1", 1), "edge1 is the owner")
+    for number in (1, 2, 3, 4):
+        hub.feed("edge1", number)
+    until(lambda: ("edge1@1", 10) in hub.totals, "the total of edge1")
+
+
+def test_the_new_owner_goes_on_from_the_old_ones_state(hub: Hub) -> None:
+    owned_by_edge1(hub)
+    hub.tell("edge1", WorkerRole.DRAINING, 1)
+    hub.tell("edge2", WorkerRole.ACTIVE, 2, "edge1")
+    hub.feed("edge2", 100)  # at once: it waits for the state
+    until(lambda: ("edge2@2", 110) in hub.totals, "the total of edge2")
+    assert [total for name, total in hub.totals if name == "edge2@2"] == [110]
+    assert hub.shows("edge2", 2)
+
+
+def test_there_and_back_and_there_again(hub: Hub) -> None:
+    owned_by_edge1(hub)
+    total, owner = 10, "edge1"
+    for epoch in range(2, 6):
+        new = "edge2" if owner == "edge1" else "edge1"
+        hub.tell(owner, WorkerRole.DRAINING, epoch - 1)
+        hub.tell(new, WorkerRole.ACTIVE, epoch, owner)
+        hub.feed(new, epoch)
+        total += epoch
+        found = (f"{new}@{epoch}", total)
+        until(lambda found=found: found in hub.totals, f"{found}")  # type: ignore[misc] # bound at once
+        owner = new
+
+
+def test_a_standby_that_took_warm_up_values_starts_from_the_state_instead(hub: Hub) -> None:
+    owned_by_edge1(hub)
+    hub.feed("edge2", 1000)  # processed in standby; put out once it is the owner, behind the state
+    time.sleep(0.1)
+    hub.tell("edge1", WorkerRole.DRAINING, 1)
+    hub.tell("edge2", WorkerRole.ACTIVE, 2, "edge1")
+    until(lambda: ("edge2@2", 1010) in hub.totals, "the warm-up value on top of the state")
+
+
+def test_a_killed_owner_means_a_cold_start_without_delay(hub: Hub) -> None:
+    owned_by_edge1(hub)
+    hub.workers["edge1"].kill()
+    until(lambda: not any("/worker/edge1/" in token for token in hub.tokens), "edge1's token is gone")
+    started = time.monotonic()
+    hub.tell("edge2", WorkerRole.ACTIVE, 2, "edge1")
+    until(lambda: hub.shows("edge2", 2), "edge2 is the owner")  # an input before that would be warm-up, taken twice
+    hub.feed("edge2", 100)
+    until(lambda: ("edge2@2", 100) in hub.totals, "edge2, cold")
+    assert time.monotonic() - started < 0.3
+    assert "cold_start epoch=2 from=edge1 why='nobody offers one'" in hub.said_by("edge2")
+
+
+def test_a_frozen_owner_costs_a_third_of_a_second(hub: Hub) -> None:
+    owned_by_edge1(hub)
+    hub.workers["edge1"].send_signal(signal.SIGSTOP)
+    started = time.monotonic()
+    hub.tell("edge2", WorkerRole.ACTIVE, 2, "edge1")
+    until(lambda: hub.shows("edge2", 2), "edge2 is the owner")  # an input before that would be warm-up, taken twice
+    hub.feed("edge2", 100)
+    until(lambda: ("edge2@2", 100) in hub.totals, "edge2, cold")
+    assert time.monotonic() - started < 0.8
+    assert "no answer within 0.3 s" in hub.said_by("edge2")
+
+
+@pytest.mark.parametrize(("mode", "why"), [("none", "nobody offers one"), ("slow", "no answer within 0.3 s")])
+def test_an_owner_without_a_state_to_give_is_a_cold_start(hub: Hub, mode: str, why: str) -> None:
+    owned_by_edge1(hub, mode)
+    hub.tell("edge1", WorkerRole.DRAINING, 1)
+    hub.tell("edge2", WorkerRole.ACTIVE, 2, "edge1")
+    until(lambda: hub.shows("edge2", 2), "edge2 is the owner")  # an input before that would be warm-up, taken twice
+    hub.feed("edge2", 100)
+    until(lambda: ("edge2@2", 100) in hub.totals, "edge2, cold")
+    assert why in hub.said_by("edge2")
+
+
+def test_a_cold_standby_that_starts_as_the_owner_fetches_too(hub: Hub) -> None:
+    hub.start_worker("edge1")
+    hub.tell("edge1", WorkerRole.ACTIVE, 1)
+    hub.feed("edge1", 7)
+    until(lambda: ("edge1@1", 7) in hub.totals, "the total of edge1")
+    hub.tell("edge1", WorkerRole.DRAINING, 1)
+    hub.tell("edge2", WorkerRole.ACTIVE, 2, "edge1")
+    hub.start_worker("edge2")
+    hub.feed("edge2", 1)
+    until(lambda: ("edge2@2", 8) in hub.totals, "edge2, started as the owner")

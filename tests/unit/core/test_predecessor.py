@@ -1,0 +1,70 @@
+"""Who is asked for the state of an epoch: the owner of the one before, while it is there."""
+
+from zsched.core.executor import Executor
+from zsched.core.fleet import TaskSpec, WorkerSpec
+from zsched.core.instructions import Instruction, SetRole
+from zsched.core.model import Allocation, Tuning, Weights
+from zsched.core.plan import Role, WorkerRole
+
+TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
+
+
+def edge(*, exclusive: bool = False) -> Executor:
+    spec = TaskSpec(
+        name="merge",
+        candidates=("edge1", "edge2"),
+        tuning=TUNING,
+        exclusive=exclusive,
+        worker=WorkerSpec(command=("merge",)),
+    )
+    return Executor(spec=spec, me="edge1", has_streams=False)
+
+
+def execute(one: Executor, owner: str, epoch: int) -> tuple[Instruction, ...]:
+    return one.execute(Allocation(task="merge", revision=epoch, epoch=epoch, owner=owner, tuning=TUNING), 0.0)
+
+
+def role(out: tuple[Instruction, ...]) -> Role:
+    (found,) = [one.role for one in out if isinstance(one, SetRole)]
+    return found
+
+
+def test_a_first_owner_has_no_predecessor() -> None:
+    assert role(execute(edge(), "edge1", 1)).predecessor is None
+
+
+def test_the_owner_before_is_the_predecessor() -> None:
+    one = edge()
+    execute(one, "edge2", 1)
+    found = role(execute(one, "edge1", 2))
+    assert (found.role, found.epoch, found.predecessor) == (WorkerRole.ACTIVE, 2, "edge2")
+
+
+def test_an_owner_that_is_gone_is_not_asked() -> None:
+    one = edge()
+    execute(one, "edge2", 1)
+    one.on_gone("edge2")
+    assert role(execute(one, "edge1", 2)).predecessor is None
+
+
+def test_somebody_elses_going_changes_nothing_and_is_forgotten_with_the_epoch() -> None:
+    one = edge()
+    execute(one, "edge3", 1)
+    one.on_gone("edge2")
+    one.on_gone("edge3")
+    execute(one, "edge2", 2)
+    assert role(execute(one, "edge1", 3)).predecessor == "edge2"
+
+
+def test_who_comes_back_to_itself_asks_nobody() -> None:
+    """This node has missed the owner in between: its own worker has the newest state it knows of."""
+    one = edge()
+    execute(one, "edge1", 1)
+    assert role(execute(one, "edge1", 3)).predecessor is None
+
+
+def test_a_lease_keeps_the_predecessor() -> None:
+    one = edge(exclusive=True)
+    execute(one, "edge2", 1)
+    execute(one, "edge1", 2)
+    assert role(one.set_lease(5.0, 1.0)).predecessor == "edge2"
