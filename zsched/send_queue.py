@@ -14,7 +14,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 from zsched.clock import monotonic_s
 
@@ -36,6 +36,7 @@ class _Waiting:
     lane: Hashable
     action: Action | None
     size: int
+    value: Any = None
 
 
 class SendQueue:
@@ -79,14 +80,17 @@ class SendQueue:
         since = self._busy_since
         return since is not None and monotonic_s() - since > STALL_S
 
-    def send(self, lane: Hashable, action: Action, size: int) -> int:
-        """Queue a sample of ``size`` bytes; answers how many samples were dropped for it (itself: 1)."""
+    def send(self, lane: Hashable, action: Action, size: int, value: Any = None) -> int:
+        """Queue a sample of ``size`` bytes; answers how many samples were dropped for it (itself: 1).
+
+        ``value`` is what `take_back` gives back while ``action`` has not begun.
+        """
         with self._wake:
             if self._is_closed:
                 return 1
             if not self._sheds and (self._count >= self._depth or self._bytes + size > MAX_BYTES):
                 return 1
-            waiting = _Waiting(lane, action, size)
+            waiting = _Waiting(lane, action, size, value)
             self._items.append(waiting)
             self._count += 1
             self._bytes += size
@@ -99,6 +103,16 @@ class SendQueue:
         with self._wake:
             self._items.append(_Waiting(None, action, 0))
             self._wake.notify()
+
+    def take_back(self) -> list[Any]:
+        """The values of the samples that have not gone out, in order; they will not any more. Markers stay."""
+        with self._wake:
+            taken = [waiting for waiting in self._items if waiting.lane is not None and waiting.action is not None]
+            self._items = deque(waiting for waiting in self._items if waiting.lane is None)
+            self._lines.clear()
+            for waiting in taken:
+                self._forget(waiting)
+            return [waiting.value for waiting in taken]
 
     def kick(self) -> None:
         """Look at ``is_open`` again, and run ``before_each``."""
@@ -170,6 +184,8 @@ class SendQueue:
 
     def _take(self) -> Action | None:
         with self._wake:
+            if not self._items:  # taken back
+                return None
             waiting = self._items.popleft()
             if waiting.action is None or waiting.lane is None:
                 return waiting.action

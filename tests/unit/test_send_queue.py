@@ -109,3 +109,17 @@ def test_a_failing_put_does_not_end_the_stream(caplog: pytest.LogCaptureFixture)
     until(lambda: receiver.got == [1], "the next one")
     assert "division by zero" in caplog.text
     queue.close()
+
+
+def test_what_has_not_gone_out_can_be_taken_back() -> None:
+    receiver = Receiver()
+    receiver.gate.clear()
+    queue = SendQueue("t", depth=10, sheds=False)
+    for number in range(4):
+        queue.send("a", receiver.take(number), 1, f"value {number}")
+    queue.then(receiver.take("end"))
+    until(lambda: queue.is_stalled, "the put blocks")
+    assert queue.take_back() == ["value 1", "value 2", "value 3"]
+    receiver.gate.set()
+    until(lambda: receiver.got == [0, "end"], "what was in hand, and the marker")
+    assert queue.close() == 0

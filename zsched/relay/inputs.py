@@ -97,6 +97,8 @@ class InputStream:
             if slot is None or slot is self._active:
                 return 0
             replayed = self._catch_up(slot)
+            for sample, stamp in self._active.outlet.take_back() if self._active is not None else ():
+                self._counter.dropped(*slot.outlet.send(sample, stamp))
             self._active = slot
             return replayed
 

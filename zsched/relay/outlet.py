@@ -118,7 +118,13 @@ class Outlet:
                 return "error", 1
             return "", 0
         size = len(sample.payload)
-        return "overflow", self._queue.send(lane, lambda: self._put(lane, sample, stamp, size), size)
+        action = lambda: self._put(lane, sample, stamp, size)  # noqa: E731 - named for the line's length
+        return "overflow", self._queue.send(lane, action, size, (sample, stamp))
+
+    def take_back(self) -> list[tuple[Sample, Timestamp | None]]:
+        """What class ``reliable`` still holds in its queue, never sent: it may go to another owner instead."""
+        is_reliable = self._settings.stream_class is StreamClass.RELIABLE
+        return self._queue.take_back() if self._queue is not None and is_reliable else []
 
     def key_of(self, sample: Sample) -> str:
         """The key that a sample goes on under (``""``: it does not fit)."""

@@ -1,0 +1,132 @@
+"""Planned and crash moves of reference echo workers under load: lost, doubled, reordered, and the gap.
+
+``python -m benchmarks.handover [--moves 200] [--class reliable|latest] [--recorder] [--stalled] [--mirror] [--crash]``.
+1 kHz x 100 B and 50 Hz x 1 MiB at once, over two edges in turn (A -> B -> A), TCP on loopback, relays driven by hand so
+that a move takes what it takes. ``--recorder``: a foreign subscriber to ``**``. ``--stalled``: a third edge whose
+worker is frozen takes the same streams meanwhile. ``--crash``: the owner's worker is killed before every move.
+"""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import tempfile
+import time
+from pathlib import Path
+
+from benchmarks.common import line, machine
+from benchmarks.rig import ROBOT, TASK, Load, Rig, Traffic, routes, until
+from zsched.core.plan import RoutePhase, RoutePlan, StreamClass
+
+SMALL = Load(name="small", hz=1000, size=100)
+LARGE = Load(name="large", hz=50, size=1 << 20)
+
+
+def main() -> None:
+    """Print what was lost, doubled, reordered, and the gaps."""
+    options = _options()
+    print(machine())
+    edges = ("edge1", "edge2", "edge3") if options.stalled else ("edge1", "edge2")
+    with tempfile.TemporaryDirectory() as folder, Rig(Path(folder), edges) as rig:
+        _run(rig, options)
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--moves", type=int, default=200)
+    parser.add_argument("--class", dest="stream_class", default="reliable", choices=["reliable", "latest"])
+    parser.add_argument("--small-hz", type=float, default=SMALL.hz)
+    parser.add_argument("--large-hz", type=float, default=LARGE.hz)
+    parser.add_argument("--recorder", action="store_true")
+    parser.add_argument("--stalled", action="store_true")
+    parser.add_argument("--mirror", action="store_true")
+    parser.add_argument("--crash", action="store_true")
+    return parser.parse_args()
+
+
+def _run(rig: Rig, options: argparse.Namespace) -> None:
+    stream_class = StreamClass(options.stream_class)
+    arguments = ("--latest",) if stream_class is StreamClass.LATEST else ()
+    loads = tuple(
+        Load(name=load.name, hz=hz, size=load.size)
+        for load, hz in ((SMALL, options.small_hz), (LARGE, options.large_hz))
+        if hz
+    )
+    for edge in ("edge1", "edge2"):
+        rig.start_worker(edge, *arguments)
+    session = rig.app()
+    traffics = [Traffic(session, load) for load in loads]
+    recorded = [0]
+    if options.recorder:
+        recorder = rig.app()
+        recorder.declare_subscriber("**", lambda _: recorded.__setitem__(0, recorded[0] + 1))
+    now = routes("edge1", 1, loads, stream_class, is_mirrored=options.mirror)
+    rig.move(now)
+    if options.stalled:
+        _stall(rig, loads, stream_class)
+    until(lambda: all(traffic.is_connected for traffic in traffics), "the application sees the relay")
+    for traffic in traffics:
+        traffic.start()
+    until(lambda: all(len(traffic.back) > 20 for traffic in traffics), "echoes")
+    moments, flips = [], []
+    for number in range(options.moves):
+        time.sleep(0.15)
+        owner = "edge2" if now.owner == "edge1" else "edge1"
+        new = routes(owner, now.epoch + 1, loads, stream_class, is_mirrored=options.mirror)
+        if options.crash:
+            rig.workers[now.owner].kill()
+            rig.workers[now.owner].wait(5)
+        moments.append(time.monotonic())
+        flips.append(rig.move(new, now, is_crash=options.crash) * 1000)
+        if options.crash:
+            rig.start_worker(now.owner, *arguments)
+        now = new
+        if number % 50 == 49:
+            print(f"  {number + 1}/{options.moves}", flush=True)
+    time.sleep(0.3)
+    for traffic in traffics:
+        traffic.stop()
+    _settle(traffics)
+    _report(rig, traffics, moments, flips)
+    if options.recorder:
+        print(f"  the recorder took {recorded[0]} samples")
+
+
+def _stall(rig: Rig, loads: tuple[Load, ...], stream_class: StreamClass) -> None:
+    """The same streams, as another task's, to an edge whose worker is frozen."""
+    rig.start_worker("edge3")
+    third = routes("edge3", 1, loads, stream_class, task=f"{TASK}3")
+    for phase in (RoutePhase.PREPARE, RoutePhase.FLIP, RoutePhase.CLOSE):
+        rig.relays[ROBOT].apply(RoutePlan(task=f"{TASK}3", phase=phase, current=third))
+        time.sleep(0.2)
+    rig.workers["edge3"].send_signal(signal.SIGSTOP)
+
+
+def _settle(traffics: list[Traffic], deadline_s: float = 5.0) -> None:
+    end = time.monotonic() + deadline_s
+    while time.monotonic() < end and any(traffic.result()[0] for traffic in traffics):
+        time.sleep(0.05)
+
+
+def _report(rig: Rig, traffics: list[Traffic], moments: list[float], flips: list[float]) -> None:
+    for traffic in traffics:
+        load = traffic.load
+        lost, doubled, reordered = traffic.result()
+        what = f"{load.name}: {load.hz:g} Hz x {load.size} B"
+        print(f"{what:<30} sent {len(traffic.sent)} lost {lost} doubled {doubled} reordered {reordered}")
+        gaps = [traffic.gap_after(moment) for moment in moments]
+        print(line(f"  gap around a move, {load.name}", gaps, "ms", f"one period ({1000 / load.hz:g}) + 20"))
+    print(line("  prepare to flip", flips, "ms", "-"))
+    left = rig.left_behind()
+    if left:
+        print(f"  reported 'at most N lost': {len(left)} slots, {sum(left)} samples, largest {max(left)}")
+    for name, count in rig.counts().items():
+        print(
+            f"  {name}: {count.messages} msg acknowledged {count.acknowledged} in flight {count.in_flight} "
+            f"lost {count.lost} doubled {count.doubled} reordered {count.reordered} replayed {count.replayed} "
+            f"at most lost {count.at_most_lost} drops {dict(count.drops)}"
+        )
+
+
+if __name__ == "__main__":
+    main()
