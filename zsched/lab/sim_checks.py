@@ -12,13 +12,15 @@ from zsched.core.damping import ESCAPES_PER_MINUTE
 from zsched.core.executor import Phase
 from zsched.core.fleet import Fleet
 from zsched.core.messages import Accepted, Promise
-from zsched.core.model import Allocation, DurableState, NodeId, RegisterState, TaskId, WorkerState
+from zsched.core.model import Allocation, Ballot, DurableState, NodeId, RegisterState, TaskId, WorkerState
 from zsched.core.plan import RoutePlan, WorkerRole
 from zsched.errors import InvariantError
 from zsched.lab.history import Checker, Learnt, Record, Routed, Started, Stored, Worked
 from zsched.lab.sim_parts import Machine
 
 GENERATION_STEP = 2**32
+FORGED = -1
+"""The number of a question that a stranger asks, or in another one's name: a yes to it is a violation."""
 MAX_WAKES = 50
 """So often in a row a node may want to be woken without time passing."""
 
@@ -31,6 +33,8 @@ class Invariants:
     checker: Checker = field(init=False)
     told: dict[tuple[TaskId, int], Allocation] = field(default_factory=dict)
     """{(task, revision): the one value}."""
+    ballots: dict[tuple[TaskId, Ballot], tuple[str, Allocation | None]] = field(default_factory=dict)
+    """{(task, ballot): (whose it is, what it carries)}."""
 
     def __post_init__(self) -> None:
         limits = {task.name: task.max_moves_per_minute + ESCAPES_PER_MINUTE for task in self.fleet.tasks}
@@ -90,7 +94,9 @@ class Invariants:
     def on_leaving(self, machine: Machine, instruction: do.Instruction) -> None:
         """What others will see, and what workers and relays do, must stand on this machine's disk."""
         match instruction:
-            case do.AnswerElection(answer=Promise() | Accepted() as answer):
+            case do.AnswerElection(request=request, answer=Promise() | Accepted() as answer):
+                if request == FORGED:
+                    raise InvariantError(f"{machine.key} said yes to a ballot that is not its asker's: {answer}")
                 self._check_answer(machine, answer)
             case do.PublishBeat(beat=beat):
                 for task, revision, _ in beat.learnt:
@@ -98,6 +104,10 @@ class Invariants:
             case do.PublishLearnt(learnt=learnt) | do.AnswerLearnt(learnt=learnt):
                 for value in learnt.values:
                     self._check_told(machine, value.task, value.revision)
+            case do.SendPrepare(prepare=prepare):
+                self._check_ballot(machine, prepare.task, prepare.ballot, None)
+            case do.SendAccept(accept=accept):
+                self._check_ballot(machine, accept.task, accept.acceptance.ballot, accept.acceptance.value)
             case do.SetRole(role=role) if role.role is WorkerRole.ACTIVE:
                 self._check_epoch(machine, role.task, role.epoch)
             case _:
@@ -119,6 +129,16 @@ class Invariants:
             raise InvariantError(f"{machine.key} answered without its acceptance on disk: {answer}")
         if isinstance(answer, Promise) and held.promised == answer.ballot and held.accepted != answer.accepted:
             raise InvariantError(f"{machine.key} promised and told another acceptance than it has: {answer}")
+
+    def _check_ballot(self, machine: Machine, task: TaskId, ballot: Ballot, value: Allocation | None) -> None:
+        """No two lives use one ballot, and it carries one value only."""
+        life = f"{machine.key} life {machine.life}"
+        first, carried = self.ballots.setdefault((task, ballot), (life, value))
+        if first != life:
+            raise InvariantError(f"{first} and {life} both use {ballot} for {task}")
+        if value is not None and carried not in (None, value):
+            raise InvariantError(f"{ballot} carries two values for {task}: {carried} and {value}")
+        self.ballots[task, ballot] = (life, value or carried)
 
     def _check_told(self, machine: Machine, task: TaskId, revision: int) -> None:
         if not revision or not _keeps_state(machine):

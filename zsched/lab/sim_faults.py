@@ -116,6 +116,7 @@ class Stage:
         sim.heal()
         sim.weather.calm()
         sim.loss, sim.delay_s, sim.cut_batch = 0.0, SMALL_DELAY_S, None
+        missing = self._one_too_few()
         for key in [key for key, machine in sim.machines.items() if key != machine.name]:
             self._remove(key)
         for machine in tuple(sim.machines.values()):
@@ -124,9 +125,20 @@ class Stage:
             is_wrong = machine.fleet is not sim.fleet or machine.key in sim.broken_disks or self._is_stopping(machine)
             machine.fleet = sim.fleet
             sim.broken_disks.discard(machine.key)
-            if is_wrong:
+            if is_wrong or machine.key == missing:
                 sim.crash(machine.key)
-            sim.start(machine.key)
+            if machine.key != missing:
+                sim.start(machine.key)
+
+    def _one_too_few(self) -> NodeId | None:
+        """In every second schedule one node that the others can do without never comes back."""
+        fleet = self.sim.fleet
+        name = self._rng.choice(fleet.nodes).name
+        electors = [other for other in fleet.electors if other != name and self.sim.disk(other) is not None]
+        voters = [other for other in fleet.voters if other != name]
+        is_missed = len(electors) < majority(len(fleet.electors)) or len(voters) < majority(len(fleet.voters))
+        is_missed |= any(set(task.candidates) <= {name} for task in fleet.tasks)
+        return None if is_missed or self._rng.random() < 0.5 else name
 
     @staticmethod
     def _is_stopping(machine: Machine) -> bool:
@@ -135,7 +147,8 @@ class Stage:
     def can_agree(self) -> bool:
         """Whether a majority of the electors has kept its state."""
         sim = self.sim
-        fit = [name for name in sim.fleet.electors if sim.node(name).agreement.is_elector]
+        running = sim.running()
+        fit = [name for name in sim.fleet.electors if name in running and sim.node(name).agreement.is_elector]
         return len(fit) >= majority(len(sim.fleet.electors))
 
     def _check_answers(self) -> None:

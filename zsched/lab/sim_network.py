@@ -19,6 +19,7 @@ from zsched import wire
 from zsched.core import events as ev
 from zsched.core.model import Ballot, NodeId
 from zsched.errors import InvariantError, WireError
+from zsched.lab.sim_checks import FORGED
 
 GHOST = "ghost"
 """A name that no fleet file holds: whoever sends in it is a stranger."""
@@ -157,12 +158,12 @@ def _forged_question(event: ev.PrepareAsked | ev.AcceptAsked, rng: Random) -> ev
     if isinstance(event, ev.PrepareAsked):
         node = GHOST if asker == GHOST else _other(event.prepare.ballot.node)
         prepare = replace(event.prepare, ballot=_high(event.prepare.ballot, node))
-        return ev.PrepareAsked(request=-1, asker=asker, prepare=prepare)
+        return ev.PrepareAsked(request=FORGED, asker=asker, prepare=prepare)
     acceptance = event.accept.acceptance
     node = GHOST if asker == GHOST else _other(acceptance.ballot.node)
     value = replace(acceptance.value, revision=acceptance.value.revision + 1)
     accept = replace(event.accept, acceptance=replace(acceptance, ballot=_high(acceptance.ballot, node), value=value))
-    return ev.AcceptAsked(request=-1, asker=asker, accept=accept)
+    return ev.AcceptAsked(request=FORGED, asker=asker, accept=accept)
 
 
 def _other(node: NodeId) -> NodeId:

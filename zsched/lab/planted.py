@@ -1,0 +1,182 @@
+"""Plants one bug at a time into the code and lets the suite find it: ``python -m zsched.lab.planted``.
+
+Knows: how a bug is planted (an import hook in a process of its own; no file is touched), the budget of each, the table.
+Does not know: what the bugs are (`zsched.lab.planted_bugs`), what finds them.
+
+For every bug the simulator plays schedules until one is violated; when none is within the budget, the bug's directed
+tests are run. The last line is ``F of N planted bugs found``; the exit code is 1 when one survives.
+Must be run in the source tree: the directed tests are there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.abc
+import importlib.machinery
+import importlib.util
+import subprocess
+import sys
+import time
+import types
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from zsched.lab.planted_bugs import BUGS, Bug
+
+BUDGET_S = 30.0
+"""What the schedules may take for one bug; the directed tests come on top."""
+TESTS_S = 120.0
+MAX_SEEDS = 100_000
+
+
+class PlantError(Exception):
+    """The text that a bug replaces is not in its module exactly once: write the bug anew."""
+
+
+def changed(bug: Bug, source: str) -> str:
+    """The module's source with the bug in it.
+
+    Raises:
+        PlantError: a text is not there exactly once.
+    """
+    for old, new in bug.changes:
+        if source.count(old) != 1:
+            raise PlantError(f"{bug.name}: {bug.module} has {source.count(old)} times {old!r}")
+        source = source.replace(old, new)
+    return source
+
+
+class _Planter(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+    """Loads one module with a bug in it."""
+
+    def __init__(self, bug: Bug) -> None:
+        self._bug = bug
+        self._path = ""
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: types.ModuleType | None = None
+    ) -> importlib.machinery.ModuleSpec | None:
+        if fullname != self._bug.module:
+            return None
+        found = importlib.machinery.PathFinder.find_spec(fullname, path, target)
+        if found is None or found.origin is None:
+            return None
+        self._path = found.origin
+        return importlib.util.spec_from_loader(fullname, self, origin=found.origin)
+
+    def exec_module(self, module: types.ModuleType) -> None:
+        source = changed(self._bug, Path(self._path).read_text(encoding="utf-8"))
+        exec(compile(source, self._path, "exec"), module.__dict__)  # noqa: S102 - our own source, a few words changed
+
+
+def plant(bug: Bug) -> None:
+    """From now on this process has the bug (its module must not have been imported yet)."""
+    if bug.module in sys.modules:
+        raise PlantError(f"{bug.name}: {bug.module} is imported already")
+    sys.meta_path.insert(0, _Planter(bug))
+
+
+# --- in the planted process ------------------------------------------------------------------------------------------
+
+
+def hunt(bug: Bug, budget_s: float) -> int:
+    """Play schedules until one is violated; 1 when one was, 0 when none was in time."""
+    plant(bug)
+    from zsched.lab.sim_faults import play  # noqa: PLC0415 - only now may the core be imported
+    from zsched.lab.sim_swarm import plan  # noqa: PLC0415 - as above
+
+    ends_at = time.process_time() + budget_s
+    first = () if bug.seed is None else (bug.seed,)
+    for seed in (*first, *range(MAX_SEEDS)):
+        result = play(plan(seed))
+        if result.violation:
+            print(f"seed {seed}: {result.violation[:200]}")
+            return 1
+        if time.process_time() > ends_at:
+            break
+    return 0
+
+
+def run_tests(bug: Bug, tests: Sequence[str]) -> int:
+    """Run directed tests; 1 when one fails."""
+    plant(bug)
+    import pytest  # noqa: PLC0415 - a lab without tests needs none
+
+    code = pytest.main(["-x", "-q", "-p", "no:cacheprovider", "--no-header", "--tb=no", *tests])
+    return int(code == pytest.ExitCode.TESTS_FAILED)
+
+
+# --- the table -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verdict:
+    """What became of one bug; ``found_by`` is empty when it survived."""
+
+    bug: Bug
+    found_by: str
+    seconds: float
+
+
+def judge(bug: Bug, budget_s: float = BUDGET_S) -> Verdict:
+    """Hunt one bug: schedules first, then its directed tests."""
+    began_at = time.monotonic()
+    found = ""
+    for how, limit_s in (("hunt", 20 * budget_s), ("tests", TESTS_S)):
+        if found or (how == "tests" and not bug.tests):
+            break
+        found = _found(bug, how, budget_s, limit_s)
+    return Verdict(bug=bug, found_by=found, seconds=time.monotonic() - began_at)
+
+
+def _found(bug: Bug, how: str, budget_s: float, limit_s: float) -> str:
+    command = [sys.executable, "-m", "zsched.lab.planted", "--only", bug.name, f"--{how}", "--budget", str(budget_s)]
+    try:
+        run = subprocess.run(command, capture_output=True, text=True, timeout=limit_s, check=False)
+    except subprocess.TimeoutExpired:
+        return f"{how} did not end within {limit_s:g} s" if how == "tests" else ""
+    if "PlantError" in run.stderr:
+        raise PlantError(run.stderr.strip().splitlines()[-1])
+    if run.returncode == 0:
+        return ""
+    lines = [line for line in run.stdout.splitlines() if line.startswith(("seed ", "FAILED ", "ERROR "))]
+    return lines[0] if lines else f"{how}: {(run.stderr or run.stdout).strip().splitlines()[-1]}"
+
+
+def table(verdicts: Sequence[Verdict]) -> str:
+    """The verdicts as Markdown."""
+    rows = ["| bug | found by | s |", "| --- | --- | ---: |"]
+    for one in verdicts:
+        found = (one.found_by or "**survived**").replace("|", "/")
+        rows.append(f"| {one.bug.name} | {found} | {one.seconds:.1f} |")
+    return "\n".join(rows)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Hunt all bugs (or ``--only`` one), print the table, return the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m zsched.lab.planted", description=__doc__)
+    parser.add_argument("--only", help="the name of one bug")
+    parser.add_argument("--budget", type=float, default=BUDGET_S, help="seconds of schedules for one bug")
+    parser.add_argument("--hunt", action="store_true", help="play schedules in this process")
+    parser.add_argument("--tests", action="store_true", help="run the directed tests in this process")
+    given = parser.parse_args(arguments)
+    bugs = [bug for bug in BUGS if given.only in (None, bug.name)]
+    if not bugs:
+        parser.error(f"no bug is called {given.only!r}")
+    if given.hunt:
+        return hunt(bugs[0], given.budget)
+    if given.tests:
+        return run_tests(bugs[0], bugs[0].tests)
+    verdicts = []
+    for bug in bugs:
+        verdicts.append(judge(bug, given.budget))
+        print(f"{bug.name}: {verdicts[-1].found_by or 'SURVIVED'} ({verdicts[-1].seconds:.1f} s)", flush=True)
+    print("\n" + table(verdicts))
+    found = sum(bool(one.found_by) for one in verdicts)
+    print(f"{found} of {len(verdicts)} planted bugs found")
+    return 0 if found == len(verdicts) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,391 @@
+"""The bugs that the suite must find: one per rule of the agreement, the lease, membership, vote and handover.
+
+Knows: which text of which module each bug replaces, and which tests may find it. Does not know: how it is planted.
+
+A bug is a few words of source. When the source changes so that the words are no longer there, planting fails and says
+so: then the bug is written anew for the new source.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bug:
+    """One planted bug: in ``module`` each of ``changes`` (old text, new text), the old text exactly once."""
+
+    name: str
+    module: str
+    changes: tuple[tuple[str, str], ...]
+    tests: tuple[str, ...] = ()
+    """Directed tests that are run when no schedule has found it within its budget."""
+    seed: int | None = None
+    """A schedule that has found it before: tried first."""
+
+
+REGISTER, LEASE = "zsched.core.register", "zsched.core.lease"
+AGREEMENT, MEMBERSHIP, NODE = "zsched.core.agreement", "zsched.core.membership", "zsched.core.node"
+ROUNDS, VOTE = "zsched.core.rounds", "zsched.core.vote"
+SCHEDULER, SCORING, EXECUTOR = "zsched.core.scheduler", "zsched.core.scoring", "zsched.core.executor"
+
+_REGISTER = ("tests/unit/core/test_register.py", "tests/unit/core/test_register_proposer.py")
+_SCHEDULES = ("tests/unit/core/test_register_schedules.py",)
+_AGREEMENT = ("tests/unit/core/test_agreement.py",)
+_LEASE = ("tests/sim/test_lease_rules.py", "tests/sim/test_exclusive.py")
+_MEMBERSHIP = ("tests/unit/core/test_membership.py", "tests/sim/test_simulator.py")
+_ROUNDS = ("tests/unit/core/test_rounds.py", "tests/unit/core/test_vote.py")
+_SCHEDULER = ("tests/unit/core/test_scheduler.py", "tests/unit/core/test_scoring.py", "tests/paper")
+_EXECUTOR = ("tests/unit/core/test_executor.py",)
+
+
+def _bug(name: str, module: str, old: str, new: str, tests: tuple[str, ...] = (), seed: int | None = None) -> Bug:
+    return Bug(name=name, module=module, changes=((old, new),), tests=tests, seed=seed)
+
+
+REGISTER_BUGS = (
+    _bug("quorum off by one", SCORING, "return count // 2 + 1", "return max(count // 2, 1)", _REGISTER),
+    _bug(
+        "promise not persisted", REGISTER, "return Step(is_dirty=True), promise", "return Step(), promise", _SCHEDULES
+    ),
+    _bug(
+        "acceptance not persisted",
+        REGISTER,
+        "return Step(is_dirty=True), Accepted(",
+        "return Step(), Accepted(",
+        _SCHEDULES,
+    ),
+    _bug(
+        "promise with >=",
+        REGISTER,
+        "prepare.ballot <= self.state.promised",
+        "prepare.ballot < self.state.promised",
+        _REGISTER,
+    ),
+    _bug(
+        "accepts below its promise",
+        REGISTER,
+        "(ballot < self.state.promised or max(",
+        "(ballot.counter < self.state.promised.counter - 9 or max(",
+        _REGISTER + _SCHEDULES,
+    ),
+    _bug(
+        "accepted value not re-accepted",
+        REGISTER,
+        "newest = max(accepted, key=lambda acceptance: acceptance.ballot, default=None)",
+        "newest = None",
+        _SCHEDULES,
+    ),
+    _bug(
+        "newest by revision instead of ballot",
+        REGISTER,
+        "key=lambda acceptance: acceptance.ballot,",
+        "key=lambda acceptance: (-acceptance.value.revision, acceptance.ballot),",
+        _REGISTER + _SCHEDULES,
+    ),
+    Bug(
+        name="own change in the same ballot as a foreign value",
+        module=REGISTER,
+        changes=(
+            (
+                "if read.revision > self.value.revision or running.change is None or running.sent is not None:",
+                "if running.change is None or running.sent is not None:",
+            ),
+            (
+                "elif running.change.base_revision != read.revision:",
+                "elif running.change.base_revision > read.revision:",
+            ),
+        ),
+        tests=_REGISTER + _SCHEDULES,
+    ),
+    _bug(
+        "a change is applied again after an unknown outcome",
+        REGISTER,
+        "is_identity = running.change is None or running.sent is not None",
+        "running.sent = None; is_identity = running.change is None",
+        _REGISTER + _SCHEDULES,
+    ),
+    Bug(
+        name="identity rounds skipped",
+        module=REGISTER,
+        changes=(
+            (
+                "        if self._is_unlearnt():\n            self._settle_tries = 0",
+                "        if False:\n            pass",
+            ),
+        ),
+        tests=_REGISTER + _SCHEDULES,
+    ),
+    _bug(
+        "restart forgets the incarnation",
+        REGISTER,
+        "running.ballot = Ballot(counter=self._counter, node=self._me, incarnation=self._incarnation)",
+        "running.ballot = Ballot(counter=self._counter, node=self._me, incarnation=0)",
+        _REGISTER,
+    ),
+    _bug(
+        "learnt value not persisted before routes",
+        REGISTER,
+        "step.is_dirty, step.learnt = True, value",
+        "step.learnt = value",
+        _REGISTER,
+    ),
+    _bug(
+        "stranger's answer counts",
+        REGISTER,
+        "answer.ballot != running.ballot or answer.elector not in self._electors",
+        "answer.ballot != running.ballot",
+        _REGISTER,
+    ),
+    _bug(
+        "answer to an older ballot counts",
+        REGISTER,
+        "running is None or answer.ballot != running.ballot or",
+        "running is None or",
+        _REGISTER,
+    ),
+    _bug(
+        "repeated answer counts twice",
+        REGISTER,
+        "running.yes[answer.elector] = True",
+        'running.yes[f"{answer.elector}/{len(running.yes)}"] = True',
+        _REGISTER,
+    ),
+    _bug(
+        "another electorate's ballot is answered",
+        REGISTER,
+        "if electorate != self._electorate:",
+        "if not electorate:",
+        _REGISTER,
+    ),
+    _bug(
+        "node without state is an elector",
+        AGREEMENT,
+        "self.is_elector = durable is not None and me in fleet.electors",
+        "self.is_elector = me in fleet.electors",
+        _AGREEMENT,
+    ),
+    _bug(
+        "accepted values are told as learnt",
+        AGREEMENT,
+        "values = tuple(value for value in self.values().values() if value.revision > 0)",
+        "values = tuple(r.state.accepted.value for r in self.registers.values() if r.state.accepted is not None)",
+        _AGREEMENT,
+    ),
+    _bug(
+        "refused disk keeps electing",
+        AGREEMENT,
+        "        for register in self.registers.values():\n            register.stop_electing()",
+        "",
+        _AGREEMENT,
+    ),
+    _bug(
+        "ballot in another's name is answered",
+        AGREEMENT,
+        "return ballot.node == asker and asker in self._nodes",
+        "return True",
+        _AGREEMENT,
+    ),
+    _bug(
+        "batch in the wrong order",
+        NODE,
+        "return (*first, *batch.send, *batch.apply)",
+        "return (*batch.send, *first, *batch.apply)",
+        ("tests/unit/core/test_node_prefixes.py",),
+    ),
+)
+
+LEASE_BUGS = (
+    Bug(
+        name="echo to an owner that was not accepted",
+        module=LEASE,
+        changes=(
+            ("if accepted is None or accepted[0] != beat.node:", "if accepted is None:"),
+            ("if epoch != accepted[1] or self._is_silenced", "if epoch is None or self._is_silenced"),
+        ),
+        tests=_LEASE,
+    ),
+    _bug(
+        "echo counts before the epoch was learnt",
+        LEASE,
+        "if grant.number >= self.first_number and grant.number > self.released:",
+        "if grant.number > self.released:",
+        _LEASE,
+    ),
+    _bug(
+        "grant not honoured after a restart",
+        LEASE,
+        "if now < self.started_at + hold and owner != self.standing:",
+        "if hold < 0.0:",
+        _LEASE,
+    ),
+    _bug(
+        "silence rule left out",
+        LEASE,
+        "return self._silent_for == (owner, epoch) and now < self._silent_until",
+        "return False",
+        _LEASE,
+    ),
+    _bug(
+        "release of another life honoured",
+        LEASE,
+        "if last is not None and (last.owner, last.incarnation) == key and last.number <= grant.number:",
+        "if last is not None and last.owner == grant.owner:",
+        _LEASE,
+    ),
+    _bug(
+        "lease from receiving instead of sending",
+        LEASE,
+        "                self._holders[grant.task].on_echo(beat.node, grant)",
+        "                held = self._holders[grant.task]\n"
+        "                held.on_echo(beat.node, grant)\n"
+        "                held._sent.append((grant.number, now))\n"
+        "                held._sent.reverse()",
+        _LEASE,
+    ),
+    _bug("lease of a minority", LEASE, "number = numbers[needed - 1]", "number = numbers[0]", _LEASE),
+    _bug(
+        "released number is granted again",
+        LEASE,
+        "if beat.sequence <= self._released.get((beat.node, beat.incarnation), -1):",
+        "if beat.sequence < 0:",
+        _LEASE,
+    ),
+    _bug("next life is granted at once", LEASE, "if self._is_other_life(beat, now):", "if not epoch:", _LEASE),
+    _bug(
+        "hold shorter than the lease",
+        LEASE,
+        "return lease_s * (1 + RHO) / (1 - RHO)",
+        "return lease_s * (1 - RHO) / (1 + RHO) - 0.02",
+        _LEASE,
+    ),
+    _bug(
+        "accepts without asking the lease",
+        LEASE,
+        "return granter is None or granter.may_accept",
+        "return True or granter.may_accept",
+        _LEASE,
+    ),
+)
+
+MEMBERSHIP_BUGS = (
+    _bug(
+        "token resurrects a peer",
+        NODE,
+        '        self.counters["tokens_seen"] += 1\n',
+        '        self.counters["tokens_seen"] += 1\n'
+        "        if event.node in self.membership._peers:\n"
+        "            self.membership._change(event.node, PeerState.ALIVE, 'token', _now)\n"
+        "            self.membership._peers[event.node].beat_at = _now\n",
+        (*_MEMBERSHIP, "tests/unit/core/test_node.py"),
+    ),
+    _bug(
+        "vouching ignored",
+        MEMBERSHIP,
+        "any(at.beat_at > peer.suspect_since for _, at in observers)",
+        "any(at.beat_at < 0.0 for _, at in observers)",
+        _MEMBERSHIP,
+    ),
+    _bug("suspicion never confirmed", MEMBERSHIP, 'return "nobody speaks for it"', 'return ""', _MEMBERSHIP),
+    _bug(
+        "second observer not needed",
+        MEMBERSHIP,
+        "                if name in observer.suspects:",
+        "                if observer.suspects or True:",
+        _MEMBERSHIP,
+    ),
+    _bug(
+        "older life's beats count",
+        MEMBERSHIP,
+        "return (beat.incarnation, beat.sequence) > (peer.incarnation, peer.sequence)",
+        "return beat.sequence > peer.sequence",
+        _MEMBERSHIP,
+    ),
+)
+
+VOTE_BUGS = (
+    Bug(
+        name="stale proposal counted",
+        module=ROUNDS,
+        changes=(
+            ("if proposal.base_revision != allocation.revision:\n            return []", "pass"),
+            ("and proposal.base_revision == allocation.revision", ""),
+        ),
+        tests=_ROUNDS,
+    ),
+    _bug(
+        "escape ignores the quorum",
+        VOTE,
+        "needed = max(min(needed, majority(len([voter for voter in voters if voter in present]))), 1)",
+        "needed = 1",
+        _ROUNDS,
+    ),
+    _bug(
+        "commit without supporters",
+        ROUNDS,
+        "if self._me not in supporters or counted.winner is None:\n            return\n",
+        "supporters.append(self._me)\n        if counted.winner is None:\n            return\n",
+        _ROUNDS,
+    ),
+    _bug(
+        "called vote ignored",
+        ROUNDS,
+        "return self.is_voter and task.commit is None and (",
+        "return False and (",
+        _ROUNDS,
+    ),
+    _bug(
+        "cool-down skipped",
+        SCHEDULER,
+        "if settled_for_s < tuning.cool_down_s:",
+        "if settled_for_s < 0.0:",
+        _SCHEDULER,
+    ),
+    _bug(
+        "bonus twice",
+        SCHEDULER,
+        "max(value + (bonus if name == owner else 0.0)",
+        "max(value + (2 * bonus if name == owner else 0.0)",
+        _SCHEDULER,
+    ),
+    _bug(
+        "unreachable left out instead of 0",
+        SCORING,
+        "utilities = [Utility(candidate=name, value=0.0, reachable=False) for name in unreachable]",
+        "utilities: list[Utility] = []",
+        _SCHEDULER,
+    ),
+    _bug(
+        "median and mean swapped",
+        SCORING,
+        "if allocation.tuning.aggregate is Aggregate.MEAN",
+        "if allocation.tuning.aggregate is not Aggregate.MEAN",
+        _SCHEDULER,
+    ),
+)
+
+HANDOVER_BUGS = (
+    _bug(
+        "epoch compared with >=",
+        EXECUTOR,
+        "if allocation.owner is None or allocation.epoch <= self.epoch:",
+        "if allocation.owner is None or allocation.epoch < self.epoch:",
+        _EXECUTOR,
+    ),
+    _bug(
+        "drain ends the gate too early",
+        EXECUTOR,
+        "        if self._predecessor is None:\n            return self._go(Phase.SETTLED, RoutePhase.CLOSE, done)",
+        "        if True:\n            return self._go(Phase.SETTLED, RoutePhase.CLOSE, done)",
+        _EXECUTOR,
+    ),
+    _bug(
+        "flips for another epoch's readiness",
+        EXECUTOR,
+        "if epoch != self.epoch or self.phase is not Phase.PREPARING:",
+        "if self.phase is not Phase.PREPARING:",
+        _EXECUTOR,
+    ),
+)
+
+BUGS: tuple[Bug, ...] = (*REGISTER_BUGS, *LEASE_BUGS, *MEMBERSHIP_BUGS, *VOTE_BUGS, *HANDOVER_BUGS)
