@@ -18,7 +18,7 @@ from benchmarks.common import line, machine
 from zsched.lab.testbed import TASK, Testbed, echo_fleet
 
 GOAL = "p99 50 ms"
-PERIOD_S = 1.5
+PERIOD_S = 1.0
 TRACE_S = 600
 STAMP = r"^(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3}) INFO "
 PROPOSED = re.compile(STAMP + rf"zsched\.scheduler task={TASK} epoch=(\d+) propose ")
