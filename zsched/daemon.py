@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import errno
 import gc
 import logging
 import os
@@ -73,8 +74,15 @@ class Endpoints:
     worker_listen: tuple[str, ...]
 
 
-def endpoints_for(fleet: Fleet, me: NodeSpec, free_port: Callable[[], int]) -> Endpoints:
-    """The endpoints of one node: its own to listen on, its seeds' to dial (gossip finds the rest)."""
+def endpoints_for(
+    fleet: Fleet, me: NodeSpec, free_port: Callable[[], int], is_here: Callable[[str], bool] = lambda _host: True
+) -> Endpoints:
+    """The endpoints of one node: its own to listen on, the others' to dial.
+
+    Control links are dialled by one side only where the file says how: two that redial each other while a cut heals can
+    end with a link that zenoh keeps alive and delivers nothing on. Data links start at the seeds. Our own address on
+    another machine (``is_here``) is dialled too: there a twin of ours may be, and must be heard.
+    """
     others = [fleet.node(name) for name in fleet.seeds if name != me.name]
     data_listen = me.listen_data or "tcp/0.0.0.0:0"
     if not dial_endpoint(data_listen, "127.0.0.1"):  # any port will do, but workers must know which
@@ -83,7 +91,7 @@ def endpoints_for(fleet: Fleet, me: NodeSpec, free_port: Callable[[], int]) -> E
     is_loopback = "/127." in data_listen or "/[::1]" in data_listen
     return Endpoints(
         control_listen=(me.listen_control or "tcp/0.0.0.0:0",),
-        control_connect=_dialled(others, lambda node: node.listen_control),
+        control_connect=_dialled(_control_targets(fleet, me, is_here), lambda node: node.listen_control),
         data_listen=(data_listen,),
         data_connect=_dialled(others, lambda node: node.listen_data),
         worker_connect=(dial_endpoint(data_listen, "127.0.0.1"),),
@@ -91,9 +99,40 @@ def endpoints_for(fleet: Fleet, me: NodeSpec, free_port: Callable[[], int]) -> E
     )
 
 
+def _control_targets(fleet: Fleet, me: NodeSpec, is_here: Callable[[str], bool]) -> list[NodeSpec]:
+    """Whom this node dials: everybody dials the seeds; of other pairs the one whose name comes later, if it can."""
+
+    def rank(node: NodeSpec) -> tuple[int, NodeId]:
+        return (fleet.seeds.index(node.name) if node.name in fleet.seeds else len(fleet.seeds), node.name)
+
+    mine = [me] if _has_address(me) and not is_here(me.host) else []
+    others = [node for node in fleet.nodes if node.name != me.name and _has_address(node)]
+    return mine + [node for node in others if rank(node) < rank(me) or not _has_address(me)]
+
+
+def has_all_addresses(fleet: Fleet) -> bool:
+    """Whether every pair of nodes can meet by the fleet file alone, without gossip."""
+    return sum(not _has_address(node) for node in fleet.nodes) <= 1
+
+
+def _has_address(node: NodeSpec) -> bool:
+    return bool(node.listen_control and dial_endpoint(node.listen_control, node.host))
+
+
 def _dialled(nodes: list[NodeSpec], endpoint: Callable[[NodeSpec], str]) -> tuple[str, ...]:
     dialled = (dial_endpoint(endpoint(node), node.host) for node in nodes if endpoint(node))
     return tuple(target for target in dialled if target)
+
+
+def is_here(host: str) -> bool:
+    """Whether ``host`` is an address of this machine (of its network namespace); unknown names are taken for ours."""
+    try:
+        family, *_, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family) as probe:
+            probe.bind(address)
+    except OSError as error:
+        return error.errno != errno.EADDRNOTAVAIL
+    return True
 
 
 def free_port() -> int:
@@ -176,7 +215,7 @@ class Daemon:
         with state_file, contextlib.ExitStack() as stack:
             durable, problem = self._restore(state_file)
             incarnation = durable.incarnation if durable is not None else wall_seconds()
-            points = endpoints_for(self._fleet, self._spec, free_port)
+            points = endpoints_for(self._fleet, self._spec, free_port, is_here)
             self._handle_signals(stack)  # first: a stop that comes while things open is an orderly one, too
             shell = self._build(stack, state_file, incarnation, points)
             node = Node(
@@ -225,6 +264,7 @@ class Daemon:
                 connect=points.control_connect,
                 timing=fleet.timing,
                 operator_json5=operator_json5,
+                dials_by_gossip=not has_all_addresses(fleet),
             ),
             post=self._inbox.post,
         )

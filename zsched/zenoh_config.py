@@ -29,10 +29,17 @@ Settings = dict[str, Any]
 
 
 def control_config(
-    *, listen: tuple[str, ...], connect: tuple[str, ...], timing: Timing = DEFAULT_TIMING, operator_json5: str = ""
+    *,
+    listen: tuple[str, ...],
+    connect: tuple[str, ...],
+    timing: Timing = DEFAULT_TIMING,
+    operator_json5: str = "",
+    dials_by_gossip: bool = True,
 ) -> str:
     """The daemon's control session: beats, ballots, status. Shared memory off, messages bounded, nothing shared.
 
+    Without ``dials_by_gossip`` only ``connect`` is dialled: when that covers every pair from one side, two sessions
+    never redial each other at once after a cut, which can leave a link that is kept alive and delivers nothing.
     ``listen`` and ``connect`` are zenoh endpoints such as ``tcp/0.0.0.0:7457``; never those of the data session.
 
     Raises:
@@ -41,6 +48,8 @@ def control_config(
     settings = _peer(listen, connect, timing)
     settings["transport/shared_memory/enabled"] = False
     settings["transport/link/rx/max_message_size"] = CONTROL_MAX_MESSAGE
+    if not dials_by_gossip:
+        settings["scouting/gossip/autoconnect"] = {"router": [], "peer": []}
     return _render(settings, operator_json5)
 
 

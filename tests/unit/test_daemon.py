@@ -22,7 +22,17 @@ from zsched.adapters.state_file import StateFile
 from zsched.core import events as ev
 from zsched.core.fleet import Fleet, NodeSpec, Timing
 from zsched.core.model import NodeKind
-from zsched.daemon import EXIT_CONFIG, EXIT_FAILED, EXIT_OK, Endpoints, Sampler, endpoints_for, free_port
+from zsched.daemon import (
+    EXIT_CONFIG,
+    EXIT_FAILED,
+    EXIT_OK,
+    Endpoints,
+    Sampler,
+    endpoints_for,
+    free_port,
+    has_all_addresses,
+    is_here,
+)
 from zsched.errors import AdapterError
 from zsched.lab.testbed import echo_fleet
 from zsched.places import socket_path
@@ -88,15 +98,37 @@ def test_port_zero_is_replaced_by_a_port_that_workers_can_dial() -> None:
 
 
 def test_seeds_are_dialled_at_their_host_except_ourselves_and_who_cannot_be() -> None:
-    me = spec("a", host="192.0.2.1", control="tcp/0.0.0.0:7457", data="tcp/0.0.0.0:7458")
+    me = spec("f", host="192.0.2.1", control="tcp/0.0.0.0:7457", data="tcp/0.0.0.0:7458")
     both = spec("b", host="192.0.2.2", control="tcp/0.0.0.0:7457", data="tcp/0.0.0.0:7458")
     six = spec("c", host="2001:db8::3", control="tcp/[::]:7457", data="tcp/192.0.2.3:1")
     nowhere = spec("d", control="tcp/0.0.0.0:7457", data="tcp/0.0.0.0:7458")
     any_port = spec("e", host="192.0.2.5", control="tcp/0.0.0.0:0")
     no_seed = spec("g", host="192.0.2.7", control="tcp/0.0.0.0:7457", data="tcp/0.0.0.0:7458")
-    found = endpoints(me, both, six, nowhere, any_port, no_seed, seeds=("a", "b", "c", "d", "e"))
-    assert found.control_connect == ("tcp/192.0.2.2:7457", "tcp/[2001:db8::3]:7457")
+    found = endpoints(me, both, six, nowhere, any_port, no_seed, seeds=("f", "b", "c", "d", "e"))
     assert found.data_connect == ("tcp/192.0.2.2:7458", "tcp/192.0.2.3:1")
+    assert found.control_connect == ()  # the first seed is dialled by all others
+
+
+def test_every_control_link_is_dialled_by_one_side_and_by_somebody() -> None:
+    nodes = [spec(name, host=f"192.0.2.{n}", control=f"tcp/0.0.0.0:{n}") for n, name in enumerate("abcd", 1)]
+    nodes += [spec("e")]  # says nothing: it dials everybody
+    whole = fleet(*nodes, seeds=("c", "a"))
+    assert has_all_addresses(whole)
+    assert not has_all_addresses(fleet(*nodes, spec("f")))
+    dialled = {node.name: endpoints_for(whole, node, lambda: 50000).control_connect for node in nodes}
+    assert {name: len(targets) for name, targets in dialled.items()} == {"a": 1, "b": 2, "c": 0, "d": 3, "e": 4}
+    assert dialled["b"] == ("tcp/192.0.2.1:1", "tcp/192.0.2.3:3")
+
+
+def test_own_address_on_another_machine_is_dialled_for_there_may_be_a_twin() -> None:
+    me = spec("a", host="192.0.2.1", control="tcp/0.0.0.0:7457")
+    assert endpoints_for(fleet(me), me, lambda: 1, lambda _: False).control_connect == ("tcp/192.0.2.1:7457",)
+    assert endpoints_for(fleet(me), me, lambda: 1, lambda _: True).control_connect == ()
+
+
+def test_an_address_is_here_when_it_can_be_bound() -> None:
+    assert is_here("127.0.0.1")
+    assert not is_here("192.0.2.1")  # RFC 5737: nobody's
 
 
 def test_free_port_can_be_bound() -> None:

@@ -91,3 +91,9 @@ def test_an_operators_file_that_is_none_is_refused_in_words() -> None:
 def test_a_process_has_a_receive_thread_for_every_link_that_may_fall_silent_at_once() -> None:
     assert [pool_threads(nodes) for nodes in (1, 6, 48, 1000)] == [4, 8, 50, 64]
     assert runtime_pools(6) == "(rx: (worker_threads: 8), tx: (worker_threads: 4))"
+
+
+def test_control_sessions_that_know_every_address_do_not_dial_by_gossip() -> None:
+    quiet = control_config(listen=(HERE,), connect=(THERE,), dials_by_gossip=False)
+    assert read(quiet, "scouting/gossip/autoconnect") == {"router": [], "peer": []}
+    assert read(quiet, "scouting/gossip/enabled") is True
