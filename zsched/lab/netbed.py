@@ -137,7 +137,7 @@ def in_namespaces(tree: Json, network: Network) -> Json:
     for name, node in tree["nodes"].items():
         host = network.address(name)
         node["host"] = host
-        node["listen"] = {"control": f"tcp/{host}:{CONTROL_PORT}", "data": f"tcp/{host}:{DATA_PORT}"}
+        node["listen"] = {"control": f"tcp/0.0.0.0:{CONTROL_PORT}", "data": f"tcp/0.0.0.0:{DATA_PORT}"}
     return tree
 
 
@@ -204,7 +204,9 @@ class Netbed(Testbed):
         self, node: NodeId, *, put: str = "", hz: float = 50.0, size: int = 0, watch: Sequence[str] = ()
     ) -> Probe:
         """An application on ``node``: a client of its data endpoint; ended with the bed."""
-        config = zenoh_config.client_config(connect=(self.fleet.node(node).listen_data,), timing=self.fleet.timing)
+        config = zenoh_config.client_config(
+            connect=(f"tcp/{self.network.address(node)}:{DATA_PORT}",), timing=self.fleet.timing
+        )
         watched = [word for key in watch for word in ("--watch", key)]
         command = [*PROBE, config, "--put", put, "--hz", str(hz), "--size", str(size), *watched]
         with (self.folder / f"probe-{node}.log").open("ab") as log:

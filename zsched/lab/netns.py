@@ -119,7 +119,7 @@ class Network:
         Raises:
             NetworkError: a tool fails.
         """
-        space, port = self._space(name), f"port{len(self._addresses) + 1}"
+        space, port = self.name_of(name), f"port{len(self._addresses) + 1}"
         address = f"{NET}.{len(self._addresses) + 1}"
         self._addresses[name] = address
         run("ip", "netns", "add", space)
@@ -134,7 +134,8 @@ class Network:
         inside = "\n".join((f"address add {address}/24 dev {INTERFACE}", f"link set {INTERFACE} up", "link set lo up"))
         run("ip", "-n", space, "-batch", "-", text=inside)
 
-    def _space(self, name: str) -> str:
+    def name_of(self, name: str) -> str:
+        """What the kernel calls a namespace."""
         return f"{self._prefix}-{name}"
 
     def address(self, name: str) -> str:
@@ -143,7 +144,7 @@ class Network:
 
     def wrap(self, name: str, command: Sequence[str | Path]) -> list[str | Path]:
         """``command`` as it must be started to run in a namespace (same pid, dies with the thread that starts it)."""
-        enter = ("nsenter", f"--net=/run/netns/{self._space(name)}")
+        enter = ("nsenter", f"--net=/run/netns/{self.name_of(name)}")
         return [*enter, "setpriv", "--pdeathsig", "KILL", "--", *command]
 
     # --- faults ------------------------------------------------------------------------------------------------------
@@ -176,10 +177,10 @@ class Network:
         """Limit what leaves a namespace to so many Mbit/s (``None``: no limit) behind a queue of 100 ms."""
         if mbit is None:
             with contextlib.suppress(NetworkError):
-                run("tc", "-n", self._space(name), "qdisc", "del", "dev", INTERFACE, "root")
+                run("tc", "-n", self.name_of(name), "qdisc", "del", "dev", INTERFACE, "root")
             return
         limit = ("rate", f"{mbit}mbit", "burst", "16kb", "latency", "100ms")
-        run("tc", "-n", self._space(name), "qdisc", "replace", "dev", INTERFACE, "root", "tbf", *limit)
+        run("tc", "-n", self.name_of(name), "qdisc", "replace", "dev", INTERFACE, "root", "tbf", *limit)
 
     def link(self, name: str, *, is_up: bool) -> None:
         """Pull or plug a namespace's cable at the bridge's end."""
@@ -203,13 +204,13 @@ class Network:
         for chain, hook in (("in", "input"), ("out", "output")):
             lines.append(f"add chain inet zsched c_{chain} {{ type filter hook {hook} priority 0; policy accept; }}")
         lines += [f"add rule inet zsched c_{rule}" for rule in rules]
-        run("nsenter", f"--net=/run/netns/{self._space(name)}", "nft", "-f", "-", text="\n".join(lines) + "\n")
+        run("nsenter", f"--net=/run/netns/{self.name_of(name)}", "nft", "-f", "-", text="\n".join(lines) + "\n")
 
     # --- end ---------------------------------------------------------------------------------------------------------
 
     def close(self) -> None:
         """Kill what still runs inside and remove everything; safe to call twice."""
-        for name in (*map(self._space, self._addresses), self._hub):
+        for name in (*map(self.name_of, self._addresses), self._hub):
             if Path("/run/netns", name).exists():
                 _remove(name)
         self._addresses.clear()
