@@ -6,6 +6,7 @@ The long runs: ``python -m zsched.lab.fuzz_wire --frames 5000000``.
 from __future__ import annotations
 
 import sys
+from dataclasses import fields
 from random import Random
 
 import msgpack
@@ -31,7 +32,7 @@ def test_no_damaged_frame_raises_changes_or_delays_anything(part: int) -> None:
 def test_the_fuzzer_makes_valid_frames_of_every_kind(kind: str) -> None:
     cls, rng = wire.KINDS[kind][0], Random(kind)
     frames = [wire.encode(sample(cls, rng)) for _ in range(50)]
-    assert len(set(frames)) > 1
+    assert len(set(frames)) > 1 or not fields(cls)
     for frame in frames:
         assert wire.decode(wire.encode(wire.decode(frame, cls)), cls) == wire.decode(frame, cls)
 

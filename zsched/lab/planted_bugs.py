@@ -29,7 +29,11 @@ AGREEMENT, MEMBERSHIP, NODE = "zsched.core.agreement", "zsched.core.membership",
 ROUNDS, VOTE = "zsched.core.rounds", "zsched.core.vote"
 SCHEDULER, SCORING, EXECUTOR = "zsched.core.scheduler", "zsched.core.scoring", "zsched.core.executor"
 
-_REGISTER = ("tests/unit/core/test_register.py", "tests/unit/core/test_register_proposer.py")
+_REGISTER = (
+    "tests/sim/test_register_rules.py",
+    "tests/unit/core/test_register.py",
+    "tests/unit/core/test_register_proposer.py",
+)
 _SCHEDULES = ("tests/unit/core/test_register_schedules.py",)
 _AGREEMENT = ("tests/unit/core/test_agreement.py",)
 _LEASE = ("tests/sim/test_lease_rules.py", "tests/sim/test_exclusive.py")

@@ -1,0 +1,172 @@
+"""The lease's rules one by one: each clause of the design that a schedule may take long to find broken."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from zsched.core.lease import RHO, Granter, Holder, hold_s
+from zsched.core.model import Beat, Grant
+
+LEASE_S, HOLD_S = 1.0, hold_s(1.0)
+ELECTORS = ("r1", "r2", "r3")
+
+
+def beat(node: str = "e1", number: int = 5, *, epoch: int = 3, life: int = 1, released: tuple[Grant, ...] = ()) -> Beat:
+    return Beat(
+        node=node,
+        incarnation=life,
+        sequence=number,
+        loop_lag_s=0.0,
+        learnt=(("guard", 7, epoch),),
+        released=released,
+    )
+
+
+def grant(number: int, *, owner: str = "e1", epoch: int = 3, life: int = 1) -> Grant:
+    return Grant(task="guard", owner=owner, incarnation=life, epoch=epoch, number=number)
+
+
+def granter(standing: str | None = "e1", started_at: float = 0.0) -> Granter:
+    return Granter(task="guard", lease_s=LEASE_S, started_at=started_at, standing=standing)
+
+
+def holder(first_number: int = 5) -> Holder:
+    return Holder(
+        task="guard", epoch=3, me="e1", incarnation=1, electors=ELECTORS, lease_s=LEASE_S, first_number=first_number
+    )
+
+
+# --- electors --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("accepted", "is_echoed"),
+    [(("e1", 3), True), (("e1", 4), False), (("e1", 2), False), (("e2", 3), False), (None, False)],
+)
+def test_only_the_accepted_owner_of_the_accepted_epoch_is_echoed(
+    accepted: tuple[str, int] | None, is_echoed: bool
+) -> None:
+    elector = granter()
+    elector.on_beat(beat(), accepted, 10.0)
+    assert (elector.echo(10.0) is not None) == is_echoed
+
+
+def test_another_owner_is_refused_until_the_hold_after_the_last_grant_is_over() -> None:
+    elector = granter()
+    elector.on_beat(beat(number=5), ("e1", 3), 10.0)
+    elector.on_beat(beat(number=6), ("e1", 3), 10.5)
+    assert elector.may_accept("e1", 10.6)
+    assert not elector.may_accept("e2", 10.5 + HOLD_S - 0.001)
+    assert elector.may_accept("e2", 10.5 + HOLD_S)
+
+
+def test_the_hold_covers_a_whole_lease_on_the_slowest_clock() -> None:
+    """The owner's clock may be slow by rho and ours fast by rho: the lease ends before the hold does."""
+    assert HOLD_S / (1 + RHO) >= LEASE_S / (1 - RHO) - 1e-12
+
+
+def test_a_restarted_elector_refuses_all_but_its_standing_owner_for_a_whole_hold() -> None:
+    elector = granter(standing="e1", started_at=100.0)
+    assert elector.may_accept("e1", 100.0)
+    assert not elector.may_accept("e2", 100.0 + HOLD_S - 0.001)
+    assert elector.may_accept("e2", 100.0 + HOLD_S)
+
+
+def test_refusing_silences_the_present_owner_and_asks_it_to_leave_for_twice_the_hold() -> None:
+    elector = granter()
+    elector.on_beat(beat(number=5), ("e1", 3), 10.0)
+    assert not elector.may_accept("e2", 10.1)
+    assert elector.echo(10.1) is None
+    assert elector.asked_to_leave(10.1) == ("guard", "e1", 3)
+    elector.on_beat(beat(number=6), ("e1", 3), 10.2)
+    assert elector.echo(10.2) is None, "no new grant meanwhile either"
+    assert elector.asked_to_leave(10.1 + 2 * HOLD_S) is None
+    elector.on_beat(beat(number=7), ("e1", 3), 10.1 + 2 * HOLD_S)
+    assert elector.echo(10.1 + 2 * HOLD_S) == grant(7)
+
+
+def test_a_release_frees_the_elector_and_its_numbers_are_never_granted_again() -> None:
+    elector = granter()
+    elector.on_beat(beat(number=5), ("e1", 3), 10.0)
+    elector.on_beat(beat(number=8, released=(grant(8),)), ("e1", 3), 10.1)
+    assert elector.may_accept("e2", 10.1)
+    elector.on_beat(beat(number=7), ("e1", 3), 10.2)  # overtaken on its way
+    assert elector.echo(10.2) is None
+    assert elector.may_accept("e2", 10.2)
+
+
+@pytest.mark.parametrize("other", [grant(9, life=2), grant(4), grant(9, owner="e9")])
+def test_a_release_of_another_life_number_or_owner_frees_nothing(other: Grant) -> None:
+    elector = granter()
+    elector.on_beat(beat(number=5), ("e1", 3), 10.0)
+    elector.on_beat(beat(number=0, life=2, released=(other,)), ("e1", 3), 10.1)
+    assert not elector.may_accept("e2", 10.2)
+
+
+def test_the_owner_s_next_life_is_granted_only_when_its_former_one_cannot_work_any_more() -> None:
+    elector = granter()
+    elector.on_beat(beat(number=5, life=1), ("e1", 3), 10.0)
+    elector.on_beat(beat(number=1, life=2), ("e1", 3), 10.5)
+    assert elector.echo(10.5) == grant(5)
+    elector.on_beat(beat(number=2, life=2), ("e1", 3), 10.0 + HOLD_S)
+    assert elector.echo(10.0 + HOLD_S) == grant(2, life=2)
+
+
+def test_an_old_beat_prolongs_nothing() -> None:
+    elector = granter()
+    elector.on_beat(beat(number=5), ("e1", 3), 10.0)
+    elector.on_beat(beat(number=4), ("e1", 3), 10.9)
+    assert elector.may_accept("e2", 10.0 + HOLD_S)
+
+
+# --- owners ----------------------------------------------------------------------------------------------------------
+
+
+def test_numbers_sent_before_the_epoch_was_learnt_count_nothing() -> None:
+    owner = holder(first_number=5)
+    owner.on_sent(4, 10.0)
+    for elector in ELECTORS:
+        owner.on_echo(elector, grant(4))
+    assert owner.lease_until() == -math.inf
+
+
+def test_the_lease_runs_from_the_sending_of_the_number_that_a_majority_has_reached() -> None:
+    owner = holder()
+    for number in range(5, 9):
+        owner.on_sent(number, 10.0 + 0.2 * (number - 5))
+    owner.on_echo("r1", grant(8))
+    assert owner.lease_until() == -math.inf, "one elector of three is no majority"
+    owner.on_echo("r2", grant(6))
+    assert owner.lease_until() == pytest.approx(10.2 + LEASE_S)
+    owner.on_echo("r3", grant(7))
+    assert owner.lease_until() == pytest.approx(10.4 + LEASE_S)
+
+
+@pytest.mark.parametrize("echo", [grant(5, life=2), grant(5, epoch=2), grant(5, owner="e2")])
+def test_an_echo_of_another_life_epoch_or_owner_counts_nothing(echo: Grant) -> None:
+    owner = holder()
+    owner.on_sent(5, 10.0)
+    for elector in ELECTORS:
+        owner.on_echo(elector, echo)
+    assert owner.lease_until() == -math.inf
+
+
+def test_a_stranger_s_echo_counts_nothing_and_an_elector_s_only_once() -> None:
+    owner = holder()
+    owner.on_sent(5, 10.0)
+    for elector in ("r1", "r1", "e2", "ghost"):
+        owner.on_echo(elector, grant(5))
+    assert owner.lease_until() == -math.inf
+
+
+def test_what_was_given_back_holds_no_lease_any_more() -> None:
+    owner = holder()
+    owner.on_sent(5, 10.0)
+    for elector in ELECTORS:
+        owner.on_echo(elector, grant(5))
+    assert owner.release(6) == grant(6)
+    assert owner.lease_until() == -math.inf
+    owner.on_echo("r1", grant(6))
+    assert owner.lease_until() == -math.inf

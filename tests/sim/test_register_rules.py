@@ -1,0 +1,91 @@
+"""Rules of a round that schedules find broken only now and then: who counts, how often, and for which ballot."""
+
+from __future__ import annotations
+
+from random import Random
+
+from zsched.core.messages import Accepted, Promise
+from zsched.core.model import Acceptance, Allocation, Ballot, RegisterState, Tuning, Weights
+from zsched.core.register import MoveOwner, Register, Step
+
+ELECTORS = ("r1", "r2", "r3")
+INITIAL = Allocation(
+    task="merge", revision=0, epoch=0, owner=None, tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
+)
+
+
+def proposer(incarnation: int = 4) -> Register:
+    return Register(
+        me="r1",
+        incarnation=incarnation,
+        electors=ELECTORS,
+        electorate="e",
+        is_elector=True,
+        initial=INITIAL,
+        state=RegisterState(task="merge"),
+        ballot_s=0.3,
+        stagger_s=0.03,
+        rng=Random(1),
+    )
+
+
+def proposed(register: Register, now: float = 0.0) -> Ballot:
+    step = register.propose(MoveOwner(base_revision=0, owner="e1", reason="test"), now)
+    assert step.prepare is not None
+    return step.prepare.ballot
+
+
+def promise(elector: str, ballot: Ballot, accepted: Acceptance | None = None) -> Promise:
+    return Promise(elector=elector, task="merge", ballot=ballot, accepted=accepted)
+
+
+def test_an_elector_s_promise_and_acceptance_count_once_however_often_they_come() -> None:
+    register = proposer()
+    ballot = proposed(register)
+    assert register.on_answer(promise("r1", ballot), 0.01) == Step()
+    assert register.on_answer(promise("r1", ballot), 0.02) == Step()
+    assert register.on_answer(promise("r2", ballot), 0.03).accept is not None
+    yes = Accepted(elector="r1", task="merge", ballot=ballot)
+    assert register.on_answer(yes, 0.04) == Step()
+    assert register.on_answer(yes, 0.05) == Step()
+    assert register.on_answer(Accepted(elector="r2", task="merge", ballot=ballot), 0.06).learnt is not None
+
+
+def test_promises_and_acceptances_of_an_earlier_attempt_count_nothing() -> None:
+    register = proposer()
+    first = proposed(register)
+    now, step = 0.0, Step()
+    while step.prepare is None:
+        now = max(register.next_deadline(), now + 0.001)
+        step = register.tick(now)
+    second = step.prepare.ballot
+    assert second > first
+    for elector in ELECTORS:
+        assert register.on_answer(promise(elector, first), now) == Step()
+    for elector in ELECTORS[:2]:
+        step = register.on_answer(promise(elector, second), now)
+    assert step.accept is not None
+    for elector in ELECTORS:
+        assert register.on_answer(Accepted(elector=elector, task="merge", ballot=first), now) == Step()
+    assert register.value == INITIAL
+
+
+def test_two_lives_of_a_node_never_use_the_same_ballot() -> None:
+    assert proposed(proposer(incarnation=4)) != proposed(proposer(incarnation=5))
+
+
+def test_newer_among_accepted_values_is_the_higher_ballot_not_the_higher_revision() -> None:
+    register = proposer()
+    ballot = proposed(register)
+    older = Acceptance(
+        ballot=Ballot(counter=1, node="r2", incarnation=1),
+        value=Allocation(task="merge", revision=2, epoch=2, owner="e2", tuning=INITIAL.tuning),
+    )
+    newer = Acceptance(
+        ballot=Ballot(counter=1, node="r3", incarnation=1),
+        value=Allocation(task="merge", revision=1, epoch=1, owner="e3", tuning=INITIAL.tuning),
+    )
+    register.on_answer(promise("r2", ballot, older), 0.01)
+    step = register.on_answer(promise("r3", ballot, newer), 0.02)
+    assert step.accept is not None
+    assert step.accept.acceptance.value == newer.value
