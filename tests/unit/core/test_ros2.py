@@ -1,0 +1,189 @@
+"""Keys, graph tokens and attachments of ROS 2 over zenoh, held to recorded ones."""
+
+from __future__ import annotations
+
+import doctest
+
+import pytest
+import zenoh
+import zenoh.ext
+from hypothesis import given
+from hypothesis import strategies as st
+
+from zsched.core import ros2
+from zsched.core.keyexpr import includes, is_valid
+from zsched.core.plan import RosGraph
+from zsched.core.ros2 import (
+    Attachment,
+    Endpoint,
+    EndpointKind,
+    decode_attachment,
+    default_qos,
+    encode_attachment,
+    endpoint_token,
+    hash_fault,
+    is_rmw_key,
+    name_fault,
+    node_token,
+    parse_token,
+    ros_key,
+    token_selector,
+    type_fault,
+)
+
+STRING_HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
+CHATTER = f"0/chatter/std_msgs::msg::dds_::String_/{STRING_HASH}"
+SERVICE_HASH = "RIHS01_e118de6bf5eeb66a2491b5bda11202e7b68f198d6f67922cf30364858239c81a"
+
+# as rmw_zenoh's design document shows them (domain 2)
+LISTENER = "@ros2_lv/2/aac3178e146ba6f1fc6e6a4085e77f21/0/0/NN/%/%/listener"
+SUBSCRIPTION = (
+    "@ros2_lv/2/aac3178e146ba6f1fc6e6a4085e77f21/0/10/MS/%/%/listener/%chatter/std_msgs::msg::dds_::String_/"
+    f"{STRING_HASH}/::,10:,:,:,,"
+)
+SERVER = (
+    "@ros2_lv/2/f9980ee0495eaafb3e38f0d19e2eae12/0/10/SS/%/%/add_two_ints_server/%add_two_ints/"
+    f"example_interfaces::srv::dds_::AddTwoInts_/{SERVICE_HASH}/::,10:,:,:,,"
+)
+# the ros2dds bridge, 1.x
+BRIDGED = "@/f9980ee0495eaafb3e38f0d19e2eae12/@ros2_lv/MP/robot1§map/nav_msgs§msg§OccupancyGrid/:1:1:0,1"
+
+
+def test_keys_are_those_of_the_design_document() -> None:
+    key = ros_key(RosGraph.RMW_ZENOH, "/chatter", domain=0, type_name="std_msgs/msg/String", type_hash=STRING_HASH)
+    assert key == CHATTER
+    namespaced = ros_key(RosGraph.RMW_ZENOH, "/robot1/chatter", domain=0, type_name="std_msgs/msg/String")
+    assert namespaced == "0/robot1/chatter/std_msgs::msg::dds_::String_/*"
+    service = ros_key(
+        RosGraph.RMW_ZENOH,
+        "/add_two_ints",
+        domain=2,
+        type_name="example_interfaces/srv/AddTwoInts",
+        type_hash=SERVICE_HASH,
+    )
+    assert service == f"2/add_two_ints/example_interfaces::srv::dds_::AddTwoInts_/{SERVICE_HASH}"
+    assert ros_key(RosGraph.ROS2DDS, "/robot1/map", domain=0) == "robot1/map"
+
+
+def test_a_key_with_open_type_and_hash_includes_the_real_one() -> None:
+    open_key = ros_key(RosGraph.RMW_ZENOH, "/chatter", domain=0)
+    assert includes(open_key, CHATTER)
+    assert is_rmw_key(open_key)
+    assert is_rmw_key(CHATTER)
+    assert is_rmw_key("0/chatter/std_msgs::msg::dds_::String_/TypeHashNotSupported")
+
+
+@pytest.mark.parametrize("key", ["edge1/merge/robot1/map", "0/merge/robot1/map", "robot1/map", "0/a"])
+def test_a_plain_key_is_no_ros_key(key: str) -> None:
+    assert not is_rmw_key(key)
+
+
+def test_recorded_tokens_are_read() -> None:
+    assert parse_token(SUBSCRIPTION) == (
+        "aac3178e146ba6f1fc6e6a4085e77f21",
+        Endpoint(kind=EndpointKind.SUBSCRIPTION, key=CHATTER.replace("0/", "2/", 1), qos="::,10:,:,:,,"),
+    )
+    parsed = parse_token(SERVER)
+    assert parsed is not None
+    assert parsed[1].kind is EndpointKind.SERVICE
+    assert parsed[1].key == f"2/add_two_ints/example_interfaces::srv::dds_::AddTwoInts_/{SERVICE_HASH}"
+    assert parse_token(BRIDGED) == (
+        "f9980ee0495eaafb3e38f0d19e2eae12",
+        Endpoint(kind=EndpointKind.PUBLISHER, key="robot1/map", type_name="nav_msgs/msg/OccupancyGrid", qos=":1:1:0,1"),
+    )
+    assert parse_token(LISTENER) is None
+
+
+@pytest.mark.parametrize(("graph", "token"), [(RosGraph.RMW_ZENOH, SUBSCRIPTION), (RosGraph.ROS2DDS, BRIDGED)])
+def test_tokens_that_we_write_differ_from_recorded_ones_in_whose_they_are_only(graph: RosGraph, token: str) -> None:
+    parsed = parse_token(token)
+    assert parsed is not None
+    ours = endpoint_token(graph, parsed[1], zid="5eed", node="zsched_robot1", number=7)
+    assert parse_token(ours) == ("5eed", parsed[1])
+    expected = token.replace(parsed[0], "5eed").replace("/0/10/", "/0/7/").replace("/listener/", "/zsched_robot1/")
+    assert ours == expected
+    assert zenoh.KeyExpr(token_selector(graph)).includes(ours)
+
+
+def test_the_node_of_our_endpoints() -> None:
+    assert node_token(RosGraph.RMW_ZENOH, domain="2", zid="5eed", node="zsched_robot1") == (
+        "@ros2_lv/2/5eed/0/0/NN/%/%/zsched_robot1"
+    )
+    assert node_token(RosGraph.ROS2DDS, domain="2", zid="5eed", node="n") is None
+
+
+def test_qos_of_what_we_announce_ourselves() -> None:
+    assert default_qos(is_latched=True, depth=1) == ":1:,1:,:,:,,"
+    assert default_qos(is_latched=False, depth=10) == "::,10:,:,:,,"
+
+
+@given(st.text(alphabet="@ros2_lv/%§:,MPSNC0a*", max_size=80))
+def test_any_token_is_read_or_not_never_an_exception(token: str) -> None:
+    parse_token(token)
+
+
+@pytest.mark.parametrize("token", ["@ros2_lv/0/z/0/1/XX/%/%/n/%t/a::b/h/q", "@/z/@ros2_lv/XX/a/b", "@ros2_lv", ""])
+def test_tokens_of_other_kinds_are_none(token: str) -> None:
+    assert parse_token(token) is None
+
+
+@pytest.mark.parametrize(
+    "name", ["/map", "/{robot}/map", "/{target}/merge/{robot}/map", "/_x/y_1", "/{robot}/s/*", "/a/**"]
+)
+def test_ros_names(name: str) -> None:
+    assert name_fault(name) is None
+
+
+@pytest.mark.parametrize("name", ["map", "/", "/a/", "//a", "/7up", "/a b", "/a__b", "~/a", "/a-b", "/{robot", "/a*"])
+def test_what_is_no_ros_name(name: str) -> None:
+    assert name_fault(name)
+
+
+@given(st.text(alphabet="/ab1_{}rot*", max_size=20))
+def test_a_ros_name_makes_a_valid_key(name: str) -> None:
+    if name_fault(name) is None and "**" not in name:
+        assert is_valid(ros2.ros_key(RosGraph.RMW_ZENOH, name.replace("{", "").replace("}", ""), domain=0))
+
+
+def test_types_and_hashes() -> None:
+    assert type_fault("std_msgs/msg/String") is None
+    assert type_fault("any") is None
+    assert "services and topics" in (type_fault("a/action/B") or "")
+    assert type_fault("std_msgs/String")
+    assert hash_fault(STRING_HASH) is None
+    assert hash_fault("TypeHashNotSupported") is None
+    assert hash_fault("RIHS01_df")
+
+
+# written out by hand from the design document: sequence 42, a stamp in ns, the length of the gid, the gid
+RECORDED = bytes.fromhex("2a000000000000000033d8a53358c317" + "10" + "000102030405060708090a0b0c0d0e0f")
+
+
+def test_the_attachment_is_33_bytes_in_the_right_order() -> None:
+    value = Attachment(sequence=42, stamp_ns=0x17C35833A5D83300, gid=bytes(range(16)))
+    assert encode_attachment(value) == RECORDED
+    assert decode_attachment(RECORDED) == value
+
+
+@given(st.integers(-(2**63), 2**63 - 1), st.integers(0, 2**63 - 1), st.binary(min_size=16, max_size=16))
+def test_the_attachment_is_what_zenohs_own_serializer_writes(sequence: int, stamp: int, gid: bytes) -> None:
+    ours = encode_attachment(Attachment(sequence=sequence, stamp_ns=stamp, gid=gid))
+    fields = (zenoh.ext.Int64(sequence), zenoh.ext.Int64(stamp), gid)
+    assert ours == zenoh.ext.z_serialize(fields).to_bytes()
+    assert decode_attachment(ours) == Attachment(sequence=sequence, stamp_ns=stamp, gid=gid)
+
+
+@pytest.mark.parametrize("value", [(1, 1, b"short"), (2**63, 1, bytes(16))])
+def test_what_does_not_fit_is_refused(value: tuple[int, int, bytes]) -> None:
+    with pytest.raises(ValueError, match=r"gid|attachment"):
+        encode_attachment(Attachment(sequence=value[0], stamp_ns=value[1], gid=value[2]))
+
+
+@given(st.binary(max_size=40))
+def test_any_bytes_are_an_attachment_or_not(raw: bytes) -> None:
+    value = decode_attachment(raw)
+    assert value is None or encode_attachment(value) == raw
+
+
+def test_examples_in_the_module_hold() -> None:
+    assert doctest.testmod(ros2).failed == 0
