@@ -287,6 +287,7 @@ class Daemon:
             ),
             on_report=shell.on_report,
             threads=zenoh_config.pool_threads(len(fleet.nodes)),
+            local_config=zenoh_config.local_config(side, timing=fleet.timing) if (side := self._spec.local) else "",
         )
         shell.supervisor = self._supervisor(stack, shell, incarnation, points, operator_json5)
         relay.start()
@@ -321,7 +322,10 @@ class Daemon:
             specs=mine,
             context=WorkerContext(fleet=fleet.name, node=me, incarnation=incarnation),
             events=shell,
-            environment=lambda task: {"ZSCHED_ZENOH_CONFIG": str(paths[task])},
+            environment=lambda task: {
+                "ZSCHED_ZENOH_CONFIG": str(paths[task]),
+                "ZENOH_SESSION_CONFIG_URI": str(paths[task]),  # a ROS node (rmw_zenoh) joins the data network by this
+            },
             rng=random.Random(f"{me}/{incarnation}/workers"),
         )
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 import json
 from typing import Any, Final
 
-from zsched.core.fleet import Timing, WorkerLink
+from zsched.core.fleet import LocalMode, LocalSide, Timing, WorkerLink
 
 DATA_SEND_BUFFER: Final = 65536
 """Kernel send buffer of data links in bytes: bounds what lies between a publisher and a slow radio."""
@@ -97,6 +97,18 @@ def worker_config(
     settings = _peer(_small_buffers(listen), _small_buffers(connect), timing)
     _set_shared_memory(settings, is_on=shared_memory)
     return _render(settings, operator_json5)
+
+
+def local_config(side: LocalSide, *, timing: Timing = DEFAULT_TIMING) -> str:
+    """The relay's session on the host's own side: a client of its router, or a peer of its applications.
+
+    The operator's zenoh file is the fleet's and does not apply here.
+    """
+    if side.mode is LocalMode.CLIENT:
+        return client_config(connect=side.connect, timing=timing)
+    settings = _peer(side.listen or (LOOPBACK_LISTEN,), side.connect, timing)
+    _set_shared_memory(settings, is_on=False)
+    return _render(settings, "")
 
 
 def client_config(

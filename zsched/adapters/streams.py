@@ -83,12 +83,17 @@ class RelayHandle:
         on_report: Callable[[HandleReport], None],
         threads: int = 6,
         python: str = sys.executable,
+        local_config: str = "",
     ) -> None:
-        """``zenoh_config`` is the JSON of the data session, ``threads`` the size of zenoh's pools (targets + 2)."""
-        self._zenoh_config = zenoh_config.encode()
+        """``zenoh_config`` is the JSON of the data session, ``threads`` the size of zenoh's pools (targets + 2).
+
+        ``local_config`` is the session of the host's own side; empty: the data session serves the host, too.
+        """
+        self._configs = tuple(text.encode() for text in (zenoh_config, local_config) if text)
         self._on_report = on_report
         self._command = [python, "-m", "zsched.relay", "--fleet", fleet, "--node", node]
         self._command += ["--threads", str(threads), "--parent", str(os.getpid())]
+        self._command += ["--local"] if local_config else []
         self._lock = threading.Lock()
         self._newest: dict[_Key, RoutePlan | Role] = {}
         self._outbox = _Outbox()
@@ -176,7 +181,8 @@ class RelayHandle:
 
     def _write(self, descriptor: int, outbox: _Outbox) -> None:
         try:
-            write_frame(descriptor, self._zenoh_config)
+            for text in self._configs:
+                write_frame(descriptor, text)
             while (value := outbox.take()) is not None:
                 write_frame(descriptor, wire.encode(value))
             write_frame(descriptor, wire.encode(RelayStop()))

@@ -2,8 +2,8 @@
 
 Knows: the command line, signals, the parent's death. Does not know: streams.
 
-``python -m zsched.relay --fleet F --node N [--threads T] [--parent PID]``; the first frame on stdin is the zenoh
-session as JSON. Logs go to stderr.
+``python -m zsched.relay --fleet F --node N [--threads T] [--parent PID] [--local]``; the first frame on stdin is
+the zenoh session as JSON (with ``--local`` the second one is that of the host's own side). Logs go to stderr.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ def main() -> None:
     try:
         from zsched.relay.process import run  # noqa: PLC0415 - imports zenoh, which must find ZENOH_RUNTIME set
 
-        code = run(arguments.fleet, arguments.node, sys.stdin.fileno(), sys.stdout.fileno())
+        pipes = (sys.stdin.fileno(), sys.stdout.fileno())
+        code = run(arguments.fleet, arguments.node, *pipes, has_local_side=arguments.local)
     except SystemExit:
         code = 0
     except BaseException:
@@ -52,6 +53,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--node", required=True)
     parser.add_argument("--threads", type=int, default=DEFAULT_THREADS, help="transmit and receive threads, each")
     parser.add_argument("--parent", type=int, default=0, help="process id that must be our parent")
+    parser.add_argument("--local", action="store_true", help="a second frame holds the session of the host's own side")
     parser.add_argument("--log-level", default="WARNING")
     return parser.parse_args()
 

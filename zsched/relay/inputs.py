@@ -41,7 +41,8 @@ class _InputSlot:
 class InputStream:
     """One input rule on this node; slots are named by their epoch."""
 
-    def __init__(self, session: Session, route: Route, own_ids: frozenset[str]) -> None:
+    def __init__(self, session: Session, route: Route, own_ids: frozenset[str], local: Session | None = None) -> None:
+        """Subscribe on ``local``, the host's own side, if there is one; ``session`` is the fleet's."""
         self.route = route
         self._session = session
         self._own_ids = own_ids
@@ -55,7 +56,7 @@ class InputStream:
         self._kept: OrderedDict[str, deque[_Kept]] = OrderedDict()
         self._closed = Tally()  # what slots that are closed have counted
         self._is_counted = False
-        self._receiver = Receiver(session, route.from_expr, route.settings, self._carry, with_history=True)
+        self._receiver = Receiver(local or session, route.from_expr, route.settings, self._carry, with_history=True)
 
     def open(self, epoch: int, route: Route, acks: Acks | None = None) -> None:
         """Declare the publishers of a slot; it carries nothing yet. With ``acks`` its worker counts what it gets.

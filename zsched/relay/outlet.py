@@ -36,13 +36,16 @@ from zsched.keyspace import END_CHUNK
 from zsched.relay.acks import Acks
 from zsched.relay.lanes import KEPT_SAMPLES, Lane, Sent
 from zsched.relay.receive import undeclare
-from zsched.relay.rewrite import rewriter
+from zsched.relay.rewrite import Rewriter, rewriter
 from zsched.relay.tally import Tally
 from zsched.relay_pipe import encode_end
 from zsched.send_queue import SendQueue
 
 QUEUE_DEPTH: Final = 1024
 """A reliable outlet's queue holds at least so many samples, whatever its depth says."""
+MAX_LANES: Final = 4096
+"""Publishers of one wildcard stream towards one place: keys come from the applications, memory is ours."""
+KEPT_OWNERS: Final = 4
 RESEND_S: Final = 0.3
 """No progress for so long: what is not acknowledged is put again."""
 SKIP_EPOCH: Final = 0
@@ -72,7 +75,7 @@ class Outlet:
         self._session = session
         self._settings = settings
         self._acks = acks
-        self._rewrite = rewriter(from_expr, to_expr)
+        self._rewriters: dict[str, Rewriter] = {from_expr: rewriter(from_expr, to_expr)}
         self._is_wild = is_wild(to_expr)
         self._to = to_expr
         self._lock = threading.Lock()
@@ -102,6 +105,16 @@ class Outlet:
         status = self._probe.matching_status
         return bool(getattr(status, "matching", False))  # the object itself is always true
 
+    def also_from(self, from_expr: str) -> None:
+        """Take samples of another owner, too: its ``from`` captures what fills the wildcards of ``to``.
+
+        Raises:
+            ValueError: ``to`` cannot be filled from it.
+        """
+        self._rewriters[from_expr] = rewriter(from_expr, self._to)
+        while len(self._rewriters) > KEPT_OWNERS:
+            self._rewriters.pop(next(iter(self._rewriters)))
+
     def send(self, sample: Sample, stamp: Timestamp | None = None) -> tuple[str, int]:
         """Put one sample; answers (why something was dropped, how much of it), with 0 when nothing was.
 
@@ -109,7 +122,7 @@ class Outlet:
         """
         lane = self._lane(sample)
         if lane is None:
-            return "no_key", 1
+            return ("no_key" if len(self._lanes) < MAX_LANES else "too_many_keys"), 1
         stamp = sample.timestamp or stamp
         if self._queue is None:
             try:
@@ -128,7 +141,7 @@ class Outlet:
 
     def key_of(self, sample: Sample) -> str:
         """The key that a sample goes on under (``""``: it does not fit)."""
-        return (self._rewrite(str(sample.key_expr)) or "") if self._is_wild else self._to
+        return (self._rewritten(str(sample.key_expr)) or "") if self._is_wild else self._to
 
     def send_end(self, epoch: int) -> None:
         """Put the end marker behind the last sample of every key; ``best_effort`` blocks while the link is full."""
@@ -171,12 +184,21 @@ class Outlet:
         priority, is_express = sample.priority, sample.express
         if self._main is not None and priority == Priority.DATA and not is_express:
             return self._main
-        key = self._rewrite(str(sample.key_expr)) if self._is_wild else self._to
+        key = self._rewritten(str(sample.key_expr)) if self._is_wild else self._to
         if key is None:
             return None
         name = (key, f"{priority}{is_express}")
         lane = self._lanes.get(name)
+        if lane is None and len(self._lanes) >= MAX_LANES:
+            return None
         return lane if lane is not None else self._declare(key, priority, is_express=is_express)
+
+    def _rewritten(self, key: str) -> str | None:
+        """The new key, by the newest owner whose ``from`` the old one matches."""
+        for rewrite in reversed(tuple(self._rewriters.values())):
+            if (result := rewrite(key)) is not None:
+                return result
+        return None
 
     def _declare(self, key: str, priority: Priority, *, is_express: bool) -> Lane:
         stream_class = self._settings.stream_class

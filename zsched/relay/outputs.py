@@ -70,8 +70,17 @@ class _OutputSlot:
 class OutputStream:
     """One output rule on this node; slots are named by their epoch."""
 
-    def __init__(self, session: Session, route: Route, own_ids: frozenset[str], wake: Callable[[], None]) -> None:
-        """Declare the publisher. ``wake`` is called (from any thread) when an end marker has come.
+    def __init__(
+        self,
+        session: Session,
+        route: Route,
+        own_ids: frozenset[str],
+        wake: Callable[[], None],
+        local: Session | None = None,
+    ) -> None:
+        """Declare the publisher, on ``local``, the host's own side, if there is one; ``session`` is the fleet's.
+
+        ``wake`` is called (from any thread) when an end marker has come.
 
         Raises:
             ValueError, zenoh.ZError: the route makes no sense (see `Outlet`).
@@ -82,7 +91,7 @@ class OutputStream:
         self._wake = wake
         self._lock = threading.Lock()
         self._counter = StreamCounter(route.stream)
-        self._outlet = Outlet(session, route.from_expr, route.to_expr, route.settings)
+        self._outlet = Outlet(local or session, route.from_expr, route.to_expr, route.settings)
         self._slots: dict[int, _OutputSlot] = {}
         self._carrier: _OutputSlot | None = None
         self._stamps: OrderedDict[str, Timestamp] = OrderedDict()  # newest that has passed, by the owner's relative key
@@ -110,6 +119,15 @@ class OutputStream:
             lambda sample: self._carry(slot, sample),
             with_history=has_epoch,
         )
+
+    def know(self, from_expr: str) -> None:
+        """Hear of another owner's ``from`` before a slot opens on it: its captures fill the wildcards of ``to``.
+
+        Raises:
+            ValueError: ``to`` cannot be filled from it.
+        """
+        with self._lock:
+            self._outlet.also_from(from_expr)
 
     def flip(self, epoch: int, *, drops_held: bool) -> None:
         """Let the slot's samples through, by the stream's handover rule.

@@ -25,6 +25,8 @@ from zsched.core.relay_protocol import RelayReport, RelayStarted, RelayStop, Wor
 from zsched.errors import WireError
 from zsched.keyspace import Keyspace
 from zsched.relay.acks import Acks
+from zsched.relay.graph import GraphMirror
+from zsched.relay.local_side import LocalSide
 from zsched.relay.roles import RoleServer
 from zsched.relay.task import TaskRelay
 from zsched.relay.tokens import Tokens
@@ -76,10 +78,19 @@ class Reporter:
 
 
 class RelayProcess:
-    """One node's relay on an open data session."""
+    """One node's relay on an open data session.
 
-    def __init__(self, session: zenoh.Session, fleet: str, node: NodeId, reporter: Reporter) -> None:
+    With ``local_config`` the host's applications are on a side of their own; plans wait until that side is there.
+    """
+
+    def __init__(
+        self, session: zenoh.Session, fleet: str, node: NodeId, reporter: Reporter, local_config: str = ""
+    ) -> None:
         self._session = session
+        self._lock = threading.Lock()  # plans come from the pipe, the local side from a thread of its own
+        self._graph: GraphMirror | None = None
+        self._local: zenoh.Session | None = None
+        self._waiting: dict[TaskId, RoutePlan] = {}
         self._node = node
         self._reporter = reporter
         self._tasks: dict[TaskId, TaskRelay] = {}
@@ -90,6 +101,26 @@ class RelayProcess:
         self._tokens = Tokens(session, keyspace, self._worker_seen, self._role_ended, self._wake)
         reporter.report(RelayStarted(pid=os.getpid(), zid=str(session.zid())))
         threading.Thread(target=self._count, name="counters", daemon=True).start()
+        if not local_config:
+            self._begin(None)
+        self._local_side = LocalSide(local_config, reporter.report, self._begin) if local_config else None
+
+    def close(self) -> None:
+        """Close both sessions; may take as long as a stopped peer holds them."""
+        if self._local_side is not None:
+            self._local_side.close()
+        self._session.close()
+
+    def _begin(self, local: zenoh.Session | None) -> None:
+        """Both sides are there: carry out the plans that have come meanwhile."""
+        with self._lock:
+            if local is not None:
+                self._own_ids |= {str(local.zid())}
+            self._local = local
+            self._graph = GraphMirror(self._session, local, self._node)
+            for plan in self._waiting.values():
+                self._apply(plan, self._graph)
+            self._waiting.clear()
 
     def obey(self, commands: int) -> None:
         """Read commands until the daemon says stop or is gone."""
@@ -114,13 +145,27 @@ class RelayProcess:
         if isinstance(command, Role):
             self._roles.set(command)
             return
-        task = self._tasks.get(command.task)
+        with self._lock:
+            if self._graph is None:
+                self._waiting[command.task] = command
+            else:
+                self._apply(command, self._graph)
+
+    def _apply(self, plan: RoutePlan, graph: GraphMirror) -> None:
+        task = self._tasks.get(plan.task)
         if task is None:
             task = TaskRelay(
-                self._session, command.task, self._tokens, self._acks, self._own_ids, self._reporter.report
+                self._session,
+                plan.task,
+                self._tokens,
+                self._acks,
+                self._own_ids,
+                self._reporter.report,
+                graph,
+                self._local,
             )
-            self._tasks[command.task] = task
-        task.apply(command)
+            self._tasks[plan.task] = task
+        task.apply(plan)
 
     def _worker_seen(self, seen: WorkerSeen) -> None:
         self._reporter.report(seen)
@@ -145,11 +190,12 @@ class RelayProcess:
             self._reporter.report(StreamsCounted(counts=counts))
 
 
-def run(fleet: str, node: NodeId, commands: int, reports: int) -> int:
+def run(fleet: str, node: NodeId, commands: int, reports: int, *, has_local_side: bool = False) -> int:
     """Serve until told to stop; the exit code: 0 stopped, 1 the session could not be opened."""
     reporter = Reporter(reports)
     text = read_frame(commands)
-    if text is None:
+    local = read_frame(commands) if has_local_side else b""
+    if text is None or local is None:
         return 0
     try:
         session = zenoh.open(zenoh.Config.from_json5(text.decode()))
@@ -158,13 +204,14 @@ def run(fleet: str, node: NodeId, commands: int, reports: int) -> int:
         reporter.report(ProblemReported(source="relay", problem=problem[:400]))
         reporter.flush(CLOSE_S)
         return 1
+    relay = RelayProcess(session, fleet, node, reporter, local.decode())
     try:
-        RelayProcess(session, fleet, node, reporter).obey(commands)
+        relay.obey(commands)
     finally:
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         signal.setitimer(signal.ITIMER_REAL, ALARM_S)
         reporter.flush(0.1)
-        closing = threading.Thread(target=session.close, name="close", daemon=True)
+        closing = threading.Thread(target=relay.close, name="close", daemon=True)
         closing.start()
         closing.join(CLOSE_S)
     return 0

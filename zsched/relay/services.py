@@ -31,6 +31,8 @@ import zenoh
 from zenoh import Query, Reply, Sample, SampleKind, Session
 
 from zsched.clock import monotonic_s
+from zsched.core.capture import Rewriter, rewriter
+from zsched.core.keyexpr import is_wild
 from zsched.core.plan import Route, StreamCount
 from zsched.core.relay_protocol import ERROR_ENCODING, REFUSED_ENCODING, ServiceProblem
 from zsched.relay.counter import StreamCounter
@@ -42,6 +44,8 @@ HOLD_S: Final = 1.0
 LOOK_AGAIN_S: Final = 0.02
 """How often a waiting request looks for an owner; a flip wakes it at once."""
 JOIN_S: Final = 0.3
+MAX_KEYS: Final = 256
+"""Keys of a wildcard service that are looked after; of further ones it is only known when a request has no answer."""
 
 _log = logging.getLogger("zsched.relay")
 
@@ -55,23 +59,39 @@ class _Outcome(Enum):
 
 @dataclass(slots=True, eq=False)
 class _ServiceSlot:
-    """One owner of the service. The querier only tells whether anybody is there: requests have their own time."""
+    """One owner of the service. The queriers only tell whether anybody is there: requests have their own time."""
 
+    session: Session
     owner_key: str
-    querier: zenoh.Querier
+    forwards: Rewriter
+    """From a key that was asked for to the owner's."""
+    queriers: dict[str, zenoh.Querier] = field(default_factory=dict)
     pending: set[Replies] = field(default_factory=set)
     is_closed: bool = False
 
     @property
     def is_matching(self) -> bool:
-        return bool(getattr(self.querier.matching_status, "matching", False))  # the object itself is always true
+        return self.serves(self.owner_key)
+
+    def key_for(self, asked: str) -> str:
+        """The owner's key for one that was asked for."""
+        return self.forwards(asked) or self.owner_key
+
+    def serves(self, key: str) -> bool:
+        """True when somebody answers under ``key``, and for keys with wildcards, of which zenoh cannot tell."""
+        if is_wild(key) or (key not in self.queriers and len(self.queriers) >= MAX_KEYS):
+            return True
+        querier = self.queriers.get(key)
+        if querier is None:
+            querier = self.queriers[key] = self.session.declare_querier(key)
+        return bool(getattr(querier.matching_status, "matching", False))  # the object itself is always true
 
 
 class ServiceStream:
     """One service rule on this node; slots are named by their epoch. Every method may be called from any thread."""
 
-    def __init__(self, session: Session, route: Route) -> None:
-        """Declare the queryable under the robot's own key.
+    def __init__(self, session: Session, route: Route, local: Session | None = None) -> None:
+        """Declare the queryable under the robot's own key, on ``local``, the host's own side, if there is one.
 
         Raises:
             zenoh.ZError: ``from`` is no key expression.
@@ -83,7 +103,7 @@ class ServiceStream:
         self._slots: dict[int, _ServiceSlot] = {}
         self._active: _ServiceSlot | None = None
         self._running = 0
-        self._queryable = session.declare_queryable(
+        self._queryable = (local or session).declare_queryable(
             route.from_expr, zenoh.handlers.FifoChannel(256), complete=True, allowed_origin=zenoh.Locality.REMOTE
         )
         handler = self._queryable.handler
@@ -94,9 +114,12 @@ class ServiceStream:
         """Make a slot ready; it is not asked yet.
 
         Raises:
+            ValueError: ``to`` cannot be filled from ``from``.
             zenoh.ZError: ``to`` is no key expression.
         """
-        slot = _ServiceSlot(owner_key=route.to_expr, querier=self._session.declare_querier(route.to_expr))
+        forwards = rewriter(route.from_expr, route.to_expr)
+        slot = _ServiceSlot(session=self._session, owner_key=route.to_expr, forwards=forwards)
+        slot.serves(route.to_expr)  # zenoh learns who is there from now on
         with self._lock:
             self._slots[epoch] = slot
 
@@ -127,7 +150,8 @@ class ServiceStream:
                 self._active = None
             for replies in slot.pending:
                 replies.stop()
-        undeclare(slot.querier)
+        for querier in slot.queriers.values():
+            undeclare(querier)
 
     def close(self) -> None:
         """Take no more requests and close every slot."""
@@ -177,7 +201,7 @@ class ServiceStream:
         until = monotonic_s() + settings.timeout_s
         hold_until = until if settings.retry else min(until, monotonic_s() + HOLD_S)
         while True:
-            slot = self._await_owner(hold_until)
+            slot = self._await_owner(str(query.key_expr), hold_until)
             if slot is None:
                 self._fail(query, ServiceProblem.NO_OWNER, f"nobody serves {self.route.from_expr}: it was not done")
                 return
@@ -192,12 +216,12 @@ class ServiceStream:
                 self._counter.dropped("retried")
                 self._lock.wait(LOOK_AGAIN_S)
 
-    def _await_owner(self, until: float) -> _ServiceSlot | None:
+    def _await_owner(self, asked: str, until: float) -> _ServiceSlot | None:
         """The slot to ask, as soon as there is somebody in it."""
         with self._lock:
             while True:
                 slot = self._active
-                if slot is not None and slot.is_matching:
+                if slot is not None and slot.serves(slot.key_for(asked)):
                     return slot
                 left = until - monotonic_s()
                 if left <= 0:
@@ -206,7 +230,7 @@ class ServiceStream:
 
     def _ask(self, query: Query, slot: _ServiceSlot, timeout_s: float) -> _Outcome:
         """Send the request to one owner and hand its answers on."""
-        selector = zenoh.Selector(slot.owner_key, query.parameters)
+        selector = zenoh.Selector(slot.key_for(str(query.key_expr)), query.parameters)
         replies = Replies(timeout_s)
         with self._lock:  # a slot that closes from here on stops it
             if slot.is_closed:
@@ -243,13 +267,17 @@ class ServiceStream:
         return _Outcome.ANSWERED
 
     def _pass_on(self, query: Query, reply: Reply) -> None:
-        key, error, sample = self.route.from_expr, reply.err, reply.ok
+        key, error, sample = self._asked_key(query), reply.err, reply.ok
         if error is not None:
             query.reply_err(error.payload, encoding=error.encoding)
         elif sample is not None and sample.kind == SampleKind.DELETE:
             query.reply_del(key, attachment=sample.attachment, timestamp=sample.timestamp, express=sample.express)
         elif sample is not None:
             _reply(query, key, sample)
+
+    def _asked_key(self, query: Query) -> str:
+        """The key to answer under: the rule's, or, when that has wildcards, the one that was asked for."""
+        return str(query.key_expr) if is_wild(self.route.from_expr) else self.route.from_expr
 
     def _fail(self, query: Query, problem: ServiceProblem, text: str) -> None:
         with self._lock:
@@ -282,8 +310,9 @@ def _problem(outcome: _Outcome, slot: _ServiceSlot) -> tuple[ServiceProblem, str
 class Services:
     """All services of one task on this node."""
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: Session, local: Session | None = None) -> None:
         self._session = session
+        self._local = local
         self._streams: dict[str, ServiceStream] = {}
 
     def open(self, epoch: int, route: Route) -> None:
@@ -296,7 +325,7 @@ class Services:
         if stream is None or (stream.route.from_expr, stream.route.service) != (route.from_expr, route.service):
             if stream is not None:
                 stream.close()
-            stream = self._streams[route.stream] = ServiceStream(self._session, route)
+            stream = self._streams[route.stream] = ServiceStream(self._session, route, self._local)
         stream.open(epoch, route)
 
     def is_matching(self, epoch: int) -> bool:

@@ -22,6 +22,7 @@ from zsched.core.model import TaskId
 from zsched.core.plan import Direction, ReadyWhen, Route, RoutePhase, RoutePlan, Slot, StreamClass, StreamCount
 from zsched.core.relay_protocol import RelayReport, SlotLost
 from zsched.relay.acks import Acks
+from zsched.relay.graph import GraphMirror
 from zsched.relay.inputs import InputStream
 from zsched.relay.outputs import OutputStream
 from zsched.relay.services import Services
@@ -57,8 +58,13 @@ class TaskRelay:
         acks: Acks,
         own_ids: frozenset[str],
         report: Callable[[RelayReport], None],
+        graph: GraphMirror,
+        local: Session | None = None,
     ) -> None:
+        """``session`` is the fleet's, ``local`` the one of the host's own side, if it has one."""
         self._session = session
+        self._local = local
+        self._graph = graph
         self._task = task
         self._tokens = tokens
         self._acks = acks
@@ -69,7 +75,7 @@ class TaskRelay:
         self._slots: dict[int, _OpenSlot] = {}
         self._inputs: dict[str, InputStream] = {}
         self._outputs: dict[str, OutputStream] = {}
-        self._services = Services(session)
+        self._services = Services(session, local)
         self._flip_by: float | None = None
         threading.Thread(target=self._run, name=f"task {task}", daemon=True).start()
 
@@ -148,6 +154,9 @@ class TaskRelay:
         if current is not None and plan.phase is RoutePhase.PREPARE and current.is_ready:
             self._report(SlotReady(task=self._task, epoch=current.slot.epoch))  # asked again: say it again
         self._forget_streams()
+        self._graph.set_routes(
+            self._task, tuple(route for state in self._slots.values() for route in state.slot.routes)
+        )
 
     def _open(self, slot: Slot) -> None:
         if slot.epoch in self._slots:
@@ -169,14 +178,17 @@ class TaskRelay:
             if source is None or (source.route.from_expr, source.route.settings) != (route.from_expr, route.settings):
                 if source is not None:
                     source.close()
-                source = self._inputs[route.stream] = InputStream(self._session, route, self._own_ids)
+                source = self._inputs[route.stream] = InputStream(self._session, route, self._own_ids, self._local)
             source.open(epoch, route, self._acks if slot.ready_when is ReadyWhen.TOKEN else None)
             return
         sink = self._outputs.get(route.stream)
         if sink is None or (sink.route.to_expr, sink.route.settings) != (route.to_expr, route.settings):
             if sink is not None:
                 sink.close()
-            sink = self._outputs[route.stream] = OutputStream(self._session, route, self._own_ids, self.wake)
+            sink = self._outputs[route.stream] = OutputStream(
+                self._session, route, self._own_ids, self.wake, self._local
+            )
+        sink.know(route.from_expr)
         sink.open(epoch, route)
 
     def _close(self, epoch: int) -> None:

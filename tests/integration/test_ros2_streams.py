@@ -1,0 +1,284 @@
+"""ROS 2 nodes on either side of a relay: keys, attachments, latched values, graph tokens and services through a move.
+
+The nodes are sessions that do on the wire what rmw_zenoh does (its design document); test_ros2_sdk.py has nodes by
+somebody else. Routes come from a fleet file.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import pytest
+import zenoh
+from zenoh import ext
+
+from zsched.adapters.streams import RelayHandle
+from zsched.config import check_bytes
+from zsched.core.events import RelayChanged, SlotFlipped, SlotReady
+from zsched.core.fleet import LocalSide
+from zsched.core.plan import RoutePhase
+from zsched.core.relay_protocol import HandleReport
+from zsched.core.ros2 import Attachment, decode_attachment, encode_attachment
+from zsched.core.route import plan_for, slot_for
+from zsched.zenoh_config import client_config, data_config, local_config, worker_config
+
+GRID = "nav_msgs::msg::dds_::OccupancyGrid_/RIHS01_8d348150c12913a31ee0ec170fbf25089e4745d17035792a1ba94d6f0bc0cfc7"
+TRIGGER = "std_srvs::srv::dds_::Trigger_/RIHS01_eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f"
+QOS = ":1:,1:,:,:,,"
+FILE = """\
+fleet: test
+nodes:
+  robot1: {kind: robot, wired: true, local: {connect: ["tcp/127.0.0.1:7447"]}, host: h, listen: LISTEN}
+  edge1: {kind: edge}
+  edge2: {kind: edge}
+electorate: [robot1, edge1, edge2]
+tasks:
+  merge:
+    candidates: [edge1, edge2]
+    weights: {cpu: 1}
+    worker: {ready: matching}
+    ros2:
+      inputs: [{topic: /map, worker_topic: "/{target}/merge/{robot}/map", class: latest}]
+      outputs: [{topic: /merged_map, worker_topic: "/{target}/merge/map", class: latest}]
+      services: [{service: /merge_now, type: std_srvs/srv/Trigger, worker_service: "/{target}/merge/now"}]
+""".replace("LISTEN", "{control: tcp/127.0.0.1:1, data: tcp/127.0.0.1:2}")
+
+
+def until(condition: Callable[[], Any], what: str, deadline_s: float = 10.0) -> Any:
+    end = time.monotonic() + deadline_s
+    while time.monotonic() < end:
+        value = condition()
+        if value:
+            return value
+        time.sleep(0.005)
+    raise AssertionError(f"not within {deadline_s} s: {what}")
+
+
+def free_endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def opened(text: str, mode: str = "", listen: str = "") -> zenoh.Session:
+    config = zenoh.Config.from_json5(text)
+    config.insert_json5("timestamping/enabled", "true")  # as in rmw_zenoh's configurations
+    if mode:
+        config.insert_json5("mode", f'"{mode}"')
+        config.insert_json5("listen/endpoints", f'["{listen}"]')
+    return zenoh.open(config)
+
+
+@dataclass(eq=False)
+class RosNode:
+    """One context of rmw_zenoh: a session with publishers, subscriptions and tokens."""
+
+    session: zenoh.Session
+    heard: list[zenoh.Sample] = field(default_factory=list)
+    entities: list[Any] = field(default_factory=list)
+    sequence: int = 0
+
+    def announce(self, kind: str, topic: str, kind_of_data: str = GRID, qos: str = QOS) -> None:
+        """The graph token that goes with an endpoint."""
+        number = len(self.entities)
+        whose = f"@ros2_lv/0/{self.session.zid()}/0/{number}/{kind}/%/%/node"
+        key = f"{whose}/%{topic.replace('/', '%')}/{kind_of_data}/{qos}"
+        self.entities.append(self.session.liveliness().declare_token(key))
+
+    def advertise(self, topic: str) -> Callable[[bytes], bytes]:
+        """A latched publisher; the function publishes and answers the attachment."""
+        publisher = ext.declare_advanced_publisher(
+            self.session, f"0/{topic}/{GRID}", cache=ext.CacheConfig(1), publisher_detection=True
+        )
+        self.entities.append(publisher)
+        self.announce("MP", topic)
+
+        def publish(payload: bytes) -> bytes:
+            self.sequence += 1
+            value = Attachment(sequence=self.sequence, stamp_ns=time.time_ns(), gid=bytes(range(16)))
+            publisher.put(payload, attachment=encode_attachment(value))
+            return encode_attachment(value)
+
+        return publish
+
+    def subscribe(self, topic: str) -> None:
+        """A latched subscription."""
+        subscriber = ext.declare_advanced_subscriber(
+            self.session,
+            f"0/{topic}/{GRID}",
+            self.heard.append,
+            history=ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
+        )
+        self.entities.append(subscriber)
+        self.announce("MS", topic)
+
+    def serve(self, service: str, answer: bytes) -> list[str]:
+        """A service that answers with the sequence and gid of the request; the list: keys it was asked for."""
+        asked: list[str] = []
+
+        def on_query(query: zenoh.Query) -> None:
+            with query:
+                asked.append(str(query.key_expr))
+                query.reply(str(query.key_expr), answer, attachment=query.attachment)
+
+        self.entities.append(self.session.declare_queryable(f"0/{service}/{TRIGGER}", on_query, complete=True))
+        self.announce("SS", service, TRIGGER)
+        return asked
+
+    def tokens(self) -> list[str]:
+        """Every endpoint of others in the graph, as kind and topic."""
+        replies = self.session.liveliness().get("@ros2_lv/0/**", timeout=1.0)
+        keys = [str(reply.ok.key_expr).split("/") for reply in replies if reply.ok is not None]
+        return sorted(f"{key[5]} {key[9]} {key[12]}" for key in keys if len(key) == 13 and key[8] == "zsched_robot1")
+
+    def close(self) -> None:
+        for entity in self.entities:
+            entity.undeclare()
+        self.session.close()
+
+
+@dataclass
+class Rig:
+    """A robot with a router of its own and its relay, two edges without daemons."""
+
+    stack: contextlib.ExitStack
+    seed: str = field(default_factory=free_endpoint)
+    host: str = field(default_factory=free_endpoint)
+    reports: list[HandleReport] = field(default_factory=list)
+    epoch: int = 0
+
+    def start(self) -> None:
+        result = check_bytes(FILE.encode())
+        assert result.fleet is not None, result.report()
+        self.task = result.fleet.tasks[0]
+        self.stack.callback(opened(client_config(connect=()), "router", self.host).close)
+        data = data_config(listen=(self.seed,), connect=(), shared_memory=False)
+        side = local_config(LocalSide(connect=(self.host,)))
+        self.relay = RelayHandle(
+            fleet="test", node="robot1", zenoh_config=data, on_report=self.reports.append, local_config=side
+        )
+        self.relay.start()
+        self.stack.callback(self.relay.stop, 2.0)
+        until(lambda: self.said(RelayChanged), "the relay runs")
+
+    def on_robot(self) -> RosNode:
+        node = RosNode(opened(client_config(connect=(self.host,))))
+        self.stack.callback(node.close)
+        return node
+
+    def on_edge(self) -> RosNode:
+        node = RosNode(opened(worker_config(connect=(self.seed,), shared_memory=False)))
+        self.stack.callback(node.close)
+        return node
+
+    def said(self, kind: type, **fields: Any) -> bool:
+        return any(
+            isinstance(report, kind) and all(getattr(report, name) == value for name, value in fields.items())
+            for report in tuple(self.reports)
+        )
+
+    def move(self, owner: str) -> None:
+        """To a new owner, whose predecessor is closed at the end."""
+        self.epoch += 1
+        for phase in (RoutePhase.PREPARE, RoutePhase.FLIP, RoutePhase.CLOSE):
+            slot = slot_for(self.task, "robot1", owner, self.epoch)
+            old = slot_for(self.task, "robot1", "edge1", self.epoch - 1) if self.epoch > 1 else None
+            self.relay.apply(plan_for(self.task, phase, slot, old))
+            expected = SlotReady if phase is RoutePhase.PREPARE else SlotFlipped
+            until(partial(self.said, expected, epoch=self.epoch), f"{phase} {owner}")
+
+
+@pytest.fixture
+def rig() -> Iterator[Rig]:
+    with contextlib.ExitStack() as stack:
+        made = Rig(stack)
+        made.start()
+        yield made
+
+
+def of(node: RosNode) -> list[tuple[bytes, bytes]]:
+    return [
+        (sample.payload.to_bytes(), sample.attachment.to_bytes() if sample.attachment is not None else b"")
+        for sample in tuple(node.heard)
+    ]
+
+
+def test_latched_topics_and_their_attachments_through_a_move(rig: Rig) -> None:
+    robot, workers = rig.on_robot(), {"edge1": rig.on_edge(), "edge2": rig.on_edge()}
+    publish = robot.advertise("map")
+    sent = publish(b"map 1")
+    merged = {}
+    for owner, worker in workers.items():
+        worker.subscribe(f"{owner}/merge/robot1/map")
+        worker.serve(f"{owner}/merge/now", b"")
+        merged[owner] = worker.advertise(f"{owner}/merge/map")
+    rig.move("edge1")
+    until(lambda: (b"map 1", sent) in of(workers["edge1"]), "the latched map, published before there was an owner")
+    first = merged["edge1"](b"merged by edge1")
+    robot.subscribe("merged_map")
+    until(lambda: (b"merged by edge1", first) in of(robot), "the first owner's result")
+    rig.move("edge2")
+    until(lambda: (b"map 1", sent) in of(workers["edge2"]), "the latched map at the new owner")
+    second = merged["edge2"](b"merged by edge2")
+    until(lambda: of(robot)[-1] == (b"merged by edge2", second), "the new owner's result")
+    late = rig.on_robot()
+    late.subscribe("merged_map")
+    until(lambda: (b"merged by edge2", second) in of(late), "the newest result for who comes late")
+    assert decode_attachment(second) is not None
+
+
+def test_graph_tools_see_the_endpoints_of_the_other_side(rig: Rig) -> None:
+    robot, workers = rig.on_robot(), {"edge1": rig.on_edge(), "edge2": rig.on_edge()}
+    robot.advertise("map")
+    robot.subscribe("merged_map")
+    for owner, worker in workers.items():
+        worker.subscribe(f"{owner}/merge/robot1/map")
+        worker.advertise(f"{owner}/merge/map")
+        worker.serve(f"{owner}/merge/now", b"")
+    rig.move("edge1")
+    here = [f"MP %merged_map {QOS}", f"MS %map {QOS}", f"SS %merge_now {QOS}"]
+    until(lambda: robot.tokens() == here, "the worker's endpoints, under the robot's names")
+    far = workers["edge1"]
+    until(
+        lambda: far.tokens() == [f"MP %edge1%merge%robot1%map {QOS}", f"MS %edge1%merge%map {QOS}"],
+        "the robot's endpoints, under the worker's names",
+    )
+    rig.move("edge2")
+    until(
+        lambda: far.tokens() == [f"MP %edge2%merge%robot1%map {QOS}", f"MS %edge2%merge%map {QOS}"],
+        "the robot's endpoints at the new owner, and there only",
+    )
+    assert robot.tokens() == here
+    workers["edge2"].close()
+    until(lambda: robot.tokens() == [], "a worker that ends takes its endpoints along")
+    workers["edge2"].entities.clear()
+    workers["edge2"].session = rig.on_edge().session
+
+
+def test_a_service_is_asked_under_the_robots_name(rig: Rig) -> None:
+    robot, worker = rig.on_robot(), rig.on_edge()
+    worker.subscribe("edge1/merge/robot1/map")
+    asked = worker.serve("edge1/merge/now", b"done")
+    rig.move("edge1")
+    mark = encode_attachment(Attachment(sequence=1, stamp_ns=time.time_ns(), gid=bytes(16)))
+    replies = robot.session.get(
+        f"0/merge_now/{TRIGGER}",
+        target=zenoh.QueryTarget.ALL_COMPLETE,
+        consolidation=zenoh.ConsolidationMode.NONE,
+        payload=b"please",
+        attachment=mark,
+        timeout=5.0,
+    )
+    (reply,) = list(replies)
+    assert reply.ok is not None
+    assert str(reply.ok.key_expr) == f"0/merge_now/{TRIGGER}"
+    assert reply.ok.payload.to_bytes() == b"done"
+    assert reply.ok.attachment is not None
+    assert reply.ok.attachment.to_bytes() == mark
+    assert asked == [f"0/edge1/merge/now/{TRIGGER}"]
