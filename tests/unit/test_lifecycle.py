@@ -78,6 +78,15 @@ def test_new_generation_starts_above_every_older_revision_and_epoch(fleet: Fleet
         assert register.learnt.tuning == fleet.task(register.task).tuning
 
 
+def test_new_generation_counts_as_accepted_or_its_first_round_would_find_a_forgotten_value(
+    fleet: Fleet, tmp_path: Path
+) -> None:
+    init_state(fleet, "robot1", tmp_path, 1)
+    for register in load(fleet, tmp_path).registers:
+        assert register.accepted is not None
+        assert register.accepted.value == register.learnt
+
+
 def test_generation_that_is_not_newer_is_refused(fleet: Fleet, tmp_path: Path) -> None:
     init_state(fleet, "robot1", tmp_path, 3)
     for generation in (0, 2, 3):
