@@ -19,6 +19,7 @@ from typing import Annotated
 import typer
 
 from zsched.cli_common import EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, CliError, Json, Verb, Verbs, print_json
+from zsched.cli_stream_verbs import stream_app
 
 EPILOG = (
     "Exit codes: 0 fine, 1 failed, 2 usage, 3 daemon not reachable, 4 reachable but degraded, 5 timed out, "
@@ -37,6 +38,8 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
+
+app.add_typer(stream_app)
 
 LAB_NEEDS = ("cv2", "matplotlib", "numpy", "onnxruntime", "rich")
 """What the extra ``lab`` installs."""

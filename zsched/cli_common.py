@@ -88,7 +88,7 @@ class Verbs(TyperGroup):
         except AdapterError as error:
             code, text = EXIT_FAILED, str(error)
         # a fleet file's faults start with its name, like a compiler's: nothing goes in front of them
-        prefix = "" if code == EXIT_CONFIG else f"zsched {ctx.invoked_subcommand}: "
+        prefix = "" if code == EXIT_CONFIG else f"{ctx.command_path} {ctx.invoked_subcommand}: "
         typer.echo(f"{prefix}{harmless(text)}", err=True)
         raise typer.Exit(code)
 

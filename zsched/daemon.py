@@ -40,6 +40,7 @@ from zsched.core.model import DurableState, NodeId, TaskId
 from zsched.core.node import Node
 from zsched.core.status import status_line
 from zsched.core.workers import runs_worker
+from zsched.daemon_access import StreamAccess
 from zsched.errors import AdapterError, ConfigError
 from zsched.shell import Desk, Inbox, Shell
 
@@ -268,7 +269,8 @@ class Daemon:
             ),
             post=self._inbox.post,
         )
-        desk = Desk(me, self._inbox, bus)
+        access = StreamAccess(fleet, me, points.worker_connect, operator_json5)
+        desk = Desk(me, self._inbox, bus, access.answer)
         door = OperatorSocket(places.socket_path(self._options.runtime_dir, me), desk.answer)
         door.open()
         stack.callback(door.close)

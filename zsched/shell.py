@@ -13,6 +13,7 @@ import logging
 import math
 import queue
 import threading
+from collections.abc import Callable
 from typing import Any, assert_never
 
 from zsched.adapters.control_bus import ControlBus
@@ -75,14 +76,18 @@ class Inbox:
 class Desk:
     """Operators' questions from the local socket: posted into the loop, awaited in the socket's thread."""
 
-    def __init__(self, node: NodeId, inbox: Inbox, bus: ControlBus) -> None:
+    def __init__(
+        self, node: NodeId, inbox: Inbox, bus: ControlBus, access: Callable[[NodeId], dict[str, Any]] | None = None
+    ) -> None:
+        """``access`` says how a tool on this machine joins a node's data network."""
         self._node, self._inbox, self._bus = node, inbox, bus
+        self._access = access
         self._numbers = itertools.count(LOCAL_REQUESTS_FROM)
         self._waiting: dict[int, queue.SimpleQueue[object]] = {}
         self._lock = threading.Lock()
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Answer one request of the socket (``status``, ``weights``), for this node or, with ``node``, for another."""
+        """Answer one request of the socket (``status``, ``weights``, ``access``); with ``node``, for another node."""
         verb, node = request["verb"], request.get("node") or self._node
         if not isinstance(node, str) or not NAME.fullmatch(node):
             return {"error": f"node: {node!r:.80} is not a name"}
@@ -96,7 +101,9 @@ class Desk:
             except (TypeError, ValueError) as error:
                 return {"error": f"weights: {error}"}
             return self._ask(node, command)
-        return {"error": f"unknown verb {verb!r:.80}; known: status, weights"}
+        if verb == "access" and self._access is not None:
+            return self._access(node)
+        return {"error": f"unknown verb {verb!r:.80}; known: access, status, weights"}
 
     def _ask(self, node: NodeId, command: SetWeights | None) -> dict[str, Any]:
         if node != self._node:

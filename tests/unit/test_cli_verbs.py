@@ -146,7 +146,7 @@ def test_wrong_usage_exits_with_2_and_explains_on_stderr(arguments: tuple[str, .
     assert "zsched" in result.stderr or "Usage" in result.stderr
 
 
-@pytest.mark.parametrize("verb", ["up", "init", "status", "weights", "check", "demo", "version"])
+@pytest.mark.parametrize("verb", ["up", "init", "status", "weights", "stream", "check", "demo", "version"])
 def test_help_of_every_verb_fits_a_small_terminal(verb: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     result = run(verb, "--help")

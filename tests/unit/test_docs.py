@@ -274,7 +274,8 @@ def wrong_commands(text: str) -> list[str]:
     """Commands of the command line in ``text`` whose verb, or an option of it, does not exist."""
     wrong = []
     for verb, rest in COMMAND.findall(text):
-        command = VERBS.get(verb)
+        below = next(iter(rest.split()), "")
+        command = getattr(VERBS.get(verb), "commands", {}).get(below) or VERBS.get(verb)
         if command is None:
             wrong.append(f"zsched {verb}")
             continue

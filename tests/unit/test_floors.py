@@ -32,7 +32,7 @@ FLOORS: Final[tuple[tuple[str, int, str], ...]] = (
     (r"adapters(\.\w+)?", 3, "*"),
     (r"relay(\..+)?", 3, "relay"),
     (r"(worker|worker_\w+)", 3, "worker"),
-    (r"(daemon|shell|lifecycle)", 4, "daemon"),
+    (r"(daemon|daemon_\w+|shell|lifecycle)", 4, "daemon"),
     (r"tasks(?:\.(\w+))?(?:\..+)?", 4, "tasks: \\1"),
     (r"lab(\..+)?", 5, "lab"),
     (r"(cli|cli_\w+)", 6, "cli"),
@@ -51,7 +51,7 @@ IMPURE_CALLS: Final = frozenset({"open", "print", "input", "exec", "eval", "comp
 HEAVY: Final = frozenset({"numpy", "cv2", "matplotlib", "onnxruntime", "rich", "pydantic", "asyncio"})
 OUTSIDE: Final[dict[str, str]] = {
     # library: who alone may import it, besides lab and tasks
-    "zenoh": r"adapters\.control_bus|relay\..+|worker|worker_\w+|zenoh_config",
+    "zenoh": r"adapters\.(control_bus|stream_tap)|relay\..+|worker|worker_\w+|zenoh_config",
     "psutil": r"adapters\.\w+",
     "msgpack": r"wire",
     "ruamel": r"config_reader",

@@ -35,7 +35,7 @@ from enum import StrEnum
 from zsched.core.fleet import OnIsolation, Standby, TaskSpec
 from zsched.core.instructions import ApplyRoutes, Instruction, RecordStory, SetRole, StartWorker, StopWorker
 from zsched.core.model import Allocation, NodeId, NodeKind
-from zsched.core.plan import Role, RoutePhase, Slot, WorkerRole
+from zsched.core.plan import Role, Route, RoutePhase, Slot, WorkerRole
 from zsched.core.route import plan_for, slot_for
 from zsched.core.workers import runs_worker
 
@@ -87,6 +87,11 @@ class Executor:
     def predecessor(self) -> NodeId | None:
         """The owner of the old slot while a handover runs."""
         return None if self._predecessor is None else self._predecessor.owner
+
+    @property
+    def routes(self) -> tuple[Route, ...]:
+        """The streams of the newest slot."""
+        return () if self._current is None else self._current.routes
 
     def again(self) -> tuple[Instruction, ...]:
         """The newest worker's state, role and plan once more, after a batch that carried them was cut off."""

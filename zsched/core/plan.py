@@ -176,3 +176,6 @@ class StreamCount:
     """Kept values sent once more to a new owner, and samples sent again for want of an acknowledgement."""
     at_most_lost: int = 0
     """Inputs: in flight to workers that died, so at most so many had no result."""
+    from_expr: str = ""
+    """Filled in by the status: the keys of the newest slot, empty while the task has no owner."""
+    to_expr: str = ""

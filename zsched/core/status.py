@@ -6,7 +6,7 @@ Knows: which figure stands where. Does not know: how it is shown.
 from __future__ import annotations
 
 from collections import Counter, deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from zsched.core.agreement import Agreement
@@ -15,7 +15,7 @@ from zsched.core.fleet import Fleet, NodeSpec, TaskSpec
 from zsched.core.gateway import Gateway
 from zsched.core.membership import Membership
 from zsched.core.model import Allocation, NodeId, NodeKind, PeerState, TaskId
-from zsched.core.plan import StreamCount
+from zsched.core.plan import Route, StreamCount
 from zsched.core.register import Register
 from zsched.core.rounds import Rounds, TaskRound
 from zsched.core.scoring import majority
@@ -142,6 +142,7 @@ def _task_status(node: NodeView, spec: TaskSpec, now: float) -> TaskStatus:
     executor, standing = node.executors[spec.name], node.rounds.tasks[spec.name]
     owner_state = "none" if value.owner is None else node.membership.state(value.owner).value
     prefix = f"{spec.name}/"
+    routes = {route.stream: route for route in executor.routes}
     return TaskStatus(
         name=spec.name,
         owner=value.owner,
@@ -155,7 +156,11 @@ def _task_status(node: NodeView, spec: TaskSpec, now: float) -> TaskStatus:
         decision=_decision(standing, now),
         vote=_vote(standing, now),
         problems=(f"cut off from {value.owner}: this robot works alone, degraded",) if executor.is_local else (),
-        streams=tuple(count for count in node.stream_counts if count.stream.startswith(prefix)),
+        streams=tuple(
+            _with_keys(count, routes.get(count.stream))
+            for count in node.stream_counts
+            if count.stream.startswith(prefix)
+        ),
         history=tuple(
             PastAllocation(
                 epoch=past.value.epoch,
@@ -167,6 +172,10 @@ def _task_status(node: NodeView, spec: TaskSpec, now: float) -> TaskStatus:
             for past in node.history[spec.name]
         ),
     )
+
+
+def _with_keys(count: StreamCount, route: Route | None) -> StreamCount:
+    return count if route is None else replace(count, from_expr=route.from_expr, to_expr=route.to_expr)
 
 
 def _decision(standing: TaskRound, now: float) -> DecisionStatus | None:

@@ -1,0 +1,144 @@
+"""`zsched stream` against a real fleet whose robot publishes at a known rate."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from zsched.lab.testbed import Testbed, echo_fleet
+
+HZ, SIZE = 50.0, 1000
+VERB_S = 30.0
+
+
+@dataclass
+class Site:
+    """A fleet of one robot and one edge; an application publishes ``robot1/in`` at `HZ`."""
+
+    runtime: Path
+
+    def run(self, *arguments: str, code: int = 0) -> str:
+        command = [sys.executable, "-m", "zsched.cli", "stream", *arguments, "--runtime-dir", str(self.runtime)]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=VERB_S, check=False)
+        assert done.returncode == code, done.stderr
+        return done.stdout if code == 0 else done.stderr
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
+    folder = tmp_path_factory.mktemp("verbs")
+    with Testbed(folder, echo_fleet(robots=1, edges=1)) as bed:
+        bed.init()
+        bed.start()
+        bed.wait_settled()
+        bed.wait(lambda: bed.task("robot1")["streams"], 10.0, "the first counters")
+        halt = threading.Event()
+        thread = threading.Thread(target=_publish, args=(bed.app("robot1"), halt))
+        thread.start()
+        try:
+            yield Site(runtime=folder)
+        finally:
+            halt.set()
+            thread.join(5)
+
+
+def _publish(session: zenoh.Session, halt: threading.Event) -> None:
+    publisher = session.declare_publisher("robot1/in")
+    due = time.monotonic()
+    while not halt.is_set():
+        publisher.put(bytes(SIZE), attachment=b"seven b", encoding="application/x")
+        due += 1 / HZ
+        time.sleep(max(0.0, due - time.monotonic()))
+
+
+def rows(text: str) -> dict[str, dict[str, Any]]:
+    """The keys of the one JSON line in ``text``."""
+    (line,) = text.splitlines()
+    return {row["key"]: row for row in json.loads(line)["keys"]}
+
+
+def test_list_shows_rates_and_keys(site: Site) -> None:
+    body = json.loads(site.run("list", "--node", "robot1", "--json", "--window", "3"))
+    assert (body["schema"], body["node"]) == ("zsched.stream.list/1", "robot1")
+    into, out = body["streams"]
+    assert (into["stream"], into["kind"], into["from"], into["to"]) == (
+        "echo/in/0",
+        "input",
+        "robot1/in",
+        "edge1/echo/robot1/in",
+    )
+    assert (out["kind"], out["from"], out["to"]) == ("output", f"edge1/echo/{out['epoch']}/robot1/out", "robot1/out")
+    assert 0.5 * HZ < into["hz"] < 1.7 * HZ  # the relay counts once a second
+    assert 0.5 * HZ * SIZE < into["bytes_per_s"] < 1.7 * HZ * SIZE
+    text = site.run("list", "in/0", "--node", "robot1", "--window", "0.5")
+    assert "robot1/in -> edge1/echo/robot1/in" in text
+    assert "out/0" not in text
+
+
+def test_an_edge_has_no_streams(site: Site) -> None:
+    assert "edge1: no streams" in site.run("list", "--node", "edge1", "--window", "0.2")
+
+
+def test_hz_of_a_stream_shows_both_its_ends(site: Site) -> None:
+    found = rows(site.run("hz", "in/0", "--node", "robot1", "--window", "2", "--count", "1", "--json"))
+    assert set(found) == {"robot1/in", "edge1/echo/robot1/in"}
+    for row in found.values():
+        assert 0.7 * HZ < row["hz"] < 1.2 * HZ
+        assert row["max_gap_s"] > row["min_gap_s"] >= 0
+        assert row["side"] == "fleet"
+
+
+def test_bw_of_the_robot_s_own_keys(site: Site) -> None:
+    found = rows(site.run("bw", "--node", "robot1", "--window", "2", "--count", "1", "--json"))
+    assert set(found) == {"robot1/in", "robot1/out"}
+    row = found["robot1/in"]
+    assert (row["min_bytes"], row["max_bytes"]) == (SIZE, SIZE)
+    assert 0.7 * HZ * SIZE < row["bytes_per_s"] < 1.2 * HZ * SIZE
+
+
+def test_any_node_sees_the_fleet_s_keys_by_wildcard(site: Site) -> None:
+    text = site.run("hz", "**", "--node", "edge1", "--window", "1", "--count", "2")
+    assert "robot1/in: " in text
+    assert " Hz, " in text
+    assert "@zsched" not in text
+
+
+def test_tail_shows_messages_as_they_come(site: Site) -> None:
+    lines = site.run("tail", "robot1/in", "--node", "robot1", "--count", "3", "--json").splitlines()
+    found = [json.loads(line) for line in lines]
+    assert [(one["key"], one["kind"], one["bytes"], one["attachment_bytes"]) for one in found] == [
+        ("robot1/in", "put", SIZE, 7)
+    ] * 3
+    assert found[0]["encoding"] == "application/x"
+    assert found[0]["head_hex"] == "00" * 64
+    assert "robot1/in 1.0 KiB" in site.run("tail", "robot1/in", "--node", "robot1", "--count", "1")
+
+
+def test_silence_and_mistakes_have_their_codes(site: Site) -> None:
+    command = ["hz", "nobody/here", "--node", "robot1", "--window", "0.5", "--count", "1"]
+    assert site.run(*command, code=1) == ""
+    assert "no key expression" in site.run("hz", "/scan", "--node", "robot1", code=2)
+    assert "robot1" in site.run("hz", "--node", "robot9", code=2)
+
+
+def test_ctrl_c_ends_a_window_at_once(site: Site) -> None:
+    command = [sys.executable, "-m", "zsched.cli", "stream", "hz", "--node", "robot1", "--window", "0.5"]
+    with subprocess.Popen([*command, "--runtime-dir", str(site.runtime)], stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            assert "robot1/" in process.stdout.readline()
+            process.send_signal(signal.SIGINT)
+            assert process.wait(5) == 0
+        finally:
+            process.kill()

@@ -1,0 +1,160 @@
+"""`zsched stream`: rates out of two statuses, words into keys, statistics of what came."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from zsched.cli import app
+from zsched.cli_common import CliError
+from zsched.cli_stream import KeyStats, keys_for, rates
+from zsched.core.fleet import Fleet, LocalSide, NodeSpec, Timing
+from zsched.core.model import NodeKind
+from zsched.daemon_access import StreamAccess
+
+
+def stream(name: str = "merge/in/0", messages: int = 10, size: int = 100, **more: Any) -> dict[str, Any]:
+    found = {"stream": name, "messages": messages, "bytes": size, "drops": {}, "last_seen_s": 0.1}
+    return found | {"from_expr": "robot1/map", "to_expr": "edge1/merge/robot1/map"} | more
+
+
+def status(*streams: dict[str, Any]) -> dict[str, Any]:
+    return {"node": "robot1", "tasks": [{"name": "merge", "owner": "edge1", "epoch": 3, "streams": list(streams)}]}
+
+
+OUT = {"name": "merge/out/0", "from_expr": "edge1/merge/3/all", "to_expr": "robot1/all"}
+SRV = {"name": "merge/srv/0", "from_expr": "robot1/now", "to_expr": "edge1/merge/now"}
+
+
+def test_rates_are_differences_over_the_time_between() -> None:
+    (found,) = rates(status(stream(messages=10, size=100)), status(stream(messages=30, size=4100)), 2.0)
+    assert (found["hz"], found["bytes_per_s"]) == (10.0, 2000.0)
+    assert (found["kind"], found["from"], found["to"]) == ("input", "robot1/map", "edge1/merge/robot1/map")
+    assert (found["owner"], found["epoch"]) == ("edge1", 3)
+
+
+@pytest.mark.parametrize("before", [status(), status(stream(messages=99))])
+def test_a_stream_that_is_new_or_began_anew_has_no_rate(before: dict[str, Any]) -> None:
+    (found,) = rates(before, status(stream(messages=30)), 1.0)
+    assert (found["hz"], found["bytes_per_s"]) == (None, None)
+
+
+def test_the_kind_of_a_stream_is_in_its_name() -> None:
+    found = rates(status(), status(stream(), stream(**OUT), stream(**SRV)), 1.0)
+    assert [one["kind"] for one in found] == ["input", "output", "service"]
+
+
+@pytest.mark.parametrize("word", ["merge/in/0", "in/0"])
+def test_a_stream_s_name_means_both_its_ends(word: str) -> None:
+    assert keys_for(status(stream(), stream(**OUT)), word) == ("robot1/map", "edge1/merge/robot1/map")
+
+
+def test_no_word_means_the_robot_s_own_keys() -> None:
+    assert keys_for(status(stream(), stream(**OUT), stream(**SRV)), None) == ("robot1/map", "robot1/all")
+
+
+@pytest.mark.parametrize("word", ["robot1/map", "**", "robot2/*/scan"])
+def test_any_other_word_is_a_key_expression(word: str) -> None:
+    assert keys_for(status(stream()), word) == (word,)
+
+
+@pytest.mark.parametrize(
+    ("word", "code", "said"),
+    [("/map", 2, "no key expression"), ("srv/0", 2, "is a service"), ("a//b", 2, "empty chunk")],
+)
+def test_a_word_that_cannot_be_listened_to_is_refused(word: str, code: int, said: str) -> None:
+    with pytest.raises(CliError, match=said) as caught:
+        keys_for(status(stream(), stream(**SRV)), word)
+    assert caught.value.code == code
+
+
+def test_streams_without_an_owner_lead_nowhere() -> None:
+    idle = status(stream(from_expr="", to_expr=""))
+    with pytest.raises(CliError, match="no owner"):
+        keys_for(idle, "in/0")
+    with pytest.raises(CliError, match="no streams"):
+        keys_for(idle, None)
+
+
+def test_statistics_of_a_key() -> None:
+    stats = KeyStats(last_at=0.9)
+    for size, at in ((100, 1.0), (300, 1.5), (200, 1.6)):
+        stats.add(size, at)
+    found = stats.as_json(2.0)
+    assert (found["messages"], found["hz"], found["bytes_per_s"], found["mean_bytes"]) == (3, 1.5, 300.0, 200.0)
+    assert (found["min_bytes"], found["max_bytes"]) == (100, 300)
+    assert found["min_gap_s"] == pytest.approx(0.1)
+    assert found["max_gap_s"] == pytest.approx(0.5)
+
+
+def test_one_message_has_no_gap() -> None:
+    stats = KeyStats()
+    stats.add(5, 1.0)
+    assert (stats.as_json(1.0)["min_gap_s"], stats.as_json(1.0)["max_gap_s"]) == (None, None)
+
+
+# --- the way to the data ---------------------------------------------------------------------------------------------
+
+NODES = (
+    NodeSpec(name="edge1", kind=NodeKind.EDGE, host="192.0.2.11", listen_data="tcp/0.0.0.0:7458"),
+    NodeSpec(name="robot1", kind=NodeKind.ROBOT, local=LocalSide(connect=("tcp/127.0.0.1:7447",))),
+    NodeSpec(name="robot2", kind=NodeKind.ROBOT),
+)
+FLEET = Fleet(name="f", timing=Timing(), nodes=NODES, tasks=(), electors=("robot1", "robot2"))
+
+
+def access(me: str) -> StreamAccess:
+    return StreamAccess(FLEET, me, ("tcp/127.0.0.1:9999",), "")
+
+
+def test_the_own_relay_is_the_way_to_the_own_streams_and_the_local_side_is_another() -> None:
+    found = access("robot1").answer("robot1")
+    assert (found["via"], found["endpoints"], set(found["sides"])) == (
+        "robot1",
+        ["tcp/127.0.0.1:9999"],
+        {"fleet", "local"},
+    )
+    assert json.loads(found["sides"]["local"])["connect"]["endpoints"] == ["tcp/127.0.0.1:7447"]
+
+
+def test_another_node_is_dialled_where_the_file_says_how() -> None:
+    found = access("robot1").answer("edge1")
+    assert (found["via"], found["endpoints"]) == ("edge1", ["tcp/192.0.2.11:7458"])
+
+
+def test_a_node_without_an_address_is_heard_through_this_one() -> None:
+    found = access("robot1").answer("robot2")
+    assert (found["via"], found["endpoints"]) == ("robot1", ["tcp/127.0.0.1:9999"])
+
+
+def test_a_node_that_is_none_is_refused() -> None:
+    assert "there are edge1, robot1, robot2" in access("robot1").answer("robot9")["error"]
+
+
+# --- the verbs -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("verb", ["list", "hz", "bw", "tail"])
+def test_help_of_every_verb_fits_a_small_terminal(verb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    result = CliRunner().invoke(app, ["stream", verb, "--help"])
+    assert result.exit_code == 0
+    assert max(map(len, result.stdout.splitlines())) <= 80
+
+
+@pytest.mark.parametrize("verb", ["list", "hz", "bw", "tail"])
+def test_without_a_daemon_every_verb_exits_with_3(verb: str, tmp_path: Path) -> None:
+    result = CliRunner().invoke(app, ["stream", verb, "--runtime-dir", str(tmp_path)])
+    assert (result.exit_code, result.stdout) == (3, "")
+    assert f"stream {verb}: no daemon" in result.stderr
+
+
+def test_the_manual_shows_every_verb() -> None:
+    manual = (Path(__file__).parents[2] / "docs" / "cli.md").read_text()
+    assert "| `zsched stream` |" in manual
+    for verb in ("list", "hz", "bw", "tail"):
+        assert f"zsched stream {verb}" in manual
