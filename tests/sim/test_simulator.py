@@ -161,7 +161,7 @@ def test_robot_that_reaches_no_edge_moves_nothing() -> None:
     assert sim.agreed(TASK) == owner
 
 
-@pytest.mark.parametrize("seed", range(60))
+@pytest.mark.parametrize("seed", range(15))
 def test_random_faults_never_break_agreement_and_end_in_an_owner(seed: int) -> None:
     """Loss, crashes, restarts, cuts, then quiet: one value per revision all along, a living owner at the end."""
     rng = Random(1000 + seed)

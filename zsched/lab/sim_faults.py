@@ -25,6 +25,8 @@ from zsched.lab.simulator import CORES, SELF_DELAY_S, WALL_S, Simulator
 
 SETTLE_S = 15.0
 """Once faults have stopped and everybody is up, every task has a living owner that all know within this time."""
+EVENTS_PER_S = 500.0
+"""A node handles about 50 a second; ten times that, on average over a whole schedule, is a storm."""
 STOP_S = 0.8
 """What a daemon that was told to stop waits for its tasks to move."""
 SMALL_DELAY_S = (0.0005, 0.003)
@@ -87,6 +89,7 @@ class Stage:
         self.sim = Simulator(
             fleet=self.plan.fleet, seed=self.plan.seed, load=self._load, delay_s=SMALL_DELAY_S, weather=Weather()
         )
+        self.sim.most_events = EVENTS_PER_S * len(self.plan.fleet.nodes) * self.plan.seconds
         self._rng = Random(f"stage {self.plan.seed}")
 
     def play(self, keep: frozenset[int] | None, calm_at: float) -> float | None:

@@ -73,6 +73,8 @@ class Simulator:
     invariants: Invariants = field(init=False)
     work: Work = field(init=False)
     events: int = 0
+    most_events: float = math.inf
+    """More than this is a storm: nodes that answer each other without end."""
     answers: list[do.AnswerCommand] = field(default_factory=list)
     """What operators were told."""
     rng: Random = field(init=False)
@@ -311,6 +313,8 @@ class Simulator:
         node = machine.node
         assert node is not None
         self.events += 1
+        if self.events > self.most_events:
+            raise InvariantError(f"{self.events} events until {self.now:.3f}: the fleet storms")
         local = machine.clock.local(self.now)
         try:
             batch = node.handle(event, local)

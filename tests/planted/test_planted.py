@@ -1,0 +1,76 @@
+"""The planted bugs: all can be planted, and a few are hunted here. All of them: ``python -m zsched.lab.planted``."""
+
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from zsched.lab.planted import PlantError, Verdict, changed, judge, plant, table
+from zsched.lab.planted_bugs import BUGS, REGISTER, Bug
+
+ROOT = Path(__file__).parents[2]
+QUICK = ("quorum off by one", "promise not persisted", "node without state is an elector", "silence rule left out")
+HARMLESS = Bug(name="harmless", module=REGISTER, changes=(("Synod on a register", "Synod on the register"),))
+
+
+def source_of(bug: Bug) -> str:
+    spec = importlib.util.find_spec(bug.module)
+    assert spec is not None
+    assert spec.origin is not None
+    return Path(spec.origin).read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("bug", BUGS, ids=lambda bug: bug.name)
+def test_every_bug_can_be_planted_in_today_s_source(bug: Bug) -> None:
+    source = source_of(bug)
+    planted = changed(bug, source)
+    assert planted != source
+    compile(planted, bug.module, "exec")
+
+
+def test_there_are_enough_bugs_each_with_a_name_of_its_own_and_tests_that_exist() -> None:
+    assert len(BUGS) >= 25
+    assert len({bug.name for bug in BUGS}) == len(BUGS)
+    assert [test for bug in BUGS for test in bug.tests if not (ROOT / test).exists()] == []
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_a_planted_bug_is_found(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
+    (bug,) = [bug for bug in BUGS if bug.name == name]
+    assert judge(bug, budget_s=20.0).found_by.startswith("seed ")
+
+
+def test_a_change_without_effect_is_not_called_found() -> None:
+    """The hunt does not cry wolf: in a process of its own, schedules of a harmless change end without a finding."""
+    code = (
+        "import sys; from zsched.lab.planted import hunt; from zsched.lab.planted_bugs import Bug\n"
+        f"sys.exit(hunt({HARMLESS!r}, 0.2))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, timeout=50, check=False).returncode == 0
+
+
+def test_a_bug_whose_text_is_gone_says_so() -> None:
+    bug = Bug(name="old", module=REGISTER, changes=(("no such words in it", ""),))
+    with pytest.raises(PlantError, match="0 times"):
+        changed(bug, source_of(bug))
+
+
+def test_a_module_that_is_already_there_cannot_be_planted() -> None:
+    import zsched.core.register
+
+    assert zsched.core.register.Register
+    with pytest.raises(PlantError, match="imported already"):
+        plant(HARMLESS)
+
+
+def test_table_names_survivors() -> None:
+    text = table(
+        [Verdict(bug=BUGS[0], found_by="seed 1: x", seconds=1.0), Verdict(bug=BUGS[1], found_by="", seconds=2)]
+    )
+    assert "**survived**" in text
+    assert "seed 1: x" in text
