@@ -37,7 +37,11 @@ _REGISTER = (
 _SCHEDULES = ("tests/unit/core/test_register_schedules.py",)
 _AGREEMENT = ("tests/unit/core/test_agreement.py",)
 _LEASE = ("tests/sim/test_lease_rules.py", "tests/sim/test_exclusive.py")
-_MEMBERSHIP = ("tests/unit/core/test_membership.py", "tests/sim/test_simulator.py")
+_MEMBERSHIP = (
+    "tests/sim/test_membership_rules.py",
+    "tests/unit/core/test_membership.py",
+    "tests/sim/test_simulator.py",
+)
 _ROUNDS = ("tests/unit/core/test_rounds.py", "tests/unit/core/test_vote.py")
 _SCHEDULER = ("tests/unit/core/test_scheduler.py", "tests/unit/core/test_scoring.py", "tests/paper")
 _EXECUTOR = ("tests/unit/core/test_executor.py",)
