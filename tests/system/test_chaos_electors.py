@@ -232,8 +232,9 @@ def test_what_a_killed_test_leaves_is_swept() -> None:
     if reason is not None:
         pytest.skip(f"no network namespaces here: {reason}")
     script = (
-        "import os, subprocess, sys; from zsched.lab.netns import Network; network = Network(['one']); "
-        "child = subprocess.Popen(network.wrap('one', ['sleep', '1000'])); "
+        "import os, subprocess; from zsched.lab.netns import Network; network = Network(['one']); "
+        "quiet = {'stdout': subprocess.DEVNULL, 'stderr': subprocess.DEVNULL}; "
+        "child = subprocess.Popen(network.wrap('one', ['sleep', '1000']), **quiet); "
         "print(network.name_of('one'), child.pid, flush=True); os.kill(os.getpid(), 9)"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=30, check=False)
