@@ -250,6 +250,8 @@ RULE: Final = Record(
         "keep_last": Field(Whole(0, 1000), "Samples per key that a new owner gets at once (class `latest`)."),
         "depth": Field(Whole(1, 100_000), "Samples that may wait between subscriber and publisher."),
         "handover": Field(Choice.of(HandoverRule), "Outputs: switch at the new owner's first sample, or lose nothing."),
+        "max_hz": Field(Number(0.01, 10_000, "Hz"), "Highest rate per key; not for `reliable`.", default="no limit"),
+        "mirror": Field(Flag(), "Inputs: feed both owners during a move (outputs with handover `latest` only)."),
     },
     StreamSettings,
 )

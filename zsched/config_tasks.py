@@ -61,6 +61,7 @@ def _task(
     limits = _limits(given, out)
     streams = tuple(_streams(given, cast, candidates, out))
     _check_exclusive(given, worker, streams, out)
+    _check_mirrors(given, streams, out)
     if not candidates:
         return None
     scheduling: Section | None = given.get("scheduling")
@@ -185,6 +186,21 @@ def _streams(given: Section, cast: Cast, candidates: tuple[str, ...], out: Colle
         yield Located(rule, section.where("to"))
 
 
+def _check_mirrors(given: Section, streams: tuple[Located[StreamRule], ...], out: Collector) -> None:
+    """Feeding two owners at a time only makes sense where one answer is enough, and where two may be given."""
+    mirrored = [stream for stream in streams if stream.value.settings.mirror]
+    whole = [stream for stream in streams if stream.value.settings.handover is HandoverRule.ALL]
+    for stream in mirrored:
+        if given.get("exclusive"):
+            out.error(
+                stream.place, "an exclusive task may not work twice, and mirror feeds two owners", "mirror: false"
+            )
+        elif whole:
+            where = f"{whole[0].place.line}:{whole[0].place.col}"
+            message = f"mirror has both owners answer, and the output at {where} lets all answers through"
+            out.error(stream.place, message, "handover: latest there, or mirror: false here")
+
+
 def _check_keys(rule: StreamRule, section: Section, cast: Cast, out: Collector) -> None:
     """What depends on the robots' local sides, and what is worth a word."""
     robots = [node for node in cast.nodes if node.kind is NodeKind.ROBOT]
@@ -226,7 +242,7 @@ def _rule(section: Section, direction: Direction, out: Collector) -> StreamRule 
 
 
 def _settings(section: Section) -> dict[str, Any]:
-    return _of(section, "class", "keep_last", "depth", "handover", "graph")
+    return _of(section, "class", "keep_last", "depth", "handover", "max_hz", "mirror", "graph")
 
 
 def _check_settings(section: Section, direction: Direction, out: Collector) -> None:
@@ -234,6 +250,10 @@ def _check_settings(section: Section, direction: Direction, out: Collector) -> N
         out.error(section.where("keep_last"), "only streams of class latest keep samples", "add class: latest")
     if direction is Direction.INPUT and "handover" in section.values:
         out.error(section.where("handover"), "only outputs have a handover: an input switches in one step", "delete it")
+    if direction is not Direction.INPUT and section.get("mirror"):
+        out.error(section.where("mirror"), "only inputs are mirrored: an output has one owner at a time", "delete it")
+    if section.get("max_hz") is not None and section.get("class") is StreamClass.RELIABLE:
+        out.error(section.where("max_hz"), "class reliable loses nothing, max_hz drops", "class: best_effort")
     if section.get("class") is StreamClass.LATEST and section.get("handover") is HandoverRule.ALL:
         message = "class latest keeps only the newest, handover all loses nothing"
         out.warn(section.where("handover"), message, "class: reliable")

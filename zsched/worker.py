@@ -42,6 +42,7 @@ from zsched.errors import ConfigError, WireError
 from zsched.keyspace import END_CHUNK, Keyspace
 from zsched.relay_pipe import decode_end
 from zsched.worker_acks import Acknowledger
+from zsched.worker_epochs import CARRY_S, Epochs
 from zsched.worker_inputs import Dispatcher, Input, Marker, Received
 from zsched.worker_outputs import Output
 from zsched.worker_services import Answer, Handler, Request, Service
@@ -87,7 +88,7 @@ class Worker:
         idle = Role(task=task, role=WorkerRole.IDLE)
         self._role = Role(task=task, role=WorkerRole.ACTIVE, epoch=1) if is_standalone else idle
         self._is_role_known = is_standalone
-        self._ended_epoch = -1
+        self._epochs = Epochs()
         self._stop = threading.Event()
         self._is_signalled = False
         self._outputs: list[Output] = []
@@ -318,12 +319,18 @@ class Worker:
         with self._lock:
             self._restorer.note(role)  # first: from the moment that we are the owner, inputs wait for the snapshot
             before, self._role, self._is_role_known = self._role, role, True
+            if not self._drains_itself:
+                self._epochs.follow(before, role)
         if role != before:
             self._errands.put(lambda: self._change_role(before, role))
 
     def _change_role(self, before: Role, role: Role) -> None:
         """Follow a new role: the token that says in which epoch we work; the ends of an epoch that was cut short."""
-        if before.epoch and before.epoch != role.epoch:
+        if self._epochs.is_carried(before.epoch):
+            carry = threading.Timer(CARRY_S, self._send_ends, (before.epoch,))
+            carry.daemon = True
+            carry.start()
+        elif before.epoch and before.epoch != role.epoch:
             self._send_ends(before.epoch)
         if role.role is WorkerRole.IDLE and before.epoch:
             self._dispatcher.forget(before.epoch)
@@ -331,8 +338,8 @@ class Worker:
         if self._role_token is not None and (not is_active or before.epoch != role.epoch):
             self._role_token.undeclare()
             self._role_token = None
-        if is_active and self._ended_epoch == role.epoch:
-            self._ended_epoch = role.epoch - 1  # it was told to stop, and works on in the same epoch after all
+        if is_active:
+            self._epochs.resume(role.epoch)
         was_held = before.lease_until_s is not None and monotonic_s() >= before.lease_until_s
         if is_active and (self._role_token is None or was_held):
             self._begin(role)  # also what was withheld for want of a lease
@@ -368,12 +375,11 @@ class Worker:
         if role.role is WorkerRole.IDLE or self._restorer.is_pending:
             self._dispatcher.note_withheld()
             return None
-        if role.epoch <= self._ended_epoch:
-            return None
+        epoch = self._epochs.stamp(role, self._dispatcher.epoch_in_hand())
         has_lease = role.lease_until_s is None or monotonic_s() < role.lease_until_s
         if not has_lease:
             self._dispatcher.note_withheld()
-        return role.epoch if has_lease else None
+        return epoch if has_lease else None
 
     def _send_acks(self, relay: str, frame: StreamAcks) -> None:
         """Tell a relay how far its samples are; what is dropped here is mended by the next one."""
@@ -402,9 +408,8 @@ class Worker:
 
     def _send_ends(self, epoch: int) -> None:
         with self._lock:
-            if epoch <= self._ended_epoch:
+            if not self._epochs.close(epoch):
                 return
-            self._ended_epoch = epoch
             outputs = tuple(self._outputs)
         self._errands.put(lambda: _end_all(outputs, epoch))
 

@@ -92,6 +92,7 @@ class Dispatcher:
         self._acks = acks
         self._stamp: zenoh.Timestamp | None = None
         self._newest_stamp: zenoh.Timestamp | None = None
+        self._in_hand: int | None = None
         self._wake = threading.Condition()
         self._queue: deque[_Waiting] = deque()
         self._markers: list[Marker] = []
@@ -146,6 +147,10 @@ class Dispatcher:
         with self._wake:
             self._markers.append(marker)
             self._wake.notify()
+
+    def epoch_in_hand(self) -> int | None:
+        """In the dispatch thread: the epoch in which the source of the input in hand was first heard."""
+        return self._in_hand if threading.current_thread() is self._thread else None
 
     def stamp(self) -> zenoh.Timestamp | None:
         """The timestamp for an output: of the input in hand (in the dispatch thread), else of the newest processed."""
@@ -219,7 +224,9 @@ class Dispatcher:
             return
         self._has_withheld = False
         begun = self._begun
+        self._in_hand = self._hear(waiting.name, sample) if waiting.name is not None else self._epoch
         self._dispatch(source, sample)
+        self._in_hand = None
         if waiting.name is not None:
             self._note(waiting.name, waiting.number, sample)
         if not self._has_withheld:
@@ -249,14 +256,21 @@ class Dispatcher:
         if self._stamp is not None and (newest is None or newest < self._stamp):  # type: ignore[operator] # zenoh's stubs
             self._newest_stamp = self._stamp
 
-    def _note(self, name: SourceName, number: int, sample: zenoh.Sample) -> None:
-        """A numbered sample is processed."""
+    def _hear(self, name: SourceName, sample: zenoh.Sample) -> int:
+        """The epoch that a source belongs to: the one in which it is first heard."""
         with self._wake:
             state = self._open.get(name)
             if state is None:
                 in_turn = sample.congestion_control == zenoh.CongestionControl.BLOCK
                 state = self._open[name] = _Open(epoch=self._epoch, in_turn=in_turn)
-            state.number = max(state.number, number)
+            return state.epoch
+
+    def _note(self, name: SourceName, number: int, sample: zenoh.Sample) -> None:
+        """A numbered sample is processed."""
+        with self._wake:
+            state = self._open.get(name)
+            if state is not None:
+                state.number = max(state.number, number)
         self._acks.processed(name, number, len(sample.payload))
 
     def _settle(self) -> None:

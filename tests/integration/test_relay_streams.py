@@ -277,6 +277,28 @@ def test_moves_of_a_reliable_stream_lose_double_and_reorder_nothing(rig: Rig) ->
     assert set(app.nodes) == {"edge1", "edge2"}
 
 
+def test_one_epoch_after_another_of_the_same_owner_loses_nothing(rig: Rig) -> None:
+    rig.start_worker("edge1")
+    app = Application(rig.app)
+    now = slot(1, "edge1", StreamClass.RELIABLE, 0)
+    rig.move(now)
+    until(app.connected, "the application sees the relay's subscription")
+    thread = app.stream(200)
+    for epoch in (2, 3, 4):
+        time.sleep(0.1)
+        new = slot(epoch, "edge1", StreamClass.RELIABLE, 0)
+        rig.role("edge1", WorkerRole.ACTIVE, epoch)
+        rig.plan(RoutePhase.PREPARE, new, now)
+        rig.wait(SlotReady, epoch=epoch, is_ready=True)
+        rig.plan(RoutePhase.FLIP, new, now)
+        rig.wait(SlotDrained, epoch=epoch - 1)
+        rig.plan(RoutePhase.CLOSE, new)
+        now = new
+    app.halt(thread)
+    until(lambda: len(app.back) >= app.sent, f"{app.sent} samples back, {len(app.back)} came")
+    assert app.back == list(range(app.sent))
+
+
 def test_moves_of_a_latest_stream_end_with_the_newest_value(rig: Rig) -> None:
     app = Application(rig.app)
     there_and_back(rig, app, StreamClass.LATEST)

@@ -6,6 +6,7 @@ import socket
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import pytest
@@ -77,9 +78,13 @@ def bench() -> Iterator[Bench]:
 
 
 def way_in(
-    stream_class: StreamClass, from_expr: str = "robot1/in", to_expr: str = "edge1/t/in", keep_last: int = 1
+    stream_class: StreamClass,
+    from_expr: str = "robot1/in",
+    to_expr: str = "edge1/t/in",
+    keep_last: int = 1,
+    **options: Any,
 ) -> Route:
-    settings = StreamSettings(stream_class=stream_class, keep_last=keep_last, depth=500)
+    settings = StreamSettings(stream_class=stream_class, keep_last=keep_last, depth=500, **options)
     return Route(stream="t/in/0", direction=Direction.INPUT, from_expr=from_expr, to_expr=to_expr, settings=settings)
 
 
@@ -193,6 +198,53 @@ def test_what_this_process_put_does_not_come_back(bench: Bench) -> None:
     publisher = bench.publisher("robot1/in")
     publisher.put(b"x", source_info=zenoh.SourceInfo(publisher.id, 0))
     until(lambda: drops(stream) == {"loop": 1}, "the loop is cut and counted")
+
+
+def test_a_mirrored_input_feeds_both_owners_until_the_old_slot_closes(bench: Bench) -> None:
+    got: list[str] = []
+    kept = [bench.outside.declare_subscriber(f"edge{n}/**", lambda s: got.append(str(s.key_expr))) for n in (1, 2)]
+    routes = [way_in(StreamClass.RELIABLE, to_expr=f"edge{n}/t/in", mirror=True) for n in (1, 2)]
+    stream = bench.input(routes[0])
+    for epoch, route in enumerate(routes, start=1):
+        stream.open(epoch, route)
+        until(partial(stream.is_matching, epoch), "the target subscribes")
+    publisher = bench.publisher("robot1/in")
+    stream.flip(1)
+    publisher.put("a")
+    until(lambda: got == ["edge1/t/in"], "the first owner")
+    stream.flip(2)
+    stream.send_end(1)  # the old owner works on: no end
+    publisher.put("b")
+    until(lambda: sorted(got[1:]) == ["edge1/t/in", "edge2/t/in"], f"both, not {got}")
+    stream.close_slot(1)
+    publisher.put("c")
+    until(lambda: got[3:] == ["edge2/t/in"], f"the new one alone, not {got}")
+    for one in kept:
+        one.undeclare()
+
+
+def test_a_thinned_stream_ends_with_its_newest_value(bench: Bench) -> None:
+    got: list[str] = []
+    kept = bench.outside.declare_subscriber("edge1/t/in", lambda s: got.append(s.payload.to_string()))
+    route = way_in(StreamClass.LATEST, max_hz=10)
+    stream = bench.input(route)
+    stream.open(1, route)
+    until(lambda: stream.is_matching(1), "the target subscribes")
+    stream.flip(1)
+    publisher = bench.publisher("robot1/in")
+    for number in range(30):
+        publisher.put(str(number))
+        time.sleep(0.005)
+
+    def newest_came() -> bool:
+        stream.look_after()
+        return got[-1:] == ["29"]
+
+    until(newest_came, "the newest")
+    assert got == sorted(set(got), key=int)
+    assert len(got) <= 6
+    assert drops(stream)["thinned"] >= 25
+    kept.undeclare()
 
 
 # --- outputs ---------------------------------------------------------------------------------------------------------
@@ -328,3 +380,28 @@ def test_numbers_that_do_not_fit_are_counted_and_old_ones_dropped(bench: Bench) 
     assert move.is_through("0", "1", "4", "5")
     count = move.stream.count()
     assert (count.lost, count.doubled, count.reordered) == (2, 1, 1)
+
+
+def test_one_epoch_after_another_of_the_same_owner_doubles_nothing(bench: Bench) -> None:
+    """Without {epoch} both slots have one key: its one subscription passes from the old slot to the new one."""
+    got: list[str] = []
+    kept = bench.outside.declare_subscriber("robot1/out", lambda s: got.append(s.payload.to_string()))
+    settings = StreamSettings(stream_class=StreamClass.RELIABLE, depth=500, handover=HandoverRule.ALL)
+    route = Route(
+        stream="t/out/0", direction=Direction.OUTPUT, from_expr="edge1/t/out", to_expr="robot1/out", settings=settings
+    )
+    stream = bench.output(route)
+    stream.open(1, route)
+    owner = bench.publisher("edge1/t/out")
+    stream.flip(1, drops_held=False)
+    for epoch in (2, 3):
+        owner.put(f"before {epoch}")
+        stream.open(epoch, route)
+        stream.flip(epoch, drops_held=False)
+        owner.put(f"between {epoch}")
+        assert stream.has_ended(epoch - 1)
+        stream.close_slot(epoch - 1)
+        owner.put(f"after {epoch}")
+    expected = [f"{when} {epoch}" for epoch in (2, 3) for when in ("before", "between", "after")]
+    until(lambda: got == expected, f"each once: {got}")
+    kept.undeclare()

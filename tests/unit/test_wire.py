@@ -78,6 +78,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "memory_mb": (1.0, 1e6),
     "keep_last": (0, 1000),
     "depth": (1, 100_000),
+    "max_hz": (0.01, 10_000),
     "timeout_s": (0.05, 3600),
     "max_pending": (1, 256),
 }

@@ -59,12 +59,18 @@ class StreamSettings:
     depth: int = 16
     """Bounded queue between subscriber and publisher, 1..100000 samples."""
     handover: HandoverRule = HandoverRule.LATEST
+    max_hz: float | None = None
+    """Highest rate per key that goes on, Hz, 0.01..10000; the rest is dropped, the newest of class ``latest`` never."""
+    mirror: bool = False
+    """Inputs: until the old slot closes, both owners are fed (outputs with handover ``latest`` only)."""
     graph: RosGraph = RosGraph.NONE
     """Set by the fleet file's `ros2:` sections."""
 
     def __post_init__(self) -> None:
         check_range("keep_last", self.keep_last, 0, 1000)
         check_range("depth", self.depth, 1, 100_000)
+        if self.max_hz is not None:
+            check_range("max_hz", self.max_hz, 0.01, 10_000)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

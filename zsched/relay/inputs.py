@@ -17,10 +17,12 @@ from typing import Final
 import zenoh
 from zenoh import Sample, Session, Timestamp
 
+from zsched.clock import monotonic_s
 from zsched.core.plan import Route, StreamClass, StreamCount
 from zsched.relay.acks import Acks
 from zsched.relay.counter import StreamCounter
 from zsched.relay.outlet import Outlet
+from zsched.relay.pace import Pace
 from zsched.relay.receive import Receiver
 from zsched.relay.tally import Tally
 
@@ -50,8 +52,13 @@ class InputStream:
         self._counter = StreamCounter(route.stream)
         self._slots: dict[int, _InputSlot] = {}
         self._active: _InputSlot | None = None
-        self._number = 0
+        self._mirror: _InputSlot | None = None
         is_latest = route.settings.stream_class is StreamClass.LATEST
+        max_hz = route.settings.max_hz
+        self._pace: Pace[tuple[Sample, Timestamp | None]] | None = (
+            None if max_hz is None else Pace(max_hz, remembers=is_latest)
+        )
+        self._number = 0
         self._keep_last = route.settings.keep_last if is_latest else 0
         self._kept: OrderedDict[str, deque[_Kept]] = OrderedDict()
         self._closed = Tally()  # what slots that are closed have counted
@@ -98,15 +105,18 @@ class InputStream:
             if slot is None or slot is self._active:
                 return 0
             replayed = self._catch_up(slot)
-            for sample, stamp in self._active.outlet.take_back() if self._active is not None else ():
-                self._counter.dropped(*slot.outlet.send(sample, stamp))
+            if self.route.settings.mirror:
+                self._mirror = self._active
+            elif self._active is not None:
+                for sample, stamp in self._active.outlet.take_back():
+                    self._counter.dropped(*slot.outlet.send(sample, stamp))
             self._active = slot
             return replayed
 
     def send_end(self, epoch: int) -> None:
         """Put the end marker behind the slot's last sample (it must not be the active one); may block on its link."""
         slot = self._slots.get(epoch)
-        if slot is not None and slot is not self._active:
+        if slot is not None and slot is not self._active and slot is not self._mirror:
             slot.outlet.send_end(epoch)
 
     def close_slot(self, epoch: int, *, is_drained: bool = False) -> int:
@@ -120,6 +130,8 @@ class InputStream:
                 return 0
             if slot is self._active:
                 self._active = None
+            if slot is self._mirror:
+                self._mirror = None
             said = slot.outlet.counted()
             left, said.in_flight = said.in_flight, 0
             if is_drained:
@@ -136,7 +148,11 @@ class InputStream:
             self.close_slot(epoch)
 
     def look_after(self) -> None:
-        """Have sent again what workers have not acknowledged in time; call it now and then."""
+        """Have sent (again) what workers have not acknowledged in time, or a rate held back; call it now and then."""
+        with self._lock:
+            if self._pace is not None and self._keep_last and self._active is not None:
+                for sample, stamp in self._pace.overdue(monotonic_s()):
+                    self._send(sample, stamp)
         for slot in tuple(self._slots.values()):
             slot.outlet.look_after()
 
@@ -159,12 +175,20 @@ class InputStream:
                 return
             self._number += 1
             stamp = self._keep(sample) if self._keep_last else None
-            slot = self._active
-            if slot is not None:
-                slot.sent = self._number
-                self._counter.dropped(*slot.outlet.send(sample, stamp))
+            pace = self._pace
+            if pace is not None and not pace.passes(str(sample.key_expr), (sample, stamp), monotonic_s()):
+                self._counter.dropped("thinned")
+            elif self._active is not None:
+                self._active.sent = self._number
+                self._send(sample, stamp)
             elif not self._keep_last:
                 self._counter.dropped("no_route")
+
+    def _send(self, sample: Sample, stamp: Timestamp | None) -> None:
+        if self._active is not None:
+            self._counter.dropped(*self._active.outlet.send(sample, stamp))
+        if self._mirror is not None:
+            self._mirror.outlet.send(sample, stamp)
 
     def _keep(self, sample: Sample) -> Timestamp | None:
         """Keep a value, with a timestamp of ours where it has none: outputs made of it inherit that, for the gate."""

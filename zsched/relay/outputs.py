@@ -25,6 +25,7 @@ from zsched.core.relay_protocol import EndMarker
 from zsched.keyspace import END_CHUNK
 from zsched.relay.counter import StreamCounter
 from zsched.relay.outlet import Outlet
+from zsched.relay.pace import Pace
 from zsched.relay.receive import Receiver, undeclare
 from zsched.relay_pipe import decode_end
 
@@ -56,10 +57,26 @@ class _Key:
 
 
 @dataclass(slots=True, eq=False)
-class _OutputSlot:
-    epoch: int
+class _Feed:
+    """A subscription to an owner's output and the slot it feeds."""
+
+    slot: _OutputSlot
     receiver: Receiver | None = None
     ends: zenoh.Subscriber[None] | None = None
+
+    def close(self) -> None:
+        if self.receiver is not None:
+            self.receiver.close()
+        if self.ends is not None:
+            undeclare(self.ends)
+
+
+@dataclass(slots=True, eq=False)
+class _OutputSlot:
+    epoch: int
+    expr: str
+    feed: _Feed | None = None
+    """``None`` while an older slot of the same owner and key has the subscription."""
     keys: dict[str, _Key] = field(default_factory=dict)
     held: deque[Sample] = field(default_factory=deque)
     held_bytes: int = 0
@@ -96,6 +113,10 @@ class OutputStream:
         self._carrier: _OutputSlot | None = None
         self._stamps: OrderedDict[str, Timestamp] = OrderedDict()  # newest that has passed, by the owner's relative key
         self._fence_until = 0.0
+        max_hz = route.settings.max_hz
+        self._pace: Pace[Sample] | None = (
+            None if max_hz is None else Pace(max_hz, remembers=route.settings.stream_class is StreamClass.LATEST)
+        )
 
     def open(self, epoch: int, route: Route) -> None:
         """Subscribe to an owner's output; nothing passes yet.
@@ -103,20 +124,23 @@ class OutputStream:
         Raises:
             zenoh.ZError: ``from`` is no key expression.
         """
-        slot = _OutputSlot(epoch=epoch)
+        slot = _OutputSlot(epoch=epoch, expr=route.from_expr)
         with self._lock:
             self._slots[epoch] = slot
+            if any(other.expr == slot.expr for other in self._slots.values() if other is not slot):
+                return  # the same owner once more, without {epoch}: what comes cannot belong to both
         has_epoch = str(epoch) in route.from_expr.split("/")
-        slot.ends = self._session.declare_subscriber(
+        feed = slot.feed = _Feed(slot=slot)
+        feed.ends = self._session.declare_subscriber(
             f"{route.from_expr}/{END_CHUNK}",
-            lambda sample: self._end(slot, sample),
+            lambda sample: self._end(feed.slot, sample),
             allowed_origin=zenoh.Locality.REMOTE,
         )
-        slot.receiver = Receiver(
+        feed.receiver = Receiver(
             self._session,
             route.from_expr,
             route.settings,
-            lambda sample: self._carry(slot, sample),
+            lambda sample: self._carry(feed.slot, sample),
             with_history=has_epoch,
         )
 
@@ -153,6 +177,8 @@ class OutputStream:
             if slot is None or (self._carrier is not None and self._carrier.epoch > epoch):
                 return True
             now = monotonic_s()
+            if any(other.is_flipped and other.feed is None for other in self._slots.values()):
+                return True  # the same owner goes on under the same key
             return bool(slot.keys) and all(key.is_ended(now) for key in slot.keys.values())
 
     def close_slot(self, epoch: int) -> None:
@@ -162,19 +188,39 @@ class OutputStream:
             if slot is None:
                 return
             slot.is_closed = True
+            feed = self._hand_on(slot)
             if slot is self._carrier:
                 self._carrier = None
                 self._promote()
-        if slot.receiver is not None:
-            slot.receiver.close()
-        if slot.ends is not None:
-            undeclare(slot.ends)
+        if feed is not None:
+            feed.close()
+
+    def _hand_on(self, slot: _OutputSlot) -> _Feed | None:
+        """Give a closing slot's subscription to the one that waits for it; answers it when nobody does."""
+        feed, slot.feed = slot.feed, None
+        heirs = [other for other in self._slots.values() if other.expr == slot.expr and other.feed is None]
+        if feed is None or not heirs:
+            return feed
+        feed.slot = heirs[0]
+        heirs[0].feed = feed
+        heirs[0].keys = slot.keys
+        for key in heirs[0].keys.values():
+            key.end = None
+        return None
 
     def close(self) -> None:
         """Close every slot and give the publisher back."""
         for epoch in sorted(self._slots, reverse=True):
             self.close_slot(epoch)
         self._outlet.undeclare()
+
+    def look_after(self) -> None:
+        """Let through what a highest rate has held back (class ``latest``: the newest); call it now and then."""
+        if self._pace is None or self.route.settings.stream_class is not StreamClass.LATEST:
+            return
+        with self._lock:
+            for sample in self._pace.overdue(monotonic_s()):
+                self._counter.dropped(*self._outlet.send(sample))
 
     def count(self) -> StreamCount:
         """The counters now."""
@@ -246,6 +292,9 @@ class OutputStream:
         is_ordered = stamp is not None and self.route.settings.stream_class is StreamClass.LATEST
         if is_ordered and not self._is_newest(self._outlet.key_of(sample), stamp):
             self._counter.dropped("superseded")
+            return
+        if self._pace is not None and not self._pace.passes(str(sample.key_expr), sample, monotonic_s()):
+            self._counter.dropped("thinned")
             return
         self._counter.dropped(*self._outlet.send(sample))
 

@@ -125,6 +125,8 @@ class TaskRelay:
         self._drain()
         for source in self._inputs.values():
             source.look_after()
+        for sink in self._outputs.values():
+            sink.look_after()
 
     def _problem(self, text: str) -> None:
         self._report(ProblemReported(source=f"relay/{self._task}", problem=text[:400]))
@@ -321,7 +323,6 @@ class TaskRelay:
         return current is not None and current.is_flipped
 
     def _is_counted(self) -> bool:
-        """True when something may have to be sent again."""
-        return any(
-            source.route.settings.stream_class is not StreamClass.BEST_EFFORT for source in self._inputs.values()
-        )
+        """True when something may have to be sent (again) without a sample coming in."""
+        streams: list[InputStream | OutputStream] = [*self._inputs.values(), *self._outputs.values()]
+        return any(stream.route.settings.stream_class is not StreamClass.BEST_EFFORT for stream in streams)

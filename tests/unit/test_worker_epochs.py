@@ -1,0 +1,69 @@
+"""The epoch an output is stamped with, step by step."""
+
+from __future__ import annotations
+
+from zsched.core.plan import Role, WorkerRole
+from zsched.worker_epochs import Epochs
+
+
+def role(kind: WorkerRole, epoch: int) -> Role:
+    return Role(task="t", role=kind, epoch=epoch)
+
+
+IDLE = role(WorkerRole.IDLE, 0)
+FIRST, SECOND = role(WorkerRole.ACTIVE, 1), role(WorkerRole.ACTIVE, 2)
+
+
+def test_the_first_epoch_is_the_roles() -> None:
+    epochs = Epochs()
+    epochs.follow(IDLE, FIRST)
+    assert [epochs.stamp(FIRST, in_hand) for in_hand in (None, 0, 1)] == [1, 1, 1]
+
+
+def test_the_older_epochs_inputs_are_stamped_with_it_until_it_ends() -> None:
+    epochs = Epochs()
+    epochs.follow(IDLE, FIRST)
+    epochs.follow(FIRST, SECOND)
+    assert epochs.is_carried(1)
+    assert [epochs.stamp(SECOND, in_hand) for in_hand in (None, 1, 2)] == [1, 1, 2]
+    assert epochs.close(1)
+    assert [epochs.stamp(SECOND, in_hand) for in_hand in (None, 1, 2)] == [2, 2, 2]
+    assert not epochs.close(1)
+
+
+def test_back_again_while_it_still_drains() -> None:
+    epochs = Epochs()
+    draining, third = role(WorkerRole.DRAINING, 1), role(WorkerRole.ACTIVE, 3)
+    epochs.follow(IDLE, FIRST)
+    epochs.follow(FIRST, draining)
+    assert not epochs.is_carried(1)
+    epochs.follow(draining, third)
+    assert [epochs.stamp(third, in_hand) for in_hand in (1, 3)] == [1, 3]
+
+
+def test_an_epoch_that_has_ended_is_not_carried() -> None:
+    epochs = Epochs()
+    epochs.follow(IDLE, FIRST)
+    epochs.close(1)
+    assert epochs.stamp(FIRST, None) is None
+    epochs.follow(FIRST, SECOND)
+    assert not epochs.is_carried(1)
+    assert epochs.stamp(SECOND, 1) == 2
+
+
+def test_two_epochs_on_come_one_is_carried() -> None:
+    epochs = Epochs()
+    third = role(WorkerRole.ACTIVE, 3)
+    epochs.follow(IDLE, FIRST)
+    epochs.follow(FIRST, SECOND)
+    epochs.follow(SECOND, third)
+    assert epochs.is_carried(1)
+    assert [epochs.stamp(third, in_hand) for in_hand in (1, 3)] == [1, 3]
+
+
+def test_asked_to_leave_and_staying_after_all() -> None:
+    epochs = Epochs()
+    epochs.follow(IDLE, FIRST)
+    epochs.close(1)
+    epochs.resume(1)
+    assert epochs.stamp(FIRST, 1) == 1

@@ -1,0 +1,55 @@
+"""Decides with which epoch a worker stamps an output.
+
+Knows: the role's epoch, the one before it that has not ended here, which ones have. Does not know: zenoh, inputs (it is
+told the epoch of the input in hand), where roles come from.
+
+A worker that becomes the owner once more while it still has an older epoch's inputs (the next epoch on the same owner,
+or A -> B -> A) goes on stamping what it makes of those with the older epoch: the robots admit the newer one only from
+their flip on, and that is when their first input of the newer epoch comes.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from zsched.core.plan import Role, WorkerRole
+
+CARRY_S: Final = 2.5
+"""The older epoch's inputs that have not ended by then never will."""
+
+
+class Epochs:
+    """One worker's epochs. Its lock is the worker's."""
+
+    def __init__(self) -> None:
+        self.ended = -1
+        """The newest epoch whose outputs are closed."""
+        self._carried = 0
+
+    def follow(self, before: Role, role: Role) -> None:
+        """A new role: from now on an older epoch may be carried beside it."""
+        is_owner_again = role.role is WorkerRole.ACTIVE and self.ended < before.epoch < role.epoch
+        if is_owner_again and before.epoch and not self.is_carried(self._carried):
+            self._carried = before.epoch
+
+    def is_carried(self, epoch: int) -> bool:
+        """True while the epoch's inputs are still worked on beside a newer role."""
+        return bool(epoch) and epoch == self._carried and epoch > self.ended
+
+    def resume(self, epoch: int) -> None:
+        """It was told to stop, and works on in the same epoch after all."""
+        if self.ended == epoch:
+            self.ended = epoch - 1
+
+    def close(self, epoch: int) -> bool:
+        """Nothing more will be stamped with ``epoch``; ``False`` when that was so already."""
+        if epoch <= self.ended:
+            return False
+        self.ended = epoch
+        return True
+
+    def stamp(self, role: Role, in_hand: int | None) -> int | None:
+        """The epoch for an output made of an input first heard in epoch ``in_hand``; ``None``: it is closed."""
+        if self.is_carried(self._carried) and (in_hand is None or in_hand <= self._carried):
+            return self._carried
+        return role.epoch if role.epoch > self.ended or self.is_carried(self._carried) else None
