@@ -196,7 +196,7 @@ def _dataclass_codec(cls: type) -> tuple[Reader, Writer]:
         for name, default, _, write_field in parts:
             item = getattr(value, name)
             if item is not default and (default is MISSING or item != default):
-                body[name] = write_field(item)
+                body[name] = item if write_field is _same else write_field(item)
         return body
 
     return read, write

@@ -5,6 +5,7 @@ Knows: which report is newer, how old is too old, what the task costs where it r
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from zsched.core.fleet import Demand, Fleet, TaskSpec
@@ -30,6 +31,8 @@ class Gateway:
         self._ttl_s = fleet.timing.profile_ttl_s
         self._profiles: dict[NodeId, tuple[Profile, float]] = {}
         self._measured: dict[TaskId, Demand] = {}
+        self.version = 0
+        """Rises with every change; what was computed from an older version may be wrong."""
 
     def absorb(self, profile: Profile, now: float) -> str | None:
         """Take a profile in; returns why it was refused (one word for a counter), or ``None``."""
@@ -39,6 +42,7 @@ class Gateway:
         if known is not None and _order(profile) <= _order(known[0]) and not self._is_new_life(profile, known, now):
             return "stale"
         self._profiles[profile.node] = (profile, now)
+        self.version += 1
         return None
 
     def _is_new_life(self, profile: Profile, known: tuple[Profile, float], now: float) -> bool:
@@ -52,8 +56,13 @@ class Gateway:
 
     def fresh(self, node: NodeId, now: float) -> Profile | None:
         """The newest profile of ``node`` when it is not older than the profile's time to live, else ``None``."""
-        data = self.newest(node, now)
-        return data.profile if data is not None and data.age_s <= self._ttl_s else None
+        known = self._profiles.get(node)
+        return known[0] if known is not None and now - known[1] <= self._ttl_s else None
+
+    def fresh_until(self, now: float) -> float:
+        """Up to when (inclusive) the same profiles as now are fresh, if none comes."""
+        ends = (at + self._ttl_s for _, at in self._profiles.values() if now - at <= self._ttl_s)
+        return min(ends, default=math.inf)
 
     def learn_demand(self, task: TaskId, owner: NodeId, now: float) -> None:
         """Note what the task's worker uses on its owner, unless the owner is starved (then it shows too little).
@@ -68,10 +77,13 @@ class Gateway:
         if load.state is not WorkerState.READY or profile.cpu_used_cores / profile.cpu_cores >= STARVED_CPU_RATIO:
             return
         known = self._measured.get(task, Demand())
-        self._measured[task] = Demand(
+        demand = Demand(
             cpu_cores=known.cpu_cores if load.cpu_cores is None else load.cpu_cores,
             memory_mb=known.memory_mb if load.memory_mb is None else load.memory_mb,
         )
+        if demand != self._measured.get(task):
+            self._measured[task] = demand
+            self.version += 1
 
     def demand(self, spec: TaskSpec) -> Demand:
         """What the task will use: the larger of the fleet file's figure and the measurement on the owner."""

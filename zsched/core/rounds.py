@@ -76,6 +76,8 @@ class Rounds:
         self.vote_s = 2 * fleet.timing.gather_s + VOTE_MARGIN_S
         self.tasks = {spec.name: TaskRound(spec=spec, judge=Judge(spec=spec), settled_at=now) for spec in fleet.tasks}
         self._gather: _Gather | None = None
+        self._answer: tuple[int, float, object, Utilities] = (-1, -math.inf, None, Utilities(voter=me, vectors=()))
+        """(gateway's version, until when, (states, values), vectors): the newest answer to a gather."""
         self._number = 0
         self._round_at = now if self.is_voter else math.inf
 
@@ -107,13 +109,20 @@ class Rounds:
         """This robot's vectors of all tasks (Alg. 2, Calculate_Utility); none on an edge."""
         if not self.is_voter:
             return Utilities(voter=self._me, vectors=())
-        return Utilities(
+        version, until, seen, answer = self._answer
+        if version == self._gateway.version and now <= until and seen == (states, values):
+            return answer  # several robots ask within a round, and nothing has changed since
+        answer = Utilities(
             voter=self._me,
             vectors=tuple(
                 score(task.spec, values[name], self._me, self._gateway, states, now)
                 for name, task in self.tasks.items()
             ),
         )
+        # A hair less than the profiles' time: sums of floats.
+        until = self._gateway.fresh_until(now) - TIMER_MARGIN_S
+        self._answer = (self._gateway.version, until, (states, values), answer)
+        return answer
 
     def tick(
         self, values: Mapping[TaskId, Allocation], states: Mapping[NodeId, PeerState], now: float

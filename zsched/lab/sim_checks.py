@@ -55,8 +55,7 @@ class Invariants:
 
     def on_synced(self, machine: Machine, state: DurableState, now: float) -> None:
         """A state reached the disk: promises only rise, and what it holds is history from now on."""
-        before = machine.disk.state
-        old = {} if before is None else {register.task: register for register in before.registers}
+        old = machine.disk.registers
         for register in state.registers:
             known = old.get(register.task)
             if known is register:
@@ -115,9 +114,7 @@ class Invariants:
 
     @staticmethod
     def _register(machine: Machine, task: TaskId) -> RegisterState:
-        state = machine.disk.state
-        registers = () if state is None else state.registers
-        return next((one for one in registers if one.task == task), RegisterState(task=task))
+        return machine.disk.registers.get(task) or RegisterState(task=task)
 
     def _check_answer(self, machine: Machine, answer: Promise | Accepted) -> None:
         if not machine.is_elector:

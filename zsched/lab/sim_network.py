@@ -53,8 +53,7 @@ class Weather:
     @property
     def is_calm(self) -> bool:
         """Whether every message arrives once, whole and on time."""
-        chances = self.duplicate, self.spike, self.mutate, self.forge, self.replay
-        return not any(chances) and not self.foreign_version
+        return not (self.duplicate or self.spike or self.mutate or self.forge or self.replay or self.foreign_version)
 
     def calm(self) -> None:
         """The faults end; what is on its way still arrives."""

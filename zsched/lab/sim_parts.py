@@ -13,7 +13,7 @@ from random import Random
 from zsched import wire
 from zsched.core import events as ev
 from zsched.core.fleet import Fleet
-from zsched.core.model import DurableState, NodeId, TaskId
+from zsched.core.model import DurableState, NodeId, RegisterState, TaskId
 from zsched.core.node import Node
 from zsched.core.plan import Role
 from zsched.errors import WireError
@@ -55,6 +55,8 @@ class Disk:
     state: DurableState | None = None
     """What is on disk, decoded (``None``: no valid file)."""
     content: bytes | None = None
+    registers: dict[TaskId, RegisterState] = field(default_factory=dict)
+    """What ``state`` holds, by task."""
     is_broken: bool = False
     """Full or read-only: it refuses every write."""
     _unsynced: DurableState | None = None
@@ -68,6 +70,7 @@ class Disk:
         if self._unsynced is not None:
             self.state, self._unsynced = self._unsynced, None
             self.content = wire.encode_state(self.state)
+            self._index()
 
     def lose_power(self, rng: Random) -> None:
         """What was not synced is there or not: the old file or the new one, each whole."""
@@ -87,10 +90,15 @@ class Disk:
             content = self.content[:at] + bytes([self.content[at] ^ bit]) + self.content[at + 1 :]
         self.content = content
         self.state = self.read()
+        self._index()
 
     def wipe(self) -> None:
         """The disk is new."""
         self.state = self.content = self._unsynced = None
+        self._index()
+
+    def _index(self) -> None:
+        self.registers = {} if self.state is None else {one.task: one for one in self.state.registers}
 
     def read(self) -> DurableState | None:
         """What a starting daemon finds, through the production format."""
