@@ -9,6 +9,10 @@ its encoding (so that a receiver can tell who answered). Rules for it::
     inputs:  [{from: "{robot}/in", to: "{target}/echo/{robot}/in", class: reliable}]
     outputs: [{from: "{target}/echo/{epoch}/{robot}/out", to: "{robot}/out", class: reliable, handover: all}]
 
+It also answers requests to ``{node}/{task}/<name>/ask`` with their own payload, attachment and its node's name::
+
+    services: [{from: "{robot}/ask", to: "{target}/echo/{robot}/ask"}]
+
 ``python -m zsched.tasks.echo [--latest] [--delay-ms N] [--standalone]``
 """
 
@@ -19,7 +23,7 @@ import sys
 import time
 
 from zsched.errors import ConfigError
-from zsched.worker import Output, Received, Worker
+from zsched.worker import Answer, Output, Received, Request, Worker
 
 EXIT_CONFIG = 78
 
@@ -35,6 +39,7 @@ def main(arguments: list[str] | None = None) -> int:
     with worker:
         echo = Echo(worker, latest=options.latest, delay_s=options.delay_ms / 1000)
         worker.subscribe("{prefix}/*/in", echo.on_sample, keep_last=None, depth=100_000)
+        worker.serve("{prefix}/*/ask", echo.on_request, depth=256)
         worker.ready()
         while worker.wait(1.0):
             pass
@@ -62,6 +67,12 @@ class Echo:
             output = self._worker.publisher(template, latest=self._is_latest, reliable=not self._is_latest)
             self._outputs[name] = output
         output.put(received.payload, attachment=received.attachment, encoding=self._encoding)
+
+    def on_request(self, request: Request) -> Answer:
+        """Answer a request with what is in it."""
+        if self._delay_s:
+            time.sleep(self._delay_s)
+        return Answer(payload=request.payload or b"", attachment=request.attachment, encoding=self._encoding)
 
 
 def _options(arguments: list[str] | None) -> argparse.Namespace:

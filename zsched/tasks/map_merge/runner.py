@@ -6,6 +6,7 @@ Knows: keys, the worker's life. Does not know: how maps are merged.
     out  {prefix}/{epoch}/global_map        nav_msgs/msg/OccupancyGrid, CDR; attachment {"merge": n, "inputs": {...}}
          {prefix}/{epoch}/tf                tf2_msgs/msg/TFMessage, CDR
          {prefix}/{epoch}/status            JSON
+    asked {prefix}/<robot>/merge_now        merge at once; the answer is the status, JSON
 """
 
 from __future__ import annotations
@@ -57,6 +58,7 @@ def run(options: argparse.Namespace) -> None:
         worker.on_snapshot(restored.put)  # `restore` and `step` share a thread
         worker.subscribe("{prefix}/*/map", on_map, keep_last=1)
         worker.offer_snapshot(service.snapshot)
+        worker.serve("{prefix}/*/merge_now", lambda _request: service.merge_now())
         worker.ready()
         while worker.wait(POLL_S):
             is_active = worker.role.role is not WorkerRole.IDLE  # read first: what comes before it is in the queue

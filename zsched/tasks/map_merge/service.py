@@ -145,6 +145,13 @@ class MapMergeService:
         """The transforms as of the newest merge, for the next owner."""
         return self._snapshot
 
+    def merge_now(self) -> bytes:
+        """Merge as soon as may be, whether anything has changed or not; answers with the status as of now."""
+        with self._lock:
+            self._is_due = True
+            self._next_merge_s = float("-inf")
+        return json.dumps(self.status()).encode()
+
     def _keep(self, robot: str, grid: Grid | None) -> None:
         with self._lock:
             self._pending[robot] = grid
