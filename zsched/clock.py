@@ -20,6 +20,11 @@ def wall_time() -> str:
     return datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
+def wall_ns() -> int:
+    """Nanoseconds since the Unix epoch, for stamps that others read; never for decisions."""
+    return time.time_ns()
+
+
 def wall_seconds() -> int:
     """Whole seconds of the wall clock: the start counter of a blank state, so that it is above an earlier life's."""
     return int(time.time())

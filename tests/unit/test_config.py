@@ -96,6 +96,7 @@ def test_shipped_files_are_there() -> None:
     assert {path.name for path in CONFIGS} >= {
         "fleet.yaml",
         "ros2.yaml",
+        "ros2-node.yaml",
         "demo.yaml",
         "robots-only.yaml",
         "minimal.yaml",

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
+from rosbags.typesys import Stores, get_typestore
 
 from zsched.config import CheckResult, check_bytes
 from zsched.core.fleet import Fleet, LocalMode, LocalSide
@@ -165,3 +168,10 @@ def test_keys_that_become_one_are_warned_of() -> None:
 )
 def test_a_local_side_must_lead_somewhere_else(local: str, said: str) -> None:
     assert said in faults("drain_s: 1", local)
+
+
+def test_type_hashes_in_the_shipped_files_are_what_rosbags_computes() -> None:
+    types = get_typestore(Stores.ROS2_JAZZY)
+    text = (Path(__file__).parents[2] / "configs" / "ros2.yaml").read_text()
+    for name in ("nav_msgs/msg/OccupancyGrid", "tf2_msgs/msg/TFMessage"):
+        assert f"type: {name}\n          hash: {types.hash_rihs01(name)}\n" in text

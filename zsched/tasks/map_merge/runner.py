@@ -15,14 +15,17 @@ import argparse
 import logging
 import os
 import queue
+from collections.abc import Mapping
 
 import cv2
 
+import zsched.worker
 from zsched.clock import monotonic_s
 from zsched.core.plan import WorkerRole
 from zsched.tasks.map_merge.merger import MergerSettings, Mode
 from zsched.tasks.map_merge.pairs import Rule
 from zsched.tasks.map_merge.poses import read_poses
+from zsched.tasks.map_merge.ros import RosPublisher
 from zsched.tasks.map_merge.service import MapMergeService, Output
 from zsched.worker import Received, Worker
 
@@ -45,7 +48,11 @@ def run(options: argparse.Namespace) -> None:
             for output in Output
         }
 
+        ros = _ros_publishers(outputs) if options.ros2 else {}
+
         def publish(output: Output, payload: bytes, attachment: bytes | None = None) -> bool:
+            if output in ros:
+                return ros[output].put(payload)
             return outputs[output].put(payload, attachment=attachment)
 
         service = MapMergeService(settings, publish, clock=monotonic_s, rate_hz=options.rate)
@@ -68,6 +75,15 @@ def run(options: argparse.Namespace) -> None:
     if service.is_searching:
         logging.shutdown()
         os._exit(0)  # a thread inside OpenCV would delay the interpreter's end, or abort it
+
+
+def _ros_publishers(outputs: Mapping[Output, zsched.worker.Output]) -> dict[Output, RosPublisher]:
+    """The outputs that are ROS messages; the status is not one."""
+
+    def publisher(output: zsched.worker.Output) -> RosPublisher:
+        return RosPublisher(lambda payload, attachment: output.put(payload, attachment=attachment))
+
+    return {name: publisher(outputs[name]) for name in (Output.GLOBAL_MAP, Output.TF)}
 
 
 def _settings(options: argparse.Namespace) -> MergerSettings:

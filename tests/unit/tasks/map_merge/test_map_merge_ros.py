@@ -1,0 +1,43 @@
+"""With `--ros2` each message carries rmw_zenoh's attachment: gapless numbers, one gid, the time."""
+
+from __future__ import annotations
+
+from zsched.core.ros2 import Attachment, decode_attachment
+from zsched.tasks.map_merge.__main__ import parser
+from zsched.tasks.map_merge.ros import RosPublisher
+
+
+def test_numbers_are_gapless_over_what_went_out() -> None:
+    sent: list[Attachment | None] = []
+    answers = iter([True, False, False, True])
+
+    def put(payload: bytes, attachment: bytes) -> bool:
+        is_out = next(answers)
+        if is_out:
+            assert payload == b"map"
+            assert len(attachment) == 33
+            sent.append(decode_attachment(attachment))
+        return is_out
+
+    publisher = RosPublisher(put, clock_ns=lambda: 1_700_000_000_000_000_000)
+    assert [publisher.put(b"map") for _ in range(4)] == [True, False, False, True]
+    assert [one.sequence for one in sent if one is not None] == [1, 2]
+    assert {one.stamp_ns for one in sent if one is not None} == {1_700_000_000_000_000_000}
+    assert len({one.gid for one in sent if one is not None}) == 1
+
+
+def test_two_publishers_differ() -> None:
+    gids: list[bytes] = []
+
+    def put(_payload: bytes, attachment: bytes) -> bool:
+        gids.append(attachment[17:])
+        return True
+
+    for _ in range(2):
+        RosPublisher(put).put(b"")
+    assert gids[0] != gids[1]
+
+
+def test_the_option_is_there_and_off() -> None:
+    assert parser().parse_args([]).ros2 is False
+    assert parser().parse_args(["--ros2"]).ros2 is True
