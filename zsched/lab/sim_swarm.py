@@ -19,7 +19,9 @@ from zsched.core.timing import WAN, WIFI, WIRED
 
 SECONDS = 30.0
 """Virtual seconds of one schedule: faults in the first half, then quiet."""
-SAMPLE_S = 0.5
+SAMPLE_S = 1.0
+DECIDE_S = (0.5, 1.0, 1.0)
+"""Machines measure, and robots look around, less often than by default: schedules are about what happens between."""
 MIN_NODES, MAX_NODES = 3, 7
 
 
@@ -76,7 +78,7 @@ def _fleet(rng: Random, size: int) -> Fleet:
     )
     return Fleet(
         name="sim",
-        timing=replace(timing, sample_s=SAMPLE_S),
+        timing=replace(timing, sample_s=SAMPLE_S, decide_s=max(timing.decide_s, rng.choice(DECIDE_S))),
         nodes=tuple(NodeSpec(name=name, kind=kind) for name, kind in sorted(names.items())),
         tasks=tasks,
         electors=tuple(sorted((*voters, *edges[:spare]))),

@@ -81,6 +81,8 @@ class Simulator:
     _queue: list[tuple[float, int, Callable[..., None], tuple[Any, ...]]] = field(default_factory=list)
     _order: Iterator[int] = field(default_factory=itertools.count)
     _asked: dict[int, tuple[Machine, Machine, Make]] = field(default_factory=dict)
+    _frames: dict[tuple[str, type[Any]], tuple[object, bytes, Any]] = field(default_factory=dict)
+    """{(sender, class): (the newest value of this class, its frame, what is read in it)}."""
     _requests: Iterator[int] = field(default_factory=lambda: itertools.count(1))
 
     def __post_init__(self) -> None:
@@ -453,9 +455,19 @@ class Simulator:
         if pair not in self.cuts:
             self.deliver(target, event)
 
+    def _framed(self, me: Machine, value: object) -> tuple[bytes, Any]:
+        """(the frame of a value, what a receiver reads in it); the same value again is the same frame."""
+        key = (me.key, type(value))
+        known = self._frames.get(key)
+        if known is None or known[0] is not value:
+            frame = wire.encode(value)
+            known = self._frames[key] = (value, frame, wire.decode(frame, type(value)))
+        return known[1], known[2]
+
     def _put(self, me: Machine, value: object, make: Make) -> None:
-        frame, kind = wire.encode(value), type(value)
-        message = Message(make(wire.decode(frame, kind)), frame, kind)
+        frame, read = self._framed(me, value)
+        kind = type(value)
+        message = Message(make(read), frame, kind)
         for other in self.machines.values():
             if other is not me:
                 self._send(me, other, message)
@@ -473,8 +485,8 @@ class Simulator:
         if question is None:
             return
         asked, asker, make = question
-        frame, kind = wire.encode(value), type(value)
-        self._send(asked, asker, Message(make(wire.decode(frame, kind)), frame, kind))
+        frame, read = self._framed(asked, value)
+        self._send(asked, asker, Message(make(read), frame, type(value)))
 
     def _gather(self, me: Machine, gather: int) -> None:
         def make(value: Any) -> ev.Event:
@@ -486,8 +498,7 @@ class Simulator:
                 self._send(me, other, Message(ev.UtilityAsked(request=number, asker=me.name)))
 
     def _elect(self, me: Machine, question: object, make: Callable[[int, Any], ev.Event]) -> None:
-        frame, kind = wire.encode(question), type(question)
-        value = wire.decode(frame, kind)
+        (frame, value), kind = self._framed(me, question), type(question)
         for elector in me.fleet.electors:
             for other in self._named(elector):
                 number = self._question(other, me, lambda answer: ev.ElectorAnswered(answer=answer))
