@@ -38,7 +38,7 @@ from zsched.core import instructions as do
 from zsched.core.fleet import Fleet, electorate_hash
 from zsched.core.model import DeviceSample, NodeId, WorkerState
 from zsched.core.node import Node
-from zsched.daemon import endpoints_for, free_port
+from zsched.daemon_endpoints import endpoints_for, free_port
 from zsched.lab.testbed import TASK, echo_fleet
 from zsched.lifecycle import init_state
 

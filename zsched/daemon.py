@@ -10,16 +10,13 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import errno
 import gc
 import logging
 import os
 import random
 import signal
-import socket
 import sys
 import threading
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -35,12 +32,13 @@ from zsched.adapters.worker_supervisor import WorkerContext, WorkerSupervisor
 from zsched.clock import monotonic_s, wall_seconds
 from zsched.config import load_fleet
 from zsched.core import events as ev
-from zsched.core.fleet import Fleet, NodeSpec, dial_endpoint, electorate_hash
+from zsched.core.fleet import NodeSpec, electorate_hash
 from zsched.core.model import DurableState, NodeId, TaskId
 from zsched.core.node import Node
 from zsched.core.status import status_line
 from zsched.core.workers import runs_worker
 from zsched.daemon_access import StreamAccess
+from zsched.daemon_endpoints import Endpoints, endpoints_for, free_port, has_all_addresses, is_here
 from zsched.errors import AdapterError, ConfigError
 from zsched.shell import Desk, Inbox, Shell
 
@@ -61,87 +59,6 @@ class Options:
     node: NodeId
     state_dir: Path
     runtime_dir: Path
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Endpoints:
-    """Where this node's sessions listen and whom they dial."""
-
-    control_listen: tuple[str, ...]
-    control_connect: tuple[str, ...]
-    data_listen: tuple[str, ...]
-    data_connect: tuple[str, ...]
-    worker_connect: tuple[str, ...]
-    worker_listen: tuple[str, ...]
-
-
-def endpoints_for(
-    fleet: Fleet, me: NodeSpec, free_port: Callable[[], int], is_here: Callable[[str], bool] = lambda _host: True
-) -> Endpoints:
-    """The endpoints of one node: its own to listen on, the others' to dial.
-
-    Control links are dialled by one side only where the file says how: two that redial each other while a cut heals can
-    end with a link that zenoh keeps alive and delivers nothing on. Data links start at the seeds. Our own address on
-    another machine (``is_here``) is dialled too: there a twin of ours may be, and must be heard.
-    """
-    others = [fleet.node(name) for name in fleet.seeds if name != me.name]
-    data_listen = me.listen_data or "tcp/0.0.0.0:0"
-    if not dial_endpoint(data_listen, "127.0.0.1"):  # any port will do, but workers must know which
-        address, _, rest = data_listen.rpartition(":")
-        data_listen = f"{address}:{free_port()}{rest.removeprefix('0')}"
-    is_loopback = "/127." in data_listen or "/[::1]" in data_listen
-    return Endpoints(
-        control_listen=(me.listen_control or "tcp/0.0.0.0:0",),
-        control_connect=_dialled(_control_targets(fleet, me, is_here), lambda node: node.listen_control),
-        data_listen=(data_listen,),
-        data_connect=_dialled(others, lambda node: node.listen_data),
-        worker_connect=(dial_endpoint(data_listen, "127.0.0.1"),),
-        worker_listen=(zenoh_config.LOOPBACK_LISTEN if is_loopback else "tcp/0.0.0.0:0",),
-    )
-
-
-def _control_targets(fleet: Fleet, me: NodeSpec, is_here: Callable[[str], bool]) -> list[NodeSpec]:
-    """Whom this node dials: everybody dials the seeds; of other pairs the one whose name comes later, if it can."""
-
-    def rank(node: NodeSpec) -> tuple[int, NodeId]:
-        return (fleet.seeds.index(node.name) if node.name in fleet.seeds else len(fleet.seeds), node.name)
-
-    mine = [me] if _has_address(me) and not is_here(me.host) else []
-    others = [node for node in fleet.nodes if node.name != me.name and _has_address(node)]
-    return mine + [node for node in others if rank(node) < rank(me) or not _has_address(me)]
-
-
-def has_all_addresses(fleet: Fleet) -> bool:
-    """Whether every pair of nodes can meet by the fleet file alone, without gossip."""
-    return sum(not _has_address(node) for node in fleet.nodes) <= 1
-
-
-def _has_address(node: NodeSpec) -> bool:
-    return bool(node.listen_control and dial_endpoint(node.listen_control, node.host))
-
-
-def _dialled(nodes: list[NodeSpec], endpoint: Callable[[NodeSpec], str]) -> tuple[str, ...]:
-    dialled = (dial_endpoint(endpoint(node), node.host) for node in nodes if endpoint(node))
-    return tuple(target for target in dialled if target)
-
-
-def is_here(host: str) -> bool:
-    """Whether ``host`` is an address of this machine (of its network namespace); unknown names are taken for ours."""
-    try:
-        family, *_, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
-        with socket.socket(family) as probe:
-            probe.bind(address)
-    except OSError as error:
-        return error.errno != errno.EADDRNOTAVAIL
-    return True
-
-
-def free_port() -> int:
-    """A TCP port that is free now (a node without a fixed data endpoint: its workers must know it)."""
-    with socket.socket() as probe:
-        probe.bind(("0.0.0.0", 0))  # noqa: S104 - only asks the kernel for a number, never listens
-        port: int = probe.getsockname()[1]
-        return port
 
 
 class Sampler:
@@ -269,7 +186,7 @@ class Daemon:
             ),
             post=self._inbox.post,
         )
-        access = StreamAccess(fleet, me, points.worker_connect, operator_json5)
+        access = StreamAccess(fleet, me, points.worker_connect[:1], operator_json5)
         desk = Desk(me, self._inbox, bus, access.answer)
         door = OperatorSocket(places.socket_path(self._options.runtime_dir, me), desk.answer)
         door.open()
@@ -286,6 +203,7 @@ class Daemon:
                 timing=fleet.timing,
                 shared_memory=False,
                 operator_json5=operator_json5,
+                dials_by_gossip=not has_all_addresses(fleet),
             ),
             on_report=shell.on_report,
             threads=zenoh_config.pool_threads(len(fleet.nodes)),
@@ -317,6 +235,7 @@ class Daemon:
                     link=spec.link,
                     shared_memory=False,
                     operator_json5=operator_json5,
+                    dials_by_gossip=not has_all_addresses(fleet),
                 )
             )
             stack.callback(paths[name].unlink, missing_ok=True)

@@ -48,8 +48,7 @@ def control_config(
     settings = _peer(listen, connect, timing)
     settings["transport/shared_memory/enabled"] = False
     settings["transport/link/rx/max_message_size"] = CONTROL_MAX_MESSAGE
-    if not dials_by_gossip:
-        settings["scouting/gossip/autoconnect"] = {"router": [], "peer": []}
+    _set_gossip(settings, dials=dials_by_gossip)
     return _render(settings, operator_json5)
 
 
@@ -60,6 +59,7 @@ def data_config(
     timing: Timing = DEFAULT_TIMING,
     shared_memory: bool = True,
     operator_json5: str = "",
+    dials_by_gossip: bool = True,
 ) -> str:
     """The relay's data session: the node's hub for local workers and applications, meshed with the other relays.
 
@@ -72,6 +72,7 @@ def data_config(
     """
     settings = _peer(_small_buffers(listen), _small_buffers(connect), timing)
     _set_shared_memory(settings, is_on=shared_memory)
+    _set_gossip(settings, dials=dials_by_gossip)
     return _render(settings, operator_json5)
 
 
@@ -83,8 +84,9 @@ def worker_config(
     link: WorkerLink = WorkerLink.PEER,
     shared_memory: bool = True,
     operator_json5: str = "",
+    dials_by_gossip: bool = True,
 ) -> str:
-    """A worker's session: joined to its own node's relay (``connect``), from there by gossip to every robot's.
+    """A worker's session: joined to its own node's relay (the first of ``connect``), by the rest or gossip to others.
 
     ``listen`` must be reachable for the robots' relays when they are other machines (``tcp/0.0.0.0:0``). With
     ``link: client`` everything goes through the node's relay (robots that cannot reach the worker's port).
@@ -93,9 +95,12 @@ def worker_config(
         ValueError: the operator's JSON5 is not a zenoh configuration.
     """
     if link is WorkerLink.CLIENT:
-        return client_config(connect=connect, timing=timing, shared_memory=shared_memory, operator_json5=operator_json5)
+        return client_config(
+            connect=connect[:1], timing=timing, shared_memory=shared_memory, operator_json5=operator_json5
+        )
     settings = _peer(_small_buffers(listen), _small_buffers(connect), timing)
     _set_shared_memory(settings, is_on=shared_memory)
+    _set_gossip(settings, dials=dials_by_gossip)
     return _render(settings, operator_json5)
 
 
@@ -172,6 +177,11 @@ def _peer(listen: tuple[str, ...], connect: tuple[str, ...], timing: Timing) -> 
     settings["connect/exit_on_failure"] = False
     settings["connect/retry"] = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
     return settings
+
+
+def _set_gossip(settings: Settings, *, dials: bool) -> None:
+    if not dials:
+        settings["scouting/gossip/autoconnect"] = {"router": [], "peer": []}
 
 
 def _set_shared_memory(settings: Settings, *, is_on: bool) -> None:

@@ -22,17 +22,8 @@ from zsched.adapters.state_file import StateFile
 from zsched.core import events as ev
 from zsched.core.fleet import Fleet, NodeSpec, Timing
 from zsched.core.model import NodeKind
-from zsched.daemon import (
-    EXIT_CONFIG,
-    EXIT_FAILED,
-    EXIT_OK,
-    Endpoints,
-    Sampler,
-    endpoints_for,
-    free_port,
-    has_all_addresses,
-    is_here,
-)
+from zsched.daemon import EXIT_CONFIG, EXIT_FAILED, EXIT_OK, Sampler
+from zsched.daemon_endpoints import Endpoints, endpoints_for, free_port, has_all_addresses, is_here
 from zsched.errors import AdapterError
 from zsched.lab.testbed import echo_fleet
 from zsched.places import socket_path
@@ -105,12 +96,17 @@ def test_seeds_are_dialled_at_their_host_except_ourselves_and_who_cannot_be() ->
     any_port = spec("e", host="192.0.2.5", control="tcp/0.0.0.0:0")
     no_seed = spec("g", host="192.0.2.7", control="tcp/0.0.0.0:7457", data="tcp/0.0.0.0:7458")
     found = endpoints(me, both, six, nowhere, any_port, no_seed, seeds=("f", "b", "c", "d", "e"))
-    assert found.data_connect == ("tcp/192.0.2.2:7458", "tcp/192.0.2.3:1")
-    assert found.control_connect == ()  # the first seed is dialled by all others
+    assert (found.control_connect, found.data_connect) == ((), ())  # the first seed is dialled by all others
+    found = endpoints(replace(me, name="z"), both, six, nowhere, any_port, no_seed, seeds=("b", "c", "d", "e"))
+    assert found.control_connect == ("tcp/192.0.2.2:7457", "tcp/[2001:db8::3]:7457", "tcp/192.0.2.7:7457")
+    assert found.data_connect == ("tcp/192.0.2.2:7458", "tcp/192.0.2.3:1", "tcp/192.0.2.7:7458")
 
 
 def test_every_control_link_is_dialled_by_one_side_and_by_somebody() -> None:
-    nodes = [spec(name, host=f"192.0.2.{n}", control=f"tcp/0.0.0.0:{n}") for n, name in enumerate("abcd", 1)]
+    nodes = [
+        spec(name, host=f"192.0.2.{n}", control=f"tcp/0.0.0.0:{n}", data=f"tcp/0.0.0.0:{n}0")
+        for n, name in enumerate("abcd", 1)
+    ]
     nodes += [spec("e")]  # says nothing: it dials everybody
     whole = fleet(*nodes, seeds=("c", "a"))
     assert has_all_addresses(whole)
@@ -118,6 +114,16 @@ def test_every_control_link_is_dialled_by_one_side_and_by_somebody() -> None:
     dialled = {node.name: endpoints_for(whole, node, lambda: 50000).control_connect for node in nodes}
     assert {name: len(targets) for name, targets in dialled.items()} == {"a": 1, "b": 2, "c": 0, "d": 3, "e": 4}
     assert dialled["b"] == ("tcp/192.0.2.1:1", "tcp/192.0.2.3:3")
+    assert endpoints_for(whole, nodes[1], lambda: 50000).data_connect == ("tcp/192.0.2.1:10", "tcp/192.0.2.3:30")
+
+
+def test_workers_dial_their_own_relay_first_and_then_the_robots() -> None:
+    nodes = [
+        replace(spec(name, host=f"192.0.2.{n}", control="tcp/0.0.0.0:1", data="tcp/0.0.0.0:2"), kind=kind)
+        for n, (name, kind) in enumerate({"e": NodeKind.EDGE, "r": NodeKind.ROBOT, "s": NodeKind.ROBOT}.items(), 1)
+    ]
+    found = endpoints_for(fleet(*nodes), nodes[0], lambda: 1).worker_connect
+    assert found == ("tcp/127.0.0.1:2", "tcp/192.0.2.2:2", "tcp/192.0.2.3:2")
 
 
 def test_own_address_on_another_machine_is_dialled_for_there_may_be_a_twin() -> None:

@@ -1,0 +1,104 @@
+"""Decides where a node's sessions listen and whom they dial.
+
+Knows: the fleet file's addresses, the seeds, who dials whom. Does not know: zenoh, what the links carry.
+"""
+
+from __future__ import annotations
+
+import errno
+import socket
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from zsched import zenoh_config
+from zsched.core.fleet import Fleet, NodeSpec, dial_endpoint
+from zsched.core.model import NodeId, NodeKind
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Endpoints:
+    """Where this node's sessions listen and whom they dial."""
+
+    control_listen: tuple[str, ...]
+    control_connect: tuple[str, ...]
+    data_listen: tuple[str, ...]
+    data_connect: tuple[str, ...]
+    worker_connect: tuple[str, ...]
+    worker_listen: tuple[str, ...]
+
+
+def endpoints_for(
+    fleet: Fleet, me: NodeSpec, free_port: Callable[[], int], is_here: Callable[[str], bool] = lambda _host: True
+) -> Endpoints:
+    """The endpoints of one node: its own to listen on, the others' to dial.
+
+    A link is dialled by one side only where the file says how: two that redial each other while a cut heals can end
+    with a link that zenoh keeps alive and delivers nothing on. Workers dial their own relay first, then the robots'.
+    Our own address on another machine (``is_here``) is dialled too: there a twin of ours may be, and must be heard.
+    """
+    robots = [node for node in fleet.nodes if node.kind is NodeKind.ROBOT and node.name != me.name]
+    is_whole = has_all_addresses(fleet)
+    data_listen = me.listen_data or "tcp/0.0.0.0:0"
+    if not dial_endpoint(data_listen, "127.0.0.1"):  # any port will do, but workers must know which
+        address, _, rest = data_listen.rpartition(":")
+        data_listen = f"{address}:{free_port()}{rest.removeprefix('0')}"
+    is_loopback = "/127." in data_listen or "/[::1]" in data_listen
+    return Endpoints(
+        control_listen=(me.listen_control or "tcp/0.0.0.0:0",),
+        control_connect=_dialled(_targets(fleet, me, _control, is_here), _control),
+        data_listen=(data_listen,),
+        data_connect=_dialled(_targets(fleet, me, _data), _data),
+        worker_connect=(dial_endpoint(data_listen, "127.0.0.1"), *(_dialled(robots, _data) if is_whole else ())),
+        worker_listen=(zenoh_config.LOOPBACK_LISTEN if is_loopback else "tcp/0.0.0.0:0",),
+    )
+
+
+def _control(node: NodeSpec) -> str:
+    return node.listen_control
+
+
+def _data(node: NodeSpec) -> str:
+    return node.listen_data
+
+
+def _targets(
+    fleet: Fleet, me: NodeSpec, endpoint: Callable[[NodeSpec], str], is_here: Callable[[str], bool] = lambda _host: True
+) -> list[NodeSpec]:
+    """Whom this node dials: everybody dials the seeds; of other pairs the one whose name comes later, if it can."""
+
+    def rank(node: NodeSpec) -> tuple[int, NodeId]:
+        return (fleet.seeds.index(node.name) if node.name in fleet.seeds else len(fleet.seeds), node.name)
+
+    has_mine = bool(_dialled([me], endpoint))
+    mine = [me] if has_mine and not is_here(me.host) else []
+    others = [node for node in fleet.nodes if node.name != me.name and _dialled([node], endpoint)]
+    return mine + [node for node in others if rank(node) < rank(me) or not has_mine]
+
+
+def has_all_addresses(fleet: Fleet) -> bool:
+    """Whether every pair of nodes can meet by the fleet file alone, without gossip."""
+    return all(len(_dialled(list(fleet.nodes), endpoint)) >= len(fleet.nodes) - 1 for endpoint in (_control, _data))
+
+
+def _dialled(nodes: list[NodeSpec], endpoint: Callable[[NodeSpec], str]) -> tuple[str, ...]:
+    dialled = (dial_endpoint(endpoint(node), node.host) for node in nodes if endpoint(node))
+    return tuple(target for target in dialled if target)
+
+
+def is_here(host: str) -> bool:
+    """Whether ``host`` is an address of this machine (of its network namespace); unknown names are taken for ours."""
+    try:
+        family, *_, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family) as probe:
+            probe.bind(address)
+    except OSError as error:
+        return error.errno != errno.EADDRNOTAVAIL
+    return True
+
+
+def free_port() -> int:
+    """A TCP port that is free now (a node without a fixed data endpoint: its workers must know it)."""
+    with socket.socket() as probe:
+        probe.bind(("0.0.0.0", 0))  # noqa: S104 - only asks the kernel for a number, never listens
+        port: int = probe.getsockname()[1]
+        return port
