@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from random import Random
 
-from zsched.core.fleet import Fleet, NodeSpec, Standby, TaskSpec, WorkerSpec
+from zsched.core.fleet import Fleet, NodeSpec, OnIsolation, Standby, TaskSpec, WorkerSpec
 from zsched.core.model import Aggregate, NodeId, NodeKind, Tuning, Weights
 from zsched.core.timing import WAN, WIFI, WIRED
 
@@ -88,6 +88,8 @@ def _fleet(rng: Random, size: int) -> Fleet:
 def _task(rng: Random, name: str, voters: tuple[NodeId, ...], edges: tuple[NodeId, ...]) -> TaskSpec:
     candidates = edges if len(edges) >= 2 and rng.random() < 0.8 else (*voters, *edges)
     is_cold = rng.random() < 0.1
+    is_exclusive = rng.random() < 0.4
+    is_local = not is_exclusive and rng.random() < 0.2
     return TaskSpec(
         name=name,
         candidates=tuple(sorted(candidates)),
@@ -99,7 +101,8 @@ def _task(rng: Random, name: str, voters: tuple[NodeId, ...], edges: tuple[NodeI
             aggregate=rng.choice(tuple(Aggregate)),
         ),
         worker=WorkerSpec(command=("work",), standby=Standby.COLD if is_cold else Standby.WARM, start_deadline_s=3.0),
-        exclusive=rng.random() < 0.4,
+        exclusive=is_exclusive,
+        on_isolation=OnIsolation.LOCAL if is_local else OnIsolation.HOLD,
         drain_s=rng.choice((0.1, 1.0)),
         max_moves_per_minute=rng.choice((6, 60)),
     )
