@@ -42,7 +42,7 @@ _MEMBERSHIP = (
     "tests/unit/core/test_membership.py",
     "tests/sim/test_simulator.py",
 )
-_ROUNDS = ("tests/unit/core/test_rounds.py", "tests/unit/core/test_vote.py")
+_ROUNDS = ("tests/sim/test_vote_rules.py", "tests/unit/core/test_rounds.py", "tests/unit/core/test_vote.py")
 _SCHEDULER = ("tests/unit/core/test_scheduler.py", "tests/unit/core/test_scoring.py", "tests/paper")
 _EXECUTOR = ("tests/unit/core/test_executor.py",)
 
@@ -328,12 +328,17 @@ VOTE_BUGS = (
         "needed = 1",
         _ROUNDS,
     ),
-    _bug(
-        "commit without supporters",
-        ROUNDS,
-        "if self._me not in supporters or counted.winner is None:\n            return\n",
-        "supporters.append(self._me)\n        if counted.winner is None:\n            return\n",
-        _ROUNDS,
+    Bug(
+        name="commit without supporters",
+        module=ROUNDS,
+        changes=(
+            (
+                "if self._me not in supporters or counted.winner is None:\n            return\n",
+                "supporters.append(self._me)\n        if counted.winner is None:\n            return\n",
+            ),
+            ("reason=fresh[self._me].reason", "reason=counted.reason"),
+        ),
+        tests=_ROUNDS,
     ),
     _bug(
         "called vote ignored",
