@@ -305,6 +305,14 @@ def _route(page: Page, task: Json) -> None:
         name, drops = stream["stream"].removeprefix(prefix), stream["drops"]
         seen = "nothing yet" if stream["last_seen_s"] is None else f"last {span(stream['last_seen_s'])} ago"
         text = f"{name} {stream['messages']} msg {size(stream['bytes'])}, {seen}"
+        told = {
+            "in flight": stream.get("in_flight"),
+            "lost": stream.get("lost"),
+            "doubled": stream.get("doubled"),
+            "out of order": stream.get("reordered"),
+            "at most lost": stream.get("at_most_lost"),
+        }
+        text += "".join(f", {count} {what}" for what, count in told.items() if count)
         if drops:
             text += ", dropped " + " ".join(f"{count} {reason}" for reason, count in drops.items())
         parts.append((text, "yellow" if drops else ""))

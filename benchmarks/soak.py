@@ -1,0 +1,89 @@
+"""Half an hour of random moves under ten streams: loss, memory, descriptors and threads over time.
+
+``python -m benchmarks.soak [--minutes 30] [--seed 1]``. Three edges with echo workers, ten reliable streams of 20 to
+200 Hz and 100 B to 20 kB, a move to a random other edge every 1 to 5 s, now and then a killed worker or a killed relay
+(of an edge). Every minute: private memory, descriptors and threads of the robot's relay and of the workers.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import signal
+import tempfile
+import time
+from pathlib import Path
+
+from benchmarks.common import machine
+from benchmarks.rig import Load, Rig, Traffic, routes, until
+from zsched.core.plan import StreamClass
+
+EDGES = ("edge1", "edge2", "edge3")
+
+
+def main() -> None:
+    """Print one line a minute and the sums."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--minutes", type=float, default=30.0)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--no-faults", action="store_true")
+    options = parser.parse_args()
+    print(machine())
+    random_ = random.Random(options.seed)
+    with tempfile.TemporaryDirectory() as folder, Rig(Path(folder), EDGES) as rig:
+        _run(rig, random_, options.minutes * 60, has_faults=not options.no_faults)
+
+
+def _run(rig: Rig, random_: random.Random, seconds: float, *, has_faults: bool) -> None:
+    loads = tuple(
+        Load(name=f"s{n}", hz=random_.choice([20, 50, 100, 200]), size=random_.choice([100, 1000, 20_000]))
+        for n in range(10)
+    )
+    for edge in EDGES:
+        rig.start_worker(edge)
+    session = rig.app()
+    traffics = [Traffic(session, load) for load in loads]
+    now = routes("edge1", 1, loads, StreamClass.RELIABLE)
+    rig.move(now)
+    until(lambda: all(traffic.is_connected for traffic in traffics), "the application sees the relay")
+    for traffic in traffics:
+        traffic.start()
+    end, next_line = time.monotonic() + seconds, 0.0
+    moves = crashes = 0
+    while time.monotonic() < end:
+        if time.monotonic() >= next_line:
+            _line(rig, traffics, moves, crashes)
+            next_line = time.monotonic() + 60
+        time.sleep(random_.uniform(1, 5))
+        is_crash = has_faults and random_.random() < 0.05
+        owner = random_.choice([edge for edge in EDGES if edge != now.owner])
+        if is_crash:
+            crashes += 1
+            rig.workers[now.owner].kill()
+            rig.workers[now.owner].wait(5)
+        elif has_faults and random_.random() < 0.03:
+            os.kill(rig.relays[now.owner].pid or 0, signal.SIGKILL)
+        new = routes(owner, now.epoch + 1, loads, StreamClass.RELIABLE)
+        rig.move(new, now, is_crash=is_crash)
+        if is_crash:
+            rig.start_worker(now.owner)
+        now, moves = new, moves + 1
+    for traffic in traffics:
+        traffic.stop()
+    time.sleep(2)
+    _line(rig, traffics, moves, crashes)
+    print(f"reported 'at most N lost': {sum(rig.left_behind())} samples in {len(rig.left_behind())} slots")
+
+
+def _line(rig: Rig, traffics: list[Traffic], moves: int, crashes: int) -> None:
+    lost, doubled, reordered = (sum(part) for part in zip(*(traffic.result() for traffic in traffics), strict=True))
+    parts = [f"{name} {mb:.1f} MB {fds} fd {threads} thr" for name, (mb, fds, threads) in rig.memory().items()]
+    sent = sum(len(traffic.sent) for traffic in traffics)
+    clock = time.strftime("%H:%M:%S")
+    print(f"{clock} moves {moves} crashes {crashes} sent {sent} open {lost} doubled {doubled} reordered {reordered}")
+    print("         " + " | ".join(parts), flush=True)
+
+
+if __name__ == "__main__":
+    main()

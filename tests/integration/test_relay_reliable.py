@@ -1,0 +1,163 @@
+"""Class reliable when links break and workers freeze or die: what is sent again, what is reported, who waits."""
+
+from __future__ import annotations
+
+import importlib.util
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from zsched.core.events import StreamsCounted
+from zsched.core.plan import RoutePhase, StreamClass, StreamCount
+from zsched.core.relay_protocol import SlotLost
+
+
+def _neighbour() -> Any:
+    """The rig of the tests beside this one (they are files, not a package)."""
+    name = "relay_streams_rig"
+    if name not in sys.modules:
+        spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name("test_relay_streams.py"))
+        assert spec is not None
+        assert spec.loader is not None
+        sys.modules[name] = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(sys.modules[name])
+    return sys.modules[name]
+
+
+streams = _neighbour()
+until, slot, Application = streams.until, streams.slot, streams.Application
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[Any]:
+    made = streams.Rig(folder=tmp_path)
+    try:
+        made.start()
+        yield made
+    finally:
+        made.stop()
+
+
+def newest(rig: Any) -> dict[str, StreamCount]:
+    reports = [report for _, report in rig.reports[streams.ROBOT].items if isinstance(report, StreamsCounted)]
+    return {count.stream: count for count in reports[-1].counts} if reports else {}
+
+
+def told(rig: Any, stream: str = "echo/in/0") -> StreamCount:
+    return newest(rig).get(stream, StreamCount(stream=stream))
+
+
+def through(rig: Any, stream_class: StreamClass = StreamClass.RELIABLE) -> tuple[Any, Any]:
+    """An application whose samples go through edge1 and come back."""
+    first = slot(1, "edge1", stream_class, 1)
+    app = Application(rig.app)
+    rig.move(first)
+    until(app.connected, "the application sees the relay's subscription")
+    return app, first
+
+
+def test_what_a_frozen_worker_missed_reaches_it_when_it_wakes_up(rig: Any) -> None:
+    """Longer than the lease: the link is closed on it, whatever was on its way is gone, and is sent again.
+
+    Its answers are numbered but not kept: the few it gives before its link is open again are counted as lost.
+    """
+    worker = rig.start_worker("edge1")
+    app, _ = through(rig)
+    thread = app.stream(200)
+    until(lambda: len(app.back) > 50, "the stream through edge1")
+    worker.send_signal(signal.SIGSTOP)
+    time.sleep(3.0)
+    worker.send_signal(signal.SIGCONT)
+    time.sleep(0.5)
+    app.halt(thread)
+    until(lambda: app.back[-1] == app.sent - 1, "the newest sample")
+    until(lambda: told(rig).acknowledged == app.sent, "every sample processed, and once")
+    assert (told(rig).in_flight, told(rig).lost) == (0, 0)
+    assert app.back == sorted(set(app.back))
+    assert app.sent - len(app.back) == told(rig, "echo/out/0").lost <= 100
+
+
+def test_a_killed_worker_leaves_at_most_what_is_reported(rig: Any) -> None:
+    worker = rig.start_worker("edge1", "--delay-ms", "5")
+    rig.start_worker("edge2")
+    app, first = through(rig)
+    thread = app.stream(400)
+    until(lambda: len(app.back) > 50, "the stream through edge1")
+    worker.kill()
+    worker.wait(5)
+    second = slot(2, "edge2", StreamClass.RELIABLE, 1)
+    rig.move(second, first, drains=False)
+    until(lambda: app.nodes[-1] == "edge2", "the stream through edge2")
+    app.halt(thread)
+    until(lambda: app.back[-1] == app.sent - 1, "the newest sample")
+    report = rig.wait(SlotLost, epoch=1)
+    lost = app.sent - len(set(app.back))
+    assert app.back == sorted(set(app.back))
+    assert 0 < lost <= report.samples
+    until(lambda: told(rig).at_most_lost == report.samples, "the same in the counters")
+
+
+def test_a_worker_that_restarts_in_place_is_not_sent_what_its_former_life_may_have_done(rig: Any) -> None:
+    worker = rig.start_worker("edge1", "--delay-ms", "5")
+    app, _ = through(rig)
+    thread = app.stream(400)
+    until(lambda: len(app.back) > 50, "the stream through edge1")
+    worker.kill()
+    worker.wait(5)
+    rig.start_worker("edge1")
+    before = len(app.back)
+    until(lambda: len(app.back) > before + 50, "the stream through its second life")
+    app.halt(thread)
+    until(lambda: app.back[-1] == app.sent - 1, "the newest sample")
+    assert app.back == sorted(set(app.back))
+    until(lambda: told(rig).at_most_lost >= app.sent - len(app.back), "what may be lost")
+
+
+@pytest.mark.parametrize("stream_class", [StreamClass.RELIABLE, StreamClass.LATEST])
+def test_a_stalled_worker_delays_no_other_robots_stream(rig: Any, stream_class: StreamClass) -> None:
+    """Two tasks through one relay; one owner is frozen under 20 MB/s. The other stream's longest gap stays small."""
+    options = ["--latest"] if stream_class is StreamClass.LATEST else []
+    frozen = rig.start_worker("edge1", *options)
+    app, _ = through(rig, stream_class)
+    app.padding = bytes(200_000)
+    beside = streams.replace(
+        slot(1, "edge2", StreamClass.RELIABLE, 0, streams.ReadyWhen.MATCHING), routes=(streams.BESIDE,)
+    )
+    arrivals: list[float] = []
+    foreign = streams.zenoh.open(
+        streams.zenoh.Config.from_json5(streams.worker_config(connect=(rig.endpoint("edge2"),)))
+    )
+    halt = threading.Event()
+    try:
+        foreign.declare_subscriber(streams.BESIDE.to_expr, lambda _: arrivals.append(time.monotonic()))
+        for phase in (RoutePhase.PREPARE, RoutePhase.FLIP):
+            rig.relays[streams.ROBOT].apply(streams.RoutePlan(task="beside", phase=phase, current=beside))
+        source = rig.app.declare_publisher(streams.BESIDE.from_expr)
+        until(lambda: source.put(b"x") or arrivals, "the live stream flows")
+
+        def put() -> None:
+            while not halt.wait(0.005):
+                source.put(b"x")
+
+        live = threading.Thread(target=put)
+        live.start()
+        thread = app.stream(100)
+        until(lambda: len(app.back) > 20, "the stream through edge1")
+        frozen.send_signal(signal.SIGSTOP)
+        time.sleep(3.0)
+        app.halt(thread)
+        halt.set()
+        live.join(5)
+        gaps = [later - earlier for earlier, later in pairwise(arrivals)]
+        assert len(gaps) > 200
+        assert max(gaps[10:]) < 0.4
+    finally:
+        halt.set()
+        foreign.close()
