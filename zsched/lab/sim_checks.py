@@ -16,9 +16,8 @@ from zsched.core.model import Allocation, Ballot, DurableState, NodeId, Register
 from zsched.core.plan import RoutePlan, WorkerRole
 from zsched.errors import InvariantError
 from zsched.lab.history import Checker, Learnt, Record, Routed, Started, Stored, Worked
-from zsched.lab.sim_parts import Machine
+from zsched.lab.sim_parts import GENERATION_STEP, Machine
 
-GENERATION_STEP = 2**32
 FORGED = -1
 """The number of a question that a stranger asks, or in another one's name: a yes to it is a violation."""
 MAX_WAKES = 50

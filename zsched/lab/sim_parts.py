@@ -12,11 +12,14 @@ from random import Random
 
 from zsched import wire
 from zsched.core import events as ev
-from zsched.core.fleet import Fleet
-from zsched.core.model import DurableState, NodeId, RegisterState, TaskId
+from zsched.core.fleet import Fleet, electorate_hash
+from zsched.core.model import Allocation, DurableState, NodeId, RegisterState, TaskId
 from zsched.core.node import Node
 from zsched.core.plan import Role
 from zsched.errors import WireError
+
+GENERATION_STEP = 2**32
+"""Revision and epoch of generation G start at G times this."""
 
 
 @dataclass(slots=True)
@@ -151,3 +154,25 @@ class Machine:
         self.roles.clear()
         self.inbox.clear()
         self.busy_until, self.is_paused, self.wake_at = -math.inf, False, math.inf
+
+
+def blank_state(machine: Machine, incarnation: int, generation: int) -> DurableState:
+    """What `zsched init` writes: this name has never voted (``generation`` above 0: the fleet starts anew)."""
+    start = generation * GENERATION_STEP
+    registers = tuple(
+        RegisterState(
+            task=task.name,
+            learnt=Allocation(task=task.name, revision=start, epoch=start, owner=None, tuning=task.tuning),
+        )
+        for task in machine.fleet.tasks
+        if generation > 0
+    )
+    return DurableState(
+        fleet=machine.fleet.name,
+        node=machine.name,
+        incarnation=incarnation,
+        generation=generation,
+        hardware="",
+        electorate=electorate_hash(machine.fleet),
+        registers=registers,
+    )

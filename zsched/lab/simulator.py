@@ -7,7 +7,6 @@ schedule has (`zsched.lab.sim_faults`), what must hold (`zsched.lab.sim_checks`)
 
 from __future__ import annotations
 
-import heapq
 import itertools
 import math
 from collections.abc import Callable, Iterator
@@ -19,13 +18,14 @@ from zsched import wire
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.fleet import Fleet, electorate_hash
-from zsched.core.model import Allocation, DeviceSample, DurableState, NodeId, PeerState, RegisterState, TaskId
+from zsched.core.model import Allocation, DeviceSample, DurableState, NodeId, PeerState, TaskId
 from zsched.core.node import Node
 from zsched.core.plan import RoutePlan
 from zsched.errors import InvariantError
-from zsched.lab.sim_checks import GENERATION_STEP, Invariants, unsettled
+from zsched.lab.sim_checks import Invariants, unsettled
+from zsched.lab.sim_loops import TICK_S, Loops
 from zsched.lab.sim_network import Message, Weather
-from zsched.lab.sim_parts import Machine
+from zsched.lab.sim_parts import Machine, blank_state
 from zsched.lab.sim_work import Work
 
 Load = Callable[[NodeId, float], tuple[float, float]]
@@ -35,8 +35,6 @@ Cut = Callable[[NodeId, tuple[do.Instruction, ...]], int | None]
 Make = Callable[[Any], ev.Event]
 
 CORES, MEMORY_MB = 4.0, 4000.0
-TICK_S = 0.0005
-"""A deadline that lies in the past is served this much later: the loop's own time."""
 TOKEN_DELAY_S = 0.005
 SELF_DELAY_S = 0.0001
 RESTART_S = 0.3
@@ -51,8 +49,8 @@ def idle(_node: NodeId, _now: float) -> tuple[float, float]:
     return 1.0, 1000.0
 
 
-@dataclass(slots=True)
-class Simulator:
+@dataclass(slots=True, kw_only=True)
+class Simulator(Loops):
     """One fleet in one schedule. `run` until a time or a condition; faults in between."""
 
     fleet: Fleet
@@ -60,7 +58,6 @@ class Simulator:
     load: Load = idle
     loss: float = 0.0
     delay_s: tuple[float, float] = (0.0005, 0.003)
-    now: float = 100.0
     cuts: set[tuple[NodeId, NodeId]] = field(default_factory=set)
     """(from, to) pairs that deliver nothing."""
     cut_batch: Cut | None = None
@@ -78,8 +75,6 @@ class Simulator:
     answers: list[do.AnswerCommand] = field(default_factory=list)
     """What operators were told."""
     rng: Random = field(init=False)
-    _queue: list[tuple[float, int, Callable[..., None], tuple[Any, ...]]] = field(default_factory=list)
-    _order: Iterator[int] = field(default_factory=itertools.count)
     _asked: dict[int, tuple[Machine, Machine, Make]] = field(default_factory=dict)
     _frames: dict[tuple[str, type[Any]], tuple[object, bytes, Any]] = field(default_factory=dict)
     """{(sender, class): (the newest value of this class, its frame, what is read in it)}."""
@@ -95,7 +90,7 @@ class Simulator:
 
     def initialise(self, machine: Machine, *, incarnation: int = 0, generation: int = 0) -> None:
         """`zsched init`: a blank durable state, which says that this name has never voted."""
-        machine.disk.write(_blank_state(machine, incarnation, generation))
+        machine.disk.write(blank_state(machine, incarnation, generation))
         machine.disk.sync()
 
     # --- what a test does --------------------------------------------------------------------------------------------
@@ -150,22 +145,6 @@ class Simulator:
         """Everything passes again."""
         self.cuts.clear()
 
-    def run(self, seconds: float) -> None:
-        """Let virtual time pass."""
-        self.run_until(lambda: False, seconds)
-
-    def run_until(self, condition: Callable[[], bool], seconds: float) -> bool:
-        """Let time pass until ``condition``, at most ``seconds``; whether it came true."""
-        end = self.now + seconds
-        queue, pop = self._queue, heapq.heappop
-        while queue and queue[0][0] <= end:
-            self.now, _, action, arguments = pop(queue)
-            action(*arguments)
-            if condition():
-                return True
-        self.now = end
-        return condition()
-
     def node(self, name: NodeId) -> Node:
         """A running node. Raises `KeyError` when it is down."""
         node = self.machines[name].node
@@ -193,10 +172,6 @@ class Simulator:
     def unsettled(self) -> str:
         """Why the fleet is not at rest, empty when it is (see `zsched.lab.sim_checks.unsettled`)."""
         return unsettled(self.fleet, self.machines, self.work.working, self.now)
-
-    def later(self, seconds: float, action: Callable[..., None], *arguments: Any) -> None:
-        """Do something ``seconds`` from now."""
-        heapq.heappush(self._queue, (self.now + seconds, next(self._order), action, arguments))
 
     # --- lives -------------------------------------------------------------------------------------------------------
 
@@ -228,7 +203,7 @@ class Simulator:
         self._tell_token(machine, ev.TokenSeen(node=machine.name, incarnation=machine.node.incarnation), TOKEN_DELAY_S)
         self._carry_out(machine, machine.node.start(local), 0)
         self.later(self.rng.uniform(0, machine.fleet.timing.sample_s), self._sample, machine, machine.life)
-        self._arm(machine)
+        self.arm(machine)
 
     def _is_refused(self, machine: Machine) -> bool:
         return machine.disk.is_broken or machine.key in self.broken_disks
@@ -246,76 +221,14 @@ class Simulator:
         self.later(self.fleet.timing.sample_s, self._sample, machine, life)
         self.deliver(machine, ev.ProfileSampled(device=sample))
 
-    # --- one machine's loop ------------------------------------------------------------------------------------------
+    # --- events ------------------------------------------------------------------------------------------------------
 
-    def rearm(self, machine: Machine) -> None:
-        """The machine's clock has changed: its next deadline lies elsewhere in true time."""
-        machine.wake_at = math.inf
-        self._arm(machine)
+    def woken(self, machine: Machine) -> None:
+        """A machine's deadline has come; it must let time pass now and then."""
+        self.invariants.on_woken(machine, self.now)
 
-    def _arm(self, machine: Machine) -> None:
-        """Make sure that the node is woken at its next deadline."""
-        node = machine.node
-        if node is None or machine.is_paused:
-            return
-        due = node.next_deadline()
-        if not machine.clock.is_true:
-            due = machine.clock.true(due)
-        due = max(due, self.now + TICK_S)
-        due = max(due, machine.busy_until)
-        if due < machine.wake_at:
-            machine.wake_at = due
-            heapq.heappush(self._queue, (due, next(self._order), self._wake, (machine, machine.life, due)))
-
-    def _wake(self, machine: Machine, life: int, at: float) -> None:
-        if machine.life != life or machine.wake_at != at:
-            return  # another life, or an earlier wake-up has come since
-        machine.wake_at = math.inf
-        node = machine.node
-        if node is None or machine.is_paused or machine.inbox or machine.busy_until > self.now:
-            return  # its loop comes to it after what it is at
-        if node.next_deadline() <= machine.clock.local(self.now):
-            self.invariants.on_woken(machine, self.now)
-            self.deliver(machine, ev.DeadlineReached())
-        self._arm(machine)
-
-    def deliver(self, machine: Machine, event: ev.Event) -> None:
-        """An event reaches a machine: handled at once, or when its loop comes to it."""
-        if machine.node is None:
-            return
-        if machine.is_paused or machine.inbox or machine.busy_until > self.now:
-            machine.inbox.append(event)
-            self._pump_later(machine)
-            return
-        self._handle(machine, event)
-
-    def pause(self, machine: Machine, seconds: float) -> None:
-        """The loop stands still (SIGSTOP); what comes queues up, and the clock goes on."""
-        if machine.node is not None:
-            machine.is_paused = True
-            self.later(seconds, self.unpause, machine, machine.life)
-
-    def unpause(self, machine: Machine, life: int) -> None:
-        """The loop goes on with what has queued up."""
-        if machine.life == life and machine.is_paused:
-            machine.is_paused = False
-            self._pump_later(machine)
-
-    def _pump_later(self, machine: Machine) -> None:
-        if not machine.is_pumping and not machine.is_paused:
-            machine.is_pumping = True
-            self.later(max(machine.busy_until - self.now, 0.0), self._pump, machine, machine.life)
-
-    def _pump(self, machine: Machine, life: int) -> None:
-        machine.is_pumping = False
-        while machine.life == life and machine.inbox and not machine.is_paused and machine.busy_until <= self.now:
-            self._handle(machine, machine.inbox.popleft())
-        if machine.inbox:
-            self._pump_later(machine)
-        else:
-            self._arm(machine)
-
-    def _handle(self, machine: Machine, event: ev.Event) -> None:
+    def handle(self, machine: Machine, event: ev.Event) -> None:
+        """Let a machine handle one event now, and carry out what it asks for."""
         node = machine.node
         assert node is not None
         self.events += 1
@@ -331,7 +244,7 @@ class Simulator:
             machine.busy_until = self.now + machine.event_s
         if batch:
             self._carry_out(machine, batch, 0)
-        self._arm(machine)
+        self.arm(machine)
 
     # --- instructions ------------------------------------------------------------------------------------------------
 
@@ -348,7 +261,7 @@ class Simulator:
             if isinstance(instruction, do.PersistState):
                 if self._is_refused(machine):
                     machine.is_durable = False
-                    self._handle(machine, ev.PersistFailed(reason="no space left on device"))
+                    self.handle(machine, ev.PersistFailed(reason="no space left on device"))
                     break
                 machine.disk.write(instruction.state)
                 if machine.disk_s[1] > 0.0:
@@ -385,8 +298,8 @@ class Simulator:
         self._sync(machine, persist.state)
         machine.busy_until = self.now
         self._do(machine, life, batch, index + 1, end)
-        self._pump_later(machine)
-        self._arm(machine)
+        self.pump_later(machine)
+        self.arm(machine)
 
     def _one(self, me: Machine, instruction: do.Instruction) -> None:
         match instruction:
@@ -503,24 +416,3 @@ class Simulator:
             for other in self._named(elector):
                 number = self._question(other, me, lambda answer: ev.ElectorAnswered(answer=answer))
                 self._send(me, other, Message(make(number, value), frame, kind))
-
-
-def _blank_state(machine: Machine, incarnation: int, generation: int) -> DurableState:
-    start = generation * GENERATION_STEP
-    registers = tuple(
-        RegisterState(
-            task=task.name,
-            learnt=Allocation(task=task.name, revision=start, epoch=start, owner=None, tuning=task.tuning),
-        )
-        for task in machine.fleet.tasks
-        if generation > 0
-    )
-    return DurableState(
-        fleet=machine.fleet.name,
-        node=machine.name,
-        incarnation=incarnation,
-        generation=generation,
-        hardware="",
-        electorate=electorate_hash(machine.fleet),
-        registers=registers,
-    )
