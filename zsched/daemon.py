@@ -45,6 +45,9 @@ from zsched.shell import Desk, Inbox, Shell
 EXIT_OK, EXIT_FAILED, EXIT_CONFIG = 0, 1, 78
 HAND_OVER_S = 0.8
 """How long a stopping owner waits for its tasks to be moved away."""
+LEAVE_S = 0.4
+"""...and how long it stays when they are: the next owner's worker asks ours for its state, and what ours has in hand is
+still to come."""
 CLOSE_WORKERS_S = 0.7
 LOOP_MAX_WAIT_S = 1.0
 
@@ -264,7 +267,7 @@ class Daemon:
         """Take an event, handle it, carry the batch out; wake up in time for the node's next deadline."""
         shell.carry_out(node.start(monotonic_s()))
         watchdog_s = watchdog_interval_s()
-        next_ping, is_ready, stop_by = 0.0, False, float("inf")
+        next_ping, is_ready, stop_by, is_leaving = 0.0, False, float("inf"), False
         while True:
             wait = min(node.next_deadline() - monotonic_s(), LOOP_MAX_WAIT_S)
             event = self._inbox.take(wait) or ev.DeadlineReached()
@@ -279,7 +282,10 @@ class Daemon:
             if isinstance(event, ev.StopRequested) and stop_by == float("inf"):
                 self._notify.stopping()
                 stop_by = now + (HAND_OVER_S if node.owned() else 0.0)
-            if now >= stop_by or (stop_by < float("inf") and not node.owned()):
+                is_leaving = stop_by > now
+            if is_leaving and not node.owned():
+                is_leaving, stop_by = False, now + LEAVE_S
+            if now >= stop_by:
                 log.info("stopping node=%s", node.me)
                 return
             if watchdog_s is not None and now >= next_ping:

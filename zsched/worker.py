@@ -46,7 +46,7 @@ from zsched.worker_epochs import CARRY_S, Epochs
 from zsched.worker_inputs import Dispatcher, Input, Marker, Received
 from zsched.worker_outputs import Output
 from zsched.worker_services import Answer, Handler, Request, Service
-from zsched.worker_snapshot import TIMEOUT_S, Offer, Restorer, fetch
+from zsched.worker_snapshot import TIMEOUT_S, Offer, Restorer, StateLink, fetch
 
 __all__ = ["Answer", "Output", "Received", "Request", "Worker"]
 
@@ -97,6 +97,7 @@ class Worker:
         self._role_token: zenoh.LivelinessToken | None = None
         self._token: zenoh.LivelinessToken | None = None
         self._session = _open(zenoh_config)
+        self._state_link = StateLink(self._session, zenoh_config)
         self._acks = Acknowledger(self._send_acks)
         self._dispatcher = Dispatcher(self._inputs_ended, self._acks)
         self._restorer = Restorer(self._fetch_snapshot, node, self._dispatcher)
@@ -215,7 +216,7 @@ class Worker:
         ``snapshot`` is called in a thread of its own whenever the next owner asks, usually while this one still works.
         """
         key = self._keyspace.snapshot(self._node, self._task)
-        self._declared.append(Offer(self._session, key, snapshot))
+        self._declared.append(Offer(self._state_link.session, key, snapshot))
 
     def on_snapshot(self, restore: Callable[[bytes], None], timeout_s: float = TIMEOUT_S) -> None:
         """Take the predecessor's state over when this worker becomes the owner; call it before `subscribe`.
@@ -223,6 +224,7 @@ class Worker:
         ``restore`` runs in the dispatch thread before any input of the new epoch, at most ``timeout_s`` (0.3 s if the
         predecessor is silent) after the role came; until then `role` is idle. Without a snapshot it is not called.
         """
+        self._errands.put(self._state_link.open)  # before it is needed, not in a move
         self._restorer.register(restore, timeout_s)
         role = self._role
         self._restorer.note(role)
@@ -284,8 +286,9 @@ class Worker:
         for entity in self._declared:  # advanced subscribers hold a closed session open otherwise
             with contextlib.suppress(zenoh.ZError):
                 entity.undeclare()
-        with contextlib.suppress(zenoh.ZError):
-            self._session.close()
+        for close in (self._state_link.close, self._session.close):
+            with contextlib.suppress(zenoh.ZError):
+                close()
 
     def _on_signal(self, _signal: int, _frame: FrameType | None) -> None:
         self._is_signalled = True
@@ -362,7 +365,7 @@ class Worker:
             self._role_token = self._session.liveliness().declare_token(key)
 
     def _fetch_snapshot(self, predecessor: str, timeout_s: float) -> bytes | str:
-        return fetch(self._session, self._keyspace.snapshot(predecessor, self._task), timeout_s)
+        return fetch(self._state_link.session, self._keyspace.snapshot(predecessor, self._task), timeout_s)
 
     def _is_owner(self) -> bool:
         role = self.role

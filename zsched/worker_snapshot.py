@@ -10,6 +10,7 @@ all of them; whatever goes wrong is a cold start with a reason, never an error.
 from __future__ import annotations
 
 import hashlib
+import json
 import logging
 import queue
 import threading
@@ -33,6 +34,52 @@ FIRST_S: Final = 0.3
 TIMEOUT_S: Final = 2.0
 
 _log = logging.getLogger("zsched.worker")
+
+
+class StateLink:
+    """The session for snapshots: a client of this node's relay, opened when it is first needed.
+
+    Workers are peers, and peers carry nothing between two others: two workers of different machines need not have a
+    link of their own. Their nodes' relays have, and a relay does carry for its clients.
+    """
+
+    def __init__(self, main: zenoh.Session, zenoh_config: str) -> None:
+        """``zenoh_config``: that of the worker's ``main`` session (JSON5), whose first ``connect`` is the relay."""
+        self._main, self._zenoh_config = main, zenoh_config
+        self._lock = threading.Lock()
+        self._own: zenoh.Session | None = None
+
+    @property
+    def session(self) -> zenoh.Session:
+        """The session; the worker's own one where that is a client already, or no relay is known."""
+        with self._lock:
+            if self._own is None:
+                self._own = self._opened()
+            return self._own
+
+    def open(self) -> None:
+        """Open it now, so that it need not be in a move."""
+        _ = self.session
+
+    def close(self) -> None:
+        """Close it, if it was opened."""
+        own = self._own
+        if own is not None and own is not self._main:
+            own.close()
+
+    def _opened(self) -> zenoh.Session:
+        try:
+            config = zenoh.Config.from_json5(self._zenoh_config)
+            endpoints = json.loads(config.get_json("connect/endpoints"))
+            if json.loads(config.get_json("mode")) == "client" or not isinstance(endpoints, list) or not endpoints:
+                return self._main
+            config.insert_json5("mode", json.dumps("client"))
+            config.insert_json5("listen/endpoints", "[]")
+            config.insert_json5("connect/endpoints", json.dumps(endpoints[:1]))
+            return zenoh.open(config)
+        except (zenoh.ZError, ValueError) as error:
+            _log.warning("no session of its own for snapshots (%s): only direct neighbours are asked", error)
+            return self._main
 
 
 class Offer:
