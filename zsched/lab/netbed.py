@@ -87,9 +87,10 @@ class Probe:
                 self.received.append(_received(*words))
             self.is_open = True
 
-    def first_after(self, moment: float) -> Received | None:
-        """The first sample back of those that were *sent* after ``moment`` (CLOCK_BOOTTIME), or ``None``."""
-        found = [one for one in self.received[-4000:] if one.sent_at > moment and one.epoch is None]
+    def first_after(self, moment: float, *, but_of: NodeId = "") -> Received | None:
+        """The first sample back, not by ``but_of``, of those *sent* after ``moment`` (CLOCK_BOOTTIME), or ``None``."""
+        newest = [one for one in self.received[-4000:] if one.sent_at > moment]
+        found = [one for one in newest if one.epoch is None and one.node != but_of]
         return min(found, key=lambda one: one.at, default=None)
 
     def is_flowing(self) -> bool:
