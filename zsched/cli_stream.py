@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 from zsched.cli_ask import Door, ask_door, find_door
 from zsched.cli_common import EXIT_FAILED, EXIT_OK, EXIT_UNREACHABLE, EXIT_USAGE, CliError, Json, nearest, print_json
 from zsched.cli_page import Page, harmless, size, span
+from zsched.clock import monotonic_s
 from zsched.core import keyexpr
 from zsched.errors import AdapterError
 
@@ -46,10 +47,10 @@ def show_list(view: StreamView, key: str | None) -> int:
     """Print the node's streams with their rates over one window; returns the exit code."""
     door = find_door(view.runtime_dir, view.node)
     first = ask_door(door, {"verb": "status"})
-    started = time.monotonic()
+    started = monotonic_s()
     time.sleep(view.window_s)
     second = ask_door(door, {"verb": "status"})
-    streams = _chosen(rates(first, second, time.monotonic() - started), key)
+    streams = _chosen(rates(first, second, monotonic_s() - started), key)
     if view.is_json:
         body = {"schema": "zsched.stream.list/1", "node": second["node"], "window_s": view.window_s}
         print_json({**body, "streams": streams})
@@ -233,7 +234,7 @@ def show_rates(view: StreamView, word: str | None, verb: str) -> int:
 
 def _window(tap: StreamTap, window_s: float, carry: dict[tuple[str, str], KeyStats]) -> dict[tuple[str, str], KeyStats]:
     stats: dict[tuple[str, str], KeyStats] = {}
-    for sample in tap.until(time.monotonic() + window_s):
+    for sample in tap.until(monotonic_s() + window_s):
         name = (sample.side, sample.key)
         if name not in stats:
             stats[name] = KeyStats(last_at=carry[name].last_at) if name in carry else KeyStats()
@@ -284,7 +285,7 @@ def show_tail(view: StreamView, word: str | None) -> int:
 
 def _endlessly(tap: StreamTap) -> Iterator[Tapped]:
     while True:
-        yield from tap.until(time.monotonic() + 3600.0)
+        yield from tap.until(monotonic_s() + 3600.0)
 
 
 def _print_sample(view: StreamView, sample: Tapped) -> None:

@@ -154,7 +154,7 @@ class Rig:
         }
         command = [sys.executable, str(self.folder / "worker.py"), str(self.folder / f"{node}.log")]
         self.workers[node] = subprocess.Popen(command, env=env)
-        seen = {"node": node, "task": TASK, "incarnation": str(self.incarnation), "is_present": True}
+        seen: dict[str, Any] = {"node": node, "task": TASK, "incarnation": str(self.incarnation), "is_present": True}
         until(lambda: self.find(WorkerSeen, **seen), f"worker of {node}")
         return self.workers[node]
 

@@ -26,8 +26,8 @@ def status(*streams: dict[str, Any]) -> dict[str, Any]:
     return {"node": "robot1", "tasks": [{"name": "merge", "owner": "edge1", "epoch": 3, "streams": list(streams)}]}
 
 
-OUT = {"name": "merge/out/0", "from_expr": "edge1/merge/3/all", "to_expr": "robot1/all"}
-SRV = {"name": "merge/srv/0", "from_expr": "robot1/now", "to_expr": "edge1/merge/now"}
+OUT: dict[str, Any] = {"name": "merge/out/0", "from_expr": "edge1/merge/3/all", "to_expr": "robot1/all"}
+SRV: dict[str, Any] = {"name": "merge/srv/0", "from_expr": "robot1/now", "to_expr": "edge1/merge/now"}
 
 
 def test_rates_are_differences_over_the_time_between() -> None:

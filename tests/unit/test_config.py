@@ -400,7 +400,7 @@ ONE_FAULT = [
     ("    outputs:  ", "    exclusive: true\n    outputs:  ", "needs {epoch}", '"{robot}/global_map"'),
     ("timing: wifi", "timing: {confirm_s: 0.1}", "it must be >= 0.2 s (beat_s)", "0.1}"),
     ("timing: wifi", "timing: {zenoh_lease_s: 2.6}", "must be < 2.5 s", "2.6"),
-    ("timing: wifi", "timing: {zenoh_lease_s: 0.5}", "must be >= 1 s", "0.5}"),
+    ("timing: wifi", "timing: {zenoh_lease_s: 0.9, lease_s: 0.6}", "must be >= 1 s", "0.9, lease"),
     ("timing: wifi", "timing: {gather_s: 0.6, ballot_s: 0.6}", "a round must end", "0.6, ballot"),
     ("timing: wifi", "timing: {profile_ttl_s: 1.5}", "one lost profile", "1.5}"),
     ("timing: wifi", "timing:", "expected", None),

@@ -237,7 +237,7 @@ def test_one_epoch_is_restored_once() -> None:
 def test_a_callback_that_fails_is_a_cold_start() -> None:
     inputs = Inputs()
     restorer = Restorer(lambda _node, _timeout_s: b"state", "edge2", inputs)
-    restorer.register(lambda _content: 1 / 0, 1.0)  # type: ignore[arg-type, return-value] # it fails on purpose
+    restorer.register(lambda _content: 1 / 0, 1.0)  # type: ignore[arg-type] # it fails on purpose
     restorer.note(active(3))
     restorer.begin(active(3), restorer.deliver)
     end = time.monotonic() + 5

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +60,7 @@ class _Hub:
         self.workers = [self._worker(folder, node, endpoint) for node in ("edge1", "edge2")]
         for node in ("edge1", "edge2"):
             key = _KEYS.worker(node, _TASK, 1)
-            _until(lambda key=key: key in self.tokens, f"worker of {node}")
+            _until(partial(self.tokens.__contains__, key), f"worker of {node}")
 
     @staticmethod
     def _worker(folder: Path, node: str, endpoint: str) -> subprocess.Popen[bytes]:
