@@ -39,6 +39,8 @@ GOALS = {
     ("cut", "wired"): "p90 900 ms",
 }
 CUT_S = 20.0
+RECOVERY_S = 3.0
+"""After a cut, TCP's own timers hold a link's streams back for up to so long; the next fault waits for it."""
 CASES = ("killed", "worker", "frozen", "cut", "heal")
 
 
@@ -122,6 +124,9 @@ class Cases:
                 "committed": cycle.first_ms(others, f"task={TASK} epoch={epoch + 1} learnt"),
             }
         mend()
+        if name in {"frozen", "cut"}:
+            mended = monotonic_s()
+            self.bed.wait(lambda: monotonic_s() > mended + RECOVERY_S, RECOVERY_S + 5, "TCP's timers")
         steps["first message"] = (first.at - cycle.at) * 1000 if first is not None else None
         return {step: value for step, value in steps.items() if value is not None}
 
