@@ -12,9 +12,10 @@ from zsched.core.register import Register
 from zsched.errors import InvariantError
 from zsched.lab import simulate
 from zsched.lab.sim_faults import SETTLE_S, Stage, play
-from zsched.lab.sim_parts import Clock, Disk
+from zsched.lab.sim_parts import GENERATION_STEP, Clock, Disk
 from zsched.lab.sim_swarm import MAKERS, MAX_NODES, MIN_NODES, Plan, plan
 from zsched.lab.simulate import Job, main, shrink
+from zsched.lab.simulator import Simulator
 
 
 @pytest.mark.parametrize("seed", range(40))
@@ -48,6 +49,16 @@ def test_every_fault_that_is_planned_is_carried_out() -> None:
         done |= set(play(one).faults)
         planned |= {fault.kind for fault in one.faults}
     assert planned <= done
+
+
+def test_a_fleet_whose_electors_lost_their_state_is_started_anew_and_gets_an_owner() -> None:
+    """Found by this simulator (seed 0): blank electors of a generation were taken for ones that had forgotten it."""
+    sim = Simulator(fleet=plan(0, nodes=5).fleet, seed=1)
+    for machine in sim.machines.values():
+        sim.initialise(machine, generation=3)
+    sim.start()
+    assert sim.run_until(lambda: not sim.unsettled(), SETTLE_S), sim.unsettled()
+    assert min(revision for _, revision in sim.learnt if revision % GENERATION_STEP) == 3 * GENERATION_STEP + 1
 
 
 @pytest.mark.parametrize("nodes", [MIN_NODES, MAX_NODES])

@@ -22,6 +22,8 @@ from zsched.core.register import Change, MoveOwner, Register, Retune, RoundOutco
 SETTLE_AFTER_START_S = 0.3
 """A starting elector learns first what was accepted before (an identity round), once its peers are connected."""
 ASK_LEARNT_EVERY_S = 0.3
+GENERATION_STEP = 2**32
+"""Revision and epoch of generation G start at G times this (`zsched init --generation G`)."""
 PREPARES_PER_S = 20.0
 PREPARE_BURST = 40.0
 """What one peer may cost an elector: proposers back off to far less, only a broken one comes near."""
@@ -94,6 +96,8 @@ class Agreement:
         self.counters: Counter[str] = Counter()
         self._buckets: dict[NodeId, tuple[float, float]] = {}
         stored = {} if durable is None else {state.task: state for state in durable.registers}
+        # What blank electors have agreed on: a generation's first value, which the operator has written everywhere.
+        start = (self.generation or 0) * GENERATION_STEP
         self.registers = {
             task.name: Register(
                 me=me,
@@ -101,7 +105,7 @@ class Agreement:
                 electors=fleet.electors,
                 electorate=electorate,
                 is_elector=self.is_elector,
-                initial=Allocation(task=task.name, revision=0, epoch=0, owner=None, tuning=task.tuning),
+                initial=Allocation(task=task.name, revision=start, epoch=start, owner=None, tuning=task.tuning),
                 state=stored.get(task.name, RegisterState(task=task.name)),
                 ballot_s=fleet.timing.ballot_s,
                 stagger_s=fleet.timing.stagger_s,

@@ -27,6 +27,8 @@ SETTLE_S = 15.0
 """Once faults have stopped and everybody is up, every task has a living owner that all know within this time."""
 EVENTS_PER_S = 500.0
 """A node handles about 50 a second; ten times that, on average over a whole schedule, is a storm."""
+LOST_S = 3.0
+"""So long a fleet that cannot agree is watched before the operator starts it anew."""
 STOP_S = 0.8
 """What a daemon that was told to stop waits for its tasks to move."""
 SMALL_DELAY_S = (0.0005, 0.003)
@@ -44,7 +46,7 @@ class Result:
     """How often each fault was carried out."""
     stories: tuple[str, ...]
     settled_s: float | None
-    """How long it took to come to rest; ``None``: too few electors have kept their state, nothing can be agreed."""
+    """How long it took to come to rest; ``None``: it did not."""
 
 
 def play(plan: Plan, keep: frozenset[int] | None = None, calm_at: float | None = None) -> Result:
@@ -56,7 +58,8 @@ def play(plan: Plan, keep: frozenset[int] | None = None, calm_at: float | None =
         calm_at: when the faults end, seconds after the start (``None``: after half the time).
     """
     stage = Stage(plan)
-    violation, settled_s = "", None
+    violation = ""
+    settled_s: float | None = None
     try:
         settled_s = stage.play(keep, plan.seconds / 2 if calm_at is None else calm_at)
     except InvariantError as error:
@@ -92,7 +95,7 @@ class Stage:
         self.sim.most_events = EVENTS_PER_S * len(self.plan.fleet.nodes) * self.plan.seconds
         self._rng = Random(f"stage {self.plan.seed}")
 
-    def play(self, keep: frozenset[int] | None, calm_at: float) -> float | None:
+    def play(self, keep: frozenset[int] | None, calm_at: float) -> float:
         """Run it all; how long the fleet took to come to rest."""
         sim = self.sim
         sim.start()
@@ -103,8 +106,9 @@ class Stage:
         self.calm()
         at = sim.now
         if not self.can_agree():
-            sim.run(self.plan.seconds / 2)
-            return None
+            sim.run(LOST_S)  # nothing may be agreed meanwhile that a majority does not remember
+            self._start_generation()
+            at = sim.now
         if not sim.run_until(_every(50, lambda: not sim.unsettled()), SETTLE_S) and sim.unsettled():
             raise InvariantError(f"not at rest {SETTLE_S:g} s after the faults: {sim.unsettled()}")
         settled_s = sim.now - at
@@ -153,6 +157,16 @@ class Stage:
         running = sim.running()
         fit = [name for name in sim.fleet.electors if name in running and sim.node(name).agreement.is_elector]
         return len(fit) >= majority(len(sim.fleet.electors))
+
+    def _start_generation(self) -> None:
+        """Too many states are lost: the operator stops every daemon and starts a new generation everywhere."""
+        sim = self.sim
+        self.done["new generation"] += 1
+        running = sim.running()
+        for machine in sim.machines.values():
+            sim.crash(machine.key)
+            sim.initialise(machine, incarnation=WALL_S + int(sim.now), generation=1)
+        sim.start(*running)
 
     def _check_answers(self) -> None:
         """An operator who was told "committed" finds the weights in that revision."""

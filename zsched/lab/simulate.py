@@ -69,7 +69,8 @@ class Totals:
     seed: int
     schedules: int = 0
     events: int = 0
-    cannot_agree: int = 0
+    generations: int = 0
+    """Schedules in which too many electors lost their state: the operator started a new generation."""
     slowest_s: float = 0.0
     violations: dict[str, str] = field(default_factory=dict)
     """{seed: what was violated}."""
@@ -81,9 +82,8 @@ class Totals:
         self.schedules += 1
         self.events += result.events
         self.faults += result.faults
-        if result.settled_s is None:
-            self.cannot_agree += not result.violation
-        else:
+        self.generations += "new generation" in result.faults
+        if result.settled_s is not None:
             self.slowest_s = max(self.slowest_s, result.settled_s)
         if result.violation:
             self.violations[str(job.seed)] = result.violation
@@ -231,9 +231,7 @@ def main(arguments: list[str] | None = None) -> int:
     counts = ", ".join(f"{name} {count}" for name, count in sorted(totals.faults.items()))
     print(f"faults: {counts}")
     print(f"{totals.events} events; slowest to come to rest: {totals.slowest_s:.2f} s;", end=" ")
-    print(
-        f"{totals.cannot_agree} ended with too few electors; {60 * played / max(took_s, 1e-9):.0f} schedules a minute"
-    )
+    print(f"{totals.generations} new generations; {60 * played / max(took_s, 1e-9):.0f} schedules a minute")
     print(f"{played} schedules, {violations} violations")
     return 1 if violations else 0
 
