@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 
-MODULES = ("status", "idle", "commit", "failover", "map_merge")
+MODULES = ("status", "idle", "commit", "failover", "streams", "handover", "map_merge")
 
 
 def main() -> None:

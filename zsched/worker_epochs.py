@@ -3,9 +3,9 @@
 Knows: the role's epoch, the one before it that has not ended here, which ones have. Does not know: zenoh, inputs (it is
 told the epoch of the input in hand), where roles come from.
 
-A worker that becomes the owner once more while it still has an older epoch's inputs (the next epoch on the same owner,
-or A -> B -> A) goes on stamping what it makes of those with the older epoch: the robots admit the newer one only from
-their flip on, and that is when their first input of the newer epoch comes.
+When one epoch follows another on the same owner, its inputs flow on. It goes on stamping what it makes of the older
+epoch's inputs with the older epoch: the robots admit the newer one only from their flip on, and that is when their
+first input of the newer epoch comes. (A -> B -> A is not such a case: A's inputs stopped at the flip to B.)
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ class Epochs:
 
     def follow(self, before: Role, role: Role) -> None:
         """A new role: from now on an older epoch may be carried beside it."""
-        is_owner_again = role.role is WorkerRole.ACTIVE and self.ended < before.epoch < role.epoch
+        both_active = before.role is WorkerRole.ACTIVE and role.role is WorkerRole.ACTIVE
+        is_owner_again = both_active and self.ended < before.epoch < role.epoch
         if is_owner_again and before.epoch and not self.is_carried(self._carried):
             self._carried = before.epoch
 

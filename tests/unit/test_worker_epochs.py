@@ -31,14 +31,14 @@ def test_the_older_epochs_inputs_are_stamped_with_it_until_it_ends() -> None:
     assert not epochs.close(1)
 
 
-def test_back_again_while_it_still_drains() -> None:
+def test_who_was_draining_starts_afresh() -> None:
     epochs = Epochs()
     draining, third = role(WorkerRole.DRAINING, 1), role(WorkerRole.ACTIVE, 3)
     epochs.follow(IDLE, FIRST)
     epochs.follow(FIRST, draining)
     assert not epochs.is_carried(1)
     epochs.follow(draining, third)
-    assert [epochs.stamp(third, in_hand) for in_hand in (1, 3)] == [1, 3]
+    assert [epochs.stamp(third, in_hand) for in_hand in (None, 1, 3)] == [3, 3, 3]
 
 
 def test_an_epoch_that_has_ended_is_not_carried() -> None:
