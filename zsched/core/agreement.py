@@ -147,12 +147,17 @@ class Agreement:
         return due
 
     def accepted(self) -> dict[TaskId, tuple[NodeId, int]]:
-        """{task: (owner, epoch)} of the value that this elector last accepted."""
+        """{task: (owner, epoch)} that this elector echoes: of the newest value that it has accepted or learnt.
+
+        Learnt counts too: what was committed without this elector would else never be echoed by it, and with another
+        elector away no majority could be. An accepted value that is newer than what is learnt comes first, so nobody
+        is echoed any more whom a newer acceptance replaces.
+        """
         found = {}
         for name, register in self.registers.items():
-            acceptance = register.state.accepted
-            if acceptance is not None and acceptance.value.owner is not None:
-                found[name] = (acceptance.value.owner, acceptance.value.epoch)
+            value = _newest(register)
+            if value is not None and value.owner is not None:
+                found[name] = (value.owner, value.epoch)
         return found
 
     def to_persist(self) -> DurableState | None:
@@ -409,6 +414,14 @@ def _refusal(request: int, outcome: CommandOutcome, detail: str) -> Effects:
     return Effects(send=[do.AnswerCommand(request=request, result=result)])
 
 
-def _owner(register: Register) -> NodeId | None:
+def _newest(register: Register) -> Allocation | None:
+    """The value of the higher revision among accepted and learnt; the accepted one when they are of the same."""
     accepted = register.state.accepted
-    return None if accepted is None else accepted.value.owner
+    known = [value for value in (register.state.learnt, None if accepted is None else accepted.value) if value]
+    return max(known, key=lambda value: value.revision, default=None)
+
+
+def _owner(register: Register) -> NodeId | None:
+    """Whom this elector may have echoed in its life before: nobody else is accepted at its start."""
+    value = _newest(register)
+    return None if value is None else value.owner

@@ -114,7 +114,7 @@ class Membership:
     def absorb_beat(self, beat: Beat, now: float) -> tuple[Transition, ...]:
         """A peer's loop is alive: it refutes every accusation. Beats of an older incarnation or order are ignored."""
         peer = self._peers.get(beat.node)
-        if peer is None or not self._is_newer(peer, beat):
+        if peer is None or not self._is_newer(peer, beat, now):
             return ()
         restarted = 0 <= peer.incarnation < beat.incarnation
         if peer.token_lost and not restarted and now < peer.token_lost_at + IN_FLIGHT_S:
@@ -131,10 +131,10 @@ class Membership:
             changes.append(Transition(node=beat.node, before=before, after=before, reason="restarted"))
         return (*changes, *self._review(now))
 
-    @staticmethod
-    def _is_newer(peer: _Peer, beat: Beat) -> bool:
-        """Newer than what we know; of a peer that is gone also an older life's count (its state was made anew)."""
-        if peer.state is PeerState.GONE and beat.incarnation != peer.incarnation:
+    def _is_newer(self, peer: _Peer, beat: Beat, now: float) -> bool:
+        """Newer than what we know; of a peer that is silent also an older life's count (its state was made anew)."""
+        is_silent = peer.state is PeerState.GONE or now >= peer.beat_at + self._timing.suspect_s
+        if is_silent and peer.state is not PeerState.ALIVE and beat.incarnation != peer.incarnation:
             return True
         return (beat.incarnation, beat.sequence) > (peer.incarnation, peer.sequence)
 
