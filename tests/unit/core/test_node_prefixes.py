@@ -96,9 +96,11 @@ def check_backed(instruction: do.Instruction, state: DurableState | None) -> Non
             assert held.accepted.ballot >= answer.ballot
     if isinstance(instruction, do.PublishBeat):
         for grant in instruction.beat.echoes:
-            accepted = register(state, grant.task).accepted
-            assert accepted is not None, f"granted by what is not on disk: {instruction}"
-            assert (accepted.value.owner, accepted.value.epoch) == (grant.owner, grant.epoch), "granted to another one"
+            held = register(state, grant.task)
+            known = [value for value in (held.learnt, held.accepted and held.accepted.value) if value]
+            assert known, f"granted by what is not on disk: {instruction}"
+            newest = max(known, key=lambda value: value.revision)
+            assert (newest.owner, newest.epoch) == (grant.owner, grant.epoch), "granted to another one"
     for task, revision in told_values(instruction):
         learnt = register(state, task).learnt
         assert learnt is not None, f"told what is not on disk: {instruction}"
