@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 from benchmarks.common import Pinger, line, machine
-from zsched.lab.testbed import Testbed, echo_fleet
+from zsched.lab.testbed import Json, Testbed, echo_fleet
 
 GOAL = "p99 300 ms"
 
@@ -31,11 +31,14 @@ def measure(bed: Testbed, pinger: Pinger) -> float:
 
 
 def _is_ready(bed: Testbed, node: str) -> bool:
-    for status in bed.status("robot1")["nodes"]:
-        if status["name"] == node:
-            states = [worker["state"] for worker in status["workers"]]
-            return bool(status["state"] == "alive" and states == ["ready"] and status["age_s"] < 1.5)
-    return False
+    """Whether every robot holds the node for alive, with its worker ready: else the next kill finds no candidate."""
+    return all(_sees_ready(bed.status(robot), node) for robot in bed.fleet.voters)
+
+
+def _sees_ready(status: Json, node: str) -> bool:
+    (seen,) = [one for one in status["nodes"] if one["name"] == node]
+    states = [worker["state"] for worker in seen["workers"]]
+    return bool(seen["state"] == "alive" and states == ["ready"] and seen["age_s"] < 1.5)
 
 
 def main() -> None:

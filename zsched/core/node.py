@@ -321,6 +321,12 @@ class Node:
         owned = {name for name, value in self.values().items() if value.owner == profile.node}
         if owned and (profile.draining or owned & failed):
             self.rounds.hurry(now)
+        elif any(self._is_orphan(value.owner) for value in self.values().values()):
+            self.rounds.hurry(now)  # this may be the candidate that the task waits for
+
+    def _is_orphan(self, owner: NodeId | None) -> bool:
+        """Whether a task's owner is gone: nobody could be found for it so far."""
+        return owner is not None and self.membership.state(owner) is PeerState.GONE
 
     # --- SCHEDULER, VOTE ---------------------------------------------------------------------------------------------
 
