@@ -258,6 +258,8 @@ class Node:
             self._agree(self.agreement.dispute(complaint), now)
 
     def _hear_leases(self, beat: Beat, now: float) -> None:
+        if not self._tenure.exclusive:
+            return  # thirty beats a second come by here
         if self._tenure.hear(beat, self.agreement.accepted(), now):
             self._beat_at = now  # a first grant: the new owner waits for its echo
         if beat.released:

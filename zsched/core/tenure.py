@@ -56,7 +56,7 @@ class Tenure:
 
     def hear(self, beat: Beat, accepted: Mapping[TaskId, tuple[NodeId, int]], now: float) -> bool:
         """A beat (our own too) may grant, echo, release, or ask us to leave. Whether to beat at once."""
-        return bool(self.exclusive) and self.leases.on_beat(beat, accepted, now)
+        return self.leases.on_beat(beat, accepted, now)
 
     def tend_leases(self, number: int, now: float) -> tuple[tuple[Instruction, ...], bool]:
         """Prolong our workers' leases; stop who is asked to leave, and give back what has stopped or run out.
