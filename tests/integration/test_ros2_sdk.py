@@ -1,12 +1,8 @@
-"""An independent implementation of rmw_zenoh's protocol (zenoh_ros2_sdk) on both sides of a relay: it notices nothing.
-
-Runs where the package is installed: ``pip install zenoh-ros2-sdk``.
-"""
+"""An independent implementation of rmw_zenoh's protocol (zenoh_ros2_sdk) on both sides of a relay: it notices nothing."""
 
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import json
 import queue
 import socket
@@ -30,9 +26,6 @@ from zsched.core.relay_protocol import HandleReport
 from zsched.core.route import plan_for, slot_for
 from zsched.zenoh_config import client_config, data_config, local_config
 
-pytestmark = pytest.mark.skipif(
-    importlib.util.find_spec("zenoh_ros2_sdk") is None, reason="zenoh-ros2-sdk is not installed"
-)
 NODE = Path(__file__).with_name("ros2_sdk_node.py")
 FILE = """\
 fleet: test
