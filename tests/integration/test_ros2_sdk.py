@@ -1,4 +1,4 @@
-"""An independent implementation of rmw_zenoh's protocol (zenoh_ros2_sdk) on both sides of a relay: it notices nothing."""
+"""An independent implementation of rmw_zenoh's protocol (zenoh_ros2_sdk) on both sides of a relay notices nothing."""
 
 from __future__ import annotations
 
