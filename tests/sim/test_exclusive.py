@@ -127,6 +127,26 @@ def test_planned_move_costs_less_than_two_round_trips_more_than_an_idempotent_on
     assert leased - plain < 2 * trip
 
 
+@pytest.mark.parametrize("stop_s", [0.05, 0.1, 0.4])
+@pytest.mark.parametrize("seed", range(5))
+def test_owner_whose_worker_is_slow_to_stop_is_left_by_the_next_vote(seed: int, stop_s: float) -> None:
+    """Proposers that take turns refuse each other meanwhile; what they settle on is no reason to let it work again.
+
+    Found by the simulator (seed 60191): identity rounds ended the silence, and an owner that had stopped once was
+    waited for until its lease ended, which the echoes prolonged for ever.
+    """
+    busy: set[NodeId] = set()
+    sim = Simulator(fleet=fleet(), seed=seed, load=lambda n, _: (CORES * (0.9 if n in busy else 0.2), 1000.0))
+    sim.work.stop_s = (stop_s,)
+    sim.start()
+    assert sim.run_until(lambda: is_working(sim), 20)
+    sim.run(3)
+    owner = sim.agreed(TASK) or ""
+    busy.add(owner)
+    assert sim.run_until(lambda: any("the worker stops" in story for story in sim.stories[-3:]), 20)
+    assert sim.run_until(lambda: sim.agreed(TASK) not in (None, owner), 2.5), "\n".join(sim.stories[-30:])
+
+
 def test_owner_that_released_for_a_move_that_failed_works_again() -> None:
     """The proposers die after the owner has stopped: within twice the hold it is echoed and works again, same epoch."""
     busy: set[NodeId] = set()

@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 
-from zsched.core.lease import RHO, Granter, Holder, hold_s
-from zsched.core.model import Beat, Grant
+from zsched.core.executor import Executor
+from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.instructions import SetRole
+from zsched.core.lease import RHO, Granter, Holder, Leases, hold_s
+from zsched.core.model import Allocation, Beat, Grant, NodeKind, Tuning, Weights
+from zsched.core.plan import WorkerRole
+from zsched.core.tenure import Tenure
 
 LEASE_S, HOLD_S = 1.0, hold_s(1.0)
 ELECTORS = ("r1", "r2", "r3")
@@ -170,3 +176,85 @@ def test_what_was_given_back_holds_no_lease_any_more() -> None:
     assert owner.lease_until() == -math.inf
     owner.on_echo("r1", grant(6))
     assert owner.lease_until() == -math.inf
+
+
+GUARD = TaskSpec(
+    name="guard",
+    candidates=ELECTORS,
+    tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0)),
+    worker=WorkerSpec(command=("true",)),
+    exclusive=True,
+)
+FLEET = Fleet(
+    name="rules",
+    timing=Timing(),
+    nodes=tuple(NodeSpec(name=name, kind=NodeKind.ROBOT) for name in ELECTORS),
+    tasks=(GUARD,),
+    electors=ELECTORS,
+)
+
+
+def leases() -> Leases:
+    held = Leases(fleet=FLEET, me="r1", incarnation=1, standing={}, now=10.0)
+    held.begin("guard", 3, 5)
+    held.on_sent(5, 10.0)
+    return held
+
+
+def ask(*, epoch: int = 3) -> Beat:
+    return replace(beat("r2", 9), asked_to_leave=(("guard", "r1", epoch),))
+
+
+def echo(elector: str, number: int) -> Beat:
+    return replace(beat(elector, 9), echoes=(grant(number, owner="r1"),))
+
+
+def test_an_owner_is_asked_to_leave_whatever_it_has_heard_of_its_grants() -> None:
+    """An elector that granted and was told of the next owner before its beat left never echoes that grant."""
+    held = leases()
+    held.on_beat(ask(), {}, 10.1)
+    assert held.leaving() == ("guard",)
+    assert held.on_stopped("guard", 3, 5)
+    held.on_beat(ask(), {}, 10.2)
+    assert held.leaving() == (), "nothing was sent since"
+    held.on_sent(6, 10.3)
+    held.on_beat(ask(), {}, 10.3)
+    assert held.leaving() == ("guard",), "this one may have been granted"
+
+
+def test_an_owner_is_not_asked_to_leave_for_another_epoch_s_sake() -> None:
+    held = leases()
+    held.on_beat(ask(epoch=2), {}, 10.1)
+    assert held.leaving() == ()
+
+
+def test_what_the_worker_was_told_ends_with_its_stop_and_not_with_the_echoes() -> None:
+    held = leases()
+    held.on_given("guard", 11.0)
+    held.on_beat(ask(), {}, 10.1)
+    assert held.given_until("guard") == 11.0
+    assert held.on_stopped("guard", 3, 5)
+    assert held.given_until("guard") == -math.inf
+
+
+def test_an_owner_that_is_asked_again_gives_back_at_once_when_its_worker_has_stopped_already() -> None:
+    """Found by the simulator (seed 60191): it waited for a second stop, and echoes prolonged the wait for ever."""
+    held = leases()
+    executor = Executor(spec=GUARD, me="r1", has_streams=True)
+    executor.execute(Allocation(task="guard", revision=7, epoch=3, owner="r1", tuning=GUARD.tuning), 10.0)
+    tenure = Tenure(fleet=FLEET, me="r1", leases=held, executors={"guard": executor})
+    for elector in ("r1", "r2"):
+        held.on_beat(echo(elector, 5), {}, 10.01)
+    roles, _ = tenure.tend_leases(5, 10.01)
+    assert [one.role.role for one in roles if isinstance(one, SetRole)] == [WorkerRole.ACTIVE]
+    held.on_beat(ask(), {}, 10.02)
+    _, has_released = tenure.tend_leases(5, 10.02)
+    assert not has_released, "the worker is still at it"
+    assert held.on_stopped("guard", 3, 5)
+    held.on_sent(6, 10.03)
+    for elector in ("r1", "r2"):
+        held.on_beat(echo(elector, 6), {}, 10.04)
+    held.on_beat(ask(), {}, 10.04)
+    roles, has_released = tenure.tend_leases(6, 10.04)
+    assert has_released
+    assert roles == ()

@@ -222,9 +222,10 @@ class Agreement:
             accept.task, accept.acceptance.value.owner, now
         )
         if is_free:
+            known = _newest(register)
             step, answer = register.on_accept(accept, now)
-            if step.is_dirty:
-                self.leases.on_newer_value(accept.task)
+            if step.is_dirty and (known is None or accept.acceptance.value.revision > known.revision):
+                self.leases.on_newer_value(accept.task)  # an identity round's is none: the next owner may still wait
             effects.is_dirty |= step.is_dirty
             effects.send.append(do.AnswerElection(request=event.request, answer=answer))
         elif now >= deadline:

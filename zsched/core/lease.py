@@ -176,6 +176,8 @@ class Holder:
     is_leaving: bool = False
     released: int = -1
     """The largest number that was given back."""
+    given_until: float = -math.inf
+    """Until when the worker was told that it may work; minus infinity once it has stopped."""
     _sent: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=SENT_KEPT))
     _echoed: dict[NodeId, int] = field(default_factory=dict)
 
@@ -202,14 +204,15 @@ class Holder:
         at = next((at for sent, at in self._sent if sent == number), None)
         return -math.inf if at is None else at + self.lease_s
 
-    def newest(self) -> int:
-        """The largest number that was echoed by anybody, -1 without one."""
-        return max(self._echoed.values(), default=-1)
+    def ask(self) -> None:
+        """Another owner waits. Electors may have granted what they do not echo, so whatever was sent is asked for."""
+        if self._sent and self._sent[-1][0] > self.released:
+            self.is_leaving = True
 
     def release(self, number: int) -> Grant:
         """Give back every number up to ``number``: the worker has stopped."""
         self.released = max(self.released, number)
-        self.is_leaving = False
+        self.is_leaving, self.given_until = False, -math.inf
         return Grant(
             task=self.task, owner=self.me, incarnation=self.incarnation, epoch=self.epoch, number=self.released
         )
@@ -299,6 +302,16 @@ class Leases:
         """Tasks whose worker here is asked to stop and has not yet."""
         return tuple(task for task, holder in self._holders.items() if holder.is_leaving)
 
+    def on_given(self, task: TaskId, until: float) -> None:
+        """The worker here is told that it may work ``until`` then."""
+        if task in self._holders:
+            self._holders[task].given_until = until
+
+    def given_until(self, task: TaskId) -> float:
+        """Until when the worker here may be working; minus infinity when it is not."""
+        holder = self._holders.get(task)
+        return -math.inf if holder is None else holder.given_until
+
     def on_stopped(self, task: TaskId, epoch: int, number: int) -> bool:
         """The worker has stopped (or its lease ran out): give everything back; false when nobody asked."""
         holder = self._holders.get(task)
@@ -331,8 +344,8 @@ class Leases:
                 self._holders[grant.task].on_echo(beat.node, grant)
         for task, owner, epoch in beat.asked_to_leave:
             holder = self._holders.get(task)
-            if holder is not None and owner == self.me and epoch == holder.epoch and holder.released < holder.newest():
-                holder.is_leaving = True
+            if holder is not None and owner == self.me and epoch == holder.epoch:
+                holder.ask()
         return is_new
 
     def next_deadline(self, now: float) -> float:
@@ -340,5 +353,5 @@ class Leases:
         if not self._granters and not self._holders:
             return math.inf
         times = [granter.next_deadline(now) for granter in self._granters.values()]
-        times += [holder.lease_until() for holder in self._holders.values() if holder.is_leaving]
+        times += [holder.given_until for holder in self._holders.values() if holder.is_leaving]
         return min((at for at in times if at > now), default=math.inf)

@@ -67,12 +67,18 @@ class Tenure:
         result: list[Instruction] = []
         has_released = False
         for task in self.exclusive:
-            executor, until = self.executors[task], self.leases.until(task)
+            executor = self.executors[task]
             if task not in self.leases.leaving():
-                result += executor.set_lease(until, now)
+                until = self.leases.until(task)
+                prolonged = executor.set_lease(until, now)
+                if prolonged:
+                    self.leases.on_given(task, until)
+                result += prolonged
                 continue
             result += executor.leave()
-            if now >= until:
+            # What the worker was told counts, not what has been echoed since: electors may echo on and on, and a
+            # worker that has stopped already will not say so again.
+            if now >= self.leases.given_until(task):
                 has_released |= self.leases.on_stopped(task, executor.epoch, number)
         return tuple(result), has_released
 

@@ -24,7 +24,7 @@ class Bug:
     """A schedule that has found it before: tried first."""
 
 
-REGISTER, LEASE = "zsched.core.register", "zsched.core.lease"
+REGISTER, LEASE, TENURE = "zsched.core.register", "zsched.core.lease", "zsched.core.tenure"
 AGREEMENT, MEMBERSHIP, NODE = "zsched.core.agreement", "zsched.core.membership", "zsched.core.node"
 ROUNDS, VOTE = "zsched.core.rounds", "zsched.core.vote"
 SCHEDULER, SCORING, EXECUTOR = "zsched.core.scheduler", "zsched.core.scoring", "zsched.core.executor"
@@ -272,6 +272,28 @@ LEASE_BUGS = (
         LEASE,
         "return granter is None or granter.may_accept",
         "return True or granter.may_accept",
+        _LEASE,
+    ),
+    _bug(
+        "identity round ends the silence",
+        AGREEMENT,
+        "if step.is_dirty and (known is None or accept.acceptance.value.revision > known.revision):",
+        "if step.is_dirty:",
+        _LEASE,
+    ),
+    _bug(
+        "echoes prolong the wait for a stopped worker",
+        TENURE,
+        "if now >= self.leases.given_until(task):",
+        "if now >= self.leases.until(task):",
+        _LEASE,
+        60191,
+    ),
+    _bug(
+        "asked to leave only for echoed grants",
+        LEASE,
+        "if self._sent and self._sent[-1][0] > self.released:",
+        "if self._echoed and max(self._echoed.values()) > self.released:",
         _LEASE,
     ),
 )

@@ -32,6 +32,8 @@ LOST_S = 3.0
 STOP_S = 0.8
 """What a daemon that was told to stop waits for its tasks to move."""
 SMALL_DELAY_S = (0.0005, 0.003)
+STOP_WORK_S = (0.002, 0.02, 0.1, 0.4)
+"""Exclusive workers stop at once, or are slower than a commit's stagger, or slower than a whole ballot."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,6 +94,7 @@ class Stage:
         self.sim = Simulator(
             fleet=self.plan.fleet, seed=self.plan.seed, load=self._load, delay_s=SMALL_DELAY_S, weather=Weather()
         )
+        self.sim.work.stop_s = STOP_WORK_S
         self.sim.most_events = EVENTS_PER_S * len(self.plan.fleet.nodes) * self.plan.seconds
         self._rng = Random(f"stage {self.plan.seed}")
 

@@ -7,6 +7,7 @@ decides that, or how streams really move.
 from __future__ import annotations
 
 from collections.abc import Callable
+from random import Random
 from typing import Any, Protocol
 
 from zsched.core import events as ev
@@ -18,7 +19,7 @@ from zsched.lab.sim_parts import Machine
 
 WORKER_START_S = 0.4
 FLIP_S = 0.005
-WORKER_STOP_S = 0.002
+WORKER_STOP_S = (0.002,)
 LOOK_AGAIN_S = 0.05
 
 
@@ -26,6 +27,7 @@ class World(Protocol):
     """What workers and relays need of the simulator."""
 
     now: float
+    rng: Random
     machines: dict[str, Machine]
     cuts: set[tuple[NodeId, NodeId]]
     invariants: Invariants
@@ -45,6 +47,8 @@ class Work:
         self.plans: dict[tuple[NodeId, TaskId], RoutePlan] = {}
         self.working: dict[TaskId, tuple[NodeId, float]] = {}
         """{exclusive task: (who works, until when at most)}."""
+        self.stop_s: tuple[float, ...] = WORKER_STOP_S
+        """What an exclusive worker may take to stop, one of these each time."""
 
     def do(self, machine: Machine, instruction: do.Instruction) -> None:
         """Carry out what concerns workers and relays; anything else is nobody's."""
@@ -99,7 +103,7 @@ class Work:
             self.working[role.task] = (machine.key, until)
         if before is None or before.role is not WorkerRole.ACTIVE or role.role is WorkerRole.ACTIVE:
             return
-        self._sim.later(WORKER_STOP_S, self._stopped, machine, machine.life, before)
+        self._sim.later(self._sim.rng.choice(self.stop_s), self._stopped, machine, machine.life, before)
 
     def _stopped(self, machine: Machine, life: int, role: Role) -> None:
         if machine.life != life:
