@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import time
@@ -29,8 +30,9 @@ def bed(tmp_path: Path) -> Iterator[Testbed]:
 def relay_of(bed: Testbed, node: NodeId) -> int:
     """The process id of a node's relay."""
     for child in psutil.Process(bed.pid(node)).children():
-        if "zsched.relay" in child.cmdline():
-            return int(child.pid)
+        with contextlib.suppress(psutil.NoSuchProcess):  # it ended while we looked
+            if "zsched.relay" in child.cmdline():
+                return int(child.pid)
     raise AssertionError(f"{node} has no relay")
 
 
