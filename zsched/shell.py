@@ -242,6 +242,8 @@ class Shell:
                 self._workers().start(task)
             case do.StopWorker(task=task):
                 self._workers().stop(task)
+            case do.RestartWorker(task=task, reason=reason):
+                self._workers().report_hung(task, self._life_of(task), reason)
             case do.StandDown(reason=reason):
                 self.stand_down = reason
             case do.RecordStory():
@@ -292,6 +294,10 @@ class Shell:
             absent = WorkerState.STOPPED if current is None else WorkerState.STARTING
             state = WorkerState.READY if is_present else absent
             self._inbox.post(ev.WorkerChanged(task=task, state=state, reason="its token"))
+
+    def _life_of(self, task: TaskId) -> int:
+        with self._lives_lock:
+            return self._lives.get(task, 0)
 
     def on_started(self, task: TaskId, pid: int, incarnation: int) -> None:
         """The supervisor: a worker process runs; it is not ready yet."""

@@ -135,6 +135,7 @@ EVERY: dict[do.Instruction, tuple[Any, ...]] = {
     do.AnswerCommand(request=4, result=RESULT): ("answer", 4, RESULT),
     do.StartWorker(task="merge"): ("start", "merge"),
     do.StopWorker(task="merge"): ("stop", "merge"),
+    do.RestartWorker(task="merge", reason="no output"): ("report_hung", "merge", 0, "no output"),
     do.SetRole(role=ROLE): ("set_role", ROLE),
     do.ApplyRoutes(plan=PLAN): ("apply", PLAN),
 }

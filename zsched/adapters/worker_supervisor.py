@@ -4,7 +4,7 @@
 | --- | --- | --- |
 | idle | `start` | starting |
 | starting | `mark_ready` / exit or start-up deadline: a failure | ready / backoff, failed |
-| ready | exit, `report_hung`: a failure / `mark_gone` | backoff, failed / starting |
+| ready | exit, `report_hung` (SIGKILL): a failure / `mark_gone` | backoff, failed / starting |
 | backoff | its delay | starting |
 | stopping (SIGINT, SIGTERM, SIGKILL, each after a grace) | exit | idle; after a failure backoff, failed |
 | failed | `reset` | idle |
@@ -41,7 +41,8 @@ log = logging.getLogger("zsched.worker")
 INCARNATIONS_PER_DAEMON = 100_000
 MAX_REASON = 200
 """Characters of a worker's last line that go into the reason of its exit."""
-STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
+KILL = signal.SIGKILL
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, KILL)
 NOT_INHERITED = frozenset({"NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID", "LISTEN_FDS", "LISTEN_PID"})
 """systemd talks to the daemon, not to its workers."""
 
@@ -172,7 +173,10 @@ class WorkerSupervisor:
         self._command(self._on_gone, task, incarnation)
 
     def report_hung(self, task: TaskId, incarnation: int, reason: str) -> None:
-        """The worker of ``incarnation`` makes no progress: end it, count a failure, start it again."""
+        """The worker of ``incarnation`` makes no progress: kill it, count a failure, start it again.
+
+        Asking it to stop would only cost time: it does not come to the place where it would hear it.
+        """
         self._command(self._on_hung, task, incarnation, reason)
 
     def reset(self, task: TaskId) -> None:
@@ -262,8 +266,9 @@ class WorkerSupervisor:
 
     def _on_hung(self, task: TaskId, incarnation: int, reason: str) -> None:
         worker = self._workers[task]
-        if worker.phase in {_Phase.STARTING, _Phase.READY} and incarnation == worker.incarnation:
-            self._begin_stop(worker, worker.spec.stop_grace_s, failure=reason)
+        is_running = worker.process is not None and worker.phase in {_Phase.STARTING, _Phase.READY}
+        if is_running and incarnation == worker.incarnation:
+            self._begin_stop(worker, worker.spec.stop_grace_s, failure=reason, first_step=STOP_SIGNALS.index(KILL))
 
     def _on_reset(self, task: TaskId) -> None:
         worker = self._workers[task]
@@ -325,14 +330,20 @@ class WorkerSupervisor:
         return inherited | own | dict(self._environment(worker.task)) | dict(worker.spec.env)
 
     def _begin_stop(
-        self, worker: _Worker, grace_s: float, *, next_grace_s: float | None = None, failure: str = ""
+        self,
+        worker: _Worker,
+        grace_s: float,
+        *,
+        next_grace_s: float | None = None,
+        failure: str = "",
+        first_step: int = 0,
     ) -> None:
         if worker.phase is not _Phase.STOPPING:
             worker.failure = failure
         worker.phase = _Phase.STOPPING
         now = monotonic_s()
         worker.stop_grace_s = grace_s
-        self._signal_stop(worker, 0, now)
+        self._signal_stop(worker, first_step, now)
         worker.stop_grace_s = grace_s if next_grace_s is None else next_grace_s
 
     def _signal_stop(self, worker: _Worker, step: int, now: float) -> None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 from zsched.core import instructions as do
 
-_LOCAL = do.ApplyRoutes | do.SetRole | do.StartWorker | do.StopWorker | do.RecordStory | do.StandDown
+_LOCAL = do.ApplyRoutes | do.SetRole | do.StartWorker | do.StopWorker | do.RestartWorker | do.RecordStory | do.StandDown
 
 
 @dataclass(slots=True)

@@ -123,6 +123,14 @@ class StopWorker:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class RestartWorker:
+    """This node's worker for the task hangs: kill it, count a failure, start it again."""
+
+    task: TaskId
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SetRole:
     """Tell this node's worker what it is now."""
 
@@ -185,6 +193,7 @@ Instruction = (
     | AnswerLearnt
     | StartWorker
     | StopWorker
+    | RestartWorker
     | SetRole
     | ApplyRoutes
     | AnswerStatus

@@ -161,6 +161,19 @@ class WorkerLoad:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class TaskProgress:
+    """What a robot sees of a task with `output_deadline_s`: do its inputs of ``epoch`` lead to outputs?"""
+
+    task: TaskId
+    epoch: int
+    is_served: bool
+
+    def __post_init__(self) -> None:
+        check_name("progress.task", self.task)
+        check_counter("progress.epoch", self.epoch)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class DeviceSample:
     """One raw reading of this machine by the device profiler.
 
@@ -206,6 +219,8 @@ class Profile:
     links: tuple[Link, ...] = ()
     workers: tuple[WorkerLoad, ...] = ()
     draining: bool = False
+    progress: tuple[TaskProgress, ...] = ()
+    """Robots: the watched tasks that answer here, or do not although inputs flow."""
 
     def __post_init__(self) -> None:
         check_name("profile.node", self.node)

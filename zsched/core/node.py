@@ -38,6 +38,7 @@ from zsched.core.model import (
 )
 from zsched.core.plan import StreamCount
 from zsched.core.profile import Profiler
+from zsched.core.progress import HangWatch
 from zsched.core.rounds import Rounds
 from zsched.core.status import PastValue, build_snapshot
 from zsched.core.tenure import Tenure
@@ -107,6 +108,7 @@ class Node:
         }
         self.fleet_file = fleet_hash(fleet)
         self._identity = Identity(me, incarnation, self.fleet_file, now)
+        self._hangs = HangWatch(fleet)
         self._tenure = Tenure(fleet, me, self.agreement.leases, self.executors)
         self._beat_at = now
         self._beat_sequence = 0
@@ -306,10 +308,14 @@ class Node:
         self.profiler.absorb(event.device, event.links, now)
 
     def _publish_profile(self, now: float) -> None:
-        profile = self.profiler.publishable(self.worker_states, is_draining=self.is_draining, now=now)
+        progress = self._hangs.reports(now)
+        profile = self.profiler.publishable(
+            self.worker_states, is_draining=self.is_draining, now=now, progress=progress
+        )
         if profile is not None:
             self.gateway.absorb(profile, now)
             self._batch.add(do.PublishProfile(profile=profile))
+            self._batch.add(*self._hangs.look(self.owned(), self.executors, self.gateway, now))
 
     def _on_profile(self, event: ev.ProfileReceived, now: float) -> None:
         profile = event.profile
@@ -319,6 +325,8 @@ class Node:
         if reason is not None:
             self.counters[f"profile_{reason}"] += 1
             return
+        if profile.progress:
+            self._batch.add(*self._hangs.look(self.owned(), self.executors, self.gateway, now))
         failed = failed_workers(profile)
         owned = {name for name, value in self.values().items() if value.owner == profile.node}
         if owned and (profile.draining or owned & failed):
@@ -416,6 +424,7 @@ class Node:
     def _on_worker(self, event: ev.WorkerChanged, now: float) -> None:
         story = self._workers.on_changed(event)
         if story is not None:
+            self._hangs.note_worker(event.task, event.state, now)
             self._batch.add(story)
             if event.task in self.owned():
                 self.rounds.hurry(now)
@@ -432,8 +441,9 @@ class Node:
         if event.task in self.executors:
             self._batch.add(*self.executors[event.task].on_drained(event.epoch))
 
-    def _on_counted(self, event: ev.StreamsCounted, _now: float) -> None:
+    def _on_counted(self, event: ev.StreamsCounted, now: float) -> None:
         self.stream_counts = event.counts
+        self._hangs.absorb(event.counts, self.executors, now)
 
     def _on_relay(self, event: ev.RelayChanged, _now: float) -> None:
         self._set_problem("relay", None if event.is_running else f"the relay is down: {event.reason}")

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections import deque
+from dataclasses import replace
 
 from zsched.core.fleet import Timing
 from zsched.core.model import (
@@ -25,6 +26,7 @@ from zsched.core.model import (
     NodeId,
     Profile,
     TaskId,
+    TaskProgress,
     WorkerLoad,
     WorkerState,
 )
@@ -157,22 +159,32 @@ class Profiler:
             memory_mb=None if memory is None else memory.value,
         )
 
-    def publishable(self, states: dict[TaskId, WorkerState], *, is_draining: bool, now: float) -> Profile | None:
+    def publishable(
+        self,
+        states: dict[TaskId, WorkerState],
+        *,
+        is_draining: bool,
+        now: float,
+        progress: tuple[TaskProgress, ...] = (),
+    ) -> Profile | None:
         """The profile to send now, or ``None`` when nothing is due.
 
         Args:
             states: the workers' states as the node knows them (fresher than the sample's).
             is_draining: the operator drains this node, or it stops.
             now: monotonic seconds.
+            progress: which watched tasks answer this robot.
         """
         is_due = now - self._sent_at >= self._timing.publish_s
-        flags = (is_draining, *states.values())
+        flags = (is_draining, *states.values(), progress)
         if not is_due and not self._is_new and flags == self._flags:
             return None  # nothing was measured since the last look
         self._is_new, self._flags = False, flags
         profile = self._current(states, is_draining=is_draining, now=now)
         if profile is None:
             return None
+        if progress:
+            profile = replace(profile, progress=progress)
         if not is_due and self._sent is not None and not _differs(profile, self._sent):
             return None
         self._sequence += 1
@@ -253,7 +265,7 @@ def _differs(new: Profile, old: Profile) -> bool:
 def _kinds(profile: Profile) -> tuple[object, ...]:
     """What is no figure: every change of it counts."""
     workers = [(load.task, load.state) for load in profile.workers]
-    return profile.draining, workers, [(link.peer, link.source) for link in profile.links]
+    return profile.draining, workers, profile.progress, [(link.peer, link.source) for link in profile.links]
 
 
 def _moved(new: float | None, old: float | None, threshold: float) -> bool:

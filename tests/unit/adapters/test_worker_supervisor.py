@@ -208,15 +208,24 @@ def test_worker_that_is_never_ready_is_ended_and_counted() -> None:
         assert [call[0] for call in recorder.calls] == ["started", "exited"] * 2 + ["failed"]
 
 
-def test_hung_worker_is_ended_and_started_again() -> None:
-    with supervised(python(SLEEP)) as (supervisor, recorder):
+def test_hung_worker_is_killed_and_started_again() -> None:
+    with supervised(python(SLEEP, stop_grace_s=30)) as (supervisor, recorder):
         supervisor.start("merge")
         pid = recorder.wait("started")[2]
         assert isinstance(pid, int)
         os.kill(pid, signal.SIGSTOP)
+        supervisor.report_hung("merge", 700000, "an older one")
         supervisor.report_hung("merge", 700001, "no output for 5 s")
-        assert recorder.wait("exited")[4] == "no output for 5 s"
+        assert recorder.wait("exited")[3:] == (-signal.SIGKILL, "no output for 5 s")
         recorder.wait("started", 2)
+
+
+def test_a_hung_worker_of_somebody_else_is_left_alone() -> None:
+    with supervised(WorkerSpec()) as (supervisor, _):
+        supervisor.mark_ready("merge", 0)
+        supervisor.report_hung("merge", 0, "no output for 5 s")
+        supervisor.mark_gone("merge", 0)
+        wait_until(lambda: supervisor.states()["merge"] is WorkerState.STOPPED)
 
 
 def test_stop_during_the_backoff_starts_nothing() -> None:

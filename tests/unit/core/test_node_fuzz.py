@@ -24,6 +24,7 @@ from zsched.core.model import (
     NodeKind,
     Profile,
     Proposal,
+    TaskProgress,
     Tuning,
     Utility,
     UtilityVector,
@@ -51,7 +52,7 @@ def task(name: str, candidates: tuple[str, ...], *, standby: Standby, exclusive:
         name=name,
         candidates=candidates,
         tuning=TUNINGS[0],
-        worker=WorkerSpec(command=("work",), standby=standby, start_deadline_s=1.0),
+        worker=WorkerSpec(command=("work",), standby=standby, start_deadline_s=1.0, output_deadline_s=0.1),
         rules=(RULE,),
         exclusive=exclusive,
     )
@@ -94,6 +95,7 @@ class Storm:
         self.rng, self.me = Random(seed), me
         self.asked: list[do.Instruction] = []
         self.plans: list[do.ApplyRoutes] = []
+        self.epochs = dict.fromkeys(TASKS, 1)
         self.makers: tuple[Callable[[], ev.Event], ...] = (
             ev.DeadlineReached, self.sampled, self.profile, self.utility, self.proposal, self.prepare, self.accept,
             self.answer, self.answer, self.answer, self.learnt, self.beat, self.beat, self.token, self.worker,
@@ -103,6 +105,7 @@ class Storm:
     def hear(self, batch: tuple[do.Instruction, ...]) -> None:
         self.asked += [one for one in batch if isinstance(one, do.AskUtilities | do.SendPrepare | do.SendAccept)]
         self.plans += [one for one in batch if isinstance(one, do.ApplyRoutes)]
+        self.epochs |= {one.role.task: one.role.epoch for one in batch if isinstance(one, do.SetRole)}
         del self.asked[:-6], self.plans[:-4]
 
     def event(self) -> ev.Event:
@@ -137,6 +140,10 @@ class Storm:
 
     def profile(self) -> ev.Event:
         loads = [WorkerLoad(task=name, state=self.rng.choice(list(WorkerState))) for name in TASKS]
+        said = [
+            TaskProgress(task=name, epoch=self.epochs[name], is_served=self.rng.random() < 0.1)
+            for name in self.rng.sample(TASKS, self.rng.randrange(len(TASKS)))
+        ]
         return ev.ProfileReceived(
             profile=Profile(
                 node=self.name(),
@@ -148,6 +155,7 @@ class Storm:
                 memory_used_mb=self.rng.uniform(0, 4000),
                 workers=tuple(loads),
                 draining=self.rng.random() < 0.1,
+                progress=tuple(said),
             )
         )
 

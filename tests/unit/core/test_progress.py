@@ -1,0 +1,192 @@
+"""Hung workers: what a robot's counters say, and what the owner makes of what the robots say."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from zsched.core.executor import Executor, Phase
+from zsched.core.fleet import Fleet, NodeSpec, StreamRule, TaskSpec, Timing, WorkerSpec
+from zsched.core.gateway import Gateway
+from zsched.core.instructions import Instruction, RecordStory, RestartWorker
+from zsched.core.model import NodeKind, Profile, TaskProgress, Tuning, Weights, WorkerState
+from zsched.core.plan import Direction, StreamCount
+from zsched.core.progress import COUNT_S, MARGIN_S, HangWatch, Progress
+
+ROBOTS = ("robot1", "robot2")
+DEADLINE_S = 4.0
+INPUT = StreamRule(direction=Direction.INPUT, from_template="{robot}/in", to_template="{target}/merge/{robot}/in")
+OUTPUT = StreamRule(direction=Direction.OUTPUT, from_template="{target}/merge/out", to_template="{robot}/out")
+SPEC = TaskSpec(
+    name="merge",
+    candidates=("edge1",),
+    tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0)),
+    worker=WorkerSpec(command=("merge",), output_deadline_s=DEADLINE_S),
+    rules=(INPUT, OUTPUT),
+)
+UNSERVED = TaskProgress(task="merge", epoch=3, is_served=False)
+SERVED = replace(UNSERVED, is_served=True)
+
+
+def settled(spec: TaskSpec = SPEC, *, has_streams: bool = True) -> Executor:
+    executor = Executor(spec=spec, me="robot1", has_streams=has_streams)
+    executor.phase, executor.epoch, executor.owner = Phase.SETTLED, 3, "edge1"
+    return executor
+
+
+class Robot:
+    """One robot's counters, told once a second."""
+
+    def __init__(self, spec: TaskSpec = SPEC) -> None:
+        self.progress, self.executor = Progress([spec]), settled(spec)
+        self.taken = self.given = 0
+        self.acknowledged: int | None = None
+        self.now = 100.0
+
+    def run(self, seconds: float, *, inputs: int = 10, outputs: int = 0) -> tuple[TaskProgress, ...]:
+        for _ in range(round(seconds / COUNT_S)):
+            self.now += COUNT_S
+            self.taken, self.given = self.taken + inputs, self.given + outputs
+            counts = (
+                StreamCount(stream="merge/in/0", messages=self.taken, acknowledged=self.acknowledged),
+                StreamCount(stream="merge/out/0", messages=self.given),
+                StreamCount(stream="merger/out/0", messages=round(self.now)),  # another task's
+            )
+            self.progress.absorb(counts, {"merge": self.executor}, self.now)
+        return self.progress.reports(self.now)
+
+
+# --- a robot ---------------------------------------------------------------------------------------------------------
+
+
+def test_inputs_without_outputs_are_reported_after_the_deadline_and_not_before() -> None:
+    robot = Robot()
+    assert robot.run(4) == ()
+    assert robot.run(1) == ()
+    assert robot.run(1) == (UNSERVED,)
+
+
+def test_outputs_are_reported_and_end_a_complaint() -> None:
+    robot = Robot()
+    assert robot.run(10) == (UNSERVED,)
+    assert robot.run(1, outputs=1) == (SERVED,)
+    assert robot.run(3) == (), "three seconds of waiting are within the deadline"
+
+
+def test_without_inputs_nobody_can_tell() -> None:
+    robot = Robot()
+    robot.run(10)
+    assert robot.run(DEADLINE_S + 1, inputs=0) == ()
+
+
+def test_a_handover_a_new_epoch_and_a_new_relay_start_anew() -> None:
+    robot = Robot()
+    robot.run(10)
+    robot.executor.phase = Phase.DRAINING
+    assert robot.run(1) == ()
+    robot.executor.phase = Phase.SETTLED
+    assert robot.run(5) == ()
+    robot.executor.epoch = 4
+    assert robot.run(5) == ()
+    robot.taken = -10  # a new relay counts from 0
+    assert robot.run(5) == ()
+    assert robot.run(1) == (replace(UNSERVED, epoch=4),)
+
+
+def test_a_task_without_outputs_is_judged_by_acknowledgements_if_there_are_any() -> None:
+    robot = Robot(replace(SPEC, rules=(INPUT,)))
+    assert robot.run(10) == (), "a foreign worker acknowledges nothing"
+    robot.acknowledged = 50
+    assert robot.run(7) == (UNSERVED,)
+    robot.acknowledged = 60
+    assert robot.run(1) == (SERVED,)
+
+
+@pytest.mark.parametrize("worker", [WorkerSpec(command=("merge",)), SPEC.worker])
+def test_only_robots_watch_and_only_tasks_that_say_so(worker: WorkerSpec) -> None:
+    robot = Robot(replace(SPEC, worker=worker))
+    robot.executor.has_streams = worker.output_deadline_s is None
+    assert robot.run(30) == ()
+
+
+# --- the owner -------------------------------------------------------------------------------------------------------
+
+
+class Owner:
+    """The daemon whose worker is judged; its worker became ready at 100 s."""
+
+    def __init__(self, spec: TaskSpec = SPEC) -> None:
+        kinds = {"robot1": NodeKind.ROBOT, "robot2": NodeKind.ROBOT, "edge1": NodeKind.EDGE}
+        self.fleet = Fleet(
+            name="test",
+            timing=Timing(),
+            nodes=tuple(NodeSpec(name=name, kind=kind) for name, kind in sorted(kinds.items())),
+            tasks=(spec,),
+            electors=ROBOTS,
+        )
+        self.watch, self.gateway = HangWatch(self.fleet), Gateway(self.fleet)
+        self.executor = settled(spec, has_streams=False)
+        self.watch.note_worker("merge", WorkerState.READY, 100.0)
+        self.sequence = 0
+
+    def hear(self, robot: str, now: float, *progress: TaskProgress) -> tuple[Instruction, ...]:
+        self.sequence += 1
+        profile = Profile(
+            node=robot,
+            incarnation=1,
+            sequence=self.sequence,
+            cpu_cores=1.0,
+            cpu_used_cores=0.1,
+            memory_mb=100.0,
+            memory_used_mb=10.0,
+            progress=progress,
+        )
+        assert self.gateway.absorb(profile, now) is None
+        return self.watch.look(["merge"], {"merge": self.executor}, self.gateway, now)
+
+
+LATE = 100.0 + DEADLINE_S + MARGIN_S + 0.1
+
+
+def test_one_robot_that_is_not_served_is_enough_and_one_complaint_ends_one_life() -> None:
+    owner = Owner()
+    restart, story = owner.hear("robot1", LATE, UNSERVED)
+    assert restart == RestartWorker(task="merge", reason="no output for 4 s while inputs flow")
+    assert isinstance(story, RecordStory)
+    assert owner.hear("robot1", LATE + 60, UNSERVED) == (), "the next life has not begun"
+
+
+def test_a_robot_that_is_served_speaks_for_the_worker() -> None:
+    owner = Owner()
+    assert owner.hear("robot2", LATE, SERVED) == ()
+    assert owner.hear("robot1", LATE, UNSERVED) == ()
+    assert owner.hear("robot1", LATE + 4, UNSERVED) != (), "robot2's profile is too old to count"
+
+
+def test_complaints_of_another_epoch_do_not_count() -> None:
+    assert Owner().hear("robot1", LATE, replace(UNSERVED, epoch=2)) == ()
+
+
+def test_a_worker_that_has_just_become_ready_or_owner_has_its_time() -> None:
+    owner = Owner()
+    owner.watch.note_worker("merge", WorkerState.STOPPED, 101.0)
+    assert owner.hear("robot1", LATE, UNSERVED) == (), "that is what start-up deadlines are for"
+    owner.watch.note_worker("merge", WorkerState.READY, LATE)
+    assert owner.hear("robot1", LATE + DEADLINE_S, UNSERVED) == ()
+    owner.executor.started_at = LATE + 3
+    assert owner.hear("robot1", LATE + DEADLINE_S + MARGIN_S + 0.1, UNSERVED) == ()
+    assert owner.hear("robot1", LATE + DEADLINE_S + MARGIN_S + 3.1, UNSERVED) != ()
+
+
+def test_a_worker_whose_token_went_still_owes() -> None:
+    owner = Owner()
+    owner.watch.note_worker("merge", WorkerState.STARTING, 101.0)
+    assert owner.hear("robot1", LATE, UNSERVED) != ()
+
+
+def test_somebody_else_s_worker_is_told_of_and_left_alone() -> None:
+    owner = Owner(replace(SPEC, worker=WorkerSpec(output_deadline_s=DEADLINE_S)))
+    (story,) = owner.hear("robot1", LATE, UNSERVED)
+    assert isinstance(story, RecordStory)
+    assert "not ours" in story.text
