@@ -197,10 +197,6 @@ class Netbed(Testbed):
                 env={**os.environ, "OMP_NUM_THREADS": "1"},
             )
 
-    def running(self) -> tuple[NodeId, ...]:
-        """Whose daemons have been started and not stopped."""
-        return tuple(self._processes)
-
     def probe(
         self, node: NodeId, *, put: str = "", hz: float = 50.0, size: int = 0, watch: Sequence[str] = ()
     ) -> Probe:

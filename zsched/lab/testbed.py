@@ -109,8 +109,8 @@ class Testbed:
         return tuple(node.name for node in self.fleet.nodes)
 
     def start(self, *nodes: NodeId) -> None:
-        """Start daemons (default: all); their stderr goes to ``<node>.log``."""
-        for node in nodes or self.names:
+        """Start daemons (default: all that do not run); their stderr goes to ``<node>.log``."""
+        for node in nodes or tuple(name for name in self.names if name not in self._processes):
             with (self.folder / f"{node}.log").open("ab") as log:
                 self._processes[node] = subprocess.Popen(
                     [*DAEMON, "--config", self.file, "--node", node, *self._folders(node)],
@@ -118,6 +118,10 @@ class Testbed:
                     stderr=log,
                     env={**os.environ, "OMP_NUM_THREADS": "1"},
                 )
+
+    def running(self) -> tuple[NodeId, ...]:
+        """Whose daemons have been started and not stopped."""
+        return tuple(self._processes)
 
     def _folders(self, node: NodeId) -> list[str | Path]:
         return ["--state-dir", self.folder / node, "--runtime-dir", self.folder]
@@ -204,6 +208,16 @@ class Testbed:
             return owner if owner in self._processes else None
 
         return self.wait(settled, timeout_s, "an owner on all nodes") or ""
+
+    def wait_whole(self, timeout_s: float = 30.0) -> NodeId:
+        """Start who is down, wait until everybody is alive to everybody and the streams are settled; the owner."""
+        self.start()
+
+        def whole() -> bool:
+            return all(peer["state"] == "alive" for node in self.names for peer in self.status(node)["nodes"])
+
+        self.wait(whole, timeout_s, "everybody alive to everybody")
+        return self.wait_settled(timeout_s)
 
     def app(self, node: NodeId) -> zenoh.Session:
         """A plain zenoh application on ``node``: a client of its data endpoint; closed with the testbed."""
