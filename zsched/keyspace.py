@@ -17,6 +17,8 @@ from zsched.core.model import NAME, NodeId, TaskId
 ROOT = "@zsched"
 END_CHUNK = "@zsched/end"
 """Suffix of the in-band end markers behind a stream's last sample: ``{to}/@zsched/end``."""
+AGAIN_CHUNK = "@zsched/again"
+"""Behind an output's key, with a relay's zenoh id behind it: what that relay has missed, sent once more."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -99,6 +101,10 @@ class Keyspace:
     def ack(self, node: NodeId, task: TaskId, incarnation: int | str, relay: str) -> str:
         """Put of a worker, to the relay with that zenoh id: how far it has processed that relay's samples."""
         return self._key("ack", node, task, str(incarnation), relay)
+
+    def received(self, node: NodeId, relay: str, worker: str) -> str:
+        """Put of ``node``'s relay (its zenoh id), to the worker with that zenoh id: how far it has its answers."""
+        return self._key("received", node, relay, worker)
 
     def snapshot(self, node: NodeId, task: TaskId) -> str:
         """Queryable of a worker: its state, chunked."""

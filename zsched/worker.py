@@ -39,12 +39,13 @@ from zsched.clock import monotonic_s
 from zsched.core.plan import Role, WorkerRole
 from zsched.core.relay_protocol import StreamAcks
 from zsched.errors import ConfigError, WireError
+from zsched.hop_acks import Acknowledger
 from zsched.keyspace import END_CHUNK, Keyspace
 from zsched.relay_pipe import decode_end
-from zsched.worker_acks import Acknowledger
 from zsched.worker_epochs import CARRY_S, Epochs
 from zsched.worker_inputs import Dispatcher, Input, Marker, Received
-from zsched.worker_outputs import Output
+from zsched.worker_keep import Keeper
+from zsched.worker_outputs import OUTPUT_DEPTH, Output
 from zsched.worker_services import Answer, Handler, Request, Service
 from zsched.worker_snapshot import TIMEOUT_S, Offer, Restorer, StateLink, fetch
 
@@ -98,6 +99,7 @@ class Worker:
         self._token: zenoh.LivelinessToken | None = None
         self._session = _open(zenoh_config)
         self._state_link = StateLink(self._session, zenoh_config)
+        self._keeper = Keeper(self._session, self._keyspace.received("*", "*", str(self._session.zid())))
         self._acks = Acknowledger(self._send_acks)
         self._dispatcher = Dispatcher(self._inputs_ended, self._acks)
         self._restorer = Restorer(self._fetch_snapshot, node, self._dispatcher)
@@ -181,11 +183,21 @@ class Worker:
         ends = self._session.declare_subscriber(f"{expr}/{END_CHUNK}", self._on_marker)
         self._declared += [data, ends]
 
-    def publisher(self, template: str, *, latest: bool = False, reliable: bool = False, keep_last: int = 1) -> Output:
+    def publisher(
+        self,
+        template: str,
+        *,
+        latest: bool = False,
+        reliable: bool = False,
+        keep_last: int = 1,
+        depth: int = OUTPUT_DEPTH,
+    ) -> Output:
         """An output; ``{prefix}`` and ``{epoch}`` are filled in, the epoch anew whenever this worker becomes the owner.
 
         ``latest``: the last ``keep_last`` values are cached for who comes late; a put never waits, behind a stalled
-        receiver the newest wait. ``reliable``: a put waits for a slow receiver (up to a lease) instead of dropping.
+        receiver the newest wait. ``reliable``: a put waits for a slow receiver (up to a lease) instead of dropping, and
+        the last ``depth`` answers (at most `zsched.worker_keep.KEPT_BYTES`) are kept until the robots' relays have
+        acknowledged them: what a broken link lost is sent again.
         """
         output = Output(
             self._session,
@@ -193,6 +205,8 @@ class Worker:
             latest=latest,
             reliable=reliable,
             keep_last=keep_last,
+            depth=depth,
+            keeper=self._keeper,
             epoch_now=self._epoch_now,
             stamp_now=self._dispatcher.stamp,
         )
@@ -262,6 +276,7 @@ class Worker:
             signal.setitimer(signal.ITIMER_REAL, ALARM_S)
         self._dispatcher.close()
         self._acks.close()
+        self._keeper.close()
         for output in tuple(self._outputs):
             output.close()
         self._errands.put(None)

@@ -23,7 +23,7 @@ import zenoh
 
 from zsched.clock import monotonic_s
 from zsched.core.relay_protocol import EndMarker
-from zsched.worker_acks import GIVE_UP_S, Acknowledger, SourceName
+from zsched.hop_acks import GIVE_UP_S, Acknowledger, SourceName
 
 END_GRACE_S: Final = 0.1
 MAX_WITHHELD: Final = 256

@@ -1,6 +1,7 @@
 """One output of a worker: stamped with the epoch, numbered, ended by a marker.
 
-Knows: publishers per epoch, how many samples went out. Does not know: roles (it asks for the epoch), inputs.
+Knows: publishers per epoch, how many samples went out. Does not know: roles (it asks for the epoch), inputs, which
+answers have arrived (`zsched.worker_keep`).
 """
 
 from __future__ import annotations
@@ -14,12 +15,13 @@ import zenoh
 from zenoh import CongestionControl, ext
 
 from zsched.core.relay_protocol import EndMarker
-from zsched.keyspace import END_CHUNK
-from zsched.relay_pipe import encode_end
 from zsched.send_queue import SendQueue
+from zsched.worker_keep import Keeper, KeptLane, put_end
 
 LATEST_DEPTH: Final = 16
 """Values of class ``latest`` that may wait for a receiver that keeps up; behind a stalled one, ``keep_last`` do."""
+OUTPUT_DEPTH: Final = 4096
+"""Answers of class ``reliable`` that an output keeps at most until they are acknowledged."""
 KEPT_EPOCHS: Final = 2
 """Publishers of older epochs are given back: nobody admits them any more."""
 
@@ -30,6 +32,8 @@ class _Stamped:
 
     key: str
     publisher: zenoh.Publisher | ext.AdvancedPublisher
+    lane: KeptLane | None
+    """Of what is kept until the robots' relays have it (classes ``latest`` and ``reliable``)."""
     count: int = 0
 
 
@@ -44,6 +48,8 @@ class Output:
         latest: bool,
         reliable: bool,
         keep_last: int,
+        depth: int,
+        keeper: Keeper,
         epoch_now: Callable[[], int | None],
         stamp_now: Callable[[], zenoh.Timestamp | None],
     ) -> None:
@@ -52,6 +58,8 @@ class Output:
         self.is_latest = latest
         """Whether the last value is kept for who comes late."""
         self._keep_last = max(1, keep_last)
+        self._keeper = keeper if latest or reliable else None
+        self._kept = self._keep_last if latest else depth
         self._congestion = CongestionControl.BLOCK if latest or reliable else CongestionControl.DROP
         self._epoch_now = epoch_now
         self._stamp_now = stamp_now
@@ -104,12 +112,10 @@ class Output:
             self._queue.close()
 
     def _put_end(self, stamped: _Stamped, epoch: int) -> None:
-        self._session.put(
-            f"{stamped.key}/{END_CHUNK}",
-            encode_end(EndMarker(epoch=epoch, count=stamped.count)),
-            congestion_control=CongestionControl.BLOCK,
-            source_info=zenoh.SourceInfo(stamped.publisher.id, stamped.count),
-        )
+        marker = EndMarker(epoch=epoch, count=stamped.count)
+        put_end(self._session, stamped.key, stamped.publisher.id, marker)
+        if stamped.lane is not None:
+            stamped.lane.note_end(marker)
 
     def _declare(self, epoch: int) -> _Stamped:
         key = self._template.replace("{epoch}", str(epoch))
@@ -125,16 +131,29 @@ class Output:
             )
         else:
             publisher = self._session.declare_publisher(key, congestion_control=self._congestion)
-        stamped = self._epochs[epoch] = _Stamped(key=key, publisher=publisher)
+        lane = None if self._keeper is None else self._keeper.lane(key, publisher.id, self._kept)
+        stamped = self._epochs[epoch] = _Stamped(key=key, publisher=publisher, lane=lane)
         for old in sorted(self._epochs)[:-KEPT_EPOCHS]:
-            self._epochs.pop(old).publisher.undeclare()  # type: ignore[no-untyped-call] # zenoh's stubs
+            gone = self._epochs.pop(old)
+            gone.publisher.undeclare()  # type: ignore[no-untyped-call] # zenoh's stubs
+            if gone.lane is not None:
+                gone.lane.is_closed = True
         return stamped
 
     def _put(self, stamped: _Stamped, payload: Any, attachment: Any, encoding: Any, timestamp: Any) -> None:
-        publisher = stamped.publisher
+        publisher, number = stamped.publisher, stamped.count
+        stamped.count += 1
+        if stamped.lane is not None:
+            payload, attachment = _own(payload), _own(attachment)
+            size = len(payload) if hasattr(payload, "__len__") else 0
+            stamped.lane.keep(number, payload, attachment, encoding, timestamp, size)
         if isinstance(publisher, zenoh.Publisher):
-            source = zenoh.SourceInfo(publisher.id, stamped.count)
+            source = zenoh.SourceInfo(publisher.id, number)
             publisher.put(payload, attachment=attachment, encoding=encoding, timestamp=timestamp, source_info=source)
         else:
             publisher.put(payload, attachment=attachment, encoding=encoding, timestamp=timestamp)
-        stamped.count += 1
+
+
+def _own(value: Any) -> Any:
+    """What its caller may change afterwards (a ``bytearray``) as bytes of our own."""
+    return zenoh.ZBytes(value) if isinstance(value, bytearray) else value

@@ -25,7 +25,8 @@ FLOORS: Final[tuple[tuple[str, int, str], ...]] = (
     # pattern of the module's name below "zsched.", floor, room ("*": each module is one of its own; \\1: the group)
     (r"__init__", 0, "version"),
     (r"core(\..+)?", 1, "core"),
-    (r"(wire|keyspace|clock|errors|report|places|zenoh_config|relay_pipe|send_queue|config|config_\w+)", 2, "seams"),
+    (r"(wire|keyspace|clock|errors|report|places|zenoh_config|relay_pipe|send_queue|hop_acks)", 2, "seams"),
+    (r"(config|config_\w+)", 2, "seams"),
     (r"adapters\.(worker_supervisor|worker_process|launch)", 3, "adapters: worker processes"),
     (r"adapters\.(network_profiler|nl80211)", 3, "adapters: radio"),
     (r"adapters\.(device_profiler|cgroup)", 3, "adapters: machine"),

@@ -29,6 +29,7 @@ for _method, _arguments in {
     "worker": ("edge1", "map_merge", "7"),
     "role": ("edge1", "map_merge"),
     "ack": ("edge1", "map_merge", "7", "a1b2c3"),
+    "received": ("robot1", "a1b2c3", "d4e5f6"),
     "snapshot": ("edge1", "map_merge"),
     "status": ("edge1", "robot1"),
     "command": ("edge1", "robot1"),

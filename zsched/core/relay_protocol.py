@@ -86,6 +86,10 @@ REFUSED_ENCODING: Final = "text/plain;zsched.refused"
 """Of a worker's word that it is not the owner and has done nothing."""
 
 
+SKIP_ENCODING: Final = "application/zsched.skip"
+"""Of an end marker among answers that are sent again: no number below its count is kept any more."""
+
+
 class ServiceProblem(StrEnum):
     """Why a request was not answered: the first words of an error reply."""
 
@@ -98,12 +102,12 @@ class ServiceProblem(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StreamAck:
-    """What a worker has had of one publisher of a relay; numbers are those of the hop, 0, 1, 2..."""
+    """What a worker has had of one publisher of a relay, or a relay of a worker's; the hop's numbers are 0, 1, 2..."""
 
     eid: int
-    """The publisher's entity id in the relay's session."""
+    """The publisher's entity id in the sender's session."""
     first: int
-    """The first number this worker has seen."""
+    """The first number the receiver has seen."""
     arrived: int
     """The number it waits for: everything from `first` up to it has come, or is given up."""
     processed: int
@@ -112,16 +116,20 @@ class StreamAck:
     doubled: int = 0
     reordered: int = 0
     has_gap: bool = False
-    """Something newer than `arrived` has come and was refused: it wants the rest again."""
+    """Something newer than `arrived` has come and cannot go on yet: it wants the rest again..."""
+    until: int = 0
+    """...up to this number, which it has; 0: it has kept nothing newer."""
+    is_ended: bool = False
+    """The end marker has come."""
 
     def __post_init__(self) -> None:
-        for name in ("eid", "first", "arrived", "processed", "lost", "doubled", "reordered"):
+        for name in ("eid", "first", "arrived", "processed", "lost", "doubled", "reordered", "until"):
             check_counter(f"ack.{name}", getattr(self, name))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StreamAcks:
-    """A worker's acknowledgements for one relay, those that changed."""
+    """A receiver's acknowledgements for one session, those that changed."""
 
     acks: tuple[StreamAck, ...]
 

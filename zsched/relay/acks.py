@@ -1,6 +1,6 @@
-"""Receives the workers' acknowledgements: how far each of this relay's publishers has been processed.
+"""Acknowledgements in both directions: what workers have processed of our samples, what we have of their answers.
 
-Knows: the key they come on, who waits for which publisher's. Does not know: what is sent again.
+Knows: the keys they go on, who waits for which publisher's. Does not know: what is sent again.
 """
 
 from __future__ import annotations
@@ -13,8 +13,10 @@ import zenoh
 from zenoh import Sample, Session
 
 from zsched import wire
+from zsched.core.model import NodeId
 from zsched.core.relay_protocol import StreamAck, StreamAcks
 from zsched.errors import WireError
+from zsched.hop_acks import Acknowledger
 from zsched.keyspace import Keyspace
 
 _log = logging.getLogger("zsched.relay")
@@ -24,10 +26,14 @@ Listener = Callable[[StreamAck, str], None]
 
 
 class Acks:
-    """One subscription and one thread per relay process; listeners are called in that thread."""
+    """One subscription and one thread for each direction per relay process; listeners are called in the first one."""
 
-    def __init__(self, session: Session, keyspace: Keyspace) -> None:
+    def __init__(self, session: Session, keyspace: Keyspace, node: NodeId) -> None:
         """Subscribe and start."""
+        self._session = session
+        self._keyspace, self._node, self._own_id = keyspace, node, str(session.zid())
+        self.answers = Acknowledger(self._send)
+        """How far we are with every answer that comes numbered."""
         self._listeners: dict[int, Listener] = {}
         key = keyspace.ack("*", "*", "*", str(session.zid()))
         self._subscriber = session.declare_subscriber(key, zenoh.handlers.FifoChannel(1024))
@@ -40,6 +46,15 @@ class Acks:
     def forget(self, eid: int) -> None:
         """The publisher is given back."""
         self._listeners.pop(eid, None)
+
+    def _send(self, worker: str, frame: StreamAcks) -> None:
+        """Tell a worker how far its answers are; what is dropped here is mended by the next one."""
+        self._session.put(
+            self._keyspace.received(self._node, self._own_id, worker),
+            wire.encode(frame),
+            priority=zenoh.Priority.INTERACTIVE_HIGH,
+            congestion_control=zenoh.CongestionControl.DROP,
+        )
 
     def _run(self, handler: zenoh.handlers.Handler[Sample]) -> None:
         for sample in handler:

@@ -13,16 +13,19 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import zenoh
-from zenoh import Sample, Session, Timestamp
+from zenoh import CongestionControl, Sample, Session, Timestamp
 
 from zsched.clock import monotonic_s
 from zsched.core.plan import HandoverRule, Route, StreamClass, StreamCount
 from zsched.core.relay_protocol import EndMarker
-from zsched.keyspace import END_CHUNK
+from zsched.hop_acks import SourceName
+from zsched.keyspace import AGAIN_CHUNK, END_CHUNK
+from zsched.relay.acks import Acks
+from zsched.relay.answers import Answers
 from zsched.relay.counter import StreamCounter
 from zsched.relay.outlet import Outlet
 from zsched.relay.pace import Pace
@@ -45,15 +48,19 @@ class _Key:
     received: int = 0
     end: EndMarker | None = None
     end_at: float = 0.0
+    ender: SourceName | None = None
+    """The publisher whose end it is, where it keeps what we have not acknowledged."""
     last_number: int = -1
     numbers: dict[tuple[str, int], int] = field(default_factory=dict)
     """{publisher: its newest number}; a worker that restarted in place is another publisher."""
 
-    def is_ended(self, now: float) -> bool:
+    def is_ended(self, now: float, answers: Answers | None) -> bool:
         if self.end is None:
             return False
         is_complete = self.received >= self.end.count or self.last_number + 1 >= self.end.count
-        return is_complete or now - self.end_at > END_GRACE_S
+        if is_complete or now - self.end_at <= END_GRACE_S:
+            return is_complete
+        return answers is None or self.ender is None or not answers.ask_for(self.ender, self.end.count)
 
 
 @dataclass(slots=True, eq=False)
@@ -62,11 +69,14 @@ class _Feed:
 
     slot: _OutputSlot
     receiver: Receiver | None = None
+    again: Receiver | None = None
+    """What our relay alone is sent once more."""
     ends: zenoh.Subscriber[None] | None = None
 
     def close(self) -> None:
-        if self.receiver is not None:
-            self.receiver.close()
+        for receiver in (self.receiver, self.again):
+            if receiver is not None:
+                receiver.close()
         if self.ends is not None:
             undeclare(self.ends)
 
@@ -75,6 +85,8 @@ class _Feed:
 class _OutputSlot:
     epoch: int
     expr: str
+    answers: Answers | None = None
+    """``None``: its worker keeps nothing for us (a foreign one)."""
     feed: _Feed | None = None
     """``None`` while an older slot of the same owner and key has the subscription."""
     keys: dict[str, _Key] = field(default_factory=dict)
@@ -118,18 +130,29 @@ class OutputStream:
             None if max_hz is None else Pace(max_hz, remembers=route.settings.stream_class is StreamClass.LATEST)
         )
 
-    def open(self, epoch: int, route: Route) -> None:
+    def open(self, epoch: int, route: Route, acks: Acks | None = None, *, is_from_start: bool = False) -> None:
         """Subscribe to an owner's output; nothing passes yet.
+
+        With ``acks`` its worker keeps its answers until we have acknowledged them; ``is_from_start``: the owner cannot
+        have answered yet, so that its first answer is number 0.
 
         Raises:
             zenoh.ZError: ``from`` is no key expression.
         """
+        has_epoch = str(epoch) in route.from_expr.split("/")
         slot = _OutputSlot(epoch=epoch, expr=route.from_expr)
+        stream_class = route.settings.stream_class
+        if acks is not None and stream_class is not StreamClass.BEST_EFFORT:
+            slot.answers = Answers(
+                acks.answers,
+                self._counter,
+                is_from_start=is_from_start and has_epoch,
+                in_turn=stream_class is StreamClass.RELIABLE,
+            )
         with self._lock:
             self._slots[epoch] = slot
             if any(other.expr == slot.expr for other in self._slots.values() if other is not slot):
                 return  # the same owner once more, without {epoch}: what comes cannot belong to both
-        has_epoch = str(epoch) in route.from_expr.split("/")
         feed = slot.feed = _Feed(slot=slot)
         feed.ends = self._session.declare_subscriber(
             f"{route.from_expr}/{END_CHUNK}",
@@ -143,6 +166,14 @@ class OutputStream:
             lambda sample: self._carry(feed.slot, sample),
             with_history=has_epoch,
         )
+        if slot.answers is not None:
+            feed.again = Receiver(
+                self._session,
+                f"{route.from_expr}/{AGAIN_CHUNK}/{self._session.zid()}",
+                replace(route.settings, stream_class=StreamClass.RELIABLE),
+                lambda sample: self._carry_again(feed.slot, sample),
+                with_history=False,
+            )
 
     def know(self, from_expr: str) -> None:
         """Hear of another owner's ``from`` before a slot opens on it: its captures fill the wildcards of ``to``.
@@ -179,7 +210,7 @@ class OutputStream:
             now = monotonic_s()
             if any(other.is_flipped and other.feed is None for other in self._slots.values()):
                 return True  # the same owner goes on under the same key
-            return bool(slot.keys) and all(key.is_ended(now) for key in slot.keys.values())
+            return bool(slot.keys) and all(key.is_ended(now, slot.answers) for key in slot.keys.values())
 
     def close_slot(self, epoch: int) -> None:
         """Unsubscribe from a slot; if it carried the stream, the flipped one takes over with what it held."""
@@ -192,6 +223,8 @@ class OutputStream:
             if slot is self._carrier:
                 self._carrier = None
                 self._promote()
+            if slot.answers is not None:
+                slot.answers.close()
         if feed is not None:
             feed.close()
 
@@ -204,6 +237,7 @@ class OutputStream:
         feed.slot = heirs[0]
         heirs[0].feed = feed
         heirs[0].keys = slot.keys
+        heirs[0].answers, slot.answers = slot.answers, heirs[0].answers
         for key in heirs[0].keys.values():
             key.end = None
         return None
@@ -215,10 +249,13 @@ class OutputStream:
         self._outlet.undeclare()
 
     def look_after(self) -> None:
-        """Let through what a highest rate has held back (class ``latest``: the newest); call it now and then."""
-        if self._pace is None or self.route.settings.stream_class is not StreamClass.LATEST:
-            return
+        """Let through what waits for answers that never come, or for a highest rate; call it now and then."""
         with self._lock:
+            for slot in tuple(self._slots.values()):
+                for key, (_, zid, eid), sample in slot.answers.overdue() if slot.answers is not None else ():
+                    self._pass(slot, slot.keys.setdefault(key, _Key()), (zid, eid), sample)
+            if self._pace is None or self.route.settings.stream_class is not StreamClass.LATEST:
+                return
             for sample in self._pace.overdue(monotonic_s()):
                 self._counter.dropped(*self._outlet.send(sample))
 
@@ -237,10 +274,31 @@ class OutputStream:
             if zid in self._own_ids:
                 self._counter.dropped("loop")
                 return
-            key = slot.keys.setdefault(str(sample.key_expr), _Key())
-            key.received += 1
-            if source is None or self._is_next(key, (zid, source.source_id.eid), source.source_sn):
+            name = str(sample.key_expr)
+            key = slot.keys.setdefault(name, _Key())
+            if source is None:
+                key.received += 1
                 self._gate(slot, sample)
+                return
+            publisher = (zid, source.source_id.eid)
+            if slot.answers is None or sample.congestion_control != CongestionControl.BLOCK:
+                self._pass(slot, key, publisher, sample)
+                return
+            for ready in slot.answers.take((name, *publisher), source.source_sn, sample):
+                self._pass(slot, key, publisher, ready)
+
+    def _carry_again(self, slot: _OutputSlot, sample: Sample) -> None:
+        with self._lock:
+            if slot.answers is None or slot.is_closed:
+                return
+            for key, (_, zid, eid), ready in slot.answers.take_again(sample):
+                self._pass(slot, slot.keys.setdefault(key, _Key()), (zid, eid), ready)
+
+    def _pass(self, slot: _OutputSlot, key: _Key, publisher: tuple[str, int], sample: Sample) -> None:
+        key.received += 1
+        info: zenoh.SourceInfo | None = sample.source_info
+        if info is None or self._is_next(key, publisher, info.source_sn):
+            self._gate(slot, sample)
 
     def _is_next(self, key: _Key, publisher: tuple[str, int], number: int) -> bool:
         """Count what does not fit the numbers of the hop; an old one is dropped."""
@@ -317,6 +375,12 @@ class OutputStream:
         if marker is None or marker.epoch != slot.epoch:
             return
         with self._lock:
-            key = slot.keys.setdefault(str(sample.key_expr).removesuffix(f"/{END_CHUNK}"), _Key())
-            key.end, key.end_at = marker, monotonic_s()
+            name = str(sample.key_expr).removesuffix(f"/{END_CHUNK}")
+            key = slot.keys.setdefault(name, _Key())
+            if key.end is None:
+                key.end, key.end_at = marker, monotonic_s()
+            source = sample.source_info
+            if slot.answers is not None and source is not None:
+                key.ender = (name, str(source.source_id.zid), source.source_id.eid)
+                slot.answers.ended(key.ender)
         self._wake()

@@ -96,7 +96,7 @@ class RelayProcess:
         self._tasks: dict[TaskId, TaskRelay] = {}
         self._own_ids = frozenset({str(session.zid())})
         keyspace = Keyspace(fleet)
-        self._acks = Acks(session, keyspace)
+        self._acks = Acks(session, keyspace, node)
         self._roles = RoleServer(session, keyspace, node)
         self._tokens = Tokens(session, keyspace, self._worker_seen, self._role_ended, self._wake)
         reporter.report(RelayStarted(pid=os.getpid(), zid=str(session.zid())))

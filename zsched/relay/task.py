@@ -149,7 +149,7 @@ class TaskRelay:
             self._open(old)
             self._flip(self._slots[old.epoch], is_reported=False)
         if plan.current is not None:
-            self._open(plan.current)
+            self._open(plan.current, is_from_start=plan.phase is RoutePhase.PREPARE)
         current = self._current()
         if current is not None and plan.phase is RoutePhase.FLIP:
             self._flip_by = monotonic_s() + FLIP_WAIT_S
@@ -160,18 +160,19 @@ class TaskRelay:
             self._task, tuple(route for state in self._slots.values() for route in state.slot.routes)
         )
 
-    def _open(self, slot: Slot) -> None:
+    def _open(self, slot: Slot, *, is_from_start: bool = False) -> None:
         if slot.epoch in self._slots:
             return
         self._slots[slot.epoch] = _OpenSlot(slot=slot)
         for route in slot.routes:
             try:
-                self._open_route(slot, route)
+                self._open_route(slot, route, is_from_start=is_from_start)
             except (ValueError, zenoh.ZError) as error:
                 self._problem(f"{route.stream}: {route.from_expr} -> {route.to_expr}: {error}")
 
-    def _open_route(self, slot: Slot, route: Route) -> None:
+    def _open_route(self, slot: Slot, route: Route, *, is_from_start: bool) -> None:
         epoch = slot.epoch
+        acks = self._acks if slot.ready_when is ReadyWhen.TOKEN else None  # a foreign worker counts nothing
         if route.direction is Direction.SERVICE:
             self._services.open(epoch, route)
             return
@@ -181,7 +182,7 @@ class TaskRelay:
                 if source is not None:
                     source.close()
                 source = self._inputs[route.stream] = InputStream(self._session, route, self._own_ids, self._local)
-            source.open(epoch, route, self._acks if slot.ready_when is ReadyWhen.TOKEN else None)
+            source.open(epoch, route, acks)
             return
         sink = self._outputs.get(route.stream)
         if sink is None or (sink.route.to_expr, sink.route.settings) != (route.to_expr, route.settings):
@@ -191,7 +192,7 @@ class TaskRelay:
                 self._session, route, self._own_ids, self.wake, self._local
             )
         sink.know(route.from_expr)
-        sink.open(epoch, route)
+        sink.open(epoch, route, acks, is_from_start=is_from_start)
 
     def _close(self, epoch: int) -> None:
         state = self._slots.pop(epoch, None)

@@ -1,11 +1,12 @@
-"""A worker's side of the numbered hop: what came, what is missing, and telling each relay how far it is.
+"""The receiving side of a numbered hop: what came, what is missing, and telling each sender how far it is.
 
 Knows: numbers per publisher, when an acknowledgement is due. Does not know: what a sample is, roles, zenoh sessions.
 
-A publisher that waits for its receivers (congestion control BLOCK: classes ``latest`` and ``reliable``) keeps what is
-not acknowledged. Where an input keeps everything, a number that is out of turn is refused and the missing ones are
-asked for, at most for `GIVE_UP_S`: then what is missing is lost and the stream goes on. An input that keeps only the
-newest takes any newer one. Numbers that came before are dropped and counted either way.
+Workers use it for their inputs, relays for the workers' answers. A publisher that waits for its receivers (congestion
+control BLOCK: classes ``latest`` and ``reliable``) keeps what is not acknowledged. Where everything is wanted, a number
+that is out of turn has to wait and the missing ones are asked for, at most for `GIVE_UP_S`: then what is missing is
+lost and the stream goes on. Who wants only the newest takes any newer one. Numbers that came before are dropped and
+counted either way.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -33,7 +34,7 @@ MAX_PER_FRAME: Final = 500
 SourceName = tuple[str, str, int]
 """(key, session id, entity id) of a publisher as zenoh names it."""
 
-_log = logging.getLogger("zsched.worker")
+_log = logging.getLogger("zsched.streams")
 
 
 @dataclass(slots=True)
@@ -45,6 +46,8 @@ class _Source:
     doubled: int = 0
     reordered: int = 0
     gap_since: float | None = None
+    until: int = 0
+    is_ended: bool = False
     missing: deque[int] = field(default_factory=lambda: deque(maxlen=MAX_MISSING))
     """The newest of the numbers given up, to tell a late sample from a double one."""
 
@@ -58,11 +61,13 @@ class _Source:
             doubled=self.doubled,
             reordered=self.reordered,
             has_gap=self.gap_since is not None,
+            until=self.until if self.gap_since is not None else 0,
+            is_ended=self.is_ended,
         )
 
 
 class Acknowledger:
-    """The numbers of every publisher heard, and a thread that sends what changed: ``send(relay, frame)``."""
+    """The numbers of every publisher heard, and a thread that sends what changed: ``send(session id, frame)``."""
 
     def __init__(self, send: Callable[[str, StreamAcks], None]) -> None:
         """``send`` puts a frame for the session with that zenoh id; it must not block long."""
@@ -85,23 +90,65 @@ class Acknowledger:
     def admit(self, name: SourceName, number: int, *, in_turn: bool) -> bool:
         """A sample came; ``False``: drop it. ``in_turn``: nothing may be missing before it."""
         with self._wake:
-            source = self._sources.get(name)
-            if source is None:
-                self._sources[name] = source = _Source(first=number, arrived=number, processed=number)
-                if len(self._sources) > MAX_SOURCES:
-                    self._sources.pop(next(iter(self._sources)))
+            source = self._sources.get(name) or self._add(name, number)
             is_admitted = self._judge(source, number, in_turn=in_turn)
             if not is_admitted:
                 self._mark(name)
             return is_admitted
 
-    def skip(self, name: SourceName, number: int) -> None:
-        """Nothing below ``number`` will come any more."""
+    def expect(self, name: SourceName, number: int) -> int:
+        """The number that the source comes to next; ``number`` when nothing of it is known yet."""
+        with self._wake:
+            return (self._sources.get(name) or self._add(name, number)).arrived
+
+    def take(self, name: SourceName, number: int, size: int) -> bool:
+        """The sample that is next came and is processed already; ``False``: it is not that one, nothing happens."""
         with self._wake:
             source = self._sources.get(name)
-            if source is not None and number > source.arrived:
-                self._jump(source, number)
-                self._mark(name)
+            if source is None or number != source.arrived:
+                return False
+            source.arrived = source.processed = number + 1
+            source.gap_since = None
+            self._samples += 1
+            self._bytes += size
+            self._mark(name)
+            return True
+
+    def ask_for(self, name: SourceName, until: int) -> float:
+        """Everything below ``until`` is missing; answers for how long nothing has come of it, in seconds."""
+        with self._wake:
+            source = self._sources.get(name) or self._add(name, until)
+            source.gap_since = source.gap_since or monotonic_s()
+            source.until = until
+            self._mark(name)
+            return monotonic_s() - source.gap_since
+
+    def skip(self, name: SourceName, number: int) -> int:
+        """Nothing below ``number`` will come any more; answers how many are lost by that."""
+        with self._wake:
+            source = self._sources.get(name)
+            if source is None or number <= source.arrived:
+                return 0
+            is_first = source.arrived == source.first  # nothing has come: the stream begins later for us
+            before = source.lost
+            self._jump(source, number)
+            if is_first:
+                source.first, source.lost = number, before
+            self._mark(name)
+            return source.lost - before
+
+    def end(self, name: SourceName) -> None:
+        """The source's end marker came."""
+        with self._wake:
+            (self._sources.get(name) or self._add(name, 0)).is_ended = True
+            self._mark(name)
+
+    def forget(self, names: Iterable[SourceName]) -> None:
+        """Tell how far these are, and then nothing more."""
+        self.flush()
+        with self._wake:
+            for name in names:
+                self._sources.pop(name, None)
 
     def arrived(self, name: SourceName) -> int:
         """The number that the source comes to next."""
@@ -126,6 +173,12 @@ class Acknowledger:
         self._send_all(frames)
 
     # --- numbers -----------------------------------------------------------------------------------------------------
+
+    def _add(self, name: SourceName, number: int) -> _Source:
+        source = self._sources[name] = _Source(first=number, arrived=number, processed=number)
+        if len(self._sources) > MAX_SOURCES:
+            self._sources.pop(next(iter(self._sources)))
+        return source
 
     def _judge(self, source: _Source, number: int, *, in_turn: bool) -> bool:
         if number == source.arrived:
@@ -175,15 +228,15 @@ class Acknowledger:
         self._dirty.clear()
         self._samples = self._bytes = 0
         return [
-            (relay, StreamAcks(acks=tuple(acks[at : at + MAX_PER_FRAME])))
-            for relay, acks in changed.items()
+            (session, StreamAcks(acks=tuple(acks[at : at + MAX_PER_FRAME])))
+            for session, acks in changed.items()
             for at in range(0, len(acks), MAX_PER_FRAME)
         ]
 
     def _send_all(self, frames: list[tuple[str, StreamAcks]]) -> None:
-        for relay, frame in frames:
+        for session, frame in frames:
             try:
-                self._send(relay, frame)
+                self._send(session, frame)
             except Exception as error:  # noqa: BLE001 - the session closes, or one frame is wrong: the next one goes on
                 _log.debug("an acknowledgement was not sent (%s)", error)
 

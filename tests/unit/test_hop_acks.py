@@ -7,9 +7,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from zsched import worker_acks
+from zsched import hop_acks
 from zsched.core.relay_protocol import StreamAck, StreamAcks
-from zsched.worker_acks import Acknowledger
+from zsched.hop_acks import Acknowledger
 
 NAME = ("edge1/t/in", "a1", 7)
 
@@ -62,7 +62,7 @@ def test_a_number_out_of_turn_is_refused_and_the_missing_ones_are_asked_for(book
 
 
 def test_what_never_comes_is_given_up(book: Book, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(worker_acks, "GIVE_UP_S", 0.05)
+    monkeypatch.setattr(hop_acks, "GIVE_UP_S", 0.05)
     assert book.admit(0, 3) == [True, False]
     time.sleep(0.1)
     assert book.admit(4) == [True]
@@ -97,7 +97,7 @@ def test_at_20_hz_while_it_changes_and_at_once_when_much_was_processed(book: Boo
     assert 5 <= len(book.sent) <= 13
     before = len(book.sent)
     book.admit(number)
-    book.acks.processed(NAME, number, worker_acks.ACK_BYTES)
+    book.acks.processed(NAME, number, hop_acks.ACK_BYTES)
     end = time.monotonic() + 0.5
     while len(book.sent) == before and time.monotonic() < end:
         time.sleep(0.001)

@@ -1,0 +1,197 @@
+"""The answers of one slot in order, over real sessions: what waits, what is asked for, what is skipped."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import zenoh
+
+from zsched import wire
+from zsched.core.plan import Direction, HandoverRule, Route, StreamClass, StreamSettings
+from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks
+from zsched.keyspace import AGAIN_CHUNK, END_CHUNK, Keyspace
+from zsched.relay import answers
+from zsched.relay.acks import Acks
+from zsched.relay.outputs import OutputStream
+from zsched.relay_pipe import encode_end
+from zsched.zenoh_config import data_config, worker_config
+
+KEY = "edge1/t/1/out"
+
+
+def until(condition: Callable[[], Any], what: str, deadline_s: float = 5.0) -> Any:
+    end = time.monotonic() + deadline_s
+    while time.monotonic() < end:
+        value = condition()
+        if value:
+            return value
+        time.sleep(0.002)
+    raise AssertionError(f"not within {deadline_s} s: {what}")
+
+
+class Bench:
+    """A relay's output stream, and a worker whose numbers the test chooses."""
+
+    def __init__(self, relay: zenoh.Session, worker: zenoh.Session) -> None:
+        self.relay, self.worker = relay, worker
+        self.said: list[StreamAck] = []
+        self.passed: list[str] = []
+        received = Keyspace("t").received("robot1", str(relay.zid()), str(worker.zid()))
+        self._heard = worker.declare_subscriber(received, self._hear)
+        self._app = worker.declare_subscriber("robot1/out", lambda s: self.passed.append(s.payload.to_string()))
+        self.acks = Acks(relay, Keyspace("t"), "robot1")
+
+    def open(self, stream_class: StreamClass = StreamClass.RELIABLE, *, is_from_start: bool = True) -> OutputStream:
+        settings = StreamSettings(stream_class=stream_class, depth=500, handover=HandoverRule.ALL)
+        route = Route(
+            stream="t/out/0", direction=Direction.OUTPUT, from_expr=KEY, to_expr="robot1/out", settings=settings
+        )
+        self.stream = OutputStream(self.relay, route, frozenset(), lambda: None)
+        self.stream.open(1, route, self.acks, is_from_start=is_from_start)
+        self.stream.flip(1, drops_held=False)
+        self.publisher = self.worker.declare_publisher(KEY, congestion_control=zenoh.CongestionControl.BLOCK)
+        self.again = self.worker.declare_publisher(
+            f"{KEY}/{AGAIN_CHUNK}/{self.relay.zid()}", congestion_control=zenoh.CongestionControl.BLOCK
+        )
+        until(lambda: matches(self.publisher) and matches(self.again), "the relay subscribes to both")
+        return self.stream
+
+    def put(self, *numbers: int) -> None:
+        for number in numbers:
+            self.publisher.put(str(number), source_info=zenoh.SourceInfo(self.publisher.id, number))
+
+    def put_again(self, *numbers: int) -> None:
+        for number in numbers:
+            self.again.put(str(number), source_info=zenoh.SourceInfo(self.publisher.id, number))
+
+    def _hear(self, sample: zenoh.Sample) -> None:
+        self.said += wire.decode(sample.payload.to_bytes(), StreamAcks).acks
+
+    def wait_ack(self, **fields: Any) -> None:
+        until(lambda: any(all(getattr(a, k) == v for k, v in fields.items()) for a in self.said), f"{fields}")
+
+    def is_through(self, *numbers: int) -> bool:
+        until(lambda: len(self.passed) >= len(numbers), f"{numbers}: {self.passed}")
+        return self.passed == [str(number) for number in numbers]
+
+
+def matches(publisher: zenoh.Publisher) -> bool:
+    status: Any = publisher.matching_status
+    return bool(status.matching)
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    relay = zenoh.open(zenoh.Config.from_json5(data_config(listen=(endpoint,), connect=(), shared_memory=False)))
+    worker = zenoh.open(zenoh.Config.from_json5(worker_config(connect=(endpoint,), shared_memory=False)))
+    made = Bench(relay, worker)
+    try:
+        yield made
+    finally:
+        made.stream.close()
+        made.acks.answers.close()
+        worker.close()
+        relay.close()
+
+
+def test_answers_are_acknowledged_to_the_worker_that_gave_them(bench: Bench) -> None:
+    bench.open()
+    bench.put(0, 1, 2)
+    assert bench.is_through(0, 1, 2)
+    bench.wait_ack(eid=bench.publisher.id.eid, arrived=3, processed=3, has_gap=False)
+
+
+def test_what_is_missing_is_asked_for_and_what_came_early_waits(bench: Bench) -> None:
+    stream = bench.open()
+    bench.put(0, 3, 4)
+    bench.wait_ack(arrived=1, has_gap=True, until=3)
+    assert bench.is_through(0)
+    bench.put_again(1, 2)
+    assert bench.is_through(0, 1, 2, 3, 4)
+    bench.wait_ack(arrived=5, has_gap=False)
+    bench.put_again(2, 3)  # once more: nobody hears of it
+    bench.put(5)
+    assert bench.is_through(0, 1, 2, 3, 4, 5)
+    count = stream.count()
+    assert (count.lost, count.doubled, count.reordered) == (0, 0, 0)
+
+
+def test_the_first_answers_are_wanted_where_the_slot_was_open_before_them(bench: Bench) -> None:
+    bench.open()
+    bench.put(2)
+    bench.wait_ack(arrived=0, has_gap=True, until=2)
+    bench.put_again(0, 1)
+    assert bench.is_through(0, 1, 2)
+
+
+def test_a_relay_that_came_later_begins_where_the_stream_is(bench: Bench) -> None:
+    bench.open(is_from_start=False)
+    bench.put(7, 8)
+    assert bench.is_through(7, 8)
+
+
+def test_what_the_worker_has_no_more_is_skipped_and_counted(bench: Bench) -> None:
+    stream = bench.open()
+    bench.put(0, 5)
+    bench.wait_ack(arrived=1, has_gap=True)
+    marker = encode_end(EndMarker(epoch=0, count=4))
+    bench.again.put(marker, encoding=SKIP_ENCODING, source_info=zenoh.SourceInfo(bench.publisher.id, 4))
+    bench.put_again(4)
+    assert bench.is_through(0, 4, 5)
+    assert stream.count().lost == 3
+
+
+def test_what_never_comes_is_given_up_also_when_nothing_else_comes(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(answers, "GIVE_UP_S", 0.1)
+    stream = bench.open()
+    bench.put(0, 2)
+    end = time.monotonic() + 5
+    while len(bench.passed) < 2 and time.monotonic() < end:
+        stream.look_after()
+        time.sleep(0.01)
+    assert bench.is_through(0, 2)
+    assert stream.count().lost == 1
+
+
+def test_what_waits_is_bounded_and_comes_again(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(answers, "MAX_WAITING", 2)
+    bench.open()
+    bench.put(1, 2, 3, 4)
+    bench.wait_ack(arrived=0, has_gap=True, until=1)
+    bench.put_again(0)
+    assert bench.is_through(0, 1, 2)
+    bench.put_again(3, 4)
+    assert bench.is_through(0, 1, 2, 3, 4)
+
+
+def test_an_end_marker_asks_for_the_tail_that_was_lost(bench: Bench) -> None:
+    stream = bench.open()
+    bench.put(0)
+    end = encode_end(EndMarker(epoch=1, count=3))
+    bench.worker.put(f"{KEY}/{END_CHUNK}", end, source_info=zenoh.SourceInfo(bench.publisher.id, 3))
+    until(lambda: stream.has_ended(1) or any(ack.until == 3 for ack in bench.said), "the tail is asked for")
+    assert not stream.has_ended(1)
+    bench.wait_ack(is_ended=True)
+    bench.put_again(1, 2)
+    assert bench.is_through(0, 1, 2)
+    until(lambda: stream.has_ended(1), "the slot has ended")
+
+
+def test_a_stream_of_newest_values_takes_what_is_newer_and_drops_what_is_older(bench: Bench) -> None:
+    bench.open(StreamClass.LATEST)
+    bench.put(3)
+    assert bench.is_through(3)
+    bench.put_again(1, 5)
+    bench.put(4, 6)
+    until(lambda: bench.passed[-1] == "6", "the newest")
+    assert bench.passed in (["3", "5", "6"], ["3", "4", "5", "6"], ["3", "4", "6"])
+    bench.wait_ack(arrived=7, has_gap=False)

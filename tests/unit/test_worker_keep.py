@@ -1,0 +1,196 @@
+"""What a worker keeps of its answers, over real sessions: until when, and what a relay is sent again."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import zenoh
+
+from zsched import wire, worker_keep
+from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks
+from zsched.keyspace import AGAIN_CHUNK, END_CHUNK, Keyspace
+from zsched.relay_pipe import decode_end
+from zsched.worker_keep import Keeper, KeptLane
+from zsched.zenoh_config import data_config, worker_config
+
+KEY = "edge1/t/1/out"
+KEYS = Keyspace("t")
+
+
+def until(condition: Callable[[], Any], what: str, deadline_s: float = 5.0) -> Any:
+    end = time.monotonic() + deadline_s
+    while time.monotonic() < end:
+        value = condition()
+        if value:
+            return value
+        time.sleep(0.002)
+    raise AssertionError(f"not within {deadline_s} s: {what}")
+
+
+class Robot:
+    """A robot's relay as a keeper sees it: acknowledgements as the test wants them."""
+
+    def __init__(self, session: zenoh.Session, worker: zenoh.Session, node: str, relay: str = "") -> None:
+        self.session, self.node = session, node
+        self.relay = relay or str(session.zid())
+        self.got: list[int] = []
+        self.skipped: list[int] = []
+        self.ends: list[int] = []
+        self._key = KEYS.received(node, self.relay, str(worker.zid()))
+        self._again = session.declare_subscriber(f"{KEY}/{AGAIN_CHUNK}/{self.relay}", self._take)
+        self._ends = session.declare_subscriber(f"{KEY}/{END_CHUNK}", self._end)
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        if str(sample.encoding) == SKIP_ENCODING:
+            marker = decode_end(sample.payload.to_bytes())
+            assert marker is not None
+            self.skipped.append(marker.count)
+            return
+        source: Any = sample.source_info
+        assert sample.payload.to_string() == f"answer {source.source_sn}"
+        self.got.append(source.source_sn)
+
+    def _end(self, sample: zenoh.Sample) -> None:
+        marker = decode_end(sample.payload.to_bytes())
+        self.ends.append(-1 if marker is None else marker.count)
+
+    def ack(self, eid: int, arrived: int, **more: Any) -> None:
+        ack = StreamAck(eid=eid, first=0, arrived=arrived, processed=arrived, **more)
+        self.session.put(self._key, wire.encode(StreamAcks(acks=(ack,))))
+
+    def leave(self) -> None:
+        self._again.undeclare()
+
+
+class Bench:
+    def __init__(self, worker: zenoh.Session, outside: zenoh.Session) -> None:
+        self.worker, self.outside = worker, outside
+        self.keeper = Keeper(worker, KEYS.received("*", "*", str(worker.zid())))
+        self.publisher = worker.declare_publisher(KEY)
+        self.eid = self.publisher.id.eid
+
+    def lane(self, limit: int = 100) -> KeptLane:
+        lane = self.keeper.lane(KEY, self.publisher.id, limit)
+        watch = self.outside.declare_publisher(KEYS.received("robot1", "x", str(self.worker.zid())))
+        until(lambda: matches(watch), "the keeper listens")
+        return lane
+
+    def robot(self, node: str, relay: str = "") -> Robot:
+        return Robot(self.outside, self.worker, node, relay)
+
+
+def matches(publisher: zenoh.Publisher) -> bool:
+    status: Any = publisher.matching_status
+    return bool(status.matching)
+
+
+def keep(lane: KeptLane, *numbers: int) -> None:
+    for number in numbers:
+        lane.keep(number, f"answer {number}".encode(), None, None, None, 10)
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    outside = zenoh.open(zenoh.Config.from_json5(data_config(listen=(endpoint,), connect=(), shared_memory=False)))
+    worker = zenoh.open(zenoh.Config.from_json5(worker_config(connect=(endpoint,), shared_memory=False)))
+    made = Bench(worker, outside)
+    try:
+        yield made
+    finally:
+        made.keeper.close()
+        worker.close()
+        outside.close()
+
+
+def test_what_every_robot_has_acknowledged_is_kept_no_more(bench: Bench) -> None:
+    lane = bench.lane()
+    first, second = bench.robot("robot1", "aa1"), bench.robot("robot2", "aa2")
+    keep(lane, 0, 1, 2, 3)
+    second.ack(bench.eid, 1)
+    until(lambda: len(lane.kept) == 3, "the slower one counts")
+    first.ack(bench.eid, 4)
+    second.ack(bench.eid, 4)
+    until(lambda: not lane.kept and lane.size == 0, "nothing is kept")
+
+
+def test_a_gap_is_filled_at_once_for_that_robot_alone(bench: Bench) -> None:
+    lane = bench.lane()
+    first, second = bench.robot("robot1", "aa1"), bench.robot("robot2", "aa2")
+    keep(lane, *range(10))
+    first.ack(bench.eid, 1)
+    second.ack(bench.eid, 10)
+    first.ack(bench.eid, 4, has_gap=True, until=7)
+    until(lambda: first.got == [4, 5, 6], "the hole")
+    assert second.got == []
+    assert first.skipped == []
+
+
+def test_who_makes_no_progress_is_sent_the_rest_again_and_the_end_too(bench: Bench) -> None:
+    lane = bench.lane()
+    robot = bench.robot("robot1")
+    keep(lane, 0, 1, 2)
+    robot.ack(bench.eid, 1)
+    until(lambda: robot.got[:2] == [1, 2], "what is not acknowledged")
+    lane.note_end(EndMarker(epoch=1, count=3))
+    robot.ack(bench.eid, 3)
+    until(lambda: robot.ends and robot.ends[0] == 3, "the end marker")
+    robot.ack(bench.eid, 3, is_ended=True)
+    until(lambda: not lane.wake.is_set(), "the keeper is at rest")
+
+
+def test_what_is_kept_no_more_is_skipped(bench: Bench) -> None:
+    lane = bench.lane(limit=3)
+    robot = bench.robot("robot1")
+    keep(lane, *range(6))
+    robot.ack(bench.eid, 1, has_gap=True, until=5)
+    until(lambda: robot.got == [3, 4], "what there is")
+    assert robot.skipped == [3]
+
+
+def test_much_is_sent_again_in_parts_as_it_arrives(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worker_keep, "BATCH", 2)
+    lane = bench.lane()
+    robot = bench.robot("robot1")
+    keep(lane, *range(5))
+    robot.ack(bench.eid, 0)
+    for count in (2, 4, 5):
+        until(lambda count=count: robot.got == list(range(count)), f"{count} of them")  # type: ignore[misc]
+        robot.ack(bench.eid, count)
+    until(lambda: not lane.kept, "all acknowledged")
+
+
+def test_a_relay_that_restarted_takes_the_place_of_its_former_life(bench: Bench) -> None:
+    lane = bench.lane()
+    before, after = bench.robot("robot1", "aa1"), bench.robot("robot1", "aa2")
+    keep(lane, 0, 1, 2)
+    before.ack(bench.eid, 0)
+    until(lambda: "aa1" in lane.receivers, "the first life")
+    after.ack(bench.eid, 3)
+    until(lambda: not lane.kept, "nobody waits for the first life")
+
+
+def test_who_cannot_be_reached_is_forgotten_and_what_nobody_acknowledges_too(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(worker_keep, "FORGET_S", 0.4)
+    lane = bench.lane()
+    robot = bench.robot("robot1")
+    keep(lane, 0, 1)
+    robot.ack(bench.eid, 1)
+    until(lambda: lane.receivers, "the robot")
+    robot.leave()
+    until(lambda: not lane.receivers and not lane.kept, "nothing is kept for nobody")
+
+
+def test_bytes_are_bounded_too(monkeypatch: pytest.MonkeyPatch, bench: Bench) -> None:
+    monkeypatch.setattr(worker_keep, "KEPT_BYTES", 25)
+    lane = bench.lane()
+    keep(lane, 0, 1, 2)
+    assert [one.number for one in lane.kept] == [1, 2]

@@ -1,0 +1,187 @@
+"""Puts the answers of one output slot in order: numbers that came early wait for those that are sent again.
+
+Knows: `zsched.worker`'s numbers and what it keeps of its answers, the acknowledger. Does not know: gates, outlets.
+
+A link that breaks loses what was on it; the worker keeps its answers until this relay has acknowledged them, and puts
+what is missing once more, for this relay alone (`AGAIN_CHUNK`). Meanwhile newer answers wait here, bounded. What the
+worker has no more is skipped at its word, what never comes after `GIVE_UP_S`; the gate counts both as lost. Where only
+the newest is wanted (class ``latest``) nothing waits. The stream's lock guards it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Final, cast
+
+import zenoh
+from zenoh import Priority, Sample, SampleKind
+
+from zsched.core.relay_protocol import SKIP_ENCODING
+from zsched.hop_acks import GIVE_UP_S, Acknowledger, SourceName
+from zsched.keyspace import AGAIN_CHUNK
+from zsched.relay.counter import StreamCounter
+from zsched.relay_pipe import decode_end
+
+MAX_WAITING: Final = 4096
+MAX_WAITING_BYTES: Final = 32 << 20
+"""Early answers of one publisher that wait; further ones are dropped here, and come again."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Resent:
+    """What the relay reads of a sample, under the key that it was first sent on (zenoh lets nobody make a sample)."""
+
+    key_expr: str
+    payload: zenoh.ZBytes
+    encoding: zenoh.Encoding
+    attachment: zenoh.ZBytes | None
+    timestamp: zenoh.Timestamp | None
+    priority: Priority
+    express: bool
+    source_info: zenoh.SourceInfo
+    kind: SampleKind
+
+
+@dataclass(slots=True)
+class _Early:
+    samples: dict[int, Sample] = field(default_factory=dict)
+    size: int = 0
+
+    def put(self, number: int, sample: Sample) -> bool:
+        """Let a sample wait; ``False`` when there is no room."""
+        if number not in self.samples:
+            self.samples[number] = sample
+            self.size += len(sample.payload)
+        return len(self.samples) <= MAX_WAITING and self.size <= MAX_WAITING_BYTES
+
+    def pop(self, number: int) -> Sample | None:
+        """Take one out, if it is there."""
+        sample = self.samples.pop(number, None)
+        self.size -= len(sample.payload) if sample is not None else 0
+        return sample
+
+    def forget(self, number: int) -> None:
+        """Let go of everything below a number."""
+        for old in [one for one in self.samples if one < number]:
+            self.pop(old)
+
+
+class Answers:
+    """The numbered answers of one slot's workers: usually one, two when it restarts in place."""
+
+    def __init__(self, acks: Acknowledger, counter: StreamCounter, *, is_from_start: bool, in_turn: bool) -> None:
+        """``is_from_start``: this slot was open before its owner could answer, number 0 is wanted too."""
+        self._acks = acks
+        self._counter = counter
+        self._is_from_start = is_from_start
+        self._in_turn = in_turn
+        self._early: dict[SourceName, _Early] = {}
+        self._names: set[SourceName] = set()
+
+    def take(self, name: SourceName, number: int, sample: Sample, *, is_again: bool = False) -> tuple[Sample, ...]:
+        """A sample came; answers those that go on now, in order."""
+        self._names.add(name)
+        if name not in self._early and self._acks.take(name, number, len(sample.payload)):
+            return (sample,)
+        expected = self._acks.expect(name, 0 if self._is_from_start and self._in_turn else number)
+        if number < expected:
+            self._acks.admit(name, number, in_turn=True)  # dropped, and acknowledged once more
+            if not is_again and self._in_turn:
+                self._counter.doubled += 1
+            return ()
+        if number > expected:
+            return self._wait_for(name, number, sample)
+        self._acks.take(name, number, len(sample.payload))
+        return (sample, *self._next_ones(name))
+
+    def take_again(self, sample: Sample) -> tuple[tuple[str, SourceName, Sample], ...]:
+        """Something came under our own key: ``(key, publisher, sample)`` of what goes on now."""
+        info: zenoh.SourceInfo | None = sample.source_info
+        if info is None:
+            return ()
+        key = str(sample.key_expr).rsplit(f"/{AGAIN_CHUNK}/", 1)[0]
+        name = (key, str(info.source_id.zid), info.source_id.eid)
+        if str(sample.encoding) == SKIP_ENCODING:
+            marker = decode_end(sample.payload.to_bytes())
+            ready = () if marker is None else self._skip(name, marker.count)
+        else:
+            resent = _Resent(
+                key_expr=key,
+                payload=sample.payload,
+                encoding=sample.encoding,
+                attachment=sample.attachment,
+                timestamp=sample.timestamp,
+                priority=sample.priority,
+                express=sample.express,
+                source_info=info,
+                kind=sample.kind,
+            )
+            ready = self.take(name, info.source_sn, cast("Sample", resent), is_again=True)
+        return tuple((key, name, one) for one in ready)
+
+    def ended(self, name: SourceName) -> None:
+        """The source's end marker came."""
+        self._names.add(name)
+        self._acks.end(name)
+
+    def ask_for(self, name: SourceName, until: int) -> bool:
+        """Ask for everything below a number; ``False`` when that has been in vain for too long."""
+        self._acks.expect(name, 0 if self._is_from_start else until)
+        return self._acks.ask_for(name, until) <= GIVE_UP_S
+
+    def arrived(self, name: SourceName) -> int:
+        """The number that comes next."""
+        return self._acks.arrived(name)
+
+    def overdue(self) -> Iterator[tuple[str, SourceName, Sample]]:
+        """What goes on now because the missing ones before it never came."""
+        for name, early in tuple(self._early.items()):
+            first = min(early.samples, default=None)
+            if first is not None and self._acks.ask_for(name, first) > GIVE_UP_S:
+                yield from ((name[0], name, sample) for sample in self._skip(name, first))
+
+    def close(self) -> None:
+        """The slot is closed: its workers hear once more how far it came."""
+        self._acks.forget(self._names)
+        self._names.clear()
+        self._early.clear()
+
+    # --- out of turn -------------------------------------------------------------------------------------------------
+
+    def _wait_for(self, name: SourceName, number: int, sample: Sample) -> tuple[Sample, ...]:
+        if not self._in_turn:
+            self._acks.skip(name, number)
+            self._acks.take(name, number, len(sample.payload))
+            return (sample,)
+        early = self._early.setdefault(name, _Early())
+        if not early.put(number, sample):
+            early.pop(number)
+        first = min(early.samples, default=number)
+        if self._acks.ask_for(name, first) > GIVE_UP_S:
+            return self._skip(name, first)
+        return ()
+
+    def _skip(self, name: SourceName, number: int) -> tuple[Sample, ...]:
+        self._acks.skip(name, number)
+        early = self._early.get(name)
+        if early is not None:
+            early.forget(self._acks.arrived(name))
+        return self._next_ones(name)
+
+    def _next_ones(self, name: SourceName) -> tuple[Sample, ...]:
+        """What has waited for the number that has just come."""
+        early = self._early.get(name)
+        if early is None:
+            return ()
+        ready = []
+        number = self._acks.arrived(name)
+        while (sample := early.pop(number)) is not None:
+            self._acks.take(name, number, len(sample.payload))
+            ready.append(sample)
+            number += 1
+        if early.samples:
+            self._acks.ask_for(name, min(early.samples))
+        else:
+            del self._early[name]
+        return tuple(ready)
