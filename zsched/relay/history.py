@@ -54,10 +54,13 @@ class History:
         self._tokens: zenoh.Subscriber[None] | None = None
 
     def start(self) -> None:
-        """Ask every cache there is, and later those of publishers that appear."""
-        self._ask(f"{self._expr}/{ADVANCED}/**")
+        """Ask every cache there is, and later those of publishers that appear.
+
+        The watch comes first: a publisher that was linked between a question and the watch would never be asked.
+        """
         watch = f"{self._expr}/{ADVANCED}/pub/**"
         self._tokens = self._session.liveliness().declare_subscriber(watch, self._token, history=False)
+        self._ask(f"{self._expr}/{ADVANCED}/**")
 
     def close(self) -> None:
         """Ask nobody any more; answers on their way are dropped."""
