@@ -34,7 +34,14 @@ _Source = tuple[str, str, int]
 class History:
     """The caches behind one key expression. ``deliver`` is called under `History.lock`, from several threads."""
 
-    def __init__(self, session: Session, expr: str, depth: int, deliver: Callable[[Sample], None]) -> None:
+    def __init__(
+        self,
+        session: Session,
+        expr: str,
+        depth: int,
+        deliver: Callable[[Sample], None],
+        origin: zenoh.Locality = zenoh.Locality.REMOTE,
+    ) -> None:
         """Watch for publishers; `start` begins to ask.
 
         Raises:
@@ -44,6 +51,7 @@ class History:
         self._expr = expr
         self._depth = max(1, depth)
         self._deliver = deliver
+        self._origin = origin
         self._own_id = str(session.zid())
         self._pending = 0
         self._is_closed = False
@@ -115,7 +123,7 @@ class History:
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             accept_replies=zenoh.ReplyKeyExpr.ANY,
-            allowed_destination=zenoh.Locality.REMOTE,
+            allowed_destination=self._origin,
             timeout=TIMEOUT_S,
         )
         for answer in answers:

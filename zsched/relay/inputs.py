@@ -47,7 +47,6 @@ class InputStream:
         """Subscribe on ``local``, the host's own side, if there is one; ``session`` is the fleet's."""
         self.route = route
         self._session = session
-        self._own_ids = own_ids
         self._lock = threading.Lock()
         self._counter = StreamCounter(route.stream)
         self._slots: dict[int, _InputSlot] = {}
@@ -63,7 +62,11 @@ class InputStream:
         self._kept: OrderedDict[str, deque[_Kept]] = OrderedDict()
         self._closed = Tally()  # what slots that are closed have counted
         self._is_counted = False
-        self._receiver = Receiver(local or session, route.from_expr, route.settings, self._carry, with_history=True)
+        side = local or session
+        self._loop_ids = own_ids - {str(side.zid())}
+        self._receiver = Receiver(
+            side, route.from_expr, route.settings, self._carry, with_history=True, origin=zenoh.Locality.ANY
+        )
 
     def open(self, epoch: int, route: Route, acks: Acks | None = None) -> None:
         """Declare the publishers of a slot; it carries nothing yet. With ``acks`` its worker counts what it gets.
@@ -170,7 +173,7 @@ class InputStream:
     def _carry(self, sample: Sample) -> None:
         with self._lock:
             self._counter.seen(len(sample.payload))
-            if _is_own(sample, self._own_ids):
+            if _is_own(sample, self._loop_ids):
                 self._counter.dropped("loop")
                 return
             self._number += 1
@@ -214,6 +217,10 @@ class InputStream:
 
 
 def _is_own(sample: Sample, own_ids: frozenset[str]) -> bool:
-    """True when a session of this process put the sample: a loop through another one of our sessions."""
+    """True when another session of this process put the sample: a loop from one of our sides to the other.
+
+    What the same session put is another task's output: a chain of tasks (rules whose relays feed each other in a circle
+    are refused when the fleet file is loaded).
+    """
     source: zenoh.SourceInfo | None = sample.source_info
     return source is not None and str(source.source_id.zid) in own_ids

@@ -36,7 +36,7 @@ def undeclare(entity: Declared) -> None:
 
 
 class Receiver:
-    """A subscriber and the thread that drains it into ``carry``; samples of this process's own session never come."""
+    """A subscriber and the thread that drains it into ``carry``."""
 
     def __init__(
         self,
@@ -46,8 +46,9 @@ class Receiver:
         carry: Callable[[Sample], None],
         *,
         with_history: bool,
+        origin: zenoh.Locality = zenoh.Locality.REMOTE,
     ) -> None:
-        """Subscribe and start.
+        """Subscribe and start; by default without what ``session`` itself puts (``origin``).
 
         ``with_history`` asks the publishers of class ``latest`` for what they still hold; wrong where a key outlives
         an owner's epoch (the old epoch's value would come back as the new one's).
@@ -58,9 +59,9 @@ class Receiver:
         is_latest = settings.stream_class is StreamClass.LATEST
         self._history: History | None = None
         if with_history and is_latest and settings.keep_last:
-            self._history = History(session, expr, settings.keep_last, carry)
+            self._history = History(session, expr, settings.keep_last, carry, origin)
         self._carry = carry if self._history is None else self._history.live
-        self._subscriber = _subscribe(session, expr, settings)
+        self._subscriber = _subscribe(session, expr, settings, origin)
         self._handler = self._subscriber.handler  # the thread's own: undeclare() refuses while recv() borrows
         self._thread = threading.Thread(target=self._run, name=f"from {expr}", daemon=True)
         self._thread.start()
@@ -86,10 +87,9 @@ class Receiver:
 _Subscriber = zenoh.Subscriber[zenoh.handlers.Handler[Sample]]
 
 
-def _subscribe(session: Session, expr: str, settings: StreamSettings) -> _Subscriber:
-    remote = zenoh.Locality.REMOTE
+def _subscribe(session: Session, expr: str, settings: StreamSettings, origin: zenoh.Locality) -> _Subscriber:
     if settings.stream_class is StreamClass.RELIABLE:
         fifo: zenoh.handlers.FifoChannel[Sample] = zenoh.handlers.FifoChannel(max(settings.depth, 256))
-        return session.declare_subscriber(expr, fifo, allowed_origin=remote)
+        return session.declare_subscriber(expr, fifo, allowed_origin=origin)
     ring: zenoh.handlers.RingChannel[Sample] = zenoh.handlers.RingChannel(settings.depth)
-    return session.declare_subscriber(expr, ring, allowed_origin=remote)
+    return session.declare_subscriber(expr, ring, allowed_origin=origin)
