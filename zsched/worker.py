@@ -23,12 +23,10 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import queue
 import signal
 import threading
 from collections.abc import Callable, Mapping
 from functools import partial
-from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any, Final, Self
 
@@ -38,16 +36,18 @@ from zsched import wire
 from zsched.clock import monotonic_s
 from zsched.core.plan import Role, WorkerRole
 from zsched.core.relay_protocol import StreamAcks
-from zsched.errors import ConfigError, WireError
 from zsched.hop_acks import Acknowledger
 from zsched.keyspace import END_CHUNK, Keyspace
 from zsched.relay_pipe import decode_end
 from zsched.worker_epochs import CARRY_S, Epochs
+from zsched.worker_errands import Errands
 from zsched.worker_inputs import Dispatcher, Input, Marker, Received
 from zsched.worker_keep import Keeper
 from zsched.worker_outputs import OUTPUT_DEPTH, Output
+from zsched.worker_roles import RoleWatch
 from zsched.worker_services import Answer, Handler, Request, Service
 from zsched.worker_snapshot import TIMEOUT_S, Offer, Restorer, StateLink, fetch
+from zsched.worker_start import open_session, surroundings
 
 __all__ = ["Answer", "Output", "Received", "Request", "Worker"]
 
@@ -55,8 +55,6 @@ CLOSE_S: Final = 0.6
 """Closing a session towards a stopped peer can take seconds; so long we wait."""
 ALARM_S: Final = 0.9
 """...and should zenoh hold Python's global lock meanwhile, the kernel ends a process that was told to stop."""
-ROLE_RETRY_S: Final = 0.5
-_ENVIRONMENT: Final = ("ZSCHED_FLEET", "ZSCHED_NODE", "ZSCHED_TASK", "ZSCHED_INCARNATION", "ZSCHED_ZENOH_CONFIG")
 
 _log = logging.getLogger("zsched.worker")
 
@@ -88,26 +86,27 @@ class Worker:
         self._lock = threading.Lock()
         idle = Role(task=task, role=WorkerRole.IDLE)
         self._role = Role(task=task, role=WorkerRole.ACTIVE, epoch=1) if is_standalone else idle
-        self._is_role_known = is_standalone
         self._epochs = Epochs()
         self._stop = threading.Event()
         self._is_signalled = False
         self._outputs: list[Output] = []
         self._declared: list[Any] = []
-        self._errands: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
-        self._role_token: zenoh.LivelinessToken | None = None
+        self._errands = Errands(self._stop)
         self._token: zenoh.LivelinessToken | None = None
-        self._session = _open(zenoh_config)
+        self._session = open_session(zenoh_config)
         self._state_link = StateLink(self._session, zenoh_config)
         self._keeper = Keeper(self._session, self._keyspace.received("*", "*", str(self._session.zid())))
         self._acks = Acknowledger(self._send_acks)
         self._dispatcher = Dispatcher(self._inputs_ended, self._acks)
         self._restorer = Restorer(self._fetch_snapshot, node, self._dispatcher)
-        self._errand_thread = threading.Thread(target=self._run_errands, name="zsched errands", daemon=True)
-        self._errand_thread.start()
         self._dispatcher.start()
+        self._watch: RoleWatch | None = None
         if not is_standalone:
-            self._watch_role()
+            key = self._keyspace.role(node, task)
+            self._watch = RoleWatch(self._session, key, self._on_role, self._stop)
+            self._declared.append(self._watch)
+            self._watch.start()
+            self._errands.put(self._watch.ask)
 
     @classmethod
     def from_env(
@@ -127,30 +126,16 @@ class Worker:
         Raises:
             ConfigError: a variable is missing, or the zenoh configuration cannot be read.
         """
-        missing = [name for name in _ENVIRONMENT if not env.get(name)]
-        if missing and not (standalone and len(missing) == len(_ENVIRONMENT)):
-            raise ConfigError(
-                f"this worker has no {', '.join(missing)} in its environment: a worker is started by its node's "
-                "daemon (zsched up); to run it by hand, say --standalone (Worker.from_env(standalone=TASK))"
-            )
-        if missing:
-            worker = cls(
-                fleet="standalone",
-                node="local",
-                task=standalone,
-                incarnation="1",
-                zenoh_config="{}",
-                is_standalone=True,
-            )
-        else:
-            worker = cls(
-                fleet=env["ZSCHED_FLEET"],
-                node=env["ZSCHED_NODE"],
-                task=env["ZSCHED_TASK"],
-                incarnation=env["ZSCHED_INCARNATION"],
-                zenoh_config=_read(env["ZSCHED_ZENOH_CONFIG"]),
-                drains_itself=drains_itself,
-            )
+        around = surroundings(env, standalone)
+        worker = cls(
+            fleet=around.fleet,
+            node=around.node,
+            task=around.task,
+            incarnation=around.incarnation,
+            zenoh_config=around.zenoh_config,
+            is_standalone=around.is_standalone,
+            drains_itself=drains_itself and not around.is_standalone,
+        )
         if handles_signals and threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, worker._on_signal)
             signal.signal(signal.SIGINT, worker._on_signal)
@@ -279,7 +264,7 @@ class Worker:
         self._keeper.close()
         for output in tuple(self._outputs):
             output.close()
-        self._errands.put(None)
+        self._errands.close()
         closing = threading.Thread(target=self._close_session, name="zsched close", daemon=True)
         closing.start()
         closing.join(CLOSE_S)
@@ -311,32 +296,10 @@ class Worker:
 
     # --- role --------------------------------------------------------------------------------------------------------
 
-    def _watch_role(self) -> None:
-        key = self._keyspace.role(self._node, self._task)
-        watch = self._session.declare_subscriber(key, lambda sample: self._on_role(sample.payload))
-        self._declared.append(watch)
-        self._errands.put(self._ask_role)
-
-    def _ask_role(self) -> None:
-        """Ask until the first answer: our relay may start later than we do."""
-        key = self._keyspace.role(self._node, self._task)
-        while not self._is_role_known and not self._stop.is_set():
-            replies = self._session.get(key, consolidation=zenoh.ConsolidationMode.NONE, timeout=ROLE_RETRY_S)
-            for reply in replies:
-                if reply.ok is not None and not self._is_role_known:
-                    self._on_role(reply.ok.payload)
-            if not self._is_role_known:
-                self._stop.wait(0.05)
-
-    def _on_role(self, payload: zenoh.ZBytes) -> None:
-        try:
-            role = wire.decode(payload.to_bytes(), Role)
-        except WireError as error:
-            _log.warning("an unreadable role was ignored (%s)", error)
-            return
+    def _on_role(self, role: Role) -> None:
         with self._lock:
             self._restorer.note(role)  # first: from the moment that we are the owner, inputs wait for the snapshot
-            before, self._role, self._is_role_known = self._role, role, True
+            before, self._role = self._role, role
             if not self._drains_itself:
                 self._epochs.follow(before, role)
         if role != before:
@@ -353,13 +316,13 @@ class Worker:
         if role.role is WorkerRole.IDLE and before.epoch:
             self._dispatcher.forget(before.epoch)
         is_active = role.role is WorkerRole.ACTIVE
-        if self._role_token is not None and (not is_active or before.epoch != role.epoch):
-            self._role_token.undeclare()
-            self._role_token = None
+        if self._watch is not None and (not is_active or before.epoch != role.epoch):
+            self._watch.hide()
         if is_active:
             self._epochs.resume(role.epoch)
         was_held = before.lease_until_s is not None and monotonic_s() >= before.lease_until_s
-        if is_active and (self._role_token is None or was_held):
+        is_shown = self._watch is not None and self._watch.is_shown
+        if is_active and (not is_shown or was_held):
             self._begin(role)  # also what was withheld for want of a lease
 
     def _begin(self, role: Role) -> None:
@@ -375,9 +338,8 @@ class Worker:
         self._restorer.deliver()
 
     def _show_role(self, epoch: int) -> None:
-        if self._role_token is None and not self._is_standalone:
-            key = f"{self._keyspace.role(self._node, self._task)}/{epoch}"
-            self._role_token = self._session.liveliness().declare_token(key)
+        if self._watch is not None:
+            self._watch.show(epoch)
 
     def _fetch_snapshot(self, predecessor: str, timeout_s: float) -> bytes | str:
         return fetch(self._state_link.session, self._keyspace.snapshot(predecessor, self._task), timeout_s)
@@ -431,32 +393,7 @@ class Worker:
             outputs = tuple(self._outputs)
         self._errands.put(lambda: _end_all(outputs, epoch))
 
-    def _run_errands(self) -> None:
-        while True:
-            errand = self._errands.get()
-            if errand is None:
-                return
-            try:
-                errand()
-            except Exception:  # noqa: BLE001 - an errand that fails (session closing) must not end the others
-                if not self._stop.is_set():
-                    _log.exception("an errand failed")
-
 
 def _end_all(outputs: tuple[Output, ...], epoch: int) -> None:
     for output in outputs:
         output.send_end(epoch)
-
-
-def _open(zenoh_config: str) -> zenoh.Session:
-    try:
-        return zenoh.open(zenoh.Config.from_json5(zenoh_config))
-    except (zenoh.ZError, ValueError) as error:
-        raise ConfigError(f"the worker's zenoh session cannot be opened: {error}") from error
-
-
-def _read(path: str) -> str:
-    try:
-        return Path(path).read_text(encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"ZSCHED_ZENOH_CONFIG: {path} cannot be read: {error.strerror}") from error

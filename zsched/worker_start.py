@@ -1,0 +1,68 @@
+"""Reads a worker's environment and opens its session.
+
+Knows: the variables that the daemon sets. Does not know: roles, inputs, outputs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import zenoh
+
+from zsched.errors import ConfigError
+
+_ENVIRONMENT: Final = ("ZSCHED_FLEET", "ZSCHED_NODE", "ZSCHED_TASK", "ZSCHED_INCARNATION", "ZSCHED_ZENOH_CONFIG")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Surroundings:
+    """Who a worker is, and its session's configuration (JSON5 text)."""
+
+    fleet: str
+    node: str
+    task: str
+    incarnation: str
+    zenoh_config: str
+    is_standalone: bool = False
+
+
+def surroundings(env: Mapping[str, str], standalone: str) -> Surroundings:
+    """What the environment says; ``standalone`` names the task of a worker started by hand.
+
+    Raises:
+        ConfigError: a variable is missing, or the zenoh configuration cannot be read.
+    """
+    missing = [name for name in _ENVIRONMENT if not env.get(name)]
+    if missing and not (standalone and len(missing) == len(_ENVIRONMENT)):
+        raise ConfigError(
+            f"this worker has no {', '.join(missing)} in its environment: a worker is started by its node's "
+            "daemon (zsched up); to run it by hand, say --standalone (Worker.from_env(standalone=TASK))"
+        )
+    if missing:
+        return Surroundings(
+            fleet="standalone", node="local", task=standalone, incarnation="1", zenoh_config="{}", is_standalone=True
+        )
+    fleet, node, task, incarnation, path = (env[name] for name in _ENVIRONMENT)
+    return Surroundings(fleet=fleet, node=node, task=task, incarnation=incarnation, zenoh_config=_read(path))
+
+
+def open_session(zenoh_config: str) -> zenoh.Session:
+    """The worker's session on the data network.
+
+    Raises:
+        ConfigError: zenoh refuses the configuration.
+    """
+    try:
+        return zenoh.open(zenoh.Config.from_json5(zenoh_config))
+    except (zenoh.ZError, ValueError) as error:
+        raise ConfigError(f"the worker's zenoh session cannot be opened: {error}") from error
+
+
+def _read(path: str) -> str:
+    try:
+        return Path(path).read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"ZSCHED_ZENOH_CONFIG: {path} cannot be read: {error.strerror}") from error
