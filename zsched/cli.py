@@ -18,6 +18,7 @@ from typing import Annotated
 
 import typer
 
+from zsched.cli_bench import bench_app
 from zsched.cli_common import EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, CliError, Json, Verb, Verbs, print_json
 from zsched.cli_stream_verbs import stream_app
 
@@ -40,6 +41,7 @@ app = typer.Typer(
 
 
 app.add_typer(stream_app)
+app.add_typer(bench_app)
 
 LAB_NEEDS = ("cv2", "matplotlib", "numpy", "onnxruntime", "rich")
 """What the extra ``lab`` installs."""

@@ -1,0 +1,149 @@
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from zsched.lab.paper.claims import (
+    CLAIMS,
+    Claim,
+    Difference,
+    Verdict,
+    better_than_ours,
+    difference,
+    judged,
+    relative,
+    table_of,
+    verdict,
+)
+from zsched.lab.paper.figures import save_all, save_radio
+from zsched.lab.paper.report import report
+from zsched.lab.paper.schemes import FIXED_SCHEMES, PAPER_SCHEMES, SCHEMES
+
+HIGHER = Claim(source="paper", says="x", metric="map_hz", mine=("a",), theirs=("b",), target=0.2)
+LOWER = Claim(source="paper", says="x", metric="task_latency_s", mine=("a",), theirs=("b",), target=-0.28)
+FIGURES = {
+    "map_hz": 2.0, "throughput_mb_s": 10.0, "task_latency_s": 30.0,
+    "merge_latency_p50_s": 0.2, "merge_latency_p95_s": 0.5, "merge_latency_p99_s": 0.7,
+    "cpu_peak": 0.9, "cpu_mean": 0.5, "memory_mean": 0.4, "memory_peak": 0.6,
+    "cpu_mean_spread": 0.4, "memory_mean_spread": 0.2,
+    "ssim_rebased": 0.3, "held_ssim_rebased": 0.1, "wall_f1": 0.9, "coverage": 0.95, "ssim_crop": 0.8,
+    "moves": 2, "wasted_moves": 0, "move_gap_mean_s": 0.4, "lost": 0, "regret": 0.1,
+}  # fmt: skip
+
+
+def a_run(scheme: str, run: int, level: str = "four", **changed: Any) -> dict[str, Any]:
+    node = {"cpu_peak": 0.9, "memory_mean": 0.4, "throughput_mb_s": 3.0}
+    host = {"pressure": 0.05, "idle_ratio": 0.4}
+    nodes = {"edge1": node, "edge2": node | {"cpu_peak": None}}
+    return {
+        "scheme": scheme,
+        "run": run,
+        "level": level,
+        "host": host,
+        "links": "simulated",
+        "nodes": nodes,
+        **FIGURES,
+        **changed,
+    }
+
+
+def test_the_difference_is_paired_and_its_interval_holds_the_mean() -> None:
+    theirs = {0: 1.0, 1: 2.0, 2: 3.0, 3: 4.0, 9: 100.0}
+    mine = {run: value * 1.3 for run, value in theirs.items() if run != 9}
+
+    found = difference(mine, theirs)
+
+    assert found is not None
+    assert (found.value, found.low, found.high) == pytest.approx((0.3, 0.3, 0.3))  # run by run the same ratio
+    assert found.runs == 4
+    assert found.text() == "+30 % [+30 %, +30 %]"
+
+
+def test_noise_widens_the_interval() -> None:
+    found = difference({0: 1.0, 1: 3.0, 2: 1.0, 3: 3.0}, dict.fromkeys(range(4), 2.0))
+
+    assert found is not None
+    assert found.low < 0.0 < found.high
+    assert difference({}, {0: 1.0}) is None
+    assert difference({0: 1.0}, {0: 0.0}) is None
+    assert relative([-1.0], [-2.0]) == pytest.approx(0.5)  # better, though both are under nothing
+
+
+@pytest.mark.parametrize(
+    ("claim", "value", "low", "high", "expected"),
+    [
+        (HIGHER, 0.30, 0.25, 0.35, Verdict.EXCEEDED),
+        (HIGHER, 0.22, 0.05, 0.30, Verdict.REPRODUCED),
+        (HIGHER, 0.15, 0.10, 0.20, Verdict.NOT_REPRODUCED),
+        (HIGHER, 0.30, -0.1, 0.70, Verdict.NOT_REPRODUCED),
+        (LOWER, -0.40, -0.50, -0.30, Verdict.EXCEEDED),
+        (LOWER, -0.30, -0.40, -0.20, Verdict.REPRODUCED),
+        (LOWER, 0.40, 0.30, 0.50, Verdict.NOT_REPRODUCED),
+    ],
+)
+def test_verdicts(claim: Claim, value: float, low: float, high: float, expected: Verdict) -> None:
+    assert verdict(claim, Difference(value=value, low=low, high=high, runs=5)) is expected
+    assert verdict(claim, Difference(value=value, low=low, high=high, runs=2)) is Verdict.TOO_FEW
+    assert verdict(claim, None) is Verdict.NOT_MEASURED
+
+
+def test_a_run_in_which_a_scheme_is_missing_does_not_count() -> None:
+    runs = [a_run("fixed_e1", 0, map_hz=1.0), a_run("fixed_e2", 0, map_hz=3.0), a_run("fixed_e1", 1, map_hz=9.0)]
+
+    assert table_of(runs, "map_hz", ("fixed_e1", "fixed_e2")) == {0: 2.0}
+
+
+def test_claims_are_judged_by_the_schemes_they_speak_of() -> None:
+    runs = [a_run(name, run, throughput_mb_s=10.0) for name in FIXED_SCHEMES for run in range(3)]
+    runs += [a_run(name, run, throughput_mb_s=15.0) for name in PAPER_SCHEMES for run in range(3)]
+    runs += [a_run("zsched", run, throughput_mb_s=11.0) for run in range(3)]
+    verdicts = {(claim.source, claim.metric, claim.mine): outcome for claim, _, outcome in judged(runs)}
+
+    assert verdicts["paper", "throughput_mb_s", PAPER_SCHEMES] is Verdict.EXCEEDED
+    assert verdicts["goal", "throughput_mb_s", ("zsched",)] is Verdict.NOT_REPRODUCED
+    assert {metric for _, metric, _ in better_than_ours(runs)} == {"throughput_mb_s"}
+    assert {scheme for scheme, _, _ in better_than_ours(runs)} == set(PAPER_SCHEMES)
+    assert all(set(claim.mine) | set(claim.theirs) <= set(SCHEMES) for claim in CLAIMS)
+
+
+def test_the_report_holds_every_claim_scheme_level_and_picture(tmp_path: Any) -> None:
+    runs = [a_run(name, run) for name in ("fixed_e1", "zsched") for run in range(3)]
+    runs += [a_run(name, 0, level="one", map_hz=2.5) for name in ("fixed_e1", "zsched")]
+    node = {"cpu_cores": 0.3, "memory_mb": 512.0, "ballast_mb": 0.0}
+    levels = {name: {"threads": 1, "hz": 0, "side": 320} for name in ("one", "four")}
+    scenario = {
+        "name": "paper", "seed": 1, "level": "four", "levels": levels, "nodes": {"edge1": node}, "mode": "track",
+        "rate_hz": 4.0, "target_coverage": 0.8, "pressure_limit": 0.2,
+    }  # fmt: skip
+    invalid = [{"cell": "four-zsched-1", "reason": "pressure 0.50\nmore"}]
+    row = {"moves": 3, "wasted_moves": 0, "mean_dbm": -55.0, "under_best_db": 1.2, "below_70_ratio": 0.0}
+    radio = {
+        "links": "simulated", "duration_s": 60.0, "best_dbm": -53.8, "best_fixed_dbm": -57.0,
+        "picture": "radio.png", "schemes": {"zsched": row},
+    }  # fmt: skip
+    results = {
+        "scenario": scenario, "runs": runs, "invalid": invalid, "command": "zsched bench paper", "input": "log x",
+        "version": "1", "radio": radio,
+    }  # fmt: skip
+    pictures = save_all(runs, "four", ("one", "four"), tmp_path, "title")
+    pictures.append(
+        save_radio(
+            tmp_path / "radio.png", {"robot1": [(0.0, -50.0), (5.0, -60.0)]}, {"zsched": [(0.0, "robot1")]}, 60.0
+        )
+    )
+
+    text = report(results, pictures)
+
+    assert all(claim.says in text for claim in CLAIMS)
+    assert "| zsched | 3 | 2.00 |" in text
+    assert "| maps/s | zsched | 2.50 | 2.00 |" in text
+    assert "four-zsched-1: pressure 0.50" in text
+    assert "-55.0" in text
+    assert {"cpu.png", "memory.png", "throughput.png", "frequency.png", "latency.png", "ssim.png", "sweep.png"} <= set(
+        pictures
+    )
+    for name in pictures:
+        assert name in text
+        assert (tmp_path / name).stat().st_size > 5000
+    assert save_all([], "four", (), tmp_path, "title") == []

@@ -1,0 +1,171 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from zsched.lab.children import ChildError
+from zsched.lab.paper.bench import BenchOptions, claim_folder, command_of, plan_body, planned
+from zsched.lab.paper.matrix import METRICS, Matrix, Progress, cells_of, collect, invalid_reason, set_aside
+from zsched.lab.paper.places import robots_scenario_path, scenario_path
+from zsched.lab.paper.run import Cell, Inputs
+from zsched.lab.paper.scenario import Scenario, Sweep, load_scenario
+from zsched.lab.paper.schemes import SCHEMES
+
+INPUTS = Inputs(log=Path("malaga.csv"))
+
+
+@pytest.fixture
+def scenario() -> Scenario:
+    return load_scenario(scenario_path())
+
+
+def options(out: Path, **given: Any) -> BenchOptions:
+    return BenchOptions(out=out, scenario=scenario_path(), robots_scenario=robots_scenario_path(), **given)
+
+
+def test_the_matrix_is_every_scheme_by_run_then_the_sweep(scenario: Scenario) -> None:
+    cells = cells_of(scenario, ())
+    main = [cell for cell in cells if cell.level == scenario.level]
+
+    assert len({cell.name for cell in cells}) == len(cells)
+    assert {cell.scheme.name for cell in main} == set(SCHEMES)
+    assert sum(cell.scheme.name == "zsched" for cell in main) == 5
+    assert sum(cell.scheme.name == "oracle" for cell in main) == 3
+    assert [cell.run for cell in main] == sorted(cell.run for cell in main)
+    assert cells[: len(main)] == tuple(main)
+    assert {cell.level for cell in cells} == set(scenario.levels)
+    swept = len(scenario.sweep.schemes) * scenario.sweep.runs * (len(scenario.levels) - 1)
+    assert len(cells) == len(main) + swept
+
+
+def test_fewer_runs_and_schemes_by_option(scenario: Scenario) -> None:
+    cells = cells_of(scenario, ("zsched", "random"), runs=1)
+
+    assert {cell.scheme.name for cell in cells if cell.level == scenario.level} == {"zsched", "random"}
+    assert {cell.scheme.name for cell in cells if cell.level != scenario.level} == {"zsched"}
+    assert {cell.run for cell in cells} == {0}
+
+
+@pytest.mark.parametrize(
+    ("host", "is_valid"),
+    [
+        ({"pressure": 0.1, "idle_ratio": 0.0}, True),
+        ({"pressure": 0.9, "idle_ratio": 0.9}, False),
+        ({"pressure": None, "idle_ratio": 0.01}, False),
+        ({"pressure": None, "idle_ratio": 0.5}, True),
+    ],
+)
+def test_a_run_on_a_host_short_of_cpu_does_not_count(
+    scenario: Scenario, host: dict[str, float | None], is_valid: bool
+) -> None:
+    assert (invalid_reason(replace(scenario, pressure_limit=0.2), host) is None) == is_valid
+
+
+class Outcomes:
+    """What became of each attempt, in order: the pressure that the host was under, or how it failed."""
+
+    def __init__(self, *outcomes: float | BaseException) -> None:
+        self.outcomes = list(outcomes)
+        self.made: list[str] = []
+
+    def make(self, cell: Cell, folder: Path) -> dict[str, Any]:
+        self.made.append(cell.name)
+        (folder / "half").write_text("")
+        outcome = self.outcomes.pop(0)
+        if isinstance(outcome, BaseException):
+            raise outcome
+        return {"host": {"pressure": outcome, "idle_ratio": 0.5}}
+
+
+def play(scenario: Scenario, out: Path, runs: Outcomes, *names: str) -> list[str]:
+    said: list[str] = []
+    scenario = replace(scenario, pressure_limit=0.2, sweep=Sweep())
+    cells = cells_of(scenario, names, runs=1)
+    Matrix(scenario, runs.make, lambda folder: ({"folder": folder.name}, "fine"), out, said.append).run(cells)
+    valid, invalid = collect(out, cells)
+    return [*said, f"{len(valid)} valid, {len(invalid)} invalid"]
+
+
+def test_an_invalid_run_is_repeated_and_kept_aside(scenario: Scenario, tmp_path: Path) -> None:
+    runs = Outcomes(0.9, ChildError("edge1 ended"), 0.1, 0.1)
+    said = play(scenario, tmp_path, runs, "zsched", "random")
+
+    assert runs.made == ["four-zsched-1"] * 3 + ["four-random-1"]
+    assert said[-1] == "2 valid, 2 invalid"
+    assert any("pressure 0.90" in line for line in said)
+    assert (tmp_path / "runs" / "four-zsched-1.invalid-2" / "half").exists()
+
+
+def test_what_stays_invalid_does_not_stop_the_rest(scenario: Scenario, tmp_path: Path) -> None:
+    said = play(scenario, tmp_path, Outcomes(0.9, 0.9, 0.9, 0.1), "zsched", "random")
+
+    assert said[-1] == "1 valid, 3 invalid"
+
+
+def test_an_interrupted_matrix_goes_on_behind_what_is_done(scenario: Scenario, tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        play(scenario, tmp_path, Outcomes(0.1, KeyboardInterrupt()), "zsched", "random")
+    assert (tmp_path / "runs" / "four-zsched-1" / METRICS).exists()
+
+    runs = Outcomes(0.1)
+    said = play(scenario, tmp_path, runs, "zsched", "random")
+
+    assert runs.made == ["four-random-1"]
+    assert said[0] == "1 of 2 runs are done already"
+    assert (tmp_path / "runs" / "four-random-1.interrupted-1").exists()
+
+
+def test_progress_tells_the_time_that_is_left(scenario: Scenario) -> None:
+    cell = cells_of(scenario, ("zsched",), runs=1)[0]
+    progress = Progress(total=4, done=1, took_s=[50.0])
+
+    assert progress.line(cell) == "[2/4, about 2 min left] four-zsched-1"
+
+
+def test_folders_set_aside_get_new_names(tmp_path: Path) -> None:
+    for _ in range(2):
+        (tmp_path / "run").mkdir()
+        set_aside(tmp_path / "run", "invalid")
+
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run.invalid-1", "run.invalid-2"]
+
+
+# --- the bench's own ------------------------------------------------------------------------------------------------
+
+
+def test_quick_is_the_fixed_schemes_one_of_the_paper_and_ours(tmp_path: Path) -> None:
+    scenario, cells = planned(options(tmp_path, is_quick=True))
+
+    assert [cell.scheme.name for cell in cells] == ["fixed_e1", "fixed_e2", "fixed_e3", "dyna_both", "zsched"]
+    assert (scenario.duration_s + 25.0) * len(cells) < 6 * 60
+
+
+def test_a_folder_goes_on_only_with_the_same_bench(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    given = options(out, is_quick=True)
+    scenario, cells = planned(given)
+    body = plan_body(scenario, INPUTS, cells)
+
+    assert claim_folder(given, body) is None
+    assert json.loads((out / "plan.json").read_text()) == body
+    assert "not empty" in (claim_folder(given, body) or "")
+    resumed = replace(given, is_resumed=True)
+    assert claim_folder(resumed, body) is None
+    other = plan_body(replace(scenario, seed=1), INPUTS, cells)
+    assert "another scenario" in (claim_folder(resumed, other) or "")
+    (out / "plan.json").unlink()
+    (out / "x").write_text("")
+    assert "none of" in (claim_folder(resumed, body) or "")
+
+
+def test_the_command_in_the_report_names_no_place_of_this_machine(tmp_path: Path) -> None:
+    given = options(
+        tmp_path, runs=2, schemes=("a", "b"), log=tmp_path / "x.log", drives=tmp_path / "drives", duration_s=30.0
+    )
+
+    assert command_of(given) == "zsched bench paper --runs 2 --schemes a,b --duration 30 --log x.log --drives drives"
+    assert str(tmp_path) not in command_of(given)

@@ -1,0 +1,191 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from zsched.adapters.network_profiler import parse_trace
+from zsched.config import load_fleet
+from zsched.errors import ConfigError
+from zsched.lab.fleet_runner import read_tree, write_fleet
+from zsched.lab.paper.load import Window, loaded_at, schedule
+from zsched.lab.paper.oracle import best_nodes, changes, utilities, utility
+from zsched.lab.paper.places import robots_scenario_path, scenario_path
+from zsched.lab.paper.radio import drive_file, simulated_drive
+from zsched.lab.paper.scenario import LoadLevel, LoadPlan, NodeShare, Radio, Scenario, load_scenario
+from zsched.lab.paper.schemes import SCHEMES, candidates_of, find_schemes, scheme_tree
+
+EDGES = ("edge1", "edge2", "edge3")
+SMALL = """
+name: small
+fleet: fleet.yaml
+duration_s: 20
+seed: 5
+runs: 1
+level: one
+levels: {one: {threads: 2}}
+nodes: {edge1: {cpu_cores: 0.3, memory_mb: 512}}
+"""
+
+
+@pytest.fixture
+def scenario() -> Scenario:
+    return load_scenario(scenario_path())
+
+
+def test_the_shipped_scenario_keeps_the_host_out_of_need_and_sweeps_the_load(scenario: Scenario) -> None:
+    assert sum(share.cpu_cores for share in scenario.nodes.values()) < 1.5
+    assert len(scenario.levels) >= 4
+    assert scenario.runs == 5
+    assert scenario.duration_s < 60
+    assert min(scenario.nodes, key=lambda node: scenario.nodes[node].cpu_cores) == "edge1"
+    assert scenario.run_seed(3) == scenario.seed + 3
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("cpu_cores: 0.3", "cpu_cores: 1.6", "cpu_cores"),
+        ("level: one", "level: two", "two"),
+        ("threads: 2", "threads: 0", "threads"),
+        ("threads: 2", "thread: 2", "thread"),
+        ("seed: 5", "seeds: 5", "seeds"),
+        ("runs: 1\n", "", "runs"),
+        ("duration_s: 20", "duration_s: 1", "duration_s"),
+    ],
+)
+def test_a_fault_in_a_scenario_is_named(tmp_path: Path, old: str, new: str, told: str) -> None:
+    path = tmp_path / "scenario.yaml"
+    path.write_text(SMALL)
+    assert load_scenario(path).nodes["edge1"] == NodeShare(cpu_cores=0.3, memory_mb=512)
+    path.write_text(SMALL.replace(old, new))
+
+    with pytest.raises(ConfigError, match=told):
+        load_scenario(path)
+
+
+def test_quotas_over_the_limit_in_all_are_refused(scenario: Scenario) -> None:
+    shares = {node: NodeShare(cpu_cores=0.6, memory_mb=512) for node in EDGES}
+
+    with pytest.raises(ValueError, match=r"1\.8 cores"):
+        replace(scenario, nodes=shares)
+
+
+def test_the_schedule_depends_on_the_seed_alone_and_never_loads_one_node_twice() -> None:
+    plan = LoadPlan(lanes=2, busy_s=(5.0, 9.0), idle_s=(1.0, 2.0))
+    seen = set()
+    for seed in range(50):
+        windows = schedule(plan, EDGES, 60.0, seed)
+        seen.add(windows)
+        assert windows == schedule(plan, tuple(reversed(EDGES)), 60.0, seed)
+        assert all(window.start_s < window.end_s <= 60.0 for window in windows)
+        for window in windows:
+            middle = (window.start_s + window.end_s) / 2
+            assert window.node in loaded_at(windows, middle)
+            assert sum(w.node == window.node and w.start_s <= middle < w.end_s for w in windows) == 1
+            assert len(loaded_at(windows, middle)) <= 2
+    assert len(seen) == 50
+
+
+def test_no_lanes_or_no_nodes_is_no_load() -> None:
+    assert schedule(LoadPlan(lanes=0), EDGES, 60.0, 1) == ()
+    assert schedule(LoadPlan(), (), 60.0, 1) == ()
+
+
+@pytest.mark.parametrize("name", list(SCHEMES))
+def test_every_scheme_makes_a_valid_fleet_file(tmp_path: Path, scenario: Scenario, name: str) -> None:
+    template = tmp_path / "template.yaml"
+    from ruamel.yaml import YAML
+
+    with template.open("w") as file:
+        YAML().dump(scheme_tree(read_tree(scenario.fleet), SCHEMES[name]), file)
+    lab = write_fleet(template, tmp_path / "fleet.yaml", {})
+    spec = load_fleet(lab.path).tasks[0]
+
+    assert spec.candidates
+    if SCHEMES[name].weights is not None:
+        assert (spec.tuning.weights.cpu, spec.tuning.weights.memory, spec.tuning.weights.network) == SCHEMES[
+            name
+        ].weights
+
+
+def test_schemes_are_what_they_say(scenario: Scenario) -> None:
+    tree = read_tree(scenario.fleet)
+
+    assert candidates_of(tree, SCHEMES["fixed_e2"]) == ["edge2"]
+    assert candidates_of(tree, SCHEMES["first_match"]) == ["edge2", "edge3"]
+    assert candidates_of(tree, SCHEMES["dyna_both"]) == list(EDGES)
+    ours = scheme_tree(tree, SCHEMES["zsched"])
+    assert ours["tasks"]["map_merge"].get("scheduling") == tree["tasks"]["map_merge"].get("scheduling")
+    assert ours["timing"] == tree["timing"]
+    assert tree == read_tree(scenario.fleet)  # untouched
+    assert find_schemes(("zsched",)) == (SCHEMES["zsched"],)
+    with pytest.raises(ConfigError, match="nonsense"):
+        find_schemes(("nonsense",))
+
+
+def test_a_fixed_scheme_beyond_the_fleet_is_refused(scenario: Scenario) -> None:
+    tree = scheme_tree(read_tree(scenario.fleet), SCHEMES["first_match"])
+
+    with pytest.raises(ConfigError, match="only 2"):
+        candidates_of(tree, SCHEMES["fixed_e3"])
+
+
+def test_the_robots_scenario_is_three_robots_by_the_radio_alone() -> None:
+    scenario = load_scenario(robots_scenario_path())
+    tree = read_tree(scenario.fleet)
+
+    assert {node["kind"] for node in tree["nodes"].values()} == {"robot"}
+    assert sorted(scenario.links) == sorted(tree["nodes"])
+    assert tree["tasks"]["map_merge"]["weights"]["network"] == 1.0
+    assert scenario.load.lanes == 0
+
+
+# --- the radio -------------------------------------------------------------------------------------------------------
+
+
+def test_a_simulated_drive_is_a_drive_like_a_recorded_one() -> None:
+    trace = parse_trace(simulated_drive("1/edge1"), "c_rssi")
+    values = list(trace.rssi_dbm)
+
+    assert simulated_drive("1/edge1") == simulated_drive("1/edge1") != simulated_drive("2/edge1")
+    assert -95 <= min(values) < -70
+    assert -60 < max(values) <= -20
+    steps = sorted(abs(b - a) for a, b in zip(values[::5], values[5::5], strict=False))
+    assert 3 <= steps[int(0.95 * len(steps))] <= 12  # recorded drives: 6 to 8 dB from second to second
+
+
+def test_a_recorded_drive_is_taken_where_there_is_one(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(simulated_drive("x"))
+
+    assert drive_file("edge1", Radio(file="a.csv"), tmp_path, tmp_path, 1) == tmp_path / "a.csv"
+    with pytest.raises(ConfigError, match=r"b\.csv"):
+        drive_file("edge1", Radio(file="b.csv"), tmp_path, tmp_path, 1)
+    assert drive_file("edge1", Radio(file="b.csv"), None, tmp_path, 1).read_text() == simulated_drive("1/edge1")
+
+
+# --- the oracle ------------------------------------------------------------------------------------------------------
+
+
+def test_a_load_makes_a_node_worse_and_a_stronger_one_not_better() -> None:
+    share = NodeShare(cpu_cores=0.45, memory_mb=640)
+    slow, full = LoadLevel(hz=4.0), LoadLevel()
+
+    free = utility(share, full, is_loaded=False)
+    assert 0.0 < utility(share, full, is_loaded=True) < utility(share, slow, is_loaded=True) < free <= 1.0
+
+
+def test_the_oracle_follows_the_schedule_and_does_not_move_for_nothing(scenario: Scenario) -> None:
+    level = scenario.levels[scenario.level]
+    windows = (Window(node="edge2", start_s=5.0, end_s=15.0), Window(node="edge1", start_s=8.0, end_s=9.0))
+
+    best = best_nodes(scenario, level, windows)
+
+    assert changes(windows, 42.0) == [0.0, 5.0, 8.0, 9.0, 15.0]
+    assert [node for _, node in best] == ["edge2", "edge1", "edge3", "edge2"] or [t for t, _ in best][:2] == [0.0, 5.0]
+    assert all(node not in loaded_at(windows, t_s) for t_s, node in best)
+    for t_s, node in best:
+        scored = utilities(scenario, level, loaded_at(windows, t_s))
+        assert scored[node] == max(scored.values())
+    assert best_nodes(replace(scenario, nodes={}), level, ()) == ()

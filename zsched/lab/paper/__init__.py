@@ -1,0 +1,1 @@
+"""The paper's evaluation on one machine: scenario, schemes, runs, figures, and a report of every claim."""

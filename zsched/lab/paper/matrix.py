@@ -1,0 +1,165 @@
+"""Runs the matrix cell by cell: shows progress and the time left, survives interruptions, repeats what is invalid.
+
+Knows: which cells there are, which are done, what makes a run invalid. Does not know: how a run is made or reported.
+
+A cell is done when its ``metrics.json`` is there. Cells are ordered by run, then scheme: whatever is done when somebody
+stops is balanced over the schemes. A run whose host was short of CPU, or one of whose processes failed, is moved aside
+(``NAME.invalid-N``) and repeated, at most `ATTEMPTS` times in all; what stays invalid is told, not counted.
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from zsched.lab.children import ChildError
+from zsched.lab.paper.run import Cell, write_json
+from zsched.lab.paper.scenario import Scenario
+from zsched.lab.paper.schemes import Family, Scheme, find_schemes
+
+ATTEMPTS = 3
+IDLE_FLOOR = 0.05
+"""Where pressure cannot be measured: a host that was less idle than this was short of CPU."""
+METRICS = "metrics.json"
+Say = Callable[[str], None]
+Json = dict[str, Any]
+Make = Callable[[Cell, Path], Json]
+"""Makes a run in a folder (`CellRun`); raises `ChildError` when it failed."""
+Measure = Callable[[Path], tuple[Json, str]]
+"""The figures of a finished run's folder, and the same in a line."""
+
+
+def cells_of(scenario: Scenario, names: tuple[str, ...], runs: int | None = None) -> tuple[Cell, ...]:
+    """The matrix at the scenario's level, then the sweep over the other levels, each by run and scheme.
+
+    ``runs`` (``None``: the scenario's) bounds the runs of every scheme; with ``names`` the sweep keeps to them too.
+
+    Raises:
+        ConfigError: an unknown scheme.
+    """
+    schemes = find_schemes(names or scenario.schemes)
+    most = scenario.runs if runs is None else runs
+    cells = list(_by_run(scenario, schemes, scenario.level, most))
+    swept = [name for name in scenario.sweep.schemes if not names or name in names]
+    if swept:
+        others = [level for level in scenario.levels if level != scenario.level]
+        for run in range(min(scenario.sweep.runs, most)):
+            cells += [Cell(scheme=s, level=level, run=run) for level in others for s in find_schemes(tuple(swept))]
+    return tuple(cells)
+
+
+def _by_run(scenario: Scenario, schemes: Sequence[Scheme], level: str, most: int) -> Iterator[Cell]:
+    for run in range(most):
+        for scheme in schemes:
+            if scheme.family is Family.YARDSTICK and run >= min(scenario.yardstick_runs, most):
+                continue
+            yield Cell(scheme=scheme, level=level, run=run)
+
+
+def invalid_reason(scenario: Scenario, host: Mapping[str, float | None]) -> str | None:
+    """Why a run does not count: the host itself was short of CPU; ``None``: it counts."""
+    pressure, idle = host.get("pressure"), host.get("idle_ratio")
+    if pressure is not None:
+        if pressure > scenario.pressure_limit:
+            return f"pressure {pressure:.2f} outside the quotas, at most {scenario.pressure_limit:g}"
+        return None
+    if idle is not None and idle < IDLE_FLOOR:
+        return f"the host was idle for {idle:.2f} of the time, at least {IDLE_FLOOR:g}"
+    return None
+
+
+@dataclass(slots=True)
+class Progress:
+    """How far the matrix is, and how long the rest takes by what the cells took so far."""
+
+    total: int
+    done: int = 0
+    took_s: list[float] = field(default_factory=list)
+
+    def line(self, cell: Cell) -> str:
+        """Before a cell is run."""
+        left = (
+            "" if not self.took_s else f", about {clock(statistics.fmean(self.took_s) * (self.total - self.done))} left"
+        )
+        return f"[{self.done + 1}/{self.total}{left}] {cell.name}"
+
+
+def clock(seconds: float) -> str:
+    """A duration for people.
+
+    >>> clock(3725), clock(59)
+    ('1 h 02 min', '59 s')
+    """
+    if seconds < 60:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes // 60} h {minutes % 60:02d} min" if minutes >= 60 else f"{minutes} min"
+
+
+class Matrix:
+    """The cells of one bench in one folder. For the main thread only (see `Children`)."""
+
+    def __init__(self, scenario: Scenario, make: Make, measure: Measure, out: Path, say: Say) -> None:
+        self._scenario, self._make, self._measure = scenario, make, measure
+        self._runs, self._say = out / "runs", say
+
+    def run(self, cells: Sequence[Cell]) -> None:
+        """Run what is not done yet; a failing cell does not stop the others."""
+        todo = [cell for cell in cells if not (self._runs / cell.name / METRICS).exists()]
+        progress = Progress(total=len(todo))
+        if len(todo) < len(cells):
+            self._say(f"{len(cells) - len(todo)} of {len(cells)} runs are done already")
+        for cell in todo:
+            self._say(progress.line(cell))
+            started = time.monotonic()
+            self._one(cell)
+            progress.took_s.append(time.monotonic() - started)
+            progress.done += 1
+
+    def _one(self, cell: Cell) -> None:
+        folder = self._runs / cell.name
+        for attempt in range(1, ATTEMPTS + 1):
+            set_aside(folder, "interrupted")
+            reason = self._attempt(cell, folder)
+            if reason is None:
+                return
+            self._say(f"{cell.name}: invalid (attempt {attempt} of {ATTEMPTS}): {reason}")
+            write_json(folder / "invalid.json", {"cell": cell.name, "attempt": attempt, "reason": reason})
+            set_aside(folder, "invalid")
+
+    def _attempt(self, cell: Cell, folder: Path) -> str | None:
+        """Make the run and its figures; returns why it is invalid."""
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            run = self._make(cell, folder)
+        except ChildError as error:
+            return str(error)
+        reason = invalid_reason(self._scenario, run["host"])
+        if reason is None:
+            figures, brief = self._measure(folder)
+            write_json(folder / METRICS, figures)
+            self._say("      " + brief)
+        return reason
+
+
+def set_aside(folder: Path, why: str) -> None:
+    """Rename the folder of a run that does not count; nothing is thrown away."""
+    if not folder.exists():
+        return
+    number = 1
+    while (target := folder.with_name(f"{folder.name}.{why}-{number}")).exists():
+        number += 1
+    folder.rename(target)
+
+
+def collect(out: Path, cells: Iterable[Cell]) -> tuple[list[Json], list[Json]]:
+    """(figures of the runs that count, what was invalid) of ``cells``, out of the folder."""
+    runs = out / "runs"
+    valid = [json.loads(path.read_text()) for cell in cells if (path := runs / cell.name / METRICS).exists()]
+    invalid = [json.loads(path.read_text()) for path in sorted(runs.glob("*.invalid-*/invalid.json"))]
+    return valid, invalid

@@ -1,0 +1,136 @@
+"""Robot to robot, the paper's real-world demonstration: three robots, no edges, the radio decides who holds the task.
+
+Knows: which schemes are run on the radio, and their figures. Does not know: how a run is made.
+
+The signal is what each robot's daemon measured and smoothed of its own link; the task's signal is that of the robot
+that holds it. "Best" is the strongest robot at every moment, known in hindsight.
+"""
+
+from __future__ import annotations
+
+import bisect
+import json
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from zsched.lab.paper.figures import save_radio
+from zsched.lab.paper.matrix import Matrix, Say, collect
+from zsched.lab.paper.metrics import wasted
+from zsched.lab.paper.run import Cell, CellRun, Inputs
+from zsched.lab.paper.scenario import Scenario
+from zsched.lab.paper.schemes import NETWORK, SCHEMES
+from zsched.lab.recorder import read_records
+
+RADIO_SCHEMES = ("zsched", "dyna_net", "argmax")
+STEP_S = 0.5
+WEAK_DBM = -70.0
+PICTURE = "radio.png"
+Series = Sequence[tuple[float, float]]
+
+
+def radio_cells(scenario: Scenario) -> tuple[Cell, ...]:
+    """One run of each scheme, all by the radio alone."""
+    schemes = [replace(SCHEMES[name], weights=NETWORK) for name in RADIO_SCHEMES]
+    return tuple(Cell(scheme=scheme, level=scenario.level, run=0) for scheme in schemes)
+
+
+def run_radio(scenario: Scenario, inputs: Inputs, out: Path, say: Say) -> dict[str, Any] | None:
+    """Run the robots; returns the figures, the picture is beside them. ``None``: no run is valid."""
+    cells, folder = radio_cells(scenario), out / "radio"
+
+    def figures_of(run: Path) -> tuple[dict[str, Any], str]:
+        figures = radio_figures(run)
+        return figures, f"{figures['moves']} moves, owner at {figures['mean_dbm']:.1f} dBm"
+
+    def make(cell: Cell, place: Path) -> dict[str, Any]:
+        return CellRun(scenario, cell, inputs, place).run()
+
+    Matrix(scenario, make, figures_of, folder, say).run(cells)
+    runs, _ = collect(folder, cells)
+    if not runs:
+        return None
+    rows = {figures["scheme"]: [(float(t_s), str(node)) for t_s, node in figures["owners"]] for figures in runs}
+    signals = {robot: [(float(t), float(v)) for t, v in series] for robot, series in runs[0]["signals"].items()}
+    save_radio(out / PICTURE, signals, rows, scenario.duration_s)
+    return {
+        "picture": PICTURE,
+        "links": runs[0]["links"],
+        "duration_s": scenario.duration_s,
+        "best_dbm": runs[0]["best_dbm"],
+        "best_fixed_dbm": runs[0]["best_fixed_dbm"],
+        "schemes": {figures["scheme"]: {k: v for k, v in figures.items() if k != "signals"} for figures in runs},
+    }
+
+
+def radio_figures(folder: Path) -> dict[str, Any]:
+    """The figures of one run.
+
+    Raises:
+        ValueError: no robot's signal was recorded.
+    """
+    run = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+    signals = read_signals(folder / "records" / "decisions.ndjson")
+    owners = [(max(float(move["t_s"]), 0.0), str(move["node"])) for move in run["allocations"]]
+    return {
+        "scheme": run["scheme"],
+        "run": run["run"],
+        "level": run["level"],
+        "host": run["host"],
+        "links": run["links"],
+        "moves": len(owners) - 1,
+        "wasted_moves": wasted(owners),
+        "owners": owners,
+        "signals": signals,
+        **signal_figures(signals, owners, float(run["duration_s"])),
+    }
+
+
+def read_signals(path: Path) -> dict[str, list[tuple[float, float]]]:
+    """{robot: [(t_s, dBm)]} as each robot's own daemon said."""
+    found: dict[str, list[tuple[float, float]]] = {}
+    for record in read_records(path):
+        links = [value for value in record.get("links") or () if value is not None]
+        if links:
+            found.setdefault(str(record["node"]), []).append((float(record["t_s"]), float(links[0])))
+    return found
+
+
+def value_at(series: Series, t_s: float) -> float | None:
+    """The newest value at ``t_s``; ``None`` before the first."""
+    index = bisect.bisect_right([at for at, _ in series], t_s)
+    return series[index - 1][1] if index else None
+
+
+def signal_figures(
+    signals: Mapping[str, Series], owners: Sequence[tuple[float, str]], duration_s: float
+) -> dict[str, float]:
+    """The task's mean signal, the best robot's at every moment, the best single robot's, and the time under -70 dBm.
+
+    Raises:
+        ValueError: there is no moment at which the owner's signal and all others' are known.
+    """
+    task, best = [], []
+    single: dict[str, list[float]] = {robot: [] for robot in signals}
+    for step in range(int(duration_s / STEP_S)):
+        t_s = step * STEP_S
+        owner = next((node for start, node in reversed(owners) if start <= t_s), None)
+        values = {robot: value_at(series, t_s) for robot, series in signals.items()}
+        known = {robot: value for robot, value in values.items() if value is not None}
+        if owner not in known or len(known) < len(signals):
+            continue
+        task.append(known[owner])
+        best.append(max(known.values()))
+        for robot, value in known.items():
+            single[robot].append(value)
+    if not task:
+        raise ValueError("no robot's signal was recorded")
+    return {
+        "mean_dbm": statistics.fmean(task),
+        "best_dbm": statistics.fmean(best),
+        "under_best_db": statistics.fmean(best) - statistics.fmean(task),
+        "best_fixed_dbm": max(statistics.fmean(values) for values in single.values()),
+        "below_70_ratio": sum(value < WEAK_DBM for value in task) / len(task),
+    }

@@ -1,0 +1,180 @@
+"""Writes report.md: every claim beside our figure, all schemes, the sweep over load, and under which conditions.
+
+Knows: Markdown, which figure stands where. Does not know: how a figure or a verdict comes about.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from zsched.lab.paper.claims import LEAST_RUNS, better_than_ours, judged
+from zsched.lab.paper.schemes import SCHEMES
+
+Json = Mapping[str, Any]
+COLUMNS = (
+    ("map_hz", "maps/s", 2),
+    ("throughput_mb_s", "MB/s", 1),
+    ("task_latency_s", "task s", 1),
+    ("merge_latency_p50_s", "p50 s", 2),
+    ("merge_latency_p95_s", "p95 s", 2),
+    ("merge_latency_p99_s", "p99 s", 2),
+    ("cpu_peak", "CPU peak", 2),
+    ("cpu_mean", "CPU mean", 2),
+    ("memory_mean", "mem mean", 2),
+    ("memory_peak", "mem peak", 2),
+    ("ssim_rebased", "SSIM", 3),
+    ("held_ssim_rebased", "SSIM held", 3),
+    ("wall_f1", "wall F1", 3),
+    ("coverage", "coverage", 3),
+    ("ssim_crop", "plain SSIM", 3),
+    ("moves", "moves", 1),
+    ("wasted_moves", "wasted", 1),
+    ("move_gap_mean_s", "gap s", 2),
+    ("lost", "lost", 1),
+    ("regret", "regret", 3),
+)
+
+
+# --- the text --------------------------------------------------------------------------------------------------------
+
+
+def report(results: Json, pictures: Sequence[str]) -> str:
+    """The whole report."""
+    scenario, runs = results["scenario"], results["runs"]
+    main = [figures for figures in runs if figures["level"] == scenario["level"]]
+    parts = [
+        "# The paper's evaluation, by zsched\n",
+        headline(results),
+        "Definitions of every figure: [docs/evaluation/README.md](README.md). Intervals: 95 %, paired bootstrap.\n",
+        "## The claims\n",
+        claims_text(main),
+        "## No scheme of the paper better than ours?\n",
+        better_text(main),
+        "## All schemes\n",
+        schemes_text(main),
+        "## Strength of the injected load\n",
+        sweep_text(runs, scenario),
+        "## What was run\n",
+        conditions_text(results),
+    ]
+    parts += [f"![{name}]({name})\n" for name in pictures]
+    if results.get("radio"):
+        parts += ["## Robot to robot\n", radio_text(results["radio"])]
+    return "\n".join(parts)
+
+
+def headline(results: Json) -> str:
+    """What was run, in a few lines."""
+    scenario = results["scenario"]
+    what = f"scenario `{scenario['name']}`, seed {scenario['seed']}, input {results['input']}"
+    count = f"{len(results['runs'])} runs that count, {len(results['invalid'])} invalid ones"
+    return f"`{results['command']}`: {what}, {count}. zsched {results['version']}.\n"
+
+
+def claims_text(runs: Sequence[Json]) -> str:
+    """Each claim beside our figure."""
+    lines = ["| from | claim | found | runs | verdict |", "| --- | --- | --- | --- | --- |"]
+    for claim, found, outcome in judged(runs):
+        text, count = ("-", "0") if found is None else (found.text(), str(found.runs))
+        lines.append(f"| {claim.source} | {claim.says} | {text} | {count} | **{outcome}** |")
+    return "\n".join(lines) + "\n"
+
+
+def better_text(runs: Sequence[Json]) -> str:
+    """Where the paper's schemes beat ours, beyond the interval."""
+    if sum(figures["scheme"] == "zsched" for figures in runs) < LEAST_RUNS:
+        return f"zsched was run less than {LEAST_RUNS} times: no verdict.\n"
+    found = better_than_ours(runs)
+    if not found:
+        return "None is, on none of the six metrics, beyond the interval.\n"
+    return "\n".join(f"* {scheme}: {metric} {one.text()} against zsched" for scheme, metric, one in found) + "\n"
+
+
+def schemes_text(runs: Sequence[Json]) -> str:
+    """One row per scheme: means over its runs."""
+    lines = [
+        "| scheme | runs | " + " | ".join(title for _, title, _ in COLUMNS) + " |",
+        "| --- " * (len(COLUMNS) + 2) + "|",
+    ]
+    for name in SCHEMES:
+        own = [figures for figures in runs if figures["scheme"] == name]
+        if own:
+            cells = [mean_text([figures.get(metric) for figures in own], digits) for metric, _, digits in COLUMNS]
+            lines.append(f"| {name} | {len(own)} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def mean_text(values: Sequence[float | None], digits: int) -> str:
+    """The mean of what was measured; a dash for nothing."""
+    known = [float(value) for value in values if value is not None]
+    return f"{statistics.fmean(known):.{digits}f}" if known else "-"
+
+
+def sweep_text(runs: Sequence[Json], scenario: Json) -> str:
+    """Map frequency, latency of the task and throughput of each scheme at every level."""
+    metrics = (
+        ("map_hz", "maps/s", 2),
+        ("throughput_mb_s", "MB/s", 1),
+        ("task_latency_s", "task s", 1),
+        ("regret", "regret", 3),
+    )
+    levels = [level for level in scenario["levels"] if any(figures["level"] == level for figures in runs)]
+    if len(levels) < 2:
+        return "Only one level was run.\n"
+    swept = [
+        name for name in SCHEMES if all(any(f["scheme"] == name and f["level"] == lv for f in runs) for lv in levels)
+    ]
+    lines = ["| metric | scheme | " + " | ".join(levels) + " |", "| --- " * (len(levels) + 2) + "|"]
+    for metric, title, digits in metrics:
+        for name in swept:
+            cells = [
+                mean_text([f.get(metric) for f in runs if f["scheme"] == name and f["level"] == lv], digits)
+                for lv in levels
+            ]
+            lines.append(f"| {title} | {name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def conditions_text(results: Json) -> str:
+    """Shares, levels, limits, and what was invalid."""
+    scenario = results["scenario"]
+    shares = [
+        f"{node} {s['cpu_cores']:g} cores, {s['memory_mb']:g} MiB, ballast {s['ballast_mb']:g} MiB"
+        for node, s in scenario["nodes"].items()
+    ]
+    levels = [
+        f"{name}: {v['threads']} threads, {v['hz'] or 'all'} frames/s of {v['side']} px"
+        for name, v in scenario["levels"].items()
+    ]
+    waits = [figures["host"]["pressure"] for figures in results["runs"] if figures["host"]["pressure"] is not None]
+    worst = f"{max(waits):.2f}" if waits else "not measured"
+    lines = [
+        f"* Nodes: {'; '.join(shares) or 'no shares'}.",
+        f"* Load levels: {'; '.join(levels)}. The matrix was run at {scenario['level']}.",
+        (
+            f"* Merging: mode {scenario['mode']}, at most {scenario['rate_hz']:g} maps/s; "
+            f"done at coverage {scenario['target_coverage']:g}."
+        ),
+        f"* Links: {', '.join(sorted({f['links'] for f in results['runs']})) or '-'} drives.",
+        f"* Pressure outside the quotas: at most {scenario['pressure_limit']:g} allowed, at most {worst} seen.",
+    ]
+    lines += [f"* Repeated: {one['cell']}: {one['reason'].splitlines()[0]}" for one in results["invalid"]]
+    return "\n".join(lines) + "\n"
+
+
+def radio_text(radio: Json) -> str:
+    """What each scheme made of the radio: moves, and the signal of the robot that held the task."""
+    lines = [
+        f"Three robots, no edges, the radio alone counts; {radio['links']} drives, {radio['duration_s']:.0f} s.",
+        f"Best robot at every moment {radio['best_dbm']:.1f} dBm, best single one {radio['best_fixed_dbm']:.1f} dBm.\n",
+        "| scheme | moves | wasted | owner's signal, dBm | under the best | time below -70 dBm |",
+        "| --- " * 6 + "|",
+    ]
+    for name, row in radio["schemes"].items():
+        lines.append(
+            f"| {name} | {row['moves']} | {row['wasted_moves']} | {row['mean_dbm']:.1f} | "
+            f"{row['under_best_db']:.1f} dB | {row['below_70_ratio']:.0%} |".replace("%", " %")
+        )
+    return "\n".join([*lines, "", f"![{radio['picture']}]({radio['picture']})\n"])

@@ -1,0 +1,348 @@
+"""Runs one cell of the matrix: one scheme, one seed, one level, with real daemons, workers, streams and load.
+
+Knows: the order of a run and what is kept of it. Does not know: other runs, figures (`zsched.lab.paper.metrics`).
+
+A run's folder holds ``run.json`` (written last: what the run was), ``fleet.yaml``, ``records/*.ndjson`` (allocations,
+decisions, accounting, what each robot saw), ``streams.mcap`` and ``logs/``.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from ruamel.yaml import YAML
+
+from zsched.adapters.cgroup import LimitedGroup
+from zsched.adapters.operator_socket import ask
+from zsched.clock import monotonic_s
+from zsched.core.model import NodeId
+from zsched.errors import AdapterError
+from zsched.lab.children import ChildError, Children
+from zsched.lab.demo_run import worker_options
+from zsched.lab.fleet_runner import CLI, FleetRunner, LabFleet, read_tree, write_fleet
+from zsched.lab.fleet_view import Status, find_task
+from zsched.lab.limits import LimitKind, NodeLimits
+from zsched.lab.mapping import displacements
+from zsched.lab.observer import Observer
+from zsched.lab.paper.load import Loads, Window, schedule
+from zsched.lab.paper.oracle import best_nodes
+from zsched.lab.paper.radio import drive_file
+from zsched.lab.paper.record import HostGauge, NodeMeter
+from zsched.lab.paper.rules import RulePlan
+from zsched.lab.paper.scenario import Scenario
+from zsched.lab.paper.schemes import Scheme, scheme_tree
+from zsched.lab.recorder import Recorder
+
+TICK_S = 0.1
+SAMPLE_S = 0.5
+OWNED_S = 40.0
+"""The task must have its first owner, and every node its worker ready, within so long."""
+RECORDER_S = 20.0
+CALM_S = 8.0
+"""So long at most the robots wait for the start-up's CPU to fade from the nodes' smoothed figures."""
+CALM_RATIO = 0.3
+SETTLE_S = 3.0
+"""After the robots' drive: their last maps are merged and come back."""
+RUN_SCHEMA = "zsched.paper.run/1"
+
+Tree = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cell:
+    """One run to be made."""
+
+    scheme: Scheme
+    level: str
+    run: int
+
+    @property
+    def name(self) -> str:
+        """Its folder's name."""
+        return f"{self.level}-{self.scheme.name}-{self.run + 1}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Inputs:
+    """What the robots see: a laser log cut into one drive per robot, and the recorded radio drives if there are any."""
+
+    log: Path
+    drives: Path | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Parts:
+    """What a running cell is made of."""
+
+    fleet: LabFleet
+    runner: FleetRunner
+    limits: NodeLimits
+    loads: Loads
+    observer: Observer
+    gauge: HostGauge
+
+
+class CellRun:
+    """One cell in one folder. For the main thread only (see `Children`)."""
+
+    def __init__(self, scenario: Scenario, cell: Cell, inputs: Inputs, folder: Path) -> None:
+        self._scenario, self._cell, self._inputs, self._folder = scenario, cell, inputs, folder
+        self._records = folder / "records"
+        self._recorder = Recorder(self._records)
+        self._plan_path = folder / "plan.json"
+        self._seed = scenario.run_seed(cell.run)
+        self._windows: tuple[Window, ...] = ()
+        self._meters: dict[NodeId, NodeMeter] = {}
+        self._decided: dict[NodeId, object] = {}
+        self._next_sample_s = 0.0
+        self._zero_s, self._zero_wall_ns = 0.0, 0
+
+    def run(self) -> dict[str, Any]:
+        """Make the run; returns what ``run.json`` holds.
+
+        Raises:
+            ChildError: a process of the run failed, or the fleet did not come up.
+        """
+        with Children(self._folder / "logs") as children, self._recorder:
+            parts = self._build(children)
+            try:
+                return self._play(children, parts)
+            finally:
+                parts.loads.stop(monotonic_s() - self._zero_s)
+
+    def _build(self, children: Children) -> _Parts:
+        runtime = Path(tempfile.gettempdir()) / f"zsched-{children.token}"
+        children.janitor.remove(runtime)
+        runtime.mkdir(mode=0o700)
+        fleet = self._write_fleet()
+        shares = {node: share for node, share in self._scenario.nodes.items() if node in fleet.kinds}
+        limits = node_limits(f"zsched-{children.token}", self._scenario, fleet)
+        candidates = sorted(shares)
+        self._windows = schedule(self._scenario.load, candidates, self._scenario.duration_s, self._seed)
+        level = self._scenario.levels[self._cell.level]
+        loads = Loads(self._windows, level, children, limits, self._records, self._tell)
+        runner = FleetRunner(fleet, children, runtime, limits, self._cli())
+        return _Parts(
+            fleet=fleet,
+            runner=runner,
+            limits=limits,
+            loads=loads,
+            observer=Observer(runner.sockets(), fleet.task, ask),
+            gauge=HostGauge.create(f"zsched-{children.token}-host"),
+        )
+
+    def _cli(self) -> tuple[str, ...]:
+        rule = self._cell.scheme.rule
+        if rule is None:
+            return CLI
+        module = (sys.executable, "-m", "zsched.lab.paper.ruled_daemon")
+        return (*module, "--rule", rule.value, "--plan", str(self._plan_path.absolute()))
+
+    def _write_fleet(self) -> LabFleet:
+        """The effective fleet file: the template, the scheme's settings, the links, free ports, true poses."""
+        tree = scheme_tree(read_tree(self._scenario.fleet), self._cell.scheme)
+        for node, radio in self._scenario.links.items():
+            path = drive_file(node, radio, self._inputs.drives, self._folder, self._seed)
+            tree["nodes"][node].pop("wired", None)
+            trace = {"file": str(path), "column": radio.column, "offset_s": radio.offset_s}
+            tree["nodes"][node]["trace"] = trace
+        template = self._folder / "template.yaml"
+        with template.open("w", encoding="utf-8") as file:
+            YAML().dump(tree, file)
+        robots = sorted(name for name, node in tree["nodes"].items() if node["kind"] == "robot")
+        frames = dict(zip(robots, displacements(len(robots), self._seed), strict=True))
+        options = worker_options(self._scenario.mode, frames) | {"--rate": (f"{self._scenario.rate_hz:g}",)}
+        return write_fleet(template, self._folder / "fleet.yaml", options)
+
+    # --- the run -----------------------------------------------------------------------------------------------------
+
+    def _play(self, children: Children, parts: _Parts) -> dict[str, Any]:
+        for node, share in self._scenario.nodes.items():
+            if node in parts.fleet.kinds and parts.limits.kind is LimitKind.CGROUP:
+                parts.loads.ballast(node, share)
+        parts.runner.init()
+        parts.runner.up()
+        self._gauge_daemons(children, parts)
+        with parts.observer:
+            parts.runner.wait_up(parts.observer.statuses, lambda: time.sleep(TICK_S))
+            self._wait_owned(children, parts)
+            self._record_streams(children, parts)
+            self._start(children, parts)
+            end_s = self._scenario.duration_s + SETTLE_S
+            while (now := monotonic_s() - self._zero_s) < end_s:
+                children.check()
+                if now < self._scenario.duration_s:
+                    parts.loads.tick(now)
+                self._sample(parts, now)
+                time.sleep(TICK_S)
+            return self._finish(children, parts)
+
+    def _gauge_daemons(self, children: Children, parts: _Parts) -> None:
+        for node in parts.fleet.kinds:
+            child = children.running(f"daemon-{node}")[0]
+            if node in self._scenario.nodes and parts.limits.kind is LimitKind.CGROUP:
+                self._meters[node] = NodeMeter.of(child.process.pid)
+            else:
+                parts.gauge.add(child.process.pid)
+
+    def _wait_owned(self, children: Children, parts: _Parts) -> None:
+        """Until the task has an owner and every candidate's worker is ready: nobody starts with a handicap."""
+        candidates = set(read_tree(self._folder / "template.yaml")["tasks"][parts.fleet.task]["candidates"])
+        end = time.monotonic() + OWNED_S
+        while True:
+            children.check()
+            views = parts.observer.statuses()
+            ready = {node for status in views.values() for node in ready_workers(status, parts.fleet.task)}
+            owners = {
+                (find_task(views[r], parts.fleet.task) or {}).get("owner") for r in parts.fleet.robots if r in views
+            }
+            if candidates <= ready and owners and None not in owners:
+                break
+            if time.monotonic() > end:
+                late = ", ".join(sorted(candidates - ready)) or "an owner"
+                raise ChildError(f"no {late} within {OWNED_S:.0f} s; see {self._folder / 'logs'}")
+            time.sleep(TICK_S)
+
+        calm_by = time.monotonic() + CALM_S
+        while time.monotonic() < calm_by and not is_calm(parts.observer.statuses(), tuple(self._scenario.nodes)):
+            children.check()
+            time.sleep(TICK_S)
+
+    def _record_streams(self, children: Children, parts: _Parts) -> None:
+        command = [sys.executable, "-m", "zsched.lab.paper.record", "--out", str(self._folder / "streams.mcap")]
+        for robot in parts.fleet.robots:
+            command += ["--robot", f"{robot}={parts.fleet.data_endpoints[robot]}"]
+        parts.gauge.add(children.start("record", command).process.pid)
+
+    def _start(self, children: Children, parts: _Parts) -> None:
+        """The robots drive; from here all times count."""
+        robots = parts.fleet.robots
+        for index, robot in enumerate(robots):
+            command = [sys.executable, "-m", "zsched.lab.robot_app", "--robot", robot, "--index", str(index)]
+            command += ["--robots", str(len(robots)), "--seed", str(self._seed), "--log", str(self._inputs.log)]
+            command += ["--endpoint", parts.fleet.data_endpoints[robot], "--records", str(self._records)]
+            command += ["--replay-s", f"{self._scenario.duration_s:.3f}"]
+            parts.gauge.add(children.start(f"app-{robot}", command).process.pid)
+        self._zero_s, self._zero_wall_ns = monotonic_s(), time.time_ns()
+        parts.gauge.start()
+        level = self._scenario.levels[self._cell.level]
+        best = best_nodes(self._scenario, level, self._windows)
+        RulePlan(zero_s=self._zero_s, seed=self._seed, best=best).save(self._plan_path)
+        self._recorder.write("events", {"kind": "zero", "t_s": self._zero_s})
+
+    def _sample(self, parts: _Parts, now: float) -> None:
+        if now < self._next_sample_s:
+            return
+        self._next_sample_s = now + SAMPLE_S
+        nodes = {node: meter.read(monotonic_s()) for node, meter in self._meters.items()}
+        self._recorder.write("nodes", {"kind": "nodes", "t_s": now, "loaded": sorted(parts.loads.loaded), **nodes})
+        for node, status in parts.observer.statuses().items():
+            task = find_task(status, parts.fleet.task) or {}
+            said = {"owner": task.get("owner"), "epoch": task.get("epoch"), "decision": task.get("decision")}
+            said |= {"vote": task.get("vote"), "links": _links(status, node)}
+            if node in parts.fleet.robots and said != self._decided.get(node):
+                self._decided[node] = said
+                self._recorder.write("decisions", {"kind": "decision", "t_s": now, "node": node, **said})
+
+    def _finish(self, children: Children, parts: _Parts) -> dict[str, Any]:
+        host = parts.gauge.result()
+        parts.loads.stop(monotonic_s() - self._zero_s)
+        allocations = [asdict(move) | {"t_s": move.t_s - self._zero_s} for move in parts.observer.moves()]
+        streams = {node: _streams(status, parts.fleet.task) for node, status in parts.observer.statuses().items()}
+        children.stop(*children.running("app-"), *children.running("record"), grace_s=RECORDER_S)
+        children.stop(*children.running("daemon-"))
+        body = {
+            "schema": RUN_SCHEMA,
+            "scenario": self._scenario.name,
+            "scheme": self._cell.scheme.name,
+            "family": self._cell.scheme.family.value,
+            "level": self._cell.level,
+            "run": self._cell.run,
+            "seed": self._seed,
+            "mode": self._scenario.mode,
+            "log": self._inputs.log.name,
+            "links": "recorded" if self._inputs.drives else "simulated",
+            "limits": parts.limits.says,
+            "zero_s": self._zero_s,
+            "zero_wall_ns": self._zero_wall_ns,
+            "duration_s": self._scenario.duration_s,
+            "robots": parts.fleet.robots,
+            "shares": {node: asdict(share) for node, share in self._scenario.nodes.items()},
+            "windows": [asdict(window) for window in self._windows],
+            "loads": [asdict(load) for load in parts.loads.past],
+            "allocations": allocations,
+            "streams": streams,
+            "host": host,
+        }
+        write_json(self._folder / "run.json", body)
+        return body
+
+    def _tell(self, t_s: float, text: str) -> None:
+        self._recorder.write("events", {"kind": "event", "t_s": t_s, "text": text})
+
+
+def node_limits(prefix: str, scenario: Scenario, fleet: LabFleet) -> NodeLimits:
+    """A control group with quota and memory limit for each node that has a share in the scenario.
+
+    Raises:
+        AdapterError: this user may not make them; without them the nodes would not differ, and nothing be shown.
+    """
+    groups: dict[NodeId, LimitedGroup] = {}
+    says = []
+    try:
+        for node, share in scenario.nodes.items():
+            if node not in fleet.kinds:
+                continue
+            name = f"{prefix}-{node}"
+            groups[node] = LimitedGroup.create(name, cpu_cores=share.cpu_cores, memory_mb=share.memory_mb)
+            says.append(f"{node} {share.cpu_cores:g} cores, {share.memory_mb:.0f} MiB")
+    except AdapterError:
+        for group in groups.values():
+            group.remove()
+        raise
+    if not groups:
+        return NodeLimits(LimitKind.NONE, "no node has a share of its own")
+    return NodeLimits(LimitKind.CGROUP, "control groups: " + "; ".join(says), groups=groups)
+
+
+def ready_workers(status: Status, task: str) -> set[NodeId]:
+    """The nodes whose worker for ``task`` is ready, by one snapshot."""
+    return {
+        str(node["name"])
+        for node in status.get("nodes") or ()
+        for worker in node.get("workers") or ()
+        if worker.get("task") == task and worker.get("state") == "ready"
+    }
+
+
+def is_calm(statuses: Mapping[NodeId, Status], nodes: tuple[NodeId, ...]) -> bool:
+    """Whether every one of ``nodes`` says of itself that it is idle."""
+    for node in nodes:
+        own = next((part for part in (statuses.get(node) or {}).get("nodes") or () if part.get("name") == node), None)
+        ratio = None if own is None else own.get("cpu_ratio")
+        if ratio is None or ratio > CALM_RATIO:
+            return False
+    return True
+
+
+def _links(status: Status, node: NodeId) -> object:
+    own: Status = next((part for part in status.get("nodes") or () if part.get("name") == node), {})
+    return [link.get("rssi_dbm") for link in own.get("links") or ()]
+
+
+def _streams(status: Status, task: str) -> object:
+    return (find_task(status, task) or {}).get("streams")
+
+
+def write_json(path: Path, body: Mapping[str, Any]) -> None:
+    """Write it so that nobody reads half of it."""
+    half = path.with_suffix(".part")
+    half.write_text(json.dumps(body, indent=1) + "\n", encoding="utf-8")
+    half.rename(path)

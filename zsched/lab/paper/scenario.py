@@ -1,0 +1,174 @@
+"""Reads a scenario: which fleet, who is weak, what is injected where and when, which radio each link follows.
+
+Knows: the scenario file's keys, units and ranges. Does not know: schemes, processes, figures.
+
+One scenario and one seed are one story: every scheme meets the same windows of load, the same radio, the same robots.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ruamel.yaml import YAML
+
+from zsched.core.model import NodeId, check_range
+from zsched.errors import ConfigError
+
+MAX_CORES = 1.5
+"""The nodes' quotas together, so that robots, daemons and the lab itself find CPU on a machine with two cores."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NodeShare:
+    """What one node may use: ``cpu_cores`` (quota), ``memory_mb`` (limit); ``ballast_mb`` is taken from the start."""
+
+    cpu_cores: float
+    memory_mb: float
+    ballast_mb: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_range("cpu_cores", self.cpu_cores, 0.05, MAX_CORES)
+        check_range("memory_mb", self.memory_mb, 128.0, 1e6)
+        check_range("ballast_mb", self.ballast_mb, 0.0, self.memory_mb)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoadLevel:
+    """How strong one injected load is: inference ``threads``, ``hz`` frames a second (0: all that the CPU gives).
+
+    ``side`` is the frame's side in pixels (a multiple of 32); ``memory_mb`` what such a process takes, for the oracle.
+    """
+
+    threads: int = 1
+    hz: float = 0.0
+    side: int = 320
+    memory_mb: float = 150.0
+
+    def __post_init__(self) -> None:
+        check_range("threads", self.threads, 1, 64)
+        check_range("hz", self.hz, 0.0, 1000.0)
+        check_range("side", self.side, 32, 4096)
+        check_range("memory_mb", self.memory_mb, 0.0, 1e6)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoadPlan:
+    """When load comes: in each of ``lanes``, windows of ``busy_s`` and pauses of ``idle_s`` (low, high) alternate.
+
+    Two lanes never load one node at a time; the first windows begin after ``first_s``.
+    """
+
+    lanes: int = 2
+    busy_s: tuple[float, float] = (10.0, 16.0)
+    idle_s: tuple[float, float] = (2.0, 5.0)
+    first_s: float = 4.0
+
+    def __post_init__(self) -> None:
+        check_range("lanes", self.lanes, 0, 64)
+        check_range("first_s", self.first_s, 0.0, 3600.0)
+        for name in ("busy_s", "idle_s"):
+            low, high = getattr(self, name)
+            check_range(name, low, 0.0, 3600.0)
+            check_range(name, high, low, 3600.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Radio:
+    """The recorded drive that a node's link follows: ``file`` within the folder of drives, from ``offset_s`` on."""
+
+    file: str
+    column: str = "c_rssi"
+    offset_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sweep:
+    """The strength of the injected load over all levels: these schemes, so many runs each."""
+
+    schemes: tuple[str, ...] = ()
+    runs: int = 2
+
+    def __post_init__(self) -> None:
+        check_range("sweep.runs", self.runs, 1, 1000)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scenario:
+    """One evaluation, but for the scheme and the number of the run.
+
+    ``duration_s`` counts from the robots' start; ``target_coverage`` ends the task (share of the truth's known cells,
+    at every robot); ``pressure_limit`` is the share of time in which processes outside the nodes' quotas may have
+    waited for a CPU: above it the run is invalid.
+    """
+
+    name: str
+    fleet: Path
+    duration_s: float
+    seed: int
+    runs: int
+    """Of each scheme of the paper and of ours."""
+    level: str
+    levels: Mapping[str, LoadLevel]
+    schemes: tuple[str, ...] = ()
+    """Those of the matrix; none: all."""
+    yardstick_runs: int = 3
+    sweep: Sweep = Sweep()
+    nodes: Mapping[NodeId, NodeShare] = field(default_factory=dict)
+    load: LoadPlan = LoadPlan()
+    links: Mapping[NodeId, Radio] = field(default_factory=dict)
+    mode: str = "track"
+    rate_hz: float = 4.0
+    target_coverage: float = 0.9
+    pressure_limit: float = 0.2
+
+    def __post_init__(self) -> None:
+        check_range("duration_s", self.duration_s, 5.0, 600.0)
+        check_range("runs", self.runs, 1, 1000)
+        check_range("yardstick_runs", self.yardstick_runs, 1, 1000)
+        check_range("rate_hz", self.rate_hz, 0.1, 100.0)
+        check_range("target_coverage", self.target_coverage, 0.01, 1.0)
+        check_range("pressure_limit", self.pressure_limit, 0.0, 1.0)
+        total = sum(share.cpu_cores for share in self.nodes.values())
+        if total > MAX_CORES:
+            raise ValueError(f"nodes: quotas of {total:g} cores in all, at most {MAX_CORES:g}")
+        if self.level not in self.levels:
+            raise ValueError(f"level: {self.level!r} is none of {', '.join(self.levels)}")
+
+    def run_seed(self, run: int) -> int:
+        """The seed of run ``run``: the same for every scheme and level."""
+        return self.seed + run
+
+
+def load_scenario(path: Path) -> Scenario:
+    """Read a scenario file.
+
+    Raises:
+        ConfigError: it cannot be read, a key is unknown or missing, or a value is out of range; says which.
+    """
+    try:
+        tree = YAML(typ="safe").load(path)
+    except Exception as error:
+        raise ConfigError(f"{path}: not readable as a scenario: {error}") from error
+    if not isinstance(tree, dict):
+        raise ConfigError(f"{path}: no scenario in it; see configs/lab/paper.scenario.yml")
+    try:
+        return _scenario(path, dict(tree))
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{path}: {error}; see configs/lab/paper.scenario.yml") from error
+
+
+def _scenario(path: Path, tree: dict[str, Any]) -> Scenario:
+    fleet = path.parent / str(tree.pop("fleet", "fleet.yaml"))
+    levels = {str(name): LoadLevel(**spec) for name, spec in dict(tree.pop("levels", {})).items()}
+    nodes = {str(name): NodeShare(**spec) for name, spec in dict(tree.pop("nodes", {})).items()}
+    links = {str(name): Radio(**spec) for name, spec in dict(tree.pop("links", {})).items()}
+    load, sweep = LoadPlan(**_tuples(tree.pop("load", {}))), Sweep(**_tuples(tree.pop("sweep", {})))
+    known = {str(name): value for name, value in _tuples(tree).items()}
+    return Scenario(fleet=fleet, levels=levels, nodes=nodes, links=links, load=load, sweep=sweep, **known)
+
+
+def _tuples(tree: Any) -> dict[str, Any]:
+    return {str(name): tuple(value) if isinstance(value, list) else value for name, value in dict(tree).items()}
