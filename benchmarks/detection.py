@@ -1,8 +1,10 @@
 """The owner fails in four ways -> detected -> committed -> first message through the new owner; and a cut that heals.
 
-``python -m benchmarks.detection [--timing wired|wifi] [--case killed worker frozen cut heal] [--n N] [--kills N]``.
-Needs root: six daemons in network namespaces with echo workers and a cool-down of 0, an application on robot1 that
-publishes at 200 Hz on its own key.
+``python -m benchmarks.detection [--timing wired wifi] [--case killed worker frozen cut heal] [--n N] [--kills N]
+[--out FOLDER] [--table]``. Needs root: six daemons in network namespaces with echo workers and a cool-down of 0, an
+application on robot1 that publishes at 200 Hz on its own key. Several timings run side by side, each with a fleet of
+its own. With ``--out`` every cycle is on disk at once: the same command goes on where it was interrupted, ``--table``
+only prints what is there.
 
 * detected: the first robot holds the owner for gone (``worker``: its daemon sees the process end);
 * committed: the first node learns a newer epoch (``worker``: no move, the worker restarts in place);
@@ -20,15 +22,17 @@ import os
 import signal
 import sys
 import tempfile
+import time
 from collections.abc import Callable
 from pathlib import Path
 
-from benchmarks.common import line, machine
+from benchmarks.common import machine
+from benchmarks.record import Record, progress, save, summary, table, together
 from zsched.clock import monotonic_s
 from zsched.core.model import NodeId
 from zsched.lab import netns
 from zsched.lab.netbed import Netbed, Probe, descendants, stamped, stop_group
-from zsched.lab.testbed import TASK, echo_fleet
+from zsched.lab.testbed import TASK, TestbedError, echo_fleet
 
 GOALS = {
     ("killed", "wifi"): "p99 300 ms",
@@ -42,6 +46,7 @@ CUT_S = 20.0
 RECOVERY_S = 3.0
 """After a cut, TCP's own timers hold a link's streams back for up to so long; the next fault waits for it."""
 CASES = ("killed", "worker", "frozen", "cut", "heal")
+MAX_FAILURES = 5
 
 
 class Cycle:
@@ -153,43 +158,90 @@ class Cases:
         return all(peer["state"] == "alive" for node in self.bed.names for peer in self.bed.status(node)["nodes"])
 
 
-def measure(cases: Cases, name: str, count: int, timing: str) -> None:
-    """Run one case ``count`` times and print its lines."""
+def measure(cases: Cases, record: Record, name: str, count: int, timing: str) -> None:
+    """Run what is missing of ``count`` cycles of one case."""
     faults = {"killed": cases.kill, "worker": cases.kill_worker, "frozen": cases.freeze, "cut": cases.cut}
-    steps: dict[str, list[float]] = {}
-    for _ in range(count):
+    for number in range(len(record.having(case=name, timing=timing)), count):
+        start = time.monotonic()
         found = cases.heal() if name == "heal" else cases.run(name, faults[name])
-        for step, value in found.items():
-            steps.setdefault(step, []).append(value)
-    for step, values in steps.items():
-        goal = GOALS.get((name, timing), "-") if step == "first message" else "-"
-        print(line(f"{name} -> {step} ({timing})", values, "ms", goal), flush=True)
+        took_s = time.monotonic() - start
+        record.add({"case": name, "timing": timing, "steps": found, "cycle_s": round(took_s, 2)})
+        steps = ", ".join(f"{step} {value:.0f}" for step, value in found.items())
+        progress(f"{timing} {name} {number + 1}/{count}: {steps} ms (cycle {took_s:.1f} s)")
+
+
+def run(record: Record, given: argparse.Namespace, timing: str) -> None:
+    """One timing profile: every case with a fresh fleet, as often as it takes."""
+    counts = {"killed": given.kills, "heal": given.heals}
+    for name in given.case:
+        count = counts.get(name, given.n)
+        failures = 0
+        while len(record.having(case=name, timing=timing)) < count:
+            try:
+                with_fleet(timing, lambda cases: measure(cases, record, name, count, timing))  # noqa: B023 - called at once
+            except TestbedError as error:
+                failures += 1
+                record.add({"case": f"{name}, failed", "timing": timing, "why": str(error)[:4000]})
+                progress(f"{timing} {name}: a cycle failed, a fresh fleet goes on: {str(error).splitlines()[0]}")
+                if failures >= MAX_FAILURES:
+                    raise
+
+
+def with_fleet(timing: str, use: Callable[[Cases], None]) -> None:
+    """A fleet and an application for some cycles."""
+    tree = echo_fleet(timing=timing)
+    tree["tasks"][TASK]["worker"] |= {"max_failures": 100, "failure_window_s": 1}  # many deaths on purpose
+    with tempfile.TemporaryDirectory() as folder, Netbed(Path(folder), tree) as bed:
+        bed.init()
+        bed.start()
+        use(Cases(bed, bed.probe("robot1", put="robot1/in", hz=200, watch=["robot1/out"])))
+
+
+def report(records: dict[str, Record], folder: Path | None) -> None:
+    """Print the distributions and keep them."""
+    rows: list[tuple[str, list[float], str]] = []
+    for timing, record in records.items():
+        for name in CASES:
+            found = [row["steps"] for row in record.having(case=name, timing=timing)]
+            for step in dict.fromkeys(step for steps in found for step in steps):
+                values = [steps[step] for steps in found if step in steps]
+                goal = GOALS.get((name, timing), "-") if step == "first message" else "-"
+                rows.append((f"{timing}: {name} -> {step}", values, goal))
+            if failed := record.having(case=f"{name}, failed", timing=timing):
+                print(f"{timing}: {name}: {len(failed)} cycles failed (see the rows)")
+    print(table(rows, "ms after the fault"))
+    save(folder, "detection", {"ms": {name: summary(values) for name, values, _ in rows if values}})
 
 
 def main() -> int:
     """Print the distributions; the exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--timing", default="wifi", choices=["wifi", "wired"])
+    parser.add_argument("--timing", nargs="+", default=["wired", "wifi"], choices=["wifi", "wired"])
     parser.add_argument("--case", nargs="+", default=list(CASES), choices=CASES)
     parser.add_argument("--n", type=int, default=40)
     parser.add_argument("--kills", type=int, default=200)
     parser.add_argument("--heals", type=int, default=5)
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--table", action="store_true")
+    parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
     given = parser.parse_args()
     reason = netns.why_not()
-    if reason is not None:
+    if reason is not None and not given.table:
         print(f"no network namespaces here: {reason}", file=sys.stderr)
         return 1
-    print(machine(), flush=True)
-    counts = {"killed": given.kills, "heal": given.heals}
-    for name in given.case:
-        tree = echo_fleet(timing=given.timing)
-        tree["tasks"][TASK]["worker"] |= {"max_failures": 100, "failure_window_s": 1}  # many deaths on purpose
-        with tempfile.TemporaryDirectory() as folder, Netbed(Path(folder), tree) as bed:
-            bed.init()
-            bed.start()
-            probe = bed.probe("robot1", put="robot1/in", hz=200, watch=["robot1/out"])
-            measure(Cases(bed, probe), name, counts.get(name, given.n), given.timing)
-    return 0
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = given.out or Path(scratch)
+        if given.child:
+            run(Record(folder, f"detection-{given.timing[0]}"), given, given.timing[0])
+            return 0
+        code = 0
+        if not given.table:
+            print(machine(), flush=True)
+            numbers = ["--n", given.n, "--kills", given.kills, "--heals", given.heals, "--out", folder, "--child"]
+            shared = [*map(str, numbers), "--case", *given.case]
+            code = together("benchmarks.detection", [["--timing", timing] for timing in given.timing], shared)
+        report({timing: Record(folder, f"detection-{timing}") for timing in given.timing}, given.out)
+    return code
 
 
 if __name__ == "__main__":
