@@ -1,6 +1,7 @@
 """Trigger -> committed with 3, 6, 12, 24 and 48 nodes, and how messages and CPU grow with their number.
 
-``python -m benchmarks.scale [--nodes 3 6 12 24 48] [--n 20] [--timing wifi]``. Half of the nodes are robots (voters and
+``python -m benchmarks.scale [--nodes 3 6 12 24 48] [--n 20] [--timing wifi] [--out FOLDER]``; with ``--out`` a size
+that is done is not measured again. Half of the nodes are robots (voters and
 electors; of three nodes one is, and all elect), half edges; every pair has a zenoh link on loopback.
 
 What runs: the real `Node`, `ControlBus` (a zenoh session per node, meshed by gossip), codec and state file (fsync
@@ -27,7 +28,8 @@ import time
 from pathlib import Path
 from typing import IO, Any
 
-from benchmarks.common import line, machine, mean
+from benchmarks.common import machine, mean
+from benchmarks.record import Record, Row, progress, save, table
 from zsched import zenoh_config
 from zsched.adapters.control_bus import ControlBus
 from zsched.adapters.state_file import StateFile
@@ -45,6 +47,8 @@ from zsched.lifecycle import init_state
 GOAL = "p99 50 ms at 6"
 IDLE_S = 5.0
 SETTLED_S = 1.0
+START_S = 240.0
+"""48 nodes in two processes have 1128 links to make."""
 SAMPLE = DeviceSample(cpu_cores=4.0, cpu_used_cores=1.0, memory_mb=4096.0, memory_used_mb=1024.0)
 
 
@@ -60,7 +64,7 @@ class Loop:
         incarnation = durable.incarnation if durable is not None else 1
         points = endpoints_for(fleet, fleet.node(name), free_port)
         config = zenoh_config.control_config(
-            listen=points.control_listen, connect=points.control_connect, timing=fleet.timing
+            listen=points.control_listen, connect=points.control_connect, timing=fleet.timing, dials_by_gossip=False
         )
         self._bus = ControlBus(
             fleet=fleet.name, node=name, incarnation=incarnation, zenoh_config=config, post=self._events.put
@@ -181,7 +185,10 @@ class Group:
         for index in range(count):
             command = [sys.executable, "-m", "benchmarks.scale", "--child", str(self.file), str(folder)]
             process = subprocess.Popen(
-                [*command, *self.names[index::count]], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+                [*command, *self.names[index::count]],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                env={**os.environ, "RUST_LOG": "off"},  # zenoh writes to standard output, in the middle of our lines
             )
             assert process.stdout is not None
             self._children.append(process)
@@ -205,9 +212,9 @@ class Group:
         """Stories from number ``since`` on that hold all words."""
         return [one for one in self.stories[since:] if all(word in one["text"] for word in words)]
 
-    def wait(self, since: int, count: int, *words: str) -> list[dict[str, Any]]:
+    def wait(self, since: int, count: int, *words: str, within_s: float = 60.0) -> list[dict[str, Any]]:
         """Until ``count`` nodes have told it."""
-        end = time.monotonic() + 60
+        end = time.monotonic() + within_s
         while time.monotonic() < end:
             found = self.told(since, *words)
             if len({one["node"] for one in found}) >= count:
@@ -234,10 +241,12 @@ class Group:
             process.wait(10)
 
 
-def measure(group: Group, count: int, timing: str) -> None:
-    """The idle load, then ``count`` triggers; prints the lines of one size."""
+def measure(group: Group, count: int) -> Row:
+    """The idle load, then ``count`` triggers."""
     nodes = len(group.names)
-    group.wait(0, nodes, "learnt revision 1:")
+    start = time.monotonic()
+    group.wait(0, nodes, "learnt revision 1:", within_s=START_S)
+    progress(f"{nodes} nodes: one owner after {time.monotonic() - start:.1f} s")
     time.sleep(2 * SETTLED_S)
     before = group.snapshot()
     time.sleep(IDLE_S)
@@ -245,27 +254,39 @@ def measure(group: Group, count: int, timing: str) -> None:
     seconds = after["at"] - before["at"]
     rates = {key: (after[key] - before[key]) / seconds / nodes for key in ("sent", "received", "cpu_s")}
     committed, everywhere = [], []
-    for _ in range(count):
+    for number in range(count):
         since, owner = len(group.stories), group.owner()
         group.tell(do="failed", node=owner)
         learnt = group.wait(since, nodes, "learnt revision")
         proposed = group.told(since, "propose ")
-        start = min(one["at"] for one in proposed)
-        committed.append((min(one["at"] for one in learnt) - start) * 1000)
-        everywhere.append((max(one["at"] for one in learnt) - start) * 1000)
+        begin = min(one["at"] for one in proposed)
+        committed.append((min(one["at"] for one in learnt) - begin) * 1000)
+        everywhere.append((max(one["at"] for one in learnt) - begin) * 1000)
+        progress(
+            f"{nodes} nodes {number + 1}/{count}: committed {committed[-1]:.0f}, everywhere {everywhere[-1]:.0f} ms"
+        )
         group.tell(do="ready", node=owner)
         time.sleep(SETTLED_S)
-    print(line(f"{nodes} nodes: trigger -> committed ({timing})", committed, "ms", GOAL))
-    print(line(f"{nodes} nodes: trigger -> known everywhere ({timing})", everywhere, "ms", "-"))
-    print(
-        f"{nodes} nodes: idle, per node: {rates['sent']:.1f} puts/s, {rates['received']:.1f} frames/s in, "
-        f"{100 * rates['cpu_s']:.1f} % of a core",
-        flush=True,
-    )
+    return {"committed": committed, "everywhere": everywhere, "idle": rates}
+
+
+def report(record: Record, timing: str, folder: Path | None) -> None:
+    """Print what there is, and keep it."""
+    rows = sorted(record.having(timing=timing), key=lambda row: row["nodes"])
+    figures = []
+    for row in rows:
+        figures.append((f"{row['nodes']} nodes: trigger -> committed", row["committed"], GOAL))
+        figures.append((f"{row['nodes']} nodes: trigger -> known everywhere", row["everywhere"], "-"))
+    print(table(figures, f"ms ({timing})"))
+    print("| idle, per node | puts/s | frames/s in | % of a core |", "| --- | --- | --- | --- |", sep="\n")
+    for row in rows:
+        idle = row["idle"]
+        print(f"| {row['nodes']} nodes | {idle['sent']:.1f} | {idle['received']:.1f} | {100 * idle['cpu_s']:.1f} |")
+    save(folder, f"scale-{timing}", {"rows": rows})
 
 
 def main() -> None:
-    """Print the lines of every size."""
+    """Measure every size that is missing, then print the tables."""
     if "--child" in sys.argv:
         _, _, config, folder, *names = sys.argv
         child(Path(config), Path(folder), list(names))
@@ -274,15 +295,22 @@ def main() -> None:
     parser.add_argument("--nodes", type=int, nargs="+", default=[3, 6, 12, 24, 48])
     parser.add_argument("--n", type=int, default=20)
     parser.add_argument("--timing", default="wifi", choices=["wifi", "wired"])
+    parser.add_argument("--out", type=Path)
     given = parser.parse_args()
     print(machine(), flush=True)
+    record = Record(given.out, f"scale-{given.timing}")
     for nodes in given.nodes:
+        if any(len(row["committed"]) >= given.n for row in record.having(nodes=nodes, timing=given.timing)):
+            continue
         with tempfile.TemporaryDirectory() as folder:
             group = Group(nodes, given.timing, Path(folder))
             try:
-                measure(group, given.n, given.timing)
+                record.add({"nodes": nodes, "timing": given.timing} | measure(group, given.n))
+            except SystemExit as error:
+                progress(f"{nodes} nodes: {error}")
             finally:
                 group.close()
+    report(record, given.timing, given.out)
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from zsched import __version__, places, zenoh_config
+from zsched.adapters import zenoh_log
 from zsched.adapters.control_bus import ControlBus
 from zsched.adapters.device_profiler import DeviceProfiler
 from zsched.adapters.network_profiler import readers_for
@@ -306,6 +307,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--log-level", default="INFO", choices=["DEBUG", "INFO", "WARNING", "ERROR"])
     given = parser.parse_args(arguments)
     _set_up_logging(given.log_level)
+    zenoh_log.capture(os.environ)
     options = Options(
         config=places.config_path(given.config, os.environ),
         node=places.node_name(given.node, os.environ),
