@@ -175,6 +175,7 @@ class Daemon:
 
     def _build(self, stack: contextlib.ExitStack, state_file: StateFile, incarnation: int, points: Endpoints) -> Shell:
         """Open the adapters; each is closed by ``stack`` in the reverse order."""
+        zenoh_log.capture(os.environ)
         fleet, me = self._fleet, self._spec.name
         operator_json5 = Path(fleet.zenoh_config).read_text() if fleet.zenoh_config else ""
         bus = ControlBus(
@@ -307,7 +308,6 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--log-level", default="INFO", choices=["DEBUG", "INFO", "WARNING", "ERROR"])
     given = parser.parse_args(arguments)
     _set_up_logging(given.log_level)
-    zenoh_log.capture(os.environ)
     options = Options(
         config=places.config_path(given.config, os.environ),
         node=places.node_name(given.node, os.environ),
