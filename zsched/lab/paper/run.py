@@ -48,7 +48,7 @@ RECORDER_S = 20.0
 CALM_S = 8.0
 """So long at most the robots wait for the start-up's CPU to fade from the nodes' smoothed figures."""
 CALM_RATIO = 0.3
-SETTLE_S = 3.0
+SETTLE_S = 2.0
 """After the robots' drive: their last maps are merged and come back."""
 RUN_SCHEMA = "zsched.paper.run/1"
 
@@ -98,6 +98,8 @@ class CellRun:
         self._recorder = Recorder(self._records)
         self._plan_path = folder / "plan.json"
         self._seed = scenario.run_seed(cell.run)
+        self.left_behind: list[str] = []
+        """What could not be removed when the run had ended."""
         self._windows: tuple[Window, ...] = ()
         self._meters: dict[NodeId, NodeMeter] = {}
         self._decided: dict[NodeId, object] = {}
@@ -110,12 +112,14 @@ class CellRun:
         Raises:
             ChildError: a process of the run failed, or the fleet did not come up.
         """
-        with Children(self._folder / "logs") as children, self._recorder:
+        with self._recorder, Children(self._folder / "logs") as children:
             parts = self._build(children)
             try:
-                return self._play(children, parts)
+                body = self._play(children, parts)
             finally:
                 parts.loads.stop(monotonic_s() - self._zero_s)
+        self.left_behind = children.left_behind
+        return body
 
     def _build(self, children: Children) -> _Parts:
         runtime = Path(tempfile.gettempdir()) / f"zsched-{children.token}"

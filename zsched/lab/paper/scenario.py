@@ -119,7 +119,7 @@ class Scenario:
     nodes: Mapping[NodeId, NodeShare] = field(default_factory=dict)
     load: LoadPlan = LoadPlan()
     links: Mapping[NodeId, Radio] = field(default_factory=dict)
-    mode: str = "track"
+    mode: str = "known"
     rate_hz: float = 4.0
     target_coverage: float = 0.9
     pressure_limit: float = 0.2

@@ -1,0 +1,55 @@
+"""One cell of the paper's matrix with real daemons, workers, load and recorder, from fleet file to figures."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+
+from zsched.adapters.cgroup import LimitedGroup
+from zsched.lab.laser_log import load_log, malaga_path
+from zsched.lab.mapping import truth_grid
+from zsched.lab.paper.metrics import Truth, measure
+from zsched.lab.paper.places import scenario_path
+from zsched.lab.paper.run import Cell, CellRun, Inputs
+from zsched.lab.paper.scenario import LoadPlan, load_scenario
+from zsched.lab.paper.schemes import SCHEMES
+from zsched.lab.recorder import read_records
+
+WHY_NOT = LimitedGroup.why_not()
+DRIVE_S = 5.0
+
+
+@pytest.mark.root
+@pytest.mark.timeout(150)
+@pytest.mark.skipif(WHY_NOT is not None, reason=f"no control groups: {WHY_NOT}")
+def test_a_cell_is_run_and_measured_and_leaves_nothing(tmp_path: Path) -> None:
+    plan = LoadPlan(lanes=1, busy_s=(3.0, 3.0), idle_s=(0.0, 0.0), first_s=1.0)
+    scenario = replace(load_scenario(scenario_path()), duration_s=DRIVE_S, load=plan, target_coverage=0.01)
+    cell = Cell(scheme=SCHEMES["random"], level="one", run=0)
+    folder = tmp_path / "cell"
+
+    one = CellRun(scenario, cell, Inputs(log=malaga_path()), folder)
+    run = one.run()
+    figures = measure(folder, scenario, Truth(truth_grid(load_log(malaga_path()))))
+
+    assert run == json.loads((folder / "run.json").read_text()) | {"robots": tuple(run["robots"])}
+    assert run["allocations"][0]["node"] in {"edge1", "edge2", "edge3"}
+    assert [load["node"] for load in run["loads"]] == [window["node"] for window in run["windows"]]
+    # Under the lot of `random` the first owner is whoever the robots agreed on, then the lot's, all by commits.
+    assert [move["epoch"] for move in run["allocations"]] == list(range(1, len(run["allocations"]) + 1))
+    assert (folder / "plan.json").exists()
+    assert figures["map_hz"] > 0
+    assert figures["is_done"]
+    assert all(figures["nodes"][node]["cpu_mean"] is not None for node in scenario.nodes)
+    assert all(figures["nodes"][node]["memory_mean"] > 0.1 for node in scenario.nodes)
+    with (folder / "streams.mcap").open("rb") as stream:
+        topics = {channel.topic for _, channel, _ in make_reader(stream).iter_messages()}
+    assert {f"{robot}/{name}" for robot in run["robots"] for name in ("map", "global_map")} <= topics
+    decisions = read_records(folder / "records" / "decisions.ndjson")
+    assert {record["node"] for record in decisions} == set(run["robots"])
+    assert any(record["decision"] and record["decision"]["utilities"] for record in decisions)
+    assert one.left_behind == []
