@@ -1,0 +1,107 @@
+"""One simulated robot in one piece: body, laser, mapping and explorer, stepped by a clock that is handed in.
+
+Knows: when scans are taken and maps, claims are due. Does not know: zenoh, wall time, how maps are merged.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from zsched.lab.explore.body import Body, Drift, Limits
+from zsched.lab.explore.explorer import Explorer
+from zsched.lab.explore.frontier import Claim
+from zsched.lab.explore.laser import SCAN_PERIOD_S, Laser, LaserScan
+from zsched.lab.explore.mapper import ScanMapper
+from zsched.lab.explore.world import World
+from zsched.tasks.map_merge.geometry import Pose2, difference
+from zsched.tasks.map_merge.grid import Grid
+
+MAP_PERIOD_S = 0.5
+CLAIM_PERIOD_S = 0.5
+STILL_PERIOD_S = 1.0
+"""A robot that stands maps once in so long: the same scan twice tells nothing new."""
+MOVED_M, TURNED_RAD = 0.02, 0.02
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RobotSettings:
+    """One robot; ``start`` in the world is its map frame's pose too."""
+
+    robot: str
+    start: Pose2
+    seed: int = 1
+    limits: Limits = Limits()
+    drift: Drift = Drift()
+    has_slam: bool = True
+    """Whether it maps itself; else it only hands out scans, for an edge to map."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Outputs:
+    """What became due in a step."""
+
+    grid: Grid | None = None
+    scan: LaserScan | None = None
+    claim: Claim | None = None
+    is_claim_due: bool = False
+
+
+class Agent:
+    """The robot. ``phase`` (0..1) of a map period: robots are not in step."""
+
+    def __init__(self, settings: RobotSettings, world: World, *, phase: float = 0.0) -> None:
+        # Seeds of words and numbers: robots of one run, and one robot's parts, draw apart.
+        seeds = np.random.SeedSequence((settings.seed, *settings.robot.encode())).spawn(2)
+        body_random, laser_random = (np.random.default_rng(seed) for seed in seeds)
+        self.settings = settings
+        self.body = Body(world, settings.start, settings.limits, settings.drift, body_random)
+        self.explorer = Explorer(settings.robot, settings.limits)
+        self._laser = Laser(world, laser_random)
+        self._mapper = ScanMapper(frame_id=f"{settings.robot}/map")
+        self._phase = phase
+        self._last_s: float | None = None
+        self._next_scan_s = self._next_map_s = self._next_claim_s = 0.0
+        self._mapped: tuple[Pose2, float] | None = None
+        self.scans = 0
+
+    def step(self, now: float, stamp_ns: int) -> Outputs:
+        """Move up to ``now``, look, map, decide; returns what is to be sent. ``now`` only rises."""
+        if self._last_s is None:
+            self._last_s = now
+            self._next_scan_s = self._next_claim_s = now
+            self._next_map_s = now + self._phase * MAP_PERIOD_S
+        twist = self.explorer.step(self.body.belief, now, is_blocked=self.body.is_blocked)
+        self.body.move(twist, now - self._last_s)
+        self._last_s = now
+        scan = self._look(now, stamp_ns)
+        is_map_due = self.settings.has_slam and now >= self._next_map_s
+        if is_map_due:
+            self._next_map_s = max(self._next_map_s + MAP_PERIOD_S, now)
+        is_claim_due = now >= self._next_claim_s
+        if is_claim_due:
+            self._next_claim_s = max(self._next_claim_s + CLAIM_PERIOD_S, now)
+        return Outputs(
+            grid=self._mapper.grid(stamp_ns) if is_map_due else None,
+            scan=scan,
+            claim=self.explorer.claim if is_claim_due else None,
+            is_claim_due=is_claim_due,
+        )
+
+    def _look(self, now: float, stamp_ns: int) -> LaserScan | None:
+        """Take the scan that is due and map it, if it can tell something new."""
+        if now < self._next_scan_s:
+            return None
+        self._next_scan_s = max(self._next_scan_s + SCAN_PERIOD_S, now)
+        belief = self.body.belief
+        if self._mapped is not None:
+            way, turn = difference(belief, self._mapped[0])
+            if way < MOVED_M and turn < TURNED_RAD and now - self._mapped[1] < STILL_PERIOD_S:
+                return None
+        self._mapped = (belief, now)
+        self.scans += 1
+        scan = self._laser.scan(self.body.pose, stamp_ns)
+        if self.settings.has_slam:
+            self._mapper.add(belief, scan)
+        return scan

@@ -1,0 +1,159 @@
+"""Decides where one robot drives: the frontier on the merged map, the way there, the velocity of this moment.
+
+Knows: the newest merged map and where the robot stands in it, others' claims, time as an argument. Does not know: the
+robot's own map, the truth, zenoh.
+
+    WAITING    no merged map yet, or the merger has not placed this robot's map: the robot stands
+    DRIVING    on its way to a frontier
+    IDLE       the newest merged map has no frontier that this robot can reach and has not just been at
+
+The only map it has is the one that comes back from the merger. On a late map it drives on to places that it or others
+have long seen, and stands when it has been at all of them: that is what a slow merger costs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import StrEnum
+
+from zsched.lab.explore.body import Limits, Twist
+from zsched.lab.explore.frontier import Claim, Frontier, choose, find_frontiers
+from zsched.lab.explore.planner import PlanMap, Point, distances, plan_map, way_to
+from zsched.tasks.map_merge.geometry import Pose2, wrap_angle
+from zsched.tasks.map_merge.grid import Grid
+
+PLAN_PERIOD_S = 0.5
+"""Plans at most so often, and only for a reason: a new map, a reached goal, a wall."""
+REACHED_M = 0.4
+AVOID_S = 8.0
+"""A frontier that the robot has been at, or could not get to, does not count for so long."""
+CLAIM_LIFE_S = 3.0
+LOOK_AHEAD_M = 0.4
+TURN_FIRST_RAD = 0.9
+BACK_S = 0.6
+"""After a bump it backs off for so long."""
+
+
+class State(StrEnum):
+    """What the robot does."""
+
+    WAITING = "waiting"
+    DRIVING = "driving"
+    IDLE = "idle"
+
+
+@dataclass(slots=True)
+class _Goal:
+    frontier: Frontier
+    way: tuple[Point, ...]
+    next: int = 0
+
+
+class Explorer:
+    """One robot's explorer; all points are in the merged frame, but poses that are handed in by `step`."""
+
+    def __init__(self, robot: str, limits: Limits) -> None:
+        self._robot = robot
+        self._limits = limits
+        self._map: Grid | None = None
+        self._plan: PlanMap | None = None
+        self._merged_t_map: Pose2 | None = None
+        self._claims: dict[str, tuple[float, Claim]] = {}
+        self._avoided: list[tuple[float, Point]] = []
+        self._goal: _Goal | None = None
+        self._is_due = False
+        self._next_plan_s = float("-inf")
+        self._back_until_s = float("-inf")
+        self.state = State.WAITING
+        self.goals = 0
+        """How many goals it has set out for."""
+
+    @property
+    def goal(self) -> Point | None:
+        """Where it drives to."""
+        return None if self._goal is None else self._goal.frontier.point
+
+    @property
+    def claim(self) -> Claim | None:
+        """What to tell the others; ``None``: it goes nowhere."""
+        if self._goal is None:
+            return None
+        x, y = self._goal.frontier.point
+        return Claim(robot=self._robot, x=x, y=y, way_m=round(self._goal.frontier.way_m, 2))
+
+    def take_map(self, grid: Grid) -> None:
+        """The newest merged map."""
+        self._map, self._is_due = grid, True
+
+    def take_transform(self, merged_t_map: Pose2) -> None:
+        """Where the merger has placed this robot's map frame."""
+        self._merged_t_map = merged_t_map
+
+    def take_claims(self, claims: Iterable[Claim], now: float) -> None:
+        """What other robots claim, newest word each."""
+        for claim in claims:
+            if claim.robot != self._robot:
+                self._claims[claim.robot] = (now, claim)
+
+    def drop_claim(self, robot: str) -> None:
+        """A robot goes nowhere any more."""
+        self._claims.pop(robot, None)
+
+    def step(self, pose: Pose2, now: float, *, is_blocked: bool = False) -> Twist:
+        """The velocity for this moment; ``pose`` is what the robot believes, in its own map frame."""
+        if self._map is None or self._merged_t_map is None:
+            return Twist()
+        here = self._merged_t_map.compose(pose)
+        self._notice(here, now, is_blocked=is_blocked)
+        if self._is_due and now >= self._next_plan_s:
+            self._next_plan_s = now + PLAN_PERIOD_S
+            self._is_due = False
+            self._decide(here)
+        if now < self._back_until_s:
+            return Twist(speed=-0.3 * self._limits.speed)
+        return Twist() if self._goal is None else self._follow(self._goal, here)
+
+    def _notice(self, here: Pose2, now: float, *, is_blocked: bool) -> None:
+        """Goals that are reached, walls that are met, words that are too old."""
+        self._avoided = [(until, point) for until, point in self._avoided if until > now]
+        self._claims = {robot: kept for robot, kept in self._claims.items() if now - kept[0] < CLAIM_LIFE_S}
+        if self._goal is None or now < self._back_until_s:
+            return
+        if is_blocked:
+            self._back_until_s = now + BACK_S
+        end = self._goal.way[-1]
+        if is_blocked or math.dist((here.x, here.y), end) < REACHED_M:
+            self._avoided.append((now + AVOID_S, self._goal.frontier.point))
+            self._goal, self._is_due = None, True
+
+    def _decide(self, here: Pose2) -> None:
+        """Choose a frontier on the newest merged map, and the way to it."""
+        assert self._map is not None
+        self._plan = plan_map(self._map)
+        field = distances(self._plan, (here.x, here.y))
+        claims = [claim for _, claim in self._claims.values()]
+        frontiers = find_frontiers(self._plan, field, [(claim.x, claim.y) for claim in claims])
+        before = self.goal
+        chosen = choose(self._robot, frontiers, claims, before, [point for _, point in self._avoided])
+        way = () if chosen is None else way_to(self._plan, field, chosen.cell)
+        if chosen is None or not way:
+            self._goal, self.state = None, State.IDLE
+            self._is_due = bool(self._avoided)  # what it avoids now counts again soon
+            return
+        if before is None or math.dist(before, chosen.point) > REACHED_M:
+            self.goals += 1
+        self._goal, self.state = _Goal(frontier=chosen, way=way), State.DRIVING
+
+    def _follow(self, goal: _Goal, here: Pose2) -> Twist:
+        """Pure pursuit: towards the first point of the way that is far enough ahead; first turn, then drive."""
+        last = len(goal.way) - 1
+        while goal.next < last and math.dist((here.x, here.y), goal.way[goal.next]) < LOOK_AHEAD_M:
+            goal.next += 1
+        x, y = goal.way[goal.next]
+        error = wrap_angle(math.atan2(y - here.y, x - here.x) - here.yaw)
+        turn = max(-self._limits.turn, min(self._limits.turn, 2.5 * error))
+        if abs(error) > TURN_FIRST_RAD:
+            return Twist(turn=turn)
+        return Twist(speed=self._limits.speed * max(0.2, math.cos(error)), turn=turn)

@@ -1,0 +1,77 @@
+"""The explorers' own messages as bytes: claims, and scans for mapping elsewhere.
+
+Knows: the two layouts. Does not know: zenoh, who sends what when. Maps and transforms are ROS messages
+(`zsched.tasks.map_merge.cdr`).
+
+A claim is JSON: ``{"robot", "x", "y", "way_m"}`` in the merged frame, without ``x`` when the robot goes nowhere. A scan
+is, little endian: ``ZSC1``, the stamp in ns (int64), the robot's pose in its map frame x, y, yaw (float64), the number
+of beams (uint16), and one float32 per beam from straight ahead counter-clockwise, infinite without an echo (as in
+sensor_msgs/msg/LaserScan).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+
+import numpy as np
+
+from zsched.errors import WireError
+from zsched.lab.explore.frontier import Claim
+from zsched.lab.explore.laser import RANGE_M, LaserScan
+from zsched.tasks.map_merge.geometry import Pose2
+
+_HEAD = struct.Struct("<4sqdddH")
+_MAGIC = b"ZSC1"
+MAX_BEAMS = 4096
+
+
+def encode_claim(robot: str, claim: Claim | None) -> bytes:
+    """A robot's claim, or its word that it has none."""
+    if claim is None:
+        return json.dumps({"robot": robot}).encode()
+    return json.dumps({"robot": robot, "x": claim.x, "y": claim.y, "way_m": claim.way_m}).encode()
+
+
+def decode_claim(payload: bytes) -> tuple[str, Claim | None]:
+    """Whose word it is, and the claim if there is one.
+
+    Raises:
+        WireError: the bytes are no claim.
+    """
+    try:
+        told = json.loads(payload)
+        robot = str(told["robot"])
+        if "x" not in told:
+            return robot, None
+        numbers = [float(told[name]) for name in ("x", "y", "way_m")]
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        raise WireError("claim", repr(error)) from error
+    if not all(map(math.isfinite, numbers)):
+        raise WireError("claim", "not a finite number")
+    return robot, Claim(robot=robot, x=numbers[0], y=numbers[1], way_m=numbers[2])
+
+
+def encode_scan(scan: LaserScan, belief: Pose2) -> bytes:
+    """A scan and where it was taken, in the robot's map frame."""
+    head = _HEAD.pack(_MAGIC, scan.stamp_ns, belief.x, belief.y, belief.yaw, scan.ranges.size)
+    return head + np.where(scan.echo, scan.ranges, np.float32(np.inf)).astype("<f4").tobytes()
+
+
+def decode_scan(payload: bytes) -> tuple[LaserScan, Pose2]:
+    """The scan and its pose.
+
+    Raises:
+        WireError: the bytes are no scan.
+    """
+    if len(payload) < _HEAD.size:
+        raise WireError("scan", f"{len(payload)} bytes are too few")
+    magic, stamp_ns, x, y, yaw, beams = _HEAD.unpack_from(payload)
+    pose = Pose2(x=x, y=y, yaw=yaw)
+    if magic != _MAGIC or not 1 <= beams <= MAX_BEAMS or len(payload) != _HEAD.size + 4 * beams or not pose.is_finite:
+        raise WireError("scan", f"{len(payload)} bytes with {beams} beams at {pose} are no scan")
+    told = np.frombuffer(payload, dtype="<f4", offset=_HEAD.size).astype(np.float32)
+    echo = np.isfinite(told) & (told >= 0.0) & (told <= RANGE_M)
+    ranges = np.where(echo, told, np.float32(RANGE_M)).astype(np.float32)
+    return LaserScan(ranges=ranges, echo=echo, stamp_ns=stamp_ns), pose

@@ -1,0 +1,294 @@
+"""One exploring robot in wall time: a plain zenoh client of its robot's data endpoint, like any robot program.
+
+Knows: its keys, the endpoint, the records. Does not know: zsched. It never notices a move of the merger, but by what a
+late map costs it.
+
+    python -m zsched.lab.explore.robot --robot robot1 --world office:1 --index 0 --robots 3 --seed 1
+        --endpoint tcp/127.0.0.1:7458 --records DIR [--start x,y,yaw] [--target 0.9] [--speed 0.5] [--slam-on edge1]
+
+    out  <robot>/map                nav_msgs/msg/OccupancyGrid, CDR, 2 Hz (not with --slam-on)
+         <robot>/scan               with --slam-on: its scans, 5 Hz (`zsched.lab.explore.slam` maps them)
+         explore/<robot>/claim      where it goes, 2 Hz
+    in   <robot>/global_map         the merged map: the only one it plans on
+         <robot>/map_merge/tf       where the merger has placed its map frame: without it the robot stands
+         <robot>/map_merge/status   recorded
+         explore/*/claim            the others' claims
+
+The merger's ``--pose <robot>=x,y,yaw`` is the robot's start: ``load_world(world).starts(robots)[index]``.
+
+Records go to ``<records>/<robot>.ndjson`` as those of `zsched.lab.robot_app` (``map``, ``status``, ``progress``), and
+besides ``start`` (once), ``path`` (2 Hz, true pose and belief) and ``covered``: once, when the merged map that this
+robot holds first knows ``--target`` of the world. Then the robot goes on until it is stopped (SIGTERM, SIGINT); at the
+end it writes ``<robot>-global_map.cdr`` and ``<robot>-map.cdr``. ``t_s`` is the daemon's clock.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import zenoh
+
+from zsched.clock import monotonic_s
+from zsched.errors import ConfigError, WireError
+from zsched.lab.explore.agent import Agent, Outputs, RobotSettings
+from zsched.lab.explore.body import Drift, Limits
+from zsched.lab.explore.messages import decode_claim, encode_claim, encode_scan
+from zsched.lab.explore.referee import Referee
+from zsched.lab.explore.world import World
+from zsched.lab.explore.worlds import load_world
+from zsched.lab.recorder import Record, Recorder
+from zsched.lab.robot_app import connect
+from zsched.lab.signals import StopFlag
+from zsched.tasks.map_merge.cdr import CdrError, decode_grid, decode_transforms, encode_grid
+from zsched.tasks.map_merge.geometry import Pose2
+
+TICK_S = 0.1
+PATH_PERIOD_S = 0.5
+PROGRESS_PERIOD_S = 1.0
+EXIT_CONFIG = 78
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Options:
+    """What one robot explores, and where it is connected."""
+
+    settings: RobotSettings
+    world: World
+    phase: float
+    endpoint: str
+    records: Path
+    target: float
+
+
+class Applications:
+    """The robot on one session: carries messages between the agent and zenoh, and keeps the records."""
+
+    def __init__(self, options: Options, session: zenoh.Session, recorder: Recorder) -> None:
+        """Declare everything; the robot does not move yet."""
+        robot = options.settings.robot
+        self._options = options
+        self._recorder = recorder
+        self._agent = Agent(options.settings, options.world, phase=options.phase)
+        self._referee = Referee(options.world)
+        # BLOCK_FIRST: a map is many fragments, which DROP loses on a slow link; one map waits, none piles up behind it.
+        latest = zenoh.CongestionControl.BLOCK_FIRST
+        self._map = session.declare_publisher(f"{robot}/map", congestion_control=latest)
+        self._scan = session.declare_publisher(f"{robot}/scan", congestion_control=zenoh.CongestionControl.DROP)
+        self._claim = session.declare_publisher(f"explore/{robot}/claim")
+        self._maps = session.declare_subscriber(f"{robot}/global_map", zenoh.handlers.RingChannel(4))
+        self._transforms = session.declare_subscriber(f"{robot}/map_merge/tf", zenoh.handlers.RingChannel(4))
+        self._states = session.declare_subscriber(f"{robot}/map_merge/status", zenoh.handlers.RingChannel(4))
+        self._claims = session.declare_subscriber("explore/*/claim", zenoh.handlers.RingChannel(64))
+        self._sent = self._sent_bytes = self._received = self._received_bytes = 0
+        self._last_sent = self._last_map = self._last_state = b""
+        self._last_map_s: float | None = None
+        self._merged_t_map: Pose2 | None = None
+        self._coverage = 0.0
+        self._is_covered = False
+
+    def run(self, stop: StopFlag) -> None:
+        """Explore until stopped."""
+        start = monotonic_s()
+        settings, pose = self._options.settings, self._options.settings.start
+        self._write({"kind": "start", "t_s": start, "x": pose.x, "y": pose.y, "yaw": pose.yaw, "seed": settings.seed})
+        next_path = next_progress = start
+        while not stop.is_set:
+            now = monotonic_s()
+            self._listen(now)
+            self._send(self._agent.step(now, time.time_ns()))
+            if now >= next_path:
+                self._record_path(now)
+                next_path = max(next_path + PATH_PERIOD_S, now)
+            if now >= next_progress:
+                self._record_progress(now)
+                next_progress = max(next_progress + PROGRESS_PERIOD_S, now)
+            time.sleep(max(0.0, TICK_S - (monotonic_s() - now)))
+        self._record_progress(monotonic_s())
+
+    def save(self) -> None:
+        """Write the last merged map and the last own map."""
+        for name, payload in (("global_map", self._last_map), ("map", self._last_sent)):
+            if payload:
+                (self._options.records / f"{self._options.settings.robot}-{name}.cdr").write_bytes(payload)
+
+    def _send(self, outputs: Outputs) -> None:
+        if outputs.grid is not None:
+            self._last_sent = encode_grid(outputs.grid)
+            self._map.put(self._last_sent)
+            self._sent, self._sent_bytes = self._sent + 1, self._sent_bytes + len(self._last_sent)
+        if outputs.scan is not None and not self._options.settings.has_slam:
+            payload = encode_scan(outputs.scan, self._agent.body.belief)
+            self._scan.put(payload)
+            self._sent, self._sent_bytes = self._sent + 1, self._sent_bytes + len(payload)
+        if outputs.is_claim_due:
+            self._claim.put(encode_claim(self._options.settings.robot, outputs.claim))
+
+    def _listen(self, now: float) -> None:
+        while (sample := self._transforms.try_recv()) is not None:
+            self._take_transforms(bytes(sample.payload))
+        while (sample := self._maps.try_recv()) is not None:
+            self._take_map(bytes(sample.payload), now)
+        while (sample := self._states.try_recv()) is not None:
+            self._take_state(bytes(sample.payload), now)
+        while (sample := self._claims.try_recv()) is not None:
+            self._take_claim(bytes(sample.payload), now)
+
+    def _take_transforms(self, payload: bytes) -> None:
+        try:
+            transforms = decode_transforms(payload)
+        except CdrError:
+            return
+        for transform in transforms:
+            if transform.child == f"{self._options.settings.robot}/map":
+                self._merged_t_map = transform.pose
+                self._agent.explorer.take_transform(transform.pose)
+
+    def _take_map(self, payload: bytes, now: float) -> None:
+        try:
+            grid = decode_grid(payload)
+        except CdrError as error:
+            self._write({"kind": "bad_map", "t_s": now, "why": str(error)})
+            return
+        gap = None if self._last_map_s is None else now - self._last_map_s
+        self._received, self._received_bytes = self._received + 1, self._received_bytes + len(payload)
+        self._last_map, self._last_map_s = payload, now
+        self._agent.explorer.take_map(grid)
+        record: Record = {"kind": "map", "t_s": now, "gap_s": gap, "bytes": len(payload)}
+        record["known_m2"] = round(grid.known_area_m2, 1)
+        if self._merged_t_map is not None:
+            world_t_merged = self._options.settings.start.compose(self._merged_t_map.inverse())
+            self._coverage = round(self._referee.coverage(grid, world_t_merged), 4)
+            record["coverage"] = self._coverage
+        self._write(record)
+        if self._coverage >= self._options.target and not self._is_covered:
+            self._is_covered = True
+            self._write({"kind": "covered", "t_s": now, "coverage": self._coverage, "target": self._options.target})
+
+    def _take_state(self, payload: bytes, now: float) -> None:
+        if payload == self._last_state:
+            return
+        self._last_state = payload
+        try:
+            word = json.loads(payload)
+        except ValueError:
+            word = None
+        self._write({"kind": "status", "t_s": now, "status": word})
+
+    def _take_claim(self, payload: bytes, now: float) -> None:
+        try:
+            robot, claim = decode_claim(payload)
+        except WireError:
+            return
+        if claim is None:
+            self._agent.explorer.drop_claim(robot)
+        else:
+            self._agent.explorer.take_claims((claim,), now)
+
+    def _record_path(self, now: float) -> None:
+        true, belief = self._agent.body.pose, self._agent.body.belief
+        record: Record = {"kind": "path", "t_s": now}
+        record |= {name: round(getattr(true, name), 3) for name in ("x", "y", "yaw")}
+        record |= {f"belief_{name}": round(getattr(belief, name), 3) for name in ("x", "y", "yaw")}
+        self._write(record)
+
+    def _record_progress(self, now: float) -> None:
+        self._write(
+            {
+                "kind": "progress",
+                "t_s": now,
+                "scans": self._agent.scans,
+                "maps_sent": self._sent,
+                "bytes_sent": self._sent_bytes,
+                "maps_received": self._received,
+                "bytes_received": self._received_bytes,
+                "coverage": self._coverage,
+                "state": self._agent.explorer.state.value,
+                "goals": self._agent.explorer.goals,
+                "way_m": round(self._agent.body.way_m, 2),
+                "cpu_s": round(time.process_time(), 3),
+            }
+        )
+
+    def _write(self, record: Record) -> None:
+        self._recorder.write(self._options.settings.robot, record)
+
+
+def parse(arguments: list[str]) -> Options:
+    """The command line as options; argparse exits 2 on a wrong one.
+
+    Raises:
+        ConfigError: the world cannot be read, or has no room for the robots.
+    """
+    parser = argparse.ArgumentParser(prog="python -m zsched.lab.explore.robot", description="An exploring lab robot.")
+    add = parser.add_argument
+    add("--robot", "--name", required=True, help="the robot's name: the first chunk of its keys")
+    add("--world", default="office:1", help="turtlebot3, office:SEED or a map_server .yaml (office:1)")
+    add("--index", type=int, default=0, help="which of the world's start places, from 0")
+    add("--robots", type=int, default=3, help="how many robots explore (3)")
+    add("--start", type=pose, help="x,y,yaw in the world instead of a start place (m, rad)")
+    add("--seed", type=int, default=1, help="of the laser's noise and the drift")
+    add("--endpoint", required=True, help="the robot's data endpoint, e.g. tcp/127.0.0.1:7458")
+    add("--records", type=Path, required=True, help="folder for what the robot saw")
+    add("--target", type=float, default=0.9, help="share of the world that counts as covered (0.9)")
+    add("--speed", type=float, default=Limits().speed, help="m/s at most (0.5; a TurtleBot3 Burger does 0.22)")
+    add("--drift-yaw", type=float, default=Drift().yaw, help="rad per square root of a metre (0.001)")
+    add("--drift-way", type=float, default=Drift().way, help="m per square root of a metre (0.003)")
+    add("--slam-on", default="", metavar="NODE", help="map on this node (zsched.lab.explore.slam) and only send scans")
+    given = parser.parse_args(arguments)
+    if not 0 <= given.index < given.robots or not 0.0 < given.speed <= 5.0:
+        parser.error("--index must be in [0, robots) and --speed in (0, 5]")
+    world = load_world(given.world)
+    settings = RobotSettings(
+        robot=given.robot,
+        start=given.start or world.starts(given.robots)[given.index],
+        seed=given.seed,
+        limits=Limits(speed=given.speed),
+        drift=Drift(yaw=given.drift_yaw, way=given.drift_way),
+        has_slam=not given.slam_on,
+    )
+    phase = given.index / given.robots
+    return Options(
+        settings=settings, world=world, phase=phase, endpoint=given.endpoint, records=given.records, target=given.target
+    )
+
+
+def pose(text: str) -> Pose2:
+    """``x,y,yaw`` as a pose; raises what argparse understands."""
+    values = [float(value) for value in text.split(",")]
+    if len(values) != 3:
+        raise argparse.ArgumentTypeError(f"{text} is not x,y,yaw")
+    return Pose2(x=values[0], y=values[1], yaw=values[2])
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Entry point: 0 after a stop signal, 1 when the robot's data endpoint never answered, 78 without a world."""
+    cv2.setNumThreads(1)
+    try:
+        options = parse(sys.argv[1:] if arguments is None else arguments)
+    except ConfigError as error:
+        sys.stderr.write(f"explore.robot: {error}\n")
+        return EXIT_CONFIG
+    stop = StopFlag()
+    stop.install()
+    try:
+        session = connect(options.endpoint, stop)
+    except zenoh.ZError as error:
+        sys.stderr.write(f"explore.robot: {options.settings.robot}: {options.endpoint} does not answer: {error}\n")
+        return 1
+    if session is None:
+        return 0
+    with session, Recorder(options.records) as recorder:
+        applications = Applications(options, session, recorder)
+        applications.run(stop)
+        applications.save()
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
