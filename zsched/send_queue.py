@@ -4,7 +4,8 @@ Knows: order, bounds, which sample gives way to a newer one. Does not know: zeno
 
 Every stream that may wait for its receiver (classes ``latest`` and ``reliable``) has one per place it goes to. With
 ``sheds`` the oldest samples of a lane give way: beyond ``depth``, or, once a put has blocked for `STALL_S`, beyond
-``keep_last``. Without it a full queue refuses the newest. What gave way was never numbered, so receivers see no gap.
+``keep_last``. Without it a full queue refuses the newest; who wants to may `wait_for_room` before, as long as the
+receiver takes something now and then. What gave way was never numbered, so receivers see no gap.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ from zsched.clock import monotonic_s
 MAX_BYTES: Final = 64 << 20
 STALL_S: Final = 0.1
 """A put that takes so long means a stalled receiver or a slow radio: from then on only the newest samples wait."""
+PATIENCE_S: Final = 0.25
+"""A receiver that takes nothing for so long is stalled, not slow: nobody waits for it."""
 POLL_S: Final = 0.05
 JOIN_S: Final = 0.3
 
@@ -62,11 +65,14 @@ class SendQueue:
         self._keep_last = max(1, keep_last)
         self._is_open = is_open or _always
         self._before_each = before_each
-        self._wake = threading.Condition()
+        lock = threading.Lock()
+        self._wake = threading.Condition(lock)
+        self._room = threading.Condition(lock)
         self._items: deque[_Waiting] = deque()
         self._lines: dict[Hashable, deque[_Waiting]] = {}
         self._count = 0
         self._bytes = 0
+        self._left_at = 0.0
         self._is_kicked = False
         self._is_closed = False
         self._at_end: Action | None = None
@@ -88,8 +94,10 @@ class SendQueue:
         with self._wake:
             if self._is_closed:
                 return 1
-            if not self._sheds and (self._count >= self._depth or self._bytes + size > MAX_BYTES):
+            if not self._sheds and self._is_full(size):
                 return 1
+            if not self._items:
+                self._left_at = monotonic_s()  # it is only now asked to take something
             waiting = _Waiting(lane, action, size, value)
             self._items.append(waiting)
             self._count += 1
@@ -97,6 +105,20 @@ class SendQueue:
             dropped = self._shed(waiting) if self._sheds else 0
             self._wake.notify()
             return dropped
+
+    def has_room(self, size: int) -> bool:
+        """True when a sample of ``size`` bytes would be taken now."""
+        return not self._is_full(size)
+
+    def wait_for_room(self, size: int) -> bool:
+        """Wait until a sample of ``size`` bytes would be taken; ``False`` as soon as the receiver is stalled."""
+        with self._room:
+            while self._is_full(size) and not self._is_closed:
+                rest = PATIENCE_S - (monotonic_s() - self._left_at)
+                if rest <= 0:
+                    return False
+                self._room.wait(rest)
+        return True
 
     def then(self, action: Action) -> None:
         """Run ``action`` behind everything that waits now; it is never dropped but by `close`."""
@@ -112,6 +134,7 @@ class SendQueue:
             self._lines.clear()
             for waiting in taken:
                 self._forget(waiting)
+            self._room.notify_all()
             return [waiting.value for waiting in taken]
 
     def kick(self) -> None:
@@ -126,6 +149,7 @@ class SendQueue:
             self._is_closed = True
             self._at_end = at_end
             self._wake.notify()
+            self._room.notify_all()
             return self._count
 
     def join(self, timeout_s: float = JOIN_S) -> None:
@@ -146,6 +170,9 @@ class SendQueue:
             self._forget(old)
             dropped += 1
         return dropped
+
+    def _is_full(self, size: int) -> bool:
+        return self._count >= self._depth or self._bytes + size > MAX_BYTES
 
     def _forget(self, waiting: _Waiting) -> None:
         self._count -= 1
@@ -190,6 +217,8 @@ class SendQueue:
             if waiting.action is None or waiting.lane is None:
                 return waiting.action
             self._forget(waiting)
+            self._left_at = monotonic_s()
+            self._room.notify()
             if self._sheds:
                 self._lines[waiting.lane].popleft()
             return waiting.action

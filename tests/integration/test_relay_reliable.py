@@ -134,6 +134,60 @@ def test_a_worker_that_restarts_in_place_is_not_sent_what_its_former_life_may_ha
     until(lambda: told(rig).at_most_lost >= app.sent - len(app.back), "what may be lost")
 
 
+class Beside:
+    """A second task's stream through the same relay, from a session of its own, to a plain zenoh program."""
+
+    def __init__(self, rig: Any) -> None:
+        self.arrivals: list[float] = []
+        config = streams.zenoh.Config.from_json5
+        self._far = streams.zenoh.open(config(streams.worker_config(connect=(rig.endpoint("edge2"),))))
+        self._near = streams.zenoh.open(config(streams.worker_config(connect=(rig.endpoint(streams.ROBOT),))))
+        self._halt = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        way = streams.replace(
+            slot(1, "edge2", StreamClass.RELIABLE, 0, streams.ReadyWhen.MATCHING), routes=(streams.BESIDE,)
+        )
+        self._far.declare_subscriber(streams.BESIDE.to_expr, lambda _: self.arrivals.append(time.monotonic()))
+        for phase in (RoutePhase.PREPARE, RoutePhase.FLIP):
+            rig.relays[streams.ROBOT].apply(streams.RoutePlan(task="beside", phase=phase, current=way))
+        self._source = self._near.declare_publisher(streams.BESIDE.from_expr)
+        until(lambda: self._source.put(b"x") or self.arrivals, "the live stream flows")
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._halt.wait(0.005):
+            self._source.put(b"x")
+
+    def longest_gap(self) -> float:
+        """From the tenth sample on."""
+        assert len(self.arrivals) > 200
+        return max(later - earlier for earlier, later in pairwise(self.arrivals[10:]))
+
+    def close(self) -> None:
+        self._halt.set()
+        self._thread.join(5)
+        for session in (self._far, self._near):
+            session.close()
+
+
+def test_a_stalled_workers_full_queue_delays_no_other_stream(rig: Any) -> None:
+    """A frozen worker is not waited for: what its queue does not hold is dropped and counted, the rest flows."""
+    frozen = rig.start_worker("edge1")
+    app, _ = through(rig)
+    app.padding = bytes(500_000)
+    beside = Beside(rig)
+    try:
+        thread = app.stream(100)
+        until(lambda: len(app.back) > 20, "the stream through edge1")
+        frozen.send_signal(signal.SIGSTOP)
+        until(lambda: dict(told(rig).drops).get("overflow", 0) > 0, "its queue is full")
+        time.sleep(0.5)  # and the application goes on
+        app.halt(thread)
+        assert beside.longest_gap() < 0.4
+    finally:
+        beside.close()
+
+
 @pytest.mark.parametrize("stream_class", [StreamClass.RELIABLE, StreamClass.LATEST])
 def test_a_stalled_worker_delays_no_other_robots_stream(rig: Any, stream_class: StreamClass) -> None:
     """Two tasks through one relay; one owner is frozen under 20 MB/s. The other stream's longest gap stays small."""

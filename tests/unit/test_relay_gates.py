@@ -5,17 +5,18 @@ from __future__ import annotations
 import socket
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
 import pytest
 import zenoh
 
+from zsched import send_queue
 from zsched.core.plan import Direction, HandoverRule, Route, StreamClass, StreamSettings
 from zsched.core.relay_protocol import EndMarker
 from zsched.keyspace import END_CHUNK
-from zsched.relay import outputs
+from zsched.relay import outlet, outputs
 from zsched.relay.inputs import InputStream
 from zsched.relay.outputs import OutputStream
 from zsched.relay_pipe import decode_end, encode_end
@@ -38,6 +39,12 @@ class Bench:
     outside: zenoh.Session
     own_ids: frozenset[str] = frozenset()
     streams: list[InputStream | OutputStream] = field(default_factory=list)
+    endpoint: str = ""
+    others: list[zenoh.Session] = field(default_factory=list)
+
+    def another(self) -> zenoh.Session:
+        self.others.append(zenoh.open(zenoh.Config.from_json5(worker_config(connect=(self.endpoint,)))))
+        return self.others[-1]
 
     def input(self, route: Route) -> InputStream:
         stream = InputStream(self.relay, route, self.own_ids | {str(self.relay.zid())})
@@ -67,12 +74,14 @@ def bench() -> Iterator[Bench]:
         endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
     relay = zenoh.open(zenoh.Config.from_json5(data_config(listen=(endpoint,), connect=())))
     outside = zenoh.open(zenoh.Config.from_json5(worker_config(connect=(endpoint,))))
-    made = Bench(relay=relay, outside=outside)
+    made = Bench(relay=relay, outside=outside, endpoint=endpoint)
     try:
         yield made
     finally:
         for stream in made.streams:
             stream.close()
+        for other in made.others:
+            other.close()
         outside.close()
         relay.close()
 
@@ -183,6 +192,35 @@ def test_the_end_marker_names_its_source_and_the_number_behind_it(bench: Bench) 
     assert [decode_end(sample.payload.to_bytes()) for sample in ends] == [EndMarker(epoch=1, count=5)]
     kept.undeclare()
     data.undeclare()
+
+
+def test_a_slow_receiver_slows_the_publisher_down_and_nothing_is_dropped(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """More than every buffer on the way holds: the relay's thread waits, zenoh and TCP hand that back to the source."""
+    monkeypatch.setattr(outlet, "QUEUE_DEPTH", 8)
+    monkeypatch.setattr(send_queue, "PATIENCE_S", 5.0)
+    settings = StreamSettings(stream_class=StreamClass.RELIABLE, depth=1)
+    route = replace(way_in(StreamClass.RELIABLE), settings=settings)
+    stream = bench.input(route)
+    got: list[int] = []
+
+    def slow(sample: zenoh.Sample) -> None:
+        got.append(int(sample.payload.to_bytes()[:8]))
+        time.sleep(0.001)
+
+    kept = bench.outside.declare_subscriber(route.to_expr, slow)
+    stream.open(1, route)
+    until(lambda: stream.is_matching(1), "the receiver")
+    stream.flip(1)
+    source = bench.another().declare_publisher(route.from_expr, congestion_control=zenoh.CongestionControl.BLOCK)
+    until(lambda: matches(source), "the relay's subscription")
+    for number in range(1200):
+        source.put(f"{number:08d}".encode() + bytes(100_000))
+    until(lambda: len(got) == 1200, "all of it", deadline_s=30.0)
+    assert got == list(range(1200))
+    assert drops(stream) == {}
+    kept.undeclare()
 
 
 def test_without_an_owner_the_loss_is_counted_and_kept_values_are_none(bench: Bench) -> None:

@@ -60,6 +60,45 @@ def test_a_full_queue_that_sheds_nothing_refuses_the_newest() -> None:
     assert queue.close() == 0
 
 
+def test_who_waits_for_room_loses_nothing_to_a_slow_receiver(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(send_queue, "PATIENCE_S", 5.0)
+    got: list[int] = []
+    queue = SendQueue("t", depth=3, sheds=False)
+
+    def slow(number: int) -> Callable[[], None]:
+        def put() -> None:
+            time.sleep(0.005)
+            got.append(number)
+
+        return put
+
+    began = time.monotonic()
+    for number in range(40):
+        assert queue.wait_for_room(1)
+        assert queue.send("a", slow(number), 1) == 0
+    assert time.monotonic() - began > 0.1
+    until(lambda: got == list(range(40)), "all of it")
+    queue.close()
+
+
+def test_nobody_waits_long_for_a_stalled_receiver() -> None:
+    receiver = Receiver()
+    receiver.gate.clear()
+    queue = SendQueue("t", depth=2, sheds=False)
+    queue.send("a", receiver.take(0), 1)
+    until(lambda: queue.is_stalled, "the put blocks")
+    for number in (1, 2):
+        queue.send("a", receiver.take(number), 1)
+    began = time.monotonic()
+    assert not queue.wait_for_room(1)
+    for _ in range(100):  # from now on not at all
+        assert not queue.wait_for_room(1)
+    assert time.monotonic() - began < 2 * send_queue.PATIENCE_S
+    receiver.gate.set()
+    until(lambda: queue.wait_for_room(1), "it takes something again")
+    queue.close()
+
+
 def test_behind_a_stalled_receiver_only_the_newest_of_each_lane_wait() -> None:
     receiver = Receiver()
     receiver.gate.clear()

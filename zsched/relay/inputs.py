@@ -171,6 +171,9 @@ class InputStream:
     # --- one sample --------------------------------------------------------------------------------------------------
 
     def _carry(self, sample: Sample) -> None:
+        active = self._active
+        if active is not None:
+            active.outlet.wait_for_room(len(sample.payload))
         with self._lock:
             self._counter.seen(len(sample.payload))
             if _is_own(sample, self._loop_ids):

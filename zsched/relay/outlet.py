@@ -51,7 +51,11 @@ RESEND_S: Final = 0.3
 SKIP_EPOCH: Final = 0
 """Epoch of a marker that ends nothing: no number below its count will come any more."""
 
+MAX_PATIENT: Final = 3
+"""Streams that may wait for room at one time: each holds one of zenoh's receive threads (six by default)."""
+
 _log = logging.getLogger("zsched.relay")
+_patient = threading.BoundedSemaphore(MAX_PATIENT)
 
 _CONGESTION: Final = {
     StreamClass.BEST_EFFORT: CongestionControl.DROP,
@@ -133,6 +137,20 @@ class Outlet:
         size = len(sample.payload)
         action = lambda: self._put(lane, sample, stamp, size)  # noqa: E731 - named for the line's length
         return "overflow", self._queue.send(lane, action, size, (sample, stamp))
+
+    def wait_for_room(self, size: int) -> None:
+        """Class ``reliable``: wait while the queue is full and its receiver takes something now and then.
+
+        That stops whoever feeds this stream, the application's link in the end; so only `MAX_PATIENT` streams of this
+        process do so at one time, and none for a stalled receiver. Never under a lock that a flip needs.
+        """
+        if self._queue is None or self._settings.stream_class is not StreamClass.RELIABLE or self._queue.has_room(size):
+            return
+        if _patient.acquire(blocking=False):
+            try:
+                self._queue.wait_for_room(size)
+            finally:
+                _patient.release()
 
     def take_back(self) -> list[tuple[Sample, Timestamp | None]]:
         """What class ``reliable`` still holds in its queue, never sent: it may go to another owner instead."""

@@ -268,20 +268,17 @@ class OutputStream:
 
     def _carry(self, slot: _OutputSlot, sample: Sample) -> None:
         with self._lock:
-            self._counter.seen(len(sample.payload))
             source = sample.source_info
             zid = "" if source is None else str(source.source_id.zid)
             if zid in self._own_ids:
+                self._counter.seen(len(sample.payload))
                 self._counter.dropped("loop")
                 return
             name = str(sample.key_expr)
             key = slot.keys.setdefault(name, _Key())
-            if source is None:
-                key.received += 1
-                self._gate(slot, sample)
-                return
-            publisher = (zid, source.source_id.eid)
-            if slot.answers is None or sample.congestion_control != CongestionControl.BLOCK:
+            publisher = (zid, 0 if source is None else source.source_id.eid)
+            is_kept = slot.answers is not None and sample.congestion_control == CongestionControl.BLOCK
+            if source is None or slot.answers is None or not is_kept:
                 self._pass(slot, key, publisher, sample)
                 return
             for ready in slot.answers.take((name, *publisher), source.source_sn, sample):
@@ -295,6 +292,7 @@ class OutputStream:
                 self._pass(slot, slot.keys.setdefault(key, _Key()), (zid, eid), ready)
 
     def _pass(self, slot: _OutputSlot, key: _Key, publisher: tuple[str, int], sample: Sample) -> None:
+        self._counter.seen(len(sample.payload))
         key.received += 1
         info: zenoh.SourceInfo | None = sample.source_info
         if info is None or self._is_next(key, publisher, info.source_sn):
