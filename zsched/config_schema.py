@@ -212,6 +212,11 @@ LINK_LIMITS: Final = Record(
     {
         "nu_dbm": Field(_DBM, "Least usable signal (Eq. 3): below it the candidate's utility is 0."),
         "rho_dbm": Field(_DBM, "Best achievable signal (Eq. 3); above `nu_dbm`."),
+        "knee_dbm": Field(
+            _DBM,
+            "Between the two: a signal that is worth 0.8; links are flat above it and steep below.",
+            default="none: linear (Eq. 3)",
+        ),
     },
     LinkLimits,
 )

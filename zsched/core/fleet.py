@@ -138,10 +138,12 @@ class StreamRule:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkLimits:
-    """Eq. 3: nu (least usable) and rho (best achievable) in dBm."""
+    """Eq. 3: nu (least usable) and rho (best achievable) in dBm, and the knee between them, if there is one."""
 
     nu_dbm: float = -80.0
     rho_dbm: float = -40.0
+    knee_dbm: float | None = None
+    """Above it a link is nearly as good as it gets, below it gets bad fast; ``None``: Eq. 3 as printed, linear."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from random import Random
 
 from zsched.core.damping import Damping
@@ -25,7 +25,8 @@ from zsched.core.messages import Utilities
 from zsched.core.model import Allocation, NodeId, PeerState, Proposal, TaskId, UtilityVector, WorkerState
 from zsched.core.register import MoveOwner
 from zsched.core.scheduler import Judge, Judgement, Outcome, escape_reason
-from zsched.core.scoring import Standing, compare, majority, score
+from zsched.core.scoring import Standing, book, compare, majority, score
+from zsched.core.turns import in_turn, who_moves_first
 from zsched.core.vote import Tally, VoteOutcome, tally
 
 VOTE_MARGIN_S = 0.1
@@ -63,6 +64,9 @@ class TaskRound:
     commit_at: float = math.inf
     commit: MoveOwner | None = None
     damping: Damping = field(default_factory=Damping)
+    called_at: float = -math.inf
+    """When this robot last proposed a planned move of it."""
+    is_waiting_its_turn: bool = False
     told: str = ""
     """The last decision written to the journal; the same one again is not."""
 
@@ -112,10 +116,11 @@ class Rounds:
         version, until, seen, answer = self._answer
         if version == self._gateway.version and now <= until and seen == (states, values):
             return answer  # several robots ask within a round, and nothing has changed since
+        bookings = book((task.spec for task in self.tasks.values()), values, self._gateway)
         answer = Utilities(
             voter=self._me,
             vectors=tuple(
-                score(task.spec, values[name], self._me, self._gateway, states, now)
+                score(task.spec, values[name], self._me, self._gateway, states, now, bookings)
                 for name, task in self.tasks.items()
             ),
         )
@@ -181,7 +186,8 @@ class Rounds:
         assert self._gather is not None
         gathered, self._gather = self._gather, None
         out: list[Instruction] = []
-        for name, task in self.tasks.items():
+        for name in in_turn(self.tasks):
+            task = self.tasks[name]
             vectors = {
                 voter: vector
                 for voter, all_vectors in gathered.vectors.items()
@@ -222,14 +228,36 @@ class Rounds:
                 now=now,
                 damping=task.damping,
             )
+        judgement = self._take_turn(task, judgement, allocation, is_called=is_called)
         task.judgement, task.judged_at = judgement, now
         self._wake_when_due(task, judgement, allocation, now)
         out: list[Instruction] = [*self._tell(task, judgement, allocation)]
         if task.commit is not None:
             return out
         if judgement.outcome is Outcome.PROPOSE or is_called:
+            task.called_at = now if not judgement.is_escape else task.called_at
             out += self._propose(task, judgement, allocation, states, now)
         return out
+
+    def _take_turn(
+        self, task: TaskRound, judgement: Judgement, allocation: Allocation, *, is_called: bool
+    ) -> Judgement:
+        """A planned move waits while another task moves; the figures are read again before it is judged once more."""
+        task.is_waiting_its_turn = False
+        if judgement.outcome is not Outcome.PROPOSE or judgement.is_escape:
+            return judgement
+        first = who_moves_first(self.tasks, task.spec.name, is_called=is_called)
+        if first is None:
+            return judgement
+        task.is_waiting_its_turn = True
+        owner = allocation.owner
+        return replace(
+            judgement,
+            outcome=Outcome.WAIT,
+            candidate=owner,
+            aggregate=judgement.aggregates.get(owner, 0.0) if owner is not None else 0.0,
+            reason=f"{judgement.reason}; {first} moves first",
+        )
 
     def _escape(
         self,
@@ -405,3 +433,5 @@ class Rounds:
         task.judge.reset(is_new_owner=is_new_epoch)
         if is_new_epoch:
             task.settled_at = now
+        if any(other.is_waiting_its_turn for other in self.tasks.values()):
+            self.hurry(now)

@@ -9,7 +9,7 @@ vectors of all fresh voters into a `Standing` (Compare_Utility), and `pick` name
 from __future__ import annotations
 
 import statistics
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from zsched.core.fleet import Demand, LinkLimits, Reach, Standby, TaskSpec
@@ -21,6 +21,7 @@ from zsched.core.model import (
     NodeId,
     PeerState,
     Profile,
+    TaskId,
     Utility,
     UtilityVector,
     WorkerState,
@@ -28,6 +29,9 @@ from zsched.core.model import (
 from zsched.core.utility import cpu_utility, memory_utility, network_utility, predicted_use, total_utility
 
 METRICS = ("cpu", "memory", "network")
+
+Bookings = Mapping[NodeId, tuple[tuple[TaskId, Demand], ...]]
+"""{owner: its tasks and what each will use there}: of a task that has just come, profiles show nothing yet."""
 
 
 def majority(count: int) -> int:
@@ -63,11 +67,13 @@ def score(
     gateway: Gateway,
     states: Mapping[NodeId, PeerState],
     now: float,
+    bookings: Bookings | None = None,
 ) -> UtilityVector:
     """This robot's utilities of a task's candidates, by the tuning of ``allocation``.
 
     A candidate that this robot cannot reach gets 0 (not: is left out, which would raise its mean); one that may not
-    have the task is refused with the reason.
+    have the task is refused with the reason. What the other tasks of ``bookings`` will use there, and do not show yet,
+    counts as in use.
     """
     demand = gateway.demand(spec)
     terms: dict[NodeId, _Terms] = {}
@@ -82,15 +88,19 @@ def score(
             unreachable.append(candidate)
             continue
         profile = gateway.fresh(candidate, now)
-        reason = "no fresh profile" if profile is None else _refusal(spec, allocation, profile, demand)
-        if profile is None or reason:
+        if profile is None:
+            refused.append((candidate, "no fresh profile"))
+            continue
+        unseen = _unseen(spec, profile, bookings)
+        reason = _refusal(spec, allocation, profile, demand, unseen)
+        if reason:
             refused.append((candidate, reason))
             continue
         signal = _signal(voter, candidate, gateway, now)
         if signal is not None and signal < spec.limits.nu_dbm:
             unreachable.append(candidate)
             continue
-        terms[candidate] = _measure(spec, profile, demand, signal)
+        terms[candidate] = _measure(spec, profile, demand, unseen, signal)
     measured = frozenset(name for name in METRICS if any(getattr(t, name) is not None for t in terms.values()))
     utilities = [Utility(candidate=name, value=0.0, reachable=False) for name in unreachable]
     for candidate, term in terms.items():
@@ -112,7 +122,38 @@ def score(
     )
 
 
-def _refusal(spec: TaskSpec, allocation: Allocation, profile: Profile, demand: Demand) -> str:
+_NOTHING = Demand()
+
+
+def book(specs: Iterable[TaskSpec], values: Mapping[TaskId, Allocation], gateway: Gateway) -> Bookings:
+    """{owner: its tasks and their demand}, as far as this robot has learnt; empty with a single task."""
+    booked: dict[NodeId, tuple[tuple[TaskId, Demand], ...]] = {}
+    specs = tuple(specs)
+    for spec in specs if len(specs) > 1 else ():
+        owner = values[spec.name].owner
+        if owner is not None:
+            booked[owner] = (*booked.get(owner, ()), (spec.name, gateway.demand(spec)))
+    return booked
+
+
+def _unseen(spec: TaskSpec, profile: Profile, bookings: Bookings | None) -> Demand:
+    """What other tasks will use on a node beyond what its profile shows of their workers.
+
+    A worker that somebody else started never shows what it uses, so it is in the profile already, or nowhere.
+    """
+    others = () if bookings is None else bookings.get(profile.node, ())
+    if not others:
+        return _NOTHING
+    cpu = memory = 0.0
+    for task, demand in others:
+        load = profile.worker(task)
+        if task != spec.name and load is not None:
+            cpu += max(demand.cpu_cores - (load.cpu_cores or 0.0), 0.0)
+            memory += max(demand.memory_mb - (load.memory_mb or 0.0), 0.0)
+    return Demand(cpu_cores=cpu, memory_mb=memory)
+
+
+def _refusal(spec: TaskSpec, allocation: Allocation, profile: Profile, demand: Demand, unseen: Demand) -> str:
     """Why the node may not have the task; empty when it may."""
     if profile.draining:
         return "draining"
@@ -126,27 +167,28 @@ def _refusal(spec: TaskSpec, allocation: Allocation, profile: Profile, demand: D
     is_warm = spec.worker.standby is Standby.WARM
     if spec.worker.command and is_warm and not is_owner and state is not WorkerState.READY:
         return f"worker {state}"
-    used = _memory_use(profile, spec, demand)
+    used = _memory_use(profile, spec, demand, unseen)
     if used is not None and used > profile.memory_mb:
         return f"needs {demand.memory_mb:.0f} MiB, has {max(profile.memory_mb - used + demand.memory_mb, 0.0):.0f} free"
     return ""
 
 
-def _memory_use(profile: Profile, spec: TaskSpec, demand: Demand) -> float | None:
+def _memory_use(profile: Profile, spec: TaskSpec, demand: Demand, unseen: Demand) -> float | None:
     if profile.memory_used_mb is None:
         return None
     load = profile.worker(spec.name)
     own = (load.memory_mb or 0.0) if load is not None else 0.0
-    return predicted_use(profile.memory_used_mb, own, demand.memory_mb)
+    return predicted_use(profile.memory_used_mb + unseen.memory_mb, own, demand.memory_mb)
 
 
-def _measure(spec: TaskSpec, profile: Profile, demand: Demand, signal: float | None) -> _Terms:
+def _measure(spec: TaskSpec, profile: Profile, demand: Demand, unseen: Demand, signal: float | None) -> _Terms:
     load = profile.worker(spec.name)
     cpu = memory = network = None
     if profile.cpu_used_cores is not None:
         own = (load.cpu_cores or 0.0) if load is not None else 0.0
-        cpu = cpu_utility(profile.cpu_cores, predicted_use(profile.cpu_used_cores, own, demand.cpu_cores))
-    used = _memory_use(profile, spec, demand)
+        used_cores = profile.cpu_used_cores + unseen.cpu_cores
+        cpu = cpu_utility(profile.cpu_cores, predicted_use(used_cores, own, demand.cpu_cores))
+    used = _memory_use(profile, spec, demand, unseen)
     if used is not None:
         memory = memory_utility(profile.memory_mb, demand.memory_mb, used - demand.memory_mb)
     if signal is not None:
@@ -159,7 +201,7 @@ WIRED_DBM = 0.0
 
 
 def _link_utility(signal: float, limits: LinkLimits) -> float:
-    return network_utility(signal, limits.nu_dbm, limits.rho_dbm)
+    return network_utility(signal, limits.nu_dbm, limits.rho_dbm, limits.knee_dbm)
 
 
 def _signal(voter: NodeId, candidate: NodeId, gateway: Gateway, now: float) -> float | None:

@@ -1,0 +1,132 @@
+"""Whose planned move goes first when several tasks want to move, and what a booked task weighs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import pytest
+
+from zsched.core.fleet import Demand, Fleet, NodeSpec, TaskSpec, Timing
+from zsched.core.gateway import Gateway
+from zsched.core.model import (
+    Allocation,
+    NodeKind,
+    PeerState,
+    Profile,
+    Tuning,
+    UtilityVector,
+    Weights,
+    WorkerLoad,
+    WorkerState,
+)
+from zsched.core.scoring import book, score
+from zsched.core.turns import in_turn, who_moves_first
+
+
+@dataclass
+class Task:
+    vote_opened_at: float | None = None
+    commit: object | None = None
+    called_at: float = -math.inf
+
+
+def test_nobody_waits_while_nothing_moves() -> None:
+    assert who_moves_first({"a": Task(), "b": Task()}, "b", is_called=False) is None
+
+
+def test_a_planned_move_waits_for_an_open_vote_and_for_a_commit() -> None:
+    for moving in (Task(vote_opened_at=1.0), Task(commit="move")):
+        assert who_moves_first({"a": moving, "b": Task()}, "b", is_called=False) == "a"
+        assert who_moves_first({"a": Task(), "b": moving}, "a", is_called=False) == "b"
+        assert who_moves_first({"a": moving}, "a", is_called=False) is None, "its own does not count"
+
+
+def test_two_votes_called_at_once_are_settled_by_name_and_a_commit_goes_before_both() -> None:
+    crossed = {"a": Task(vote_opened_at=1.0), "b": Task(vote_opened_at=1.0)}
+    assert who_moves_first(crossed, "a", is_called=True) is None
+    assert who_moves_first(crossed, "b", is_called=True) == "a"
+    assert who_moves_first({"a": Task(vote_opened_at=1.0), "b": Task(commit="move")}, "a", is_called=True) == "b"
+
+
+def test_who_has_proposed_longest_ago_is_judged_first() -> None:
+    tasks = {"a": Task(called_at=9.0), "b": Task(called_at=3.0), "c": Task()}
+    assert in_turn(tasks) == ["c", "b", "a"]
+    assert in_turn({"b": Task(), "a": Task()}) == ["a", "b"]
+
+
+# --- bookings --------------------------------------------------------------------------------------------------------
+
+TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
+DEMAND = Demand(cpu_cores=1.0, memory_mb=800.0)
+A, B = (TaskSpec(name=name, candidates=("edge1", "edge2"), tuning=TUNING, demand=DEMAND) for name in ("a", "b"))
+FLEET = Fleet(
+    name="two",
+    timing=Timing(),
+    nodes=(NodeSpec(name="edge1", kind=NodeKind.EDGE), NodeSpec(name="edge2", kind=NodeKind.EDGE)),
+    tasks=(A, B),
+    electors=("robot1",),
+)
+ALIVE = dict.fromkeys(("edge1", "edge2"), PeerState.ALIVE)
+
+
+def values(owner_of_a: str | None, owner_of_b: str | None = None) -> dict[str, Allocation]:
+    owners = {"a": owner_of_a, "b": owner_of_b}
+    return {name: Allocation(task=name, revision=1, epoch=1, owner=o, tuning=TUNING) for name, o in owners.items()}
+
+
+def scored_b(gateway: Gateway, agreed: dict[str, Allocation]) -> UtilityVector:
+    return score(B, agreed["b"], "robot1", gateway, ALIVE, 0.0, book(FLEET.tasks, agreed, gateway))
+
+
+def gateway_with(*workers_on_edge1: WorkerLoad, memory_mb: float = 1000.0) -> Gateway:
+    gateway = Gateway(FLEET)
+    for node, workers in (("edge1", workers_on_edge1), ("edge2", ())):
+        seen_cores = sum(load.cpu_cores or 0.0 for load in workers)
+        seen_mb = sum(load.memory_mb or 0.0 for load in workers)
+        profile = Profile(
+            node=node,
+            incarnation=1,
+            sequence=1,
+            cpu_cores=4.0,
+            cpu_used_cores=1.0 + seen_cores,
+            memory_mb=4000.0,
+            memory_used_mb=memory_mb + seen_mb,
+            workers=workers,
+        )
+        assert gateway.absorb(profile, 0.0) is None
+    return gateway
+
+
+def of_a(cpu: float | None, memory: float | None) -> WorkerLoad:
+    return WorkerLoad(task="a", state=WorkerState.READY, cpu_cores=cpu, memory_mb=memory)
+
+
+def value(vector: UtilityVector, node: str) -> float:
+    return next(one.value for one in vector.utilities if one.candidate == node)
+
+
+@pytest.mark.parametrize("shown", [0.0, 0.5, 1.0, None])
+def test_a_task_that_has_just_come_counts_before_its_load_shows_and_not_twice_afterwards(shown: float | None) -> None:
+    load = of_a(shown, None if shown is None else shown * DEMAND.memory_mb)
+    vector = scored_b(gateway_with(load), values("edge1"))
+    # 4 cores: 1 in use by others, 1 by a (seen or not), 1 by b; 4000 MiB: 1000, 800, 800
+    assert value(vector, "edge1") == pytest.approx(0.5 * 0.25 + 0.5 * 1400 / 4000)
+    assert value(vector, "edge2") == pytest.approx(0.5 * 0.5 + 0.5 * 2200 / 4000)
+
+
+def test_nothing_is_booked_for_a_task_elsewhere_for_oneself_and_for_a_foreign_worker() -> None:
+    for agreed, workers in ((values("edge2"), (of_a(0.0, 0.0),)), (values("edge1"), ())):
+        vector = scored_b(gateway_with(*workers), agreed)
+        assert value(vector, "edge1") == pytest.approx(0.5 * 0.5 + 0.5 * 2200 / 4000)
+    own = WorkerLoad(task="b", state=WorkerState.READY, cpu_cores=0.0, memory_mb=0.0)
+    assert value(scored_b(gateway_with(own), values(None, "edge1")), "edge1") == pytest.approx(0.525)
+
+
+def test_memory_that_is_booked_cannot_be_had_twice() -> None:
+    vector = scored_b(gateway_with(of_a(0.0, 0.0), memory_mb=2800.0), values("edge1"))
+    assert dict(vector.refused) == {"edge1": "needs 800 MiB, has 400 free"}
+
+
+def test_a_single_task_has_no_bookings() -> None:
+    assert book((A,), values("edge1"), gateway_with()) == {}

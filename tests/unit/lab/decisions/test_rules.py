@@ -1,0 +1,91 @@
+"""The rules on short histories: what each does, and that the goals for stickiness and quickness hold."""
+
+from __future__ import annotations
+
+import itertools
+from random import Random
+
+import pytest
+
+from zsched.core.model import Tuning
+from zsched.lab.decisions import entries
+from zsched.lab.decisions.replay import Entry, replay
+from zsched.lab.decisions.rules import AreaJudge, BlindRule, CoreRule, Move, PickRule, drawn, first_match, fixed
+from zsched.lab.decisions.view import Look
+from zsched.lab.decisions.world import EVEN, World, equal_world, loaded_world
+
+STEP_AT_S = 60.0
+
+
+def only(world: World, entry: Entry, seed: int = 0) -> list[Move]:
+    return [move for move in replay(world, (entry,), seed)[entry.name] if move.left is not None]
+
+
+def test_equal_nodes_under_noise_are_not_moved_between_and_the_penalty_never_rests() -> None:
+    world = equal_world(seed=1, hours=0.1)
+    assert len(only(world, Entry(name="zsched", make=entries.core(world)))) == 0
+    penalty = only(world, Entry(name="penalty", make=lambda view: PickRule(view, cost=-0.1)))
+    assert len(penalty) > 100
+    argmax = only(world, Entry(name="argmax", look=entries.RAW, make=PickRule))
+    assert 10 < len(argmax) < len(penalty)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_step_of_thirty_percent_is_followed_in_time(seed: int) -> None:
+    world = equal_world(seed=seed, hours=0.03, step_at_s=STEP_AT_S)
+    (move,) = only(world, Entry(name="zsched", make=entries.core(world)), seed)
+    timing, tuning = world.fleet.timing, world.spec.tuning
+    assert move.left == "edge001"
+    assert move.at_s - STEP_AT_S >= tuning.time_to_trigger_s
+    assert move.at_s - STEP_AT_S <= tuning.time_to_trigger_s + 0.6 * timing.smoothing_s + 1.1 * timing.decide_s
+
+
+def test_after_a_move_the_cool_down_holds() -> None:
+    world = loaded_world(seed=1, hours=0.3)
+    tuning = Tuning(weights=EVEN, bonus=0.0, time_to_trigger_s=0.0, cool_down_s=20.0)
+    moves = only(world, Entry(name="eager", make=lambda view: CoreRule(view, tuning)))
+    planned = [after.at_s - before.at_s for before, after in itertools.pairwise(moves) if not after.is_escape]
+    assert len(planned) >= 3
+    assert min(planned) >= 20.0
+
+
+def test_the_area_moves_sooner_for_a_big_lead_than_for_a_small_one() -> None:
+    def delay(area: float) -> float:
+        world = equal_world(seed=1, hours=0.03, half_width=0.0, step_at_s=STEP_AT_S)
+        tuning = Tuning(weights=EVEN, bonus=0.05, time_to_trigger_s=0.0, cool_down_s=0.0)
+        entry = Entry(
+            name="area", make=lambda view: CoreRule(view, tuning, make_judge=lambda s: AreaJudge(spec=s, area=area))
+        )
+        (move,) = only(world, entry)
+        return move.at_s - STEP_AT_S
+
+    assert delay(0.05) < delay(0.4) < delay(1.6)
+
+
+def test_rules_that_look_at_nothing() -> None:
+    world = loaded_world(seed=1, hours=0.05)
+    always = only(world, Entry(name="fixed", make=lambda view: BlindRule(view, fixed("edge002"))))
+    assert always == []
+    first = replay(world, (Entry(name="first", make=lambda view: BlindRule(view, first_match, period_s=1.0)),))
+    assert [move.owner for move in first["first"]] == ["edge001"]
+    anyone = only(world, Entry(name="random", make=lambda view: BlindRule(view, drawn(Random(1)), period_s=5.0)))
+    assert len(anyone) > 10
+
+
+def test_every_entry_of_every_cast_plays_and_has_a_name_of_its_own() -> None:
+    world = loaded_world(seed=1, hours=0.01, with_radio=True)
+    for cast in (entries.schemes(world, 1), entries.fading(world), entries.knees(world), entries.grid(world)):
+        names = [entry.name for entry in cast]
+        assert len(set(names)) == len(names)
+        moves = replay(world, cast)
+        assert all(moves[name] for name in names), "everybody places the task"
+
+
+def test_the_grid_holds_the_default() -> None:
+    world = loaded_world(seed=1, hours=0.05)
+    tuning = Tuning(weights=EVEN)
+    smoothing_s = world.fleet.timing.smoothing_s
+    default = f"s{smoothing_s:g} b{tuning.bonus:g} t{tuning.time_to_trigger_s:g} c{tuning.cool_down_s:g}"
+    cast = {entry.name: entry for entry in entries.grid(world)}
+    assert only(world, cast[default]) == only(world, Entry(name="zsched", make=entries.core(world)))
+    assert cast[default].look == Look(smoothing_s=smoothing_s)

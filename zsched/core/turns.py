@@ -1,0 +1,55 @@
+"""SCHEDULER, several tasks: one move at a time, so that no two tasks flock to the node that both see idle.
+
+Knows: which votes are open and which commits are under way at this robot. Does not know: who is better.
+
+Planned moves and first placements take turns; after each the figures are read again, with what the moved task will use
+at its new owner (`zsched.core.scoring.Bookings`). Escapes never wait. Robots that call votes for two tasks at the same
+moment are settled by name: a commit that is under way goes first, then the vote for the lower name. Nothing unsafe
+happens when both get through; then two tasks have moved by the same figures, once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Protocol
+
+from zsched.core.model import TaskId
+
+
+class Turn(Protocol):
+    """What a task's round shows of a move that is under way."""
+
+    @property
+    def vote_opened_at(self) -> float | None:
+        """Since when a vote on a move is open."""
+
+    @property
+    def commit(self) -> object | None:
+        """A change that this robot will or does propose to the register."""
+
+    @property
+    def called_at(self) -> float:
+        """When this robot last proposed a planned move of it."""
+
+
+def who_moves_first(tasks: Mapping[TaskId, Turn], mine: TaskId, *, is_called: bool) -> TaskId | None:
+    """The other task whose move ``mine`` must wait for, or ``None``.
+
+    Args:
+        tasks: {task: its round at this robot}.
+        mine: whose planned move this robot would propose.
+        is_called: another robot has called the vote on it already; then only a lower name's vote goes first.
+    """
+    others = [(name, turn) for name, turn in tasks.items() if name != mine]
+    for name, turn in others:
+        if turn.commit is not None:
+            return name
+    for name, turn in others:
+        if turn.vote_opened_at is not None and (not is_called or name < mine):
+            return name
+    return None
+
+
+def in_turn(tasks: Mapping[TaskId, Turn]) -> list[TaskId]:
+    """The order in which a round judges: who has proposed longest ago first, so that nobody waits for ever."""
+    return sorted(tasks, key=lambda name: (tasks[name].called_at, name))

@@ -1,0 +1,1 @@
+"""Decision quality offline: the real scoring and stickiness over thousands of simulated hours, against an oracle."""

@@ -1,0 +1,123 @@
+"""Who takes part: the paper's schemes, yardsticks, zsched's own rule, and the grid over its tuning.
+
+Knows: every rule's name and settings. Does not know: histories, results.
+
+The paper gives neither the cost of Alg. 2 nor rates; its schemes run here with our bonus, once a second, on readings
+averaged over about a second, and with the demand-corrected equations of docs/decisions/0001.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from random import Random
+from typing import Any, Final
+
+from zsched.core.fleet import LinkLimits
+from zsched.core.model import Tuning, Weights
+from zsched.lab.decisions.replay import Entry
+from zsched.lab.decisions.rules import (
+    AreaJudge,
+    BlindRule,
+    CoreRule,
+    PickRule,
+    Rule,
+    drawn,
+    first_match,
+    fixed,
+)
+from zsched.lab.decisions.view import Look, View
+from zsched.lab.decisions.world import EVEN, RADIO_ONLY, World
+
+RAW: Final = Look(smoothing_s=0.5)
+"""As noisy as a profiler that averages over one second."""
+PAPER_COST: Final = Tuning(weights=EVEN).bonus
+CPU_ONLY: Final = Weights(cpu=1.0, memory=0.0, network=0.0)
+MEMORY_ONLY: Final = Weights(cpu=0.0, memory=1.0, network=0.0)
+
+
+def core(
+    world: World,
+    *,
+    bonus: float | None = None,
+    time_to_trigger_s: float | None = None,
+    cool_down_s: float | None = None,
+    area: float | None = None,
+) -> Callable[[View], Rule]:
+    """The production's decision; what is ``None`` is its default, ``area`` replaces the time-to-trigger."""
+    given = {"bonus": bonus, "time_to_trigger_s": time_to_trigger_s, "cool_down_s": cool_down_s}
+    settings: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    tuning = Tuning(weights=world.spec.tuning.weights, **settings)
+    if area is None:
+        return lambda view: CoreRule(view, tuning)
+    return lambda view: CoreRule(view, tuning, make_judge=lambda spec: AreaJudge(spec=spec, area=area))
+
+
+def schemes(world: World, seed: int) -> tuple[Entry, ...]:
+    """zsched, the paper's schemes and the yardsticks."""
+    names = world.candidates[:3]
+    return (
+        Entry(name="zsched", make=core(world)),
+        *(Entry(name=f"fixed_e{index}", make=_blind(fixed(name))) for index, name in enumerate(names, 1)),
+        Entry(name="dyna_cpu", look=RAW, weights=CPU_ONLY, make=_pick(PAPER_COST)),
+        Entry(name="dyna_mem", look=RAW, weights=MEMORY_ONLY, make=_pick(PAPER_COST)),
+        Entry(name="dyna_both", look=RAW, weights=EVEN, make=_pick(PAPER_COST)),
+        Entry(name="dyna_net", look=RAW, weights=RADIO_ONLY, make=_pick(PAPER_COST)),
+        Entry(name="dyna_both_penalty", look=RAW, weights=EVEN, make=_pick(-PAPER_COST)),
+        Entry(name="argmax", look=RAW, make=_pick(0.0)),
+        Entry(name="every_25s", look=RAW, make=lambda view: PickRule(view, period_s=25.0)),
+        Entry(name="random", make=lambda view: BlindRule(view, drawn(Random(seed)), period_s=25.0)),
+        Entry(name="first_match", look=RAW, make=lambda view: BlindRule(view, first_match, period_s=1.0)),
+    )
+
+
+def _pick(cost: float) -> Callable[[View], Rule]:
+    return lambda view: PickRule(view, cost=cost)
+
+
+def _blind(choose: Callable[[tuple[str, ...]], str]) -> Callable[[View], Rule]:
+    return lambda view: BlindRule(view, choose)
+
+
+def grid(world: World) -> tuple[Entry, ...]:
+    """The sweep over zsched's tuning: smoothing, bonus, time-to-trigger, cool-down; and the area in place of the timer.
+
+    Names read ``s3 b0.1 t2 c10`` and ``s3 b0.05 a0.2 c5``.
+    """
+    timed = tuple(
+        Entry(
+            name=f"s{smoothing_s:g} b{bonus:g} t{trigger_s:g} c{cool_s:g}",
+            look=Look(smoothing_s=smoothing_s),
+            make=core(world, bonus=bonus, time_to_trigger_s=trigger_s, cool_down_s=cool_s),
+        )
+        for smoothing_s, bonus, trigger_s, cool_s in itertools.product(
+            (1.5, 3.0), (0.03, 0.05, 0.07, 0.10, 0.15), (1.0, 2.0, 4.0), (5.0, 10.0)
+        )
+    )
+    areas = tuple(
+        Entry(
+            name=f"s{smoothing_s:g} b{bonus:g} a{area:g} c5",
+            look=Look(smoothing_s=smoothing_s),
+            make=core(world, bonus=bonus, time_to_trigger_s=0.0, cool_down_s=5.0, area=area),
+        )
+        for smoothing_s, bonus, area in itertools.product((1.5, 3.0), (0.03, 0.05, 0.07), (0.05, 0.1, 0.2))
+    )
+    return timed + areas
+
+
+def fading(world: World) -> tuple[Entry, ...]:
+    """Prediction of a fading link, at the default tuning: signals ``lead_s`` seconds ahead along their slope."""
+    return tuple(
+        Entry(
+            name=f"lead{lead_s:g} slope{slope_s:g}" if lead_s else "lead0",
+            look=Look(lead_s=lead_s, slope_s=slope_s),
+            make=core(world),
+        )
+        for lead_s, slope_s in ((0.0, 3.0), (1.0, 3.0), (2.0, 3.0), (2.0, 6.0), (4.0, 6.0))
+    )
+
+
+def knees(world: World) -> tuple[Entry, ...]:
+    """The link's utility as the paper has it, and with a knee."""
+    shapes = {"linear": LinkLimits(), "knee-65": LinkLimits(knee_dbm=-65.0), "knee-70": LinkLimits(knee_dbm=-70.0)}
+    return tuple(Entry(name=name, limits=limits, make=core(world)) for name, limits in shapes.items())

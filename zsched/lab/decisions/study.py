@@ -1,0 +1,131 @@
+"""Which histories are played to whom, and what comes of it: results as lines of JSON that a later run goes on from.
+
+Knows: experiments, seeds (those that defaults are chosen by, and those that are only looked at afterwards), resuming.
+Does not know: how a rule decides, how results are shown.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Final
+
+from zsched.lab.decisions import entries, loads
+from zsched.lab.decisions.replay import Entry, replay
+from zsched.lab.decisions.score import figures, truth_of
+from zsched.lab.decisions.world import World, equal_world, loaded_world
+
+TRAIN: Final = range(1, 1000)
+"""Seeds that the defaults are chosen by."""
+TEST: Final = range(1001, 2000)
+"""Seeds that are only looked at afterwards."""
+CANDIDATES: Final = (3, 10, 50, 200)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Case:
+    """One history to be played: ``build(seed, hours)`` makes it, ``cast`` says to whom."""
+
+    name: str
+    build: Callable[[int, float], World]
+    cast: Callable[[World, int], tuple[Entry, ...]]
+    hours: float
+    """Length of one history."""
+    share: float = 1.0
+    """How many of the hours asked for: large fleets get fewer."""
+
+
+def _loads(edges: int, plan: loads.LoadPlan, *, with_radio: bool = False) -> Callable[[int, float], World]:
+    return lambda seed, hours: loaded_world(seed=seed, hours=hours, edges=edges, plan=plan, with_radio=with_radio)
+
+
+def _equal(seed: int, hours: float) -> World:
+    return equal_world(seed=seed, hours=hours)
+
+
+def compared(candidates: tuple[int, ...]) -> tuple[Case, ...]:
+    """The schemes on every kind of history, and on fleets of every size."""
+    kinds = (
+        ("long", _loads(3, loads.LONG)),
+        ("mixed", _loads(3, loads.MIXED)),
+        ("short", _loads(3, loads.SHORT)),
+        ("radio", _loads(3, loads.LONG, with_radio=True)),
+        ("equal", _equal),
+    )
+    small = tuple(Case(name=name, build=build, cast=entries.schemes, hours=1.0) for name, build in kinds)
+    large = tuple(
+        Case(
+            name=f"long-{count}",
+            build=_loads(count, loads.LONG),
+            cast=entries.schemes,
+            hours=min(1.0, 12.5 / count),
+            share=min(0.5, 1.25 / count),
+        )
+        for count in candidates
+        if count > 3
+    )
+    return small + large
+
+
+def swept() -> tuple[Case, ...]:
+    """The grid over zsched's tuning."""
+
+    def cast(world: World, _seed: int) -> tuple[Entry, ...]:
+        return entries.grid(world)
+
+    return tuple(
+        Case(name=f"sweep {name}", build=build, cast=cast, hours=1.0, share=share)
+        for name, build, share in (
+            ("long", _loads(3, loads.LONG), 1.0),
+            ("mixed", _loads(3, loads.MIXED), 0.5),
+            ("radio", _loads(3, loads.LONG, with_radio=True), 0.5),
+            ("equal", _equal, 0.5),
+        )
+    )
+
+
+def options() -> tuple[Case, ...]:
+    """What might be better than the paper's: prediction of a fading link, a link with a knee."""
+    radio = _loads(3, loads.LONG, with_radio=True)
+    return (
+        Case(name="fading radio", build=radio, cast=lambda world, _seed: entries.fading(world), hours=1.0),
+        Case(name="knee radio", build=radio, cast=lambda world, _seed: entries.knees(world), hours=1.0),
+    )
+
+
+def play(cases: tuple[Case, ...], hours: float, seeds: range, out: Path) -> Iterator[str]:
+    """Play every case for about ``hours``, one history per seed, and append each result to ``out``.
+
+    Histories that ``out`` holds already are not played again. Yields one line per history for people.
+    """
+    done = {(row["case"], row["seed"]) for row in read(out)}
+    for case in cases:
+        count = max(1, round(hours * case.share / case.hours))
+        for seed in seeds[:count]:
+            if (case.name, seed) in done:
+                continue
+            world = case.build(seed, case.hours)
+            truth = truth_of(world)
+            moves = replay(world, case.cast(world, seed), seed)
+            rows = [
+                {"case": case.name, "seed": seed, "rule": name, **asdict(figures(world, truth, made))}
+                for name, made in moves.items()
+            ]
+            rows.append({"case": case.name, "seed": seed, "rule": "oracle", **asdict(truth.figures())})
+            with out.open("a", encoding="utf-8") as file:
+                file.writelines(json.dumps(row) + "\n" for row in rows)
+            yield f"{case.name} seed {seed}: {len(rows)} rules, {case.hours:g} h"
+
+
+def read(out: Path) -> list[dict[str, float | str]]:
+    """All results so far; a line that was cut off by the end of a run is left out."""
+    rows = []
+    if out.exists():
+        for line in out.read_text(encoding="utf-8").splitlines():
+            try:
+                rows.append(json.loads(line))
+            except ValueError:
+                continue
+    return rows

@@ -1,0 +1,159 @@
+"""What the robots of a simulated fleet see: the production profilers, gateway, scores and comparison on a history.
+
+Knows: sampling, smoothing, publication, gathers without loss. Does not know: rules, and the truth behind readings.
+
+Every robot receives every profile at once, so one gateway stands for all; each robot has its own utilities, for its
+links are its own. What is seen does not depend on who has the task (its own load is subtracted), so all rules that want
+the same smoothing, weights and limits share one `View`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+from zsched.core.fleet import Fleet
+from zsched.core.gateway import Gateway
+from zsched.core.model import (
+    Allocation,
+    DeviceSample,
+    LinkSample,
+    LinkSource,
+    NodeId,
+    PeerState,
+    Profile,
+    UtilityVector,
+)
+from zsched.core.profile import Ewma, Profiler
+from zsched.core.scoring import Standing, compare, score
+from zsched.lab.decisions.world import DT_S, MEMORY_MB, World
+
+START_S: Final = 100.0
+"""The clock at step 0: nothing in the core may depend on where a clock begins."""
+IDLE: Final = DeviceSample(cpu_cores=4.0, cpu_used_cores=1.0, memory_mb=MEMORY_MB, memory_used_mb=1000.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Look:
+    """How a rule wants to see: seconds of smoothing, and seconds by which radio signals are extrapolated."""
+
+    smoothing_s: float = 3.0
+    lead_s: float = 0.0
+    slope_s: float = 3.0
+    """Time constant of the slope (with ``lead_s`` only)."""
+
+
+class View:
+    """One way to look at a history; `step` through it, `standing` whenever a robot judges."""
+
+    def __init__(self, world: World, look: Look) -> None:
+        spec = world.spec
+        smoothing_s = max(look.smoothing_s, 1e-9)
+        self.fleet: Fleet = replace(world.fleet, timing=replace(world.fleet.timing, smoothing_s=smoothing_s))
+        self._world, self._look = world, look
+        self.gateway = Gateway(self.fleet)
+        self._states = dict.fromkeys((node.name for node in self.fleet.nodes), PeerState.ALIVE)
+        self._profilers = {node.name: Profiler(node.name, 1, self.fleet.timing) for node in self.fleet.nodes}
+        self._column = {name: index for index, name in enumerate(world.candidates)}
+        self._row = {name: index for index, name in enumerate(self.fleet.voters)}
+        self._slopes: dict[tuple[NodeId, NodeId | None], _Slope] = {}
+        self._read = _Readings.of(world)
+        self._allocation = Allocation(task=spec.name, revision=0, epoch=0, owner=None, tuning=spec.tuning)
+        self._standing: Standing | None = None
+        self._version = -1
+
+    def step(self, index: int) -> None:
+        """Every node takes its reading of step ``index``; profiles that are due reach every robot."""
+        now = START_S + index * DT_S
+        for name, profiler in self._profilers.items():
+            profiler.absorb(self._device(name, index), self._links(name, index), now)
+            profile = profiler.publishable({}, is_draining=False, now=now)
+            if profile is not None:
+                self.gateway.absorb(self._ahead(profile, now), now)
+
+    def standing(self, now: float) -> Standing:
+        """The joint view of a gather now; computed anew only when a profile has come."""
+        if self._standing is None or self._version != self.gateway.version:
+            self._version = self.gateway.version
+            vectors = self.vectors(now)
+            self._standing = compare(self._world.spec, self._allocation, vectors)
+        return self._standing
+
+    def vectors(self, now: float) -> dict[NodeId, UtilityVector]:
+        """{robot: its utilities now}."""
+        spec = self._world.spec
+        return {
+            voter: score(spec, self._allocation, voter, self.gateway, self._states, now) for voter in self.fleet.voters
+        }
+
+    def _device(self, name: NodeId, index: int) -> DeviceSample:
+        column = self._column.get(name)
+        if column is None:
+            return IDLE
+        cores = self._read.cores[column]
+        return DeviceSample(
+            cpu_cores=cores,
+            cpu_used_cores=self._read.cpu[index][column] * cores,
+            memory_mb=MEMORY_MB,
+            memory_used_mb=self._read.memory[index][column] * MEMORY_MB,
+        )
+
+    def _links(self, name: NodeId, index: int) -> tuple[LinkSample, ...]:
+        row, signal = self._row.get(name), self._read.signal
+        if signal is None:
+            return (LinkSample(source=LinkSource.WIRED),)
+        if row is None:
+            return ()
+        read = signal[index][row]
+        if isinstance(read, list):
+            pairs = zip(self._world.candidates, read, strict=True)
+            return tuple(LinkSample(source=LinkSource.TRACE, peer=peer, rssi_dbm=_dbm(value)) for peer, value in pairs)
+        return (LinkSample(source=LinkSource.TRACE, rssi_dbm=_dbm(read)),)
+
+    def _ahead(self, profile: Profile, now: float) -> Profile:
+        """The profile with its signals ``lead_s`` further along their slope."""
+        if self._look.lead_s <= 0.0:
+            return profile
+        links = []
+        for link in profile.links:
+            slope = self._slopes.setdefault((profile.node, link.peer), _Slope(Ewma(self._look.slope_s)))
+            ahead = slope.ahead(link.rssi_dbm, self._look.lead_s, now)
+            links.append(link if ahead is None else replace(link, rssi_dbm=ahead))
+        return replace(profile, links=tuple(links))
+
+
+def _dbm(value: float) -> float | None:
+    return None if math.isnan(value) else value
+
+
+@dataclass(slots=True)
+class _Slope:
+    """The slope of one filtered signal, and where the signal will be."""
+
+    mean: Ewma
+    before: tuple[float, float] | None = None
+
+    def ahead(self, rssi_dbm: float | None, lead_s: float, now: float) -> float | None:
+        if rssi_dbm is None:
+            self.before = None
+            return None
+        if self.before is not None and now > self.before[1]:
+            self.mean.update((rssi_dbm - self.before[0]) / (now - self.before[1]), now)
+        self.before = (rssi_dbm, now)
+        return min(max(rssi_dbm + lead_s * (self.mean.value or 0.0), -120.0), 0.0)
+
+
+@dataclass(slots=True)
+class _Readings:
+    """The history's readings as plain lists: single numbers are read out of those much faster than out of arrays."""
+
+    cores: list[float]
+    cpu: list[list[float]]
+    memory: list[list[float]]
+    signal: list[list[float]] | list[list[list[float]]] | None = field(default=None)
+
+    @classmethod
+    def of(cls, world: World) -> _Readings:
+        signal = None if world.signal_read is None else world.signal_read.tolist()
+        return cls(world.cores.tolist(), world.cpu_read.tolist(), world.memory_read.tolist(), signal)
