@@ -10,10 +10,10 @@ import pytest
 from mcap.reader import make_reader
 
 from zsched.adapters.cgroup import LimitedGroup
-from zsched.lab.laser_log import load_log, malaga_path
-from zsched.lab.mapping import truth_grid
+from zsched.lab.laser_log import malaga_path
 from zsched.lab.paper.metrics import Truth, measure
 from zsched.lab.paper.places import scenario_path
+from zsched.lab.paper.robots import LogRobots
 from zsched.lab.paper.run import Cell, CellRun, Inputs
 from zsched.lab.paper.scenario import LoadPlan, load_scenario
 from zsched.lab.paper.schemes import SCHEMES
@@ -32,9 +32,10 @@ def test_a_cell_is_run_and_measured_and_leaves_nothing(tmp_path: Path) -> None:
     cell = Cell(scheme=SCHEMES["random"], level="one", run=0)
     folder = tmp_path / "cell"
 
-    one = CellRun(scenario, cell, Inputs(log=malaga_path()), folder)
+    robots = LogRobots(log=malaga_path())
+    one = CellRun(scenario, cell, Inputs(robots=robots), folder)
     run = one.run()
-    figures = measure(folder, scenario, Truth(truth_grid(load_log(malaga_path()))))
+    figures = measure(folder, scenario, Truth(robots.truth()))
 
     assert run == json.loads((folder / "run.json").read_text()) | {"robots": tuple(run["robots"])}
     assert run["allocations"][0]["node"] in {"edge1", "edge2", "edge3"}

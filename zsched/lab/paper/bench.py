@@ -15,13 +15,13 @@ from typing import Any
 from zsched import __version__
 from zsched.errors import ConfigError, ZschedError
 from zsched.lab.demo import EXIT_CONFIG, EXIT_FAILED, EXIT_SIGNAL, EXIT_USAGE, Interrupted, interruptible
-from zsched.lab.laser_log import load_log, malaga_path
-from zsched.lab.mapping import truth_grid
+from zsched.lab.laser_log import malaga_path
 from zsched.lab.paper.figures import save_all
 from zsched.lab.paper.matrix import Matrix, cells_of, collect
 from zsched.lab.paper.metrics import Truth, brief, measure
 from zsched.lab.paper.radio_bench import run_radio
 from zsched.lab.paper.report import report
+from zsched.lab.paper.robots import LogRobots
 from zsched.lab.paper.run import Cell, CellRun, Inputs, write_json
 from zsched.lab.paper.scenario import Scenario, load_scenario
 from zsched.lab.paper.schemes import QUICK_SCHEMES
@@ -68,13 +68,14 @@ def run_bench(options: BenchOptions) -> int:
 
 def _run(options: BenchOptions) -> int:
     scenario, cells = planned(options)
-    inputs = Inputs(log=(options.log or malaga_path()).absolute(), drives=options.drives)
+    robots = LogRobots(log=(options.log or malaga_path()).absolute())
+    inputs = Inputs(robots=robots, drives=options.drives)
     body = plan_body(scenario, inputs, cells)
     wrong = claim_folder(options, body)
     if wrong:
         say(wrong)
         return EXIT_USAGE
-    truth = Truth(truth_grid(load_log(inputs.log)))
+    truth = Truth(robots.truth())
 
     def figures_of(folder: Path) -> tuple[dict[str, Any], str]:
         figures = measure(folder, scenario, truth)
@@ -110,7 +111,7 @@ def plan_body(scenario: Scenario, inputs: Inputs, cells: Sequence[Cell]) -> dict
     """What a folder was made for, so that nothing else goes on in it."""
     body = asdict(scenario) | {"fleet": scenario.fleet.name}
     drives = inputs.drives.name if inputs.drives else None
-    found = {"scenario": body, "log": inputs.log.name, "drives": drives, "cells": [cell.name for cell in cells]}
+    found = {"scenario": body, "input": inputs.robots.name, "drives": drives, "cells": [cell.name for cell in cells]}
     return dict(json.loads(json.dumps(found)))  # as it is read back: no tuples
 
 
@@ -143,13 +144,13 @@ def conclude(
         "version": __version__,
         "command": command_of(options),
         "scenario": asdict(scenario) | {"fleet": scenario.fleet.name},
-        "input": f"log {inputs.log.name}",
+        "input": inputs.robots.name,
         "runs": runs,
         "invalid": invalid,
         "radio": radio,
     }
     write_json(options.out / "results.json", results)
-    title = f"{scenario.name}, load {scenario.level}, seed {scenario.seed}, {inputs.log.name}"
+    title = f"{scenario.name}, load {scenario.level}, seed {scenario.seed}, {inputs.robots.name}"
     drawn = save_all(runs, scenario.level, tuple(scenario.levels), options.out, title)
     (options.out / "report.md").write_text(report(results, drawn), encoding="utf-8")
     missing = len(cells) - len(runs)

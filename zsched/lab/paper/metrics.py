@@ -99,12 +99,13 @@ def measure(folder: Path, scenario: Scenario, truth: Truth) -> Json:
     is_done = len(done) == len(run["robots"]) and max(done, default=duration_s) <= duration_s
     per_edge = {node: edge_figures(node, nodes, streams, owners, duration_s) for node in run["shares"]}
     return {
-        **{key: run[key] for key in ("scheme", "family", "level", "run", "seed", "host", "mode", "log", "links")},
+        **{key: run[key] for key in ("scheme", "family", "level", "run", "seed", "host", "mode", "input", "links")},
         "nodes": per_edge,
         **over_nodes(per_edge),
         **stream_figures(streams, len(run["robots"]), duration_s),
         "task_latency_s": max(done) if is_done else duration_s,
         "is_done": is_done,
+        "duration_s": duration_s,
         **map_figures(streams, truth),
         **move_figures(run, streams, owners),
         "regret": regret(scenario, run, owners),

@@ -29,16 +29,16 @@ from zsched.lab.demo_run import worker_options
 from zsched.lab.fleet_runner import CLI, FleetRunner, LabFleet, read_tree, write_fleet
 from zsched.lab.fleet_view import Status, find_task
 from zsched.lab.limits import LimitKind, NodeLimits
-from zsched.lab.mapping import displacements
 from zsched.lab.observer import Observer
 from zsched.lab.paper.load import Loads, Window, schedule
 from zsched.lab.paper.oracle import best_nodes
 from zsched.lab.paper.radio import drive_file
 from zsched.lab.paper.record import HostGauge, NodeMeter
+from zsched.lab.paper.robots import Place, Robots
 from zsched.lab.paper.rules import RulePlan
 from zsched.lab.paper.scenario import Scenario
 from zsched.lab.paper.schemes import Scheme, scheme_tree
-from zsched.lab.recorder import Recorder
+from zsched.lab.recorder import Follower, Recorder
 
 TICK_S = 0.1
 SAMPLE_S = 0.5
@@ -71,9 +71,9 @@ class Cell:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Inputs:
-    """What the robots see: a laser log cut into one drive per robot, and the recorded radio drives if there are any."""
+    """What the robots see, and the folder of recorded radio drives if there is one."""
 
-    log: Path
+    robots: Robots
     drives: Path | None = None
 
 
@@ -87,6 +87,20 @@ class _Parts:
     loads: Loads
     observer: Observer
     gauge: HostGauge
+
+
+class Seen:
+    """Which robots have said that the map they hold covers the target."""
+
+    def __init__(self, robots: tuple[NodeId, ...], records: Path) -> None:
+        self._waiting = {robot: Follower(records / f"{robot}.ndjson") for robot in robots}
+
+    def is_covered(self) -> bool:
+        """Whether all have."""
+        for robot, follower in tuple(self._waiting.items()):
+            if any(record.get("kind") == "covered" for record in follower.new()):
+                del self._waiting[robot]
+        return not self._waiting
 
 
 class CellRun:
@@ -161,7 +175,7 @@ class CellRun:
         with template.open("w", encoding="utf-8") as file:
             YAML().dump(tree, file)
         robots = sorted(name for name, node in tree["nodes"].items() if node["kind"] == "robot")
-        frames = dict(zip(robots, displacements(len(robots), self._seed), strict=True))
+        frames = dict(zip(robots, self._inputs.robots.frames(len(robots), self._seed), strict=True))
         options = worker_options(self._scenario.mode, frames) | {"--rate": (f"{self._scenario.rate_hz:g}",)}
         return write_fleet(template, self._folder / "fleet.yaml", options)
 
@@ -179,14 +193,22 @@ class CellRun:
             self._wait_owned(children, parts)
             self._record_streams(children, parts)
             self._start(children, parts)
-            end_s = self._scenario.duration_s + SETTLE_S
-            while (now := monotonic_s() - self._zero_s) < end_s:
-                children.check()
-                if now < self._scenario.duration_s:
-                    parts.loads.tick(now)
-                self._sample(parts, now)
-                time.sleep(TICK_S)
-            return self._finish(children, parts)
+            done_s = self._drive(children, parts)
+            return self._finish(children, parts, done_s)
+
+    def _drive(self, children: Children, parts: _Parts) -> float:
+        """The robots' time and a moment more; returns how long they drove."""
+        seen = Seen(parts.fleet.robots, self._records)
+        end_s = self._scenario.duration_s
+        while (now := monotonic_s() - self._zero_s) < end_s + SETTLE_S:
+            children.check()
+            if now < end_s:
+                parts.loads.tick(now)
+                if self._inputs.robots.ends_when_covered and seen.is_covered():
+                    end_s = now
+            self._sample(parts, now)
+            time.sleep(TICK_S)
+        return end_s
 
     def _gauge_daemons(self, children: Children, parts: _Parts) -> None:
         for node in parts.fleet.kinds:
@@ -229,11 +251,18 @@ class CellRun:
         """The robots drive; from here all times count."""
         robots = parts.fleet.robots
         for index, robot in enumerate(robots):
-            command = [sys.executable, "-m", "zsched.lab.robot_app", "--robot", robot, "--index", str(index)]
-            command += ["--robots", str(len(robots)), "--seed", str(self._seed), "--log", str(self._inputs.log)]
-            command += ["--endpoint", parts.fleet.data_endpoints[robot], "--records", str(self._records)]
-            command += ["--replay-s", f"{self._scenario.duration_s:.3f}"]
-            parts.gauge.add(children.start(f"app-{robot}", command).process.pid)
+            place = Place(
+                robot=robot,
+                index=index,
+                robots=len(robots),
+                seed=self._seed,
+                endpoint=parts.fleet.data_endpoints[robot],
+                records=self._records,
+                duration_s=self._scenario.duration_s,
+                target_coverage=self._scenario.target_coverage,
+            )
+            child = children.start(f"app-{robot}", self._inputs.robots.command(place))
+            parts.gauge.add(child.process.pid)
         self._zero_s, self._zero_wall_ns = monotonic_s(), time.time_ns()
         parts.gauge.start()
         level = self._scenario.levels[self._cell.level]
@@ -255,7 +284,7 @@ class CellRun:
                 self._decided[node] = said
                 self._recorder.write("decisions", {"kind": "decision", "t_s": now, "node": node, **said})
 
-    def _finish(self, children: Children, parts: _Parts) -> dict[str, Any]:
+    def _finish(self, children: Children, parts: _Parts, drove_s: float) -> dict[str, Any]:
         host = parts.gauge.result()
         parts.loads.stop(monotonic_s() - self._zero_s)
         allocations = [asdict(move) | {"t_s": move.t_s - self._zero_s} for move in parts.observer.moves()]
@@ -271,12 +300,12 @@ class CellRun:
             "run": self._cell.run,
             "seed": self._seed,
             "mode": self._scenario.mode,
-            "log": self._inputs.log.name,
+            "input": self._inputs.robots.name,
             "links": "recorded" if self._inputs.drives else "simulated",
             "limits": parts.limits.says,
             "zero_s": self._zero_s,
             "zero_wall_ns": self._zero_wall_ns,
-            "duration_s": self._scenario.duration_s,
+            "duration_s": drove_s,
             "robots": parts.fleet.robots,
             "shares": {node: asdict(share) for node, share in self._scenario.nodes.items()},
             "windows": [asdict(window) for window in self._windows],

@@ -11,11 +11,12 @@ from zsched.lab.children import ChildError
 from zsched.lab.paper.bench import BenchOptions, claim_folder, command_of, plan_body, planned
 from zsched.lab.paper.matrix import METRICS, Matrix, Progress, cells_of, collect, invalid_reason, set_aside
 from zsched.lab.paper.places import robots_scenario_path, scenario_path
+from zsched.lab.paper.robots import LogRobots
 from zsched.lab.paper.run import Cell, Inputs
 from zsched.lab.paper.scenario import Scenario, Sweep, load_scenario
 from zsched.lab.paper.schemes import SCHEMES
 
-INPUTS = Inputs(log=Path("malaga.csv"))
+INPUTS = Inputs(robots=LogRobots(log=Path("malaga.csv")))
 
 
 @pytest.fixture

@@ -1,0 +1,184 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from zsched.lab.paper.load import Window
+from zsched.lab.paper.metrics import (
+    Truth,
+    brief,
+    held_instants,
+    measure,
+    over_nodes,
+    owned_s,
+    owner_at,
+    percentile,
+    reached_s,
+    wasted,
+)
+from zsched.lab.paper.places import scenario_path
+from zsched.lab.paper.radio_bench import radio_figures
+from zsched.lab.paper.record import Heard, StreamFile
+from zsched.lab.paper.scenario import NodeShare, Scenario, load_scenario
+from zsched.lab.recorder import Recorder
+from zsched.tasks.map_merge.cdr import encode_grid
+from zsched.tasks.map_merge.geometry import Pose2
+from zsched.tasks.map_merge.grid import FREE, OCCUPIED, UNKNOWN, Grid
+
+ZERO_NS = 1_700_000_000_000_000_000
+SIDE = 0.05
+
+
+def a_room() -> Grid:
+    data = np.full((40, 60), FREE, dtype=np.int8)
+    data[[0, -1], :] = OCCUPIED
+    data[:, [0, -1]] = OCCUPIED
+    return Grid(data=data, resolution=SIDE, origin=Pose2(x=1.0, y=-2.0))
+
+
+def part_of_room(share: float, stamp_ns: int = 0, margin: int = 0) -> bytes:
+    """The room's left part, in a canvas with a margin around it: as a merged map that grows."""
+    room = a_room()
+    data = room.data.copy()
+    data[:, int(share * data.shape[1]) :] = UNKNOWN
+    data = np.pad(data, margin, constant_values=UNKNOWN)
+    origin = Pose2(x=room.origin.x - margin * SIDE, y=room.origin.y - margin * SIDE)
+    return encode_grid(Grid(data=data, resolution=SIDE, origin=origin, stamp_ns=stamp_ns))
+
+
+@pytest.fixture
+def scenario() -> Scenario:
+    shares = {"edge1": NodeShare(cpu_cores=0.3, memory_mb=512), "edge2": NodeShare(cpu_cores=0.3, memory_mb=512)}
+    return replace(load_scenario(scenario_path()), nodes=shares, target_coverage=0.8)
+
+
+def write_run(folder: Path, **changed: Any) -> Path:
+    """A run of 10 s with two robots: a merged map each second that knows a tenth more; edge1 to edge2 at 4.5 s."""
+    moves = [(-0.5, "edge1"), (4.5, "edge2")]
+    run = {
+        "scheme": "zsched", "family": "zsched", "level": "four", "run": 0, "seed": 1, "mode": "known", "input": "x",
+        "links": "simulated", "host": {"pressure": 0.1, "idle_ratio": 0.3}, "duration_s": 10.0, "zero_wall_ns": ZERO_NS,
+        "robots": ["robot1", "robot2"], "shares": {"edge1": {}, "edge2": {}},
+        "loads": [{"node": "edge1", "start_s": 4.0, "end_s": 10.0}],
+        "allocations": [{"t_s": t_s, "node": node} for t_s, node in moves],
+        "streams": {"robot1": [{"lost": 1, "at_most_lost": 2, "drops": {"full": 3}}], "robot2": None},
+        **changed,
+    }  # fmt: skip
+    with Recorder(folder / "records") as recorder:
+        for step in range(20):
+            node = {"cpu_ratio": None if step == 0 else 0.5 + 0.5 * (step == 7), "memory_ratio": 0.2}
+            recorder.write("nodes", {"t_s": step / 2, "edge1": node, "edge2": {"cpu_ratio": 0.25, "memory_ratio": 0.4}})
+    with (folder / "streams.mcap").open("wb") as stream:
+        file = StreamFile(stream)
+        for second in range(1, 10):
+            at_ns = ZERO_NS + second * 10**9
+            for index, robot in enumerate(("robot1", "robot2")):
+                file.write(Heard(f"{robot}/map", b"x" * 100, at_ns - 5 * 10**8))
+                payload = part_of_room(second / 10, stamp_ns=at_ns - 2 * 10**8, margin=second)
+                file.write(Heard(f"{robot}/global_map", payload, at_ns + index * 10**8))
+                file.write(Heard(f"{robot}/map_merge/status", b"{}", at_ns))
+        file.close()
+    (folder / "run.json").write_text(json.dumps(run))
+    return folder
+
+
+def test_a_runs_figures_by_their_definitions(tmp_path: Path, scenario: Scenario) -> None:
+    figures = measure(write_run(tmp_path), scenario, Truth(a_room()))
+
+    assert figures["is_done"]
+    assert figures["task_latency_s"] == pytest.approx(8.1)  # robot2 gets the eighth map a tenth later
+    assert figures["map_hz"] == pytest.approx(0.9)
+    assert figures["merge_latency_p50_s"] == pytest.approx(0.2)
+    assert figures["merge_latency_p99_s"] == pytest.approx(0.3)
+    assert figures["coverage"] == pytest.approx(0.9)
+    assert figures["moves"] == 1
+    assert figures["wasted_moves"] == 0
+    assert figures["move_gap_max_s"] == pytest.approx(1.0)
+    assert (figures["lost"], figures["dropped"]) == (3, 3)
+    assert figures["held_ssim_rebased"] < figures["ssim_rebased"] <= 1.0
+    assert brief(figures).startswith("0.90 maps/s")
+
+
+def test_a_nodes_figures_are_its_own(tmp_path: Path, scenario: Scenario) -> None:
+    figures = measure(write_run(tmp_path), scenario, Truth(a_room()))
+    edge1, edge2 = figures["nodes"]["edge1"], figures["nodes"]["edge2"]
+
+    assert edge1["cpu_peak"] == pytest.approx(0.75)  # of one second: one half second was full
+    assert edge2["cpu_mean"] == pytest.approx(0.25)
+    assert (edge1["memory_mean"], edge2["memory_peak"]) == (pytest.approx(0.2), pytest.approx(0.4))
+    assert figures["memory_mean_spread"] == pytest.approx(0.2)
+    assert (edge1["owned_s"], edge2["owned_s"]) == (4.5, 5.5)
+    total = edge1["throughput_mb_s"] + edge2["throughput_mb_s"]
+    assert total == pytest.approx(figures["throughput_mb_s"])
+    assert edge2["throughput_mb_s"] > edge1["throughput_mb_s"] > 0
+
+
+def test_a_run_that_does_not_get_there_counts_with_its_whole_duration(tmp_path: Path, scenario: Scenario) -> None:
+    figures = measure(write_run(tmp_path), replace(scenario, target_coverage=0.95), Truth(a_room()))
+
+    assert not figures["is_done"]
+    assert figures["task_latency_s"] == 10.0
+
+
+def test_regret_is_what_the_owner_lacked(tmp_path: Path, scenario: Scenario) -> None:
+    late = measure(write_run(tmp_path / "late"), scenario, Truth(a_room()))["regret"]
+    stuck = [{"t_s": 0.0, "node": "edge1"}]
+    stays = measure(write_run(tmp_path / "stays", allocations=stuck), scenario, Truth(a_room()))["regret"]
+    away = [{"t_s": 0.0, "node": "edge2"}]
+    best = measure(write_run(tmp_path / "best", allocations=away), scenario, Truth(a_room()))["regret"]
+
+    assert best == pytest.approx(0.0)
+    assert 0.0 < late < stays < 1.0
+
+
+def test_coverage_is_cell_on_cell_wherever_the_canvas_begins() -> None:
+    truth = Truth(a_room())
+
+    assert truth.coverage(part_of_room(1.0)) == pytest.approx(1.0)
+    assert truth.coverage(part_of_room(0.5, margin=7)) == pytest.approx(0.5)
+    far = Grid(data=a_room().data, resolution=SIDE, origin=Pose2(x=100.0, y=0.0))
+    assert truth.coverage(encode_grid(far)) == 0.0
+    cut = Grid(data=a_room().data[10:, 10:], resolution=SIDE, origin=Pose2(x=1.5, y=-1.5))
+    assert truth.coverage(encode_grid(cut)) == pytest.approx(30 * 50 / 2400)
+    assert truth.coverage(b"no map") == 0.0
+
+
+def test_small_figures() -> None:
+    assert percentile([], 0.5) is None
+    assert percentile([1.0, 2.0, 3.0], 0.95) == 3.0
+    assert held_instants(12.0) == [5.0, 10.0, 12.0]
+    assert held_instants(10.0) == [5.0, 10.0]
+    assert reached_s([], 0.5) is None
+    assert owner_at([(1.0, "a")], 0.5) is None
+    assert owned_s([(1.0, "a"), (3.0, "b"), (99.0, "a")], "a", 10.0) == 2.0
+    assert over_nodes({})["cpu_peak"] is None
+    assert wasted([(0.0, "a"), (10.0, "b"), (45.0, "a")]) == 0
+    assert Window(node="a", start_s=0.0, end_s=1.0).node == "a"
+
+
+def test_the_radios_figures(tmp_path: Path) -> None:
+    moves = [{"t_s": -1.0, "node": "robot1"}, {"t_s": 5.0, "node": "robot2"}]
+    folder = write_run(tmp_path, allocations=moves)
+    with Recorder(folder / "records") as recorder:
+        for step in range(20):
+            for robot, dbm in (("robot1", -50.0), ("robot2", -60.0 if step < 10 else -40.0)):
+                recorder.write("decisions", {"node": robot, "t_s": step / 2, "links": [dbm]})
+
+    figures = radio_figures(folder)
+
+    assert figures["moves"] == 1
+    assert figures["mean_dbm"] == pytest.approx(-45.0)
+    assert figures["best_dbm"] == pytest.approx(-45.0)
+    assert figures["under_best_db"] == pytest.approx(0.0)
+    assert figures["best_fixed_dbm"] == pytest.approx(-50.0)
+    assert figures["below_70_ratio"] == 0.0
+
+
+def test_a_run_without_signals_is_no_radio_run(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="signal"):
+        radio_figures(write_run(tmp_path))

@@ -1,0 +1,62 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+from zsched.lab.laser_log import malaga_path
+from zsched.lab.paper.robots import LogRobots, Place
+from zsched.lab.paper.run import Seen, is_calm, ready_workers
+from zsched.lab.recorder import Recorder
+from zsched.lab.robot_app import parse
+
+
+def a_place(records: Path, robot: str = "robot2", index: int = 1) -> Place:
+    return Place(
+        robot=robot,
+        index=index,
+        robots=3,
+        seed=7,
+        endpoint="tcp/127.0.0.1:7458",
+        records=records,
+        duration_s=30.0,
+        target_coverage=0.8,
+    )
+
+
+def test_a_log_robots_command_is_one_that_its_program_takes(tmp_path: Path) -> None:
+    robots = LogRobots(log=malaga_path())
+
+    options = parse(robots.command(a_place(tmp_path))[3:])
+
+    assert (options.robot, options.index, options.robots, options.seed) == ("robot2", 1, 3, 7)
+    assert (options.endpoint, options.replay_s, options.records) == ("tcp/127.0.0.1:7458", 30.0, tmp_path)
+    assert robots.name == "log malaga-keyframes.csv.gz"
+    assert len(robots.frames(3, 7)) == 3
+    assert robots.frames(3, 7) == robots.frames(3, 7) != robots.frames(3, 8)
+    assert not robots.ends_when_covered
+
+
+def test_the_task_is_over_when_every_robot_has_said_so(tmp_path: Path) -> None:
+    seen = Seen(("robot1", "robot2"), tmp_path)
+    with Recorder(tmp_path) as recorder:
+        assert not seen.is_covered()
+        recorder.write("robot1", {"kind": "covered", "t_s": 1.0})
+        recorder.write("robot2", {"kind": "map", "t_s": 1.0})
+        assert not seen.is_covered()
+        recorder.write("robot2", {"kind": "covered", "t_s": 2.0})
+        assert seen.is_covered()
+        assert seen.is_covered()
+
+
+def test_nobody_starts_with_a_handicap() -> None:
+    worker = {"task": "map_merge", "state": "ready"}
+    edge1 = {"name": "edge1", "cpu_ratio": 0.1, "workers": [worker]}
+    edge2 = {"name": "edge2", "cpu_ratio": 0.9, "workers": [worker | {"state": "starting"}]}
+    statuses = {"edge1": {"nodes": [edge1, edge2]}, "edge2": {"nodes": [edge1, edge2]}}
+
+    assert ready_workers(statuses["edge1"], "map_merge") == {"edge1"}
+    assert ready_workers(statuses["edge1"], "other") == set()
+    assert is_calm(statuses, ("edge1",))
+    assert not is_calm(statuses, ("edge1", "edge2"))
+    assert not is_calm({}, ("edge1",))
+    assert not is_calm({"edge1": {"nodes": [{"name": "edge1", "cpu_ratio": None}]}}, ("edge1",))
+    assert is_calm({}, ())

@@ -1,0 +1,84 @@
+"""What the robots see: a recorded laser log that each replays a part of, or a known world that they explore.
+
+Knows: the robots' programs and their options, the truth that maps are held against. Does not know: daemons, schemes.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from zsched.core.model import NodeId
+from zsched.lab.laser_log import load_log
+from zsched.lab.mapping import displacements, truth_grid
+from zsched.tasks.map_merge.geometry import Pose2
+from zsched.tasks.map_merge.grid import Grid
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Place:
+    """One robot of a run: who it is, its number of how many, the seed, where it is connected and what it is told."""
+
+    robot: NodeId
+    index: int
+    robots: int
+    seed: int
+    endpoint: str
+    records: Path
+    duration_s: float
+    target_coverage: float
+
+
+class Robots(Protocol):
+    """One kind of input."""
+
+    @property
+    def name(self) -> str:
+        """As shown in reports; names no place of this machine."""
+
+    @property
+    def ends_when_covered(self) -> bool:
+        """Whether the task is over when all robots hold the target, so that a late map costs time."""
+
+    def truth(self) -> Grid:
+        """What a perfect merged map knows, in the frame in which `frames` are."""
+
+    def frames(self, robots: int, seed: int) -> tuple[Pose2, ...]:
+        """The true pose of each robot's map frame."""
+
+    def command(self, place: Place) -> list[str]:
+        """The program of one robot's applications."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LogRobots:
+    """Robots that replay a laser log, each its part, at an even pace."""
+
+    log: Path
+
+    @property
+    def name(self) -> str:
+        """The log's."""
+        return f"log {self.log.name}"
+
+    @property
+    def ends_when_covered(self) -> bool:
+        """The drive has a set length."""
+        return False
+
+    def truth(self) -> Grid:
+        """The grid of the whole log."""
+        return truth_grid(load_log(self.log))
+
+    def frames(self, robots: int, seed: int) -> tuple[Pose2, ...]:
+        """Anywhere near, turned by any angle."""
+        return displacements(robots, seed)
+
+    def command(self, place: Place) -> list[str]:
+        """`zsched.lab.robot_app`."""
+        command = [sys.executable, "-m", "zsched.lab.robot_app", "--robot", place.robot, "--index", str(place.index)]
+        command += ["--robots", str(place.robots), "--seed", str(place.seed), "--log", str(self.log)]
+        command += ["--endpoint", place.endpoint, "--records", str(place.records)]
+        return [*command, "--replay-s", f"{place.duration_s:.3f}"]
