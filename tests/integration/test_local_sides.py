@@ -6,9 +6,7 @@ Real relays, a real worker's session, and a zenoh router per robot, as `rmw_zeno
 from __future__ import annotations
 
 import contextlib
-import socket
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -16,6 +14,8 @@ from typing import Any
 import pytest
 import zenoh
 
+from support.sessions import opened
+from support.waiting import free_endpoint, until
 from zsched.adapters.streams import RelayHandle
 from zsched.core.events import ProblemReported, RelayChanged, SlotFlipped, SlotReady
 from zsched.core.fleet import LocalMode, LocalSide
@@ -27,32 +27,12 @@ ROBOTS = ("robot1", "robot2", "robot3")
 TASK = "merge"
 
 
-def until(condition: Callable[[], Any], what: str, deadline_s: float = 10.0) -> Any:
-    end = time.monotonic() + deadline_s
-    while time.monotonic() < end:
-        value = condition()
-        if value:
-            return value
-        time.sleep(0.005)
-    raise AssertionError(f"not within {deadline_s} s: {what}")
-
-
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-
-
 def router(endpoint: str) -> zenoh.Session:
     """What a host's `rmw_zenohd` is: a router that nobody else is joined to."""
     config = zenoh.Config.from_json5(client_config(connect=()))
     config.insert_json5("mode", '"router"')
     config.insert_json5("listen/endpoints", f'["{endpoint}"]')
     return zenoh.open(config)
-
-
-def opened(text: str) -> zenoh.Session:
-    return zenoh.open(zenoh.Config.from_json5(text))
 
 
 @dataclass

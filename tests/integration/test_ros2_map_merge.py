@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import os
-import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import zenoh
 from zenoh import ext
 
+from support.waiting import free_endpoint, until
 from zsched.adapters.streams import RelayHandle
 from zsched.config import load_fleet
 from zsched.core.events import RelayChanged, SlotFlipped, SlotReady
@@ -34,22 +33,6 @@ CONFIG = Path(__file__).parents[2] / "configs" / "ros2.yaml"
 GRID = "nav_msgs::msg::dds_::OccupancyGrid_/RIHS01_8d348150c12913a31ee0ec170fbf25089e4745d17035792a1ba94d6f0bc0cfc7"
 TF = "tf2_msgs::msg::dds_::TFMessage_/RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
 ROBOTS = ("robot1", "robot2")
-
-
-def until(condition: Callable[[], Any], what: str, deadline_s: float = 20.0) -> Any:
-    end = time.monotonic() + deadline_s
-    while time.monotonic() < end:
-        value = condition()
-        if value:
-            return value
-        time.sleep(0.01)
-    raise AssertionError(f"not within {deadline_s} s: {what}")
-
-
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def opened(text: str, **more: str) -> zenoh.Session:

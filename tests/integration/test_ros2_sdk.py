@@ -5,18 +5,18 @@ from __future__ import annotations
 import contextlib
 import json
 import queue
-import socket
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import zenoh
 
+from support.waiting import free_port, until
 from zsched.adapters.streams import RelayHandle
 from zsched.config import check_bytes
 from zsched.core.events import RelayChanged, SlotFlipped, SlotReady
@@ -44,23 +44,6 @@ tasks:
       outputs: [{topic: /answers, type: std_msgs/msg/String, worker_topic: "/{target}/echo/answers"}]
       services: [{service: /merge_now, type: std_srvs/srv/Trigger, worker_service: "/{target}/echo/now"}]
 """.replace("LISTEN", "{control: tcp/127.0.0.1:1, data: tcp/127.0.0.1:2}")
-
-
-def until(condition: Callable[[], Any], what: str, deadline_s: float = 15.0) -> Any:
-    end = time.monotonic() + deadline_s
-    while time.monotonic() < end:
-        value = condition()
-        if value:
-            return value
-        time.sleep(0.01)
-    raise AssertionError(f"not within {deadline_s} s: {what}")
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 class Node:

@@ -7,7 +7,6 @@ somebody else. Routes come from a fleet file.
 from __future__ import annotations
 
 import contextlib
-import socket
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -18,6 +17,7 @@ import pytest
 import zenoh
 from zenoh import ext
 
+from support.waiting import free_endpoint, until
 from zsched.adapters.streams import RelayHandle
 from zsched.config import check_bytes
 from zsched.core.events import RelayChanged, SlotFlipped, SlotReady
@@ -48,22 +48,6 @@ tasks:
       outputs: [{topic: /merged_map, worker_topic: "/{target}/merge/map", class: latest}]
       services: [{service: /merge_now, type: std_srvs/srv/Trigger, worker_service: "/{target}/merge/now"}]
 """.replace("LISTEN", "{control: tcp/127.0.0.1:1, data: tcp/127.0.0.1:2}")
-
-
-def until(condition: Callable[[], Any], what: str, deadline_s: float = 10.0) -> Any:
-    end = time.monotonic() + deadline_s
-    while time.monotonic() < end:
-        value = condition()
-        if value:
-            return value
-        time.sleep(0.005)
-    raise AssertionError(f"not within {deadline_s} s: {what}")
-
-
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def opened(text: str, mode: str = "", listen: str = "") -> zenoh.Session:

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import pytest
 import zenoh
 
+from support.waiting import free_endpoint, until
 from zsched import wire
 from zsched.core.plan import Role, WorkerRole
 from zsched.keyspace import Keyspace
@@ -58,16 +56,6 @@ with Worker.from_env() as worker:
 '''
 
 
-def until(condition: Callable[[], Any], what: str, deadline_s: float = 10.0) -> Any:
-    end = time.monotonic() + deadline_s
-    while time.monotonic() < end:
-        value = condition()
-        if value:
-            return value
-        time.sleep(0.005)
-    raise AssertionError(f"not within {deadline_s} s: {what}")
-
-
 @dataclass
 class Hub:
     """One session that all workers join: it tells roles, feeds inputs, hears outputs and tokens."""
@@ -82,9 +70,7 @@ class Hub:
 
     def start(self) -> None:
         (self.folder / "worker.py").write_text(WORKER)
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            self.endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        self.endpoint = free_endpoint()
         text = data_config(listen=(self.endpoint,), connect=(), shared_memory=False)
         self.session = zenoh.open(zenoh.Config.from_json5(text))
         self._kept = [

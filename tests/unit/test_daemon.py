@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 
+from support.waiting import until
 from zsched import daemon
 from zsched.adapters.operator_socket import ask
 from zsched.adapters.state_file import StateFile
@@ -213,15 +214,6 @@ def place(tmp_path: Path) -> Iterator[Place]:
         if process.poll() is None:
             process.kill()
         process.communicate(timeout=10)
-
-
-def until(condition: Callable[[], Any], what: str, deadline_s: float = 20.0) -> Any:
-    end = time.monotonic() + deadline_s
-    while time.monotonic() < end:
-        if value := condition():
-            return value
-        time.sleep(0.01)
-    raise AssertionError(f"not within {deadline_s} s: {what}")
 
 
 def test_help_goes_to_stdout_and_is_fine(capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
 import zenoh
 
+from support.sessions import hub_and_neighbour, matches
+from support.waiting import until
 from zsched import wire
 from zsched.core.plan import Direction, HandoverRule, Route, StreamClass, StreamSettings
 from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks
@@ -18,19 +19,8 @@ from zsched.relay import answers
 from zsched.relay.acks import Acks
 from zsched.relay.outputs import OutputStream
 from zsched.relay_pipe import encode_end
-from zsched.zenoh_config import data_config, worker_config
 
 KEY = "edge1/t/1/out"
-
-
-def until(condition: Callable[[], Any], what: str, deadline_s: float = 5.0) -> Any:
-    end = time.monotonic() + deadline_s
-    while time.monotonic() < end:
-        value = condition()
-        if value:
-            return value
-        time.sleep(0.002)
-    raise AssertionError(f"not within {deadline_s} s: {what}")
 
 
 class Bench:
@@ -79,26 +69,13 @@ class Bench:
         return self.passed == [str(number) for number in numbers]
 
 
-def matches(publisher: zenoh.Publisher) -> bool:
-    status: Any = publisher.matching_status
-    return bool(status.matching)
-
-
 @pytest.fixture
 def bench() -> Iterator[Bench]:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-    relay = zenoh.open(zenoh.Config.from_json5(data_config(listen=(endpoint,), connect=(), shared_memory=False)))
-    worker = zenoh.open(zenoh.Config.from_json5(worker_config(connect=(endpoint,), shared_memory=False)))
-    made = Bench(relay, worker)
-    try:
+    with hub_and_neighbour() as (relay, worker):
+        made = Bench(relay, worker)
         yield made
-    finally:
         made.stream.close()
         made.acks.answers.close()
-        worker.close()
-        relay.close()
 
 
 def test_answers_are_acknowledged_to_the_worker_that_gave_them(bench: Bench) -> None:

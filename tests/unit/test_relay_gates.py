@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -12,6 +11,8 @@ from typing import Any
 import pytest
 import zenoh
 
+from support.sessions import hub_and_neighbour, matches
+from support.waiting import free_endpoint, until
 from zsched import send_queue
 from zsched.core.plan import Direction, HandoverRule, Route, StreamClass, StreamSettings
 from zsched.core.relay_protocol import EndMarker
@@ -20,17 +21,7 @@ from zsched.relay import outlet, outputs
 from zsched.relay.inputs import InputStream
 from zsched.relay.outputs import OutputStream
 from zsched.relay_pipe import decode_end, encode_end
-from zsched.zenoh_config import data_config, worker_config
-
-
-def until(condition: Callable[[], Any], what: str, deadline_s: float = 5.0) -> Any:
-    end = time.monotonic() + deadline_s
-    while time.monotonic() < end:
-        value = condition()
-        if value:
-            return value
-        time.sleep(0.002)
-    raise AssertionError(f"not within {deadline_s} s: {what}")
+from zsched.zenoh_config import worker_config
 
 
 @dataclass
@@ -62,28 +53,16 @@ class Bench:
         return publisher
 
 
-def matches(publisher: zenoh.Publisher) -> bool:
-    status: Any = publisher.matching_status
-    return bool(status.matching)
-
-
 @pytest.fixture
 def bench() -> Iterator[Bench]:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-    relay = zenoh.open(zenoh.Config.from_json5(data_config(listen=(endpoint,), connect=())))
-    outside = zenoh.open(zenoh.Config.from_json5(worker_config(connect=(endpoint,))))
-    made = Bench(relay=relay, outside=outside, endpoint=endpoint)
-    try:
+    endpoint = free_endpoint()
+    with hub_and_neighbour(endpoint) as (relay, outside):
+        made = Bench(relay=relay, outside=outside, endpoint=endpoint)
         yield made
-    finally:
         for stream in made.streams:
             stream.close()
         for other in made.others:
             other.close()
-        outside.close()
-        relay.close()
 
 
 def way_in(

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import signal
-import socket
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import pytest
 import zenoh
 from zenoh import ext
 
+from support.sessions import matches
+from support.waiting import free_endpoint, until
 from zsched.core.plan import StreamClass, StreamSettings
 from zsched.relay import history
 from zsched.relay.receive import Receiver
@@ -44,23 +44,11 @@ sys.stdin.read()
 """
 
 
-def until(condition: Callable[[], Any], what: str, deadline_s: float = 5.0) -> Any:
-    end = time.monotonic() + deadline_s
-    while time.monotonic() < end:
-        value = condition()
-        if value:
-            return value
-        time.sleep(0.002)
-    raise AssertionError(f"not within {deadline_s} s: {what}")
-
-
 class Net:
     """The relay's session and an application's."""
 
     def __init__(self) -> None:
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            self.endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        self.endpoint = free_endpoint()
         self.relay = zenoh.open(zenoh.Config.from_json5(data_config(listen=(self.endpoint,), connect=())))
         self.app = zenoh.open(zenoh.Config.from_json5(worker_config(connect=(self.endpoint,))))
         self.got: list[str] = []
@@ -127,11 +115,6 @@ def test_a_publisher_without_numbers_is_not_taken_for_double(net: Net) -> None:
     for _ in range(3):
         plain.put("same")
     until(lambda: net.got == ["same"] * 3, "all three")
-
-
-def matches(publisher: zenoh.Publisher) -> bool:
-    status: Any = publisher.matching_status
-    return bool(status.matching)
 
 
 class publisher:  # noqa: N801 - reads as a verb in a with statement

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import socket
-import time
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Iterator
 
 import pytest
 import zenoh
 
+from support.sessions import hub_and_neighbour
+from support.waiting import until
 from zsched.core.fleet import LocalMode, LocalSide
 from zsched.core.plan import Direction, Route, StreamClass, StreamSettings
 from zsched.keyspace import END_CHUNK
@@ -17,30 +16,16 @@ from zsched.relay import outlet
 from zsched.relay.inputs import InputStream
 from zsched.relay.outputs import OutputStream
 from zsched.relay_pipe import decode_end
-from zsched.zenoh_config import data_config, local_config, worker_config
+from zsched.zenoh_config import local_config
 
 SENSORS = ("front/scan", "rear/scan", "imu")
-
-
-def until(condition: Callable[[], Any], what: str, deadline_s: float = 5.0) -> Any:
-    end = time.monotonic() + deadline_s
-    while time.monotonic() < end:
-        value = condition()
-        if value:
-            return value
-        time.sleep(0.002)
-    raise AssertionError(f"not within {deadline_s} s: {what}")
 
 
 class Bench:
     """A relay's session and one for everybody else, which keeps what it hears by key."""
 
-    def __init__(self) -> None:
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-        self.relay = zenoh.open(zenoh.Config.from_json5(data_config(listen=(endpoint,), connect=())))
-        self.outside = zenoh.open(zenoh.Config.from_json5(worker_config(connect=(endpoint,))))
+    def __init__(self, relay: zenoh.Session, outside: zenoh.Session) -> None:
+        self.relay, self.outside = relay, outside
         self.heard: dict[str, list[bytes]] = {}
         self.streams: list[InputStream | OutputStream] = []
 
@@ -61,16 +46,13 @@ class Bench:
     def close(self) -> None:
         for stream in self.streams:
             stream.close()
-        self.outside.close()
-        self.relay.close()
 
 
 @pytest.fixture
 def bench() -> Iterator[Bench]:
-    made = Bench()
-    try:
+    with hub_and_neighbour() as (relay, outside):
+        made = Bench(relay, outside)
         yield made
-    finally:
         made.close()
 
 

@@ -8,15 +8,9 @@ from collections.abc import Callable
 
 import pytest
 
+from support.waiting import until
 from zsched import send_queue
 from zsched.send_queue import SendQueue
-
-
-def until(condition: Callable[[], object], what: str, deadline_s: float = 3.0) -> None:
-    end = time.monotonic() + deadline_s
-    while not condition():
-        assert time.monotonic() < end, f"not within {deadline_s} s: {what}"
-        time.sleep(0.002)
 
 
 class Receiver:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,6 +11,7 @@ from typing import Any, cast
 
 import pytest
 
+from support.waiting import until
 from zsched import shell as shell_module
 from zsched.adapters.state_file import StateFile
 from zsched.adapters.worker_supervisor import WorkerContext, WorkerSupervisor
@@ -62,15 +62,6 @@ RESULT = CommandResult(outcome=CommandOutcome.OK, detail="done", revision=4)
 PLAN = RoutePlan(task="merge", phase=RoutePhase.CLOSE, current=None)
 ROLE = Role(task="merge", role=WorkerRole.IDLE)
 STATE = DurableState(fleet="f", node="robot1", incarnation=3, generation=0, hardware="", electorate="e")
-
-
-def until(condition: Callable[[], Any], what: str, deadline_s: float = 10.0) -> Any:
-    end = time.monotonic() + deadline_s
-    while time.monotonic() < end:
-        if value := condition():
-            return value
-        time.sleep(0.002)
-    raise AssertionError(f"not within {deadline_s} s: {what}")
 
 
 class Adapter:

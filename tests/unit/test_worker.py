@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import zenoh
 
+from support.waiting import free_endpoint, until
 from zsched import wire
 from zsched.clock import monotonic_s
 from zsched.core.plan import Role, WorkerRole
@@ -31,23 +31,11 @@ ROLE_KEY = KEYS.role("edge1", "t")
 INPUT = "edge1/t/robot1/in"
 
 
-def until(condition: Callable[[], Any], what: str, deadline_s: float = 5.0) -> Any:
-    end = time.monotonic() + deadline_s
-    while time.monotonic() < end:
-        value = condition()
-        if value:
-            return value
-        time.sleep(0.002)
-    raise AssertionError(f"not within {deadline_s} s: {what}")
-
-
 class Relay:
     """What a relay shows to one worker: its role, inputs with numbers, end markers; what it hears back."""
 
     def __init__(self) -> None:
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            self.endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        self.endpoint = free_endpoint()
         self.session = zenoh.open(zenoh.Config.from_json5(data_config(listen=(self.endpoint,), connect=())))
         self.role = Role(task="t", role=WorkerRole.IDLE)
         self.tokens: set[str] = set()
@@ -275,9 +263,7 @@ def test_a_signalled_worker_is_gone_within_a_second(tmp_path: Path, is_relay_sto
         "kept = session.liveliness().declare_subscriber('@zsched/**', seen, history=True)\n"
         "time.sleep(60)\n"
     )
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = free_endpoint()
     text = data_config(listen=(endpoint,), connect=())
     (tmp_path / "worker.json5").write_text(worker_config(connect=(endpoint,)))
     env = os.environ | {

@@ -2,33 +2,22 @@
 
 from __future__ import annotations
 
-import socket
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
 import zenoh
 
+from support.sessions import hub_and_neighbour, matches
+from support.waiting import until
 from zsched import wire, worker_keep
 from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks
 from zsched.keyspace import AGAIN_CHUNK, END_CHUNK, Keyspace
 from zsched.relay_pipe import decode_end
 from zsched.worker_keep import Keeper, KeptLane
-from zsched.zenoh_config import data_config, worker_config
 
 KEY = "edge1/t/1/out"
 KEYS = Keyspace("t")
-
-
-def until(condition: Callable[[], Any], what: str, deadline_s: float = 5.0) -> Any:
-    end = time.monotonic() + deadline_s
-    while time.monotonic() < end:
-        value = condition()
-        if value:
-            return value
-        time.sleep(0.002)
-    raise AssertionError(f"not within {deadline_s} s: {what}")
 
 
 class Robot:
@@ -83,11 +72,6 @@ class Bench:
         return Robot(self.outside, self.worker, node, relay)
 
 
-def matches(publisher: zenoh.Publisher) -> bool:
-    status: Any = publisher.matching_status
-    return bool(status.matching)
-
-
 def keep(lane: KeptLane, *numbers: int) -> None:
     for number in numbers:
         lane.keep(number, f"answer {number}".encode(), None, None, None, 10)
@@ -95,18 +79,10 @@ def keep(lane: KeptLane, *numbers: int) -> None:
 
 @pytest.fixture
 def bench() -> Iterator[Bench]:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-    outside = zenoh.open(zenoh.Config.from_json5(data_config(listen=(endpoint,), connect=(), shared_memory=False)))
-    worker = zenoh.open(zenoh.Config.from_json5(worker_config(connect=(endpoint,), shared_memory=False)))
-    made = Bench(worker, outside)
-    try:
+    with hub_and_neighbour() as (outside, worker):
+        made = Bench(worker, outside)
         yield made
-    finally:
         made.keeper.close()
-        worker.close()
-        outside.close()
 
 
 def test_what_every_robot_has_acknowledged_is_kept_no_more(bench: Bench) -> None:

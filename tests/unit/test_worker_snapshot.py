@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import queue
-import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -14,6 +13,7 @@ import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
+from support.waiting import free_endpoint
 from zsched.core.plan import Role, WorkerRole
 from zsched.core.relay_protocol import SnapshotChunk
 from zsched.relay_pipe import encode_chunk
@@ -73,9 +73,7 @@ def test_an_impossible_chunk_is_refused_before_anything_is_kept(index: int, coun
 
 @pytest.fixture(scope="module")
 def sessions() -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = free_endpoint()
     one = worker_config(connect=(), listen=(endpoint,), shared_memory=False)
     two = worker_config(connect=(endpoint,), shared_memory=False)
     with zenoh.open(zenoh.Config.from_json5(one)) as first, zenoh.open(zenoh.Config.from_json5(two)) as second:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, TypeVar
 
 import pytest
 import zenoh
 
+from support.waiting import free_port, until
 from zsched import wire
 from zsched.adapters import control_bus
 from zsched.adapters.control_bus import ControlBus, Questions
@@ -63,22 +63,6 @@ SNAPSHOT = Snapshot(
 )
 RESULT = CommandResult(outcome=CommandOutcome.OK, detail="done", revision=4)
 COMMAND = SetWeights(task="merge", cpu=1.0, memory=0.0, network=0.0)
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
-
-
-def until(condition: Callable[[], Any], what: str, deadline_s: float = 10.0) -> Any:
-    end = time.monotonic() + deadline_s
-    while time.monotonic() < end:
-        if value := condition():
-            return value
-        time.sleep(0.002)
-    raise AssertionError(f"not within {deadline_s} s: {what}")
 
 
 class Peer:

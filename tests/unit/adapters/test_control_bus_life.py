@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import signal
-import socket
 import subprocess
 import sys
 import textwrap
 import time
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import pytest
 
+from support.waiting import free_endpoint, until
 from zsched.adapters.control_bus import ControlBus
 from zsched.core import events as ev
 from zsched.core.fleet import Timing
@@ -44,22 +43,11 @@ CHILD = textwrap.dedent(
 )
 
 
-def until(condition: Callable[[], Any], what: str, deadline_s: float = 10.0) -> Any:
-    end = time.monotonic() + deadline_s
-    while time.monotonic() < end:
-        if value := condition():
-            return value
-        time.sleep(0.001)
-    raise AssertionError(f"not within {deadline_s} s: {what}")
-
-
 class Parent:
     """A bus in this process."""
 
     def __init__(self) -> None:
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            self.endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        self.endpoint = free_endpoint()
         self.events: list[ev.Event] = []
         self.bus = self.make()
 

@@ -8,13 +8,13 @@ import os
 import socket
 import stat
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from support.waiting import until
 from zsched.adapters import operator_socket
 from zsched.adapters.operator_socket import MAX_CONNECTIONS, MAX_LINE, OperatorSocket, ask
 from zsched.errors import AdapterError
@@ -26,15 +26,6 @@ def echo(request: Json) -> Json:
     if request["verb"] == "raise":
         raise RuntimeError("a bug")
     return {"heard": request}
-
-
-def until(condition: Callable[[], Any], what: str, deadline_s: float = 10.0) -> Any:
-    end = time.monotonic() + deadline_s
-    while time.monotonic() < end:
-        if value := condition():
-            return value
-        time.sleep(0.002)
-    raise AssertionError(f"not within {deadline_s} s: {what}")
 
 
 @pytest.fixture

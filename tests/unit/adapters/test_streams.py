@@ -7,12 +7,12 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
+from support.waiting import until
 from zsched.adapters import streams
 from zsched.adapters.streams import RelayHandle
 from zsched.core.events import RelayChanged
@@ -21,16 +21,6 @@ from zsched.core.relay_protocol import HandleReport
 from zsched.zenoh_config import data_config
 
 CONFIG = data_config(listen=("tcp/127.0.0.1:0",), connect=())
-
-
-def until(condition: Callable[[], Any], what: str, deadline_s: float = 10.0) -> Any:
-    end = time.monotonic() + deadline_s
-    while time.monotonic() < end:
-        value = condition()
-        if value:
-            return value
-        time.sleep(0.005)
-    raise AssertionError(f"not within {deadline_s} s: {what}")
 
 
 def is_there(pid: int) -> bool:

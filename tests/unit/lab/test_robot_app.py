@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import json
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -11,6 +10,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from support.waiting import free_port
 from zsched.lab.laser_log import LaserLog, load_log, malaga_path
 from zsched.lab.recorder import read_records
 from zsched.lab.robot_app import Drive, parse
@@ -64,9 +64,7 @@ def peer(port: int) -> zenoh.Session:
 
 
 def test_it_publishes_its_growing_map_and_counts_the_merged_ones(tmp_path: Path) -> None:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     command = [sys.executable, "-m", "zsched.lab.robot_app", "--robot", "robot1", "--index", "0", "--robots", "3"]
     command += ["--endpoint", f"tcp/127.0.0.1:{port}", "--records", str(tmp_path), "--replay-s", "1.5"]
     process = subprocess.Popen(command)

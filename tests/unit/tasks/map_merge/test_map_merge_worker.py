@@ -5,10 +5,8 @@ from __future__ import annotations
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -17,6 +15,8 @@ import numpy as np
 import pytest
 import zenoh
 
+from support.sessions import matches
+from support.waiting import free_endpoint, until
 from zsched.adapters.streams import RelayHandle
 from zsched.core.events import SlotFlipped, SlotReady
 from zsched.core.plan import (
@@ -38,23 +38,7 @@ from zsched.tasks.map_merge.grid import Grid
 from zsched.zenoh_config import data_config, worker_config
 
 _FLEET, _TASK, _ROBOT, _EDGE, _EPOCH = "test", "map_merge", "robot1", "edge1", 3
-_DEADLINE_S = 15.0
 View = Callable[[tuple[float, float, float, float], Pose2], Grid]
-
-
-def _until(condition: Callable[[], Any], what: str) -> Any:
-    end = time.monotonic() + _DEADLINE_S
-    while time.monotonic() < end:
-        if value := condition():
-            return value
-        time.sleep(0.01)
-    raise AssertionError(f"not within {_DEADLINE_S} s: {what}")
-
-
-def _free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def _route(name: str, direction: Direction, from_expr: str, to_expr: str) -> Route:
@@ -77,18 +61,21 @@ class _Rig:
 
     def __init__(self, folder: Path, *arguments: str) -> None:
         self.reports: list[HandleReport] = []
-        robot, edge = _free_endpoint(), _free_endpoint()
+        robot, edge = free_endpoint(), free_endpoint()
         self.relays = {
-            _ROBOT: self._relay(_ROBOT, data_config(listen=(robot,), connect=()), self.reports.append),
-            _EDGE: self._relay(_EDGE, data_config(listen=(edge,), connect=(robot,)), lambda _report: None),
+            _ROBOT: self._relay(_ROBOT, robot, (), self.reports.append),
+            _EDGE: self._relay(_EDGE, edge, (robot,), lambda _report: None),
         }
-        self.app = zenoh.open(zenoh.Config.from_json5(worker_config(connect=(robot,))))
+        self.app = zenoh.open(zenoh.Config.from_json5(worker_config(connect=(robot,), shared_memory=False)))
         config = folder / "worker.json5"
-        config.write_text(worker_config(connect=(edge,)))
+        config.write_text(worker_config(connect=(edge,), shared_memory=False))
         self.worker = self._start_worker(config, arguments)
 
     @staticmethod
-    def _relay(node: str, config: str, on_report: Callable[[HandleReport], None]) -> RelayHandle:
+    def _relay(
+        node: str, listen: str, connect: tuple[str, ...], on_report: Callable[[HandleReport], None]
+    ) -> RelayHandle:
+        config = data_config(listen=(listen,), connect=connect, shared_memory=False)
         handle = RelayHandle(fleet=_FLEET, node=node, zenoh_config=config, on_report=on_report)
         handle.start()
         return handle
@@ -112,7 +99,7 @@ class _Rig:
             self._await(report)
 
     def _await(self, kind: type[HandleReport]) -> None:
-        _until(lambda: any(isinstance(one, kind) for one in tuple(self.reports)), kind.__name__)
+        until(lambda: any(isinstance(one, kind) for one in tuple(self.reports)), kind.__name__)
 
     def stop(self) -> None:
         self.worker.kill()
@@ -143,19 +130,21 @@ def test_map_goes_in_and_merged_map_comes_out_at_the_robot(rig: _Rig, view: View
 
     watch = rig.app.declare_subscriber(f"{_ROBOT}/*", keep)
     grid = view((0.0, 0.0, 12.0, 16.0), Pose2(x=2.0, y=-1.0, yaw=0.4))
-    publisher = rig.app.declare_publisher(f"{_ROBOT}/map")
+    block = zenoh.CongestionControl.BLOCK
+    publisher = rig.app.declare_publisher(f"{_ROBOT}/map", congestion_control=block)
     rig.move_in()
+    until(lambda: matches(publisher), "the application sees the relay's subscription")
     publisher.put(encode_grid(grid))
-    payload, attachment = _until(lambda: seen.get(f"{_ROBOT}/global_map"), "a merged map at the robot")
+    payload, attachment = until(lambda: seen.get(f"{_ROBOT}/global_map"), "a merged map at the robot")
     merged = decode_grid(payload)
     assert np.count_nonzero(merged.occupied) > 0.7 * np.count_nonzero(grid.occupied)
     assert attachment is not None
     assert json.loads(attachment)["inputs"] == {"robot1": 7}
-    (transform,) = decode_transforms(_until(lambda: seen.get(f"{_ROBOT}/tf"), "transforms")[0])
+    (transform,) = decode_transforms(until(lambda: seen.get(f"{_ROBOT}/tf"), "transforms")[0])
     assert transform.child == "robot1/map"
     assert transform.pose.yaw == pytest.approx(0.4)
     publisher.put(b"no map at all")
-    _until(lambda: status()["robots"].get("robot1", {}).get("bad") == 1, "the bad map in the status")
+    until(lambda: status()["robots"].get("robot1", {}).get("bad") == 1, "the bad map in the status")
     assert status()["robots"]["robot1"]["state"] == "attached"
     watch.undeclare()
     rig.worker.send_signal(signal.SIGTERM)

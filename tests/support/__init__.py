@@ -1,0 +1,1 @@
+"""What tests of several modules share: waiting, sessions, registers. No test is in here."""

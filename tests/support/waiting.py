@@ -1,0 +1,39 @@
+"""Waits for conditions, and finds ports. Knows: deadlines. Does not know: what is waited for.
+
+A deadline costs nothing when the condition comes true, so it is generous: the machine may be busy with other things.
+"""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Callable
+from typing import Any
+
+DEADLINE_S = 20.0
+POLL_S = 0.003
+
+
+def until(condition: Callable[[], Any], what: str, deadline_s: float = DEADLINE_S) -> Any:
+    """The condition's first true value; `AssertionError` with ``what`` when there is none in time."""
+    end = time.monotonic() + deadline_s
+    while True:
+        value = condition()
+        if value:
+            return value
+        if time.monotonic() > end:
+            raise AssertionError(f"not within {deadline_s:g} s: {what}")
+        time.sleep(POLL_S)
+
+
+def free_port() -> int:
+    """A TCP port of 127.0.0.1 that was free a moment ago."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+def free_endpoint() -> str:
+    """A zenoh endpoint on loopback that was free a moment ago."""
+    return f"tcp/127.0.0.1:{free_port()}"
