@@ -22,6 +22,8 @@ def main() -> None:
     parser.add_argument("--seeds", choices=("train", "test"), default="test", help="which seeds (default test)")
     parser.add_argument("--candidates", default="3,10,50,200", help="sizes of fleets (default 3,10,50,200)")
     parser.add_argument("--parts", default="compare,options", help=f"some of {','.join(PARTS)}")
+    parser.add_argument("--only", default="", help="play these rules only (names, separated by ';')")
+    parser.add_argument("--cases", default="", help="play these kinds of histories only")
     parser.add_argument("--out", type=Path, default=Path("decisions"), help="folder of the results")
     parser.add_argument("--resume", action="store_true", help="go on from the results in the folder")
     given = parser.parse_args()
@@ -37,7 +39,9 @@ def main() -> None:
     seeds = study.TRAIN if given.seeds == "train" else study.TEST
     began_at = time.monotonic()
     for part in parts:
-        for line in study.play(made[part], given.hours, seeds, results):
+        cases = tuple(case for case in made[part] if not given.cases or case.name in given.cases.split(","))
+        only = frozenset(filter(None, given.only.split(";")))
+        for line in study.play(cases, given.hours, seeds, results, only):
             print(f"{time.monotonic() - began_at:7.0f} s  {line}", flush=True)
 
 

@@ -12,7 +12,7 @@ from random import Random
 from zsched.core.fleet import LinkLimits
 from zsched.core.model import Weights
 from zsched.lab.decisions.rules import Move, Rule
-from zsched.lab.decisions.view import START_S, Look, View
+from zsched.lab.decisions.view import START_S, Feed, Look, View
 from zsched.lab.decisions.world import DT_S, World, with_task
 
 TICKS = 2
@@ -33,18 +33,19 @@ class Entry:
 
 def replay(world: World, entries: tuple[Entry, ...], seed: int = 0) -> Mapping[str, list[Move]]:
     """{entry: its moves}, after one pass over the history."""
+    feeds = {look: Feed(world, look) for look in dict.fromkeys(entry.look for entry in entries)}
     views: dict[tuple[Look, Weights | None, LinkLimits | None], View] = {}
     rules: dict[str, Rule] = {}
     for entry in entries:
         key = (entry.look, entry.weights, entry.limits)
         if key not in views:
-            views[key] = View(with_task(world, weights=entry.weights, limits=entry.limits), entry.look)
+            views[key] = View(with_task(world, weights=entry.weights, limits=entry.limits), feeds[entry.look])
         rules[entry.name] = entry.make(views[key])
     rounds = _rounds(world, seed)
     for tick in range(world.steps * TICKS):
         if tick % TICKS == 0:
-            for view in views.values():
-                view.step(tick // TICKS)
+            for feed in feeds.values():
+                feed.step(tick // TICKS)
         at_s = tick * DT_S / TICKS
         now, seats = START_S + at_s, rounds[tick]
         for rule in rules.values():

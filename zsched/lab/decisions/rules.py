@@ -65,7 +65,7 @@ class CoreRule:
     _spec: TaskSpec = field(init=False)
 
     def __post_init__(self) -> None:
-        self._spec = self.view.fleet.tasks[0]
+        self._spec = self.view.spec
         self._judges = [self.make_judge(self._spec) for _ in self.view.fleet.voters]
         self._allocation = Allocation(task=self._spec.name, revision=0, epoch=0, owner=None, tuning=self.tuning)
 

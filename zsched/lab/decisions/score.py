@@ -64,6 +64,8 @@ class Figures:
     """Share of the time on a bad node while a good one was there."""
     mean_utility: float
     hours: float
+    reaction_s: float | None = None
+    """From the step to the move away from what got worse (histories with a step; ``None``: it did not move)."""
 
 
 def oracle(utility: Array, move_cost: float) -> tuple[float, int, list[int]]:
@@ -137,4 +139,13 @@ def figures(world: World, truth: Truth, moves: list[Move]) -> Figures:
         bad=float(was_bad.mean()),
         mean_utility=float(earned.mean()),
         hours=len(owner) * DT_S / 3600,
+        reaction_s=_reaction_s(world, moves),
     )
+
+
+def _reaction_s(world: World, moves: list[Move]) -> float | None:
+    step_at_s = world.step_at_s
+    if step_at_s is None:
+        return None
+    worse = world.candidates[0]
+    return next((move.at_s - step_at_s for move in moves if move.left == worse and move.at_s > step_at_s), None)

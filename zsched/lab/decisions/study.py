@@ -45,6 +45,10 @@ def _equal(seed: int, hours: float) -> World:
     return equal_world(seed=seed, hours=hours)
 
 
+def _step(seed: int, hours: float) -> World:
+    return equal_world(seed=seed, hours=hours, step_at_s=60.0)
+
+
 def compared(candidates: tuple[int, ...]) -> tuple[Case, ...]:
     """The schemes on every kind of history, and on fleets of every size."""
     kinds = (
@@ -55,6 +59,7 @@ def compared(candidates: tuple[int, ...]) -> tuple[Case, ...]:
         ("equal", _equal),
     )
     small = tuple(Case(name=name, build=build, cast=entries.schemes, hours=1.0) for name, build in kinds)
+    step = Case(name="step", build=_step, cast=entries.schemes, hours=0.025, share=0.25)
     large = tuple(
         Case(
             name=f"long-{count}",
@@ -66,7 +71,7 @@ def compared(candidates: tuple[int, ...]) -> tuple[Case, ...]:
         for count in candidates
         if count > 3
     )
-    return small + large
+    return (*small, step, *large)
 
 
 def swept() -> tuple[Case, ...]:
@@ -95,10 +100,13 @@ def options() -> tuple[Case, ...]:
     )
 
 
-def play(cases: tuple[Case, ...], hours: float, seeds: range, out: Path) -> Iterator[str]:
+def play(
+    cases: tuple[Case, ...], hours: float, seeds: range, out: Path, only: frozenset[str] = frozenset()
+) -> Iterator[str]:
     """Play every case for about ``hours``, one history per seed, and append each result to ``out``.
 
-    Histories that ``out`` holds already are not played again. Yields one line per history for people.
+    Histories that ``out`` holds already are not played again. Yields one line per history for people. ``only`` names
+    the rules that take part (none: all).
     """
     done = {(row["case"], row["seed"]) for row in read(out)}
     for case in cases:
@@ -108,7 +116,8 @@ def play(cases: tuple[Case, ...], hours: float, seeds: range, out: Path) -> Iter
                 continue
             world = case.build(seed, case.hours)
             truth = truth_of(world)
-            moves = replay(world, case.cast(world, seed), seed)
+            cast = tuple(entry for entry in case.cast(world, seed) if not only or entry.name in only)
+            moves = replay(world, cast, seed)
             rows = [
                 {"case": case.name, "seed": seed, "rule": name, **asdict(figures(world, truth, made))}
                 for name, made in moves.items()

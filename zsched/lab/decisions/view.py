@@ -44,24 +44,19 @@ class Look:
     """Time constant of the slope (with ``lead_s`` only)."""
 
 
-class View:
-    """One way to look at a history; `step` through it, `standing` whenever a robot judges."""
+class Feed:
+    """What reaches the robots of a history under one `Look`: every node's profiles, in one gateway."""
 
     def __init__(self, world: World, look: Look) -> None:
-        spec = world.spec
         smoothing_s = max(look.smoothing_s, 1e-9)
         self.fleet: Fleet = replace(world.fleet, timing=replace(world.fleet.timing, smoothing_s=smoothing_s))
         self._world, self._look = world, look
         self.gateway = Gateway(self.fleet)
-        self._states = dict.fromkeys((node.name for node in self.fleet.nodes), PeerState.ALIVE)
         self._profilers = {node.name: Profiler(node.name, 1, self.fleet.timing) for node in self.fleet.nodes}
         self._column = {name: index for index, name in enumerate(world.candidates)}
         self._row = {name: index for index, name in enumerate(self.fleet.voters)}
         self._slopes: dict[tuple[NodeId, NodeId | None], _Slope] = {}
         self._read = _Readings.of(world)
-        self._allocation = Allocation(task=spec.name, revision=0, epoch=0, owner=None, tuning=spec.tuning)
-        self._standing: Standing | None = None
-        self._version = -1
 
     def step(self, index: int) -> None:
         """Every node takes its reading of step ``index``; profiles that are due reach every robot."""
@@ -71,21 +66,6 @@ class View:
             profile = profiler.publishable({}, is_draining=False, now=now)
             if profile is not None:
                 self.gateway.absorb(self._ahead(profile, now), now)
-
-    def standing(self, now: float) -> Standing:
-        """The joint view of a gather now; computed anew only when a profile has come."""
-        if self._standing is None or self._version != self.gateway.version:
-            self._version = self.gateway.version
-            vectors = self.vectors(now)
-            self._standing = compare(self._world.spec, self._allocation, vectors)
-        return self._standing
-
-    def vectors(self, now: float) -> dict[NodeId, UtilityVector]:
-        """{robot: its utilities now}."""
-        spec = self._world.spec
-        return {
-            voter: score(spec, self._allocation, voter, self.gateway, self._states, now) for voter in self.fleet.voters
-        }
 
     def _device(self, name: NodeId, index: int) -> DeviceSample:
         column = self._column.get(name)
@@ -121,6 +101,34 @@ class View:
             ahead = slope.ahead(link.rssi_dbm, self._look.lead_s, now)
             links.append(link if ahead is None else replace(link, rssi_dbm=ahead))
         return replace(profile, links=tuple(links))
+
+
+class View:
+    """What the robots make of a feed, under one task's weights and limits."""
+
+    def __init__(self, world: World, feed: Feed) -> None:
+        self.fleet, self.gateway = feed.fleet, feed.gateway
+        self.spec = world.spec
+        self._states = dict.fromkeys((node.name for node in self.fleet.nodes), PeerState.ALIVE)
+        tuning = self.spec.tuning
+        self._allocation = Allocation(task=self.spec.name, revision=0, epoch=0, owner=None, tuning=tuning)
+        self._standing: Standing | None = None
+        self._version = -1
+
+    def standing(self, now: float) -> Standing:
+        """The joint view of a gather now; computed anew only when a profile has come."""
+        if self._standing is None or self._version != self.gateway.version:
+            self._version = self.gateway.version
+            vectors = self.vectors(now)
+            self._standing = compare(self.spec, self._allocation, vectors)
+        return self._standing
+
+    def vectors(self, now: float) -> dict[NodeId, UtilityVector]:
+        """{robot: its utilities now}."""
+        return {
+            voter: score(self.spec, self._allocation, voter, self.gateway, self._states, now)
+            for voter in self.fleet.voters
+        }
 
 
 def _dbm(value: float) -> float | None:

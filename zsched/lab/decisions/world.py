@@ -49,6 +49,8 @@ class World:
     memory_read: Array
     signal: Array | None = None
     signal_read: Array | None = None
+    step_at_s: float | None = None
+    """When the first candidate gets 30 % worse, if that is what the history is about."""
 
     @property
     def spec(self) -> TaskSpec:
@@ -180,6 +182,7 @@ def equal_world(*, seed: int, hours: float, half_width: float = 0.15, step_at_s:
         memory=use.copy(),
         cpu_read=_read(use, scatter, rng, is_cpu=True),
         memory_read=_read(use, scatter, rng, is_cpu=True),
+        step_at_s=step_at_s,
     )
 
 

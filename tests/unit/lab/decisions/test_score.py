@@ -11,7 +11,7 @@ import pytest
 from zsched.lab.decisions import loads
 from zsched.lab.decisions.rules import Move
 from zsched.lab.decisions.score import MOVE_COST_S, figures, oracle, truth_of, wasted_moves
-from zsched.lab.decisions.view import START_S, Look, View
+from zsched.lab.decisions.view import START_S, Feed, Look, View
 from zsched.lab.decisions.world import DT_S, World, bad, loaded_world, true_utility
 
 
@@ -26,9 +26,10 @@ def still(*, with_radio: bool) -> World:
 @pytest.mark.parametrize("with_radio", [False, True])
 def test_the_true_utility_is_what_the_robots_compute_from_perfect_readings(*, with_radio: bool) -> None:
     world = still(with_radio=with_radio)
-    view = View(world, Look())
+    feed = Feed(world, Look())
+    view = View(world, feed)
     for step in range(50):
-        view.step(step)
+        feed.step(step)
     standing = view.standing(START_S + 50 * DT_S)
     truth = true_utility(world)[50]
     for column, name in enumerate(world.candidates):
