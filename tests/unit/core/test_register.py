@@ -7,84 +7,30 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable
 from dataclasses import replace
 from random import Random
 
 import pytest
 
-from zsched.core.messages import Accept, Accepted, Prepare, Promise, Refusal, Refused
-from zsched.core.model import MAX_COUNTER, Acceptance, Allocation, Ballot, RegisterState, Tuning, Weights
-from zsched.core.register import BACKOFF_CAP_S, MAX_JUMP, MoveOwner, Register, RoundOutcome, Step
-
-ELECTORS = ("r1", "r2", "r3")
-TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
-INITIAL = Allocation(task="merge", revision=0, epoch=0, owner=None, tuning=TUNING)
-BLANK = RegisterState(task="merge")
-FIRST = MoveOwner(base_revision=0, owner="e1", reason="test")
-BALLOT_S, STAGGER_S = 0.3, 0.03
-
-
-def make(
-    me: str = "r1",
-    *,
-    state: RegisterState = BLANK,
-    incarnation: int = 1,
-    electorate: str = "abc",
-    is_elector: bool | None = None,
-    electors: tuple[str, ...] = ELECTORS,
-    kind: type[Register] = Register,
-) -> Register:
-    return kind(
-        me=me,
-        incarnation=incarnation,
-        electors=electors,
-        electorate=electorate,
-        is_elector=me in electors if is_elector is None else is_elector,
-        initial=INITIAL,
-        state=state,
-        ballot_s=BALLOT_S,
-        stagger_s=STAGGER_S,
-        rng=Random(1),
-    )
-
-
-def allocation(revision: int, owner: str = "e1") -> Allocation:
-    return replace(INITIAL, revision=revision, epoch=revision, owner=owner)
-
-
-def ballot(counter: int, node: str = "r9") -> Ballot:
-    return Ballot(counter=counter, node=node, incarnation=1)
-
-
-def prepare(counter: int, node: str = "r9", electorate: str = "abc") -> Prepare:
-    return Prepare(task="merge", ballot=ballot(counter, node), electorate=electorate)
-
-
-def accept(counter: int, value: Allocation, node: str = "r9", electorate: str = "abc") -> Accept:
-    return Accept(task="merge", acceptance=Acceptance(ballot=ballot(counter, node), value=value), electorate=electorate)
-
-
-def promise_all(proposer: Register, asked: Step, acceptors: Iterable[Register], now: float = 0.0) -> Step:
-    """Hand a prepare to acceptors and their answers back; the last step that wants something."""
-    assert asked.prepare is not None
-    return last(proposer.on_answer(acceptor.on_prepare(asked.prepare)[1], now) for acceptor in acceptors)
-
-
-def accept_all(proposer: Register, asked: Step, acceptors: Iterable[Register], now: float = 0.0) -> Step:
-    assert asked.accept is not None
-    return last(proposer.on_answer(acceptor.on_accept(asked.accept, now)[1], now) for acceptor in acceptors)
-
-
-def last(steps: Iterable[Step]) -> Step:
-    """The last step that is not empty (every one is taken, as the daemon would)."""
-    wanted = [step for step in steps if step != Step()]
-    return wanted[-1] if wanted else Step()
-
-
-def commit(proposer: Register, asked: Step, acceptors: list[Register], now: float = 0.0) -> Step:
-    return accept_all(proposer, promise_all(proposer, asked, acceptors, now), acceptors, now)
-
+from support.registers import (
+    BALLOT_S,
+    BLANK,
+    ELECTORS,
+    FIRST,
+    STAGGER_S,
+    accept,
+    accept_all,
+    allocation,
+    ballot,
+    commit,
+    last,
+    make,
+    prepare,
+    promise_all,
+)
+from zsched.core.messages import Accepted, Prepare, Promise, Refusal, Refused
+from zsched.core.model import MAX_COUNTER, Acceptance
+from zsched.core.register import BACKOFF_CAP_S, MAX_JUMP, Register, RoundOutcome, Step
 
 # --- acceptor --------------------------------------------------------------------------------------------------------
 

@@ -13,14 +13,13 @@ from random import Random
 
 import pytest
 
+from support.registers import BALLOT_S, INITIAL, TUNING
 from zsched.core.messages import Accept, Accepted, Prepare, Promise, Refused
-from zsched.core.model import Acceptance, Allocation, Ballot, RegisterState, Tuning, Weights
+from zsched.core.model import Acceptance, Allocation, Ballot, RegisterState
 from zsched.core.register import Change, MoveOwner, Register, Retune, RoundOutcome, Step
 from zsched.core.scoring import majority
 
-TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
-INITIAL = Allocation(task="merge", revision=0, epoch=0, owner=None, tuning=TUNING)
-BALLOT_S, FAULTS_END_S = 0.3, 3.0
+FAULTS_END_S = 3.0
 Message = Prepare | Accept | Promise | Accepted | Refused | Allocation
 
 
