@@ -5,6 +5,7 @@ Knows: options. Does not know: what is run (`zsched.lab.paper`); the lab is impo
 
 from __future__ import annotations
 
+from enum import StrEnum
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
@@ -15,6 +16,14 @@ from zsched.cli_common import EXIT_FAILED, EXIT_USAGE, CliError, Verb, Verbs
 
 NEEDS = ("cv2", "matplotlib", "mcap", "numpy", "onnxruntime", "rich")
 """What the extra ``lab`` installs."""
+
+
+class RobotsSee(StrEnum):
+    """A recorded laser log, or a known world that they explore in closed loop."""
+
+    LOG = "log"
+    EXPLORE = "explore"
+
 
 bench_app = typer.Typer(
     name="bench",
@@ -39,6 +48,7 @@ def paper(
     quick: Annotated[bool, typer.Option("--quick", help="Fixed, dyna_both and zsched once: under 6 minutes.")] = False,
     schemes: Annotated[str, typer.Option(metavar="A,B", help="Only these schemes. [the scenario's]")] = "",
     resume: Annotated[bool, typer.Option("--resume", help="Go on in the folder of --out.")] = False,
+    kind: Annotated[RobotsSee, typer.Option("--input", help="What the robots see.")] = RobotsSee.LOG,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the results.")] = Path("zsched-paper"),
     scenario: Annotated[Path | None, typer.Option(metavar="FILE", help="Scenario. [the paper's]")] = None,
     log: Annotated[Path | None, typer.Option(metavar="FILE", help="CARMEN laser log. [Malaga, shipped]")] = None,
@@ -56,6 +66,8 @@ def paper(
         raise CliError(
             EXIT_FAILED, f"the lab needs {', '.join(missing)}, not installed here; run `pip install 'zsched[lab]'`"
         )
+    if log is not None and kind is RobotsSee.EXPLORE:
+        raise CliError(EXIT_USAGE, "--log goes with --input log; leave one of them out")
     names = tuple(name.strip() for name in schemes.split(",") if name.strip())
     if schemes and not names:
         raise CliError(EXIT_USAGE, f"--schemes {schemes!r}: give names, e.g. --schemes dyna_both,zsched")
@@ -73,5 +85,6 @@ def paper(
         log=log,
         drives=drives,
         duration_s=duration,
+        is_exploring=kind is RobotsSee.EXPLORE,
     )
     raise typer.Exit(run_bench(options))

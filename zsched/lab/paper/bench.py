@@ -21,7 +21,7 @@ from zsched.lab.paper.matrix import Matrix, cells_of, collect
 from zsched.lab.paper.metrics import Truth, brief, measure
 from zsched.lab.paper.radio_bench import run_radio
 from zsched.lab.paper.report import report
-from zsched.lab.paper.robots import LogRobots
+from zsched.lab.paper.robots import ExploreRobots, LogRobots, Robots
 from zsched.lab.paper.run import Cell, CellRun, Inputs, write_json
 from zsched.lab.paper.scenario import Scenario, load_scenario
 from zsched.lab.paper.schemes import QUICK_SCHEMES
@@ -45,6 +45,7 @@ class BenchOptions:
     log: Path | None = None
     drives: Path | None = None
     duration_s: float | None = None
+    is_exploring: bool = False
 
 
 def run_bench(options: BenchOptions) -> int:
@@ -68,7 +69,7 @@ def run_bench(options: BenchOptions) -> int:
 
 def _run(options: BenchOptions) -> int:
     scenario, cells = planned(options)
-    robots = LogRobots(log=(options.log or malaga_path()).absolute())
+    robots = robots_of(options, scenario)
     inputs = Inputs(robots=robots, drives=options.drives)
     body = plan_body(scenario, inputs, cells)
     wrong = claim_folder(options, body)
@@ -86,8 +87,22 @@ def _run(options: BenchOptions) -> int:
 
     Matrix(scenario, make, figures_of, options.out, say).run(cells)
     wants_radio = not options.is_quick and not options.schemes
-    radio = run_radio(load_scenario(options.robots_scenario), inputs, options.out, say) if wants_radio else None
+    # A drive of minutes: the robots replay a log there, an exploration would be over before.
+    replay = Inputs(robots=LogRobots(log=log_path(options)), drives=options.drives)
+    radio = run_radio(load_scenario(options.robots_scenario), replay, options.out, say) if wants_radio else None
     return conclude(options, scenario, inputs, cells, radio)
+
+
+def robots_of(options: BenchOptions, scenario: Scenario) -> Robots:
+    """What the robots see."""
+    if options.is_exploring:
+        return ExploreRobots(world=scenario.explore.world, speed=scenario.explore.speed)
+    return LogRobots(log=log_path(options))
+
+
+def log_path(options: BenchOptions) -> Path:
+    """The log given, else the shipped one."""
+    return (options.log or malaga_path()).absolute()
 
 
 def planned(options: BenchOptions) -> tuple[Scenario, tuple[Cell, ...]]:
@@ -97,11 +112,14 @@ def planned(options: BenchOptions) -> tuple[Scenario, tuple[Cell, ...]]:
         ConfigError: the scenario is damaged, or a scheme unknown.
     """
     scenario = load_scenario(options.scenario)
+    if options.is_exploring:
+        loop = scenario.explore
+        scenario = replace(scenario, duration_s=loop.duration_s, target_coverage=loop.target_coverage)
     if options.is_quick:
-        quick = options.schemes or QUICK_SCHEMES
-        scenario = replace(
-            scenario, duration_s=QUICK_S, schemes=quick, runs=1, sweep=replace(scenario.sweep, schemes=())
-        )
+        names = options.schemes or QUICK_SCHEMES
+        scenario = replace(scenario, schemes=names, runs=1, sweep=replace(scenario.sweep, schemes=()))
+    if options.is_quick and not options.is_exploring:
+        scenario = replace(scenario, duration_s=QUICK_S)
     if options.duration_s is not None:
         scenario = replace(scenario, duration_s=options.duration_s)
     return scenario, cells_of(scenario, options.schemes, options.runs)
@@ -164,6 +182,7 @@ def command_of(options: BenchOptions) -> str:
     """The command that makes these results, without the places of this machine."""
     words = ["zsched bench paper"]
     words += ["--quick"] if options.is_quick else []
+    words += ["--input explore"] if options.is_exploring else []
     words += [f"--runs {options.runs}"] if options.runs is not None else []
     words += [f"--schemes {','.join(options.schemes)}"] if options.schemes else []
     words += [f"--duration {options.duration_s:g}"] if options.duration_s is not None else []

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Protocol
 
 from zsched.core.model import NodeId
+from zsched.lab.explore.worlds import load_world
 from zsched.lab.laser_log import load_log
 from zsched.lab.mapping import displacements, truth_grid
 from zsched.tasks.map_merge.geometry import Pose2
@@ -82,3 +83,38 @@ class LogRobots:
         command += ["--robots", str(place.robots), "--seed", str(place.seed), "--log", str(self.log)]
         command += ["--endpoint", place.endpoint, "--records", str(place.records)]
         return [*command, "--replay-s", f"{place.duration_s:.3f}"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExploreRobots:
+    """Robots with a simulated laser in a known world, who choose where to go on the merged map that they receive."""
+
+    world: str
+    """As `zsched.lab.explore.worlds.load_world` takes it."""
+    speed: float
+
+    @property
+    def name(self) -> str:
+        """The world's."""
+        return f"explore {Path(self.world).name}"
+
+    @property
+    def ends_when_covered(self) -> bool:
+        """A late map costs time."""
+        return True
+
+    def truth(self) -> Grid:
+        """What can be seen of the world."""
+        return load_world(self.world).truth()
+
+    def frames(self, robots: int, seed: int) -> tuple[Pose2, ...]:
+        """Where the robots start, side by side; the same for every seed."""
+        del seed
+        return load_world(self.world).starts(robots)
+
+    def command(self, place: Place) -> list[str]:
+        """`zsched.lab.explore.robot`."""
+        command = [sys.executable, "-m", "zsched.lab.explore.robot", "--robot", place.robot, "--world", self.world]
+        command += ["--index", str(place.index), "--robots", str(place.robots), "--seed", str(place.seed)]
+        command += ["--endpoint", place.endpoint, "--records", str(place.records), "--speed", f"{self.speed:g}"]
+        return [*command, "--target", f"{place.target_coverage:g}"]

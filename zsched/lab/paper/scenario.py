@@ -85,6 +85,21 @@ class Radio:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Exploration:
+    """The closed loop: ``world`` by its name, ``speed`` in m/s; the run ends at the target, or after ``duration_s``."""
+
+    world: str = "office:1"
+    speed: float = 1.0
+    duration_s: float = 50.0
+    target_coverage: float = 0.8
+
+    def __post_init__(self) -> None:
+        check_range("explore.speed", self.speed, 0.01, 5.0)
+        check_range("explore.duration_s", self.duration_s, 5.0, 600.0)
+        check_range("explore.target_coverage", self.target_coverage, 0.01, 1.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Sweep:
     """The strength of the injected load over all levels: these schemes, so many runs each."""
 
@@ -116,6 +131,7 @@ class Scenario:
     """Those of the matrix; none: all."""
     yardstick_runs: int = 3
     sweep: Sweep = Sweep()
+    explore: Exploration = Exploration()
     nodes: Mapping[NodeId, NodeShare] = field(default_factory=dict)
     load: LoadPlan = LoadPlan()
     links: Mapping[NodeId, Radio] = field(default_factory=dict)
@@ -166,8 +182,11 @@ def _scenario(path: Path, tree: dict[str, Any]) -> Scenario:
     nodes = {str(name): NodeShare(**spec) for name, spec in dict(tree.pop("nodes", {})).items()}
     links = {str(name): Radio(**spec) for name, spec in dict(tree.pop("links", {})).items()}
     load, sweep = LoadPlan(**_tuples(tree.pop("load", {}))), Sweep(**_tuples(tree.pop("sweep", {})))
+    explore = Exploration(**dict(tree.pop("explore", {})))
     known = {str(name): value for name, value in _tuples(tree).items()}
-    return Scenario(fleet=fleet, levels=levels, nodes=nodes, links=links, load=load, sweep=sweep, **known)
+    return Scenario(
+        fleet=fleet, levels=levels, nodes=nodes, links=links, load=load, sweep=sweep, explore=explore, **known
+    )
 
 
 def _tuples(tree: Any) -> dict[str, Any]:

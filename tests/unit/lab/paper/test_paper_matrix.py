@@ -145,6 +145,16 @@ def test_quick_is_the_fixed_schemes_one_of_the_paper_and_ours(tmp_path: Path) ->
     assert (scenario.duration_s + 25.0) * len(cells) < 6 * 60
 
 
+def test_exploring_robots_have_their_own_target_and_time(tmp_path: Path, scenario: Scenario) -> None:
+    explored, _ = planned(options(tmp_path, is_exploring=True))
+    quick, cells = planned(options(tmp_path, is_exploring=True, is_quick=True, duration_s=30.0))
+
+    loop = scenario.explore
+    assert (explored.duration_s, explored.target_coverage) == (loop.duration_s, loop.target_coverage)
+    assert (quick.duration_s, len(cells)) == (30.0, 5)
+    assert loop.duration_s + 10 <= 60
+
+
 def test_a_folder_goes_on_only_with_the_same_bench(tmp_path: Path) -> None:
     out = tmp_path / "out"
     given = options(out, is_quick=True)

@@ -2,8 +2,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from zsched.lab.explore.robot import parse as parse_explorer
 from zsched.lab.laser_log import malaga_path
-from zsched.lab.paper.robots import LogRobots, Place
+from zsched.lab.paper.robots import ExploreRobots, LogRobots, Place
 from zsched.lab.paper.run import Seen, is_calm, ready_workers
 from zsched.lab.recorder import Recorder
 from zsched.lab.robot_app import parse
@@ -33,6 +34,20 @@ def test_a_log_robots_command_is_one_that_its_program_takes(tmp_path: Path) -> N
     assert len(robots.frames(3, 7)) == 3
     assert robots.frames(3, 7) == robots.frames(3, 7) != robots.frames(3, 8)
     assert not robots.ends_when_covered
+
+
+def test_an_exploring_robots_command_is_one_that_its_program_takes(tmp_path: Path) -> None:
+    robots = ExploreRobots(world="turtlebot3", speed=0.4)
+
+    options = parse_explorer(robots.command(a_place(tmp_path))[3:])
+
+    assert options.settings.robot == "robot2"
+    assert options.settings.start == robots.frames(3, 7)[1]
+    assert (options.settings.limits.speed, options.target, options.endpoint) == (0.4, 0.8, "tcp/127.0.0.1:7458")
+    assert robots.name == "explore turtlebot3"
+    assert robots.ends_when_covered
+    assert robots.truth().known.any()
+    assert abs(robots.truth().resolution - 0.05) < 1e-9  # as the merged map's: coverage is taken cell on cell
 
 
 def test_the_task_is_over_when_every_robot_has_said_so(tmp_path: Path) -> None:
