@@ -142,9 +142,7 @@ class Agreement:
         due = self._settle_at
         for register in self.registers.values():
             due = min(due, register.next_deadline())
-        for _, deadline in self._parked.values():
-            due = min(due, deadline)
-        return due
+        return min(due, *(deadline for _, deadline in self._parked.values())) if self._parked else due
 
     def accepted(self) -> dict[TaskId, tuple[NodeId, int]]:
         """{task: (owner, epoch)} that this elector echoes: of the newest value that it has accepted or learnt.
@@ -238,6 +236,11 @@ class Agreement:
         register = self.registers[event.accept.task]
         return register.refuse(event.accept.acceptance.ballot, Refusal.LEASE)
 
+    @property
+    def has_parked(self) -> bool:
+        """Whether a question waits for an exclusive task's owner to leave."""
+        return bool(self._parked)
+
     def retry_parked(self, now: float) -> Effects:
         """A lease may have been released or run out, or a parked question may have waited long enough."""
         if not self._parked:
@@ -285,8 +288,11 @@ class Agreement:
 
     def _is_our_generation(self, node: NodeId, generation: int) -> bool:
         """Whether a node's learnt values mean anything here; the difference is shown."""
+        is_ours = self.generation is None or generation == self.generation
+        if is_ours and not self.problems:
+            return True  # thirty beats a second come by here
         source = f"generation/{node}"
-        if self.generation is None or generation == self.generation:
+        if is_ours:
             self.problems.pop(source, None)
             return True
         self.problems[source] = f"{node} is of generation {generation}, this node of {self.generation}: init them alike"
@@ -315,7 +321,8 @@ class Agreement:
         is_behind = False
         for task, revision, _ in beat.learnt:
             register = self.registers.get(task)
-            is_behind |= register is not None and revision > register.value.revision
+            if register is not None and revision > register.value.revision:
+                is_behind = True
         if not is_behind or now - self._asked_at.get(beat.node, -math.inf) < ASK_LEARNT_EVERY_S:
             return NOTHING
         self._asked_at[beat.node] = now

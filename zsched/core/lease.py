@@ -298,6 +298,11 @@ class Leases:
         holder = self._holders.get(task)
         return -math.inf if holder is None else holder.lease_until()
 
+    @property
+    def is_holding(self) -> bool:
+        """Whether this node owns an exclusive task."""
+        return bool(self._holders)
+
     def leaving(self) -> tuple[TaskId, ...]:
         """Tasks whose worker here is asked to stop and has not yet."""
         return tuple(task for task, holder in self._holders.items() if holder.is_leaving)

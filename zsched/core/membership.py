@@ -63,6 +63,7 @@ class Membership:
         self._deadline: float | None = None
         """`next_deadline`, until something changes it."""
         self._states = dict.fromkeys(sorted(nodes), PeerState.UNKNOWN) | {me: PeerState.ALIVE}
+        self._has_suspect = False
         self._has_watched = False
         """Whether this node has listened for as long as silence takes to mean something."""
 
@@ -129,7 +130,7 @@ class Membership:
             changes.append(self._change(beat.node, PeerState.ALIVE, "beats again" if restarted else "beats", now))
         elif restarted:
             changes.append(Transition(node=beat.node, before=before, after=before, reason="restarted"))
-        return (*changes, *self._review(now))
+        return (*changes, *self._review(now)) if self._has_suspect else tuple(changes)
 
     def _is_newer(self, peer: _Peer, beat: Beat, now: float) -> bool:
         """Newer than what we know; of a peer that is silent also an older life's count (its state was made anew)."""
@@ -215,6 +216,7 @@ class Membership:
         peer = self._peers[node]
         before, peer.state = peer.state, after
         self._states = {**self._states, node: after}  # a new one: whoever holds the old one sees one moment
+        self._has_suspect = PeerState.SUSPECT in self._states.values()
         self._deadline = None
         peer.suspect_since = now if after is PeerState.SUSPECT else math.inf
         peer.vouched_until = -math.inf

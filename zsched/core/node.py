@@ -45,7 +45,18 @@ from zsched.core.tenure import Tenure
 from zsched.core.workers import Workers, failed_workers
 
 HISTORY = 32
-_OFTEN_QUIET = frozenset({ev.BeatReceived, ev.ProfileReceived, ev.TokenSeen, ev.StreamsCounted, ev.FrameDropped})
+_OFTEN_QUIET = frozenset(
+    {
+        ev.BeatReceived,
+        ev.ProfileReceived,
+        ev.UtilityAsked,
+        ev.UtilityReceived,
+        ev.LearntAsked,
+        ev.TokenSeen,
+        ev.StreamsCounted,
+        ev.FrameDropped,
+    }
+)
 
 
 class Node:
@@ -135,20 +146,29 @@ class Node:
             event: what happened.
             now: monotonic seconds, never less than before.
         """
-        self._note_lag(now)
+        if now > self._promised:
+            self._note_lag(now - self._promised)
         self._handlers[type(event)](event, now)
         if type(event) in _OFTEN_QUIET and self._is_quiet(now):
-            return ()
+            return self._only_sent()
         return self._finish(now)
 
     def _is_quiet(self, now: float) -> bool:
-        """Whether the event left nothing to do before the deadline that was promised: nine beats in ten do.
+        """Whether the event left nothing but an answer before the deadline that was promised: nine in ten do.
 
         A later deadline is not worth computing then: waking up once too early costs less than thirty beats a second.
         """
         batch = self._batch
-        has_work = batch.is_dirty or batch.send or batch.apply or self._tenure.exclusive
-        return not has_work and now < min(self._promised, self._beat_at, self.rounds.next_deadline())
+        if batch.is_dirty or batch.apply or self._tenure.is_busy or self.agreement.has_parked:
+            return False
+        return now < self._promised and now < self._beat_at and now < self.rounds.next_deadline()
+
+    def _only_sent(self) -> tuple[do.Instruction, ...]:
+        """The batch of an event that changed nothing here."""
+        if not self._batch.send:
+            return ()
+        sent, self._batch.send = tuple(self._batch.send), []
+        return sent
 
     def next_deadline(self) -> float:
         """When to call `handle` with `DeadlineReached` if nothing happens before (monotonic seconds)."""
@@ -175,11 +195,9 @@ class Node:
             due = min(due, executor.next_deadline())
         return due
 
-    def _note_lag(self, now: float) -> None:
-        if now > self._promised:
-            lag_s = now - self._promised
-            self.loop_lag_s = max(self.loop_lag_s, lag_s)
-            self.membership.note_lag(lag_s)
+    def _note_lag(self, lag_s: float) -> None:
+        self.loop_lag_s = max(self.loop_lag_s, lag_s)
+        self.membership.note_lag(lag_s)
 
     def _advance(self, now: float) -> None:
         """Let every stage act on the time that has passed, in the data's order."""
@@ -244,7 +262,8 @@ class Node:
             self._on_transition(change, now)
         self._agree(self.agreement.compare(beat, now), now)
         self._agree(self.agreement.note_voter(beat), now)
-        self._set_problem(f"fleet/{beat.node}", self._identity.file_complaint(beat))
+        if beat.fleet_file != self.fleet_file or self.problems:
+            self._set_problem(f"fleet/{beat.node}", self._identity.file_complaint(beat))
         self._hear_leases(beat, now)
 
     def _on_own_name(self, beat: Beat, now: float) -> None:

@@ -176,6 +176,8 @@ class Rounds:
         if any(vector.voter != utilities.voter for vector in utilities.vectors):
             return False
         running.expected.remove(utilities.voter)
+        if not running.expected:
+            running.deadline = -math.inf  # nobody is waited for any more
         running.vectors[utilities.voter] = utilities.vectors
         return True
 

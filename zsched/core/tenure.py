@@ -38,6 +38,11 @@ class Tenure:
         self.exclusive = tuple(task.name for task in self.fleet.tasks if task.exclusive)
         self._local = tuple(task.name for task in self.fleet.tasks if task.on_isolation is OnIsolation.LOCAL)
 
+    @property
+    def is_busy(self) -> bool:
+        """Whether a worker here may have to be given a lease or stopped with any beat."""
+        return self.leases.is_holding
+
     def next_deadline(self, now: float) -> float:
         """When `tend` may have something to do."""
         alone = (at + ALONE_AFTER_S for name, at in self._alone_since.items() if not self.executors[name].is_local)

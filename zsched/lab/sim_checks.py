@@ -169,7 +169,8 @@ class Invariants:
         assert node is not None
         if node.next_deadline() < local:
             raise InvariantError(f"{machine.key}: next deadline {node.next_deadline():.6f} in the past of {local:.6f}")
-        if not _keeps_state(machine):
+        disk = machine.disk
+        if disk.state is None or disk.is_broken or not machine.is_durable:
             for register in node.registers.values():
                 self.on_learnt(machine, register.value, now)
 

@@ -67,8 +67,9 @@ class Loops:
         due = node.next_deadline()
         if not machine.clock.is_true:
             due = machine.clock.true(due)
-        due = max(due, self.now + TICK_S)
-        due = max(due, machine.busy_until)
+        if due >= machine.wake_at:
+            return
+        due = max(due, self.now + TICK_S, machine.busy_until)
         if due < machine.wake_at:
             machine.wake_at = due
             heapq.heappush(self._queue, (due, next(self._order), self._wake, (machine, machine.life, due)))

@@ -27,13 +27,10 @@ class Clock:
     """A machine's CLOCK_BOOTTIME against true time; it may run fast, slow or jump forward, never back."""
 
     rate: float = 1.0
+    is_true: bool = True
+    """Whether both are the same number (so that nothing is rounded)."""
     _true: float = 0.0
     _local: float = 0.0
-
-    @property
-    def is_true(self) -> bool:
-        """Whether both are the same number (so that nothing is rounded)."""
-        return self.rate == 1.0 and self._true == self._local
 
     def local(self, true: float) -> float:
         """What the machine reads at a true time."""
@@ -41,7 +38,7 @@ class Clock:
 
     def true(self, local: float) -> float:
         """When the machine reads ``local``, as things are now."""
-        if self.is_true or math.isinf(local):
+        if self.is_true or local == math.inf:
             return local
         return self._true + (local - self._local) / self.rate
 
@@ -49,6 +46,7 @@ class Clock:
         """From now on run at another rate, or a little later at once (``jump_s`` >= 0)."""
         self._local, self._true = self.local(true) + jump_s, true
         self.rate = self.rate if rate is None else rate
+        self.is_true = self.rate == 1.0 and self._true == self._local
 
 
 @dataclass(slots=True)

@@ -234,7 +234,7 @@ class Simulator(Loops):
         self.events += 1
         if self.events > self.most_events:
             raise InvariantError(f"{self.events} events until {self.now:.3f}: the fleet storms")
-        local = machine.clock.local(self.now)
+        local = self.now if machine.clock.is_true else machine.clock.local(self.now)
         try:
             batch = node.handle(event, local)
         except Exception as error:
