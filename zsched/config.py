@@ -94,6 +94,7 @@ def _fleet(section: Section, folder: Path, out: Collector) -> Fleet | None:
         electors=electors,
         seeds=seeds,
         zenoh_config=zenoh_config,
+        **{name: section.get(name) for name in ("relay_orphan_s", "shared_memory") if name in section.values},
     )
 
 

@@ -29,11 +29,13 @@ from zsched.config_blocks import (
 from zsched.config_ros2 import ros2_record
 from zsched.core.fleet import (
     Demand,
+    Fleet,
     LinkLimits,
     LocalMode,
     LocalSide,
     OnIsolation,
     Reach,
+    SharedMemory,
     Standby,
     TaskSpec,
     Timing,
@@ -332,7 +334,14 @@ FLEET: Final = Record(
             ),
             "Settings of zenoh itself.",
         ),
+        "relay_orphan_s": Field(
+            Number(0, 600, "s"), "How long a relay carries the streams on when its daemon is gone; 0: not at all."
+        ),
+        "shared_memory": Field(
+            Choice.of(SharedMemory), "Large payloads within a machine; `auto`: where the node finds it fit."
+        ),
     },
+    Fleet,
 )
 
 

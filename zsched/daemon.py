@@ -27,13 +27,13 @@ from zsched.adapters.device_profiler import DeviceProfiler
 from zsched.adapters.network_profiler import readers_for
 from zsched.adapters.operator_socket import OperatorSocket
 from zsched.adapters.state_file import StateFile
-from zsched.adapters.streams import RelayHandle
+from zsched.adapters.streams import SILENCE_S, Bequest, RelayHandle
 from zsched.adapters.systemd import Notifier, watchdog_interval_s
 from zsched.adapters.worker_supervisor import WorkerContext, WorkerSupervisor
 from zsched.clock import monotonic_s, wall_seconds
 from zsched.config import load_fleet
 from zsched.core import events as ev
-from zsched.core.fleet import NodeSpec, electorate_hash
+from zsched.core.fleet import NodeSpec, electorate_hash, fleet_hash
 from zsched.core.model import DurableState, NodeId, TaskId
 from zsched.core.node import Node
 from zsched.core.status import status_line
@@ -41,6 +41,7 @@ from zsched.core.workers import runs_worker
 from zsched.daemon_access import StreamAccess
 from zsched.daemon_endpoints import Endpoints, endpoints_for, free_port, has_all_addresses, is_here
 from zsched.errors import AdapterError, ConfigError
+from zsched.relay_door import Door
 from zsched.shell import Desk, Inbox, Shell
 
 EXIT_OK, EXIT_FAILED, EXIT_CONFIG = 0, 1, 78
@@ -51,6 +52,8 @@ LEAVE_S = 0.4
 still to come."""
 CLOSE_WORKERS_S = 0.7
 LOOP_MAX_WAIT_S = 1.0
+RESTART_SIGNAL = signal.SIGUSR2
+"""As SIGTERM, but the relay stays and carries the streams on for the daemon that follows (`systemctl restart`)."""
 
 log = logging.getLogger("zsched.daemon")
 
@@ -130,6 +133,8 @@ class Daemon:
         self._inbox = Inbox()
         self._notify = Notifier()
         self._next_status = 0.0
+        self._is_restart = False
+        self._door = Door(options.runtime_dir, options.node)
 
     def run(self) -> int:
         """Run until SIGTERM or SIGINT; the exit code."""
@@ -137,7 +142,7 @@ class Daemon:
         with state_file, contextlib.ExitStack() as stack:
             durable, problem = self._restore(state_file)
             incarnation = durable.incarnation if durable is not None else wall_seconds()
-            points = endpoints_for(self._fleet, self._spec, free_port, is_here)
+            points = endpoints_for(self._fleet, self._spec, self._data_port, is_here)
             self._handle_signals(stack)  # first: a stop that comes while things open is an orderly one, too
             shell = self._build(stack, state_file, incarnation, points)
             node = Node(
@@ -173,6 +178,12 @@ class Daemon:
             return None, str(error)
         return state, None
 
+    def _data_port(self) -> int:
+        """A port for the data session: that of the relay that may be taken over, else any that is free."""
+        note = self._door.note()
+        port = "" if note is None else note.listen.partition("#")[0].rpartition(":")[2]
+        return int(port) if port.isdigit() else free_port()
+
     def _build(self, stack: contextlib.ExitStack, state_file: StateFile, incarnation: int, points: Endpoints) -> Shell:
         """Open the adapters; each is closed by ``stack`` in the reverse order."""
         zenoh_log.capture(os.environ)
@@ -199,9 +210,28 @@ class Daemon:
         bus.open()
         stack.callback(bus.close)
         shell = Shell(node=me, inbox=self._inbox, bus=bus, state_file=state_file, desk=desk)
-        shell.relay = relay = RelayHandle(
+        shell.relay = relay = self._relay(shell, incarnation, points, operator_json5)
+        shell.supervisor = self._supervisor(stack, shell, incarnation, points, operator_json5)
+        relay.start()
+        stack.callback(lambda: relay.leave() if self._is_restart else relay.stop(1.0))
+        stack.callback(shell.supervisor.close, CLOSE_WORKERS_S)
+        sampler = Sampler(self._spec, fleet.timing.sample_s, shell, self._inbox)
+        sampler.start()
+        stack.callback(sampler.stop)
+        return shell
+
+    def _relay(self, shell: Shell, incarnation: int, points: Endpoints, operator_json5: str) -> RelayHandle:
+        fleet = self._fleet
+        bequest = Bequest(
+            door=self._door,
+            orphan_s=fleet.relay_orphan_s,
+            incarnation=incarnation,
+            digest=fleet_hash(fleet),
+            listen=points.data_listen[0],
+        )
+        return RelayHandle(
             fleet=fleet.name,
-            node=me,
+            node=self._spec.name,
             zenoh_config=zenoh_config.data_config(
                 listen=points.data_listen,
                 connect=points.data_connect,
@@ -213,15 +243,9 @@ class Daemon:
             on_report=shell.on_report,
             threads=zenoh_config.pool_threads(len(fleet.nodes)),
             local_config=zenoh_config.local_config(side, timing=fleet.timing) if (side := self._spec.local) else "",
+            silence_s=max(SILENCE_S, fleet.timing.zenoh_lease_s + 0.5),
+            bequest=bequest if fleet.relay_orphan_s > 0 else None,
         )
-        shell.supervisor = self._supervisor(stack, shell, incarnation, points, operator_json5)
-        relay.start()
-        stack.callback(relay.stop, 1.0)
-        stack.callback(shell.supervisor.close, CLOSE_WORKERS_S)
-        sampler = Sampler(self._spec, fleet.timing.sample_s, shell, self._inbox)
-        sampler.start()
-        stack.callback(sampler.stop)
-        return shell
 
     def _supervisor(
         self, stack: contextlib.ExitStack, shell: Shell, incarnation: int, points: Endpoints, operator_json5: str
@@ -258,10 +282,11 @@ class Daemon:
     # --- the loop ----------------------------------------------------------------------------------------------------
 
     def _handle_signals(self, stack: contextlib.ExitStack) -> None:
-        def stop(_number: int, _frame: object) -> None:
+        def stop(number: int, _frame: object) -> None:
+            self._is_restart = number == RESTART_SIGNAL
             self._inbox.post(ev.StopRequested())
 
-        for number in (signal.SIGTERM, signal.SIGINT):
+        for number in (signal.SIGTERM, signal.SIGINT, RESTART_SIGNAL):
             previous = signal.signal(number, stop)
             stack.callback(signal.signal, number, previous)
 

@@ -13,7 +13,7 @@ import struct
 from typing import Any, Final
 
 from zsched import wire
-from zsched.core import events, relay_protocol
+from zsched.core import events, relay_life, relay_protocol
 from zsched.core.plan import Role, RoutePlan
 from zsched.errors import WireError
 
@@ -24,6 +24,10 @@ _SMALL: Final = 8 * 1024
 _REGISTERED: Final[tuple[tuple[str, type, int], ...]] = (
     ("relay_stop", relay_protocol.RelayStop, _SMALL),
     ("relay_started", relay_protocol.RelayStarted, _SMALL),
+    ("relay_pulse", relay_life.RelayPulse, _SMALL),
+    ("relay_hello", relay_life.RelayHello, _SMALL),
+    ("relay_here", relay_life.RelayHere, _SMALL),
+    ("relay_refused", relay_life.RelayRefused, _SMALL),
     ("worker_seen", relay_protocol.WorkerSeen, _SMALL),
     ("end_marker", relay_protocol.EndMarker, 256),
     ("snapshot_chunk", relay_protocol.SnapshotChunk, 256),
@@ -42,6 +46,7 @@ for _kind, _cls, _bound in _REGISTERED:
 COMMANDS: Final[tuple[type[Any], ...]] = (RoutePlan, Role, relay_protocol.RelayStop)
 REPORTS: Final[tuple[type[Any], ...]] = (
     relay_protocol.RelayStarted,
+    relay_life.RelayPulse,
     relay_protocol.WorkerSeen,
     relay_protocol.SlotLost,
     events.SlotReady,

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
+import itertools
+import math
 import os
 import signal
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
-import psutil
 import pytest
 
 from zsched.core.model import NodeId
@@ -29,11 +30,9 @@ def bed(tmp_path: Path) -> Iterator[Testbed]:
 
 def relay_of(bed: Testbed, node: NodeId) -> int:
     """The process id of a node's relay."""
-    for child in psutil.Process(bed.pid(node)).children():
-        with contextlib.suppress(psutil.NoSuchProcess):  # it ended while we looked
-            if "zsched.relay" in child.cmdline():
-                return int(child.pid)
-    raise AssertionError(f"{node} has no relay")
+    pid = bed.relay_pid(node)
+    assert pid is not None, f"{node} has no relay"
+    return pid
 
 
 class Pinger:
@@ -91,14 +90,120 @@ def _is_replaced(bed: Testbed, node: NodeId, old: int) -> bool:
         return False
 
 
-def test_a_robots_daemon_that_restarts_takes_its_streams_up_again(bed: Testbed) -> None:
-    """Its relay dies with it: the streams of this one robot rest meanwhile; the others' task does not move."""
+class Talker:
+    """An application that asks for an echo every 5 ms all the time, in a thread of its own."""
+
+    def __init__(self, bed: Testbed) -> None:
+        session = bed.app("robot1")
+        self.sent: list[float] = []
+        self.back: dict[int, float] = {}
+        self._publisher = session.declare_publisher("robot1/in")
+        self._subscriber = session.declare_subscriber("robot1/out", self._take)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _take(self, sample: object) -> None:
+        number = int(sample.payload.to_bytes())  # type: ignore[attr-defined] # a zenoh sample
+        self.back.setdefault(number, time.monotonic())
+
+    def _run(self) -> None:
+        while not self._stop.wait(0.005):
+            self._publisher.put(str(len(self.sent)).encode())
+            self.sent.append(time.monotonic())
+
+    def stop(self) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def missing(self, since: float) -> list[int]:
+        """What was asked since then and has not been answered."""
+        return [number for number, at in enumerate(tuple(self.sent)) if at >= since and number not in self.back]
+
+    def longest_gap_s(self, since: float) -> float:
+        times = sorted(at for at in tuple(self.back.values()) if at >= since)
+        return max((after - before for before, after in itertools.pairwise(times)), default=math.inf)
+
+
+@pytest.fixture
+def reliable_bed(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Testbed]:
+    tree = echo_fleet(stream_class="reliable", task={"exclusive": request.param == "exclusive"})
+    with Testbed(tmp_path, tree) as testbed:
+        testbed.init()
+        testbed.start()
+        testbed.wait_settled()
+        yield testbed
+
+
+def end_daemon(bed: Testbed, node: NodeId, how: str) -> None:
+    if how == "crashed":
+        bed.kill(node, with_relay=False)
+    else:
+        bed.send(node, signal.SIGUSR2)
+        bed.wait(lambda: bed.has_ended(node), 5, "the daemon has ended")
+
+
+@pytest.mark.parametrize("reliable_bed", ["idempotent"], indirect=True)
+@pytest.mark.parametrize("how", ["crashed", "restarted"])
+def test_a_robots_streams_run_on_while_its_daemon_restarts(reliable_bed: Testbed, how: str) -> None:
+    """Nothing lost, no pause, the same relay; the daemon that follows takes it over and the task stays."""
+    bed = reliable_bed
+    owner, epoch, relay = bed.wait_settled(), bed.task("robot1")["epoch"], relay_of(bed, "robot1")
+    talker = Talker(bed)
+    try:
+        bed.wait(lambda: len(talker.back) > 20, 10, "echoes")
+        moment = time.monotonic()
+        end_daemon(bed, "robot1", how)
+        bed.start("robot1")
+        assert bed.wait_settled() == owner
+        bed.wait(lambda: time.monotonic() > moment + 2, 5, "a while")
+    finally:
+        talker.stop()
+    bed.wait(lambda: not talker.missing(moment), 5, "every answer")
+    gap_s = talker.longest_gap_s(moment)
+    print(f"\ndaemon {how}: longest gap {gap_s * 1000:.0f} ms, lost 0 of {len(talker.sent)}")
+    assert gap_s < 0.5
+    assert relay_of(bed, "robot1") == relay
+    assert bed.task("robot1")["epoch"] == epoch
+    assert "taken over" in bed.log("robot1")
+
+
+@pytest.mark.parametrize("reliable_bed", ["exclusive"], indirect=True)
+def test_an_exclusive_tasks_answers_wait_until_a_daemon_says_whose_count(reliable_bed: Testbed) -> None:
+    """Nobody here would hear of another owner: nothing passes the gate, and nothing is lost."""
+    bed = reliable_bed
     owner = bed.wait_settled()
-    pinger = Pinger(bed)
-    pinger.silence_after(time.monotonic(), 10)
-    moment = time.monotonic()
-    bed.kill("robot1")
-    bed.start("robot1")
-    silence_s = pinger.silence_after(moment, 20)
-    print(f"\ndaemon restarted: silence {silence_s:.2f} s")
-    assert bed.task("robot1")["owner"] == owner
+    talker = Talker(bed)
+    try:
+        bed.wait(lambda: len(talker.back) > 20, 10, "echoes")
+        moment = time.monotonic()
+        bed.kill("robot1", with_relay=False)
+        bed.wait(lambda: time.monotonic() > moment + 1, 5, "a while without a daemon")
+        alone = [at for at in tuple(talker.back.values()) if at > moment + 0.3]
+        assert not alone
+        bed.start("robot1")
+        assert bed.wait_settled() == owner
+    finally:
+        talker.stop()
+    bed.wait(lambda: not talker.missing(moment), 5, "every answer")
+
+
+@pytest.mark.parametrize("reliable_bed", ["idempotent"], indirect=True)
+def test_an_orphaned_relay_follows_a_move_once_its_next_daemon_knows(reliable_bed: Testbed) -> None:
+    """The task moves while the robot has no daemon: its streams go to the new owner as soon as it has one again."""
+    bed = reliable_bed
+    first = bed.wait_settled()
+    talker = Talker(bed)
+    try:
+        bed.wait(lambda: len(talker.back) > 20, 10, "echoes")
+        bed.kill("robot1", with_relay=False)
+        bed.kill(first)
+        bed.wait(lambda: bed.owner("robot2", "robot3") not in (None, first), 20, "another owner")
+        bed.start("robot1")
+        second = bed.wait_settled()
+        moment = time.monotonic()
+        bed.wait(lambda: any(at > moment for at in tuple(talker.back.values())), 10, "echoes of the new owner")
+    finally:
+        talker.stop()
+    assert second != first
+    bed.wait(lambda: not talker.missing(moment), 5, "every answer")

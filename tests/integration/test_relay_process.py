@@ -21,6 +21,7 @@ from zsched.core.plan import (
     Slot,
     StreamSettings,
 )
+from zsched.core.relay_life import RelayPulse
 from zsched.core.relay_protocol import RelayStarted, RelayStop
 from zsched.relay_pipe import REPORTS, read_frame, write_frame
 from zsched.zenoh_config import data_config
@@ -49,10 +50,17 @@ def begin(child: subprocess.Popen[bytes], config: str = CONFIG) -> tuple[int, in
     return child.stdin.fileno(), child.stdout.fileno()
 
 
-def next_report(descriptor: int) -> Any:
+def next_word(descriptor: int) -> Any:
     frame = read_frame(descriptor)
     assert frame is not None
     return wire.decode(frame, *REPORTS)
+
+
+def next_report(descriptor: int) -> Any:
+    """The next word that says more than that the relay lives."""
+    while isinstance(word := next_word(descriptor), RelayPulse):
+        pass
+    return word
 
 
 def test_it_says_that_it_started_and_counts_every_second(process: subprocess.Popen[bytes]) -> None:
@@ -63,6 +71,14 @@ def test_it_says_that_it_started_and_counts_every_second(process: subprocess.Pop
     assert isinstance(next_report(reports), StreamsCounted)
 
 
+def test_it_gives_a_sign_of_life_between_its_counts(process: subprocess.Popen[bytes]) -> None:
+    _, reports = begin(process)
+    words = [next_word(reports) for _ in range(5)]
+    ages = [word.counted_s for word in words if isinstance(word, RelayPulse)]
+    assert ages
+    assert all(age < 1.5 for age in ages)
+
+
 def test_it_ends_within_a_second_when_the_pipe_ends(process: subprocess.Popen[bytes]) -> None:
     _, reports = begin(process)
     next_report(reports)
@@ -71,15 +87,23 @@ def test_it_ends_within_a_second_when_the_pipe_ends(process: subprocess.Popen[by
     assert process.wait(1.0) == 0
 
 
-@pytest.mark.parametrize("how", ["stop", "sigterm"])
-def test_it_ends_within_a_second_when_told(process: subprocess.Popen[bytes], how: str) -> None:
+@pytest.mark.parametrize("is_asked_before", [False, True])
+def test_it_ends_within_a_second_when_told(process: subprocess.Popen[bytes], *, is_asked_before: bool) -> None:
     commands, reports = begin(process)
     next_report(reports)
-    if how == "stop":
-        write_frame(commands, wire.encode(RelayStop()))
-    else:
+    if is_asked_before:
         process.send_signal(signal.SIGTERM)
+    write_frame(commands, wire.encode(RelayStop()))
     assert process.wait(1.0) == 0
+
+
+def test_a_sigterm_leaves_the_daemon_time_for_its_own_orderly_stop(process: subprocess.Popen[bytes]) -> None:
+    """It reaches the whole process group, and the daemon needs its robot's streams while it hands its tasks over."""
+    _, reports = begin(process)
+    next_report(reports)
+    process.send_signal(signal.SIGTERM)
+    assert isinstance(next_report(reports), StreamsCounted)
+    assert process.wait(4.0) == 0
 
 
 def test_ctrl_c_on_the_terminal_is_the_daemons_business(process: subprocess.Popen[bytes]) -> None:

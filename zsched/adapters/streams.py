@@ -1,19 +1,18 @@
-"""The daemon's handle on the relay process: starts it, feeds it plans and roles, restarts it, hears its reports.
+"""The daemon's handle on the relay process: takes over the one that runs or starts one, feeds it, hears its reports.
 
-Knows: the process, its pipe, the newest plan and role of every task. Does not know: what a plan means, zenoh.
+Knows: the process, its pipe, the newest plan and role of every task, when a relay counts as wedged. Does not know: what
+a plan means, zenoh.
 
 Nothing here ever blocks the caller: commands wait in a table where the newest per task replaces the one before, and a
-thread writes them. A relay that dies, or gives no sign of life, is restarted with backoff and given the newest plans
-and roles again. It dies with the daemon: its stdin ends, and the kernel kills it with its parent.
+thread writes them. A relay that dies, or is wedged, is replaced and given the newest plans and roles again. With a
+`Bequest` it outlives this daemon for a while, and the next one takes it over, streams and all; else it dies with it.
 """
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import os
 import select
-import subprocess
 import sys
 import threading
 from collections.abc import Callable
@@ -21,21 +20,30 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from zsched import wire
+from zsched.adapters.relay_child import RelayChild, is_idle, start_relay
 from zsched.clock import monotonic_s
 from zsched.core.events import ProblemReported, RelayChanged
 from zsched.core.model import NodeId
 from zsched.core.plan import Role, RoutePlan
+from zsched.core.relay_life import RelayHello, RelayPulse
 from zsched.core.relay_protocol import HandleReport, RelayStarted, RelayStop
-from zsched.errors import WireError
+from zsched.errors import AdapterError, WireError
+from zsched.relay_door import Door, digest_of
 from zsched.relay_pipe import REPORTS, read_frame, write_frame
 
 BACKOFF_MIN_S: Final = 0.1
 BACKOFF_MAX_S: Final = 5.0
 BACKOFF_FACTOR: Final = 2.0
-CALM_S: Final = 30.0
-"""A relay that lived so long starts again with the shortest backoff."""
-SILENCE_S: Final = 5.0
-"""A relay counts every second; after so long without a word it is wedged and killed."""
+CALM_S: Final = 10.0
+"""A relay that lived so long is replaced at once; one that did not waits for its backoff."""
+SILENCE_S: Final = 1.5
+"""A relay says something twice a second; after so long without a word it is wedged, unless it lacks a processor..."""
+STARVED_S: Final = 15.0
+"""...then it has so long, and so long to say its first word: killing it would only make the machine busier."""
+STILL_S: Final = 8.0
+"""Its streams are counted every second; after so long without a count they hang on something, though it lives."""
+LOOK_S: Final = 0.25
+EVICT_S: Final = 2.0
 
 _log = logging.getLogger("zsched.streams")
 
@@ -71,6 +79,21 @@ class _Outbox:
             return self.items.pop(next(iter(self.items)))
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bequest:
+    """How a relay passes from this daemon to the next one."""
+
+    door: Door
+    orphan_s: float
+    """The relay goes on without a daemon for so long."""
+    incarnation: int
+    """This daemon's; only a later one may take the relay over."""
+    digest: str
+    """Over everything beside the sessions that a running relay must agree with (`digest_of`)."""
+    listen: str = ""
+    """Where the data session listens, for the next daemon."""
+
+
 class RelayHandle:
     """One node's relay process. ``on_report`` is called from this handle's thread and must only enqueue."""
 
@@ -84,31 +107,43 @@ class RelayHandle:
         threads: int = 6,
         python: str = sys.executable,
         local_config: str = "",
+        silence_s: float = SILENCE_S,
+        bequest: Bequest | None = None,
     ) -> None:
         """``zenoh_config`` is the JSON of the data session, ``threads`` the size of zenoh's pools (targets + 2).
 
-        ``local_config`` is the session of the host's own side; empty: the data session serves the host, too.
+        ``local_config`` is the session of the host's own side; empty: the data session serves the host, too. Without
+        ``bequest`` the relay dies with this process. ``silence_s`` should be over zenoh's lease: a call of zenoh that
+        waits for a frozen peer may hold Python's lock so long.
         """
         self._configs = tuple(text.encode() for text in (zenoh_config, local_config) if text)
         self._on_report = on_report
+        self._silence_s = min(silence_s, STARVED_S)
+        self._bequest = bequest
         self._command = [python, "-m", "zsched.relay", "--fleet", fleet, "--node", node]
         self._command += ["--threads", str(threads), "--parent", str(os.getpid())]
         self._command += ["--local"] if local_config else []
+        if bequest is not None:
+            digest = digest_of(bequest.digest, python, str(threads), zenoh_config, local_config)
+            self._hello = RelayHello(fleet=fleet, node=node, incarnation=bequest.incarnation, digest=digest)
+            self._command += ["--orphan", str(bequest.orphan_s), "--digest", digest]
+            self._command += ["--incarnation", str(bequest.incarnation)]
         self._lock = threading.Lock()
         self._newest: dict[_Key, RoutePlan | Role] = {}
         self._outbox = _Outbox()
-        self._process: subprocess.Popen[bytes] | None = None
+        self._relay: RelayChild | None = None
         self._stopping = threading.Event()
+        self._is_leaving = False
         self._thread = threading.Thread(target=self._supervise, name="relay", daemon=True)
 
     @property
     def pid(self) -> int | None:
         """The relay's process id, ``None`` while none runs."""
-        process = self._process
-        return process.pid if process is not None and process.poll() is None else None
+        relay = self._relay
+        return relay.pid if relay is not None and not relay.has_ended() else None
 
     def start(self) -> None:
-        """Start the relay; `RelayChanged` tells when its session is open."""
+        """Take over or start the relay; `RelayChanged` tells when it obeys."""
         self._thread.start()
 
     def apply(self, plan: RoutePlan) -> None:
@@ -123,15 +158,28 @@ class RelayHandle:
         """Stop the relay in order, with SIGKILL at the deadline; returns when it is gone."""
         until = monotonic_s() + deadline_s
         self._stopping.set()
-        process = self._process
-        if process is not None:
+        relay = self._relay
+        if relay is not None:
             self._outbox.close()
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(max(0.0, until - monotonic_s()))
-            if process.poll() is None:
-                process.kill()
+            if not relay.wait(max(0.0, until - monotonic_s())):
+                relay.kill()
         if self._thread.is_alive():
             self._thread.join(max(0.5, until - monotonic_s()))
+        if self._bequest is not None and self._bequest.door.note() is None:
+            self._bequest.door.remove()
+
+    def leave(self) -> None:
+        """Let go of the relay, which carries on for this node's next daemon; without a `Bequest` it is stopped."""
+        if self._bequest is None:
+            self.stop()
+            return
+        self._is_leaving = True
+        self._stopping.set()
+        if (relay := self._relay) is not None:
+            relay.hang_up()
+        self._outbox.close()
+        if self._thread.is_alive():
+            self._thread.join(1.0)
 
     # --- internals ---------------------------------------------------------------------------------------------------
 
@@ -142,69 +190,100 @@ class RelayHandle:
 
     def _supervise(self) -> None:
         """One process after the other; this thread is their parent (PDEATHSIG counts threads) and lives on."""
-        backoff = BACKOFF_MIN_S
-        while not self._stopping.is_set():
+        backoff = 0.0
+        found = self._take_over()
+        while found is not None or not self._stopping.is_set():
             started_at = monotonic_s()
-            reason = self._run_once()
+            reason = self._run_once(found)
+            found = None
             if self._stopping.is_set():
                 return
-            if monotonic_s() - started_at > CALM_S:
-                backoff = BACKOFF_MIN_S
+            backoff = 0.0 if monotonic_s() - started_at > CALM_S else backoff
             _log.warning("the relay is gone (%s), next one in %.1f s", reason, backoff)
             self._on_report(RelayChanged(is_running=False, reason=reason))
             self._stopping.wait(backoff)
-            backoff = min(backoff * BACKOFF_FACTOR, BACKOFF_MAX_S)
+            backoff = min(max(BACKOFF_MIN_S, backoff * BACKOFF_FACTOR), BACKOFF_MAX_S)
 
-    def _run_once(self) -> str:
-        """Run one relay to its end; answers why it ended."""
+    def _take_over(self) -> RelayChild | None:
+        """The relay that an earlier daemon left; one that is not for us is ended, for there must be one only."""
+        bequest = self._bequest
+        note = None if bequest is None else bequest.door.note()
+        if bequest is None or note is None:
+            return None
+        found = bequest.door.connect(self._hello)
+        if isinstance(found, str):
+            _log.warning("the relay that runs here (pid %d) is replaced: %s", note.pid, found)
+            RelayChild(pid=note.pid, link=None, door=bequest.door).end(EVICT_S)
+            return None
+        link, here = found
+        _log.info("the relay that runs here (pid %d) is taken over", here.pid)
+        return RelayChild(pid=here.pid, link=link, door=bequest.door)
+
+    def _run_once(self, found: RelayChild | None) -> str:
+        """Serve one relay to its end; answers why it ended."""
         try:
-            process = subprocess.Popen(self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0)
-        except OSError as error:
+            relay = found or self._start()
+        except (OSError, AdapterError) as error:
             return f"cannot start {self._command[0]}: {error}"
-        assert process.stdin is not None
-        assert process.stdout is not None
         with self._lock:
             outbox = self._outbox = _Outbox(items=dict(self._newest))
-            self._process = process
+            self._relay = relay
+        if self._is_leaving:
+            relay.hang_up()
         if self._stopping.is_set():
             outbox.close()
-        writer = threading.Thread(target=self._write, args=(process.stdin.fileno(), outbox), daemon=True)
+        writer = threading.Thread(target=self._write, args=(relay, outbox), daemon=True)
         writer.start()
-        reason = self._listen(process.stdout.fileno())
-        process.kill()
-        code = process.wait()
+        reason = self._listen(relay)
+        if not self._is_leaving:
+            relay.kill()
         outbox.close()
         writer.join()
-        process.stdin.close()
-        process.stdout.close()
-        return reason or f"exit code {code}"
+        relay.close()
+        return reason or relay.ending
 
-    def _write(self, descriptor: int, outbox: _Outbox) -> None:
+    def _start(self) -> RelayChild:
+        if self._bequest is None:
+            return start_relay(self._command)
+        return start_relay(self._command, self._bequest.door, self._bequest.listen)
+
+    def _write(self, relay: RelayChild, outbox: _Outbox) -> None:
         try:
-            for text in self._configs:
-                write_frame(descriptor, text)
+            for text in self._configs if relay.is_child else ():
+                write_frame(relay.descriptor, text)
             while (value := outbox.take()) is not None:
-                write_frame(descriptor, wire.encode(value))
-            write_frame(descriptor, wire.encode(RelayStop()))
+                write_frame(relay.descriptor, wire.encode(value))
+            write_frame(relay.descriptor, wire.encode(RelayStop()))
         except OSError:
             return  # it is gone: the reader says so
         except WireError as error:
             self._on_report(ProblemReported(source="relay", problem=f"a plan is too large: {error}"[:400]))
 
-    def _listen(self, descriptor: int) -> str:
+    def _listen(self, relay: RelayChild) -> str:
         """Hand on reports until the pipe ends; answers what was wrong, or ``""``."""
         poller = select.poll()
-        poller.register(descriptor, select.POLLIN)
+        poller.register(relay.descriptor, select.POLLIN)
+        heard_at, patience_s = monotonic_s(), STARVED_S
         while True:
-            if not poller.poll(SILENCE_S * 1000):
-                return f"no sign of life for {SILENCE_S:g} s"
+            silent_s = monotonic_s() - heard_at
+            if not poller.poll(max(LOOK_S, patience_s - silent_s) * 1000):
+                silent_s = monotonic_s() - heard_at
+                if silent_s >= STARVED_S or (silent_s >= patience_s and is_idle(relay.pid)):
+                    return f"no sign of life for {silent_s:.1f} s"
+                continue
             try:
-                frame = read_frame(descriptor)
+                frame = read_frame(relay.descriptor)
                 if frame is None:
                     return ""
-                report: HandleReport = wire.decode(frame, *REPORTS)
-            except WireError as error:
+                report: HandleReport | RelayPulse = wire.decode(frame, *REPORTS)
+            except (WireError, OSError) as error:
                 return f"unreadable report: {error}"
+            heard_at = monotonic_s()
+            if isinstance(report, RelayPulse):
+                if report.counted_s > STILL_S:
+                    return f"its streams stand still for {report.counted_s:.1f} s"
+                continue
             if isinstance(report, RelayStarted):
+                patience_s = self._silence_s
                 self._on_report(RelayChanged(is_running=True, reason=f"pid {report.pid}"))
             self._on_report(report)

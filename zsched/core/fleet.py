@@ -196,6 +196,13 @@ class Timing:
     """Exclusive tasks: how long an owner may work on the echoes of one beat."""
 
 
+class SharedMemory(StrEnum):
+    """Whether large payloads may pass between processes of one machine through shared memory."""
+
+    OFF = "off"
+    AUTO = "auto"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fleet:
     """The whole fleet file, validated and with every name resolved."""
@@ -211,6 +218,10 @@ class Fleet:
     seeds: tuple[NodeId, ...] = ()
     zenoh_config: str = ""
     """Path of a zenoh JSON5 file, passed through untouched; empty: none."""
+    relay_orphan_s: float = 10.0
+    """A relay carries on for so long when its daemon is gone, and the next daemon takes it over; 0: it ends with it."""
+    shared_memory: SharedMemory = SharedMemory.OFF
+    """``auto``: where the node finds /dev/shm fit for it."""
 
     @property
     def voters(self) -> tuple[NodeId, ...]:

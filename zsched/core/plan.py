@@ -129,6 +129,8 @@ class RoutePlan:
     phase: RoutePhase
     current: Slot | None
     predecessor: Slot | None = None
+    exclusive: bool = False
+    """What the owner puts out must not pass while nobody here would hear of another owner."""
 
 
 class WorkerRole(StrEnum):

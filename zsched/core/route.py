@@ -28,4 +28,5 @@ def plan_for(spec: TaskSpec, phase: RoutePhase, current: Slot, predecessor: Slot
         phase=phase,
         current=current,
         predecessor=None if phase is RoutePhase.CLOSE else predecessor,
+        exclusive=spec.exclusive,
     )

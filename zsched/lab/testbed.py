@@ -2,12 +2,13 @@
 
 Knows: fleet files with free ports, daemon processes, signals, waiting for a condition. Does not know: what is tested.
 
-Everything that was started is gone when the context ends, whatever happened inside; workers and relays die with their
-daemons.
+Everything that was started is gone when the context ends, whatever happened inside. Workers die with their daemons; a
+relay outlives one that crashed, so `Testbed.kill` ends it, too, unless it is told otherwise.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -29,6 +30,7 @@ from zsched.core.model import NodeId
 from zsched.errors import AdapterError, ZschedError
 from zsched.lab.fleet_runner import free_ports
 from zsched.lifecycle import init_state
+from zsched.relay_door import Door
 
 DAEMON = (sys.executable, "-m", "zsched.daemon")
 ECHO = ("python", "-m", "zsched.tasks.echo")
@@ -130,10 +132,32 @@ class Testbed:
         """Send a signal to one daemon (not to its relay or workers)."""
         self._processes[node].send_signal(number)
 
-    def kill(self, node: NodeId) -> None:
-        """SIGKILL one daemon and reap it; its relay and workers die with it."""
+    def kill(self, node: NodeId, *, with_relay: bool = True) -> None:
+        """SIGKILL one daemon and reap it; its workers die with it, and its relay unless only the daemon crashes."""
+        relay = self.relay_pid(node) if with_relay else None
         self.send(node, signal.SIGKILL)
         self._processes.pop(node).wait(10)
+        if relay is not None:
+            self._end_relay(node, relay)
+
+    def has_ended(self, node: NodeId) -> bool:
+        """Whether a daemon that was told to stop has ended; it is forgotten then."""
+        if self._processes[node].poll() is None:
+            return False
+        del self._processes[node]
+        return True
+
+    def relay_pid(self, node: NodeId) -> int | None:
+        """The process id of a node's relay, whoever started it."""
+        note = Door(self.folder, node).note()
+        return None if note is None or note.pid == 0 else note.pid
+
+    def _end_relay(self, node: NodeId, pid: int) -> None:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+        deadline = time.monotonic() + 5.0
+        while self.relay_pid(node) == pid and time.monotonic() < deadline:
+            time.sleep(POLL_S)
 
     def stop(self, *nodes: NodeId, within_s: float = 5.0) -> dict[NodeId, tuple[int, float]]:
         """SIGTERM daemons (default: all that run) and wait; {node: (exit code, seconds)}."""
@@ -239,3 +263,6 @@ class Testbed:
             session.close()
         if self._processes:
             self.stop()
+        for node in self.names:
+            if (relay := self.relay_pid(node)) is not None:
+                self._end_relay(node, relay)

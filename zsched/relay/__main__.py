@@ -4,6 +4,8 @@ Knows: the command line, signals, the parent's death. Does not know: streams.
 
 ``python -m zsched.relay --fleet F --node N [--threads T] [--parent PID] [--local]``; the first frame on stdin is
 the zenoh session as JSON (with ``--local`` the second one is that of the host's own side). Logs go to stderr.
+With ``--door FD --orphan S`` it outlives its daemon for S seconds and obeys the next one that comes through the door;
+without, it dies with its parent.
 """
 
 from __future__ import annotations
@@ -16,17 +18,23 @@ import os
 import signal
 import sys
 
+from zsched.core.relay_life import RelayHello
+
 PR_SET_PDEATHSIG = 1
 DEFAULT_THREADS = 6
+STOP_S = 2.0
+"""A daemon that stops hands its tasks over first, and its robot's streams must run until then."""
 
 
 def main() -> None:
     """Run the relay; never returns (threads of zenoh must not be waited for at exit)."""
     arguments = _arguments()
     logging.basicConfig(stream=sys.stderr, level=arguments.log_level, format="%(name)s %(levelname)s %(message)s")
-    _die_with(arguments.parent)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the daemon stops us in order
-    signal.signal(signal.SIGTERM, _stop)
+    if arguments.door is None:
+        _die_with(arguments.parent)
+    # Both may reach the whole group: the daemon needs us for its own orderly stop, and ends us with it.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, _stop_soon)
     faulthandler.register(signal.SIGUSR1)  # where every thread stands, for whoever has to ask
     # One stalled target holds one transmit thread: there must be more threads than targets may stall. Read once, when
     # zenoh's runtime starts.
@@ -37,7 +45,10 @@ def main() -> None:
         from zsched.relay.process import run  # noqa: PLC0415 - imports zenoh, which must find ZENOH_RUNTIME set
 
         pipes = (sys.stdin.fileno(), sys.stdout.fileno())
-        code = run(arguments.fleet, arguments.node, *pipes, has_local_side=arguments.local)
+        me = RelayHello(
+            fleet=arguments.fleet, node=arguments.node, incarnation=arguments.incarnation, digest=arguments.digest
+        )
+        code = run(me, *pipes, has_local_side=arguments.local, door=arguments.door, orphan_s=arguments.orphan)
     except SystemExit:
         code = 0
     except BaseException:
@@ -54,6 +65,10 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--threads", type=int, default=DEFAULT_THREADS, help="transmit and receive threads, each")
     parser.add_argument("--parent", type=int, default=0, help="process id that must be our parent")
     parser.add_argument("--local", action="store_true", help="a second frame holds the session of the host's own side")
+    parser.add_argument("--door", type=int, help="listening socket (inherited) for the daemon's successors")
+    parser.add_argument("--orphan", type=float, default=0.0, help="seconds to go on without a daemon (with --door)")
+    parser.add_argument("--incarnation", type=int, default=0, help="of the daemon that starts us")
+    parser.add_argument("--digest", default="", help="what the next daemon must have been started with")
     parser.add_argument("--log-level", default="WARNING")
     return parser.parse_args()
 
@@ -65,6 +80,12 @@ def _die_with(parent: int) -> None:
     ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     if parent and os.getppid() != parent:  # it died before we asked
         os._exit(0)
+
+
+def _stop_soon(_signal: int, _frame: object) -> None:
+    """End when the daemon says so, as it will if it was told the same, or a little later."""
+    signal.signal(signal.SIGALRM, _stop)
+    signal.setitimer(signal.ITIMER_REAL, STOP_S)
 
 
 def _stop(_signal: int, _frame: object) -> None:

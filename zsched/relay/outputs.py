@@ -125,6 +125,7 @@ class OutputStream:
         self._carrier: _OutputSlot | None = None
         self._stamps: OrderedDict[str, Timestamp] = OrderedDict()  # newest that has passed, by the owner's relative key
         self._fence_until = 0.0
+        self._is_paused = False
         max_hz = route.settings.max_hz
         self._pace: Pace[Sample] | None = (
             None if max_hz is None else Pace(max_hz, remembers=route.settings.stream_class is StreamClass.LATEST)
@@ -200,6 +201,27 @@ class OutputStream:
             slot.is_flipped = True
             if self._carrier is None or (slot.held and self.route.settings.handover is HandoverRule.LATEST):
                 self._take_over(slot)
+
+    def pause(self) -> None:
+        """Let nothing through: it waits, bounded."""
+        with self._lock:
+            self._is_paused = True
+
+    def resume(self, epoch: int) -> None:
+        """End a pause; what came meanwhile goes on if ``epoch`` is still the newest, else it is dropped."""
+        with self._lock:
+            carrier = self._carrier
+            if not self._is_paused:
+                return
+            self._is_paused = False
+            if carrier is None:
+                self._promote()
+            elif carrier.epoch == epoch:
+                self._release(carrier)
+            else:
+                self._counter.dropped("stale_epoch", len(carrier.held))
+                carrier.held.clear()
+                carrier.held_bytes = 0
 
     def has_ended(self, epoch: int) -> bool:
         """True when everything of the slot has come (end markers), it was cut, or it is not there."""
@@ -311,7 +333,9 @@ class OutputStream:
         return number > last
 
     def _gate(self, slot: _OutputSlot, sample: Sample) -> None:
-        if slot is self._carrier:
+        if self._is_paused and not slot.is_closed:
+            self._hold(slot, sample)
+        elif slot is self._carrier:
             self._forward(sample)
         elif slot.is_closed:
             self._counter.dropped("stale_epoch")
@@ -339,6 +363,9 @@ class OutputStream:
         if self._carrier is not None or self._stamps:
             self._fence_until = monotonic_s() + FENCE_S
         self._carrier = slot
+        self._release(slot)
+
+    def _release(self, slot: _OutputSlot) -> None:
         while slot.held:
             self._forward(slot.held.popleft())
         slot.held_bytes = 0

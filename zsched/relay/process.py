@@ -1,7 +1,11 @@
 """The relay process: its session, its threads, its pipe to the daemon.
 
-Knows: how commands become tasks' plans and roles, how reports leave, how to end within a second. Does not know: how a
-stream is carried.
+Knows: how commands become tasks' plans and roles, how reports leave, how to go on without a daemon for a while, how to
+end within a second. Does not know: how a stream is carried.
+
+Without a daemon the streams run on: plans are obeyed as they are. Two things do not: no worker is told a role (those of
+this node died with the daemon, the next daemon says what the next ones are), and what an exclusive task puts out waits
+at the gate, for nobody here would learn that it has another owner.
 """
 
 from __future__ import annotations
@@ -11,6 +15,7 @@ import logging
 import os
 import queue
 import signal
+import socket
 import threading
 from typing import Final
 
@@ -21,6 +26,7 @@ from zsched.clock import monotonic_s
 from zsched.core.events import ProblemReported, RoleEnded, StreamsCounted
 from zsched.core.model import NodeId, TaskId
 from zsched.core.plan import Role, RoutePlan
+from zsched.core.relay_life import RelayHello, RelayPulse
 from zsched.core.relay_protocol import RelayReport, RelayStarted, RelayStop, WorkerSeen
 from zsched.errors import WireError
 from zsched.keyspace import Keyspace
@@ -28,12 +34,15 @@ from zsched.relay.acks import Acks
 from zsched.relay.graph import GraphMirror
 from zsched.relay.local_side import LocalSide
 from zsched.relay.roles import RoleServer
+from zsched.relay.successors import Successors
 from zsched.relay.task import TaskRelay
 from zsched.relay.tokens import Tokens
 from zsched.relay_pipe import COMMANDS, read_frame, write_frame
 
 COUNT_S: Final = 1.0
-"""Period of the counters, which are also this process's sign of life."""
+"""Period of the counters."""
+PULSE_S: Final = 0.5
+"""A daemon that has heard nothing for so long is told that we live, whatever the streams' threads wait for."""
 CLOSE_S: Final = 0.6
 """Closing a session towards a stopped peer can take seconds: so long we wait, then the process ends anyway."""
 ALARM_S: Final = 0.9
@@ -44,22 +53,42 @@ _log = logging.getLogger("zsched.relay")
 
 
 class Reporter:
-    """Writes reports to the daemon from a thread of its own; when the daemon stalls, counters are the first to go."""
+    """Writes reports to the daemon from a thread of its own; when the daemon stalls, counters are the first to go.
+
+    While there is no daemon reports are dropped: `attach` tells the next one what still holds.
+    """
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
         self._queue: queue.Queue[RelayReport | None] = queue.Queue(MAX_REPORTS)
+        self._writing = threading.Lock()
+        self._problems: dict[str, ProblemReported] = {}
+        self._counted_at = monotonic_s()
         self._thread = threading.Thread(target=self._run, name="reports", daemon=True)
         self._thread.start()
 
     def report(self, value: RelayReport) -> None:
         """Send a report; never blocks."""
-        if isinstance(value, StreamsCounted) and self._queue.qsize() > MAX_REPORTS // 2:
-            return
+        if isinstance(value, StreamsCounted):
+            self._counted_at = monotonic_s()
+            if self._queue.qsize() > MAX_REPORTS // 2:
+                return
+        if isinstance(value, ProblemReported):
+            self._problems[value.source] = value
         try:
             self._queue.put_nowait(value)
         except queue.Full:
             _log.error("the daemon does not read: a report was dropped (%s)", value)
+
+    def attach(self, link: socket.socket, *, commands: int) -> None:
+        """Report to another daemon, and take ``commands`` from it; problems that last are told again."""
+        with self._writing:  # no frame may begin on one link and end on another
+            os.dup2(link.fileno(), self._descriptor)
+            os.dup2(link.fileno(), commands)
+        link.close()
+        for problem in tuple(self._problems.values()):
+            if problem.problem is not None:
+                self.report(problem)
 
     def flush(self, deadline_s: float) -> None:
         """Send what is queued, at most for so long."""
@@ -68,13 +97,24 @@ class Reporter:
         self._thread.join(deadline_s)
 
     def _run(self) -> None:
-        while (value := self._queue.get()) is not None:
+        while True:
             try:
-                write_frame(self._descriptor, wire.encode(value))
-            except OSError:
-                return  # the daemon is gone; the end of our stdin says so too
-            except WireError as error:
-                _log.error("a report is too large: %s", error)
+                value = self._queue.get(timeout=PULSE_S)
+            except queue.Empty:
+                self._write(RelayPulse(counted_s=monotonic_s() - self._counted_at))
+                continue
+            if value is None:
+                return
+            self._write(value)
+
+    def _write(self, value: RelayReport | RelayPulse) -> None:
+        try:
+            frame = wire.encode(value)
+        except WireError as error:
+            _log.error("a report is too large: %s", error)
+            return
+        with self._writing, contextlib.suppress(OSError):  # the daemon is gone: the end of our commands says so too
+            write_frame(self._descriptor, frame)
 
 
 class RelayProcess:
@@ -122,24 +162,36 @@ class RelayProcess:
                 self._apply(plan, self._graph)
             self._waiting.clear()
 
-    def obey(self, commands: int) -> None:
-        """Read commands until the daemon says stop or is gone."""
+    def obey(self, commands: int) -> bool:
+        """Read commands until the daemon says stop (true) or is gone (false)."""
         while True:
             try:
                 frame = read_frame(commands)
-            except WireError as error:
+            except (WireError, OSError) as error:
                 _log.error("the daemon's pipe is broken: %s", error)
-                return
+                return False
             if frame is None:
-                return
+                return False
             try:
                 command = wire.decode(frame, *COMMANDS)
             except WireError as error:
                 self._reporter.report(ProblemReported(source="relay", problem=f"unreadable command: {error}"[:400]))
                 continue
             if isinstance(command, RelayStop):
-                return
+                return True
             self._do(command)
+
+    def go_on_alone(self) -> None:
+        """The daemon is gone, and nobody says what holds: see the module's first lines."""
+        self._roles.forget()
+        for task in tuple(self._tasks.values()):
+            task.lose_daemon()
+
+    def begin_again(self) -> None:
+        """Another daemon has come, and knows nothing of us: tell it who is there; its plans follow."""
+        self._reporter.report(RelayStarted(pid=os.getpid(), zid=str(self._session.zid())))
+        for seen in self._tokens.seen():
+            self._reporter.report(seen)
 
     def _do(self, command: RoutePlan | Role) -> None:
         if isinstance(command, Role):
@@ -190,8 +242,19 @@ class RelayProcess:
             self._reporter.report(StreamsCounted(counts=counts))
 
 
-def run(fleet: str, node: NodeId, commands: int, reports: int, *, has_local_side: bool = False) -> int:
-    """Serve until told to stop; the exit code: 0 stopped, 1 the session could not be opened."""
+def run(
+    me: RelayHello,
+    commands: int,
+    reports: int,
+    *,
+    has_local_side: bool = False,
+    door: int | None = None,
+    orphan_s: float = 0.0,
+) -> int:
+    """Serve until told to stop; the exit code: 0 stopped, 1 the session could not be opened.
+
+    ``door`` is a listening socket: through it the daemon's successor comes, within ``orphan_s`` of the daemon's end.
+    """
     reporter = Reporter(reports)
     text = read_frame(commands)
     local = read_frame(commands) if has_local_side else b""
@@ -204,9 +267,15 @@ def run(fleet: str, node: NodeId, commands: int, reports: int, *, has_local_side
         reporter.report(ProblemReported(source="relay", problem=problem[:400]))
         reporter.flush(CLOSE_S)
         return 1
-    relay = RelayProcess(session, fleet, node, reporter, local.decode())
+    relay = RelayProcess(session, me.fleet, me.node, reporter, local.decode())
+    successors = None if door is None else Successors(socket.socket(fileno=door), me)
     try:
-        relay.obey(commands)
+        while not relay.obey(commands) and successors is not None:
+            link = _bridge(relay, successors, orphan_s)
+            if link is None:
+                break
+            reporter.attach(link, commands=commands)
+            relay.begin_again()
     finally:
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         signal.setitimer(signal.ITIMER_REAL, ALARM_S)
@@ -215,3 +284,21 @@ def run(fleet: str, node: NodeId, commands: int, reports: int, *, has_local_side
         closing.start()
         closing.join(CLOSE_S)
     return 0
+
+
+def _bridge(relay: RelayProcess, successors: Successors, orphan_s: float) -> socket.socket | None:
+    """Carry on without a daemon until the next one comes; ``None`` when it does not."""
+    if signal.getitimer(signal.ITIMER_REAL)[0] > 0:
+        return None  # we have been told to stop
+    _log.warning("the daemon is gone: carrying on for %g s", orphan_s)
+    relay.go_on_alone()
+    before = signal.signal(signal.SIGTERM, _end)
+    link = successors.wait(orphan_s)
+    signal.signal(signal.SIGTERM, before)
+    _log.warning("%s", "no daemon came: ends" if link is None else "another daemon has taken over")
+    return link
+
+
+def _end(_signal: int, _frame: object) -> None:
+    """Nobody else will tell us to stop."""
+    raise SystemExit(0)

@@ -32,6 +32,10 @@ class RoleServer:
         self._roles[role.task] = role
         self.tell(role.task)
 
+    def forget(self) -> None:
+        """Tell nobody anything any more, until the next `set`: the daemon whose word these roles were is gone."""
+        self._roles.clear()
+
     def tell(self, task: TaskId) -> None:
         """Put the task's role again (its worker has just appeared); nothing when there is none yet."""
         role = self._roles.get(task)

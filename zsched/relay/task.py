@@ -47,6 +47,10 @@ class _OpenSlot:
     gone_at: float | None = None
 
 
+class _Orphaned:
+    """In the queue of plans: those behind it are another daemon's."""
+
+
 class TaskRelay:
     """One task's streams on this node. Every method may be called from any thread; none blocks."""
 
@@ -70,13 +74,15 @@ class TaskRelay:
         self._acks = acks
         self._own_ids = own_ids
         self._report = report
-        self._queue: queue.SimpleQueue[RoutePlan | None] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[RoutePlan | _Orphaned | None] = queue.SimpleQueue()
         self._plan: RoutePlan | None = None
         self._slots: dict[int, _OpenSlot] = {}
         self._inputs: dict[str, InputStream] = {}
         self._outputs: dict[str, OutputStream] = {}
         self._services = Services(session, local)
         self._flip_by: float | None = None
+        self._is_inherited = False
+        """What we carry is the work of a daemon that is gone; the next one may not know of an older slot."""
         threading.Thread(target=self._run, name=f"task {task}", daemon=True).start()
 
     def apply(self, plan: RoutePlan) -> None:
@@ -86,6 +92,10 @@ class TaskRelay:
     def wake(self) -> None:
         """Something that readiness or draining hangs on has changed."""
         self._queue.put(None)
+
+    def lose_daemon(self) -> None:
+        """Nobody would tell us of another owner from now on, until the next plan."""
+        self._queue.put(_Orphaned())
 
     def counts(self) -> tuple[StreamCount, ...]:
         """The counters of every stream, by name."""
@@ -102,7 +112,9 @@ class TaskRelay:
             except queue.Empty:
                 plan = None
             try:
-                if plan is not None:
+                if isinstance(plan, _Orphaned):
+                    self._pause()
+                elif plan is not None:
                     self._take(plan)
                 self._step()
             except Exception as error:  # noqa: BLE001 - a bad plan must not end the task's thread
@@ -133,11 +145,18 @@ class TaskRelay:
 
     # --- plans -------------------------------------------------------------------------------------------------------
 
+    def _pause(self) -> None:
+        self._is_inherited = True
+        if self._plan is not None and self._plan.exclusive:
+            for sink in self._outputs.values():
+                sink.pause()
+
     def _take(self, plan: RoutePlan) -> None:
         self._plan = plan
         self._flip_by = None
         keeps_old = plan.phase is not RoutePhase.CLOSE
-        old = plan.predecessor if keeps_old else None
+        old = (plan.predecessor or self._inherited(plan)) if keeps_old else None
+        self._is_inherited &= keeps_old
         wanted = {slot.epoch: slot for slot in (old, plan.current) if slot is not None}
         if plan.phase is RoutePhase.CLOSE and plan.current is not None:
             self._open(plan.current)
@@ -155,10 +174,21 @@ class TaskRelay:
             self._flip_by = monotonic_s() + FLIP_WAIT_S
         if current is not None and plan.phase is RoutePhase.PREPARE and current.is_ready:
             self._report(SlotReady(task=self._task, epoch=current.slot.epoch))  # asked again: say it again
+        if current is not None and plan.phase is RoutePhase.FLIP and current.is_flipped:
+            self._report(SlotFlipped(task=self._task, epoch=current.slot.epoch, replayed=0))  # for another daemon
+        for sink in self._outputs.values():
+            sink.resume(0 if plan.current is None else plan.current.epoch)
         self._forget_streams()
         self._graph.set_routes(
             self._task, tuple(route for state in self._slots.values() for route in state.slot.routes)
         )
+
+    def _inherited(self, plan: RoutePlan) -> Slot | None:
+        """The slot that carries since another daemon's time, while the new owner is not ready."""
+        if not self._is_inherited or plan.current is None:
+            return None
+        olds = [state.slot for epoch, state in self._slots.items() if state.is_flipped and epoch < plan.current.epoch]
+        return max(olds, key=lambda slot: slot.epoch, default=None)
 
     def _open(self, slot: Slot, *, is_from_start: bool = False) -> None:
         if slot.epoch in self._slots:

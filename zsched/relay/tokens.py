@@ -53,18 +53,31 @@ class Tokens:
         """True when the node's worker says that it works in that epoch."""
         return f"{self._keyspace.role(node, task)}/{epoch}" in self._present
 
+    def seen(self) -> tuple[WorkerSeen, ...]:
+        """Every worker that is there now."""
+        found = (_worker(key, is_present=True) for key in sorted(self._present))
+        return tuple(worker for worker in found if worker is not None)
+
     def _run(self, handler: zenoh.handlers.Handler[Sample]) -> None:
         for sample in handler:
             self._note(str(sample.key_expr), is_present=sample.kind == SampleKind.PUT)
 
     def _note(self, key: str, *, is_present: bool) -> None:
         self._present = self._present | {key} if is_present else self._present - {key}
+        if (worker := _worker(key, is_present=is_present)) is not None:
+            self._on_worker(worker)
         parsed = parse(key)
-        if parsed is not None and parsed.kind == WORKER and len(parsed.rest) == 2:
-            task, incarnation = parsed.rest
-            self._on_worker(WorkerSeen(node=parsed.owner, task=task, incarnation=incarnation, is_present=is_present))
         if parsed is not None and parsed.kind == ROLE and len(parsed.rest) == 2 and not is_present:
             task, epoch = parsed.rest
             if epoch.isdigit():
                 self._on_role_ended(parsed.owner, RoleEnded(task=task, epoch=int(epoch)))
         self._wake()
+
+
+def _worker(key: str, *, is_present: bool) -> WorkerSeen | None:
+    """What a token says of a worker; ``None``: it is a role's."""
+    parsed = parse(key)
+    if parsed is None or parsed.kind != WORKER or len(parsed.rest) != 2:
+        return None
+    task, incarnation = parsed.rest
+    return WorkerSeen(node=parsed.owner, task=task, incarnation=incarnation, is_present=is_present)

@@ -13,7 +13,6 @@ from pathlib import Path
 import pytest
 
 from support.waiting import until
-from zsched.adapters import streams
 from zsched.adapters.streams import RelayHandle
 from zsched.core.events import RelayChanged
 from zsched.core.plan import Role, WorkerRole
@@ -63,12 +62,9 @@ def test_a_killed_relay_is_replaced(daemon: Daemon) -> None:
     assert daemon.handle.pid != pid
 
 
-def test_a_wedged_relay_is_replaced(monkeypatch: pytest.MonkeyPatch, daemon: Daemon) -> None:
-    monkeypatch.setattr(streams, "SILENCE_S", 1.5)
-    os.kill(daemon.handle.pid or 0, signal.SIGKILL)  # the next one is watched with the short patience
-    until(lambda: daemon.changes() == [True, False, True], "gone and back")
+def test_a_wedged_relay_is_replaced(daemon: Daemon) -> None:
     os.kill(daemon.handle.pid or 0, signal.SIGSTOP)
-    until(lambda: daemon.changes() == [True, False, True, False, True], "wedged, killed and back")
+    until(lambda: daemon.changes() == [True, False, True], "wedged, killed and back")
     assert any(isinstance(r, RelayChanged) and "no sign of life" in r.reason for r in daemon.reports)
 
 
@@ -86,7 +82,7 @@ def test_a_stopped_relay_never_blocks_the_daemon(daemon: Daemon) -> None:
     assert not is_there(pid)
 
 
-def test_the_relay_dies_with_its_daemon() -> None:
+def test_the_relay_dies_with_its_daemon_without_a_bequest() -> None:
     script = (
         "import sys, time\n"
         "from zsched.adapters.streams import RelayHandle\n"

@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from zsched import relay_pipe, wire
-from zsched.core import events, messages, model, plan, relay_protocol, snapshot
+from zsched.core import events, messages, model, plan, relay_life, relay_protocol, snapshot
 
 HERE = Path(__file__).parent
 
@@ -152,6 +152,10 @@ SAMPLES: dict[str, object] = {
     "role": plan.Role(task="map_merge", role=plan.WorkerRole.DRAINING, epoch=4),
     "route_plan": plan.RoutePlan(task="map_merge", phase=plan.RoutePhase.FLIP, current=_SLOT, predecessor=_SLOT),
     "relay_stop": relay_protocol.RelayStop(),
+    "relay_pulse": relay_life.RelayPulse(counted_s=0.5),
+    "relay_hello": relay_life.RelayHello(fleet="warehouse", node="robot1", incarnation=3, digest="0123456789abcdef"),
+    "relay_here": relay_life.RelayHere(pid=4711),
+    "relay_refused": relay_life.RelayRefused(reason="it is not ours"),
     "relay_started": relay_protocol.RelayStarted(pid=4711, zid="a1b2c3"),
     "worker_seen": relay_protocol.WorkerSeen(node="edge1", task="map_merge", incarnation="3-1", is_present=True),
     "end_marker": relay_protocol.EndMarker(epoch=4, count=1000),

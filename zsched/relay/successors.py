@@ -1,0 +1,82 @@
+"""Waits, once the daemon is gone, for the one that comes after it, and lets no other in.
+
+Knows: the listening socket in the runtime folder, who may take this relay over. Does not know: why the daemon went,
+what is carried meanwhile.
+
+A successor is the same user's, of the same fleet and node, was started later (its incarnation is higher) and would
+start a relay with the very same sessions, fleet file and version: anything else makes a new relay necessary.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import select
+import socket
+from dataclasses import replace
+from typing import Final
+
+from zsched import wire
+from zsched.clock import monotonic_s
+from zsched.core.relay_life import RelayHello, RelayHere, RelayRefused
+from zsched.errors import WireError
+from zsched.relay_door import set_patience, user_of
+from zsched.relay_pipe import read_frame, write_frame
+
+HELLO_S: Final = 0.5
+
+_log = logging.getLogger("zsched.relay")
+
+
+class Successors:
+    """The way by which another daemon reaches this relay."""
+
+    def __init__(self, listener: socket.socket, daemon: RelayHello) -> None:
+        """``daemon`` is the one that started this relay."""
+        self._listener = listener
+        self._daemon = daemon
+
+    def wait(self, patience_s: float) -> socket.socket | None:
+        """The link to the next daemon, or ``None`` when none came within ``patience_s``."""
+        until = monotonic_s() + patience_s
+        poller = select.poll()
+        poller.register(self._listener, select.POLLIN)
+        while (left := until - monotonic_s()) > 0:
+            if not poller.poll(left * 1000):
+                continue
+            link, _ = self._listener.accept()
+            if (reason := self._greet(link)) is None:
+                return link
+            _log.warning("a daemon was not let in: %s", reason)
+            link.close()
+        return None
+
+    def _greet(self, link: socket.socket) -> str | None:
+        """Let the daemon behind ``link`` in (``None``), or tell it why not."""
+        set_patience(link, HELLO_S)
+        try:
+            frame = read_frame(link.fileno())
+            if frame is None:
+                return "it went away"
+            hello = wire.decode(frame, RelayHello)
+            reason = self._objection(hello, user_of(link))
+            answer = RelayHere(pid=os.getpid()) if reason is None else RelayRefused(reason=reason)
+            write_frame(link.fileno(), wire.encode(answer))
+        except (OSError, WireError) as error:
+            return f"no greeting ({error})"
+        if reason is None:
+            self._daemon = replace(self._daemon, incarnation=hello.incarnation)
+            set_patience(link, 0.0)
+        return reason
+
+    def _objection(self, hello: RelayHello, user: int) -> str | None:
+        mine = self._daemon
+        if user != os.getuid():
+            return f"it is user {user}'s, this relay is user {os.getuid()}'s"
+        if (hello.fleet, hello.node) != (mine.fleet, mine.node):
+            return f"it is {hello.fleet}/{hello.node}, this is the relay of {mine.fleet}/{mine.node}"
+        if hello.incarnation <= mine.incarnation:
+            return f"incarnation {hello.incarnation} is not after {mine.incarnation}, whose relay this is"
+        if hello.digest != mine.digest:
+            return "the fleet file, the sessions or the version are others than those this relay was started with"
+        return None

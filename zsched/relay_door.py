@@ -1,0 +1,164 @@
+"""Where a relay that outlived its daemon is found again: a socket, a lock and a note in the runtime folder.
+
+Knows: the two files of a node's relay, flock(2), the words before the pipe's first frame. Does not know: how relays are
+started, zenoh, plans.
+
+The lock is held by the relay process alone, by a file description it inherits, so the kernel gives it back however the
+relay ends: as long as it is held there is exactly one relay, and the note in the file is about it. The relay accepts
+connections on the socket only while it has no daemon.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import socket
+import struct
+from dataclasses import dataclass
+from hashlib import blake2s
+from pathlib import Path
+from typing import Any, Final
+
+from zsched import __version__, wire
+from zsched.core.model import NodeId
+from zsched.core.relay_life import RelayHello, RelayHere, RelayRefused
+from zsched.errors import AdapterError, WireError
+from zsched.relay_pipe import read_frame, write_frame
+
+PROTOCOL: Final = 1
+"""Raised whenever an older relay would misunderstand a newer daemon."""
+GREETING_S: Final = 1.0
+"""A relay that does not answer so long is no relay to go on with."""
+_ANSWERS: Final[tuple[type[Any], ...]] = (RelayHere, RelayRefused)
+_TIMEVAL: Final = struct.Struct("ll")
+_CREDENTIALS: Final = struct.Struct("3i")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Note:
+    """About the relay that holds the lock: its process, and the endpoint its data session listens on."""
+
+    pid: int
+    listen: str
+
+
+@dataclass(slots=True, kw_only=True)
+class Claim:
+    """What the next relay inherits: the lock, and the listening socket for its daemon's successors."""
+
+    lock: int
+    listener: socket.socket
+
+    def close(self) -> None:
+        """Give up our copies; the relay's own stay."""
+        os.close(self.lock)
+        self.listener.close()
+
+
+class Door:
+    """The two files of one node's relay."""
+
+    def __init__(self, folder: Path, node: NodeId) -> None:
+        self._socket = folder / f"{node}.relay"
+        self._lock = folder / f"{node}.relay.lock"
+
+    def note(self) -> Note | None:
+        """The note about the relay that runs, ``None`` when none does."""
+        try:
+            descriptor = os.open(self._lock, os.O_RDONLY | os.O_CLOEXEC)
+        except OSError:
+            return None
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except OSError:
+            return _read_note(os.pread(descriptor, 4096, 0))
+        finally:
+            os.close(descriptor)
+        return None
+
+    def claim(self) -> Claim:
+        """Lock the place for a relay that is about to be started, and listen.
+
+        Raises:
+            AdapterError: a relay holds the lock, or the folder cannot be used.
+        """
+        try:
+            lock = os.open(self._lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        except OSError as error:
+            raise AdapterError(f"cannot open {self._lock}: {error.strerror}; check --runtime-dir") from error
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._socket.unlink(missing_ok=True)
+            listener.bind(str(self._socket))
+            self._socket.chmod(0o600)
+            listener.listen(4)
+        except OSError as error:
+            os.close(lock)
+            listener.close()
+            if isinstance(error, BlockingIOError):
+                raise AdapterError(f"another relay holds {self._lock}; it ends by itself soon") from error
+            raise AdapterError(f"cannot listen on {self._socket}: {error}; check --runtime-dir") from error
+        return Claim(lock=lock, listener=listener)
+
+    def sign(self, claim: Claim, note: Note) -> None:
+        """Write down which relay has taken the claim."""
+        os.ftruncate(claim.lock, 0)
+        os.pwrite(claim.lock, json.dumps({"pid": note.pid, "listen": note.listen}).encode(), 0)
+
+    def connect(self, hello: RelayHello) -> tuple[socket.socket, RelayHere] | str:
+        """Take over the relay behind the socket; answers the link to it, or why that cannot be."""
+        link = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            link.settimeout(GREETING_S)
+            link.connect(str(self._socket))
+            link.settimeout(None)
+            set_patience(link, GREETING_S)
+            write_frame(link.fileno(), wire.encode(hello))
+            frame = read_frame(link.fileno())
+            answer: RelayHere | RelayRefused | None = None if frame is None else wire.decode(frame, *_ANSWERS)
+        except (OSError, WireError) as error:
+            link.close()
+            return f"it does not answer ({error})"
+        if isinstance(answer, RelayHere):
+            set_patience(link, 0.0)
+            return link, answer
+        link.close()
+        return "it went away" if answer is None else answer.reason
+
+    def remove(self) -> None:
+        """Remove both files, once the relay is gone."""
+        for path in (self._socket, self._lock):
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)
+
+
+def digest_of(*parts: str) -> str:
+    """16 hex digits over all that a relay was started with; another one means: start a new relay."""
+    state = blake2s(digest_size=8)
+    for part in (__version__, str(PROTOCOL), *parts):
+        state.update(len(part).to_bytes(4, "big") + part.encode())
+    return state.hexdigest()
+
+
+def set_patience(link: socket.socket, seconds: float) -> None:
+    """Bound every read and write on ``link`` (0: unbounded); over it they raise `BlockingIOError`."""
+    value = _TIMEVAL.pack(int(seconds), int(seconds % 1 * 1e6))
+    for option in (socket.SO_RCVTIMEO, socket.SO_SNDTIMEO):
+        link.setsockopt(socket.SOL_SOCKET, option, value)
+
+
+def user_of(link: socket.socket) -> int:
+    """The user id of the process at the other end."""
+    _, user, _ = _CREDENTIALS.unpack(link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))
+    return int(user)
+
+
+def _read_note(text: bytes) -> Note | None:
+    try:
+        found = json.loads(text)
+        return Note(pid=int(found["pid"]), listen=str(found["listen"]))
+    except (ValueError, KeyError, TypeError):
+        return Note(pid=0, listen="")  # it has only just been started
