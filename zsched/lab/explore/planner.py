@@ -85,8 +85,7 @@ def _blocks(mask: Mask, times: int) -> Mask:
     rows, columns = (-(-size // times) for size in mask.shape)
     padded = np.zeros((rows * times, columns * times), dtype=np.bool_)
     padded[: mask.shape[0], : mask.shape[1]] = mask
-    blocks: Mask = padded.reshape(rows, times, columns, times).any(axis=(1, 3))
-    return blocks
+    return np.asarray(padded.reshape(rows, times, columns, times).any(axis=(1, 3)), dtype=np.bool_)
 
 
 def distances(plan: PlanMap, start: Point) -> Field:

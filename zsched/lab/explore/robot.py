@@ -85,7 +85,7 @@ class Applications:
         self._transforms = session.declare_subscriber(f"{robot}/map_merge/tf", zenoh.handlers.RingChannel(4))
         self._states = session.declare_subscriber(f"{robot}/map_merge/status", zenoh.handlers.RingChannel(4))
         self._claims = session.declare_subscriber("explore/*/claim", zenoh.handlers.RingChannel(64))
-        self._sent = self._sent_bytes = self._received = self._received_bytes = 0
+        self._sent = self._sent_bytes = self._received = self._received_bytes = self._claims_heard = 0
         self._last_sent = self._last_map = self._last_state = b""
         self._last_map_s: float | None = None
         self._merged_t_map: Pose2 | None = None
@@ -185,6 +185,7 @@ class Applications:
             robot, claim = decode_claim(payload)
         except WireError:
             return
+        self._claims_heard += robot != self._options.settings.robot
         if claim is None:
             self._agent.explorer.drop_claim(robot)
         else:
@@ -207,6 +208,7 @@ class Applications:
                 "bytes_sent": self._sent_bytes,
                 "maps_received": self._received,
                 "bytes_received": self._received_bytes,
+                "claims_heard": self._claims_heard,
                 "coverage": self._coverage,
                 "state": self._agent.explorer.state.value,
                 "goals": self._agent.explorer.goals,

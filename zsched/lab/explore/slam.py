@@ -1,0 +1,82 @@
+"""Maps for a robot on another node: takes its scans, publishes its map (the paper places SLAM on the edges).
+
+Knows: the robot's keys, this node's data endpoint. Does not know: zsched, other robots, the world.
+
+    python -m zsched.lab.explore.slam --robot robot1 --endpoint tcp/127.0.0.1:7460
+
+    in   <robot>/scan    scans with the pose that the robot believes (`zsched.lab.explore.messages`)
+    out  <robot>/map     nav_msgs/msg/OccupancyGrid, CDR, 2 Hz once there was a scan
+
+The robot is started with ``--slam-on NODE``, and its relay picks ``<robot>/map`` up as ever. Run it inside the node's
+control group: its CPU is then part of what that node has in use. It ends on SIGTERM or SIGINT.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+
+import cv2
+import zenoh
+
+from zsched.clock import monotonic_s
+from zsched.errors import WireError
+from zsched.lab.explore.agent import MAP_PERIOD_S
+from zsched.lab.explore.mapper import ScanMapper
+from zsched.lab.explore.messages import decode_scan
+from zsched.lab.robot_app import connect
+from zsched.lab.signals import StopFlag
+from zsched.tasks.map_merge.cdr import encode_grid
+
+POLL_S = 0.05
+WAITING_SCANS = 16
+"""Scans kept while this process has no CPU; then the oldest are lost, as in any SLAM that falls behind."""
+
+
+def serve(robot: str, session: zenoh.Session, stop: StopFlag) -> None:
+    """Map until stopped."""
+    mapper = ScanMapper(frame_id=f"{robot}/map")
+    scans = session.declare_subscriber(f"{robot}/scan", zenoh.handlers.RingChannel(WAITING_SCANS))
+    publisher = session.declare_publisher(f"{robot}/map", congestion_control=zenoh.CongestionControl.BLOCK_FIRST)
+    stamp_ns: int | None = None
+    next_map = monotonic_s()
+    while not stop.is_set:
+        while (sample := scans.try_recv()) is not None:
+            try:
+                scan, pose = decode_scan(bytes(sample.payload))
+            except WireError as error:
+                sys.stderr.write(f"explore.slam: {robot}: {error}\n")
+                continue
+            mapper.add(pose, scan)
+            stamp_ns = scan.stamp_ns
+        now = monotonic_s()
+        if stamp_ns is not None and now >= next_map:
+            publisher.put(encode_grid(mapper.grid(stamp_ns)))
+            next_map = max(next_map + MAP_PERIOD_S, now)
+        time.sleep(POLL_S)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Entry point: 0 after a stop signal, 1 when the data endpoint never answered, 2 on wrong usage."""
+    cv2.setNumThreads(1)
+    parser = argparse.ArgumentParser(prog="python -m zsched.lab.explore.slam", description="Map for a robot.")
+    parser.add_argument("--robot", "--name", required=True, help="the robot whose scans are mapped")
+    parser.add_argument("--endpoint", required=True, help="this node's data endpoint, e.g. tcp/127.0.0.1:7460")
+    given = parser.parse_args(arguments)
+    stop = StopFlag()
+    stop.install()
+    try:
+        session = connect(given.endpoint, stop)
+    except zenoh.ZError as error:
+        sys.stderr.write(f"explore.slam: {given.robot}: {given.endpoint} does not answer: {error}\n")
+        return 1
+    if session is None:
+        return 0
+    with session:
+        serve(given.robot, session, stop)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
