@@ -10,7 +10,9 @@ receiver takes something now and then. What gave way was never numbered, so rece
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import queue
 import threading
 from collections import deque
 from collections.abc import Callable, Hashable
@@ -53,21 +55,24 @@ class SendQueue:
         sheds: bool,
         keep_last: int = 1,
         is_open: Callable[[], bool] | None = None,
-        before_each: Action | None = None,
+        at_kick: Action | None = None,
     ) -> None:
         """Start the thread.
 
         ``is_open`` is asked before each sample: while it answers false, samples wait (markers too, they keep their
-        place). ``before_each`` runs in the thread whenever it wakes (`kick` wakes it).
+        place). ``at_kick`` runs in the thread after a `kick`.
         """
         self._depth = depth
         self._sheds = sheds
         self._keep_last = max(1, keep_last)
         self._is_open = is_open or _always
-        self._before_each = before_each
-        lock = threading.Lock()
-        self._wake = threading.Condition(lock)
-        self._room = threading.Condition(lock)
+        self._at_kick = at_kick
+        self._lock = threading.Lock()
+        self._room = threading.Condition(self._lock)
+        # A bell of its own: a condition wakes its waiter while the lock is still held, to wait once more for that.
+        self._bell: queue.SimpleQueue[None] = queue.SimpleQueue()
+        self._wants_item = False
+        self._wants_kick = False
         self._items: deque[_Waiting] = deque()
         self._lines: dict[Hashable, deque[_Waiting]] = {}
         self._count = 0
@@ -91,7 +96,7 @@ class SendQueue:
 
         ``value`` is what `take_back` gives back while ``action`` has not begun.
         """
-        with self._wake:
+        with self._lock:
             if self._is_closed:
                 return 1
             if not self._sheds and self._is_full(size):
@@ -103,8 +108,10 @@ class SendQueue:
             self._count += 1
             self._bytes += size
             dropped = self._shed(waiting) if self._sheds else 0
-            self._wake.notify()
-            return dropped
+            is_awaited, self._wants_item = self._wants_item, False
+        if is_awaited:
+            self._bell.put(None)
+        return dropped
 
     def has_room(self, size: int) -> bool:
         """True when a sample of ``size`` bytes would be taken now."""
@@ -122,13 +129,13 @@ class SendQueue:
 
     def then(self, action: Action) -> None:
         """Run ``action`` behind everything that waits now; it is never dropped but by `close`."""
-        with self._wake:
+        with self._lock:
             self._items.append(_Waiting(None, action, 0))
-            self._wake.notify()
+        self._ring()
 
     def take_back(self) -> list[Any]:
         """The values of the samples that have not gone out, in order; they will not any more. Markers stay."""
-        with self._wake:
+        with self._lock:
             taken = [waiting for waiting in self._items if waiting.lane is not None and waiting.action is not None]
             self._items = deque(waiting for waiting in self._items if waiting.lane is None)
             self._lines.clear()
@@ -138,19 +145,19 @@ class SendQueue:
             return [waiting.value for waiting in taken]
 
     def kick(self) -> None:
-        """Look at ``is_open`` again, and run ``before_each``."""
-        with self._wake:
-            self._is_kicked = True
-            self._wake.notify()
+        """Run ``at_kick``, and look at ``is_open`` again."""
+        self._is_kicked = True
+        self._ring()
 
     def close(self, at_end: Action | None = None) -> int:
         """End the thread behind what it has in hand, ``at_end`` last; answers how many samples still waited."""
-        with self._wake:
+        with self._lock:
             self._is_closed = True
             self._at_end = at_end
-            self._wake.notify()
             self._room.notify_all()
-            return self._count
+            left = self._count
+        self._ring()
+        return left
 
     def join(self, timeout_s: float = JOIN_S) -> None:
         """Wait at most so long for the thread's end."""
@@ -189,28 +196,39 @@ class SendQueue:
 
     def _next(self) -> Action | None:
         """The next action, waiting for one; ``None`` once closed."""
-        while True:
-            with self._wake:
-                while not self._items and not self._is_closed and not self._is_kicked:
-                    self._wake.wait()
-                if self._is_closed:
-                    return None
+        while not self._is_closed:
+            if self._is_kicked:
                 self._is_kicked = False
-            if self._before_each is not None:
-                self._do(self._before_each)
-            if not self._items:
-                continue
-            if not self._is_open():
-                with self._wake:
-                    if not self._is_kicked and not self._is_closed:
-                        self._wake.wait(POLL_S)
-                continue
-            action = self._take()
-            if action is not None:
-                return action
+                if self._at_kick is not None:
+                    self._do(self._at_kick)
+            is_shut = bool(self._items) and not self._is_open()
+            if self._items and not is_shut:
+                action = self._take()
+                if action is not None:
+                    return action
+            else:
+                self._sleep(is_shut=is_shut)
+        return None
+
+    def _sleep(self, *, is_shut: bool) -> None:
+        """Until something comes (`POLL_S` at most while shut), a kick or the end."""
+        with self._lock:
+            if self._is_closed or self._is_kicked or (self._items and not is_shut):
+                return
+            self._wants_item, self._wants_kick = not is_shut, True
+        with contextlib.suppress(queue.Empty):
+            self._bell.get(timeout=POLL_S if is_shut else None)
+        self._wants_item = self._wants_kick = False
+
+    def _ring(self) -> None:
+        with self._lock:
+            is_awaited = self._wants_item or self._wants_kick
+            self._wants_item = self._wants_kick = False
+        if is_awaited:
+            self._bell.put(None)
 
     def _take(self) -> Action | None:
-        with self._wake:
+        with self._lock:
             if not self._items:  # taken back
                 return None
             waiting = self._items.popleft()

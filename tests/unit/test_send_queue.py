@@ -109,8 +109,9 @@ def test_behind_a_stalled_receiver_only_the_newest_of_each_lane_wait() -> None:
 
 def test_while_it_is_shut_samples_wait_and_a_kick_looks_again() -> None:
     receiver, is_open, looks = Receiver(), threading.Event(), []
-    queue = SendQueue("t", depth=10, sheds=False, is_open=is_open.is_set, before_each=lambda: looks.append(1))
+    queue = SendQueue("t", depth=10, sheds=False, is_open=is_open.is_set, at_kick=lambda: looks.append(1))
     queue.send("a", receiver.take(1), 1)
+    queue.kick()
     until(lambda: looks, "it looked")
     assert receiver.got == []
     is_open.set()

@@ -57,6 +57,7 @@ class InputStream:
         self._pace: Pace[tuple[Sample, Timestamp | None]] | None = (
             None if max_hz is None else Pace(max_hz, remembers=is_latest)
         )
+        self._is_patient = route.settings.stream_class is StreamClass.RELIABLE
         self._number = 0
         self._keep_last = route.settings.keep_last if is_latest else 0
         self._kept: OrderedDict[str, deque[_Kept]] = OrderedDict()
@@ -172,11 +173,11 @@ class InputStream:
 
     def _carry(self, sample: Sample) -> None:
         active = self._active
-        if active is not None:
+        if active is not None and self._is_patient:
             active.outlet.wait_for_room(len(sample.payload))
         with self._lock:
             self._counter.seen(len(sample.payload))
-            if _is_own(sample, self._loop_ids):
+            if self._loop_ids and _is_own(sample, self._loop_ids):
                 self._counter.dropped("loop")
                 return
             self._number += 1

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, NamedTuple
 
 import zenoh
 from zenoh import CongestionControl, Sample, SampleKind, Session, Timestamp, ext
@@ -22,9 +22,8 @@ KEPT_BYTES: Final = 16 << 20
 _DELETE: Final = SampleKind.DELETE
 
 
-@dataclass(frozen=True, slots=True)
-class Sent:
-    """A sample that went out under ``number`` and is kept."""
+class Sent(NamedTuple):
+    """A sample that went out under ``number`` and is kept (a tuple: one is made for every sample)."""
 
     number: int
     sample: Sample

@@ -80,6 +80,8 @@ class Outlet:
         self._settings = settings
         self._acks = acks
         self._rewriters: dict[str, Rewriter] = {from_expr: rewriter(from_expr, to_expr)}
+        self._is_reliable = settings.stream_class is StreamClass.RELIABLE
+        self._kept_limit = KEPT_SAMPLES if self._is_reliable else max(settings.depth, settings.keep_last)
         self._is_wild = is_wild(to_expr)
         self._to = to_expr
         self._lock = threading.Lock()
@@ -100,7 +102,7 @@ class Outlet:
             sheds=not is_reliable,
             keep_last=self._settings.keep_last,
             is_open=self._is_open if is_reliable and self._acks is not None else None,
-            before_each=self._resend if self._acks is not None else None,
+            at_kick=self._resend if self._acks is not None else None,
         )
 
     @property
@@ -144,7 +146,7 @@ class Outlet:
         That stops whoever feeds this stream, the application's link in the end; so only `MAX_PATIENT` streams of this
         process do so at one time, and none for a stalled receiver. Never under a lock that a flip needs.
         """
-        if self._queue is None or self._settings.stream_class is not StreamClass.RELIABLE or self._queue.has_room(size):
+        if self._queue is None or not self._is_reliable or self._queue.has_room(size):
             return
         if _patient.acquire(blocking=False):
             try:
@@ -154,8 +156,7 @@ class Outlet:
 
     def take_back(self) -> list[tuple[Sample, Timestamp | None]]:
         """What class ``reliable`` still holds in its queue, never sent: it may go to another owner instead."""
-        is_reliable = self._settings.stream_class is StreamClass.RELIABLE
-        return self._queue.take_back() if self._queue is not None and is_reliable else []
+        return self._queue.take_back() if self._queue is not None and self._is_reliable else []
 
     def key_of(self, sample: Sample) -> str:
         """The key that a sample goes on under (``""``: it does not fit)."""
@@ -277,14 +278,15 @@ class Outlet:
         lane.put(sample, stamp)
         if self._acks is None:
             return
-        is_reliable = self._settings.stream_class is StreamClass.RELIABLE
-        limit = KEPT_SAMPLES if is_reliable else max(self._settings.depth, self._settings.keep_last)
         with self._lock:
-            lane.keep(sample, stamp, size, limit)
+            lane.keep(sample, stamp, size, self._kept_limit)
             lane.moved_at = monotonic_s()
 
     def _is_open(self) -> bool:
         """Class ``reliable``: nothing goes out to nobody, and no more than can be sent again."""
+        main = self._main
+        if main is not None and len(self._lanes) == 1:  # the usual case, asked before every sample
+            return main.ack is None or (not main.is_full() and self.is_matching)
         with self._lock:
             lanes = tuple(self._lanes.values())
         has_acks = any(lane.ack is not None for lane in lanes)
