@@ -96,7 +96,8 @@ def _run(options: BenchOptions) -> int:
 def robots_of(options: BenchOptions, scenario: Scenario) -> Robots:
     """What the robots see."""
     if options.is_exploring:
-        return ExploreRobots(world=scenario.explore.world, speed=scenario.explore.speed)
+        loop = scenario.explore
+        return ExploreRobots(world=loop.world, speed=loop.speed, slam_on=loop.slam_on)
     return LogRobots(log=log_path(options))
 
 

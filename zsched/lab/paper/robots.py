@@ -6,7 +6,8 @@ Knows: the robots' programs and their options, the truth that maps are held agai
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
@@ -52,6 +53,9 @@ class Robots(Protocol):
     def command(self, place: Place) -> list[str]:
         """The program of one robot's applications."""
 
+    def helpers(self, endpoints: Mapping[NodeId, str]) -> Sequence[tuple[NodeId, list[str]]]:
+        """(node, program) of what the robots have running elsewhere; ``endpoints`` are the nodes' data endpoints."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LogRobots:
@@ -84,6 +88,11 @@ class LogRobots:
         command += ["--endpoint", place.endpoint, "--records", str(place.records)]
         return [*command, "--replay-s", f"{place.duration_s:.3f}"]
 
+    def helpers(self, endpoints: Mapping[NodeId, str]) -> Sequence[tuple[NodeId, list[str]]]:
+        """None: the robots map on board."""
+        del endpoints
+        return ()
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExploreRobots:
@@ -92,6 +101,8 @@ class ExploreRobots:
     world: str
     """As `zsched.lab.explore.worlds.load_world` takes it."""
     speed: float
+    slam_on: Mapping[NodeId, NodeId] = field(default_factory=dict)
+    """{robot: node that maps for it}; a robot that is not in it maps on board."""
 
     @property
     def name(self) -> str:
@@ -117,4 +128,11 @@ class ExploreRobots:
         command = [sys.executable, "-m", "zsched.lab.explore.robot", "--robot", place.robot, "--world", self.world]
         command += ["--index", str(place.index), "--robots", str(place.robots), "--seed", str(place.seed)]
         command += ["--endpoint", place.endpoint, "--records", str(place.records), "--speed", f"{self.speed:g}"]
-        return [*command, "--target", f"{place.target_coverage:g}"]
+        command += ["--target", f"{place.target_coverage:g}"]
+        node = self.slam_on.get(place.robot)
+        return command if node is None else [*command, "--slam-on", node]
+
+    def helpers(self, endpoints: Mapping[NodeId, str]) -> Sequence[tuple[NodeId, list[str]]]:
+        """The robots' mapping, where it is placed on other nodes."""
+        module = [sys.executable, "-m", "zsched.lab.explore.slam"]
+        return [(n, [*module, "--robot", robot, "--endpoint", endpoints[n]]) for robot, n in self.slam_on.items()]

@@ -36,7 +36,7 @@ from zsched.lab.paper.radio import drive_file
 from zsched.lab.paper.record import HostGauge, NodeMeter
 from zsched.lab.paper.robots import Place, Robots
 from zsched.lab.paper.rules import RulePlan
-from zsched.lab.paper.scenario import Scenario
+from zsched.lab.paper.scenario import LinkView, Scenario
 from zsched.lab.paper.schemes import Scheme, scheme_tree
 from zsched.lab.recorder import Follower, Recorder
 
@@ -139,7 +139,7 @@ class CellRun:
         runtime = Path(tempfile.gettempdir()) / f"zsched-{children.token}"
         children.janitor.remove(runtime)
         runtime.mkdir(mode=0o700)
-        fleet = self._write_fleet()
+        fleet = self.write_fleet()
         shares = {node: share for node, share in self._scenario.nodes.items() if node in fleet.kinds}
         limits = node_limits(f"zsched-{children.token}", self._scenario, fleet)
         candidates = sorted(shares)
@@ -163,14 +163,10 @@ class CellRun:
         module = (sys.executable, "-m", "zsched.lab.paper.ruled_daemon")
         return (*module, "--rule", rule.value, "--plan", str(self._plan_path.absolute()))
 
-    def _write_fleet(self) -> LabFleet:
+    def write_fleet(self) -> LabFleet:
         """The effective fleet file: the template, the scheme's settings, the links, free ports, true poses."""
         tree = scheme_tree(read_tree(self._scenario.fleet), self._cell.scheme)
-        for node, radio in self._scenario.links.items():
-            path = drive_file(node, radio, self._inputs.drives, self._folder, self._seed)
-            tree["nodes"][node].pop("wired", None)
-            trace = {"file": str(path), "column": radio.column, "offset_s": radio.offset_s}
-            tree["nodes"][node]["trace"] = trace
+        self._lay_links(tree["nodes"])
         template = self._folder / "template.yaml"
         with template.open("w", encoding="utf-8") as file:
             YAML().dump(tree, file)
@@ -178,6 +174,18 @@ class CellRun:
         frames = dict(zip(robots, self._inputs.robots.frames(len(robots), self._seed), strict=True))
         options = worker_options(self._scenario.mode, frames) | {"--rate": (f"{self._scenario.rate_hz:g}",)}
         return write_fleet(template, self._folder / "fleet.yaml", options)
+
+    def _lay_links(self, nodes: Tree) -> None:
+        traces = {}
+        for node, radio in self._scenario.links.items():
+            path = drive_file(node, radio, self._inputs.drives, self._folder, self._seed)
+            traces[node] = {"file": str(path), "column": radio.column, "offset_s": radio.offset_s}
+            nodes[node].pop("wired", None)
+            nodes[node]["trace"] = traces[node]
+        if self._scenario.link_view is not LinkView.DIRECT:
+            return
+        for node in traces:
+            nodes[node]["links"] = {other: {"trace": dict(traces[other])} for other in traces if other != node}
 
     # --- the run -----------------------------------------------------------------------------------------------------
 
@@ -190,6 +198,8 @@ class CellRun:
         self._gauge_daemons(children, parts)
         with parts.observer:
             parts.runner.wait_up(parts.observer.statuses, lambda: time.sleep(TICK_S))
+            for number, (node, command) in enumerate(self._inputs.robots.helpers(parts.fleet.data_endpoints), start=1):
+                parts.limits.put(node, children.start(f"helper-{number}-{node}", command).process.pid)
             self._wait_owned(children, parts)
             self._record_streams(children, parts)
             self._start(children, parts)
@@ -289,7 +299,8 @@ class CellRun:
         parts.loads.stop(monotonic_s() - self._zero_s)
         allocations = [asdict(move) | {"t_s": move.t_s - self._zero_s} for move in parts.observer.moves()]
         streams = {node: _streams(status, parts.fleet.task) for node, status in parts.observer.statuses().items()}
-        children.stop(*children.running("app-"), *children.running("record"), grace_s=RECORDER_S)
+        apps = [*children.running("app-"), *children.running("record"), *children.running("helper-")]
+        children.stop(*apps, grace_s=RECORDER_S)
         children.stop(*children.running("daemon-"))
         body = {
             "schema": RUN_SCHEMA,
@@ -367,7 +378,7 @@ def is_calm(statuses: Mapping[NodeId, Status], nodes: tuple[NodeId, ...]) -> boo
 
 def _links(status: Status, node: NodeId) -> object:
     own: Status = next((part for part in status.get("nodes") or () if part.get("name") == node), {})
-    return [link.get("rssi_dbm") for link in own.get("links") or ()]
+    return [link.get("rssi_dbm") for link in own.get("links") or () if link.get("peer") is None]
 
 
 def _streams(status: Status, task: str) -> object:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -84,6 +85,17 @@ class Radio:
     offset_s: float = 0.0
 
 
+class LinkView(StrEnum):
+    """``access_point``: each node knows its own way to the access point, and a pair is as good as the weaker one.
+
+    ``direct``: every node hears each other node's signal itself, so that a candidate's signal is the same for all
+    (the paper's Eq. 3 has one signal per candidate).
+    """
+
+    ACCESS_POINT = "access_point"
+    DIRECT = "direct"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Exploration:
     """The closed loop: ``world`` by its name, ``speed`` in m/s; the run ends at the target, or after ``duration_s``."""
@@ -92,6 +104,8 @@ class Exploration:
     speed: float = 1.0
     duration_s: float = 50.0
     target_coverage: float = 0.8
+    slam_on: Mapping[NodeId, NodeId] = field(default_factory=dict)
+    """{robot: the node that maps for it, inside its share}, as the paper places SLAM on the edges."""
 
     def __post_init__(self) -> None:
         check_range("explore.speed", self.speed, 0.01, 5.0)
@@ -135,6 +149,7 @@ class Scenario:
     nodes: Mapping[NodeId, NodeShare] = field(default_factory=dict)
     load: LoadPlan = LoadPlan()
     links: Mapping[NodeId, Radio] = field(default_factory=dict)
+    link_view: LinkView = LinkView.ACCESS_POINT
     mode: str = "known"
     rate_hz: float = 4.0
     target_coverage: float = 0.9
@@ -182,11 +197,11 @@ def _scenario(path: Path, tree: dict[str, Any]) -> Scenario:
     nodes = {str(name): NodeShare(**spec) for name, spec in dict(tree.pop("nodes", {})).items()}
     links = {str(name): Radio(**spec) for name, spec in dict(tree.pop("links", {})).items()}
     load, sweep = LoadPlan(**_tuples(tree.pop("load", {}))), Sweep(**_tuples(tree.pop("sweep", {})))
+    view = LinkView(tree.pop("link_view", LinkView.ACCESS_POINT))
     explore = Exploration(**dict(tree.pop("explore", {})))
     known = {str(name): value for name, value in _tuples(tree).items()}
-    return Scenario(
-        fleet=fleet, levels=levels, nodes=nodes, links=links, load=load, sweep=sweep, explore=explore, **known
-    )
+    blocks: dict[str, Any] = {"levels": levels, "nodes": nodes, "links": links, "link_view": view}
+    return Scenario(fleet=fleet, load=load, sweep=sweep, explore=explore, **blocks, **known)
 
 
 def _tuples(tree: Any) -> dict[str, Any]:

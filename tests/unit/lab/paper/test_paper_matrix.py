@@ -153,6 +153,7 @@ def test_exploring_robots_have_their_own_target_and_time(tmp_path: Path, scenari
     assert (explored.duration_s, explored.target_coverage) == (loop.duration_s, loop.target_coverage)
     assert (quick.duration_s, len(cells)) == (30.0, 5)
     assert loop.duration_s + 10 <= 60
+    assert sorted(loop.slam_on.values()) == sorted(scenario.nodes)
 
 
 def test_a_folder_goes_on_only_with_the_same_bench(tmp_path: Path) -> None:

@@ -1,11 +1,16 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+from zsched.config import load_fleet
 from zsched.lab.explore.robot import parse as parse_explorer
 from zsched.lab.laser_log import malaga_path
+from zsched.lab.paper.places import robots_scenario_path
 from zsched.lab.paper.robots import ExploreRobots, LogRobots, Place
-from zsched.lab.paper.run import Seen, is_calm, ready_workers
+from zsched.lab.paper.run import Cell, CellRun, Inputs, Seen, is_calm, ready_workers
+from zsched.lab.paper.scenario import LinkView, load_scenario
+from zsched.lab.paper.schemes import SCHEMES
 from zsched.lab.recorder import Recorder
 from zsched.lab.robot_app import parse
 
@@ -50,6 +55,20 @@ def test_an_exploring_robots_command_is_one_that_its_program_takes(tmp_path: Pat
     assert abs(robots.truth().resolution - 0.05) < 1e-9  # as the merged map's: coverage is taken cell on cell
 
 
+def test_mapping_may_be_placed_on_other_nodes(tmp_path: Path) -> None:
+    robots = ExploreRobots(world="turtlebot3", speed=0.4, slam_on={"robot2": "edge1"})
+
+    ((node, command),) = robots.helpers({"edge1": "tcp/127.0.0.1:1", "robot2": "tcp/127.0.0.1:2"})
+
+    assert not parse_explorer(robots.command(a_place(tmp_path))[3:]).settings.has_slam
+    assert parse_explorer(robots.command(a_place(tmp_path, "robot1", 0))[3:]).settings.has_slam
+    assert (node, command[2:]) == (
+        "edge1",
+        ["zsched.lab.explore.slam", "--robot", "robot2", "--endpoint", "tcp/127.0.0.1:1"],
+    )
+    assert LogRobots(log=malaga_path()).helpers({}) == ()
+
+
 def test_the_task_is_over_when_every_robot_has_said_so(tmp_path: Path) -> None:
     seen = Seen(("robot1", "robot2"), tmp_path)
     with Recorder(tmp_path) as recorder:
@@ -60,6 +79,22 @@ def test_the_task_is_over_when_every_robot_has_said_so(tmp_path: Path) -> None:
         recorder.write("robot2", {"kind": "covered", "t_s": 2.0})
         assert seen.is_covered()
         assert seen.is_covered()
+
+
+def test_each_robot_hears_the_others_where_the_scenario_says_so(tmp_path: Path) -> None:
+    scenario = load_scenario(robots_scenario_path())
+    inputs = Inputs(robots=LogRobots(log=malaga_path()))
+    folders = {view: tmp_path / view.value for view in LinkView}
+    for view, folder in folders.items():
+        folder.mkdir()
+        cell = Cell(scheme=SCHEMES["zsched"], level=scenario.level, run=0)
+        CellRun(replace(scenario, link_view=view), cell, inputs, folder).write_fleet()
+    direct, point = (load_fleet(folders[view] / "fleet.yaml") for view in (LinkView.DIRECT, LinkView.ACCESS_POINT))
+
+    heard = {link.peer: Path(link.value).name for link in direct.node("robot1").links}
+    assert heard == {None: "drive-robot1.csv", "robot2": "drive-robot2.csv", "robot3": "drive-robot3.csv"}
+    assert [link.peer for link in point.node("robot1").links] == [None]
+    assert {link.offset_s for link in direct.node("robot1").links if link.peer == "robot3"} == {120.0}
 
 
 def test_nobody_starts_with_a_handicap() -> None:

@@ -13,7 +13,7 @@ from zsched.lab.paper.load import Window, loaded_at, schedule
 from zsched.lab.paper.oracle import best_nodes, changes, utilities, utility
 from zsched.lab.paper.places import robots_scenario_path, scenario_path
 from zsched.lab.paper.radio import drive_file, simulated_drive
-from zsched.lab.paper.scenario import LoadLevel, LoadPlan, NodeShare, Radio, Scenario, load_scenario
+from zsched.lab.paper.scenario import LinkView, LoadLevel, LoadPlan, NodeShare, Radio, Scenario, load_scenario
 from zsched.lab.paper.schemes import SCHEMES, candidates_of, find_schemes, scheme_tree
 
 EDGES = ("edge1", "edge2", "edge3")
@@ -140,6 +140,7 @@ def test_the_robots_scenario_is_three_robots_by_the_radio_alone() -> None:
     assert sorted(scenario.links) == sorted(tree["nodes"])
     assert tree["tasks"]["map_merge"]["weights"]["network"] == 1.0
     assert scenario.load.lanes == 0
+    assert scenario.link_view is LinkView.DIRECT
 
 
 # --- the radio -------------------------------------------------------------------------------------------------------
