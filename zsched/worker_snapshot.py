@@ -32,6 +32,8 @@ MAX_SNAPSHOT: Final = 32 << 20
 FIRST_S: Final = 0.3
 """Silence after which the predecessor is taken for dead; a relay's flip waits as long for the new owner."""
 TIMEOUT_S: Final = 2.0
+RELAY_S: Final = 5.0
+"""So long a worker that starts waits for its node's relay, which may start later than it does (or again)."""
 
 _log = logging.getLogger("zsched.worker")
 
@@ -76,6 +78,7 @@ class StateLink:
             config.insert_json5("mode", json.dumps("client"))
             config.insert_json5("listen/endpoints", "[]")
             config.insert_json5("connect/endpoints", json.dumps(endpoints[:1]))
+            config.insert_json5("connect/timeout_ms", json.dumps(round(RELAY_S * 1000)))
             return zenoh.open(config)
         except (zenoh.ZError, ValueError) as error:
             _log.warning("no session of its own for snapshots (%s): only direct neighbours are asked", error)

@@ -13,12 +13,13 @@ import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
+from support.sessions import opened
 from support.waiting import free_endpoint
 from zsched.core.plan import Role, WorkerRole
 from zsched.core.relay_protocol import SnapshotChunk
 from zsched.relay_pipe import encode_chunk
-from zsched.worker_snapshot import CHUNK, MAX_SNAPSHOT, Assembly, Offer, Restorer, chunks, fetch
-from zsched.zenoh_config import worker_config
+from zsched.worker_snapshot import CHUNK, MAX_SNAPSHOT, Assembly, Offer, Restorer, StateLink, chunks, fetch
+from zsched.zenoh_config import data_config, worker_config
 
 KEY = "@zsched/test/snapshot/edge1/task"
 SIZES = st.sampled_from([0, 1, CHUNK - 1, CHUNK, CHUNK + 1, 3 * CHUNK, 3 * CHUNK + 7])
@@ -92,6 +93,22 @@ def until_offered(session: zenoh.Session, key: str = KEY) -> None:
         assert time.monotonic() < end, "the queryable is not seen"
         time.sleep(0.005)
     querier.undeclare()
+
+
+def test_a_worker_that_is_there_before_its_relay_waits_for_it() -> None:
+    endpoint = free_endpoint()
+    text = worker_config(connect=(endpoint,), shared_memory=False)
+    relays: list[zenoh.Session] = []
+    listen = data_config(listen=(endpoint,), connect=(), shared_memory=False)
+    late = threading.Timer(0.3, lambda: relays.append(opened(listen)))
+    with opened(text) as main:
+        late.start()
+        link = StateLink(main, text)
+        own = link.session
+        assert own.zid() != main.zid(), "its own session, though the relay came later"
+        link.close()
+    late.join()
+    relays[0].close()
 
 
 def test_a_large_snapshot_arrives_whole(sessions: tuple[zenoh.Session, zenoh.Session]) -> None:
