@@ -32,6 +32,7 @@ PROTOCOL: Final = 1
 GREETING_S: Final = 1.0
 """A relay that does not answer so long is no relay to go on with."""
 _ANSWERS: Final[tuple[type[Any], ...]] = (RelayHere, RelayRefused)
+_LOCK: Final = ".relay.lock"
 _TIMEVAL: Final = struct.Struct("ll")
 _CREDENTIALS: Final = struct.Struct("3i")
 
@@ -62,7 +63,7 @@ class Door:
 
     def __init__(self, folder: Path, node: NodeId) -> None:
         self._socket = folder / f"{node}.relay"
-        self._lock = folder / f"{node}.relay.lock"
+        self._lock = folder / f"{node}{_LOCK}"
 
     def note(self) -> Note | None:
         """The note about the relay that runs, ``None`` when none does."""
@@ -133,6 +134,12 @@ class Door:
         for path in (self._socket, self._lock):
             with contextlib.suppress(OSError):
                 path.unlink(missing_ok=True)
+
+
+def relays_in(folder: Path) -> tuple[int, ...]:
+    """The process ids of the relays that can be found again in a runtime folder."""
+    notes = (Door(folder, path.name.removesuffix(_LOCK)).note() for path in sorted(folder.glob(f"*{_LOCK}")))
+    return tuple(note.pid for note in notes if note is not None and note.pid > 0)
 
 
 def digest_of(*parts: str) -> str:

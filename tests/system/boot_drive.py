@@ -64,6 +64,32 @@ def is_back(state: dict[str, str], old_pid: int) -> bool:
     return is_new and EXPECTED in state["StatusText"]
 
 
+def relays() -> list[str]:
+    return [line.split()[0] for line in processes() if "zsched.relay" in line]
+
+
+def group_of(pid: int) -> Path:
+    """Where to write a process id for the process to join ``pid``'s control group."""
+    lines = [line.split(":", 2) for line in Path(f"/proc/{pid}/cgroup").read_text().splitlines()]
+    named = [f"/sys/fs/cgroup/systemd{path}" for _, name, path in lines if name == "name=systemd"]
+    return Path((named or [f"/sys/fs/cgroup{path}" for number, _, path in lines if number == "0"])[0], "cgroup.procs")
+
+
+def crash_and_restart(report: dict[str, object], pid: int) -> int:
+    """SIGKILL the daemon, then `systemctl restart`: each time another daemon, and the relay stays; the newest's pid."""
+    user = os.stat(f"/proc/{pid}").st_uid  # noqa: PTH116 - a /proc path, nothing to gain
+    stray = subprocess.Popen(["sleep", "1001"], start_new_session=True, user=user)
+    group_of(pid).write_text(str(stray.pid))
+    os.kill(pid, 9)
+    back = wait_for(lambda state: is_back(state, pid), 20.0)
+    stray.poll()
+    report["crashed"] = back | {"relay": relays(), "escaped": [one for one in processes() if "sleep 1001" in one]}
+    run("systemctl", "restart", UNIT)
+    again = wait_for(lambda state: is_back(state, int(back["MainPID"])), 20.0)
+    report["restarted"] = again | {"relay": relays()}
+    return int(again["MainPID"])
+
+
 def observe() -> dict[str, object]:
     report: dict[str, object] = {}
     start_s, start_said = timed("systemctl", "start", UNIT)
@@ -79,8 +105,11 @@ def observe() -> dict[str, object]:
     report["runtime"] = {
         path.name: path.read_text(errors="replace")[:2000] for path in Path("/run/zsched").glob("*.txt")
     }
+    report["relay"] = relays()
+    if report["relay"]:
+        pid = crash_and_restart(report, pid)
     os.kill(pid, 19)  # SIGSTOP: the loop is wedged, the process lives
-    report["watchdog"] = wait_for(lambda state: is_back(state, pid), 40.0)
+    report["watchdog"] = wait_for(lambda state: is_back(state, pid), 40.0) | {"relay": relays()}
     report["survivors"] = sorted(set(processes(user)) & before)
     stop_s, stop_said = timed("systemctl", "stop", UNIT)
     report["stop"] = show() | {"seconds": round(stop_s, 3), "said": stop_said}

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from zsched.adapters.systemd import Notifier, watchdog_interval_s
+from zsched.daemon import RESTART_SIGNAL
 
 UNIT = Path(__file__).parents[3] / "systemd" / "zsched.service"
 MAX_EXPOSURE = 1.5
@@ -84,7 +85,10 @@ def test_unit_promises_what_the_daemon_keeps() -> None:
     assert service["Restart"] == "always"
     assert service["RestartPreventExitStatus"] == "78"
     assert service["WatchdogSec"] == "10"
-    assert service["KillMode"] == "mixed"
+    assert service["KillMode"] == "process"
+    assert service["RestartKillSignal"] == RESTART_SIGNAL.name
+    assert service["RuntimeDirectoryPreserve"] == "restart"
+    assert service["ExecStopPost"].endswith("-m zsched.leftovers")
 
 
 def analyze(*arguments: str) -> subprocess.CompletedProcess[str]:
