@@ -205,6 +205,12 @@ SCHEDULING: Final = Record(
         "max_moves_per_minute": Field(
             Whole(1, 100_000), "Hard cap of planned moves; escapes are bounded too, at 60.", default="`6`"
         ),
+        "patience": Field(
+            Number(0.001, 1000),
+            "Move once staying has cost so much, lead times seconds (in place of `time_to_trigger_s`): "
+            "a big lead is followed sooner than a small one.",
+            default="the time-to-trigger",
+        ),
     },
     Tuning,
 )

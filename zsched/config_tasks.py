@@ -28,6 +28,8 @@ from zsched.core.templates import (
 
 _ANY_TUNING: Final = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
 """Stands in for a faulty one, so that the task's rules are checked in the same pass; such a file gives no fleet."""
+_OF_THE_TASK: Final = ("reach", "memory_floor_ratio", "max_moves_per_minute", "patience")
+"""Keys of `scheduling:` that are not part of the tuning: they cannot be changed at run time."""
 _Places = dict[str, Place]
 """Where each rule stands, by stream name."""
 
@@ -65,7 +67,7 @@ def _task(
     if not candidates:
         return None
     scheduling: Section | None = given.get("scheduling")
-    more = {} if scheduling is None else _of(scheduling, "reach", "memory_floor_ratio", "max_moves_per_minute")
+    more = {} if scheduling is None else _of(scheduling, *_OF_THE_TASK)
     demand: Section | None = given.get("demand")
     task = TaskSpec(
         name=name,

@@ -141,7 +141,8 @@ def test_every_setting_of_a_task_arrives() -> None:
         "[python, -m, zsched.tasks.map_merge], standby: warm}\n",
         """\
     scheduling:
-      {bonus: 0.2, time_to_trigger_s: 3, cool_down_s: 4, aggregate: median, reach: all, memory_floor_ratio: 0.1}
+      {bonus: 0.2, time_to_trigger_s: 3, cool_down_s: 4, aggregate: median, reach: all, memory_floor_ratio: 0.1,
+       patience: 0.3}
     link: {nu_dbm: -75, rho_dbm: -45, knee_dbm: -60}
     on_isolation: local
     drain_s: 5
@@ -161,6 +162,7 @@ def test_every_setting_of_a_task_arrives() -> None:
     task = fleet_of(text).task("map_merge")
     assert (task.tuning.bonus, task.tuning.time_to_trigger_s, task.tuning.cool_down_s) == (0.2, 3, 4)
     assert (task.tuning.aggregate, task.reach, task.memory_floor_ratio) == (Aggregate.MEDIAN, Reach.ALL, 0.1)
+    assert task.patience == 0.3
     assert (task.limits.nu_dbm, task.limits.rho_dbm, task.limits.knee_dbm) == (-75, -45, -60)
     assert (task.on_isolation, task.drain_s) == (OnIsolation.LOCAL, 5)
     worker = task.worker
@@ -388,7 +390,7 @@ ONE_FAULT = [
     ("[python, -m, zsched.tasks.map_merge]", "python -m x", "expected a list", "python -m x"),
     ("[python, -m, zsched.tasks.map_merge]", "[]", "expected a list", "[]"),
     ("standby: warm", "env: {ZSCHED_NODE: x}", "is set by zsched itself", "ZSCHED_NODE"),
-    ("    outputs:  ", "    link: {knee_dbm: -40}\n    outputs:  ", "must lie between nu_dbm (-80)", "knee_dbm: -40"),
+    ("    outputs:  ", "    link: {knee_dbm: -40}\n    outputs:  ", "must lie between nu_dbm (-80)", "-40}"),
     ("keep_last: 1", "keep_last: 1001", "not in the allowed range 0..1000", "1001"),
     ("keep_last: 1", "keep_last: 1.5", "expected a whole number", "1.5"),
     ("class: latest, keep_last: 1", "keep_last: 1", "only streams of class latest", "1}]"),

@@ -161,6 +161,8 @@ class TaskSpec:
     """Escape: the owner's free memory under this fraction."""
     max_moves_per_minute: int = 6
     """Hard cap of planned moves; escapes have their own (`zsched.core.damping`)."""
+    patience: float | None = None
+    """Utility seconds that staying may cost before the task moves, in place of the time-to-trigger; ``None``: that."""
     on_isolation: OnIsolation = OnIsolation.HOLD
     exclusive: bool = False
     drain_s: float = 2.0

@@ -18,6 +18,9 @@ from zsched.core.fleet import TaskSpec
 from zsched.core.model import Allocation, NodeId, PeerState, Profile, WorkerState
 from zsched.core.scoring import Standing, pick
 
+FORGIVEN_IN_S = 2.0
+LONGEST_GAP_S = 2.0
+"""Nothing is charged for longer than this between two judgements: nobody looked."""
 INITIAL_SETTLE_S = 3.0
 """A task that nobody owns yet waits so long for candidates that are still starting."""
 
@@ -52,12 +55,15 @@ class Judge:
     beaten_since: float | None = None
     """Since when the owner has been beaten by somebody, without a break."""
     not_ready_since: float | None = None
+    spent: float = 0.0
+    """What staying has cost so far, in utility seconds (tasks with a ``patience``)."""
+    spent_at: float | None = None
     seen_first_at: float | None = None
     """When a first candidate could be scored (a task that nobody owns waits for the others)."""
 
     def reset(self, *, is_new_owner: bool = False) -> None:
         """A vote was lost or the value changed: wait the whole time-to-trigger again."""
-        self.beaten_since = None
+        self.beaten_since, self.spent = None, 0.0
         if is_new_owner:
             self.not_ready_since = None
 
@@ -95,6 +101,7 @@ class Judge:
         if winner is None:
             self.beaten_since = None
             return Judgement(outcome=Outcome.NONE, candidate=owner, aggregate=0.0, reason="no candidate can have it")
+        self._spend(scored, owner, now)
         outcome, reason = self._outcome(winner, scored, allocation, settled_for_s, escape, is_called, now)
         cap = None if damping is None or owner is None else self._cap(damping, is_escape=escape is not None, now=now)
         if outcome is Outcome.PROPOSE and cap is not None:
@@ -108,6 +115,20 @@ class Judge:
             is_escape=escape is not None and outcome is Outcome.PROPOSE,
             aggregates=scored,
         )
+
+    def _spend(self, scored: Mapping[NodeId, float], owner: NodeId | None, now: float) -> None:
+        """Add up the lead over the owner with its bonus, over time (Page's CUSUM, Biometrika 41, 1954).
+
+        The bonus is its drift and the patience its threshold. `FORGIVEN_IN_S` without a lead clear the account.
+        """
+        patience = self.spec.patience
+        if patience is None or owner is None or owner not in scored:
+            self.spent, self.spent_at = 0.0, None
+            return
+        elapsed_s = 0.0 if self.spent_at is None else min(now - self.spent_at, LONGEST_GAP_S)
+        lead = max(scored.values()) - scored[owner]
+        rate = lead if lead > 0.0 else -patience / FORGIVEN_IN_S
+        self.spent, self.spent_at = max(self.spent + elapsed_s * rate, 0.0), now
 
     def _cap(self, damping: Damping, *, is_escape: bool, now: float) -> str | None:
         """Why no further move is allowed in this minute, or ``None``."""
@@ -145,7 +166,10 @@ class Judge:
             return Outcome.PROPOSE, f"vote called; {why}"
         if settled_for_s < tuning.cool_down_s:
             return Outcome.WAIT, f"{why}; cool-down {settled_for_s:.1f} of {tuning.cool_down_s:g} s"
-        if led_for < tuning.time_to_trigger_s:
+        patience = self.spec.patience
+        if patience is not None and self.spent < patience:
+            return Outcome.WAIT, f"{why}; staying has cost {self.spent:.3f} of {patience:g}"
+        if patience is None and led_for < tuning.time_to_trigger_s:
             return Outcome.WAIT, f"{why}; for {led_for:.1f} of {tuning.time_to_trigger_s:g} s"
         return Outcome.PROPOSE, f"{why} for {led_for:.1f} s"
 

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 import pytest
 
@@ -340,3 +342,51 @@ def test_an_owner_that_too_few_robots_reach_is_left_one_that_is_not_scored_is_no
     assert reason(profile(), vetoed={"edge1": "reached by 1 of 3 robots"}) == "edge1 is reached by 1 of 3 robots"
     assert reason(profile(), vetoed={"edge1": "no fresh profile"}) is None
     assert reason(profile(), vetoed={"edge2": "reached by 0 of 3 robots"}) is None
+
+
+# --- patience --------------------------------------------------------------------------------------------------------
+
+PATIENT = replace(SPEC, patience=0.2)
+
+
+def moved_after(aggregates: Mapping[str, float], *, settled: float = LONG) -> float:
+    """Seconds of judgements every half second until the first proposal, at most a minute."""
+    judge = Judge(spec=PATIENT)
+    for tick in range(120):
+        if judged(judge, aggregates, 100.0 + tick / 2, settled=settled + tick / 2).outcome is Outcome.PROPOSE:
+            return tick / 2
+    return math.inf
+
+
+@pytest.mark.parametrize(("challenger", "after_s"), [(0.64, 5.0), (0.7, 2.0), (0.8, 1.0), (1.0, 0.5), (0.6, math.inf)])
+def test_with_patience_a_task_moves_once_staying_has_cost_it(challenger: float, after_s: float) -> None:
+    """The owner has 0.5 and a bonus of 0.1; lead times seconds must reach 0.2 (rounded up to the next judgement)."""
+    assert moved_after({"edge1": 0.5, "edge2": challenger + 1e-6}) == after_s
+
+
+def test_patience_is_given_back_while_nobody_leads() -> None:
+    judge, lead = Judge(spec=PATIENT), {"edge1": 0.5, "edge2": 0.7}
+    for tick in range(40):
+        # a lead for 1.5 s, then two seconds without: the account never gets full
+        aggregates = lead if tick % 7 < 3 else EQUAL
+        assert judged(judge, aggregates, 100.0 + tick / 2).outcome is not Outcome.PROPOSE
+    assert judge.spent < 0.2
+
+
+def test_patience_does_not_shorten_the_cool_down_and_nobody_else_waits_for_it() -> None:
+    assert moved_after({"edge1": 0.5, "edge2": 0.9}, settled=4.0) == TUNING.cool_down_s - 4.0
+    fresh = Judge(spec=PATIENT)
+    assert judged(fresh, {"edge1": 0.5, "edge2": 0.61}, 100.0, called=True).outcome is Outcome.PROPOSE
+
+
+def test_a_vote_that_was_lost_is_paid_for_anew_and_a_gap_in_the_judgements_is_not() -> None:
+    judge, lead = Judge(spec=PATIENT), {"edge1": 0.5, "edge2": 0.7}
+    for tick in range(6):
+        last = judged(judge, lead, 100.0 + tick / 2)
+    assert last.outcome is Outcome.PROPOSE
+    judge.reset()
+    assert judged(judge, lead, 103.0).outcome is Outcome.WAIT
+    slight = {"edge1": 0.5, "edge2": 0.62}
+    judge = Judge(spec=PATIENT)
+    assert judged(judge, slight, 100.0).outcome is Outcome.WAIT
+    assert judged(judge, slight, 900.0).outcome is Outcome.WAIT, "nobody looked for so long"

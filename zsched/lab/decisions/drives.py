@@ -67,7 +67,7 @@ def cast(world: World) -> tuple[Entry, ...]:
         Entry(name="cool-down 5 s", make=entries.core(world, cool_down_s=5.0)),
         Entry(name="with a knee", limits=knee, make=entries.core(world)),
         Entry(name="2 s ahead", look=Look(lead_s=2.0), make=entries.core(world)),
-        Entry(name="area 0.2", make=entries.core(world, bonus=0.05, time_to_trigger_s=0.0, area=0.2)),
+        Entry(name="patience", make=entries.core(world, bonus=0.05, patience=entries.PATIENCE)),
         Entry(name="dyna_net", look=UNSMOOTHED, make=lambda view: PickRule(view, cost=entries.PAPER_COST)),
         Entry(name="dyna_net_penalty", look=UNSMOOTHED, make=lambda view: PickRule(view, cost=-entries.PAPER_COST)),
         Entry(name="argmax", look=UNSMOOTHED, make=PickRule),

@@ -2,8 +2,8 @@
 
 Knows: every rule's name and settings. Does not know: histories, results.
 
-The paper gives neither the cost of Alg. 2 nor rates; its schemes run here with our bonus, once a second, on readings
-averaged over about a second, and with the demand-corrected equations of docs/decisions/0001.
+The paper gives neither the cost of Alg. 2 nor rates; its schemes run here with a cost of 0.1, once a second, on
+readings averaged over about a second, and with the demand-corrected equations of docs/decisions/0001.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from zsched.core.fleet import LinkLimits
 from zsched.core.model import Tuning, Weights
 from zsched.lab.decisions.replay import Entry
 from zsched.lab.decisions.rules import (
-    AreaJudge,
     BlindRule,
     CoreRule,
     PickRule,
@@ -31,7 +30,9 @@ from zsched.lab.decisions.world import EVEN, RADIO_ONLY, World
 
 RAW: Final = Look(smoothing_s=0.5)
 """As noisy as a profiler that averages over one second."""
-PAPER_COST: Final = Tuning(weights=EVEN).bonus
+PAPER_COST: Final = 0.1
+PATIENCE: Final = 0.2
+"""Utility seconds, with a bonus of 0.05 (docs/evaluation/decisions.md)."""
 CPU_ONLY: Final = Weights(cpu=1.0, memory=0.0, network=0.0)
 MEMORY_ONLY: Final = Weights(cpu=0.0, memory=1.0, network=0.0)
 
@@ -42,15 +43,13 @@ def core(
     bonus: float | None = None,
     time_to_trigger_s: float | None = None,
     cool_down_s: float | None = None,
-    area: float | None = None,
+    patience: float | None = None,
 ) -> Callable[[View], Rule]:
-    """The production's decision; what is ``None`` is its default, ``area`` replaces the time-to-trigger."""
+    """The production's decision; what is ``None`` is its default, a ``patience`` replaces the time-to-trigger."""
     given = {"bonus": bonus, "time_to_trigger_s": time_to_trigger_s, "cool_down_s": cool_down_s}
     settings: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     tuning = Tuning(weights=world.spec.tuning.weights, **settings)
-    if area is None:
-        return lambda view: CoreRule(view, tuning)
-    return lambda view: CoreRule(view, tuning, make_judge=lambda spec: AreaJudge(spec=spec, area=area))
+    return lambda view: CoreRule(view, tuning, patience=patience)
 
 
 def schemes(world: World, seed: int) -> tuple[Entry, ...]:
@@ -58,6 +57,8 @@ def schemes(world: World, seed: int) -> tuple[Entry, ...]:
     names = world.candidates[:3]
     return (
         Entry(name="zsched", make=core(world)),
+        Entry(name="zsched, bonus 0.05", make=core(world, bonus=0.05)),
+        Entry(name="zsched, patience", make=core(world, bonus=0.05, patience=PATIENCE)),
         *(Entry(name=f"fixed_e{index}", make=_blind(fixed(name))) for index, name in enumerate(names, 1)),
         Entry(name="dyna_cpu", look=RAW, weights=CPU_ONLY, make=_pick(PAPER_COST)),
         Entry(name="dyna_mem", look=RAW, weights=MEMORY_ONLY, make=_pick(PAPER_COST)),
@@ -80,9 +81,9 @@ def _blind(choose: Callable[[tuple[str, ...]], str]) -> Callable[[View], Rule]:
 
 
 def grid(world: World) -> tuple[Entry, ...]:
-    """The sweep over zsched's tuning: smoothing, bonus, time-to-trigger, cool-down; and the area in place of the timer.
+    """The sweep over zsched's tuning: smoothing, bonus, time-to-trigger, cool-down; patience in place of the timer.
 
-    Names read ``s3 b0.1 t2 c10`` and ``s3 b0.05 a0.2 c5``.
+    Names read ``s3 b0.1 t2 c10`` and ``s3 b0.05 p0.2 c5``.
     """
     timed = tuple(
         Entry(
@@ -94,15 +95,15 @@ def grid(world: World) -> tuple[Entry, ...]:
             (1.5, 3.0), (0.03, 0.05, 0.07, 0.10, 0.15), (1.0, 2.0, 4.0), (5.0, 10.0)
         )
     )
-    areas = tuple(
+    patient = tuple(
         Entry(
-            name=f"s{smoothing_s:g} b{bonus:g} a{area:g} c5",
+            name=f"s{smoothing_s:g} b{bonus:g} p{patience:g} c5",
             look=Look(smoothing_s=smoothing_s),
-            make=core(world, bonus=bonus, time_to_trigger_s=0.0, cool_down_s=5.0, area=area),
+            make=core(world, bonus=bonus, cool_down_s=5.0, patience=patience),
         )
-        for smoothing_s, bonus, area in itertools.product((1.5, 3.0), (0.03, 0.05, 0.07), (0.05, 0.1, 0.2))
+        for smoothing_s, bonus, patience in itertools.product((1.5, 3.0), (0.03, 0.05, 0.07), (0.05, 0.1, 0.2))
     )
-    return timed + areas
+    return timed + patient
 
 
 def fading(world: World) -> tuple[Entry, ...]:

@@ -33,7 +33,7 @@ DPI: Final = 110
 
 
 def _colour(rule: str) -> str:
-    if rule == "zsched":
+    if rule.startswith("zsched"):
         return OURS
     return THEIRS if rule.startswith("dyna") else YARDSTICK
 
@@ -82,8 +82,8 @@ def grid(rows: Sequence[Row], chosen: str, before: str, path: Path) -> None:
     groups = (
         ("time-to-trigger, smoothing 3 s", "#2c6fbb", "s3 ", " t"),
         ("time-to-trigger, smoothing 1.5 s", "#74b3e0", "s1.5 ", " t"),
-        ("area, smoothing 3 s", "#2e8b57", "s3 ", " a"),
-        ("area, smoothing 1.5 s", "#90d0a8", "s1.5 ", " a"),
+        ("patience, smoothing 3 s", "#2e8b57", "s3 ", " p"),
+        ("patience, smoothing 1.5 s", "#90d0a8", "s1.5 ", " p"),
     )
     for label, colour, smoothing, trigger in groups:
         names = [name for name in regrets if name.startswith(smoothing) and trigger in name]

@@ -14,7 +14,19 @@ from zsched.lab.decisions.drives import DriveFigures
 
 Row = Mapping[str, Any]
 RULES: Final = (
-    *("oracle", "zsched", "fixed_e1", "fixed_e2", "fixed_e3", "dyna_cpu", "dyna_mem", "dyna_both", "dyna_net"),
+    *(
+        "oracle",
+        "zsched",
+        "zsched, bonus 0.05",
+        "zsched, patience",
+        "fixed_e1",
+        "fixed_e2",
+        "fixed_e3",
+        "dyna_cpu",
+        "dyna_mem",
+        "dyna_both",
+        "dyna_net",
+    ),
     *("dyna_both_penalty", "argmax", "every_25s", "random", "first_match"),
 )
 SPREAD_Z: Final = 1.96

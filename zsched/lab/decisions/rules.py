@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from random import Random
 from typing import Protocol
 
@@ -54,8 +54,7 @@ class CoreRule:
 
     view: View
     tuning: Tuning
-    make_judge: Callable[[TaskSpec], Judge] = lambda spec: Judge(spec=spec)
-    is_damped: bool = True
+    patience: float | None = None
     moves: list[Move] = field(default_factory=list)
     _judges: list[Judge] = field(init=False)
     _allocation: Allocation = field(init=False)
@@ -65,8 +64,8 @@ class CoreRule:
     _spec: TaskSpec = field(init=False)
 
     def __post_init__(self) -> None:
-        self._spec = self.view.spec
-        self._judges = [self.make_judge(self._spec) for _ in self.view.fleet.voters]
+        self._spec = replace(self.view.spec, patience=self.patience)
+        self._judges = [Judge(spec=self._spec) for _ in self.view.fleet.voters]
         self._allocation = Allocation(task=self._spec.name, revision=0, epoch=0, owner=None, tuning=self.tuning)
 
     def round(self, seats: tuple[int, ...], at_s: float, now: float) -> None:
@@ -96,7 +95,7 @@ class CoreRule:
             escape=escape,
             is_called=is_called,
             now=now,
-            damping=self._damping if self.is_damped else None,
+            damping=self._damping,
         )
 
     def _wake_when_due(self, seat: int, judgement: Judgement, now: float) -> None:
@@ -208,39 +207,3 @@ def first_match(can: tuple[NodeId, ...]) -> NodeId:
 def drawn(rng: Random) -> Callable[[tuple[NodeId, ...]], NodeId]:
     """A random one of those that can have it."""
     return rng.choice
-
-
-@dataclass(slots=True)
-class AreaJudge(Judge):
-    """Rent or buy: move once what staying has cost exceeds ``area`` (utility seconds), however it adds up.
-
-    Evaluated as an alternative to the time-to-trigger: a big lead is followed sooner than a small one. The bonus is the
-    CUSUM's drift, ``area`` its threshold (E. S. Page, Biometrika 41, 1954).
-    """
-
-    area: float = 0.2
-    _cost: float = 0.0
-    _seen_at: float | None = None
-
-    def judge(self, standing: Standing, allocation: Allocation, **given: object) -> Judgement:
-        """As `Judge`, with the area in place of the timer."""
-        now = given["now"]
-        assert isinstance(now, float)
-        judged = Judge.judge(self, standing, allocation, **given)  # type: ignore[arg-type]
-        owner = allocation.owner
-        elapsed = 0.0 if self._seen_at is None else now - self._seen_at
-        self._seen_at = now
-        if owner is None or judged.is_escape or owner not in judged.aggregates:
-            self._cost = 0.0
-            return judged
-        lead = max(judged.aggregates.values()) - judged.aggregates[owner]
-        drain = 0.0 if lead > 0.0 else self.area / 2.0  # two seconds of not leading clear the account
-        self._cost = max(self._cost + elapsed * (lead - drain), 0.0)
-        if judged.outcome is Outcome.PROPOSE and not given["is_called"] and self._cost < self.area:
-            return Judgement(outcome=Outcome.WAIT, candidate=owner, aggregate=0.0, reason="the lead is too young")
-        return judged
-
-    def reset(self, *, is_new_owner: bool = False) -> None:
-        """A vote ended: the account is closed."""
-        Judge.reset(self, is_new_owner=is_new_owner)
-        self._cost = 0.0

@@ -10,7 +10,7 @@ import pytest
 from zsched.core.model import Tuning
 from zsched.lab.decisions import entries
 from zsched.lab.decisions.replay import Entry, replay
-from zsched.lab.decisions.rules import AreaJudge, BlindRule, CoreRule, Move, PickRule, drawn, first_match, fixed
+from zsched.lab.decisions.rules import BlindRule, CoreRule, Move, PickRule, drawn, first_match, fixed
 from zsched.lab.decisions.view import Look
 from zsched.lab.decisions.world import EVEN, World, equal_world, loaded_world
 
@@ -49,14 +49,10 @@ def test_after_a_move_the_cool_down_holds() -> None:
     assert min(planned) >= 20.0
 
 
-def test_the_area_moves_sooner_for_a_big_lead_than_for_a_small_one() -> None:
-    def delay(area: float) -> float:
+def test_patience_follows_a_big_lead_sooner_than_a_small_one() -> None:
+    def delay(patience: float) -> float:
         world = equal_world(seed=1, hours=0.03, half_width=0.0, step_at_s=STEP_AT_S)
-        tuning = Tuning(weights=EVEN, bonus=0.05, time_to_trigger_s=0.0, cool_down_s=0.0)
-        entry = Entry(
-            name="area", make=lambda view: CoreRule(view, tuning, make_judge=lambda s: AreaJudge(spec=s, area=area))
-        )
-        (move,) = only(world, entry)
+        (move,) = only(world, Entry(name="patient", make=entries.core(world, bonus=0.05, patience=patience)))
         return move.at_s - STEP_AT_S
 
     assert delay(0.05) < delay(0.4) < delay(1.6)
