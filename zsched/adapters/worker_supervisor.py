@@ -338,6 +338,8 @@ class WorkerSupervisor:
         failure: str = "",
         first_step: int = 0,
     ) -> None:
+        if worker.phase is _Phase.STARTING and not failure:  # no handlers yet: SIGINT would be a traceback in the log
+            first_step = max(first_step, STOP_SIGNALS.index(signal.SIGTERM))
         if worker.phase is not _Phase.STOPPING:
             worker.failure = failure
         worker.phase = _Phase.STOPPING

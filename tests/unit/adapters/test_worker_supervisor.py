@@ -137,6 +137,7 @@ def test_stop_uses_sigint_first_and_start_runs_it_again() -> None:
     with supervised(python(SLEEP)) as (supervisor, recorder):
         supervisor.start("merge")
         recorder.wait("started")
+        supervisor.mark_ready("merge", 700001)
         supervisor.stop("merge")
         supervisor.start("merge")
         _, _, _, _, reason = recorder.wait("exited")
@@ -144,6 +145,18 @@ def test_stop_uses_sigint_first_and_start_runs_it_again() -> None:
         _, _, _, incarnation = recorder.wait("started", 2)
         assert incarnation == 700002
         assert not [call for call in recorder.calls if call[0] == "failed"]
+
+
+def test_a_worker_that_is_starting_is_stopped_without_a_traceback(caplog: pytest.LogCaptureFixture) -> None:
+    """It has no handlers yet: Python would answer SIGINT with a KeyboardInterrupt in the middle of an import."""
+    caplog.set_level("INFO")
+    with supervised(python("print('up', flush=True); import time; time.sleep(60)")) as (supervisor, recorder):
+        supervisor.start("merge")
+        wait_until(lambda: "up" in caplog.text)
+        supervisor.stop("merge")
+        _, _, _, _, reason = recorder.wait("exited")
+        assert reason == "stopped by SIGTERM"
+    assert "Traceback" not in caplog.text
 
 
 def test_stop_kills_a_stubborn_worker_and_its_grandchildren(tmp_path: Path) -> None:
