@@ -25,6 +25,8 @@ from zsched.lab.paper.schemes import Family, Scheme, find_schemes
 ATTEMPTS = 3
 IDLE_FLOOR = 0.05
 """Where pressure cannot be measured: a host that was less idle than this was short of CPU."""
+GIVE_UP = 3
+"""So many cells in a row that stay invalid: the machine or the fleet is at fault, and the rest would fail as well."""
 METRICS = "metrics.json"
 Say = Callable[[str], None]
 Json = dict[str, Any]
@@ -109,28 +111,38 @@ class Matrix:
         self._runs, self._say = out / "runs", say
 
     def run(self, cells: Sequence[Cell]) -> None:
-        """Run what is not done yet; a failing cell does not stop the others."""
+        """Run what is not done yet; a failing cell does not stop the others.
+
+        Raises:
+            ChildError: `GIVE_UP` cells in a row stayed invalid.
+        """
         todo = [cell for cell in cells if not (self._runs / cell.name / METRICS).exists()]
         progress = Progress(total=len(todo))
         if len(todo) < len(cells):
             self._say(f"{len(cells) - len(todo)} of {len(cells)} runs are done already")
+        in_a_row = 0
         for cell in todo:
             self._say(progress.line(cell))
             started = time.monotonic()
-            self._one(cell)
+            reason = self._one(cell)
+            in_a_row = 0 if reason is None else in_a_row + 1
+            if in_a_row >= GIVE_UP:
+                raise ChildError(f"{GIVE_UP} cells in a row stayed invalid, the last: {reason}; see {self._runs}")
             progress.took_s.append(time.monotonic() - started)
             progress.done += 1
 
-    def _one(self, cell: Cell) -> None:
-        folder = self._runs / cell.name
+    def _one(self, cell: Cell) -> str | None:
+        """One cell until it is valid; returns why it is not after all attempts."""
+        folder, reason = self._runs / cell.name, None
         for attempt in range(1, ATTEMPTS + 1):
             set_aside(folder, "interrupted")
             reason = self._attempt(cell, folder)
             if reason is None:
-                return
+                return None
             self._say(f"{cell.name}: invalid (attempt {attempt} of {ATTEMPTS}): {reason}")
             write_json(folder / "invalid.json", {"cell": cell.name, "attempt": attempt, "reason": reason})
             set_aside(folder, "invalid")
+        return reason
 
     def _attempt(self, cell: Cell, folder: Path) -> str | None:
         """Make the run and its figures; returns why it is invalid."""

@@ -17,6 +17,7 @@ COLUMNS = (
     ("map_hz", "maps/s", 2),
     ("throughput_mb_s", "MB/s", 1),
     ("task_latency_s", "task s", 1),
+    ("is_done", "done", 2),
     ("merge_latency_p50_s", "p50 s", 2),
     ("merge_latency_p95_s", "p95 s", 2),
     ("merge_latency_p99_s", "p99 s", 2),

@@ -87,23 +87,27 @@ class Rule:
             case RuleName.PENALTY:
                 return {n: max(value - PENALTY * (n == owner), 0.0) for n, value in aggregates.items()}
             case RuleName.FIRST:
-                return _only(aggregates, min(aggregates, default=None))
+                return _only(aggregates, min(aggregates, default=None), owner)
             case RuleName.RANDOM:
-                return self._random(aggregates, now)
+                return self._random(aggregates, owner, now)
             case RuleName.ORACLE:
-                plan = self._current()
-                return aggregates if plan is None else _only(aggregates, plan.best_at(now - plan.zero_s))
+                return self._oracle(aggregates, owner, now)
             case RuleName.EVERY:
                 return self._every(aggregates, owner, now, is_called=is_called)
             case _:
                 return aggregates
 
-    def _random(self, aggregates: Mapping[NodeId, float], now: float) -> Mapping[NodeId, float]:
+    def _random(self, aggregates: Mapping[NodeId, float], owner: NodeId | None, now: float) -> Mapping[NodeId, float]:
         plan = self._current()
         if plan is None or not aggregates:
             return aggregates
         window = int((now - plan.zero_s) // RANDOM_PERIOD_S)
-        return _only(aggregates, random.Random(f"{plan.seed}/{window}").choice(sorted(aggregates)))
+        lot = random.Random(f"{plan.seed}/{window}").choice(sorted(aggregates))
+        return _only(aggregates, lot, owner)
+
+    def _oracle(self, aggregates: Mapping[NodeId, float], owner: NodeId | None, now: float) -> Mapping[NodeId, float]:
+        plan = self._current()
+        return aggregates if plan is None else _only(aggregates, plan.best_at(now - plan.zero_s), owner)
 
     def _every(
         self, aggregates: Mapping[NodeId, float], owner: NodeId | None, now: float, *, is_called: bool
@@ -113,7 +117,7 @@ class Rule:
             return aggregates
         window = int((now - plan.zero_s) // EVERY_S)
         if window <= self._decided and not is_called:
-            return _only(aggregates, owner)
+            return _only(aggregates, owner, owner)
         self._decided = max(window, self._decided)
         return aggregates
 
@@ -123,11 +127,12 @@ class Rule:
         return self._plan
 
 
-def _only(aggregates: Mapping[NodeId, float], chosen: NodeId | None) -> Mapping[NodeId, float]:
-    """``chosen`` is certain, everybody else out of the question; unchanged when it may not have the task."""
-    if chosen not in aggregates:
+def _only(aggregates: Mapping[NodeId, float], chosen: NodeId | None, owner: NodeId | None) -> Mapping[NodeId, float]:
+    """``chosen`` is certain, everybody else out of the question; the owner when ``chosen`` may not have the task now."""
+    wanted = chosen if chosen in aggregates else owner
+    if wanted not in aggregates:
         return aggregates
-    return {name: CERTAIN if name == chosen else 0.0 for name in aggregates}
+    return {name: CERTAIN if name == wanted else 0.0 for name in aggregates}
 
 
 class RuledJudge(Judge):

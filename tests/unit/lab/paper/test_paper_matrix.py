@@ -9,7 +9,17 @@ import pytest
 
 from zsched.lab.children import ChildError
 from zsched.lab.paper.bench import BenchOptions, claim_folder, command_of, plan_body, planned
-from zsched.lab.paper.matrix import METRICS, Matrix, Progress, cells_of, collect, invalid_reason, set_aside
+from zsched.lab.paper.matrix import (
+    ATTEMPTS,
+    GIVE_UP,
+    METRICS,
+    Matrix,
+    Progress,
+    cells_of,
+    collect,
+    invalid_reason,
+    set_aside,
+)
 from zsched.lab.paper.places import robots_scenario_path, scenario_path
 from zsched.lab.paper.robots import LogRobots
 from zsched.lab.paper.run import Cell, Inputs
@@ -105,6 +115,15 @@ def test_what_stays_invalid_does_not_stop_the_rest(scenario: Scenario, tmp_path:
     said = play(scenario, tmp_path, Outcomes(0.9, 0.9, 0.9, 0.1), "zsched", "random")
 
     assert said[-1] == "1 valid, 3 invalid"
+
+
+def test_a_machine_that_never_gives_a_valid_run_ends_the_bench(scenario: Scenario, tmp_path: Path) -> None:
+    runs = Outcomes(*[0.9] * 99)
+
+    with pytest.raises(ChildError, match="in a row"):
+        play(scenario, tmp_path, runs, "zsched", "random", "argmax", "oracle")
+
+    assert len(runs.made) == GIVE_UP * ATTEMPTS
 
 
 def test_an_interrupted_matrix_goes_on_behind_what_is_done(scenario: Scenario, tmp_path: Path) -> None:

@@ -75,7 +75,9 @@ def test_the_oracle_follows_its_plan_once_it_is_there(tmp_path: Path, plan: Path
     assert rule.apply(VALUES, "e1", 101.0, is_called=False) == {"e1": 0.0, "e2": 0.0, "e3": 1.0}
     assert rule.apply(VALUES, "e1", 110.5, is_called=False) == {"e1": 0.0, "e2": 1.0, "e3": 0.0}
     without = {"e1": 0.5, "e3": 0.3}
-    assert rule.apply(without, "e1", 110.5, is_called=False) == without  # e2 may not have the task now
+    # e2 may not have the task now: the owner keeps it, unless it may not either.
+    assert rule.apply(without, "e1", 110.5, is_called=False) == {"e1": 1.0, "e3": 0.0}
+    assert rule.apply(without, "e2", 110.5, is_called=False) == without
 
 
 def test_random_is_one_lot_per_window_for_all_robots(plan: Path) -> None:
