@@ -16,8 +16,8 @@ from zsched.core.utility import clamp
 from zsched.lab.paper.load import Window, loaded_at
 from zsched.lab.paper.scenario import LoadLevel, NodeShare, Scenario
 
-BASE_MB = 190.0
-"""Daemon, relay and warm merging worker of an edge together (measured: 150 to 220 MiB)."""
+BASE_MB = 110.0
+"""Daemon, relay and merging worker of an edge together (measured: 65 MiB idle, 150 MiB as the owner)."""
 TASK_CORES = 0.15
 FRAME_CORES_S = 0.013
 """CPU seconds of one frame of 320 x 320 on one thread; larger frames cost by their area."""

@@ -128,7 +128,7 @@ class Rule:
 
 
 def _only(aggregates: Mapping[NodeId, float], chosen: NodeId | None, owner: NodeId | None) -> Mapping[NodeId, float]:
-    """``chosen`` is certain, everybody else out of the question; the owner when ``chosen`` may not have the task now."""
+    """``chosen`` is certain, all others are out of the question; the owner, when ``chosen`` may not have the task."""
     wanted = chosen if chosen in aggregates else owner
     if wanted not in aggregates:
         return aggregates
