@@ -34,7 +34,7 @@ from zsched.clock import monotonic_s, wall_seconds
 from zsched.config import load_fleet
 from zsched.core import events as ev
 from zsched.core.fleet import NodeSpec, electorate_hash, fleet_hash
-from zsched.core.model import DurableState, NodeId, TaskId
+from zsched.core.model import DurableState, NodeId, NodeKind, TaskId
 from zsched.core.node import Node
 from zsched.core.status import status_line
 from zsched.core.workers import runs_worker
@@ -54,6 +54,8 @@ CLOSE_WORKERS_S = 0.7
 LOOP_MAX_WAIT_S = 1.0
 RESTART_SIGNAL = signal.SIGUSR2
 """As SIGTERM, but the relay stays and carries the streams on for the daemon that follows (`systemctl restart`)."""
+ALERT_S, ALERT_WAIT_S = 1.0, 0.01
+"""After a token went, beats are looked at so often and for so long: they tell whether its node lives."""
 
 log = logging.getLogger("zsched.daemon")
 
@@ -110,7 +112,7 @@ class Sampler:
         states, pids = (supervisor.states(), supervisor.pids()) if supervisor is not None else ({}, {})
         device = self._device.sample({task: (state, pids.get(task)) for task, state in states.items()})
         links = tuple(reader.read() for reader in self._readers)
-        self._inbox.post(ev.ProfileSampled(device=device, links=links))
+        self._inbox.post_quietly(ev.ProfileSampled(device=device, links=links))
         for index, reader in enumerate(self._readers):
             self._report(f"profile/link{index}", reader.problem)
 
@@ -135,6 +137,7 @@ class Daemon:
         self._next_status = 0.0
         self._is_restart = False
         self._door = Door(options.runtime_dir, options.node)
+        self._is_ready = False
 
     def run(self) -> int:
         """Run until SIGTERM or SIGINT; the exit code."""
@@ -201,6 +204,8 @@ class Daemon:
                 dials_by_gossip=not has_all_addresses(fleet),
             ),
             post=self._inbox.post,
+            is_voter=self._spec.kind is NodeKind.ROBOT,
+            hears_all_beats_at_once=any(task.exclusive for task in fleet.tasks),
         )
         access = StreamAccess(fleet, me, points.worker_connect[:1], operator_json5)
         desk = Desk(me, self._inbox, bus, access.answer)
@@ -294,18 +299,21 @@ class Daemon:
         """Take an event, handle it, carry the batch out; wake up in time for the node's next deadline."""
         shell.carry_out(node.start(monotonic_s()))
         watchdog_s = watchdog_interval_s()
-        next_ping, is_ready, stop_by, is_leaving = 0.0, False, float("inf"), False
+        next_ping, stop_by, is_leaving, alert_until = 0.0, float("inf"), False, 0.0
         while True:
             wait = min(node.next_deadline() - monotonic_s(), LOOP_MAX_WAIT_S)
+            if monotonic_s() < alert_until:
+                wait = min(wait, ALERT_WAIT_S)
             event = self._inbox.take(wait) or ev.DeadlineReached()
+            now = monotonic_s()
+            if now >= node.next_deadline() or now < alert_until or isinstance(event, ev.TokenLost):
+                self._take_waiting(node, shell)  # before the event: they came before it, and nobody may look silent
             now = monotonic_s()
             shell.carry_out(node.handle(event, now))
             if shell.stand_down:
                 raise ConfigError(f"{node.me}: {shell.stand_down}")
-            if not is_ready and isinstance(event, ev.ProfileSampled):
-                is_ready = True
-                self._notify.ready()
-                log.info("ready node=%s fleet=%s incarnation=%d", node.me, self._fleet.name, node.incarnation)
+            if isinstance(event, ev.TokenLost):
+                alert_until = now + ALERT_S
             if isinstance(event, ev.StopRequested) and stop_by == float("inf"):
                 self._notify.stopping()
                 stop_by = now + (HAND_OVER_S if node.owned() else 0.0)
@@ -321,6 +329,20 @@ class Daemon:
             if now >= self._next_status:
                 self._next_status = now + 1.0
                 self._notify.status(status_line(node))
+
+    def _take_waiting(self, node: Node, shell: Shell) -> None:
+        """Let the node have what has come without waking the loop: our own samples, and frames in turn."""
+        for waiting in (*self._inbox.waiting(), *shell.waiting_frames()):
+            shell.carry_out(node.handle(waiting, monotonic_s()))
+            self._note_ready(node, waiting)
+
+    def _note_ready(self, node: Node, event: ev.Event) -> None:
+        """Ready is who runs and has measured its machine."""
+        if self._is_ready or not isinstance(event, ev.ProfileSampled):
+            return
+        self._is_ready = True
+        self._notify.ready()
+        log.info("ready node=%s fleet=%s incarnation=%d", node.me, self._fleet.name, node.incarnation)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -55,12 +55,20 @@ class Keyspace:
         return self._key("alive", node, str(incarnation))
 
     def beat(self, node: NodeId) -> str:
-        """Put, best effort: the heartbeat out of the decision loop."""
+        """Put, best effort: a heartbeat out of turn, for it has news; receivers wake up for it."""
         return self._key("beat", node)
 
+    def beat_in_turn(self, node: NodeId) -> str:
+        """Put, best effort: the heartbeat out of the decision loop; receivers look at it when they are awake anyway."""
+        return self._key("beat", node, "in", "turn")
+
     def profile(self, node: NodeId) -> str:
-        """Put: `Profile`."""
+        """Put: `Profile`, for something has happened: a worker's state, draining, a link that came or went."""
         return self._key("profile", node)
+
+    def profile_in_turn(self, node: NodeId) -> str:
+        """Put: `Profile` with new figures; receivers look at it when they are awake anyway."""
+        return self._key("profile", node, "in", "turn")
 
     def utility(self, node: NodeId, asker: NodeId) -> str:
         """Queryable of ``node``: its utility vectors for all tasks."""
@@ -83,8 +91,12 @@ class Keyspace:
         return self._key("allocation", node, asker)
 
     def all_puts(self) -> str:
-        """Selector over every put of every node (beat, profile, proposal, allocation)."""
+        """Selector over every put of every node that wakes its receivers (beat, profile, proposal, allocation)."""
         return self._key("*", "*")
+
+    def all_in_turn(self) -> str:
+        """Selector over every put of every node that wakes nobody up."""
+        return self._key("*", "*", "in", "turn")
 
     def all_questions(self, node: NodeId) -> str:
         """Key expression of every question to ``node``: ``<kind>/<node>/<asker>``."""

@@ -13,7 +13,8 @@ import logging
 import math
 import queue
 import threading
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator
 from typing import Any, assert_never
 
 from zsched.adapters.control_bus import ControlBus
@@ -31,6 +32,7 @@ from zsched.errors import AdapterError, WireError
 from zsched.report import snapshot_json
 
 INBOX_LIMIT = 20_000
+WAITING_LIMIT = 64
 ANSWER_TIMEOUT_S = 3.0
 PROBLEM_TTL_S = 60.0
 """An instruction that failed and was never tried again is no problem any more after so long."""
@@ -49,6 +51,7 @@ class Inbox:
     def __init__(self) -> None:
         self._queue: queue.SimpleQueue[ev.Event] = queue.SimpleQueue()
         self._first: ev.Event | None = None
+        self._waiting: deque[ev.Event] = deque(maxlen=WAITING_LIMIT)
         self.overflowed = 0
 
     def post(self, event: ev.Event) -> None:
@@ -57,6 +60,15 @@ class Inbox:
             self.overflowed += 1
             return
         self._queue.put(event)
+
+    def post_quietly(self, event: ev.Event) -> None:
+        """Enqueue without waking the loop: it is taken by `waiting` when the loop is awake anyway; the oldest go."""
+        self._waiting.append(event)
+
+    def waiting(self) -> Iterator[ev.Event]:
+        """What has been posted quietly, in order."""
+        while self._waiting:
+            yield self._waiting.popleft()
 
     def put_first(self, event: ev.Event) -> None:
         """Let ``event`` be the next one taken; from the loop only."""
@@ -195,6 +207,10 @@ class Shell:
                 if self._failed_at:
                     self._forget(kind)
 
+    def waiting_frames(self) -> Iterator[ev.Event]:
+        """The beats and profiles that have come and woken nobody up."""
+        return self._bus.waiting()
+
     def _forget(self, works: str) -> None:
         """End the problem of an instruction that works again, and those that are too old to mean anything."""
         now = monotonic_s()
@@ -208,10 +224,10 @@ class Shell:
         match instruction:
             case do.PersistState(state=state):
                 self._state_file.save(state)
-            case do.PublishBeat(beat=beat):
-                bus.publish("beat", beat)
-            case do.PublishProfile(profile=profile):
-                bus.publish("profile", profile)
+            case do.PublishBeat(beat=beat, is_news=is_news):
+                bus.publish("beat" if is_news else "beat_in_turn", beat)
+            case do.PublishProfile(profile=profile, is_news=is_news):
+                bus.publish("profile" if is_news else "profile_in_turn", profile)
             case do.PublishProposal(proposal=proposal):
                 bus.publish("proposal", proposal)
             case do.PublishLearnt(learnt=learnt):

@@ -29,6 +29,7 @@ FLOORS: Final[tuple[tuple[str, int, str], ...]] = (
     (r"(config|config_\w+)", 2, "seams"),
     (r"relay_door", 2, "seams"),
     (r"adapters\.(worker_supervisor|worker_process|launch)", 3, "adapters: worker processes"),
+    (r"adapters\.(control_bus|open_questions)", 3, "adapters: control"),
     (r"adapters\.(network_profiler|nl80211)", 3, "adapters: radio"),
     (r"adapters\.(streams|relay_child)", 3, "adapters: relay"),
     (r"adapters\.(device_profiler|cgroup)", 3, "adapters: machine"),
@@ -55,7 +56,7 @@ IMPURE_CALLS: Final = frozenset({"open", "print", "input", "exec", "eval", "comp
 HEAVY: Final = frozenset({"numpy", "cv2", "matplotlib", "onnxruntime", "rich", "pydantic", "asyncio"})
 OUTSIDE: Final[dict[str, str]] = {
     # library: who alone may import it, besides lab and tasks
-    "zenoh": r"adapters\.(control_bus|stream_tap)|relay\..+|worker|worker_\w+|zenoh_config",
+    "zenoh": r"adapters\.(control_bus|open_questions|stream_tap)|relay\..+|worker|worker_\w+|zenoh_config",
     "psutil": r"adapters\.\w+",
     "msgpack": r"wire",
     "ruamel": r"config_reader",

@@ -12,7 +12,8 @@ import zenoh
 from zsched.keyspace import END_CHUNK, ROOT, Keyspace, ParsedKey, parse
 
 KEYS = Keyspace("warehouse")
-KIND_OF = {"learnt": "allocation"}
+KIND_OF = {"learnt": "allocation", "beat_in_turn": "beat", "profile_in_turn": "profile"}
+IN_TURN = {"beat_in_turn", "profile_in_turn"}
 PUTS = {"beat", "profile", "proposal", "allocation"}
 QUESTIONS = {"utility", "register", "learnt", "status", "command"}
 BUILT: dict[str, tuple[str, ParsedKey]] = {}
@@ -20,7 +21,9 @@ BUILT: dict[str, tuple[str, ParsedKey]] = {}
 for _method, _arguments in {
     "alive": ("edge1", 7),
     "beat": ("edge1",),
+    "beat_in_turn": ("edge1",),
     "profile": ("edge1",),
+    "profile_in_turn": ("edge1",),
     "utility": ("robot1", "robot2"),
     "proposal": ("robot1",),
     "register": ("robot1", "robot2"),
@@ -36,18 +39,24 @@ for _method, _arguments in {
 }.items():
     _build: Callable[..., str] = getattr(KEYS, _method)
     _rest = tuple(str(argument) for argument in _arguments[1:])
+    _rest = ("in", "turn") if _method in IN_TURN else _rest
     _parsed = ParsedKey(fleet="warehouse", kind=KIND_OF.get(_method, _method), owner=str(_arguments[0]), rest=_rest)
     BUILT[_method] = (_build(*_arguments), _parsed)
 
 
 def test_every_builder_is_covered_here() -> None:
     builders = {name for name, _ in inspect.getmembers(Keyspace, inspect.isfunction) if not name.startswith("_")}
-    assert builders == set(BUILT) | {"all_puts", "all_questions"}
+    assert builders == set(BUILT) | {"all_puts", "all_in_turn", "all_questions"}
 
 
 def test_selector_over_all_puts_matches_those_only() -> None:
     selector = zenoh.KeyExpr(KEYS.all_puts())
     assert {kind for kind, (key, _) in BUILT.items() if selector.includes(zenoh.KeyExpr(key))} == PUTS
+
+
+def test_selector_over_what_comes_in_turn_matches_that_only() -> None:
+    selector = zenoh.KeyExpr(KEYS.all_in_turn())
+    assert {kind for kind, (key, _) in BUILT.items() if selector.includes(zenoh.KeyExpr(key))} == IN_TURN
 
 
 def test_selector_over_all_questions_matches_every_question_to_that_node_and_no_put() -> None:
@@ -62,7 +71,7 @@ def test_selector_over_all_questions_matches_every_question_to_that_node_and_no_
         if zenoh.KeyExpr(KEYS.all_questions("edge9")).includes(zenoh.KeyExpr(key))
     }
     assert ours >= QUESTIONS
-    assert ours.isdisjoint(PUTS | {"worker"})
+    assert ours.isdisjoint(PUTS | IN_TURN | {"worker"})
     assert others == set()
 
 
@@ -88,14 +97,15 @@ def test_no_wildcard_of_a_user_receives_a_control_key(kind: str, user: str) -> N
 @pytest.mark.parametrize("kind", BUILT)
 def test_selector_over_all_matches_its_own_kind_only(kind: str) -> None:
     build: Callable[..., str] = getattr(KEYS, kind)
-    selector = zenoh.KeyExpr(build(*["*"] * (1 + len(BUILT[kind][1].rest))))
+    selector = zenoh.KeyExpr(build(*["*"] * len(inspect.signature(build).parameters)))
     matched = {other for other, (key, _) in BUILT.items() if selector.includes(zenoh.KeyExpr(key))}
     assert matched == {kind}
 
 
 def test_other_fleets_keys_never_meet_ours() -> None:
     others = [key.replace("warehouse", "yard") for key, _ in BUILT.values()]
-    selectors = [getattr(KEYS, kind)(*["*"] * (1 + len(parsed.rest))) for kind, (_, parsed) in BUILT.items()]
+    builders = [getattr(KEYS, kind) for kind in BUILT]
+    selectors = [build(*["*"] * len(inspect.signature(build).parameters)) for build in builders]
     for selector, other in itertools.product(selectors, others):
         assert not zenoh.KeyExpr(selector).intersects(zenoh.KeyExpr(other))
 

@@ -43,7 +43,7 @@ from zsched.core.model import (
 from zsched.core.plan import Role, RoutePhase, RoutePlan, WorkerRole
 from zsched.core.relay_protocol import RelayStarted, WorkerSeen
 from zsched.errors import AdapterError, WireError
-from zsched.shell import INBOX_LIMIT, LOCAL_REQUESTS_FROM, PROBLEM_TTL_S, Desk, Inbox, Shell
+from zsched.shell import INBOX_LIMIT, LOCAL_REQUESTS_FROM, PROBLEM_TTL_S, WAITING_LIMIT, Desk, Inbox, Shell
 
 TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
 BALLOT = Ballot(counter=1, node="robot1", incarnation=1)
@@ -113,7 +113,9 @@ def house(tmp_path: Path) -> Iterator[House]:
 
 EVERY: dict[do.Instruction, tuple[Any, ...]] = {
     do.PublishBeat(beat=BEAT): ("publish", "beat", BEAT),
+    do.PublishBeat(beat=BEAT, is_news=False): ("publish", "beat_in_turn", BEAT),
     do.PublishProfile(profile=PROFILE): ("publish", "profile", PROFILE),
+    do.PublishProfile(profile=PROFILE, is_news=False): ("publish", "profile_in_turn", PROFILE),
     do.PublishProposal(proposal=PROPOSAL): ("publish", "proposal", PROPOSAL),
     do.PublishLearnt(learnt=LEARNT): ("publish", "allocation", LEARNT),
     do.AskUtilities(gather=3, deadline_s=0.1): ("ask_utilities", 3, 0.1),
@@ -380,3 +382,16 @@ def test_desk_asks_other_nodes_over_the_bus_and_hands_its_errors_on(house: House
     assert house.desk.answer({**weights, "node": "edge1"})["outcome"] == "ok"
     assert "edge2 did not answer" in house.desk.answer({"verb": "status", "node": "edge2"})["error"]
     assert house.events() == [], "the loop is not asked for another node"
+
+
+def test_what_is_posted_quietly_wakes_nobody_and_keeps_its_order() -> None:
+    inbox = Inbox()
+    first, second = ev.StreamsCounted(counts=()), ev.DeadlineReached()
+    inbox.post_quietly(first)
+    inbox.post_quietly(second)
+    assert inbox.take(0.01) is None
+    assert list(inbox.waiting()) == [first, second]
+    assert list(inbox.waiting()) == []
+    for _ in range(WAITING_LIMIT + 5):
+        inbox.post_quietly(second)
+    assert len(list(inbox.waiting())) == WAITING_LIMIT

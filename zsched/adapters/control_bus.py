@@ -10,16 +10,15 @@ the loop, by its number. A frame that is malformed, or whose key names another n
 from __future__ import annotations
 
 import contextlib
-import itertools
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import zenoh
 
 from zsched import wire
-from zsched.clock import monotonic_s
+from zsched.adapters.open_questions import Questions
 from zsched.core import events as ev
 from zsched.core.messages import (
     Accept,
@@ -37,10 +36,10 @@ from zsched.core.snapshot import Snapshot
 from zsched.errors import AdapterError, WireError
 from zsched.keyspace import Keyspace, parse
 
-QUESTION_TTL_S = 5.0
-MAX_QUESTIONS = 1024
 OPERATOR_TIMEOUT_S = 3.0
 CLOSE_S = 0.5
+RING = 1024
+"""Frames in turn that wait for the loop; when it does not come the oldest go, and zenoh waits for nobody."""
 
 Post = Callable[[ev.Event], None]
 log = logging.getLogger("zsched.bus")
@@ -65,51 +64,23 @@ def _event_of(value: Beat | Profile | Proposal | Learnt) -> tuple[NodeId, ev.Eve
     return value.node, ev.LearntReceived(learnt=value)
 
 
-class Questions:
-    """Open zenoh queries by number, until they are answered or too old."""
-
-    def __init__(self) -> None:
-        self._numbers = itertools.count(1)
-        self._open: dict[int, tuple[zenoh.Query, str, float]] = {}
-        self._lock = threading.Lock()
-
-    def keep(self, query: zenoh.Query, reply_key: str) -> int:
-        """Remember a query; the oldest ones are dropped when there are too many or they are too old."""
-        now = monotonic_s()
-        with self._lock:
-            number = next(self._numbers)
-            self._open[number] = (query, reply_key, now)
-            expired = [n for n, (_, _, at) in self._open.items() if now - at > QUESTION_TTL_S]
-            expired += list(self._open)[: max(len(self._open) - MAX_QUESTIONS, 0)]
-            dropped = [self._open.pop(n)[0] for n in expired if n in self._open]
-        for old in dropped:
-            old.drop()
-        return number
-
-    def answer(self, number: int, value: object) -> None:
-        """Reply and let go; too late is no error."""
-        with self._lock:
-            entry = self._open.pop(number, None)
-        if entry is None:
-            return
-        query, reply_key, _ = entry
-        try:
-            query.reply(reply_key, wire.encode(value))
-        finally:
-            query.drop()
-
-    def clear(self) -> None:
-        """Let go of everything (the session closes)."""
-        with self._lock:
-            entries, self._open = list(self._open.values()), {}
-        for query, _, _ in entries:
-            query.drop()
-
-
 class ControlBus:
     """One node's control session. ``post`` must only enqueue; all other methods are called from the loop."""
 
-    def __init__(self, *, fleet: str, node: NodeId, incarnation: int, zenoh_config: str, post: Post) -> None:
+    def __init__(
+        self,
+        *,
+        fleet: str,
+        node: NodeId,
+        incarnation: int,
+        zenoh_config: str,
+        post: Post,
+        is_voter: bool = True,
+        hears_all_beats_at_once: bool = True,
+    ) -> None:
+        """``is_voter``: peers gather utilities here. What comes in turn is posted at once, or waits for `waiting`."""
+        self._is_voter, self._hears_all_at_once = is_voter, hears_all_beats_at_once
+        self._ring: zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]] | None = None
         self._keys = Keyspace(fleet)
         self._node, self._incarnation = node, incarnation
         self._config = zenoh_config
@@ -136,7 +107,9 @@ class ControlBus:
         keys, node = self._keys, self._node
         self._publishers = {
             "beat": self._publisher(session, keys.beat(node), zenoh.Priority.REAL_TIME),
+            "beat_in_turn": self._publisher(session, keys.beat_in_turn(node), zenoh.Priority.REAL_TIME),
             "profile": self._publisher(session, keys.profile(node), zenoh.Priority.INTERACTIVE_LOW),
+            "profile_in_turn": self._publisher(session, keys.profile_in_turn(node), zenoh.Priority.INTERACTIVE_LOW),
             "proposal": self._publisher(session, keys.proposal(node), zenoh.Priority.INTERACTIVE_HIGH),
             "allocation": self._publisher(session, keys.allocation(node), zenoh.Priority.INTERACTIVE_HIGH),
         }
@@ -144,10 +117,32 @@ class ControlBus:
         # The token goes last: who sees it may ask, and must find the queryable.
         self._kept = [
             session.declare_subscriber(keys.all_puts(), self._on_sample),
-            session.declare_queryable(keys.all_questions(node), self._on_query),
+            *self._hear_in_turn(session),
+            *(session.declare_queryable(key, self._on_query) for key in self._questions_to_us()),
             session.liveliness().declare_subscriber(keys.alive("*", "*"), self._on_token, history=True),
             session.liveliness().declare_token(token),
         ]
+
+    def _hear_in_turn(self, session: zenoh.Session) -> list[Any]:
+        """Subscribe to what comes in turn: thirty frames a second in a small fleet, not worth waking up for each."""
+        key = self._keys.all_in_turn()
+        if self._hears_all_at_once:
+            return [session.declare_subscriber(key, self._on_sample)]
+        self._ring = session.declare_subscriber(key, zenoh.handlers.RingChannel(RING))
+        return [self._ring]
+
+    def _questions_to_us(self) -> list[str]:
+        """An edge has no utilities, so it is not to be asked for them."""
+        keys, node = self._keys, self._node
+        if self._is_voter:
+            return [keys.all_questions(node)]
+        return [keys.register(node, "*"), keys.learnt(node, "*"), keys.status(node, "*"), keys.command(node, "*")]
+
+    def waiting(self) -> Iterator[ev.Event]:
+        """The beats and profiles in turn that have come since the last call (the loop)."""
+        ring = self._ring
+        while ring is not None and (sample := ring.handler.try_recv()) is not None:
+            yield self._event(sample)
 
     def _publisher(self, session: zenoh.Session, key: str, priority: zenoh.Priority) -> zenoh.Publisher:
         return session.declare_publisher(
@@ -166,7 +161,7 @@ class ControlBus:
         session, self._session = self._session, None
         if session is None:
             return
-        kept, self._kept, self._publishers = self._kept, [], {}
+        kept, self._kept, self._publishers, self._ring = self._kept, [], {}, None
         closing = threading.Thread(target=self._close, args=(session, kept), name="zsched-bus-close", daemon=True)
         closing.start()
         closing.join(CLOSE_S)
@@ -188,19 +183,18 @@ class ControlBus:
     # --- what comes in (zenoh's threads) -----------------------------------------------------------------------------
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
+        self._post(self._event(sample))
+
+    def _event(self, sample: zenoh.Sample) -> ev.Event:
         key = parse(str(sample.key_expr))
         if key is None or key.kind not in _PUTS:
-            self._post(ev.FrameDropped(kind="key", reason="unknown"))
-            return
+            return ev.FrameDropped(kind="key", reason="unknown")
         try:
             value = wire.decode(sample.payload.to_bytes(), _PUTS[key.kind])
         except WireError as error:
-            self._post(ev.FrameDropped(kind=key.kind, reason=error.reason))
-            return
+            return ev.FrameDropped(kind=key.kind, reason=error.reason)
         owner, event = _event_of(value)
-        if owner != key.owner:
-            event = ev.FrameDropped(kind=key.kind, reason="foreign")
-        self._post(event)
+        return event if owner == key.owner else ev.FrameDropped(kind=key.kind, reason="foreign")
 
     def _on_token(self, sample: zenoh.Sample) -> None:
         key = parse(str(sample.key_expr))

@@ -26,16 +26,21 @@ class PersistState:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PublishBeat:
-    """Send the heartbeat to everybody, best effort."""
+    """Send the heartbeat to everybody, best effort.
+
+    Out of turn (``is_news``) it wakes its receivers up; in turn it waits until they are awake anyway.
+    """
 
     beat: Beat
+    is_news: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PublishProfile:
-    """Send our profile to every gateway."""
+    """Send our profile to every gateway; with news (more than figures) it wakes its receivers up."""
 
     profile: Profile
+    is_news: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

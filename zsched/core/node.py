@@ -121,7 +121,7 @@ class Node:
         self._identity = Identity(me, incarnation, self.fleet_file, now)
         self._hangs = HangWatch(fleet)
         self._tenure = Tenure(fleet, me, self.agreement.leases, self.executors)
-        self._beat_at = now
+        self._beat_at = self._turn_at = now
         self._beat_sequence = 0
         self.loop_lag_s = 0.0
         self._promised = math.inf
@@ -246,8 +246,9 @@ class Node:
             generation=self.agreement.generation or 0,
         )
         self.loop_lag_s = 0.0
-        self._beat_at = now + self.fleet.timing.beat_s
-        self._batch.add(do.PublishBeat(beat=beat))
+        is_in_turn = self._beat_at == self._turn_at  # whoever has news has brought the next beat forward
+        self._beat_at = self._turn_at = now + self.fleet.timing.beat_s
+        self._batch.add(do.PublishBeat(beat=beat, is_news=not is_in_turn))
         self._hear_leases(beat, now)
 
     def _on_beat(self, event: ev.BeatReceived, now: float) -> None:
@@ -333,7 +334,7 @@ class Node:
         )
         if profile is not None:
             self.gateway.absorb(profile, now)
-            self._batch.add(do.PublishProfile(profile=profile))
+            self._batch.add(do.PublishProfile(profile=profile, is_news=self.profiler.has_news))
             self._batch.add(*self._hangs.look(self.owned(), self.executors, self.gateway, now))
 
     def _on_profile(self, event: ev.ProfileReceived, now: float) -> None:

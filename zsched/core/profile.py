@@ -121,6 +121,8 @@ class Profiler:
         self._sampled_at = -math.inf
         self._is_new = False
         self._flags: tuple[object, ...] = ()
+        self.has_news = True
+        """The profile that was last sent says more than figures that differ."""
         self._links: tuple[Link, ...] = ()
         self._workers: tuple[WorkerLoad, ...] = ()
         self._sent: Profile | None = None
@@ -188,6 +190,7 @@ class Profiler:
         if not is_due and self._sent is not None and not _differs(profile, self._sent):
             return None
         self._sequence += 1
+        self.has_news = self._sent is None or _kinds(profile) != _kinds(self._sent)
         self._sent, self._sent_at = profile, now
         return profile
 

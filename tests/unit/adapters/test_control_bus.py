@@ -13,8 +13,9 @@ import zenoh
 
 from support.waiting import free_port, until
 from zsched import wire
-from zsched.adapters import control_bus
-from zsched.adapters.control_bus import ControlBus, Questions
+from zsched.adapters import control_bus, open_questions
+from zsched.adapters.control_bus import ControlBus
+from zsched.adapters.open_questions import Questions
 from zsched.core import events as ev
 from zsched.core.fleet import Timing
 from zsched.core.messages import (
@@ -68,13 +69,13 @@ COMMAND = SetWeights(task="merge", cpu=1.0, memory=0.0, network=0.0)
 class Peer:
     """One bus and the events it posted."""
 
-    def __init__(self, name: str, port: int, hub: int | None, incarnation: int = 1) -> None:
+    def __init__(self, name: str, port: int, hub: int | None, incarnation: int = 1, **options: bool) -> None:
         self.events: list[ev.Event] = []
         listen, connect = f"tcp/127.0.0.1:{port}", () if hub is None else (f"tcp/127.0.0.1:{hub}",)
         config = control_config(listen=(listen,), connect=connect, timing=TIMING)
         self.port, self.name = port, name
         self.bus = ControlBus(
-            fleet="f", node=name, incarnation=incarnation, zenoh_config=config, post=self.events.append
+            fleet="f", node=name, incarnation=incarnation, zenoh_config=config, post=self.events.append, **options
         )
 
     def of(self, kind: type[T]) -> list[T]:
@@ -132,7 +133,9 @@ def stranger(trio: tuple[Peer, Peer, Peer]) -> Iterator[zenoh.Session]:
     ("kind", "value", "event"),
     [
         ("beat", BEAT, ev.BeatReceived(beat=BEAT)),
+        ("beat_in_turn", BEAT, ev.BeatReceived(beat=BEAT)),
         ("profile", PROFILE, ev.ProfileReceived(profile=PROFILE)),
+        ("profile_in_turn", PROFILE, ev.ProfileReceived(profile=PROFILE)),
         ("proposal", PROPOSAL, ev.ProposalReceived(proposal=PROPOSAL)),
         ("allocation", LEARNT, ev.LearntReceived(learnt=LEARNT)),
     ],
@@ -145,6 +148,63 @@ def test_every_put_arrives_everywhere_but_at_its_sender(
     assert b.next(type(event)) == event
     assert c.next(type(event)) == event
     assert a.events == []
+
+
+def test_what_comes_in_turn_waits_until_the_loop_asks_and_news_do_not() -> None:
+    hub = free_port()
+    a, b = Peer("a", hub, None), Peer("b", free_port(), hub, hears_all_beats_at_once=False)
+    try:
+        a.bus.open()
+        b.bus.open()
+        until(lambda: a.sees("b") and b.sees("a"), "each other's tokens")
+        found: list[ev.Event] = []
+
+        def comes() -> bool:
+            a.bus.publish("beat_in_turn", BEAT)
+            found.extend(b.bus.waiting())
+            return bool(found)
+
+        until(comes, "a beat in turn")
+        a.bus.publish("profile_in_turn", PROFILE)
+        a.bus.publish("beat", replace(BEAT, sequence=99))
+        assert b.next(ev.BeatReceived).beat.sequence == 99
+        assert b.of(ev.ProfileReceived) == []
+        found.clear()
+
+        def has_profile() -> bool:
+            found.extend(b.bus.waiting())
+            return ev.ProfileReceived(profile=PROFILE) in found
+
+        until(has_profile, "the profile")
+        assert all(isinstance(event, ev.BeatReceived | ev.ProfileReceived) for event in found)
+    finally:
+        a.bus.close()
+        b.bus.close()
+    assert list(b.bus.waiting()) == []
+
+
+def test_edges_are_not_asked_for_utilities_and_answer_everything_else() -> None:
+    hub = free_port()
+    robot, edge = Peer("a", hub, None), Peer("b", free_port(), hub, is_voter=False)
+    try:
+        robot.bus.open()
+        edge.bus.open()
+        until(lambda: robot.sees("b") and edge.sees("a"), "each other's tokens")
+
+        def answers() -> bool:
+            robot.bus.ask_learnt("b", 1.0)
+            return bool(edge.of(ev.LearntAsked))
+
+        until(answers, "a question that it answers")
+        robot.bus.ask_utilities(1, 0.2)
+        robot.bus.ask_electors(PREPARE, 1.0)
+        edge.next(ev.PrepareAsked)  # asked after the utilities
+        assert edge.of(ev.UtilityAsked) == []
+        edge.bus.ask_utilities(2, 1.0)
+        robot.next(ev.UtilityAsked)
+    finally:
+        robot.bus.close()
+        edge.bus.close()
 
 
 def test_frame_that_is_too_large_to_send_is_an_error_of_the_adapter(mesh: tuple[Peer, Peer, Peer]) -> None:
@@ -321,13 +381,13 @@ class Query:
 
 def test_open_questions_are_bounded_in_number_and_age(monkeypatch: pytest.MonkeyPatch) -> None:
     now = 100.0
-    monkeypatch.setattr(control_bus, "monotonic_s", lambda: now)
+    monkeypatch.setattr(open_questions, "monotonic_s", lambda: now)
     questions: Any = Questions()
-    queries = [Query() for _ in range(control_bus.MAX_QUESTIONS + 10)]
+    queries = [Query() for _ in range(open_questions.MAX_QUESTIONS + 10)]
     for query in queries:
         questions.keep(query, "key")
-    assert [query.is_dropped for query in queries] == [True] * 10 + [False] * control_bus.MAX_QUESTIONS
-    now += control_bus.QUESTION_TTL_S + 0.1
+    assert [query.is_dropped for query in queries] == [True] * 10 + [False] * open_questions.MAX_QUESTIONS
+    now += open_questions.QUESTION_TTL_S + 0.1
     questions.keep(Query(), "key")
     assert all(query.is_dropped for query in queries)
     assert len(questions._open) == 1

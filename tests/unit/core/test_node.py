@@ -316,6 +316,7 @@ def test_draining_is_told_in_the_same_batch() -> None:
     node = started("edge1", learnt=value(1, "edge1"))
     (published,) = of(node.handle(ev.StopRequested(), 100.1), do.PublishProfile)
     assert published.profile.draining
+    assert published.is_news
 
 
 def test_stopped_worker_is_told_in_the_same_batch_and_once() -> None:
@@ -323,6 +324,7 @@ def test_stopped_worker_is_told_in_the_same_batch_and_once() -> None:
     batch = node.handle(ev.WorkerChanged(task="merge", state=WorkerState.FAILED, reason="exit code 1"), 100.1)
     (published,) = of(batch, do.PublishProfile)
     assert [load.state for load in published.profile.workers] == [WorkerState.FAILED]
+    assert published.is_news
     assert [one.text for one in of(batch, do.RecordStory)] == ["worker failed: exit code 1"]
     assert node.handle(ev.WorkerChanged(task="merge", state=WorkerState.FAILED), 100.1) == ()
 
@@ -425,4 +427,20 @@ def test_changes_of_peers_are_told_at_once() -> None:
     batch = node.handle(ev.TokenLost(node="edge1", incarnation=3), 100.1)
     (told,) = of(batch, do.PublishBeat)
     assert told.beat.suspects == ("edge1",)
+    assert told.is_news, "it wakes its receivers up"
     assert node.membership.state("edge1") is PeerState.SUSPECT
+
+
+def test_beats_in_turn_are_no_news() -> None:
+    node = started()
+    told = [
+        one for _ in range(3) for one in of(node.handle(ev.DeadlineReached(), node.next_deadline()), do.PublishBeat)
+    ]
+    assert told
+    assert not any(one.is_news for one in told[1:])
+
+
+def test_profiles_with_other_figures_are_no_news() -> None:
+    node = started()
+    (told,) = of(node.handle(ev.ProfileSampled(device=replace(SAMPLE, cpu_used_cores=3.5)), 102.0), do.PublishProfile)
+    assert not told.is_news
