@@ -308,8 +308,7 @@ class Daemon:
             now = monotonic_s()
             if now >= node.next_deadline() or now < alert_until or isinstance(event, ev.TokenLost):
                 self._take_waiting(node, shell)  # before the event: they came before it, and nobody may look silent
-            now = monotonic_s()
-            shell.carry_out(node.handle(event, now))
+            now = self._handle(node, shell, event)
             if shell.stand_down:
                 raise ConfigError(f"{node.me}: {shell.stand_down}")
             if isinstance(event, ev.TokenLost):
@@ -330,10 +329,19 @@ class Daemon:
                 self._next_status = now + 1.0
                 self._notify.status(status_line(node))
 
+    def _handle(self, node: Node, shell: Shell, event: ev.Event) -> float:
+        """One event, and what must come before any other (a disk that refused); when that was."""
+        now = monotonic_s()
+        shell.carry_out(node.handle(event, now))
+        while (first := self._inbox.take_first()) is not None:
+            now = monotonic_s()
+            shell.carry_out(node.handle(first, now))
+        return now
+
     def _take_waiting(self, node: Node, shell: Shell) -> None:
         """Let the node have what has come without waking the loop: our own samples, and frames in turn."""
         for waiting in (*self._inbox.waiting(), *shell.waiting_frames()):
-            shell.carry_out(node.handle(waiting, monotonic_s()))
+            self._handle(node, shell, waiting)
             self._note_ready(node, waiting)
 
     def _note_ready(self, node: Node, event: ev.Event) -> None:

@@ -74,9 +74,14 @@ class Inbox:
         """Let ``event`` be the next one taken; from the loop only."""
         self._first = event
 
+    def take_first(self) -> ev.Event | None:
+        """What must be taken before anything else, if there is something."""
+        event, self._first = self._first, None
+        return event
+
     def take(self, timeout_s: float) -> ev.Event | None:
         """The next event, waiting at most ``timeout_s`` (<= 0: not at all); ``None`` when there is none."""
-        event, self._first = self._first, None
+        event = self.take_first()
         if event is not None:
             return event
         try:
