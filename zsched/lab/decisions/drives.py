@@ -67,10 +67,11 @@ def cast(world: World) -> tuple[Entry, ...]:
         Entry(name="cool-down 5 s", make=entries.core(world, cool_down_s=5.0)),
         Entry(name="with a knee", limits=knee, make=entries.core(world)),
         Entry(name="2 s ahead", look=Look(lead_s=2.0), make=entries.core(world)),
-        Entry(name="patience", make=entries.core(world, bonus=0.05, patience=entries.PATIENCE)),
+        Entry(name="zsched, patience", make=entries.core(world, bonus=0.05, patience=entries.PATIENCE)),
         Entry(name="dyna_net", look=UNSMOOTHED, make=lambda view: PickRule(view, cost=entries.PAPER_COST)),
         Entry(name="dyna_net_penalty", look=UNSMOOTHED, make=lambda view: PickRule(view, cost=-entries.PAPER_COST)),
         Entry(name="argmax", look=UNSMOOTHED, make=PickRule),
+        Entry(name="argmax, every 0.5 s", look=UNSMOOTHED, make=lambda view: PickRule(view, period_s=0.5)),
         Entry(name="every_25s", look=UNSMOOTHED, make=lambda view: PickRule(view, period_s=25.0)),
         *(entry for entry in entries.schemes(world, 1) if entry.name.startswith("fixed")),
     )

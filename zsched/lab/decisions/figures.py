@@ -73,8 +73,8 @@ def rules(rows: Sequence[Row], path: Path) -> None:
     _save(figure, path)
 
 
-def grid(rows: Sequence[Row], chosen: str, before: str, path: Path) -> None:
-    """The sweep: regret against moves, one point per setting."""
+def grid(rows: Sequence[Row], stars: Mapping[str, str], path: Path) -> None:
+    """The sweep: regret against moves, one point per setting; ``stars`` is {label: setting}."""
     figure, axis = plt.subplots(figsize=(8, 5), layout="constrained")
     regrets = grid_regrets(rows)
     cases = WHOLE_GRID
@@ -88,11 +88,10 @@ def grid(rows: Sequence[Row], chosen: str, before: str, path: Path) -> None:
     for label, colour, smoothing, trigger in groups:
         names = [name for name in regrets if name.startswith(smoothing) and trigger in name]
         axis.scatter([moves[n] for n in names], [100 * regrets[n] for n in names], s=22, color=colour, label=label)
-    for name, colour, label in ((chosen, OURS, "the default"), (before, "black", "the first default")):
+    for (label, name), colour in zip(stars.items(), (OURS, "black"), strict=False):
         if name in regrets:
-            axis.scatter(
-                [moves[name]], [100 * regrets[name]], s=110, marker="*", color=colour, label=f"{label}: {name}"
-            )
+            place = ([moves[name]], [100 * regrets[name]])
+            axis.scatter(*place, s=120, marker="*", color=colour, label=f"{label}: {name}")
     axis.set_xlabel("moves per hour")
     axis.set_ylabel("mean regret, %")
     axis.set_title("Every setting of the grid on the training seeds (long, mixed)", fontsize=10)

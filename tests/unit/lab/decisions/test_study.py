@@ -1,0 +1,87 @@
+"""Experiments: resuming, seeds that are kept apart, tables and pictures from real (short) results."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from zsched.lab.decisions import report, study
+from zsched.lab.decisions.drives import DriveFigures
+from zsched.lab.decisions.figures import rules as rules_picture
+
+ONLY = frozenset({"zsched", "argmax", "fixed_e1"})
+CASES = tuple(case for case in study.compared((3,)) if case.name in ("long", "step"))
+
+
+def played(out: Path, hours: float, seeds: range = study.TEST) -> list[str]:
+    short = tuple(case if case.name == "step" else replace(case, hours=0.04) for case in CASES)
+    return list(study.play(short, hours, seeds, out, ONLY))
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("study") / "results-test.ndjson"
+    assert len(played(out, 0.08)) == 3, "two of long, one of step"
+    return out
+
+
+def test_a_later_run_goes_on_where_the_earlier_one_ended(results: Path, tmp_path: Path) -> None:
+    assert played(results, 0.08) == []
+    copy = tmp_path / "cut.ndjson"
+    lines = results.read_text().splitlines()
+    copy.write_text("\n".join(lines) + '\n{"case": "long", "se')  # a run that was killed while it wrote
+    assert len(study.read(copy)) == len(lines)
+
+
+def test_every_rule_and_the_oracle_have_a_line_for_every_history(results: Path) -> None:
+    rows = study.read(results)
+    found = {(row["case"], row["seed"], row["rule"]) for row in rows}
+    names = ONLY | {"oracle"}
+    assert found == {
+        (case, seed, name) for case, seed in (("long", 1001), ("long", 1002), ("step", 1001)) for name in names
+    }
+    assert all(float(row["regret"]) >= -1e-9 for row in rows), "nobody beats the oracle"
+
+
+def test_seeds_for_choosing_and_for_checking_are_different() -> None:
+    assert not set(study.TRAIN) & set(study.TEST)
+
+
+def test_the_tables_say_what_the_results_say(results: Path, tmp_path: Path) -> None:
+    rows = study.read(results)
+    figures = DriveFigures(rule="oracle", moves=3, wasted=1, mean_dbm=-50.0, weak=0.25, delay_ms=30.0)
+    report.write(rows, {"drives": [figures]}, tmp_path / "report.md")
+    text = (tmp_path / "report.md").read_text()
+    regrets = [100 * float(row["regret"]) for row in report.of(rows, "long", "fixed_e1")]
+    mean, spread = report.mean_and_spread(regrets)
+    assert f"| fixed_e1 | {mean:.2f} ± {spread:.2f} | 0.0 | 0.0 |" in text
+    assert "| zsched | 1 of 1 |" in text
+    assert "| fixed_e1 | 0 of 1 | - | - |" in text
+    assert "| oracle | 3 | 1 | -50.0 | 0.00 | 25.0 | 30.0 |" in text
+    assert text.index("| oracle |") < text.index("| zsched |") < text.index("| argmax |")
+
+
+def test_the_picture_is_drawn(results: Path, tmp_path: Path) -> None:
+    rules_picture(study.read(results), tmp_path / "rules.png")
+    assert (tmp_path / "rules.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_spread_is_the_interval_of_the_mean() -> None:
+    assert report.mean_and_spread([2.0]) == (2.0, 0.0)
+    mean, spread = report.mean_and_spread([1.0, 2.0, 3.0])
+    assert mean == 2.0
+    assert spread == pytest.approx(1.96 / 3**0.5)
+
+
+def test_the_command_refuses_to_mix_results_unless_told_to_resume(tmp_path: Path) -> None:
+    (tmp_path / "results-test.ndjson").write_text("")
+    command = [sys.executable, "-m", "zsched.lab.decisions", "--out", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 1
+    assert "--resume" in done.stderr
+    done = subprocess.run([*command, "--parts", "nonsense"], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 2
