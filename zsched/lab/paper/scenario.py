@@ -193,16 +193,16 @@ def load_scenario(path: Path) -> Scenario:
 
 def _scenario(path: Path, tree: dict[str, Any]) -> Scenario:
     fleet = path.parent / str(tree.pop("fleet", "fleet.yaml"))
-    levels = {str(name): LoadLevel(**spec) for name, spec in dict(tree.pop("levels", {})).items()}
-    nodes = {str(name): NodeShare(**spec) for name, spec in dict(tree.pop("nodes", {})).items()}
-    links = {str(name): Radio(**spec) for name, spec in dict(tree.pop("links", {})).items()}
+    levels = {str(name): LoadLevel(**spec) for name, spec in dict(tree.pop("levels", None) or {}).items()}
+    nodes = {str(name): NodeShare(**spec) for name, spec in dict(tree.pop("nodes", None) or {}).items()}
+    links = {str(name): Radio(**spec) for name, spec in dict(tree.pop("links", None) or {}).items()}
     load, sweep = LoadPlan(**_tuples(tree.pop("load", {}))), Sweep(**_tuples(tree.pop("sweep", {})))
     view = LinkView(tree.pop("link_view", LinkView.ACCESS_POINT))
-    explore = Exploration(**dict(tree.pop("explore", {})))
+    explore = Exploration(**dict(tree.pop("explore", None) or {}))
     known = {str(name): value for name, value in _tuples(tree).items()}
     blocks: dict[str, Any] = {"levels": levels, "nodes": nodes, "links": links, "link_view": view}
     return Scenario(fleet=fleet, load=load, sweep=sweep, explore=explore, **blocks, **known)
 
 
 def _tuples(tree: Any) -> dict[str, Any]:
-    return {str(name): tuple(value) if isinstance(value, list) else value for name, value in dict(tree).items()}
+    return {str(name): tuple(value) if isinstance(value, list) else value for name, value in dict(tree or {}).items()}
