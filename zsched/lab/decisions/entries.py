@@ -13,7 +13,6 @@ from collections.abc import Callable
 from random import Random
 from typing import Any, Final
 
-from zsched.core.fleet import LinkLimits
 from zsched.core.model import Tuning, Weights
 from zsched.lab.decisions.replay import Entry
 from zsched.lab.decisions.rules import (
@@ -116,9 +115,3 @@ def fading(world: World) -> tuple[Entry, ...]:
         )
         for lead_s, slope_s in ((0.0, 3.0), (1.0, 3.0), (2.0, 3.0), (2.0, 6.0), (4.0, 6.0))
     )
-
-
-def knees(world: World) -> tuple[Entry, ...]:
-    """The link's utility as the paper has it, and with a knee."""
-    shapes = {"linear": LinkLimits(), "knee-65": LinkLimits(knee_dbm=-65.0), "knee-70": LinkLimits(knee_dbm=-70.0)}
-    return tuple(Entry(name=name, limits=limits, make=core(world)) for name, limits in shapes.items())

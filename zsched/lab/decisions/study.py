@@ -92,12 +92,9 @@ def swept() -> tuple[Case, ...]:
 
 
 def options() -> tuple[Case, ...]:
-    """What might be better than the paper's: prediction of a fading link, a link with a knee."""
+    """What might be better than the paper's: prediction of a fading link."""
     radio = _loads(3, loads.LONG, with_radio=True)
-    return (
-        Case(name="fading radio", build=radio, cast=lambda world, _seed: entries.fading(world), hours=1.0),
-        Case(name="knee radio", build=radio, cast=lambda world, _seed: entries.knees(world), hours=1.0),
-    )
+    return (Case(name="fading radio", build=radio, cast=lambda world, _seed: entries.fading(world), hours=1.0),)
 
 
 def play(

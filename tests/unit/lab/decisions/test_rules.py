@@ -70,7 +70,7 @@ def test_rules_that_look_at_nothing() -> None:
 
 def test_every_entry_of_every_cast_plays_and_has_a_name_of_its_own() -> None:
     world = loaded_world(seed=1, hours=0.01, with_radio=True)
-    for cast in (entries.schemes(world, 1), entries.fading(world), entries.knees(world), entries.grid(world)):
+    for cast in (entries.schemes(world, 1), entries.fading(world), entries.grid(world)):
         names = [entry.name for entry in cast]
         assert len(set(names)) == len(names)
         moves = replay(world, cast)
