@@ -1,10 +1,11 @@
 """What one hop costs: direct pair, native router hop, naive relay, zsched's hop, in one interleaved run.
 
-``python -m benchmarks.streams [--rounds 3] [--seconds 1.5] [--sizes 64 1024 65536 1048576 4194304]``. TCP on loopback,
-shared memory off; publisher, hop and subscriber are processes of their own. Throughput: flat out, BLOCK. Latency: one
-way, paced (CLOCK_MONOTONIC is one clock for all processes). Hop CPU: user and system time of the hop's process per
-message of the throughput run. *naive*: ``bytes(payload)`` and a put in the subscriber's callback. *best_effort* and
-*reliable*: `python -m zsched.relay` itself, with a plan that rewrites ``bench/in`` to ``edge1/bench/in``.
+``python -m benchmarks.streams [--rounds 3] [--seconds 1.5] [--sizes 64 1024 65536 1048576 4194304] [--shared-memory]``.
+TCP on loopback, shared memory off unless asked for; publisher, hop and subscriber are processes of their own.
+Throughput: flat out, BLOCK. Latency: one way, paced (CLOCK_MONOTONIC is one clock for all processes). Hop CPU: user and
+system time of the hop's process per message of the throughput run. *naive*: ``bytes(payload)`` and a put in the
+subscriber's callback. *best_effort* and *reliable*: `python -m zsched.relay` itself, with a plan that rewrites
+``bench/in`` to ``edge1/bench/in``.
 """
 
 from __future__ import annotations
@@ -117,8 +118,8 @@ class Result:
 class Bench:
     """The processes of one way from a publisher to a subscriber over one kind of hop."""
 
-    def __init__(self, folder: Path, hop: str) -> None:
-        self._hop, self._folder = hop, folder
+    def __init__(self, folder: Path, hop: str, *, shared_memory: bool = False) -> None:
+        self._hop, self._folder, self._shared = hop, folder, shared_memory
         self._port = free_port()
         self._processes: list[subprocess.Popen[str]] = []
         self._relay: RelayHandle | None = None
@@ -156,7 +157,7 @@ class Bench:
         if self._hop in ("router", "naive"):
             process = self._start(NAIVE if self._hop == "naive" else ROUTER, "hop", IN, OUT, is_hub=True)
             return process.pid
-        text = data_config(listen=(self._endpoint(),), connect=(), shared_memory=False)
+        text = data_config(listen=(self._endpoint(),), connect=(), shared_memory=self._shared)
         self._relay = RelayHandle(fleet=FLEET, node="robot1", zenoh_config=text, on_report=self._heard.append)
         self._relay.start()
         until(lambda: any(isinstance(r, RelayChanged) and r.is_running for r in self._heard), "the relay runs")
@@ -188,8 +189,9 @@ class Bench:
         if not is_hub:
             # Ends of the native hop are clients: peers would find each other and leave the hop out.
             link = WorkerLink.CLIENT if self._hop == "router" else WorkerLink.PEER
-            return worker_config(connect=(self._endpoint(),), shared_memory=False, link=link)
-        config = zenoh.Config.from_json5(data_config(listen=(self._endpoint(),), connect=(), shared_memory=False))
+            return worker_config(connect=(self._endpoint(),), shared_memory=self._shared, link=link)
+        text = data_config(listen=(self._endpoint(),), connect=(), shared_memory=self._shared)
+        config = zenoh.Config.from_json5(text)
         if self._hop == "router":
             config.insert_json5("mode", json.dumps("router"))
         return str(config)
@@ -217,10 +219,10 @@ def _cpu_s(pid: int | None) -> float:
     return float(times.user + times.system)
 
 
-def _measure(folder: Path, hop: str, size: int, hz: float, seconds: float) -> Result:
-    bench = Bench(folder, hop)
+def _measure(folder: Path, hop: str, size: int, hz: float, options: argparse.Namespace) -> Result:
+    bench = Bench(folder, hop, shared_memory=options.shared_memory)
     try:
-        return bench.run(size, hz, seconds)
+        return bench.run(size, hz, options.seconds)
     finally:
         bench.close()
 
@@ -232,6 +234,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=1.5)
     parser.add_argument("--sizes", type=int, nargs="+", default=sorted(PACE_HZ))
     parser.add_argument("--hops", nargs="+", default=HOPS, choices=HOPS)
+    parser.add_argument("--shared-memory", action="store_true", help="between all of them, for puts of 3 KiB and more")
     options = parser.parse_args()
     print(machine())
     print("payload   hop          msg/s      MB/s   of router   p50 us   p99 us  added p50   hop CPU us/msg   received")
@@ -245,8 +248,8 @@ def _row(folder: Path, size: int, options: argparse.Namespace) -> None:
     paced: dict[str, list[Result]] = defaultdict(list)
     for _ in range(options.rounds):
         for hop in options.hops:
-            fast[hop].append(_measure(folder, hop, size, 0.0, options.seconds))
-            paced[hop].append(_measure(folder, hop, size, PACE_HZ.get(size, 100), options.seconds))
+            fast[hop].append(_measure(folder, hop, size, 0.0, options))
+            paced[hop].append(_measure(folder, hop, size, PACE_HZ.get(size, 100), options))
     rate = {hop: statistics.median(result.hz for result in results) for hop, results in fast.items()}
     p50 = {hop: _median_of(results, 0.5) for hop, results in paced.items()}
     for hop in options.hops:

@@ -40,6 +40,7 @@ from zsched.core.status import status_line
 from zsched.core.workers import runs_worker
 from zsched.daemon_access import StreamAccess
 from zsched.daemon_endpoints import Endpoints, endpoints_for, free_port, has_all_addresses, is_here
+from zsched.daemon_memory import shared_memory_objection
 from zsched.errors import AdapterError, ConfigError
 from zsched.relay_door import Door
 from zsched.shell import Desk, Inbox, Shell
@@ -138,6 +139,7 @@ class Daemon:
         self._is_restart = False
         self._door = Door(options.runtime_dir, options.node)
         self._is_ready = False
+        self._memory_objection = shared_memory_objection(self._fleet, self._spec)
 
     def run(self) -> int:
         """Run until SIGTERM or SIGINT; the exit code."""
@@ -160,6 +162,9 @@ class Daemon:
             )
             if problem is not None:
                 node.problems["state"] = problem
+            if self._memory_objection:
+                log.warning("shared_memory off why=%s", self._memory_objection)
+                node.problems["shared_memory"] = f"shared memory is off here: {self._memory_objection}"
             gc.freeze()  # what lives until the end need not be looked at again
             self._loop(node, shell)
         return EXIT_OK
@@ -241,7 +246,7 @@ class Daemon:
                 listen=points.data_listen,
                 connect=points.data_connect,
                 timing=fleet.timing,
-                shared_memory=False,
+                shared_memory=self._memory_objection == "",
                 operator_json5=operator_json5,
                 dials_by_gossip=not has_all_addresses(fleet),
             ),
@@ -267,7 +272,7 @@ class Daemon:
                     listen=points.worker_listen,
                     timing=fleet.timing,
                     link=spec.link,
-                    shared_memory=False,
+                    shared_memory=self._memory_objection == "",
                     operator_json5=operator_json5,
                     dials_by_gossip=not has_all_addresses(fleet),
                 )
