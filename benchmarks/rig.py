@@ -133,7 +133,7 @@ class Rig:
             on_report = _listener(heard)
             self.relays[node] = RelayHandle(fleet=FLEET, node=node, zenoh_config=text, on_report=on_report)
             self.relays[node].start()
-        until(lambda: all(self.find(RelayChanged, node, is_running=True) for node in nodes), "the relays run")
+        until(lambda: all(self.find(RelayChanged, node, is_running=True) for node in nodes), "the relays run", 60.0)
         return self
 
     def __exit__(
@@ -179,7 +179,7 @@ class Rig:
         }
         self.workers[node] = subprocess.Popen([sys.executable, "-m", "zsched.tasks.echo", *options], env=env)
         number = str(self.incarnation)
-        until(lambda: self.find(WorkerSeen, incarnation=number, is_present=True), f"the worker of {node}")
+        until(lambda: self.find(WorkerSeen, incarnation=number, is_present=True), f"the worker of {node}", 60.0)
 
     def role(self, node: str, role: WorkerRole, epoch: int = 0) -> None:
         """Tell a node's worker its role."""

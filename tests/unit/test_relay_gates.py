@@ -17,7 +17,7 @@ from zsched import send_queue
 from zsched.core.plan import Direction, HandoverRule, Route, StreamClass, StreamSettings
 from zsched.core.relay_protocol import EndMarker
 from zsched.keyspace import END_CHUNK
-from zsched.relay import outlet, outputs
+from zsched.relay import outlet, outputs, slots
 from zsched.relay.inputs import InputStream
 from zsched.relay.outputs import OutputStream
 from zsched.relay_pipe import decode_end, encode_end
@@ -341,7 +341,7 @@ def test_a_marker_of_another_epoch_ends_nothing(bench: Bench) -> None:
     move.stream.flip(2, drops_held=False)
     bench.outside.put(f"edge1/t/1/out/{END_CHUNK}", encode_end(EndMarker(epoch=7, count=0)))
     bench.outside.put(f"edge1/t/1/out/{END_CHUNK}", b"no marker")
-    time.sleep(2 * outputs.END_GRACE_S)
+    time.sleep(2 * slots.END_GRACE_S)
     assert not move.stream.has_ended(1)
 
 

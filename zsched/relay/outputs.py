@@ -11,18 +11,17 @@ until the old slot has ended. The publisher outlives every slot: applications se
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict, deque
+from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Final
 
 import zenoh
 from zenoh import CongestionControl, Sample, Session, Timestamp
 
 from zsched.clock import monotonic_s
+from zsched.core import keyexpr
 from zsched.core.plan import HandoverRule, Route, StreamClass, StreamCount
-from zsched.core.relay_protocol import EndMarker
-from zsched.hop_acks import SourceName
 from zsched.keyspace import AGAIN_CHUNK, END_CHUNK
 from zsched.relay.acks import Acks
 from zsched.relay.answers import Answers
@@ -30,6 +29,7 @@ from zsched.relay.counter import StreamCounter
 from zsched.relay.outlet import Outlet
 from zsched.relay.pace import Pace
 from zsched.relay.receive import Receiver, undeclare
+from zsched.relay.slots import Feed, KeyState, OutputSlot
 from zsched.relay_pipe import decode_end
 
 HOLD_SAMPLES: Final = 10_000
@@ -37,63 +37,6 @@ HOLD_BYTES: Final = 64 << 20
 FENCE_S: Final = 2.0
 """So long after a new owner took over, its answers to values older than what has passed are dropped."""
 MAX_STAMPS: Final = 4096
-END_GRACE_S: Final = 0.1
-"""A marker travels behind its data on one link; so long after it, what is still missing was dropped on the way."""
-
-
-@dataclass(slots=True)
-class _Key:
-    """What came on one concrete key of a slot, and what its end marker said."""
-
-    received: int = 0
-    end: EndMarker | None = None
-    end_at: float = 0.0
-    ender: SourceName | None = None
-    """The publisher whose end it is, where it keeps what we have not acknowledged."""
-    last_number: int = -1
-    numbers: dict[tuple[str, int], int] = field(default_factory=dict)
-    """{publisher: its newest number}; a worker that restarted in place is another publisher."""
-
-    def is_ended(self, now: float, answers: Answers | None) -> bool:
-        if self.end is None:
-            return False
-        is_complete = self.received >= self.end.count or self.last_number + 1 >= self.end.count
-        if is_complete or now - self.end_at <= END_GRACE_S:
-            return is_complete
-        return answers is None or self.ender is None or not answers.ask_for(self.ender, self.end.count)
-
-
-@dataclass(slots=True, eq=False)
-class _Feed:
-    """A subscription to an owner's output and the slot it feeds."""
-
-    slot: _OutputSlot
-    receiver: Receiver | None = None
-    again: Receiver | None = None
-    """What our relay alone is sent once more."""
-    ends: zenoh.Subscriber[None] | None = None
-
-    def close(self) -> None:
-        for receiver in (self.receiver, self.again):
-            if receiver is not None:
-                receiver.close()
-        if self.ends is not None:
-            undeclare(self.ends)
-
-
-@dataclass(slots=True, eq=False)
-class _OutputSlot:
-    epoch: int
-    expr: str
-    answers: Answers | None = None
-    """``None``: its worker keeps nothing for us (a foreign one)."""
-    feed: _Feed | None = None
-    """``None`` while an older slot of the same owner and key has the subscription."""
-    keys: dict[str, _Key] = field(default_factory=dict)
-    held: deque[Sample] = field(default_factory=deque)
-    held_bytes: int = 0
-    is_flipped: bool = False
-    is_closed: bool = False
 
 
 class OutputStream:
@@ -121,8 +64,9 @@ class OutputStream:
         self._lock = threading.Lock()
         self._counter = StreamCounter(route.stream)
         self._outlet = Outlet(local or session, route.from_expr, route.to_expr, route.settings)
-        self._slots: dict[int, _OutputSlot] = {}
-        self._carrier: _OutputSlot | None = None
+        self._slots: dict[int, OutputSlot] = {}
+        self._ends: dict[str, zenoh.Subscriber[None]] = {}
+        self._carrier: OutputSlot | None = None
         self._stamps: OrderedDict[str, Timestamp] = OrderedDict()  # newest that has passed, by the owner's relative key
         self._fence_until = 0.0
         self._is_paused = False
@@ -141,7 +85,7 @@ class OutputStream:
             zenoh.ZError: ``from`` is no key expression.
         """
         has_epoch = str(epoch) in route.from_expr.split("/")
-        slot = _OutputSlot(epoch=epoch, expr=route.from_expr)
+        slot = OutputSlot(epoch=epoch, expr=route.from_expr)
         stream_class = route.settings.stream_class
         if acks is not None and stream_class is not StreamClass.BEST_EFFORT:
             slot.answers = Answers(
@@ -154,12 +98,8 @@ class OutputStream:
             self._slots[epoch] = slot
             if any(other.expr == slot.expr for other in self._slots.values() if other is not slot):
                 return  # the same owner once more, without {epoch}: what comes cannot belong to both
-        feed = slot.feed = _Feed(slot=slot)
-        feed.ends = self._session.declare_subscriber(
-            f"{route.from_expr}/{END_CHUNK}",
-            lambda sample: self._end(feed.slot, sample),
-            allowed_origin=zenoh.Locality.REMOTE,
-        )
+        feed = slot.feed = Feed(slot=slot)
+        self._listen_for_ends(epoch, route.from_expr)
         feed.receiver = Receiver(
             self._session,
             route.from_expr,
@@ -174,6 +114,14 @@ class OutputStream:
                 replace(route.settings, stream_class=StreamClass.RELIABLE),
                 lambda sample: self._carry_again(feed.slot, sample),
                 with_history=False,
+            )
+
+    def _listen_for_ends(self, epoch: int, from_expr: str) -> None:
+        """One subscription for all epochs of an owner: zenoh 1.10 never frees what it keeps of a key that is new."""
+        expr = "/".join("*" if chunk == str(epoch) else chunk for chunk in from_expr.split("/"))
+        if expr not in self._ends:
+            self._ends[expr] = self._session.declare_subscriber(
+                f"{expr}/{END_CHUNK}", self._end, allowed_origin=zenoh.Locality.REMOTE
             )
 
     def know(self, from_expr: str) -> None:
@@ -250,7 +198,7 @@ class OutputStream:
         if feed is not None:
             feed.close()
 
-    def _hand_on(self, slot: _OutputSlot) -> _Feed | None:
+    def _hand_on(self, slot: OutputSlot) -> Feed | None:
         """Give a closing slot's subscription to the one that waits for it; answers it when nobody does."""
         feed, slot.feed = slot.feed, None
         heirs = [other for other in self._slots.values() if other.expr == slot.expr and other.feed is None]
@@ -268,6 +216,9 @@ class OutputStream:
         """Close every slot and give the publisher back."""
         for epoch in sorted(self._slots, reverse=True):
             self.close_slot(epoch)
+        for ends in self._ends.values():
+            undeclare(ends)
+        self._ends.clear()
         self._outlet.undeclare()
 
     def look_after(self) -> None:
@@ -275,7 +226,7 @@ class OutputStream:
         with self._lock:
             for slot in tuple(self._slots.values()):
                 for key, (_, zid, eid), sample in slot.answers.overdue() if slot.answers is not None else ():
-                    self._pass(slot, slot.keys.setdefault(key, _Key()), (zid, eid), sample)
+                    self._pass(slot, slot.keys.setdefault(key, KeyState()), (zid, eid), sample)
             if self._pace is None or self.route.settings.stream_class is not StreamClass.LATEST:
                 return
             for sample in self._pace.overdue(monotonic_s()):
@@ -288,7 +239,7 @@ class OutputStream:
 
     # --- one sample --------------------------------------------------------------------------------------------------
 
-    def _carry(self, slot: _OutputSlot, sample: Sample) -> None:
+    def _carry(self, slot: OutputSlot, sample: Sample) -> None:
         with self._lock:
             source = sample.source_info
             zid = "" if source is None else str(source.source_id.zid)
@@ -297,7 +248,7 @@ class OutputStream:
                 self._counter.dropped("loop")
                 return
             name = str(sample.key_expr)
-            key = slot.keys.setdefault(name, _Key())
+            key = slot.keys.setdefault(name, KeyState())
             publisher = (zid, 0 if source is None else source.source_id.eid)
             is_kept = slot.answers is not None and sample.congestion_control == CongestionControl.BLOCK
             if source is None or slot.answers is None or not is_kept:
@@ -306,21 +257,21 @@ class OutputStream:
             for ready in slot.answers.take((name, *publisher), source.source_sn, sample):
                 self._pass(slot, key, publisher, ready)
 
-    def _carry_again(self, slot: _OutputSlot, sample: Sample) -> None:
+    def _carry_again(self, slot: OutputSlot, sample: Sample) -> None:
         with self._lock:
             if slot.answers is None or slot.is_closed:
                 return
             for key, (_, zid, eid), ready in slot.answers.take_again(sample):
-                self._pass(slot, slot.keys.setdefault(key, _Key()), (zid, eid), ready)
+                self._pass(slot, slot.keys.setdefault(key, KeyState()), (zid, eid), ready)
 
-    def _pass(self, slot: _OutputSlot, key: _Key, publisher: tuple[str, int], sample: Sample) -> None:
+    def _pass(self, slot: OutputSlot, key: KeyState, publisher: tuple[str, int], sample: Sample) -> None:
         self._counter.seen(len(sample.payload))
         key.received += 1
         info: zenoh.SourceInfo | None = sample.source_info
         if info is None or self._is_next(key, publisher, info.source_sn):
             self._gate(slot, sample)
 
-    def _is_next(self, key: _Key, publisher: tuple[str, int], number: int) -> bool:
+    def _is_next(self, key: KeyState, publisher: tuple[str, int], number: int) -> bool:
         """Count what does not fit the numbers of the hop; an old one is dropped."""
         last = key.numbers.get(publisher, -1)
         key.last_number = key.numbers[publisher] = max(number, last)
@@ -332,7 +283,7 @@ class OutputStream:
             self._counter.lost += number - last - 1
         return number > last
 
-    def _gate(self, slot: _OutputSlot, sample: Sample) -> None:
+    def _gate(self, slot: OutputSlot, sample: Sample) -> None:
         if self._is_paused and not slot.is_closed:
             self._hold(slot, sample)
         elif slot is self._carrier:
@@ -347,7 +298,7 @@ class OutputStream:
         else:
             self._hold(slot, sample)
 
-    def _hold(self, slot: _OutputSlot, sample: Sample) -> None:
+    def _hold(self, slot: OutputSlot, sample: Sample) -> None:
         slot.held.append(sample)
         slot.held_bytes += len(sample.payload)
         while len(slot.held) > HOLD_SAMPLES or slot.held_bytes > HOLD_BYTES:
@@ -359,13 +310,13 @@ class OutputStream:
         if flipped:
             self._take_over(max(flipped, key=lambda slot: slot.epoch))
 
-    def _take_over(self, slot: _OutputSlot) -> None:
+    def _take_over(self, slot: OutputSlot) -> None:
         if self._carrier is not None or self._stamps:
             self._fence_until = monotonic_s() + FENCE_S
         self._carrier = slot
         self._release(slot)
 
-    def _release(self, slot: _OutputSlot) -> None:
+    def _release(self, slot: OutputSlot) -> None:
         while slot.held:
             self._forward(slot.held.popleft())
         slot.held_bytes = 0
@@ -394,14 +345,17 @@ class OutputStream:
             self._stamps.popitem(last=False)
         return True
 
-    def _end(self, slot: _OutputSlot, sample: Sample) -> None:
+    def _end(self, sample: Sample) -> None:
         """An end marker came (zenoh's callback thread: note it, wake the task, nothing else)."""
         marker = decode_end(sample.payload.to_bytes())
-        if marker is None or marker.epoch != slot.epoch:
+        if marker is None:
             return
+        name = str(sample.key_expr).removesuffix(f"/{END_CHUNK}")
         with self._lock:
-            name = str(sample.key_expr).removesuffix(f"/{END_CHUNK}")
-            key = slot.keys.setdefault(name, _Key())
+            slot = self._slots.get(marker.epoch)
+            if slot is None or not keyexpr.intersects(slot.expr, name):
+                return
+            key = slot.keys.setdefault(name, KeyState())
             if key.end is None:
                 key.end, key.end_at = marker, monotonic_s()
             source = sample.source_info

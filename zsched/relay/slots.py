@@ -1,0 +1,76 @@
+"""What an output stream knows of each of its slots: the subscription, the keys, the samples that wait, the ends.
+
+Knows: end markers, how long what is missing before one may take. Does not know: gates, who feeds a slot.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Final
+
+from zenoh import Sample
+
+from zsched.core.relay_protocol import EndMarker
+from zsched.hop_acks import SourceName
+from zsched.relay.answers import Answers
+from zsched.relay.receive import Receiver
+
+END_GRACE_S: Final = 0.1
+"""A marker travels behind its data on one link; so long after it, what is still missing was dropped on the way."""
+
+
+@dataclass(slots=True)
+class KeyState:
+    """What came on one concrete key of a slot, and what its end marker said."""
+
+    received: int = 0
+    end: EndMarker | None = None
+    end_at: float = 0.0
+    ender: SourceName | None = None
+    """The publisher whose end it is, where it keeps what we have not acknowledged."""
+    last_number: int = -1
+    numbers: dict[tuple[str, int], int] = field(default_factory=dict)
+    """{publisher: its newest number}; a worker that restarted in place is another publisher."""
+
+    def is_ended(self, now: float, answers: Answers | None) -> bool:
+        """True when everything up to the end marker has come, or will not come any more."""
+        if self.end is None:
+            return False
+        is_complete = self.received >= self.end.count or self.last_number + 1 >= self.end.count
+        if is_complete or now - self.end_at <= END_GRACE_S:
+            return is_complete
+        return answers is None or self.ender is None or not answers.ask_for(self.ender, self.end.count)
+
+
+@dataclass(slots=True, eq=False)
+class Feed:
+    """A subscription to an owner's output and the slot it feeds."""
+
+    slot: OutputSlot
+    receiver: Receiver | None = None
+    again: Receiver | None = None
+    """What our relay alone is sent once more."""
+
+    def close(self) -> None:
+        """Unsubscribe."""
+        for receiver in (self.receiver, self.again):
+            if receiver is not None:
+                receiver.close()
+
+
+@dataclass(slots=True, eq=False)
+class OutputSlot:
+    """One owner's epoch: what feeds it, what waits in it, how far its handover is."""
+
+    epoch: int
+    expr: str
+    answers: Answers | None = None
+    """``None``: its worker keeps nothing for us (a foreign one)."""
+    feed: Feed | None = None
+    """``None`` while an older slot of the same owner and key has the subscription."""
+    keys: dict[str, KeyState] = field(default_factory=dict)
+    held: deque[Sample] = field(default_factory=deque)
+    held_bytes: int = 0
+    is_flipped: bool = False
+    is_closed: bool = False
