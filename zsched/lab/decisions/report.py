@@ -29,7 +29,8 @@ RULES: Final = (
     ),
     *("dyna_both_penalty", "argmax", "every_25s", "random", "first_match"),
 )
-SPREAD_Z: Final = 1.96
+ERRORS: Final = 1.96
+"""Standard errors: a 95 % interval if there are many seeds."""
 WHOLE_GRID: Final = ("sweep long", "sweep mixed")
 """The kinds of histories that the whole grid has played; the others, only the best of these."""
 
@@ -40,11 +41,11 @@ def of(rows: Iterable[Row], case: str, rule: str | None = None) -> list[Row]:
 
 
 def mean_and_spread(values: Sequence[float]) -> tuple[float, float]:
-    """(mean, half width of the 95 % interval over seeds); the width is 0 with a single seed."""
+    """(mean, 1.96 standard errors over seeds); the latter is 0 with a single seed, and too small with a few."""
     mean = statistics.fmean(values)
     if len(values) < 2:
         return mean, 0.0
-    return mean, SPREAD_Z * statistics.stdev(values) / len(values) ** 0.5
+    return mean, ERRORS * statistics.stdev(values) / len(values) ** 0.5
 
 
 def rate(rows: Sequence[Row], field: str) -> float:
@@ -79,6 +80,8 @@ def step_table(rows: Sequence[Row]) -> str:
     """How soon each rule leaves a node that got 30 % worse."""
     lines = [
         "### step: 30 % worse in every weighted metric",
+        "",
+        "A rule that had left the node before the step has nothing to follow.",
         "",
         "| rule | followed | reaction s, median | longest |",
         "| --- | --- | --- | --- |",
@@ -155,7 +158,8 @@ def write(rows: Sequence[Row], drives: Mapping[str, Sequence[DriveFigures]], out
         parts.append("### The grid\n\n" + sweep_table(rows))
     parts += [drive_table(figures, title) for title, figures in drives.items()]
     played = sum(float(row["hours"]) for row in rows)
-    parts.insert(0, f"{played:.0f} hours of decisions in all, every rule's counted.\n")
+    heading = f"{played:.0f} hours of decisions in all, every rule's counted; ± is 1.96 standard errors over seeds.\n"
+    parts.insert(0, heading)
     out.write_text("\n".join(parts), encoding="utf-8")
 
 

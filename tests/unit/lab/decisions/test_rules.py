@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from random import Random
 
+import numpy as np
 import pytest
 
 from zsched.core.model import Tuning
@@ -12,7 +14,7 @@ from zsched.lab.decisions import entries
 from zsched.lab.decisions.replay import Entry, replay
 from zsched.lab.decisions.rules import BlindRule, CoreRule, Move, PickRule, drawn, first_match, fixed
 from zsched.lab.decisions.view import Look
-from zsched.lab.decisions.world import EVEN, World, equal_world, loaded_world
+from zsched.lab.decisions.world import DT_S, EVEN, World, equal_world, loaded_world
 
 STEP_AT_S = 60.0
 
@@ -56,6 +58,34 @@ def test_patience_follows_a_big_lead_sooner_than_a_small_one() -> None:
         return move.at_s - STEP_AT_S
 
     assert delay(0.05) < delay(0.4) < delay(1.6)
+
+
+def spiky() -> World:
+    """Every 20 s the first edge is half a machine busier for one second, in CPU and memory."""
+    world = equal_world(seed=1, hours=0.05, half_width=0.0)
+    use = world.cpu.copy()
+    at_s = np.arange(world.steps) * DT_S
+    use[(at_s + 5.0) % 20.0 < 1.0, 0] += 0.5
+    use[at_s < 10.0, 1] += 0.3  # every rule begins on the first edge
+    return replace(world, cpu=use, memory=use, cpu_read=use, memory_read=use)
+
+
+def test_short_spikes_move_nothing_by_default_and_with_patience_and_a_small_bonus_alone_is_not_enough() -> None:
+    """Why the default bonus is what it is (docs/decisions/0015)."""
+    world = spiky()
+    patient = entries.core(world, bonus=0.05, patience=entries.PATIENCE)
+    assert only(world, Entry(name="zsched", make=entries.core(world))) == []
+    assert only(world, Entry(name="patient", make=patient)) == []
+    assert len(only(world, Entry(name="small bonus", make=entries.core(world, bonus=0.05)))) >= 1
+
+
+def test_patience_keeps_equal_nodes_apart_as_well_and_follows_a_step_sooner() -> None:
+    patient = Entry(name="patient", make=lambda view: CoreRule(view, Tuning(weights=EVEN, bonus=0.05), patience=0.2))
+    assert only(equal_world(seed=1, hours=0.2), patient) == []
+    world = equal_world(seed=1, hours=0.03, step_at_s=STEP_AT_S)
+    (move,) = only(world, patient)
+    (default,) = only(world, Entry(name="zsched", make=entries.core(world)))
+    assert move.at_s < default.at_s
 
 
 def test_rules_that_look_at_nothing() -> None:

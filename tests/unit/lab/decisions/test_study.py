@@ -70,7 +70,7 @@ def test_the_picture_is_drawn(results: Path, tmp_path: Path) -> None:
     assert (tmp_path / "rules.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_spread_is_the_interval_of_the_mean() -> None:
+def test_the_spread_is_two_standard_errors_of_the_mean() -> None:
     assert report.mean_and_spread([2.0]) == (2.0, 0.0)
     mean, spread = report.mean_and_spread([1.0, 2.0, 3.0])
     assert mean == 2.0
