@@ -39,7 +39,7 @@ from zsched.core.node import Node
 from zsched.core.status import status_line
 from zsched.core.workers import runs_worker
 from zsched.daemon_access import StreamAccess
-from zsched.daemon_endpoints import Endpoints, endpoints_for, free_port, has_all_addresses, is_here
+from zsched.daemon_endpoints import Endpoints, endpoints_for, free_port, is_here
 from zsched.daemon_memory import shared_memory_objection
 from zsched.errors import AdapterError, ConfigError
 from zsched.relay_door import Door
@@ -206,7 +206,7 @@ class Daemon:
                 connect=points.control_connect,
                 timing=fleet.timing,
                 operator_json5=operator_json5,
-                dials_by_gossip=not has_all_addresses(fleet),
+                dials_by_gossip=points.control_by_gossip,
             ),
             post=self._inbox.post,
             is_voter=self._spec.kind is NodeKind.ROBOT,
@@ -248,7 +248,7 @@ class Daemon:
                 timing=fleet.timing,
                 shared_memory=self._memory_objection == "",
                 operator_json5=operator_json5,
-                dials_by_gossip=not has_all_addresses(fleet),
+                dials_by_gossip=points.data_by_gossip,
             ),
             on_report=shell.on_report,
             threads=zenoh_config.pool_threads(len(fleet.nodes)),
@@ -274,7 +274,7 @@ class Daemon:
                     link=spec.link,
                     shared_memory=self._memory_objection == "",
                     operator_json5=operator_json5,
-                    dials_by_gossip=not has_all_addresses(fleet),
+                    dials_by_gossip=points.worker_by_gossip,
                 )
             )
             stack.callback(paths[name].unlink, missing_ok=True)

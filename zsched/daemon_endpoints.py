@@ -25,6 +25,10 @@ class Endpoints:
     data_connect: tuple[str, ...]
     worker_connect: tuple[str, ...]
     worker_listen: tuple[str, ...]
+    control_by_gossip: bool
+    """Whether the control session dials whom it hears of by gossip; the same for the relay's and the workers'."""
+    data_by_gossip: bool
+    worker_by_gossip: bool
 
 
 def endpoints_for(
@@ -32,12 +36,12 @@ def endpoints_for(
 ) -> Endpoints:
     """The endpoints of one node: its own to listen on, the others' to dial.
 
-    A link is dialled by one side only where the file says how: two that redial each other while a cut heals can end
-    with a link that zenoh keeps alive and delivers nothing on. Workers dial their own relay first, then the robots'.
+    A link is dialled by one side only: two that redial each other while a cut heals can end with a link that zenoh
+    keeps alive and delivers nothing on. Who gives no address dials everybody who does; only two that give none meet by
+    gossip, and then zenoh's ids decide who dials. Workers dial their own relay first, then the robots'.
     Our own address on another machine (``is_here``) is dialled too: there a twin of ours may be, and must be heard.
     """
     robots = [node for node in fleet.nodes if node.kind is NodeKind.ROBOT and node.name != me.name]
-    is_whole = has_all_addresses(fleet)
     data_listen = me.listen_data or "tcp/0.0.0.0:0"
     if not dial_endpoint(data_listen, "127.0.0.1"):  # any port will do, but workers must know which
         address, _, rest = data_listen.rpartition(":")
@@ -48,8 +52,11 @@ def endpoints_for(
         control_connect=_dialled(_targets(fleet, me, _control, is_here), _control),
         data_listen=(data_listen,),
         data_connect=_dialled(_targets(fleet, me, _data), _data),
-        worker_connect=(dial_endpoint(data_listen, "127.0.0.1"), *(_dialled(robots, _data) if is_whole else ())),
+        worker_connect=(dial_endpoint(data_listen, "127.0.0.1"), *_dialled(robots, _data)),
         worker_listen=(zenoh_config.LOOPBACK_LISTEN if is_loopback else "tcp/0.0.0.0:0",),
+        control_by_gossip=not _dialled([me], _control) and len(_hidden(list(fleet.nodes), _control)) > 1,
+        data_by_gossip=not _dialled([me], _data),  # also for the workers of others, if this is a robot
+        worker_by_gossip=bool(_hidden(robots, _data)),
     )
 
 
@@ -75,9 +82,9 @@ def _targets(
     return mine + [node for node in others if rank(node) < rank(me) or not has_mine]
 
 
-def has_all_addresses(fleet: Fleet) -> bool:
-    """Whether every pair of nodes can meet by the fleet file alone, without gossip."""
-    return all(len(_dialled(list(fleet.nodes), endpoint)) >= len(fleet.nodes) - 1 for endpoint in (_control, _data))
+def _hidden(nodes: list[NodeSpec], endpoint: Callable[[NodeSpec], str]) -> list[NodeSpec]:
+    """Who cannot be dialled by the fleet file alone."""
+    return [node for node in nodes if not _dialled([node], endpoint)]
 
 
 def _dialled(nodes: list[NodeSpec], endpoint: Callable[[NodeSpec], str]) -> tuple[str, ...]:

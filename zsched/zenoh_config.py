@@ -183,6 +183,9 @@ def _peer(listen: tuple[str, ...], connect: tuple[str, ...], timing: Timing) -> 
 def _set_gossip(settings: Settings, *, dials: bool) -> None:
     if not dials:
         settings["scouting/gossip/autoconnect"] = {"router": [], "peer": []}
+        return
+    # Of two that hear of each other one dials: where both redial after a cut, a link may come back dead.
+    settings["scouting/gossip/autoconnect_strategy"] = {"peer": {"to_router": "always", "to_peer": "greater-zid"}}
 
 
 def _set_shared_memory(settings: Settings, *, is_on: bool) -> None:

@@ -24,7 +24,7 @@ from zsched.core import events as ev
 from zsched.core.fleet import Fleet, NodeSpec, Timing
 from zsched.core.model import NodeKind
 from zsched.daemon import EXIT_CONFIG, EXIT_FAILED, EXIT_OK, Sampler
-from zsched.daemon_endpoints import Endpoints, endpoints_for, free_port, has_all_addresses, is_here
+from zsched.daemon_endpoints import Endpoints, endpoints_for, free_port, is_here
 from zsched.errors import AdapterError
 from zsched.lab.testbed import echo_fleet
 from zsched.places import socket_path
@@ -57,6 +57,9 @@ def test_node_listens_where_the_file_says_and_its_workers_dial_it_on_this_machin
         data_connect=(),
         worker_connect=("tcp/127.0.0.1:7458",),
         worker_listen=("tcp/0.0.0.0:0",),
+        control_by_gossip=False,
+        data_by_gossip=False,
+        worker_by_gossip=False,
     )
 
 
@@ -110,12 +113,25 @@ def test_every_control_link_is_dialled_by_one_side_and_by_somebody() -> None:
     ]
     nodes += [spec("e")]  # says nothing: it dials everybody
     whole = fleet(*nodes, seeds=("c", "a"))
-    assert has_all_addresses(whole)
-    assert not has_all_addresses(fleet(*nodes, spec("f")))
     dialled = {node.name: endpoints_for(whole, node, lambda: 50000).control_connect for node in nodes}
     assert {name: len(targets) for name, targets in dialled.items()} == {"a": 1, "b": 2, "c": 0, "d": 3, "e": 4}
     assert dialled["b"] == ("tcp/192.0.2.1:1", "tcp/192.0.2.3:3")
     assert endpoints_for(whole, nodes[1], lambda: 50000).data_connect == ("tcp/192.0.2.1:10", "tcp/192.0.2.3:30")
+
+
+def test_only_who_gives_no_address_dials_by_gossip_and_only_if_there_are_two() -> None:
+    known = replace(spec("a", host="192.0.2.1", control="tcp/0.0.0.0:1", data="tcp/0.0.0.0:2"), kind=NodeKind.ROBOT)
+    hidden = [replace(spec(name), kind=NodeKind.ROBOT) for name in "bc"]
+
+    def gossip(me: NodeSpec, *nodes: NodeSpec) -> tuple[bool, bool, bool]:
+        found = endpoints_for(fleet(*nodes), me, lambda: 1)
+        return found.control_by_gossip, found.data_by_gossip, found.worker_by_gossip
+
+    assert gossip(known, known, *hidden) == (False, False, True), "its workers look for the hidden robots"
+    assert gossip(hidden[0], known, *hidden) == (True, True, True)
+    assert gossip(hidden[0], known, hidden[0]) == (False, True, False), "others' workers look for it"
+    assert gossip(known, known) == (False, False, False)
+    assert endpoints_for(fleet(known, *hidden), hidden[0], lambda: 1).worker_connect[1:] == ("tcp/192.0.2.1:2",)
 
 
 def test_workers_dial_their_own_relay_first_and_then_the_robots() -> None:

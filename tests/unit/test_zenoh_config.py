@@ -97,3 +97,8 @@ def test_control_sessions_that_know_every_address_do_not_dial_by_gossip() -> Non
     quiet = control_config(listen=(HERE,), connect=(THERE,), dials_by_gossip=False)
     assert read(quiet, "scouting/gossip/autoconnect") == {"router": [], "peer": []}
     assert read(quiet, "scouting/gossip/enabled") is True
+
+
+def test_of_two_that_meet_by_gossip_one_dials() -> None:
+    found = read(control_config(listen=(HERE,), connect=(THERE,)), "scouting/gossip/autoconnect_strategy")
+    assert found == {"peer": {"to_router": "always", "to_peer": "greater-zid"}}

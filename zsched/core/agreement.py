@@ -388,6 +388,8 @@ class Agreement:
         effects.is_dirty |= step.is_dirty
         if step.problem:
             self.problems[f"register/{task}"] = step.problem
+        elif step.learnt is not None:
+            self.problems.pop(f"register/{task}", None)  # agreement goes on
         deadline_s = self._fleet.timing.ballot_s
         if step.prepare is not None:
             effects.send.append(do.SendPrepare(prepare=step.prepare, deadline_s=deadline_s))

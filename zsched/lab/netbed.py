@@ -15,7 +15,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -132,10 +132,13 @@ def _received(key: str, number: str, sent_at: str, epoch: str, at: str, node: st
     )
 
 
-def in_namespaces(tree: Json, network: Network) -> Json:
-    """The fleet file ``tree`` with every node at its namespace's address and zsched's usual ports."""
+def in_namespaces(tree: Json, network: Network, hidden: Collection[NodeId] = ()) -> Json:
+    """The fleet file ``tree`` with every node but ``hidden`` at its namespace's address and zsched's usual ports."""
     tree = copy.deepcopy(tree)
     for name, node in tree["nodes"].items():
+        if name in hidden:
+            del node["host"], node["listen"]
+            continue
         host = network.address(name)
         node["host"] = host
         node["listen"] = {"control": f"tcp/0.0.0.0:{CONTROL_PORT}", "data": f"tcp/0.0.0.0:{DATA_PORT}"}
@@ -150,6 +153,7 @@ class Netbed(Testbed):
         tree: a fleet file as plain data (`zsched.lab.testbed.echo_fleet`); hosts and ports are filled in.
         network: has a namespace per node; `None`: one is made. Closed with the bed either way.
         tmpfs: {node: size, e.g. ``64k``}: whose state folder is a small file system of its own.
+        hidden: nodes whose address the fleet file does not give (no application can be put beside them).
         wrapper: run instead of the daemon's module (a script that takes the same arguments).
     """
 
@@ -163,13 +167,14 @@ class Netbed(Testbed):
         network: Network | None = None,
         tmpfs: Mapping[NodeId, str] | None = None,
         wrapper: Path | None = None,
+        hidden: Collection[NodeId] = (),
     ) -> None:
         self.network = Network(tree["nodes"]) if network is None else network
         self.tmpfs = dict(tmpfs or {})
         self._daemon: tuple[str | Path, ...] = DAEMON if wrapper is None else (sys.executable, wrapper)
         self._probes: list[Probe] = []
         try:
-            super().__init__(folder, in_namespaces(tree, self.network))
+            super().__init__(folder, in_namespaces(tree, self.network, hidden))
         except BaseException:
             self.network.close()
             raise

@@ -251,6 +251,8 @@ def test_two_values_for_one_revision_are_a_problem_that_is_shown() -> None:
     agreement = make(RegisterState(task="merge", learnt=value(3)))
     assert agreement.on_learnt(Learnt(node="robot2", values=(value(3, "robot2"),)), 100.0).learnt == []
     assert "two values for revision 3" in agreement.problems["register/merge"]
+    assert agreement.on_learnt(Learnt(node="robot2", values=(value(4, "robot2"),)), 100.1).learnt != []
+    assert agreement.problems == {}, "agreement goes on"
 
 
 # --- settling at the start -------------------------------------------------------------------------------------------

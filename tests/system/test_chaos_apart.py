@@ -1,0 +1,133 @@
+"""Nodes that work apart and come together again, on real daemons in namespaces.
+
+A robot that works alone while it is cut off, nodes that meet by gossip only, and one whose fleet file names other
+electors than its state.
+
+One fleet for the module: three robots and two edges; ``robot3`` and ``edge2`` give no address, so that these two can
+only meet by gossip. Every robot keeps a standby of the task (`on_isolation: local`).
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from zsched.adapters.operator_socket import ask
+from zsched.adapters.state_file import StateFile
+from zsched.clock import monotonic_s
+from zsched.core.model import NodeId
+from zsched.lab import netns
+from zsched.lab.netbed import Netbed, Probe
+from zsched.lab.testbed import TASK, Json, echo_fleet
+from zsched.places import socket_path
+
+pytestmark = [pytest.mark.timeout(120), pytest.mark.root]
+
+HIDDEN = ("edge2", "robot3")
+
+
+class Bed(Netbed):
+    """The fleet, and an application on robot1."""
+
+    __test__ = False
+    app_on_robot1: Probe
+
+    def is_whole(self) -> bool:
+        """Whether everybody is alive to everybody, and one owner serves."""
+        states = {peer["state"] for node in self.names for peer in self.status(node)["nodes"]}
+        return states == {"alive"} and self.owner() is not None and self.app_on_robot1.is_flowing()
+
+    def newest(self) -> NodeId | None:
+        """Who has answered the application last, if it was a moment ago."""
+        received = tuple(self.app_on_robot1.received[-1:])
+        return received[0].node if received and monotonic_s() - received[0].at < 0.3 else None
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bed]:
+    reason = netns.why_not()
+    if reason is not None:
+        pytest.skip(f"no network namespaces here: {reason}")
+    tree = echo_fleet(robots=3, edges=2, timing="wired", task={"on_isolation": "local"})
+    with Bed(tmp_path_factory.mktemp("apart"), tree, hidden=HIDDEN) as bed:
+        bed.init()
+        bed.start()
+        bed.app_on_robot1 = bed.probe("robot1", put="robot1/in", watch=["robot1/out"])
+        yield bed
+
+
+@pytest.fixture
+def bed(fleet: Bed) -> Bed:
+    fleet.network.heal()
+    fleet.wait(fleet.is_whole, 40, "everybody alive to everybody")
+    return fleet
+
+
+def test_two_nodes_without_addresses_find_each_other_again_after_short_cuts(bed: Bed) -> None:
+    """Cuts about as long as zenoh's lease: where both sides redialled, 3 links of 40 stayed alive and mute."""
+    for length_s in (0.8, 1.0, 1.2):
+        bed.network.cut("robot3")
+        begin = monotonic_s()
+        bed.wait(lambda: monotonic_s() > begin + length_s, 5, "the cut")  # noqa: B023 - called at once
+        bed.network.heal()
+        bed.wait(bed.is_whole, 15, f"everybody alive to everybody after {length_s} s")
+
+
+def test_a_robot_that_is_cut_off_is_served_by_its_own_standby_and_nothing_comes_twice(bed: Bed) -> None:
+    owner, epoch = bed.owner(), bed.task("robot1")["epoch"]
+    assert owner != "robot1"
+    bed.network.cut("robot1")
+    bed.wait(lambda: bed.newest() == "robot1", 10, "answers of its own worker")
+    assert any("works alone" in text for text in bed.task("robot1")["problems"]), bed.task("robot1")
+    assert bed.task("robot1")["epoch"] == epoch
+    assert bed.owner("robot2", "robot3", "edge1", "edge2") == owner, "the others go on"
+    bed.network.heal()
+    bed.wait(lambda: bed.newest() == owner, 15, "answers of the owner")
+    healed = monotonic_s()
+    bed.wait(lambda: monotonic_s() > healed + 1.0, 5, "a second of them")
+    counts = Counter(one.number for one in tuple(bed.app_on_robot1.received))
+    twice = [number for number, count in counts.items() if count > 1]
+    assert twice == []
+    owners = bed.app_on_robot1.owners("robot1/out")
+    assert owners[-3:] == [owner, "robot1", owner], "the local slot closes before the owner's opens"
+    assert not any("works alone" in text for text in bed.task("robot1")["problems"])
+
+
+def test_a_node_whose_file_names_other_electors_than_its_state_is_no_elector_and_works_on(bed: Bed) -> None:
+    """The operator changed the electorate on one machine, and restarted it: nothing it says counts in a commit."""
+    tree = json.loads(bed.file.read_text())
+    tree["electorate"] = ["robot1", "robot2", "edge1"]
+    file = bed.folder / "changed.yaml"
+    file.write_text(json.dumps(tree))
+    bed.stop("robot2")
+    stored = StateFile(bed.folder / "robot2", fleet=bed.fleet.name, node="robot2").path
+    state = stored.read_bytes()
+    process = spawn(bed, "robot2", file)
+    try:
+        bed.wait(lambda: status(bed)["quorum"]["this_node"] != "elector", 20, "robot2 to be no elector")
+        bed.wait(lambda: status(bed)["tasks"][0]["owner"] == bed.task("robot1")["owner"], 20, "what was agreed")
+        assert "another electorate" in "\n".join(status(bed)["problems"])
+        weights = {"verb": "weights", "task": TASK, "cpu": 0.6, "memory": 0.4, "network": 0.0}
+        assert ask(socket_path(bed.folder, "robot1"), weights, 5.0)["outcome"] == "ok", "two of three agree without it"
+        bed.wait(lambda: status(bed)["tasks"][0]["revision"] == bed.task("robot1")["revision"], 10, "it hears of it")
+    finally:
+        process.terminate()
+        process.wait(10)
+    assert stored.read_bytes() == state, "what it had promised stays on its disk"
+    bed.start("robot2")
+    bed.wait(lambda: status(bed)["quorum"]["this_node"] == "elector", 20, "an elector again, with the old file")
+
+
+def status(bed: Bed) -> Json:
+    found: Json = ask(socket_path(bed.folder, "robot2"), {"verb": "status"}, 3.0)
+    return found
+
+
+def spawn(bed: Bed, node: NodeId, file: Path) -> subprocess.Popen[bytes]:
+    command = [*bed._daemon, "--config", file, "--node", node, *bed._folders(node)]
+    return bed.spawn(node, command, log=f"{node}.log")
