@@ -29,7 +29,7 @@ DRIVE_S = 5.0
 def test_a_cell_is_run_and_measured_and_leaves_nothing(tmp_path: Path) -> None:
     plan = LoadPlan(lanes=1, busy_s=(3.0, 3.0), idle_s=(0.0, 0.0), first_s=1.0)
     scenario = replace(load_scenario(scenario_path()), duration_s=DRIVE_S, load=plan, target_coverage=0.01)
-    cell = Cell(scheme=SCHEMES["random"], level="two", run=0)
+    cell = Cell(scheme=SCHEMES["random"], level="one", run=0)
     folder = tmp_path / "cell"
 
     robots = LogRobots(log=malaga_path())

@@ -120,7 +120,7 @@ class Loads:
     def _start(self, window: Window, t_s: float) -> None:
         name = f"load-{len(self._past) + len(self._running) + 1}-{window.node}"
         level = self._level
-        command = [sys.executable, "-m", "zsched.lab.neural_load", "--threads", str(level.threads)]
+        command = [sys.executable, "-m", "zsched.lab.paper.cameras", "--streams", str(level.streams)]
         command += ["--hz", f"{level.hz:g}", "--side", str(level.side)]
         child = self._children.start(name, command, output=self._records / f"{name}.ndjson")
         self._limits.put(window.node, child.process.pid)

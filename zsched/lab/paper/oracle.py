@@ -3,7 +3,7 @@
 Knows: the scenario's shares, windows and levels. Does not know: what any scheme did.
 
 The yardstick of regret: each node's utility by Eq. 1 and 2 with weights of one half each, if nothing but the schedule
-were true. An injected load takes its threads' share of the quota (all of it, unless its frames are limited) and its
+were true. An injected load takes all of the quota (unless its frames are limited) and its
 memory; every node carries its daemon and warm worker (`BASE_MB`), and the task costs the same everywhere.
 """
 
@@ -28,7 +28,7 @@ WORTH = 0.02
 def utility(share: NodeShare, level: LoadLevel, *, is_loaded: bool) -> float:
     """How good a node is, in [0, 1], by Eq. 1 and 2 with what the schedule says."""
     frame = FRAME_CORES_S * (level.side / 320) ** 2
-    wanted = share.cpu_cores if level.hz <= 0 else min(level.hz * frame, share.cpu_cores)
+    wanted = share.cpu_cores if level.hz <= 0 else min(level.streams * level.hz * frame, share.cpu_cores)
     cpu = clamp((share.cpu_cores - TASK_CORES - (wanted if is_loaded else 0.0)) / share.cpu_cores)
     used_mb = BASE_MB + share.ballast_mb + (level.memory_mb if is_loaded else 0.0)
     return 0.5 * cpu + 0.5 * clamp((share.memory_mb - used_mb) / share.memory_mb)

@@ -146,7 +146,7 @@ def conditions_text(results: Json) -> str:
         for node, s in scenario["nodes"].items()
     ]
     levels = [
-        f"{name}: {v['threads']} threads, {v['hz'] or 'all'} frames/s of {v['side']} px"
+        f"{name}: {v['streams']} streams, {v['hz'] or 'all'} frames/s of {v['side']} px"
         for name, v in scenario["levels"].items()
     ]
     waits = [figures["host"]["pressure"] for figures in results["runs"] if figures["host"]["pressure"] is not None]

@@ -38,18 +38,18 @@ class NodeShare:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoadLevel:
-    """How strong one injected load is: inference ``threads``, ``hz`` frames a second (0: all that the CPU gives).
+    """How strong one injected load is: so many camera ``streams``, each of ``hz`` frames a second (0: all it can get).
 
     ``side`` is the frame's side in pixels (a multiple of 32); ``memory_mb`` what such a process takes, for the oracle.
     """
 
-    threads: int = 1
+    streams: int = 1
     hz: float = 0.0
     side: int = 320
     memory_mb: float = 150.0
 
     def __post_init__(self) -> None:
-        check_range("threads", self.threads, 1, 64)
+        check_range("streams", self.streams, 1, 64)
         check_range("hz", self.hz, 0.0, 1000.0)
         check_range("side", self.side, 32, 4096)
         check_range("memory_mb", self.memory_mb, 0.0, 1e6)

@@ -32,7 +32,7 @@ FIGURES = {
 }  # fmt: skip
 
 
-def a_run(scheme: str, run: int, level: str = "four", **changed: Any) -> dict[str, Any]:
+def a_run(scheme: str, run: int, level: str = "eight", **changed: Any) -> dict[str, Any]:
     node = {"cpu_peak": 0.9, "memory_mean": 0.4, "throughput_mb_s": 3.0}
     host = {"pressure": 0.05, "idle_ratio": 0.4}
     nodes = {"edge1": node, "edge2": node | {"cpu_peak": None}}
@@ -111,12 +111,12 @@ def test_the_report_holds_every_claim_scheme_level_and_picture(tmp_path: Any) ->
     runs = [a_run(name, run) for name in ("fixed_e1", "zsched") for run in range(3)]
     runs += [a_run(name, 0, level="one", map_hz=2.5) for name in ("fixed_e1", "zsched")]
     node = {"cpu_cores": 0.3, "memory_mb": 512.0, "ballast_mb": 0.0}
-    levels = {name: {"threads": 1, "hz": 0, "side": 320} for name in ("one", "four")}
+    levels = {name: {"streams": 1, "hz": 0, "side": 320} for name in ("one", "eight")}
     scenario = {
-        "name": "paper", "seed": 1, "level": "four", "levels": levels, "nodes": {"edge1": node}, "mode": "track",
+        "name": "paper", "seed": 1, "level": "eight", "levels": levels, "nodes": {"edge1": node}, "mode": "track",
         "rate_hz": 4.0, "target_coverage": 0.8, "pressure_limit": 0.2,
     }  # fmt: skip
-    invalid = [{"cell": "four-zsched-1", "reason": "pressure 0.50\nmore"}]
+    invalid = [{"cell": "eight-zsched-1", "reason": "pressure 0.50\nmore"}]
     row = {"moves": 3, "wasted_moves": 0, "mean_dbm": -55.0, "under_best_db": 1.2, "below_70_ratio": 0.0}
     radio = {
         "links": "simulated", "duration_s": 60.0, "best_dbm": -53.8, "best_fixed_dbm": -57.0,
@@ -126,7 +126,7 @@ def test_the_report_holds_every_claim_scheme_level_and_picture(tmp_path: Any) ->
         "scenario": scenario, "runs": runs, "invalid": invalid, "command": "zsched bench paper", "input": "log x",
         "version": "1", "radio": radio,
     }  # fmt: skip
-    pictures = save_all(runs, "four", ("one", "four"), tmp_path, "title")
+    pictures = save_all(runs, "eight", ("one", "eight"), tmp_path, "title")
     pictures.append(
         save_radio(
             tmp_path / "radio.png", {"robot1": [(0.0, -50.0), (5.0, -60.0)]}, {"zsched": [(0.0, "robot1")]}, 60.0
@@ -138,7 +138,7 @@ def test_the_report_holds_every_claim_scheme_level_and_picture(tmp_path: Any) ->
     assert all(claim.says in text for claim in CLAIMS)
     assert "| zsched | 3 | 2.00 |" in text
     assert "| maps/s | zsched | 2.50 | 2.00 |" in text
-    assert "four-zsched-1: pressure 0.50" in text
+    assert "eight-zsched-1: pressure 0.50" in text
     assert "-55.0" in text
     assert {"cpu.png", "memory.png", "throughput.png", "frequency.png", "latency.png", "ssim.png", "sweep.png"} <= set(
         pictures
@@ -146,4 +146,4 @@ def test_the_report_holds_every_claim_scheme_level_and_picture(tmp_path: Any) ->
     for name in pictures:
         assert name in text
         assert (tmp_path / name).stat().st_size > 5000
-    assert save_all([], "four", (), tmp_path, "title") == []
+    assert save_all([], "eight", (), tmp_path, "title") == []

@@ -105,10 +105,10 @@ def test_an_invalid_run_is_repeated_and_kept_aside(scenario: Scenario, tmp_path:
     runs = Outcomes(0.9, ChildError("edge1 ended"), 0.1, 0.1)
     said = play(scenario, tmp_path, runs, "zsched", "random")
 
-    assert runs.made == ["four-zsched-1"] * 3 + ["four-random-1"]
+    assert runs.made == ["eight-zsched-1"] * 3 + ["eight-random-1"]
     assert said[-1] == "2 valid, 2 invalid"
     assert any("pressure 0.90" in line for line in said)
-    assert (tmp_path / "runs" / "four-zsched-1.invalid-2" / "half").exists()
+    assert (tmp_path / "runs" / "eight-zsched-1.invalid-2" / "half").exists()
 
 
 def test_what_stays_invalid_does_not_stop_the_rest(scenario: Scenario, tmp_path: Path) -> None:
@@ -129,21 +129,21 @@ def test_a_machine_that_never_gives_a_valid_run_ends_the_bench(scenario: Scenari
 def test_an_interrupted_matrix_goes_on_behind_what_is_done(scenario: Scenario, tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         play(scenario, tmp_path, Outcomes(0.1, KeyboardInterrupt()), "zsched", "random")
-    assert (tmp_path / "runs" / "four-zsched-1" / METRICS).exists()
+    assert (tmp_path / "runs" / "eight-zsched-1" / METRICS).exists()
 
     runs = Outcomes(0.1)
     said = play(scenario, tmp_path, runs, "zsched", "random")
 
-    assert runs.made == ["four-random-1"]
+    assert runs.made == ["eight-random-1"]
     assert said[0] == "1 of 2 runs are done already"
-    assert (tmp_path / "runs" / "four-random-1.interrupted-1").exists()
+    assert (tmp_path / "runs" / "eight-random-1.interrupted-1").exists()
 
 
 def test_progress_tells_the_time_that_is_left(scenario: Scenario) -> None:
     cell = cells_of(scenario, ("zsched",), runs=1)[0]
     progress = Progress(total=4, done=1, took_s=[50.0])
 
-    assert progress.line(cell) == "[2/4, about 2 min left] four-zsched-1"
+    assert progress.line(cell) == "[2/4, about 2 min left] eight-zsched-1"
 
 
 def test_folders_set_aside_get_new_names(tmp_path: Path) -> None:

@@ -61,7 +61,7 @@ def write_run(folder: Path, **changed: Any) -> Path:
     """A run of 10 s with two robots: a merged map each second that knows a tenth more; edge1 to edge2 at 4.5 s."""
     moves = [(-0.5, "edge1"), (4.5, "edge2")]
     run = {
-        "scheme": "zsched", "family": "zsched", "level": "four", "run": 0, "seed": 1, "mode": "known", "input": "x",
+        "scheme": "zsched", "family": "zsched", "level": "eight", "run": 0, "seed": 1, "mode": "known", "input": "x",
         "links": "simulated", "host": {"pressure": 0.1, "idle_ratio": 0.3}, "duration_s": 10.0, "zero_wall_ns": ZERO_NS,
         "robots": ["robot1", "robot2"], "shares": {"edge1": {}, "edge2": {}},
         "loads": [{"node": "edge1", "start_s": 4.0, "end_s": 10.0}],

@@ -24,7 +24,7 @@ duration_s: 20
 seed: 5
 runs: 1
 level: one
-levels: {one: {threads: 2}}
+levels: {one: {streams: 2}}
 nodes: {edge1: {cpu_cores: 0.3, memory_mb: 512}}
 """
 
@@ -48,8 +48,8 @@ def test_the_shipped_scenario_keeps_the_host_out_of_need_and_sweeps_the_load(sce
     [
         ("cpu_cores: 0.3", "cpu_cores: 1.6", "cpu_cores"),
         ("level: one", "level: two", "two"),
-        ("threads: 2", "threads: 0", "threads"),
-        ("threads: 2", "thread: 2", "thread"),
+        ("streams: 2", "streams: 0", "streams"),
+        ("streams: 2", "stream: 2", "stream"),
         ("seed: 5", "seeds: 5", "seeds"),
         ("runs: 1\n", "", "runs"),
         ("duration_s: 20", "duration_s: 1", "duration_s"),
