@@ -2,9 +2,9 @@
 
 ``python -m benchmarks.isolation [--seconds 6] [--classes best_effort latest reliable]``. One robot feeds two owners
 over one relay: a bulk stream (64 KiB at 200 Hz) to ``edge1``, a small one (100 Hz, echoed) to ``edge2``. Three phases:
-*alone*, without the bulk stream; *bulk*; *stalled*: the bulk stream's worker is stopped for 2 s, runs for 1 s, and so on
-(its link ends after zenoh's lease). Shown: the small stream's way there and back and its longest pause, and the time in
-which another robot's status came over the control network (a query, answered by its decision loop).
+*alone*, without the bulk stream; *bulk*; *stalled*: the bulk stream's worker is stopped for 2 s, runs for 1 s, and so
+on (its link ends after zenoh's lease). Shown: the small stream's way there and back and its longest pause, and the time
+in which another robot's status came over the control network (a query, answered by its decision loop).
 """
 
 from __future__ import annotations
