@@ -30,7 +30,7 @@ REACHED_M = 0.4
 AVOID_S = 8.0
 """A frontier that the robot has been at, or could not get to, does not count for so long."""
 CLAIM_LIFE_S = 3.0
-LOOK_AHEAD_M = 0.4
+CORNER_M = 0.15
 TURN_FIRST_RAD = 0.9
 BACK_S = 0.6
 """After a bump it backs off for so long."""
@@ -147,9 +147,9 @@ class Explorer:
         self._goal, self.state = _Goal(frontier=chosen, way=way), State.DRIVING
 
     def _follow(self, goal: _Goal, here: Pose2) -> Twist:
-        """Pure pursuit: towards the first point of the way that is far enough ahead; first turn, then drive."""
+        """Towards the next corner of the way; first turn, then drive."""
         last = len(goal.way) - 1
-        while goal.next < last and math.dist((here.x, here.y), goal.way[goal.next]) < LOOK_AHEAD_M:
+        while goal.next < last and math.dist((here.x, here.y), goal.way[goal.next]) < CORNER_M:
             goal.next += 1
         x, y = goal.way[goal.next]
         error = wrap_angle(math.atan2(y - here.y, x - here.x) - here.yaw)

@@ -4,7 +4,7 @@ Knows: a grid in the merged frame, walls grown by the robot's size. Does not kno
 
 Cells of the map are taken together to `PLAN_CELL_M` (a wall in any of them is a wall). The distance is a wave from the
 robot's cell over free cells that keep `INFLATION_M` from every wall: Dijkstra's algorithm for unit costs, as dilations
-by a cross and by a square in turn (an octagon for a circle: at most 6 % off). Unknown cells are never driven on.
+by crosses and squares in turn (an octagon for a circle: up to 8 % too short). Unknown cells are never driven on.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from zsched.tasks.map_merge.grid import Grid, Mask
 PLAN_CELL_M = 0.1
 INFLATION_M = 0.18
 """Half a Burger and a cell: drift and corners are in it."""
+LONGEST_LEG_CELLS = 30
 MARGIN_CELLS = 16
 """Unknown cells put round the map: its last rows border on what nobody has seen, and that is a frontier."""
 START_RADIUS_M = 0.5
@@ -35,6 +36,8 @@ Point = tuple[float, float]
 
 CROSS: Bytes = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], dtype=np.uint8)
 SQUARE: Bytes = np.ones((3, 3), dtype=np.uint8)
+SQUARE_TURNS = (2, 4)
+"""Of five steps two are by a square: the octagon that comes nearest to a circle."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -101,10 +104,11 @@ def distances(plan: PlanMap, start: Point) -> Field:
     count, step = 1, 0
     while True:
         step += 1
-        grown = grown_by(reached, CROSS if step % 2 else SQUARE) & drivable
+        is_square = step % 5 in SQUARE_TURNS
+        grown = grown_by(reached, SQUARE if is_square else CROSS) & drivable
         total = cv2.countNonZero(grown)
         # A cross may have to wait for the square that gets it through a diagonal gap.
-        if total == count and step % 2 == 0:
+        if total == count and is_square:
             return field
         if total != count:
             field[(grown ^ reached).view(np.bool_)] = step * plan.side
@@ -130,7 +134,7 @@ def _start_cell(plan: PlanMap, cell: Cell) -> Cell | None:
 
 
 def way_to(plan: PlanMap, field: Field, goal: Cell) -> tuple[Point, ...]:
-    """The points from the robot's side to ``goal``, downhill in ``field``; empty when no way leads there."""
+    """The corners of the way from the robot's side to ``goal``, downhill in ``field``; empty when there is no way."""
     if not math.isfinite(float(field[goal])):
         return ()
     cells = [goal]
@@ -143,4 +147,23 @@ def way_to(plan: PlanMap, field: Field, goal: Cell) -> tuple[Point, ...]:
         if following == cells[-1] or field[following] >= field[cells[-1]]:
             return ()
         cells.append(following)
-    return tuple(plan.point(cell) for cell in reversed(cells))
+    return tuple(plan.point(cell) for cell in _straightened(plan, cells[::-1]))
+
+
+def _straightened(plan: PlanMap, cells: list[Cell]) -> list[Cell]:
+    """The same way with fewer corners: from each cell straight on as far as it can be driven."""
+    kept, index = [cells[0]], 0
+    while index < len(cells) - 1:
+        reach = min(len(cells) - 1, index + LONGEST_LEG_CELLS)
+        index = next(
+            (far for far in range(reach, index + 1, -3) if _is_clear(plan, cells[index], cells[far])), index + 1
+        )
+        kept.append(cells[index])
+    return kept
+
+
+def _is_clear(plan: PlanMap, a: Cell, b: Cell) -> bool:
+    """Whether the straight line between two cells is drivable."""
+    count = 2 * max(abs(b[0] - a[0]), abs(b[1] - a[1])) + 1
+    rows, columns = (np.rint(np.linspace(start, end, count)).astype(np.intp) for start, end in zip(a, b, strict=True))
+    return bool(plan.drivable[rows, columns].all())

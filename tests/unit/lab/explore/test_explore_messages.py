@@ -1,0 +1,67 @@
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+import pytest
+
+from zsched.errors import WireError
+from zsched.lab.explore.frontier import Claim
+from zsched.lab.explore.laser import RANGE_M, LaserScan
+from zsched.lab.explore.messages import decode_claim, decode_scan, encode_claim, encode_scan
+from zsched.tasks.map_merge.geometry import Pose2
+
+POSE = Pose2(x=1.5, y=-2.0, yaw=0.25)
+
+
+def scan() -> LaserScan:
+    echo = np.array([True, False, True])
+    return LaserScan(ranges=np.array([1.0, RANGE_M, 2.5], dtype=np.float32), echo=echo, stamp_ns=123)
+
+
+def test_claims_come_back() -> None:
+    claim = Claim(robot="robot2", x=1.25, y=-3.0, way_m=4.5)
+    assert decode_claim(encode_claim("robot2", claim)) == ("robot2", claim)
+    assert decode_claim(encode_claim("robot2", None)) == ("robot2", None)
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"",
+        b"\xff",
+        b"[]",
+        b"{}",
+        b'{"robot": "a", "x": 1}',
+        b'{"robot": "a", "x": NaN, "y": 0, "way_m": 0}',
+        b"[" * 9999,
+    ],
+)
+def test_bytes_that_are_no_claim_are_refused(payload: bytes) -> None:
+    with pytest.raises(WireError):
+        decode_claim(payload)
+
+
+def test_scans_come_back_with_their_pose() -> None:
+    back, pose = decode_scan(encode_scan(scan(), POSE))
+    assert pose == POSE
+    assert back.stamp_ns == 123
+    assert np.array_equal(back.ranges, scan().ranges)
+    assert np.array_equal(back.echo, scan().echo)
+
+
+def test_an_absurd_range_is_no_echo() -> None:
+    payload = bytearray(encode_scan(scan(), POSE))
+    payload[-4:] = struct.pack("<f", 99.0)
+    payload[-12:-8] = struct.pack("<f", float("nan"))
+    back, _ = decode_scan(bytes(payload))
+    assert back.echo.tolist() == [False, False, False]
+    assert back.ranges.tolist() == [RANGE_M] * 3
+
+
+def test_bytes_that_are_no_scan_are_refused() -> None:
+    good = encode_scan(scan(), POSE)
+    nowhere = good[:12] + struct.pack("<d", float("inf")) + good[20:]
+    for payload in (b"", good[:-1], good + b"x", b"XSC1" + good[4:], nowhere):
+        with pytest.raises(WireError):
+            decode_scan(payload)

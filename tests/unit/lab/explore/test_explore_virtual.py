@@ -1,0 +1,99 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import pytest
+
+from zsched.lab.explore.__main__ import main, paired_interval, table
+from zsched.lab.explore.virtual import VirtualResult, VirtualRun, run_virtual
+from zsched.lab.explore.world import World
+from zsched.lab.explore.worlds import load_world
+from zsched.lab.map_metrics import score_map
+
+SEEDS = (1, 2, 3, 4, 5)
+LATE_S = 5.0
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    return load_world("turtlebot3")
+
+
+@pytest.fixture(scope="module")
+def fresh(world: World) -> list[VirtualResult]:
+    return [run_virtual(VirtualRun(world=world, seed=seed)) for seed in SEEDS]
+
+
+def test_three_robots_explore_the_turtlebot3_world(world: World, fresh: list[VirtualResult]) -> None:
+    for result in fresh:
+        assert result.time_s is not None
+        assert result.merged is not None
+        assert [share for _, share in result.coverage] == sorted(share for _, share in result.coverage)
+        assert set(result.paths) == {"robot1", "robot2", "robot3"}
+        for path in result.paths.values():
+            assert all(world.room_m(pose.x, pose.y) > 0.0 for pose in path)
+    score = score_map(fresh[0].merged, world.truth())
+    assert score.coverage >= 0.9
+    assert score.wall_f1 > 0.85
+
+
+def test_the_seed_decides_everything(world: World, fresh: list[VirtualResult]) -> None:
+    again = run_virtual(VirtualRun(world=world, seed=1))
+    assert again.coverage == fresh[0].coverage
+    assert again.paths == fresh[0].paths
+    assert again.paths != fresh[1].paths
+
+
+def test_a_late_merged_map_costs_more_than_its_lateness(world: World, fresh: list[VirtualResult]) -> None:
+    """Else the robots would not plan on it. docs/evaluation/exploration.md has the figures of a larger world."""
+    for seed, sooner in zip(SEEDS, fresh, strict=True):
+        later = run_virtual(VirtualRun(world=world, seed=seed, delay_s=LATE_S))
+        assert later.time_s is not None
+        assert sooner.time_s is not None
+        assert later.time_s > sooner.time_s + LATE_S
+        assert later.way_m > sooner.way_m
+
+
+def test_without_any_merged_map_no_robot_moves(world: World) -> None:
+    result = run_virtual(VirtualRun(world=world, seed=1, delay_s=100.0, longest_s=10.0))
+    assert (result.time_s, result.merged, result.way_m, result.goals) == (None, None, 0.0, 0)
+
+
+def test_more_robots_are_faster_than_one() -> None:
+    place = load_world("turtlebot3")
+    alone, three = (run_virtual(VirtualRun(world=place, seed=1, robots=n)).time_s for n in (1, 3))
+    assert alone is not None
+    assert three is not None
+    assert three < 0.7 * alone
+
+
+def test_the_interval_holds_the_difference_and_shrinks_to_it() -> None:
+    low, high = paired_interval([12.0, 14.0, 13.0, 15.0], [10.0, 11.0, 10.0, 11.0])
+    assert 2.0 <= low < 3.25 < high <= 4.0
+    assert paired_interval([3.0, 4.0], [1.0, 2.0]) == (2.0, 2.0)
+
+
+def test_the_table_tells_means_and_differences() -> None:
+    lines = table({0.0: [10.0, 12.0], 5.0: [20.0, 22.0]})
+    assert "11.0 s" in lines[1]
+    assert "+10.0 s [+10.0, +10.0], +91%" in lines[2]
+
+
+def test_the_benchmark_prints_a_line_per_run_and_draws(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    png = tmp_path / "explored.png"
+    arguments = ["--world", "turtlebot3", "--seeds", "1", "--delays", "0,2", "--json", "--png", str(png)]
+    assert main(arguments) == 0
+    runs = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [run["delay_s"] for run in runs] == [0.0, 2.0]
+    assert runs[0]["time_s"] < runs[1]["time_s"]
+    assert runs[0]["coverage"] >= 0.89
+    picture = cv2.imread(str(png))
+    assert picture is not None
+    assert picture.std() > 10.0
+
+
+def test_the_benchmark_names_a_world_that_is_not_there(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--world", "nowhere"]) == 78
+    assert "nowhere" in capsys.readouterr().err
