@@ -38,7 +38,7 @@ from zsched.config import load_fleet
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.fleet import Fleet, electorate_hash
-from zsched.core.model import DeviceSample, NodeId, WorkerState
+from zsched.core.model import DeviceSample, NodeId, NodeKind, WorkerState
 from zsched.core.node import Node
 from zsched.daemon_endpoints import endpoints_for, free_port
 from zsched.lab.testbed import TASK, echo_fleet
@@ -67,7 +67,13 @@ class Loop:
             listen=points.control_listen, connect=points.control_connect, timing=fleet.timing, dials_by_gossip=False
         )
         self._bus = ControlBus(
-            fleet=fleet.name, node=name, incarnation=incarnation, zenoh_config=config, post=self._events.put
+            fleet=fleet.name,
+            node=name,
+            incarnation=incarnation,
+            zenoh_config=config,
+            post=self._events.put,
+            is_voter=fleet.node(name).kind is NodeKind.ROBOT,
+            hears_all_beats_at_once=False,
         )
         self._node = Node(
             fleet=fleet,
@@ -97,6 +103,11 @@ class Loop:
             except queue.Empty:
                 event = ev.DeadlineReached()
             now = monotonic_s()
+            if now >= self._node.next_deadline():
+                for frame in self._bus.waiting():
+                    self.received += 1
+                    self._carry_out(self._node.handle(frame, monotonic_s()))
+            now = monotonic_s()
             self._carry_out(self._node.handle(event, now))
             if now >= sample_at:
                 sample_at = now + self._fleet.timing.sample_s
@@ -109,10 +120,10 @@ class Loop:
             match one:
                 case do.PersistState(state=state):
                     self._file.save(state)
-                case do.PublishBeat(beat=value):
-                    bus.publish("beat", value)
-                case do.PublishProfile(profile=value):
-                    bus.publish("profile", value)
+                case do.PublishBeat(beat=value, is_news=is_news):
+                    bus.publish("beat" if is_news else "beat_in_turn", value)
+                case do.PublishProfile(profile=value, is_news=is_news):
+                    bus.publish("profile" if is_news else "profile_in_turn", value)
                 case do.PublishProposal(proposal=value):
                     bus.publish("proposal", value)
                 case do.PublishLearnt(learnt=value):
@@ -212,7 +223,7 @@ class Group:
         """Stories from number ``since`` on that hold all words."""
         return [one for one in self.stories[since:] if all(word in one["text"] for word in words)]
 
-    def wait(self, since: int, count: int, *words: str, within_s: float = 60.0) -> list[dict[str, Any]]:
+    def wait(self, since: int, count: int, *words: str, within_s: float = 120.0) -> list[dict[str, Any]]:
         """Until ``count`` nodes have told it."""
         end = time.monotonic() + within_s
         while time.monotonic() < end:
