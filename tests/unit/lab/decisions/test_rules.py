@@ -71,7 +71,7 @@ def spiky() -> World:
 
 
 def test_short_spikes_move_nothing_by_default_and_with_patience_and_a_small_bonus_alone_is_not_enough() -> None:
-    """Why the default bonus is what it is (docs/decisions/0015)."""
+    """Why the default bonus is what it is (docs/decisions/0017)."""
     world = spiky()
     patient = entries.core(world, bonus=0.05, patience=entries.PATIENCE)
     assert only(world, Entry(name="zsched", make=entries.core(world))) == []
