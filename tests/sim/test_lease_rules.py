@@ -80,6 +80,15 @@ def test_a_restarted_elector_refuses_all_but_its_standing_owner_for_a_whole_hold
     assert elector.may_accept("e2", 100.0 + HOLD_S)
 
 
+def test_a_restarted_elector_echoes_nobody_for_a_whole_hold() -> None:
+    """Found by the simulator (seed 74): it had granted to the owner's life before, and to the next one at once."""
+    elector = granter(standing="e1", started_at=100.0)
+    elector.on_beat(beat(number=5), ("e1", 3), 100.0 + HOLD_S - 0.001)
+    assert elector.echo(100.0 + HOLD_S - 0.001) is None
+    elector.on_beat(beat(number=6), ("e1", 3), 100.0 + HOLD_S)
+    assert elector.echo(100.0 + HOLD_S) == grant(6)
+
+
 def test_refusing_silences_the_present_owner_and_asks_it_to_leave_for_twice_the_hold() -> None:
     elector = granter()
     elector.on_beat(beat(number=5), ("e1", 3), 10.0)

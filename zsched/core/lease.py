@@ -10,7 +10,7 @@ L is the lease, rho the bound on how far two clocks' rates differ. Nobody compar
   L after the *sending* of the largest number that a majority has echoed or exceeded.
 * An elector that granted refuses an accept for another owner until L(1+rho)/(1-rho) after its last grant on its own
   clock, or until the owner released; one that has just started refuses every owner but that of its own persisted
-  accepted value for as long.
+  accepted value for as long, and echoes nobody: that owner's life may be another one than it granted to before.
 * When it refuses, it stops echoing the owner for whose sake it refused (at most twice that time, or until it accepts or
   learns a newer revision), and its beats ask that owner to leave; the owner drains and releases all numbers up to now,
   which are never granted again. Without this a planned move would never happen.
@@ -102,6 +102,8 @@ class Granter:
     def _is_other_life(self, beat: Beat, now: float) -> bool:
         """Whether an earlier life of the same owner may still hold our grant: its worker might outlive it."""
         last = self._last
+        if now < self.started_at + hold_s(self.lease_s):
+            return True  # what this elector granted before it started is forgotten, and to whom
         if last is None or last.owner != beat.node or last.incarnation == beat.incarnation:
             return False
         return now < self._granted_at + hold_s(self.lease_s)

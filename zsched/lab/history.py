@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from zsched.core.model import NodeId, TaskId
@@ -76,13 +76,17 @@ class Admitted:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Worked:
-    """An exclusive task's worker worked from ``at`` on; ``until`` is when it stopped or its lease ended."""
+    """An exclusive task's worker worked from ``at`` on; ``until`` is when it stopped or its lease ended.
+
+    Workers of two lives of a node are two workers: the older one may outlive its daemon until its lease ends.
+    """
 
     at: float
     node: NodeId
     task: TaskId
     epoch: int
     until: float
+    life: int = 0
 
 
 Record = Started | Learnt | Stored | Routed | Admitted | Worked
@@ -112,7 +116,7 @@ class Checker:
     _routed: dict[tuple[NodeId, TaskId], int] = field(default_factory=dict)
     _admitted: dict[tuple[NodeId, TaskId], int] = field(default_factory=dict)
     _stored: dict[tuple[TaskId, int], dict[str, set[NodeId]]] = field(default_factory=dict)
-    _worked: dict[TaskId, dict[NodeId, Worked]] = field(default_factory=dict)
+    _worked: dict[TaskId, dict[tuple[NodeId, int], Worked]] = field(default_factory=dict)
     _moves: dict[TaskId, deque[float]] = field(default_factory=dict)
 
     def take(self, record: Record) -> list[str]:
@@ -205,17 +209,18 @@ class Checker:
         found = [
             f"{other.node} (epoch {other.epoch}, until {other.until:.4f}) and {new.node} (epoch {new.epoch}, from "
             f"{new.at:.4f}) both work on {new.task}"
-            for other in mine.values()
-            if other.node != new.node and min(other.until, new.until) - max(other.at, new.at) > self.slack_s
+            for (node, life), other in mine.items()
+            if (node, life) != (new.node, new.life)
+            and min(other.until, new.until) - max(other.at, new.at) > self.slack_s
         ]
-        mine[new.node] = new
+        mine[new.node, new.life] = new
         return found
 
-    def stop_working(self, node: NodeId, task: TaskId, at: float) -> None:
+    def stop_working(self, node: NodeId, task: TaskId, at: float, life: int = 0) -> None:
         """The worker of ``node`` was seen to have stopped before the end that its last `Worked` gave."""
-        last = self._worked.get(task, {}).get(node)
+        last = self._worked.get(task, {}).get((node, life))
         if last is not None and at < last.until:
-            self._worked[task][node] = Worked(at=last.at, node=node, task=task, epoch=last.epoch, until=at)
+            self._worked[task][node, life] = replace(last, until=at)
 
 
 def _same(one: Learnt, other: Learnt) -> bool:

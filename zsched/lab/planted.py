@@ -19,7 +19,9 @@ import sys
 import time
 import types
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from zsched.lab.planted_bugs import BUGS, Bug
@@ -161,6 +163,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m zsched.lab.planted", description=__doc__)
     parser.add_argument("--only", help="the name of one bug")
     parser.add_argument("--budget", type=float, default=BUDGET_S, help="seconds of schedules for one bug")
+    parser.add_argument("--jobs", type=int, default=1, help="bugs at a time")
     parser.add_argument("--hunt", action="store_true", help="play schedules in this process")
     parser.add_argument("--tests", action="store_true", help="run the directed tests in this process")
     given = parser.parse_args(arguments)
@@ -172,9 +175,10 @@ def main(arguments: list[str] | None = None) -> int:
     if given.tests:
         return run_tests(bugs[0], bugs[0].tests)
     verdicts = []
-    for bug in bugs:
-        verdicts.append(judge(bug, given.budget))
-        print(f"{bug.name}: {verdicts[-1].found_by or 'SURVIVED'} ({verdicts[-1].seconds:.1f} s)", flush=True)
+    with ThreadPoolExecutor(given.jobs) as pool:
+        for one in pool.map(partial(judge, budget_s=given.budget), bugs):
+            verdicts.append(one)
+            print(f"{one.bug.name}: {one.found_by or 'SURVIVED'} ({one.seconds:.1f} s)", flush=True)
     print("\n" + table(verdicts))
     found = sum(bool(one.found_by) for one in verdicts)
     print(f"{found} of {len(verdicts)} planted bugs found")

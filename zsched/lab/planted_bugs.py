@@ -226,6 +226,7 @@ LEASE_BUGS = (
         "if now < self.started_at + hold and owner != self.standing:",
         "if hold < 0.0:",
         _LEASE,
+        114,
     ),
     _bug(
         "silence rule left out",
@@ -250,8 +251,9 @@ LEASE_BUGS = (
         "                held._sent.append((grant.number, now))\n"
         "                held._sent.reverse()",
         _LEASE,
+        42,
     ),
-    _bug("lease of a minority", LEASE, "number = numbers[needed - 1]", "number = numbers[0]", _LEASE),
+    _bug("lease of a minority", LEASE, "number = numbers[needed - 1]", "number = numbers[0]", _LEASE, 26),
     _bug(
         "released number is granted again",
         LEASE,
@@ -259,13 +261,22 @@ LEASE_BUGS = (
         "if beat.sequence < 0:",
         _LEASE,
     ),
-    _bug("next life is granted at once", LEASE, "if self._is_other_life(beat, now):", "if not epoch:", _LEASE),
+    _bug("next life is granted at once", LEASE, "if self._is_other_life(beat, now):", "if not epoch:", _LEASE, 30),
+    _bug(
+        "restarted elector echoes at once",
+        LEASE,
+        "        if now < self.started_at + hold_s(self.lease_s):\n            return True",
+        "        if self.lease_s < 0.0:\n            return True",
+        _LEASE,
+        74,
+    ),
     _bug(
         "hold shorter than the lease",
         LEASE,
         "return lease_s * (1 + RHO) / (1 - RHO)",
         "return lease_s * (1 - RHO) / (1 + RHO) - 0.02",
         _LEASE,
+        50,
     ),
     _bug(
         "accepts without asking the lease",

@@ -159,7 +159,7 @@ class Invariants:
 
     def on_worked(self, machine: Machine, task: TaskId, epoch: int, now: float, until: float) -> None:
         """An exclusive worker may work until a true time."""
-        self.take(Worked(at=now, node=machine.key, task=task, epoch=epoch, until=until))
+        self.take(Worked(at=now, node=machine.key, task=task, epoch=epoch, until=until, life=machine.life))
 
     # --- the loop ----------------------------------------------------------------------------------------------------
 

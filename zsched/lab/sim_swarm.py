@@ -23,6 +23,11 @@ SAMPLE_S = 1.0
 DECIDE_S = (0.5, 1.0, 1.0)
 """Machines measure, and robots look around, less often than by default: schedules are about what happens between."""
 MIN_NODES, MAX_NODES = 3, 7
+LEASE_EVERY, LEASE_OFFSET = 4, 2
+"""Every fourth seed is about leases: an exclusive task of few candidates that moves often under their faults."""
+CPU_ONLY = Weights(cpu=1.0, memory=0.0, network=0.0)
+LEASE_KINDS = ("cut", "one_way", "pause", "kill", "storm", "spike", "delay", "replay", "partial", "clock", "slow")
+"""What leases hang on: silence, restarts, late messages, clocks."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,6 +64,9 @@ def plan(seed: int, *, nodes: int | None = None, seconds: float = SECONDS) -> Pl
     """
     rng = Random(f"schedule {seed}")
     fleet = _fleet(rng, nodes or rng.randint(MIN_NODES, MAX_NODES))
+    if seed % LEASE_EVERY == LEASE_OFFSET:
+        fleet = _leased(rng, fleet)
+        return Plan(seed=seed, fleet=fleet, faults=_lease_faults(rng, fleet, seconds / 2), seconds=seconds)
     return Plan(seed=seed, fleet=fleet, faults=_faults(rng, fleet, seconds / 2), seconds=seconds)
 
 
@@ -108,6 +116,28 @@ def _task(rng: Random, name: str, voters: tuple[NodeId, ...], edges: tuple[NodeI
     )
 
 
+def _leased(rng: Random, fleet: Fleet) -> Fleet:
+    """The same fleet with exclusive tasks that want to move: few candidates, electors among them, no cool-down."""
+    names, candidates = [node.name for node in fleet.nodes], set(rng.sample(fleet.electors, 1))
+    candidates |= set(rng.sample(names, rng.choice((1, 2, 2))))
+    while len(candidates) < 2:
+        candidates.add(rng.choice(names))
+    tasks = tuple(
+        replace(
+            task,
+            candidates=tuple(sorted(candidates)),
+            tuning=replace(task.tuning, weights=CPU_ONLY, bonus=0.0, time_to_trigger_s=0.0, cool_down_s=0.0),
+            worker=replace(task.worker, standby=Standby.WARM),
+            exclusive=True,
+            on_isolation=OnIsolation.HOLD,
+            max_moves_per_minute=60,
+        )
+        for task in fleet.tasks[:1]
+    )
+    quick = replace(fleet.timing, decide_s=max(fleet.timing.gather_s, 0.5), smoothing_s=SAMPLE_S)
+    return replace(fleet, tasks=tasks, timing=quick)
+
+
 # --- faults ----------------------------------------------------------------------------------------------------------
 
 Maker = Callable[[Random, Fleet, float], list[Fault]]
@@ -123,6 +153,32 @@ def _faults(rng: Random, fleet: Fleet, until: float) -> tuple[Fault, ...]:
             found += make(rng, fleet, until)
     found += _load(rng, fleet, until)
     return tuple(sorted(found, key=lambda fault: (fault.at, fault.kind, fault.nodes)))
+
+
+def _lease_faults(rng: Random, fleet: Fleet, until: float) -> tuple[Fault, ...]:
+    """Faults of the candidates, cuts with other electors on their side too, and loads that push the task around."""
+    candidates = fleet.tasks[0].candidates
+    found: list[Fault] = []
+    for kind in LEASE_KINDS:
+        if rng.random() < 0.4:
+            found += [_at_candidate(rng, fault, candidates) for fault in MAKERS[kind](rng, fleet, until)]
+    pushes = rng.randint(4, 12)
+    for number in range(pushes):
+        at = until * (number + rng.random()) / pushes
+        busy = rng.choice(candidates)
+        found += [Fault(at=at, kind="load", nodes=(name,), size=0.95 if name == busy else 0.05) for name in candidates]
+    return tuple(sorted(found, key=lambda fault: (fault.at, fault.kind, fault.nodes)))
+
+
+def _at_candidate(rng: Random, fault: Fault, candidates: tuple[NodeId, ...]) -> Fault:
+    """The same fault, mostly of a candidate; one node's is often short enough to end within a lease."""
+    if not fault.nodes or rng.random() < 0.3:
+        return fault
+    if len(fault.nodes) > 1:
+        others = tuple(name for name in fault.nodes if name not in candidates)
+        return replace(fault, nodes=(rng.choice(candidates), *others))
+    seconds = rng.choice((fault.seconds, rng.uniform(0.02, 0.6)))
+    return replace(fault, nodes=(rng.choice(candidates),), seconds=fault.seconds if fault.kind == "pause" else seconds)
 
 
 def _names(fleet: Fleet) -> list[NodeId]:

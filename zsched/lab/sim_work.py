@@ -109,7 +109,7 @@ class Work:
         if machine.life != life:
             return
         if machine.roles[role.task].role is not WorkerRole.ACTIVE:
-            self._sim.invariants.checker.stop_working(machine.key, role.task, self._sim.now)
+            self._sim.invariants.checker.stop_working(machine.key, role.task, self._sim.now, life)
             working = self.working.get(role.task)
             if working is not None and working[0] == machine.key:
                 self.working[role.task] = (machine.key, min(working[1], self._sim.now))

@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
+import signal
 import subprocess
 import sys
 import time
@@ -26,6 +27,8 @@ from zsched.lab.sim_swarm import MAX_NODES, MIN_NODES, SECONDS, Plan, plan
 CHUNK = 10
 STORIES_SHOWN = 40
 PROGRESS_EVERY = 500
+STOPPED = 143
+"""Exit code after SIGTERM; what was played is in the file that ``--resume`` names."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -211,6 +214,7 @@ def main(arguments: list[str] | None = None) -> int:
     totals = Totals(seed=first)
     if given.resume is not None and given.resume.exists():
         totals = Totals.load(given.resume)
+    print(f"seeds {totals.seed} to {totals.seed + given.runs - 1}", flush=True)
     before, began_at, violations = totals.schedules, time.monotonic(), 0
     for job, result in play_all(_jobs(given, totals.seed), given.jobs):
         totals.take(job, result)
@@ -237,4 +241,5 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(STOPPED))  # else the pool's processes would stay
     sys.exit(main())
