@@ -3,9 +3,9 @@
 Knows: `zsched.worker`'s numbers and what it keeps of its answers, the acknowledger. Does not know: gates, outlets.
 
 A link that breaks loses what was on it; the worker keeps its answers until this relay has acknowledged them, and puts
-what is missing once more, for this relay alone (`AGAIN_CHUNK`). Meanwhile newer answers wait here, bounded. What the
-worker has no more is skipped at its word, what never comes after `GIVE_UP_S`; the gate counts both as lost. Where only
-the newest is wanted (class ``latest``) nothing waits. The stream's lock guards it.
+what is missing once more, for this relay alone. Meanwhile newer answers wait here, bounded. What the worker has no more
+is skipped at its word, what never comes after `GIVE_UP_S`; the gate counts both as lost. Where only the newest is
+wanted (class ``latest``) nothing waits. The stream's lock guards it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from zenoh import Priority, Sample, SampleKind
 
 from zsched.core.relay_protocol import SKIP_ENCODING
 from zsched.hop_acks import GIVE_UP_S, Acknowledger, SourceName
-from zsched.keyspace import AGAIN_CHUNK
 from zsched.relay.counter import StreamCounter
 from zsched.relay_pipe import decode_end
 
@@ -95,12 +94,11 @@ class Answers:
         self._acks.take(name, number, len(sample.payload))
         return (sample, *self._next_ones(name))
 
-    def take_again(self, sample: Sample) -> tuple[tuple[str, SourceName, Sample], ...]:
-        """Something came under our own key: ``(key, publisher, sample)`` of what goes on now."""
+    def take_again(self, key: str, sample: Sample) -> tuple[tuple[SourceName, Sample], ...]:
+        """Something of ``key`` came once more, for us alone: ``(publisher, sample)`` of what goes on now."""
         info: zenoh.SourceInfo | None = sample.source_info
         if info is None:
             return ()
-        key = str(sample.key_expr).rsplit(f"/{AGAIN_CHUNK}/", 1)[0]
         name = (key, str(info.source_id.zid), info.source_id.eid)
         if str(sample.encoding) == SKIP_ENCODING:
             marker = decode_end(sample.payload.to_bytes())
@@ -118,7 +116,7 @@ class Answers:
                 kind=sample.kind,
             )
             ready = self.take(name, info.source_sn, cast("Sample", resent), is_again=True)
-        return tuple((key, name, one) for one in ready)
+        return tuple((name, one) for one in ready)
 
     def ended(self, name: SourceName) -> None:
         """The source's end marker came."""
@@ -134,12 +132,12 @@ class Answers:
         """The number that comes next."""
         return self._acks.arrived(name)
 
-    def overdue(self) -> Iterator[tuple[str, SourceName, Sample]]:
+    def overdue(self) -> Iterator[tuple[SourceName, Sample]]:
         """What goes on now because the missing ones before it never came."""
         for name, early in tuple(self._early.items()):
             first = min(early.samples, default=None)
             if first is not None and self._acks.ask_for(name, first) > GIVE_UP_S:
-                yield from ((name[0], name, sample) for sample in self._skip(name, first))
+                yield from ((name, sample) for sample in self._skip(name, first))
 
     def close(self) -> None:
         """The slot is closed: its workers hear once more how far it came."""

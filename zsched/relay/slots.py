@@ -11,6 +11,7 @@ from typing import Final
 
 from zenoh import Sample
 
+from zsched.core import keyexpr
 from zsched.core.relay_protocol import EndMarker
 from zsched.hop_acks import SourceName
 from zsched.relay.answers import Answers
@@ -74,3 +75,10 @@ class OutputSlot:
     held_bytes: int = 0
     is_flipped: bool = False
     is_closed: bool = False
+
+    def key(self, name: str) -> KeyState | None:
+        """What has come on a concrete key; ``None`` when it is none of this slot's."""
+        state = self.keys.get(name)
+        if state is None and keyexpr.intersects(self.expr, name):
+            state = self.keys[name] = KeyState()
+        return state
