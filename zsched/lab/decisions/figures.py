@@ -64,10 +64,10 @@ def rules(rows: Sequence[Row], path: Path) -> None:
         oracle = rate(of(rows, case, "oracle"), "moves")
         axes[row][1].axhline(oracle, color="black", lw=0.8, ls="--", label="oracle")
         axes[row][1].set_yscale("symlog", linthresh=1.0)
-        axes[row][1].set_ylim(0, 2.0 * max(total))
+        axes[row][1].set_ylim(0, 40.0 * max(total))  # room for the legend
         axes[row][1].set_ylabel("moves per hour")
         axes[row][1].set_title(f"{title}: moves", fontsize=10)
-        axes[row][1].legend(fontsize=8)
+        axes[row][1].legend(fontsize=8, ncols=2, loc="upper left")
         for axis in axes[row]:
             axis.set_xticks(at, names, rotation=40, ha="right", fontsize=8)
     _save(figure, path)
