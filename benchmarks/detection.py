@@ -47,6 +47,7 @@ RECOVERY_S = 3.0
 """After a cut, TCP's own timers hold a link's streams back for up to so long; the next fault waits for it."""
 CASES = ("killed", "worker", "frozen", "cut", "heal")
 MAX_FAILURES = 5
+CALM_S = 90.0
 
 
 class Cycle:
@@ -109,7 +110,7 @@ class Cases:
 
     def run(self, name: str, fault: Callable[[NodeId], Callable[[], None]]) -> dict[str, float]:
         """One cycle; {step: milliseconds} of the steps that were seen."""
-        self.bed.wait(self.is_ready, 40, "a calm fleet")
+        self.bed.wait(self.is_ready, CALM_S, "a calm fleet")
         owner = self.bed.owner() or ""
         others = tuple(node for node in self.bed.names if node != owner)
         epoch = self.bed.task("robot1")["epoch"]
@@ -137,7 +138,7 @@ class Cases:
 
     def heal(self) -> dict[str, float]:
         """Cut robot3 and the owner off together, heal, and wait."""
-        self.bed.wait(self.is_ready, 40, "a calm fleet")
+        self.bed.wait(self.is_ready, CALM_S, "a calm fleet")
         owner = self.bed.owner() or ""
         ours = {"robot3", owner}
         theirs = tuple(node for node in self.bed.names if node not in ours)

@@ -74,7 +74,7 @@ class WorkerContext:
 class RestartPolicy:
     """Delay before restart ``n`` (1, 2, ...): ``first_s * 2**(n-1)``, at most ``most_s``, +- ``jitter_ratio`` of it."""
 
-    first_s: float = 0.5
+    first_s: float = 0.1
     most_s: float = 10.0
     jitter_ratio: float = 0.2
 
