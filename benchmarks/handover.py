@@ -4,15 +4,18 @@
 1 kHz x 100 B and 50 Hz x 1 MiB at once, over two edges in turn (A -> B -> A), TCP on loopback, relays driven by hand so
 that a move takes what it takes. ``--recorder``: a foreign subscriber to ``**``. ``--stalled``: a third edge whose
 worker is frozen takes the same streams meanwhile. ``--crash``: the owner's worker is killed before every move.
+``--all`` makes each of these runs, and a plain one of both classes, in turn. ``--out FILE`` keeps what was printed.
 """
 
 from __future__ import annotations
 
 import argparse
 import signal
+import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import TextIO
 
 from benchmarks.common import line, machine
 from benchmarks.rig import ROBOT, TASK, Load, Rig, Traffic, routes, until
@@ -20,15 +23,48 @@ from zsched.core.plan import RoutePhase, RoutePlan, StreamClass
 
 SMALL = Load(name="small", hz=1000, size=100)
 LARGE = Load(name="large", hz=50, size=1 << 20)
+ALL_RUNS: tuple[dict[str, object], ...] = (
+    {},
+    {"recorder": True},
+    {"stalled": True},
+    {"crash": True},
+    {"stream_class": "latest"},
+    {"stream_class": "latest", "mirror": True},
+)
 
 
 def main() -> None:
     """Print what was lost, doubled, reordered, and the gaps."""
     options = _options()
+    if options.out is not None:
+        sys.stdout = _Both(options.out.open("a", encoding="utf-8"))
     print(machine())
+    for changes in ALL_RUNS if options.all else ({},):
+        _one(argparse.Namespace(**(vars(options) | changes)))
+
+
+def _one(options: argparse.Namespace) -> None:
+    extras = [name for name in ("recorder", "stalled", "mirror", "crash") if getattr(options, name)]
+    print(f"\n{options.moves} moves, class {options.stream_class}{''.join(f', {name}' for name in extras)}", flush=True)
     edges = ("edge1", "edge2", "edge3") if options.stalled else ("edge1", "edge2")
     with tempfile.TemporaryDirectory() as folder, Rig(Path(folder), edges) as rig:
         _run(rig, options)
+
+
+class _Both:
+    """Standard output, and a file that is complete after every line."""
+
+    def __init__(self, file: TextIO) -> None:
+        self._file = file
+
+    def write(self, text: str) -> int:
+        self._file.write(text)
+        self._file.flush()
+        return sys.__stdout__.write(text) if sys.__stdout__ is not None else 0
+
+    def flush(self) -> None:
+        if sys.__stdout__ is not None:
+            sys.__stdout__.flush()
 
 
 def _options() -> argparse.Namespace:
@@ -41,6 +77,8 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--stalled", action="store_true")
     parser.add_argument("--mirror", action="store_true")
     parser.add_argument("--crash", action="store_true")
+    parser.add_argument("--all", action="store_true")
+    parser.add_argument("--out", type=Path)
     return parser.parse_args()
 
 
@@ -67,7 +105,7 @@ def _run(rig: Rig, options: argparse.Namespace) -> None:
     until(lambda: all(traffic.is_connected for traffic in traffics), "the application sees the relay")
     for traffic in traffics:
         traffic.start()
-    until(lambda: all(len(traffic.back) > 20 for traffic in traffics), "echoes")
+    until(lambda: all(len(traffic.back) > 5 for traffic in traffics), "echoes", 60.0)
     moments, flips = [], []
     for number in range(options.moves):
         time.sleep(0.15)
@@ -119,7 +157,9 @@ def _report(rig: Rig, traffics: list[Traffic], moments: list[float], flips: list
     print(line("  prepare to flip", flips, "ms", "-"))
     left = rig.left_behind()
     if left:
-        print(f"  reported 'at most N lost': {len(left)} slots, {sum(left)} samples, largest {max(left)}")
+        lost = sum(traffic.result()[0] for traffic in traffics)
+        told = f"{len(left)} slots, {sum(left)} samples, largest {max(left)}"
+        print(f"  reported 'at most N lost': {told}; lost were {lost}")
     for name, count in rig.counts().items():
         print(
             f"  {name}: {count.messages} msg acknowledged {count.acknowledged} in flight {count.in_flight} "
