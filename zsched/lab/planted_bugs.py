@@ -388,6 +388,13 @@ VOTE_BUGS = (
         _SCHEDULER,
     ),
     _bug(
+        "cap of moves forgotten",
+        SCHEDULER,
+        "return None if done < limit else f",
+        "return None if done < 10 * limit else f",
+        _SCHEDULER,
+    ),
+    _bug(
         "bonus twice",
         SCHEDULER,
         "max(value + (bonus if name == owner else 0.0)",

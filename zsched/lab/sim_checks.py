@@ -6,13 +6,14 @@ Knows: what must hold, over all nodes and all their lives. Does not know: what h
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 from zsched.core import instructions as do
-from zsched.core.damping import ESCAPES_PER_MINUTE
+from zsched.core.damping import ESCAPES_PER_MINUTE, WINDOW_S
 from zsched.core.executor import Phase
 from zsched.core.fleet import Fleet
 from zsched.core.messages import Accepted, Promise
-from zsched.core.model import Allocation, Ballot, DurableState, NodeId, RegisterState, TaskId, WorkerState
+from zsched.core.model import Allocation, Ballot, DurableState, NodeId, Proposal, RegisterState, TaskId, WorkerState
 from zsched.core.plan import RoutePlan, WorkerRole
 from zsched.errors import InvariantError
 from zsched.lab.history import Checker, Learnt, Record, Routed, Started, Stored, Worked
@@ -106,6 +107,8 @@ class Invariants:
                 self._check_ballot(machine, prepare.task, prepare.ballot, None)
             case do.SendAccept(accept=accept):
                 self._check_ballot(machine, accept.task, accept.acceptance.ballot, accept.acceptance.value)
+            case do.PublishProposal(proposal=proposal) if not proposal.is_escape:
+                self._check_cap(machine, proposal)
             case do.SetRole(role=role) if role.role is WorkerRole.ACTIVE:
                 self._check_epoch(machine, role.task, role.epoch)
             case _:
@@ -135,6 +138,21 @@ class Invariants:
         if value is not None and carried not in (None, value):
             raise InvariantError(f"{ballot} carries two values for {task}: {carried} and {value}")
         self.ballots[task, ballot] = (life, value or carried)
+
+    def _check_cap(self, machine: Machine, proposal: Proposal) -> None:
+        """Who has seen a minute's planned moves in this life proposes no further one: counted from what it learnt."""
+        node = machine.node
+        assert node is not None
+        task = node.rounds.tasks[proposal.task]
+        if node.registers[proposal.task].value.owner in (None, proposal.candidate):
+            return
+        moves = sum(
+            new.value.epoch > old.value.epoch and old.value.owner is not None and task.judged_at - new.at <= WINDOW_S
+            for old, new in pairwise(node.history[proposal.task])
+        )
+        planned = moves - task.damping.moves_within(WINDOW_S, task.judged_at, escapes=True)
+        if planned >= task.spec.max_moves_per_minute:
+            raise InvariantError(f"{machine.key} proposes move {planned + 1} of {proposal.task} within a minute")
 
     def _check_told(self, machine: Machine, task: TaskId, revision: int) -> None:
         if not revision or not _keeps_state(machine):

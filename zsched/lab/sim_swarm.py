@@ -112,7 +112,7 @@ def _task(rng: Random, name: str, voters: tuple[NodeId, ...], edges: tuple[NodeI
         exclusive=is_exclusive,
         on_isolation=OnIsolation.LOCAL if is_local else OnIsolation.HOLD,
         drain_s=rng.choice((0.1, 1.0)),
-        max_moves_per_minute=rng.choice((6, 60)),
+        max_moves_per_minute=rng.choice((2, 60)),
     )
 
 
