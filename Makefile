@@ -26,11 +26,13 @@ $(VENV)/.dev: pyproject.toml $(VENV)/.python
 demo: $(VENV)/.lab  ## Watch six machines merge laser maps (DEMO_ARGS="--headless --out DIR" to choose)
 	$(BIN)/zsched demo $(DEMO_ARGS)
 
-test: $(VENV)/.dev  ## All tests: unit, paper, integration and system (real daemons on localhost)
-	$(BIN)/python -m pytest -q
+# Two at a time where a test only needs a processor; alone where fleets of real processes run.
+test: $(VENV)/.dev  ## All tests: unit, paper, simulator, integration and system (real daemons on localhost)
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile tests/unit tests/paper tests/sim tests/planted
+	$(BIN)/python -m pytest -q --durations=15 tests/integration tests/system
 
 test-quick: $(VENV)/.dev  ## Unit and paper tests only
-	$(BIN)/python -m pytest -q tests/unit tests/paper
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile tests/unit tests/paper
 
 lint: $(VENV)/.dev  ## ruff, format check, mypy --strict
 	$(BIN)/ruff check .

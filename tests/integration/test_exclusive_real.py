@@ -13,7 +13,7 @@ import zenoh
 
 from zsched.lab.testbed import Testbed, echo_fleet
 
-pytestmark = pytest.mark.timeout(90)
+pytestmark = pytest.mark.timeout(180)
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ import pytest
 from zsched.lab.testbed import DAEMON, Testbed, echo_fleet
 from zsched.lifecycle import init_state
 
-pytestmark = pytest.mark.timeout(90)
+pytestmark = pytest.mark.timeout(180)
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ import pytest
 from zsched.core.model import NodeId
 from zsched.lab.testbed import Testbed, echo_fleet
 
-pytestmark = pytest.mark.timeout(90)
+pytestmark = pytest.mark.timeout(180)
 
 
 @pytest.fixture

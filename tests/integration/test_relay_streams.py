@@ -12,7 +12,6 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ import zenoh
 from support.waiting import free_port, until
 from zsched.adapters.streams import RelayHandle
 from zsched.core.events import RelayChanged, SlotDrained, SlotFlipped, SlotReady, StreamsCounted
+from zsched.core.fleet import Timing
 from zsched.core.plan import (
     Direction,
     HandoverRule,
@@ -36,7 +36,7 @@ from zsched.core.plan import (
     WorkerRole,
 )
 from zsched.core.relay_protocol import HandleReport, WorkerSeen
-from zsched.zenoh_config import data_config, worker_config
+from zsched.zenoh_config import DEFAULT_TIMING, data_config, worker_config
 
 FLEET, ROBOT, TASK = "test", "robot1", "echo"
 DEADLINE_S = 10.0
@@ -87,6 +87,7 @@ class Rig:
     """Three nodes' relays on loopback, echo workers, one application session beside the robot."""
 
     folder: Path
+    timing: Timing = DEFAULT_TIMING
     ports: dict[str, int] = field(default_factory=lambda: {n: free_port() for n in (ROBOT, "edge1", "edge2")})
     relays: dict[str, RelayHandle] = field(default_factory=dict)
     reports: dict[str, Reports] = field(default_factory=dict)
@@ -99,7 +100,7 @@ class Rig:
             self.reports[node] = Reports()
             connect = () if node == ROBOT else (seed,)
             # no shared memory: a stalled target must fill its socket
-            text = data_config(listen=(self.endpoint(node),), connect=connect, shared_memory=False)
+            text = data_config(listen=(self.endpoint(node),), connect=connect, timing=self.timing, shared_memory=False)
             self.relays[node] = RelayHandle(fleet=FLEET, node=node, zenoh_config=text, on_report=self.reports[node].add)
             self.relays[node].start()
         until(lambda: all(r.find(RelayChanged, is_running=True) for r in self.reports.values()), "the relays run")
@@ -111,7 +112,7 @@ class Rig:
     def start_worker(self, node: str, *options: str) -> subprocess.Popen[bytes]:
         self.incarnation += 1
         path = self.folder / f"{node}.json5"
-        path.write_text(worker_config(connect=(self.endpoint(node),), shared_memory=False))
+        path.write_text(worker_config(connect=(self.endpoint(node),), timing=self.timing, shared_memory=False))
         env = os.environ | {
             "ZSCHED_FLEET": FLEET,
             "ZSCHED_NODE": node,
@@ -180,6 +181,19 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
         made.stop()
 
 
+@pytest.fixture
+def patient_rig(tmp_path: Path) -> Iterator[Rig]:
+    """Links to a frozen process stay for 10 s: who waits for one is seen to."""
+    made = Rig(folder=tmp_path, timing=replace(DEFAULT_TIMING, zenoh_lease_s=10.0))
+    try:
+        made.start()
+        yield made
+    finally:
+        made.stop()
+
+
+WAITS_S = 5.0
+"""Half of such a link's lease."""
 BESIDE = Route(
     stream="beside/in/0",
     direction=Direction.INPUT,
@@ -293,7 +307,8 @@ def test_moves_of_a_latest_stream_end_with_the_newest_value(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize("stream_class", [StreamClass.RELIABLE, StreamClass.LATEST])
-def test_a_frozen_owner_does_not_hold_up_its_successor(rig: Rig, stream_class: StreamClass) -> None:
+def test_a_frozen_owner_does_not_hold_up_its_successor(patient_rig: Rig, stream_class: StreamClass) -> None:
+    rig = patient_rig
     options = ["--latest"] if stream_class is StreamClass.LATEST else []
     frozen = rig.start_worker("edge1", *options)
     rig.start_worker("edge2", *options)
@@ -308,12 +323,13 @@ def test_a_frozen_owner_does_not_hold_up_its_successor(rig: Rig, stream_class: S
     time.sleep(0.5)  # its socket and queues fill up
     started = time.monotonic()
     rig.move(second, first, drains=False)
-    until(lambda: app.nodes[-1] == "edge2", "the stream through edge2", deadline_s=1.0)
-    assert time.monotonic() - started < 1.0
+    until(lambda: app.nodes[-1] == "edge2", "the stream through edge2")
+    assert time.monotonic() - started < WAITS_S
     app.halt(thread)
 
 
-def test_a_stalled_owner_delays_no_other_stream(rig: Rig) -> None:
+def test_a_stalled_owner_delays_no_other_stream(patient_rig: Rig) -> None:
+    rig = patient_rig
     stalled = rig.start_worker("edge1")
     app = Application(rig.app)
     rig.move(slot(1, "edge1", StreamClass.RELIABLE, 0))
@@ -330,13 +346,15 @@ def test_a_stalled_owner_delays_no_other_stream(rig: Rig) -> None:
         source = rig.app.declare_publisher(BESIDE.from_expr)
         until(lambda: rig.app.put(BESIDE.from_expr, b"x") or arrivals, "the live stream flows")
         stalled.send_signal(signal.SIGSTOP)
-        end = time.monotonic() + 1.5
-        while time.monotonic() < end:
+        started, before = time.monotonic(), len(arrivals)
+
+        def put() -> bool:
             rig.app.put(f"{ROBOT}/in", bytes(65536), attachment=b"attached")
             source.put(b"x")
-            time.sleep(0.005)
-        gaps = [later - earlier for earlier, later in pairwise(arrivals)]
-        assert max(gaps[-200:]) < 0.4
+            return len(arrivals) > before + 250
+
+        until(put, "the live stream goes on")
+        assert time.monotonic() - started < WAITS_S
     finally:
         foreign.close()
 

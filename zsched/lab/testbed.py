@@ -224,7 +224,7 @@ class Testbed:
                 raise TestbedError(f"waited {timeout_s:g} s for {what}\n{tails}")
             time.sleep(POLL_S)
 
-    def wait_settled(self, timeout_s: float = 30.0) -> NodeId:
+    def wait_settled(self, timeout_s: float = 60.0) -> NodeId:
         """Wait until all running nodes agree on a living owner and every robot's streams are settled on it."""
 
         def settled() -> NodeId | None:
@@ -233,7 +233,7 @@ class Testbed:
 
         return self.wait(settled, timeout_s, "an owner on all nodes") or ""
 
-    def wait_whole(self, timeout_s: float = 30.0) -> NodeId:
+    def wait_whole(self, timeout_s: float = 60.0) -> NodeId:
         """Start who is down, wait until everybody is alive to everybody and the streams are settled; the owner."""
         self.start()
 
