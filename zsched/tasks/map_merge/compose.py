@@ -22,6 +22,9 @@ from zsched.tasks.map_merge.geometry import FloatArray, Pose2
 from zsched.tasks.map_merge.grid import MAX_CELLS, MAX_SIDE_CELLS, OCCUPIED, UNKNOWN, Cells, Grid, same_resolution
 
 BLOCK_CELLS = 64
+_NUDGE_CELLS = 2.0**-9
+"""Half-way between two cells OpenCV takes the even one: a grid that lies off by half a cell would lose every other row.
+This much to one side (more than single precision blurs an index) and it takes them all."""
 Levels = npt.NDArray[np.uint8]
 """Cells shifted by one so that unknown is 0: what OpenCV can warp, dilate and pad without a special case."""
 
@@ -177,4 +180,5 @@ def _cell_matrix(grid: Grid, world_t_map: Pose2, extent: Extent, resolution: flo
     per_cell = 1.0 / grid.resolution
     grid_to_cell = np.array([[per_cell, 0.0, -0.5], [0.0, per_cell, -0.5], [0.0, 0.0, 1.0]])
     matrix: FloatArray = grid_to_cell @ world_to_grid @ cell_to_world
+    matrix[:2, 2] += _NUDGE_CELLS
     return matrix[:2]

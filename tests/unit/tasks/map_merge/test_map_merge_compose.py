@@ -10,7 +10,7 @@ import pytest
 
 from zsched.tasks.map_merge.compose import Extent, compose, extent_of, resample
 from zsched.tasks.map_merge.geometry import Pose2
-from zsched.tasks.map_merge.grid import Grid, crop_known
+from zsched.tasks.map_merge.grid import OCCUPIED, Grid, crop_known
 
 
 def _grid(data: list[list[int]], *, resolution: float = 0.05, origin: Pose2 | None = None) -> Grid:
@@ -127,3 +127,14 @@ def test_crop_known_cuts_margins_and_keeps_the_place() -> None:
 def test_grid_refuses_what_no_map_is(data: Any, resolution: float, origin: Pose2) -> None:
     with pytest.raises(ValueError, match=r"grid\."):
         Grid(data=data, resolution=resolution, origin=origin)
+
+
+@pytest.mark.parametrize("offset_m", [0.0, 0.0125, 0.025, 0.0375, -0.025])
+@pytest.mark.parametrize("yaw", [0.0, math.pi / 2, math.pi])
+def test_walls_of_one_cell_survive_whatever_part_of_a_cell_the_grid_lies_off(offset_m: float, yaw: float) -> None:
+    data = np.zeros((41, 41), dtype=np.int8)
+    data[1::2] = OCCUPIED
+    grid = Grid(data=data, resolution=0.05, origin=Pose2(x=offset_m, y=offset_m))
+    pose = Pose2(yaw=yaw)
+    merged = compose([(grid, pose)], extent_of(grid, pose, 0.05), 0.05)
+    assert np.count_nonzero(merged.data == OCCUPIED) == np.count_nonzero(data == OCCUPIED)
