@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
 import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
-from pathlib import Path
+from collections.abc import Callable, Iterator
 
 import pytest
 
@@ -19,13 +19,34 @@ from zsched.lab.testbed import Testbed, echo_fleet
 pytestmark = pytest.mark.timeout(180)
 
 
+@pytest.fixture(scope="module")
+def fleets(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str], Testbed]]:
+    """Two fleets, started when first asked for: their task is idempotent, or exclusive."""
+    with contextlib.ExitStack() as stack:
+        made: dict[str, Testbed] = {}
+
+        def fleet(kind: str) -> Testbed:
+            if kind not in made:
+                edges = 1 if kind == "exclusive" else 2
+                tree = echo_fleet(edges=edges, stream_class="reliable", task={"exclusive": kind == "exclusive"})
+                made[kind] = stack.enter_context(Testbed(tmp_path_factory.mktemp(kind), tree))
+                made[kind].init()
+            made[kind].wait_whole(60)
+            return made[kind]
+
+        yield fleet
+
+
 @pytest.fixture
-def bed(tmp_path: Path) -> Iterator[Testbed]:
-    with Testbed(tmp_path, echo_fleet()) as testbed:
-        testbed.init()
-        testbed.start()
-        testbed.wait_settled()
-        yield testbed
+def bed(fleets: Callable[[str], Testbed]) -> Testbed:
+    """The idempotent fleet, whole again whatever the last test did to it."""
+    testbed = fleets("idempotent")
+    testbed.wait(lambda: not any("relay" in text for text in relay_problems(testbed)), 30, "every relay runs")
+    return testbed
+
+
+def relay_problems(bed: Testbed) -> list[str]:
+    return [text for node in bed.names for text in bed.status(node)["problems"]]
 
 
 def relay_of(bed: Testbed, node: NodeId) -> int:
@@ -125,16 +146,6 @@ class Talker:
         return max((after - before for before, after in itertools.pairwise(times)), default=math.inf)
 
 
-@pytest.fixture
-def reliable_bed(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Testbed]:
-    tree = echo_fleet(stream_class="reliable", task={"exclusive": request.param == "exclusive"})
-    with Testbed(tmp_path, tree) as testbed:
-        testbed.init()
-        testbed.start()
-        testbed.wait_settled()
-        yield testbed
-
-
 def end_daemon(bed: Testbed, node: NodeId, how: str) -> None:
     if how == "crashed":
         bed.kill(node, with_relay=False)
@@ -143,11 +154,9 @@ def end_daemon(bed: Testbed, node: NodeId, how: str) -> None:
         bed.wait(lambda: bed.has_ended(node), 5, "the daemon has ended")
 
 
-@pytest.mark.parametrize("reliable_bed", ["idempotent"], indirect=True)
 @pytest.mark.parametrize("how", ["crashed", "restarted"])
-def test_a_robots_streams_run_on_while_its_daemon_restarts(reliable_bed: Testbed, how: str) -> None:
+def test_a_robots_streams_run_on_while_its_daemon_restarts(bed: Testbed, how: str) -> None:
     """Nothing lost, no pause, the same relay; the daemon that follows takes it over and the task stays."""
-    bed = reliable_bed
     owner, epoch, relay = bed.wait_settled(), bed.task("robot1")["epoch"], relay_of(bed, "robot1")
     talker = Talker(bed)
     try:
@@ -168,10 +177,9 @@ def test_a_robots_streams_run_on_while_its_daemon_restarts(reliable_bed: Testbed
     assert "taken over" in bed.log("robot1")
 
 
-@pytest.mark.parametrize("reliable_bed", ["exclusive"], indirect=True)
-def test_an_exclusive_tasks_answers_wait_until_a_daemon_says_whose_count(reliable_bed: Testbed) -> None:
+def test_an_exclusive_tasks_answers_wait_until_a_daemon_says_whose_count(fleets: Callable[[str], Testbed]) -> None:
     """Nobody here would hear of another owner: nothing passes the gate, and nothing is lost."""
-    bed = reliable_bed
+    bed = fleets("exclusive")
     owner = bed.wait_settled()
     talker = Talker(bed)
     try:
@@ -188,10 +196,8 @@ def test_an_exclusive_tasks_answers_wait_until_a_daemon_says_whose_count(reliabl
     bed.wait(lambda: not talker.missing(moment), 5, "every answer")
 
 
-@pytest.mark.parametrize("reliable_bed", ["idempotent"], indirect=True)
-def test_an_orphaned_relay_follows_a_move_once_its_next_daemon_knows(reliable_bed: Testbed) -> None:
+def test_an_orphaned_relay_follows_a_move_once_its_next_daemon_knows(bed: Testbed) -> None:
     """The task moves while the robot has no daemon: its streams go to the new owner as soon as it has one again."""
-    bed = reliable_bed
     first = bed.wait_settled()
     talker = Talker(bed)
     try:

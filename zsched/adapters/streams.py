@@ -38,8 +38,10 @@ CALM_S: Final = 10.0
 """A relay that lived so long is replaced at once; one that did not waits for its backoff."""
 SILENCE_S: Final = 1.5
 """A relay says something twice a second; after so long without a word it is wedged, unless it lacks a processor..."""
+START_S: Final = 5.0
+"""The same for its first word."""
 STARVED_S: Final = 15.0
-"""...then it has so long, and so long to say its first word: killing it would only make the machine busier."""
+"""...then it has so long: killing it would only make the machine busier."""
 STILL_S: Final = 8.0
 """Its streams are counted every second; after so long without a count they hang on something, though it lives."""
 LOOK_S: Final = 0.25
@@ -263,7 +265,7 @@ class RelayHandle:
         """Hand on reports until the pipe ends; answers what was wrong, or ``""``."""
         poller = select.poll()
         poller.register(relay.descriptor, select.POLLIN)
-        heard_at, patience_s = monotonic_s(), STARVED_S
+        heard_at, patience_s = monotonic_s(), START_S
         while True:
             silent_s = monotonic_s() - heard_at
             if not poller.poll(max(LOOK_S, patience_s - silent_s) * 1000):

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from support.waiting import until
+from zsched.adapters import streams
 from zsched.adapters.streams import RelayHandle
 from zsched.core.events import RelayChanged
 from zsched.core.plan import Role, WorkerRole
@@ -66,6 +67,52 @@ def test_a_wedged_relay_is_replaced(daemon: Daemon) -> None:
     os.kill(daemon.handle.pid or 0, signal.SIGSTOP)
     until(lambda: daemon.changes() == [True, False, True], "wedged, killed and back")
     assert any(isinstance(r, RelayChanged) and "no sign of life" in r.reason for r in daemon.reports)
+
+
+SILENT = """#!{python}
+import os, sys, time
+sys.path[:0] = {path!r}
+from zsched import wire
+from zsched.core.relay_protocol import RelayStarted
+from zsched.relay_pipe import write_frame
+while True:
+    write_frame(1, wire.encode(RelayStarted(pid=os.getpid(), zid="1")))
+    end = time.monotonic() + 3.0
+    while time.monotonic() < end:
+        {deed}
+"""
+
+
+@pytest.mark.parametrize(("deed", "is_replaced"), [("pass", False), ("time.sleep(0.5)", True)], ids=["busy", "asleep"])
+def test_only_a_silent_relay_that_wants_no_processor_is_wedged(tmp_path: Path, deed: str, *, is_replaced: bool) -> None:
+    """A process in the relay's place says a word every 3 s, where 1.5 s of silence are too long."""
+    program = tmp_path / "silent"
+    program.write_text(SILENT.format(python=sys.executable, path=sys.path, deed=deed))
+    program.chmod(0o755)
+    reports: list[HandleReport] = []
+    handle = RelayHandle(
+        fleet="test", node="robot1", zenoh_config=CONFIG, on_report=reports.append, python=str(program)
+    )
+    handle.start()
+    try:
+        until(lambda: sum(isinstance(report, RelayChanged) for report in reports) >= 2, "it speaks again, or is gone")
+        changes = [report for report in reports if isinstance(report, RelayChanged)]
+        assert changes[1].is_running is not is_replaced
+    finally:
+        handle.stop(0.5)
+
+
+def test_a_relay_that_is_wedged_before_its_first_word_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(streams, "START_S", 0.5)
+    reports: list[HandleReport] = []
+    handle = RelayHandle(fleet="test", node="robot1", zenoh_config=CONFIG, on_report=reports.append)
+    handle.start()
+    try:
+        os.kill(until(lambda: handle.pid, "a process"), signal.SIGSTOP)
+        until(lambda: any(isinstance(r, RelayChanged) and r.is_running for r in reports), "another one runs")
+        assert any(isinstance(r, RelayChanged) and "no sign of life" in r.reason for r in reports)
+    finally:
+        handle.stop(2.0)
 
 
 def test_a_stopped_relay_never_blocks_the_daemon(daemon: Daemon) -> None:
