@@ -46,6 +46,7 @@ def control_config(
         ValueError: the operator's JSON5 is not a zenoh configuration.
     """
     settings = _peer(listen, connect, timing)
+    settings["connect/retry"] = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
     settings["transport/shared_memory/enabled"] = False
     settings["transport/link/rx/max_message_size"] = CONTROL_MAX_MESSAGE
     _set_gossip(settings, dials=dials_by_gossip)
@@ -166,7 +167,7 @@ def _common(timing: Timing) -> Settings:
         "transport/unicast/accept_timeout": 1000,
         "timestamping/enabled": False,
         # also of clients: a relay that dies is back within 0.3 s, zenoh's default looks after 1 s, then 2, then 4
-        "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 1.5},
+        "connect/retry": {"period_init_ms": 50, "period_max_ms": 1000, "period_increase_factor": 1.25},
     }
 
 

@@ -39,8 +39,14 @@ def test_every_session_scouts_nowhere_and_has_our_lease(text: str) -> None:
     assert read(text, "scouting/multicast/enabled") is False
     assert read(text, "transport/link/tx/lease") == 1250
     assert read(text, "timestamping/enabled") is False
-    assert read(text, "connect/retry")["period_init_ms"] == 100  # a relay is back within 0.3 s
     assert read(text, "id") is None  # random: a fixed one keeps a restarted node out for a lease
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_every_session_looks_again_quickly(name: str) -> None:
+    """A relay is back within 0.3 s."""
+    assert read(ALL[name], "connect/retry")["period_init_ms"] == (200 if name == "control" else 50)
+    assert read(ALL[name], "connect/retry")["period_max_ms"] == 1000
 
 
 @pytest.mark.parametrize("name", ["control", "data", "worker"])
