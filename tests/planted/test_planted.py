@@ -69,8 +69,14 @@ def test_a_module_that_is_already_there_cannot_be_planted() -> None:
 
 
 def test_table_names_survivors() -> None:
-    text = table(
-        [Verdict(bug=BUGS[0], found_by="seed 1: x", seconds=1.0), Verdict(bug=BUGS[1], found_by="", seconds=2)]
-    )
-    assert "**survived**" in text
-    assert "seed 1: x" in text
+    failed = "FAILED tests/sim/test_register_rules.py::test_a_rule[0] - AssertionError"
+    rows = table(
+        [
+            Verdict(bug=BUGS[0], found_by="seed 1: x", seconds=1.0),
+            Verdict(bug=BUGS[1], found_by="", seconds=2.0),
+            Verdict(bug=BUGS[2], found_by=failed, seconds=3.0),
+        ]
+    ).splitlines()[2:]
+    assert rows[0] == "| quorum off by one | `core/scoring.py` | seed 1: x | 1.0 |"
+    assert "**survived**" in rows[1]
+    assert "| `test_a_rule` |" in rows[2]

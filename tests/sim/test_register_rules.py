@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from random import Random
 
-from zsched.core.messages import Accepted, Promise
-from zsched.core.model import Acceptance, Allocation, Ballot, RegisterState, Tuning, Weights
+import pytest
+
+from zsched.core.agreement import Agreement
+from zsched.core.events import AcceptAsked, PrepareAsked
+from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, electorate_hash
+from zsched.core.messages import Accept, Accepted, Prepare, Promise
+from zsched.core.model import Acceptance, Allocation, Ballot, DurableState, NodeKind, RegisterState, Tuning, Weights
 from zsched.core.register import MoveOwner, Register, Step
 
 ELECTORS = ("r1", "r2", "r3")
@@ -89,3 +95,29 @@ def test_newer_among_accepted_values_is_the_higher_ballot_not_the_higher_revisio
     step = register.on_answer(promise("r3", ballot, newer), 0.02)
     assert step.accept is not None
     assert step.accept.acceptance.value == newer.value
+
+
+@pytest.mark.parametrize(("node", "asker"), [("r3", "r2"), ("ghost", "ghost"), ("r2x", "r2")])
+def test_a_ballot_that_is_not_its_asker_s_or_a_stranger_s_gets_no_answer(node: str, asker: str) -> None:
+    spec = TaskSpec(name="merge", candidates=ELECTORS, tuning=INITIAL.tuning, worker=WorkerSpec(command=("true",)))
+    fleet = Fleet(
+        name="rules",
+        timing=Timing(),
+        nodes=tuple(NodeSpec(name=name, kind=NodeKind.ROBOT) for name in ELECTORS),
+        tasks=(spec,),
+        electors=ELECTORS,
+    )
+    electorate = electorate_hash(fleet)
+    state = DurableState(fleet="rules", node="r1", incarnation=1, generation=0, hardware="", electorate=electorate)
+    elector = Agreement(
+        fleet=fleet, me="r1", durable=state, incarnation=1, electorate=electorate, rng=Random(1), now=0.0
+    )
+    ballot = Ballot(counter=1, node=node, incarnation=1)
+    prepare = Prepare(task="merge", ballot=ballot, electorate=electorate)
+    value = replace(INITIAL, revision=1, epoch=1, owner="r2")
+    accept = Accept(task="merge", acceptance=Acceptance(ballot=ballot, value=value), electorate=electorate)
+    assert not elector.on_prepare(PrepareAsked(request=1, asker=asker, prepare=prepare), 1.0).send
+    assert not elector.on_accept(AcceptAsked(request=2, asker=asker, accept=accept), 1.0).send
+    assert elector.counters == {"prepare_foreign": 1, "accept_foreign": 1}
+    own = replace(prepare, ballot=replace(ballot, node="r2"))
+    assert elector.on_prepare(PrepareAsked(request=3, asker="r2", prepare=own), 1.0).send, "its own one does"

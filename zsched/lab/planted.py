@@ -34,6 +34,8 @@ STUCK_S = 120.0
 """So much CPU time beyond its budget only a schedule, or a test, that does not end takes."""
 LONGEST_S = 1800.0
 """Of the wall clock, on a machine that is busy with other work; a bug that is not judged by then counts as survived."""
+CELL = 100
+"""Characters of a violation in the table."""
 FOUND = 10
 """Exit code of a process that has found the bug planted in it (0: it has not; anything else: it broke down)."""
 MAX_SEEDS = 100_000
@@ -158,12 +160,20 @@ def _found(bug: Bug, how: str, budget_s: float) -> str:
 
 
 def table(verdicts: Sequence[Verdict]) -> str:
-    """The verdicts as Markdown."""
-    rows = ["| bug | found by | s |", "| --- | --- | ---: |"]
+    """The verdicts as Markdown, as docs/planted-bugs.md keeps them."""
+    rows = ["| bug | in | found by | s |", "| --- | --- | --- | ---: |"]
     for one in verdicts:
-        found = (one.found_by or "**survived**").replace("|", "/")
-        rows.append(f"| {one.bug.name} | {found} | {one.seconds:.1f} |")
+        module = one.bug.module.removeprefix("zsched.").replace(".", "/")
+        rows.append(f"| {one.bug.name} | `{module}.py` | {_short(one.found_by)} | {one.seconds:.1f} |")
     return "\n".join(rows)
+
+
+def _short(found_by: str) -> str:
+    """What found a bug, in a table's cell: the violation's beginning, or the test's name."""
+    if found_by.startswith("FAILED "):
+        return f"`{found_by.partition('::')[2].partition(' - ')[0].partition('[')[0]}`"
+    text = found_by.replace("|", "/") or "**survived**"
+    return text if len(text) <= CELL else f"{text[:CELL]} …"
 
 
 def main(arguments: list[str] | None = None) -> int:

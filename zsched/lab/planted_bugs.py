@@ -192,7 +192,8 @@ REGISTER_BUGS = (
         AGREEMENT,
         "return ballot.node == asker and asker in self._nodes",
         "return True",
-        _AGREEMENT,
+        _REGISTER,
+        13,
     ),
     _bug(
         "batch in the wrong order",
