@@ -223,10 +223,9 @@ class Merger:
     def restore(self, snapshot: bytes) -> str:
         """Take over a previous owner's transforms; returns why they are not taken (empty: taken).
 
-        Only for a merger that has no transforms of its own yet.
+        An owner that comes back takes them over too: the robots have followed its predecessor's map meanwhile. The
+        canvas then covers what either had, unless the world frame is another.
         """
-        if self._reference is not None or self._extent is not None:
-            return "this merger has a map of its own"
         try:
             state = json.loads(snapshot)
             if state["schema"] != SNAPSHOT_SCHEMA:
@@ -243,7 +242,13 @@ class Merger:
             return "malformed snapshot: extent"
         for edge in edges:
             self._pairs.adopt(edge)
-        self._extent, self._reference, self._revision = extent, reference, revision
+        if reference is None and extent is None:
+            return ""  # the predecessor never had a map
+        is_same_world = self._reference in {None, reference}
+        if is_same_world:
+            both = self._extent if extent is None else extent.union(self._extent)
+            extent = extent if both is not None and both.is_too_large else both
+        self._extent, self._reference, self._revision = extent, reference, max(revision, self._revision)
         return ""
 
     def _robots(self) -> set[str]:

@@ -33,6 +33,11 @@ REFERENCE_GRACE_S = 0.3
 
 A new owner gets all kept maps within milliseconds; the one that happens to be first must not decide the world frame.
 """
+FRESH_GRACE_S = 0.3
+"""How long an owner that comes back waits for a map of every robot it knew.
+
+It holds maps of its former tenure; merged with the first new ones they would show the robots the past for a moment.
+"""
 STATUS_PERIOD_S = 1.0
 """Status at least so often while active: the ages in it go on."""
 _LOG = logging.getLogger("zsched.tasks.map_merge")
@@ -103,6 +108,8 @@ class MapMergeService:
         self._strangers = 0
         self._is_due = False
         self._was_active = False
+        self._active_s = float("-inf")
+        self._stale: set[str] = set()
         self._result: MergeResult | None = None
         self._merges = 0
         self._merge_ms: float | None = None
@@ -155,6 +162,7 @@ class MapMergeService:
     def _keep(self, robot: str, grid: Grid | None) -> None:
         with self._lock:
             self._pending[robot] = grid
+            self._stale.discard(robot)
             self._is_due = True
 
     # --- one thread ---------------------------------------------------------------------------------------------------
@@ -173,15 +181,20 @@ class MapMergeService:
 
         While idle, maps are only kept; the first step as owner merges what there is, at once.
         """
+        now = self._clock()
         if is_active and not self._was_active:
             self._is_due = True
+            self._active_s = now
             self._next_merge_s = self._next_status_s = float("-inf")
+        elif self._was_active and not is_active:
+            with self._lock:
+                self._stale = set(self._inputs)
         self._was_active = is_active
-        now = self._clock()
         if not is_active:
             return False
         self._take_found()
-        if self._is_due and now >= self._next_merge_s and not self._awaits_reference(now):
+        awaits = self._awaits_reference(now) or self._awaits_fresh_maps(now)
+        if self._is_due and now >= self._next_merge_s and not awaits:
             self._next_merge_s = now + self._period_s
             self._merge()
             return True
@@ -192,6 +205,12 @@ class MapMergeService:
     def _awaits_reference(self, now: float) -> bool:
         first_s = self._first_map_s
         return self._merger.needs_reference and first_s is not None and now < first_s + REFERENCE_GRACE_S
+
+    def _awaits_fresh_maps(self, now: float) -> bool:
+        with self._lock:
+            if now >= self._active_s + FRESH_GRACE_S:
+                self._stale.clear()  # who has sent nothing since then is merged as it was last seen
+            return bool(self._stale)
 
     def _merge(self) -> None:
         with self._lock:

@@ -107,13 +107,50 @@ def test_idle_keeps_the_newest_maps_and_the_owner_merges_them_at_once(view: View
     assert decode_grid(wire.last(Output.GLOBAL_MAP)[0]).known_area_m2 > 300
 
 
-def test_owner_again_publishes_at_once_without_a_new_input(view: View) -> None:
+def test_owner_again_waits_a_moment_for_a_new_map_of_every_robot_then_shows_what_it_has(view: View) -> None:
     wire = _Wire()
     service = _service(wire)
-    _feed(service, view, "robot1")
+    _feed(service, view, "robot1", "robot2")
     service.step(is_active=True)
     service.step(is_active=False)
+    wire.now_s += 60.0
+    assert not service.step(is_active=True)
+    _feed(service, view, "robot1")
+    assert not service.step(is_active=True)
+    wire.now_s += 0.31
     assert service.step(is_active=True)
+
+
+def test_owner_again_merges_at_once_when_every_robots_newest_map_came_while_it_stood_by(view: View) -> None:
+    wire = _Wire()
+    service = _service(wire)
+    _feed(service, view, "robot1", "robot2")
+    service.step(is_active=True)
+    service.step(is_active=False)
+    wire.now_s += 60.0
+    _feed(service, view, "robot2", "robot1")
+    assert service.step(is_active=True)
+
+
+def test_owner_again_takes_its_predecessors_transforms_and_keeps_the_larger_canvas(view: View) -> None:
+    wire = _Wire()
+    first, second = _service(wire, Mode.ESTIMATE), _service(wire, Mode.ESTIMATE)
+    _feed(first, view, "robot1")
+    wire.now_s += 1.0
+    assert first.step(is_active=True)
+    small = wire.status()["map"]
+    second.restore(first.snapshot())
+    first.step(is_active=False)
+    _feed(second, view, "robot1", "robot2")
+    while second.step(is_active=True):
+        wire.now_s += 1.0
+    large = wire.status()["map"]
+    assert large["width"] * large["height"] > small["width"] * small["height"]
+    first.restore(second.snapshot())
+    _feed(first, view, "robot1")
+    assert first.step(is_active=True)
+    again = wire.status()["map"]
+    assert (again["width"], again["height"]) == (large["width"], large["height"])
 
 
 def test_rate_bounds_merges_and_no_input_no_merge(view: View) -> None:
