@@ -106,7 +106,7 @@ class Loop:
             if now >= self._node.next_deadline():
                 for frame in self._bus.waiting():
                     self.received += 1
-                    self._carry_out(self._node.handle(frame, monotonic_s()))
+                    self._node.absorb(frame, now)
             now = monotonic_s()
             self._carry_out(self._node.handle(event, now))
             if now >= sample_at:

@@ -312,7 +312,7 @@ class Daemon:
             event = self._inbox.take(wait) or ev.DeadlineReached()
             now = monotonic_s()
             if now >= node.next_deadline() or now < alert_until or isinstance(event, ev.TokenLost):
-                self._take_waiting(node, shell)  # before the event: they came before it, and nobody may look silent
+                self._absorb_waiting(node, shell)  # before the event: they came before it, and nobody may look silent
             now = self._handle(node, shell, event)
             if shell.stand_down:
                 raise ConfigError(f"{node.me}: {shell.stand_down}")
@@ -343,10 +343,10 @@ class Daemon:
             shell.carry_out(node.handle(first, now))
         return now
 
-    def _take_waiting(self, node: Node, shell: Shell) -> None:
+    def _absorb_waiting(self, node: Node, shell: Shell) -> None:
         """Let the node have what has come without waking the loop: our own samples, and frames in turn."""
         for waiting in (*self._inbox.waiting(), *shell.waiting_frames()):
-            self._handle(node, shell, waiting)
+            node.absorb(waiting, monotonic_s())
             self._note_ready(node, waiting)
 
     def _note_ready(self, node: Node, event: ev.Event) -> None:

@@ -146,12 +146,20 @@ class Node:
             event: what happened.
             now: monotonic seconds, never less than before.
         """
-        if now > self._promised:
-            self._note_lag(now - self._promised)
-        self._handlers[type(event)](event, now)
+        self.absorb(event, now)
         if type(event) in _OFTEN_QUIET and self._is_quiet(now):
             return self._only_sent()
         return self._finish(now)
+
+    def absorb(self, event: ev.Event, now: float) -> None:
+        """Take an event in and act on nothing yet, nor on the time that has passed: `handle` must follow at once.
+
+        After a stall many beats wait. Whoever judged by the time after the first of them would take the senders of all
+        others for silent.
+        """
+        if now > self._promised:
+            self._note_lag(now - self._promised)
+        self._handlers[type(event)](event, now)
 
     def _is_quiet(self, now: float) -> bool:
         """Whether the event left nothing but an answer before the deadline that was promised: nine in ten do.

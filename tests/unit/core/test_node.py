@@ -440,6 +440,19 @@ def test_beats_in_turn_are_no_news() -> None:
     assert not any(one.is_news for one in told[1:])
 
 
+def test_after_a_stall_nobody_is_accused_whose_beat_waits() -> None:
+    """Absorbed one after the other, judged at the end; whoever has sent nothing meanwhile is suspect."""
+    node, now = started(), 105.0
+    for name in ("robot2", "robot3", "edge1"):
+        node.absorb(ev.BeatReceived(beat=beat(name, 30)), now)
+    batch = node.handle(ev.DeadlineReached(), now)
+    accused = [one.text.split()[0] for one in of(batch, do.RecordStory) if "suspect" in one.text]
+    assert accused == ["edge2"]
+    hasty = started()
+    batch = hasty.handle(ev.BeatReceived(beat=beat("robot2", 30)), now)
+    assert len([one for one in of(batch, do.RecordStory) if "-> suspect" in one.text]) == 3, "what it is good for"
+
+
 def test_profiles_with_other_figures_are_no_news() -> None:
     node = started()
     (told,) = of(node.handle(ev.ProfileSampled(device=replace(SAMPLE, cpu_used_cores=3.5)), 102.0), do.PublishProfile)
