@@ -118,7 +118,8 @@ def mesh(trio: tuple[Peer, Peer, Peer]) -> tuple[Peer, Peer, Peer]:
 def stranger(trio: tuple[Peer, Peer, Peer]) -> Iterator[zenoh.Session]:
     """A plain session on the same network that says what it likes."""
     hub = f"tcp/127.0.0.1:{trio[0].port}"
-    session = zenoh.open(zenoh.Config.from_json5(control_config(listen=(), connect=(hub,), timing=TIMING)))
+    listen = f"tcp/127.0.0.1:{free_port()}"  # of two that meet by gossip either may have to dial
+    session = zenoh.open(zenoh.Config.from_json5(control_config(listen=(listen,), connect=(hub,), timing=TIMING)))
     try:
         until(lambda: all(peer.bus.peers() == 3 for peer in trio), "the stranger is in the mesh")
         yield session
