@@ -393,7 +393,7 @@ VOTE_BUGS = (
         SCHEDULER,
         "return None if done < limit else f",
         "return None if done < 10 * limit else f",
-        _SCHEDULER,
+        ("tests/unit/core/test_damping.py",),
     ),
     _bug(
         "bonus twice",
