@@ -18,6 +18,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
+from zsched.clock import monotonic_s
 from zsched.relay_door import relays_in
 
 DEADLINE_S: Final = 1.0
@@ -51,13 +52,13 @@ def own_group(text: str, root: Path = GROUPS) -> Path | None:
 def end_all(group: Path, spared: frozenset[int]) -> list[int]:
     """SIGKILL every process in ``group`` but ``spared``; returns those that were there."""
     found: dict[int, None] = {}
-    until = time.monotonic() + DEADLINE_S
+    until = monotonic_s() + DEADLINE_S
     while left := [pid for pid in members(group) if pid not in spared]:
         for pid in left:
             found[pid] = None
             with contextlib.suppress(OSError):
                 os.kill(pid, signal.SIGKILL)
-        if time.monotonic() > until:
+        if monotonic_s() > until:
             break
         time.sleep(POLL_S)
     return list(found)
