@@ -53,28 +53,30 @@ def test_init_without_a_reachable_node_goes_on(tmp_path: Path) -> None:
     assert "no other node reached" in done.stderr
 
 
-def test_second_machine_of_a_name_leaves_again_with_78(bed: Testbed) -> None:
-    """A daemon that finds its own name alive elsewhere exits 78; the one that was there stays an elector."""
-    tree = json.loads(bed.file.read_text())
-    other = dict(tree["nodes"]["robot2"])
-    other["listen"] = {"control": "tcp/127.0.0.1:0", "data": "tcp/127.0.0.1:0"}
-    twin_file = bed.folder / "twin.yaml"
-    del other["listen"]
-    tree["nodes"]["robot2"] = other
-    del tree["nodes"]["edge1"]["listen"]  # not every address is known: it dials by gossip, too, and finds its twin
-    twin_file.write_text(json.dumps(tree))
-    init_state(bed.fleet, "robot2", bed.folder / "twin", 0)  # an operator who does not ask the fleet
-    folders = ("--state-dir", str(bed.folder / "twin"), "--runtime-dir", str(bed.folder / "twin-run"))
-    twin = subprocess.run(
-        [*DAEMON, "--config", str(twin_file), "--node", "robot2", *folders],
-        capture_output=True,
-        text=True,
-        timeout=30,
-        check=False,
-    )
-    assert twin.returncode == 78, twin.stderr[-2000:]
-    assert "another daemon calls itself 'robot2'" in twin.stderr
-    assert bed.status("robot2")["quorum"]["this_node"] == "elector"
+def test_second_machine_of_a_name_leaves_again_with_78(tmp_path: Path) -> None:
+    """A daemon that finds its own name alive elsewhere exits 78; the one that was there stays an elector.
+
+    Neither gives an address, so they meet by gossip, as everybody without one does. Twins of an address: chaos tests.
+    """
+    tree = echo_fleet(edges=1)
+    for node in ("robot2", "edge1"):
+        del tree["nodes"][node]["listen"], tree["nodes"][node]["host"]
+    with Testbed(tmp_path, tree) as bed:
+        bed.init()
+        bed.start()
+        bed.wait_settled()
+        init_state(bed.fleet, "robot2", bed.folder / "twin", 0)  # an operator who does not ask the fleet
+        folders = ("--state-dir", str(bed.folder / "twin"), "--runtime-dir", str(bed.folder / "twin-run"))
+        twin = subprocess.run(
+            [*DAEMON, "--config", str(bed.file), "--node", "robot2", *folders],
+            capture_output=True,
+            text=True,
+            timeout=30,
+            check=False,
+        )
+        assert twin.returncode == 78, twin.stderr[-2000:]
+        assert "another daemon calls itself 'robot2'" in twin.stderr
+        assert bed.status("robot2")["quorum"]["this_node"] == "elector"
 
 
 def test_another_fleet_file_is_shown(bed: Testbed) -> None:
