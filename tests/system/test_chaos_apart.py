@@ -4,7 +4,8 @@ A robot that works alone while it is cut off, nodes that meet by gossip only, an
 electors than its state.
 
 One fleet for the module: three robots and two edges; ``robot3`` and ``edge2`` give no address, so that these two can
-only meet by gossip. Every robot keeps a standby of the task (`on_isolation: local`).
+only meet by gossip. Every robot keeps a standby of the task (`on_isolation: local`). Its streams are of two classes:
+of ``latest`` the newest value may be answered by both owners of a move (docs/streams.md), of ``reliable`` nothing.
 """
 
 from __future__ import annotations
@@ -12,7 +13,8 @@ from __future__ import annotations
 import json
 import subprocess
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -22,30 +24,45 @@ from zsched.adapters.state_file import StateFile
 from zsched.clock import monotonic_s
 from zsched.core.model import NodeId
 from zsched.lab import netns
-from zsched.lab.netbed import Netbed, Probe
+from zsched.lab.netbed import Netbed, Probe, Received
 from zsched.lab.testbed import TASK, Json, echo_fleet
 from zsched.places import socket_path
 
 pytestmark = [pytest.mark.timeout(120), pytest.mark.root]
 
 HIDDEN = ("edge2", "robot3")
+ROBOTS_TASK: Json = {
+    "on_isolation": "local",
+    "inputs": [
+        {"from": "{robot}/in", "to": "{target}/echo/{robot}/in", "class": "latest"},
+        {"from": "{robot}/order", "to": "{target}/echo/{robot}-orders/in", "class": "reliable"},
+    ],
+    "outputs": [
+        {"from": "{target}/echo/{epoch}/{robot}/out", "to": "{robot}/out", "class": "latest"},
+        {"from": "{target}/echo/{epoch}/{robot}-orders/out", "to": "{robot}/done", "class": "reliable"},
+    ],
+}
 
 
 class Bed(Netbed):
-    """The fleet, and an application on robot1."""
+    """The fleet, and two applications on robot1: one with a stream of class ``latest``, one with ``reliable``."""
 
     __test__ = False
     app_on_robot1: Probe
+    orders_of_robot1: Probe
 
     def is_whole(self) -> bool:
         """Whether everybody is alive to everybody, and one owner serves."""
         states = {peer["state"] for node in self.names for peer in self.status(node)["nodes"]}
-        return states == {"alive"} and self.owner() is not None and self.app_on_robot1.is_flowing()
+        return states == {"alive"} and self.owner() is not None and self._is_served()
 
-    def newest(self) -> NodeId | None:
-        """Who has answered the application last, if it was a moment ago."""
-        received = tuple(self.app_on_robot1.received[-1:])
-        return received[0].node if received and monotonic_s() - received[0].at < 0.3 else None
+    def _is_served(self) -> bool:
+        return self.app_on_robot1.is_flowing() and self.orders_of_robot1.is_flowing()
+
+    def served_by(self, node: NodeId) -> bool:
+        """Whether ``node`` has answered both applications last, a moment ago."""
+        newest = [one for probe in (self.app_on_robot1, self.orders_of_robot1) for one in tuple(probe.received[-1:])]
+        return len(newest) == 2 and all(one.node == node and monotonic_s() - one.at < 0.3 for one in newest)
 
 
 @pytest.fixture(scope="module")
@@ -53,11 +70,12 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bed]:
     reason = netns.why_not()
     if reason is not None:
         pytest.skip(f"no network namespaces here: {reason}")
-    tree = echo_fleet(robots=3, edges=2, timing="wired", task={"on_isolation": "local"})
+    tree = echo_fleet(robots=3, edges=2, timing="wired", task=ROBOTS_TASK)
     with Bed(tmp_path_factory.mktemp("apart"), tree, hidden=HIDDEN) as bed:
         bed.init()
         bed.start()
         bed.app_on_robot1 = bed.probe("robot1", put="robot1/in", watch=["robot1/out"])
+        bed.orders_of_robot1 = bed.probe("robot1", put="robot1/order", watch=["robot1/done"])
         yield bed
 
 
@@ -80,22 +98,32 @@ def test_two_nodes_without_addresses_find_each_other_again_after_short_cuts(bed:
 
 def test_a_robot_that_is_cut_off_is_served_by_its_own_standby_and_nothing_comes_twice(bed: Bed) -> None:
     owner, epoch = bed.owner(), bed.task("robot1")["epoch"]
+    assert owner is not None
     assert owner != "robot1"
     bed.network.cut("robot1")
-    bed.wait(lambda: bed.newest() == "robot1", 10, "answers of its own worker")
+    bed.wait(lambda: bed.served_by("robot1"), 10, "answers of its own worker")
     assert any("works alone" in text for text in bed.task("robot1")["problems"]), bed.task("robot1")
     assert bed.task("robot1")["epoch"] == epoch
     assert bed.owner("robot2", "robot3", "edge1", "edge2") == owner, "the others go on"
     bed.network.heal()
-    bed.wait(lambda: bed.newest() == owner, 15, "answers of the owner")
+    bed.wait(lambda: bed.served_by(owner), 15, "answers of the owner")
     healed = monotonic_s()
     bed.wait(lambda: monotonic_s() > healed + 1.0, 5, "a second of them")
-    counts = Counter(one.number for one in tuple(bed.app_on_robot1.received))
-    twice = [number for number, count in counts.items() if count > 1]
-    assert twice == []
+    counts = Counter(one.number for one in tuple(bed.orders_of_robot1.received))
+    assert [number for number, count in counts.items() if count > 1] == [], "of class reliable nothing comes twice"
+    assert_only_the_newest_came_twice(tuple(bed.app_on_robot1.received))
     owners = bed.app_on_robot1.owners("robot1/out")
     assert owners[-3:] == [owner, "robot1", owner], "the local slot closes before the owner's opens"
     assert not any("works alone" in text for text in bed.task("robot1")["problems"])
+
+
+def assert_only_the_newest_came_twice(received: Sequence[Received]) -> None:
+    """Class ``latest``: when the owner changes the newest value may be answered again, and nothing older follows it."""
+    pairs = tuple(pairwise(received))
+    assert [(one.number, after.number) for one, after in pairs if after.number < one.number] == []
+    moves = sum(one.node != after.node for one, after in pairs)
+    twice = [one.number for one, after in pairs if after.number == one.number]
+    assert len(twice) <= 2 * moves, (twice, moves)
 
 
 def test_a_node_whose_file_names_other_electors_than_its_state_is_no_elector_and_works_on(bed: Bed) -> None:

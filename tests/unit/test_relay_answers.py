@@ -172,3 +172,18 @@ def test_a_stream_of_newest_values_takes_what_is_newer_and_drops_what_is_older(b
     until(lambda: bench.passed[-1] == "6", "the newest")
     assert bench.passed in (["3", "5", "6"], ["3", "4", "5", "6"], ["3", "4", "6"])
     bench.wait_ack(arrived=7, has_gap=False)
+
+
+def test_an_owner_that_is_left_and_comes_back_in_its_epoch_doubles_nothing(bench: Bench) -> None:
+    """A robot that was cut off worked alone meanwhile; the owner sends what the cut kept us from acknowledging."""
+    stream = bench.open()
+    bench.put(0, 1, 2)
+    assert bench.is_through(0, 1, 2)
+    stream.close_slot(1)
+    stream.open(1, stream.route, bench.acks, is_from_start=True)
+    stream.flip(1, drops_held=False)
+    until(lambda: matches(bench.again), "the relay subscribes again")
+    bench.put_again(1, 2, 3)  # 3: made of what reached the owner before the cut
+    bench.put(4)
+    assert bench.is_through(0, 1, 2, 3, 4)
+    assert stream.count().lost == 0

@@ -10,7 +10,7 @@ wanted (class ``latest``) nothing waits. The stream's lock guards it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Final, cast
 
@@ -69,14 +69,27 @@ class _Early:
 class Answers:
     """The numbered answers of one slot's workers: usually one, two when it restarts in place."""
 
-    def __init__(self, acks: Acknowledger, counter: StreamCounter, *, is_from_start: bool, in_turn: bool) -> None:
-        """``is_from_start``: this slot was open before its owner could answer, number 0 is wanted too."""
+    def __init__(
+        self,
+        acks: Acknowledger,
+        counter: StreamCounter,
+        *,
+        is_from_start: bool,
+        in_turn: bool,
+        heard: Mapping[SourceName, int],
+    ) -> None:
+        """``is_from_start``: this slot was open before its owner could answer, number 0 is wanted too.
+
+        ``heard``: what `close` answered when a slot of the same owner and epoch closed; it goes on from there.
+        """
         self._acks = acks
         self._counter = counter
         self._is_from_start = is_from_start
         self._in_turn = in_turn
         self._early: dict[SourceName, _Early] = {}
-        self._names: set[SourceName] = set()
+        self._names: set[SourceName] = set(heard)
+        for name, number in heard.items():
+            acks.expect(name, number)
 
     def take(self, name: SourceName, number: int, sample: Sample, *, is_again: bool = False) -> tuple[Sample, ...]:
         """A sample came; answers those that go on now, in order."""
@@ -139,11 +152,13 @@ class Answers:
             if first is not None and self._acks.ask_for(name, first) > GIVE_UP_S:
                 yield from ((name, sample) for sample in self._skip(name, first))
 
-    def close(self) -> None:
-        """The slot is closed: its workers hear once more how far it came."""
+    def close(self) -> dict[SourceName, int]:
+        """The slot is closed: its workers hear once more how far it came; answers the number each comes to next."""
+        heard = {name: self._acks.arrived(name) for name in self._names}
         self._acks.forget(self._names)
         self._names.clear()
         self._early.clear()
+        return heard
 
     # --- out of turn -------------------------------------------------------------------------------------------------
 

@@ -21,6 +21,7 @@ from zenoh import CongestionControl, Sample, Session, Timestamp
 
 from zsched.clock import monotonic_s
 from zsched.core.plan import HandoverRule, Route, StreamClass, StreamCount
+from zsched.hop_acks import SourceName
 from zsched.keyspace import AGAIN_CHUNK, END_CHUNK
 from zsched.relay.acks import Acks
 from zsched.relay.answers import Answers
@@ -36,6 +37,8 @@ HOLD_BYTES: Final = 64 << 20
 FENCE_S: Final = 2.0
 """So long after a new owner took over, its answers to values older than what has passed are dropped."""
 MAX_STAMPS: Final = 4096
+HEARD_SLOTS: Final = 4
+"""Closed slots of which is known how far they came: an owner may be left and come back in one epoch (isolation)."""
 
 
 class OutputStream:
@@ -67,6 +70,7 @@ class OutputStream:
         self._ends: dict[str, zenoh.Subscriber[None]] = {}
         self._carrier: OutputSlot | None = None
         self._stamps: OrderedDict[str, Timestamp] = OrderedDict()  # newest that has passed, by the owner's relative key
+        self._heard: OrderedDict[tuple[int, str], dict[SourceName, int]] = OrderedDict()  # {(epoch, from): numbers}
         self._fence_until = 0.0
         self._is_paused = False
         max_hz = route.settings.max_hz
@@ -92,6 +96,7 @@ class OutputStream:
                 self._counter,
                 is_from_start=is_from_start and has_epoch,
                 in_turn=stream_class is StreamClass.RELIABLE,
+                heard=self._heard.pop((epoch, route.from_expr), {}),
             )
         with self._lock:
             self._slots[epoch] = slot
@@ -194,7 +199,9 @@ class OutputStream:
                 self._carrier = None
                 self._promote()
             if slot.answers is not None:
-                slot.answers.close()
+                self._heard[slot.epoch, slot.expr] = slot.answers.close()
+                while len(self._heard) > HEARD_SLOTS:
+                    self._heard.popitem(last=False)
         if feed is not None:
             feed.close()
 
