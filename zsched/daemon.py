@@ -132,7 +132,9 @@ class Daemon:
             )
         self._spec = self._fleet.node(options.node)
         # Read once, when zenoh's runtime starts; the workers inherit it. An operator's own setting wins.
-        os.environ.setdefault("ZENOH_RUNTIME", zenoh_config.runtime_pools(len(self._fleet.nodes)))
+        os.environ.setdefault(
+            "ZENOH_RUNTIME", zenoh_config.runtime_pools(len(self._fleet.nodes), len(self._fleet.tasks))
+        )
         self._inbox = Inbox()
         self._notify = Notifier()
         self._next_status = 0.0
@@ -251,7 +253,7 @@ class Daemon:
                 dials_by_gossip=points.data_by_gossip,
             ),
             on_report=shell.on_report,
-            threads=zenoh_config.pool_threads(len(fleet.nodes)),
+            threads=zenoh_config.pool_threads(len(fleet.nodes), len(fleet.tasks)),
             local_config=zenoh_config.local_config(side, timing=fleet.timing) if (side := self._spec.local) else "",
             silence_s=max(SILENCE_S, fleet.timing.zenoh_lease_s + 0.5),
             bequest=bequest if fleet.relay_orphan_s > 0 else None,

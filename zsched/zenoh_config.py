@@ -141,18 +141,20 @@ def client_config(
 # --- threads ---------------------------------------------------------------------------------------------------------
 
 
-def pool_threads(nodes: int) -> int:
-    """How many threads zenoh's receive pool of one process needs in a fleet of so many nodes (4..64).
+def pool_threads(nodes: int, tasks: int = 0) -> int:
+    """How many threads zenoh's receive pool of one process needs in a fleet of so many nodes and tasks (4..64).
 
-    A link that falls silent holds one of them for about a second when its lease ends. With the default pool of two, a
-    split that takes several links at once also silences those that still work: beats stop, the living look dead.
+    A link that falls silent holds one of them when its lease ends: about a second, or 10 s (zenoh's SO_LINGER) where
+    something was still to be sent. With fewer threads than links, a split that takes all of them also silences those
+    that still work: beats stop, the living look dead, a robot that is cut off is not served by its own worker. On the
+    data network every worker is a peer of its own: a node may have a relay and one worker per task.
     """
-    return min(max(nodes + 2, 4), 64)
+    return min(max(nodes * (1 + tasks) + 2, 4), 64)
 
 
-def runtime_pools(nodes: int) -> str:
+def runtime_pools(nodes: int, tasks: int = 0) -> str:
     """The value of ``ZENOH_RUNTIME`` for a process with links to so many nodes (zenoh reads it once)."""
-    return f"(rx: (worker_threads: {pool_threads(nodes)}), tx: (worker_threads: 4))"
+    return f"(rx: (worker_threads: {pool_threads(nodes, tasks)}), tx: (worker_threads: 4))"
 
 
 # --- parts -----------------------------------------------------------------------------------------------------------
