@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -39,6 +38,7 @@ from zsched.core.plan import (
     WorkerRole,
 )
 from zsched.core.relay_protocol import HandleReport, SlotLost, WorkerSeen
+from zsched.lab.fleet_runner import free_ports
 from zsched.zenoh_config import data_config, worker_config
 
 FLEET, ROBOT, TASK = "bench", "robot1", "echo"
@@ -58,10 +58,7 @@ def until(condition: Callable[[], Any], what: str, deadline_s: float = 10.0) -> 
 
 def free_port() -> int:
     """A TCP port that was free a moment ago."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
+    return free_ports(1)[0]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

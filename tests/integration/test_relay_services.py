@@ -252,14 +252,15 @@ def test_requests_in_a_stream_of_moves_are_each_done_once(rig: Rig) -> None:
     now = begin(rig, ONCE)
     asked: list[Asked] = []
     for epoch, owner in enumerate(["edge2", "edge1", "edge2", "edge1"], start=2):
-        asked += [rig.ask(f"{epoch}-{number}") for number in range(3)]
+        batch = [rig.ask(f"{epoch}-{number}") for number in range(3)]  # under way while the task moves
         new = slot(epoch, owner, ONCE)
         rig.flip(new, now)
         rig.wait(SlotDrained, epoch=now.epoch)
         rig.plan(RoutePhase.CLOSE, new)
         now = new
-    for one in asked:
-        one.wait()
+        for one in batch:
+            one.wait()  # a worker here holds four
+        asked += batch
     assert [one.errors for one in asked] == [[]] * len(asked)
     done = rig.done_by("edge1") + rig.done_by("edge2")
     assert sorted(done) == sorted(f"{epoch}-{number}" for epoch in range(2, 6) for number in range(3))

@@ -5,10 +5,11 @@ A deadline costs nothing when the condition comes true, so it is generous: the m
 
 from __future__ import annotations
 
-import socket
 import time
 from collections.abc import Callable
 from typing import Any
+
+from zsched.lab.fleet_runner import free_ports
 
 DEADLINE_S = 20.0
 POLL_S = 0.003
@@ -27,11 +28,8 @@ def until(condition: Callable[[], Any], what: str, deadline_s: float = DEADLINE_
 
 
 def free_port() -> int:
-    """A TCP port of 127.0.0.1 that was free a moment ago."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
+    """A TCP port of 127.0.0.1 that was free a moment ago, and that nobody else asks for."""
+    return free_ports(1)[0]
 
 
 def free_endpoint() -> str:

@@ -12,7 +12,6 @@ import importlib.util
 import json
 import os
 import shutil
-import socket
 import subprocess
 import sys
 import sysconfig
@@ -23,6 +22,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
+from zsched.lab.fleet_runner import free_ports
 
 HERE, REPO = Path(__file__).parent, Path(__file__).parents[2]
 SUITE = "bookworm"
@@ -123,11 +124,8 @@ def overlaid(debian: Path, folder: Path) -> Iterator[Path]:
 
 def fleet_file() -> str:
     """The fleet file with ports that are free: the machine shares this one's network."""
-    with socket.socket() as control, socket.socket() as data:
-        control.bind(("127.0.0.1", 0))
-        data.bind(("127.0.0.1", 0))
-        ports = str(control.getsockname()[1]), str(data.getsockname()[1])
-    return FLEET.replace("CONTROL", ports[0]).replace("DATA", ports[1])
+    control, data = free_ports(2)
+    return FLEET.replace("CONTROL", str(control)).replace("DATA", str(data))
 
 
 def furnish(root: Path, start: str, expected: str) -> None:

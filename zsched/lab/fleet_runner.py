@@ -6,6 +6,8 @@ Knows: the fleet file, the command line, who is up. Does not know: robots' appli
 from __future__ import annotations
 
 import contextlib
+import itertools
+import os
 import socket
 import sys
 import time
@@ -26,6 +28,7 @@ CLI = (sys.executable, "-m", "zsched.cli")
 INIT_S = 20.0
 UP_S = 30.0
 POLL_S = 0.05
+FIRST_PORT, PORTS = 12_000, 20_000
 
 Tree = dict[str, Any]
 """A fleet file as plain YAML data."""
@@ -53,13 +56,22 @@ class LabFleet:
         return tuple(sorted(name for name, kind in self.kinds.items() if kind == "edge"))
 
 
+_ports = itertools.count(os.getpid() * 97)
+
+
 def free_ports(count: int) -> list[int]:
-    """So many different TCP ports that were free on 127.0.0.1 a moment ago."""
-    with contextlib.ExitStack() as stack:
-        sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
-        for one in sockets:
-            one.bind(("127.0.0.1", 0))
-        return [int(one.getsockname()[1]) for one in sockets]
+    """So many different TCP ports that were free on 127.0.0.1 a moment ago.
+
+    From below the range that the kernel gives to outgoing connections, each once per process, and processes begin at
+    different places: nobody takes one of them between this call and its use.
+    """
+    found: list[int] = []
+    while len(found) < count:
+        port = FIRST_PORT + next(_ports) % PORTS
+        with socket.socket() as probe, contextlib.suppress(OSError):
+            probe.bind(("127.0.0.1", port))
+            found.append(port)
+    return found
 
 
 def read_tree(path: Path) -> Tree:
