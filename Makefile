@@ -26,10 +26,10 @@ $(VENV)/.dev: pyproject.toml $(VENV)/.python
 demo: $(VENV)/.lab  ## Watch six machines merge laser maps (DEMO_ARGS="--headless --out DIR" to choose)
 	$(BIN)/zsched demo $(DEMO_ARGS)
 
-# Two modules at a time: the real fleets of the second half mostly wait.
+# Two modules at a time: the real fleets of the second half mostly wait. In their order, for the longest come first.
 test: $(VENV)/.dev  ## All tests: unit, paper, simulator, integration and system (real daemons on localhost)
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile tests/unit tests/paper tests/sim tests/planted
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile --durations=15 tests/integration tests/system
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder --durations=15 tests/system tests/integration
 
 test-quick: $(VENV)/.dev  ## Unit and paper tests only
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile tests/unit tests/paper
