@@ -23,6 +23,8 @@ CONTROL_MAX_MESSAGE: Final = 1 << 20
 """Largest control message a peer may make us assemble, bytes (zenoh's default is 1 GiB)."""
 LOOPBACK_LISTEN: Final = "tcp/127.0.0.1:0"
 
+RELAY_START_S: Final = 10.0
+"""A worker that is started together with its relay, on a busy machine, waits so long for it."""
 DEFAULT_TIMING: Final = Timing()
 
 Settings = dict[str, Any]
@@ -97,7 +99,11 @@ def worker_config(
     """
     if link is WorkerLink.CLIENT:
         return client_config(
-            connect=connect[:1], timing=timing, shared_memory=shared_memory, operator_json5=operator_json5
+            connect=connect[:1],
+            timing=timing,
+            shared_memory=shared_memory,
+            operator_json5=operator_json5,
+            patience_s=RELAY_START_S,
         )
     settings = _peer(_small_buffers(listen), _small_buffers(connect), timing)
     _set_shared_memory(settings, is_on=shared_memory)
@@ -123,10 +129,11 @@ def client_config(
     timing: Timing = DEFAULT_TIMING,
     shared_memory: bool = False,
     operator_json5: str = "",
+    patience_s: float = 0.0,
 ) -> str:
     """A session that hangs on one node: an application, the command line, a worker with ``link: client``.
 
-    A client's ``open`` fails at once when nobody listens (a peer's goes on trying in the background).
+    A client's ``open`` fails when nobody listens for ``patience_s`` (a peer's goes on trying in the background).
 
     Raises:
         ValueError: the operator's JSON5 is not a zenoh configuration.
@@ -134,6 +141,7 @@ def client_config(
     settings = _common(timing)
     settings["mode"] = "client"
     settings["connect/endpoints"] = list(connect)
+    settings["connect/timeout_ms"] = round(patience_s * 1000)
     _set_shared_memory(settings, is_on=shared_memory)
     return _render(settings, operator_json5)
 
