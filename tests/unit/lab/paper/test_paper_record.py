@@ -17,6 +17,7 @@ import zenoh
 from mcap.reader import make_reader
 from rosbags.typesys import Stores, get_typestore
 
+from support.waiting import until
 from zsched.adapters.cgroup import LimitedGroup
 from zsched.lab import robot_app
 from zsched.lab.children import Children
@@ -43,6 +44,8 @@ from zsched.tasks.map_merge.grid import Grid
 NO_GROUPS = LimitedGroup.why_not()
 needs_groups = pytest.mark.skipif(NO_GROUPS is not None, reason=f"no control groups: {NO_GROUPS}")
 SPIN = (sys.executable, "-c", "while True: pass")
+GROW = (sys.executable, "-c", "held = []\nwhile True:\n    held = [bytes(1 << 20) * 2 for _ in range(4)]")
+"""Takes memory again and again: only what is taken inside a group is charged to it."""
 
 
 def a_map(stamp: int) -> bytes:
@@ -143,7 +146,7 @@ def test_idle_ticks_go_on() -> None:
 
 @pytest.fixture
 def spinner() -> Iterator[subprocess.Popen[bytes]]:
-    process = subprocess.Popen(SPIN)
+    process = subprocess.Popen(GROW)
     yield process
     process.kill()
     process.wait()
@@ -160,8 +163,9 @@ def test_a_nodes_meter_reads_its_share_and_the_gauge_does_not_count_its_throttli
         group.add(spinner.pid)
         meter = NodeMeter.of(spinner.pid)
         assert meter.read(time.monotonic())["cpu_ratio"] is None
+        until(lambda: meter.read(time.monotonic())["memory_ratio"], "memory taken in the group")
         gauge.start()
-        time.sleep(0.5)
+        time.sleep(0.5)  # what is measured: some periods of the quota
         read = meter.read(time.monotonic())
         host = gauge.result()
     finally:
