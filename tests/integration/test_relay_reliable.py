@@ -2,60 +2,43 @@
 
 from __future__ import annotations
 
-import importlib.util
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import pytest
+import zenoh
 
+from support.relay_rig import BESIDE, ROBOT, Application, Rig, relay_rig, slot
+from support.waiting import until
 from zsched.core.events import StreamsCounted
-from zsched.core.plan import RoutePhase, StreamClass, StreamCount
+from zsched.core.plan import ReadyWhen, RoutePhase, RoutePlan, StreamClass, StreamCount
 from zsched.core.relay_protocol import SlotLost, WorkerSeen
-
-
-def _neighbour() -> Any:
-    """The rig of the tests beside this one (they are files, not a package)."""
-    name = "relay_streams_rig"
-    if name not in sys.modules:
-        spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name("test_relay_streams.py"))
-        assert spec is not None
-        assert spec.loader is not None
-        sys.modules[name] = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(sys.modules[name])
-    return sys.modules[name]
-
-
-streams = _neighbour()
-until, slot, Application = streams.until, streams.slot, streams.Application
+from zsched.zenoh_config import worker_config
 
 
 @pytest.fixture
-def rig(tmp_path: Path) -> Iterator[Any]:
-    made = streams.Rig(folder=tmp_path)
-    try:
-        made.start()
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    with relay_rig(tmp_path) as made:
         yield made
-    finally:
-        made.stop()
 
 
-def newest(rig: Any) -> dict[str, StreamCount]:
-    reports = [report for _, report in rig.reports[streams.ROBOT].items if isinstance(report, StreamsCounted)]
+def newest(rig: Rig) -> dict[str, StreamCount]:
+    reports = [report for _, report in rig.reports[ROBOT].items if isinstance(report, StreamsCounted)]
     return {count.stream: count for count in reports[-1].counts} if reports else {}
 
 
-def told(rig: Any, stream: str = "echo/in/0") -> StreamCount:
+def told(rig: Rig, stream: str = "echo/in/0") -> StreamCount:
     return newest(rig).get(stream, StreamCount(stream=stream))
 
 
-def through(rig: Any, stream_class: StreamClass = StreamClass.RELIABLE) -> tuple[Any, Any]:
+def through(rig: Rig, stream_class: StreamClass = StreamClass.RELIABLE) -> tuple[Any, Any]:
     """An application whose samples go through edge1 and come back."""
     first = slot(1, "edge1", stream_class, 1)
     app = Application(rig.app)
@@ -64,13 +47,13 @@ def through(rig: Any, stream_class: StreamClass = StreamClass.RELIABLE) -> tuple
     return app, first
 
 
-def freeze(rig: Any, worker: subprocess.Popen[bytes]) -> None:
+def freeze(rig: Rig, worker: subprocess.Popen[bytes]) -> None:
     """Stop a worker for longer than the lease: its link is closed, its token goes."""
     worker.send_signal(signal.SIGSTOP)
     rig.wait(WorkerSeen, is_present=False)
 
 
-def test_what_a_frozen_worker_missed_reaches_it_when_it_wakes_up(rig: Any) -> None:
+def test_what_a_frozen_worker_missed_reaches_it_when_it_wakes_up(rig: Rig) -> None:
     """Longer than the lease: its link is closed, whatever was on its way is gone, and is sent again, both ways."""
     worker = rig.start_worker("edge1")
     app, _ = through(rig)
@@ -90,7 +73,7 @@ def test_what_a_frozen_worker_missed_reaches_it_when_it_wakes_up(rig: Any) -> No
     assert (answers.lost, answers.doubled, answers.reordered) == (0, 0, 0)
 
 
-def test_the_newest_answer_of_a_frozen_worker_reaches_its_robot(rig: Any) -> None:
+def test_the_newest_answer_of_a_frozen_worker_reaches_its_robot(rig: Rig) -> None:
     """Class latest: whatever it answers while its link is closed, the newest is sent again."""
     worker = rig.start_worker("edge1", "--latest")
     app, _ = through(rig, StreamClass.LATEST)
@@ -104,7 +87,7 @@ def test_the_newest_answer_of_a_frozen_worker_reaches_its_robot(rig: Any) -> Non
     assert len(app.back) - len(set(app.back)) <= 1  # its ready token came back: the kept value is sent to be sure
 
 
-def test_a_killed_worker_leaves_at_most_what_is_reported(rig: Any) -> None:
+def test_a_killed_worker_leaves_at_most_what_is_reported(rig: Rig) -> None:
     worker = rig.start_worker("edge1", "--delay-ms", "5")
     rig.start_worker("edge2")
     app, first = through(rig)
@@ -124,7 +107,7 @@ def test_a_killed_worker_leaves_at_most_what_is_reported(rig: Any) -> None:
     until(lambda: told(rig).at_most_lost == report.samples, "the same in the counters")
 
 
-def test_a_worker_that_restarts_in_place_is_not_sent_what_its_former_life_may_have_done(rig: Any) -> None:
+def test_a_worker_that_restarts_in_place_is_not_sent_what_its_former_life_may_have_done(rig: Rig) -> None:
     worker = rig.start_worker("edge1", "--delay-ms", "5")
     app, _ = through(rig)
     thread = app.stream(400)
@@ -143,20 +126,18 @@ def test_a_worker_that_restarts_in_place_is_not_sent_what_its_former_life_may_ha
 class Beside:
     """A second task's stream through the same relay, from a session of its own, to a plain zenoh program."""
 
-    def __init__(self, rig: Any) -> None:
+    def __init__(self, rig: Rig) -> None:
         self.arrivals: list[float] = []
-        config = streams.zenoh.Config.from_json5
-        self._far = streams.zenoh.open(config(streams.worker_config(connect=(rig.endpoint("edge2"),))))
-        self._near = streams.zenoh.open(config(streams.worker_config(connect=(rig.endpoint(streams.ROBOT),))))
+        config = zenoh.Config.from_json5
+        self._far = zenoh.open(config(worker_config(connect=(rig.endpoint("edge2"),))))
+        self._near = zenoh.open(config(worker_config(connect=(rig.endpoint(ROBOT),))))
         self._halt = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
-        way = streams.replace(
-            slot(1, "edge2", StreamClass.RELIABLE, 0, streams.ReadyWhen.MATCHING), routes=(streams.BESIDE,)
-        )
-        self._far.declare_subscriber(streams.BESIDE.to_expr, lambda _: self.arrivals.append(time.monotonic()))
+        way = replace(slot(1, "edge2", StreamClass.RELIABLE, 0, ReadyWhen.MATCHING), routes=(BESIDE,))
+        self._far.declare_subscriber(BESIDE.to_expr, lambda _: self.arrivals.append(time.monotonic()))
         for phase in (RoutePhase.PREPARE, RoutePhase.FLIP):
-            rig.relays[streams.ROBOT].apply(streams.RoutePlan(task="beside", phase=phase, current=way))
-        self._source = self._near.declare_publisher(streams.BESIDE.from_expr)
+            rig.relays[ROBOT].apply(RoutePlan(task="beside", phase=phase, current=way))
+        self._source = self._near.declare_publisher(BESIDE.from_expr)
         until(lambda: self._source.put(b"x") or self.arrivals, "the live stream flows")
         self._thread.start()
 
@@ -176,7 +157,7 @@ class Beside:
             session.close()
 
 
-def test_a_stalled_workers_full_queue_delays_no_other_stream(rig: Any) -> None:
+def test_a_stalled_workers_full_queue_delays_no_other_stream(rig: Rig) -> None:
     """A frozen worker is not waited for: what its queue does not hold is dropped and counted, the rest flows."""
     frozen = rig.start_worker("edge1")
     app, _ = through(rig)
@@ -195,25 +176,21 @@ def test_a_stalled_workers_full_queue_delays_no_other_stream(rig: Any) -> None:
 
 
 @pytest.mark.parametrize("stream_class", [StreamClass.RELIABLE, StreamClass.LATEST])
-def test_a_stalled_worker_delays_no_other_robots_stream(rig: Any, stream_class: StreamClass) -> None:
+def test_a_stalled_worker_delays_no_other_robots_stream(rig: Rig, stream_class: StreamClass) -> None:
     """Two tasks through one relay; one owner is frozen under 20 MB/s. The other stream's longest gap stays small."""
     options = ["--latest"] if stream_class is StreamClass.LATEST else []
     frozen = rig.start_worker("edge1", *options)
     app, _ = through(rig, stream_class)
     app.padding = bytes(200_000)
-    beside = streams.replace(
-        slot(1, "edge2", StreamClass.RELIABLE, 0, streams.ReadyWhen.MATCHING), routes=(streams.BESIDE,)
-    )
+    beside = replace(slot(1, "edge2", StreamClass.RELIABLE, 0, ReadyWhen.MATCHING), routes=(BESIDE,))
     arrivals: list[float] = []
-    foreign = streams.zenoh.open(
-        streams.zenoh.Config.from_json5(streams.worker_config(connect=(rig.endpoint("edge2"),)))
-    )
+    foreign = zenoh.open(zenoh.Config.from_json5(worker_config(connect=(rig.endpoint("edge2"),))))
     halt = threading.Event()
     try:
-        foreign.declare_subscriber(streams.BESIDE.to_expr, lambda _: arrivals.append(time.monotonic()))
+        foreign.declare_subscriber(BESIDE.to_expr, lambda _: arrivals.append(time.monotonic()))
         for phase in (RoutePhase.PREPARE, RoutePhase.FLIP):
-            rig.relays[streams.ROBOT].apply(streams.RoutePlan(task="beside", phase=phase, current=beside))
-        source = rig.app.declare_publisher(streams.BESIDE.from_expr)
+            rig.relays[ROBOT].apply(RoutePlan(task="beside", phase=phase, current=beside))
+        source = rig.app.declare_publisher(BESIDE.from_expr)
         until(lambda: source.put(b"x") or arrivals, "the live stream flows")
 
         def put() -> None:

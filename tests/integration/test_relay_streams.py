@@ -3,250 +3,42 @@
 from __future__ import annotations
 
 import os
-import queue
 import signal
-import subprocess
-import sys
-import threading
 import time
-from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import zenoh
 
-from support.waiting import free_port, until
-from zsched.adapters.streams import RelayHandle
-from zsched.core.events import RelayChanged, SlotDrained, SlotFlipped, SlotReady, StreamsCounted
-from zsched.core.fleet import Timing
+from support.relay_rig import BESIDE, ROBOT, TASK, Application, Rig, relay_rig, slot
+from support.waiting import until
+from zsched.core.events import RelayChanged, SlotDrained, SlotFlipped, SlotReady
 from zsched.core.plan import (
-    Direction,
-    HandoverRule,
     ReadyWhen,
-    Role,
-    Route,
     RoutePhase,
     RoutePlan,
-    Slot,
     StreamClass,
-    StreamSettings,
     WorkerRole,
 )
-from zsched.core.relay_protocol import HandleReport, WorkerSeen
-from zsched.zenoh_config import DEFAULT_TIMING, data_config, worker_config
+from zsched.zenoh_config import DEFAULT_TIMING, worker_config
 
-FLEET, ROBOT, TASK = "test", "robot1", "echo"
-DEADLINE_S = 10.0
-
-
-def slot(epoch: int, owner: str, stream_class: StreamClass, keep_last: int, ready: ReadyWhen = ReadyWhen.TOKEN) -> Slot:
-    settings = StreamSettings(stream_class=stream_class, keep_last=keep_last, depth=4000, handover=HandoverRule.ALL)
-    routes = (
-        Route(
-            stream=f"{TASK}/in/0",
-            direction=Direction.INPUT,
-            from_expr=f"{ROBOT}/in",
-            to_expr=f"{owner}/{TASK}/{ROBOT}/in",
-            settings=settings,
-        ),
-        Route(
-            stream=f"{TASK}/out/0",
-            direction=Direction.OUTPUT,
-            from_expr=f"{owner}/{TASK}/{epoch}/{ROBOT}/out",
-            to_expr=f"{ROBOT}/out",
-            settings=settings,
-        ),
-    )
-    return Slot(epoch=epoch, owner=owner, routes=routes, ready_when=ready)
-
-
-@dataclass
-class Reports:
-    """What one relay said, in order."""
-
-    items: list[tuple[float, HandleReport]] = field(default_factory=list)
-
-    def add(self, report: HandleReport) -> None:
-        self.items.append((time.monotonic(), report))
-
-    def find(self, kind: type, **fields: Any) -> HandleReport | None:
-        for _, report in tuple(self.items):
-            if isinstance(report, kind) and all(getattr(report, name) == value for name, value in fields.items()):
-                return report
-        return None
-
-    def count(self, kind: type) -> int:
-        return sum(isinstance(report, kind) for _, report in tuple(self.items))
-
-
-@dataclass
-class Rig:
-    """Three nodes' relays on loopback, echo workers, one application session beside the robot."""
-
-    folder: Path
-    timing: Timing = DEFAULT_TIMING
-    ports: dict[str, int] = field(default_factory=lambda: {n: free_port() for n in (ROBOT, "edge1", "edge2")})
-    relays: dict[str, RelayHandle] = field(default_factory=dict)
-    reports: dict[str, Reports] = field(default_factory=dict)
-    workers: dict[str, subprocess.Popen[bytes]] = field(default_factory=dict)
-    incarnation: int = 0
-
-    def start(self) -> None:
-        seed = self.endpoint(ROBOT)
-        for node in self.ports:
-            self.reports[node] = Reports()
-            connect = () if node == ROBOT else (seed,)
-            # no shared memory: a stalled target must fill its socket
-            text = data_config(listen=(self.endpoint(node),), connect=connect, timing=self.timing, shared_memory=False)
-            self.relays[node] = RelayHandle(fleet=FLEET, node=node, zenoh_config=text, on_report=self.reports[node].add)
-            self.relays[node].start()
-        until(lambda: all(r.find(RelayChanged, is_running=True) for r in self.reports.values()), "the relays run")
-        self.app = zenoh.open(zenoh.Config.from_json5(worker_config(connect=(seed,), shared_memory=False)))
-
-    def endpoint(self, node: str) -> str:
-        return f"tcp/127.0.0.1:{self.ports[node]}"
-
-    def start_worker(self, node: str, *options: str) -> subprocess.Popen[bytes]:
-        self.incarnation += 1
-        path = self.folder / f"{node}.json5"
-        path.write_text(worker_config(connect=(self.endpoint(node),), timing=self.timing, shared_memory=False))
-        env = os.environ | {
-            "ZSCHED_FLEET": FLEET,
-            "ZSCHED_NODE": node,
-            "ZSCHED_TASK": TASK,
-            "ZSCHED_INCARNATION": str(self.incarnation),
-            "ZSCHED_ZENOH_CONFIG": str(path),
-        }
-        command = [sys.executable, "-m", "zsched.tasks.echo", *options]
-        self.workers[node] = subprocess.Popen(command, env=env)
-        seen = {"node": node, "task": TASK, "incarnation": str(self.incarnation), "is_present": True}
-        until(lambda: self.reports[ROBOT].find(WorkerSeen, **seen), f"worker of {node}")
-        return self.workers[node]
-
-    def role(self, node: str, role: WorkerRole, epoch: int = 0) -> None:
-        self.relays[node].set_role(Role(task=TASK, role=role, epoch=epoch))
-
-    def plan(self, phase: RoutePhase, current: Slot | None, predecessor: Slot | None = None) -> None:
-        self.relays[ROBOT].apply(RoutePlan(task=TASK, phase=phase, current=current, predecessor=predecessor))
-
-    def wait(self, kind: type, **fields: Any) -> HandleReport:
-        report: HandleReport = until(lambda: self.reports[ROBOT].find(kind, **fields), f"{kind.__name__} {fields}")
-        return report
-
-    def move(self, new: Slot, old: Slot | None = None, *, drains: bool = True) -> float:
-        """The executor's table, step by step; answers how long the flip took."""
-        self.role(new.owner, WorkerRole.ACTIVE, new.epoch)
-        if old is not None:
-            self.role(old.owner, WorkerRole.DRAINING, old.epoch)
-        self.plan(RoutePhase.PREPARE, new, old)
-        self.wait(SlotReady, epoch=new.epoch, is_ready=True)
-        started = time.monotonic()
-        self.plan(RoutePhase.FLIP, new, old)
-        self.wait(SlotFlipped, epoch=new.epoch)
-        took = time.monotonic() - started
-        if old is not None and drains:
-            self.wait(SlotDrained, epoch=old.epoch)
-        self.plan(RoutePhase.CLOSE, new)
-        return took
-
-    def drops(self) -> Counter[str]:
-        """The newest counters of the robot's relay, summed over its streams."""
-        reports = [report for _, report in self.reports[ROBOT].items if isinstance(report, StreamsCounted)]
-        result: Counter[str] = Counter()
-        for count in reports[-1].counts if reports else ():
-            result.update(dict(count.drops))
-        return result
-
-    def stop(self) -> None:
-        if hasattr(self, "app"):
-            self.app.close()
-        for worker in self.workers.values():
-            worker.send_signal(signal.SIGCONT)
-            worker.kill()
-            worker.wait(5)
-        for relay in self.relays.values():
-            relay.stop(2.0)
+WAITS_S = 5.0
+"""Half of such a link's lease."""
 
 
 @pytest.fixture
 def rig(tmp_path: Path) -> Iterator[Rig]:
-    made = Rig(folder=tmp_path)
-    try:
-        made.start()
+    with relay_rig(tmp_path) as made:
         yield made
-    finally:
-        made.stop()
 
 
 @pytest.fixture
 def patient_rig(tmp_path: Path) -> Iterator[Rig]:
     """Links to a frozen process stay for 10 s: who waits for one is seen to."""
-    made = Rig(folder=tmp_path, timing=replace(DEFAULT_TIMING, zenoh_lease_s=10.0))
-    try:
-        made.start()
+    with relay_rig(tmp_path, replace(DEFAULT_TIMING, zenoh_lease_s=10.0)) as made:
         yield made
-    finally:
-        made.stop()
-
-
-WAITS_S = 5.0
-"""Half of such a link's lease."""
-BESIDE = Route(
-    stream="beside/in/0",
-    direction=Direction.INPUT,
-    from_expr=f"{ROBOT}/beside",
-    to_expr=f"edge2/beside/{ROBOT}",
-    settings=StreamSettings(stream_class=StreamClass.RELIABLE, depth=1000),
-)
-
-
-class Application:
-    """Publishes numbers on the robot's own key and collects what comes back; never hears of owners."""
-
-    def __init__(self, session: zenoh.Session) -> None:
-        self.back: list[int] = []
-        self.nodes: list[str] = []
-        self.sent = 0
-        self.padding = b""
-        self._samples: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
-        self._subscriber = session.declare_subscriber(f"{ROBOT}/out", self._take)
-        block = zenoh.CongestionControl.BLOCK
-        self._publisher = session.declare_publisher(f"{ROBOT}/in", congestion_control=block)
-        self._halt = threading.Event()
-
-    def _take(self, sample: zenoh.Sample) -> None:
-        self.back.append(int(sample.payload.to_bytes().split(b" ")[0]))
-        self.nodes.append(str(sample.encoding).rsplit(";", 1)[-1])
-        assert sample.attachment is not None
-        assert sample.attachment.to_bytes() == b"attached"
-
-    def put(self) -> bool:
-        self._publisher.put(str(self.sent).encode() + b" " + self.padding, attachment=b"attached")
-        self.sent += 1
-        return False
-
-    def connected(self) -> bool:
-        status: Any = self._publisher.matching_status
-        return bool(status.matching)
-
-    def stream(self, hz: float) -> threading.Thread:
-        thread = threading.Thread(target=self._stream, args=(1 / hz,), daemon=True)
-        thread.start()
-        return thread
-
-    def _stream(self, period: float) -> None:
-        due = time.monotonic()
-        while not self._halt.is_set():
-            self.put()
-            due += period
-            time.sleep(max(0.0, due - time.monotonic()))
-
-    def halt(self, thread: threading.Thread) -> None:
-        self._halt.set()
-        thread.join(5)
 
 
 def there_and_back(rig: Rig, app: Application, stream_class: StreamClass) -> None:

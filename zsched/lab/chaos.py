@@ -11,7 +11,6 @@ import signal
 from pathlib import Path
 
 from zsched.core.model import NodeId
-from zsched.errors import AdapterError
 from zsched.lab.history import Admitted, History, Learnt, Worked
 from zsched.lab.netbed import Netbed, stop_group
 from zsched.lab.testbed import TASK, Json, echo_fleet
@@ -136,14 +135,6 @@ class ChaosBed(Netbed):
             if not _is_subsequence(admitted, owners):
                 found.append(f"{robot} admitted {admitted}, its owners were {owners}")
         return found
-
-    def is_answering(self, node: NodeId) -> bool:
-        """Whether a daemon answers its operator socket within a moment."""
-        try:
-            self.status(node, 0.3)
-        except AdapterError:
-            return False
-        return True
 
 
 def _foreign_ticks(history: History) -> list[str]:

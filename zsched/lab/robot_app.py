@@ -20,18 +20,17 @@ from pathlib import Path
 import zenoh
 
 from zsched.clock import monotonic_s
+from zsched.lab import application
 from zsched.lab.laser_log import LaserLog, Scan, load_log, malaga_path, split_log
 from zsched.lab.mapping import GridMapper, displacements
 from zsched.lab.recorder import Record, Recorder
 from zsched.lab.signals import StopFlag
 from zsched.tasks.map_merge.cdr import CdrError, decode_grid, encode_grid
-from zsched.zenoh_config import client_config
 
 MAP_PERIOD_S = 1.0
 PROGRESS_PERIOD_S = 1.0
 POLL_S = 0.02
 """How often the subscribers are looked at: the error of an arrival time."""
-CONNECT_S = 30.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -182,23 +181,6 @@ class Applications:
         self._recorder.write(self._options.robot, record)
 
 
-def connect(endpoint: str, stop: StopFlag) -> zenoh.Session | None:
-    """A session with the robot's data side, tried again for `CONNECT_S`; ``None`` when stopped meanwhile.
-
-    Raises:
-        zenoh.ZError: the endpoint did not answer in time.
-    """
-    deadline = monotonic_s() + CONNECT_S
-    while not stop.is_set:
-        try:
-            return zenoh.open(zenoh.Config.from_json5(client_config(connect=(endpoint,))))
-        except zenoh.ZError:
-            if monotonic_s() > deadline:
-                raise
-            time.sleep(0.2)
-    return None
-
-
 def parse(arguments: list[str]) -> RobotOptions:
     """The command line as options; argparse exits 2 on a wrong one."""
     parser = argparse.ArgumentParser(prog="python -m zsched.lab.robot_app", description="A lab robot's applications.")
@@ -219,20 +201,14 @@ def parse(arguments: list[str]) -> RobotOptions:
 def main(arguments: list[str] | None = None) -> int:
     """Entry point: 0 after a stop signal, 1 when the robot's data endpoint never answered."""
     options = parse(sys.argv[1:] if arguments is None else arguments)
-    stop = StopFlag()
-    stop.install()
-    try:
-        session = connect(options.endpoint, stop)
-    except zenoh.ZError as error:
-        sys.stderr.write(f"robot_app: {options.robot}: {options.endpoint} does not answer: {error}\n")
-        return 1
-    if session is None:
-        return 0
-    with session, Recorder(options.records) as recorder:
-        applications = Applications(options, session, recorder)
-        applications.run(stop)
-        applications.save()
-    return 0
+
+    def work(session: zenoh.Session, stop: StopFlag) -> None:
+        with Recorder(options.records) as recorder:
+            applications = Applications(options, session, recorder)
+            applications.run(stop)
+            applications.save()
+
+    return application.run(f"robot_app: {options.robot}", options.endpoint, work)
 
 
 if __name__ == "__main__":

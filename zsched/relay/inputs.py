@@ -35,7 +35,6 @@ _Kept = tuple[int, Sample, Timestamp | None]
 @dataclass(slots=True)
 class _InputSlot:
     outlet: Outlet
-    is_counted: bool
     sent: int = 0
     """Number of the newest sample that went into this slot; kept values above it are still owed."""
 
@@ -78,7 +77,7 @@ class InputStream:
         outlet = Outlet(self._session, route.from_expr, route.to_expr, route.settings, acks)
         with self._lock:
             self._is_counted |= acks is not None
-            self._slots[epoch] = _InputSlot(outlet=outlet, is_counted=acks is not None)
+            self._slots[epoch] = _InputSlot(outlet=outlet)
 
     def is_matching(self, epoch: int) -> bool:
         """True when somebody subscribes to the slot's keys."""

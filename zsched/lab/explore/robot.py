@@ -36,6 +36,7 @@ import zenoh
 
 from zsched.clock import monotonic_s
 from zsched.errors import ConfigError, WireError
+from zsched.lab import application
 from zsched.lab.explore.agent import Agent, Outputs, RobotSettings
 from zsched.lab.explore.body import Drift, Limits
 from zsched.lab.explore.messages import decode_claim, encode_claim, encode_scan
@@ -43,7 +44,6 @@ from zsched.lab.explore.referee import Referee
 from zsched.lab.explore.world import World
 from zsched.lab.explore.worlds import load_world
 from zsched.lab.recorder import Record, Recorder
-from zsched.lab.robot_app import connect
 from zsched.lab.signals import StopFlag
 from zsched.tasks.map_merge.cdr import CdrError, decode_grid, decode_transforms, encode_grid
 from zsched.tasks.map_merge.geometry import Pose2
@@ -276,20 +276,14 @@ def main(arguments: list[str] | None = None) -> int:
     except ConfigError as error:
         sys.stderr.write(f"explore.robot: {error}\n")
         return EXIT_CONFIG
-    stop = StopFlag()
-    stop.install()
-    try:
-        session = connect(options.endpoint, stop)
-    except zenoh.ZError as error:
-        sys.stderr.write(f"explore.robot: {options.settings.robot}: {options.endpoint} does not answer: {error}\n")
-        return 1
-    if session is None:
-        return 0
-    with session, Recorder(options.records) as recorder:
-        applications = Applications(options, session, recorder)
-        applications.run(stop)
-        applications.save()
-    return 0
+
+    def work(session: zenoh.Session, stop: StopFlag) -> None:
+        with Recorder(options.records) as recorder:
+            applications = Applications(options, session, recorder)
+            applications.run(stop)
+            applications.save()
+
+    return application.run(f"explore.robot: {options.settings.robot}", options.endpoint, work)
 
 
 if __name__ == "__main__":

@@ -22,10 +22,10 @@ import zenoh
 
 from zsched.clock import monotonic_s
 from zsched.errors import WireError
+from zsched.lab import application
 from zsched.lab.explore.agent import MAP_PERIOD_S
 from zsched.lab.explore.mapper import ScanMapper
 from zsched.lab.explore.messages import decode_scan
-from zsched.lab.robot_app import connect
 from zsched.lab.signals import StopFlag
 from zsched.tasks.map_merge.cdr import encode_grid
 
@@ -64,18 +64,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--robot", "--name", required=True, help="the robot whose scans are mapped")
     parser.add_argument("--endpoint", required=True, help="this node's data endpoint, e.g. tcp/127.0.0.1:7460")
     given = parser.parse_args(arguments)
-    stop = StopFlag()
-    stop.install()
-    try:
-        session = connect(given.endpoint, stop)
-    except zenoh.ZError as error:
-        sys.stderr.write(f"explore.slam: {given.robot}: {given.endpoint} does not answer: {error}\n")
-        return 1
-    if session is None:
-        return 0
-    with session:
+
+    def work(session: zenoh.Session, stop: StopFlag) -> None:
         serve(given.robot, session, stop)
-    return 0
+
+    return application.run(f"explore.slam: {given.robot}", given.endpoint, work)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from support.waiting import until
 from zsched.adapters.cgroup import LimitedGroup
-from zsched.lab import robot_app
+from zsched.lab import application
 from zsched.lab.children import Children
 from zsched.lab.fleet_runner import free_ports
 from zsched.lab.limits import LimitKind, NodeLimits
@@ -119,7 +119,7 @@ def matches(publisher: zenoh.Publisher) -> bool:
 
 
 def test_a_robot_that_is_not_there_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(robot_app, "CONNECT_S", 0.1)
+    monkeypatch.setattr(application, "CONNECT_S", 0.1)
     endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
 
     with pytest.raises(zenoh.ZError):
