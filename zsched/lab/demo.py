@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import signal
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -20,7 +18,7 @@ from zsched.lab.evaluate import evaluate, print_summary
 from zsched.lab.laser_log import load_log, malaga_path
 from zsched.lab.live_view import make_view
 from zsched.lab.schedule import SchedulePolicy
-from zsched.lab.signals import STOP_SIGNALS
+from zsched.lab.signals import Interrupted, interruptible
 
 MODES = ("known", "track", "estimate")
 MIN_DURATION_S, MAX_DURATION_S = 20.0, 3600.0
@@ -38,32 +36,6 @@ class DemoOptions:
     mode: str = "known"
     seed: int = 1
     policy: SchedulePolicy = SchedulePolicy.PUSH
-
-
-class Interrupted(BaseException):
-    """A stop signal arrived; not an `Exception`, so that nobody takes it for a failure and goes on."""
-
-    def __init__(self, number: int) -> None:
-        super().__init__(number)
-        self.number = number
-
-
-@contextmanager
-def interruptible() -> Iterator[None]:
-    """Raise `Interrupted` at the first stop signal; further ones are ignored, so that they cannot cut the clean-up."""
-
-    def interrupt(number: int, frame: object) -> None:
-        del frame
-        for other in STOP_SIGNALS:
-            signal.signal(other, signal.SIG_IGN)
-        raise Interrupted(number)
-
-    before = {number: signal.signal(number, interrupt) for number in STOP_SIGNALS}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def run_demo(options: DemoOptions) -> int:

@@ -42,7 +42,7 @@ ENDING = f"""
 import sys
 from pathlib import Path
 from zsched.lab.children import Children
-from zsched.lab.demo import Interrupted, interruptible
+from zsched.lab.signals import Interrupted, interruptible
 folder = Path(sys.argv[1])
 try:
     with interruptible(), Children(folder / "logs") as children:

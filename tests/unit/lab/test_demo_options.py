@@ -2,11 +2,14 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
+import time
 from pathlib import Path
 
 import pytest
 
-from zsched.lab.demo import DemoOptions, Interrupted, interruptible, run_demo
+from zsched.lab.demo import DemoOptions, run_demo
+from zsched.lab.signals import LOOK_AGAIN_S, Interrupted, interruptible
 
 
 @pytest.mark.parametrize(
@@ -55,3 +58,49 @@ def test_the_first_signal_interrupts_and_later_ones_cannot_cut_the_clean_up(numb
     assert caught.value.number == number
     assert cleaned
     assert signal.getsignal(number) is before
+
+
+def test_foreign_code_that_drops_the_exception_only_delays_it() -> None:
+    class Drops:
+        def __del__(self) -> None:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(1.0)
+            reached.append("dropped")
+
+    reached: list[str] = []
+    unraisable: list[object] = []
+    hook, sys.unraisablehook = sys.unraisablehook, unraisable.append
+
+    def work() -> None:
+        with interruptible():
+            Drops()
+            reached.append("went on")
+            time.sleep(10.0)
+            reached.append("was never interrupted")
+
+    try:
+        with pytest.raises(Interrupted):
+            work()
+    finally:
+        sys.unraisablehook = hook
+
+    assert len(unraisable) == 1
+    assert reached == ["went on"]
+
+
+def test_a_long_clean_up_is_not_interrupted_again() -> None:
+    cleaned = []
+
+    def work() -> None:
+        with interruptible():
+            try:
+                os.kill(os.getpid(), signal.SIGTERM)
+                signal.pause()
+            finally:
+                time.sleep(3 * LOOK_AGAIN_S)
+                cleaned.append(True)
+
+    with pytest.raises(Interrupted):
+        work()
+
+    assert cleaned

@@ -14,7 +14,7 @@ from typing import Any
 
 from zsched import __version__
 from zsched.errors import ConfigError, ZschedError
-from zsched.lab.demo import EXIT_CONFIG, EXIT_FAILED, EXIT_SIGNAL, EXIT_USAGE, Interrupted, interruptible
+from zsched.lab.demo import EXIT_CONFIG, EXIT_FAILED, EXIT_SIGNAL, EXIT_USAGE
 from zsched.lab.laser_log import malaga_path
 from zsched.lab.paper.figures import save_all
 from zsched.lab.paper.matrix import Matrix, cells_of, collect
@@ -25,6 +25,7 @@ from zsched.lab.paper.robots import ExploreRobots, LogRobots, Robots
 from zsched.lab.paper.run import Cell, CellRun, Inputs, write_json
 from zsched.lab.paper.scenario import Scenario, load_scenario
 from zsched.lab.paper.schemes import QUICK_SCHEMES
+from zsched.lab.signals import Interrupted, interruptible
 
 RESULTS_SCHEMA = "zsched.paper/1"
 QUICK_S = 34.0
