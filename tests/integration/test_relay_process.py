@@ -121,11 +121,12 @@ def test_a_port_that_is_taken_is_a_problem_in_words(process: subprocess.Popen[by
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
-        config = data_config(listen=(f"tcp/127.0.0.1:{taken.getsockname()[1]}",), connect=())
+        port = taken.getsockname()[1]
+        config = data_config(listen=(f"tcp/127.0.0.1:{port}",), connect=())
         _, reports = begin(process, config)
         problem = next_report(reports)
     assert isinstance(problem, ProblemReported)
-    assert "cannot be opened" in str(problem.problem)
+    assert f"cannot listen on tcp/127.0.0.1:{port}: another program has that port" in str(problem.problem)
     assert process.wait(5) == 1
 
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from zsched import wire
-from zsched.adapters.relay_child import RelayChild, is_idle, start_relay
+from zsched.adapters.relay_child import ENDING_S, RelayChild, is_idle, start_relay
 from zsched.clock import monotonic_s
 from zsched.core.events import ProblemReported, RelayChanged
 from zsched.core.model import NodeId
@@ -238,6 +238,8 @@ class RelayHandle:
         writer.start()
         reason = self._listen(relay)
         if not self._is_leaving:
+            if not reason:  # it ends itself: its exit code says more than our SIGKILL's
+                relay.wait(ENDING_S)
             relay.kill()
         outbox.close()
         writer.join()
@@ -262,10 +264,14 @@ class RelayHandle:
             self._on_report(ProblemReported(source="relay", problem=f"a plan is too large: {error}"[:400]))
 
     def _listen(self, relay: RelayChild) -> str:
-        """Hand on reports until the pipe ends; answers what was wrong, or ``""``."""
+        """Hand on reports until the pipe ends; answers what was wrong, or ``""``.
+
+        A relay that cannot start says why (a problem before `RelayStarted`) and ends: that is the answer then.
+        """
         poller = select.poll()
         poller.register(relay.descriptor, select.POLLIN)
         heard_at, patience_s = monotonic_s(), START_S
+        has_started, last_word = False, ""
         while True:
             silent_s = monotonic_s() - heard_at
             if not poller.poll(max(LOOK_S, patience_s - silent_s) * 1000):
@@ -276,8 +282,10 @@ class RelayHandle:
             try:
                 frame = read_frame(relay.descriptor)
                 if frame is None:
-                    return ""
+                    return last_word
                 report: HandleReport | RelayPulse = wire.decode(frame, *REPORTS)
+            except ConnectionResetError:  # it ended before it had read all that we said
+                return last_word
             except (WireError, OSError) as error:
                 return f"unreadable report: {error}"
             heard_at = monotonic_s()
@@ -285,7 +293,9 @@ class RelayHandle:
                 if report.counted_s > STILL_S:
                     return f"its streams stand still for {report.counted_s:.1f} s"
                 continue
+            if isinstance(report, ProblemReported) and not has_started:
+                last_word = report.problem or ""
             if isinstance(report, RelayStarted):
-                patience_s = self._silence_s
+                patience_s, has_started, last_word = self._silence_s, True, ""
                 self._on_report(RelayChanged(is_running=True, reason=f"pid {report.pid}"))
             self._on_report(report)

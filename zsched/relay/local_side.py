@@ -18,6 +18,7 @@ import zenoh
 
 from zsched.core.events import ProblemReported
 from zsched.core.relay_protocol import RelayReport
+from zsched.relay.opening import why_not_open
 
 RETRY_S: Final = 0.5
 SOURCE: Final = "relay/local"
@@ -53,9 +54,9 @@ class LocalSide:
             try:
                 session = zenoh.open(zenoh.Config.from_json5(self._config))
             except (zenoh.ZError, ValueError) as error:
-                problem = f"the host's own side cannot be joined: {error}; is its router up?"
+                problem = f"the host's own side {why_not_open(self._config, error)}"
                 if not told:
-                    self._report(ProblemReported(source=SOURCE, problem=problem[:400]))
+                    self._report(ProblemReported(source=SOURCE, problem=problem))
                 told = problem
                 self._stop.wait(RETRY_S)
                 continue

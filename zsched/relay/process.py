@@ -33,6 +33,7 @@ from zsched.keyspace import Keyspace
 from zsched.relay.acks import Acks
 from zsched.relay.graph import GraphMirror
 from zsched.relay.local_side import LocalSide
+from zsched.relay.opening import why_not_open
 from zsched.relay.roles import RoleServer
 from zsched.relay.successors import Successors
 from zsched.relay.task import TaskRelay
@@ -48,6 +49,7 @@ CLOSE_S: Final = 0.6
 ALARM_S: Final = 0.9
 """...and should zenoh hold Python's global lock meanwhile, the kernel ends it."""
 MAX_REPORTS: Final = 4096
+SOURCE: Final = "relay"
 
 _log = logging.getLogger("zsched.relay")
 
@@ -124,7 +126,13 @@ class RelayProcess:
     """
 
     def __init__(
-        self, session: zenoh.Session, fleet: str, node: NodeId, reporter: Reporter, local_config: str = ""
+        self,
+        session: zenoh.Session,
+        fleet: str,
+        node: NodeId,
+        reporter: Reporter,
+        local_config: str = "",
+        introducer: Introducer | None = None,
     ) -> None:
         self._session = session
         self._lock = threading.Lock()  # plans come from the pipe, the local side from a thread of its own
@@ -133,6 +141,7 @@ class RelayProcess:
         self._waiting: dict[TaskId, RoutePlan] = {}
         self._node = node
         self._reporter = reporter
+        self._introducer = introducer
         self._tasks: dict[TaskId, TaskRelay] = {}
         self._own_ids = frozenset({str(session.zid())})
         keyspace = Keyspace(fleet)
@@ -149,6 +158,8 @@ class RelayProcess:
         """Close both sessions; may take as long as a stopped peer holds them."""
         if self._local_side is not None:
             self._local_side.close()
+        if self._introducer is not None:
+            self._introducer.close()
         self._session.close()
 
     def _begin(self, local: zenoh.Session | None) -> None:
@@ -175,7 +186,7 @@ class RelayProcess:
             try:
                 command = wire.decode(frame, *COMMANDS)
             except WireError as error:
-                self._reporter.report(ProblemReported(source="relay", problem=f"unreadable command: {error}"[:400]))
+                self._reporter.report(ProblemReported(source=SOURCE, problem=f"unreadable command: {error}"[:400]))
                 continue
             if isinstance(command, RelayStop):
                 return True
@@ -235,11 +246,15 @@ class RelayProcess:
     def _count(self) -> None:
         due = monotonic_s()
         pause = threading.Event()
+        introductions = Introductions()
         while True:
             due += COUNT_S
             pause.wait(max(0.0, due - monotonic_s()))
             counts = tuple(count for task in tuple(self._tasks.values()) for count in task.counts())
             self._reporter.report(StreamsCounted(counts=counts))
+            is_missing = any(task.misses_its_worker for task in tuple(self._tasks.values()))
+            if introductions.is_due(monotonic_s(), is_missing=is_missing) and self._introducer is not None:
+                self._introducer.introduce()
 
 
 def run(
@@ -263,11 +278,11 @@ def run(
     try:
         session = zenoh.open(zenoh.Config.from_json5(text.decode()))
     except (zenoh.ZError, ValueError) as error:
-        problem = f"the data session cannot be opened: {error}; is its port taken?"
-        reporter.report(ProblemReported(source="relay", problem=problem[:400]))
+        problem = f"its data session {why_not_open(text.decode(), error)}"
+        reporter.report(ProblemReported(source=SOURCE, problem=problem))
         reporter.flush(CLOSE_S)
         return 1
-    relay = RelayProcess(session, me.fleet, me.node, reporter, local.decode())
+    relay = RelayProcess(session, me.fleet, me.node, reporter, local.decode(), Introducer(text.decode()))
     successors = None if door is None else Successors(socket.socket(fileno=door), me)
     try:
         while not relay.obey(commands) and successors is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -61,6 +62,33 @@ def test_a_killed_relay_is_replaced(daemon: Daemon) -> None:
     os.kill(pid, signal.SIGKILL)
     until(lambda: daemon.changes() == [True, False, True], "gone and back")
     assert daemon.handle.pid != pid
+
+
+def test_a_relay_that_cannot_start_ends_with_its_own_reason() -> None:
+    """Also when it leaves plans unread, which resets the pipe."""
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        config = data_config(listen=(endpoint,), connect=())
+        reports: list[HandleReport] = []
+        handle = RelayHandle(fleet="test", node="robot1", zenoh_config=config, on_report=reports.append)
+        handle.set_role(Role(task="t", role=WorkerRole.ACTIVE, epoch=1))
+        handle.start()
+        try:
+            until(lambda: sum(isinstance(report, RelayChanged) for report in reports) >= 2, "two in vain")
+        finally:
+            handle.stop(2.0)
+    ends = [report for report in reports if isinstance(report, RelayChanged)]
+    assert all(f"cannot listen on {endpoint}" in end.reason and not end.is_running for end in ends)
+
+
+def test_a_relay_that_ends_by_itself_is_reported_with_its_exit_code(daemon: Daemon) -> None:
+    """What it complained of while it worked is not why it ended."""
+    os.kill(daemon.handle.pid or 0, signal.SIGKILL)
+    until(lambda: daemon.changes()[:2] == [True, False], "gone")
+    ends = [r for r in daemon.reports if isinstance(r, RelayChanged) and not r.is_running]
+    assert ends[0].reason == "exit code -9"
 
 
 def test_a_wedged_relay_is_replaced(daemon: Daemon) -> None:
