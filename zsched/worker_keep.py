@@ -35,6 +35,8 @@ MAX_PAUSE_S: Final = 2.0
 ASKED_S: Final = 0.1
 """A relay that asks for the same once more within this time has it on its way."""
 FORGET_S: Final = 10.0
+NEWCOMERS_S: Final = 3.0
+"""So long after an epoch's first answer a robot may begin with it: one that learnt of the move late, or had no link."""
 TICK_S: Final = 0.1
 BATCH: Final = 512
 BATCH_BYTES: Final = 4 << 20
@@ -84,13 +86,16 @@ class KeptLane:
     receivers: dict[str, _Receiver] = field(default_factory=dict)
     end: EndMarker | None = None
     ended_at: float = 0.0
+    began_at: float | None = None
     is_closed: bool = False
 
     def keep(self, number: int, payload: Any, attachment: Any, encoding: Any, stamp: Any, size: int) -> None:
         """Keep what is about to be put under a number; the oldest give way."""
+        now = monotonic_s()
         with self.lock:
             self.count, self.end = number + 1, None
-            self.kept.append(_Kept(number, payload, attachment, encoding, stamp, size, monotonic_s()))
+            self.began_at = now if self.began_at is None else self.began_at
+            self.kept.append(_Kept(number, payload, attachment, encoding, stamp, size, now))
             self.size += size
             while len(self.kept) > self.limit or (self.size > KEPT_BYTES and len(self.kept) > 1):
                 self.size -= self.kept.popleft().size
@@ -115,10 +120,16 @@ class KeptLane:
             receiver.is_ended = ack.is_ended
             if has_moved:
                 receiver.arrived, receiver.moved_at, receiver.pause_s = ack.arrived, now, RESEND_S
-            low = min(one.arrived for one in self.receivers.values())
-            while self.kept and self.kept[0].number < low:
-                self.size -= self.kept.popleft().size
+            self._let_go(now)
             return receiver, has_moved
+
+    def _let_go(self, now: float) -> None:
+        """Of what every relay that we know of has, once those that we do not know have had time to come."""
+        if not self.receivers or (self.began_at is not None and now - self.began_at < NEWCOMERS_S):
+            return
+        low = min(one.arrived for one in self.receivers.values())
+        while self.kept and self.kept[0].number < low:
+            self.size -= self.kept.popleft().size
 
     def wanted(self, start: int, until: int) -> tuple[_Kept, ...]:
         """What is kept of the numbers from ``start`` to before ``until``, as much as goes at one time."""
@@ -150,6 +161,7 @@ class KeptLane:
     def expire(self, now: float) -> bool:
         """Let go of what nobody will acknowledge; ``True`` when the lane has nothing left to do."""
         with self.lock:
+            self._let_go(now)
             while self.kept and not self.receivers and now - self.kept[0].at > FORGET_S:
                 self.size -= self.kept.popleft().size
             is_told = all(one.is_ended for one in self.receivers.values()) or now - self.ended_at > FORGET_S

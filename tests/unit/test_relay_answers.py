@@ -125,6 +125,40 @@ def test_what_the_worker_has_no_more_is_skipped_and_counted(bench: Bench) -> Non
     assert stream.count().lost == 3
 
 
+def test_first_answers_that_the_worker_has_no_more_are_counted_too(bench: Bench) -> None:
+    """Nothing came before them, so that the gate cannot tell by its last number."""
+    stream = bench.open()
+    bench.put(5)
+    bench.wait_ack(arrived=0, has_gap=True, until=5)
+    marker = encode_end(EndMarker(epoch=0, count=3))
+    bench.again.put(marker, encoding=SKIP_ENCODING, source_info=zenoh.SourceInfo(bench.publisher.id, 3))
+    bench.put_again(3, 4)
+    assert bench.is_through(3, 4, 5)
+    assert stream.count().lost == 3
+
+
+def test_a_relay_that_came_later_counts_nothing_of_what_was_before(bench: Bench) -> None:
+    stream = bench.open(is_from_start=False)
+    bench.put(7, 8)
+    assert bench.is_through(7, 8)
+    assert stream.count().lost == 0
+
+
+@pytest.mark.parametrize(("had", "lost"), [((0,), 2), ((), 3)])
+def test_a_tail_that_is_asked_for_in_vain_is_counted_when_the_slot_closes(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, had: tuple[int, ...], lost: int
+) -> None:
+    monkeypatch.setattr(answers, "GIVE_UP_S", 0.1)
+    stream = bench.open()
+    bench.put(*had)
+    assert bench.is_through(*had)
+    end = encode_end(EndMarker(epoch=1, count=3))
+    bench.worker.put(f"{KEY}/{END_CHUNK}", end, source_info=zenoh.SourceInfo(bench.publisher.id, 3))
+    until(lambda: stream.has_ended(1), "it is given up")
+    stream.close_slot(1)
+    assert stream.count().lost == lost
+
+
 def test_what_never_comes_is_given_up_also_when_nothing_else_comes(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:

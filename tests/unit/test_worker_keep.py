@@ -85,7 +85,8 @@ def bench() -> Iterator[Bench]:
         made.keeper.close()
 
 
-def test_what_every_robot_has_acknowledged_is_kept_no_more(bench: Bench) -> None:
+def test_what_every_robot_has_acknowledged_is_kept_no_more(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worker_keep, "NEWCOMERS_S", 0.0)
     lane = bench.lane()
     first, second = bench.robot("robot1", "aa1"), bench.robot("robot2", "aa2")
     keep(lane, 0, 1, 2, 3)
@@ -94,6 +95,31 @@ def test_what_every_robot_has_acknowledged_is_kept_no_more(bench: Bench) -> None
     first.ack(bench.eid, 4)
     second.ack(bench.eid, 4)
     until(lambda: not lane.kept and lane.size == 0, "nothing is kept")
+
+
+def test_a_robot_that_follows_the_move_last_is_given_what_the_first_has_acknowledged_already(bench: Bench) -> None:
+    """An output that several robots share: one was there first, the other's link came up ten answers later."""
+    lane = bench.lane()
+    first, second = bench.robot("robot1", "aa1"), bench.robot("robot2", "aa2")
+    keep(lane, *range(10))
+    first.ack(bench.eid, 10)
+    until(lambda: lane.receivers and lane.receivers["aa1"].arrived == 10, "the first robot's word")
+    keep(lane, 10)
+    second.ack(bench.eid, 0, has_gap=True, until=10)
+    until(lambda: second.got == list(range(10)), "the beginning")
+    assert (first.got, second.skipped) == ([], [])
+
+
+def test_the_first_answers_of_an_epoch_do_not_stay_for_ever(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also when nobody says anything any more."""
+    monkeypatch.setattr(worker_keep, "NEWCOMERS_S", 0.3)
+    lane = bench.lane()
+    robot = bench.robot("robot1")
+    keep(lane, 0, 1, 2)
+    robot.ack(bench.eid, 3)
+    until(lambda: lane.receivers, "the robot's only word")
+    until(lambda: not lane.kept and lane.size == 0, "they are let go of")
+    until(lambda: not lane.wake.is_set(), "the keeper is at rest")
 
 
 def test_a_gap_is_filled_at_once_for_that_robot_alone(bench: Bench) -> None:
@@ -132,6 +158,7 @@ def test_what_is_kept_no_more_is_skipped(bench: Bench) -> None:
 
 def test_much_is_sent_again_in_parts_as_it_arrives(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worker_keep, "BATCH", 2)
+    monkeypatch.setattr(worker_keep, "NEWCOMERS_S", 0.0)
     lane = bench.lane()
     robot = bench.robot("robot1")
     keep(lane, *range(5))
@@ -142,7 +169,10 @@ def test_much_is_sent_again_in_parts_as_it_arrives(bench: Bench, monkeypatch: py
     until(lambda: not lane.kept, "all acknowledged")
 
 
-def test_a_relay_that_restarted_takes_the_place_of_its_former_life(bench: Bench) -> None:
+def test_a_relay_that_restarted_takes_the_place_of_its_former_life(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(worker_keep, "NEWCOMERS_S", 0.0)
     lane = bench.lane()
     before, after = bench.robot("robot1", "aa1"), bench.robot("robot1", "aa2")
     keep(lane, 0, 1, 2)

@@ -4,7 +4,8 @@ Knows: `zsched.worker`'s numbers and what it keeps of its answers, the acknowled
 
 A link that breaks loses what was on it; the worker keeps its answers until this relay has acknowledged them, and puts
 what is missing once more, for this relay alone. Meanwhile newer answers wait here, bounded. What the worker has no more
-is skipped at its word, what never comes after `GIVE_UP_S`; the gate counts both as lost. Where only the newest is
+is skipped at its word, what never comes after `GIVE_UP_S`; both count as lost: at the gate, here at the very beginning,
+and behind the last one that came when the slot closes. Where only the newest is
 wanted (class ``latest``) nothing waits. The stream's lock guards it.
 """
 
@@ -88,6 +89,7 @@ class Answers:
         self._in_turn = in_turn
         self._early: dict[SourceName, _Early] = {}
         self._names: set[SourceName] = set(heard)
+        self._starts = dict(heard)
         for name, number in heard.items():
             acks.expect(name, number)
 
@@ -141,9 +143,14 @@ class Answers:
         self._acks.expect(name, 0 if self._is_from_start else until)
         return self._acks.ask_for(name, until) <= GIVE_UP_S
 
-    def arrived(self, name: SourceName) -> int:
-        """The number that comes next."""
-        return self._acks.arrived(name)
+    def missing(self, name: SourceName, until: int) -> int:
+        """How many numbers below ``until`` have not come, of a source that we should have had whole."""
+        start = self._start_of(name)
+        return 0 if start is None else max(0, until - max(start, self._acks.arrived(name)))
+
+    def _start_of(self, name: SourceName) -> int | None:
+        """The first number that we had to get; ``None``: we came when the stream had begun."""
+        return self._starts.get(name, 0 if self._is_from_start else None)
 
     def overdue(self) -> Iterator[tuple[SourceName, Sample]]:
         """What goes on now because the missing ones before it never came."""
@@ -176,6 +183,9 @@ class Answers:
         return ()
 
     def _skip(self, name: SourceName, number: int) -> tuple[Sample, ...]:
+        is_known = self._in_turn and name in self._names
+        if is_known and self._acks.arrived(name) == self._start_of(name):  # the gate counts between two that came
+            self._counter.lost += self.missing(name, number)
         self._acks.skip(name, number)
         early = self._early.get(name)
         if early is not None:

@@ -195,7 +195,8 @@ class OutputStream:
                 return
             slot.is_closed = True
             feed = self._hand_on(slot)
-            if slot is self._carrier:
+            if slot is self._carrier:  # of any other nothing more was wanted
+                self._counter.lost += slot.missing() if feed is not None else 0
                 self._carrier = None
                 self._promote()
             if slot.answers is not None:

@@ -43,6 +43,14 @@ class KeyState:
             return is_complete
         return answers is None or self.ender is None or not answers.ask_for(self.ender, self.end.count)
 
+    def missing(self, answers: Answers | None) -> int:
+        """How many samples before the end marker have not come."""
+        if self.end is None:
+            return 0
+        if answers is not None and self.ender is not None:
+            return answers.missing(self.ender, self.end.count)
+        return max(0, self.end.count - self.last_number - 1) if self.last_number >= 0 else 0
+
 
 @dataclass(slots=True, eq=False)
 class Feed:
@@ -75,6 +83,10 @@ class OutputSlot:
     held_bytes: int = 0
     is_flipped: bool = False
     is_closed: bool = False
+
+    def missing(self) -> int:
+        """How many samples its owner has put out that did not come (as far as it has said how many there are)."""
+        return sum(key.missing(self.answers) for key in self.keys.values())
 
     def key(self, name: str) -> KeyState | None:
         """What has come on a concrete key; ``None`` when it is none of this slot's."""
