@@ -163,8 +163,7 @@ class Worker:
         """
         expr = key_expr.replace("{prefix}", self.prefix)
         source = Input(on_sample=on_sample, keep_last=keep_last, depth=depth)
-        dispatcher = self._dispatcher
-        data = self._session.declare_subscriber(expr, lambda sample: dispatcher.put(source, sample))
+        data = self._session.declare_subscriber(expr, lambda sample: self._dispatcher.put(source, sample))
         ends = self._session.declare_subscriber(f"{expr}/{END_CHUNK}", self._on_marker)
         self._declared += [data, ends]
 
@@ -225,6 +224,7 @@ class Worker:
         """
         self._errands.put(self._state_link.open)  # before it is needed, not in a move
         self._restorer.register(restore, timeout_s)
+        self._dispatcher.remember(lambda: self.role.role is WorkerRole.IDLE)
         role = self._role
         self._restorer.note(role)
         self._errands.put(lambda: self._begin(role))

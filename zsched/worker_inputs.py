@@ -8,6 +8,8 @@ processed, or, should some have been dropped on the way, a grace time after it c
 
 A sample whose output was withheld because the worker was not the owner (a warm-up, or one that outran the role) is kept
 and processed again when it becomes the owner: else the newest map of a crashed owner would have no result at all.
+So is, where a predecessor's state takes the place of its own, every sample processed before: it was sent to nobody else
+(a flip waits only so long for the role), and what it had done to the state is gone.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, NamedTuple
 
 import zenoh
 
@@ -28,6 +30,8 @@ from zsched.hop_acks import GIVE_UP_S, Acknowledger, SourceName
 END_GRACE_S: Final = 0.1
 MAX_WITHHELD: Final = 256
 """Samples per key of an input without ``keep_last`` that are kept for the day this worker becomes the owner."""
+QUIET_S: Final = 10.0
+"""What was processed longer ago than this came with another move, or the predecessor had it, too."""
 JOIN_S: Final = 0.2
 
 _log = logging.getLogger("zsched.worker")
@@ -74,6 +78,18 @@ class _Waiting:
     number: int = 0
 
 
+class _Done(NamedTuple):
+    """A sample processed while this worker was not the owner."""
+
+    sample: zenoh.Sample
+    quiet_at: float | None
+    """When it was processed, if nothing was withheld of it: it counts where the state that it went into is replaced."""
+
+    def is_over(self, *, is_restored: bool, now: float) -> bool:
+        """True when it need not be processed again."""
+        return self.quiet_at is not None and not (is_restored and now - self.quiet_at < QUIET_S)
+
+
 @dataclass(slots=True)
 class _Open:
     """A source that has sent something: its newest number, and the epoch it was first heard in (0: standby)."""
@@ -100,11 +116,12 @@ class Dispatcher:
         self._epoch = 0
         self._begun = 0
         self._has_withheld = False
-        self._withheld: dict[tuple[int, str], tuple[Input, deque[zenoh.Sample]]] = {}
-        self._again: deque[tuple[Input, zenoh.Sample]] = deque()
+        self._withheld: dict[tuple[int, str], tuple[Input, deque[_Done]]] = {}
+        self._again: deque[tuple[Input, _Done]] = deque()
+        self._is_standby: Callable[[], bool] = _never
         self._is_closed = False
         self._is_held = False
-        self._first: Callable[[], None] | None = None
+        self._first: Callable[[], bool] | None = None
         self._thread = threading.Thread(target=self._run, name="zsched dispatch", daemon=True)
 
     def start(self) -> None:
@@ -156,15 +173,29 @@ class Dispatcher:
         """The timestamp for an output: of the input in hand (in the dispatch thread), else of the newest processed."""
         return self._stamp if threading.current_thread() is self._thread else self._newest_stamp
 
+    def remember(self, is_standby: Callable[[], bool]) -> None:
+        """Keep every sample that is processed while ``is_standby``: a predecessor's state may take over from ours."""
+        self._is_standby = is_standby
+
     def begin(self, epoch: int) -> None:
         """This worker is the owner from now on: sources heard first from here on belong to ``epoch``."""
         with self._wake:
             self._epoch = epoch
             self._begun += 1
             for source, samples in self._withheld.values():
-                self._again.extend((source, sample) for sample in samples)
+                self._again.extend((source, done) for done in samples)
             self._withheld.clear()
+            if not self._is_held and self._first is None:
+                self._settle_state(is_restored=False)
             self._wake.notify()
+
+    def _settle_state(self, *, is_restored: bool) -> None:
+        """Our state stays, or a predecessor's has taken its place."""
+        now = monotonic_s()
+        again = self._again
+        self._again = deque(
+            (source, done) for source, done in again if not done.is_over(is_restored=is_restored, now=now)
+        )
 
     def forget(self, epoch: int) -> None:
         """The epoch is over for this worker: what has not ended will not."""
@@ -176,8 +207,8 @@ class Dispatcher:
         with self._wake:
             self._is_held = True
 
-    def release(self, first: Callable[[], None]) -> None:
-        """Call ``first`` in the dispatch thread, then process what has come."""
+    def release(self, first: Callable[[], bool]) -> None:
+        """Call ``first`` in the dispatch thread, then process what has come; it answers whether our state changed."""
         with self._wake:
             self._is_held, self._first = False, first
             self._wake.notify()
@@ -199,7 +230,9 @@ class Dispatcher:
                 first, self._first = self._first, None
                 claimed = None if self._is_held or first is not None else self._claim()
             if first is not None:
-                first()
+                is_restored = first()
+                with self._wake:
+                    self._settle_state(is_restored=is_restored)
             if claimed is not None:
                 self._process(claimed)
             if self._markers:
@@ -211,7 +244,8 @@ class Dispatcher:
     def _claim(self) -> _Waiting | None:
         """Take the next sample out of its key's line (under the lock): from here on nothing sheds it."""
         if self._again:
-            return _Waiting(*self._again.popleft())
+            source, done = self._again.popleft()
+            return _Waiting(source, done.sample)
         waiting = self._queue.popleft() if self._queue else None
         if waiting is None or waiting.sample is None:
             return None
@@ -223,21 +257,22 @@ class Dispatcher:
         if sample is None:
             return
         self._has_withheld = False
-        begun = self._begun
+        begun, was_standby = self._begun, self._is_standby()
         self._in_hand = self._hear(waiting.name, sample) if waiting.name is not None else self._epoch
         self._dispatch(source, sample)
         self._in_hand = None
         if waiting.name is not None:
             self._note(waiting.name, waiting.number, sample)
-        if not self._has_withheld:
+        if not self._has_withheld and not was_standby:
             return
+        done = _Done(sample, None if self._has_withheld else monotonic_s())
         with self._wake:
             if self._begun != begun:  # it became the owner meanwhile
-                self._again.append((source, sample))
+                self._again.append((source, done))
                 return
             name = (id(source), str(sample.key_expr))
-            empty: deque[zenoh.Sample] = deque(maxlen=source.keep_last or MAX_WITHHELD)
-            self._withheld.setdefault(name, (source, empty))[1].append(sample)
+            empty: deque[_Done] = deque(maxlen=source.keep_last or MAX_WITHHELD)
+            self._withheld.setdefault(name, (source, empty))[1].append(done)
 
     def _dispatch(self, source: Input, sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)
@@ -297,3 +332,7 @@ class Dispatcher:
 
     def _is_over(self, epoch: int) -> bool:
         return all(state.epoch > epoch for state in self._open.values())
+
+
+def _never() -> bool:
+    return False

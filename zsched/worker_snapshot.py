@@ -256,12 +256,14 @@ class Restorer:
             self._inputs.hold()
 
     def begin(self, role: Role, then: Callable[[], None]) -> bool:
-        """Start the fetch of this role's epoch, once; ``then`` follows in its thread. ``False``: nothing to fetch."""
+        """Start the fetch of this role's epoch, once; ``then`` follows in its thread. ``False``: nothing to await."""
         with self._lock:
-            is_due = self.is_pending and not self._has_begun
             noted = self._noted
-            if not is_due or noted is None or noted.epoch != role.epoch or noted.predecessor is None:
+            is_ours = noted is not None and noted.epoch == role.epoch
+            if not self.is_pending or not is_ours or noted is None or noted.predecessor is None:
                 return False
+            if self._has_begun:
+                return self._result is None  # under way: who asks again (a lease was renewed) waits like the first
             self._has_begun = True
             predecessor = noted.predecessor
         arguments = (role.epoch, predecessor, then)
@@ -283,7 +285,8 @@ class Restorer:
                 self._result = _Fetched(epoch, predecessor, content, monotonic_s() - started)
         then()
 
-    def _hand_over(self, result: _Fetched) -> None:
+    def _hand_over(self, result: _Fetched) -> bool:
+        """Give the worker its predecessor's state; answers whether it has it."""
         content, callback = result.content, self._callback
         if isinstance(content, bytes) and callback is not None:
             try:
@@ -302,6 +305,7 @@ class Restorer:
             _log.info("restored epoch=%d from=%s bytes=%d took_ms=%.0f", *where, len(content), took_ms)
         else:
             _log.warning("cold_start epoch=%d from=%s why=%r", *where, content)
+        return isinstance(content, bytes)
 
 
 class Held(Protocol):
@@ -310,5 +314,5 @@ class Held(Protocol):
     def hold(self) -> None:
         """Process no input until `release`."""
 
-    def release(self, first: Callable[[], None]) -> None:
-        """Call ``first`` in the dispatch thread, then go on."""
+    def release(self, first: Callable[[], bool]) -> None:
+        """Call ``first`` in the dispatch thread, then go on; it answers whether the worker's state is another now."""

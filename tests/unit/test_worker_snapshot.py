@@ -249,6 +249,25 @@ def test_one_epoch_is_restored_once() -> None:
     assert (len(got), inputs.said) == (1, ["hold", "release"])
 
 
+def test_who_asks_again_while_the_state_is_on_its_way_waits_too() -> None:
+    """A lease that is renewed is another role of the same epoch: no reason to work without the state."""
+    inputs = Inputs()
+    comes, then = threading.Event(), threading.Event()
+
+    def late(_node: str, _timeout_s: float) -> bytes:
+        comes.wait(5)
+        return b"state"
+
+    restorer = Restorer(late, "edge2", inputs)
+    restorer.register(lambda _content: None, 1.0)
+    restorer.note(active(3))
+    assert restorer.begin(active(3), then.set)
+    assert restorer.begin(active(3), then.set)
+    comes.set()
+    assert then.wait(5)
+    assert restorer.begin(active(3), then.set) is False
+
+
 def test_a_callback_that_fails_is_a_cold_start() -> None:
     inputs = Inputs()
     restorer = Restorer(lambda _node, _timeout_s: b"state", "edge2", inputs)
