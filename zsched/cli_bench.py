@@ -48,7 +48,10 @@ def paper(
     quick: Annotated[bool, typer.Option("--quick", help="Fixed, dyna_both and zsched once: under 6 minutes.")] = False,
     schemes: Annotated[str, typer.Option(metavar="A,B", help="Only these schemes. [the scenario's]")] = "",
     resume: Annotated[bool, typer.Option("--resume", help="Go on in the folder of --out.")] = False,
-    kind: Annotated[RobotsSee, typer.Option("--input", help="What the robots see.")] = RobotsSee.LOG,
+    plan: Annotated[bool, typer.Option("--plan", help="Only say what would be run, and for how long.")] = False,
+    kind: Annotated[
+        RobotsSee | None, typer.Option("--input", help="What the robots see. [explore; log with --quick or --log]")
+    ] = None,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the results.")] = Path("zsched-paper"),
     scenario: Annotated[Path | None, typer.Option(metavar="FILE", help="Scenario. [the paper's]")] = None,
     log: Annotated[Path | None, typer.Option(metavar="FILE", help="CARMEN laser log. [Malaga, shipped]")] = None,
@@ -66,7 +69,8 @@ def paper(
         raise CliError(
             EXIT_FAILED, f"the lab needs {', '.join(missing)}, not installed here; run `pip install 'zsched[lab]'`"
         )
-    if log is not None and kind is RobotsSee.EXPLORE:
+    is_replay = kind is RobotsSee.LOG or (kind is None and (quick or log is not None))
+    if log is not None and not is_replay:
         raise CliError(EXIT_USAGE, "--log goes with --input log; leave one of them out")
     names = tuple(name.strip() for name in schemes.split(",") if name.strip())
     if schemes and not names:
@@ -85,6 +89,7 @@ def paper(
         log=log,
         drives=drives,
         duration_s=duration,
-        is_exploring=kind is RobotsSee.EXPLORE,
+        is_exploring=not is_replay,
+        is_plan=plan,
     )
     raise typer.Exit(run_bench(options))

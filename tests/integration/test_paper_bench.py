@@ -11,10 +11,11 @@ from mcap.reader import make_reader
 
 from zsched.adapters.cgroup import LimitedGroup
 from zsched.lab.laser_log import malaga_path
+from zsched.lab.paper.cells import Cell
 from zsched.lab.paper.metrics import Truth, measure
 from zsched.lab.paper.places import scenario_path
 from zsched.lab.paper.robots import LogRobots
-from zsched.lab.paper.run import Cell, CellRun, Inputs
+from zsched.lab.paper.run import CellRun, Inputs
 from zsched.lab.paper.scenario import LoadPlan, load_scenario
 from zsched.lab.paper.schemes import SCHEMES
 from zsched.lab.recorder import read_records

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +16,17 @@ from zsched import __version__
 from zsched.errors import ConfigError, ZschedError
 from zsched.lab.demo import EXIT_CONFIG, EXIT_FAILED, EXIT_SIGNAL, EXIT_USAGE
 from zsched.lab.laser_log import malaga_path
+from zsched.lab.netns import why_not
+from zsched.lab.paper.cells import Cell, cells_of, world_of
 from zsched.lab.paper.figures import save_all
-from zsched.lab.paper.matrix import Matrix, cells_of, collect
+from zsched.lab.paper.matrix import Matrix, collect, undone
 from zsched.lab.paper.metrics import Truth, brief, measure
-from zsched.lab.paper.radio_bench import run_radio
-from zsched.lab.paper.report import report
+from zsched.lab.paper.plan import AROUND_S, leave_out, plan_text, without
+from zsched.lab.paper.radio_bench import RADIO_SCHEMES, run_radio
+from zsched.lab.paper.report import in_block, report, snippet
 from zsched.lab.paper.robots import ExploreRobots, LogRobots, Robots
-from zsched.lab.paper.run import Cell, CellRun, Inputs, write_json
-from zsched.lab.paper.scenario import Scenario, load_scenario
+from zsched.lab.paper.run import CellRun, Inputs, write_json
+from zsched.lab.paper.scenario import MATRIX, Scenario, load_scenario
 from zsched.lab.paper.schemes import QUICK_SCHEMES
 from zsched.lab.signals import Interrupted, interruptible
 
@@ -47,6 +50,8 @@ class BenchOptions:
     drives: Path | None = None
     duration_s: float | None = None
     is_exploring: bool = False
+    is_plan: bool = False
+    """Only say what would be run."""
 
 
 def run_bench(options: BenchOptions) -> int:
@@ -69,37 +74,97 @@ def run_bench(options: BenchOptions) -> int:
 
 
 def _run(options: BenchOptions) -> int:
-    scenario, cells = planned(options)
-    robots = robots_of(options, scenario)
-    inputs = Inputs(robots=robots, drives=options.drives)
+    scenario, cells, skipped = planned(options)
+    inputs = InputsOf(options, scenario)
     body = plan_body(scenario, inputs, cells)
-    wrong = claim_folder(options, body)
+    radio = load_scenario(options.robots_scenario) if not options.is_quick and not options.schemes else None
+    wrong = None if options.is_plan else claim_folder(options, body)
     if wrong:
         say(wrong)
         return EXIT_USAGE
-    truth = Truth(robots.truth())
+    text = told_plan(options, scenario, cells, radio, skipped)
+    if options.is_plan:
+        print(text)
+        return 0
+    say(text)
+    truths = inputs.truths(cells)
 
-    def figures_of(folder: Path) -> tuple[dict[str, Any], str]:
-        figures = measure(folder, scenario, truth)
+    def figures_of(cell: Cell, folder: Path) -> tuple[dict[str, Any], str]:
+        figures = measure(folder, scenario, truths[inputs.of(cell).robots.name])
         return figures, brief(figures)
 
     def make(cell: Cell, folder: Path) -> dict[str, Any]:
-        return CellRun(scenario, cell, inputs, folder).run()
+        return CellRun(scenario, cell, inputs.of(cell), folder).run()
 
     Matrix(scenario, make, figures_of, options.out, say).run(cells)
-    wants_radio = not options.is_quick and not options.schemes
     # A drive of minutes: the robots replay a log there, an exploration would be over before.
     replay = Inputs(robots=LogRobots(log=log_path(options)), drives=options.drives)
-    radio = run_radio(load_scenario(options.robots_scenario), replay, options.out, say) if wants_radio else None
-    return conclude(options, scenario, inputs, cells, radio)
+    found = None if radio is None else run_radio(radio, replay, options.out, say)
+    return conclude(options, scenario, inputs, cells, Rest(radio=found, skipped=skipped))
 
 
-def robots_of(options: BenchOptions, scenario: Scenario) -> Robots:
-    """What the robots see."""
-    if options.is_exploring:
-        loop = scenario.explore
-        return ExploreRobots(world=loop.world, speed=loop.speed, slam_on=loop.slam_on)
-    return LogRobots(log=log_path(options))
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rest:
+    """What stands in the results beside the runs."""
+
+    radio: Mapping[str, Any] | None = None
+    skipped: Mapping[str, str] = field(default_factory=dict)
+    """{block: why it was left out}."""
+
+
+class InputsOf:
+    """What the robots of each cell see: one log for all, or the world of the cell's run and block."""
+
+    def __init__(self, options: BenchOptions, scenario: Scenario) -> None:
+        self._options, self._scenario = options, scenario
+
+    @property
+    def name(self) -> str:
+        """As shown in reports."""
+        if self._options.is_exploring:
+            return f"explore {Path(self._scenario.explore.world).name}"
+        return LogRobots(log=log_path(self._options)).name
+
+    @property
+    def drives(self) -> Path | None:
+        """The folder of recorded drives."""
+        return self._options.drives
+
+    def of(self, cell: Cell) -> Inputs:
+        """One cell's."""
+        return Inputs(robots=self._robots(cell), drives=self._options.drives)
+
+    def truths(self, cells: Sequence[Cell]) -> dict[str, Truth]:
+        """The truth of each input by its name.
+
+        Raises:
+            ConfigError: a log or a world cannot be read, or has no room for the robots.
+        """
+        found: dict[str, Truth] = {}
+        for cell in cells:
+            robots = self._robots(cell)
+            if robots.name not in found:
+                found[robots.name] = Truth(robots.truth())
+        return found
+
+    def _robots(self, cell: Cell) -> Robots:
+        if not self._options.is_exploring:
+            return LogRobots(log=log_path(self._options))
+        loop = self._scenario.explore
+        return ExploreRobots(world=world_of(self._scenario, cell), speed=loop.speed, slam_on=loop.slam_on)
+
+
+def told_plan(
+    options: BenchOptions,
+    scenario: Scenario,
+    cells: Sequence[Cell],
+    radio: Scenario | None,
+    skipped: Mapping[str, str],
+) -> str:
+    """The plan for people: blocks, runs, how long at most."""
+    radio_s = 0.0 if radio is None else len(RADIO_SCHEMES) * (radio.duration_s + AROUND_S)
+    log = None if options.is_exploring else LogRobots(log=log_path(options)).name
+    return plan_text(scenario, cells, undone(options.out, cells), radio_s, skipped, log)
 
 
 def log_path(options: BenchOptions) -> Path:
@@ -107,8 +172,8 @@ def log_path(options: BenchOptions) -> Path:
     return (options.log or malaga_path()).absolute()
 
 
-def planned(options: BenchOptions) -> tuple[Scenario, tuple[Cell, ...]]:
-    """The scenario and the cells that the options ask for.
+def planned(options: BenchOptions) -> tuple[Scenario, tuple[Cell, ...], dict[str, str]]:
+    """The scenario, the cells that the options ask for, and {block: why it is left out}.
 
     Raises:
         ConfigError: the scenario is damaged, or a scheme unknown.
@@ -119,19 +184,20 @@ def planned(options: BenchOptions) -> tuple[Scenario, tuple[Cell, ...]]:
         scenario = replace(scenario, duration_s=loop.duration_s, target_coverage=loop.target_coverage)
     if options.is_quick:
         names = options.schemes or QUICK_SCHEMES
-        scenario = replace(scenario, schemes=names, runs=1, sweep=replace(scenario.sweep, schemes=()))
+        scenario = replace(scenario, schemes=names, runs=1, sweep=replace(scenario.sweep, schemes=()), blocks={})
     if options.is_quick and not options.is_exploring:
         scenario = replace(scenario, duration_s=QUICK_S)
     if options.duration_s is not None:
         scenario = replace(scenario, duration_s=options.duration_s)
-    return scenario, cells_of(scenario, options.schemes, options.runs)
+    skipped = without(scenario, is_exploring=options.is_exploring, why_not=why_not)
+    return scenario, cells_of(leave_out(scenario, skipped), options.schemes, options.runs), skipped
 
 
-def plan_body(scenario: Scenario, inputs: Inputs, cells: Sequence[Cell]) -> dict[str, Any]:
+def plan_body(scenario: Scenario, inputs: InputsOf, cells: Sequence[Cell]) -> dict[str, Any]:
     """What a folder was made for, so that nothing else goes on in it."""
     body = asdict(scenario) | {"fleet": scenario.fleet.name}
     drives = inputs.drives.name if inputs.drives else None
-    found = {"scenario": body, "input": inputs.robots.name, "drives": drives, "cells": [cell.name for cell in cells]}
+    found = {"scenario": body, "input": inputs.name, "drives": drives, "cells": [cell.name for cell in cells]}
     return dict(json.loads(json.dumps(found)))  # as it is read back: no tuples
 
 
@@ -154,25 +220,26 @@ def claim_folder(options: BenchOptions, body: Mapping[str, Any]) -> str | None:
     return None
 
 
-def conclude(
-    options: BenchOptions, scenario: Scenario, inputs: Inputs, cells: Sequence[Cell], radio: Mapping[str, Any] | None
-) -> int:
-    """Write results.json, report.md and the pictures out of what is in the folder."""
+def conclude(options: BenchOptions, scenario: Scenario, inputs: InputsOf, cells: Sequence[Cell], rest: Rest) -> int:
+    """Write results.json, report.md, readme.md and the pictures out of what is in the folder."""
     runs, invalid = collect(options.out, cells)
     results = {
         "schema": RESULTS_SCHEMA,
         "version": __version__,
         "command": command_of(options),
         "scenario": asdict(scenario) | {"fleet": scenario.fleet.name},
-        "input": inputs.robots.name,
+        "input": inputs.name,
         "runs": runs,
         "invalid": invalid,
-        "radio": radio,
+        "missing": [cell.name for cell in undone(options.out, cells)],
+        "skipped": rest.skipped,
+        "radio": rest.radio,
     }
     write_json(options.out / "results.json", results)
-    title = f"{scenario.name}, load {scenario.level}, seed {scenario.seed}, {inputs.robots.name}"
-    drawn = save_all(runs, scenario.level, tuple(scenario.levels), options.out, title)
+    title = f"{scenario.name}, load {scenario.level}, seed {scenario.seed}, {inputs.name}"
+    drawn = save_all(in_block(runs, MATRIX), scenario.level, tuple(scenario.levels), options.out, title)
     (options.out / "report.md").write_text(report(results, drawn), encoding="utf-8")
+    (options.out / "readme.md").write_text(snippet(results, drawn), encoding="utf-8")
     missing = len(cells) - len(runs)
     if missing:
         say(f"{missing} of {len(cells)} runs have no valid result; see {options.out / 'runs'}, then --resume")
@@ -184,7 +251,7 @@ def command_of(options: BenchOptions) -> str:
     """The command that makes these results, without the places of this machine."""
     words = ["zsched bench paper"]
     words += ["--quick"] if options.is_quick else []
-    words += ["--input explore"] if options.is_exploring else []
+    words += [f"--input {'explore' if options.is_exploring else 'log'}"]
     words += [f"--runs {options.runs}"] if options.runs is not None else []
     words += [f"--schemes {','.join(options.schemes)}"] if options.schemes else []
     words += [f"--duration {options.duration_s:g}"] if options.duration_s is not None else []

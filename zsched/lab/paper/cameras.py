@@ -8,7 +8,10 @@ for its robots' cameras. Streams do not wait for one another: N of them compete 
 the threads inside one inference would mostly wait at its barriers. Every second one line of JSON goes to stdout:
 ``{"t_s", "frames", "fps", "model", "streams"}``.
 
-    python -m zsched.lab.paper.cameras [--streams N] [--hz F] [--side PX]
+A stream's strength is the CPU that it takes, not its frames: it pauses after each frame for as long as that frame's own
+CPU time asks for. So one number is the same load on every machine. What a full node keeps from it is never caught up.
+
+    python -m zsched.lab.paper.cameras [--streams N] [--cores F] [--side PX]
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ import threading
 import time
 
 from zsched.clock import monotonic_s
-from zsched.lab.neural_load import Network, frames, load_network, pace
+from zsched.lab.neural_load import Network, frames, load_network
 from zsched.lab.signals import StopFlag
 
 REPORT_S = 1.0
@@ -30,18 +33,29 @@ LAST_FRAME_S = 2.0
 class Camera(threading.Thread):
     """One stream: infers frame after frame, and counts."""
 
-    def __init__(self, network: Network, hz: float, side: int, stop: StopFlag) -> None:
+    def __init__(self, network: Network, cores: float, side: int, stop: StopFlag) -> None:
         super().__init__(name="camera", daemon=True)
         self.frames = 0
-        self._network, self._hz, self._side, self._stop_flag = network, hz, side, stop
+        self._network, self._cores, self._side, self._stop_flag = network, cores, side, stop
 
     def run(self) -> None:
         """Until stopped."""
-        pictures, due = frames(self._side), monotonic_s()
+        pictures, due = frames(self._side), 0.0
         while not self._stop_flag.is_set:
+            began, before = monotonic_s(), time.thread_time()
             self._network.infer(pictures[self.frames % len(pictures)])
             self.frames += 1
-            due = pace(due, self._hz)
+            due = next_frame(due, began, time.thread_time() - before, self._cores)
+            time.sleep(max(due - monotonic_s(), 0.0))
+
+
+def next_frame(due: float, began: float, cpu_s: float, cores: float) -> float:
+    """When the next frame is due, after one that was due at ``due``, ``began`` later and took ``cpu_s``.
+
+    >>> next_frame(10.0, 10.0, 0.05, 0.25), next_frame(10.0, 99.0, 0.05, 0.25), next_frame(10.0, 10.0, 0.05, 0.0)
+    (10.2, 99.2, 10.0)
+    """
+    return max(due, began) + cpu_s / cores if cores > 0.0 else began
 
 
 def watch(cameras: list[Camera], model: str, stop: StopFlag) -> int:
@@ -64,15 +78,15 @@ def main(arguments: list[str] | None = None) -> int:
     """Entry point: 0 after a stop signal."""
     parser = argparse.ArgumentParser(prog="python -m zsched.lab.paper.cameras")
     parser.add_argument("--streams", type=int, default=1)
-    parser.add_argument("--hz", type=float, default=0.0, help="frames per second and stream, 0: as many as possible")
-    parser.add_argument("--side", type=int, default=320, help="frame side in pixels (a multiple of 32)")
+    parser.add_argument("--cores", type=float, default=0.0, help="CPU that each stream takes, 0: all that it can get")
+    parser.add_argument("--side", type=int, default=640, help="frame side in pixels (a multiple of 32)")
     given = parser.parse_args(arguments)
-    if given.streams < 1 or given.hz < 0 or given.side < 32 or given.side % 32:
-        parser.error("--streams must be >= 1, --hz >= 0 and --side a multiple of 32")
+    if given.streams < 1 or given.cores < 0 or given.side < 32 or given.side % 32:
+        parser.error("--streams must be >= 1, --cores >= 0 and --side a multiple of 32")
     stop = StopFlag()
     stop.install()
     network = load_network(threads=1)
-    cameras = [Camera(network, given.hz, given.side, stop) for _ in range(given.streams)]
+    cameras = [Camera(network, given.cores, given.side, stop) for _ in range(given.streams)]
     for camera in cameras:
         camera.start()
     total = watch(cameras, network.name, stop)

@@ -73,13 +73,14 @@ class Loads:
         self,
         windows: tuple[Window, ...],
         level: LoadLevel,
+        full_cores: float,
         children: Children,
         limits: NodeLimits,
         records: Path,
         tell: Tell,
     ) -> None:
         self._waiting = list(windows)
-        self._level = level
+        self._level, self._full_cores = level, full_cores
         self._children, self._limits = children, limits
         self._records, self._tell = records, tell
         self._running: dict[NodeId, tuple[Window, Child, float]] = {}
@@ -121,7 +122,7 @@ class Loads:
         name = f"load-{len(self._past) + len(self._running) + 1}-{window.node}"
         level = self._level
         command = [sys.executable, "-m", "zsched.lab.paper.cameras", "--streams", str(level.streams)]
-        command += ["--hz", f"{level.hz:g}", "--side", str(level.side)]
+        command += ["--cores", f"{level.share * self._full_cores:g}", "--side", str(level.side)]
         child = self._children.start(name, command, output=self._records / f"{name}.ndjson")
         self._limits.put(window.node, child.process.pid)
         self._running[window.node] = (window, child, t_s)

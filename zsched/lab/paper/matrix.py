@@ -2,9 +2,9 @@
 
 Knows: which cells there are, which are done, what makes a run invalid. Does not know: how a run is made or reported.
 
-A cell is done when its ``metrics.json`` is there. Cells are ordered by run, then scheme: whatever is done when somebody
-stops is balanced over the schemes. A run whose host was short of CPU, or one of whose processes failed, is moved aside
-(``NAME.invalid-N``) and repeated, at most `ATTEMPTS` times in all; what stays invalid is told, not counted.
+A cell is done when its ``metrics.json`` is there. A run whose host was short of CPU, or one of whose processes failed,
+is moved aside (``NAME.invalid-N``) and repeated, at most `ATTEMPTS` times in all; what stays invalid is told, not
+counted. A run that was cut (a signal, a kill) is moved aside (``NAME.interrupted-N``) and made again.
 """
 
 from __future__ import annotations
@@ -12,15 +12,16 @@ from __future__ import annotations
 import json
 import statistics
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from zsched.lab.children import ChildError
-from zsched.lab.paper.run import Cell, write_json
+from zsched.lab.paper.cells import Cell
+from zsched.lab.paper.plan import clock
+from zsched.lab.paper.run import write_json
 from zsched.lab.paper.scenario import Scenario
-from zsched.lab.paper.schemes import Family, Scheme, find_schemes
 
 ATTEMPTS = 3
 IDLE_FLOOR = 0.05
@@ -32,35 +33,8 @@ Say = Callable[[str], None]
 Json = dict[str, Any]
 Make = Callable[[Cell, Path], Json]
 """Makes a run in a folder (`CellRun`); raises `ChildError` when it failed."""
-Measure = Callable[[Path], tuple[Json, str]]
-"""The figures of a finished run's folder, and the same in a line."""
-
-
-def cells_of(scenario: Scenario, names: tuple[str, ...], runs: int | None = None) -> tuple[Cell, ...]:
-    """The matrix at the scenario's level, then the sweep over the other levels, each by run and scheme.
-
-    ``runs`` (``None``: the scenario's) bounds the runs of every scheme; with ``names`` the sweep keeps to them too.
-
-    Raises:
-        ConfigError: an unknown scheme.
-    """
-    schemes = find_schemes(names or scenario.schemes)
-    most = scenario.runs if runs is None else runs
-    cells = list(_by_run(scenario, schemes, scenario.level, most))
-    swept = [name for name in scenario.sweep.schemes if not names or name in names]
-    if swept:
-        others = [level for level in scenario.levels if level != scenario.level]
-        for run in range(min(scenario.sweep.runs, most)):
-            cells += [Cell(scheme=s, level=level, run=run) for level in others for s in find_schemes(tuple(swept))]
-    return tuple(cells)
-
-
-def _by_run(scenario: Scenario, schemes: Sequence[Scheme], level: str, most: int) -> Iterator[Cell]:
-    for run in range(most):
-        for scheme in schemes:
-            if scheme.family is Family.YARDSTICK and run >= min(scenario.yardstick_runs, most):
-                continue
-            yield Cell(scheme=scheme, level=level, run=run)
+Measure = Callable[[Cell, Path], tuple[Json, str]]
+"""The figures of a finished run in its folder, and the same in a line."""
 
 
 def invalid_reason(scenario: Scenario, host: Mapping[str, float | None]) -> str | None:
@@ -91,18 +65,6 @@ class Progress:
         return f"[{self.done + 1}/{self.total}{left}] {cell.name}"
 
 
-def clock(seconds: float) -> str:
-    """A duration for people.
-
-    >>> clock(3725), clock(59)
-    ('1 h 02 min', '59 s')
-    """
-    if seconds < 60:
-        return f"{seconds:.0f} s"
-    minutes = round(seconds / 60)
-    return f"{minutes // 60} h {minutes % 60:02d} min" if minutes >= 60 else f"{minutes} min"
-
-
 class Matrix:
     """The cells of one bench in one folder. For the main thread only (see `Children`)."""
 
@@ -116,7 +78,7 @@ class Matrix:
         Raises:
             ChildError: `GIVE_UP` cells in a row stayed invalid.
         """
-        todo = [cell for cell in cells if not (self._runs / cell.name / METRICS).exists()]
+        todo = undone(self._runs.parent, cells)
         progress = Progress(total=len(todo))
         if len(todo) < len(cells):
             self._say(f"{len(cells) - len(todo)} of {len(cells)} runs are done already")
@@ -153,10 +115,15 @@ class Matrix:
             return str(error)
         reason = invalid_reason(self._scenario, run["host"])
         if reason is None:
-            figures, brief = self._measure(folder)
+            figures, brief = self._measure(cell, folder)
             write_json(folder / METRICS, figures)
             self._say("      " + brief)
         return reason
+
+
+def undone(out: Path, cells: Iterable[Cell]) -> list[Cell]:
+    """The cells that have no valid run in the folder yet."""
+    return [cell for cell in cells if not (out / "runs" / cell.name / METRICS).exists()]
 
 
 def set_aside(folder: Path, why: str) -> None:

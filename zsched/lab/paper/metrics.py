@@ -8,6 +8,7 @@ Times are seconds since the robots started. A map counts when a robot received i
 from __future__ import annotations
 
 import bisect
+import heapq
 import itertools
 import json
 import statistics
@@ -90,7 +91,7 @@ def measure(folder: Path, scenario: Scenario, truth: Truth) -> Json:
         ValueError: its records are damaged.
     """
     run: Json = json.loads((folder / "run.json").read_text(encoding="utf-8"))
-    streams = read_streams(folder / "streams.mcap", run, truth)
+    streams = read_streams(folder, run, truth)
     nodes = read_records(folder / "records" / "nodes.ndjson")
     duration_s = float(run["duration_s"])
     owners = [(max(float(move["t_s"]), 0.0), move["node"]) for move in run["allocations"]]
@@ -99,7 +100,10 @@ def measure(folder: Path, scenario: Scenario, truth: Truth) -> Json:
     is_done = len(done) == len(run["robots"]) and max(done, default=duration_s) <= duration_s
     per_edge = {node: edge_figures(node, nodes, streams, owners, duration_s) for node in run["shares"]}
     return {
-        **{key: run[key] for key in ("scheme", "family", "level", "run", "seed", "host", "mode", "input", "links")},
+        **{
+            key: run[key]
+            for key in ("scheme", "family", "block", "level", "run", "seed", "host", "mode", "input", "links")
+        },
         "nodes": per_edge,
         **over_nodes(per_edge),
         **stream_figures(streams, len(run["robots"]), duration_s),
@@ -126,14 +130,14 @@ def brief(figures: Mapping[str, Any]) -> str:
 # --- streams ---------------------------------------------------------------------------------------------------------
 
 
-def read_streams(path: Path, run: Mapping[str, Any], truth: Truth) -> Streams:
-    """The maps of a run, out of its MCAP file; only those whose payload is needed later are kept."""
+def read_streams(folder: Path, run: Mapping[str, Any], truth: Truth) -> Streams:
+    """The maps of a run, out of its MCAP files; only those whose payload is needed later are kept."""
     offset_ns = int(run["zero_wall_ns"])
     found = Streams(maps={robot: [] for robot in run["robots"]}, sent={robot: [] for robot in run["robots"]})
     known: dict[int, float] = {}
     newest: dict[NodeId, int] = {}
     instants = held_instants(float(run["duration_s"]))
-    for topic, log_ns, sent_ns, data in messages(path):
+    for topic, log_ns, sent_ns, data in messages(sorted(folder.glob("streams*.mcap"))):
         robot, _, name = topic.partition("/")
         t_s = (log_ns - offset_ns) / 1e9
         if name == "map":
@@ -173,8 +177,13 @@ def drop_unheld(found: Streams, newest: Mapping[NodeId, int]) -> None:
         del found.payloads[key]
 
 
-def messages(path: Path) -> Iterator[tuple[str, int, int, bytes]]:
-    """(topic, log time, publish time, payload) by log time."""
+def messages(paths: Iterable[Path]) -> Iterator[tuple[str, int, int, bytes]]:
+    """(topic, log time, publish time, payload) of all files by log time."""
+    return heapq.merge(*(one_files(path) for path in paths), key=lambda message: message[1])
+
+
+def one_files(path: Path) -> Iterator[tuple[str, int, int, bytes]]:
+    """The same of one file."""
     with path.open("rb") as stream:
         for _, channel, message in make_reader(stream).iter_messages():
             yield channel.topic, message.log_time, message.publish_time, message.data
@@ -303,13 +312,15 @@ def move_figures(run: Mapping[str, Any], streams: Streams, owners: Sequence[tupl
     moves = [start for start, _ in owners[1:]]
     gaps = [gap for t_s in moves if (gap := gap_around(streams, t_s)) is not None]
     counts = [count for node in run["robots"] for count in (run["streams"].get(node) or [])]
+    lost = sum(int(count.get("lost") or 0) + int(count.get("at_most_lost") or 0) for count in counts)
     return {
         "moves": len(moves),
         "wasted_moves": wasted(owners),
         "move_gap_mean_s": statistics.fmean(gaps) if gaps else None,
         "move_gap_max_s": max(gaps, default=None),
         "gap_max_s": max((gap for maps in streams.maps.values() for gap in silences(maps)), default=None),
-        "lost": sum(int(count.get("lost") or 0) + int(count.get("at_most_lost") or 0) for count in counts),
+        "lost": lost,
+        "lost_per_move": lost / len(moves) if moves else None,
         "dropped": sum(sum((count.get("drops") or {}).values()) for count in counts),
         "owners": [[round(start, 3), node] for start, node in owners],
     }

@@ -3,8 +3,8 @@
 Knows: the scenario's shares, windows and levels. Does not know: what any scheme did.
 
 The yardstick of regret: each node's utility by Eq. 1 and 2 with weights of one half each, if nothing but the schedule
-were true. An injected load takes all of the quota (unless its frames are limited) and its
-memory; every node carries its daemon and warm worker (`BASE_MB`), and the task costs the same everywhere.
+were true. An injected load takes its share of a whole edge, at most all of the node's quota, and its memory; every node
+carries its daemon and warm worker (`BASE_MB`), and the task costs the same everywhere.
 """
 
 from __future__ import annotations
@@ -19,16 +19,13 @@ from zsched.lab.paper.scenario import LoadLevel, NodeShare, Scenario
 BASE_MB = 110.0
 """Daemon, relay and merging worker of an edge together (measured: 65 MiB idle, 150 MiB as the owner)."""
 TASK_CORES = 0.15
-FRAME_CORES_S = 0.013
-"""CPU seconds of one frame of 320 x 320 on one thread; larger frames cost by their area."""
 WORTH = 0.02
 """A window's best node must be better by this than the one before: the oracle does not move for nothing."""
 
 
-def utility(share: NodeShare, level: LoadLevel, *, is_loaded: bool) -> float:
-    """How good a node is, in [0, 1], by Eq. 1 and 2 with what the schedule says."""
-    frame = FRAME_CORES_S * (level.side / 320) ** 2
-    wanted = share.cpu_cores if level.hz <= 0 else min(level.streams * level.hz * frame, share.cpu_cores)
+def utility(share: NodeShare, level: LoadLevel, full_cores: float, *, is_loaded: bool) -> float:
+    """How good a node is, in [0, 1], by Eq. 1 and 2 with what the schedule says; ``full_cores``: a whole edge."""
+    wanted = level.streams * level.share * full_cores if level.share > 0 else share.cpu_cores
     cpu = clamp((share.cpu_cores - TASK_CORES - (wanted if is_loaded else 0.0)) / share.cpu_cores)
     used_mb = BASE_MB + share.ballast_mb + (level.memory_mb if is_loaded else 0.0)
     return 0.5 * cpu + 0.5 * clamp((share.memory_mb - used_mb) / share.memory_mb)
@@ -37,7 +34,8 @@ def utility(share: NodeShare, level: LoadLevel, *, is_loaded: bool) -> float:
 def utilities(scenario: Scenario, level: LoadLevel, loaded: Iterable[NodeId]) -> Mapping[NodeId, float]:
     """Every node's `utility` with these loaded."""
     busy = frozenset(loaded)
-    return {node: utility(share, level, is_loaded=node in busy) for node, share in sorted(scenario.nodes.items())}
+    full = scenario.full_cores
+    return {node: utility(share, level, full, is_loaded=node in busy) for node, share in sorted(scenario.nodes.items())}
 
 
 def changes(windows: Iterable[Window], duration_s: float) -> list[float]:

@@ -16,10 +16,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from zsched.lab.paper.cells import Cell
 from zsched.lab.paper.figures import save_radio
 from zsched.lab.paper.matrix import Matrix, Say, collect
 from zsched.lab.paper.metrics import wasted
-from zsched.lab.paper.run import Cell, CellRun, Inputs
+from zsched.lab.paper.run import CellRun, Inputs
 from zsched.lab.paper.scenario import Scenario
 from zsched.lab.paper.schemes import NETWORK, SCHEMES
 from zsched.lab.recorder import read_records
@@ -41,7 +42,8 @@ def run_radio(scenario: Scenario, inputs: Inputs, out: Path, say: Say) -> dict[s
     """Run the robots; returns the figures, the picture is beside them. ``None``: no run is valid."""
     cells, folder = radio_cells(scenario), out / "radio"
 
-    def figures_of(run: Path) -> tuple[dict[str, Any], str]:
+    def figures_of(cell: Cell, run: Path) -> tuple[dict[str, Any], str]:
+        del cell
         figures = radio_figures(run)
         return figures, f"{figures['moves']} moves, owner at {figures['mean_dbm']:.1f} dBm"
 

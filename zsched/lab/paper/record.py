@@ -9,6 +9,7 @@ is its header's stamp, the log time that of its arrival.
 **Pressure.** /proc/pressure/cpu also counts processes that stand still because of their own quota: one loop under a
 quota of 0.2 cores shows 0.8 on an idle machine. So everything outside the nodes' quotas is put into a control group of
 the unified hierarchy, and that group's own pressure counts: the share of time in which some of it waited for a CPU.
+It stands for other machines, which no edge slows down: where the nodes want a CPU, too, it goes first (`PRECEDENCE`).
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import os
 import queue
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
@@ -34,6 +35,8 @@ from zsched.lab.application import connect
 from zsched.lab.signals import StopFlag
 from zsched.tasks.map_merge.cdr import CdrError, decode_grid
 
+PRECEDENCE = 10
+"""How much more of a contended CPU goes to what has no quota than to a node."""
 STREAMS = ("map", "global_map", "map_merge/status")
 OCCUPANCY_GRID = """std_msgs/Header header
 nav_msgs/MapMetaData info
@@ -110,6 +113,9 @@ class HostGauge:
     """The pressure on everything that has no quota, and how idle the machine was."""
 
     folder: Path | None
+    """The group whose pressure is read."""
+    first: Path | None = None
+    """The group that goes first, where CPUs are shared out in another hierarchy."""
     _start_us: int | None = None
     _start_s: float = 0.0
     _start_ticks: tuple[int, int] = field(default=(0, 0))
@@ -117,22 +123,28 @@ class HostGauge:
     @classmethod
     def create(cls, name: str) -> HostGauge:
         """A group for what has no quota; without one (no unified hierarchy, not allowed) there is no pressure."""
-        folders = CgroupTree().folders("")
-        if not folders:
-            return cls(None)
-        folder = folders[0] / name
-        with contextlib.suppress(OSError):
-            folder.mkdir()
-            if (folder / "cpu.pressure").exists():
-                return cls(folder)
-            folder.rmdir()
-        return cls(None)
+        tree = CgroupTree()
+        folders, cpu_folders = tree.folders(""), () if tree.is_v2("cpu") else tree.folders("cpu")
+        folder = made_group(folders, name, "cpu.pressure")
+        first = made_group(cpu_folders, name, "cpu.shares")
+        for group, file, value in ((folder, "cpu.weight", 100 * PRECEDENCE), (first, "cpu.shares", 1024 * PRECEDENCE)):
+            with contextlib.suppress(OSError):
+                if group is not None and (group / file).exists():
+                    (group / file).write_text(str(value), encoding="ascii")
+        return cls(folder, first)
 
     def add(self, pid: int) -> None:
         """Count this process, with what it starts later; one that has ended does not count."""
-        if self.folder is not None:
+        for group in (self.folder, self.first):
             with contextlib.suppress(OSError):
-                (self.folder / "cgroup.procs").write_text(str(pid), encoding="ascii")
+                if group is not None:
+                    (group / "cgroup.procs").write_text(str(pid), encoding="ascii")
+
+    def remove(self) -> None:
+        """Remove the groups, once nothing is inside (in a run the janitor does it)."""
+        for group in (self.folder, self.first):
+            if group is not None:
+                group.rmdir()
 
     def start(self) -> None:
         """From now on."""
@@ -154,6 +166,19 @@ class HostGauge:
             return parse_pressure((self.folder / "cpu.pressure").read_text(encoding="ascii"))
         except (OSError, ValueError):
             return None
+
+
+def made_group(parents: Sequence[Path], name: str, file: str) -> Path | None:
+    """A new group below the first of ``parents``; ``None`` where it may not be made, or has no such file."""
+    if not parents:
+        return None
+    folder = parents[0] / name
+    with contextlib.suppress(OSError):
+        folder.mkdir()
+        if (folder / file).exists():
+            return folder
+        folder.rmdir()
+    return None
 
 
 def parse_pressure(text: str) -> int:

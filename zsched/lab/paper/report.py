@@ -1,6 +1,7 @@
-"""Writes report.md: every claim beside our figure, all schemes, the sweep over load, and under which conditions.
+"""Writes report.md: every claim beside our figure, all schemes, the sweep over load, the blocks, what was run and how.
 
-Knows: Markdown, which figure stands where. Does not know: how a figure or a verdict comes about.
+Knows: Markdown, which figure stands where, what the README shows of it. Does not know: how a figure or a verdict comes
+about.
 """
 
 from __future__ import annotations
@@ -9,7 +10,8 @@ import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from zsched.lab.paper.claims import LEAST_RUNS, better_than_ours, judged
+from zsched.lab.paper.claims import LEAST_RUNS, Verdict, better_than_ours, judged
+from zsched.lab.paper.scenario import MATRIX
 from zsched.lab.paper.schemes import SCHEMES
 
 Json = Mapping[str, Any]
@@ -29,12 +31,13 @@ COLUMNS = (
     ("held_ssim_rebased", "SSIM held", 3),
     ("wall_f1", "wall F1", 3),
     ("coverage", "coverage", 3),
-    ("ssim_crop", "plain SSIM", 3),
     ("moves", "moves", 1),
     ("wasted_moves", "wasted", 1),
     ("move_gap_mean_s", "gap s", 2),
-    ("lost", "lost", 1),
+    ("move_gap_max_s", "max gap s", 2),
+    ("lost_per_move", "lost/move", 1),
     ("regret", "regret", 3),
+    ("ssim_crop", "<sub>plain SSIM</sub>", 3),
 )
 
 
@@ -43,12 +46,12 @@ COLUMNS = (
 
 def report(results: Json, pictures: Sequence[str]) -> str:
     """The whole report."""
-    scenario, runs = results["scenario"], results["runs"]
+    scenario, runs = results["scenario"], in_block(results["runs"], MATRIX)
     main = [figures for figures in runs if figures["level"] == scenario["level"]]
     parts = [
         "# The paper's evaluation, by zsched\n",
         headline(results),
-        "Definitions of every figure: [docs/evaluation/README.md](README.md). Intervals: 95 %, paired bootstrap.\n",
+        "Definitions of every figure: [docs/evaluation/README.md](README.md). Intervals: 95 %, paired, Student's t.\n",
         "## The claims\n",
         claims_text(main),
         "## No scheme of the paper better than ours?\n",
@@ -57,6 +60,7 @@ def report(results: Json, pictures: Sequence[str]) -> str:
         schemes_text(main),
         "## Strength of the injected load\n",
         sweep_text(runs, scenario),
+        *blocks_parts(results),
         "## What was run\n",
         conditions_text(results),
     ]
@@ -64,6 +68,11 @@ def report(results: Json, pictures: Sequence[str]) -> str:
     if results.get("radio"):
         parts += ["## Robot to robot\n", radio_text(results["radio"])]
     return "\n".join(parts)
+
+
+def in_block(runs: Sequence[Json], block: str) -> list[Json]:
+    """The runs of one block."""
+    return [figures for figures in runs if figures.get("block", MATRIX) == block]
 
 
 def headline(results: Json) -> str:
@@ -76,10 +85,14 @@ def headline(results: Json) -> str:
 
 def claims_text(runs: Sequence[Json]) -> str:
     """Each claim beside our figure."""
-    lines = ["| from | claim | found | runs | verdict |", "| --- | --- | --- | --- | --- |"]
+    lines = ["| from | claim | figure | ours | against | difference | runs | verdict |", "| --- " * 8 + "|"]
     for claim, found, outcome in judged(runs):
-        text, count = ("-", "0") if found is None else (found.text(), str(found.runs))
-        lines.append(f"| {claim.source} | {claim.says} | {text} | {count} | **{outcome}** |")
+        shown = (
+            "- | - | - | 0"
+            if found is None
+            else f"{found.mine:.3g} | {found.theirs:.3g} | {found.text()} | {found.runs}"
+        )
+        lines.append(f"| {claim.source} | {claim.says} | {claim.metric} | {shown} | **{outcome}** |")
     return "\n".join(lines) + "\n"
 
 
@@ -138,6 +151,20 @@ def sweep_text(runs: Sequence[Json], scenario: Json) -> str:
     return "\n".join(lines) + "\n"
 
 
+def blocks_parts(results: Json) -> list[str]:
+    """Each block's table under its own heading, or why there is none."""
+    parts = []
+    for name, block in results["scenario"].get("blocks", {}).items():
+        rate = (block.get("links") or {}).get("bandwidth_mbit")
+        world = f"world {block['world']}" if block.get("world") else "the matrix's worlds"
+        links = "" if rate is None else f", every node sends at most {rate:g} Mbit/s"
+        why = results.get("skipped", {}).get(name)
+        own = in_block(results["runs"], name)
+        text = f"Left out: {why}.\n" if why else schemes_text(own) if own else "Not run.\n"
+        parts += [f"## Block {name}\n", f"As the matrix, but for: {world}{links}.\n", text]
+    return parts
+
+
 def conditions_text(results: Json) -> str:
     """Shares, levels, limits, and what was invalid."""
     scenario = results["scenario"]
@@ -146,7 +173,7 @@ def conditions_text(results: Json) -> str:
         for node, s in scenario["nodes"].items()
     ]
     levels = [
-        f"{name}: {v['streams']} streams, {v['hz'] or 'all'} frames/s of {v['side']} px"
+        f"{name}: {v['streams']} x {v['share'] or 'all'} of an edge, frames of {v['side']} px"
         for name, v in scenario["levels"].items()
     ]
     waits = [figures["host"]["pressure"] for figures in results["runs"] if figures["host"]["pressure"] is not None]
@@ -161,8 +188,33 @@ def conditions_text(results: Json) -> str:
         f"* Links: {', '.join(sorted({f['links'] for f in results['runs']})) or '-'} drives.",
         f"* Pressure outside the quotas: at most {scenario['pressure_limit']:g} allowed, at most {worst} seen.",
     ]
+    lines += [f"* No valid run: {name}." for name in results.get("missing", ())]
     lines += [f"* Repeated: {one['cell']}: {one['reason'].splitlines()[0]}" for one in results["invalid"]]
     return "\n".join(lines) + "\n"
+
+
+def snippet(results: Json, pictures: Sequence[str]) -> str:
+    """What the README shows: the claims with verdicts, and the picture of the map frequency."""
+    scenario = results["scenario"]
+    main = [f for f in in_block(results["runs"], MATRIX) if f["level"] == scenario["level"]]
+    outcomes = [outcome for _, _, outcome in judged(main)]
+    kept = sum(outcome in (Verdict.REPRODUCED, Verdict.EXCEEDED) for outcome in outcomes)
+    lines = [
+        (
+            f"`{results['command']}` (seed {scenario['seed']}, {len(results['runs'])} runs): "
+            f"{kept} of {len(outcomes)} claims hold."
+        ),
+        "",
+        "| claim | found, 95 % interval | verdict |",
+        "| --- | --- | --- |",
+    ]
+    for claim, found, outcome in judged(main):
+        lines.append(f"| {claim.source}: {claim.says} | {'-' if found is None else found.text()} | {outcome} |")
+    lines.append("")
+    if "frequency.png" in pictures:
+        lines += ["![Merged maps per second under each scheme](docs/evaluation/frequency.png)", ""]
+    lines.append("All figures: [docs/evaluation/report.md](docs/evaluation/report.md).\n")
+    return "\n".join(lines)
 
 
 def radio_text(radio: Json) -> str:

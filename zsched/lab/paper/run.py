@@ -3,7 +3,7 @@
 Knows: the order of a run and what is kept of it. Does not know: other runs, figures (`zsched.lab.paper.metrics`).
 
 A run's folder holds ``run.json`` (written last: what the run was), ``fleet.yaml``, ``records/*.ndjson`` (allocations,
-decisions, accounting, what each robot saw), ``streams.mcap`` and ``logs/``.
+decisions, accounting, what each robot saw), ``streams*.mcap`` and ``logs/``.
 """
 
 from __future__ import annotations
@@ -19,25 +19,27 @@ from typing import Any
 
 from ruamel.yaml import YAML
 
-from zsched.adapters.cgroup import LimitedGroup
 from zsched.adapters.operator_socket import ask
 from zsched.clock import monotonic_s
 from zsched.core.model import NodeId
-from zsched.errors import AdapterError
 from zsched.lab.children import ChildError, Children
 from zsched.lab.demo_run import worker_options
 from zsched.lab.fleet_runner import CLI, FleetRunner, LabFleet, read_tree, write_fleet
-from zsched.lab.fleet_view import Status, find_task
+from zsched.lab.fleet_view import find_task
 from zsched.lab.limits import LimitKind, NodeLimits
+from zsched.lab.netns import Network
 from zsched.lab.observer import Observer
+from zsched.lab.paper.cells import Cell, bandwidth_of
 from zsched.lab.paper.load import Loads, Window, schedule
+from zsched.lab.paper.node_state import is_calm, node_limits, own_links, ready_workers, task_streams
 from zsched.lab.paper.oracle import best_nodes
 from zsched.lab.paper.radio import drive_file
 from zsched.lab.paper.record import HostGauge, NodeMeter
 from zsched.lab.paper.robots import Place, Robots
 from zsched.lab.paper.rules import RulePlan
 from zsched.lab.paper.scenario import LinkView, Scenario
-from zsched.lab.paper.schemes import Scheme, scheme_tree
+from zsched.lab.paper.schemes import scheme_tree
+from zsched.lab.paper.spaces import NodeChildren, narrow_links, spaced
 from zsched.lab.recorder import Follower, Recorder
 
 TICK_S = 0.1
@@ -47,26 +49,11 @@ OWNED_S = 40.0
 RECORDER_S = 20.0
 CALM_S = 8.0
 """So long at most the robots wait for the start-up's CPU to fade from the nodes' smoothed figures."""
-CALM_RATIO = 0.3
 SETTLE_S = 2.0
 """After the robots' drive: their last maps are merged and come back."""
 RUN_SCHEMA = "zsched.paper.run/1"
 
 Tree = dict[str, Any]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Cell:
-    """One run to be made."""
-
-    scheme: Scheme
-    level: str
-    run: int
-
-    @property
-    def name(self) -> str:
-        """Its folder's name."""
-        return f"{self.level}-{self.scheme.name}-{self.run + 1}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -112,6 +99,7 @@ class CellRun:
         self._recorder = Recorder(self._records)
         self._plan_path = folder / "plan.json"
         self._seed = scenario.run_seed(cell.run)
+        self._bandwidth_mbit = bandwidth_of(scenario, cell)
         self.left_behind: list[str] = []
         """What could not be removed when the run had ended."""
         self._windows: tuple[Window, ...] = ()
@@ -126,8 +114,13 @@ class CellRun:
         Raises:
             ChildError: a process of the run failed, or the fleet did not come up.
         """
-        with self._recorder, Children(self._folder / "logs") as children:
-            parts = self._build(children)
+        nodes, logs = sorted(read_tree(self._scenario.fleet)["nodes"]), self._folder / "logs"
+        with (
+            self._recorder,
+            narrow_links(nodes, self._bandwidth_mbit) as network,
+            NodeChildren(logs, network, nodes) as children,
+        ):
+            parts = self._build(children, network)
             try:
                 body = self._play(children, parts)
             finally:
@@ -135,17 +128,19 @@ class CellRun:
         self.left_behind = children.left_behind
         return body
 
-    def _build(self, children: Children) -> _Parts:
+    def _build(self, children: Children, network: Network | None) -> _Parts:
         runtime = Path(tempfile.gettempdir()) / f"zsched-{children.token}"
         children.janitor.remove(runtime)
         runtime.mkdir(mode=0o700)
         fleet = self.write_fleet()
+        fleet = fleet if network is None else spaced(fleet, network)
         shares = {node: share for node, share in self._scenario.nodes.items() if node in fleet.kinds}
         limits = node_limits(f"zsched-{children.token}", self._scenario, fleet)
         candidates = sorted(shares)
         self._windows = schedule(self._scenario.load, candidates, self._scenario.duration_s, self._seed)
         level = self._scenario.levels[self._cell.level]
-        loads = Loads(self._windows, level, children, limits, self._records, self._tell)
+        full = self._scenario.full_cores
+        loads = Loads(self._windows, level, full, children, limits, self._records, self._tell)
         runner = FleetRunner(fleet, children, runtime, limits, self._cli())
         return _Parts(
             fleet=fleet,
@@ -252,10 +247,15 @@ class CellRun:
             time.sleep(TICK_S)
 
     def _record_streams(self, children: Children, parts: _Parts) -> None:
-        command = [sys.executable, "-m", "zsched.lab.paper.record", "--out", str(self._folder / "streams.mcap")]
-        for robot in parts.fleet.robots:
-            command += ["--robot", f"{robot}={parts.fleet.data_endpoints[robot]}"]
-        parts.gauge.add(children.start("record", command).process.pid)
+        """One recorder for all robots, or behind narrow links one beside each: its copies must not pass the link."""
+        robots = parts.fleet.robots
+        groups = {"": robots} if self._bandwidth_mbit is None else {f"-{robot}": (robot,) for robot in robots}
+        for suffix, heard in groups.items():
+            command = [sys.executable, "-m", "zsched.lab.paper.record"]
+            command += ["--out", str(self._folder / f"streams{suffix}.mcap")]
+            for robot in heard:
+                command += ["--robot", f"{robot}={parts.fleet.data_endpoints[robot]}"]
+            parts.gauge.add(children.start(f"record{suffix}", command).process.pid)
 
     def _start(self, children: Children, parts: _Parts) -> None:
         """The robots drive; from here all times count."""
@@ -289,7 +289,7 @@ class CellRun:
         for node, status in parts.observer.statuses().items():
             task = find_task(status, parts.fleet.task) or {}
             said = {"owner": task.get("owner"), "epoch": task.get("epoch"), "decision": task.get("decision")}
-            said |= {"vote": task.get("vote"), "links": _links(status, node)}
+            said |= {"vote": task.get("vote"), "links": own_links(status, node)}
             if node in parts.fleet.robots and said != self._decided.get(node):
                 self._decided[node] = said
                 self._recorder.write("decisions", {"kind": "decision", "t_s": now, "node": node, **said})
@@ -298,7 +298,7 @@ class CellRun:
         host = parts.gauge.result()
         parts.loads.stop(monotonic_s() - self._zero_s)
         allocations = [asdict(move) | {"t_s": move.t_s - self._zero_s} for move in parts.observer.moves()]
-        streams = {node: _streams(status, parts.fleet.task) for node, status in parts.observer.statuses().items()}
+        streams = {node: task_streams(status, parts.fleet.task) for node, status in parts.observer.statuses().items()}
         apps = [*children.running("app-"), *children.running("record"), *children.running("helper-")]
         children.stop(*apps, grace_s=RECORDER_S)
         children.stop(*children.running("daemon-"))
@@ -307,6 +307,8 @@ class CellRun:
             "scenario": self._scenario.name,
             "scheme": self._cell.scheme.name,
             "family": self._cell.scheme.family.value,
+            "block": self._cell.block,
+            "bandwidth_mbit": self._bandwidth_mbit,
             "level": self._cell.level,
             "run": self._cell.run,
             "seed": self._seed,
@@ -330,59 +332,6 @@ class CellRun:
 
     def _tell(self, t_s: float, text: str) -> None:
         self._recorder.write("events", {"kind": "event", "t_s": t_s, "text": text})
-
-
-def node_limits(prefix: str, scenario: Scenario, fleet: LabFleet) -> NodeLimits:
-    """A control group with quota and memory limit for each node that has a share in the scenario.
-
-    Raises:
-        AdapterError: this user may not make them; without them the nodes would not differ, and nothing be shown.
-    """
-    groups: dict[NodeId, LimitedGroup] = {}
-    says = []
-    try:
-        for node, share in scenario.nodes.items():
-            if node not in fleet.kinds:
-                continue
-            name = f"{prefix}-{node}"
-            groups[node] = LimitedGroup.create(name, cpu_cores=share.cpu_cores, memory_mb=share.memory_mb)
-            says.append(f"{node} {share.cpu_cores:g} cores, {share.memory_mb:.0f} MiB")
-    except AdapterError:
-        for group in groups.values():
-            group.remove()
-        raise
-    if not groups:
-        return NodeLimits(LimitKind.NONE, "no node has a share of its own")
-    return NodeLimits(LimitKind.CGROUP, "control groups: " + "; ".join(says), groups=groups)
-
-
-def ready_workers(status: Status, task: str) -> set[NodeId]:
-    """The nodes whose worker for ``task`` is ready, by one snapshot."""
-    return {
-        str(node["name"])
-        for node in status.get("nodes") or ()
-        for worker in node.get("workers") or ()
-        if worker.get("task") == task and worker.get("state") == "ready"
-    }
-
-
-def is_calm(statuses: Mapping[NodeId, Status], nodes: tuple[NodeId, ...]) -> bool:
-    """Whether every one of ``nodes`` says of itself that it is idle."""
-    for node in nodes:
-        own = next((part for part in (statuses.get(node) or {}).get("nodes") or () if part.get("name") == node), None)
-        ratio = None if own is None else own.get("cpu_ratio")
-        if ratio is None or ratio > CALM_RATIO:
-            return False
-    return True
-
-
-def _links(status: Status, node: NodeId) -> object:
-    own: Status = next((part for part in status.get("nodes") or () if part.get("name") == node), {})
-    return [link.get("rssi_dbm") for link in own.get("links") or () if link.get("peer") is None]
-
-
-def _streams(status: Status, task: str) -> object:
-    return (find_task(status, task) or {}).get("streams")
 
 
 def write_json(path: Path, body: Mapping[str, Any]) -> None:

@@ -18,6 +18,8 @@ from ruamel.yaml import YAML
 from zsched.core.model import NodeId, check_range
 from zsched.errors import ConfigError
 
+MATRIX = "matrix"
+"""The block of the scenario itself: all schemes at its level, and the sweep over the others."""
 MAX_CORES = 1.5
 """The nodes' quotas together, so that robots, daemons and the lab itself find CPU on a machine with two cores."""
 
@@ -38,19 +40,21 @@ class NodeShare:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoadLevel:
-    """How strong one injected load is: so many camera ``streams``, each of ``hz`` frames a second (0: all it can get).
+    """How strong one injected load is: so many models (camera ``streams``), each taking ``share`` of an edge's CPU.
 
-    ``side`` is the frame's side in pixels (a multiple of 32); ``memory_mb`` what such a process takes, for the oracle.
+    ``share`` is of the largest quota among the nodes (0: all that it can get), so a weak edge is filled by what a
+    strong one bears. ``side`` is the frame's side in pixels (a multiple of 32); ``memory_mb`` what such a process
+    takes, for the oracle.
     """
 
     streams: int = 1
-    hz: float = 0.0
-    side: int = 320
-    memory_mb: float = 150.0
+    share: float = 0.6
+    side: int = 640
+    memory_mb: float = 226.0
 
     def __post_init__(self) -> None:
         check_range("streams", self.streams, 1, 64)
-        check_range("hz", self.hz, 0.0, 1000.0)
+        check_range("share", self.share, 0.0, 1.0)
         check_range("side", self.side, 32, 4096)
         check_range("memory_mb", self.memory_mb, 0.0, 1e6)
 
@@ -98,9 +102,12 @@ class LinkView(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Exploration:
-    """The closed loop: ``world`` by its name, ``speed`` in m/s; the run ends at the target, or after ``duration_s``."""
+    """The closed loop: ``world`` by its name, ``speed`` in m/s; the run ends at the target, or after ``duration_s``.
 
-    world: str = "office:1"
+    ``{seed}`` in ``world`` is the run's seed: each run has a world of its own, the same for all schemes.
+    """
+
+    world: str = "office:{seed}"
     speed: float = 1.0
     duration_s: float = 50.0
     target_coverage: float = 0.8
@@ -111,6 +118,31 @@ class Exploration:
         check_range("explore.speed", self.speed, 0.01, 5.0)
         check_range("explore.duration_s", self.duration_s, 5.0, 600.0)
         check_range("explore.target_coverage", self.target_coverage, 0.01, 1.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkLimits:
+    """What every node's link carries, each way, in Mbit/s (``None``: as much as the machine); needs namespaces."""
+
+    bandwidth_mbit: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.bandwidth_mbit is not None:
+            check_range("links.bandwidth_mbit", self.bandwidth_mbit, 0.1, 1e5)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Block:
+    """Rows of their own beside the matrix: these schemes, so many runs, in another world or over narrow links."""
+
+    schemes: tuple[str, ...] = ()
+    runs: int = 2
+    world: str | None = None
+    """``None``: the scenario's."""
+    links: LinkLimits = LinkLimits()
+
+    def __post_init__(self) -> None:
+        check_range("runs", self.runs, 1, 1000)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -146,6 +178,7 @@ class Scenario:
     yardstick_runs: int = 3
     sweep: Sweep = Sweep()
     explore: Exploration = Exploration()
+    blocks: Mapping[str, Block] = field(default_factory=dict)
     nodes: Mapping[NodeId, NodeShare] = field(default_factory=dict)
     load: LoadPlan = LoadPlan()
     links: Mapping[NodeId, Radio] = field(default_factory=dict)
@@ -167,6 +200,14 @@ class Scenario:
             raise ValueError(f"nodes: quotas of {total:g} cores in all, at most {MAX_CORES:g}")
         if self.level not in self.levels:
             raise ValueError(f"level: {self.level!r} is none of {', '.join(self.levels)}")
+        doubled = sorted(({*self.levels, MATRIX}) & self.blocks.keys())
+        if doubled:
+            raise ValueError(f"blocks: {', '.join(doubled)} is taken; choose another name")
+
+    @property
+    def full_cores(self) -> float:
+        """The quota of the strongest node: a whole edge; 0 without nodes."""
+        return max((share.cpu_cores for share in self.nodes.values()), default=0.0)
 
     def run_seed(self, run: int) -> int:
         """The seed of run ``run``: the same for every scheme and level."""
@@ -198,10 +239,15 @@ def _scenario(path: Path, tree: dict[str, Any]) -> Scenario:
     links = {str(name): Radio(**spec) for name, spec in dict(tree.pop("links", None) or {}).items()}
     load, sweep = LoadPlan(**_tuples(tree.pop("load", {}))), Sweep(**_tuples(tree.pop("sweep", {})))
     view = LinkView(tree.pop("link_view", LinkView.ACCESS_POINT))
+    rows = {str(name): _block(dict(spec)) for name, spec in dict(tree.pop("blocks", None) or {}).items()}
     explore = Exploration(**dict(tree.pop("explore", None) or {}))
     known = {str(name): value for name, value in _tuples(tree).items()}
-    blocks: dict[str, Any] = {"levels": levels, "nodes": nodes, "links": links, "link_view": view}
+    blocks: dict[str, Any] = {"levels": levels, "nodes": nodes, "links": links, "link_view": view, "blocks": rows}
     return Scenario(fleet=fleet, load=load, sweep=sweep, explore=explore, **blocks, **known)
+
+
+def _block(spec: dict[str, Any]) -> Block:
+    return Block(links=LinkLimits(**dict(spec.pop("links", None) or {})), **_tuples(spec))
 
 
 def _tuples(tree: Any) -> dict[str, Any]:

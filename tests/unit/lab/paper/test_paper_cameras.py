@@ -9,10 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from zsched.lab.paper.cameras import main
+from zsched.lab.neural_load import Network
+from zsched.lab.paper.cameras import Camera, main
+from zsched.lab.signals import StopFlag
 
 
-@pytest.mark.parametrize("wrong", [["--streams", "0"], ["--side", "100"], ["--hz", "-1"]])
+@pytest.mark.parametrize("wrong", [["--streams", "0"], ["--side", "100"], ["--cores", "-1"]])
 def test_wrong_options_exit_2(wrong: list[str]) -> None:
     with pytest.raises(SystemExit) as caught:
         main(wrong)
@@ -22,7 +24,17 @@ def test_wrong_options_exit_2(wrong: list[str]) -> None:
 def test_streams_run_side_by_side_and_end_on_sigterm(tmp_path: Path) -> None:
     output = tmp_path / "out"
     with output.open("wb") as file:
-        command = [sys.executable, "-m", "zsched.lab.paper.cameras", "--streams", "3", "--hz", "5", "--side", "32"]
+        command = [
+            sys.executable,
+            "-m",
+            "zsched.lab.paper.cameras",
+            "--streams",
+            "3",
+            "--cores",
+            "0.05",
+            "--side",
+            "32",
+        ]
         process = subprocess.Popen(command, stdout=file, stderr=subprocess.DEVNULL)
     try:
         deadline = time.monotonic() + 40.0
@@ -38,4 +50,27 @@ def test_streams_run_side_by_side_and_end_on_sigterm(tmp_path: Path) -> None:
     assert threads >= 4
     assert lines[-1]["streams"] == 3
     assert 0 < lines[0]["frames"] < lines[-1]["frames"]
-    assert lines[-1]["fps"] <= 3 * 5 * 1.5
+
+
+def test_streams_take_the_cpu_that_they_are_given() -> None:
+    stop, network = StopFlag(), Network(name="busy", infer=lambda _: burn(0.02))
+    cameras = [Camera(network, 0.1, 32, stop) for _ in range(2)]
+    began, before = time.monotonic(), time.process_time()
+    for camera in cameras:
+        camera.start()
+    deadline = began + 30.0
+    while min(camera.frames for camera in cameras) < 6 and time.monotonic() < deadline:
+        time.sleep(0.05)
+    stop.is_set = True
+    for camera in cameras:
+        camera.join(5.0)
+    used = (time.process_time() - before) / (time.monotonic() - began)
+
+    assert min(camera.frames for camera in cameras) >= 6
+    assert used < 2 * 0.1 * 1.5  # both together; less on a machine that is short of CPU
+
+
+def burn(cpu_s: float) -> None:
+    until = time.thread_time() + cpu_s
+    while time.thread_time() < until:
+        pass

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytest
@@ -17,7 +18,7 @@ from zsched.lab.paper.claims import (
     verdict,
 )
 from zsched.lab.paper.figures import save_all, save_radio
-from zsched.lab.paper.report import report
+from zsched.lab.paper.report import report, snippet
 from zsched.lab.paper.schemes import FIXED_SCHEMES, PAPER_SCHEMES, SCHEMES
 
 HIGHER = Claim(source="paper", says="x", metric="map_hz", mine=("a",), theirs=("b",), target=0.2)
@@ -28,11 +29,11 @@ FIGURES = {
     "cpu_peak": 0.9, "cpu_mean": 0.5, "memory_mean": 0.4, "memory_peak": 0.6,
     "cpu_mean_spread": 0.4, "memory_mean_spread": 0.2,
     "ssim_rebased": 0.3, "held_ssim_rebased": 0.1, "wall_f1": 0.9, "coverage": 0.95, "ssim_crop": 0.8,
-    "moves": 2, "wasted_moves": 0, "move_gap_mean_s": 0.4, "lost": 0, "regret": 0.1,
+    "moves": 2, "wasted_moves": 0, "move_gap_mean_s": 0.4, "move_gap_max_s": 0.6, "lost_per_move": 0.5, "regret": 0.1,
 }  # fmt: skip
 
 
-def a_run(scheme: str, run: int, level: str = "eight", **changed: Any) -> dict[str, Any]:
+def a_run(scheme: str, run: int, level: str = "one", **changed: Any) -> dict[str, Any]:
     node = {"cpu_peak": 0.9, "memory_mean": 0.4, "throughput_mb_s": 3.0}
     host = {"pressure": 0.05, "idle_ratio": 0.4}
     nodes = {"edge1": node, "edge2": node | {"cpu_peak": None}}
@@ -60,6 +61,20 @@ def test_the_difference_is_paired_and_its_interval_holds_the_mean() -> None:
     assert found.text() == "+30 % [+30 %, +30 %]"
 
 
+def test_the_interval_by_hand() -> None:
+    # Means 3 and 2, ratio 1.5; residuals 0, 1, -1 with s = 1; t(2) = 4.303: 4.303 * 1 / sqrt(3) / 2 = 1.2422.
+    found = difference({0: 3.0, 1: 4.0, 2: 2.0}, dict.fromkeys(range(3), 2.0))
+
+    assert found is not None
+    assert (found.mine, found.theirs, found.value) == pytest.approx((3.0, 2.0, 0.5))
+    assert (found.low, found.high) == pytest.approx((0.5 - 1.2422, 0.5 + 1.2422), abs=1e-4)
+    # Pairs cancel what they share: mine = theirs + 1 is no noise but a little of the ratio's.
+    paired = difference({0: 2.0, 1: 3.0, 2: 4.0}, {0: 1.0, 1: 2.0, 2: 3.0})
+    assert paired is not None
+    # Ratio 1.5; residuals 0.5, 0, -0.5 with s = 0.5; 4.303 * 0.5 / sqrt(3) / 2 = 0.6211.
+    assert (paired.value, paired.high - paired.value) == pytest.approx((0.5, 0.6211), abs=1e-4)
+
+
 def test_noise_widens_the_interval() -> None:
     found = difference({0: 1.0, 1: 3.0, 2: 1.0, 3: 3.0}, dict.fromkeys(range(4), 2.0))
 
@@ -67,6 +82,9 @@ def test_noise_widens_the_interval() -> None:
     assert found.low < 0.0 < found.high
     assert difference({}, {0: 1.0}) is None
     assert difference({0: 1.0}, {0: 0.0}) is None
+    single = difference({0: 2.0}, {0: 1.0})
+    assert single is not None
+    assert single.high == math.inf  # of one run nothing is known
     assert relative([-1.0], [-2.0]) == pytest.approx(0.5)  # better, though both are under nothing
 
 
@@ -109,14 +127,19 @@ def test_claims_are_judged_by_the_schemes_they_speak_of() -> None:
 
 def test_the_report_holds_every_claim_scheme_level_and_picture(tmp_path: Any) -> None:
     runs = [a_run(name, run) for name in ("fixed_e1", "zsched") for run in range(3)]
-    runs += [a_run(name, 0, level="one", map_hz=2.5) for name in ("fixed_e1", "zsched")]
+    runs += [a_run(name, 0, block="narrow", map_hz=7.5) for name in ("fixed_e1", "zsched")]
+    runs += [a_run(name, 0, level="two", map_hz=2.5) for name in ("fixed_e1", "zsched")]
     node = {"cpu_cores": 0.3, "memory_mb": 512.0, "ballast_mb": 0.0}
-    levels = {name: {"streams": 1, "hz": 0, "side": 320} for name in ("one", "eight")}
+    levels = {name: {"streams": 1, "share": 0.6, "side": 640} for name in ("one", "two")}
     scenario = {
-        "name": "paper", "seed": 1, "level": "eight", "levels": levels, "nodes": {"edge1": node}, "mode": "track",
+        "name": "paper", "seed": 1, "level": "one", "levels": levels, "nodes": {"edge1": node}, "mode": "track",
         "rate_hz": 4.0, "target_coverage": 0.8, "pressure_limit": 0.2,
+        "blocks": {
+            "narrow": {"world": None, "links": {"bandwidth_mbit": 9.8}},
+            "gone": {"world": "turtlebot3", "links": {"bandwidth_mbit": None}},
+        },
     }  # fmt: skip
-    invalid = [{"cell": "eight-zsched-1", "reason": "pressure 0.50\nmore"}]
+    invalid = [{"cell": "one-zsched-1", "reason": "pressure 0.50\nmore"}]
     row = {"moves": 3, "wasted_moves": 0, "mean_dbm": -55.0, "under_best_db": 1.2, "below_70_ratio": 0.0}
     radio = {
         "links": "simulated", "duration_s": 60.0, "best_dbm": -53.8, "best_fixed_dbm": -57.0,
@@ -124,9 +147,9 @@ def test_the_report_holds_every_claim_scheme_level_and_picture(tmp_path: Any) ->
     }  # fmt: skip
     results = {
         "scenario": scenario, "runs": runs, "invalid": invalid, "command": "zsched bench paper", "input": "log x",
-        "version": "1", "radio": radio,
+        "version": "1", "radio": radio, "missing": ["one-random-3"], "skipped": {"gone": "no exploring robots"},
     }  # fmt: skip
-    pictures = save_all(runs, "eight", ("one", "eight"), tmp_path, "title")
+    pictures = save_all(runs, "one", ("one", "two"), tmp_path, "title")
     pictures.append(
         save_radio(
             tmp_path / "radio.png", {"robot1": [(0.0, -50.0), (5.0, -60.0)]}, {"zsched": [(0.0, "robot1")]}, 60.0
@@ -136,9 +159,18 @@ def test_the_report_holds_every_claim_scheme_level_and_picture(tmp_path: Any) ->
     text = report(results, pictures)
 
     assert all(claim.says in text for claim in CLAIMS)
-    assert "| zsched | 3 | 2.00 |" in text
-    assert "| maps/s | zsched | 2.50 | 2.00 |" in text
-    assert "eight-zsched-1: pressure 0.50" in text
+    assert "| zsched | 3 | 2.00 |" in text  # the matrix's, without the block's
+    assert "| zsched | 1 | 7.50 |" in text
+    assert "every node sends at most 9.8 Mbit/s" in text
+    assert "Left out: no exploring robots." in text
+    assert "No valid run: one-random-3." in text
+    assert "<sub>plain SSIM</sub>" in text
+    shown = snippet(results, pictures)
+    assert all(claim.says in shown for claim in CLAIMS)
+    assert f"0 of {len(CLAIMS)} claims hold" in shown
+    assert "docs/evaluation/frequency.png" in shown
+    assert "| maps/s | zsched | 2.00 | 2.50 |" in text
+    assert "one-zsched-1: pressure 0.50" in text
     assert "-55.0" in text
     assert {"cpu.png", "memory.png", "throughput.png", "frequency.png", "latency.png", "ssim.png", "sweep.png"} <= set(
         pictures
@@ -146,4 +178,4 @@ def test_the_report_holds_every_claim_scheme_level_and_picture(tmp_path: Any) ->
     for name in pictures:
         assert name in text
         assert (tmp_path / name).stat().st_size > 5000
-    assert save_all([], "eight", (), tmp_path, "title") == []
+    assert save_all([], "one", (), tmp_path, "title") == []

@@ -8,25 +8,22 @@ from typing import Any
 import pytest
 
 from zsched.lab.children import ChildError
-from zsched.lab.paper.bench import BenchOptions, claim_folder, command_of, plan_body, planned
+from zsched.lab.paper.bench import BenchOptions, InputsOf, claim_folder, command_of, plan_body, planned, run_bench
+from zsched.lab.paper.cells import Cell, bandwidth_of, cells_of, world_of
 from zsched.lab.paper.matrix import (
     ATTEMPTS,
     GIVE_UP,
     METRICS,
     Matrix,
     Progress,
-    cells_of,
     collect,
     invalid_reason,
     set_aside,
 )
 from zsched.lab.paper.places import robots_scenario_path, scenario_path
-from zsched.lab.paper.robots import LogRobots
-from zsched.lab.paper.run import Cell, Inputs
-from zsched.lab.paper.scenario import Scenario, Sweep, load_scenario
+from zsched.lab.paper.plan import AROUND_S, leave_out, plan_text, without
+from zsched.lab.paper.scenario import MATRIX, LinkLimits, Scenario, Sweep, load_scenario
 from zsched.lab.paper.schemes import SCHEMES
-
-INPUTS = Inputs(robots=LogRobots(log=Path("malaga.csv")))
 
 
 @pytest.fixture
@@ -40,7 +37,7 @@ def options(out: Path, **given: Any) -> BenchOptions:
 
 def test_the_matrix_is_every_scheme_by_run_then_the_sweep(scenario: Scenario) -> None:
     cells = cells_of(scenario, ())
-    main = [cell for cell in cells if cell.level == scenario.level]
+    main = [cell for cell in cells if cell.level == scenario.level and cell.block == MATRIX]
 
     assert len({cell.name for cell in cells}) == len(cells)
     assert {cell.scheme.name for cell in main} == set(SCHEMES)
@@ -50,15 +47,71 @@ def test_the_matrix_is_every_scheme_by_run_then_the_sweep(scenario: Scenario) ->
     assert cells[: len(main)] == tuple(main)
     assert {cell.level for cell in cells} == set(scenario.levels)
     swept = len(scenario.sweep.schemes) * scenario.sweep.runs * (len(scenario.levels) - 1)
-    assert len(cells) == len(main) + swept
+    extra = sum(len(block.schemes) * block.runs for block in scenario.blocks.values())
+    assert len(cells) == len(main) + swept + extra
 
 
 def test_fewer_runs_and_schemes_by_option(scenario: Scenario) -> None:
     cells = cells_of(scenario, ("zsched", "random"), runs=1)
 
-    assert {cell.scheme.name for cell in cells if cell.level == scenario.level} == {"zsched", "random"}
-    assert {cell.scheme.name for cell in cells if cell.level != scenario.level} == {"zsched"}
+    assert {cell.scheme.name for cell in cells if cell.name.startswith("one-")} == {"zsched", "random"}
+    assert {cell.scheme.name for cell in cells if not cell.name.startswith("one-")} == {"zsched"}
     assert {cell.run for cell in cells} == {0}
+
+
+def test_each_run_has_a_world_of_its_own_the_same_for_every_scheme_and_level(scenario: Scenario) -> None:
+    cells = cells_of(scenario, ())
+    by_run: dict[int, set[str]] = {}
+    for cell in cells:
+        if cell.block != "turtlebot3":
+            by_run.setdefault(cell.run, set()).add(world_of(scenario, cell))
+
+    assert by_run == {run: {f"office:{scenario.seed + run}"} for run in range(scenario.runs)}
+    assert {world_of(scenario, cell) for cell in cells if cell.block == "turtlebot3"} == {"turtlebot3"}
+    rates = {cell.block: bandwidth_of(scenario, cell) for cell in cells}
+    assert rates == {MATRIX: None, "turtlebot3": None, "narrow": 9.8}
+
+
+def test_a_block_that_cannot_be_run_here_is_left_out_with_its_reason(scenario: Scenario) -> None:
+    asked: list[str] = []
+
+    def why_not() -> str:
+        asked.append("x")
+        return "not root"
+
+    skipped = without(scenario, is_exploring=True, why_not=why_not)
+    kept = leave_out(scenario, skipped)
+
+    assert list(skipped) == ["narrow"]
+    assert "not root" in skipped["narrow"]
+    assert {cell.block for cell in cells_of(kept, ())} == {MATRIX, "turtlebot3"}
+    assert without(scenario, is_exploring=False, why_not=lambda: None).keys() == {"turtlebot3"}
+    blocks = {name: replace(block, links=LinkLimits()) for name, block in scenario.blocks.items()}
+    assert without(replace(scenario, blocks=blocks), is_exploring=True, why_not=why_not) == {}
+    assert len(asked) == 1  # namespaces are tried only for who wants them
+
+
+def test_the_plan_tells_blocks_runs_and_time_by_hand(scenario: Scenario) -> None:
+    scenario = replace(scenario, duration_s=42.0, runs=2, schemes=("zsched", "fixed_e1"), sweep=Sweep())
+    cells = cells_of(scenario, ("zsched", "fixed_e1"))
+
+    text = plan_text(scenario, cells, cells[1:], 120.0, {"gone": "no namespaces"}, None)
+    rows = {line.split("  ")[0].strip(): line for line in text.splitlines()}
+
+    assert AROUND_S == 18.0
+    assert "  4    4 min  2 schemes, load one, office:20260 to office:20261" in rows["matrix (one)"]
+    assert "  4    4 min  2 schemes, load one, turtlebot3" in rows["turtlebot3"]
+    assert "  4    4 min" in rows["narrow"]  # 4 x (60 + 4) s = 256 s
+    assert "links of 9.8 Mbit/s" in rows["narrow"]
+    assert rows["gone"].endswith("left out: no namespaces")
+    # 11 cells of 60 s are left, four of them take 4 s more, and 120 s of radio: 796 s.
+    assert "12 runs, 1 of them done already; at most 13 min" in text
+
+
+def test_a_plan_starts_nothing_and_makes_no_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_bench(options(tmp_path / "out", is_exploring=True, is_plan=True)) == 0
+    assert not (tmp_path / "out").exists()
+    assert "matrix (one)" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -94,9 +147,9 @@ class Outcomes:
 
 def play(scenario: Scenario, out: Path, runs: Outcomes, *names: str) -> list[str]:
     said: list[str] = []
-    scenario = replace(scenario, pressure_limit=0.2, sweep=Sweep())
+    scenario = replace(scenario, pressure_limit=0.2, sweep=Sweep(), blocks={})
     cells = cells_of(scenario, names, runs=1)
-    Matrix(scenario, runs.make, lambda folder: ({"folder": folder.name}, "fine"), out, said.append).run(cells)
+    Matrix(scenario, runs.make, lambda _, folder: ({"folder": folder.name}, "fine"), out, said.append).run(cells)
     valid, invalid = collect(out, cells)
     return [*said, f"{len(valid)} valid, {len(invalid)} invalid"]
 
@@ -105,10 +158,10 @@ def test_an_invalid_run_is_repeated_and_kept_aside(scenario: Scenario, tmp_path:
     runs = Outcomes(0.9, ChildError("edge1 ended"), 0.1, 0.1)
     said = play(scenario, tmp_path, runs, "zsched", "random")
 
-    assert runs.made == ["eight-zsched-1"] * 3 + ["eight-random-1"]
+    assert runs.made == ["one-zsched-1"] * 3 + ["one-random-1"]
     assert said[-1] == "2 valid, 2 invalid"
     assert any("pressure 0.90" in line for line in said)
-    assert (tmp_path / "runs" / "eight-zsched-1.invalid-2" / "half").exists()
+    assert (tmp_path / "runs" / "one-zsched-1.invalid-2" / "half").exists()
 
 
 def test_what_stays_invalid_does_not_stop_the_rest(scenario: Scenario, tmp_path: Path) -> None:
@@ -129,21 +182,21 @@ def test_a_machine_that_never_gives_a_valid_run_ends_the_bench(scenario: Scenari
 def test_an_interrupted_matrix_goes_on_behind_what_is_done(scenario: Scenario, tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         play(scenario, tmp_path, Outcomes(0.1, KeyboardInterrupt()), "zsched", "random")
-    assert (tmp_path / "runs" / "eight-zsched-1" / METRICS).exists()
+    assert (tmp_path / "runs" / "one-zsched-1" / METRICS).exists()
 
     runs = Outcomes(0.1)
     said = play(scenario, tmp_path, runs, "zsched", "random")
 
-    assert runs.made == ["eight-random-1"]
+    assert runs.made == ["one-random-1"]
     assert said[0] == "1 of 2 runs are done already"
-    assert (tmp_path / "runs" / "eight-random-1.interrupted-1").exists()
+    assert (tmp_path / "runs" / "one-random-1.interrupted-1").exists()
 
 
 def test_progress_tells_the_time_that_is_left(scenario: Scenario) -> None:
     cell = cells_of(scenario, ("zsched",), runs=1)[0]
     progress = Progress(total=4, done=1, took_s=[50.0])
 
-    assert progress.line(cell) == "[2/4, about 2 min left] eight-zsched-1"
+    assert progress.line(cell) == "[2/4, about 2 min left] one-zsched-1"
 
 
 def test_folders_set_aside_get_new_names(tmp_path: Path) -> None:
@@ -158,35 +211,36 @@ def test_folders_set_aside_get_new_names(tmp_path: Path) -> None:
 
 
 def test_quick_is_the_fixed_schemes_one_of_the_paper_and_ours(tmp_path: Path) -> None:
-    scenario, cells = planned(options(tmp_path, is_quick=True))
+    scenario, cells, _ = planned(options(tmp_path, is_quick=True))
 
     assert [cell.scheme.name for cell in cells] == ["fixed_e1", "fixed_e2", "fixed_e3", "dyna_both", "zsched"]
-    assert (scenario.duration_s + 25.0) * len(cells) < 6 * 60
+    assert (scenario.duration_s + AROUND_S) * len(cells) < 6 * 60
 
 
 def test_exploring_robots_have_their_own_target_and_time(tmp_path: Path, scenario: Scenario) -> None:
-    explored, _ = planned(options(tmp_path, is_exploring=True))
-    quick, cells = planned(options(tmp_path, is_exploring=True, is_quick=True, duration_s=30.0))
+    explored, _, _ = planned(options(tmp_path, is_exploring=True))
+    quick, cells, _ = planned(options(tmp_path, is_exploring=True, is_quick=True, duration_s=30.0))
 
     loop = scenario.explore
     assert (explored.duration_s, explored.target_coverage) == (loop.duration_s, loop.target_coverage)
     assert (quick.duration_s, len(cells)) == (30.0, 5)
-    assert loop.duration_s + 10 <= 60
+    assert loop.duration_s + AROUND_S <= 60
     assert sorted(loop.slam_on.values()) == sorted(scenario.nodes)
 
 
 def test_a_folder_goes_on_only_with_the_same_bench(tmp_path: Path) -> None:
     out = tmp_path / "out"
     given = options(out, is_quick=True)
-    scenario, cells = planned(given)
-    body = plan_body(scenario, INPUTS, cells)
+    scenario, cells, _ = planned(given)
+    inputs = InputsOf(given, scenario)
+    body = plan_body(scenario, inputs, cells)
 
     assert claim_folder(given, body) is None
     assert json.loads((out / "plan.json").read_text()) == body
     assert "not empty" in (claim_folder(given, body) or "")
     resumed = replace(given, is_resumed=True)
     assert claim_folder(resumed, body) is None
-    other = plan_body(replace(scenario, seed=1), INPUTS, cells)
+    other = plan_body(replace(scenario, seed=1), inputs, cells)
     assert "another scenario" in (claim_folder(resumed, other) or "")
     (out / "plan.json").unlink()
     (out / "x").write_text("")
@@ -198,5 +252,8 @@ def test_the_command_in_the_report_names_no_place_of_this_machine(tmp_path: Path
         tmp_path, runs=2, schemes=("a", "b"), log=tmp_path / "x.log", drives=tmp_path / "drives", duration_s=30.0
     )
 
-    assert command_of(given) == "zsched bench paper --runs 2 --schemes a,b --duration 30 --log x.log --drives drives"
+    assert (
+        command_of(given)
+        == "zsched bench paper --input log --runs 2 --schemes a,b --duration 30 --log x.log --drives drives"
+    )
     assert str(tmp_path) not in command_of(given)

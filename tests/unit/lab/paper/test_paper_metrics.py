@@ -61,7 +61,8 @@ def write_run(folder: Path, **changed: Any) -> Path:
     """A run of 10 s with two robots: a merged map each second that knows a tenth more; edge1 to edge2 at 4.5 s."""
     moves = [(-0.5, "edge1"), (4.5, "edge2")]
     run = {
-        "scheme": "zsched", "family": "zsched", "level": "eight", "run": 0, "seed": 1, "mode": "known", "input": "x",
+        "scheme": "zsched", "family": "zsched", "block": "matrix", "level": "one", "run": 0, "seed": 1,
+        "mode": "known", "input": "x",
         "links": "simulated", "host": {"pressure": 0.1, "idle_ratio": 0.3}, "duration_s": 10.0, "zero_wall_ns": ZERO_NS,
         "robots": ["robot1", "robot2"], "shares": {"edge1": {}, "edge2": {}},
         "loads": [{"node": "edge1", "start_s": 4.0, "end_s": 10.0}],
@@ -99,7 +100,7 @@ def test_a_runs_figures_by_their_definitions(tmp_path: Path, scenario: Scenario)
     assert figures["moves"] == 1
     assert figures["wasted_moves"] == 0
     assert figures["move_gap_max_s"] == pytest.approx(1.0)
-    assert (figures["lost"], figures["dropped"]) == (3, 3)
+    assert (figures["lost"], figures["lost_per_move"], figures["dropped"]) == (3, 3.0, 3)
     assert figures["held_ssim_rebased"] < figures["ssim_rebased"] <= 1.0
     assert brief(figures).startswith("0.90 maps/s")
 

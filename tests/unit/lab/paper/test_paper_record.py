@@ -172,8 +172,7 @@ def test_a_nodes_meter_reads_its_share_and_the_gauge_does_not_count_its_throttli
         spinner.kill()
         spinner.wait()
         group.remove()
-        if gauge.folder is not None:
-            gauge.folder.rmdir()
+        gauge.remove()
     assert read["cpu_ratio"] is not None
     assert read["memory_ratio"] is not None
     assert 0.0 < read["cpu_ratio"] < 2.0
@@ -201,7 +200,7 @@ def test_the_gauge_sees_that_the_host_is_short() -> None:
         for spinner in spinners:
             spinner.kill()
             spinner.wait()
-        gauge.folder.rmdir()
+        gauge.remove()
     assert pressure is not None
     assert pressure >= 0.3
 
@@ -215,7 +214,7 @@ def test_loads_come_and_go_by_the_schedule_and_ballast_stays(tmp_path: Path) -> 
     told: list[str] = []
     with Children(tmp_path) as children:
         loads = Loads(
-            windows, LoadLevel(hz=1.0, side=32), children, limits, tmp_path, lambda _, text: told.append(text)
+            windows, LoadLevel(share=0.1, side=32), 1.0, children, limits, tmp_path, lambda _, text: told.append(text)
         )
         loads.ballast("edge3", NodeShare(cpu_cores=0.1, memory_mb=256, ballast_mb=64))
         loads.ballast("edge2", NodeShare(cpu_cores=0.1, memory_mb=256))

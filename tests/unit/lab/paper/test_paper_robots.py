@@ -6,9 +6,11 @@ from pathlib import Path
 from zsched.config import load_fleet
 from zsched.lab.explore.robot import parse as parse_explorer
 from zsched.lab.laser_log import malaga_path
+from zsched.lab.paper.cells import Cell
+from zsched.lab.paper.node_state import is_calm, ready_workers
 from zsched.lab.paper.places import robots_scenario_path
 from zsched.lab.paper.robots import ExploreRobots, LogRobots, Place
-from zsched.lab.paper.run import Cell, CellRun, Inputs, Seen, is_calm, ready_workers
+from zsched.lab.paper.run import CellRun, Inputs, Seen
 from zsched.lab.paper.scenario import LinkView, load_scenario
 from zsched.lab.paper.schemes import SCHEMES
 from zsched.lab.recorder import Recorder

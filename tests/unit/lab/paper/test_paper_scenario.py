@@ -171,10 +171,22 @@ def test_a_recorded_drive_is_taken_where_there_is_one(tmp_path: Path) -> None:
 
 def test_a_load_makes_a_node_worse_and_a_stronger_one_not_better() -> None:
     share = NodeShare(cpu_cores=0.45, memory_mb=640)
-    slow, full = LoadLevel(hz=4.0), LoadLevel()
+    slow, full = LoadLevel(share=0.3), LoadLevel(share=0.0)
 
-    free = utility(share, full, is_loaded=False)
-    assert 0.0 < utility(share, full, is_loaded=True) < utility(share, slow, is_loaded=True) < free <= 1.0
+    free = utility(share, full, 0.45, is_loaded=False)
+    assert 0.0 < utility(share, full, 0.45, is_loaded=True) < utility(share, slow, 0.45, is_loaded=True) < free <= 1.0
+
+
+def test_the_utility_by_hand() -> None:
+    one = LoadLevel(streams=1, share=0.6, memory_mb=226.0)
+    strong = NodeShare(cpu_cores=0.45, memory_mb=1024, ballast_mb=100.0)
+    weak = NodeShare(cpu_cores=0.3, memory_mb=1024)
+
+    # 0.45 - 0.15 for the task - 0.6 * 0.45 for the model = 0.03; 1024 - 110 - 100 - 226 = 588 MiB free.
+    assert utility(strong, one, 0.45, is_loaded=True) == pytest.approx(0.5 * 0.03 / 0.45 + 0.5 * 588 / 1024)
+    # The same model leaves the weak one nothing: 0.3 - 0.15 - 0.27 < 0.
+    assert utility(weak, one, 0.45, is_loaded=True) == pytest.approx(0.5 * (1024 - 110 - 226) / 1024)
+    assert utility(weak, one, 0.45, is_loaded=False) == pytest.approx(0.5 * 0.5 + 0.5 * 914 / 1024)
 
 
 def test_the_oracle_follows_the_schedule_and_does_not_move_for_nothing(scenario: Scenario) -> None:
