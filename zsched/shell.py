@@ -245,6 +245,8 @@ class Shell:
                 bus.ask_electors(accept, deadline_s)
             case do.AskLearnt(peer=peer, deadline_s=deadline_s):
                 bus.ask_learnt(peer, deadline_s)
+            case do.IntroducePeers():
+                bus.introduce_peers()
             case do.AnswerUtilities(request=request, utilities=value):
                 bus.answer(request, value)
             case do.AnswerElection(request=request, answer=vote):

@@ -146,6 +146,29 @@ def client_config(
     return _render(settings, operator_json5)
 
 
+def introduction_config(session: str) -> str | None:
+    """Of a session (its configuration) that meets others by gossip: one that dials whom it dials, and all they know.
+
+    ``None`` when the session does not dial by gossip, or nobody at all by its configuration: there is nothing to mend,
+    or nobody to begin with. See `zsched.introduction`.
+    """
+    import zenoh  # noqa: PLC0415 - the operator's own settings (TLS, access control) hold here, too
+
+    config = zenoh.Config.from_json5(session)
+    if json.loads(config.get_json("mode")) != "peer" or not json.loads(config.get_json("connect/endpoints")):
+        return None
+    if json.loads(config.get_json("scouting/gossip/autoconnect")) is not None:
+        return None  # our own setting for "only who is in `connect`"
+    for path, value in {
+        "listen/endpoints": [],
+        "scouting/gossip/autoconnect": {"router": [], "peer": ["router", "peer"]},
+        "scouting/gossip/autoconnect_strategy": {"peer": {"to_router": "always", "to_peer": "always"}},
+        "transport/shared_memory/enabled": False,
+    }.items():
+        config.insert_json5(path, json.dumps(value))
+    return str(config)
+
+
 # --- threads ---------------------------------------------------------------------------------------------------------
 
 

@@ -3,8 +3,8 @@
 A robot that works alone while it is cut off, nodes that meet by gossip only, and one whose fleet file names other
 electors than its state.
 
-One fleet for the module: three robots and two edges; the edges give no address, so that these two can only meet
-by gossip. Every robot keeps a standby of the task (`on_isolation: local`). Its streams are of two classes:
+One fleet for the module: three robots and two edges; the edges and one robot give no address, so that these three can
+only meet by gossip. Every robot keeps a standby of the task (`on_isolation: local`). Its streams are of two classes:
 of ``latest`` the newest value may be answered by both owners of a move (docs/streams.md), of ``reliable`` nothing.
 """
 
@@ -30,7 +30,7 @@ from zsched.places import socket_path
 
 pytestmark = [pytest.mark.timeout(120), pytest.mark.root]
 
-HIDDEN = ("edge1", "edge2")
+HIDDEN = ("edge1", "edge2", "robot3")
 ROBOTS_TASK: Json = {
     "on_isolation": "local",
     "inputs": [
@@ -50,6 +50,7 @@ class Bed(Netbed):
     __test__ = False
     app_on_robot1: Probe
     orders_of_robot1: Probe
+    app_on_robot3: Probe
 
     def is_whole(self) -> bool:
         """Whether everybody is alive to everybody, and one owner serves."""
@@ -57,7 +58,11 @@ class Bed(Netbed):
         return states == {"alive"} and self.owner() is not None and self._is_served()
 
     def _is_served(self) -> bool:
-        return self.app_on_robot1.is_flowing() and self.orders_of_robot1.is_flowing()
+        return all(one.is_flowing() for one in (self.app_on_robot1, self.orders_of_robot1, self.app_on_robot3))
+
+    def missed_by(self, node: NodeId) -> list[NodeId]:
+        """Whom ``node`` does not hear."""
+        return [peer["name"] for peer in self.status(node)["nodes"] if peer["state"] != "alive"]
 
     def served_by(self, node: NodeId) -> bool:
         """Whether ``node`` has answered both applications last, a moment ago."""
@@ -75,6 +80,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bed]:
         bed.init()
         bed.start()
         bed.app_on_robot1 = bed.probe("robot1", put="robot1/in", watch=["robot1/out"])
+        bed.app_on_robot3 = bed.probe("robot3", put="robot3/in", watch=["robot3/out"])
         bed.orders_of_robot1 = bed.probe("robot1", put="robot1/order", watch=["robot1/done"])
         yield bed
 
@@ -94,6 +100,17 @@ def test_two_nodes_without_addresses_find_each_other_again_after_short_cuts(bed:
         bed.wait(lambda: monotonic_s() > begin + length_s, 5, "the cut")  # noqa: B023 - called at once
         bed.network.heal()
         bed.wait(bed.is_whole, 15, f"everybody alive to everybody after {length_s} s")
+
+
+def test_the_link_of_two_nodes_without_addresses_comes_back_when_it_alone_was_cut(bed: Bed) -> None:
+    """Gossip tells of a peer only while a link is new, and the links of both to everybody else stay up."""
+    owner = bed.owner()
+    assert owner in HIDDEN
+    bed.network.separate(["robot3"], [owner])
+    bed.wait(lambda: not bed.app_on_robot3.is_flowing(), 10, "robot3 to lose its streams")
+    bed.wait(lambda: "robot3" in bed.missed_by(owner), 10, "the end of the link")
+    bed.network.heal()
+    bed.wait(bed.is_whole, 10, "robot3's streams")
 
 
 def test_a_robot_that_is_cut_off_is_served_by_its_own_standby_and_nothing_comes_twice(bed: Bed) -> None:

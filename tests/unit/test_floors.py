@@ -27,7 +27,7 @@ FLOORS: Final[tuple[tuple[str, int, str], ...]] = (
     (r"core(\..+)?", 1, "core"),
     (r"(wire|keyspace|clock|errors|report|places|zenoh_config|relay_pipe|send_queue|hop_acks)", 2, "seams"),
     (r"(config|config_\w+)", 2, "seams"),
-    (r"relay_door", 2, "seams"),
+    (r"(relay_door|introduction)", 2, "seams"),
     (r"adapters\.(worker_supervisor|worker_process|launch)", 3, "adapters: worker processes"),
     (r"adapters\.(control_bus|open_questions)", 3, "adapters: control"),
     (r"adapters\.(network_profiler|nl80211)", 3, "adapters: radio"),
@@ -56,7 +56,7 @@ IMPURE_CALLS: Final = frozenset({"open", "print", "input", "exec", "eval", "comp
 HEAVY: Final = frozenset({"numpy", "cv2", "matplotlib", "onnxruntime", "rich", "pydantic", "asyncio"})
 OUTSIDE: Final[dict[str, str]] = {
     # library: who alone may import it, besides lab and tasks
-    "zenoh": r"adapters\.(control_bus|open_questions|stream_tap)|relay\..+|worker|worker_\w+|zenoh_config",
+    "zenoh": r"adapters\.(control_bus|open_questions|stream_tap)|relay\..+|worker|worker_\w+|zenoh_config|introduction",
     "psutil": r"adapters\.\w+",
     "msgpack": r"wire",
     "ruamel": r"config_reader",

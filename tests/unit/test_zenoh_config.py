@@ -11,6 +11,7 @@ from zsched.zenoh_config import (
     client_config,
     control_config,
     data_config,
+    introduction_config,
     pool_threads,
     runtime_pools,
     worker_config,
@@ -109,3 +110,34 @@ def test_control_sessions_that_know_every_address_do_not_dial_by_gossip() -> Non
 def test_of_two_that_meet_by_gossip_one_dials() -> None:
     found = read(control_config(listen=(HERE,), connect=(THERE,)), "scouting/gossip/autoconnect_strategy")
     assert found == {"peer": {"to_router": "always", "to_peer": "greater-zid"}}
+
+
+def test_an_introduction_dials_the_same_and_everybody_they_know_and_listens_nowhere() -> None:
+    text = introduction_config(ALL["data"])
+    assert text is not None
+    assert read(text, "connect/endpoints") == read(ALL["data"], "connect/endpoints")
+    assert read(text, "listen/endpoints") == []
+    assert read(text, "scouting/gossip/autoconnect")["peer"] == ["router", "peer"]
+    assert read(text, "scouting/gossip/autoconnect_strategy") == {"peer": {"to_router": "always", "to_peer": "always"}}
+    assert read(text, "scouting/multicast/enabled") is False
+    zenoh.Config.from_json5(text)
+
+
+def test_an_introduction_keeps_the_operators_own_settings() -> None:
+    session = data_config(
+        listen=(HERE,), connect=(THERE,), operator_json5="{transport: {auth: {usrpwd: {user: 'u', password: 'p'}}}}"
+    )
+    assert read(introduction_config(session) or "", "transport/auth/usrpwd/user") == "u"
+
+
+@pytest.mark.parametrize(
+    "session",
+    [
+        ALL["client"],
+        data_config(listen=(HERE,), connect=(), timing=TIMING),
+        data_config(listen=(HERE,), connect=(THERE,), dials_by_gossip=False),
+    ],
+    ids=["a client", "dials nobody", "does not dial by gossip"],
+)
+def test_who_is_not_met_by_gossip_needs_no_introduction(session: str) -> None:
+    assert introduction_config(session) is None

@@ -34,6 +34,7 @@ from zsched.core.messages import (
 from zsched.core.model import NAME, Beat, NodeId, Profile, Proposal
 from zsched.core.snapshot import Snapshot
 from zsched.errors import AdapterError, WireError
+from zsched.introduction import Introducer
 from zsched.keyspace import Keyspace, parse
 
 OPERATOR_TIMEOUT_S = 3.0
@@ -84,6 +85,7 @@ class ControlBus:
         self._keys = Keyspace(fleet)
         self._node, self._incarnation = node, incarnation
         self._config = zenoh_config
+        self._introducer = Introducer(zenoh_config)
         self._post = post
         self._questions = Questions()
         self._session: zenoh.Session | None = None
@@ -161,6 +163,7 @@ class ControlBus:
         session, self._session = self._session, None
         if session is None:
             return
+        self._introducer.close()
         kept, self._kept, self._publishers, self._ring = self._kept, [], {}, None
         closing = threading.Thread(target=self._close, args=(session, kept), name="zsched-bus-close", daemon=True)
         closing.start()
@@ -175,6 +178,10 @@ class ControlBus:
         self._questions.clear()
         with contextlib.suppress(zenoh.ZError):
             session.close()
+
+    def introduce_peers(self) -> None:
+        """Let everybody hear of everybody's address again; returns at once (nothing where addresses are configured)."""
+        self._introducer.introduce()
 
     def peers(self) -> int:
         """How many zenoh peers the session has a link to."""

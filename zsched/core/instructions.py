@@ -106,6 +106,11 @@ class AskLearnt:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class IntroducePeers:
+    """Somebody is missing on the control network: see that everybody hears of everybody's addresses again."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class AnswerLearnt:
     """Answer a peer's `AskLearnt`."""
 
@@ -196,6 +201,7 @@ Instruction = (
     | PublishLearnt
     | AskLearnt
     | AnswerLearnt
+    | IntroducePeers
     | StartWorker
     | StopWorker
     | RestartWorker

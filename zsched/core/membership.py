@@ -64,6 +64,7 @@ class Membership:
         """`next_deadline`, until something changes it."""
         self._states = dict.fromkeys(sorted(nodes), PeerState.UNKNOWN) | {me: PeerState.ALIVE}
         self._has_suspect = False
+        self._misses_anybody = bool(self._peers)
         self._has_watched = False
         """Whether this node has listened for as long as silence takes to mean something."""
 
@@ -97,6 +98,11 @@ class Membership:
         """Whom this node accuses: suspect, gone, or never heard although it has listened for long enough."""
         excused = (PeerState.ALIVE,) if self._has_watched else (PeerState.ALIVE, PeerState.UNKNOWN)
         return tuple(name for name, peer in self._peers.items() if peer.state not in excused)
+
+    @property
+    def misses_anybody(self) -> bool:
+        """Whether some node of the fleet file is not heard."""
+        return self._misses_anybody
 
     # --- what changes it ---------------------------------------------------------------------------------------
 
@@ -217,6 +223,7 @@ class Membership:
         before, peer.state = peer.state, after
         self._states = {**self._states, node: after}  # a new one: whoever holds the old one sees one moment
         self._has_suspect = PeerState.SUSPECT in self._states.values()
+        self._misses_anybody = any(state is not PeerState.ALIVE for state in self._states.values())
         self._deadline = None
         peer.suspect_since = now if after is PeerState.SUSPECT else math.inf
         peer.vouched_until = -math.inf

@@ -24,6 +24,7 @@ from zsched.core.executor import Executor
 from zsched.core.fleet import Fleet, fleet_hash
 from zsched.core.gateway import Gateway
 from zsched.core.identity import Identity, Verdict
+from zsched.core.introductions import Introductions
 from zsched.core.membership import Membership, Transition
 from zsched.core.model import (
     Allocation,
@@ -119,6 +120,7 @@ class Node:
         }
         self.fleet_file = fleet_hash(fleet)
         self._identity = Identity(me, incarnation, self.fleet_file, now)
+        self._introductions = Introductions()
         self._hangs = HangWatch(fleet)
         self._tenure = Tenure(fleet, me, self.agreement.leases, self.executors)
         self._beat_at = self._turn_at = now
@@ -258,6 +260,8 @@ class Node:
         self._beat_at = self._turn_at = now + self.fleet.timing.beat_s
         self._batch.add(do.PublishBeat(beat=beat, is_news=not is_in_turn))
         self._hear_leases(beat, now)
+        if self._introductions.is_due(now, is_missing=self.membership.misses_anybody):
+            self._batch.add(do.IntroducePeers())
 
     def _on_beat(self, event: ev.BeatReceived, now: float) -> None:
         beat = event.beat

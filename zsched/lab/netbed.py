@@ -23,11 +23,13 @@ from types import TracebackType
 from typing import IO
 
 from zsched import zenoh_config
+from zsched.adapters.operator_socket import ask
 from zsched.clock import monotonic_s
 from zsched.core.model import NodeId, PeerState
 from zsched.lab.history import History, Learnt, Started
 from zsched.lab.netns import Network
 from zsched.lab.testbed import DAEMON, Json, Testbed
+from zsched.places import socket_path
 
 CONTROL_PORT, DATA_PORT = 7457, 7458
 PROBE = (sys.executable, "-m", "zsched.lab.probe")
@@ -153,7 +155,7 @@ class Netbed(Testbed):
         tree: a fleet file as plain data (`zsched.lab.testbed.echo_fleet`); hosts and ports are filled in.
         network: has a namespace per node; `None`: one is made. Closed with the bed either way.
         tmpfs: {node: size, e.g. ``64k``}: whose state folder is a small file system of its own.
-        hidden: nodes whose address the fleet file does not give (no application can be put beside them).
+        hidden: nodes whose address the fleet file does not give.
         wrapper: run instead of the daemon's module (a script that takes the same arguments).
     """
 
@@ -206,15 +208,20 @@ class Netbed(Testbed):
         self, node: NodeId, *, put: str = "", hz: float = 50.0, size: int = 0, watch: Sequence[str] = ()
     ) -> Probe:
         """An application on ``node``: a client of its data endpoint; ended with the bed."""
-        config = zenoh_config.client_config(
-            connect=(f"tcp/{self.network.address(node)}:{DATA_PORT}",), timing=self.fleet.timing
-        )
+        config = zenoh_config.client_config(connect=(self._data_endpoint(node),), timing=self.fleet.timing)
         watched = [word for key in watch for word in ("--watch", key)]
         command = [*PROBE, config, "--put", put, "--hz", str(hz), "--size", str(size), *watched]
         with (self.folder / f"probe-{node}.log").open("ab") as log:
             probe = Probe(self.network.wrap(node, command), log)
         self._probes.append(probe)
         return probe
+
+    def _data_endpoint(self, node: NodeId) -> str:
+        if self.fleet.node(node).listen_data:
+            return f"tcp/{self.network.address(node)}:{DATA_PORT}"
+        self.wait(lambda: self.status(node), 20, f"{node} to answer")  # a hidden node's port is its own choice
+        endpoints: list[str] = ask(socket_path(self.folder, node), {"verb": "access"}, 3.0)["endpoints"]
+        return endpoints[0]
 
     # --- what the logs tell ------------------------------------------------------------------------------------------
 

@@ -24,11 +24,13 @@ import zenoh
 from zsched import wire
 from zsched.clock import monotonic_s
 from zsched.core.events import ProblemReported, RoleEnded, StreamsCounted
+from zsched.core.introductions import Introductions
 from zsched.core.model import NodeId, TaskId
 from zsched.core.plan import Role, RoutePlan
 from zsched.core.relay_life import RelayHello, RelayPulse
 from zsched.core.relay_protocol import RelayReport, RelayStarted, RelayStop, WorkerSeen
 from zsched.errors import WireError
+from zsched.introduction import Introducer
 from zsched.keyspace import Keyspace
 from zsched.relay.acks import Acks
 from zsched.relay.graph import GraphMirror
@@ -126,7 +128,13 @@ class RelayProcess:
     """
 
     def __init__(
-        self, session: zenoh.Session, fleet: str, node: NodeId, reporter: Reporter, local_config: str = ""
+        self,
+        session: zenoh.Session,
+        fleet: str,
+        node: NodeId,
+        reporter: Reporter,
+        local_config: str = "",
+        introducer: Introducer | None = None,
     ) -> None:
         self._session = session
         self._lock = threading.Lock()  # plans come from the pipe, the local side from a thread of its own
@@ -135,6 +143,7 @@ class RelayProcess:
         self._waiting: dict[TaskId, RoutePlan] = {}
         self._node = node
         self._reporter = reporter
+        self._introducer = introducer
         self._tasks: dict[TaskId, TaskRelay] = {}
         self._own_ids = frozenset({str(session.zid())})
         keyspace = Keyspace(fleet)
@@ -151,6 +160,8 @@ class RelayProcess:
         """Close both sessions; may take as long as a stopped peer holds them."""
         if self._local_side is not None:
             self._local_side.close()
+        if self._introducer is not None:
+            self._introducer.close()
         self._session.close()
 
     def _begin(self, local: zenoh.Session | None) -> None:
@@ -237,11 +248,15 @@ class RelayProcess:
     def _count(self) -> None:
         due = monotonic_s()
         pause = threading.Event()
+        introductions = Introductions()
         while True:
             due += COUNT_S
             pause.wait(max(0.0, due - monotonic_s()))
             counts = tuple(count for task in tuple(self._tasks.values()) for count in task.counts())
             self._reporter.report(StreamsCounted(counts=counts))
+            is_missing = any(task.misses_its_worker for task in tuple(self._tasks.values()))
+            if introductions.is_due(monotonic_s(), is_missing=is_missing) and self._introducer is not None:
+                self._introducer.introduce()
 
 
 def run(
@@ -269,7 +284,7 @@ def run(
         reporter.report(ProblemReported(source=SOURCE, problem=problem))
         reporter.flush(CLOSE_S)
         return 1
-    relay = RelayProcess(session, me.fleet, me.node, reporter, local.decode())
+    relay = RelayProcess(session, me.fleet, me.node, reporter, local.decode(), Introducer(text.decode()))
     successors = None if door is None else Successors(socket.socket(fileno=door), me)
     try:
         while not relay.obey(commands) and successors is not None:

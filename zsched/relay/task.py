@@ -97,6 +97,12 @@ class TaskRelay:
         """Nobody would tell us of another owner from now on, until the next plan."""
         self._queue.put(_Orphaned())
 
+    @property
+    def misses_its_worker(self) -> bool:
+        """Whether streams are meant to go to a worker that is not ready, or cannot be reached."""
+        current = self._current()
+        return current is not None and not current.is_ready
+
     def counts(self) -> tuple[StreamCount, ...]:
         """The counters of every stream, by name."""
         streams: list[InputStream | OutputStream] = [*self._inputs.values(), *self._outputs.values()]
