@@ -50,7 +50,7 @@ class LoadLevel:
     streams: int = 1
     share: float = 0.6
     side: int = 640
-    memory_mb: float = 226.0
+    memory_mb: float = 189.0
 
     def __post_init__(self) -> None:
         check_range("streams", self.streams, 1, 64)

@@ -14,6 +14,7 @@ from zsched.lab.paper.metrics import (
     brief,
     held_instants,
     measure,
+    messages,
     over_nodes,
     owned_s,
     owner_at,
@@ -24,7 +25,7 @@ from zsched.lab.paper.metrics import (
 from zsched.lab.paper.places import scenario_path
 from zsched.lab.paper.radio_bench import radio_figures
 from zsched.lab.paper.record import Heard, StreamFile
-from zsched.lab.paper.scenario import NodeShare, Scenario, load_scenario
+from zsched.lab.paper.scenario import LoadLevel, NodeShare, Scenario, load_scenario
 from zsched.lab.recorder import Recorder
 from zsched.tasks.map_merge.cdr import encode_grid
 from zsched.tasks.map_merge.geometry import Pose2
@@ -135,6 +136,44 @@ def test_regret_is_what_the_owner_lacked(tmp_path: Path, scenario: Scenario) -> 
 
     assert best == pytest.approx(0.0)
     assert 0.0 < late < stays < 1.0
+
+
+def test_regret_by_hand(tmp_path: Path, scenario: Scenario) -> None:
+    level = LoadLevel(streams=1, share=0.6, memory_mb=189.0)
+    scenario = replace(scenario, levels={"one": level})
+    found = measure(write_run(tmp_path), scenario, Truth(a_room()))["regret"]
+
+    free = 0.5 * (0.3 - 0.15) / 0.3 + 0.5 * (512 - 110) / 512
+    loaded = 0.0 + 0.5 * (512 - 110 - 189) / 512  # 0.6 of 0.3 cores and the task's 0.15 are more than there is
+    # Of 10 s, edge1 is loaded from 4 s on and left at 4.5 s: half a second on the worse node.
+    assert found == pytest.approx(0.5 * (free - loaded) / (10.0 * free))
+
+
+def test_throughput_by_hand(tmp_path: Path, scenario: Scenario) -> None:
+    figures = measure(write_run(tmp_path), scenario, Truth(a_room()))
+
+    sizes = [len(part_of_room(second / 10, margin=second)) for second in range(1, 10)]
+    assert figures["received_mb_s"] == pytest.approx(2 * sum(sizes) / 10.0 / 1e6)
+    assert figures["throughput_mb_s"] == pytest.approx((2 * sum(sizes) + 2 * 9 * 100) / 10.0 / 1e6)
+    assert figures["mb_per_map"] == pytest.approx(sum(sizes) / 9 / 1e6)
+    # Until 4.5 s edge1 owned: four merged maps each, and the robots' own of 0.5 to 3.5 s.
+    assert figures["nodes"]["edge1"]["throughput_mb_s"] == pytest.approx((2 * sum(sizes[:4]) + 2 * 4 * 100) / 10 / 1e6)
+
+
+def test_a_recorder_beside_each_robot_says_the_same_as_one_for_all(tmp_path: Path, scenario: Scenario) -> None:
+    together = measure(write_run(tmp_path), scenario, Truth(a_room()))
+    whole = tmp_path / "streams.mcap"
+    heard = list(messages([whole]))
+    for robot in ("robot1", "robot2"):
+        with (tmp_path / f"streams-{robot}.mcap").open("wb") as stream:
+            file = StreamFile(stream)
+            for topic, at_ns, _, data in heard:
+                if topic.startswith(robot):
+                    file.write(Heard(topic, data, at_ns))
+            file.close()
+    whole.unlink()
+
+    assert measure(tmp_path, scenario, Truth(a_room())) == together
 
 
 def test_coverage_is_cell_on_cell_wherever_the_canvas_begins() -> None:

@@ -9,6 +9,7 @@ from zsched.adapters.network_profiler import parse_trace
 from zsched.config import load_fleet
 from zsched.errors import ConfigError
 from zsched.lab.fleet_runner import read_tree, write_fleet
+from zsched.lab.paper.claims import CLAIMS
 from zsched.lab.paper.load import Window, loaded_at, schedule
 from zsched.lab.paper.oracle import best_nodes, changes, utilities, utility
 from zsched.lab.paper.places import robots_scenario_path, scenario_path
@@ -41,6 +42,41 @@ def test_the_shipped_scenario_keeps_the_host_out_of_need_and_sweeps_the_load(sce
     assert scenario.duration_s < 60
     assert min(scenario.nodes, key=lambda node: scenario.nodes[node].cpu_cores) == "edge1"
     assert scenario.run_seed(3) == scenario.seed + 3
+
+
+def test_what_the_scenario_says_of_its_choices_holds(scenario: Scenario) -> None:
+    smallest = min(abs(claim.target) for claim in CLAIMS if claim.target)
+    main = scenario.levels[scenario.level]
+    full = max(share.memory_mb for share in scenario.nodes.values())
+
+    assert scenario.pressure_limit == pytest.approx(smallest / 2)
+    assert (main.streams, main.share, main.side) == (1, 0.6, 640)
+    assert main.memory_mb / full == pytest.approx(0.2, abs=0.03)
+    assert [level.streams * level.share for level in scenario.levels.values()] == pytest.approx(
+        [0.3, 0.6, 1.2, 1.8, 2.4]
+    )
+    for share in scenario.nodes.values():  # the strongest load beside daemon, mapping and the task's worker fits
+        assert share.ballast_mb + scenario.levels["four"].memory_mb + 200.0 < 0.95 * share.memory_mb
+
+
+@pytest.mark.parametrize(
+    ("block", "told"),
+    [
+        ("{one: {world: office}}", "one"),
+        ("{matrix: {}}", "matrix"),
+        ("{x: {links: {bandwidth_mbit: 0}}}", "bandwidth_mbit"),
+        ("{x: {links: {bandwith: 3}}}", "bandwith"),
+        ("{x: {runs: 0}}", "runs"),
+    ],
+)
+def test_a_fault_in_a_block_is_named(tmp_path: Path, block: str, told: str) -> None:
+    path = tmp_path / "scenario.yaml"
+    path.write_text(SMALL + "blocks: {x: {links: {bandwidth_mbit: 3.5}}}\n")
+    assert load_scenario(path).blocks["x"].links.bandwidth_mbit == 3.5
+    path.write_text(SMALL + f"blocks: {block}\n")
+
+    with pytest.raises(ConfigError, match=told):
+        load_scenario(path)
 
 
 @pytest.mark.parametrize(
