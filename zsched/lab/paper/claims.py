@@ -181,6 +181,15 @@ SIX = ("cpu_peak", "memory_mean", "throughput_mb_s", "map_hz", "task_latency_s",
 # --- figures ---------------------------------------------------------------------------------------------------------
 
 
+def shared(runs: Sequence[Json], key: str) -> list[Json]:
+    """The runs whose number every group by ``key`` has: means over them are of the same worlds and schedules."""
+    numbers: dict[str, set[int]] = {}
+    for figures in runs:
+        numbers.setdefault(str(figures[key]), set()).add(int(figures["run"]))
+    common = set.intersection(*numbers.values()) if numbers else set()
+    return [figures for figures in runs if int(figures["run"]) in common]
+
+
 def table_of(runs: Sequence[Json], metric: str, schemes: Sequence[str]) -> dict[int, float]:
     """{run: mean of the schemes' figures}; only runs in which every one of the schemes has the figure."""
     found: dict[int, dict[str, float]] = {}

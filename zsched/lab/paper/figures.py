@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from zsched.lab.paper.claims import shared
 from zsched.lab.paper.schemes import SCHEMES, Family
 from zsched.lab.plots import COLOURS, DPI
 
@@ -51,7 +52,7 @@ def save_all(runs: Sequence[Json], level: str, levels: Sequence[str], folder: Pa
         )
     shown = [one for one in levels if any(figures["level"] == one for figures in runs)]
     if len(shown) > 1:
-        names.append(save(folder / "sweep.png", lambda axes: sweep(axes, runs, shown), title))
+        names.append(save(folder / "sweep.png", lambda axes: sweep(axes, shared(runs, "level"), shown), title))
     return names
 
 

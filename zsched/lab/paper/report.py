@@ -10,7 +10,7 @@ import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from zsched.lab.paper.claims import LEAST_RUNS, Verdict, better_than_ours, judged
+from zsched.lab.paper.claims import LEAST_RUNS, Verdict, better_than_ours, judged, shared
 from zsched.lab.paper.scenario import MATRIX
 from zsched.lab.paper.schemes import SCHEMES
 
@@ -58,6 +58,7 @@ def report(results: Json, pictures: Sequence[str]) -> str:
         better_text(main),
         "## All schemes\n",
         schemes_text(main),
+        *same_runs_parts(main),
         "## Strength of the injected load\n",
         sweep_text(runs, scenario),
         *blocks_parts(results),
@@ -120,6 +121,15 @@ def schemes_text(runs: Sequence[Json]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def same_runs_parts(runs: Sequence[Json]) -> list[str]:
+    """The table again over the runs that every scheme has, where some have more: each run has a world of its own."""
+    common = shared(runs, "scheme")
+    if not common or len(common) == len(runs):
+        return []
+    numbers = ", ".join(str(number + 1) for number in sorted({int(figures["run"]) for figures in common}))
+    return [f"Only the runs that every scheme has ({numbers}), so that rows compare:\n", schemes_text(common)]
+
+
 def mean_text(values: Sequence[float | None], digits: int) -> str:
     """The mean of what was measured; a dash for nothing."""
     known = [float(value) for value in values if value is not None]
@@ -127,13 +137,14 @@ def mean_text(values: Sequence[float | None], digits: int) -> str:
 
 
 def sweep_text(runs: Sequence[Json], scenario: Json) -> str:
-    """Map frequency, latency of the task and throughput of each scheme at every level."""
+    """The main figures of each scheme at every level, over the runs that all levels have."""
     metrics = (
         ("map_hz", "maps/s", 2),
         ("throughput_mb_s", "MB/s", 1),
         ("task_latency_s", "task s", 1),
         ("regret", "regret", 3),
     )
+    runs = shared(runs, "level")
     levels = [level for level in scenario["levels"] if any(figures["level"] == level for figures in runs)]
     if len(levels) < 2:
         return "Only one level was run.\n"

@@ -14,6 +14,7 @@ from zsched.lab.paper.claims import (
     difference,
     judged,
     relative,
+    shared,
     table_of,
     verdict,
 )
@@ -112,6 +113,15 @@ def test_a_run_in_which_a_scheme_is_missing_does_not_count() -> None:
     assert table_of(runs, "map_hz", ("fixed_e1", "fixed_e2")) == {0: 2.0}
 
 
+def test_rows_are_compared_over_the_runs_that_all_have() -> None:
+    runs = [a_run("zsched", run) for run in range(5)] + [a_run("random", run) for run in (1, 2)]
+
+    assert [(figures["scheme"], figures["run"]) for figures in shared(runs, "scheme")] == [
+        ("zsched", 1), ("zsched", 2), ("random", 1), ("random", 2),
+    ]  # fmt: skip
+    assert shared([], "scheme") == []
+
+
 def test_claims_are_judged_by_the_schemes_they_speak_of() -> None:
     runs = [a_run(name, run, throughput_mb_s=10.0) for name in FIXED_SCHEMES for run in range(3)]
     runs += [a_run(name, run, throughput_mb_s=15.0) for name in PAPER_SCHEMES for run in range(3)]
@@ -127,6 +137,7 @@ def test_claims_are_judged_by_the_schemes_they_speak_of() -> None:
 
 def test_the_report_holds_every_claim_scheme_level_and_picture(tmp_path: Any) -> None:
     runs = [a_run(name, run) for name in ("fixed_e1", "zsched") for run in range(3)]
+    runs += [a_run("random", 0)]
     runs += [a_run(name, 0, block="narrow", map_hz=7.5) for name in ("fixed_e1", "zsched")]
     runs += [a_run(name, 0, level="two", map_hz=2.5) for name in ("fixed_e1", "zsched")]
     node = {"cpu_cores": 0.3, "memory_mb": 512.0, "ballast_mb": 0.0}
@@ -161,6 +172,7 @@ def test_the_report_holds_every_claim_scheme_level_and_picture(tmp_path: Any) ->
     assert all(claim.says in text for claim in CLAIMS)
     assert "| zsched | 3 | 2.00 |" in text  # the matrix's, without the block's
     assert "| zsched | 1 | 7.50 |" in text
+    assert "Only the runs that every scheme has (1)" in text
     assert "every node sends at most 9.8 Mbit/s" in text
     assert "Left out: no exploring robots." in text
     assert "No valid run: one-random-3." in text

@@ -26,6 +26,7 @@ from zsched.lab.limits import LimitKind, NodeLimits
 from zsched.lab.paper.load import Loads, Window
 from zsched.lab.paper.record import (
     OCCUPANCY_GRID,
+    PRECEDENCE,
     Heard,
     HostGauge,
     NodeMeter,
@@ -187,6 +188,8 @@ def test_the_gauge_sees_that_the_host_is_short() -> None:
     gauge = HostGauge.create(f"zsched-test-{os.getpid()}-short")
     if gauge.folder is None:
         pytest.skip("no pressure per group here (needs the unified hierarchy)")
+    if gauge.first is not None:
+        assert int((gauge.first / "cpu.shares").read_text()) == 1024 * PRECEDENCE
     spinners = [subprocess.Popen(SPIN) for _ in range(2 + (os.cpu_count() or 1))]
     try:
         for spinner in spinners:
