@@ -34,6 +34,7 @@ from zsched.core.fleet import (
     LocalMode,
     LocalSide,
     OnIsolation,
+    PairReading,
     Reach,
     SharedMemory,
     Standby,
@@ -211,6 +212,11 @@ SCHEDULING: Final = Record(
             "a big lead is followed sooner than a small one.",
             default="the time-to-trigger",
         ),
+        "pays_off_in_s": Field(
+            Number(1, 86400, "s"),
+            "A move must earn what the last moves have cost within so long: the bonus rises by measured cost / this.",
+            default="the bonus alone",
+        ),
     },
     Tuning,
 )
@@ -224,6 +230,13 @@ LINK_LIMITS: Final = Record(
             _DBM,
             "Between the two: a signal that is worth 0.8; links are flat above it and steep below.",
             default="none: linear (Eq. 3)",
+        ),
+        "pair": Field(
+            Choice.of(PairReading),
+            "Worth of a link through an access point: by the candidate's way (as printed), the weaker, or the mean.",
+        ),
+        "foresee_s": Field(
+            Number(0, 30, "s"), "Signals count as they will be so far ahead along their trend (at most 6 dB)."
         ),
     },
     LinkLimits,

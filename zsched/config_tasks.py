@@ -28,7 +28,7 @@ from zsched.core.templates import (
 
 _ANY_TUNING: Final = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
 """Stands in for a faulty one, so that the task's rules are checked in the same pass; such a file gives no fleet."""
-_OF_THE_TASK: Final = ("reach", "memory_floor_ratio", "max_moves_per_minute", "patience")
+_OF_THE_TASK: Final = ("reach", "memory_floor_ratio", "max_moves_per_minute", "patience", "pays_off_in_s")
 """Keys of `scheduling:` that are not part of the tuning: they cannot be changed at run time."""
 _Places = dict[str, Place]
 """Where each rule stands, by stream name."""

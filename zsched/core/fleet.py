@@ -136,14 +136,28 @@ class StreamRule:
     """Services only."""
 
 
+class PairReading(StrEnum):
+    """What a link is worth whose two ends reach each other through one access point (docs/decisions/0018)."""
+
+    CANDIDATE = "candidate"
+    """The candidate's own way, as the paper prints Eq. 3: the robot's is part of every path, and decides nothing."""
+    WEAKER = "weaker"
+    """The weaker of the two ways: the bottleneck."""
+    MEAN = "mean"
+    """Half of what the two ways are worth together: their delays add up."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkLimits:
-    """Eq. 3: nu (least usable) and rho (best achievable) in dBm, and the knee between them, if there is one."""
+    """Eq. 3: nu (least usable) and rho (best achievable) in dBm, the knee between them, and how links are read."""
 
     nu_dbm: float = -80.0
     rho_dbm: float = -40.0
     knee_dbm: float | None = None
     """Above it a link is nearly as good as it gets, below it gets bad fast; ``None``: Eq. 3 as printed, linear."""
+    pair: PairReading = PairReading.CANDIDATE
+    foresee_s: float = 0.0
+    """Signals count as they will be so many seconds ahead along their trend; 0: as they are."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -163,6 +177,8 @@ class TaskSpec:
     """Hard cap of planned moves; escapes have their own (`zsched.core.damping`)."""
     patience: float | None = None
     """Utility seconds that staying may cost before the task moves, in place of the time-to-trigger; ``None``: that."""
+    pays_off_in_s: float | None = None
+    """A move must earn what moves have cost (measured) within so many seconds; ``None``: the bonus alone counts."""
     on_isolation: OnIsolation = OnIsolation.HOLD
     exclusive: bool = False
     drain_s: float = 2.0

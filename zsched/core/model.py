@@ -24,6 +24,7 @@ NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}")
 MAX_COUNTER = 2**53
 """Largest revision, epoch, incarnation or sequence number (exact in every language's float)."""
 MAX_CPU_CORES, MAX_MEMORY_MB, MAX_BITRATE_MBPS = 4096.0, 1e8, 1e6
+MAX_TREND_DB_S = 100.0
 """What no machine or link exceeds: a larger figure is a fault of whoever measured or sent it."""
 
 
@@ -127,11 +128,14 @@ class Link:
     rssi_dbm: float | None = None
     bitrate_mbps: float | None = None
     retry_ratio: float | None = None
+    trend_db_s: float | None = None
+    """How fast the smoothed signal changes, dB per second; ``None``: not known."""
 
     def __post_init__(self) -> None:
         if self.peer is not None:
             check_name("link.peer", self.peer)
         check_range("link.rssi_dbm", self.rssi_dbm, RSSI_MIN_DBM, RSSI_MAX_DBM)
+        check_range("link.trend_db_s", self.trend_db_s, -MAX_TREND_DB_S, MAX_TREND_DB_S)
         check_range("link.bitrate_mbps", self.bitrate_mbps, 0.0, MAX_BITRATE_MBPS)
         check_range("link.retry_ratio", self.retry_ratio, 0.0, 1.0)
 

@@ -476,6 +476,7 @@ class Node:
     def _on_counted(self, event: ev.StreamsCounted, now: float) -> None:
         self.stream_counts = event.counts
         self._hangs.absorb(event.counts, self.executors, now)
+        self.rounds.absorb_counts(event.counts, now)
 
     def _on_relay(self, event: ev.RelayChanged, _now: float) -> None:
         self._set_problem("relay", None if event.is_running else f"the relay is down: {event.reason}")

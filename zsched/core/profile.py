@@ -19,6 +19,7 @@ from zsched.core.model import (
     MAX_BITRATE_MBPS,
     MAX_CPU_CORES,
     MAX_MEMORY_MB,
+    MAX_TREND_DB_S,
     DeviceSample,
     Link,
     LinkSample,
@@ -77,10 +78,11 @@ class Ewma:
 class SignalFilter:
     """Drops impossible values and outliers of one radio link, and smooths the rest in dBm."""
 
-    __slots__ = ("_mean", "_recent", "_valid_at", "dropped")
+    __slots__ = ("_mean", "_mean_of_means", "_recent", "_valid_at", "dropped")
 
     def __init__(self, tau_s: float) -> None:
         self._mean = Ewma(tau_s)
+        self._mean_of_means = Ewma(tau_s)
         self._recent: deque[float] = deque(maxlen=RSSI_WINDOW)
         self._valid_at = -math.inf
         self.dropped = 0
@@ -89,12 +91,23 @@ class SignalFilter:
         """Take one reading in; the smoothed signal in dBm, or ``None`` when there was none for `STALE_S`."""
         if rssi_dbm is not None and self._is_plausible(rssi_dbm):
             self._valid_at = now
-            self._mean.update(rssi_dbm, now)
+            self._mean_of_means.update(self._mean.update(rssi_dbm, now), now)
         elif rssi_dbm is not None:
             self.dropped += 1
         if now - self._valid_at > STALE_S:
-            self._mean.value = None
+            self._mean.value = self._mean_of_means.value = None
         return self._mean.value
+
+    @property
+    def trend_db_s(self) -> float | None:
+        """How fast the smoothed signal changes, in dB per second (Brown 1956); ``None`` without a signal.
+
+        On a ramp a mean lags by the time constant, and the mean of the means by twice that.
+        """
+        once, twice, tau_s = self._mean.value, self._mean_of_means.value, self._mean.tau_s
+        if once is None or twice is None or tau_s <= 0.0:
+            return None
+        return min(max((once - twice) / tau_s, -MAX_TREND_DB_S), MAX_TREND_DB_S)
 
     def _is_plausible(self, rssi_dbm: float) -> bool:
         if not RSSI_IMPOSSIBLE_BELOW_DBM < rssi_dbm <= RSSI_IMPOSSIBLE_ABOVE_DBM:
@@ -140,16 +153,18 @@ class Profiler:
         self._workers = tuple(self._worker(load) for load in device.workers)
 
     def _link(self, sample: LinkSample, now: float) -> Link:
-        rssi = None
+        rssi = trend = None
         if sample.source is not LinkSource.WIRED:
             signal = self._signals.setdefault(sample.peer, SignalFilter(self._timing.smoothing_s))
             rssi = signal.update(sample.rssi_dbm, now)
+            trend = signal.trend_db_s
         return Link(
             source=sample.source,
             peer=sample.peer,
             rssi_dbm=rssi,
             bitrate_mbps=_possible(sample.bitrate_mbps, MAX_BITRATE_MBPS),
             retry_ratio=_possible(sample.retry_ratio, 1.0),
+            trend_db_s=trend,
         )
 
     def _worker(self, load: WorkerLoad) -> WorkerLoad:

@@ -17,12 +17,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from random import Random
 
+from zsched.core.costs import MoveCost
 from zsched.core.damping import Damping
 from zsched.core.fleet import Fleet, TaskSpec
 from zsched.core.gateway import Gateway
 from zsched.core.instructions import AskUtilities, Instruction, PublishProposal, RecordStory
 from zsched.core.messages import Utilities
 from zsched.core.model import Allocation, NodeId, PeerState, Proposal, TaskId, UtilityVector, WorkerState
+from zsched.core.plan import StreamCount
 from zsched.core.register import MoveOwner
 from zsched.core.scheduler import Judge, Judgement, Outcome, escape_reason
 from zsched.core.scoring import Standing, book, compare, majority, score
@@ -48,6 +50,7 @@ class TaskRound:
 
     spec: TaskSpec
     judge: Judge
+    cost: MoveCost
     settled_at: float
     """When this node learnt the current epoch."""
     is_called: bool = False
@@ -78,7 +81,10 @@ class Rounds:
         self._fleet, self._me, self._gateway, self._rng = fleet, me, gateway, rng
         self.is_voter = me in fleet.voters
         self.vote_s = 2 * fleet.timing.gather_s + VOTE_MARGIN_S
-        self.tasks = {spec.name: TaskRound(spec=spec, judge=Judge(spec=spec), settled_at=now) for spec in fleet.tasks}
+        self.tasks = {
+            spec.name: TaskRound(spec=spec, judge=Judge(spec=spec), cost=MoveCost(spec.name), settled_at=now)
+            for spec in fleet.tasks
+        }
         self._gather: _Gather | None = None
         self._answer: tuple[int, float, object, Utilities] = (-1, -math.inf, None, Utilities(voter=me, vectors=()))
         """(gateway's version, until when, (states, values), vectors): the newest answer to a gather."""
@@ -423,6 +429,14 @@ class Rounds:
     def on_moved(self, name: TaskId, left: NodeId | None, *, has_failed: bool, now: float) -> None:
         """A new owner is known: ``left`` is the one before, ``has_failed`` whether it was fled from."""
         self.tasks[name].damping.note_move(left, has_failed=has_failed, now=now)
+        self.tasks[name].cost.on_moved(is_planned=left is not None and not has_failed, now=now)
+
+    def absorb_counts(self, counts: tuple[StreamCount, ...], now: float) -> None:
+        """This robot's relay has counted its streams: what did the last moves cost?"""
+        for task in self.tasks.values():
+            if task.spec.pays_off_in_s is not None:
+                task.cost.absorb(counts, now)
+                task.judge.move_cost_s = task.cost.seconds
 
     def on_learnt(self, name: TaskId, *, is_new_epoch: bool, now: float) -> None:
         """A newer revision is known: proposals on older bases are worthless."""

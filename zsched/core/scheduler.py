@@ -21,6 +21,8 @@ from zsched.core.scoring import Standing, pick
 FORGIVEN_IN_S = 2.0
 LONGEST_GAP_S = 2.0
 """Nothing is charged for longer than this between two judgements: nobody looked."""
+MOST_FOR_COST = 0.3
+"""The bonus rises by no more than this, whatever moves cost: a task must be able to leave a node that is full."""
 INITIAL_SETTLE_S = 3.0
 """A task that nobody owns yet waits so long for candidates that are still starting."""
 
@@ -58,6 +60,8 @@ class Judge:
     spent: float = 0.0
     """What staying has cost so far, in utility seconds (tasks with a ``patience``)."""
     spent_at: float | None = None
+    move_cost_s: float = 0.0
+    """What the last moves have cost, in seconds of the task's work (`zsched.core.costs`; tasks with a horizon)."""
     seen_first_at: float | None = None
     """When a first candidate could be scored (a task that nobody owns waits for the others)."""
 
@@ -90,7 +94,7 @@ class Judge:
             damping: the task's record of moves: penalties, and the cap.
         """
         owner = allocation.owner
-        bonus = allocation.tuning.bonus if escape is None else 0.0
+        bonus = self._bonus(allocation) if escape is None else 0.0
         penalties = {} if damping is None else damping.penalties(now)
         scored = {
             name: max(value + (bonus if name == owner else 0.0) - penalties.get(name, 0.0), 0.0)
@@ -115,6 +119,13 @@ class Judge:
             is_escape=escape is not None and outcome is Outcome.PROPOSE,
             aggregates=scored,
         )
+
+    def _bonus(self, allocation: Allocation) -> float:
+        """What a lead must be: the tuning's bonus against noise, and what a move costs, spread over the horizon."""
+        horizon_s = self.spec.pays_off_in_s
+        if horizon_s is None:
+            return allocation.tuning.bonus
+        return allocation.tuning.bonus + min(self.move_cost_s / horizon_s, MOST_FOR_COST)
 
     def _spend(self, scored: Mapping[NodeId, float], owner: NodeId | None, now: float) -> None:
         """Add up the lead over the owner with its bonus, over time (Page's CUSUM, Biometrika 41, 1954).

@@ -12,12 +12,12 @@ import statistics
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from zsched.core.fleet import Demand, LinkLimits, Reach, Standby, TaskSpec
+from zsched.core.fleet import Demand, Reach, Standby, TaskSpec
 from zsched.core.gateway import Gateway
+from zsched.core.links import PairLink, pair_link
 from zsched.core.model import (
     Aggregate,
     Allocation,
-    LinkSource,
     NodeId,
     PeerState,
     Profile,
@@ -26,7 +26,7 @@ from zsched.core.model import (
     UtilityVector,
     WorkerState,
 )
-from zsched.core.utility import cpu_utility, memory_utility, network_utility, predicted_use, total_utility
+from zsched.core.utility import cpu_utility, memory_utility, predicted_use, total_utility
 
 METRICS = ("cpu", "memory", "network")
 
@@ -96,11 +96,11 @@ def score(
         if reason:
             refused.append((candidate, reason))
             continue
-        signal = _signal(voter, candidate, gateway, now)
-        if signal is not None and signal < spec.limits.nu_dbm:
+        link = pair_link(voter, candidate, gateway, spec.limits, now)
+        if link is not None and not link.is_reached:
             unreachable.append(candidate)
             continue
-        terms[candidate] = _measure(spec, profile, demand, unseen, signal)
+        terms[candidate] = _measure(spec, profile, demand, unseen, link)
     measured = frozenset(name for name in METRICS if any(getattr(t, name) is not None for t in terms.values()))
     utilities = [Utility(candidate=name, value=0.0, reachable=False) for name in unreachable]
     for candidate, term in terms.items():
@@ -181,9 +181,9 @@ def _memory_use(profile: Profile, spec: TaskSpec, demand: Demand, unseen: Demand
     return predicted_use(profile.memory_used_mb + unseen.memory_mb, own, demand.memory_mb)
 
 
-def _measure(spec: TaskSpec, profile: Profile, demand: Demand, unseen: Demand, signal: float | None) -> _Terms:
+def _measure(spec: TaskSpec, profile: Profile, demand: Demand, unseen: Demand, link: PairLink | None) -> _Terms:
     load = profile.worker(spec.name)
-    cpu = memory = network = None
+    cpu = memory = None
     if profile.cpu_used_cores is not None:
         own = (load.cpu_cores or 0.0) if load is not None else 0.0
         used_cores = profile.cpu_used_cores + unseen.cpu_cores
@@ -191,42 +191,7 @@ def _measure(spec: TaskSpec, profile: Profile, demand: Demand, unseen: Demand, s
     used = _memory_use(profile, spec, demand, unseen)
     if used is not None:
         memory = memory_utility(profile.memory_mb, demand.memory_mb, used - demand.memory_mb)
-    if signal is not None:
-        network = _link_utility(signal, spec.limits)
-    return _Terms(cpu, memory, network)
-
-
-WIRED_DBM = 0.0
-"""Stands for a cable in comparisons of signals: better than any radio."""
-
-
-def _link_utility(signal: float, limits: LinkLimits) -> float:
-    return network_utility(signal, limits.nu_dbm, limits.rho_dbm, limits.knee_dbm)
-
-
-def _signal(voter: NodeId, candidate: NodeId, gateway: Gateway, now: float) -> float | None:
-    """Eq. 3's lambda for one (robot, candidate) pair in dBm, or ``None`` when nobody measured it.
-
-    A link measured between the two counts as it is, from either end. Else both reach each other through one access
-    point, and the weaker of the two ways counts.
-    """
-    if voter == candidate:
-        return WIRED_DBM
-    ends = (gateway.fresh(voter, now), gateway.fresh(candidate, now))
-    for end, other in ((ends[0], candidate), (ends[1], voter)):
-        direct = None if end is None else _link_signal(end, other)
-        if direct is not None:
-            return direct
-    ways = [None if end is None else _link_signal(end, None) for end in ends]
-    known = [way for way in ways if way is not None]
-    return min(known) if len(known) == len(ways) else None
-
-
-def _link_signal(profile: Profile, peer: NodeId | None) -> float | None:
-    for link in profile.links:
-        if link.peer == peer:
-            return WIRED_DBM if link.source is LinkSource.WIRED else link.rssi_dbm
-    return None
+    return _Terms(cpu, memory, None if link is None else link.utility)
 
 
 # --- compare: all robots' views (Compare_Utility) --------------------------------------------------------------------

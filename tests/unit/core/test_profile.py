@@ -327,3 +327,37 @@ def test_a_sampler_that_died_leaves_nothing_measured() -> None:
     assert first is not None
     assert later is not None
     assert (first.cpu_used_cores, later.cpu_used_cores, later.memory_used_mb) == (1.0, None, None)
+
+
+# --- the trend of a signal -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("slope", [-1.0, 0.0, 1.0])
+def test_on_a_ramp_the_trend_is_its_slope_and_foreseeing_a_time_constant_undoes_the_delay(slope: float) -> None:
+    """Brown 1956: a mean lags a ramp by tau, the mean of the means by 2 tau."""
+    signal, tau_s, mean = SignalFilter(3.0), 3.0, 0.0
+    for step in range(400):
+        mean = signal.update(-60.0 + slope * 0.05 * step, 0.05 * step) or 0.0
+    assert signal.trend_db_s == pytest.approx(slope, abs=0.05)
+    true = -60.0 + slope * 0.05 * 399
+    assert mean + tau_s * (signal.trend_db_s or 0.0) == pytest.approx(true, abs=0.2)
+
+
+def test_without_a_signal_there_is_no_trend() -> None:
+    signal, trends = SignalFilter(3.0), []
+    for rssi, at in ((None, 0.0), (-60.0, 0.2), (None, STALE_S + 1.0)):
+        signal.update(rssi, at)
+        trends.append(signal.trend_db_s)
+    assert trends == [None, 0.0, None]
+
+
+def test_a_profile_carries_the_trend_of_a_radio_and_none_of_a_cable() -> None:
+    profiler = make_profiler()
+    for step in range(30):
+        profiler.absorb(
+            device(), (radio(-50.0 - 0.4 * step), LinkSample(source=LinkSource.WIRED, peer="x")), 0.2 * step
+        )
+    links = taken(profiler, 6.0).links
+    assert links[0].trend_db_s is not None
+    assert -2.0 < links[0].trend_db_s < -1.0
+    assert links[1].trend_db_s is None

@@ -13,7 +13,7 @@ from pathlib import Path
 from zsched.lab.decisions import drives, figures, report, study
 
 PARTS = ("compare", "sweep", "options")
-SHOWN = ("zsched", "zsched, patience", "dyna_net", "argmax", "dyna_net_penalty")
+SHOWN = ("zsched", "foresee 4 s", "the weaker way", "dyna_net", "argmax", "dyna_net_penalty")
 
 
 def parse() -> argparse.Namespace:
@@ -63,6 +63,10 @@ def show(out: Path, folder: Path | None) -> None:
     cases = {str(row["case"]) for row in rows}
     if "long" in cases:
         figures.rules(rows, out / "rules.png")
+    if {"equal", "step"} <= cases:
+        figures.stickiness(rows, out / "stickiness.png")
+    if "fading" in cases:
+        figures.options(rows, out / "options.png")
     if any(case.startswith("long-") for case in cases):
         figures.sizes(rows, out / "sizes.png")
     if set(report.WHOLE_GRID) <= cases:

@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from zsched.core.fleet import LinkLimits
+from zsched.core.fleet import LinkLimits, PairReading
 from zsched.lab.decisions import entries
 from zsched.lab.decisions.radio import Drive, read_drive
 from zsched.lab.decisions.replay import Entry, replay
@@ -66,11 +66,30 @@ def cast(world: World) -> tuple[Entry, ...]:
         ),
         Entry(name="cool-down 5 s", make=entries.core(world, cool_down_s=5.0)),
         Entry(name="with a knee", limits=knee, make=entries.core(world)),
-        Entry(name="2 s ahead", look=Look(lead_s=2.0), make=entries.core(world)),
+        *(
+            Entry(name=f"foresee {lead_s:g} s", limits=LinkLimits(foresee_s=lead_s), make=entries.core(world))
+            for lead_s in (1.0, 2.0, 3.0, 4.0)
+        ),
+        *(
+            Entry(
+                name=f"foresee {lead_s:g} s, patience",
+                limits=LinkLimits(foresee_s=lead_s),
+                make=entries.core(world, bonus=0.05, patience=entries.PATIENCE),
+            )
+            for lead_s in (2.0, 3.0)
+        ),
         Entry(name="zsched, patience", make=entries.core(world, bonus=0.05, patience=entries.PATIENCE)),
+        *(
+            Entry(name=name, limits=LinkLimits(pair=pair), make=entries.core(world))
+            for name, pair in (("the weaker way", PairReading.WEAKER), ("the mean way", PairReading.MEAN))
+        ),
         Entry(name="dyna_net", look=UNSMOOTHED, make=lambda view: PickRule(view, cost=entries.PAPER_COST)),
         Entry(name="dyna_net_penalty", look=UNSMOOTHED, make=lambda view: PickRule(view, cost=-entries.PAPER_COST)),
         Entry(name="argmax", look=UNSMOOTHED, make=PickRule),
+        *(
+            Entry(name=f"argmax, {pair}", look=UNSMOOTHED, limits=LinkLimits(pair=pair), make=PickRule)
+            for pair in (PairReading.WEAKER, PairReading.MEAN)
+        ),
         Entry(name="argmax, every 0.5 s", look=UNSMOOTHED, make=lambda view: PickRule(view, period_s=0.5)),
         Entry(name="every_25s", look=UNSMOOTHED, make=lambda view: PickRule(view, period_s=25.0)),
         *(entry for entry in entries.schemes(world, 1) if entry.name.startswith("fixed")),

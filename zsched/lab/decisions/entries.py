@@ -13,6 +13,7 @@ from collections.abc import Callable
 from random import Random
 from typing import Any, Final
 
+from zsched.core.fleet import LinkLimits, PairReading
 from zsched.core.model import Tuning, Weights
 from zsched.lab.decisions.replay import Entry
 from zsched.lab.decisions.rules import (
@@ -43,12 +44,14 @@ def core(
     time_to_trigger_s: float | None = None,
     cool_down_s: float | None = None,
     patience: float | None = None,
+    pays_off_in_s: float | None = None,
+    move_cost_s: float = 0.0,
 ) -> Callable[[View], Rule]:
     """The production's decision; what is ``None`` is its default, a ``patience`` replaces the time-to-trigger."""
     given = {"bonus": bonus, "time_to_trigger_s": time_to_trigger_s, "cool_down_s": cool_down_s}
     settings: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     tuning = Tuning(weights=world.spec.tuning.weights, **settings)
-    return lambda view: CoreRule(view, tuning, patience=patience)
+    return lambda view: CoreRule(view, tuning, patience=patience, pays_off_in_s=pays_off_in_s, move_cost_s=move_cost_s)
 
 
 def schemes(world: World, seed: int) -> tuple[Entry, ...]:
@@ -106,12 +109,52 @@ def grid(world: World) -> tuple[Entry, ...]:
 
 
 def fading(world: World) -> tuple[Entry, ...]:
-    """Prediction of a fading link, at the default tuning: signals ``lead_s`` seconds ahead along their slope."""
-    return tuple(
-        Entry(
-            name=f"lead{lead_s:g} slope{slope_s:g}" if lead_s else "lead0",
-            look=Look(lead_s=lead_s, slope_s=slope_s),
-            make=core(world),
-        )
-        for lead_s, slope_s in ((0.0, 3.0), (1.0, 3.0), (2.0, 3.0), (2.0, 6.0), (4.0, 6.0))
+    """Prediction of a fading link, at the default tuning: ``link.foresee_s``; and a knee, and both."""
+    ahead = tuple(
+        Entry(name=f"foresee {lead_s:g} s", limits=LinkLimits(foresee_s=lead_s), make=core(world))
+        for lead_s in (1.0, 2.0, 3.0, 4.0)
     )
+    return (
+        Entry(name="zsched", make=core(world)),
+        *ahead,
+        Entry(name="knee -65 dBm", limits=LinkLimits(knee_dbm=-65.0), make=core(world)),
+        Entry(name="patience, foresee 2 s", limits=LinkLimits(foresee_s=2.0), make=_patient(world)),
+        Entry(name="zsched, patience", make=_patient(world)),
+    )
+
+
+def _patient(world: World) -> Callable[[View], Rule]:
+    return core(world, bonus=0.05, patience=PATIENCE)
+
+
+def costly(world: World, move_cost_s: float) -> tuple[Entry, ...]:
+    """What to do when a move costs so many seconds of work: fixed bonuses, patience, and the measured cost."""
+    return (
+        Entry(name="zsched", make=core(world)),
+        *(Entry(name=f"bonus {bonus:g}", make=core(world, bonus=bonus)) for bonus in (0.05, 0.15, 0.2, 0.3)),
+        *(
+            Entry(
+                name=f"bonus {bonus:g} + cost over {horizon_s:g} s",
+                make=core(world, bonus=bonus, pays_off_in_s=horizon_s, move_cost_s=move_cost_s),
+            )
+            for bonus, horizon_s in ((0.05, 60.0), (0.05, 120.0), (0.1, 60.0), (0.1, 120.0))
+        ),
+        Entry(name="zsched, patience", make=_patient(world)),
+        Entry(name="patience of the cost", make=core(world, bonus=0.05, patience=max(PATIENCE, 0.5 * move_cost_s))),
+    )
+
+
+def readings(world: World) -> tuple[Entry, ...]:
+    """Robot to robot through one access point: every reading of a pair, at several bonuses, and plain argmax."""
+    judged = tuple(
+        Entry(
+            name=f"{pair}, bonus {bonus:g}" + (f", foresee {lead_s:g} s" if lead_s else ""),
+            limits=LinkLimits(pair=pair, foresee_s=lead_s),
+            make=core(world, bonus=bonus),
+        )
+        for pair, bonus, lead_s in itertools.product(PairReading, (0.1, 0.05, 0.03), (0.0, 2.0))
+    )
+    plain = tuple(
+        Entry(name=f"{pair}, argmax", look=RAW, limits=LinkLimits(pair=pair), make=_pick(0.0)) for pair in PairReading
+    )
+    return judged + plain

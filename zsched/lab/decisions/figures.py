@@ -14,7 +14,7 @@ from typing import Any, Final
 import matplotlib as mpl
 import numpy as np
 
-from zsched.lab.decisions.report import RULES, WHOLE_GRID, Row, grid_regrets, of, rate
+from zsched.lab.decisions.report import RULES, WHOLE_GRID, Row, grid_regrets, mean_and_spread, of, rate
 from zsched.lab.decisions.rules import Move
 from zsched.lab.decisions.score import owners_by_step
 from zsched.lab.decisions.world import DT_S, World
@@ -29,6 +29,9 @@ KINDS: Final = (
     ("short", "loads of 3 to 20 s"),
     ("radio", "driving robots, loads of 60 to 240 s"),
 )
+OPTIONS: Final = {"fading": "driving robots, three edges", "robots": "three robots, one access point"}
+STEP_GOAL_S: Final = 4.3
+"""Time-to-trigger, 0.6 time constants and a round (design)."""
 DPI: Final = 110
 
 
@@ -52,12 +55,13 @@ def rules(rows: Sequence[Row], path: Path) -> None:
         regrets = [[100.0 * float(one["regret"]) for one in of(rows, case, name)] for name in names]
         at = np.arange(len(names))
         colours = [_colour(name) for name in names]
-        means = [statistics.fmean(values) for values in regrets]
-        spans = np.asarray([[m - min(v), max(v) - m] for m, v in zip(means, regrets, strict=True)]).T
+        means, spans = zip(*(mean_and_spread(values) for values in regrets), strict=True)
         axes[row][0].bar(at, means, color=colours, yerr=spans, error_kw={"lw": 0.8, "capsize": 2})
         axes[row][0].axhline(5.0, color="black", lw=0.8, ls=":")
         axes[row][0].set_ylabel("regret, %")
-        axes[row][0].set_title(f"{title}: regret (whiskers: all seeds; dotted: 5 %)", fontsize=10)
+        axes[row][0].set_title(
+            f"{title}: regret ({len(regrets[0])} h; whiskers: 1.96 standard errors; dotted: 5 %)", fontsize=10
+        )
         total, wasted = ([rate(of(rows, case, name), field) for name in names] for field in ("moves", "wasted"))
         axes[row][1].bar(at, total, color=colours)
         axes[row][1].bar(at, wasted, color="black", width=0.35, label="back within 30 s")
@@ -70,6 +74,51 @@ def rules(rows: Sequence[Row], path: Path) -> None:
         axes[row][1].legend(fontsize=8, ncols=2, loc="upper left")
         for axis in axes[row]:
             axis.set_xticks(at, names, rotation=40, ha="right", fontsize=8)
+    _save(figure, path)
+
+
+def stickiness(rows: Sequence[Row], path: Path) -> None:
+    """Two equal nodes under noise: moves per hour; one of them 30 % worse: how soon each rule leaves it."""
+    names = [name for name in RULES if of(rows, "equal", name) and of(rows, "step", name) and name != "oracle"]
+    figure, axes = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained", sharey=True)
+    at = np.arange(len(names))
+    axes[0].barh(at, [rate(of(rows, "equal", name), "moves") for name in names], color=[_colour(n) for n in names])
+    axes[0].set_xscale("symlog", linthresh=1.0)
+    axes[0].axvline(1.0, color="black", lw=0.8, ls=":")
+    axes[0].set_xlabel("moves per hour (dotted: goal, at most 1)")
+    axes[0].set_title("two equal nodes, readings uniform within 15 %", fontsize=10)
+    axes[0].set_yticks(at, names, fontsize=8)
+    axes[0].invert_yaxis()
+    for index, name in enumerate(names):
+        mine = of(rows, "step", name)
+        took = [float(row["reaction_s"]) for row in mine if row.get("reaction_s") is not None]
+        axes[1].scatter(took, [index] * len(took), s=14, color=_colour(name), alpha=0.6)
+        axes[1].text(17.0, index, f"{len(took)} of {len(mine)}", fontsize=8, va="center")
+    axes[1].axvline(STEP_GOAL_S, color="black", lw=0.8, ls=":")
+    axes[1].set_xlim(0, 20)
+    axes[1].set_xlabel(f"seconds from the step to the move (dotted: goal, {STEP_GOAL_S:g} s)")
+    axes[1].set_title("the owner gets 30 % worse (right: how often followed)", fontsize=10)
+    _save(figure, path)
+
+
+def options(rows: Sequence[Row], path: Path) -> None:
+    """What each option loses to the oracle, one panel per question."""
+    cases = [case for case in dict.fromkeys(str(row["case"]) for row in rows) if case in OPTIONS or "costs" in case]
+    figure, axes = plt.subplots(-(-len(cases) // 3), 3, figsize=(14, 8.5), layout="constrained", squeeze=False)
+    for axis in axes.flat[len(cases) :]:
+        axis.set_axis_off()
+    for axis, case in zip(axes.flat, cases, strict=False):
+        found = dict.fromkeys(str(row["rule"]) for row in of(rows, case))
+        names = [name for name in found if name != "oracle" and "argmax" not in name]
+        pairs = [mean_and_spread([100.0 * float(row["regret"]) for row in of(rows, case, name)]) for name in names]
+        at = np.arange(len(names))
+        colours = [OURS if name == "zsched" else THEIRS for name in names]
+        axis.barh(at, [mean for mean, _ in pairs], xerr=[span for _, span in pairs], color=colours,
+                  error_kw={"lw": 0.8, "capsize": 2})  # fmt: skip
+        axis.set_yticks(at, names, fontsize=7)
+        axis.invert_yaxis()
+        axis.set_xlabel("regret, %")
+        axis.set_title(f"{OPTIONS.get(case, case)} ({len(of(rows, case, names[0]))} h)", fontsize=9)
     _save(figure, path)
 
 

@@ -14,14 +14,15 @@ from typing import Final
 
 from zsched.lab.decisions import entries, loads
 from zsched.lab.decisions.replay import Entry, replay
-from zsched.lab.decisions.score import figures, truth_of
-from zsched.lab.decisions.world import World, equal_world, loaded_world
+from zsched.lab.decisions.score import MOVE_COST_S, figures, truth_of
+from zsched.lab.decisions.world import World, equal_world, loaded_world, robots_world
 
 TRAIN: Final = range(1, 1000)
 """Seeds that the defaults are chosen by."""
 TEST: Final = range(1001, 2000)
 """Seeds that are only looked at afterwards."""
 CANDIDATES: Final = (3, 10, 50, 200)
+COSTS_S: Final = (1.0, 5.0, 15.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,6 +36,7 @@ class Case:
     """Length of one history."""
     share: float = 1.0
     """How many of the hours asked for: large fleets get fewer."""
+    move_cost_s: float = MOVE_COST_S
 
 
 def _loads(edges: int, plan: loads.LoadPlan, *, with_radio: bool = False) -> Callable[[int, float], World]:
@@ -43,6 +45,10 @@ def _loads(edges: int, plan: loads.LoadPlan, *, with_radio: bool = False) -> Cal
 
 def _equal(seed: int, hours: float) -> World:
     return equal_world(seed=seed, hours=hours)
+
+
+def _robots(seed: int, hours: float) -> World:
+    return robots_world(seed=seed, hours=hours)
 
 
 def _step(seed: int, hours: float) -> World:
@@ -92,9 +98,23 @@ def swept() -> tuple[Case, ...]:
 
 
 def options() -> tuple[Case, ...]:
-    """What might be better than the paper's: prediction of a fading link."""
+    """What might be better than the paper's: prediction of a fading link, a measured cost, readings of a pair."""
     radio = _loads(3, loads.LONG, with_radio=True)
-    return (Case(name="fading radio", build=radio, cast=lambda world, _seed: entries.fading(world), hours=1.0),)
+    return (
+        Case(name="fading", build=radio, cast=lambda world, _seed: entries.fading(world), hours=1.0),
+        Case(name="robots", build=_robots, cast=lambda world, _seed: entries.readings(world), hours=1.0),
+        *(_costly(cost_s) for cost_s in COSTS_S),
+    )
+
+
+def _costly(cost_s: float) -> Case:
+    return Case(
+        name=f"a move costs {cost_s:g} s",
+        build=_loads(3, loads.MIXED),
+        cast=lambda world, _seed: entries.costly(world, cost_s),
+        hours=1.0,
+        move_cost_s=cost_s,
+    )
 
 
 def play(
@@ -112,7 +132,7 @@ def play(
             if (case.name, seed) in done:
                 continue
             world = case.build(seed, case.hours)
-            truth = truth_of(world)
+            truth = truth_of(world, move_cost_s=case.move_cost_s)
             cast = tuple(entry for entry in case.cast(world, seed) if not only or entry.name in only)
             moves = replay(world, cast, seed)
             rows = [

@@ -22,10 +22,9 @@ from zsched.core.model import (
     LinkSource,
     NodeId,
     PeerState,
-    Profile,
     UtilityVector,
 )
-from zsched.core.profile import Ewma, Profiler
+from zsched.core.profile import Profiler
 from zsched.core.scoring import Standing, compare, score
 from zsched.lab.decisions.world import DT_S, MEMORY_MB, World
 
@@ -36,12 +35,9 @@ IDLE: Final = DeviceSample(cpu_cores=4.0, cpu_used_cores=1.0, memory_mb=MEMORY_M
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Look:
-    """How a rule wants to see: seconds of smoothing, and seconds by which radio signals are extrapolated."""
+    """How a rule wants to see: seconds of smoothing at the source."""
 
     smoothing_s: float = 3.0
-    lead_s: float = 0.0
-    slope_s: float = 3.0
-    """Time constant of the slope (with ``lead_s`` only)."""
 
 
 class Feed:
@@ -50,12 +46,11 @@ class Feed:
     def __init__(self, world: World, look: Look) -> None:
         smoothing_s = max(look.smoothing_s, 1e-9)
         self.fleet: Fleet = replace(world.fleet, timing=replace(world.fleet.timing, smoothing_s=smoothing_s))
-        self._world, self._look = world, look
+        self._world = world
         self.gateway = Gateway(self.fleet)
         self._profilers = {node.name: Profiler(node.name, 1, self.fleet.timing) for node in self.fleet.nodes}
         self._column = {name: index for index, name in enumerate(world.candidates)}
         self._row = {name: index for index, name in enumerate(self.fleet.voters)}
-        self._slopes: dict[tuple[NodeId, NodeId | None], _Slope] = {}
         self._read = _Readings.of(world)
 
     def step(self, index: int) -> None:
@@ -65,7 +60,7 @@ class Feed:
             profiler.absorb(self._device(name, index), self._links(name, index), now)
             profile = profiler.publishable({}, is_draining=False, now=now)
             if profile is not None:
-                self.gateway.absorb(self._ahead(profile, now), now)
+                self.gateway.absorb(profile, now)
 
     def _device(self, name: NodeId, index: int) -> DeviceSample:
         column = self._column.get(name)
@@ -90,17 +85,6 @@ class Feed:
             pairs = zip(self._world.candidates, read, strict=True)
             return tuple(LinkSample(source=LinkSource.TRACE, peer=peer, rssi_dbm=_dbm(value)) for peer, value in pairs)
         return (LinkSample(source=LinkSource.TRACE, rssi_dbm=_dbm(read)),)
-
-    def _ahead(self, profile: Profile, now: float) -> Profile:
-        """The profile with its signals ``lead_s`` further along their slope."""
-        if self._look.lead_s <= 0.0:
-            return profile
-        links = []
-        for link in profile.links:
-            slope = self._slopes.setdefault((profile.node, link.peer), _Slope(Ewma(self._look.slope_s)))
-            ahead = slope.ahead(link.rssi_dbm, self._look.lead_s, now)
-            links.append(link if ahead is None else replace(link, rssi_dbm=ahead))
-        return replace(profile, links=tuple(links))
 
 
 class View:
@@ -133,23 +117,6 @@ class View:
 
 def _dbm(value: float) -> float | None:
     return None if math.isnan(value) else value
-
-
-@dataclass(slots=True)
-class _Slope:
-    """The slope of one filtered signal, and where the signal will be."""
-
-    mean: Ewma
-    before: tuple[float, float] | None = None
-
-    def ahead(self, rssi_dbm: float | None, lead_s: float, now: float) -> float | None:
-        if rssi_dbm is None:
-            self.before = None
-            return None
-        if self.before is not None and now > self.before[1]:
-            self.mean.update((rssi_dbm - self.before[0]) / (now - self.before[1]), now)
-        self.before = (rssi_dbm, now)
-        return min(max(rssi_dbm + lead_s * (self.mean.value or 0.0), -120.0), 0.0)
 
 
 @dataclass(slots=True)

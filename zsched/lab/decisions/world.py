@@ -68,13 +68,14 @@ class World:
         return len(self.cpu)
 
     def between(self) -> Array | None:
-        """True signals [T, R, C] between robots and candidates; through an access point the weaker way counts."""
+        """True signals [T, R, C] between robots and candidates.
+
+        Through one access point the delays of both ways add up. The robots' own ways are part of that whoever has the
+        task; what is decided about is the candidate's way, so that is what counts (docs/decisions/0018).
+        """
         if self.signal is None or self.signal.ndim == 3:
             return self.signal
-        pairs = np.minimum(self.signal[:, :, None], self.signal[:, None, :])
-        own = np.arange(pairs.shape[1])
-        pairs[:, own, own] = 0.0
-        return pairs
+        return np.repeat(self.signal[:, None, :], self.signal.shape[1], axis=1)
 
 
 def true_utility(world: World) -> Array:
@@ -183,6 +184,25 @@ def equal_world(*, seed: int, hours: float, half_width: float = 0.15, step_at_s:
         cpu_read=_read(use, scatter, rng, is_cpu=True),
         memory_read=_read(use, scatter, rng, is_cpu=True),
         step_at_s=step_at_s,
+    )
+
+
+def robots_world(*, seed: int, hours: float, robots: int = 3) -> World:
+    """Robots that drive through a hall with one access point in it, and have the task among themselves."""
+    rng = np.random.default_rng(seed)
+    steps = round(hours * 3600 / DT_S)
+    signal = radio.hall_signals(steps, DT_S, robots, 1, rng)[:, :, 0]
+    quiet = np.full((steps, robots), 0.2)
+    return World(
+        name="robots",
+        fleet=build_fleet(robots, 0, RADIO_ONLY, Timing(), are_robots_candidates=True),
+        cores=np.full(robots, 4.0),
+        cpu=quiet,
+        memory=quiet,
+        cpu_read=quiet,
+        memory_read=quiet,
+        signal=signal,
+        signal_read=signal + radio.fading_db(signal.shape, rng),
     )
 
 

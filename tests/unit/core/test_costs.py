@@ -1,0 +1,93 @@
+"""What a move costs: the outputs missing around it, whatever the rate, and nothing when nothing was asked."""
+
+from __future__ import annotations
+
+import pytest
+
+from zsched.core.costs import NEWEST, WINDOW_S, MoveCost
+from zsched.core.plan import StreamCount
+
+
+class Relay:
+    """Counts as a relay does: once a second, of a task that answers every input, but for its silences."""
+
+    def __init__(self, hz: float = 10.0) -> None:
+        self.cost, self.now, self.hz = MoveCost("merge"), 100.0, hz
+        self.taken = self.given = 0.0
+
+    def run(self, seconds: int, *, silent_s: float = 0.0, asks: bool = True) -> None:
+        """``silent_s`` of the outputs of this time are missing."""
+        for _ in range(seconds):
+            quiet = min(silent_s, 1.0)
+            silent_s -= quiet
+            self.taken += self.hz if asks else 0.0
+            self.given += self.hz * (1.0 - quiet) if asks else 0.0
+            self.now += 1.0
+            counts = (
+                StreamCount(stream="merge/in/0", messages=round(self.taken)),
+                StreamCount(stream="merge/out/0", messages=round(self.given)),
+                StreamCount(stream="other/out/0", messages=999),
+            )
+            self.cost.absorb(counts, self.now)
+
+    def move(self, *, is_planned: bool = True) -> None:
+        self.cost.on_moved(is_planned=is_planned, now=self.now + 0.4)
+
+
+@pytest.mark.parametrize("hz", [1.0, 10.0, 500.0])
+@pytest.mark.parametrize("silent_s", [0.0, 2.0])
+def test_the_cost_is_the_work_that_is_missing_at_any_rate(hz: float, silent_s: float) -> None:
+    relay = Relay(hz)
+    relay.run(20)
+    relay.move()
+    relay.run(8, silent_s=silent_s)
+    assert relay.cost.moves == 1
+    assert relay.cost.seconds == pytest.approx(silent_s, abs=0.05)
+
+
+def test_a_silence_shorter_than_the_relays_reports_is_seen() -> None:
+    relay = Relay(100.0)
+    relay.run(20)
+    relay.move()
+    relay.run(8, silent_s=0.3)
+    assert relay.cost.seconds == pytest.approx(0.3, abs=0.05)
+
+
+def test_later_moves_count_more_than_earlier_ones() -> None:
+    relay = Relay()
+    relay.run(20)
+    for silent_s in (2.0, 0.0):
+        relay.move()
+        relay.run(20, silent_s=silent_s)
+    assert relay.cost.seconds == pytest.approx(2.0 * (1.0 - NEWEST), abs=0.1)
+
+
+def test_escapes_and_first_placements_are_not_measured() -> None:
+    relay = Relay()
+    relay.run(20)
+    relay.move(is_planned=False)
+    relay.run(10, silent_s=3.0)
+    assert (relay.cost.moves, relay.cost.seconds) == (0, 0.0)
+
+
+def test_a_task_that_nobody_asks_anything_costs_nothing() -> None:
+    relay = Relay()
+    relay.run(20)
+    relay.move()
+    relay.run(10, asks=False)
+    assert relay.cost.moves == 0
+
+
+def test_two_moves_within_a_window_and_a_new_relay_are_not_measured() -> None:
+    relay = Relay()
+    relay.run(20)
+    relay.move()
+    relay.run(1, silent_s=1.0)
+    relay.move()
+    relay.run(round(WINDOW_S) + 4, silent_s=1.0)
+    assert relay.cost.moves == 0
+    relay.run(20)
+    relay.move()
+    relay.taken = relay.given = 0.0
+    relay.run(round(WINDOW_S) + 4)
+    assert relay.cost.moves == 0
