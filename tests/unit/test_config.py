@@ -13,6 +13,7 @@ from zsched.core.fleet import (
     Fleet,
     LinkSpec,
     OnIsolation,
+    PairReading,
     Reach,
     Standby,
     WorkerLink,
@@ -142,8 +143,8 @@ def test_every_setting_of_a_task_arrives() -> None:
         """\
     scheduling:
       {bonus: 0.2, time_to_trigger_s: 3, cool_down_s: 4, aggregate: median, reach: all, memory_floor_ratio: 0.1,
-       patience: 0.3}
-    link: {nu_dbm: -75, rho_dbm: -45, knee_dbm: -60}
+       patience: 0.3, pays_off_in_s: 60}
+    link: {nu_dbm: -75, rho_dbm: -45, knee_dbm: -60, pair: weaker, foresee_s: 2}
     on_isolation: local
     drain_s: 5
     worker:
@@ -162,7 +163,8 @@ def test_every_setting_of_a_task_arrives() -> None:
     task = fleet_of(text).task("map_merge")
     assert (task.tuning.bonus, task.tuning.time_to_trigger_s, task.tuning.cool_down_s) == (0.2, 3, 4)
     assert (task.tuning.aggregate, task.reach, task.memory_floor_ratio) == (Aggregate.MEDIAN, Reach.ALL, 0.1)
-    assert task.patience == 0.3
+    assert (task.patience, task.pays_off_in_s) == (0.3, 60)
+    assert (task.limits.pair, task.limits.foresee_s) == (PairReading.WEAKER, 2)
     assert (task.limits.nu_dbm, task.limits.rho_dbm, task.limits.knee_dbm) == (-75, -45, -60)
     assert (task.on_isolation, task.drain_s) == (OnIsolation.LOCAL, 5)
     worker = task.worker

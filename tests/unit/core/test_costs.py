@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from random import Random
+
 import pytest
 
 from zsched.core.costs import NEWEST, WINDOW_S, MoveCost
+from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing
+from zsched.core.gateway import Gateway
+from zsched.core.model import NodeKind, Tuning, Weights
 from zsched.core.plan import StreamCount
+from zsched.core.rounds import Rounds
 
 
 class Relay:
@@ -76,6 +82,29 @@ def test_a_task_that_nobody_asks_anything_costs_nothing() -> None:
     relay.move()
     relay.run(10, asks=False)
     assert relay.cost.moves == 0
+
+
+@pytest.mark.parametrize(("horizon_s", "known_s"), [(60.0, 2.0), (None, 0.0)])
+def test_a_robots_rounds_tell_the_judge_what_planned_moves_have_cost(horizon_s: float | None, known_s: float) -> None:
+    spec = TaskSpec(
+        name="merge",
+        candidates=("edge1",),
+        tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0)),
+        pays_off_in_s=horizon_s,
+    )
+    nodes = (NodeSpec(name="edge1", kind=NodeKind.EDGE), NodeSpec(name="robot1", kind=NodeKind.ROBOT))
+    fleet = Fleet(name="lab", timing=Timing(), nodes=nodes, tasks=(spec,), electors=("robot1",))
+    rounds = Rounds(fleet, "robot1", Gateway(fleet), Random(1), 0.0)
+    for second in range(1, 40):
+        if second == 20:
+            rounds.on_moved("merge", "edge1", has_failed=False, now=19.5)
+        given = 10 * (second if second < 20 else max(second - 2, 19))
+        counts = (
+            StreamCount(stream="merge/in/0", messages=10 * second),
+            StreamCount(stream="merge/out/0", messages=given),
+        )
+        rounds.absorb_counts(counts, float(second))
+    assert rounds.tasks["merge"].judge.move_cost_s == pytest.approx(known_s, abs=0.05)
 
 
 def test_two_moves_within_a_window_and_a_new_relay_are_not_measured() -> None:
