@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from zsched.lab.neural_load import Network
-from zsched.lab.paper.cameras import Camera, main
+from zsched.lab.paper.cameras import Camera, main, next_frame
 from zsched.lab.signals import StopFlag
 
 
@@ -50,6 +50,13 @@ def test_streams_run_side_by_side_and_end_on_sigterm(tmp_path: Path) -> None:
     assert threads >= 4
     assert lines[-1]["streams"] == 3
     assert 0 < lines[0]["frames"] < lines[-1]["frames"]
+
+
+def test_a_stream_pauses_by_its_own_cpu_time_and_catches_nothing_up() -> None:
+    assert next_frame(10.0, 10.0, 0.05, 0.25) == pytest.approx(10.2)
+    assert next_frame(10.0, 99.0, 0.05, 0.25) == pytest.approx(99.2)  # late: a full node
+    assert next_frame(10.2, 10.1, 0.05, 0.25) == pytest.approx(10.4)
+    assert next_frame(10.0, 10.0, 0.05, 0.0) == 10.0  # all it can get
 
 
 def test_streams_take_the_cpu_that_they_are_given() -> None:

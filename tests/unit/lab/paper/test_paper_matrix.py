@@ -118,7 +118,8 @@ def test_a_plan_starts_nothing_and_makes_no_folder(tmp_path: Path, capsys: pytes
     ("host", "is_valid"),
     [
         ({"pressure": 0.1, "idle_ratio": 0.0}, True),
-        ({"pressure": 0.9, "idle_ratio": 0.9}, False),
+        ({"pressure": 0.2, "idle_ratio": 0.0}, True),
+        ({"pressure": 0.21, "idle_ratio": 0.9}, False),
         ({"pressure": None, "idle_ratio": 0.01}, False),
         ({"pressure": None, "idle_ratio": 0.5}, True),
     ],

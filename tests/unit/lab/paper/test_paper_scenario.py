@@ -217,9 +217,13 @@ def test_the_utility_by_hand() -> None:
     one = LoadLevel(streams=1, share=0.6, memory_mb=226.0)
     strong = NodeShare(cpu_cores=0.45, memory_mb=1024, ballast_mb=100.0)
     weak = NodeShare(cpu_cores=0.3, memory_mb=1024)
+    large = NodeShare(cpu_cores=0.9, memory_mb=1024)
+    three = replace(one, streams=3)
 
     # 0.45 - 0.15 for the task - 0.6 * 0.45 for the model = 0.03; 1024 - 110 - 100 - 226 = 588 MiB free.
     assert utility(strong, one, 0.45, is_loaded=True) == pytest.approx(0.5 * 0.03 / 0.45 + 0.5 * 588 / 1024)
+    # Three of them take 0.54 cores of a whole edge of 0.3: 0.9 - 0.15 - 0.54 = 0.21 are left.
+    assert utility(large, three, 0.3, is_loaded=True) == pytest.approx(0.5 * 0.21 / 0.9 + 0.5 * 688 / 1024)
     # The same model leaves the weak one nothing: 0.3 - 0.15 - 0.27 < 0.
     assert utility(weak, one, 0.45, is_loaded=True) == pytest.approx(0.5 * (1024 - 110 - 226) / 1024)
     assert utility(weak, one, 0.45, is_loaded=False) == pytest.approx(0.5 * 0.5 + 0.5 * 914 / 1024)
