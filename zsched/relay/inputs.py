@@ -171,11 +171,11 @@ class InputStream:
     # --- one sample --------------------------------------------------------------------------------------------------
 
     def _carry(self, sample: Sample) -> None:
-        active = self._active
+        active, size = self._active, len(sample.payload)
         if active is not None and self._is_patient:
-            active.outlet.wait_for_room(len(sample.payload))
+            active.outlet.wait_for_room(size)
         with self._lock:
-            self._counter.seen(len(sample.payload))
+            self._counter.seen(size)
             if self._loop_ids and _is_own(sample, self._loop_ids):
                 self._counter.dropped("loop")
                 return
@@ -186,15 +186,17 @@ class InputStream:
                 self._counter.dropped("thinned")
             elif self._active is not None:
                 self._active.sent = self._number
-                self._send(sample, stamp)
+                self._send(sample, stamp, size)
             elif not self._keep_last:
                 self._counter.dropped("no_route")
 
-    def _send(self, sample: Sample, stamp: Timestamp | None) -> None:
+    def _send(self, sample: Sample, stamp: Timestamp | None, size: int | None = None) -> None:
         if self._active is not None:
-            self._counter.dropped(*self._active.outlet.send(sample, stamp))
+            reason, dropped = self._active.outlet.send(sample, stamp, size)
+            if dropped:
+                self._counter.dropped(reason, dropped)
         if self._mirror is not None:
-            self._mirror.outlet.send(sample, stamp)
+            self._mirror.outlet.send(sample, stamp, size)
 
     def _keep(self, sample: Sample) -> Timestamp | None:
         """Keep a value, with a timestamp of ours where it has none: outputs made of it inherit that, for the gate."""

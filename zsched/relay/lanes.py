@@ -20,6 +20,8 @@ KEPT_BYTES: Final = 16 << 20
 """Bounds of what one publisher keeps until it is acknowledged."""
 
 _DELETE: Final = SampleKind.DELETE
+_Plain = zenoh.Publisher
+_SourceInfo = zenoh.SourceInfo
 
 
 class Sent(NamedTuple):
@@ -54,13 +56,13 @@ class Lane:
         publisher = self.publisher
         if sample.kind == _DELETE:
             self._delete(sample, stamp)
-        elif isinstance(publisher, zenoh.Publisher):
+        elif isinstance(publisher, _Plain):
             publisher.put(
                 sample.payload,
                 encoding=sample.encoding,
                 attachment=sample.attachment,
                 timestamp=stamp,
-                source_info=zenoh.SourceInfo(self.source_id, self.count),
+                source_info=_SourceInfo(self.source_id, self.count),
             )
         else:
             publisher.put(sample.payload, encoding=sample.encoding, attachment=sample.attachment, timestamp=stamp)

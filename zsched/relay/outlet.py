@@ -57,6 +57,9 @@ MAX_PATIENT: Final = 3
 _log = logging.getLogger("zsched.relay")
 _patient = threading.BoundedSemaphore(MAX_PATIENT)
 
+_ALL_WENT: Final = ("", 0)
+_DATA: Final = Priority.DATA
+
 _CONGESTION: Final = {
     StreamClass.BEST_EFFORT: CongestionControl.DROP,
     StreamClass.LATEST: CongestionControl.BLOCK,
@@ -121,10 +124,10 @@ class Outlet:
         while len(self._rewriters) > KEPT_OWNERS:
             self._rewriters.pop(next(iter(self._rewriters)))
 
-    def send(self, sample: Sample, stamp: Timestamp | None = None) -> tuple[str, int]:
+    def send(self, sample: Sample, stamp: Timestamp | None = None, size: int | None = None) -> tuple[str, int]:
         """Put one sample; answers (why something was dropped, how much of it), with 0 when nothing was.
 
-        ``stamp`` stands in for the timestamp that the sample lacks.
+        ``stamp`` stands in for the timestamp that the sample lacks; ``size`` is its payload's, where it is known.
         """
         lane = self._lane(sample)
         if lane is None:
@@ -135,10 +138,11 @@ class Outlet:
                 lane.put(sample, stamp)
             except zenoh.ZError:
                 return "error", 1
-            return "", 0
-        size = len(sample.payload)
+            return _ALL_WENT
+        size = len(sample.payload) if size is None else size
         action = lambda: self._put(lane, sample, stamp, size)  # noqa: E731 - named for the line's length
-        return "overflow", self._queue.send(lane, action, size, (sample, stamp))
+        dropped = self._queue.send(lane, action, size, (sample, stamp))
+        return ("overflow", dropped) if dropped else _ALL_WENT
 
     def wait_for_room(self, size: int) -> None:
         """Class ``reliable``: wait while the queue is full and its receiver takes something now and then.
@@ -201,7 +205,7 @@ class Outlet:
 
     def _lane(self, sample: Sample) -> Lane | None:
         priority, is_express = sample.priority, sample.express
-        if self._main is not None and priority == Priority.DATA and not is_express:
+        if self._main is not None and not is_express and priority == _DATA:
             return self._main
         key = self._rewritten(str(sample.key_expr)) if self._is_wild else self._to
         if key is None:

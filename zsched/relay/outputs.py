@@ -17,7 +17,7 @@ from dataclasses import replace
 from typing import Final
 
 import zenoh
-from zenoh import CongestionControl, Sample, Session, Timestamp
+from zenoh import CongestionControl, Sample, Session
 
 from zsched.clock import monotonic_s
 from zsched.core.plan import HandoverRule, Route, StreamClass, StreamCount
@@ -26,6 +26,7 @@ from zsched.keyspace import AGAIN_CHUNK, END_CHUNK
 from zsched.relay.acks import Acks
 from zsched.relay.answers import Answers
 from zsched.relay.counter import StreamCounter
+from zsched.relay.fence import Fence
 from zsched.relay.outlet import Outlet
 from zsched.relay.pace import Pace
 from zsched.relay.receive import Receiver, undeclare
@@ -34,11 +35,15 @@ from zsched.relay_pipe import decode_end
 
 HOLD_SAMPLES: Final = 10_000
 HOLD_BYTES: Final = 64 << 20
-FENCE_S: Final = 2.0
-"""So long after a new owner took over, its answers to values older than what has passed are dropped."""
-MAX_STAMPS: Final = 4096
+UNNUMBERED: Final = -1
 HEARD_SLOTS: Final = 4
 """Closed slots of which is known how far they came: an owner may be left and come back in one epoch (isolation)."""
+
+
+_Publisher = tuple[str, int]
+"""(session id, entity id)."""
+_BLOCK: Final = CongestionControl.BLOCK
+_NOBODY: Final[_Publisher] = ("", 0)
 
 
 class OutputStream:
@@ -69,14 +74,12 @@ class OutputStream:
         self._slots: dict[int, OutputSlot] = {}
         self._ends: dict[str, zenoh.Subscriber[None]] = {}
         self._carrier: OutputSlot | None = None
-        self._stamps: OrderedDict[str, Timestamp] = OrderedDict()  # newest that has passed, by the owner's relative key
+        self._fence = Fence()
         self._heard: OrderedDict[tuple[int, str], dict[SourceName, int]] = OrderedDict()  # {(epoch, from): numbers}
-        self._fence_until = 0.0
         self._is_paused = False
+        self._is_latest = route.settings.stream_class is StreamClass.LATEST
         max_hz = route.settings.max_hz
-        self._pace: Pace[Sample] | None = (
-            None if max_hz is None else Pace(max_hz, remembers=route.settings.stream_class is StreamClass.LATEST)
-        )
+        self._pace: Pace[Sample] | None = None if max_hz is None else Pace(max_hz, remembers=self._is_latest)
 
     def open(self, epoch: int, route: Route, acks: Acks | None = None, *, is_from_start: bool = False) -> None:
         """Subscribe to an owner's output; nothing passes yet.
@@ -235,7 +238,7 @@ class OutputStream:
             for slot in tuple(self._slots.values()):
                 for (name, zid, eid), sample in slot.answers.overdue() if slot.answers is not None else ():
                     self._pass(slot, slot.keys.setdefault(name, KeyState()), (zid, eid), sample)
-            if self._pace is None or self.route.settings.stream_class is not StreamClass.LATEST:
+            if self._pace is None or not self._is_latest:
                 return
             for sample in self._pace.overdue(monotonic_s()):
                 self._counter.dropped(*self._outlet.send(sample))
@@ -249,23 +252,25 @@ class OutputStream:
 
     def _carry(self, slot: OutputSlot, sample: Sample) -> None:
         with self._lock:
-            source = sample.source_info
-            zid = "" if source is None else str(source.source_id.zid)
-            if zid in self._own_ids:
+            publisher, number = _publisher_of(sample)
+            if publisher[0] in self._own_ids:
                 self._counter.seen(len(sample.payload))
                 self._counter.dropped("loop")
                 return
             name = str(sample.key_expr)
-            key = slot.key(name)
+            key = slot.keys.get(name) or slot.key(name)
             if key is None:
                 return
-            publisher = (zid, 0 if source is None else source.source_id.eid)
-            is_kept = slot.answers is not None and sample.congestion_control == CongestionControl.BLOCK
-            if source is None or slot.answers is None or not is_kept:
-                self._pass(slot, key, publisher, sample)
+            answers = slot.answers
+            if number == UNNUMBERED or answers is None or sample.congestion_control != _BLOCK:
+                self._pass(slot, key, publisher, sample, number)
                 return
-            for ready in slot.answers.take((name, *publisher), source.source_sn, sample):
-                self._pass(slot, key, publisher, ready)
+            ready = answers.take((name, *publisher), number, sample)
+            if len(ready) == 1 and ready[0] is sample:  # the usual case: nothing was missing
+                self._pass(slot, key, publisher, sample, number)
+                return
+            for one in ready:
+                self._pass(slot, key, publisher, one)
 
     def _carry_again(self, slot: OutputSlot, sample: Sample) -> None:
         with self._lock:
@@ -278,12 +283,16 @@ class OutputStream:
             for (_, zid, eid), ready in slot.answers.take_again(name, sample):
                 self._pass(slot, key, (zid, eid), ready)
 
-    def _pass(self, slot: OutputSlot, key: KeyState, publisher: tuple[str, int], sample: Sample) -> None:
-        self._counter.seen(len(sample.payload))
+    def _pass(
+        self, slot: OutputSlot, key: KeyState, publisher: _Publisher, sample: Sample, number: int | None = None
+    ) -> None:
+        """``number``: the sample's on the hop where that is known, `UNNUMBERED` for a foreign worker's."""
+        number = _publisher_of(sample)[1] if number is None else number
+        size = len(sample.payload)
+        self._counter.seen(size)
         key.received += 1
-        info: zenoh.SourceInfo | None = sample.source_info
-        if info is None or self._is_next(key, publisher, info.source_sn):
-            self._gate(slot, sample)
+        if number == UNNUMBERED or self._is_next(key, publisher, number):
+            self._gate(slot, sample, size)
 
     def _is_next(self, key: KeyState, publisher: tuple[str, int], number: int) -> bool:
         """Count what does not fit the numbers of the hop; an old one is dropped."""
@@ -297,11 +306,11 @@ class OutputStream:
             self._counter.lost += number - last - 1
         return number > last
 
-    def _gate(self, slot: OutputSlot, sample: Sample) -> None:
+    def _gate(self, slot: OutputSlot, sample: Sample, size: int) -> None:
         if self._is_paused and not slot.is_closed:
             self._hold(slot, sample)
         elif slot is self._carrier:
-            self._forward(sample)
+            self._forward(sample, size)
         elif slot.is_closed:
             self._counter.dropped("stale_epoch")
         elif self._carrier is not None and slot.epoch < self._carrier.epoch:
@@ -325,8 +334,7 @@ class OutputStream:
             self._take_over(max(flipped, key=lambda slot: slot.epoch))
 
     def _take_over(self, slot: OutputSlot) -> None:
-        if self._carrier is not None or self._stamps:
-            self._fence_until = monotonic_s() + FENCE_S
+        self._fence.begin(is_first=self._carrier is None)
         self._carrier = slot
         self._release(slot)
 
@@ -335,29 +343,18 @@ class OutputStream:
             self._forward(slot.held.popleft())
         slot.held_bytes = 0
 
-    def _forward(self, sample: Sample) -> None:
-        stamp = sample.timestamp
-        is_ordered = stamp is not None and self.route.settings.stream_class is StreamClass.LATEST
-        if is_ordered and not self._is_newest(self._outlet.key_of(sample), stamp):
-            self._counter.dropped("superseded")
-            return
+    def _forward(self, sample: Sample, size: int | None = None) -> None:
+        if self._is_latest:
+            stamp = sample.timestamp
+            if stamp is not None and not self._fence.passes(self._outlet.key_of(sample), stamp):
+                self._counter.dropped("superseded")
+                return
         if self._pace is not None and not self._pace.passes(str(sample.key_expr), sample, monotonic_s()):
             self._counter.dropped("thinned")
             return
-        self._counter.dropped(*self._outlet.send(sample))
-
-    def _is_newest(self, key: str, stamp: Timestamp | None) -> bool:
-        """True unless a newer value has passed; asked about a new owner's first answers only (an owner may go back)."""
-        newest = self._stamps.get(key)
-        if stamp is None:
-            return True
-        is_older = newest is not None and stamp < newest  # type: ignore[operator] # zenoh's stubs
-        if is_older and monotonic_s() < self._fence_until:
-            return False
-        self._stamps[key] = stamp
-        if len(self._stamps) > MAX_STAMPS:
-            self._stamps.popitem(last=False)
-        return True
+        reason, dropped = self._outlet.send(sample, None, size)
+        if dropped:
+            self._counter.dropped(reason, dropped)
 
     def _end(self, sample: Sample) -> None:
         """An end marker came (zenoh's callback thread: note it, wake the task, nothing else)."""
@@ -377,6 +374,15 @@ class OutputStream:
                 key.ender = (name, str(source.source_id.zid), source.source_id.eid)
                 slot.answers.ended(key.ender)
         self._wake()
+
+
+def _publisher_of(sample: Sample) -> tuple[_Publisher, int]:
+    """Who put a sample, and the number it has; asked once for every sample."""
+    source: zenoh.SourceInfo | None = sample.source_info
+    if source is None:
+        return _NOBODY, UNNUMBERED
+    identity = source.source_id
+    return (str(identity.zid), identity.eid), source.source_sn
 
 
 def _with_epoch(expr: str, epoch: int, chunk: str) -> str:
