@@ -14,17 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import zenoh
 
-from support.waiting import free_port, until
-from zsched.adapters.streams import RelayHandle
-from zsched.config import check_bytes
-from zsched.core.events import RelayChanged, SlotFlipped, SlotReady
-from zsched.core.fleet import LocalSide
-from zsched.core.plan import RoutePhase
-from zsched.core.relay_protocol import HandleReport
-from zsched.core.route import plan_for, slot_for
-from zsched.zenoh_config import client_config, data_config, local_config
+from support.ros_host import RosHost
+from support.waiting import until
 
 NODE = Path(__file__).with_name("ros2_sdk_node.py")
 FILE = """\
@@ -96,48 +88,17 @@ class Node:
         self.process.stdout.close()
 
 
-class Rig:
-    """A robot's host with a router and a relay; edges whose nodes join the data network."""
+class Rig(RosHost):
+    """A robot's host, and foreign nodes beside it and on the edges."""
 
     def __init__(self, stack: contextlib.ExitStack) -> None:
-        result = check_bytes(FILE.encode())
-        assert result.fleet is not None, result.report()
-        self.task = result.fleet.tasks[0]
-        self.host, self.data = free_port(), free_port()
-        router = zenoh.Config.from_json5(client_config(connect=()))
-        router.insert_json5("mode", '"router"')
-        router.insert_json5("listen/endpoints", f'["tcp/127.0.0.1:{self.host}"]')
-        stack.callback(zenoh.open(router).close)
-        self.reports: list[HandleReport] = []
-        self.relay = RelayHandle(
-            fleet="test",
-            node="robot1",
-            zenoh_config=data_config(listen=(f"tcp/127.0.0.1:{self.data}",), connect=(), shared_memory=False),
-            on_report=self.reports.append,
-            local_config=local_config(LocalSide(connect=(f"tcp/127.0.0.1:{self.host}",))),
-        )
-        self.relay.start()
-        stack.callback(self.relay.stop, 2.0)
-        until(lambda: any(isinstance(report, RelayChanged) for report in tuple(self.reports)), "the relay runs")
+        super().__init__(stack, FILE)
         self._stack = stack
 
-    def node(self, role: str, port: int) -> Node:
-        made = Node(role, port)
+    def node(self, role: str, endpoint: str) -> Node:
+        made = Node(role, int(endpoint.rpartition(":")[2]))
         self._stack.callback(made.stop)
         return made
-
-    def move(self, owner: str, epoch: int) -> None:
-        old = slot_for(self.task, "robot1", "edge1", epoch - 1) if epoch > 1 else None
-        for phase, kind in ((RoutePhase.PREPARE, SlotReady), (RoutePhase.FLIP, SlotFlipped), (RoutePhase.CLOSE, None)):
-            self.relay.apply(plan_for(self.task, phase, slot_for(self.task, "robot1", owner, epoch), old))
-            if kind is not None:
-                self._wait(kind, epoch)
-
-    def _wait(self, kind: type, epoch: int) -> None:
-        def has_said() -> bool:
-            return any(isinstance(one, kind) and getattr(one, "epoch", 0) == epoch for one in tuple(self.reports))
-
-        until(has_said, f"{kind.__name__} {epoch}")
 
 
 @pytest.fixture
@@ -149,12 +110,12 @@ def rig() -> Iterator[Rig]:
 def test_a_foreign_node_talks_listens_asks_and_looks_through_a_move(rig: Rig) -> None:
     robot = rig.node("robot", rig.host)
     for owner in ("edge1", "edge2"):
-        rig.node(owner, rig.data)
-    rig.move("edge1", 1)
+        rig.node(owner, rig.seed)
+    rig.move("edge1")
     robot.asks_until("publish one", "heard", ["edge1 one"])
     robot.asks_until("ask", "answer", ["done by edge1"])
     robot.asks_until("graph /chatter", "graph", [["talker"], ["zsched_robot1"]])
-    rig.move("edge2", 2)
+    rig.move("edge2")
     robot.asks_until("publish two", "heard", ["edge2 two"])
     robot.asks_until("ask", "answer", ["done by edge2"])
     robot.asks_until("graph /answers", "graph", [["zsched_robot1"], ["listener"]])

@@ -10,23 +10,16 @@ import contextlib
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
 import pytest
 import zenoh
 from zenoh import ext
 
-from support.waiting import free_endpoint, until
-from zsched.adapters.streams import RelayHandle
-from zsched.config import check_bytes
-from zsched.core.events import RelayChanged, SlotFlipped, SlotReady
-from zsched.core.fleet import LocalSide
-from zsched.core.plan import RoutePhase
-from zsched.core.relay_protocol import HandleReport
+from support.ros_host import RosHost, opened
+from support.waiting import until
 from zsched.core.ros2 import Attachment, decode_attachment, encode_attachment
-from zsched.core.route import plan_for, slot_for
-from zsched.zenoh_config import client_config, data_config, local_config, worker_config
+from zsched.zenoh_config import client_config, worker_config
 
 GRID = "nav_msgs::msg::dds_::OccupancyGrid_/RIHS01_8d348150c12913a31ee0ec170fbf25089e4745d17035792a1ba94d6f0bc0cfc7"
 TRIGGER = "std_srvs::srv::dds_::Trigger_/RIHS01_eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f"
@@ -48,15 +41,6 @@ tasks:
       outputs: [{topic: /merged_map, worker_topic: "/{target}/merge/map", class: latest}]
       services: [{service: /merge_now, type: std_srvs/srv/Trigger, worker_service: "/{target}/merge/now"}]
 """.replace("LISTEN", "{control: tcp/127.0.0.1:1, data: tcp/127.0.0.1:2}")
-
-
-def opened(text: str, mode: str = "", listen: str = "") -> zenoh.Session:
-    config = zenoh.Config.from_json5(text)
-    config.insert_json5("timestamping/enabled", "true")  # as in rmw_zenoh's configurations
-    if mode:
-        config.insert_json5("mode", f'"{mode}"')
-        config.insert_json5("listen/endpoints", f'["{listen}"]')
-    return zenoh.open(config)
 
 
 @dataclass(eq=False)
@@ -127,63 +111,29 @@ class RosNode:
         self.session.close()
 
 
-@dataclass
-class Rig:
-    """A robot with a router of its own and its relay, two edges without daemons."""
+class Rig(RosHost):
+    """A robot's host, and nodes beside it and on the edges."""
 
-    stack: contextlib.ExitStack
-    seed: str = field(default_factory=free_endpoint)
-    host: str = field(default_factory=free_endpoint)
-    reports: list[HandleReport] = field(default_factory=list)
-    epoch: int = 0
-
-    def start(self) -> None:
-        result = check_bytes(FILE.encode())
-        assert result.fleet is not None, result.report()
-        self.task = result.fleet.tasks[0]
-        self.stack.callback(opened(client_config(connect=()), "router", self.host).close)
-        data = data_config(listen=(self.seed,), connect=(), shared_memory=False)
-        side = local_config(LocalSide(connect=(self.host,)))
-        self.relay = RelayHandle(
-            fleet="test", node="robot1", zenoh_config=data, on_report=self.reports.append, local_config=side
-        )
-        self.relay.start()
-        self.stack.callback(self.relay.stop, 2.0)
-        until(lambda: self.said(RelayChanged), "the relay runs")
+    def __init__(self, stack: contextlib.ExitStack) -> None:
+        super().__init__(stack, FILE)
+        self._stack = stack
 
     def on_robot(self) -> RosNode:
-        node = RosNode(opened(client_config(connect=(self.host,))))
-        self.stack.callback(node.close)
-        return node
+        return self._node(client_config(connect=(self.host,)))
 
     def on_edge(self) -> RosNode:
-        node = RosNode(opened(worker_config(connect=(self.seed,), shared_memory=False)))
-        self.stack.callback(node.close)
+        return self._node(worker_config(connect=(self.seed,), shared_memory=False))
+
+    def _node(self, config: str) -> RosNode:
+        node = RosNode(opened(config))
+        self._stack.callback(node.close)
         return node
-
-    def said(self, kind: type, **fields: Any) -> bool:
-        return any(
-            isinstance(report, kind) and all(getattr(report, name) == value for name, value in fields.items())
-            for report in tuple(self.reports)
-        )
-
-    def move(self, owner: str) -> None:
-        """To a new owner, whose predecessor is closed at the end."""
-        self.epoch += 1
-        for phase in (RoutePhase.PREPARE, RoutePhase.FLIP, RoutePhase.CLOSE):
-            slot = slot_for(self.task, "robot1", owner, self.epoch)
-            old = slot_for(self.task, "robot1", "edge1", self.epoch - 1) if self.epoch > 1 else None
-            self.relay.apply(plan_for(self.task, phase, slot, old))
-            expected = SlotReady if phase is RoutePhase.PREPARE else SlotFlipped
-            until(partial(self.said, expected, epoch=self.epoch), f"{phase} {owner}")
 
 
 @pytest.fixture
 def rig() -> Iterator[Rig]:
     with contextlib.ExitStack() as stack:
-        made = Rig(stack)
-        made.start()
-        yield made
+        yield Rig(stack)
 
 
 def of(node: RosNode) -> list[tuple[bytes, bytes]]:

@@ -1,0 +1,66 @@
+"""A ROS 2 robot's host: a router of its own, the relay beside it, one task of a fleet file that the test moves.
+
+Knows: rmw_zenoh's router, local sides, the executor's steps. Does not know: what the nodes on either side say.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from functools import partial
+
+import zenoh
+
+from support.relay_rig import Reports
+from support.waiting import free_endpoint, until
+from zsched.adapters.streams import RelayHandle
+from zsched.config import check_bytes
+from zsched.core.events import RelayChanged, SlotFlipped, SlotReady
+from zsched.core.fleet import LocalSide
+from zsched.core.plan import RoutePhase, Slot
+from zsched.core.route import plan_for, slot_for
+from zsched.zenoh_config import client_config, data_config, local_config
+
+ROBOT = "robot1"
+
+
+def opened(text: str, mode: str = "", listen: str = "") -> zenoh.Session:
+    """A session with timestamps, as in rmw_zenoh's configurations."""
+    config = zenoh.Config.from_json5(text)
+    config.insert_json5("timestamping/enabled", "true")
+    if mode:
+        config.insert_json5("mode", f'"{mode}"')
+        config.insert_json5("listen/endpoints", f'["{listen}"]')
+    return zenoh.open(config)
+
+
+class RosHost:
+    """``host`` is the router's endpoint, ``seed`` the data network's; edges have no daemons."""
+
+    def __init__(self, stack: contextlib.ExitStack, file: str) -> None:
+        """Start what ``stack`` closes; ``file`` is the text of a fleet file, its first task the one that moves."""
+        result = check_bytes(file.encode())
+        assert result.fleet is not None, result.report()
+        self._task = result.fleet.tasks[0]
+        self._now: Slot | None = None
+        self.host, self.seed = free_endpoint(), free_endpoint()
+        stack.callback(opened(client_config(connect=()), "router", self.host).close)
+        self.reports = Reports()
+        self._relay = RelayHandle(
+            fleet="test",
+            node=ROBOT,
+            zenoh_config=data_config(listen=(self.seed,), connect=(), shared_memory=False),
+            on_report=self.reports.add,
+            local_config=local_config(LocalSide(connect=(self.host,))),
+        )
+        self._relay.start()
+        stack.callback(self._relay.stop, 2.0)
+        until(lambda: self.reports.find(RelayChanged, is_running=True), "the relay runs")
+
+    def move(self, owner: str) -> None:
+        """To a new owner, whose predecessor is closed at the end."""
+        old = self._now
+        new = self._now = slot_for(self._task, ROBOT, owner, 1 if old is None else old.epoch + 1)
+        for phase, kind in ((RoutePhase.PREPARE, SlotReady), (RoutePhase.FLIP, SlotFlipped)):
+            self._relay.apply(plan_for(self._task, phase, new, old))
+            until(partial(self.reports.find, kind, epoch=new.epoch), f"{phase} {owner}")
+        self._relay.apply(plan_for(self._task, RoutePhase.CLOSE, new, old))
