@@ -35,6 +35,7 @@ from zsched.core.plan import (
     RoutePlan,
     Slot,
     StreamClass,
+    StreamCount,
     StreamSettings,
     WorkerRole,
 )
@@ -156,11 +157,19 @@ class Rig:
         self.plan(RoutePhase.CLOSE, new, task=task)
         return took
 
+    def counts(self) -> tuple[StreamCount, ...]:
+        """The newest counters of the robot's relay."""
+        reports = [report for _, report in tuple(self.reports[ROBOT].items) if isinstance(report, StreamsCounted)]
+        return reports[-1].counts if reports else ()
+
+    def told(self, stream: str) -> StreamCount:
+        """The newest counters of one stream."""
+        return next((count for count in self.counts() if count.stream == stream), StreamCount(stream=stream))
+
     def drops(self) -> Counter[str]:
-        """The newest counters of the robot's relay, summed over its streams."""
-        reports = [report for _, report in self.reports[ROBOT].items if isinstance(report, StreamsCounted)]
+        """The newest drops, summed over all streams."""
         result: Counter[str] = Counter()
-        for count in reports[-1].counts if reports else ():
+        for count in self.counts():
             result.update(dict(count.drops))
         return result
 

@@ -7,7 +7,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -168,9 +167,11 @@ def test_an_orphan_ends_by_itself(tmp_path: Path) -> None:
         first.close()
 
 
-def test_an_orphan_obeys_sigterm_at_once(first: First) -> None:
+def test_an_orphan_obeys_sigterm_at_once(first: First, tmp_path: Path) -> None:
     first.crash()
-    time.sleep(0.1)
+    stranger = RelayHello(fleet="other", node="robot1", incarnation=99, digest="")
+    door = Door(tmp_path, "robot1")
+    until(lambda: "this is the relay of test/robot1" in str(door.connect(stranger)), "it knows that it is an orphan")
     os.kill(first.relay, signal.SIGTERM)
     until(lambda: not is_there(first.relay), "the orphan has ended", 1.5)
 
