@@ -209,11 +209,12 @@ def snippet(results: Json, pictures: Sequence[str]) -> str:
     scenario = results["scenario"]
     main = [f for f in in_block(results["runs"], MATRIX) if f["level"] == scenario["level"]]
     outcomes = [outcome for _, _, outcome in judged(main)]
-    kept = sum(outcome in (Verdict.REPRODUCED, Verdict.EXCEEDED) for outcome in outcomes)
+    judgeable = [outcome for outcome in outcomes if outcome not in (Verdict.NOT_MEASURED, Verdict.TOO_FEW)]
+    kept = sum(outcome is not Verdict.NOT_REPRODUCED for outcome in judgeable)
     lines = [
         (
             f"`{results['command']}` (seed {scenario['seed']}, {len(results['runs'])} runs): "
-            f"{kept} of {len(outcomes)} claims hold."
+            f"{kept} of {len(judgeable)} claims hold, {len(outcomes) - len(judgeable)} could not be judged."
         ),
         "",
         "| claim | found, 95 % interval | verdict |",
