@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 import math
 import types
-from dataclasses import MISSING, fields, is_dataclass, replace
+from dataclasses import MISSING, fields, is_dataclass, make_dataclass, replace
 from enum import Enum
 from pathlib import Path
 from random import Random
@@ -155,6 +155,18 @@ def test_whole_number_is_read_as_float_where_a_float_stands() -> None:
 
 
 # --- newer and older peers -------------------------------------------------------------------------------------------
+
+
+def test_fields_may_have_the_names_that_the_written_out_codec_uses_itself() -> None:
+    names = ("value", "get", "cls", "f", "fail", "item0", "default1", "_3", "inf", "len", "type", "x", "body")
+    odd = make_dataclass("Odd", [(name, int | None, None) for name in names], frozen=True, kw_only=True)
+    read, write = wire._codec(odd)
+    value = odd(**{name: index for index, name in enumerate(names)})
+    assert write(value) == {name: index for index, name in enumerate(names)}
+    assert read(write(value)) == value
+    assert read({}) == odd()
+    with pytest.raises(WireError):
+        read({"len": "no number"})
 
 
 def test_unknown_fields_of_a_newer_peer_are_ignored_at_every_depth() -> None:
