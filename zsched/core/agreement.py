@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from random import Random
 
@@ -125,12 +126,31 @@ class Agreement:
             now=now,
         )
         self._parked: dict[tuple[TaskId, NodeId], tuple[ev.AcceptAsked, float]] = {}
+        self._seen: list[RegisterState] = []
+        """The registers' states of which `values` and `accepted` are told."""
+        self._values: dict[TaskId, Allocation] = {}
+        self._accepted: dict[TaskId, tuple[NodeId, int]] = {}
 
     # --- queries -----------------------------------------------------------------------------------------------------
 
-    def values(self) -> dict[TaskId, Allocation]:
-        """{task: the newest learnt value}."""
-        return {name: register.value for name, register in self.registers.items()}
+    def values(self) -> Mapping[TaskId, Allocation]:
+        """{task: the newest learnt value}; a new mapping whenever one changes."""
+        self._look()
+        return self._values
+
+    def _look(self) -> None:
+        """See whether a register has changed: beats ask thirty times a second, and it hardly ever has."""
+        states = [register.state for register in self.registers.values()]
+        if states == self._seen:
+            return
+        self._seen = states
+        self._values = {name: register.value for name, register in self.registers.items()}
+        newest = {name: _newest(register) for name, register in self.registers.items()}
+        self._accepted = {
+            name: (value.owner, value.epoch)
+            for name, value in newest.items()
+            if value is not None and value.owner is not None
+        }
 
     def learnt(self) -> Learnt:
         """What this node tells others: learnt values only, never accepted ones."""
@@ -144,19 +164,15 @@ class Agreement:
             due = min(due, register.next_deadline())
         return min(due, *(deadline for _, deadline in self._parked.values())) if self._parked else due
 
-    def accepted(self) -> dict[TaskId, tuple[NodeId, int]]:
+    def accepted(self) -> Mapping[TaskId, tuple[NodeId, int]]:
         """{task: (owner, epoch)} that this elector echoes: of the newest value that it has accepted or learnt.
 
         Learnt counts too: what was committed without this elector would else never be echoed by it, and with another
         elector away no majority could be. An accepted value that is newer than what is learnt comes first, so nobody
         is echoed any more whom a newer acceptance replaces.
         """
-        found = {}
-        for name, register in self.registers.items():
-            value = _newest(register)
-            if value is not None and value.owner is not None:
-                found[name] = (value.owner, value.epoch)
-        return found
+        self._look()
+        return self._accepted
 
     def to_persist(self) -> DurableState | None:
         """The state to write now, or ``None`` when this node keeps none."""
@@ -426,9 +442,10 @@ def _refusal(request: int, outcome: CommandOutcome, detail: str) -> Effects:
 
 def _newest(register: Register) -> Allocation | None:
     """The value of the higher revision among accepted and learnt; the accepted one when they are of the same."""
-    accepted = register.state.accepted
-    known = [value for value in (register.state.learnt, None if accepted is None else accepted.value) if value]
-    return max(known, key=lambda value: value.revision, default=None)
+    accepted, learnt = register.state.accepted, register.state.learnt
+    if accepted is None:
+        return learnt
+    return accepted.value if learnt is None or accepted.value.revision > learnt.revision else learnt
 
 
 def _owner(register: Register) -> NodeId | None:

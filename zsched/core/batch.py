@@ -9,7 +9,17 @@ from dataclasses import dataclass, field
 
 from zsched.core import instructions as do
 
-_LOCAL = do.ApplyRoutes | do.SetRole | do.StartWorker | do.StopWorker | do.RestartWorker | do.RecordStory | do.StandDown
+_LOCAL = frozenset(
+    {
+        do.ApplyRoutes,
+        do.SetRole,
+        do.StartWorker,
+        do.StopWorker,
+        do.RestartWorker,
+        do.RecordStory,
+        do.StandDown,
+    }
+)
 
 
 @dataclass(slots=True)
@@ -23,4 +33,4 @@ class Batch:
     def add(self, *instructions: do.Instruction) -> None:
         """Sort instructions into sending (other nodes see it) and applying (this machine does it)."""
         for instruction in instructions:
-            (self.apply if isinstance(instruction, _LOCAL) else self.send).append(instruction)
+            (self.apply if type(instruction) in _LOCAL else self.send).append(instruction)

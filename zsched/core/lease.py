@@ -150,8 +150,9 @@ class Granter:
 
     def next_deadline(self, now: float) -> float:
         """When `may_accept` may change its mind; infinity when never."""
-        times = [self.started_at + hold_s(self.lease_s), self._granted_at + hold_s(self.lease_s)]
-        return min((at for at in times if at > now), default=math.inf)
+        hold = hold_s(self.lease_s)
+        start, grant = self.started_at + hold, self._granted_at + hold
+        return min(start if start > now else math.inf, grant if grant > now else math.inf)
 
 
 @dataclass(slots=True)
@@ -357,8 +358,10 @@ class Leases:
 
     def next_deadline(self, now: float) -> float:
         """When an elector may accept what it refused, or a leaving owner's lease ends."""
-        if not self._granters and not self._holders:
-            return math.inf
-        times = [granter.next_deadline(now) for granter in self._granters.values()]
-        times += [holder.given_until for holder in self._holders.values() if holder.is_leaving]
-        return min((at for at in times if at > now), default=math.inf)
+        due = math.inf
+        for granter in self._granters.values():
+            due = min(due, granter.next_deadline(now))
+        for holder in self._holders.values():
+            if holder.is_leaving and holder.given_until > now:
+                due = min(due, holder.given_until)
+        return due

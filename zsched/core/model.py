@@ -237,7 +237,10 @@ class Profile:
 
     def worker(self, task: TaskId) -> WorkerLoad | None:
         """The load of ``task``'s worker on this node, or ``None`` when the node runs none."""
-        return next((load for load in self.workers if load.task == task), None)
+        for load in self.workers:
+            if load.task == task:
+                return load
+        return None
 
 
 # --- SCHEDULER -------------------------------------------------------------------------------------------------------
@@ -256,8 +259,10 @@ class Utility:
 
     def __post_init__(self) -> None:
         check_name("utility.candidate", self.candidate)
-        for field in ("value", "cpu", "memory", "network"):
-            check_range(f"utility.{field}", getattr(self, field), 0.0, 1.0)
+        check_range("utility.value", self.value, 0.0, 1.0)
+        check_range("utility.cpu", self.cpu, 0.0, 1.0)
+        check_range("utility.memory", self.memory, 0.0, 1.0)
+        check_range("utility.network", self.network, 0.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -410,8 +415,9 @@ class Grant:
     def __post_init__(self) -> None:
         check_name("grant.task", self.task)
         check_name("grant.owner", self.owner)
-        for field in ("incarnation", "epoch", "number"):
-            check_counter(f"grant.{field}", getattr(self, field))
+        check_counter("grant.incarnation", self.incarnation)
+        check_counter("grant.epoch", self.epoch)
+        check_counter("grant.number", self.number)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

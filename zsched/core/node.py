@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from random import Random
 from typing import Any
 
@@ -168,10 +168,10 @@ class Node:
 
         A later deadline is not worth computing then: waking up once too early costs less than thirty beats a second.
         """
-        batch = self._batch
-        if batch.is_dirty or batch.apply or self._tenure.is_busy or self.agreement.has_parked:
+        if now >= self._promised or now >= self._beat_at or now >= self.rounds.next_deadline():
             return False
-        return now < self._promised and now < self._beat_at and now < self.rounds.next_deadline()
+        batch = self._batch
+        return not (batch.is_dirty or batch.apply or self._tenure.is_busy or self.agreement.has_parked)
 
     def _only_sent(self) -> tuple[do.Instruction, ...]:
         """The batch of an event that changed nothing here."""
@@ -227,7 +227,7 @@ class Node:
         if now >= self._beat_at:
             self._beat(now)
 
-    def values(self) -> dict[TaskId, Allocation]:
+    def values(self) -> Mapping[TaskId, Allocation]:
         """{task: the newest learnt register value}."""
         return self.agreement.values()
 
@@ -360,10 +360,11 @@ class Node:
         if profile.progress:
             self._batch.add(*self._hangs.look(self.owned(), self.executors, self.gateway, now))
         failed = failed_workers(profile)
-        owned = {name for name, value in self.values().items() if value.owner == profile.node}
+        values = self.values()
+        owned = {name for name, value in values.items() if value.owner == profile.node}
         if owned and (profile.draining or owned & failed):
             self.rounds.hurry(now)
-        elif any(self._is_orphan(value.owner) for value in self.values().values()):
+        elif any(self._is_orphan(value.owner) for value in values.values()):
             self.rounds.hurry(now)  # this may be the candidate that the task waits for
 
     def _is_orphan(self, owner: NodeId | None) -> bool:

@@ -6,7 +6,6 @@ the handover's table (`zsched.core.executor`), how a worker is told.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -45,8 +44,11 @@ class Tenure:
 
     def next_deadline(self, now: float) -> float:
         """When `tend` may have something to do."""
-        alone = (at + ALONE_AFTER_S for name, at in self._alone_since.items() if not self.executors[name].is_local)
-        return min(self.leases.next_deadline(now), *alone, math.inf)
+        due = self.leases.next_deadline(now)
+        for name, at in self._alone_since.items():
+            if not self.executors[name].is_local:
+                due = min(due, at + ALONE_AFTER_S)
+        return due
 
     # --- exclusive tasks ---------------------------------------------------------------------------------------------
 
@@ -71,9 +73,12 @@ class Tenure:
         """
         result: list[Instruction] = []
         has_released = False
+        if not self.leases.is_holding:
+            return (), False  # nobody works here
+        leaving = self.leases.leaving()
         for task in self.exclusive:
             executor = self.executors[task]
-            if task not in self.leases.leaving():
+            if task not in leaving:
                 until = self.leases.until(task)
                 prolonged = executor.set_lease(until, now)
                 if prolonged:

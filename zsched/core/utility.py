@@ -110,9 +110,16 @@ def total_utility(
     >>> total_utility(w, cpu=0.8, memory=0.4, network=None, measured=frozenset({"cpu", "memory"}))
     0.6666666666666666
     """
-    terms = (("cpu", weights.cpu, cpu), ("memory", weights.memory, memory), ("network", weights.network, network))
-    used = [(weight, term) for name, weight, term in terms if weight > 0.0 and name in measured]
-    share = sum(weight for weight, _ in used)
-    if share <= 0.0 or any(term is None for _, term in used):
-        return None
-    return clamp(sum(weight * term for weight, term in used if term is not None) / share)
+    share = total = 0.0
+    for name, weight, term in (
+        ("cpu", weights.cpu, cpu),
+        ("memory", weights.memory, memory),
+        ("network", weights.network, network),
+    ):
+        if weight <= 0.0 or name not in measured:
+            continue
+        if term is None:
+            return None
+        share += weight
+        total += weight * term
+    return clamp(total / share) if share > 0.0 else None
