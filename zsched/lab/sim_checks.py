@@ -21,6 +21,8 @@ from zsched.lab.sim_parts import GENERATION_STEP, Machine
 
 FORGED = -1
 """The number of a question that a stranger asks, or in another one's name: a yes to it is a violation."""
+_SAYS_NOTHING = frozenset({do.AskUtilities, do.AnswerUtilities, do.PublishProfile, do.AskLearnt, do.RecordStory})
+"""Half of what leaves: it claims nothing that must be on a disk."""
 MAX_WAKES = 50
 """So often in a row a node may want to be woken without time passing."""
 
@@ -51,6 +53,7 @@ class Invariants:
     def on_started(self, machine: Machine, now: float, *, has_state: bool) -> None:
         """A daemon starts; one without state may know less than before."""
         self.take(Started(at=now, node=machine.key, has_state=has_state))
+        machine.known.clear()
         machine.woken_at, machine.wakes = now, 0
 
     def on_synced(self, machine: Machine, state: DurableState, now: float) -> None:
@@ -92,6 +95,8 @@ class Invariants:
 
     def on_leaving(self, machine: Machine, instruction: do.Instruction) -> None:
         """What others will see, and what workers and relays do, must stand on this machine's disk."""
+        if type(instruction) in _SAYS_NOTHING:
+            return
         match instruction:
             case do.AnswerElection(request=request, answer=Promise() | Accepted() as answer):
                 if request == FORGED:
@@ -185,12 +190,15 @@ class Invariants:
         """An event was handled: the next deadline lies ahead, and a node without a disk has learnt for this life."""
         node = machine.node
         assert node is not None
-        if node.next_deadline() < local:
-            raise InvariantError(f"{machine.key}: next deadline {node.next_deadline():.6f} in the past of {local:.6f}")
-        disk = machine.disk
-        if disk.state is None or disk.is_broken or not machine.is_durable:
+        due = node.next_deadline()
+        if due < local:
+            raise InvariantError(f"{machine.key}: next deadline {due:.6f} in the past of {local:.6f}")
+        if not _keeps_state(machine):
             for register in node.registers.values():
-                self.on_learnt(machine, register.value, now)
+                value = register.value
+                if machine.known.get(value.task) is not value:
+                    machine.known[value.task] = value
+                    self.on_learnt(machine, value, now)
 
     @staticmethod
     def on_woken(machine: Machine, now: float) -> None:

@@ -36,7 +36,12 @@ class Loops:
 
     def run(self, seconds: float) -> None:
         """Let virtual time pass."""
-        self.run_until(lambda: False, seconds)
+        end = self.now + seconds
+        queue, pop = self._queue, heapq.heappop
+        while queue and queue[0][0] <= end:
+            self.now, _, action, arguments = pop(queue)
+            action(*arguments)
+        self.now = end
 
     def run_until(self, condition: Callable[[], bool], seconds: float) -> bool:
         """Let time pass until ``condition``, at most ``seconds``; whether it came true."""
