@@ -11,16 +11,18 @@ from mcap.reader import make_reader
 
 from zsched.adapters.cgroup import LimitedGroup
 from zsched.lab.laser_log import malaga_path
-from zsched.lab.paper.cells import Cell
+from zsched.lab.netns import why_not
+from zsched.lab.paper.cells import Cell, bandwidth_of, world_of
 from zsched.lab.paper.metrics import Truth, measure
 from zsched.lab.paper.places import scenario_path
-from zsched.lab.paper.robots import LogRobots
+from zsched.lab.paper.robots import ExploreRobots, LogRobots
 from zsched.lab.paper.run import CellRun, Inputs
 from zsched.lab.paper.scenario import LoadPlan, load_scenario
 from zsched.lab.paper.schemes import SCHEMES
 from zsched.lab.recorder import read_records
 
 WHY_NOT = LimitedGroup.why_not()
+NO_SPACES = WHY_NOT or why_not()
 DRIVE_S = 5.0
 
 
@@ -54,4 +56,28 @@ def test_a_cell_is_run_and_measured_and_leaves_nothing(tmp_path: Path) -> None:
     decisions = read_records(folder / "records" / "decisions.ndjson")
     assert {record["node"] for record in decisions} == set(run["robots"])
     assert any(record["decision"] and record["decision"]["utilities"] for record in decisions)
+    assert one.left_behind == []
+
+
+@pytest.mark.root
+@pytest.mark.timeout(240)
+@pytest.mark.skipif(NO_SPACES is not None, reason=f"no control groups or namespaces: {NO_SPACES}")
+def test_a_cell_in_closed_loop_behind_narrow_links_ends_at_its_target(tmp_path: Path) -> None:
+    scenario = replace(load_scenario(scenario_path()), duration_s=60.0, target_coverage=0.3)
+    cell = Cell(scheme=SCHEMES["fixed_e2"], level="half", run=1, block="narrow")
+    loop = scenario.explore
+    robots = ExploreRobots(world=world_of(scenario, cell), speed=loop.speed, slam_on=loop.slam_on)
+    folder = tmp_path / "cell"
+
+    one = CellRun(scenario, cell, Inputs(robots=robots), folder)
+    run = one.run()
+    figures = measure(folder, scenario, Truth(robots.truth()))
+
+    assert run["bandwidth_mbit"] == bandwidth_of(scenario, cell) == 9.8
+    assert run["input"] == f"explore office:{scenario.seed + 1}"
+    assert figures["is_done"]
+    assert figures["task_latency_s"] <= run["duration_s"] < 60.0  # it ended when every robot held its target
+    assert sorted(path.name for path in folder.glob("*.mcap")) == [f"streams-{robot}.mcap" for robot in run["robots"]]
+    assert figures["map_hz"] > 0
+    assert {move["node"] for move in run["allocations"]} == {"edge2"}
     assert one.left_behind == []
