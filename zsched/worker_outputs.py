@@ -22,6 +22,8 @@ LATEST_DEPTH: Final = 16
 """Values of class ``latest`` that may wait for a receiver that keeps up; behind a stalled one, ``keep_last`` do."""
 OUTPUT_DEPTH: Final = 4096
 """Answers of class ``reliable`` that an output keeps at most until they are acknowledged."""
+RECEIVE_BUFFER: Final = 1 << 16
+"""Bytes of zenoh's batches (``transport/link/rx/buffer_size``); what is larger has come in several, and has its own."""
 KEPT_EPOCHS: Final = 2
 """Publishers of older epochs are given back: nobody admits them any more."""
 
@@ -155,5 +157,12 @@ class Output:
 
 
 def _own(value: Any) -> Any:
-    """What its caller may change afterwards (a ``bytearray``) as bytes of our own."""
-    return zenoh.ZBytes(value) if isinstance(value, bytearray) else value
+    """As bytes of our own: what its caller may change afterwards (a ``bytearray``), and a small part of what came in.
+
+    The latter lies in zenoh's receive buffer, which it would hold as a whole for as long as it is kept.
+    """
+    if isinstance(value, bytearray):
+        return zenoh.ZBytes(value)
+    if isinstance(value, zenoh.ZBytes) and len(value) < RECEIVE_BUFFER:
+        return zenoh.ZBytes(value.to_bytes())
+    return value
