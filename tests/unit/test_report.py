@@ -103,6 +103,7 @@ def test_snapshot_as_json_has_objects_for_pairs_and_null_for_what_is_not_measure
         "rssi_dbm": None,
         "bitrate_mbps": None,
         "retry_ratio": None,
+        "trend_db_s": None,
     }
     (task,) = body["tasks"]
     assert task["decision"]["utilities"]["robot1"]["edge1"]["value"] == 0.6
