@@ -59,9 +59,7 @@ def rules(rows: Sequence[Row], path: Path) -> None:
         axes[row][0].bar(at, means, color=colours, yerr=spans, error_kw={"lw": 0.8, "capsize": 2})
         axes[row][0].axhline(5.0, color="black", lw=0.8, ls=":")
         axes[row][0].set_ylabel("regret, %")
-        axes[row][0].set_title(
-            f"{title}: regret ({len(regrets[0])} h; whiskers: 1.96 standard errors; dotted: 5 %)", fontsize=10
-        )
+        axes[row][0].set_title(f"{title}: regret ({len(regrets[0])} h, ± 1.96 s.e.)", fontsize=10)
         total, wasted = ([rate(of(rows, case, name), field) for name in names] for field in ("moves", "wasted"))
         axes[row][1].bar(at, total, color=colours)
         axes[row][1].bar(at, wasted, color="black", width=0.35, label="back within 30 s")
