@@ -246,6 +246,69 @@ def test_what_the_worker_was_told_ends_with_its_stop_and_not_with_the_echoes() -
     assert held.given_until("guard") == -math.inf
 
 
+def worked(tenure: Tenure, number: int, now: float) -> None:
+    """A majority echoes the beat ``number`` that has just left: the worker works (again)."""
+    tenure.leases.on_sent(number, now)
+    for elector in ("r1", "r2"):
+        tenure.leases.on_beat(echo(elector, number), {}, now)
+    roles, _ = tenure.tend_leases(number, now)
+    assert [one.role.role for one in roles if isinstance(one, SetRole)] == [WorkerRole.ACTIVE]
+
+
+def asked(tenure: Tenure, number: int, now: float) -> None:
+    """An elector asks the owner to leave, and its worker is told to stop."""
+    tenure.leases.on_beat(ask(), {}, now)
+    roles, has_released = tenure.tend_leases(number, now)
+    assert [one.role.role for one in roles if isinstance(one, SetRole)] == [WorkerRole.IDLE]
+    assert not has_released
+
+
+def tenured() -> Tenure:
+    executor = Executor(spec=GUARD, me="r1", has_streams=True)
+    executor.execute(Allocation(task="guard", revision=7, epoch=3, owner="r1", tuning=GUARD.tuning), 10.0)
+    return Tenure(fleet=FLEET, me="r1", leases=leases(), executors={"guard": executor})
+
+
+def test_the_late_word_of_an_earlier_stop_does_not_give_back_the_lease_that_came_after_it() -> None:
+    """A slow worker outlasts its lease, is given another one in its epoch, and only then its first stop is told."""
+    tenure = tenured()
+    worked(tenure, 6, 10.0)
+    asked(tenure, 6, 10.1)
+    assert tenure.tend_leases(6, 11.0) == ((), True), "the lease is over, whatever the worker says"
+    worked(tenure, 7, 12.0)
+    asked(tenure, 7, 12.1)
+    assert not tenure.leases.on_stopped("guard", 3, 7), "this may be the first stop's word"
+    assert tenure.leases.given_until("guard") == 13.0
+    assert tenure.tend_leases(7, 12.99) == ((), False)
+    assert tenure.tend_leases(7, 13.0) == ((), True)
+
+
+def test_the_word_of_a_stop_before_the_first_lease_is_not_taken_for_a_later_one_s() -> None:
+    tenure = tenured()
+    tenure.leases.on_beat(ask(), {}, 10.1)
+    assert tenure.tend_leases(5, 10.1)[1], "nothing was given yet"
+    worked(tenure, 6, 12.0)
+    asked(tenure, 6, 12.1)
+    assert not tenure.leases.on_stopped("guard", 3, 6)
+
+
+def test_the_word_of_a_process_that_is_dead_does_not_speak_for_the_next_one() -> None:
+    tenure = tenured()
+    worked(tenure, 6, 10.0)
+    tenure.leases.on_worker_lost("guard")
+    asked(tenure, 6, 10.3)
+    assert not tenure.leases.on_stopped("guard", 3, 6)
+    assert tenure.tend_leases(6, 11.0) == ((), True)
+
+
+def test_stops_that_are_told_in_time_are_believed_again_and_again() -> None:
+    tenure = tenured()
+    for number, now in ((6, 10.0), (7, 12.0), (8, 14.0)):
+        worked(tenure, number, now)
+        asked(tenure, number, now + 0.1)
+        assert tenure.leases.on_stopped("guard", 3, number)
+
+
 def test_an_owner_that_is_asked_again_gives_back_at_once_when_its_worker_has_stopped_already() -> None:
     """Found by the simulator (seed 60191): it waited for a second stop, and echoes prolonged the wait for ever."""
     held = leases()

@@ -179,7 +179,10 @@ class SlotDrained:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RoleEnded:
-    """This node's worker says that it does not work in ``epoch`` any more, or it is dead."""
+    """This node's worker says that it does not work in ``epoch`` any more, or it is dead.
+
+    It names no stop: where it might be an earlier one's, `zsched.core.lease.Leases.on_stopped` does not believe it.
+    """
 
     task: TaskId
     epoch: int

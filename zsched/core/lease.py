@@ -14,6 +14,8 @@ L is the lease, rho the bound on how far two clocks' rates differ. Nobody compar
 * When it refuses, it stops echoing the owner for whose sake it refused (at most twice that time, or until it accepts or
   learns a newer revision), and its beats ask that owner to leave; the owner drains and releases all numbers up to now,
   which are never granted again. Without this a planned move would never happen.
+* The worker's own word that it has stopped ends the owner's wait before the lease does, but only while no earlier word
+  of the same epoch is missing: a late one would give back a lease that the worker has been given since.
 
 Source: Gray & Cheriton 1989 (leases), with the epoch as fencing token.
 """
@@ -181,6 +183,10 @@ class Holder:
     """The largest number that was given back."""
     given_until: float = -math.inf
     """Until when the worker was told that it may work; minus infinity once it has stopped."""
+    awaits_report: bool = False
+    """The worker was told to stop and has not said yet that it has."""
+    is_doubtful: bool = False
+    """A word of an earlier stop in this epoch may still come: from now on only the end of what was given counts."""
     _sent: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=SENT_KEPT))
     _echoed: dict[NodeId, int] = field(default_factory=dict)
 
@@ -320,11 +326,35 @@ class Leases:
         holder = self._holders.get(task)
         return -math.inf if holder is None else holder.given_until
 
+    def on_told_to_stop(self, task: TaskId) -> None:
+        """The worker here is told to stop: it will say when it has."""
+        if task in self._holders:
+            self._holders[task].awaits_report = True
+
+    def on_worker_lost(self, task: TaskId) -> None:
+        """The worker's process here has ended; another one may be given leases before its end is told."""
+        if task in self._holders:
+            self._holders[task].is_doubtful = True
+
     def on_stopped(self, task: TaskId, epoch: int, number: int) -> bool:
-        """The worker has stopped (or its lease ran out): give everything back; false when nobody asked."""
+        """The worker says that it has stopped: give everything back; false when nobody asked.
+
+        False, too, when this may be the late word of an earlier stop in this epoch, or of a process that is dead: the
+        worker may be at it again, so `on_run_out` decides.
+        """
         holder = self._holders.get(task)
-        if holder is None or holder.epoch != epoch or not holder.is_leaving:
+        if holder is None or holder.epoch != epoch or not holder.is_leaving or holder.is_doubtful:
             return False
+        holder.awaits_report = False
+        self._releases[task] = holder.release(number)
+        return True
+
+    def on_run_out(self, task: TaskId, number: int) -> bool:
+        """All that a leaving worker was ever given is over: give everything back; false when nobody asked."""
+        holder = self._holders.get(task)
+        if holder is None or not holder.is_leaving:
+            return False
+        holder.is_doubtful |= holder.awaits_report
         self._releases[task] = holder.release(number)
         return True
 

@@ -36,6 +36,7 @@ from zsched.core.model import (
     Proposal,
     TaskId,
     Weights,
+    WorkerState,
 )
 from zsched.core.plan import StreamCount
 from zsched.core.profile import Profiler
@@ -455,8 +456,11 @@ class Node:
         return profile is not None and task in failed_workers(profile)
 
     def _on_worker(self, event: ev.WorkerChanged, now: float) -> None:
+        was_ready = self.worker_states.get(event.task) is WorkerState.READY
         story = self._workers.on_changed(event)
         if story is not None:
+            if was_ready:
+                self.agreement.leases.on_worker_lost(event.task)
             self._hangs.note_worker(event.task, event.state, now)
             self._batch.add(story)
             if event.task in self.owned():

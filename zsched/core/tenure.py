@@ -85,11 +85,14 @@ class Tenure:
                     self.leases.on_given(task, until)
                 result += prolonged
                 continue
-            result += executor.leave()
+            told = executor.leave()
+            if told:
+                self.leases.on_told_to_stop(task)
+            result += told
             # What the worker was told counts, not what has been echoed since: electors may echo on and on, and a
             # worker that has stopped already will not say so again.
             if now >= self.leases.given_until(task):
-                has_released |= self.leases.on_stopped(task, executor.epoch, number)
+                has_released |= self.leases.on_run_out(task, number)
         return tuple(result), has_released
 
     # --- isolation ---------------------------------------------------------------------------------------------------

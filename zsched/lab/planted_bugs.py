@@ -302,6 +302,13 @@ LEASE_BUGS = (
         60191,
     ),
     _bug(
+        "late word of an earlier stop gives a newer lease back",
+        LEASE,
+        "not holder.is_leaving or holder.is_doubtful:",
+        "not holder.is_leaving:",
+        _LEASE,
+    ),
+    _bug(
         "asked to leave only for echoed grants",
         LEASE,
         "if self._sent and self._sent[-1][0] > self.released:",

@@ -6,6 +6,7 @@ decides that, or how streams really move.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from random import Random
 from typing import Any, Protocol
@@ -47,6 +48,8 @@ class Work:
         self.plans: dict[tuple[NodeId, TaskId], RoutePlan] = {}
         self.working: dict[TaskId, tuple[NodeId, float]] = {}
         """{exclusive task: (who works, until when at most)}."""
+        self._begun: Counter[tuple[str, TaskId]] = Counter()
+        """{(machine, task): how often its worker was made active}: one that is again before it has stopped works on."""
         self.stop_s: tuple[float, ...] = WORKER_STOP_S
         """What an exclusive worker may take to stop, one of these each time."""
 
@@ -101,14 +104,18 @@ class Work:
         if until > now:
             self._sim.invariants.on_worked(machine, role.task, role.epoch, now, until)
             self.working[role.task] = (machine.key, until)
-        if before is None or before.role is not WorkerRole.ACTIVE or role.role is WorkerRole.ACTIVE:
+        was_active = before is not None and before.role is WorkerRole.ACTIVE
+        if role.role is WorkerRole.ACTIVE and not was_active:
+            self._begun[machine.key, role.task] += 1
+        if before is None or not was_active or role.role is WorkerRole.ACTIVE:
             return
-        self._sim.later(self._sim.rng.choice(self.stop_s), self._stopped, machine, machine.life, before)
+        begun = self._begun[machine.key, role.task]
+        self._sim.later(self._sim.rng.choice(self.stop_s), self._stopped, machine, machine.life, before, begun)
 
-    def _stopped(self, machine: Machine, life: int, role: Role) -> None:
+    def _stopped(self, machine: Machine, life: int, role: Role, begun: int) -> None:
         if machine.life != life:
             return
-        if machine.roles[role.task].role is not WorkerRole.ACTIVE:
+        if begun == self._begun[machine.key, role.task]:
             self._sim.invariants.checker.stop_working(machine.key, role.task, self._sim.now, life)
             working = self.working.get(role.task)
             if working is not None and working[0] == machine.key:
