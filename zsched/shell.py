@@ -291,7 +291,7 @@ class Shell:
     # --- what adapters report (their threads) ------------------------------------------------------------------------
 
     def on_report(self, report: HandleReport) -> None:
-        """The relay's handle: most reports are events; workers' tokens concern only our own workers."""
+        """The relay's handle: most reports are events; our own workers' tokens go by the supervisor."""
         if isinstance(report, RelayStarted):
             return
         if isinstance(report, SlotLost):
@@ -301,7 +301,14 @@ class Shell:
         if not isinstance(report, WorkerSeen):
             self._inbox.post(report)
             return
-        if report.node != self._node or not report.incarnation.isdigit():
+        if report.node != self._node:
+            self._inbox.post(
+                ev.WorkerShown(
+                    node=report.node, task=report.task, incarnation=report.incarnation, is_present=report.is_present
+                )
+            )
+            return
+        if not report.incarnation.isdigit():
             return
         supervisor = self.supervisor
         if supervisor is not None and report.task in supervisor.states():

@@ -6,11 +6,14 @@ from random import Random
 
 import pytest
 
+from zsched.core import events as ev
+from zsched.core.fleet import Fleet, NodeSpec, Reach, TaskSpec, Timing, WorkerSpec
 from zsched.core.gateway import Gateway
-from zsched.core.model import Allocation, PeerState, Proposal
+from zsched.core.model import Allocation, NodeKind, PeerState, Proposal, Tuning, Weights
 from zsched.core.rounds import Rounds
 from zsched.core.vote import VoteOutcome, tally
 from zsched.lab.sim_swarm import plan
+from zsched.lab.simulator import Simulator
 
 VOTERS = ("robot1", "robot2", "robot3")
 
@@ -49,3 +52,48 @@ def test_only_a_robot_that_voted_for_the_winner_commits_it(mine: str, commits: i
     for voter, candidate in (("robot1", mine), ("robot2", "edge2"), ("robot3", "edge2")):
         rounds.absorb_proposal(proposal(voter, candidate), value, states, 1.0)
     assert len(rounds.due_commits(5.0)) == commits
+
+
+def reaching_all(robots: int) -> Simulator:
+    """Robots and three edges at rest; the task's owner must be reached by every robot."""
+    voters, edges = tuple(f"robot{i}" for i in range(1, robots + 1)), ("edge1", "edge2", "edge3")
+    task = TaskSpec(
+        name="merge",
+        candidates=edges,
+        tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0), time_to_trigger_s=0.0, cool_down_s=0.0),
+        worker=WorkerSpec(command=("true",)),
+        reach=Reach.ALL,
+    )
+    kinds = {**dict.fromkeys(edges, NodeKind.EDGE), **dict.fromkeys(voters, NodeKind.ROBOT)}
+    nodes = tuple(NodeSpec(name=name, kind=kind) for name, kind in kinds.items())
+    fleet = Fleet(name="sim", timing=Timing(), nodes=nodes, tasks=(task,), electors=voters)
+    sim = Simulator(fleet=fleet, seed=3)
+    sim.start()
+    assert sim.run_until(lambda: not sim.unsettled(), 20), sim.unsettled()
+    sim.run(5)
+    return sim
+
+
+@pytest.mark.parametrize("robots", [2, 3])
+def test_a_suspicion_that_the_next_beat_refutes_moves_nothing_though_every_robot_must_reach_the_owner(
+    robots: int,
+) -> None:
+    sim = reaching_all(robots)
+    owner, epochs = sim.agreed("merge") or "", len(sim.owners)
+    for _ in range(5):
+        sim.deliver(sim.machines["robot1"], ev.TokenLost(node=owner, incarnation=sim.node(owner).incarnation))
+        assert sim.sees("robot1", owner) is PeerState.SUSPECT
+        assert sim.run_until(lambda: sim.sees("robot1", owner) is PeerState.ALIVE, 1.0)
+        sim.run(1.3)
+    assert len(sim.owners) == epochs, "\n".join(sim.stories[-20:])
+
+
+def test_an_owner_that_one_robot_has_really_lost_is_left_once_it_had_its_time_where_all_must_reach_it() -> None:
+    sim = reaching_all(3)
+    owner = sim.agreed("merge") or ""
+    sim.cut(("robot1",), (owner,))
+    at = sim.now
+    assert sim.run_until(lambda: sim.agreed("merge") not in (None, owner), 10), "\n".join(sim.stories[-20:])
+    timing = sim.fleet.timing
+    assert sim.now - at > timing.suspect_s + timing.confirm_s - timing.beat_s
+    assert all(sim.sees(robot, owner) is PeerState.ALIVE for robot in ("robot2", "robot3"))

@@ -302,6 +302,13 @@ def test_tokens_that_are_not_ours_are_ignored_and_do_no_harm(supervised: House, 
     assert states(supervised) == [WorkerState.STARTING]
 
 
+@pytest.mark.parametrize("is_present", [True, False])
+def test_another_node_s_token_is_told_to_the_node(house: House, is_present: bool) -> None:
+    house.shell.on_report(seen("merge", "3-1", node="edge1", is_present=is_present))
+    shown = ev.WorkerShown(node="edge1", task="merge", incarnation="3-1", is_present=is_present)
+    assert house.events() == [shown]
+
+
 def test_foreign_worker_comes_and_goes_by_its_token(supervised: House) -> None:
     supervised.shell.on_report(seen("foreign", 1))
     supervised.shell.on_report(seen("foreign", 1, is_present=False))

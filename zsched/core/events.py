@@ -151,6 +151,16 @@ class WorkerChanged:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class WorkerShown:
+    """The relay saw the token of another node's worker come over a living link, or go."""
+
+    node: NodeId
+    task: TaskId
+    incarnation: str
+    is_present: bool = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SlotReady:
     """The relay sees the new owner's worker ready (or no longer) for the slot of ``epoch``."""
 
@@ -259,6 +269,7 @@ Event = (
     | TokenSeen
     | TokenLost
     | WorkerChanged
+    | WorkerShown
     | SlotReady
     | SlotFlipped
     | SlotDrained

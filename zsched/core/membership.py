@@ -25,6 +25,8 @@ MAX_DOUBT = 3.0
 IN_FLIGHT_S = 0.03
 """A beat that arrives so soon after its sender's token went was on its way before: it refutes nothing."""
 
+_NOBODY: frozenset[NodeId] = frozenset()
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Transition:
@@ -93,6 +95,13 @@ class Membership:
     def alive(self) -> tuple[NodeId, ...]:
         """The living peers, sorted, without this node."""
         return tuple(name for name, peer in self._peers.items() if peer.state is PeerState.ALIVE)
+
+    def in_grace(self) -> frozenset[NodeId]:
+        """The suspects whose confirmation time still runs: by then they have beaten again, are gone, or are cut off."""
+        if not self._has_suspect:
+            return _NOBODY
+        suspects = ((name, peer) for name, peer in self._peers.items() if peer.state is PeerState.SUSPECT)
+        return frozenset(name for name, peer in suspects if peer.vouched_until == -math.inf)
 
     def suspects(self) -> tuple[NodeId, ...]:
         """Whom this node accuses: suspect, gone, or never heard although it has listened for long enough."""

@@ -21,7 +21,7 @@ from zsched.core import instructions as do
 from zsched.core.agreement import NOTHING, Agreement, Effects
 from zsched.core.batch import Batch
 from zsched.core.executor import Executor
-from zsched.core.fleet import Fleet, fleet_hash
+from zsched.core.fleet import Fleet, TaskSpec, fleet_hash
 from zsched.core.gateway import Gateway
 from zsched.core.identity import Identity, Verdict
 from zsched.core.introductions import Introductions
@@ -39,9 +39,11 @@ from zsched.core.model import (
     WorkerState,
 )
 from zsched.core.plan import StreamCount
+from zsched.core.probation import Probation
 from zsched.core.profile import Profiler
 from zsched.core.progress import HangWatch
 from zsched.core.rounds import Rounds
+from zsched.core.scoring import NO_DOUBTS, Doubts
 from zsched.core.status import PastValue, build_snapshot
 from zsched.core.tenure import Tenure
 from zsched.core.workers import Workers, failed_workers
@@ -105,7 +107,8 @@ class Node:
         self.membership = Membership(me, names, fleet.timing)
         self.profiler = Profiler(me, incarnation, fleet.timing)
         self.gateway = Gateway(fleet)
-        self.rounds = Rounds(fleet, me, self.gateway, rng, now)
+        self._probation = Probation(fleet)
+        self.rounds = Rounds(fleet, me, self.gateway, rng, now, self._doubts)
         self.agreement = Agreement(
             fleet=fleet,
             me=me,
@@ -329,7 +332,10 @@ class Node:
         text = f"{change.node} {change.before} -> {change.after}: {change.reason}"
         self._batch.add(do.RecordStory(stage="membership", text=text))
         self._beat_at = now  # tell the others at once: they wait for a second observer
+        if change.before is PeerState.GONE:
+            self._probation.on_back(change.node, now)
         if change.after is PeerState.GONE:
+            self._probation.on_gone(change.node, now)
             for executor in self.executors.values():
                 self._batch.add(*executor.on_gone(change.node))
         if any(value.owner == change.node for value in self.values().values()):
@@ -373,6 +379,10 @@ class Node:
         return owner is not None and self.membership.state(owner) is PeerState.GONE
 
     # --- SCHEDULER, VOTE ---------------------------------------------------------------------------------------------
+
+    def _doubts(self, spec: TaskSpec, now: float) -> Doubts:
+        in_grace, unproven = self.membership.in_grace(), self._probation.doubts(spec, now)
+        return Doubts(in_grace=in_grace, unproven=unproven) if in_grace or unproven else NO_DOUBTS
 
     def _on_utility_asked(self, event: ev.UtilityAsked, now: float) -> None:
         utilities = self.rounds.vectors(self.values(), self.membership.states(), now)
@@ -466,6 +476,13 @@ class Node:
             if event.task in self.owned():
                 self.rounds.hurry(now)
 
+    def _on_worker_shown(self, event: ev.WorkerShown, now: float) -> None:
+        if event.task not in self.executors or not self.membership.is_known(event.node):
+            return
+        self._probation.on_token(event.node, event.task, event.incarnation, is_present=event.is_present, now=now)
+        if event.is_present and self._is_orphan(self.registers[event.task].value.owner):
+            self.rounds.hurry(now)  # this may be the candidate that the task waits for
+
     def _on_slot_ready(self, event: ev.SlotReady, _now: float) -> None:
         if event.task in self.executors and event.is_ready:
             self._batch.add(*self.executors[event.task].on_ready(event.epoch))
@@ -486,6 +503,7 @@ class Node:
     def _on_relay(self, event: ev.RelayChanged, _now: float) -> None:
         self._set_problem("relay", None if event.is_running else f"the relay is down: {event.reason}")
         if not event.is_running:
+            self._probation.forget_tokens()
             self.counters["relay_exits"] += 1
 
     # --- operators ---------------------------------------------------------------------------------------------------
@@ -529,6 +547,7 @@ class Node:
             ev.TokenSeen: self._on_token_seen,
             ev.TokenLost: self._on_token_lost,
             ev.WorkerChanged: self._on_worker,
+            ev.WorkerShown: self._on_worker_shown,
             ev.SlotReady: self._on_slot_ready,
             ev.SlotFlipped: self._on_slot_flipped,
             ev.SlotDrained: self._on_slot_drained,

@@ -13,7 +13,7 @@ a whole gather when a peer is frozen.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from random import Random
 
@@ -27,7 +27,7 @@ from zsched.core.model import Allocation, NodeId, PeerState, Proposal, TaskId, U
 from zsched.core.plan import StreamCount
 from zsched.core.register import MoveOwner
 from zsched.core.scheduler import Judge, Judgement, Outcome, escape_reason
-from zsched.core.scoring import Standing, book, compare, majority, score
+from zsched.core.scoring import NO_DOUBTS, Doubts, Standing, book, compare, majority, score
 from zsched.core.turns import in_turn, who_moves_first
 from zsched.core.vote import Tally, VoteOutcome, tally
 
@@ -77,8 +77,17 @@ class TaskRound:
 class Rounds:
     """All tasks' rounds at one robot (on edges it is idle)."""
 
-    def __init__(self, fleet: Fleet, me: NodeId, gateway: Gateway, rng: Random, now: float) -> None:
+    def __init__(
+        self,
+        fleet: Fleet,
+        me: NodeId,
+        gateway: Gateway,
+        rng: Random,
+        now: float,
+        doubts: Callable[[TaskSpec, float], Doubts] = lambda _spec, _now: NO_DOUBTS,
+    ) -> None:
         self._fleet, self._me, self._gateway, self._rng = fleet, me, gateway, rng
+        self._doubts = doubts
         self.is_voter = me in fleet.voters
         self.vote_s = 2 * fleet.timing.gather_s + VOTE_MARGIN_S
         self.tasks = {
@@ -87,7 +96,7 @@ class Rounds:
         }
         self._gather: _Gather | None = None
         self._answer: tuple[int, float, object, Utilities] = (-1, -math.inf, None, Utilities(voter=me, vectors=()))
-        """(gateway's version, until when, (states, values), vectors): the newest answer to a gather."""
+        """(gateway's version, until when, (states, values, doubts), vectors): the newest answer to a gather."""
         self._number = 0
         self._round_at = now if self.is_voter else math.inf
 
@@ -120,19 +129,20 @@ class Rounds:
         if not self.is_voter:
             return Utilities(voter=self._me, vectors=())
         version, until, seen, answer = self._answer
-        if version == self._gateway.version and now <= until and seen == (states, values):
+        doubts = {name: self._doubts(task.spec, now) for name, task in self.tasks.items()}
+        if version == self._gateway.version and now <= until and seen == (states, values, doubts):
             return answer  # several robots ask within a round, and nothing has changed since
         bookings = book((task.spec for task in self.tasks.values()), values, self._gateway)
         answer = Utilities(
             voter=self._me,
             vectors=tuple(
-                score(task.spec, values[name], self._me, self._gateway, states, now, bookings)
+                score(task.spec, values[name], self._me, self._gateway, states, now, bookings, doubts[name])
                 for name, task in self.tasks.items()
             ),
         )
         # A hair less than the profiles' time: sums of floats.
         until = self._gateway.fresh_until(now) - TIMER_MARGIN_S
-        self._answer = (self._gateway.version, until, (states, values), answer)
+        self._answer = (self._gateway.version, until, (states, values, doubts), answer)
         return answer
 
     def tick(

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass, field
 
 from zsched.core.fleet import Demand, Reach, Standby, TaskSpec
 from zsched.core.gateway import Gateway
@@ -60,6 +61,19 @@ class _Terms:
     network: float | None
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Doubts:
+    """Doubts about nodes that are too young, or not enough, to take a task from them."""
+
+    in_grace: AbstractSet[NodeId] = frozenset()
+    """Suspect, but not for long enough to tell a lost beat from a lost node: an owner among them counts as alive."""
+    unproven: Mapping[NodeId, str] = field(default_factory=dict)
+    """{candidate: why it may not get the task} of those that were gone (`zsched.core.probation`)."""
+
+
+NO_DOUBTS = Doubts()
+
+
 def score(
     spec: TaskSpec,
     allocation: Allocation,
@@ -68,12 +82,14 @@ def score(
     states: Mapping[NodeId, PeerState],
     now: float,
     bookings: Bookings | None = None,
+    doubts: Doubts = NO_DOUBTS,
 ) -> UtilityVector:
     """This robot's utilities of a task's candidates, by the tuning of ``allocation``.
 
     A candidate that this robot cannot reach gets 0 (not: is left out, which would raise its mean); one that may not
-    have the task is refused with the reason. What the other tasks of ``bookings`` will use there, and do not show yet,
-    counts as in use.
+    have the task is refused with the reason. Where there are ``doubts`` about a node, it keeps
+    what it has and gets nothing new. What the other tasks of ``bookings`` will use there, and do not show yet, counts
+    as in use.
     """
     demand = gateway.demand(spec)
     terms: dict[NodeId, _Terms] = {}
@@ -84,8 +100,12 @@ def score(
         if state is PeerState.UNKNOWN:
             refused.append((candidate, "not heard yet"))  # we may have just started: that says nothing about it
             continue
-        if state is not PeerState.ALIVE:
+        is_spared = candidate == allocation.owner and candidate in doubts.in_grace
+        if state is not PeerState.ALIVE and not is_spared:
             unreachable.append(candidate)
+            continue
+        if candidate in doubts.unproven and candidate != allocation.owner:
+            refused.append((candidate, doubts.unproven[candidate]))
             continue
         profile = gateway.fresh(candidate, now)
         if profile is None:

@@ -417,6 +417,20 @@ VOTE_BUGS = (
         _SCHEDULER,
     ),
     _bug(
+        "a young suspicion takes the owner for unreachable",
+        SCORING,
+        "is_spared = candidate == allocation.owner and candidate in doubts.in_grace",
+        "is_spared = False",
+        (*_SCHEDULER, "tests/sim/test_vote_rules.py"),
+    ),
+    _bug(
+        "a node that is back gets a task before its streams are proven",
+        SCORING,
+        "if candidate in doubts.unproven and candidate != allocation.owner:",
+        "if candidate in doubts.unproven and not candidate:",
+        (*_SCHEDULER, "tests/sim/test_return.py"),
+    ),
+    _bug(
         "median and mean swapped",
         SCORING,
         "if allocation.tuning.aggregate is Aggregate.MEAN",

@@ -236,6 +236,7 @@ class Stage:
             if node is not None and target in self.sim.machines:
                 event = ev.TokenLost(node=source, incarnation=node.incarnation)
                 self.sim.later(SELF_DELAY_S, self.sim.deliver, self.sim.machines[target], event)
+                self.sim.work.lose(self.sim.machines[source], self.sim.machines[target])
 
     def _version(self, fault: Fault) -> None:
         names = set(fault.nodes)

@@ -22,6 +22,7 @@ WORKER_START_S = 0.4
 FLIP_S = 0.005
 WORKER_STOP_S = (0.002,)
 LOOK_AGAIN_S = 0.05
+SHOWN_S = 0.005
 
 
 class World(Protocol):
@@ -77,6 +78,42 @@ class Work:
     def _ready(self, machine: Machine, task: TaskId, life: int) -> None:
         if machine.life == life and task in machine.workers:
             self._sim.deliver(machine, ev.WorkerChanged(task=task, state=WorkerState.READY))
+            for other in tuple(self._sim.machines.values()):
+                self._show_later(machine, task, other)
+
+    # --- tokens ------------------------------------------------------------------------------------------------------
+
+    def greet(self, machine: Machine) -> None:
+        """A relay has started: it sees the tokens of all workers that it reaches."""
+        for other in tuple(self._sim.machines.values()):
+            for task in other.workers:
+                if other.node is not None and other.node.worker_states.get(task) is WorkerState.READY:
+                    self._show_later(other, task, machine)
+
+    def lose(self, source: Machine, target: Machine, delay_s: float = 0.0) -> None:
+        """A link has ended, or the machine at its other end: the tokens behind it go, and come with the next link."""
+        for task in source.workers if self._is_watching(target) else ():
+            gone = ev.WorkerShown(node=source.name, task=task, incarnation=str(source.life), is_present=False)
+            self._sim.later(delay_s + SHOWN_S, self._sim.deliver, target, gone)
+            self._show_later(source, task, target)
+
+    @staticmethod
+    def _is_watching(machine: Machine) -> bool:
+        return machine.node is not None and machine.node.rounds.is_voter
+
+    def _show_later(self, machine: Machine, task: TaskId, target: Machine) -> None:
+        if machine is not target and self._is_watching(target):
+            self._sim.later(SHOWN_S * 2, self._show, machine, machine.life, task, target, target.life)
+
+    def _show(self, machine: Machine, life: int, task: TaskId, target: Machine, target_life: int) -> None:
+        if (machine.life, target.life) != (life, target_life) or machine.node is None or task not in machine.workers:
+            return
+        if (machine.name, target.name) in self._sim.cuts:
+            self._sim.later(LOOK_AGAIN_S, self._show, machine, life, task, target, target_life)
+            return
+        self._sim.deliver(target, ev.WorkerShown(node=machine.name, task=task, incarnation=str(life)))
+
+    # --- ends --------------------------------------------------------------------------------------------------------
 
     def _stop(self, machine: Machine, task: TaskId) -> None:
         if machine.workers.pop(task, None) is not None:

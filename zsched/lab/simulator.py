@@ -131,9 +131,12 @@ class Simulator(Loops):
         if machine.node is None:
             return
         incarnation = machine.node.incarnation
+        delay_s = self.fleet.timing.zenoh_lease_s if is_power_lost else TOKEN_DELAY_S
+        for other in self.machines.values():
+            if other is not machine and (machine.name, other.name) not in self.cuts:
+                self.work.lose(machine, other, delay_s)
         machine.end()
         machine.disk.lose_power(self.rng)
-        delay_s = self.fleet.timing.zenoh_lease_s if is_power_lost else TOKEN_DELAY_S
         self._tell_token(machine, ev.TokenLost(node=machine.name, incarnation=incarnation), delay_s)
 
     def cut(self, *sides: tuple[NodeId, ...]) -> None:
@@ -202,6 +205,7 @@ class Simulator(Loops):
         )
         self._tell_token(machine, ev.TokenSeen(node=machine.name, incarnation=machine.node.incarnation), TOKEN_DELAY_S)
         self._carry_out(machine, machine.node.start(local), 0)
+        self.work.greet(machine)
         self.later(self.rng.uniform(0, machine.fleet.timing.sample_s), self._sample, machine, machine.life)
         self.arm(machine)
 

@@ -197,6 +197,22 @@ def test_peer_that_others_still_hear_stays_suspect(timing: Timing) -> None:
     assert [(node, state) for _, node, state in seen] == [("a", SUSPECT)]
 
 
+def test_suspicion_is_young_until_it_is_confirmed_refuted_or_somebody_vouches() -> None:
+    ear = heard(LARGE)
+    assert ear.members.in_grace() == frozenset()
+    ear.members.absorb_token_lost("a", 1, 0.1)
+    assert ear.members.in_grace() == {"a"}
+    ear.beat("a", 0.2)
+    assert ear.members.in_grace() == frozenset()
+    ear.members.absorb_token_lost("a", 1, 0.3)
+    young_until = 0.3 + WIFI.confirm_s
+    ear.run(0.3, young_until - 0.001, ("b", "c"))
+    assert ear.members.in_grace() == {"a"}
+    ear.run(young_until, young_until + WIFI.beat_s, ("b", "c"))
+    assert ear.members.state("a") is SUSPECT, "others hear it"
+    assert ear.members.in_grace() == frozenset(), "but we had our time to"
+
+
 def test_voucher_that_loses_some_beats_still_vouches() -> None:
     ear = heard(LARGE)
     rng, now = Random(3), 0.0

@@ -21,7 +21,7 @@ from zsched.core.model import (
     WorkerLoad,
     WorkerState,
 )
-from zsched.core.scoring import compare, score
+from zsched.core.scoring import NO_DOUBTS, Doubts, compare, score
 
 CPU = Weights(cpu=1.0, memory=0.0, network=0.0)
 HALVES = Weights(cpu=0.5, memory=0.0, network=0.5)
@@ -74,6 +74,7 @@ def scored(
     voter: str = "robot1",
     states: Mapping[str, PeerState] | None = None,
     age_s: float = 0.0,
+    doubts: Doubts = NO_DOUBTS,
 ) -> UtilityVector:
     names = sorted({*spec.candidates, voter, *(one.node for one in profiles)})
     fleet = Fleet(
@@ -87,7 +88,7 @@ def scored(
     for one in profiles:
         assert gateway.absorb(one, 0.0) is None
     seen = dict.fromkeys(names, PeerState.ALIVE) | dict(states or {})
-    return score(spec, agreed or allocation(), voter, gateway, seen, age_s)
+    return score(spec, agreed or allocation(), voter, gateway, seen, age_s, doubts=doubts)
 
 
 def values(vector: UtilityVector) -> dict[str, float]:
@@ -115,6 +116,27 @@ def test_a_candidate_never_heard_is_left_out_for_the_listener_may_have_just_star
 
     assert "edge2" not in values(vector)
     assert vector.refused == (("edge2", "not heard yet"),)
+
+
+def test_an_owner_whose_suspicion_is_young_is_scored_and_reached_as_before() -> None:
+    silent = {"edge1": PeerState.SUSPECT}
+    vector = scored(ROBOT, *EDGES, states=silent, doubts=Doubts(in_grace={"edge1"}))
+
+    assert vector == scored(ROBOT, *EDGES)
+    assert not {one.candidate: one.reachable for one in scored(ROBOT, *EDGES, states=silent).utilities}["edge1"]
+
+
+def test_another_candidate_whose_suspicion_is_young_is_not_reached() -> None:
+    vector = scored(ROBOT, *EDGES, states={"edge3": PeerState.SUSPECT}, doubts=Doubts(in_grace={"edge3"}))
+
+    assert values(vector)["edge3"] == 0.0
+
+
+def test_a_candidate_whose_streams_are_not_proven_is_refused_and_the_owner_stays() -> None:
+    vector = scored(ROBOT, *EDGES, doubts=Doubts(unproven={"edge1": "back", "edge3": "back for 1.2 s"}))
+
+    assert values(vector) == {"edge1": 0.25, "edge2": 0.5}
+    assert vector.refused == (("edge3", "back for 1.2 s"),)
 
 
 @pytest.mark.parametrize("state", [PeerState.SUSPECT, PeerState.GONE])
