@@ -90,7 +90,7 @@ class Radio:
 
 
 class LinkView(StrEnum):
-    """``access_point``: each node knows its own way to the access point, and a pair is as good as the weaker one.
+    """``access_point``: each node knows its own way to the access point; what a pair is worth, the task's `link` says.
 
     ``direct``: every node hears each other node's signal itself, so that a candidate's signal is the same for all
     (the paper's Eq. 3 has one signal per candidate).
