@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -287,5 +288,7 @@ class Traffic:
 
     def gap_after(self, moment: float, window_s: float = 0.6) -> float:
         """The longest silence between two echoes in a window around a moment, milliseconds."""
-        times = [at for _, at in self.back[-20_000:] if moment - 0.1 < at < moment + window_s]
+        begin = bisect_left(self.back, moment - 0.1, key=lambda one: one[1])
+        end = bisect_left(self.back, moment + window_s, key=lambda one: one[1])
+        times = [at for _, at in self.back[begin:end]]
         return max((later - earlier for earlier, later in pairwise(times)), default=window_s) * 1000
