@@ -30,6 +30,7 @@ demo: $(VENV)/.lab  ## Watch six machines merge laser maps (DEMO_ARGS="--headles
 test: $(VENV)/.dev  ## All tests: unit, paper, simulator, integration and system (real daemons on localhost)
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile tests/unit tests/paper tests/sim tests/planted
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder --durations=15 tests/system tests/integration
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile tests/bench
 
 test-quick: $(VENV)/.dev  ## Unit and paper tests only
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile tests/unit tests/paper
