@@ -131,7 +131,10 @@ class Invariants:
             raise InvariantError(f"{machine.key} answered without its promise on disk: {answer}")
         if isinstance(answer, Accepted) and (held.accepted is None or held.accepted.ballot < answer.ballot):
             raise InvariantError(f"{machine.key} answered without its acceptance on disk: {answer}")
-        if isinstance(answer, Promise) and held.promised == answer.ballot and held.accepted != answer.accepted:
+        # What it has accepted in the ballot of its promise came after the promise, both in one write.
+        is_later = held.accepted is not None and held.accepted.ballot == answer.ballot
+        is_last = held.promised == answer.ballot and not is_later
+        if isinstance(answer, Promise) and is_last and held.accepted != answer.accepted:
             raise InvariantError(f"{machine.key} promised and told another acceptance than it has: {answer}")
 
     def _check_ballot(self, machine: Machine, task: TaskId, ballot: Ballot, value: Allocation | None) -> None:

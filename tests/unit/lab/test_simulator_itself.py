@@ -9,6 +9,7 @@ import pytest
 
 from zsched.core import instructions as do
 from zsched.core.fleet import Fleet, NodeSpec, StreamRule, TaskSpec, Timing, WorkerSpec
+from zsched.core.messages import Promise
 from zsched.core.model import Allocation, NodeId, NodeKind, PeerState, Tuning, Weights
 from zsched.core.plan import Direction, Role, WorkerRole
 from zsched.errors import InvariantError
@@ -184,3 +185,22 @@ def test_node_is_woken_at_its_own_deadlines() -> None:
         assert due < math.inf
         sim.run_until(lambda due=due: node.next_deadline() > due, 2)  # type: ignore[misc]
         assert sim.now <= due + 0.01
+
+
+def test_promise_that_tells_another_acceptance_than_the_disk_holds_is_found() -> None:
+    """But for an acceptance in the promise's own ballot: that came later, and went to the disk in the same write."""
+    sim = settled()
+    machine = sim.machines["robot1"]
+    state = machine.disk.registers["merge"]
+    before = state.accepted
+    assert before is not None
+    ballot = replace(state.promised, counter=state.promised.counter + 1)
+    later = replace(before, ballot=ballot, value=value("edge2", before.value.revision + 1, before.value.epoch + 1))
+    promise = Promise(elector="robot1", task="merge", ballot=ballot, accepted=before)
+
+    machine.disk.registers["merge"] = replace(state, promised=ballot, accepted=later)
+    sim.invariants.on_leaving(machine, do.AnswerElection(request=7, answer=promise))
+
+    machine.disk.registers["merge"] = replace(state, promised=ballot, accepted=None)
+    with pytest.raises(InvariantError, match="told another acceptance"):
+        sim.invariants.on_leaving(machine, do.AnswerElection(request=7, answer=promise))
