@@ -124,8 +124,15 @@ def play_all(jobs: Iterable[Job], processes: int) -> Iterator[tuple[Job, Result]
     if processes <= 1:
         yield from map(_play, jobs)
         return
-    with multiprocessing.Pool(processes) as pool:
+    with multiprocessing.Pool(processes, initializer=_end_at_once) as pool:
         yield from pool.imap(_play, jobs, chunksize=CHUNK)
+        pool.close()
+        pool.join()
+
+
+def _end_at_once() -> None:
+    """A pool ends its processes by SIGTERM: our own handler, inherited, may wait for ever for one of its locks."""
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 # --- shrinking -------------------------------------------------------------------------------------------------------
