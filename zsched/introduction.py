@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from functools import cached_property
 
 import zenoh
 
@@ -28,17 +29,22 @@ class Introducer:
 
     def __init__(self, session_config: str) -> None:
         """``session_config`` is the configuration (JSON) of the session that may miss somebody."""
-        self._config = introduction_config(session_config)
+        self._session_config = session_config
         self._thread: threading.Thread | None = None
         self._ended = threading.Event()
 
-    def introduce(self) -> bool:
-        """Begin, and return at once. False: it is under way, or makes no sense (zenoh redials who has an address)."""
-        if self._config is None or self._ended.is_set() or (self._thread is not None and self._thread.is_alive()):
-            return False
+    @cached_property
+    def _config(self) -> str | None:
+        """Worked out when somebody is missed for the first time, not at the start."""
+        return introduction_config(self._session_config)
+
+    def introduce(self) -> None:
+        """Begin, and return at once; nothing while it is under way, or where zenoh redials everybody by itself."""
+        is_busy = self._thread is not None and self._thread.is_alive()
+        if self._ended.is_set() or is_busy or self._config is None:
+            return
         self._thread = threading.Thread(target=self._introduce, args=(self._config,), name="introduction", daemon=True)
         self._thread.start()
-        return True
 
     def close(self) -> None:
         """End what is under way."""

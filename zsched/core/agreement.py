@@ -441,7 +441,7 @@ def _refusal(request: int, outcome: CommandOutcome, detail: str) -> Effects:
 
 
 def _newest(register: Register) -> Allocation | None:
-    """The value of the higher revision among accepted and learnt; the accepted one when they are of the same."""
+    """The value of the higher revision among accepted and learnt; the learnt one when they are of the same."""
     accepted, learnt = register.state.accepted, register.state.learnt
     if accepted is None:
         return learnt

@@ -11,7 +11,7 @@ Only planned moves are measured (an escape's cost is the fault's), and only whil
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from zsched.core.model import TaskId
 from zsched.core.plan import StreamCount
@@ -40,7 +40,7 @@ class MoveCost:
     """Of the task's usual work, an exponential mean over the moves; 0 before the first."""
     moves: int = 0
     _newest: _Counted | None = None
-    _usual: tuple[float, float] | None = field(default=None)
+    _usual: tuple[float, float] | None = None
     """(inputs, outputs) per second between moves."""
     _before: _Counted | None = None
     """The newest report before the move that is being measured."""

@@ -16,8 +16,7 @@ class Introductions:
     """The times of one session's introductions."""
 
     def __init__(self) -> None:
-        self._missing_since = math.inf
-        self._due_at = math.inf
+        self._due_at = math.inf  # while nobody is missing
         self._pause_s = FIRST_PAUSE_S
 
     def is_due(self, now: float, *, is_missing: bool) -> bool:
@@ -28,10 +27,10 @@ class Introductions:
             is_missing: whether somebody is missing at this moment. Nobody: the next time begins from the start.
         """
         if not is_missing:
-            self._missing_since = math.inf
+            self._due_at = math.inf
             return False
-        if self._missing_since == math.inf:
-            self._missing_since, self._due_at, self._pause_s = now, now + PATIENCE_S, FIRST_PAUSE_S
+        if self._due_at == math.inf:
+            self._due_at, self._pause_s = now + PATIENCE_S, FIRST_PAUSE_S
         if now < self._due_at:
             return False
         self._due_at = now + self._pause_s

@@ -277,14 +277,15 @@ def run(
     local = read_frame(commands) if has_local_side else b""
     if text is None or local is None:
         return 0
+    config = text.decode()
     try:
-        session = zenoh.open(zenoh.Config.from_json5(text.decode()))
+        session = zenoh.open(zenoh.Config.from_json5(config))
     except (zenoh.ZError, ValueError) as error:
-        problem = f"its data session {why_not_open(text.decode(), error)}"
+        problem = f"its data session {why_not_open(config, error)}"
         reporter.report(ProblemReported(source=SOURCE, problem=problem))
         reporter.flush(CLOSE_S)
         return 1
-    relay = RelayProcess(session, me.fleet, me.node, reporter, local.decode(), Introducer(text.decode()))
+    relay = RelayProcess(session, me.fleet, me.node, reporter, local.decode(), Introducer(config))
     successors = None if door is None else Successors(socket.socket(fileno=door), me)
     try:
         while not relay.obey(commands) and successors is not None:
