@@ -6,7 +6,9 @@ Route flap damping (RFC 2439) in utility units: every time a node is left it col
 failed, one more when it was left while on probation (that move was wasted); points decay with a half-life, and the
 penalty grows as ``STEP * (2**points - 1)``, at most `MAX_PENALTY`. A penalised node stays eligible: when it is the only
 one, it serves.
-Every robot learns the same allocations, so all come to the same penalties without exchanging any.
+Every robot learns the same allocations, so all come to the same penalties; but one that was cut off has missed some,
+and one that was restarted has forgotten them. So robots tell each other (`UtilityVector.penalties`), and what any of
+them remembers counts (`zsched.core.scoring.joined`).
 """
 
 from __future__ import annotations

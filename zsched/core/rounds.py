@@ -136,7 +136,17 @@ class Rounds:
         answer = Utilities(
             voter=self._me,
             vectors=tuple(
-                score(task.spec, values[name], self._me, self._gateway, states, now, bookings, doubts[name])
+                score(
+                    task.spec,
+                    values[name],
+                    self._me,
+                    self._gateway,
+                    states,
+                    now,
+                    bookings,
+                    doubts[name],
+                    task.damping.penalties(now),
+                )
                 for name, task in self.tasks.items()
             ),
         )

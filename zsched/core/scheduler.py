@@ -16,7 +16,7 @@ from enum import StrEnum
 from zsched.core.damping import ESCAPES_PER_MINUTE, WINDOW_S, Damping
 from zsched.core.fleet import TaskSpec
 from zsched.core.model import Allocation, NodeId, PeerState, Profile, WorkerState
-from zsched.core.scoring import Standing, pick
+from zsched.core.scoring import Standing, joined, pick
 
 FORGIVEN_IN_S = 2.0
 LONGEST_GAP_S = 2.0
@@ -91,11 +91,12 @@ class Judge:
             escape: why the owner must be left at once (`escape_reason`), or ``None``.
             is_called: another robot called a vote: answer with today's winner, without waiting for our own timers.
             now: monotonic seconds.
-            damping: the task's record of moves: penalties, and the cap.
+            damping: the task's record of moves, for the cap and the penalties (those that other robots remember, in
+                ``standing``, count as well); ``None``: neither.
         """
         owner = allocation.owner
         bonus = self._bonus(allocation) if escape is None else 0.0
-        penalties = {} if damping is None else damping.penalties(now)
+        penalties = {} if damping is None else joined((damping.penalties(now), standing.penalties))
         scored = {
             name: max(value + (bonus if name == owner else 0.0) - penalties.get(name, 0.0), 0.0)
             for name, value in standing.aggregates.items()

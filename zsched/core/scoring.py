@@ -72,6 +72,7 @@ class Doubts:
 
 
 NO_DOUBTS = Doubts()
+NOTHING_HELD: Mapping[NodeId, float] = {}
 
 
 def score(
@@ -83,13 +84,14 @@ def score(
     now: float,
     bookings: Bookings | None = None,
     doubts: Doubts = NO_DOUBTS,
+    penalties: Mapping[NodeId, float] = NOTHING_HELD,
 ) -> UtilityVector:
     """This robot's utilities of a task's candidates, by the tuning of ``allocation``.
 
     A candidate that this robot cannot reach gets 0 (not: is left out, which would raise its mean); one that may not
     have the task is refused with the reason. Where there are ``doubts`` about a node, it keeps
     what it has and gets nothing new. What the other tasks of ``bookings`` will use there, and do not show yet, counts
-    as in use.
+    as in use. ``penalties`` are what this robot remembers; they go along, and `compare` joins them.
     """
     demand = gateway.demand(spec)
     terms: dict[NodeId, _Terms] = {}
@@ -139,6 +141,7 @@ def score(
         revision=allocation.revision,
         utilities=tuple(sorted(utilities, key=lambda utility: utility.candidate)),
         refused=tuple(sorted(refused)),
+        penalties=tuple(sorted((name, round(penalty, 4)) for name, penalty in penalties.items())),
     )
 
 
@@ -225,6 +228,8 @@ class Standing:
     vetoed: Mapping[NodeId, str]
     vectors: tuple[UtilityVector, ...]
     voters_heard: int
+    penalties: Mapping[NodeId, float] = field(default_factory=dict)
+    """{node: what is held against it}, by the robot that remembers most."""
 
 
 def compare(spec: TaskSpec, allocation: Allocation, vectors: Mapping[NodeId, UtilityVector]) -> Standing:
@@ -256,7 +261,26 @@ def compare(spec: TaskSpec, allocation: Allocation, vectors: Mapping[NodeId, Uti
             vetoed[candidate] = f"reached by {reaching} of {len(fresh)} robots"
         else:
             aggregates[candidate] = mean([utility.value for utility in column])
-    return Standing(aggregates=aggregates, vetoed=vetoed, vectors=fresh, voters_heard=len(fresh))
+    return Standing(
+        aggregates=aggregates,
+        vetoed=vetoed,
+        vectors=fresh,
+        voters_heard=len(fresh),
+        penalties=joined(dict(vector.penalties) for vector in fresh),
+    )
+
+
+def joined(penalties: Iterable[Mapping[NodeId, float]]) -> dict[NodeId, float]:
+    """What any of them holds against a node, the most of it: forgetting (a restart) and not knowing say nothing.
+
+    >>> joined([{"edge1": 0.09}, {}, {"edge1": 0.03, "edge2": 0.03}])
+    {'edge1': 0.09, 'edge2': 0.03}
+    """
+    most: dict[NodeId, float] = {}
+    for held in penalties:
+        for name, penalty in held.items():
+            most[name] = max(penalty, most.get(name, 0.0))
+    return dict(sorted(most.items()))
 
 
 def pick(aggregates: Mapping[NodeId, float], owner: NodeId | None) -> NodeId | None:

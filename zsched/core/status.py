@@ -18,7 +18,7 @@ from zsched.core.model import Allocation, NodeId, NodeKind, PeerState, TaskId
 from zsched.core.plan import Route, StreamCount
 from zsched.core.register import Register
 from zsched.core.rounds import Rounds, TaskRound
-from zsched.core.scoring import majority
+from zsched.core.scoring import joined, majority
 from zsched.core.snapshot import (
     SCHEMA,
     DecisionStatus,
@@ -190,7 +190,7 @@ def _decision(standing: TaskRound, now: float) -> DecisionStatus | None:
         aggregates=tuple(sorted(judgement.aggregates.items())),
         utilities=tuple((vector.voter, vector.utilities) for vector in joint.vectors),
         vetoed=tuple(sorted(joint.vetoed.items())),
-        penalties=tuple(standing.damping.penalties(now).items()),
+        penalties=tuple(joined((standing.damping.penalties(now), joint.penalties)).items()),
         silent=standing.silent,
     )
 

@@ -431,6 +431,13 @@ VOTE_BUGS = (
         (*_SCHEDULER, "tests/sim/test_return.py"),
     ),
     _bug(
+        "what other robots hold against a node is not heard",
+        SCHEDULER,
+        "joined((damping.penalties(now), standing.penalties))",
+        "joined((damping.penalties(now),))",
+        (*_SCHEDULER, "tests/sim/test_vote_rules.py"),
+    ),
+    _bug(
         "median and mean swapped",
         SCORING,
         "if allocation.tuning.aggregate is Aggregate.MEAN",

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import pytest
 
 from zsched.core.damping import MAX_PENALTY, PROBATION_S, STEP, WINDOW_S, Damping
@@ -94,3 +97,14 @@ def test_planned_moves_are_capped_per_minute_and_escapes_are_not_by_that_cap() -
     assert fled.outcome is Outcome.PROPOSE
     free = judge.judge(joint, OWNED, settled_for_s=99, escape=None, is_called=False, now=175.0, damping=damping)
     assert free.outcome is Outcome.PROPOSE
+
+
+def test_what_any_robot_remembers_counts_and_nothing_counts_for_a_judge_without_damping() -> None:
+    joint = replace(standing(edge1=0.5, edge2=0.6), penalties={"edge2": 0.3})
+    given: dict[str, Any] = {"settled_for_s": 99.0, "escape": None, "is_called": False, "now": 100.0}
+    forgetful = Judge(spec=SPEC).judge(joint, OWNED, **given, damping=Damping())
+    assert forgetful.aggregates["edge2"] == pytest.approx(0.3)
+    own = Damping()
+    own.note_move("edge2", has_failed=False, now=100.0)
+    assert Judge(spec=SPEC).judge(joint, OWNED, **given, damping=own).aggregates["edge2"] == pytest.approx(0.3)
+    assert Judge(spec=SPEC).judge(joint, OWNED, **given).aggregates["edge2"] == pytest.approx(0.6)
