@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from zsched.core.executor import Executor
-from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, lease_terms
 from zsched.core.instructions import SetRole
 from zsched.core.lease import RHO, Granter, Holder, Leases, hold_s
 from zsched.core.model import Allocation, Beat, Grant, NodeKind, Tuning, Weights
@@ -215,7 +215,7 @@ def ask(*, epoch: int = 3) -> Beat:
 
 
 def echo(elector: str, number: int) -> Beat:
-    return replace(beat(elector, 9), echoes=(grant(number, owner="r1"),))
+    return replace(beat(elector, 9), echoes=(grant(number, owner="r1"),), lease_terms=lease_terms(FLEET))
 
 
 def test_an_owner_is_asked_to_leave_whatever_it_has_heard_of_its_grants() -> None:
@@ -229,6 +229,29 @@ def test_an_owner_is_asked_to_leave_whatever_it_has_heard_of_its_grants() -> Non
     held.on_sent(6, 10.3)
     held.on_beat(ask(), {}, 10.3)
     assert held.leaving() == ("guard",), "this one may have been granted"
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        replace(FLEET, electors=("r1", "r2")),
+        replace(FLEET, timing=replace(FLEET.timing, lease_s=2 * FLEET.timing.lease_s)),
+        None,
+    ],
+    ids=["other electors", "another length", "none told"],
+)
+def test_an_echo_counts_only_under_the_owner_s_own_electors_and_length(other: Fleet | None) -> None:
+    """The majority of other electors need not meet the one that granted to this node's earlier life."""
+    held = leases()
+    terms = "" if other is None else lease_terms(other)
+    for elector in ELECTORS:
+        held.on_beat(replace(echo(elector, 5), lease_terms=terms), {}, 10.1)
+    assert held.until("guard") == -math.inf
+    assert set(held.unfit()) == (set() if other is None else set(ELECTORS))
+    for elector in ELECTORS:
+        held.on_beat(echo(elector, 5), {}, 10.1)
+    assert held.until("guard") == 10.0 + FLEET.timing.lease_s
+    assert held.unfit() == {}
 
 
 def test_an_owner_is_not_asked_to_leave_for_another_epoch_s_sake() -> None:

@@ -295,6 +295,15 @@ def electorate_hash(fleet: Fleet) -> str:
     return _digest("electorate", (fleet.name, fleet.electors))
 
 
+def lease_terms(fleet: Fleet) -> str:
+    """16 hex digits over all that a lease of an exclusive task hangs on: the electors and its length.
+
+    A majority of other electors need not meet the majority that has granted, and an elector that waits for a shorter
+    lease than the owner counts on waits for nothing.
+    """
+    return _digest("lease", (fleet.name, fleet.electors, fleet.timing.lease_s))
+
+
 def _digest(kind: str, value: object) -> str:
     state = hashlib.blake2s(digest_size=8, person=b"zsched1", salt=kind[:8].encode())
     for part in _canonical(value):

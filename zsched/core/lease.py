@@ -14,6 +14,8 @@ L is the lease, rho the bound on how far two clocks' rates differ. Nobody compar
 * When it refuses, it stops echoing the owner for whose sake it refused (at most twice that time, or until it accepts or
   learns a newer revision), and its beats ask that owner to leave; the owner drains and releases all numbers up to now,
   which are never granted again. Without this a planned move would never happen.
+* An echo counts only under the same terms (`lease_terms`): the electors and L of both fleet files. The majority of
+  another electorate need not meet the one that granted to this owner's earlier life. Such a node gets no exclusive task.
 * The worker's own word that it has stopped ends the owner's wait before the lease does, but only while no earlier word
   of the same epoch is missing: a late one would give back a lease that the worker has been given since.
 
@@ -27,7 +29,7 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from zsched.core.fleet import Fleet
+from zsched.core.fleet import Fleet, lease_terms
 from zsched.core.model import Beat, Grant, NodeId, TaskId
 from zsched.core.scoring import majority
 
@@ -253,12 +255,16 @@ class Leases:
     incarnation: int
     standing: Mapping[TaskId, NodeId | None]
     now: float
+    terms: str = field(init=False)
+    _others: dict[NodeId, str] = field(default_factory=dict)
+    """{node: its terms} of those that go by other terms than this node."""
     _granters: dict[TaskId, Granter] = field(init=False)
     _holders: dict[TaskId, Holder] = field(default_factory=dict)
     _releases: dict[TaskId, Grant] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         lease_s = self.fleet.timing.lease_s
+        self.terms = lease_terms(self.fleet) if any(task.exclusive for task in self.fleet.tasks) else ""
         self._granters = {
             task.name: Granter(task=task.name, lease_s=lease_s, started_at=self.now, standing=self.standing[task.name])
             for task in self.fleet.tasks
@@ -377,7 +383,11 @@ class Leases:
         is_new = False
         for task, granter in self._granters.items():
             is_new |= granter.on_beat(beat, accepted.get(task), now)
-        for grant in beat.echoes:
+        if beat.lease_terms in ("", self.terms):
+            self._others.pop(beat.node, None)
+        else:
+            self._others[beat.node] = beat.lease_terms
+        for grant in beat.echoes if beat.lease_terms == self.terms else ():
             if grant.task in self._holders:
                 self._holders[grant.task].on_echo(beat.node, grant)
         for task, owner, epoch in beat.asked_to_leave:
@@ -385,6 +395,10 @@ class Leases:
             if holder is not None and owner == self.me and epoch == holder.epoch:
                 holder.ask()
         return is_new
+
+    def unfit(self) -> dict[NodeId, str]:
+        """{node: why it could never hold a lease that counts here}."""
+        return {node: f"goes by other leases ({terms}, here {self.terms})" for node, terms in self._others.items()}
 
     def next_deadline(self, now: float) -> float:
         """When an elector may accept what it refused, or a leaving owner's lease ends."""

@@ -448,6 +448,8 @@ class Beat:
     """Whether this elector has ever promised anything."""
     generation: int = 0
     """Of this node's state; what nodes of another generation have learnt means nothing here."""
+    lease_terms: str = ""
+    """Of a fleet with exclusive tasks: what its leases hang on; an echo under other terms is none."""
 
     def __post_init__(self) -> None:
         check_name("beat.node", self.node)

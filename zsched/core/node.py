@@ -258,6 +258,7 @@ class Node:
             fleet_file=self.fleet_file,
             has_voted=self.agreement.has_voted,
             generation=self.agreement.generation or 0,
+            lease_terms=self.agreement.leases.terms,
         )
         self.loop_lag_s = 0.0
         is_in_turn = self._beat_at == self._turn_at  # whoever has news has brought the next beat forward
@@ -382,7 +383,10 @@ class Node:
 
     def _doubts(self, spec: TaskSpec, now: float) -> Doubts:
         in_grace, unproven = self.membership.in_grace(), self._probation.doubts(spec, now)
-        return Doubts(in_grace=in_grace, unproven=unproven) if in_grace or unproven else NO_DOUBTS
+        unfit = self.agreement.leases.unfit() if spec.exclusive else {}
+        if not in_grace and not unproven and not unfit:
+            return NO_DOUBTS
+        return Doubts(in_grace=in_grace, unproven=unproven, unfit=unfit)
 
     def _on_utility_asked(self, event: ev.UtilityAsked, now: float) -> None:
         utilities = self.rounds.vectors(self.values(), self.membership.states(), now)

@@ -69,6 +69,8 @@ class Doubts:
     """Suspect, but not for long enough to tell a lost beat from a lost node: an owner among them counts as alive."""
     unproven: Mapping[NodeId, str] = field(default_factory=dict)
     """{candidate: why it may not get the task} of those that were gone (`zsched.core.probation`)."""
+    unfit: Mapping[NodeId, str] = field(default_factory=dict)
+    """{candidate: why it may not have the task, though it has it} of an exclusive task (`zsched.core.lease`)."""
 
 
 NO_DOUBTS = Doubts()
@@ -105,6 +107,9 @@ def score(
         is_spared = candidate == allocation.owner and candidate in doubts.in_grace
         if state is not PeerState.ALIVE and not is_spared:
             unreachable.append(candidate)
+            continue
+        if candidate in doubts.unfit:
+            refused.append((candidate, doubts.unfit[candidate]))
             continue
         if candidate in doubts.unproven and candidate != allocation.owner:
             refused.append((candidate, doubts.unproven[candidate]))

@@ -254,6 +254,14 @@ LEASE_BUGS = (
         _LEASE,
         42,
     ),
+    _bug(
+        "echo of another electorate counts",
+        LEASE,
+        "for grant in beat.echoes if beat.lease_terms == self.terms else ():",
+        "for grant in beat.echoes:",
+        _LEASE,
+        1012468,
+    ),
     _bug("lease of a minority", LEASE, "number = numbers[needed - 1]", "number = numbers[0]", _LEASE, 26),
     _bug(
         "released number is granted again",

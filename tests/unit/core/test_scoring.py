@@ -139,6 +139,13 @@ def test_a_candidate_whose_streams_are_not_proven_is_refused_and_the_owner_stays
     assert vector.refused == (("edge3", "back for 1.2 s"),)
 
 
+def test_a_node_that_can_hold_no_lease_is_refused_though_it_is_the_owner() -> None:
+    vector = scored(ROBOT, *EDGES, doubts=Doubts(unfit={"edge1": "goes by other leases"}))
+
+    assert set(values(vector)) == {"edge2", "edge3"}
+    assert vector.refused == (("edge1", "goes by other leases"),)
+
+
 @pytest.mark.parametrize("state", [PeerState.SUSPECT, PeerState.GONE])
 def test_a_candidate_that_is_not_alive_gets_zero_and_is_not_left_out(state: PeerState) -> None:
     vector = scored(ROBOT, *EDGES, states={"edge2": state})
