@@ -15,7 +15,7 @@ L is the lease, rho the bound on how far two clocks' rates differ. Nobody compar
   learns a newer revision), and its beats ask that owner to leave; the owner drains and releases all numbers up to now,
   which are never granted again. Without this a planned move would never happen.
 * An echo counts only under the same terms (`lease_terms`): the electors and L of both fleet files. The majority of
-  another electorate need not meet the one that granted to this owner's earlier life. Such a node gets no exclusive task.
+  another electorate need not meet the one that granted to this owner's earlier life. Such a node gets no such task.
 * The worker's own word that it has stopped ends the owner's wait before the lease does, but only while no earlier word
   of the same epoch is missing: a late one would give back a lease that the worker has been given since.
 

@@ -260,7 +260,6 @@ LEASE_BUGS = (
         "for grant in beat.echoes if beat.lease_terms == self.terms else ():",
         "for grant in beat.echoes:",
         _LEASE,
-        1012468,
     ),
     _bug("lease of a minority", LEASE, "number = numbers[needed - 1]", "number = numbers[0]", _LEASE, 26),
     _bug(

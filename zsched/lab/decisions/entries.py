@@ -118,7 +118,10 @@ def fading(world: World) -> tuple[Entry, ...]:
         Entry(name="zsched", make=core(world)),
         *ahead,
         Entry(name="knee -65 dBm", limits=LinkLimits(knee_dbm=-65.0), make=core(world)),
-        Entry(name="patience, foresee 2 s", limits=LinkLimits(foresee_s=2.0), make=_patient(world)),
+        *(
+            Entry(name=f"patience, foresee {lead_s:g} s", limits=LinkLimits(foresee_s=lead_s), make=_patient(world))
+            for lead_s in (2.0, 3.0, 4.0)
+        ),
         Entry(name="zsched, patience", make=_patient(world)),
     )
 
