@@ -1,10 +1,10 @@
 """A large map over a thin radio while a second target of the robot stands still: does every map arrive, and control?
 
-``python -m benchmarks.thin_link [--minutes 2] [--mbit 20] [--size 4194304] [--every 4]``. Needs root: real daemons
-in network namespaces; what leaves robot1 passes a token bucket of ``--mbit`` with a queue of 100 ms. Its application
-puts a map (class ``latest``) every 4 s. One task takes it to edge1, whose echo worker answers; a second task takes
-the same map to edge2, whose worker is frozen. Control: 200 B at 20 Hz from robot1 to edge1 over a session of their own
-that is set up like the daemons' control session; one-way latency (the namespaces share one clock).
+``python -m benchmarks.thin_link [--minutes 2] [--mbit 20] [--class latest] [--size 4194304] [--every 4]``. Needs root:
+real daemons in network namespaces; what leaves robot1 passes a token bucket of ``--mbit`` with a queue of 100 ms. Its
+application puts a map every 4 s. One task takes it to edge1, whose echo worker answers; a second task takes the same
+map to edge2, whose worker is frozen in the second half. Control: 200 B at 20 Hz from robot1 to edge1 over a session of
+their own that is set up like the daemons' control session; one-way latency (the namespaces share one clock).
 
 Printed: maps put and come back, how long each took, control latency with no map, with maps, and with the frozen target;
 who suspected whom meanwhile (goal: nobody alive).
@@ -29,6 +29,8 @@ from zsched.lab.testbed import Json, echo_fleet
 
 PING_PORT = 7990
 WORKER = "zsched.tasks.echo"
+FROZEN_FOR_S = 3600.0
+"""A worker that is not ready for so long is restarted: the frozen one must stay as it is."""
 
 
 def main() -> None:
@@ -37,27 +39,29 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=2.0)
     parser.add_argument("--mbit", type=float, default=20.0)
     parser.add_argument("--size", type=int, default=4 << 20)
+    parser.add_argument("--class", dest="stream_class", choices=("latest", "reliable"), default="latest")
     parser.add_argument("--every", type=float, default=4.0, help="seconds between two maps")
     options = parser.parse_args()
     reason = netns.why_not()
     if reason is not None:
         raise SystemExit(f"no network namespaces here: {reason}")
     print(machine())
-    with tempfile.TemporaryDirectory() as folder, Netbed(Path(folder), _fleet()) as bed:
+    with tempfile.TemporaryDirectory() as folder, Netbed(Path(folder), _fleet(options.stream_class)) as bed:
         bed.init()
         bed.start()
         bed.wait(lambda: all(_is_ready(bed, task) for task in ("echo", "second")), 60.0, "both tasks have their owners")
         _run(bed, options)
 
 
-def _fleet() -> Json:
+def _fleet(stream_class: str) -> Json:
     """One robot, two edges, and a task for each edge that takes the robot's map."""
     tree = echo_fleet(robots=1, edges=2)
     body = tree["tasks"]["echo"]
-    rules = {"class": "latest", "keep_last": 1}
+    rules = {"class": "reliable"} if stream_class == "reliable" else {"class": stream_class, "keep_last": 1}
     for task, edge in (("echo", "edge1"), ("second", "edge2")):
         tree["tasks"][task] = {
             **body,
+            "worker": {**body["worker"], "start_deadline_s": FROZEN_FOR_S},
             "candidates": [edge],
             "inputs": [{"from": "{robot}/map", "to": f"{{target}}/{task}/{{robot}}/in", **rules}],
             "outputs": [{"from": f"{{target}}/{task}/{{epoch}}/{{robot}}/out", "to": f"{{robot}}/{task}", **rules}],
@@ -133,6 +137,9 @@ def _report(
         took = [(one.at - one.sent_at) * 1000 for one in back.values()]
         if took:
             print(line(f"  a map of {options.size} B there and back", took, "ms", "every one"))
+    streams = [one for task in bed.status("robot1")["tasks"] for one in task.get("streams", [])]
+    again = {one["stream"]: one.get("replayed", 0) for one in streams if one["stream"].endswith("in/0")}
+    print(f"samples that were put once more: {again}")
     bad = [one for one in bed.changes(since=spans[0][1]) if one.after is not PeerState.ALIVE]
     print(f"held for suspect or gone meanwhile: {len(bad)} {[(one.observer, one.node, one.reason) for one in bad[:5]]}")
 

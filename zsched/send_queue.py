@@ -91,6 +91,11 @@ class SendQueue:
         since = self._busy_since
         return since is not None and monotonic_s() - since > STALL_S
 
+    @property
+    def is_busy(self) -> bool:
+        """True while a put is under way."""
+        return self._busy_since is not None
+
     def send(self, lane: Hashable, action: Action, size: int, value: Any = None) -> int:
         """Queue a sample of ``size`` bytes; answers how many samples were dropped for it (itself: 1).
 

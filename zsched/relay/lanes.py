@@ -18,6 +18,11 @@ from zsched.core.relay_protocol import StreamAck
 KEPT_SAMPLES: Final = 2048
 KEPT_BYTES: Final = 16 << 20
 """Bounds of what one publisher keeps until it is acknowledged."""
+KEPT_BYTES_LATEST: Final = 256 << 10
+"""Class ``latest``: so much besides the newest ``keep_last`` samples; large ones are not worth a radio's time again."""
+RESEND_S: Final = 0.3
+MAX_RESEND_S: Final = 10.0
+"""Bounds of the time without progress after which what is not acknowledged is put again."""
 
 _DELETE: Final = SampleKind.DELETE
 _Plain = zenoh.Publisher
@@ -31,6 +36,10 @@ class Sent(NamedTuple):
     sample: Sample
     stamp: Timestamp | None
     size: int
+    at: float
+    """When its put had returned (monotonic seconds)."""
+    took_s: float
+    """How long the put waited for the link."""
 
 
 @dataclass(slots=True, eq=False)
@@ -50,6 +59,9 @@ class Lane:
     resend_from: int | None = None
     moved_at: float = 0.0
     """When something was last sent or newly acknowledged (monotonic seconds)."""
+    pause_s: float = RESEND_S
+    """How long nothing may move before it is put again: twice what acknowledgements take here, or as long as a put
+    takes; doubled each time."""
 
     def put(self, sample: Sample, stamp: Timestamp | None) -> None:
         """Put a sample on under the next number, with everything that zenoh lets us keep."""
@@ -103,21 +115,39 @@ class Lane:
 
     # --- what came of it ---------------------------------------------------------------------------------------------
 
-    def keep(self, sample: Sample, stamp: Timestamp | None, size: int, limit: int) -> None:
-        """Keep what was just put, at most ``limit`` samples and `KEPT_BYTES`; the oldest go."""
-        self.kept.append(Sent(self.count - 1, sample, stamp, size))
-        self.kept_bytes += size
-        while len(self.kept) > limit or (self.kept_bytes > KEPT_BYTES and len(self.kept) > 1):
+    def keep(self, sent: Sent, *, samples: int, least: int, size: int) -> None:
+        """Keep what was just put: at most so many ``samples`` and ``size`` bytes, but ``least`` of them; oldest go."""
+        self.kept.append(sent)
+        self.kept_bytes += sent.size
+        self.moved_at, self.pause_s = sent.at, max(self.pause_s, min(sent.took_s, MAX_RESEND_S))
+        while len(self.kept) > samples or (self.kept_bytes > size and len(self.kept) > least):
             self.kept_bytes -= self.kept.popleft().size
 
-    def acknowledge(self, ack: StreamAck, incarnation: str) -> bool:
+    def is_late(self, now: float) -> bool:
+        """Whether what is not acknowledged should be put again.
+
+        As TCP's retransmission timer (RFC 6298): a slow radio takes its time for every large sample, and sending it
+        twice would make it slower.
+        """
+        return self.arrived < self.count and now - self.moved_at > self.pause_s
+
+    def ask_again(self, start: int, now: float) -> None:
+        """Have everything from ``start`` on put again; the next time with twice the patience, while nothing moves."""
+        self.resend_from, self.moved_at = start, now
+        self.pause_s = min(2 * self.pause_s, MAX_RESEND_S)
+
+    def acknowledge(self, ack: StreamAck, incarnation: str, now: float) -> bool:
         """Take an acknowledgement; ``True`` when it is of another life of the worker, which starts anew."""
         is_other = bool(self.incarnation) and incarnation != self.incarnation
         self.incarnation = incarnation
         if is_other or self.ack is None or ack.processed >= self.ack.processed:
             self.ack = ack
+        newest: Sent | None = None
         while self.kept and self.kept[0].number < ack.arrived:
-            self.kept_bytes -= self.kept.popleft().size
+            newest = self.kept.popleft()
+            self.kept_bytes -= newest.size
+        if newest is not None:
+            self.pause_s = min(max(2 * (now - newest.at), newest.took_s, RESEND_S), MAX_RESEND_S)
         return is_other
 
     @property

@@ -16,7 +16,8 @@ blocks zenoh's own runtime (tokens and samples of every other peer came more tha
 hold Python's global lock until the receiver's lease ends (measured with zenoh 1.10.2: 4 s of an 8 s lease).
 
 Where the receiver is `zsched.worker`, samples are kept until it acknowledges them. A number that did not come, or no
-progress for `RESEND_S`, and they are put again under the numbers they had; the worker drops what it has already.
+progress for a while (`Lane.is_late`), and they are put again under the numbers they had; the worker drops what it has
+already.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from zsched.core.plan import StreamClass, StreamSettings
 from zsched.core.relay_protocol import EndMarker, StreamAck
 from zsched.keyspace import END_CHUNK
 from zsched.relay.acks import Acks
-from zsched.relay.lanes import KEPT_SAMPLES, Lane, Sent
+from zsched.relay.lanes import KEPT_BYTES, KEPT_BYTES_LATEST, KEPT_SAMPLES, Lane, Sent
 from zsched.relay.receive import undeclare
 from zsched.relay.rewrite import Rewriter, rewriter
 from zsched.relay.tally import Tally
@@ -46,8 +47,6 @@ QUEUE_DEPTH: Final = 1024
 MAX_LANES: Final = 4096
 """Publishers of one wildcard stream towards one place: keys come from the applications, memory is ours."""
 KEPT_OWNERS: Final = 4
-RESEND_S: Final = 0.3
-"""No progress for so long: what is not acknowledged is put again."""
 SKIP_EPOCH: Final = 0
 """Epoch of a marker that ends nothing: no number below its count will come any more."""
 
@@ -85,6 +84,8 @@ class Outlet:
         self._rewriters: dict[str, Rewriter] = {from_expr: rewriter(from_expr, to_expr)}
         self._is_reliable = settings.stream_class is StreamClass.RELIABLE
         self._kept_limit = KEPT_SAMPLES if self._is_reliable else max(settings.depth, settings.keep_last)
+        self._kept_least = 1 if self._is_reliable else settings.keep_last
+        self._kept_bytes = KEPT_BYTES if self._is_reliable else KEPT_BYTES_LATEST
         self._is_wild = is_wild(to_expr)
         self._to = to_expr
         self._lock = threading.Lock()
@@ -185,14 +186,13 @@ class Outlet:
 
     def look_after(self) -> None:
         """Have sent again what was not acknowledged in time; call it now and then."""
-        if self._queue is None or self._acks is None or not self.is_matching:
-            return
+        if self._queue is None or self._acks is None or self._queue.is_busy or not self.is_matching:
+            return  # what a put waits for now, one more would wait for behind it
         now = monotonic_s()
         with self._lock:
-            late = [lane for lane in self._lanes.values() if lane.arrived < lane.count]
-            late = [lane for lane in late if now - lane.moved_at > RESEND_S]
+            late = [lane for lane in self._lanes.values() if lane.is_late(now)]
             for lane in late:
-                lane.resend_from, lane.moved_at = lane.arrived, now
+                lane.ask_again(lane.arrived, now)
         if late:
             self._queue.kick()
 
@@ -279,12 +279,14 @@ class Outlet:
     # --- the queue's thread ------------------------------------------------------------------------------------------
 
     def _put(self, lane: Lane, sample: Sample, stamp: Timestamp | None, size: int) -> None:
+        began = monotonic_s()
         lane.put(sample, stamp)
         if self._acks is None:
             return
         with self._lock:
-            lane.keep(sample, stamp, size, self._kept_limit)
-            lane.moved_at = monotonic_s()
+            now = monotonic_s()
+            sent = Sent(lane.count - 1, sample, stamp, size, now, now - began)
+            lane.keep(sent, samples=self._kept_limit, least=self._kept_least, size=self._kept_bytes)
 
     def _is_open(self) -> bool:
         """Class ``reliable``: nothing goes out to nobody, and no more than can be sent again."""
@@ -320,12 +322,12 @@ class Outlet:
         now = monotonic_s()
         with self._lock:
             before = lane.ack
-            if lane.acknowledge(ack, incarnation):
+            if lane.acknowledge(ack, incarnation, now):
                 self.tally.new_life(before, lane.count)
             elif before is None or ack.arrived > before.arrived:
                 lane.moved_at = now
-            is_gap = ack.has_gap and now - lane.moved_at > RESEND_S / 3
+            is_gap = ack.has_gap and now - lane.moved_at > lane.pause_s / 3
             if ack.has_gap and (is_gap or before is None or not before.has_gap):
-                lane.resend_from, lane.moved_at = ack.arrived, now
+                lane.ask_again(ack.arrived, now)
         if self._queue is not None:
             self._queue.kick()
