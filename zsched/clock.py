@@ -25,6 +25,9 @@ def wall_ns() -> int:
     return time.time_ns()
 
 
-def wall_seconds() -> int:
-    """Whole seconds of the wall clock: the start counter of a blank state, so that it is above an earlier life's."""
-    return int(time.time())
+def wall_tenths() -> int:
+    """Tenths of a second of the wall clock: the start counter of a blank state, so that it is above an earlier life's.
+
+    Finer than a daemon can start, so that no count of starts gets ahead of it.
+    """
+    return int(time.time() * 10)

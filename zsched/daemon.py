@@ -30,7 +30,7 @@ from zsched.adapters.state_file import StateFile
 from zsched.adapters.streams import SILENCE_S, Bequest, RelayHandle
 from zsched.adapters.systemd import Notifier, watchdog_interval_s
 from zsched.adapters.worker_supervisor import WorkerContext, WorkerSupervisor
-from zsched.clock import monotonic_s, wall_seconds
+from zsched.clock import monotonic_s, wall_tenths
 from zsched.config import load_fleet
 from zsched.core import events as ev
 from zsched.core.fleet import NodeSpec, electorate_hash, fleet_hash
@@ -148,7 +148,7 @@ class Daemon:
         state_file = StateFile(self._options.state_dir, fleet=self._fleet.name, node=self._spec.name)
         with state_file, contextlib.ExitStack() as stack:
             durable, problem = self._restore(state_file)
-            incarnation = durable.incarnation if durable is not None else wall_seconds()
+            incarnation = durable.incarnation if durable is not None else wall_tenths()
             points = endpoints_for(self._fleet, self._spec, self._data_port, is_here)
             self._handle_signals(stack)  # first: a stop that comes while things open is an orderly one, too
             shell = self._build(stack, state_file, incarnation, points)

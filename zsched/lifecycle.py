@@ -11,7 +11,7 @@ from pathlib import Path
 from zsched import zenoh_config
 from zsched.adapters.control_bus import ask_fleet
 from zsched.adapters.state_file import StateFile, hardware_id
-from zsched.clock import wall_seconds
+from zsched.clock import wall_tenths
 from zsched.core.fleet import Fleet, dial_endpoint, electorate_hash
 from zsched.core.model import NO_BALLOT, Acceptance, Allocation, DurableState, NodeId, RegisterState
 from zsched.errors import AdapterError
@@ -43,7 +43,7 @@ def init_state(fleet: Fleet, node: NodeId, folder: Path, generation: int) -> Pat
     state = DurableState(
         fleet=fleet.name,
         node=node,
-        incarnation=wall_seconds(),
+        incarnation=wall_tenths(),
         generation=generation,
         hardware=hardware_id(),
         electorate=electorate_hash(fleet),

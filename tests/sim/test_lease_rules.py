@@ -254,6 +254,20 @@ def test_an_echo_counts_only_under_the_owner_s_own_electors_and_length(other: Fl
     assert held.unfit() == {}
 
 
+def test_giving_back_what_was_never_used_is_worth_a_beat_only_now_and_then() -> None:
+    """Two owners that ask each other to leave would answer every beat with a beat (seed 1031212)."""
+    held = leases()
+    held.on_beat(ask(), {}, 10.1)
+    assert held.on_run_out("guard", 5, 10.1)
+    assert held.on_sent(6, 10.1).released == (grant(5, owner="r1"),)
+    held.on_beat(ask(), {}, 10.11)
+    assert not held.on_run_out("guard", 6, 10.11)
+    assert held.on_sent(7, 10.2).released == (grant(6, owner="r1"),), "it is given back all the same"
+    held.on_given("guard", 11.2)
+    held.on_beat(ask(), {}, 10.21)
+    assert held.on_run_out("guard", 7, 10.21), "a worker has been at work: who waits should know at once"
+
+
 def test_an_owner_is_not_asked_to_leave_for_another_epoch_s_sake() -> None:
     held = leases()
     held.on_beat(ask(epoch=2), {}, 10.1)

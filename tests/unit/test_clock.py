@@ -7,7 +7,7 @@ import time
 from datetime import UTC, datetime
 from pathlib import Path
 
-from zsched.clock import monotonic_s, wall_time
+from zsched.clock import monotonic_s, wall_tenths, wall_time
 
 
 def test_monotonic_s_never_goes_back() -> None:
@@ -19,6 +19,11 @@ def test_monotonic_s_is_boot_time_suspend_included() -> None:
     before = time.clock_gettime(time.CLOCK_BOOTTIME)
     reading = monotonic_s()
     assert before <= reading <= time.clock_gettime(time.CLOCK_BOOTTIME)
+
+
+def test_a_blank_state_s_first_incarnation_is_finer_than_a_daemon_can_start() -> None:
+    before = time.time() * 10
+    assert before - 1 <= wall_tenths() <= time.time() * 10
 
 
 def test_wall_time_is_rfc_3339_in_utc_with_milliseconds() -> None:

@@ -36,6 +36,8 @@ from zsched.core.scoring import majority
 RHO = 1e-3
 """Bound on the relative difference of two clocks' rates (a crystal is within 1e-4)."""
 SENT_KEPT = 128
+HURRY_S = 0.05
+"""A release of nothing that was used is worth a beat of its own at most so often."""
 
 
 def hold_s(lease_s: float) -> float:
@@ -189,6 +191,8 @@ class Holder:
     """The worker was told to stop and has not said yet that it has."""
     is_doubtful: bool = False
     """A word of an earlier stop in this epoch may still come: from now on only the end of what was given counts."""
+    hurried_at: float = -math.inf
+    """When a release of nothing that was used last had a beat of its own."""
     _sent: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=SENT_KEPT))
     _echoed: dict[NodeId, int] = field(default_factory=dict)
 
@@ -355,13 +359,21 @@ class Leases:
         self._releases[task] = holder.release(number)
         return True
 
-    def on_run_out(self, task: TaskId, number: int) -> bool:
-        """All that a leaving worker was ever given is over: give everything back; false when nobody asked."""
+    def on_run_out(self, task: TaskId, number: int, now: float) -> bool:
+        """All that a leaving worker was ever given is over: give everything back. Whether that is worth a beat at once.
+
+        It is when the worker was given something since the last time, and now and then when it was not. Two owners,
+        each an elector that asks the other one to leave, would otherwise answer every beat with a beat.
+        """
         holder = self._holders.get(task)
         if holder is None or not holder.is_leaving:
             return False
+        was_given = holder.given_until > -math.inf or holder.awaits_report
         holder.is_doubtful |= holder.awaits_report
         self._releases[task] = holder.release(number)
+        if not was_given and now - holder.hurried_at < HURRY_S:
+            return False
+        holder.hurried_at = now if not was_given else holder.hurried_at
         return True
 
     # --- beats -------------------------------------------------------------------------------------------------------

@@ -92,7 +92,7 @@ class Tenure:
             # What the worker was told counts, not what has been echoed since: electors may echo on and on, and a
             # worker that has stopped already will not say so again.
             if now >= self.leases.given_until(task):
-                has_released |= self.leases.on_run_out(task, number)
+                has_released |= self.leases.on_run_out(task, number, now)
         return tuple(result), has_released
 
     # --- isolation ---------------------------------------------------------------------------------------------------

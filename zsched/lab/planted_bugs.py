@@ -255,6 +255,13 @@ LEASE_BUGS = (
         42,
     ),
     _bug(
+        "an empty release is worth a beat at once",
+        LEASE,
+        "if not was_given and now - holder.hurried_at < HURRY_S:",
+        "if not was_given and now < holder.hurried_at:",
+        _LEASE,
+    ),
+    _bug(
         "echo of another electorate counts",
         LEASE,
         "for grant in beat.echoes if beat.lease_terms == self.terms else ():",

@@ -21,7 +21,7 @@ from zsched.errors import InvariantError
 from zsched.lab.sim_network import Weather
 from zsched.lab.sim_parts import Machine
 from zsched.lab.sim_swarm import Fault, Plan
-from zsched.lab.simulator import CORES, SELF_DELAY_S, WALL_S, Simulator
+from zsched.lab.simulator import CORES, SELF_DELAY_S, Simulator
 
 SETTLE_S = 15.0
 """Once faults have stopped and everybody is up, every task has a living owner that all know within this time."""
@@ -168,7 +168,7 @@ class Stage:
         running = sim.running()
         for machine in sim.machines.values():
             sim.crash(machine.key)
-            sim.initialise(machine, incarnation=WALL_S + int(sim.now), generation=1)
+            sim.initialise(machine, incarnation=sim.wall_count, generation=1)
         sim.start(*running)
 
     def _check_answers(self) -> None:
@@ -275,7 +275,7 @@ class Stage:
         else:
             machine.disk.wipe()
             if machine.name not in self.sim.fleet.electors:
-                self.sim.initialise(machine, incarnation=WALL_S + int(self.sim.now))
+                self.sim.initialise(machine, incarnation=self.sim.wall_count)
         self._start_later(fault)
 
     def _storm(self, fault: Fault) -> None:

@@ -39,8 +39,8 @@ TOKEN_DELAY_S = 0.005
 SELF_DELAY_S = 0.0001
 RESTART_S = 0.3
 """A node that crashed in the middle of a batch comes back this much later."""
-WALL_S = 1_700_000_000
-"""A daemon without a state takes the wall clock's seconds for its incarnation."""
+WALL_MS = 1_700_000_000_000
+"""The wall clock when a simulation begins, in milliseconds since 1970 (plus the simulation's own)."""
 QUESTIONS_KEPT = 4000
 
 
@@ -94,6 +94,14 @@ class Simulator(Loops):
         machine.disk.sync()
 
     # --- what a test does --------------------------------------------------------------------------------------------
+
+    @property
+    def wall_count(self) -> int:
+        """The incarnation that a blank state or none begins with (`zsched.clock.wall_tenths`).
+
+        Finer than a tenth of a second: these machines can be wiped and started more often than any real one.
+        """
+        return WALL_MS + int(self.now * 1000)
 
     @property
     def learnt(self) -> dict[tuple[TaskId, int], Allocation]:
@@ -198,7 +206,7 @@ class Simulator(Loops):
             fleet=machine.fleet,
             me=machine.name,
             durable=state,
-            incarnation=state.incarnation if state is not None else WALL_S + int(self.now * 1000),
+            incarnation=state.incarnation if state is not None else self.wall_count,
             electorate=electorate,
             rng=Random(self.rng.random()),
             now=local,
