@@ -29,6 +29,8 @@ EVENTS_PER_S = 500.0
 """A node handles about 50 a second; ten times that, on average over a whole schedule, is a storm."""
 LOST_S = 3.0
 """So long a fleet that cannot agree is watched before the operator starts it anew."""
+AFTERMATH_S = 1.0
+"""What was under way when the faults ended has arrived."""
 STOP_S = 0.8
 """What a daemon that was told to stop waits for its tasks to move."""
 SMALL_DELAY_S = (0.0005, 0.003)
@@ -139,6 +141,11 @@ class Stage:
                 sim.crash(machine.key)
             if machine.key != missing:
                 sim.start(machine.key)
+        sim.later(AFTERMATH_S, self._start_again, missing)
+
+    def _start_again(self, missing: NodeId | None) -> None:
+        """A twin's last beat may still have made the node stand down whose name it had: the operator starts it."""
+        self.sim.start(*(key for key in sorted(self.sim.machines) if key != missing))
 
     def _one_too_few(self) -> NodeId | None:
         """In every second schedule one node that the others can do without never comes back."""
