@@ -192,11 +192,12 @@ def _task(page: Page, status: Json, task: Json) -> None:
 def _scheduler(page: Page, status: Json, task: Json) -> None:
     tuning, decision = task["tuning"], task["decision"]
     weights = " ".join(f"{name} {value:g}" for name, value in tuning["weights"].items())
+    patience = task.get("patience")  # a later field of the schema's major version
     page.block(
         "SCHEDULER",
         (weights, ""),
         (f"bonus {tuning['bonus']:g}", ""),
-        (f"trigger {tuning['time_to_trigger_s']:g}s", ""),
+        (f"trigger {tuning['time_to_trigger_s']:g}s" if patience is None else f"patience {patience:g}", ""),
         (f"cool-down {tuning['cool_down_s']:g}s", ""),
     )
     if decision is None:

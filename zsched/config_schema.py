@@ -28,6 +28,9 @@ from zsched.config_blocks import (
 )
 from zsched.config_ros2 import ros2_record
 from zsched.core.fleet import (
+    DEFAULT_FORESEE_S,
+    DEFAULT_PATIENCE,
+    PATIENT_BONUS,
     Demand,
     Fleet,
     LinkLimits,
@@ -195,8 +198,14 @@ DEMAND: Final = Record(
 SCHEDULING: Final = Record(
     "a scheduling section",
     {
-        "bonus": Field(_SHARE, "Added to the owner's joint utility: what a move must gain."),
-        "time_to_trigger_s": Field(Number(0, 3600, "s"), "How long another candidate must lead."),
+        "bonus": Field(
+            _SHARE,
+            "Added to the owner's joint utility: what a move must gain.",
+            default=f"`{PATIENT_BONUS:g}`; `0.1` with `time_to_trigger_s` alone",
+        ),
+        "time_to_trigger_s": Field(
+            Number(0, 3600, "s"), "How long another candidate must lead, for tasks without `patience`.", default="none"
+        ),
         "cool_down_s": Field(Number(0, 86400, "s"), "Least stay after a move."),
         "aggregate": Field(Choice.of(Aggregate), "How the robots' utilities become one; `median` resists a liar."),
         "reach": Field(Choice.of(Reach), "Who must reach a candidate.", default=f"`{Reach.MAJORITY}`"),
@@ -208,9 +217,9 @@ SCHEDULING: Final = Record(
         ),
         "patience": Field(
             Number(0.001, 1000),
-            "Move once staying has cost so much, lead times seconds (in place of `time_to_trigger_s`): "
+            "Move once staying has cost so much, lead times seconds (`time_to_trigger_s` does not count then): "
             "a big lead is followed sooner than a small one.",
-            default="the time-to-trigger",
+            default=f"`{DEFAULT_PATIENCE:g}`; none with `time_to_trigger_s` alone",
         ),
         "pays_off_in_s": Field(
             Number(1, 86400, "s"),
@@ -236,7 +245,9 @@ LINK_LIMITS: Final = Record(
             "Worth of a link through an access point: by the candidate's way (as printed), the weaker, or the mean.",
         ),
         "foresee_s": Field(
-            Number(0, 30, "s"), "Signals count as they will be so far ahead along their trend (at most 6 dB)."
+            Number(0, 30, "s"),
+            "Signals count as they will be so far ahead along their trend (at most 6 dB); `0`: as they are.",
+            default=f"`{DEFAULT_FORESEE_S:g}`",
         ),
     },
     LinkLimits,

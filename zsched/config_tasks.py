@@ -12,7 +12,17 @@ from zsched.config_blocks import Located, Section
 from zsched.config_nodes import Cast, select
 from zsched.config_reader import Collector, Place, nearest
 from zsched.config_ros2 import ros2_rules
-from zsched.core.fleet import Demand, LinkLimits, OnIsolation, StreamRule, TaskSpec, WorkerSpec
+from zsched.core.fleet import (
+    DEFAULT_FORESEE_S,
+    DEFAULT_PATIENCE,
+    PATIENT_BONUS,
+    Demand,
+    LinkLimits,
+    OnIsolation,
+    StreamRule,
+    TaskSpec,
+    WorkerSpec,
+)
 from zsched.core.model import NodeKind, Tuning, Weights
 from zsched.core.plan import Direction, HandoverRule, ReadyWhen, RosGraph, ServiceSettings, StreamClass, StreamSettings
 from zsched.core.rulecheck import RuleConflict, rule_conflicts
@@ -28,8 +38,8 @@ from zsched.core.templates import (
 
 _ANY_TUNING: Final = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
 """Stands in for a faulty one, so that the task's rules are checked in the same pass; such a file gives no fleet."""
-_OF_THE_TASK: Final = ("reach", "memory_floor_ratio", "max_moves_per_minute", "patience", "pays_off_in_s")
-"""Keys of `scheduling:` that are not part of the tuning: they cannot be changed at run time."""
+_OF_THE_TASK: Final = ("reach", "memory_floor_ratio", "max_moves_per_minute", "pays_off_in_s")
+"""Keys of `scheduling:` that are not part of the tuning: they cannot be changed at run time (nor can `patience`)."""
 _Places = dict[str, Place]
 """Where each rule stands, by stream name."""
 
@@ -77,6 +87,7 @@ def _task(
         limits=limits,
         worker=worker,
         rules=tuple(stream.value for stream in streams),
+        patience=_patience(scheduling),
         **_of(given, "on_isolation", "exclusive", "drain_s"),
         **more,
     )
@@ -115,15 +126,24 @@ def _tuning(given: Section, out: Collector) -> Tuning | None:
         return None
     scheduling: Section | None = given.get("scheduling")
     if scheduling is None:
-        return Tuning(weights=weights)
-    return scheduling.build(Tuning, out, weights=weights)
+        return Tuning(weights=weights, bonus=PATIENT_BONUS)
+    default = {"bonus": PATIENT_BONUS} if _patience(scheduling) is not None else {}
+    return scheduling.build(Tuning, out, weights=weights, **{**default, **_of(scheduling, "bonus")})
+
+
+def _patience(scheduling: Section | None) -> float | None:
+    """As given; none where only a time-to-trigger is given; else the default."""
+    values = {} if scheduling is None else scheduling.values
+    patience: float | None = values.get("patience", None if "time_to_trigger_s" in values else DEFAULT_PATIENCE)
+    return patience
 
 
 def _limits(given: Section, out: Collector) -> LinkLimits:
     section: Section | None = given.get("link")
     if section is None:
-        return LinkLimits()
-    limits = section.build(LinkLimits, out) or LinkLimits()
+        return LinkLimits(foresee_s=DEFAULT_FORESEE_S)
+    ahead = {"foresee_s": DEFAULT_FORESEE_S, **_of(section, "foresee_s")}
+    limits = section.build(LinkLimits, out, **ahead) or LinkLimits()
     if section.is_whole and limits.nu_dbm >= limits.rho_dbm:
         place = section.where("nu_dbm" if "nu_dbm" in section.places else "rho_dbm")
         out.error(place, f"nu_dbm ({limits.nu_dbm:g}) must be below rho_dbm ({limits.rho_dbm:g})")

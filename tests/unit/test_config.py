@@ -10,6 +10,9 @@ import pytest
 
 from zsched.config import CheckResult, check_bytes, check_file, load_fleet
 from zsched.core.fleet import (
+    DEFAULT_FORESEE_S,
+    DEFAULT_PATIENCE,
+    PATIENT_BONUS,
     Fleet,
     LinkSpec,
     OnIsolation,
@@ -134,6 +137,51 @@ def test_links_of_every_source() -> None:
     assert wired == LinkSpec(source=LinkSource.WIRED)
     assert (trace.source, trace.peer, trace.column, trace.offset_s) == (LinkSource.TRACE, "edge2", "rssi", 120)
     assert Path(trace.value).is_absolute()
+
+
+@pytest.mark.parametrize(
+    ("scheduling", "patience", "bonus", "trigger_s"),
+    [
+        ("", DEFAULT_PATIENCE, PATIENT_BONUS, None),
+        ("{}", DEFAULT_PATIENCE, PATIENT_BONUS, None),
+        ("{cool_down_s: 5}", DEFAULT_PATIENCE, PATIENT_BONUS, None),
+        ("{bonus: 0.2}", DEFAULT_PATIENCE, 0.2, None),
+        ("{bonus: 0}", DEFAULT_PATIENCE, 0.0, None),
+        ("{patience: 0.3}", 0.3, PATIENT_BONUS, None),
+        ("{patience: 0.3, bonus: 0.2}", 0.3, 0.2, None),
+        ("{time_to_trigger_s: 2}", None, 0.1, 2.0),
+        ("{time_to_trigger_s: 0}", None, 0.1, 0.0),
+        ("{time_to_trigger_s: 3, bonus: 0.05}", None, 0.05, 3.0),
+        ("{time_to_trigger_s: 3, patience: 0.3}", 0.3, PATIENT_BONUS, 3.0),
+        ("{time_to_trigger_s: 3, patience: 0.3, bonus: 0.2}", 0.3, 0.2, 3.0),
+    ],
+)
+def test_patience_is_the_default_and_a_time_to_trigger_alone_takes_its_place(
+    scheduling: str, patience: float | None, bonus: float, trigger_s: float | None
+) -> None:
+    """docs/decisions/0021."""
+    given = f"    scheduling: {scheduling}\n" if scheduling else ""
+    task = fleet_of(swapped("    scheduling: {bonus: 0.10, time_to_trigger_s: 2, cool_down_s: 10}\n", given)).tasks[0]
+    assert task.patience == patience
+    assert task.tuning.bonus == bonus
+    if trigger_s is not None:
+        assert task.tuning.time_to_trigger_s == trigger_s
+
+
+@pytest.mark.parametrize(
+    ("link", "foresee_s"),
+    [("", DEFAULT_FORESEE_S), ("{nu_dbm: -75}", DEFAULT_FORESEE_S), ("{foresee_s: 0}", 0.0), ("{foresee_s: 1}", 1.0)],
+)
+def test_signals_are_foreseen_unless_the_file_says_otherwise(link: str, foresee_s: float) -> None:
+    scheduling = "    scheduling: {bonus: 0.10, time_to_trigger_s: 2, cool_down_s: 10}\n"
+    given = f"{scheduling}    link: {link}\n" if link else scheduling
+    limits = fleet_of(swapped(scheduling, given)).tasks[0].limits
+    assert limits.foresee_s == foresee_s
+    assert limits.nu_dbm == (-75.0 if "nu_dbm" in link else -80.0)
+
+
+def test_the_defaults_of_a_fleet_file_are_those_of_decision_0021() -> None:
+    assert (DEFAULT_PATIENCE, PATIENT_BONUS, DEFAULT_FORESEE_S) == (0.2, 0.05, 3.0)
 
 
 def test_every_setting_of_a_task_arrives() -> None:

@@ -4,8 +4,17 @@ from dataclasses import MISSING, fields
 from pathlib import Path
 
 from zsched.config import check_bytes
-from zsched.config_schema import RULE, SCHEDULING, TRACE, WORKER, reference
-from zsched.core.fleet import LinkSpec, TaskSpec, Timing, WorkerSpec
+from zsched.config_schema import LINK_LIMITS, RULE, SCHEDULING, TRACE, WORKER, reference
+from zsched.core.fleet import (
+    DEFAULT_FORESEE_S,
+    DEFAULT_PATIENCE,
+    PATIENT_BONUS,
+    LinkSpec,
+    TaskSpec,
+    Timing,
+    WorkerSpec,
+)
+from zsched.core.model import Tuning
 from zsched.core.plan import StreamSettings
 from zsched.core.timing import _RELATIONS, PROFILES
 
@@ -32,6 +41,13 @@ def test_defaults_told_by_hand_are_the_classes_own() -> None:
         assert default is not MISSING
         shown = f"{default:g}" if isinstance(default, float) else str(default)
         assert record.default_text(key) == f"`{shown}`", key
+
+
+def test_defaults_that_hang_on_each_other_are_the_codes() -> None:
+    timer_bonus = next(field.default for field in fields(Tuning) if field.name == "bonus")
+    assert SCHEDULING.default_text("bonus") == f"`{PATIENT_BONUS:g}`; `{timer_bonus:g}` with `time_to_trigger_s` alone"
+    assert SCHEDULING.default_text("patience").startswith(f"`{DEFAULT_PATIENCE:g}`; ")
+    assert LINK_LIMITS.default_text("foresee_s") == f"`{DEFAULT_FORESEE_S:g}`"
 
 
 def test_timing_table_and_relations_are_the_codes() -> None:

@@ -190,6 +190,17 @@ def test_more_robots_than_fit_are_counted() -> None:
     assert f"+{20 - shown}" in head
 
 
+def test_the_scheduler_shows_patience_where_there_is_one_and_else_the_timer() -> None:
+    status = recorded("healthy")
+    (by_timer,) = [line for line in render_status(status, 80, color=False).splitlines() if "SCHEDULER" in line]
+    status["tasks"][0]["patience"] = 0.2
+    (patient,) = [line for line in render_status(status, 80, color=False).splitlines() if "SCHEDULER" in line]
+    assert "patience" not in by_timer
+    assert re.sub(r"trigger [0-9.]+s", "patience 0.2", by_timer) == patient != by_timer
+    status["tasks"][0]["patience"] = None
+    assert by_timer in render_status(status, 80, color=False).splitlines()
+
+
 def test_bonus_and_penalty_stand_beside_the_candidate_they_change() -> None:
     status = recorded("healthy")
     status["tasks"][0]["decision"]["penalties"] = {"edge2": 0.05, "edge1": 0.0}

@@ -1,6 +1,9 @@
 """The frozen values of the fleet file: nodes, tasks, streams, timing. Built and validated by `zsched.config`.
 
 Knows: what an operator may say, with the defaults (they live here only). Does not know: YAML, files, positions.
+
+A class's defaults are the plain rule: a time-to-trigger, signals as they are. The three constants below are what a task
+of a fleet file gets that says nothing else.
 """
 
 from __future__ import annotations
@@ -13,6 +16,13 @@ from functools import lru_cache
 
 from zsched.core.model import LinkSource, NodeId, NodeKind, TaskId, Tuning, check_range
 from zsched.core.plan import Direction, ReadyWhen, ServiceSettings, StreamSettings
+
+DEFAULT_PATIENCE = 0.2
+"""Utility seconds; for a task whose fleet file gives neither a patience nor a time-to-trigger (docs/decisions/0021)."""
+PATIENT_BONUS = 0.05
+"""The bonus of a task with a patience, when its fleet file gives none; with a time-to-trigger it is `Tuning`'s."""
+DEFAULT_FORESEE_S = 3.0
+"""How far ahead the signals of a task count when its fleet file does not say."""
 
 
 class Standby(StrEnum):

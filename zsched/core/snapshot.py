@@ -99,6 +99,8 @@ class TaskStatus:
     streams: tuple[StreamCount, ...] = ()
     history: tuple[PastAllocation, ...] = ()
     problems: tuple[str, ...] = ()
+    patience: float | None = None
+    """Utility seconds that staying may cost; ``None``: the tuning's time-to-trigger counts."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

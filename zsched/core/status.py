@@ -153,6 +153,7 @@ def _task_status(node: NodeView, spec: TaskSpec, now: float) -> TaskStatus:
         phase=executor.phase.value,
         tuning=value.tuning,
         candidates=spec.candidates,
+        patience=spec.patience,
         decision=_decision(standing, now),
         vote=_vote(standing, now),
         problems=(f"cut off from {value.owner}: this robot works alone, degraded",) if executor.is_local else (),

@@ -12,7 +12,7 @@ from random import Random
 
 import pytest
 
-from zsched.core.fleet import Demand, Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.fleet import DEFAULT_PATIENCE, PATIENT_BONUS, Demand, Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
 from zsched.core.gateway import Gateway
 from zsched.core.model import (
     Allocation,
@@ -86,6 +86,8 @@ class Loop:
     tuning: Tuning = field(default_factory=lambda: Tuning(weights=BOTH))
     timing: Timing = field(default_factory=Timing)
     robots: tuple[str, ...] = ("robot1",)
+    patience: float | None = None
+    """In place of the time-to-trigger."""
     seed: int = 0
     moves: list[tuple[float, str]] = field(default_factory=list)
 
@@ -96,6 +98,7 @@ class Loop:
             candidates=names,
             tuning=replace(self.tuning, weights=self.weights),
             demand=Demand(),
+            patience=self.patience,
             worker=WorkerSpec(command=("worker",)),
         )
         nodes = [NodeSpec(name=name, kind=NodeKind.EDGE) for name in names]
@@ -191,6 +194,8 @@ class Loop:
         self.moves.append((now, result.winner))
 
 
+PATIENT = Tuning(weights=BOTH, bonus=PATIENT_BONUS)
+"""With `DEFAULT_PATIENCE`: what a task gets whose fleet file says nothing (docs/decisions/0021)."""
 RESTLESS = Tuning(weights=BOTH, bonus=0.0, time_to_trigger_s=0.0, cool_down_s=0.0)
 
 
@@ -203,6 +208,13 @@ def test_two_equal_nodes_under_noise_move_at_most_once_in_an_hour(seed: int) -> 
     loop = Loop((Machine(name="edge1", noise=0.15), Machine(name="edge2", noise=0.15)), seed=seed)
 
     assert len(loop.run(HOUR_S)) <= 1
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_nor_do_they_with_patience(seed: int) -> None:
+    machines = (Machine(name="edge1", noise=0.15), Machine(name="edge2", noise=0.15))
+
+    assert len(Loop(machines, tuning=PATIENT, patience=DEFAULT_PATIENCE, seed=seed).run(HOUR_S)) <= 1
 
 
 def test_the_same_noise_without_stickiness_moves_the_task_all_the_time() -> None:
@@ -237,6 +249,22 @@ def test_a_step_of_30_percent_is_followed_in_time(weights: Weights, phase: float
     assert loop.tuning.time_to_trigger_s <= moved_at - at <= allowed
 
 
+@pytest.mark.parametrize("phase", [0.0, 0.1, 0.33])
+@pytest.mark.parametrize("weights", [BOTH, Weights(cpu=0.4, memory=0.3, network=0.3)])
+def test_a_step_of_30_percent_is_followed_as_soon_with_patience(weights: Weights, phase: float) -> None:
+    """The goal of the time-to-trigger (4.3 s) holds for the default that took its place; and not after one reading."""
+    at = 15.0 + phase
+    stepped = Machine(name="edge1", step=lambda now: 0.3 if now >= at else 0.0)
+    robots = ("robot1", "robot2", "robot3")
+    loop = Loop(
+        (stepped, Machine(name="edge2")), weights=weights, robots=robots, tuning=PATIENT, patience=DEFAULT_PATIENCE
+    )
+    ((moved_at, where),) = loop.run(22.0)
+
+    assert where == "edge2"
+    assert 2.0 <= moved_at - at <= 4.3
+
+
 def test_a_step_smaller_than_the_bonus_moves_nothing() -> None:
     stepped = Machine(name="edge1", step=lambda now: 0.09 if now >= 30.0 else 0.0)
 
@@ -247,6 +275,16 @@ def test_a_spike_shorter_than_the_time_to_trigger_moves_nothing() -> None:
     spiky = Machine(name="edge1", step=lambda now: 0.5 if now % 20.0 < 1.0 else 0.0)
 
     assert Loop((spiky, Machine(name="edge2"))).run(200.0) == []
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.1, 0.2, 0.3, 0.4])
+def test_nor_does_it_with_patience(phase: float) -> None:
+    """Half of the machine for 1 s, as above; the bonus of patience without it would follow."""
+    spiky = Machine(name="edge1", step=lambda now: 0.5 if now >= 15.0 and (now - phase) % 20.0 < 1.0 else 0.0)
+    machines = (spiky, Machine(name="edge2"))
+
+    assert Loop(machines, tuning=PATIENT, patience=DEFAULT_PATIENCE).run(200.0) == []
+    assert Loop(machines, tuning=PATIENT).run(200.0) != []
 
 
 def test_loads_that_follow_the_task_are_fled_no_faster_than_the_cool_down() -> None:

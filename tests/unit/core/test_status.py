@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from random import Random
 from typing import Any
 
@@ -100,6 +101,15 @@ def test_quorum_counts_the_living_electors_and_says_what_this_node_is(
     assert (quorum.electors, quorum.needed) == (3, 2)
     assert (quorum.alive, quorum.ok, quorum.this_node) == expected
     assert status_line(node).endswith("NO QUORUM") is not expected[1]
+
+
+@pytest.mark.parametrize("patience", [None, 0.2])
+def test_a_task_says_whether_it_is_moved_by_patience(patience: float | None) -> None:
+    node = make()
+    node.fleet = replace(node.fleet, tasks=tuple(replace(task, patience=patience) for task in node.fleet.tasks))
+    snapshot = build_snapshot(node, 100.0)
+    assert [task.patience for task in snapshot.tasks] == [patience] * 2
+    assert [task["patience"] for task in snapshot_json(snapshot)["tasks"]] == [patience] * 2
 
 
 def test_problems_say_what_is_missing_in_words() -> None:

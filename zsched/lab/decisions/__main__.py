@@ -13,7 +13,7 @@ from pathlib import Path
 from zsched.lab.decisions import drives, figures, report, study
 
 PARTS = ("compare", "sweep", "options")
-SHOWN = ("zsched", "foresee 4 s", "the weaker way", "dyna_net", "argmax", "dyna_net_penalty")
+SHOWN = ("zsched", "zsched, timer", "the weaker way", "dyna_net", "argmax", "dyna_net_penalty")
 
 
 def parse() -> argparse.Namespace:
@@ -70,7 +70,7 @@ def show(out: Path, folder: Path | None) -> None:
     if any(case.startswith("long-") for case in cases):
         figures.sizes(rows, out / "sizes.png")
     if set(report.WHOLE_GRID) <= cases:
-        figures.grid(rows, {"the default": "s3 b0.1 t2 c10", "with patience": "s3 b0.05 p0.2 c5"}, out / "grid.png")
+        figures.grid(rows, {"the default": "s3 b0.05 p0.2 c10", "the timer": "s3 b0.1 t2 c10"}, out / "grid.png")
     print(f"written: {out / 'report.md'} and the pictures beside it")
 
 

@@ -52,35 +52,26 @@ def load(folder: Path) -> tuple[Drive, ...]:
 
 def cast(world: World) -> tuple[Entry, ...]:
     """Who drives: zsched, what it could be, and the yardsticks."""
-    knee = LinkLimits(knee_dbm=-65.0)
+    ahead = entries.foreseeing(world)
     return (
-        Entry(name="zsched", make=entries.core(world)),
-        *(Entry(name=f"bonus {bonus:g}", make=entries.core(world, bonus=bonus)) for bonus in (0.03, 0.05, 0.07, 0.1)),
+        *entries.ours(world),
+        *(
+            Entry(name=f"timer, bonus {bonus:g}", make=entries.timed(world, bonus=bonus))
+            for bonus in (0.03, 0.05, 0.07)
+        ),
         *(
             Entry(
-                name=f"bonus {bonus:g}, smoothing 1.5 s",
+                name=f"timer, bonus {bonus:g}, smoothing 1.5 s",
                 look=Look(smoothing_s=1.5),
-                make=entries.core(world, bonus=bonus),
+                make=entries.timed(world, bonus=bonus),
             )
             for bonus in (0.05, 0.1)
         ),
-        Entry(name="cool-down 5 s", make=entries.core(world, cool_down_s=5.0)),
-        Entry(name="with a knee", limits=knee, make=entries.core(world)),
+        Entry(name="cool-down 5 s", limits=ahead, make=entries.core(world, cool_down_s=5.0)),
+        Entry(name="with a knee", limits=entries.foreseeing(world, knee_dbm=-65.0), make=entries.core(world)),
+        *entries.foresights(world),
         *(
-            Entry(name=f"foresee {lead_s:g} s", limits=LinkLimits(foresee_s=lead_s), make=entries.core(world))
-            for lead_s in (1.0, 2.0, 3.0, 4.0)
-        ),
-        *(
-            Entry(
-                name=f"foresee {lead_s:g} s, patience",
-                limits=LinkLimits(foresee_s=lead_s),
-                make=entries.core(world, bonus=0.05, patience=entries.PATIENCE),
-            )
-            for lead_s in (2.0, 3.0)
-        ),
-        Entry(name="zsched, patience", make=entries.core(world, bonus=0.05, patience=entries.PATIENCE)),
-        *(
-            Entry(name=name, limits=LinkLimits(pair=pair), make=entries.core(world))
+            Entry(name=name, limits=entries.foreseeing(world, pair=pair), make=entries.core(world))
             for name, pair in (("the weaker way", PairReading.WEAKER), ("the mean way", PairReading.MEAN))
         ),
         Entry(name="dyna_net", look=UNSMOOTHED, make=lambda view: PickRule(view, cost=entries.PAPER_COST)),

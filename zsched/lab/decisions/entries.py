@@ -13,7 +13,7 @@ from collections.abc import Callable
 from random import Random
 from typing import Any, Final
 
-from zsched.core.fleet import LinkLimits, PairReading
+from zsched.core.fleet import DEFAULT_FORESEE_S, DEFAULT_PATIENCE, PATIENT_BONUS, LinkLimits, PairReading
 from zsched.core.model import Tuning, Weights
 from zsched.lab.decisions.replay import Entry
 from zsched.lab.decisions.rules import (
@@ -31,8 +31,8 @@ from zsched.lab.decisions.world import EVEN, RADIO_ONLY, World
 RAW: Final = Look(smoothing_s=0.5)
 """As noisy as a profiler that averages over one second."""
 PAPER_COST: Final = 0.1
-PATIENCE: Final = 0.2
-"""Utility seconds, with a bonus of 0.05 (docs/evaluation/decisions.md)."""
+TIMER_S: Final = 2.0
+"""The time-to-trigger of the rules that have one, with the bonus of `Tuning` (docs/decisions/0017)."""
 CPU_ONLY: Final = Weights(cpu=1.0, memory=0.0, network=0.0)
 MEMORY_ONLY: Final = Weights(cpu=0.0, memory=1.0, network=0.0)
 
@@ -47,20 +47,45 @@ def core(
     pays_off_in_s: float | None = None,
     move_cost_s: float = 0.0,
 ) -> Callable[[View], Rule]:
-    """The production's decision; what is ``None`` is its default, a ``patience`` replaces the time-to-trigger."""
+    """The production's decision; what is ``None`` is what a fleet file gets that does not say it (docs/decisions/0021).
+
+    Neither a patience nor a time-to-trigger: the default patience. Signals are `foreseeing`'s affair.
+    """
+    if patience is None and time_to_trigger_s is None:
+        patience = DEFAULT_PATIENCE
+    if patience is not None and bonus is None:
+        bonus = PATIENT_BONUS
     given = {"bonus": bonus, "time_to_trigger_s": time_to_trigger_s, "cool_down_s": cool_down_s}
     settings: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     tuning = Tuning(weights=world.spec.tuning.weights, **settings)
     return lambda view: CoreRule(view, tuning, patience=patience, pays_off_in_s=pays_off_in_s, move_cost_s=move_cost_s)
 
 
+def foreseeing(world: World, lead_s: float = DEFAULT_FORESEE_S, **more: Any) -> LinkLimits | None:
+    """The limits of a task that counts signals ``lead_s`` ahead; the world's own where there is no radio."""
+    return None if world.signal is None else LinkLimits(foresee_s=lead_s, **more)
+
+
+def ours(world: World) -> tuple[Entry, ...]:
+    """The product as it comes, and as it came before it had patience and foresight."""
+    return (
+        Entry(name="zsched", limits=foreseeing(world), make=core(world)),
+        Entry(name="zsched, timer", make=timed(world)),
+    )
+
+
+def timed(world: World, **settings: Any) -> Callable[[View], Rule]:
+    """The production's decision with a time-to-trigger, at its defaults until docs/decisions/0021; see `core`."""
+    return core(world, **{"time_to_trigger_s": TIMER_S, **settings})
+
+
 def schemes(world: World, seed: int) -> tuple[Entry, ...]:
     """zsched, the paper's schemes and the yardsticks."""
     names = world.candidates[:3]
     return (
-        Entry(name="zsched", make=core(world)),
-        Entry(name="zsched, bonus 0.05", make=core(world, bonus=0.05)),
-        Entry(name="zsched, patience", make=core(world, bonus=0.05, patience=PATIENCE)),
+        *ours(world),
+        Entry(name="zsched, timer, bonus 0.05", make=timed(world, bonus=0.05)),
+        *((Entry(name="patience without foresight", make=core(world)),) if world.signal is not None else ()),
         *(Entry(name=f"fixed_e{index}", make=_blind(fixed(name))) for index, name in enumerate(names, 1)),
         Entry(name="dyna_cpu", look=RAW, weights=CPU_ONLY, make=_pick(PAPER_COST)),
         Entry(name="dyna_mem", look=RAW, weights=MEMORY_ONLY, make=_pick(PAPER_COST)),
@@ -87,7 +112,7 @@ def grid(world: World) -> tuple[Entry, ...]:
 
     Names read ``s3 b0.1 t2 c10`` and ``s3 b0.05 p0.2 c5``.
     """
-    timed = tuple(
+    by_timer = tuple(
         Entry(
             name=f"s{smoothing_s:g} b{bonus:g} t{trigger_s:g} c{cool_s:g}",
             look=Look(smoothing_s=smoothing_s),
@@ -99,61 +124,74 @@ def grid(world: World) -> tuple[Entry, ...]:
     )
     patient = tuple(
         Entry(
-            name=f"s{smoothing_s:g} b{bonus:g} p{patience:g} c5",
+            name=f"s{smoothing_s:g} b{bonus:g} p{patience:g} c{cool_s:g}",
             look=Look(smoothing_s=smoothing_s),
-            make=core(world, bonus=bonus, cool_down_s=5.0, patience=patience),
+            make=core(world, bonus=bonus, cool_down_s=cool_s, patience=patience),
         )
-        for smoothing_s, bonus, patience in itertools.product((1.5, 3.0), (0.03, 0.05, 0.07), (0.05, 0.1, 0.2))
+        for smoothing_s, bonus, patience, cool_s in itertools.product(
+            (1.5, 3.0), (0.03, 0.05, 0.07), (0.05, 0.1, 0.2), (5.0, 10.0)
+        )
     )
-    return timed + patient
+    return by_timer + patient
 
 
 def fading(world: World) -> tuple[Entry, ...]:
-    """Prediction of a fading link, at the default tuning: ``link.foresee_s``; and a knee, and both."""
-    ahead = tuple(
-        Entry(name=f"foresee {lead_s:g} s", limits=LinkLimits(foresee_s=lead_s), make=core(world))
-        for lead_s in (1.0, 2.0, 3.0, 4.0)
-    )
+    """Prediction of a fading link, with patience (3 s is the default) and with the timer; and a knee on the default."""
     return (
-        Entry(name="zsched", make=core(world)),
-        *ahead,
-        Entry(name="knee -65 dBm", limits=LinkLimits(knee_dbm=-65.0), make=core(world)),
-        *(
-            Entry(name=f"patience, foresee {lead_s:g} s", limits=LinkLimits(foresee_s=lead_s), make=_patient(world))
-            for lead_s in (2.0, 3.0, 4.0)
-        ),
-        Entry(name="zsched, patience", make=_patient(world)),
+        *ours(world),
+        *foresights(world),
+        Entry(name="knee -65 dBm", limits=foreseeing(world, knee_dbm=-65.0), make=core(world)),
     )
 
 
-def _patient(world: World) -> Callable[[View], Rule]:
-    return core(world, bonus=0.05, patience=PATIENCE)
+def foresights(world: World) -> tuple[Entry, ...]:
+    """``link.foresee_s`` from 0 to 4 s, with the timer and with patience, where that is neither of `ours`."""
+    return (
+        *(
+            Entry(name=f"timer, foresee {lead_s:g} s", limits=foreseeing(world, lead_s), make=timed(world))
+            for lead_s in (1.0, 2.0, 3.0, 4.0)
+        ),
+        *(
+            Entry(name=f"patience, foresee {lead_s:g} s", limits=foreseeing(world, lead_s), make=core(world))
+            for lead_s in (2.0, 4.0)
+        ),
+        Entry(name="patience without foresight", make=core(world)),
+    )
 
 
 def costly(world: World, move_cost_s: float) -> tuple[Entry, ...]:
     """What to do when a move costs so many seconds of work: fixed bonuses, patience, and the measured cost."""
     return (
-        Entry(name="zsched", make=core(world)),
-        *(Entry(name=f"bonus {bonus:g}", make=core(world, bonus=bonus)) for bonus in (0.05, 0.15, 0.2, 0.3)),
+        *ours(world),
+        *(Entry(name=f"timer, bonus {bonus:g}", make=timed(world, bonus=bonus)) for bonus in (0.05, 0.15, 0.2, 0.3)),
         *(
             Entry(
-                name=f"bonus {bonus:g} + cost over {horizon_s:g} s",
-                make=core(world, bonus=bonus, pays_off_in_s=horizon_s, move_cost_s=move_cost_s),
+                name=f"timer, bonus {bonus:g} + cost over {horizon_s:g} s",
+                make=timed(world, bonus=bonus, pays_off_in_s=horizon_s, move_cost_s=move_cost_s),
             )
             for bonus, horizon_s in ((0.05, 60.0), (0.05, 120.0), (0.1, 60.0), (0.1, 120.0))
         ),
-        Entry(name="zsched, patience", make=_patient(world)),
-        Entry(name="patience of the cost", make=core(world, bonus=0.05, patience=max(PATIENCE, 0.5 * move_cost_s))),
+        *(
+            Entry(
+                name=f"patience + cost over {horizon_s:g} s",
+                make=core(world, pays_off_in_s=horizon_s, move_cost_s=move_cost_s),
+            )
+            for horizon_s in (60.0, 120.0)
+        ),
+        Entry(name="patience of the cost", make=core(world, patience=max(DEFAULT_PATIENCE, 0.5 * move_cost_s))),
     )
 
 
 def readings(world: World) -> tuple[Entry, ...]:
-    """Robot to robot through one access point: every reading of a pair, at several bonuses, and plain argmax."""
+    """Robot to robot through one access point: every reading of a pair, by default, with timers, and plain argmax."""
     judged = tuple(
+        Entry(name=f"{pair}, zsched", limits=foreseeing(world, pair=pair), make=core(world)) for pair in PairReading
+    )
+    judged += tuple(
         Entry(
-            name=f"{pair}, bonus {bonus:g}" + (f", foresee {lead_s:g} s" if lead_s else ""),
+            name=f"{pair}, timer, bonus {bonus:g}" + (f", foresee {lead_s:g} s" if lead_s else ""),
             limits=LinkLimits(pair=pair, foresee_s=lead_s),
-            make=core(world, bonus=bonus),
+            make=timed(world, bonus=bonus),
         )
         for pair, bonus, lead_s in itertools.product(PairReading, (0.1, 0.05, 0.03), (0.0, 2.0))
     )

@@ -36,7 +36,7 @@ DPI: Final = 110
 
 
 def _colour(rule: str) -> str:
-    if rule.startswith("zsched"):
+    if rule.startswith(("zsched", "patience")):
         return OURS
     return THEIRS if rule.startswith("dyna") else YARDSTICK
 

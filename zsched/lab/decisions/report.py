@@ -17,8 +17,9 @@ RULES: Final = (
     *(
         "oracle",
         "zsched",
-        "zsched, bonus 0.05",
-        "zsched, patience",
+        "zsched, timer",
+        "zsched, timer, bonus 0.05",
+        "patience without foresight",
         "fixed_e1",
         "fixed_e2",
         "fixed_e3",

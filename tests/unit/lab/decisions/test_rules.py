@@ -9,14 +9,28 @@ from random import Random
 import numpy as np
 import pytest
 
+from zsched.config import check_bytes
+from zsched.core.fleet import DEFAULT_PATIENCE, PATIENT_BONUS
 from zsched.core.model import Tuning
 from zsched.lab.decisions import entries
 from zsched.lab.decisions.replay import Entry, replay
 from zsched.lab.decisions.rules import BlindRule, CoreRule, Move, PickRule, drawn, first_match, fixed
-from zsched.lab.decisions.view import Look
+from zsched.lab.decisions.view import Feed, Look, View
 from zsched.lab.decisions.world import DT_S, EVEN, World, equal_world, loaded_world
 
 STEP_AT_S = 60.0
+PLAIN = """\
+fleet: plain
+nodes:
+  robot1: {kind: robot}
+  edge1: {kind: edge, host: 192.0.2.11, listen: {control: tcp/0.0.0.0:7457, data: tcp/0.0.0.0:7458}}
+seeds: [edge1]
+tasks:
+  plain:
+    candidates: {kind: edge}
+    weights: {cpu: 0.5, memory: 0.5}
+"""
+"""A fleet file that leaves everything to zsched."""
 
 
 def only(world: World, entry: Entry, seed: int = 0) -> list[Move]:
@@ -25,7 +39,7 @@ def only(world: World, entry: Entry, seed: int = 0) -> list[Move]:
 
 def test_equal_nodes_under_noise_are_not_moved_between_and_the_penalty_never_rests() -> None:
     world = equal_world(seed=1, hours=0.1)
-    assert len(only(world, Entry(name="zsched", make=entries.core(world)))) == 0
+    assert [len(only(world, entry)) for entry in entries.ours(world)] == [0, 0]
     penalty = only(world, Entry(name="penalty", make=lambda view: PickRule(view, cost=-0.1)))
     assert len(penalty) > 100
     argmax = only(world, Entry(name="argmax", look=entries.RAW, make=PickRule))
@@ -34,12 +48,14 @@ def test_equal_nodes_under_noise_are_not_moved_between_and_the_penalty_never_res
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_step_of_thirty_percent_is_followed_in_time(seed: int) -> None:
+    """The goal is the timer's; patience is held to it, too."""
     world = equal_world(seed=seed, hours=0.03, step_at_s=STEP_AT_S)
-    (move,) = only(world, Entry(name="zsched", make=entries.core(world)), seed)
-    timing, tuning = world.fleet.timing, world.spec.tuning
-    assert move.left == "edge001"
-    assert move.at_s - STEP_AT_S >= tuning.time_to_trigger_s
-    assert move.at_s - STEP_AT_S <= tuning.time_to_trigger_s + 0.6 * timing.smoothing_s + 1.1 * timing.decide_s
+    timing, trigger_s = world.fleet.timing, entries.TIMER_S
+    for entry in entries.ours(world):
+        (move,) = only(world, entry, seed)
+        assert move.left == "edge001"
+        assert move.at_s - STEP_AT_S >= trigger_s, entry.name
+        assert move.at_s - STEP_AT_S <= trigger_s + 0.6 * timing.smoothing_s + 1.1 * timing.decide_s, entry.name
 
 
 def test_after_a_move_the_cool_down_holds() -> None:
@@ -54,7 +70,7 @@ def test_after_a_move_the_cool_down_holds() -> None:
 def test_patience_follows_a_big_lead_sooner_than_a_small_one() -> None:
     def delay(patience: float) -> float:
         world = equal_world(seed=1, hours=0.03, half_width=0.0, step_at_s=STEP_AT_S)
-        (move,) = only(world, Entry(name="patient", make=entries.core(world, bonus=0.05, patience=patience)))
+        (move,) = only(world, Entry(name="patient", make=entries.core(world, patience=patience)))
         return move.at_s - STEP_AT_S
 
     assert delay(0.05) < delay(0.4) < delay(1.6)
@@ -70,13 +86,11 @@ def spiky() -> World:
     return replace(world, cpu=use, memory=use, cpu_read=use, memory_read=use)
 
 
-def test_short_spikes_move_nothing_by_default_and_with_patience_and_a_small_bonus_alone_is_not_enough() -> None:
-    """Why the default bonus is what it is (docs/decisions/0017)."""
+def test_short_spikes_move_nothing_by_default_nor_with_the_timer_and_a_small_bonus_needs_patience() -> None:
+    """Why the timer's bonus is not that of patience (docs/decisions/0017)."""
     world = spiky()
-    patient = entries.core(world, bonus=0.05, patience=entries.PATIENCE)
-    assert only(world, Entry(name="zsched", make=entries.core(world))) == []
-    assert only(world, Entry(name="patient", make=patient)) == []
-    assert len(only(world, Entry(name="small bonus", make=entries.core(world, bonus=0.05)))) >= 1
+    assert [only(world, entry) for entry in entries.ours(world)] == [[], []]
+    assert len(only(world, Entry(name="small bonus", make=entries.timed(world, bonus=0.05)))) >= 1
 
 
 def test_patience_keeps_equal_nodes_apart_as_well_and_follows_a_step_sooner() -> None:
@@ -84,8 +98,27 @@ def test_patience_keeps_equal_nodes_apart_as_well_and_follows_a_step_sooner() ->
     assert only(equal_world(seed=1, hours=0.2), patient) == []
     world = equal_world(seed=1, hours=0.03, step_at_s=STEP_AT_S)
     (move,) = only(world, patient)
-    (default,) = only(world, Entry(name="zsched", make=entries.core(world)))
-    assert move.at_s < default.at_s
+    (by_timer,) = only(world, Entry(name="timer", make=entries.timed(world)))
+    assert move.at_s < by_timer.at_s
+
+
+def test_zsched_in_the_comparison_is_what_a_fleet_file_without_settings_gets() -> None:
+    """Rule "zsched" plays the product's defaults, whatever they are."""
+    result = check_bytes(PLAIN.encode(), "plain.yaml")
+    assert result.fleet is not None, result.faults
+    task = result.fleet.task("plain")
+    world = loaded_world(seed=1, hours=0.05, with_radio=True)
+    as_file = CoreRule(View(world, Feed(world, Look())), task.tuning, patience=task.patience)
+    zsched, timer = entries.ours(world)
+    rule = zsched.make(as_file.view)
+    assert isinstance(rule, CoreRule)
+    settings = replace(task.tuning, weights=rule.tuning.weights)
+    assert (rule.tuning, rule.patience, rule.pays_off_in_s) == (settings, task.patience, task.pays_off_in_s)
+    assert zsched.limits == task.limits
+    assert zsched.look == Look(smoothing_s=result.fleet.timing.smoothing_s)
+    was = timer.make(as_file.view)
+    assert isinstance(was, CoreRule)
+    assert (was.tuning.bonus, was.tuning.time_to_trigger_s, was.patience, timer.limits) == (0.1, 2.0, None, None)
 
 
 def test_rules_that_look_at_nothing() -> None:
@@ -100,7 +133,8 @@ def test_rules_that_look_at_nothing() -> None:
 
 def test_every_entry_of_every_cast_plays_and_has_a_name_of_its_own() -> None:
     world = loaded_world(seed=1, hours=0.01, with_radio=True)
-    for cast in (entries.schemes(world, 1), entries.fading(world), entries.grid(world)):
+    casts = (entries.schemes, lambda world, _: entries.fading(world), lambda world, _: entries.costly(world, 5.0))
+    for cast in (*(make(world, 1) for make in casts), entries.grid(world)):
         names = [entry.name for entry in cast]
         assert len(set(names)) == len(names)
         moves = replay(world, cast)
@@ -110,8 +144,10 @@ def test_every_entry_of_every_cast_plays_and_has_a_name_of_its_own() -> None:
 def test_the_grid_holds_the_default() -> None:
     world = loaded_world(seed=1, hours=0.05)
     tuning = Tuning(weights=EVEN)
-    smoothing_s = world.fleet.timing.smoothing_s
-    default = f"s{smoothing_s:g} b{tuning.bonus:g} t{tuning.time_to_trigger_s:g} c{tuning.cool_down_s:g}"
+    smoothing, cool_down = f"s{world.fleet.timing.smoothing_s:g}", f"c{tuning.cool_down_s:g}"
+    default = f"{smoothing} b{PATIENT_BONUS:g} p{DEFAULT_PATIENCE:g} {cool_down}"
+    timer = f"{smoothing} b{tuning.bonus:g} t{tuning.time_to_trigger_s:g} {cool_down}"
     cast = {entry.name: entry for entry in entries.grid(world)}
-    assert only(world, cast[default]) == only(world, Entry(name="zsched", make=entries.core(world)))
-    assert cast[default].look == Look(smoothing_s=smoothing_s)
+    for name, entry in zip((default, timer), entries.ours(world), strict=True):
+        assert only(world, cast[name]) == only(world, entry)
+        assert cast[name].look == Look(smoothing_s=world.fleet.timing.smoothing_s)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from zsched.core.fleet import Timing
+from zsched.core.fleet import DEFAULT_PATIENCE, PATIENT_BONUS, Timing
 from zsched.core.model import Tuning
 from zsched.lab.decisions.loads import Array
 from zsched.lab.decisions.replay import Entry, replay
@@ -15,7 +15,8 @@ from zsched.lab.decisions.rules import CoreRule
 from zsched.lab.decisions.world import DT_S, EVEN, World, build_fleet
 from zsched.lab.simulator import CORES, MEMORY_MB, Simulator
 
-TUNING = Tuning(weights=EVEN, cool_down_s=10.0)
+TIMER = Tuning(weights=EVEN, cool_down_s=10.0)
+PATIENT = Tuning(weights=EVEN, cool_down_s=10.0, bonus=PATIENT_BONUS)
 MINUTES = 3
 STARTED_AT_S = 100.0
 """The simulator's clock at its start."""
@@ -47,7 +48,7 @@ def history(seed: int, scatter: float) -> World:
     )
 
 
-def by_nodes(world: World) -> list[tuple[float, str]]:
+def by_nodes(world: World, tuning: Tuning, patience: float | None) -> list[tuple[float, str]]:
     """(time, owner) of every allocation that a fleet of full nodes learns."""
     column = {name: index for index, name in enumerate(world.candidates)}
     cpu, memory = world.cpu_read, world.memory_read
@@ -58,7 +59,7 @@ def by_nodes(world: World) -> list[tuple[float, str]]:
             return 1.0, 1000.0
         return _at(cpu, step, column[name]) * CORES, _at(memory, step, column[name]) * MEMORY_MB
 
-    task = replace(world.spec, tuning=TUNING)
+    task = replace(world.spec, tuning=tuning, patience=patience)
     sim = Simulator(fleet=replace(world.fleet, tasks=(task,)), seed=1, load=load)
     sim.start()
     learnt: list[tuple[float, str]] = []
@@ -77,11 +78,15 @@ def _at(table: Array, step: int, column: int) -> float:
     return float(table[step, column])
 
 
+@pytest.mark.parametrize(("tuning", "patience"), [(TIMER, None), (PATIENT, DEFAULT_PATIENCE)])
 @pytest.mark.parametrize(("seed", "scatter"), [(1, 0.0), (2, 0.03)])
-def test_the_replay_makes_the_moves_that_full_nodes_make(seed: int, scatter: float) -> None:
+def test_the_replay_makes_the_moves_that_full_nodes_make(
+    seed: int, scatter: float, tuning: Tuning, patience: float | None
+) -> None:
     world = history(seed, scatter)
-    moves = replay(world, (Entry(name="zsched", make=lambda view: CoreRule(view, TUNING)),))["zsched"]
-    nodes = by_nodes(world)
+    rule = Entry(name="zsched", make=lambda view: CoreRule(view, tuning, patience=patience))
+    moves = replay(world, (rule,))["zsched"]
+    nodes = by_nodes(world, tuning, patience)
 
     assert [move.owner for move in moves] == [owner for _, owner in nodes]
     assert len(moves) >= 4, "a history without moves shows nothing"

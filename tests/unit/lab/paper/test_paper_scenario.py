@@ -7,6 +7,7 @@ import pytest
 
 from zsched.adapters.network_profiler import parse_trace
 from zsched.config import load_fleet
+from zsched.core.fleet import DEFAULT_FORESEE_S, DEFAULT_PATIENCE, PATIENT_BONUS
 from zsched.errors import ConfigError
 from zsched.lab.fleet_runner import read_tree, write_fleet
 from zsched.lab.paper.claims import CLAIMS
@@ -15,7 +16,7 @@ from zsched.lab.paper.oracle import best_nodes, changes, utilities, utility
 from zsched.lab.paper.places import robots_scenario_path, scenario_path
 from zsched.lab.paper.radio import drive_file, simulated_drive
 from zsched.lab.paper.scenario import LinkView, LoadLevel, LoadPlan, NodeShare, Radio, Scenario, load_scenario
-from zsched.lab.paper.schemes import SCHEMES, candidates_of, find_schemes, scheme_tree
+from zsched.lab.paper.schemes import SCHEMES, Family, candidates_of, find_schemes, scheme_tree
 
 EDGES = ("edge1", "edge2", "edge3")
 SMALL = """
@@ -140,6 +141,12 @@ def test_every_scheme_makes_a_valid_fleet_file(tmp_path: Path, scenario: Scenari
     spec = load_fleet(lab.path).tasks[0]
 
     assert spec.candidates
+    family = SCHEMES[name].family
+    if family is Family.OURS:
+        tuned = (spec.patience, spec.tuning.bonus, spec.limits.foresee_s)
+        assert tuned == (DEFAULT_PATIENCE, PATIENT_BONUS, DEFAULT_FORESEE_S), "the product as it comes"
+    elif family is not Family.FIXED:
+        assert (spec.patience, spec.tuning.time_to_trigger_s, spec.limits.foresee_s) == (None, 0.0, 0.0)
     if SCHEMES[name].weights is not None:
         assert (spec.tuning.weights.cpu, spec.tuning.weights.memory, spec.tuning.weights.network) == SCHEMES[
             name
@@ -177,6 +184,10 @@ def test_the_robots_scenario_is_three_robots_by_the_radio_alone() -> None:
     assert tree["tasks"]["map_merge"]["weights"]["network"] == 1.0
     assert scenario.load.lanes == 0
     assert scenario.link_view is LinkView.DIRECT
+    task = tree["tasks"]["map_merge"]
+    assert scheme_tree(tree, SCHEMES["zsched"])["tasks"]["map_merge"] == {**task, "candidates": sorted(tree["nodes"])}
+    assert not {"scheduling", "link"} & set(task), "zsched is the product as it comes"
+    assert scheme_tree(tree, SCHEMES["dyna_net"])["tasks"]["map_merge"]["link"] == {"foresee_s": 0.0}
 
 
 # --- the radio -------------------------------------------------------------------------------------------------------
