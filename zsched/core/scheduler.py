@@ -140,7 +140,8 @@ class Judge:
         elapsed_s = 0.0 if self.spent_at is None else min(now - self.spent_at, LONGEST_GAP_S)
         lead = max(scored.values()) - scored[owner]
         rate = lead if lead > 0.0 else -patience / FORGIVEN_IN_S
-        self.spent, self.spent_at = max(self.spent + elapsed_s * rate, 0.0), now
+        # No more than is asked for: what a lead within the cool-down leaves behind is forgiven as soon as anything.
+        self.spent, self.spent_at = min(max(self.spent + elapsed_s * rate, 0.0), patience), now
 
     def _cap(self, damping: Damping, *, is_escape: bool, now: float) -> str | None:
         """Why no further move is allowed in this minute, or ``None``."""

@@ -373,6 +373,15 @@ def test_patience_is_given_back_while_nobody_leads() -> None:
     assert judge.spent < 0.2
 
 
+def test_a_long_lead_within_the_cool_down_is_forgiven_as_soon_as_a_short_one() -> None:
+    judge, lead = Judge(spec=PATIENT), {"edge1": 0.5, "edge2": 0.9}
+    for tick in range(16):
+        assert judged(judge, lead, 100.0 + tick / 2, settled=tick / 2).outcome is Outcome.WAIT
+    for tick in range(5):
+        judged(judge, EQUAL, 108.0 + tick / 2)
+    assert judge.spent == 0.0
+
+
 def test_patience_does_not_shorten_the_cool_down_and_nobody_else_waits_for_it() -> None:
     assert moved_after({"edge1": 0.5, "edge2": 0.9}, settled=4.0) == TUNING.cool_down_s - 4.0
     fresh = Judge(spec=PATIENT)
