@@ -24,7 +24,7 @@ from zsched import zenoh_config
 from zsched.clock import monotonic_s
 from zsched.core.model import PeerState
 from zsched.lab import netns
-from zsched.lab.netbed import PROBE, Netbed, Probe, descendants
+from zsched.lab.netbed import PROBE, Netbed, Probe, command_of, descendants
 from zsched.lab.testbed import Json, echo_fleet
 
 PING_PORT = 7990
@@ -113,7 +113,7 @@ def _probe(bed: Netbed, node: str, config: str, *arguments: str) -> Probe:
 
 def _worker_pids(bed: Netbed, node: str) -> list[int]:
     pids = descendants(bed.pid(node))
-    return [pid for pid in pids if WORKER in Path(f"/proc/{pid}/cmdline").read_text().split("\0")]
+    return [pid for pid in pids if WORKER in command_of(pid)]
 
 
 def _report(

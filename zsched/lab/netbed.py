@@ -293,6 +293,13 @@ def stop_group(pid: int, number: signal.Signals) -> None:
             os.kill(one, number)
 
 
+def command_of(pid: int) -> list[str]:
+    """A process's words; none when it has ended meanwhile."""
+    with contextlib.suppress(OSError):
+        return Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").split("\0")
+    return []
+
+
 def descendants(pid: int) -> list[int]:
     """Every living process below ``pid``."""
     found: list[int] = []
