@@ -31,7 +31,7 @@ from benchmarks.record import Record, progress, save, summary, table, together
 from zsched.clock import monotonic_s
 from zsched.core.model import NodeId
 from zsched.lab import netns
-from zsched.lab.netbed import Netbed, Probe, command_of, descendants, stamped, stop_group
+from zsched.lab.netbed import Netbed, Probe, descendants_running, stamped, stop_group
 from zsched.lab.testbed import TASK, TestbedError, echo_fleet
 
 GOALS = {
@@ -106,9 +106,8 @@ class Cases:
 
     def kill_worker(self, owner: NodeId) -> Callable[[], None]:
         """SIGKILL the worker process; its daemon starts another."""
-        for pid in descendants(self.bed.pid(owner)):
-            if "zsched.tasks.echo" in command_of(pid):
-                os.kill(pid, signal.SIGKILL)
+        for pid in descendants_running(self.bed.pid(owner), "zsched.tasks.echo"):
+            os.kill(pid, signal.SIGKILL)
         return lambda: None
 
     def run(self, name: str, fault: Callable[[NodeId], Callable[[], None]]) -> dict[str, float]:

@@ -24,7 +24,7 @@ from zsched import zenoh_config
 from zsched.clock import monotonic_s
 from zsched.core.model import PeerState
 from zsched.lab import netns
-from zsched.lab.netbed import PROBE, Netbed, Probe, command_of, descendants
+from zsched.lab.netbed import PROBE, Netbed, Probe, descendants_running
 from zsched.lab.testbed import Json, echo_fleet
 
 PING_PORT = 7990
@@ -57,7 +57,7 @@ def _fleet(stream_class: str) -> Json:
     """One robot, two edges, and a task for each edge that takes the robot's map."""
     tree = echo_fleet(robots=1, edges=2)
     body = tree["tasks"]["echo"]
-    rules = {"class": "reliable"} if stream_class == "reliable" else {"class": stream_class, "keep_last": 1}
+    rules = {"class": stream_class}
     for task, edge in (("echo", "edge1"), ("second", "edge2")):
         tree["tasks"][task] = {
             **body,
@@ -112,8 +112,7 @@ def _probe(bed: Netbed, node: str, config: str, *arguments: str) -> Probe:
 
 
 def _worker_pids(bed: Netbed, node: str) -> list[int]:
-    pids = descendants(bed.pid(node))
-    return [pid for pid in pids if WORKER in command_of(pid)]
+    return descendants_running(bed.pid(node), WORKER)
 
 
 def _report(

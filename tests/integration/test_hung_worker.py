@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from zsched.lab.netbed import command_of, descendants
+from zsched.lab.netbed import descendants_running
 from zsched.lab.testbed import TASK, Testbed, echo_fleet
 
 WORKER = Path(__file__).with_name("hangable_echo.py")
@@ -46,7 +46,7 @@ class Bed(Testbed):
         self._thread.join(5)
 
     def worker_pid(self, node: str) -> int | None:
-        found = [pid for pid in descendants(self.pid(node)) if str(WORKER) in command_of(pid)]
+        found = descendants_running(self.pid(node), str(WORKER))
         return found[0] if found else None
 
 

@@ -371,9 +371,11 @@ class Leases:
         was_given = holder.given_until > -math.inf or holder.awaits_report
         holder.is_doubtful |= holder.awaits_report
         self._releases[task] = holder.release(number)
-        if not was_given and now - holder.hurried_at < HURRY_S:
+        if was_given:
+            return True
+        if now - holder.hurried_at < HURRY_S:
             return False
-        holder.hurried_at = now if not was_given else holder.hurried_at
+        holder.hurried_at = now
         return True
 
     # --- beats -------------------------------------------------------------------------------------------------------

@@ -293,13 +293,6 @@ def stop_group(pid: int, number: signal.Signals) -> None:
             os.kill(one, number)
 
 
-def command_of(pid: int) -> list[str]:
-    """A process's words; none when it has ended meanwhile."""
-    with contextlib.suppress(OSError):
-        return Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").split("\0")
-    return []
-
-
 def descendants(pid: int) -> list[int]:
     """Every living process below ``pid``."""
     found: list[int] = []
@@ -308,3 +301,15 @@ def descendants(pid: int) -> list[int]:
             for child in (task / "children").read_text().split():
                 found += [int(child), *descendants(int(child))]
     return found
+
+
+def descendants_running(pid: int, word: str) -> list[int]:
+    """Every living process below ``pid`` with ``word`` (whole) on its command line."""
+    return [below for below in descendants(pid) if word in _words(below)]
+
+
+def _words(pid: int) -> list[str]:
+    """A process's command line; none when it has ended meanwhile."""
+    with contextlib.suppress(OSError):
+        return Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").split("\0")
+    return []

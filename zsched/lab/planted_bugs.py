@@ -257,8 +257,8 @@ LEASE_BUGS = (
     _bug(
         "an empty release is worth a beat at once",
         LEASE,
-        "if not was_given and now - holder.hurried_at < HURRY_S:",
-        "if not was_given and now < holder.hurried_at:",
+        "if now - holder.hurried_at < HURRY_S:",
+        "if now < holder.hurried_at:",
         _LEASE,
     ),
     _bug(

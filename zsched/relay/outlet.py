@@ -279,10 +279,11 @@ class Outlet:
     # --- the queue's thread ------------------------------------------------------------------------------------------
 
     def _put(self, lane: Lane, sample: Sample, stamp: Timestamp | None, size: int) -> None:
+        if self._acks is None:
+            lane.put(sample, stamp)
+            return
         began = monotonic_s()
         lane.put(sample, stamp)
-        if self._acks is None:
-            return
         with self._lock:
             now = monotonic_s()
             sent = Sent(lane.count - 1, sample, stamp, size, now, now - began)
