@@ -124,6 +124,7 @@ def test_a_robot_that_is_cut_off_is_served_by_its_own_standby_and_nothing_comes_
     assert bed.owner("robot2", "robot3", "edge1", "edge2") == owner, "the others go on"
     bed.network.heal()
     bed.wait(lambda: bed.served_by(owner), 15, "answers of the owner")
+    assert bed.task("robot1")["epoch"] == epoch, "whoever is heard first is no reason to flee from the owner"
     healed = monotonic_s()
     bed.wait(lambda: monotonic_s() > healed + 1.0, 5, "a second of them")
     counts = Counter(one.number for one in tuple(bed.orders_of_robot1.received))

@@ -221,3 +221,23 @@ def test_an_owner_that_is_left_and_comes_back_in_its_epoch_doubles_nothing(bench
     bench.put(4)
     assert bench.is_through(0, 1, 2, 3, 4)
     assert stream.count().lost == 0
+
+
+def test_an_answer_in_hand_while_its_slot_closes_starts_no_count_of_its_own(bench: Bench) -> None:
+    """The receiver's thread waited for the lock; its sample was counted from 0 on, and all before it came again."""
+    stream = bench.open()
+    taken: list[zenoh.Sample] = []
+    tap = bench.relay.declare_subscriber(KEY, taken.append)
+    bench.put(0, 1, 2)
+    assert bench.is_through(0, 1, 2)
+    until(lambda: len(taken) == 3, "the samples themselves")
+    slot = stream._slots[1]
+    stream.close_slot(1)
+    stream._carry(slot, taken[2])
+    stream.open(1, stream.route, bench.acks, is_from_start=True)
+    stream.flip(1, drops_held=False)
+    until(lambda: matches(bench.again), "the relay subscribes again")
+    bench.put_again(0, 1, 2, 3)
+    assert bench.is_through(0, 1, 2, 3)
+    assert dict(stream.count().drops)["stale_epoch"] == 1
+    tap.undeclare()

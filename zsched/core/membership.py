@@ -9,6 +9,10 @@ or when nobody speaks for it during the confirmation time; a living observer tha
 partial cut). Any beat refutes. A node whose own loop lags doubts itself first: its deadlines lengthen, at most
 threefold, and never stop (after Lifeguard, arXiv 1707.00788). An observer that has watched for a while without ever
 hearing a peer accuses it as well: it must not vouch for what it does not know.
+
+Whoever comes back after a cut is heard before the others behind the same cut. As long as its beats do not accuse them,
+they are not gone but *suspect*: else a robot that hears a healed network's first node would flee from an owner that
+everybody else hears.
 """
 
 from __future__ import annotations
@@ -143,9 +147,21 @@ class Membership:
         changes = []
         if before is not PeerState.ALIVE:
             changes.append(self._change(beat.node, PeerState.ALIVE, "beats again" if restarted else "beats", now))
+            if before is PeerState.GONE and not restarted:
+                changes += self._take_word(beat, now)
         elif restarted:
             changes.append(Transition(node=beat.node, before=before, after=before, reason="restarted"))
         return (*changes, *self._review(now)) if self._has_suspect else tuple(changes)
+
+    def _take_word(self, beat: Beat, now: float) -> list[Transition]:
+        """A peer that we had lost is back: whom it does not accuse we had lost with it, and should hear soon."""
+        changes = []
+        accused = {name for peer in self._peers.values() if peer.state is PeerState.ALIVE for name in peer.suspects}
+        for name, peer in self._peers.items():
+            if peer.state is PeerState.GONE and name not in accused:
+                changes.append(self._change(name, PeerState.SUSPECT, f"{beat.node} is back and hears it", now))
+                peer.vouched_until = now + self._timing.suspect_s * self._doubt
+        return changes
 
     def _is_newer(self, peer: _Peer, beat: Beat, now: float) -> bool:
         """Newer than what we know; of a peer that is silent also an older life's count (its state was made anew)."""

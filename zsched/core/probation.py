@@ -52,8 +52,9 @@ class Probation:
 
     def on_back(self, node: NodeId, now: float) -> None:
         """A peer that was gone beats again."""
-        if node in self._returns:
-            self._returns[node].back_at = now
+        known = self._returns.get(node)
+        if known is not None and known.back_at == math.inf:
+            known.back_at = now
 
     def on_token(self, node: NodeId, task: TaskId, incarnation: str, *, is_present: bool, now: float) -> None:
         """Our relay saw a worker's token come or go."""

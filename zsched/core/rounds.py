@@ -257,6 +257,8 @@ class Rounds:
                 damping=task.damping,
             )
         judgement = self._take_turn(task, judgement, allocation, is_called=is_called)
+        if not is_called:
+            judgement = self._spare(judgement, allocation, states)
         task.judgement, task.judged_at = judgement, now
         self._wake_when_due(task, judgement, allocation, now)
         out: list[Instruction] = [*self._tell(task, judgement, allocation)]
@@ -278,14 +280,18 @@ class Rounds:
         if first is None:
             return judgement
         task.is_waiting_its_turn = True
-        owner = allocation.owner
-        return replace(
-            judgement,
-            outcome=Outcome.WAIT,
-            candidate=owner,
-            aggregate=judgement.aggregates.get(owner, 0.0) if owner is not None else 0.0,
-            reason=f"{judgement.reason}; {first} moves first",
-        )
+        return _put_off(judgement, allocation, f"{first} moves first")
+
+    def _spare(self, judgement: Judgement, allocation: Allocation, states: Mapping[NodeId, PeerState]) -> Judgement:
+        """What too few electors could agree to is not called for.
+
+        It would wait in the register for the very moment in which the network heals, and be committed then.
+        """
+        electors = self._fleet.electors
+        heard = sum(states[name] is not PeerState.GONE for name in electors)
+        if judgement.outcome is not Outcome.PROPOSE or heard >= majority(len(electors)):
+            return judgement
+        return _put_off(judgement, allocation, f"{heard} of {len(electors)} electors heard")
 
     def _escape(
         self,
@@ -471,3 +477,16 @@ class Rounds:
             task.settled_at = now
         if any(other.is_waiting_its_turn for other in self.tasks.values()):
             self.hurry(now)
+
+
+def _put_off(judgement: Judgement, allocation: Allocation, why: str) -> Judgement:
+    """The same judgement, without the move."""
+    owner = allocation.owner
+    return replace(
+        judgement,
+        outcome=Outcome.WAIT,
+        candidate=owner,
+        aggregate=judgement.aggregates.get(owner, 0.0) if owner is not None else 0.0,
+        reason=f"{judgement.reason}; {why}",
+        is_escape=False,
+    )

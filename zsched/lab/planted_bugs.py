@@ -364,6 +364,27 @@ MEMBERSHIP_BUGS = (
         "return beat.sequence > peer.sequence",
         _MEMBERSHIP,
     ),
+    _bug(
+        "the first node heard after a cut speaks for nobody",
+        MEMBERSHIP,
+        "if before is PeerState.GONE and not restarted:",
+        "if before is PeerState.GONE and not self:",
+        _MEMBERSHIP,
+    ),
+    _bug(
+        "a node without memory speaks for those it has not heard yet",
+        MEMBERSHIP,
+        "if before is PeerState.GONE and not restarted:",
+        "if before is PeerState.GONE:",
+        _MEMBERSHIP,
+    ),
+    _bug(
+        "a minority's wish waits for the network to heal",
+        ROUNDS,
+        "heard >= majority(len(electors)):",
+        "heard >= 1:",
+        _ROUNDS,
+    ),
 )
 
 VOTE_BUGS = (

@@ -257,6 +257,10 @@ class OutputStream:
                 self._counter.seen(len(sample.payload))
                 self._counter.dropped("loop")
                 return
+            if slot.is_closed:  # our thread waited for the lock; a count of it would begin anew, from 0
+                self._counter.seen(len(sample.payload))
+                self._counter.dropped("stale_epoch")
+                return
             name = str(sample.key_expr)
             key = slot.keys.get(name) or slot.key(name)
             if key is None:
@@ -307,12 +311,10 @@ class OutputStream:
         return number > last
 
     def _gate(self, slot: OutputSlot, sample: Sample, size: int) -> None:
-        if self._is_paused and not slot.is_closed:
+        if self._is_paused:
             self._hold(slot, sample)
         elif slot is self._carrier:
             self._forward(sample, size)
-        elif slot.is_closed:
-            self._counter.dropped("stale_epoch")
         elif self._carrier is not None and slot.epoch < self._carrier.epoch:
             self._counter.dropped("cut")
         elif slot.is_flipped and self.route.settings.handover is HandoverRule.LATEST:

@@ -238,6 +238,45 @@ def test_voucher_that_changes_its_mind_confirms() -> None:
     assert ear.beat("c", 3.1, suspects=("a",)) == [GONE]
 
 
+def all_gone(nodes: tuple[NodeId, ...]) -> tuple[Ear, float]:
+    """We were cut off from everybody; it is so long after the last beat."""
+    ear = heard(nodes)
+    now = WIFI.suspect_s + WIFI.confirm_s + 1.0
+    ear.run(0.0, now, ())
+    assert ear.members.alive() == ()
+    return ear, now
+
+
+@pytest.mark.parametrize("nodes", [SMALL, LARGE])
+def test_who_comes_back_first_after_a_cut_speaks_for_whom_it_hears(nodes: tuple[NodeId, ...]) -> None:
+    """The owner behind the same cut is not gone: its link only comes up a moment later."""
+    ear, now = all_gone(nodes)
+    assert ear.beat("a", now) == [ALIVE, *[SUSPECT] * (len(nodes) - 2)]
+    ear.run(now, now + WIFI.suspect_s - 0.01, ("a",))
+    assert ear.members.state("b") is SUSPECT
+    assert ear.beat("b", now + WIFI.suspect_s) == [ALIVE]
+
+
+def test_who_comes_back_first_and_misses_a_peer_too_leaves_it_gone() -> None:
+    ear, now = all_gone(LARGE)
+    assert ear.beat("a", now, suspects=("b",)) == [ALIVE, SUSPECT]
+    assert ear.members.state("b") is GONE
+    assert ear.beat("c", now) == [ALIVE]
+    assert ear.members.state("b") is GONE, "c has not noticed yet, but a has"
+
+
+def test_who_was_restarted_speaks_for_nobody() -> None:
+    """It accuses nobody because it is new, not because it hears everybody."""
+    ear, now = all_gone(LARGE)
+    assert ear.beat("a", now, incarnation=2) == [ALIVE]
+
+
+def test_word_for_a_peer_that_is_dead_holds_only_until_the_speaker_misses_it() -> None:
+    ear, now = all_gone(LARGE)
+    ear.beat("a", now)
+    assert ear.beat("a", now + 0.1, suspects=("b",)) == [GONE]
+
+
 def test_observer_that_never_heard_a_peer_excuses_it_only_while_it_is_new() -> None:
     """Else a robot that starts after a machine died would vouch for the dead for ever."""
     ear = Ear(LARGE)

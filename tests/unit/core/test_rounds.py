@@ -49,11 +49,13 @@ GATHER_S, STAGGER_S = FLEET.timing.gather_s, FLEET.timing.stagger_s
 class Robot:
     """One robot's rounds with what surrounds them: peers, profiles, the register's value."""
 
-    def __init__(self, me: str = "robot1", *, owner: str | None = "edge1", owner_cpu: float = 1.0) -> None:
+    def __init__(
+        self, me: str = "robot1", *, owner: str | None = "edge1", owner_cpu: float = 1.0, fleet: Fleet = FLEET
+    ) -> None:
         self.me, self.now = me, 100.0
         self.states = dict.fromkeys((*ROBOTS, *EDGES), PeerState.ALIVE)
-        self.gateway = Gateway(FLEET)
-        self.rounds = Rounds(FLEET, me, self.gateway, Random(1), self.now)
+        self.gateway = Gateway(fleet)
+        self.rounds = Rounds(fleet, me, self.gateway, Random(1), self.now)
         revision = 0 if owner is None else 5
         self.value = Allocation(task="merge", revision=revision, epoch=revision, owner=owner, tuning=TUNING)
         self.sequence = 0
@@ -232,11 +234,23 @@ def test_lead_that_waits_for_its_time_to_trigger_is_judged_when_it_ends() -> Non
 
 
 def test_gone_owner_is_left_in_one_round_by_whoever_is_there() -> None:
-    robot = Robot()
+    robot = Robot(fleet=replace(FLEET, electors=("edge1", "edge2", "robot1")))
     robot.states.update(edge1=PeerState.GONE, robot2=PeerState.GONE, robot3=PeerState.GONE)
     assert proposed(robot.tick()) == ["edge2"]
     assert robot.task.judgement is not None
     assert robot.task.judgement.is_escape
+
+
+def test_what_too_few_electors_could_agree_to_is_not_called_for() -> None:
+    """It would wait in the register until the network heals, and move the task then, for a reason that is over."""
+    robot = Robot()
+    robot.states.update(edge1=PeerState.GONE, robot2=PeerState.GONE, robot3=PeerState.GONE)
+    assert proposed(robot.tick()) == []
+    assert robot.task.judgement is not None
+    assert robot.task.judgement.reason == "edge1 is gone; 1 of 3 electors heard"
+    assert (robot.outcome(), robot.task.judgement.candidate) == (Outcome.WAIT, "edge1")
+    robot.states["robot2"] = PeerState.ALIVE
+    assert proposed(robot.round(edge1=0.0)) == ["edge2"]
 
 
 def test_suspect_owner_is_left_only_when_another_robot_calls_an_escape() -> None:
