@@ -268,6 +268,22 @@ def test_giving_back_what_was_never_used_is_worth_a_beat_only_now_and_then() -> 
     assert held.on_run_out("guard", 7, 10.21), "a worker has been at work: who waits should know at once"
 
 
+def test_a_worker_that_never_says_that_it_has_stopped_is_waited_for_once() -> None:
+    """Its silence made every giving back urgent, and two owners that ask each other to leave storm again (1073981)."""
+    held = leases()
+    held.on_given("guard", 10.9)
+    held.on_told_to_stop("guard")
+    held.on_beat(ask(), {}, 10.1)
+    assert held.on_run_out("guard", 5, 11.0)
+    assert held.on_sent(6, 11.0).released == (grant(5, owner="r1"),)
+    held.on_beat(ask(), {}, 11.01)
+    held.on_run_out("guard", 6, 11.01)
+    held.on_beat(ask(), {}, 11.02)
+    assert not held.on_run_out("guard", 7, 11.02)
+    held.on_beat(ask(), {}, 11.03)
+    assert not held.on_stopped("guard", 1, 8), "when it comes, it is of a stop that is over"
+
+
 def test_an_owner_is_not_asked_to_leave_for_another_epoch_s_sake() -> None:
     held = leases()
     held.on_beat(ask(epoch=2), {}, 10.1)

@@ -370,6 +370,7 @@ class Leases:
             return False
         was_given = holder.given_until > -math.inf or holder.awaits_report
         holder.is_doubtful |= holder.awaits_report
+        holder.awaits_report = False  # when it comes, it is of a stop that is over
         self._releases[task] = holder.release(number)
         if was_given:
             return True

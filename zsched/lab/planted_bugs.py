@@ -329,6 +329,14 @@ LEASE_BUGS = (
         "if self._echoed and max(self._echoed.values()) > self.released:",
         _LEASE,
     ),
+    _bug(
+        "a worker that never says that it has stopped is waited for again and again",
+        LEASE,
+        "        holder.awaits_report = False  # when it comes",
+        "        pass  # when it comes",
+        _LEASE,
+        seed=1073981,
+    ),
 )
 
 MEMBERSHIP_BUGS = (
