@@ -15,6 +15,7 @@ from zsched.lab.explore.frontier import Claim
 from zsched.lab.explore.laser import SCAN_PERIOD_S, Laser, LaserScan
 from zsched.lab.explore.mapper import ScanMapper
 from zsched.lab.explore.world import World
+from zsched.lab.mapping import RESOLUTION_M
 from zsched.tasks.map_merge.geometry import Pose2, difference
 from zsched.tasks.map_merge.grid import Grid
 
@@ -34,6 +35,8 @@ class RobotSettings:
     seed: int = 1
     limits: Limits = Limits()
     drift: Drift = Drift()
+    resolution_m: float = RESOLUTION_M
+    """Of its own map."""
     has_slam: bool = True
     """Whether it maps itself; else it only hands out scans, for an edge to map."""
 
@@ -59,7 +62,7 @@ class Agent:
         self.body = Body(world, settings.start, settings.limits, settings.drift, body_random)
         self.explorer = Explorer(settings.robot, settings.limits)
         self._laser = Laser(world, laser_random)
-        self._mapper = ScanMapper(frame_id=f"{settings.robot}/map")
+        self._mapper = ScanMapper(resolution=settings.resolution_m, frame_id=f"{settings.robot}/map")
         self._phase = phase
         self._last_s: float | None = None
         self._next_scan_s = self._next_map_s = self._next_claim_s = 0.0

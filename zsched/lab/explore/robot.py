@@ -39,10 +39,12 @@ from zsched.errors import ConfigError, WireError
 from zsched.lab import application
 from zsched.lab.explore.agent import Agent, Outputs, RobotSettings
 from zsched.lab.explore.body import Drift, Limits
+from zsched.lab.explore.mapper import metres_per_cell
 from zsched.lab.explore.messages import decode_claim, encode_claim, encode_scan
 from zsched.lab.explore.referee import Referee
 from zsched.lab.explore.world import World
 from zsched.lab.explore.worlds import load_world
+from zsched.lab.mapping import RESOLUTION_M
 from zsched.lab.recorder import Record, Recorder
 from zsched.lab.signals import StopFlag
 from zsched.tasks.map_merge.cdr import CdrError, decode_grid, decode_transforms, encode_grid
@@ -241,6 +243,7 @@ def parse(arguments: list[str]) -> Options:
     add("--speed", type=float, default=Limits().speed, help="m/s at most (0.5; a TurtleBot3 Burger does 0.22)")
     add("--drift-yaw", type=float, default=Drift().yaw, help="rad per square root of a metre (0.001)")
     add("--drift-way", type=float, default=Drift().way, help="m per square root of a metre (0.003)")
+    add("--resolution", type=metres_per_cell, default=RESOLUTION_M, help="of its own map, metres per cell (0.05)")
     add("--slam-on", default="", metavar="NODE", help="map on this node (zsched.lab.explore.slam) and only send scans")
     given = parser.parse_args(arguments)
     if not 0 <= given.index < given.robots or not 0.0 < given.speed <= 5.0:
@@ -252,6 +255,7 @@ def parse(arguments: list[str]) -> Options:
         seed=given.seed,
         limits=Limits(speed=given.speed),
         drift=Drift(yaw=given.drift_yaw, way=given.drift_way),
+        resolution_m=given.resolution,
         has_slam=not given.slam_on,
     )
     phase = given.index / given.robots

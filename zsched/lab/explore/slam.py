@@ -24,8 +24,9 @@ from zsched.clock import monotonic_s
 from zsched.errors import WireError
 from zsched.lab import application
 from zsched.lab.explore.agent import MAP_PERIOD_S
-from zsched.lab.explore.mapper import ScanMapper
+from zsched.lab.explore.mapper import ScanMapper, metres_per_cell
 from zsched.lab.explore.messages import decode_scan
+from zsched.lab.mapping import RESOLUTION_M
 from zsched.lab.signals import StopFlag
 from zsched.tasks.map_merge.cdr import encode_grid
 
@@ -34,9 +35,9 @@ WAITING_SCANS = 16
 """Scans kept while this process has no CPU; then the oldest are lost, as in any SLAM that falls behind."""
 
 
-def serve(robot: str, session: zenoh.Session, stop: StopFlag) -> None:
-    """Map until stopped."""
-    mapper = ScanMapper(frame_id=f"{robot}/map")
+def serve(robot: str, session: zenoh.Session, stop: StopFlag, resolution_m: float = RESOLUTION_M) -> None:
+    """Map until stopped; ``resolution_m`` in metres per cell."""
+    mapper = ScanMapper(resolution=resolution_m, frame_id=f"{robot}/map")
     scans = session.declare_subscriber(f"{robot}/scan", zenoh.handlers.RingChannel(WAITING_SCANS))
     publisher = session.declare_publisher(f"{robot}/map", congestion_control=zenoh.CongestionControl.BLOCK_FIRST)
     stamp_ns: int | None = None
@@ -63,10 +64,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m zsched.lab.explore.slam", description="Map for a robot.")
     parser.add_argument("--robot", "--name", required=True, help="the robot whose scans are mapped")
     parser.add_argument("--endpoint", required=True, help="this node's data endpoint, e.g. tcp/127.0.0.1:7460")
+    parser.add_argument("--resolution", type=metres_per_cell, default=RESOLUTION_M, help="m per cell of the map (0.05)")
     given = parser.parse_args(arguments)
 
     def work(session: zenoh.Session, stop: StopFlag) -> None:
-        serve(given.robot, session, stop)
+        serve(given.robot, session, stop, given.resolution)
 
     return application.run(f"explore.slam: {given.robot}", given.endpoint, work)
 

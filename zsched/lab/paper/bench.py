@@ -17,7 +17,7 @@ from zsched.errors import ConfigError, ZschedError
 from zsched.lab.demo import EXIT_CONFIG, EXIT_FAILED, EXIT_SIGNAL, EXIT_USAGE
 from zsched.lab.laser_log import malaga_path
 from zsched.lab.netns import why_not
-from zsched.lab.paper.cells import Cell, cells_of, world_of
+from zsched.lab.paper.cells import Cell, cells_of, merge_of, world_of
 from zsched.lab.paper.figures import save_all
 from zsched.lab.paper.matrix import Matrix, collect, undone
 from zsched.lab.paper.metrics import Truth, brief, measure
@@ -151,7 +151,8 @@ class InputsOf:
         if not self._options.is_exploring:
             return LogRobots(log=log_path(self._options))
         loop = self._scenario.explore
-        return ExploreRobots(world=world_of(self._scenario, cell), speed=loop.speed, slam_on=loop.slam_on)
+        world, resolution_m = world_of(self._scenario, cell), merge_of(self._scenario, cell).resolution_m
+        return ExploreRobots(world=world, speed=loop.speed, slam_on=loop.slam_on, resolution_m=resolution_m)
 
 
 def told_plan(

@@ -8,9 +8,9 @@ Cells are ordered by run, then scheme: whatever is done when somebody stops is b
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from zsched.lab.paper.scenario import MATRIX, Scenario
+from zsched.lab.paper.scenario import MATRIX, MergeTask, Scenario
 from zsched.lab.paper.schemes import Family, Scheme, find_schemes
 
 
@@ -46,7 +46,7 @@ def cells_of(scenario: Scenario, names: tuple[str, ...], runs: int | None = None
     for name, block in scenario.blocks.items():
         kept = _kept(block.schemes, names)
         for run in range(min(block.runs, most)):
-            cells += [Cell(scheme=s, level=scenario.level, run=run, block=name) for s in kept]
+            cells += [Cell(scheme=s, level=block.level or scenario.level, run=run, block=name) for s in kept]
     return tuple(cells)
 
 
@@ -77,3 +77,9 @@ def bandwidth_of(scenario: Scenario, cell: Cell) -> float | None:
     """What every node's link carries in Mbit/s; ``None``: no limit."""
     block = scenario.blocks.get(cell.block)
     return None if block is None else block.links.bandwidth_mbit
+
+
+def merge_of(scenario: Scenario, cell: Cell) -> MergeTask:
+    """What the task is in this cell."""
+    block = scenario.blocks.get(cell.block)
+    return scenario.merge if block is None else replace(scenario.merge, **block.merge)

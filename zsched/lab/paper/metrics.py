@@ -17,6 +17,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from mcap.reader import make_reader
 
 from zsched.core.model import NodeId
@@ -63,24 +64,22 @@ class Truth:
 
     def __init__(self, grid: Grid) -> None:
         self.grid = grid
-        self._known = grid.known
-        self._total = int(self._known.sum())
+        rows, columns = np.nonzero(grid.known)
+        self._x = grid.origin.x + (columns + 0.5) * grid.resolution
+        self._y = grid.origin.y + (rows + 0.5) * grid.resolution
 
     def coverage(self, payload: bytes) -> float:
         """Share of the known cells that the map in ``payload`` knows; 0 for what is no map.
 
-        Cell on cell (both have one resolution and no turn; a part of a cell does not matter here).
+        Looked up at the middle of each of the truth's cells (neither is turned).
         """
         grid = grid_of(payload)
-        if grid is None or not self._total:
+        if grid is None or not self._x.size:
             return 0.0
-        right = round((grid.origin.x - self.grid.origin.x) / self.grid.resolution)
-        up = round((grid.origin.y - self.grid.origin.y) / self.grid.resolution)
-        rows = slice(max(up, 0), max(min(up + grid.height, self.grid.height), 0))
-        columns = slice(max(right, 0), max(min(right + grid.width, self.grid.width), 0))
-        mine = grid.known[rows.start - up : rows.stop - up, columns.start - right : columns.stop - right]
-        truth = self._known[rows, columns]
-        return float((truth & mine).sum()) / self._total if truth.size else 0.0
+        columns = np.floor((self._x - grid.origin.x) / grid.resolution).astype(np.int64)
+        rows = np.floor((self._y - grid.origin.y) / grid.resolution).astype(np.int64)
+        inside = (columns >= 0) & (columns < grid.width) & (rows >= 0) & (rows < grid.height)
+        return float(grid.known[rows[inside], columns[inside]].sum()) / self._x.size
 
 
 def measure(folder: Path, scenario: Scenario, truth: Truth) -> Json:

@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
-from zsched.lab.paper.cells import Cell, bandwidth_of, world_of
-from zsched.lab.paper.scenario import MATRIX, Scenario
+from zsched.lab.paper.cells import Cell, bandwidth_of, merge_of, world_of
+from zsched.lab.paper.scenario import MATRIX, MergeTask, Scenario
 
 AROUND_S = 18.0
 """Of a run, before and after the robots' drive, on two cores: daemons, first owner, last maps, figures."""
@@ -72,9 +72,20 @@ def _rows(scenario: Scenario, cells: Sequence[Cell], log: str | None) -> list[st
         what = f"{len(schemes)} schemes, load {own[0].level}, {worlds[0]}" + (f" to {worlds[-1]}" if worlds[1:] else "")
         rate = bandwidth_of(scenario, own[0])
         what += "" if rate is None else f", links of {rate:g} Mbit/s"
+        merge = merge_of(scenario, own[0])
+        what += "" if merge == scenario.merge else f", {merge_text(merge)}"
         title = f"matrix ({name})" if name == scenario.level else name
         rows.append(f"{title:<15} {len(own):>4}  {clock(sum(cell_s(scenario, c) for c in own)):>7}  {what}")
     return rows
+
+
+def merge_text(merge: MergeTask) -> str:
+    """What the task is, for people.
+
+    >>> merge_text(MergeTask())
+    'mode known, at most 4 maps/s of 5 cm cells'
+    """
+    return f"mode {merge.mode}, at most {merge.rate_hz:g} maps/s of {merge.resolution_m * 100:g} cm cells"
 
 
 def clock(seconds: float) -> str:

@@ -11,7 +11,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from zsched.lab.paper.claims import LEAST_RUNS, Verdict, better_than_ours, judged, shared
-from zsched.lab.paper.scenario import MATRIX
+from zsched.lab.paper.plan import merge_text
+from zsched.lab.paper.scenario import MATRIX, MergeTask
 from zsched.lab.paper.schemes import SCHEMES
 
 Json = Mapping[str, Any]
@@ -169,10 +170,13 @@ def blocks_parts(results: Json) -> list[str]:
         rate = (block.get("links") or {}).get("bandwidth_mbit")
         world = f"world {block['world']}" if block.get("world") else "the matrix's worlds"
         links = "" if rate is None else f", every node sends at most {rate:g} Mbit/s"
+        level = f", load {block['level']}" if block.get("level") else ""
+        merge = {**results["scenario"]["merge"], **(block.get("merge") or {})}
+        task = f", {merge_text(MergeTask(**merge))}" if block.get("merge") else ""
         why = results.get("skipped", {}).get(name)
         own = in_block(results["runs"], name)
         text = f"Left out: {why}.\n" if why else schemes_text(own) if own else "Not run.\n"
-        parts += [f"## Block {name}\n", f"As the matrix, but for: {world}{links}.\n", text]
+        parts += [f"## Block {name}\n", f"As the matrix, but for: {world}{links}{level}{task}.\n", text]
     return parts
 
 
@@ -192,10 +196,7 @@ def conditions_text(results: Json) -> str:
     lines = [
         f"* Nodes: {'; '.join(shares) or 'no shares'}.",
         f"* Load levels: {'; '.join(levels)}. The matrix was run at {scenario['level']}.",
-        (
-            f"* Merging: mode {scenario['mode']}, at most {scenario['rate_hz']:g} maps/s; "
-            f"done at coverage {scenario['target_coverage']:g}."
-        ),
+        (f"* Merging: {merge_text(MergeTask(**scenario['merge']))}; done at coverage {scenario['target_coverage']:g}."),
         f"* Links: {', '.join(sorted({f['links'] for f in results['runs']})) or '-'} drives.",
         f"* Pressure outside the quotas: at most {scenario['pressure_limit']:g} allowed, at most {worst} seen.",
     ]

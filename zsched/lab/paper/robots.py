@@ -14,7 +14,7 @@ from typing import Protocol
 from zsched.core.model import NodeId
 from zsched.lab.explore.worlds import load_world
 from zsched.lab.laser_log import load_log
-from zsched.lab.mapping import displacements, truth_grid
+from zsched.lab.mapping import RESOLUTION_M, displacements, truth_grid
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid
 
@@ -103,6 +103,8 @@ class ExploreRobots:
     speed: float
     slam_on: Mapping[NodeId, NodeId] = field(default_factory=dict)
     """{robot: node that maps for it}; a robot that is not in it maps on board."""
+    resolution_m: float = RESOLUTION_M
+    """Of the robots' maps."""
 
     @property
     def name(self) -> str:
@@ -128,11 +130,11 @@ class ExploreRobots:
         command = [sys.executable, "-m", "zsched.lab.explore.robot", "--robot", place.robot, "--world", self.world]
         command += ["--index", str(place.index), "--robots", str(place.robots), "--seed", str(place.seed)]
         command += ["--endpoint", place.endpoint, "--records", str(place.records), "--speed", f"{self.speed:g}"]
-        command += ["--target", f"{place.target_coverage:g}"]
+        command += ["--target", f"{place.target_coverage:g}", "--resolution", f"{self.resolution_m:g}"]
         node = self.slam_on.get(place.robot)
         return command if node is None else [*command, "--slam-on", node]
 
     def helpers(self, endpoints: Mapping[NodeId, str]) -> Sequence[tuple[NodeId, list[str]]]:
         """The robots' mapping, where it is placed on other nodes."""
-        module = [sys.executable, "-m", "zsched.lab.explore.slam"]
+        module = [sys.executable, "-m", "zsched.lab.explore.slam", "--resolution", f"{self.resolution_m:g}"]
         return [(n, [*module, "--robot", robot, "--endpoint", endpoints[n]]) for robot, n in self.slam_on.items()]

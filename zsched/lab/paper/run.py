@@ -29,7 +29,7 @@ from zsched.lab.fleet_view import find_task
 from zsched.lab.limits import LimitKind, NodeLimits
 from zsched.lab.netns import Network
 from zsched.lab.observer import Observer
-from zsched.lab.paper.cells import Cell, bandwidth_of
+from zsched.lab.paper.cells import Cell, bandwidth_of, merge_of
 from zsched.lab.paper.load import Loads, Window, schedule
 from zsched.lab.paper.node_state import is_calm, node_limits, own_links, ready_workers, task_streams
 from zsched.lab.paper.oracle import best_nodes
@@ -167,7 +167,11 @@ class CellRun:
             YAML().dump(tree, file)
         robots = sorted(name for name, node in tree["nodes"].items() if node["kind"] == "robot")
         frames = dict(zip(robots, self._inputs.robots.frames(len(robots), self._seed), strict=True))
-        options = worker_options(self._scenario.mode, frames) | {"--rate": (f"{self._scenario.rate_hz:g}",)}
+        merge = merge_of(self._scenario, self._cell)
+        options = worker_options(merge.mode, frames) | {
+            "--rate": (f"{merge.rate_hz:g}",),
+            "--resolution": (f"{merge.resolution_m:g}",),
+        }
         return write_fleet(template, self._folder / "fleet.yaml", options)
 
     def _lay_links(self, nodes: Tree) -> None:
@@ -312,7 +316,7 @@ class CellRun:
             "level": self._cell.level,
             "run": self._cell.run,
             "seed": self._seed,
-            "mode": self._scenario.mode,
+            "mode": merge_of(self._scenario, self._cell).mode,
             "input": self._inputs.robots.name,
             "links": "recorded" if self._inputs.drives else "simulated",
             "limits": parts.limits.says,

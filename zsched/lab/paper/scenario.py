@@ -8,7 +8,7 @@ One scenario and one seed are one story: every scheme meets the same windows of 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from ruamel.yaml import YAML
 
 from zsched.core.model import NodeId, check_range
 from zsched.errors import ConfigError
+from zsched.tasks.map_merge.merger import Mode
 
 MATRIX = "matrix"
 """The block of the scenario itself: all schemes at its level, and the sweep over the others."""
@@ -132,14 +133,32 @@ class LinkLimits:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class MergeTask:
+    """The task itself: the merger's ``mode``, at most ``rate_hz`` maps a second, ``resolution_m`` of maps and merge."""
+
+    mode: str = "known"
+    rate_hz: float = 4.0
+    resolution_m: float = 0.05
+
+    def __post_init__(self) -> None:
+        Mode(self.mode)
+        check_range("merge.rate_hz", self.rate_hz, 0.1, 100.0)
+        check_range("merge.resolution_m", self.resolution_m, 0.01, 1.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Block:
-    """Rows of their own beside the matrix: these schemes, so many runs, in another world or over narrow links."""
+    """Rows of their own beside the matrix: these schemes, so many runs, and what is different there."""
 
     schemes: tuple[str, ...] = ()
     runs: int = 2
     world: str | None = None
     """``None``: the scenario's."""
+    level: str | None = None
+    """``None``: the scenario's."""
     links: LinkLimits = LinkLimits()
+    merge: Mapping[str, Any] = field(default_factory=dict)
+    """What is different in `Scenario.merge`."""
 
     def __post_init__(self) -> None:
         check_range("runs", self.runs, 1, 1000)
@@ -183,8 +202,7 @@ class Scenario:
     load: LoadPlan = LoadPlan()
     links: Mapping[NodeId, Radio] = field(default_factory=dict)
     link_view: LinkView = LinkView.ACCESS_POINT
-    mode: str = "known"
-    rate_hz: float = 4.0
+    merge: MergeTask = MergeTask()
     target_coverage: float = 0.9
     pressure_limit: float = 0.2
 
@@ -192,7 +210,6 @@ class Scenario:
         check_range("duration_s", self.duration_s, 5.0, 600.0)
         check_range("runs", self.runs, 1, 1000)
         check_range("yardstick_runs", self.yardstick_runs, 1, 1000)
-        check_range("rate_hz", self.rate_hz, 0.1, 100.0)
         check_range("target_coverage", self.target_coverage, 0.01, 1.0)
         check_range("pressure_limit", self.pressure_limit, 0.0, 1.0)
         total = sum(share.cpu_cores for share in self.nodes.values())
@@ -203,6 +220,10 @@ class Scenario:
         doubled = sorted(({*self.levels, MATRIX}) & self.blocks.keys())
         if doubled:
             raise ValueError(f"blocks: {', '.join(doubled)} is taken; choose another name")
+        for name, block in self.blocks.items():
+            if block.level not in (None, *self.levels):
+                raise ValueError(f"blocks: {name}: level {block.level!r} is none of {', '.join(self.levels)}")
+            replace(self.merge, **block.merge)
 
     @property
     def full_cores(self) -> float:
@@ -241,9 +262,10 @@ def _scenario(path: Path, tree: dict[str, Any]) -> Scenario:
     view = LinkView(tree.pop("link_view", LinkView.ACCESS_POINT))
     rows = {str(name): _block(dict(spec)) for name, spec in dict(tree.pop("blocks", None) or {}).items()}
     explore = Exploration(**dict(tree.pop("explore", None) or {}))
+    merge = MergeTask(**dict(tree.pop("merge", None) or {}))
     known = {str(name): value for name, value in _tuples(tree).items()}
     blocks: dict[str, Any] = {"levels": levels, "nodes": nodes, "links": links, "link_view": view, "blocks": rows}
-    return Scenario(fleet=fleet, load=load, sweep=sweep, explore=explore, **blocks, **known)
+    return Scenario(fleet=fleet, load=load, sweep=sweep, explore=explore, merge=merge, **blocks, **known)
 
 
 def _block(spec: dict[str, Any]) -> Block:

@@ -149,8 +149,8 @@ def test_the_report_holds_every_claim_scheme_level_and_picture(tmp_path: Any) ->
     node = {"cpu_cores": 0.3, "memory_mb": 512.0, "ballast_mb": 0.0}
     levels = {name: {"streams": 1, "share": 0.6, "side": 640} for name in ("one", "two")}
     scenario = {
-        "name": "paper", "seed": 1, "level": "one", "levels": levels, "nodes": {"edge1": node}, "mode": "track",
-        "rate_hz": 4.0, "target_coverage": 0.8, "pressure_limit": 0.2,
+        "name": "paper", "seed": 1, "level": "one", "levels": levels, "nodes": {"edge1": node},
+        "merge": {"mode": "track", "rate_hz": 4.0, "resolution_m": 0.05}, "target_coverage": 0.8, "pressure_limit": 0.2,
         "blocks": {
             "narrow": {"world": None, "links": {"bandwidth_mbit": 9.8}},
             "gone": {"world": "turtlebot3", "links": {"bandwidth_mbit": None}},

@@ -9,7 +9,7 @@ import pytest
 
 from zsched.lab.children import ChildError
 from zsched.lab.paper.bench import BenchOptions, InputsOf, claim_folder, command_of, plan_body, planned, run_bench
-from zsched.lab.paper.cells import Cell, bandwidth_of, cells_of, world_of
+from zsched.lab.paper.cells import Cell, bandwidth_of, cells_of, merge_of, world_of
 from zsched.lab.paper.matrix import (
     ATTEMPTS,
     GIVE_UP,
@@ -22,7 +22,7 @@ from zsched.lab.paper.matrix import (
 )
 from zsched.lab.paper.places import robots_scenario_path, scenario_path
 from zsched.lab.paper.plan import AROUND_S, leave_out, plan_text, without
-from zsched.lab.paper.scenario import MATRIX, LinkLimits, Scenario, Sweep, load_scenario
+from zsched.lab.paper.scenario import MATRIX, LinkLimits, MergeTask, Scenario, Sweep, load_scenario
 from zsched.lab.paper.schemes import SCHEMES
 
 
@@ -69,7 +69,15 @@ def test_each_run_has_a_world_of_its_own_the_same_for_every_scheme_and_level(sce
     assert by_run == {run: {f"office:{scenario.seed + run}"} for run in range(scenario.runs)}
     assert {world_of(scenario, cell) for cell in cells if cell.block == "turtlebot3"} == {"turtlebot3"}
     rates = {cell.block: bandwidth_of(scenario, cell) for cell in cells}
-    assert rates == {MATRIX: None, "turtlebot3": None, "narrow": 9.8}
+    assert {block: rate for block, rate in rates.items() if rate is not None} == {"narrow": 9.8}
+
+
+def test_a_block_may_have_another_task_and_level(scenario: Scenario) -> None:
+    cells = {cell.block: cell for cell in cells_of(scenario, ())}
+    assert (cells["fine"].level, cells["fine_four"].level, cells["narrow"].level) == ("one", "four", "one")
+    assert merge_of(scenario, cells["fine_four"]) == MergeTask(mode="known", rate_hz=20, resolution_m=0.02)
+    assert merge_of(scenario, cells["narrow"]) == merge_of(scenario, cells[MATRIX]) == scenario.merge
+    assert "at most 20 maps/s of 2 cm cells" in plan_text(scenario, [cells["fine"]], [], 0.0, {}, None)
 
 
 def test_a_block_that_cannot_be_run_here_is_left_out_with_its_reason(scenario: Scenario) -> None:
@@ -84,7 +92,7 @@ def test_a_block_that_cannot_be_run_here_is_left_out_with_its_reason(scenario: S
 
     assert list(skipped) == ["narrow"]
     assert "not root" in skipped["narrow"]
-    assert {cell.block for cell in cells_of(kept, ())} == {MATRIX, "turtlebot3"}
+    assert {cell.block for cell in cells_of(kept, ())} == {MATRIX, *scenario.blocks} - {"narrow"}
     assert without(scenario, is_exploring=False, why_not=lambda: None).keys() == {"turtlebot3"}
     blocks = {name: replace(block, links=LinkLimits()) for name, block in scenario.blocks.items()}
     assert without(replace(scenario, blocks=blocks), is_exploring=True, why_not=why_not) == {}
@@ -92,7 +100,9 @@ def test_a_block_that_cannot_be_run_here_is_left_out_with_its_reason(scenario: S
 
 
 def test_the_plan_tells_blocks_runs_and_time_by_hand(scenario: Scenario) -> None:
-    scenario = replace(scenario, duration_s=42.0, runs=2, schemes=("zsched", "fixed_e1"), sweep=Sweep())
+    blocks = {name: scenario.blocks[name] for name in ("turtlebot3", "narrow")}
+    schemes = ("zsched", "fixed_e1")
+    scenario = replace(scenario, duration_s=42.0, runs=2, schemes=schemes, sweep=Sweep(), blocks=blocks)
     cells = cells_of(scenario, ("zsched", "fixed_e1"))
 
     text = plan_text(scenario, cells, cells[1:], 120.0, {"gone": "no namespaces"}, None)

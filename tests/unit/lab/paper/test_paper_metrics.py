@@ -42,6 +42,16 @@ def a_room() -> Grid:
     return Grid(data=data, resolution=SIDE, origin=Pose2(x=1.0, y=-2.0))
 
 
+@pytest.mark.parametrize("factor", [1, 2, 5])
+def test_coverage_does_not_depend_on_the_merged_map_s_resolution(factor: int) -> None:
+    room = a_room()
+    data = room.data.copy()
+    data[:, 15:] = UNKNOWN
+    fine = np.kron(data, np.ones((factor, factor), dtype=np.int8))
+    merged = Grid(data=fine, resolution=SIDE / factor, origin=room.origin)
+    assert Truth(room).coverage(encode_grid(merged)) == pytest.approx(0.25)
+
+
 def part_of_room(share: float, stamp_ns: int = 0, margin: int = 0) -> bytes:
     """The room's left part, in a canvas with a margin around it: as a merged map that grows."""
     room = a_room()
@@ -140,7 +150,7 @@ def test_regret_is_what_the_owner_lacked(tmp_path: Path, scenario: Scenario) -> 
 
 def test_regret_by_hand(tmp_path: Path, scenario: Scenario) -> None:
     level = LoadLevel(streams=1, share=0.6, memory_mb=189.0)
-    scenario = replace(scenario, levels={"one": level})
+    scenario = replace(scenario, levels={"one": level}, blocks={})
     found = measure(write_run(tmp_path), scenario, Truth(a_room()))["regret"]
 
     free = 0.5 * (0.3 - 0.15) / 0.3 + 0.5 * (512 - 110) / 512

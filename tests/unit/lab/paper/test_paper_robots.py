@@ -54,7 +54,7 @@ def test_an_exploring_robots_command_is_one_that_its_program_takes(tmp_path: Pat
     assert robots.name == "explore turtlebot3"
     assert robots.ends_when_covered
     assert robots.truth().known.any()
-    assert abs(robots.truth().resolution - 0.05) < 1e-9  # as the merged map's: coverage is taken cell on cell
+    assert abs(robots.truth().resolution - 0.05) < 1e-9
 
 
 def test_mapping_may_be_placed_on_other_nodes(tmp_path: Path) -> None:
@@ -66,9 +66,11 @@ def test_mapping_may_be_placed_on_other_nodes(tmp_path: Path) -> None:
     assert parse_explorer(robots.command(a_place(tmp_path, "robot1", 0))[3:]).settings.has_slam
     assert (node, command[2:]) == (
         "edge1",
-        ["zsched.lab.explore.slam", "--robot", "robot2", "--endpoint", "tcp/127.0.0.1:1"],
+        ["zsched.lab.explore.slam", "--resolution", "0.05", "--robot", "robot2", "--endpoint", "tcp/127.0.0.1:1"],
     )
     assert LogRobots(log=malaga_path()).helpers({}) == ()
+    fine = replace(robots, resolution_m=0.02)
+    assert parse_explorer(fine.command(a_place(tmp_path))[3:]).settings.resolution_m == 0.02
 
 
 def test_the_task_is_over_when_every_robot_has_said_so(tmp_path: Path) -> None:

@@ -68,6 +68,10 @@ def test_what_the_scenario_says_of_its_choices_holds(scenario: Scenario) -> None
         ("{x: {links: {bandwidth_mbit: 0}}}", "bandwidth_mbit"),
         ("{x: {links: {bandwith: 3}}}", "bandwith"),
         ("{x: {runs: 0}}", "runs"),
+        ("{x: {level: nine}}", "x: level 'nine' is none of one"),
+        ("{x: {merge: {mode: guess}}}", "guess"),
+        ("{x: {merge: {resolution_m: 0}}}", "resolution_m"),
+        ("{x: {merge: {speed: 1}}}", "speed"),
     ],
 )
 def test_a_fault_in_a_block_is_named(tmp_path: Path, block: str, told: str) -> None:
