@@ -53,6 +53,8 @@ class _Peer:
     """A suspect for whom somebody speaks is looked at again then."""
     token_lost: bool = False
     token_lost_at: float = -math.inf
+    back_at: float = -math.inf
+    """When it last came back from gone in the same life."""
     suspects: tuple[NodeId, ...] = ()
 
 
@@ -148,6 +150,7 @@ class Membership:
         if before is not PeerState.ALIVE:
             changes.append(self._change(beat.node, PeerState.ALIVE, "beats again" if restarted else "beats", now))
             if before is PeerState.GONE and not restarted:
+                peer.back_at = now
                 changes += self._take_word(beat, now)
         elif restarted:
             changes.append(Transition(node=beat.node, before=before, after=before, reason="restarted"))
@@ -171,9 +174,15 @@ class Membership:
         return (beat.incarnation, beat.sequence) > (peer.incarnation, peer.sequence)
 
     def absorb_token_lost(self, node: NodeId, incarnation: int, now: float) -> tuple[Transition, ...]:
-        """A peer's token went: suspect at once, if it is the token of the life we know."""
+        """A peer's token went: suspect at once, if it is the token of the life we know.
+
+        Of a peer that has just come back it is most likely the old link's: the beats came by a new one, and zenoh ends
+        the token of the other when it notices. So for a lease only silence counts.
+        """
         peer = self._peers.get(node)
         if peer is None or peer.incarnation != incarnation or peer.state is not PeerState.ALIVE:
+            return ()
+        if now < peer.back_at + self._timing.zenoh_lease_s:
             return ()
         peer.token_lost, peer.token_lost_at = True, now
         return (self._change(node, PeerState.SUSPECT, "its token went", now), *self._review(now))

@@ -380,6 +380,13 @@ MEMBERSHIP_BUGS = (
         _MEMBERSHIP,
     ),
     _bug(
+        "the old link's token accuses a node that has just come back",
+        MEMBERSHIP,
+        "if now < peer.back_at + self._timing.zenoh_lease_s:",
+        "if now < peer.back_at:",
+        _MEMBERSHIP,
+    ),
+    _bug(
         "a node without memory speaks for those it has not heard yet",
         MEMBERSHIP,
         "if before is PeerState.GONE and not restarted:",

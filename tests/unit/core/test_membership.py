@@ -316,6 +316,27 @@ def test_lost_token_is_refuted_by_a_beat(nodes: tuple[NodeId, ...]) -> None:
     assert seen == []
 
 
+def test_token_that_goes_just_after_its_node_came_back_is_the_old_link_s() -> None:
+    """In every heal of a cut the beats came first, and some ten milliseconds later the old link's token went."""
+    ear, now = all_gone(LARGE)
+    for node in LARGE[1:]:
+        ear.beat(node, now)
+    assert ear.members.absorb_token_lost("a", 1, now + 0.03) == ()
+    assert ear.members.state("a") is ALIVE
+    later = now + WIFI.zenoh_lease_s
+    ear.run(now, later, LARGE[1:])
+    (change,) = ear.members.absorb_token_lost("a", 1, later)
+    assert change.after is SUSPECT
+
+
+def test_token_of_a_restarted_peer_is_believed_at_once() -> None:
+    ear, now = all_gone(LARGE)
+    for node in LARGE[1:]:
+        ear.beat(node, now, incarnation=2)
+    (change,) = ear.members.absorb_token_lost("a", 2, now + 0.03)
+    assert change.after is SUSPECT
+
+
 def test_token_of_a_former_life_accuses_nobody() -> None:
     ear = heard(SMALL)
     ear.beat("a", 0.1, incarnation=2, sequence=0)
