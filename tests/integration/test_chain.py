@@ -219,7 +219,8 @@ def test_bad_frames_only_raise_counters(bed: Testbed) -> None:
             if frame and round_number % 4 == 1:
                 frame[rng.randrange(len(frame))] ^= 0xFF
             session.put(key, bytes(frame))
-        return sum(bed.status("robot1")["counters"].values()) > 100
+        counters: dict[str, int] = bed.status("robot1")["counters"]
+        return sum(counters.values()) > 100
 
     with zenoh.open(zenoh.Config.from_json5(config)) as session:
         for body in (b"", b"\xc1", good):
