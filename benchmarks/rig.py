@@ -167,7 +167,8 @@ class Rig:
         """Start an echo worker and wait for its token."""
         self.incarnation += 1
         path = self.folder / f"{node}.json5"
-        path.write_text(worker_config(connect=(self.endpoint(node),), shared_memory=False))
+        connect = tuple(dict.fromkeys((self.endpoint(node), self.endpoint(ROBOT))))  # as `zsched.daemon_endpoints`
+        path.write_text(worker_config(connect=connect, shared_memory=False))
         env = os.environ | {
             "ZSCHED_FLEET": FLEET,
             "ZSCHED_NODE": node,

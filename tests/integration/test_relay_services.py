@@ -127,7 +127,8 @@ class Rig:
     def start_worker(self, node: str) -> subprocess.Popen[bytes]:
         self.incarnation += 1
         path = self.folder / f"{node}.json5"
-        path.write_text(worker_config(connect=(self.endpoint(node),), shared_memory=False))
+        connect = tuple(dict.fromkeys((self.endpoint(node), self.endpoint(ROBOT))))  # as `zsched.daemon_endpoints`
+        path.write_text(worker_config(connect=connect, shared_memory=False))
         env = os.environ | {
             "ZSCHED_FLEET": FLEET,
             "ZSCHED_NODE": node,

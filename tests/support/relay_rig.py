@@ -116,7 +116,9 @@ class Rig:
     def start_worker(self, node: str, *options: str, task: str = TASK) -> subprocess.Popen[bytes]:
         self.incarnation += 1
         path = self.folder / f"{task}-{node}.json5"
-        path.write_text(worker_config(connect=(self.endpoint(node),), timing=self.timing, shared_memory=False))
+        # its own relay first, then the robot's, as `zsched.daemon_endpoints` has it: what is dialled is dialled again
+        connect = tuple(dict.fromkeys((self.endpoint(node), self.endpoint(ROBOT))))
+        path.write_text(worker_config(connect=connect, timing=self.timing, shared_memory=False))
         env = os.environ | {
             "ZSCHED_FLEET": FLEET,
             "ZSCHED_NODE": node,
