@@ -25,9 +25,8 @@ time.sleep(60)
 """
 # A lab that starts a stubborn child, tells its token and waits to be killed.
 LAB = f"""
-import signal, sys, time
+import sys, time
 from pathlib import Path
-signal.signal(signal.SIGHUP, signal.SIG_DFL)  # whoever runs the tests under nohup has it ignored
 from zsched.lab.children import Children
 folder = Path(sys.argv[1])
 with Children(folder / "logs") as children:
