@@ -333,7 +333,7 @@ class Node:
         text = f"{change.node} {change.before} -> {change.after}: {change.reason}"
         self._batch.add(do.RecordStory(stage="membership", text=text))
         self._beat_at = now  # tell the others at once: they wait for a second observer
-        if change.before is not PeerState.ALIVE and change.after is PeerState.ALIVE:
+        if change.after is PeerState.ALIVE:
             self._probation.on_back(change.node, now)
         if change.after is PeerState.GONE:
             self._probation.on_gone(change.node, now)

@@ -287,9 +287,11 @@ class Rounds:
 
         It would wait in the register for the very moment in which the network heals, and be committed then.
         """
+        if judgement.outcome is not Outcome.PROPOSE:
+            return judgement
         electors = self._fleet.electors
         heard = sum(states[name] is not PeerState.GONE for name in electors)
-        if judgement.outcome is not Outcome.PROPOSE or heard >= majority(len(electors)):
+        if heard >= majority(len(electors)):
             return judgement
         return _put_off(judgement, allocation, f"{heard} of {len(electors)} electors heard")
 

@@ -10,7 +10,6 @@ values it shares; the poses are given (`zsched.lab.explore.body`: truth plus the
 
 from __future__ import annotations
 
-import argparse
 import math
 
 import numpy as np
@@ -29,17 +28,6 @@ _BETWEEN = np.array([0.2, 0.4, 0.6, 0.8])
 _Box = tuple[int, int, int, int]
 """Cells of the map frame: low x, low y (inclusive), high x, high y (exclusive)."""
 _LogOdds = npt.NDArray[np.float32]
-
-
-def metres_per_cell(text: str) -> float:
-    """A map's resolution off the command line, in [0.01, 1] m. Raises what argparse understands."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0.01 <= value <= 1.0:
-        raise argparse.ArgumentTypeError(f"{text} is no resolution in [0.01, 1] metres per cell")
-    return value
 
 
 class ScanMapper:

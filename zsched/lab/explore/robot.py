@@ -39,7 +39,6 @@ from zsched.errors import ConfigError, WireError
 from zsched.lab import application
 from zsched.lab.explore.agent import Agent, Outputs, RobotSettings
 from zsched.lab.explore.body import Drift, Limits
-from zsched.lab.explore.mapper import metres_per_cell
 from zsched.lab.explore.messages import decode_claim, encode_claim, encode_scan
 from zsched.lab.explore.referee import Referee
 from zsched.lab.explore.world import World
@@ -47,6 +46,7 @@ from zsched.lab.explore.worlds import load_world
 from zsched.lab.mapping import RESOLUTION_M
 from zsched.lab.recorder import Record, Recorder
 from zsched.lab.signals import StopFlag
+from zsched.tasks.map_merge.__main__ import metres_per_cell
 from zsched.tasks.map_merge.cdr import CdrError, decode_grid, decode_transforms, encode_grid
 from zsched.tasks.map_merge.geometry import Pose2
 

@@ -24,10 +24,11 @@ from zsched.clock import monotonic_s
 from zsched.errors import WireError
 from zsched.lab import application
 from zsched.lab.explore.agent import MAP_PERIOD_S
-from zsched.lab.explore.mapper import ScanMapper, metres_per_cell
+from zsched.lab.explore.mapper import ScanMapper
 from zsched.lab.explore.messages import decode_scan
 from zsched.lab.mapping import RESOLUTION_M
 from zsched.lab.signals import StopFlag
+from zsched.tasks.map_merge.__main__ import metres_per_cell
 from zsched.tasks.map_merge.cdr import encode_grid
 
 POLL_S = 0.05

@@ -196,7 +196,7 @@ def conditions_text(results: Json) -> str:
     lines = [
         f"* Nodes: {'; '.join(shares) or 'no shares'}.",
         f"* Load levels: {'; '.join(levels)}. The matrix was run at {scenario['level']}.",
-        (f"* Merging: {merge_text(MergeTask(**scenario['merge']))}; done at coverage {scenario['target_coverage']:g}."),
+        f"* Merging: {merge_text(MergeTask(**scenario['merge']))}; done at coverage {scenario['target_coverage']:g}.",
         f"* Links: {', '.join(sorted({f['links'] for f in results['runs']})) or '-'} drives.",
         f"* Pressure outside the quotas: at most {scenario['pressure_limit']:g} allowed, at most {worst} seen.",
     ]

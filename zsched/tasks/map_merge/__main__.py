@@ -33,7 +33,8 @@ def _ratio(text: str) -> float:
     return value
 
 
-def _resolution(text: str) -> float:
+def metres_per_cell(text: str) -> float:
+    """A map's resolution off a command line, in [0.01, 1] m. Raises what argparse understands."""
     value = float(text)
     if not 0.01 <= value <= 1.0:
         raise argparse.ArgumentTypeError(f"{text} is not in [0.01, 1] metres per cell")
@@ -49,7 +50,7 @@ def parser() -> argparse.ArgumentParser:
     add("--mode", choices=("known", "track", "estimate"), default="estimate", help="how transforms come about")
     add("--pose", action="append", default=[], metavar="ROBOT=X,Y,YAW", help="pose of a robot's map frame (m, rad)")
     add("--poses", type=Path, metavar="FILE", help="poses as YAML or JSON: {robot1: [x, y, yaw]}")
-    add("--resolution", type=_resolution, default=0.05, help="of the merged map, metres per cell (0.05)")
+    add("--resolution", type=metres_per_cell, default=0.05, help="of the merged map, metres per cell (0.05)")
     add("--rate", type=_positive, default=4.0, help="merges per second at most (4)")
     add("--threads", type=int, choices=range(1, 65), default=1, metavar="N", help="threads of OpenCV and BLAS (1)")
     add("--world-frame", default="world", help="frame_id of the merged map (world)")
