@@ -31,6 +31,7 @@ from zsched.core.fleet import (
     DEFAULT_FORESEE_S,
     DEFAULT_PATIENCE,
     PATIENT_BONUS,
+    PATIENT_COOL_DOWN_S,
     Demand,
     Fleet,
     LinkLimits,
@@ -206,7 +207,11 @@ SCHEDULING: Final = Record(
         "time_to_trigger_s": Field(
             Number(0, 3600, "s"), "How long another candidate must lead, for tasks without `patience`.", default="none"
         ),
-        "cool_down_s": Field(Number(0, 86400, "s"), "Least stay after a move."),
+        "cool_down_s": Field(
+            Number(0, 86400, "s"),
+            "Least stay after a move.",
+            default=f"`{PATIENT_COOL_DOWN_S:g}`; `10` with `time_to_trigger_s` alone",
+        ),
         "aggregate": Field(Choice.of(Aggregate), "How the robots' utilities become one; `median` resists a liar."),
         "reach": Field(Choice.of(Reach), "Who must reach a candidate.", default=f"`{Reach.MAJORITY}`"),
         "memory_floor_ratio": Field(

@@ -16,6 +16,7 @@ from zsched.core.fleet import (
     DEFAULT_FORESEE_S,
     DEFAULT_PATIENCE,
     PATIENT_BONUS,
+    PATIENT_COOL_DOWN_S,
     Demand,
     LinkLimits,
     OnIsolation,
@@ -125,10 +126,11 @@ def _tuning(given: Section, out: Collector) -> Tuning | None:
     if weights is None:
         return None
     scheduling: Section | None = given.get("scheduling")
+    patient: dict[str, Any] = {"bonus": PATIENT_BONUS, "cool_down_s": PATIENT_COOL_DOWN_S}
     if scheduling is None:
-        return Tuning(weights=weights, bonus=PATIENT_BONUS)
-    default = {"bonus": PATIENT_BONUS} if _patience(scheduling) is not None else {}
-    return scheduling.build(Tuning, out, weights=weights, **{**default, **_of(scheduling, "bonus")})
+        return Tuning(weights=weights, **patient)
+    default = patient if _patience(scheduling) is not None else {}
+    return scheduling.build(Tuning, out, weights=weights, **{**default, **_of(scheduling, *patient)})
 
 
 def _patience(scheduling: Section | None) -> float | None:

@@ -13,6 +13,7 @@ from zsched.core.fleet import (
     DEFAULT_FORESEE_S,
     DEFAULT_PATIENCE,
     PATIENT_BONUS,
+    PATIENT_COOL_DOWN_S,
     Fleet,
     LinkSpec,
     OnIsolation,
@@ -140,30 +141,31 @@ def test_links_of_every_source() -> None:
 
 
 @pytest.mark.parametrize(
-    ("scheduling", "patience", "bonus", "trigger_s"),
+    ("scheduling", "patience", "bonus", "cool_down_s", "trigger_s"),
     [
-        ("", DEFAULT_PATIENCE, PATIENT_BONUS, None),
-        ("{}", DEFAULT_PATIENCE, PATIENT_BONUS, None),
-        ("{cool_down_s: 5}", DEFAULT_PATIENCE, PATIENT_BONUS, None),
-        ("{bonus: 0.2}", DEFAULT_PATIENCE, 0.2, None),
-        ("{bonus: 0}", DEFAULT_PATIENCE, 0.0, None),
-        ("{patience: 0.3}", 0.3, PATIENT_BONUS, None),
-        ("{patience: 0.3, bonus: 0.2}", 0.3, 0.2, None),
-        ("{time_to_trigger_s: 2}", None, 0.1, 2.0),
-        ("{time_to_trigger_s: 0}", None, 0.1, 0.0),
-        ("{time_to_trigger_s: 3, bonus: 0.05}", None, 0.05, 3.0),
-        ("{time_to_trigger_s: 3, patience: 0.3}", 0.3, PATIENT_BONUS, 3.0),
-        ("{time_to_trigger_s: 3, patience: 0.3, bonus: 0.2}", 0.3, 0.2, 3.0),
+        ("", DEFAULT_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S, None),
+        ("{}", DEFAULT_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S, None),
+        ("{cool_down_s: 7}", DEFAULT_PATIENCE, PATIENT_BONUS, 7.0, None),
+        ("{cool_down_s: 0}", DEFAULT_PATIENCE, PATIENT_BONUS, 0.0, None),
+        ("{bonus: 0.2}", DEFAULT_PATIENCE, 0.2, PATIENT_COOL_DOWN_S, None),
+        ("{bonus: 0}", DEFAULT_PATIENCE, 0.0, PATIENT_COOL_DOWN_S, None),
+        ("{patience: 0.3}", 0.3, PATIENT_BONUS, PATIENT_COOL_DOWN_S, None),
+        ("{patience: 0.3, bonus: 0.2}", 0.3, 0.2, PATIENT_COOL_DOWN_S, None),
+        ("{time_to_trigger_s: 2}", None, 0.1, 10.0, 2.0),
+        ("{time_to_trigger_s: 0}", None, 0.1, 10.0, 0.0),
+        ("{time_to_trigger_s: 3, bonus: 0.05, cool_down_s: 4}", None, 0.05, 4.0, 3.0),
+        ("{time_to_trigger_s: 3, patience: 0.3}", 0.3, PATIENT_BONUS, PATIENT_COOL_DOWN_S, 3.0),
+        ("{time_to_trigger_s: 3, patience: 0.3, bonus: 0.2}", 0.3, 0.2, PATIENT_COOL_DOWN_S, 3.0),
     ],
 )
 def test_patience_is_the_default_and_a_time_to_trigger_alone_takes_its_place(
-    scheduling: str, patience: float | None, bonus: float, trigger_s: float | None
+    scheduling: str, patience: float | None, bonus: float, cool_down_s: float, trigger_s: float | None
 ) -> None:
-    """docs/decisions/0021."""
+    """docs/decisions/0021 and 0023."""
     given = f"    scheduling: {scheduling}\n" if scheduling else ""
     task = fleet_of(swapped("    scheduling: {bonus: 0.10, time_to_trigger_s: 2, cool_down_s: 10}\n", given)).tasks[0]
     assert task.patience == patience
-    assert task.tuning.bonus == bonus
+    assert (task.tuning.bonus, task.tuning.cool_down_s) == (bonus, cool_down_s)
     if trigger_s is not None:
         assert task.tuning.time_to_trigger_s == trigger_s
 
@@ -180,8 +182,8 @@ def test_signals_are_foreseen_unless_the_file_says_otherwise(link: str, foresee_
     assert limits.nu_dbm == (-75.0 if "nu_dbm" in link else -80.0)
 
 
-def test_the_defaults_of_a_fleet_file_are_those_of_decision_0021() -> None:
-    assert (DEFAULT_PATIENCE, PATIENT_BONUS, DEFAULT_FORESEE_S) == (0.2, 0.05, 3.0)
+def test_the_defaults_of_a_fleet_file_are_those_of_decisions_0021_and_0023() -> None:
+    assert (DEFAULT_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S, DEFAULT_FORESEE_S) == (0.2, 0.05, 5.0, 3.0)
 
 
 def test_every_setting_of_a_task_arrives() -> None:

@@ -9,6 +9,7 @@ from zsched.core.fleet import (
     DEFAULT_FORESEE_S,
     DEFAULT_PATIENCE,
     PATIENT_BONUS,
+    PATIENT_COOL_DOWN_S,
     LinkSpec,
     TaskSpec,
     Timing,
@@ -44,8 +45,10 @@ def test_defaults_told_by_hand_are_the_classes_own() -> None:
 
 
 def test_defaults_that_hang_on_each_other_are_the_codes() -> None:
-    timer_bonus = next(field.default for field in fields(Tuning) if field.name == "bonus")
-    assert SCHEDULING.default_text("bonus") == f"`{PATIENT_BONUS:g}`; `{timer_bonus:g}` with `time_to_trigger_s` alone"
+    timers = {field.name: field.default for field in fields(Tuning)}
+    alone = "with `time_to_trigger_s` alone"
+    assert SCHEDULING.default_text("bonus") == f"`{PATIENT_BONUS:g}`; `{timers['bonus']:g}` {alone}"
+    assert SCHEDULING.default_text("cool_down_s") == f"`{PATIENT_COOL_DOWN_S:g}`; `{timers['cool_down_s']:g}` {alone}"
     assert SCHEDULING.default_text("patience").startswith(f"`{DEFAULT_PATIENCE:g}`; ")
     assert LINK_LIMITS.default_text("foresee_s") == f"`{DEFAULT_FORESEE_S:g}`"
 

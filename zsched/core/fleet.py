@@ -21,6 +21,8 @@ DEFAULT_PATIENCE = 0.2
 """Utility seconds; for a task whose fleet file gives neither a patience nor a time-to-trigger (docs/decisions/0021)."""
 PATIENT_BONUS = 0.05
 """The bonus of a task with a patience, when its fleet file gives none; with a time-to-trigger it is `Tuning`'s."""
+PATIENT_COOL_DOWN_S = 5.0
+"""The cool-down of a task with a patience, likewise (docs/decisions/0023)."""
 DEFAULT_FORESEE_S = 3.0
 """How far ahead the signals of a task count when its fleet file does not say."""
 

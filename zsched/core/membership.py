@@ -53,6 +53,8 @@ class _Peer:
     """A suspect for whom somebody speaks is looked at again then."""
     token_lost: bool = False
     token_lost_at: float = -math.inf
+    has_been_gone: bool = False
+    """Gone since it was last alive, even if somebody's word has made it a suspect again."""
     back_at: float = -math.inf
     """When it last came back from gone in the same life."""
     suspects: tuple[NodeId, ...] = ()
@@ -142,15 +144,16 @@ class Membership:
         if peer.token_lost and not restarted and now < peer.token_lost_at + IN_FLIGHT_S:
             peer.sequence = beat.sequence
             return ()
-        before = peer.state
+        before, is_back = peer.state, peer.has_been_gone and not restarted
         self._deadline = None
         peer.incarnation, peer.sequence, peer.beat_at = beat.incarnation, beat.sequence, now
         peer.suspects, peer.token_lost = beat.suspects, False
         changes = []
         if before is not PeerState.ALIVE:
             changes.append(self._change(beat.node, PeerState.ALIVE, "beats again" if restarted else "beats", now))
-            if before is PeerState.GONE and not restarted:
+            if is_back:
                 peer.back_at = now
+            if is_back and before is PeerState.GONE:
                 changes += self._take_word(beat, now)
         elif restarted:
             changes.append(Transition(node=beat.node, before=before, after=before, reason="restarted"))
@@ -255,6 +258,8 @@ class Membership:
     def _change(self, node: NodeId, after: PeerState, reason: str, now: float) -> Transition:
         peer = self._peers[node]
         before, peer.state = peer.state, after
+        if after is not PeerState.SUSPECT:
+            peer.has_been_gone = after is PeerState.GONE
         self._states = {**self._states, node: after}  # a new one: whoever holds the old one sees one moment
         self._has_suspect = PeerState.SUSPECT in self._states.values()
         self._misses_anybody = any(state is not PeerState.ALIVE for state in self._states.values())

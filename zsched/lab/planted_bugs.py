@@ -375,8 +375,8 @@ MEMBERSHIP_BUGS = (
     _bug(
         "the first node heard after a cut speaks for nobody",
         MEMBERSHIP,
-        "if before is PeerState.GONE and not restarted:",
-        "if before is PeerState.GONE and not self:",
+        "if is_back and before is PeerState.GONE:",
+        "if is_back and before is PeerState.ALIVE:",
         _MEMBERSHIP,
     ),
     _bug(
@@ -389,8 +389,8 @@ MEMBERSHIP_BUGS = (
     _bug(
         "a node without memory speaks for those it has not heard yet",
         MEMBERSHIP,
-        "if before is PeerState.GONE and not restarted:",
-        "if before is PeerState.GONE:",
+        "before, is_back = peer.state, peer.has_been_gone and not restarted",
+        "before, is_back = peer.state, peer.has_been_gone",
         _MEMBERSHIP,
     ),
     _bug(

@@ -12,7 +12,17 @@ from random import Random
 
 import pytest
 
-from zsched.core.fleet import DEFAULT_PATIENCE, PATIENT_BONUS, Demand, Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.fleet import (
+    DEFAULT_PATIENCE,
+    PATIENT_BONUS,
+    PATIENT_COOL_DOWN_S,
+    Demand,
+    Fleet,
+    NodeSpec,
+    TaskSpec,
+    Timing,
+    WorkerSpec,
+)
 from zsched.core.gateway import Gateway
 from zsched.core.model import (
     Allocation,
@@ -194,8 +204,8 @@ class Loop:
         self.moves.append((now, result.winner))
 
 
-PATIENT = Tuning(weights=BOTH, bonus=PATIENT_BONUS)
-"""With `DEFAULT_PATIENCE`: what a task gets whose fleet file says nothing (docs/decisions/0021)."""
+PATIENT = Tuning(weights=BOTH, bonus=PATIENT_BONUS, cool_down_s=PATIENT_COOL_DOWN_S)
+"""With `DEFAULT_PATIENCE`: what a task gets whose fleet file says nothing (docs/decisions/0021 and 0023)."""
 RESTLESS = Tuning(weights=BOTH, bonus=0.0, time_to_trigger_s=0.0, cool_down_s=0.0)
 
 
@@ -301,6 +311,18 @@ def test_loads_that_follow_the_task_are_fled_no_faster_than_the_cool_down() -> N
     assert all(later - earlier >= loop.tuning.cool_down_s for earlier, later in itertools.pairwise(times))
 
 
+def test_with_patience_the_stay_is_the_shorter_cool_down() -> None:
+    """Loads that are large enough to use up the patience within it are followed after it, not before."""
+    loads = [lambda now, phase=phase: 0.6 if int(now / 6.0) % 2 == phase else 0.0 for phase in (0, 1)]
+    machines = tuple(Machine(name=f"edge{index}", step=load) for index, load in enumerate(loads, 1))
+    loop = Loop(machines, tuning=PATIENT, patience=DEFAULT_PATIENCE)
+    times = [at for at, _ in loop.run(120.0)]
+
+    stays = [later - earlier for earlier, later in itertools.pairwise(times)]
+    assert min(stays) >= PATIENT_COOL_DOWN_S
+    assert min(stays) < Tuning(weights=BOTH).cool_down_s, "the timer's would have held it longer"
+
+
 # --- the task's own load -------------------------------------------------------------------------------------------
 
 THOUSAND_ROUNDS_S = 1000 * Timing().decide_s
@@ -317,6 +339,8 @@ def test_a_heavy_task_does_not_chase_itself_around_in_a_thousand_rounds(other_co
     )
 
     assert len(Loop(machines, seed=3).run(THOUSAND_ROUNDS_S)) <= 1
+    patient = Loop(machines, tuning=PATIENT, patience=DEFAULT_PATIENCE, seed=3)
+    assert len(patient.run(THOUSAND_ROUNDS_S)) <= 1
 
 
 def test_without_the_demand_correction_the_same_task_oscillates() -> None:

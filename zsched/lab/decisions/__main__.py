@@ -12,7 +12,7 @@ from pathlib import Path
 
 from zsched.lab.decisions import drives, figures, report, study
 
-PARTS = ("compare", "sweep", "options")
+PARTS = ("compare", "sweep", "options", "cool-down")
 SHOWN = ("zsched", "zsched, timer", "the weaker way", "dyna_net", "argmax", "dyna_net_penalty")
 
 
@@ -41,6 +41,7 @@ def play(given: argparse.Namespace) -> None:
         sys.exit(f"{results} is there already: give --resume to go on from it, or another --out")
     candidates = tuple(int(count) for count in given.candidates.split(","))
     made = {"compare": study.compared(candidates), "sweep": study.swept(), "options": study.options()}
+    made["cool-down"] = study.cooled()
     seeds = study.TRAIN if given.seeds == "train" else study.TEST
     only = frozenset(filter(None, given.only.split(";")))
     began_at = time.monotonic()
@@ -70,7 +71,7 @@ def show(out: Path, folder: Path | None) -> None:
     if any(case.startswith("long-") for case in cases):
         figures.sizes(rows, out / "sizes.png")
     if set(report.WHOLE_GRID) <= cases:
-        figures.grid(rows, {"the default": "s3 b0.05 p0.2 c10", "the timer": "s3 b0.1 t2 c10"}, out / "grid.png")
+        figures.grid(rows, {"the default": "s3 b0.05 p0.2 c5", "the timer": "s3 b0.1 t2 c10"}, out / "grid.png")
     print(f"written: {out / 'report.md'} and the pictures beside it")
 
 

@@ -13,7 +13,14 @@ from collections.abc import Callable
 from random import Random
 from typing import Any, Final
 
-from zsched.core.fleet import DEFAULT_FORESEE_S, DEFAULT_PATIENCE, PATIENT_BONUS, LinkLimits, PairReading
+from zsched.core.fleet import (
+    DEFAULT_FORESEE_S,
+    DEFAULT_PATIENCE,
+    PATIENT_BONUS,
+    PATIENT_COOL_DOWN_S,
+    LinkLimits,
+    PairReading,
+)
 from zsched.core.model import Tuning, Weights
 from zsched.lab.decisions.replay import Entry
 from zsched.lab.decisions.rules import (
@@ -53,8 +60,9 @@ def core(
     """
     if patience is None and time_to_trigger_s is None:
         patience = DEFAULT_PATIENCE
-    if patience is not None and bonus is None:
-        bonus = PATIENT_BONUS
+    if patience is not None:
+        bonus = PATIENT_BONUS if bonus is None else bonus
+        cool_down_s = PATIENT_COOL_DOWN_S if cool_down_s is None else cool_down_s
     given = {"bonus": bonus, "time_to_trigger_s": time_to_trigger_s, "cool_down_s": cool_down_s}
     settings: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     tuning = Tuning(weights=world.spec.tuning.weights, **settings)
@@ -133,6 +141,14 @@ def grid(world: World) -> tuple[Entry, ...]:
         )
     )
     return by_timer + patient
+
+
+def cool_downs(world: World) -> tuple[Entry, ...]:
+    """The default with other cool-downs, from shorter than the smoothing to what the timer has."""
+    return tuple(
+        Entry(name=f"cool-down {cool_s:g} s", limits=foreseeing(world), make=core(world, cool_down_s=cool_s))
+        for cool_s in (1.0, 2.0, 3.0, 5.0, 7.0, 10.0)
+    )
 
 
 def fading(world: World) -> tuple[Entry, ...]:

@@ -117,6 +117,16 @@ def _costly(cost_s: float) -> Case:
     )
 
 
+def cooled() -> tuple[Case, ...]:
+    """How long a task should stay after a move at least."""
+
+    def cast(world: World, _seed: int) -> tuple[Entry, ...]:
+        return entries.cool_downs(world)
+
+    whole = [case for case in compared(()) if case.hours == 1.0]
+    return tuple(Case(name=f"cool-down {case.name}", build=case.build, cast=cast, hours=1.0) for case in whole)
+
+
 def play(
     cases: tuple[Case, ...], hours: float, seeds: range, out: Path, only: frozenset[str] = frozenset()
 ) -> Iterator[str]:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from zsched.config import check_bytes
-from zsched.core.fleet import DEFAULT_PATIENCE, PATIENT_BONUS
+from zsched.core.fleet import DEFAULT_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S
 from zsched.core.model import Tuning
 from zsched.lab.decisions import entries
 from zsched.lab.decisions.replay import Entry, replay
@@ -144,9 +144,9 @@ def test_every_entry_of_every_cast_plays_and_has_a_name_of_its_own() -> None:
 def test_the_grid_holds_the_default() -> None:
     world = loaded_world(seed=1, hours=0.05)
     tuning = Tuning(weights=EVEN)
-    smoothing, cool_down = f"s{world.fleet.timing.smoothing_s:g}", f"c{tuning.cool_down_s:g}"
-    default = f"{smoothing} b{PATIENT_BONUS:g} p{DEFAULT_PATIENCE:g} {cool_down}"
-    timer = f"{smoothing} b{tuning.bonus:g} t{tuning.time_to_trigger_s:g} {cool_down}"
+    smoothing = f"s{world.fleet.timing.smoothing_s:g}"
+    default = f"{smoothing} b{PATIENT_BONUS:g} p{DEFAULT_PATIENCE:g} c{PATIENT_COOL_DOWN_S:g}"
+    timer = f"{smoothing} b{tuning.bonus:g} t{tuning.time_to_trigger_s:g} c{tuning.cool_down_s:g}"
     cast = {entry.name: entry for entry in entries.grid(world)}
     for name, entry in zip((default, timer), entries.ours(world), strict=True):
         assert only(world, cast[name]) == only(world, entry)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from zsched.core.fleet import DEFAULT_PATIENCE, PATIENT_BONUS, Timing
+from zsched.core.fleet import DEFAULT_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S, Timing
 from zsched.core.model import Tuning
 from zsched.lab.decisions.loads import Array
 from zsched.lab.decisions.replay import Entry, replay
@@ -16,7 +16,7 @@ from zsched.lab.decisions.world import DT_S, EVEN, World, build_fleet
 from zsched.lab.simulator import CORES, MEMORY_MB, Simulator
 
 TIMER = Tuning(weights=EVEN, cool_down_s=10.0)
-PATIENT = Tuning(weights=EVEN, cool_down_s=10.0, bonus=PATIENT_BONUS)
+PATIENT = Tuning(weights=EVEN, cool_down_s=PATIENT_COOL_DOWN_S, bonus=PATIENT_BONUS)
 MINUTES = 3
 STARTED_AT_S = 100.0
 """The simulator's clock at its start."""

@@ -7,7 +7,7 @@ import pytest
 
 from zsched.adapters.network_profiler import parse_trace
 from zsched.config import load_fleet
-from zsched.core.fleet import DEFAULT_FORESEE_S, DEFAULT_PATIENCE, PATIENT_BONUS
+from zsched.core.fleet import DEFAULT_FORESEE_S, DEFAULT_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S
 from zsched.errors import ConfigError
 from zsched.lab.fleet_runner import read_tree, write_fleet
 from zsched.lab.paper.claims import CLAIMS
@@ -147,8 +147,9 @@ def test_every_scheme_makes_a_valid_fleet_file(tmp_path: Path, scenario: Scenari
     assert spec.candidates
     family = SCHEMES[name].family
     if family is Family.OURS:
-        tuned = (spec.patience, spec.tuning.bonus, spec.limits.foresee_s)
-        assert tuned == (DEFAULT_PATIENCE, PATIENT_BONUS, DEFAULT_FORESEE_S), "the product as it comes"
+        tuned = (spec.patience, spec.tuning.bonus, spec.tuning.cool_down_s, spec.limits.foresee_s)
+        as_it_comes = (DEFAULT_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S, DEFAULT_FORESEE_S)
+        assert tuned == as_it_comes, "the product as it comes"
     elif family is not Family.FIXED:
         assert (spec.patience, spec.tuning.time_to_trigger_s, spec.limits.foresee_s) == (None, 0.0, 0.0)
     if SCHEMES[name].weights is not None:
