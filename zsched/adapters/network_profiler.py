@@ -282,7 +282,7 @@ class TraceReader:
         self._begin_s: float | None = None
         self._trace: Trace | None = None
         try:
-            self._trace = parse_trace(_text(Path(spec.value)), spec.column)
+            self._trace = parse_trace(read_text(Path(spec.value)), spec.column)
         except (OSError, EOFError, ValueError, csv.Error, zlib.error) as error:
             self.problem = f"trace {spec.value}: {error}"
 
@@ -297,7 +297,8 @@ class TraceReader:
         """Nothing to give back."""
 
 
-def _text(path: Path) -> str:
+def read_text(path: Path) -> str:
+    """A drive's CSV, unpacked if its name ends in ``.gz``. Raises `OSError`, `EOFError` or `zlib.error`."""
     if path.suffix != ".gz":
         return path.read_text(encoding="utf-8", errors="replace")
     with gzip.open(path, "rt", encoding="utf-8", errors="replace") as file:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
@@ -69,10 +69,20 @@ class Claim:
 
 
 OTHER_DYNAMIC = ("dyna_cpu", "dyna_both")
+
+
+def _each(says: str, metric: str, schemes: tuple[str, ...], theirs: tuple[str, ...], target: float) -> Iterator[Claim]:
+    """A claim that the paper makes of every one of its variants."""
+    for scheme in schemes:
+        yield Claim(
+            source="paper", says=f"{says}: {scheme}", metric=metric, mine=(scheme,), theirs=theirs, target=target
+        )
+
+
 CLAIMS = (
     Claim(
         source="paper",
-        says="throughput +40 % over fixed (all variants)",
+        says="throughput +40 % over fixed",
         metric="throughput_mb_s",
         mine=PAPER_SCHEMES,
         theirs=FIXED_SCHEMES,
@@ -80,11 +90,20 @@ CLAIMS = (
     ),
     Claim(
         source="paper",
-        says="task latency -28 % against fixed (all variants)",
+        says="task latency -28 % against fixed, the variants' mean",
         metric="task_latency_s",
         mine=PAPER_SCHEMES,
         theirs=FIXED_SCHEMES,
         target=-0.28,
+    ),
+    *_each("task latency -28 % against fixed", "task_latency_s", PAPER_SCHEMES, FIXED_SCHEMES, target=-0.28),
+    Claim(
+        source="paper",
+        says="better map frequency than fixed",
+        metric="map_hz",
+        mine=PAPER_SCHEMES,
+        theirs=FIXED_SCHEMES,
+        target=0.0,
     ),
     Claim(
         source="paper",
@@ -96,26 +115,30 @@ CLAIMS = (
     ),
     Claim(
         source="paper",
-        says="map frequency of its best variant over fixed",
+        says="map frequency: dyna_mem over fixed",
         metric="map_hz",
         mine=("dyna_mem",),
         theirs=FIXED_SCHEMES,
         target=0.0,
     ),
-    Claim(
-        source="paper",
-        says="best map accuracy: dyna_both over fixed",
-        metric="ssim_rebased",
-        mine=("dyna_both",),
-        theirs=FIXED_SCHEMES,
-        target=0.0,
+    *_each("better map accuracy than fixed", "ssim_rebased", PAPER_SCHEMES, FIXED_SCHEMES, target=0.0),
+    *(
+        Claim(
+            source="paper",
+            says=f"best map accuracy: dyna_both over {other}",
+            metric="ssim_rebased",
+            mine=("dyna_both",),
+            theirs=(other,),
+            target=0.0,
+        )
+        for other in ("dyna_cpu", "dyna_mem")
     ),
     Claim(
         source="paper",
-        says="best map accuracy: dyna_both over the other variants",
-        metric="ssim_rebased",
-        mine=("dyna_both",),
-        theirs=("dyna_cpu", "dyna_mem"),
+        says="peaks of CPU are spread more evenly than under fixed",
+        metric="cpu_peak_spread",
+        mine=PAPER_SCHEMES,
+        theirs=FIXED_SCHEMES,
         target=0.0,
     ),
     Claim(
@@ -128,7 +151,7 @@ CLAIMS = (
     ),
     Claim(
         source="paper",
-        says="memory is spread more evenly than under fixed",
+        says="memory is balanced better than under fixed",
         metric="memory_mean_spread",
         mine=PAPER_SCHEMES,
         theirs=FIXED_SCHEMES,
@@ -163,8 +186,10 @@ LESS_IS_BETTER = frozenset(
     {
         "task_latency_s",
         "cpu_peak",
+        "cpu_peak_spread",
         "cpu_mean_spread",
         "memory_mean",
+        "memory_peak",
         "memory_mean_spread",
         "regret",
         "gap_max_s",
@@ -178,14 +203,17 @@ LESS_IS_BETTER = frozenset(
 SIX = ("cpu_peak", "memory_mean", "throughput_mb_s", "map_hz", "task_latency_s", "ssim_rebased")
 """The paper's six metrics, fleet-wide."""
 
+GAINS = ("throughput_mb_s", "map_hz", "task_latency_s", "merge_latency_p50_s", "merge_latency_p95_s")
+"""What a better place is to bring."""
+
 # --- figures ---------------------------------------------------------------------------------------------------------
 
 
-def shared(runs: Sequence[Json], key: str) -> list[Json]:
-    """The runs whose number every group by ``key`` has: means over them are of the same worlds and schedules."""
-    numbers: dict[str, set[int]] = {}
+def shared(runs: Sequence[Json], *keys: str) -> list[Json]:
+    """The runs whose number every group by ``keys`` has: means over them are of the same worlds and schedules."""
+    numbers: dict[tuple[str, ...], set[int]] = {}
     for figures in runs:
-        numbers.setdefault(str(figures[key]), set()).add(int(figures["run"]))
+        numbers.setdefault(tuple(str(figures[key]) for key in keys), set()).add(int(figures["run"]))
     common = set.intersection(*numbers.values()) if numbers else set()
     return [figures for figures in runs if int(figures["run"]) in common]
 
@@ -266,6 +294,13 @@ def judged(runs: Sequence[Json]) -> list[tuple[Claim, Difference | None, Verdict
         one = difference(table_of(runs, claim.metric, claim.mine), table_of(runs, claim.metric, claim.theirs))
         found.append((claim, one, verdict(claim, one)))
     return found
+
+
+def over_fixed(runs: Sequence[Json], scheme: str) -> list[tuple[str, Difference]]:
+    """(metric, difference) of a scheme to the mean of the fixed ones, where all of them were run often enough."""
+    pairs = [(metric, table_of(runs, metric, (scheme,)), table_of(runs, metric, FIXED_SCHEMES)) for metric in GAINS]
+    found = [(metric, difference(mine, theirs)) for metric, mine, theirs in pairs]
+    return [(metric, one) for metric, one in found if one is not None and one.runs >= LEAST_RUNS]
 
 
 def better_than_ours(runs: Sequence[Json]) -> list[tuple[str, str, Difference]]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,8 @@ PER_SCHEME = (
     ("frequency", "map_hz", "merged maps per second, as the robots see them"),
     ("latency", "task_latency_s", "task latency: time to the target coverage (s)"),
     ("ssim", "ssim_rebased", "structural similarity of the map (0: no map, 1: truth)"),
+)
+WITH_YARDSTICKS = (
     ("merge-latency", "merge_latency_p95_s", "newest input to merged map at a robot, p95 (s)"),
     ("moves", "moves", "moves in a run"),
     ("regret", "regret", "regret against the oracle"),
@@ -36,23 +39,27 @@ PER_SCHEME = (
 
 
 def save_all(runs: Sequence[Json], level: str, levels: Sequence[str], folder: Path, title: str) -> list[str]:
-    """Every picture that the runs have figures for; returns the names of the files."""
+    """Every picture that the runs have figures for; returns the names of the files.
+
+    The paper's panels show the paper's schemes and ours, the others all schemes; every picture holds only the runs that
+    each of its schemes has, since each run has a world of its own.
+    """
     main = [figures for figures in runs if figures["level"] == level]
-    present = [name for name in SCHEMES if any(figures["scheme"] == name for figures in main)]
-    if not present:
-        return []
+    paper = shared([f for f in main if SCHEMES[f["scheme"]].family is not Family.YARDSTICK], "scheme")
+    every = shared(main, "scheme")
+    panels = [(per_node, paper, panel) for panel in PER_NODE]
+    panels += [(per_scheme, paper, panel) for panel in PER_SCHEME]
+    panels += [(per_scheme, every, panel) for panel in WITH_YARDSTICKS]
     names = []
-    for name, metric, label in PER_NODE:
-        names.append(
-            save(folder / f"{name}.png", lambda axes, m=metric, t=label: per_node(axes, main, present, m, t), title)
-        )
-    for name, metric, label in PER_SCHEME:
-        names.append(
-            save(folder / f"{name}.png", lambda axes, m=metric, t=label: per_scheme(axes, main, present, m, t), title)
-        )
-    shown = [one for one in levels if any(figures["level"] == one for figures in runs)]
-    if len(shown) > 1:
-        names.append(save(folder / "sweep.png", lambda axes: sweep(axes, shared(runs, "level"), shown), title))
+    for draw, shown, (name, metric, label) in panels:
+        schemes = [one for one in SCHEMES if any(figures["scheme"] == one for figures in shown)]
+        if schemes:
+            fill = partial(draw, runs=shown, schemes=schemes, metric=metric, label=label)
+            names.append(save(folder / f"{name}.png", fill, title))
+    swept = shared(runs, "level", "scheme")
+    at = [one for one in levels if any(figures["level"] == one for figures in swept)]
+    if len(at) > 1:
+        names.append(save(folder / "sweep.png", partial(sweep, runs=swept, levels=at), title))
     return names
 
 
@@ -143,7 +150,7 @@ def save_radio(
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1 + len(rows) * 0.35))
     for robot in robots:
         above.plot(*zip(*signals[robot], strict=True), color=colours[robot], label=robot, linewidth=1.1)
-    above.set_ylabel("signal, smoothed (dBm)", fontsize=8)
+    above.set_ylabel("signal as the robots smoothed it (dBm)", fontsize=8)
     above.legend(fontsize=7, ncols=len(robots), frameon=False)
     for place, owners in enumerate(rows.values()):
         ends = [*(start for start, _ in owners[1:]), end_s]

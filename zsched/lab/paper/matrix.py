@@ -2,9 +2,10 @@
 
 Knows: which cells there are, which are done, what makes a run invalid. Does not know: how a run is made or reported.
 
-A cell is done when its ``metrics.json`` is there. A run whose host was short of CPU, or one of whose processes failed,
-is moved aside (``NAME.invalid-N``) and repeated, at most `ATTEMPTS` times in all; what stays invalid is told, not
-counted. A run that was cut (a signal, a kill) is moved aside (``NAME.interrupted-N``) and made again.
+A cell is done when its ``metrics.json`` is there; figures by older definitions are made again from its records.
+A run whose host was short of CPU, or one of whose processes failed, is moved aside (``NAME.invalid-N``) and repeated,
+at most `ATTEMPTS` times in all; what stays invalid is told, not counted. A run that was cut (a signal, a kill) is
+moved aside (``NAME.interrupted-N``) and made again.
 """
 
 from __future__ import annotations
@@ -29,6 +30,8 @@ IDLE_FLOOR = 0.05
 GIVE_UP = 3
 """So many cells in a row that stay invalid: the machine or the fleet is at fault, and the rest would fail as well."""
 METRICS = "metrics.json"
+DEFINITIONS = 2
+"""Raise it when a figure's definition changes: figures of finished runs are then made again."""
 Say = Callable[[str], None]
 Json = dict[str, Any]
 Make = Callable[[Cell, Path], Json]
@@ -82,6 +85,7 @@ class Matrix:
         progress = Progress(total=len(todo))
         if len(todo) < len(cells):
             self._say(f"{len(cells) - len(todo)} of {len(cells)} runs are done already")
+        self._measure_again([cell for cell in cells if cell not in todo])
         in_a_row = 0
         for cell in todo:
             self._say(progress.line(cell))
@@ -92,6 +96,17 @@ class Matrix:
                 raise ChildError(f"{GIVE_UP} cells in a row stayed invalid, the last: {reason}; see {self._runs}")
             progress.took_s.append(time.monotonic() - started)
             progress.done += 1
+
+    def _measure_again(self, done: Sequence[Cell]) -> None:
+        old = [cell for cell in done if read_json(self._runs / cell.name / METRICS).get("definitions") != DEFINITIONS]
+        for number, cell in enumerate(old, start=1):
+            self._say(f"[{number}/{len(old)}] {cell.name}: figures by the present definitions")
+            self._note(cell, self._runs / cell.name)
+
+    def _note(self, cell: Cell, folder: Path) -> str:
+        figures, brief = self._measure(cell, folder)
+        write_json(folder / METRICS, {**figures, "definitions": DEFINITIONS})
+        return brief
 
     def _one(self, cell: Cell) -> str | None:
         """One cell until it is valid; returns why it is not after all attempts."""
@@ -115,9 +130,7 @@ class Matrix:
             return str(error)
         reason = invalid_reason(self._scenario, run["host"])
         if reason is None:
-            figures, brief = self._measure(cell, folder)
-            write_json(folder / METRICS, figures)
-            self._say("      " + brief)
+            self._say("      " + self._note(cell, folder))
         return reason
 
 
@@ -139,6 +152,12 @@ def set_aside(folder: Path, why: str) -> None:
 def collect(out: Path, cells: Iterable[Cell]) -> tuple[list[Json], list[Json]]:
     """(figures of the runs that count, what was invalid) of ``cells``, out of the folder."""
     runs = out / "runs"
-    valid = [json.loads(path.read_text()) for cell in cells if (path := runs / cell.name / METRICS).exists()]
-    invalid = [json.loads(path.read_text()) for path in sorted(runs.glob("*.invalid-*/invalid.json"))]
+    valid = [read_json(path) for cell in cells if (path := runs / cell.name / METRICS).exists()]
+    invalid = [read_json(path) for path in sorted(runs.glob("*.invalid-*/invalid.json"))]
     return valid, invalid
+
+
+def read_json(path: Path) -> Json:
+    """What `write_json` wrote."""
+    body: Json = json.loads(path.read_text(encoding="utf-8"))
+    return body

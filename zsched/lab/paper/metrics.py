@@ -93,7 +93,7 @@ def measure(folder: Path, scenario: Scenario, truth: Truth) -> Json:
     streams = read_streams(folder, run, truth)
     nodes = read_records(folder / "records" / "nodes.ndjson")
     duration_s = float(run["duration_s"])
-    owners = [(max(float(move["t_s"]), 0.0), move["node"]) for move in run["allocations"]]
+    owners = owners_within(run["allocations"], duration_s)
     reached = {robot: reached_s(maps, scenario.target_coverage) for robot, maps in streams.maps.items()}
     done = [t_s for t_s in reached.values() if t_s is not None]
     is_done = len(done) == len(run["robots"]) and max(done, default=duration_s) <= duration_s
@@ -109,7 +109,7 @@ def measure(folder: Path, scenario: Scenario, truth: Truth) -> Json:
         "task_latency_s": max(done) if is_done else duration_s,
         "is_done": is_done,
         "duration_s": duration_s,
-        **map_figures(streams, truth),
+        **map_figures(streams, truth, len(run["robots"])),
         **move_figures(run, streams, owners),
         "regret": regret(scenario, run, owners),
     }
@@ -243,8 +243,8 @@ def edge_figures(
 
 
 def pairs(values: Sequence[float]) -> list[float]:
-    """Means of two and two: half seconds to seconds."""
-    return [statistics.fmean(values[index : index + 2]) for index in range(0, len(values), 2)]
+    """Means of two and two: half seconds to seconds; an odd one at the end is left out."""
+    return [statistics.fmean(values[index : index + 2]) for index in range(0, len(values) - 1, 2)]
 
 
 def over_nodes(per_edge: Mapping[NodeId, Mapping[str, Any]]) -> Json:
@@ -263,6 +263,16 @@ def transfers(streams: Streams) -> Iterator[tuple[float, int]]:
         yield from ((arrival.t_s, arrival.size) for arrival in maps)
     for own in streams.sent.values():
         yield from own
+
+
+def owners_within(allocations: Iterable[Mapping[str, Any]], duration_s: float) -> list[tuple[float, NodeId]]:
+    """(from when, who) of the robots' drive; whoever had the task when they started has it from 0.
+
+    What was decided before, while the workers started, and after the drive is nobody's merit or fault.
+    """
+    made = [(float(move["t_s"]), str(move["node"])) for move in allocations]
+    before = [node for t_s, node in made if t_s <= 0.0]
+    return [*((0.0, node) for node in before[-1:]), *((t_s, node) for t_s, node in made if 0.0 < t_s <= duration_s)]
 
 
 def owner_at(owners: Sequence[tuple[float, NodeId]], t_s: float) -> NodeId | None:
@@ -284,16 +294,20 @@ def owned_s(owners: Sequence[tuple[float, NodeId]], node: NodeId, duration_s: fl
 # --- maps, moves, regret ---------------------------------------------------------------------------------------------
 
 
-def map_figures(streams: Streams, truth: Truth) -> Json:
-    """The last map that the robots held, and (``held_``) what they held on the way, against the truth of the end."""
+def map_figures(streams: Streams, truth: Truth, robots: int) -> Json:
+    """The last map that the robots held, and (``held_``) what they held on the way, against the truth of the end.
+
+    A robot without a map counts as one with a blank map.
+    """
+    blank = score_map(None, truth.grid)
     held = {key for keys in streams.held.values() for key in keys}
     scored = {key: score_map(grid_of(streams.payloads[key]), truth.grid) for key in held}
-    last = streams.held[max(streams.held)] if streams.held else []
-    final = [scored[key] for key in last]
-    on_way = [
-        statistics.fmean(scored[key].ssim_rebased for key in keys) if keys else 0.0 for keys in streams.held.values()
+    by_instant = [
+        [*(scored[key] for key in keys), *[blank] * (robots - len(keys))] for _, keys in sorted(streams.held.items())
     ]
+    on_way = [statistics.fmean(one.ssim_rebased for one in scores) for scores in by_instant]
     names = ("ssim_rebased", "wall_f1", "coverage", "ssim_crop")
+    final = by_instant[-1] if by_instant else []
     means = {name: statistics.fmean(getattr(one, name) for one in final) if final else None for name in names}
     return {**means, "held_ssim_rebased": statistics.fmean(on_way) if on_way else None}
 
@@ -307,9 +321,13 @@ def grid_of(payload: bytes) -> Grid | None:
 
 
 def move_figures(run: Mapping[str, Any], streams: Streams, owners: Sequence[tuple[float, NodeId]]) -> Json:
-    """Moves, wasted ones, the silence around each, and what was lost in the streams."""
+    """Moves, wasted ones, the silence around each, and what was lost in the streams.
+
+    The relays count losses from their start on, so they are shared out over all moves, earlier ones included.
+    """
     moves = [start for start, _ in owners[1:]]
-    gaps = [gap for t_s in moves if (gap := gap_around(streams, t_s)) is not None]
+    in_all = max(len(run["allocations"]) - 1, 0)
+    gaps = [gap for t_s in moves if (gap := gap_around(streams, t_s, float(run["duration_s"]))) is not None]
     counts = [count for node in run["robots"] for count in (run["streams"].get(node) or [])]
     lost = sum(int(count.get("lost") or 0) + int(count.get("at_most_lost") or 0) for count in counts)
     return {
@@ -319,7 +337,7 @@ def move_figures(run: Mapping[str, Any], streams: Streams, owners: Sequence[tupl
         "move_gap_max_s": max(gaps, default=None),
         "gap_max_s": max((gap for maps in streams.maps.values() for gap in silences(maps)), default=None),
         "lost": lost,
-        "lost_per_move": lost / len(moves) if moves else None,
+        "lost_per_move": lost / in_all if in_all else None,
         "dropped": sum(sum((count.get("drops") or {}).values()) for count in counts),
         "owners": [[round(start, 3), node] for start, node in owners],
     }
@@ -335,14 +353,14 @@ def wasted(owners: Sequence[tuple[float, NodeId]]) -> int:
     return sum(before[1] == after[1] and after[0] - left[0] < WASTED_S for before, left, after in triples)
 
 
-def gap_around(streams: Streams, t_s: float) -> float | None:
-    """The longest silence at any robot from its last map before ``t_s`` to the next one."""
+def gap_around(streams: Streams, t_s: float, end_s: float) -> float | None:
+    """The longest silence at any robot from its last map before ``t_s`` to the next one, or to the run's end."""
     found = []
     for maps in streams.maps.values():
         times = [arrival.t_s for arrival in maps]
         index = bisect.bisect_right(times, t_s)
-        if 0 < index < len(times):
-            found.append(times[index] - times[index - 1])
+        if index > 0:
+            found.append((times[index] if index < len(times) else max(end_s, t_s)) - times[index - 1])
     return max(found, default=None)
 
 

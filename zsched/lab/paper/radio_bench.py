@@ -2,13 +2,13 @@
 
 Knows: which schemes are run on the radio, and their figures. Does not know: how a run is made.
 
-The signal is what each robot's daemon measured and smoothed of its own link; the task's signal is that of the robot
-that holds it. "Best" is the strongest robot at every moment, known in hindsight.
+The signal is the drive's own reading of every moment, the same for all schemes, however they smooth it; the task's
+signal is that of the robot that holds it. "Best" is the strongest robot at every moment, known in hindsight.
+The picture shows the signals as the first scheme's daemons smoothed them.
 """
 
 from __future__ import annotations
 
-import bisect
 import json
 import statistics
 from collections.abc import Mapping, Sequence
@@ -17,9 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from zsched.lab.paper.cells import Cell
+from zsched.lab.paper.drive_clock import DriveClock, clocks
 from zsched.lab.paper.figures import save_radio
 from zsched.lab.paper.matrix import Matrix, Say, collect
-from zsched.lab.paper.metrics import wasted
+from zsched.lab.paper.metrics import owners_within, wasted
 from zsched.lab.paper.run import CellRun, Inputs
 from zsched.lab.paper.scenario import Scenario
 from zsched.lab.paper.schemes import NETWORK, SCHEMES
@@ -75,7 +76,10 @@ def radio_figures(folder: Path) -> dict[str, Any]:
     """
     run = json.loads((folder / "run.json").read_text(encoding="utf-8"))
     signals = read_signals(folder / "records" / "decisions.ndjson")
-    owners = [(max(float(move["t_s"]), 0.0), str(move["node"])) for move in run["allocations"]]
+    if not signals:
+        raise ValueError("no robot's signal was recorded")
+    duration_s = float(run["duration_s"])
+    owners = owners_within(run["allocations"], duration_s)
     return {
         "scheme": run["scheme"],
         "run": run["run"],
@@ -86,7 +90,7 @@ def radio_figures(folder: Path) -> dict[str, Any]:
         "wasted_moves": wasted(owners),
         "owners": owners,
         "signals": signals,
-        **signal_figures(signals, owners, float(run["duration_s"])),
+        **signal_figures(clocks(folder, signals), owners, duration_s),
     }
 
 
@@ -100,14 +104,8 @@ def read_signals(path: Path) -> dict[str, list[tuple[float, float]]]:
     return found
 
 
-def value_at(series: Series, t_s: float) -> float | None:
-    """The newest value at ``t_s``; ``None`` before the first."""
-    index = bisect.bisect_right([at for at, _ in series], t_s)
-    return series[index - 1][1] if index else None
-
-
 def signal_figures(
-    signals: Mapping[str, Series], owners: Sequence[tuple[float, str]], duration_s: float
+    signals: Mapping[str, DriveClock], owners: Sequence[tuple[float, str]], duration_s: float
 ) -> dict[str, float]:
     """The task's mean signal, the best robot's at every moment, the best single robot's, and the time under -70 dBm.
 
@@ -119,7 +117,7 @@ def signal_figures(
     for step in range(int(duration_s / STEP_S)):
         t_s = step * STEP_S
         owner = next((node for start, node in reversed(owners) if start <= t_s), None)
-        values = {robot: value_at(series, t_s) for robot, series in signals.items()}
+        values = {robot: drive.at(t_s) for robot, drive in signals.items()}
         known = {robot: value for robot, value in values.items() if value is not None}
         if owner not in known or len(known) < len(signals):
             continue

@@ -12,6 +12,7 @@ from zsched.lab.paper.bench import BenchOptions, InputsOf, claim_folder, command
 from zsched.lab.paper.cells import Cell, bandwidth_of, cells_of, merge_of, world_of
 from zsched.lab.paper.matrix import (
     ATTEMPTS,
+    DEFINITIONS,
     GIVE_UP,
     METRICS,
     Matrix,
@@ -201,6 +202,21 @@ def test_an_interrupted_matrix_goes_on_behind_what_is_done(scenario: Scenario, t
     assert runs.made == ["one-random-1"]
     assert said[0] == "1 of 2 runs are done already"
     assert (tmp_path / "runs" / "one-random-1.interrupted-1").exists()
+
+
+def test_figures_by_older_definitions_are_made_again_without_a_run(scenario: Scenario, tmp_path: Path) -> None:
+    play(scenario, tmp_path, Outcomes(0.1, 0.1), "zsched", "random")
+    path = tmp_path / "runs" / "one-zsched-1" / METRICS
+    path.write_text(json.dumps({"folder": "older", "definitions": DEFINITIONS - 1}))
+
+    runs = Outcomes()
+    said = play(scenario, tmp_path, runs, "zsched", "random")
+
+    assert runs.made == []
+    assert json.loads(path.read_text()) == {"folder": "one-zsched-1", "definitions": DEFINITIONS}
+    assert [line for line in said if "definitions" in line] == [
+        "[1/1] one-zsched-1: figures by the present definitions"
+    ]
 
 
 def test_progress_tells_the_time_that_is_left(scenario: Scenario) -> None:

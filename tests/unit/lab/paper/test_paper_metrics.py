@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -8,6 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from zsched.adapters.network_profiler import Trace
+from zsched.lab.paper.drive_clock import begun_before, smoothed
 from zsched.lab.paper.load import Window
 from zsched.lab.paper.metrics import (
     Truth,
@@ -18,6 +21,7 @@ from zsched.lab.paper.metrics import (
     over_nodes,
     owned_s,
     owner_at,
+    owners_within,
     percentile,
     reached_s,
     wasted,
@@ -198,6 +202,36 @@ def test_coverage_is_cell_on_cell_wherever_the_canvas_begins() -> None:
     assert truth.coverage(b"no map") == 0.0
 
 
+def test_what_was_decided_before_the_drive_and_after_it_does_not_count(tmp_path: Path, scenario: Scenario) -> None:
+    """Rules without restraint move every second while the workers start; zsched does not."""
+    at = [(-3.0, "edge2"), (-2.0, "edge1"), (-1.0, "edge2"), (-0.5, "edge1"), (4.5, "edge2"), (10.5, "edge1")]
+    moves = [{"t_s": t_s, "node": node} for t_s, node in at]
+    assert owners_within(moves, 10.0) == [(0.0, "edge1"), (4.5, "edge2")]
+    assert owners_within(moves[4:], 10.0) == [(4.5, "edge2")]
+
+    truth = Truth(a_room())
+    figures = measure(write_run(tmp_path, allocations=moves), scenario, truth)
+    assert (figures["moves"], figures["wasted_moves"]) == (1, 0)
+    assert figures["lost_per_move"] == pytest.approx(3 / 5)  # the relays counted through all five
+    assert figures["owners"] == [[0.0, "edge1"], [4.5, "edge2"]]
+
+
+def test_a_robot_without_a_map_counts_as_one_with_a_blank_map(tmp_path: Path, scenario: Scenario) -> None:
+    two = measure(write_run(tmp_path / "two"), scenario, Truth(a_room()))
+    three = measure(write_run(tmp_path / "three", robots=["robot1", "robot2", "robot3"]), scenario, Truth(a_room()))
+
+    for name in ("ssim_rebased", "held_ssim_rebased", "coverage"):
+        assert three[name] == pytest.approx(two[name] * 2 / 3)
+
+
+def test_a_move_after_which_no_map_came_has_a_gap_to_the_end(tmp_path: Path, scenario: Scenario) -> None:
+    moves = [{"t_s": -0.5, "node": "edge1"}, {"t_s": 9.2, "node": "edge2"}]
+
+    figures = measure(write_run(tmp_path, allocations=moves), scenario, Truth(a_room()))
+
+    assert figures["move_gap_max_s"] == pytest.approx(1.0)  # the last maps came at 9.0 and 9.1 s, the run ended at 10
+
+
 def test_small_figures() -> None:
     assert percentile([], 0.5) is None
     assert percentile([1.0, 2.0, 3.0], 0.95) == 3.0
@@ -214,9 +248,13 @@ def test_small_figures() -> None:
 def test_the_radios_figures(tmp_path: Path) -> None:
     moves = [{"t_s": -1.0, "node": "robot1"}, {"t_s": 5.0, "node": "robot2"}]
     folder = write_run(tmp_path, allocations=moves)
+    begun_s = 3.0  # the daemons began the drive so long before the run
+    write_drives(folder, {"robot1": [(0, -50)], "robot2": [(0, -60), (begun_s + 5.0, -40)]})
     with Recorder(folder / "records") as recorder:
         for step in range(20):
-            for robot, dbm in (("robot1", -50.0), ("robot2", -60.0 if step < 10 else -40.0)):
+            # What a daemon says is smoothed: it comes late, and later with the product's smoothing.
+            risen = 0.0 if step < 10 else 1.0 - math.exp(-(step / 2 - 5.0 + 0.1) / 3.0)
+            for robot, dbm in (("robot1", -50.0), ("robot2", -60.0 + 20.0 * risen)):
                 recorder.write("decisions", {"node": robot, "t_s": step / 2, "links": [dbm]})
 
     figures = radio_figures(folder)
@@ -227,6 +265,34 @@ def test_the_radios_figures(tmp_path: Path) -> None:
     assert figures["under_best_db"] == pytest.approx(0.0)
     assert figures["best_fixed_dbm"] == pytest.approx(-50.0)
     assert figures["below_70_ratio"] == 0.0
+
+
+def write_drives(folder: Path, drives: dict[str, list[tuple[float, int]]]) -> None:
+    """A fleet file whose robots follow drives of 100 s: [(from when, dBm)]."""
+    nodes = ""
+    for index, (robot, steps) in enumerate(sorted(drives.items())):
+        rows = ["time_stamp,c_rssi"]
+        for tenth in range(1000):
+            dbm = [value for start_s, value in steps if start_s <= tenth / 10 + 0.01][-1]
+            rows.append(f"{(tenth + 1) * 10**8},{dbm}")
+        path = folder / f"{robot}.csv"
+        path.write_text("\n".join(rows) + "\n")
+        listen = f"{{control: tcp/127.0.0.1:{7000 + index}, data: tcp/127.0.0.1:{7100 + index}}}"
+        nodes += f"  {robot}: {{kind: robot, listen: {listen}, trace: {{file: {path}, column: c_rssi}}}}\n"
+    task = "tasks:\n  t:\n    candidates: {kind: robot}\n    weights: {network: 1}\n"
+    (folder / "fleet.yaml").write_text(f"fleet: x\ntiming: wifi\nseeds: [robot1]\nnodes:\n{nodes}{task}")
+
+
+@pytest.mark.parametrize("smoothing_s", [0.0, 1.0, 3.0])
+@pytest.mark.parametrize("begun_s", [0.0, 4.2, 17.0])
+def test_where_in_its_drive_a_robot_was_is_found_again(smoothing_s: float, begun_s: float) -> None:
+    generator = np.random.default_rng(1)
+    dbm = -60.0 + np.cumsum(generator.normal(0.0, 1.0, 600))
+    trace = Trace(times_s=tuple(np.arange(600) * 0.2), rssi_dbm=tuple(dbm), duration_s=120.0)
+    said = smoothed(trace, 20.0, smoothing_s, 900)
+    series = [(step * 0.5, float(said[round(begun_s / 0.1) + 5 * step])) for step in range(80)]
+
+    assert begun_before(series, trace, 20.0, smoothing_s) == pytest.approx(begun_s)
 
 
 def test_a_run_without_signals_is_no_radio_run(tmp_path: Path) -> None:

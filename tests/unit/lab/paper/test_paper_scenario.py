@@ -50,7 +50,7 @@ def test_what_the_scenario_says_of_its_choices_holds(scenario: Scenario) -> None
     main = scenario.levels[scenario.level]
     full = max(share.memory_mb for share in scenario.nodes.values())
 
-    assert scenario.pressure_limit <= 0.07 + smallest / 2, "the floor that is seen without load, docs/evaluation/README.md"
+    assert scenario.pressure_limit <= 0.07 + smallest / 2, "the floor that is seen without load (docs)"
     assert (main.streams, main.share, main.side) == (1, 0.6, 640)
     assert main.memory_mb / full == pytest.approx(0.2, abs=0.03)
     assert [level.streams * level.share for level in scenario.levels.values()] == pytest.approx(
