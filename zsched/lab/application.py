@@ -16,6 +16,8 @@ from zsched.lab.signals import StopFlag
 from zsched.zenoh_config import client_config
 
 CONNECT_S = 30.0
+LOOK_S = 0.2
+"""How often a waiting application looks whether it is to stop."""
 
 
 def connect(endpoint: str, stop: StopFlag) -> zenoh.Session | None:
@@ -33,6 +35,12 @@ def connect(endpoint: str, stop: StopFlag) -> zenoh.Session | None:
                 raise
             time.sleep(0.2)
     return None
+
+
+def wait_until(begin_s: float | None, stop: StopFlag) -> None:
+    """Wait for ``begin_s`` (`monotonic_s`; ``None``: do not), or until stopped."""
+    while begin_s is not None and not stop.is_set and (left_s := begin_s - monotonic_s()) > 0.0:
+        time.sleep(min(left_s, LOOK_S))
 
 
 def run(name: str, endpoint: str, work: Callable[[zenoh.Session, StopFlag], None]) -> int:

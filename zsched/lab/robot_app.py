@@ -46,6 +46,8 @@ class RobotOptions:
     records: Path
     replay_s: float
     """Real seconds in which the whole part is driven: the speed factor follows from it."""
+    begin_s: float | None = None
+    """When it begins, on the machine's monotonic clock; ``None``: at once."""
 
 
 class Drive:
@@ -103,6 +105,7 @@ class Applications:
 
     def run(self, stop: StopFlag) -> None:
         """Drive, map, publish and listen until stopped."""
+        application.wait_until(self._options.begin_s, stop)
         start = next_progress = monotonic_s()
         # Robots are not in step; spread evenly, runs can be compared (maps that come together are merged together).
         next_map = start + MAP_PERIOD_S * self._options.index / self._options.robots
@@ -192,6 +195,7 @@ def parse(arguments: list[str]) -> RobotOptions:
     parser.add_argument("--endpoint", required=True, help="the robot's data endpoint, e.g. tcp/127.0.0.1:7458")
     parser.add_argument("--records", type=Path, required=True, help="folder for what the robot saw")
     parser.add_argument("--replay-s", type=float, default=50.0, help="seconds for the whole drive")
+    parser.add_argument("--begin-s", type=float, help="when to begin, on the machine's monotonic clock (at once)")
     given = vars(parser.parse_args(arguments))
     if not 0 <= given["index"] < given["robots"] or given["replay_s"] <= 0:
         parser.error("--index must be in [0, robots) and --replay-s above 0")

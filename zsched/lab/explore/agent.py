@@ -52,7 +52,10 @@ class Outputs:
 
 
 class Agent:
-    """The robot. ``phase`` (0..1) of a map period: robots are not in step."""
+    """The robot. ``phase`` (0..1) of a map period: robots are not in step.
+
+    A robot that maps itself sends its maps so much later; one whose scans are mapped elsewhere begins so much later.
+    """
 
     def __init__(self, settings: RobotSettings, world: World, *, phase: float = 0.0) -> None:
         # Seeds of words and numbers: robots of one run, and one robot's parts, draw apart.
@@ -73,8 +76,9 @@ class Agent:
         """Move up to ``now``, look, map, decide; returns what is to be sent. ``now`` only rises."""
         if self._last_s is None:
             self._last_s = now
-            self._next_scan_s = self._next_claim_s = now
+            self._next_claim_s = now
             self._next_map_s = now + self._phase * MAP_PERIOD_S
+            self._next_scan_s = now if self.settings.has_slam else self._next_map_s
         twist = self.explorer.step(self.body.belief, now, is_blocked=self.body.is_blocked)
         self.body.move(twist, now - self._last_s)
         self._last_s = now

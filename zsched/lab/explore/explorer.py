@@ -134,7 +134,10 @@ class Explorer:
         self._plan = plan_map(self._map)
         field = distances(self._plan, (here.x, here.y))
         claims = [claim for _, claim in self._claims.values()]
-        frontiers = find_frontiers(self._plan, field, [(claim.x, claim.y) for claim in claims])
+        mine = self.claim
+        # Of two that go to one place the nearer one stays. If both gave way, both would come back, and so on for ever.
+        taken = [one for one in claims if mine is None or not one.contests(mine) or one.goes_before(mine)]
+        frontiers = find_frontiers(self._plan, field, [(claim.x, claim.y) for claim in taken])
         before = self.goal
         chosen = choose(self._robot, frontiers, claims, before, [point for _, point in self._avoided])
         way = () if chosen is None else way_to(self._plan, field, chosen.cell)

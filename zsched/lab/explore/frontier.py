@@ -51,6 +51,14 @@ class Claim:
     y: float
     way_m: float
 
+    def contests(self, other: Claim) -> bool:
+        """Whether both are for one place."""
+        return math.dist((self.x, self.y), (other.x, other.y)) < CLAIM_RADIUS_M
+
+    def goes_before(self, other: Claim) -> bool:
+        """Whether this one's robot is nearer. Rounded: both robots must come to the same word on that."""
+        return (round(self.way_m, 1), self.robot) < (round(other.way_m, 1), other.robot)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Frontier:

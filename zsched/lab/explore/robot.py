@@ -66,6 +66,8 @@ class Options:
     endpoint: str
     records: Path
     target: float
+    begin_s: float | None = None
+    """When it begins, on the machine's monotonic clock; ``None``: at once."""
 
 
 class Applications:
@@ -96,6 +98,7 @@ class Applications:
 
     def run(self, stop: StopFlag) -> None:
         """Explore until stopped."""
+        application.wait_until(self._options.begin_s, stop)
         start = monotonic_s()
         settings, pose = self._options.settings, self._options.settings.start
         self._write({"kind": "start", "t_s": start, "x": pose.x, "y": pose.y, "yaw": pose.yaw, "seed": settings.seed})
@@ -245,6 +248,7 @@ def parse(arguments: list[str]) -> Options:
     add("--drift-way", type=float, default=Drift().way, help="m per square root of a metre (0.003)")
     add("--resolution", type=metres_per_cell, default=RESOLUTION_M, help="of its own map, metres per cell (0.05)")
     add("--slam-on", default="", metavar="NODE", help="map on this node (zsched.lab.explore.slam) and only send scans")
+    add("--begin-s", type=float, help="when to begin, on the machine's monotonic clock (at once)")
     given = parser.parse_args(arguments)
     if not 0 <= given.index < given.robots or not 0.0 < given.speed <= 5.0:
         parser.error("--index must be in [0, robots) and --speed in (0, 5]")
@@ -260,7 +264,13 @@ def parse(arguments: list[str]) -> Options:
     )
     phase = given.index / given.robots
     return Options(
-        settings=settings, world=world, phase=phase, endpoint=given.endpoint, records=given.records, target=given.target
+        settings=settings,
+        world=world,
+        phase=phase,
+        endpoint=given.endpoint,
+        records=given.records,
+        target=given.target,
+        begin_s=given.begin_s,
     )
 
 

@@ -31,7 +31,7 @@ from zsched.lab.signals import StopFlag
 from zsched.tasks.map_merge.__main__ import metres_per_cell
 from zsched.tasks.map_merge.cdr import encode_grid
 
-POLL_S = 0.05
+POLL_S = 0.02
 WAITING_SCANS = 16
 """Scans kept while this process has no CPU; then the oldest are lost, as in any SLAM that falls behind."""
 
@@ -42,7 +42,8 @@ def serve(robot: str, session: zenoh.Session, stop: StopFlag, resolution_m: floa
     scans = session.declare_subscriber(f"{robot}/scan", zenoh.handlers.RingChannel(WAITING_SCANS))
     publisher = session.declare_publisher(f"{robot}/map", congestion_control=zenoh.CongestionControl.BLOCK_FIRST)
     stamp_ns: int | None = None
-    next_map = monotonic_s()
+    next_map: float | None = None
+    """From the first scan on: the robots' maps keep the phases of their scans."""
     while not stop.is_set:
         while (sample := scans.try_recv()) is not None:
             try:
@@ -53,9 +54,9 @@ def serve(robot: str, session: zenoh.Session, stop: StopFlag, resolution_m: floa
             mapper.add(pose, scan)
             stamp_ns = scan.stamp_ns
         now = monotonic_s()
-        if stamp_ns is not None and now >= next_map:
+        if stamp_ns is not None and (next_map is None or now >= next_map):
             publisher.put(encode_grid(mapper.grid(stamp_ns)))
-            next_map = max(next_map + MAP_PERIOD_S, now)
+            next_map = max((now if next_map is None else next_map) + MAP_PERIOD_S, now)
         time.sleep(POLL_S)
 
 

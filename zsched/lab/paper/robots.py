@@ -31,6 +31,13 @@ class Place:
     records: Path
     duration_s: float
     target_coverage: float
+    begin_s: float
+    """When all robots begin, on the machine's monotonic clock."""
+
+    @property
+    def begin(self) -> tuple[str, str]:
+        """The same as an option of a robot's program."""
+        return "--begin-s", f"{self.begin_s:.3f}"
 
 
 class Robots(Protocol):
@@ -86,7 +93,7 @@ class LogRobots:
         command = [sys.executable, "-m", "zsched.lab.robot_app", "--robot", place.robot, "--index", str(place.index)]
         command += ["--robots", str(place.robots), "--seed", str(place.seed), "--log", str(self.log)]
         command += ["--endpoint", place.endpoint, "--records", str(place.records)]
-        return [*command, "--replay-s", f"{place.duration_s:.3f}"]
+        return [*command, *place.begin, "--replay-s", f"{place.duration_s:.3f}"]
 
     def helpers(self, endpoints: Mapping[NodeId, str]) -> Sequence[tuple[NodeId, list[str]]]:
         """None: the robots map on board."""
@@ -130,7 +137,7 @@ class ExploreRobots:
         command = [sys.executable, "-m", "zsched.lab.explore.robot", "--robot", place.robot, "--world", self.world]
         command += ["--index", str(place.index), "--robots", str(place.robots), "--seed", str(place.seed)]
         command += ["--endpoint", place.endpoint, "--records", str(place.records), "--speed", f"{self.speed:g}"]
-        command += ["--target", f"{place.target_coverage:g}", "--resolution", f"{self.resolution_m:g}"]
+        command += ["--target", f"{place.target_coverage:g}", "--resolution", f"{self.resolution_m:g}", *place.begin]
         node = self.slam_on.get(place.robot)
         return command if node is None else [*command, "--slam-on", node]
 

@@ -49,6 +49,8 @@ OWNED_S = 40.0
 RECORDER_S = 20.0
 CALM_S = 8.0
 """So long at most the robots wait for the start-up's CPU to fade from the nodes' smoothed figures."""
+LEAD_S = 2.0
+"""From the start of the robots' programs to their begin: by then they are up (0.4 to 0.8 s here)."""
 SETTLE_S = 2.0
 """After the robots' drive: their last maps are merged and come back."""
 RUN_SCHEMA = "zsched.paper.run/1"
@@ -262,8 +264,14 @@ class CellRun:
             parts.gauge.add(children.start(f"record{suffix}", command).process.pid)
 
     def _start(self, children: Children, parts: _Parts) -> None:
-        """The robots drive; from here all times count."""
+        """The robots drive; from here all times count.
+
+        They begin together, once all of their programs are up: then each robot's maps come at its own moments of every
+        half second, under every scheme the same ones. (Maps that come together are merged together: without that, how
+        many merged maps there are was mostly a matter of which program was up first.)
+        """
         robots = parts.fleet.robots
+        self._zero_s, self._zero_wall_ns = monotonic_s() + LEAD_S, time.time_ns() + round(LEAD_S * 1e9)
         for index, robot in enumerate(robots):
             place = Place(
                 robot=robot,
@@ -274,10 +282,13 @@ class CellRun:
                 records=self._records,
                 duration_s=self._scenario.duration_s,
                 target_coverage=self._scenario.target_coverage,
+                begin_s=self._zero_s,
             )
             child = children.start(f"app-{robot}", self._inputs.robots.command(place))
             parts.gauge.add(child.process.pid)
-        self._zero_s, self._zero_wall_ns = monotonic_s(), time.time_ns()
+        while monotonic_s() < self._zero_s:
+            children.check()
+            time.sleep(TICK_S)
         parts.gauge.start()
         level = self._scenario.levels[self._cell.level]
         best = best_nodes(self._scenario, level, self._windows)

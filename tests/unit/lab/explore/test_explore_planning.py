@@ -250,6 +250,26 @@ def test_it_backs_off_a_wall_and_takes_another_goal() -> None:
     assert math.dist(first, one.goal) > 1.0
 
 
+@pytest.mark.parametrize("gap_m", [0.1, 0.3, 0.5])
+def test_two_that_plan_in_step_do_not_swap_goals_for_ever(gap_m: float) -> None:
+    """Both went to one place, both gave way, both came back: twice a second, and neither got anywhere."""
+    poses = {"robot1": Pose2(x=5.9, y=2.0), "robot2": Pose2(x=5.9, y=2.0 + gap_m)}
+    robots = {name: Explorer(name, Limits()) for name in poses}
+    for round_number in range(12):
+        now = round_number * 0.5
+        for name, one in robots.items():
+            one.take_transform(Pose2())
+            one.take_map(grid_of(open_on_both_sides()))
+            one.step(poses[name], now)
+        claims = [one.claim for one in robots.values() if one.claim is not None]
+        for one in robots.values():
+            one.take_claims(claims, now)
+
+    assert max(one.goals for one in robots.values()) <= 2
+    left, right = sorted(one.goal for one in robots.values() if one.goal is not None)
+    assert math.dist(left, right) > 3.0, "one to each side"
+
+
 def test_anothers_claim_sends_it_to_the_other_side_and_expires() -> None:
     at = Pose2(x=5.0, y=2.0)
     alone = explorer(open_on_both_sides())

@@ -7,6 +7,7 @@ import cv2
 import pytest
 
 from zsched.lab.explore.__main__ import main, paired_interval, table
+from zsched.lab.explore.agent import MAP_PERIOD_S, Agent, RobotSettings
 from zsched.lab.explore.virtual import VirtualResult, VirtualRun, run_virtual
 from zsched.lab.explore.world import World
 from zsched.lab.explore.worlds import load_world
@@ -54,6 +55,19 @@ def test_a_late_merged_map_costs_more_than_its_lateness(world: World, fresh: lis
         assert sooner.time_s is not None
         assert later.time_s > sooner.time_s + LATE_S
         assert later.way_m > sooner.way_m
+
+
+@pytest.mark.parametrize("has_slam", [True, False])
+def test_robots_are_not_in_step_wherever_they_are_mapped(world: World, *, has_slam: bool) -> None:
+    """Maps that come together are merged together: how many merged maps there are hangs on the robots' phases."""
+    first = []
+    for index, start in enumerate(world.starts(3)):
+        settings = RobotSettings(robot=f"robot{index + 1}", start=start, has_slam=has_slam)
+        agent = Agent(settings, world, phase=index / 3)
+        outputs = ((step / 100, agent.step(step / 100, step)) for step in range(100))
+        first.append(next(now for now, out in outputs if (out.grid if has_slam else out.scan) is not None))
+
+    assert first == pytest.approx([0.0, MAP_PERIOD_S / 3, 2 * MAP_PERIOD_S / 3], abs=0.01)
 
 
 def test_without_any_merged_map_no_robot_moves(world: World) -> None:

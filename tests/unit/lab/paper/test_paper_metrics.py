@@ -79,6 +79,7 @@ def write_run(folder: Path, **changed: Any) -> Path:
         "scheme": "zsched", "family": "zsched", "block": "matrix", "level": "one", "run": 0, "seed": 1,
         "mode": "known", "input": "x",
         "links": "simulated", "host": {"pressure": 0.1, "idle_ratio": 0.3}, "duration_s": 10.0, "zero_wall_ns": ZERO_NS,
+        "zero_s": 50.0,
         "robots": ["robot1", "robot2"], "shares": {"edge1": {}, "edge2": {}},
         "loads": [{"node": "edge1", "start_s": 4.0, "end_s": 10.0}],
         "allocations": [{"t_s": t_s, "node": node} for t_s, node in moves],
@@ -230,6 +231,20 @@ def test_a_move_after_which_no_map_came_has_a_gap_to_the_end(tmp_path: Path, sce
     figures = measure(write_run(tmp_path, allocations=moves), scenario, Truth(a_room()))
 
     assert figures["move_gap_max_s"] == pytest.approx(1.0)  # the last maps came at 9.0 and 9.1 s, the run ended at 10
+
+
+def test_an_exploring_robots_own_word_ends_the_task(tmp_path: Path, scenario: Scenario) -> None:
+    """A run ends by that word; by the figures here it may lack a cell or two."""
+    folder = write_run(tmp_path, zero_s=100.0)
+    with Recorder(folder / "records") as recorder:
+        recorder.write("robot1", {"kind": "start", "t_s": 100.0})
+        recorder.write("robot1", {"kind": "covered", "t_s": 106.5, "coverage": 0.8001, "target": 0.8})
+        recorder.write("robot2", {"kind": "covered", "t_s": 106.75, "coverage": 0.8001, "target": 0.8})
+
+    figures = measure(folder, replace(scenario, target_coverage=0.99), Truth(a_room()))
+
+    assert figures["is_done"]
+    assert figures["task_latency_s"] == pytest.approx(6.75)
 
 
 def test_small_figures() -> None:

@@ -27,6 +27,7 @@ def a_place(records: Path, robot: str = "robot2", index: int = 1) -> Place:
         records=records,
         duration_s=30.0,
         target_coverage=0.8,
+        begin_s=1234.5678,
     )
 
 
@@ -37,6 +38,7 @@ def test_a_log_robots_command_is_one_that_its_program_takes(tmp_path: Path) -> N
 
     assert (options.robot, options.index, options.robots, options.seed) == ("robot2", 1, 3, 7)
     assert (options.endpoint, options.replay_s, options.records) == ("tcp/127.0.0.1:7458", 30.0, tmp_path)
+    assert options.begin_s == 1234.568
     assert robots.name == "log malaga-keyframes.csv.gz"
     assert len(robots.frames(3, 7)) == 3
     assert robots.frames(3, 7) == robots.frames(3, 7) != robots.frames(3, 8)
@@ -51,6 +53,7 @@ def test_an_exploring_robots_command_is_one_that_its_program_takes(tmp_path: Pat
     assert options.settings.robot == "robot2"
     assert options.settings.start == robots.frames(3, 7)[1]
     assert (options.settings.limits.speed, options.target, options.endpoint) == (0.4, 0.8, "tcp/127.0.0.1:7458")
+    assert (options.begin_s, options.phase) == (1234.568, 1 / 3)
     assert robots.name == "explore turtlebot3"
     assert robots.ends_when_covered
     assert robots.truth().known.any()
