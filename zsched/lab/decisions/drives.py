@@ -52,7 +52,6 @@ def load(folder: Path) -> tuple[Drive, ...]:
 
 def cast(world: World) -> tuple[Entry, ...]:
     """Who drives: zsched, what it could be, and the yardsticks."""
-    ahead = entries.foreseeing(world)
     return (
         *entries.ours(world),
         *(
@@ -67,7 +66,6 @@ def cast(world: World) -> tuple[Entry, ...]:
             )
             for bonus in (0.05, 0.1)
         ),
-        Entry(name="cool-down 5 s", limits=ahead, make=entries.core(world, cool_down_s=5.0)),
         Entry(name="with a knee", limits=entries.foreseeing(world, knee_dbm=-65.0), make=entries.core(world)),
         *entries.foresights(world),
         *(
