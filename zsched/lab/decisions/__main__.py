@@ -40,8 +40,12 @@ def play(given: argparse.Namespace) -> None:
     if results.exists() and not given.resume:
         sys.exit(f"{results} is there already: give --resume to go on from it, or another --out")
     candidates = tuple(int(count) for count in given.candidates.split(","))
-    made = {"compare": study.compared(candidates), "sweep": study.swept(), "options": study.options()}
-    made["cool-down"] = study.cooled()
+    made = {
+        "compare": study.compared(candidates),
+        "sweep": study.swept(),
+        "options": study.options(),
+        "cool-down": study.cooled(),
+    }
     seeds = study.TRAIN if given.seeds == "train" else study.TEST
     only = frozenset(filter(None, given.only.split(";")))
     began_at = time.monotonic()

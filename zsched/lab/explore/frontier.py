@@ -115,12 +115,9 @@ def utility(robot: str, frontier: Frontier, claims: Collection[Claim], present: 
     worth = GAIN_PER_M2 * frontier.gain_m2 - frontier.way_m
     if present is not None and math.dist(frontier.point, present) < KEEP_RADIUS_M:
         worth += KEEP_BONUS_M
-    for claim in claims:
-        is_same = math.dist(frontier.point, (claim.x, claim.y)) < CLAIM_RADIUS_M
-        # Rounded: both robots must come to the same word on who is nearer.
-        if is_same and (round(claim.way_m, 1), claim.robot) < (round(frontier.way_m, 1), robot):
-            worth -= CLAIM_COST_M
-            break
+    mine = Claim(robot=robot, x=frontier.point[0], y=frontier.point[1], way_m=frontier.way_m)
+    if any(claim.contests(mine) and claim.goes_before(mine) for claim in claims):
+        worth -= CLAIM_COST_M
     return worth
 
 
