@@ -78,7 +78,7 @@ def parser() -> argparse.ArgumentParser:
     """The arguments."""
     arguments = argparse.ArgumentParser(prog="python -m zsched.lab.explore", description=__doc__.split("\n")[0])
     add = arguments.add_argument
-    add("--world", default="office:1", help="turtlebot3, office:SEED or a map_server .yaml (office:1)")
+    add("--world", default="office:1", help="turtlebot3, office:SEED[:LENGTH] or a map_server .yaml (office:1)")
     add("--delays", default="0,5", help="seconds from a merge to the robots, comma-separated (0,5)")
     add("--seeds", type=int, default=5, help="runs per delay, with the seeds 1.. (5)")
     add("--robots", type=int, default=3)

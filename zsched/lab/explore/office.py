@@ -49,6 +49,7 @@ class _Plan:
 def office(seed: int, size: OfficeSize | None = None) -> World:
     """The office of a seed; robots start in the middle of the lower corridor."""
     size = size or OfficeSize()
+    name = f"office:{seed}" + ("" if size == OfficeSize() else f":{size.length_m:g}")
     random = np.random.default_rng((seed, 0x0FF1CE))
     band = 2 * (ROOM_DEPTH_M + WALL_M) + CORRIDOR_M + WALL_M
     plan = _Plan(size.length_m + 2 * WALL_M, size.corridors * band + WALL_M)
@@ -60,7 +61,7 @@ def office(seed: int, size: OfficeSize | None = None) -> World:
         _rooms(plan, random, size.length_m, middle + CORRIDOR_M + WALL_M, middle + CORRIDOR_M)
     _cross_corridors(plan, size, band)
     home = (WALL_M + size.length_m / 2, WALL_M + ROOM_DEPTH_M + WALL_M + CORRIDOR_M / 2)
-    return make_world(f"office:{seed}", plan.solid, RESOLUTION_M, (0.0, 0.0), home)
+    return make_world(name, plan.solid, RESOLUTION_M, (0.0, 0.0), home)
 
 
 def _rooms(plan: _Plan, random: np.random.Generator, length_m: float, low: float, door_wall: float) -> None:

@@ -235,7 +235,7 @@ def parse(arguments: list[str]) -> Options:
     parser = argparse.ArgumentParser(prog="python -m zsched.lab.explore.robot", description="An exploring lab robot.")
     add = parser.add_argument
     add("--robot", "--name", required=True, help="the robot's name: the first chunk of its keys")
-    add("--world", default="office:1", help="turtlebot3, office:SEED or a map_server .yaml (office:1)")
+    add("--world", default="office:1", help="turtlebot3, office:SEED[:LENGTH] or a map_server .yaml (office:1)")
     add("--index", type=int, default=0, help="which of the world's start places, from 0")
     add("--robots", type=int, default=3, help="how many robots explore (3)")
     add("--start", type=pose, help="x,y,yaw in the world instead of a start place (m, rad)")

@@ -85,7 +85,8 @@ def merge_text(merge: MergeTask) -> str:
     >>> merge_text(MergeTask())
     'mode known, at most 4 maps/s of 5 cm cells'
     """
-    return f"mode {merge.mode}, at most {merge.rate_hz:g} maps/s of {merge.resolution_m * 100:g} cm cells"
+    rule = "" if merge.min_agreeing == MergeTask().min_agreeing else f", joined at {merge.min_agreeing} wall cells"
+    return f"mode {merge.mode}, at most {merge.rate_hz:g} maps/s of {merge.resolution_m * 100:g} cm cells{rule}"
 
 
 def clock(seconds: float) -> str:

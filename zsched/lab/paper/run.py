@@ -41,6 +41,7 @@ from zsched.lab.paper.scenario import LinkView, Scenario
 from zsched.lab.paper.schemes import scheme_tree
 from zsched.lab.paper.spaces import NodeChildren, narrow_links, spaced
 from zsched.lab.recorder import Follower, Recorder
+from zsched.tasks.map_merge.merger import Mode
 
 TICK_S = 0.1
 SAMPLE_S = 0.5
@@ -170,9 +171,13 @@ class CellRun:
         robots = sorted(name for name, node in tree["nodes"].items() if node["kind"] == "robot")
         frames = dict(zip(robots, self._inputs.robots.frames(len(robots), self._seed), strict=True))
         merge = merge_of(self._scenario, self._cell)
-        options = worker_options(merge.mode, frames) | {
+        # Where nothing but the first robot's start is told, merged maps still lie in the truth's frame.
+        told = dict(list(frames.items())[:1]) if merge.mode == Mode.ESTIMATE else frames
+        options = worker_options(Mode.KNOWN, told) | {
+            "--mode": (merge.mode,),
             "--rate": (f"{merge.rate_hz:g}",),
             "--resolution": (f"{merge.resolution_m:g}",),
+            "--min-agreeing": (f"{merge.min_agreeing}",),
         }
         return write_fleet(template, self._folder / "fleet.yaml", options)
 

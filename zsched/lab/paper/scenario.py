@@ -18,6 +18,7 @@ from ruamel.yaml import YAML
 from zsched.core.model import NodeId, check_range
 from zsched.errors import ConfigError
 from zsched.tasks.map_merge.merger import Mode
+from zsched.tasks.map_merge.pairs import Rule
 
 MATRIX = "matrix"
 """The block of the scenario itself: all schemes at its level, and the sweep over the others."""
@@ -134,16 +135,22 @@ class LinkLimits:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MergeTask:
-    """The task itself: the merger's ``mode``, at most ``rate_hz`` maps a second, ``resolution_m`` of maps and merge."""
+    """The task itself: the merger's ``mode``, at most ``rate_hz`` maps a second, ``resolution_m`` of maps and merge.
+
+    ``min_agreeing``: the wall cells (of 0.05 m) that must agree before two maps are joined; small worlds have few.
+    With ``mode: estimate`` the merger is told where the first robot started, and nothing of the others.
+    """
 
     mode: str = "known"
     rate_hz: float = 4.0
     resolution_m: float = 0.05
+    min_agreeing: int = Rule().min_agreeing
 
     def __post_init__(self) -> None:
         Mode(self.mode)
         check_range("merge.rate_hz", self.rate_hz, 0.1, 100.0)
         check_range("merge.resolution_m", self.resolution_m, 0.01, 1.0)
+        check_range("merge.min_agreeing", self.min_agreeing, 1, 100_000)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

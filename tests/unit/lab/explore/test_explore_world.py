@@ -73,6 +73,15 @@ def test_the_same_seed_builds_the_same_office_and_another_seed_another() -> None
     assert office(7, OfficeSize(length_m=20.0)).solid.shape[1] > one.solid.shape[1]
 
 
+def test_an_office_of_another_length_has_a_name_of_its_own_and_the_usual_one_keeps_its() -> None:
+    long = load_world("office:7:20")
+    assert np.array_equal(long.solid, office(7, OfficeSize(length_m=20.0)).solid)
+    assert (long.name, load_world("office:7:10").name) == ("office:7:20", "office:7")
+    for length in (5, 101):
+        with pytest.raises(ConfigError, match="6 to 100 m"):
+            load_world(f"office:7:{length}")
+
+
 def test_a_map_server_file_is_read_upright_and_unknown_is_solid(tmp_path: Path) -> None:
     image = np.full((20, 30), 254, dtype=np.uint8)
     image[0, :] = 0  # the upper side

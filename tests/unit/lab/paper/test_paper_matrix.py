@@ -64,11 +64,14 @@ def test_each_run_has_a_world_of_its_own_the_same_for_every_scheme_and_level(sce
     cells = cells_of(scenario, ())
     by_run: dict[int, set[str]] = {}
     for cell in cells:
-        if cell.block != "turtlebot3":
+        if cell.block != "turtlebot3" and not cell.block.startswith("heavy"):
             by_run.setdefault(cell.run, set()).add(world_of(scenario, cell))
 
     assert by_run == {run: {f"office:{scenario.seed + run}"} for run in range(scenario.runs)}
     assert {world_of(scenario, cell) for cell in cells if cell.block == "turtlebot3"} == {"turtlebot3"}
+    assert all(
+        world_of(scenario, c) == f"office:{scenario.seed + c.run}:14" for c in cells if c.block.startswith("heavy")
+    )
     rates = {cell.block: bandwidth_of(scenario, cell) for cell in cells}
     assert {block: rate for block, rate in rates.items() if rate is not None} == {"narrow": 9.8}
 
@@ -78,7 +81,12 @@ def test_a_block_may_have_another_task_and_level(scenario: Scenario) -> None:
     assert (cells["fine"].level, cells["fine_four"].level, cells["narrow"].level) == ("one", "four", "one")
     assert merge_of(scenario, cells["fine_four"]) == MergeTask(mode="known", rate_hz=20, resolution_m=0.02)
     assert merge_of(scenario, cells["narrow"]) == merge_of(scenario, cells[MATRIX]) == scenario.merge
+    heavy = MergeTask(mode="track", rate_hz=20, resolution_m=0.02, min_agreeing=150)
+    levels = {name: cells[name].level for name in scenario.blocks if name.startswith("heavy")}
+    assert levels == {"heavy": "four", "heavy_three": "three", "heavy_two": "two", "heavy_one": "one"}
+    assert {merge_of(scenario, cells[name]) for name in levels} == {heavy}
     assert "at most 20 maps/s of 2 cm cells" in plan_text(scenario, [cells["fine"]], [], 0.0, {}, None)
+    assert "2 cm cells, joined at 150 wall cells" in plan_text(scenario, [cells["heavy"]], [], 0.0, {}, None)
 
 
 def test_a_block_that_cannot_be_run_here_is_left_out_with_its_reason(scenario: Scenario) -> None:
@@ -94,7 +102,10 @@ def test_a_block_that_cannot_be_run_here_is_left_out_with_its_reason(scenario: S
     assert list(skipped) == ["narrow"]
     assert "not root" in skipped["narrow"]
     assert {cell.block for cell in cells_of(kept, ())} == {MATRIX, *scenario.blocks} - {"narrow"}
-    assert without(scenario, is_exploring=False, why_not=lambda: None).keys() == {"turtlebot3"}
+    assert without(scenario, is_exploring=False, why_not=lambda: None).keys() == {
+        "turtlebot3",
+        *(name for name in scenario.blocks if name.startswith("heavy")),
+    }
     blocks = {name: replace(block, links=LinkLimits()) for name, block in scenario.blocks.items()}
     assert without(replace(scenario, blocks=blocks), is_exploring=True, why_not=why_not) == {}
     assert len(asked) == 1  # namespaces are tried only for who wants them

@@ -3,15 +3,17 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
 from zsched.config import load_fleet
 from zsched.lab.explore.robot import parse as parse_explorer
 from zsched.lab.laser_log import malaga_path
 from zsched.lab.paper.cells import Cell
 from zsched.lab.paper.node_state import is_calm, ready_workers
-from zsched.lab.paper.places import robots_scenario_path
+from zsched.lab.paper.places import robots_scenario_path, scenario_path
 from zsched.lab.paper.robots import ExploreRobots, LogRobots, Place
 from zsched.lab.paper.run import CellRun, Inputs, Seen
-from zsched.lab.paper.scenario import LinkView, load_scenario
+from zsched.lab.paper.scenario import LinkView, MergeTask, load_scenario
 from zsched.lab.paper.schemes import SCHEMES
 from zsched.lab.recorder import Recorder
 from zsched.lab.robot_app import parse
@@ -102,6 +104,24 @@ def test_each_robot_hears_the_others_where_the_scenario_says_so(tmp_path: Path) 
     assert heard == {None: "drive-robot1.csv", "robot2": "drive-robot2.csv", "robot3": "drive-robot3.csv"}
     assert [link.peer for link in point.node("robot1").links] == [None]
     assert {link.offset_s for link in direct.node("robot1").links if link.peer == "robot3"} == {120.0}
+
+
+@pytest.mark.parametrize(("mode", "told"), [("known", 3), ("track", 3), ("estimate", 1)])
+def test_the_merger_is_told_the_task_and_only_the_poses_that_its_mode_needs(
+    tmp_path: Path, mode: str, told: int
+) -> None:
+    scenario = load_scenario(scenario_path())
+    merge = MergeTask(mode=mode, rate_hz=8.0, resolution_m=0.02, min_agreeing=150)
+    cell = Cell(scheme=SCHEMES["zsched"], level=scenario.level, run=0)
+    run = CellRun(replace(scenario, merge=merge), cell, Inputs(robots=LogRobots(log=malaga_path())), tmp_path)
+    run.write_fleet()
+
+    command = list(load_fleet(tmp_path / "fleet.yaml").tasks[0].worker.command)
+    given = {option: command[command.index(option) + 1] for option in ("--mode", "--rate", "--resolution")}
+    assert given == {"--mode": mode, "--rate": "8", "--resolution": "0.02"}
+    assert command[command.index("--min-agreeing") + 1] == "150"
+    poses = [command[index + 1] for index, word in enumerate(command) if word == "--pose"]
+    assert [pose.split("=")[0] for pose in poses] == ["robot1", "robot2", "robot3"][:told]
 
 
 def test_nobody_starts_with_a_handicap() -> None:

@@ -71,6 +71,7 @@ def test_what_the_scenario_says_of_its_choices_holds(scenario: Scenario) -> None
         ("{x: {level: nine}}", "x: level 'nine' is none of one"),
         ("{x: {merge: {mode: guess}}}", "guess"),
         ("{x: {merge: {resolution_m: 0}}}", "resolution_m"),
+        ("{x: {merge: {min_agreeing: 0}}}", "min_agreeing"),
         ("{x: {merge: {speed: 1}}}", "speed"),
     ],
 )
