@@ -48,6 +48,7 @@ def paper(
     quick: Annotated[bool, typer.Option("--quick", help="Fixed, dyna_both and zsched once: under 6 minutes.")] = False,
     schemes: Annotated[str, typer.Option(metavar="A,B", help="Only these schemes. [the scenario's]")] = "",
     resume: Annotated[bool, typer.Option("--resume", help="Go on in the folder of --out.")] = False,
+    report: Annotated[bool, typer.Option("--report", help="Run nothing; report what is done in --out.")] = False,
     plan: Annotated[bool, typer.Option("--plan", help="Only say what would be run, and for how long.")] = False,
     kind: Annotated[
         RobotsSee | None, typer.Option("--input", help="What the robots see. [explore; log with --quick or --log]")
@@ -91,5 +92,6 @@ def paper(
         duration_s=duration,
         is_exploring=not is_replay,
         is_plan=plan,
+        is_report=report,
     )
     raise typer.Exit(run_bench(options))

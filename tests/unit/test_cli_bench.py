@@ -27,6 +27,7 @@ levels: {one: {}}
         (["--scenario", "absent.yml"], 78, "absent.yml"),
         (["--runs", "0"], 2, "--runs"),
         (["--log", "absent.log"], 78, "absent.log"),
+        (["--report"], 2, "--out"),
     ],
 )
 def test_wrong_arguments_are_told_before_anything_starts(

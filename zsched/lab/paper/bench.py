@@ -18,12 +18,12 @@ from zsched.lab.demo import EXIT_CONFIG, EXIT_FAILED, EXIT_SIGNAL, EXIT_USAGE
 from zsched.lab.laser_log import malaga_path
 from zsched.lab.netns import why_not
 from zsched.lab.paper.cells import Cell, cells_of, merge_of, world_of
-from zsched.lab.paper.figures import save_all
+from zsched.lab.paper.figures import save_all, save_gains, save_panels
 from zsched.lab.paper.matrix import Matrix, collect, undone
 from zsched.lab.paper.metrics import Truth, brief, measure
 from zsched.lab.paper.plan import AROUND_S, leave_out, plan_text, without
-from zsched.lab.paper.radio_bench import RADIO_SCHEMES, run_radio
-from zsched.lab.paper.report import in_block, report, snippet
+from zsched.lab.paper.radio_bench import RADIO_SCHEMES, radio_results, run_radio
+from zsched.lab.paper.report import groups_of, in_block, is_whole, report, snippet
 from zsched.lab.paper.robots import ExploreRobots, LogRobots, Robots
 from zsched.lab.paper.run import CellRun, Inputs, write_json
 from zsched.lab.paper.scenario import MATRIX, Scenario, load_scenario
@@ -52,6 +52,8 @@ class BenchOptions:
     is_exploring: bool = False
     is_plan: bool = False
     """Only say what would be run."""
+    is_report: bool = False
+    """Run nothing; report what is done in the folder."""
 
 
 def run_bench(options: BenchOptions) -> int:
@@ -96,6 +98,9 @@ def _run(options: BenchOptions) -> int:
     def make(cell: Cell, folder: Path) -> dict[str, Any]:
         return CellRun(scenario, cell, inputs.of(cell), folder).run()
 
+    if options.is_report:
+        found = None if radio is None else radio_results(radio, options.out)
+        return conclude(options, scenario, inputs, cells, Rest(radio=found, skipped=skipped))
     Matrix(scenario, make, figures_of, options.out, say).run(cells)
     # A drive of minutes: the robots replay a log there, an exploration would be over before.
     replay = Inputs(robots=LogRobots(log=log_path(options)), drives=options.drives)
@@ -205,11 +210,13 @@ def plan_body(scenario: Scenario, inputs: InputsOf, cells: Sequence[Cell]) -> di
 def claim_folder(options: BenchOptions, body: Mapping[str, Any]) -> str | None:
     """Make the folder this bench's own; returns why it is not to be used."""
     out, plan = options.out, options.out / "plan.json"
+    if options.is_report and not plan.exists():
+        return f"--report: there is no run of `zsched bench paper` in {out}; name its folder with --out"
     if not out.exists() or not any(out.iterdir()):
         out.mkdir(parents=True, exist_ok=True)
         write_json(plan, body)
         return None
-    if not options.is_resumed:
+    if not options.is_resumed and not options.is_report:
         return f"--out {out}: the folder is not empty; name a new one, or go on with --resume"
     try:
         before = json.loads(plan.read_text(encoding="utf-8"))
@@ -239,13 +246,26 @@ def conclude(options: BenchOptions, scenario: Scenario, inputs: InputsOf, cells:
     write_json(options.out / "results.json", results)
     title = f"{scenario.name}, load {scenario.level}, seed {scenario.seed}, {inputs.name}"
     drawn = save_all(in_block(runs, MATRIX), scenario.level, tuple(scenario.levels), options.out, title)
+    drawn += block_pictures(results, options.out)
     (options.out / "report.md").write_text(report(results, drawn), encoding="utf-8")
     (options.out / "readme.md").write_text(snippet(results, drawn), encoding="utf-8")
     missing = len(cells) - len(runs)
     if missing:
         say(f"{missing} of {len(cells)} runs have no valid result; see {options.out / 'runs'}, then --resume")
     print(f"{options.out / 'report.md'}: {len(runs)} runs")
-    return EXIT_FAILED if missing else 0
+    return EXIT_FAILED if missing and not options.is_report else 0
+
+
+def block_pictures(results: Mapping[str, Any], out: Path) -> list[str]:
+    """What placing gains in the matrix and the blocks, and the paper's panels for each block that is a whole matrix."""
+    title = f"{results['scenario']['name']}, seed {results['scenario']['seed']}"
+    gains = save_gains(out / "gains.png", groups_of(results), f"{title}: against the mean of the fixed schemes, 95 %")
+    panels = [
+        save_panels(out / f"{name}.png", own, f"{title}, block {name}")
+        for name in results["scenario"]["blocks"]
+        if is_whole(own := in_block(results["runs"], name))
+    ]
+    return [*([gains] if gains else []), *panels]
 
 
 def command_of(options: BenchOptions) -> str:

@@ -1,4 +1,4 @@
-"""Draws one PNG per panel of the paper's figure, the sweep over load, and the radio with the task's moves.
+"""Draws the panels of the paper's figure, the sweep over load, what placing gains, and the radio with the task's moves.
 
 Knows: figures per run, colours. Does not know: how they were measured.
 """
@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from zsched.lab.paper.claims import shared
+from zsched.lab.paper.claims import over_fixed, shared
 from zsched.lab.paper.schemes import SCHEMES, Family
 from zsched.lab.plots import COLOURS, DPI
 
@@ -36,6 +36,12 @@ WITH_YARDSTICKS = (
     ("moves", "moves", "moves in a run"),
     ("regret", "regret", "regret against the oracle"),
 )
+GAIN_LABELS = {
+    "throughput_mb_s": "throughput, % of fixed",
+    "map_hz": "merged maps per second, %",
+    "task_latency_s": "task latency, % (less is better)",
+    "merge_latency_p95_s": "merge latency p95, % (less is better)",
+}
 
 
 def save_all(runs: Sequence[Json], level: str, levels: Sequence[str], folder: Path, title: str) -> list[str]:
@@ -61,6 +67,53 @@ def save_all(runs: Sequence[Json], level: str, levels: Sequence[str], folder: Pa
     if len(at) > 1:
         names.append(save(folder / "sweep.png", partial(sweep, runs=swept, levels=at), title))
     return names
+
+
+def save_panels(path: Path, runs: Sequence[Json], title: str) -> str:
+    """The six panels of the paper's figure in one picture, over the runs that every scheme has: for a block."""
+    shown = shared(runs, "scheme")
+    schemes = [one for one in SCHEMES if any(figures["scheme"] == one for figures in shown)]
+    figure = Figure(figsize=(13.0, 7.0), layout="constrained", dpi=DPI)
+    above, below = figure.subplots(2, 3)
+    for axes, (_, metric, label) in zip(above, PER_NODE, strict=True):
+        per_node(axes, shown, schemes, metric, label)
+    for axes, (_, metric, label) in zip(below, PER_SCHEME, strict=True):
+        per_scheme(axes, shown, schemes, metric, label)
+    figure.suptitle(title, fontsize=8, color="#666666", x=0.01, ha="left")
+    FigureCanvasAgg(figure).print_figure(path)
+    return path.name
+
+
+def save_gains(path: Path, groups: Mapping[str, Sequence[Json]], title: str) -> str | None:
+    """What zsched gains over fixed placement, and what the oracle does, with intervals: a row per group of runs.
+
+    ``None``, and no picture, where no group has enough runs.
+    """
+    found = {
+        (name, scheme): dict(over_fixed(runs, scheme))
+        for name, runs in groups.items()
+        for scheme in ("oracle", "zsched")
+    }
+    rows = [key for key, known in found.items() if known]
+    if not rows:
+        return None
+    rows.reverse()  # the first at the top
+    figure = Figure(figsize=(11.0, 1.2 + 0.3 * len(rows)), layout="constrained", dpi=DPI)
+    panels = figure.subplots(1, len(GAIN_LABELS), sharey=True)
+    for axes, (metric, label) in zip(panels, GAIN_LABELS.items(), strict=True):
+        for place, key in enumerate(rows):
+            if (one := found[key].get(metric)) is None:
+                continue
+            colour = FAMILY_COLOURS[SCHEMES[key[1]].family]
+            axes.plot([100 * one.low, 100 * one.high], [place, place], color=colour, linewidth=2)
+            axes.plot(100 * one.value, place, "o", color=colour, markersize=5)
+        axes.axvline(0.0, color="#999999", linewidth=0.8)
+        axes.set_xlabel(label, fontsize=8)
+        axes.tick_params(labelsize=8)
+    panels[0].set_yticks(range(len(rows)), [f"{name}: {scheme}" for name, scheme in rows], fontsize=8)
+    figure.suptitle(title, fontsize=8, color="#666666", x=0.01, ha="left")
+    FigureCanvasAgg(figure).print_figure(path)
+    return path.name
 
 
 def save(path: Path, draw: Any, title: str) -> str:

@@ -40,7 +40,7 @@ def radio_cells(scenario: Scenario) -> tuple[Cell, ...]:
 
 
 def run_radio(scenario: Scenario, inputs: Inputs, out: Path, say: Say) -> dict[str, Any] | None:
-    """Run the robots; returns the figures, the picture is beside them. ``None``: no run is valid."""
+    """Run the robots; returns `radio_results`."""
     cells, folder = radio_cells(scenario), out / "radio"
 
     def figures_of(cell: Cell, run: Path) -> tuple[dict[str, Any], str]:
@@ -52,7 +52,12 @@ def run_radio(scenario: Scenario, inputs: Inputs, out: Path, say: Say) -> dict[s
         return CellRun(scenario, cell, inputs, place).run()
 
     Matrix(scenario, make, figures_of, folder, say).run(cells)
-    runs, _ = collect(folder, cells)
+    return radio_results(scenario, out)
+
+
+def radio_results(scenario: Scenario, out: Path) -> dict[str, Any] | None:
+    """The figures of the runs in the folder, with their picture drawn beside them. ``None``: no run is valid."""
+    runs, _ = collect(out / "radio", radio_cells(scenario))
     if not runs:
         return None
     rows = {figures["scheme"]: [(float(t_s), str(node)) for t_s, node in figures["owners"]] for figures in runs}

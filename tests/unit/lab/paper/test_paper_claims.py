@@ -19,8 +19,17 @@ from zsched.lab.paper.claims import (
     table_of,
     verdict,
 )
-from zsched.lab.paper.figures import save_all, save_radio
-from zsched.lab.paper.report import over_fixed_text, report, snippet
+from zsched.lab.paper.figures import save_all, save_gains, save_panels, save_radio
+from zsched.lab.paper.report import (
+    blocks_parts,
+    gains_parts,
+    groups_of,
+    in_block,
+    is_whole,
+    over_fixed_text,
+    report,
+    snippet,
+)
 from zsched.lab.paper.schemes import FIXED_SCHEMES, PAPER_SCHEMES, SCHEMES
 
 HIGHER = Claim(source="paper", says="x", metric="map_hz", mine=("a",), theirs=("b",), target=0.2)
@@ -157,6 +166,44 @@ def test_each_table_says_how_far_a_scheme_is_from_the_fixed_ones() -> None:
     assert over_fixed_text(runs[:3]) == ""
 
 
+def a_block(name: str, schemes: tuple[str, ...], runs: int = 3) -> list[dict[str, Any]]:
+    """Runs of a block in which zsched makes half as many maps again as the fixed schemes."""
+    return [
+        a_run(scheme, run, "four", block=name, map_hz=(6.0 if scheme == "zsched" else 4.0) + run / 10)
+        for scheme in schemes
+        for run in range(runs)
+    ]
+
+
+def test_the_report_says_where_placing_pays_and_judges_a_block_that_is_a_whole_matrix(tmp_path: Any) -> None:
+    every = (*FIXED_SCHEMES, *PAPER_SCHEMES, "zsched")
+    runs = a_block("heavy", every) + a_block("part", (*FIXED_SCHEMES, "zsched")) + a_block("thin", every, runs=2)
+    results = {"scenario": {"level": "one", "blocks": {"heavy": {}, "part": {}, "thin": {}, "gone": {}}}, "runs": runs}
+
+    text = "\n".join(gains_parts(results))
+    assert "| heavy | zsched | 3 |" in text
+    assert "+49 % [" in text
+    assert "| part | zsched | 3 |" in text
+    assert "matrix" not in text, "it was not run"
+    assert "oracle |" not in text
+    assert "thin" not in text, "two runs say nothing"
+    assert gains_parts({**results, "runs": []}) == []
+
+    assert is_whole(in_block(runs, "heavy"))
+    assert not is_whole(in_block(runs, "part"))
+    assert not is_whole(in_block(runs, "thin"))
+    blocks = {name: {} for name in ("heavy", "part")}
+    shown = "\n".join(blocks_parts({"scenario": {"blocks": blocks, "merge": {}}, "runs": runs}))
+    assert shown.count("zsched: map frequency at least +20 % over fixed") == 1
+    assert "| **exceeded** |" in shown
+
+    groups = groups_of(results)
+    assert save_gains(tmp_path / "gains.png", groups, "title") == "gains.png"
+    assert save_panels(tmp_path / "heavy.png", groups["heavy"], "title") == "heavy.png"
+    assert save_gains(tmp_path / "none.png", {"thin": groups["thin"]}, "title") is None
+    assert {path.name for path in tmp_path.iterdir()} == {"gains.png", "heavy.png"}
+
+
 def test_the_report_holds_every_claim_scheme_level_and_picture(tmp_path: Any) -> None:
     runs = [a_run(name, run) for name in ("fixed_e1", "zsched") for run in range(3)]
     runs += [a_run("random", 0)]
@@ -198,7 +245,7 @@ def test_the_report_holds_every_claim_scheme_level_and_picture(tmp_path: Any) ->
     assert "Only the runs that every scheme has (1)" in text
     assert "every node sends at most 9.8 Mbit/s" in text
     assert "Left out: no exploring robots." in text
-    assert "No valid run: one-random-3." in text
+    assert "No valid run of 1 cells: one-random-3." in text
     assert "in any run: zsched 0.60, fixed 0.60." in text
     assert "<sub>plain SSIM</sub>" in text
     shown = snippet(results, pictures)

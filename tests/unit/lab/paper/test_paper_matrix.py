@@ -285,6 +285,37 @@ def test_a_folder_goes_on_only_with_the_same_bench(tmp_path: Path) -> None:
     assert "none of" in (claim_folder(resumed, body) or "")
 
 
+def test_a_report_of_what_is_done_so_far_runs_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    given = options(out, is_exploring=True, schemes=("zsched",))
+    scenario, cells, _ = planned(given)
+    assert run_bench(replace(given, is_report=True)) == 2
+    assert "no run of" in capsys.readouterr().err
+    assert not out.exists()
+
+    claim_folder(given, plan_body(scenario, InputsOf(given, scenario), cells))
+    (out / "runs" / cells[0].name).mkdir(parents=True)
+    host = {"pressure": 0.05, "idle_ratio": None}
+    done = {
+        "scheme": "zsched",
+        "run": 0,
+        "level": "one",
+        "host": host,
+        "links": "simulated",
+        "nodes": {},
+        "map_hz": 3.5,
+    }
+    (out / "runs" / cells[0].name / "metrics.json").write_text(json.dumps(done))
+    before = sorted(path.name for path in (out / "runs").iterdir())
+
+    assert run_bench(replace(given, is_report=True)) == 0
+
+    assert sorted(path.name for path in (out / "runs").iterdir()) == before
+    text = (out / "report.md").read_text()
+    assert f"No valid run of {len(cells) - 1} cells" in text
+    assert "1 runs that count" in text
+
+
 def test_the_command_in_the_report_names_no_place_of_this_machine(tmp_path: Path) -> None:
     given = options(
         tmp_path, runs=2, schemes=("a", "b"), log=tmp_path / "x.log", drives=tmp_path / "drives", duration_s=30.0
