@@ -264,7 +264,8 @@ def blocks_parts(results: Json) -> list[str]:
 def is_whole(runs: Sequence[Json]) -> bool:
     """Whether the runs of a block can be judged as the matrix is."""
     schemes = (*FIXED_SCHEMES, *PAPER_SCHEMES, "zsched")
-    return min(sum(figures["scheme"] == name for figures in runs) for name in schemes) >= LEAST_RUNS
+    counts = [sum(bool(figures["scheme"] == name) for figures in runs) for name in schemes]
+    return min(counts) >= LEAST_RUNS
 
 
 def judged_parts(runs: Sequence[Json]) -> list[str]:

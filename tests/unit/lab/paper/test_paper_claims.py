@@ -192,7 +192,7 @@ def test_the_report_says_where_placing_pays_and_judges_a_block_that_is_a_whole_m
     assert is_whole(in_block(runs, "heavy"))
     assert not is_whole(in_block(runs, "part"))
     assert not is_whole(in_block(runs, "thin"))
-    blocks = {name: {} for name in ("heavy", "part")}
+    blocks: dict[str, Any] = {"heavy": {}, "part": {}}
     shown = "\n".join(blocks_parts({"scenario": {"blocks": blocks, "merge": {}}, "runs": runs}))
     assert shown.count("zsched: map frequency at least +20 % over fixed") == 1
     assert "| **exceeded** |" in shown
