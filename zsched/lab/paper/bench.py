@@ -6,6 +6,8 @@ Knows: options, exit codes, files of the folder. Does not know: how a run is mad
 from __future__ import annotations
 
 import json
+import os
+import platform
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -234,6 +236,8 @@ def conclude(options: BenchOptions, scenario: Scenario, inputs: InputsOf, cells:
     results = {
         "schema": RESULTS_SCHEMA,
         "version": __version__,
+        "machine": f"{os.cpu_count()} cores, {platform.machine()}, Linux {platform.release()}, "
+        f"Python {platform.python_version()}",
         "command": command_of(options),
         "scenario": asdict(scenario) | {"fleet": scenario.fleet.name},
         "input": inputs.name,

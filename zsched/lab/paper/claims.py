@@ -296,9 +296,9 @@ def judged(runs: Sequence[Json]) -> list[tuple[Claim, Difference | None, Verdict
     return found
 
 
-def over_fixed(runs: Sequence[Json], scheme: str) -> list[tuple[str, Difference]]:
+def over_fixed(runs: Sequence[Json], scheme: str, fixed: Sequence[str] = FIXED_SCHEMES) -> list[tuple[str, Difference]]:
     """(metric, difference) of a scheme to the mean of the fixed ones, where all of them were run often enough."""
-    pairs = [(metric, table_of(runs, metric, (scheme,)), table_of(runs, metric, FIXED_SCHEMES)) for metric in GAINS]
+    pairs = [(metric, table_of(runs, metric, (scheme,)), table_of(runs, metric, fixed)) for metric in GAINS]
     found = [(metric, difference(mine, theirs)) for metric, mine, theirs in pairs]
     return [(metric, one) for metric, one in found if one is not None and one.runs >= LEAST_RUNS]
 
@@ -306,7 +306,7 @@ def over_fixed(runs: Sequence[Json], scheme: str) -> list[tuple[str, Difference]
 def better_than_ours(runs: Sequence[Json]) -> list[tuple[str, str, Difference]]:
     """(scheme, metric, difference) where one of the paper's beats ours beyond the interval, on the six metrics."""
     found = []
-    for scheme in (*FIXED_SCHEMES, *PAPER_SCHEMES):
+    for scheme in (*FIXED_SCHEMES, *PAPER_SCHEMES, "dyna_net"):
         for metric in SIX:
             one = difference(table_of(runs, metric, (scheme,)), table_of(runs, metric, ("zsched",)))
             if one is None or one.runs < LEAST_RUNS:

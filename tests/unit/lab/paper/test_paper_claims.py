@@ -26,7 +26,9 @@ from zsched.lab.paper.report import (
     groups_of,
     in_block,
     is_whole,
+    memory_text,
     over_fixed_text,
+    radio_text,
     report,
     snippet,
 )
@@ -152,6 +154,17 @@ def test_claims_are_judged_by_the_schemes_they_speak_of() -> None:
     assert all(set(claim.mine) | set(claim.theirs) <= set(SCHEMES) for claim in CLAIMS)
 
 
+def test_whether_memory_was_exhausted_is_judged_too() -> None:
+    def with_peak(scheme: str, peak: float) -> dict[str, Any]:
+        return a_run(scheme, 0, nodes={"edge1": {"memory_peak": peak}})
+
+    both = [with_peak("fixed_e1", 0.5), with_peak("dyna_cpu", 0.6)]
+    assert "variants 0.60, fixed 0.50. **reproduced** (but so it is under fixed placement)." in memory_text(both)
+    assert memory_text([with_peak("fixed_e1", 0.97), with_peak("dyna_cpu", 0.6)]).endswith("**reproduced**.\n")
+    assert memory_text([with_peak("dyna_mem", 0.96)]).endswith("**not reproduced**.\n")
+    assert memory_text([]) == ""
+
+
 def test_each_table_says_how_far_a_scheme_is_from_the_fixed_ones() -> None:
     runs = [a_run(name, run, map_hz=4.0 + run / 10) for name in FIXED_SCHEMES for run in range(3)]
     runs += [a_run("zsched", run, map_hz=5.0 + run / 8) for run in range(3)]
@@ -162,6 +175,8 @@ def test_each_table_says_how_far_a_scheme_is_from_the_fixed_ones() -> None:
     text = over_fixed_text(runs)
     assert "| scheme | runs | MB/s | maps/s | task s | p50 s | p95 s |" in text
     assert "+25 % [+25 %, +25 %]" in text
+    assert "| against | runs |" in text
+    assert "| fixed_e2 | 3 |" in text
     assert "random" not in text
     assert over_fixed_text(runs[:3]) == ""
 
@@ -228,7 +243,8 @@ def test_the_report_holds_every_claim_scheme_level_and_picture(tmp_path: Any) ->
     }  # fmt: skip
     results = {
         "scenario": scenario, "runs": runs, "invalid": invalid, "command": "zsched bench paper", "input": "log x",
-        "version": "1", "radio": radio, "missing": ["one-random-3"], "skipped": {"gone": "no exploring robots"},
+        "version": "1", "machine": "2 cores", "radio": radio,
+        "missing": ["one-random-3"], "skipped": {"gone": "no exploring robots"},
     }  # fmt: skip
     pictures = save_all(runs, "one", ("one", "two"), tmp_path, "title")
     pictures.append(
@@ -251,10 +267,14 @@ def test_the_report_holds_every_claim_scheme_level_and_picture(tmp_path: Any) ->
     shown = snippet(results, pictures)
     assert all(claim.says in shown for claim in CLAIMS)
     assert f"0 of 0 claims hold, {len(CLAIMS)} could not be judged" in shown
-    assert "docs/evaluation/frequency.png" in shown
+    assert "docs/evaluation/gains.png" in snippet(results, [*pictures, "gains.png"])
+    assert "docs/evaluation/gains.png" not in shown
     assert "| maps/s | zsched | 2.00 | 2.50 |" in text
     assert "one-zsched-1: pressure 0.50" in text
     assert "-55.0" in text
+    assert "strongest signal, says the paper: zsched: **reproduced**" in text
+    lost = {**radio, "schemes": {"dyna_net": row | {"under_best_db": 1.6}, "zsched": row | {"mean_dbm": -57.5}}}
+    assert radio_text(lost).count("**not reproduced**") == 2
     assert {"cpu.png", "memory.png", "throughput.png", "frequency.png", "latency.png", "ssim.png", "sweep.png"} <= set(
         pictures
     )
