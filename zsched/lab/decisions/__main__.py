@@ -12,7 +12,7 @@ from pathlib import Path
 
 from zsched.lab.decisions import drives, figures, report, study
 
-PARTS = ("compare", "sweep", "options", "cool-down")
+PARTS = ("compare", "sweep", "options", "cool-down", "smoothing")
 SHOWN = ("zsched", "zsched, timer", "the weaker way", "dyna_net", "argmax", "dyna_net_penalty")
 
 
@@ -45,6 +45,7 @@ def play(given: argparse.Namespace) -> None:
         "sweep": study.swept(),
         "options": study.options(),
         "cool-down": study.cooled(),
+        "smoothing": study.smoothed(),
     }
     seeds = study.TRAIN if given.seeds == "train" else study.TEST
     only = frozenset(filter(None, given.only.split(";")))

@@ -68,6 +68,7 @@ def cast(world: World) -> tuple[Entry, ...]:
         ),
         Entry(name="with a knee", limits=entries.foreseeing(world, knee_dbm=-65.0), make=entries.core(world)),
         *entries.foresights(world),
+        *entries.smoothings(world),
         *(
             Entry(name=name, limits=entries.foreseeing(world, pair=pair), make=entries.core(world))
             for name, pair in (("the weaker way", PairReading.WEAKER), ("the mean way", PairReading.MEAN))

@@ -151,6 +151,19 @@ def cool_downs(world: World) -> tuple[Entry, ...]:
     )
 
 
+def smoothings(world: World) -> tuple[Entry, ...]:
+    """The default with other smoothing and patience. Names read ``s3 p0.2``."""
+    return tuple(
+        Entry(
+            name=f"s{smoothing_s:g} p{patience:g}",
+            look=Look(smoothing_s=smoothing_s),
+            limits=foreseeing(world),
+            make=core(world, patience=patience),
+        )
+        for smoothing_s, patience in itertools.product((0.75, 1.0, 1.5, 2.0, 3.0), (0.1, 0.15, 0.2, 0.3))
+    )
+
+
 def fading(world: World) -> tuple[Entry, ...]:
     """Prediction of a fading link, with patience (3 s is the default) and with the timer; and a knee on the default."""
     return (

@@ -119,12 +119,22 @@ def _costly(cost_s: float) -> Case:
 
 def cooled() -> tuple[Case, ...]:
     """How long a task should stay after a move at least."""
+    return _whole("cool-down", entries.cool_downs)
+
+
+def smoothed() -> tuple[Case, ...]:
+    """How much profiles should be smoothed, and how patient a task should then be."""
+    return _whole("smoothing", entries.smoothings)
+
+
+def _whole(part: str, rules: Callable[[World], tuple[Entry, ...]]) -> tuple[Case, ...]:
+    """The histories of three candidates, to rules of their own."""
 
     def cast(world: World, _seed: int) -> tuple[Entry, ...]:
-        return entries.cool_downs(world)
+        return rules(world)
 
     whole = [case for case in compared(()) if case.hours == 1.0]
-    return tuple(Case(name=f"cool-down {case.name}", build=case.build, cast=cast, hours=1.0) for case in whole)
+    return tuple(Case(name=f"{part} {case.name}", build=case.build, cast=cast, hours=1.0) for case in whole)
 
 
 def play(

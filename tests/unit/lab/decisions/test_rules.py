@@ -134,7 +134,8 @@ def test_rules_that_look_at_nothing() -> None:
 def test_every_entry_of_every_cast_plays_and_has_a_name_of_its_own() -> None:
     world = loaded_world(seed=1, hours=0.01, with_radio=True)
     casts = (entries.schemes, lambda world, _: entries.fading(world), lambda world, _: entries.costly(world, 5.0))
-    for cast in (*(make(world, 1) for make in casts), entries.grid(world)):
+    parts = (entries.grid(world), entries.cool_downs(world), entries.smoothings(world))
+    for cast in (*(make(world, 1) for make in casts), *parts):
         names = [entry.name for entry in cast]
         assert len(set(names)) == len(names)
         moves = replay(world, cast)
@@ -151,3 +152,6 @@ def test_the_grid_holds_the_default() -> None:
     for name, entry in zip((default, timer), entries.ours(world), strict=True):
         assert only(world, cast[name]) == only(world, entry)
         assert cast[name].look == Look(smoothing_s=world.fleet.timing.smoothing_s)
+    name = f"{smoothing} p{DEFAULT_PATIENCE:g}"
+    smoothed = {entry.name: entry for entry in entries.smoothings(world)}
+    assert only(world, smoothed[name]) == only(world, entries.ours(world)[0])
