@@ -63,8 +63,7 @@ COLUMNS = (
 
 def report(results: Json, pictures: Sequence[str]) -> str:
     """The whole report."""
-    scenario, runs = results["scenario"], in_block(results["runs"], MATRIX)
-    main = [figures for figures in runs if figures["level"] == scenario["level"]]
+    scenario, runs, main = results["scenario"], in_block(results["runs"], MATRIX), main_runs(results)
     parts = [
         "# The paper's evaluation, by zsched\n",
         headline(results),
@@ -97,6 +96,12 @@ def in_block(runs: Sequence[Json], block: str) -> list[Json]:
     return [figures for figures in runs if figures.get("block", MATRIX) == block]
 
 
+def main_runs(results: Json) -> list[Json]:
+    """The matrix's own runs, without the sweep."""
+    level = results["scenario"]["level"]
+    return [figures for figures in in_block(results["runs"], MATRIX) if figures["level"] == level]
+
+
 def headline(results: Json) -> str:
     """What was run, in a few lines."""
     scenario = results["scenario"]
@@ -118,20 +123,25 @@ def claims_text(runs: Sequence[Json]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def gains_parts(results: Json, schemes: Sequence[str] = ("zsched", "oracle")) -> list[str]:
-    """What the schemes, where they were run, gain over fixed placement in the matrix and in every block."""
-    groups = groups_of(results)
-    rows: dict[tuple[str, ...], dict[str, Difference]] = {
-        (title, scheme): dict(over_fixed(runs, scheme)) for title, runs in groups.items() for scheme in schemes
-    }
-    table = gains_table(("where", "scheme"), rows)
+def gains_parts(results: Json) -> list[str]:
+    """What zsched and the oracle gain, under its heading; nothing without enough runs."""
+    table = gains_text(results, ("zsched", "oracle"))
     return ["## Where placing pays\n", GAINS_SAY, table] if table else []
+
+
+def gains_text(results: Json, schemes: Sequence[str]) -> str:
+    """What the schemes, where they were run, gain over fixed placement in the matrix and in every block."""
+    rows: dict[tuple[str, ...], dict[str, Difference]] = {
+        (title, scheme): dict(over_fixed(runs, scheme))
+        for title, runs in groups_of(results).items()
+        for scheme in schemes
+    }
+    return gains_table(("where", "scheme"), rows)
 
 
 def groups_of(results: Json) -> dict[str, list[Json]]:
     """{title: runs}: the matrix and every block that was run."""
-    scenario = results["scenario"]
-    main = [f for f in in_block(results["runs"], MATRIX) if f["level"] == scenario["level"]]
+    scenario, main = results["scenario"], main_runs(results)
     blocks = {name: in_block(results["runs"], name) for name in scenario.get("blocks", {})}
     return {f"matrix ({scenario['level']})": main} | {name: own for name, own in blocks.items() if own}
 
@@ -324,8 +334,7 @@ def conditions_text(results: Json) -> str:
 
 def snippet(results: Json, pictures: Sequence[str]) -> str:
     """What the README shows: where placing pays, the claims with verdicts, and a picture."""
-    scenario = results["scenario"]
-    main = [f for f in in_block(results["runs"], MATRIX) if f["level"] == scenario["level"]]
+    scenario, main = results["scenario"], main_runs(results)
     outcomes = [outcome for _, _, outcome in judged(main)]
     judgeable = [outcome for outcome in outcomes if outcome not in (Verdict.NOT_MEASURED, Verdict.TOO_FEW)]
     kept = sum(outcome is not Verdict.NOT_REPRODUCED for outcome in judgeable)
@@ -335,7 +344,7 @@ def snippet(results: Json, pictures: Sequence[str]) -> str:
             f"{kept} of {len(judgeable)} claims hold, {len(outcomes) - len(judgeable)} could not be judged."
         ),
         "",
-        *gains_parts(results, ("zsched",))[2:],
+        *([table] if (table := gains_text(results, ("zsched",))) else []),
         "| claim, in the matrix | found, 95 % interval | verdict |",
         "| --- | --- | --- |",
     ]
