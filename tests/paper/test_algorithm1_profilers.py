@@ -87,12 +87,12 @@ def test_profilers_are_continually_active() -> None:
 
 
 def test_profiles_are_smoothed_by_elapsed_time_where_they_are_measured() -> None:
-    """Reading: a momentary peak of a shared processor is no reason to move (EWMA, time constant 3 s)."""
+    """Reading: a momentary peak of a shared processor is no reason to move (EWMA, time constant 1 s)."""
     profiler = Profiler("edge1", 1, TIMING)
     sampled(profiler, 0.0, cpu=1.0)
     sampled(profiler, 0.2, cpu=4.0)
 
-    assert published(profiler, 0.2).cpu_used_cores == pytest.approx(1.0 + 3.0 * (1 - math.exp(-0.2 / 3.0)))
+    assert published(profiler, 0.2).cpu_used_cores == pytest.approx(1.0 + 3.0 * (1 - math.exp(-0.2 / TIMING.smoothing_s)))
 
 
 def test_every_robot_s_gateway_holds_edge_data_of_every_edge() -> None:

@@ -182,8 +182,8 @@ def test_signals_are_foreseen_unless_the_file_says_otherwise(link: str, foresee_
     assert limits.nu_dbm == (-75.0 if "nu_dbm" in link else -80.0)
 
 
-def test_the_defaults_of_a_fleet_file_are_those_of_decisions_0021_and_0023() -> None:
-    assert (DEFAULT_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S, DEFAULT_FORESEE_S) == (0.2, 0.05, 5.0, 3.0)
+def test_the_defaults_of_a_fleet_file_are_those_of_decisions_0021_0023_and_0024() -> None:
+    assert (DEFAULT_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S, DEFAULT_FORESEE_S) == (0.4, 0.05, 5.0, 3.0)
 
 
 def test_every_setting_of_a_task_arrives() -> None:

@@ -17,8 +17,8 @@ from functools import lru_cache
 from zsched.core.model import LinkSource, NodeId, NodeKind, TaskId, Tuning, check_range
 from zsched.core.plan import Direction, ReadyWhen, ServiceSettings, StreamSettings
 
-DEFAULT_PATIENCE = 0.2
-"""Utility seconds; for a task whose fleet file gives neither a patience nor a time-to-trigger (docs/decisions/0021)."""
+DEFAULT_PATIENCE = 0.4
+"""Utility seconds; for a task whose fleet file gives neither a patience nor a time-to-trigger (docs/decisions/0024)."""
 PATIENT_BONUS = 0.05
 """The bonus of a task with a patience, when its fleet file gives none; with a time-to-trigger it is `Tuning`'s."""
 PATIENT_COOL_DOWN_S = 5.0
@@ -210,7 +210,7 @@ class Timing:
     """How long a suspect may refute, or a second observer confirm, before it is gone."""
     zenoh_lease_s: float = 1.5
     sample_s: float = 0.2
-    smoothing_s: float = 3.0
+    smoothing_s: float = 1.0
     """EWMA time constant of CPU, memory and dBm."""
     publish_s: float = 1.0
     """Profiles at least so often (sooner on change)."""

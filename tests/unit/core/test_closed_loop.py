@@ -205,7 +205,7 @@ class Loop:
 
 
 PATIENT = Tuning(weights=BOTH, bonus=PATIENT_BONUS, cool_down_s=PATIENT_COOL_DOWN_S)
-"""With `DEFAULT_PATIENCE`: what a task gets whose fleet file says nothing (docs/decisions/0021 and 0023)."""
+"""With `DEFAULT_PATIENCE`: what a task gets whose fleet file says nothing (docs/decisions/0023 and 0024)."""
 RESTLESS = Tuning(weights=BOTH, bonus=0.0, time_to_trigger_s=0.0, cool_down_s=0.0)
 
 
@@ -281,13 +281,14 @@ def test_a_step_smaller_than_the_bonus_moves_nothing() -> None:
     assert Loop((stepped, Machine(name="edge2"))).run(120.0) == []
 
 
-def test_a_spike_shorter_than_the_time_to_trigger_moves_nothing() -> None:
-    spiky = Machine(name="edge1", step=lambda now: 0.5 if now % 20.0 < 1.0 else 0.0)
+@pytest.mark.parametrize("phase", [0.0, 0.07, 0.1, 0.2, 0.3, 0.4])
+def test_a_spike_shorter_than_the_time_to_trigger_moves_nothing(phase: float) -> None:
+    spiky = Machine(name="edge1", step=lambda now: 0.5 if (now - phase) % 20.0 < 1.0 else 0.0)
 
     assert Loop((spiky, Machine(name="edge2"))).run(200.0) == []
 
 
-@pytest.mark.parametrize("phase", [0.0, 0.1, 0.2, 0.3, 0.4])
+@pytest.mark.parametrize("phase", [0.0, 0.07, 0.1, 0.2, 0.3, 0.4])
 def test_nor_does_it_with_patience(phase: float) -> None:
     """Half of the machine for 1 s, as above; the bonus of patience without it would follow."""
     spiky = Machine(name="edge1", step=lambda now: 0.5 if now >= 15.0 and (now - phase) % 20.0 < 1.0 else 0.0)

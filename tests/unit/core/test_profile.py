@@ -123,9 +123,9 @@ def test_a_radio_that_gives_nothing_is_soon_not_measured_any_more() -> None:
 def test_signals_are_smoothed_in_dbm_and_each_link_for_itself() -> None:
     profiler = make_profiler()
     profiler.absorb(device(), (radio(-60.0), radio(-40.0, "robot2")), now=0.0)
-    profiler.absorb(device(), (radio(-70.0), radio(-40.0, "robot2")), now=3.0)
+    profiler.absorb(device(), (radio(-70.0), radio(-40.0, "robot2")), now=TIMING.smoothing_s)
 
-    way, direct = taken(profiler, 3.0).links
+    way, direct = taken(profiler, TIMING.smoothing_s).links
     assert way.rssi_dbm == pytest.approx(-60.0 - 10.0 * (1 - math.exp(-1.0)))
     assert direct.peer == "robot2"
     assert direct.rssi_dbm == pytest.approx(-40.0)

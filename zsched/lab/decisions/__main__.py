@@ -75,8 +75,8 @@ def show(out: Path, folder: Path | None) -> None:
         figures.options(rows, out / "options.png")
     if any(case.startswith("long-") for case in cases):
         figures.sizes(rows, out / "sizes.png")
-    if set(report.WHOLE_GRID) <= cases:
-        figures.grid(rows, {"the default": "s3 b0.05 p0.2 c5", "the timer": "s3 b0.1 t2 c10"}, out / "grid.png")
+    if cases.intersection(report.GRID_CASES):
+        figures.grid(rows, out / "grid.png")
     print(f"written: {out / 'report.md'} and the pictures beside it")
 
 

@@ -60,8 +60,8 @@ def cast(world: World) -> tuple[Entry, ...]:
         ),
         *(
             Entry(
-                name=f"timer, bonus {bonus:g}, smoothing 1.5 s",
-                look=Look(smoothing_s=1.5),
+                name=f"timer, bonus {bonus:g}, smoothing 3 s",
+                look=Look(smoothing_s=3.0),
                 make=entries.timed(world, bonus=bonus),
             )
             for bonus in (0.05, 0.1)

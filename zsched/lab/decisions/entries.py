@@ -54,7 +54,7 @@ def core(
     pays_off_in_s: float | None = None,
     move_cost_s: float = 0.0,
 ) -> Callable[[View], Rule]:
-    """The production's decision; what is ``None`` is what a fleet file gets that does not say it (docs/decisions/0021).
+    """The production's decision; what is ``None`` is what a fleet file gets that does not say it (docs/decisions/0024).
 
     Neither a patience nor a time-to-trigger: the default patience. Signals are `foreseeing`'s affair.
     """
@@ -75,7 +75,7 @@ def foreseeing(world: World, lead_s: float = DEFAULT_FORESEE_S, **more: Any) -> 
 
 
 def ours(world: World) -> tuple[Entry, ...]:
-    """The product as it comes, and as it came before it had patience and foresight."""
+    """The product as it comes, and with a time-to-trigger in place of patience and foresight."""
     return (
         Entry(name="zsched", limits=foreseeing(world), make=core(world)),
         Entry(name="zsched, timer", make=timed(world)),
@@ -83,7 +83,7 @@ def ours(world: World) -> tuple[Entry, ...]:
 
 
 def timed(world: World, **settings: Any) -> Callable[[View], Rule]:
-    """The production's decision with a time-to-trigger, at its defaults until docs/decisions/0021; see `core`."""
+    """The production's decision with a time-to-trigger, as it came until docs/decisions/0021; see `core`."""
     return core(world, **{"time_to_trigger_s": TIMER_S, **settings})
 
 
@@ -118,7 +118,7 @@ def _blind(choose: Callable[[tuple[str, ...]], str]) -> Callable[[View], Rule]:
 def grid(world: World) -> tuple[Entry, ...]:
     """The sweep over zsched's tuning: smoothing, bonus, time-to-trigger, cool-down; patience in place of the timer.
 
-    Names read ``s3 b0.1 t2 c10`` and ``s3 b0.05 p0.2 c5``.
+    Names read ``s1 b0.1 t2 c10`` and ``s1 b0.05 p0.4 c5``.
     """
     by_timer = tuple(
         Entry(
@@ -127,7 +127,7 @@ def grid(world: World) -> tuple[Entry, ...]:
             make=core(world, bonus=bonus, time_to_trigger_s=trigger_s, cool_down_s=cool_s),
         )
         for smoothing_s, bonus, trigger_s, cool_s in itertools.product(
-            (1.5, 3.0), (0.03, 0.05, 0.07, 0.10, 0.15), (1.0, 2.0, 4.0), (5.0, 10.0)
+            (1.0, 3.0), (0.03, 0.05, 0.10, 0.15), (1.0, 2.0, 4.0), (10.0,)
         )
     )
     patient = tuple(
@@ -137,7 +137,7 @@ def grid(world: World) -> tuple[Entry, ...]:
             make=core(world, bonus=bonus, cool_down_s=cool_s, patience=patience),
         )
         for smoothing_s, bonus, patience, cool_s in itertools.product(
-            (1.5, 3.0), (0.03, 0.05, 0.07), (0.05, 0.1, 0.2), (5.0, 10.0)
+            (1.0, 1.5, 3.0), (0.03, 0.05, 0.07), (0.1, 0.2, 0.4, 0.6), (5.0,)
         )
     )
     return by_timer + patient
@@ -160,7 +160,7 @@ def smoothings(world: World) -> tuple[Entry, ...]:
             limits=foreseeing(world),
             make=core(world, patience=patience),
         )
-        for smoothing_s, patience in itertools.product((0.75, 1.0, 1.5, 2.0, 3.0), (0.1, 0.15, 0.2, 0.3))
+        for smoothing_s, patience in itertools.product((0.5, 0.75, 1.0, 1.5, 2.0, 3.0), (0.1, 0.2, 0.3, 0.35, 0.4, 0.5))
     )
 
 

@@ -14,7 +14,7 @@ from typing import Any, Final
 import matplotlib as mpl
 import numpy as np
 
-from zsched.lab.decisions.report import RULES, WHOLE_GRID, Row, grid_regrets, mean_and_spread, of, rate
+from zsched.lab.decisions.report import GRID_CASES, RULES, STARS, Row, grid_regrets, mean_and_spread, of, rate
 from zsched.lab.decisions.rules import Move
 from zsched.lab.decisions.score import owners_by_step
 from zsched.lab.decisions.world import DT_S, World
@@ -120,28 +120,30 @@ def options(rows: Sequence[Row], path: Path) -> None:
     _save(figure, path)
 
 
-def grid(rows: Sequence[Row], stars: Mapping[str, str], path: Path) -> None:
-    """The sweep: regret against moves, one point per setting; ``stars`` is {label: setting}."""
+def grid(rows: Sequence[Row], path: Path) -> None:
+    """The sweep: regret against moves, one point per setting, the `STARS` among them."""
     figure, axis = plt.subplots(figsize=(8, 5), layout="constrained")
     regrets = grid_regrets(rows)
-    cases = WHOLE_GRID
+    cases = [case for case in GRID_CASES if of(rows, case)]
     moves = {name: statistics.fmean(rate(of(rows, case, name), "moves") for case in cases) for name in regrets}
     groups = (
         ("time-to-trigger, smoothing 3 s", "#2c6fbb", "s3 ", " t"),
-        ("time-to-trigger, smoothing 1.5 s", "#74b3e0", "s1.5 ", " t"),
+        ("time-to-trigger, smoothing 1 s", "#74b3e0", "s1 ", " t"),
         ("patience, smoothing 3 s", "#2e8b57", "s3 ", " p"),
         ("patience, smoothing 1.5 s", "#90d0a8", "s1.5 ", " p"),
+        ("patience, smoothing 1 s", "#c9a227", "s1 ", " p"),
     )
     for label, colour, smoothing, trigger in groups:
         names = [name for name in regrets if name.startswith(smoothing) and trigger in name]
         axis.scatter([moves[n] for n in names], [100 * regrets[n] for n in names], s=22, color=colour, label=label)
-    for (label, name), colour in zip(stars.items(), (OURS, "black"), strict=False):
+    for (label, name), colour in zip(STARS.items(), (OURS, "black"), strict=True):
         if name in regrets:
             place = ([moves[name]], [100 * regrets[name]])
             axis.scatter(*place, s=120, marker="*", color=colour, label=f"{label}: {name}")
     axis.set_xlabel("moves per hour")
     axis.set_ylabel("mean regret, %")
-    axis.set_title("Every setting of the grid on the training seeds (long, mixed)", fontsize=10)
+    kinds = ", ".join(case.removeprefix("sweep ") for case in cases)
+    axis.set_title(f"Every setting of the grid on the training seeds ({kinds})", fontsize=10)
     axis.legend(fontsize=8)
     _save(figure, path)
 

@@ -32,8 +32,12 @@ RULES: Final = (
 )
 ERRORS: Final = 1.96
 """Standard errors: a 95 % interval if there are many seeds."""
-WHOLE_GRID: Final = ("sweep long", "sweep mixed")
-"""The kinds of histories that the whole grid has played; the others, only the best of these."""
+GRID_CASES: Final = ("sweep long", "sweep mixed", "sweep radio")
+"""The kinds of histories that rank the settings of the grid; between equal nodes there is no regret to rank by."""
+
+
+STARS: Final[Mapping[str, str]] = {"the default": "s1 b0.05 p0.4 c5", "the timer": "s1 b0.1 t2 c10"}
+"""Settings of the grid that have a name."""
 
 
 def of(rows: Iterable[Row], case: str, rule: str | None = None) -> list[Row]:
@@ -113,11 +117,10 @@ def drive_table(figures: Sequence[DriveFigures], title: str) -> str:
 
 
 def sweep_table(rows: Sequence[Row], top: int = 15) -> str:
-    """The grid's best by the mean regret over the kinds of histories that the whole grid has played."""
+    """The grid's best by the mean regret, then those of the rest that have a name."""
     cases = sorted({str(row["case"]) for row in rows if str(row["case"]).startswith("sweep ")})
     ranked = sorted(grid_regrets(rows).items(), key=lambda item: item[1])
-    finalists = {str(row["rule"]) for row in of(rows, "sweep radio")}
-    shown = ranked[:top] + [item for item in ranked[top:] if item[0] in finalists]
+    shown = ranked[:top] + [item for item in ranked[top:] if item[0] in STARS.values()]
     lines = [
         "| smoothing, bonus, trigger, cool-down | mean regret % | "
         + " | ".join(f"{case.removeprefix('sweep ')}: regret %, moves / h" for case in cases)
@@ -139,11 +142,12 @@ def sweep_table(rows: Sequence[Row], top: int = 15) -> str:
 
 
 def grid_regrets(rows: Sequence[Row]) -> dict[str, float]:
-    """{setting: mean regret over the kinds of histories that the whole grid has played, each with the same weight}."""
-    names = sorted({str(row["rule"]) for row in of(rows, WHOLE_GRID[0])} - {"oracle"})
+    """{setting: mean regret over the cases of the grid that were played, each with the same weight}."""
+    played = [case for case in GRID_CASES if of(rows, case)]
+    names = sorted({str(row["rule"]) for case in played for row in of(rows, case)} - {"oracle"})
     return {
         name: statistics.fmean(
-            statistics.fmean(float(row["regret"]) for row in of(rows, case, name)) for case in WHOLE_GRID
+            statistics.fmean(float(row["regret"]) for row in of(rows, case, name)) for case in played
         )
         for name in names
     }

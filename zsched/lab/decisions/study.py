@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -119,22 +119,22 @@ def _costly(cost_s: float) -> Case:
 
 def cooled() -> tuple[Case, ...]:
     """How long a task should stay after a move at least."""
-    return _whole("cool-down", entries.cool_downs)
+    whole = tuple(case for case in compared(()) if case.hours == 1.0)
+    return _to_others("cool-down", whole, entries.cool_downs)
 
 
 def smoothed() -> tuple[Case, ...]:
-    """How much profiles should be smoothed, and how patient a task should then be."""
-    return _whole("smoothing", entries.smoothings)
+    """How much profiles should be smoothed, and how patient a task should then be; in larger fleets, too."""
+    return _to_others("smoothing", compared((10, 50)), entries.smoothings)
 
 
-def _whole(part: str, rules: Callable[[World], tuple[Entry, ...]]) -> tuple[Case, ...]:
-    """The histories of three candidates, to rules of their own."""
+def _to_others(part: str, cases: tuple[Case, ...], rules: Callable[[World], tuple[Entry, ...]]) -> tuple[Case, ...]:
+    """The same histories, to rules of their own."""
 
     def cast(world: World, _seed: int) -> tuple[Entry, ...]:
         return rules(world)
 
-    whole = [case for case in compared(()) if case.hours == 1.0]
-    return tuple(Case(name=f"{part} {case.name}", build=case.build, cast=cast, hours=1.0) for case in whole)
+    return tuple(replace(case, name=f"{part} {case.name}", cast=cast) for case in cases)
 
 
 def play(

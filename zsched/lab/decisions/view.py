@@ -37,7 +37,7 @@ IDLE: Final = DeviceSample(cpu_cores=4.0, cpu_used_cores=1.0, memory_mb=MEMORY_M
 class Look:
     """How a rule wants to see: seconds of smoothing at the source."""
 
-    smoothing_s: float = 3.0
+    smoothing_s: float = 1.0
 
 
 class Feed:

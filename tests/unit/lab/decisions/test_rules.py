@@ -14,6 +14,7 @@ from zsched.core.fleet import DEFAULT_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN
 from zsched.core.model import Tuning
 from zsched.lab.decisions import entries
 from zsched.lab.decisions.replay import Entry, replay
+from zsched.lab.decisions.report import STARS
 from zsched.lab.decisions.rules import BlindRule, CoreRule, Move, PickRule, drawn, first_match, fixed
 from zsched.lab.decisions.view import Feed, Look, View
 from zsched.lab.decisions.world import DT_S, EVEN, World, equal_world, loaded_world
@@ -148,6 +149,7 @@ def test_the_grid_holds_the_default() -> None:
     smoothing = f"s{world.fleet.timing.smoothing_s:g}"
     default = f"{smoothing} b{PATIENT_BONUS:g} p{DEFAULT_PATIENCE:g} c{PATIENT_COOL_DOWN_S:g}"
     timer = f"{smoothing} b{tuning.bonus:g} t{tuning.time_to_trigger_s:g} c{tuning.cool_down_s:g}"
+    assert list(STARS.values()) == [default, timer]
     cast = {entry.name: entry for entry in entries.grid(world)}
     for name, entry in zip((default, timer), entries.ours(world), strict=True):
         assert only(world, cast[name]) == only(world, entry)

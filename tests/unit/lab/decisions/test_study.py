@@ -11,6 +11,7 @@ import pytest
 
 from zsched.lab.decisions import report, study
 from zsched.lab.decisions.drives import DriveFigures
+from zsched.lab.decisions.figures import grid as grid_picture
 from zsched.lab.decisions.figures import rules as rules_picture
 
 ONLY = frozenset({"zsched", "argmax", "fixed_e1"})
@@ -63,6 +64,21 @@ def test_the_tables_say_what_the_results_say(results: Path, tmp_path: Path) -> N
     assert "| fixed_e1 | 0 of 1 | - | - |" in text
     assert "| oracle | 3 | 1 | -50.0 | 0.00 | 25.0 | 30.0 |" in text
     assert text.index("| oracle |") < text.index("| zsched |") < text.index("| argmax |")
+
+
+def test_the_grid_is_ranked_by_what_was_played_of_it(tmp_path: Path) -> None:
+    """A run of some cases of the sweep has its table and its picture, too."""
+    regrets = {"long": {"s1 b0.03 p0.1 c5": 0.03, "s3 b0.03 p0.1 c5": 0.01, "oracle": 0.0}, "equal": {"oracle": 0.0}}
+    rows = [
+        {"case": f"sweep {case}", "seed": 1, "rule": rule, "regret": regret, "moves": 2, "wasted": 0, "hours": 1.0}
+        for case, rules in regrets.items()
+        for rule, regret in rules.items()
+    ]
+    assert report.grid_regrets(rows) == {"s1 b0.03 p0.1 c5": 0.03, "s3 b0.03 p0.1 c5": 0.01}
+    table = report.sweep_table(rows)
+    assert table.index("| s3 b0.03 p0.1 c5 | 1.00 | - | 1.00, 2.0 |") < table.index("| s1 b0.03 p0.1 c5 | 3.00 |")
+    grid_picture(rows, tmp_path / "grid.png")
+    assert (tmp_path / "grid.png").stat().st_size > 10_000
 
 
 def test_the_picture_is_drawn(results: Path, tmp_path: Path) -> None:

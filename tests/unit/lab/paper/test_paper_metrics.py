@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from zsched.adapters.network_profiler import Trace
+from zsched.core.fleet import Timing
 from zsched.lab.paper.drive_clock import begun_before, smoothed
 from zsched.lab.paper.load import Window
 from zsched.lab.paper.metrics import (
@@ -268,7 +269,7 @@ def test_the_radios_figures(tmp_path: Path) -> None:
     with Recorder(folder / "records") as recorder:
         for step in range(20):
             # What a daemon says is smoothed: it comes late, and later with the product's smoothing.
-            risen = 0.0 if step < 10 else 1.0 - math.exp(-(step / 2 - 5.0 + 0.1) / 3.0)
+            risen = 0.0 if step < 10 else 1.0 - math.exp(-(step / 2 - 5.0 + 0.1) / Timing().smoothing_s)
             for robot, dbm in (("robot1", -50.0), ("robot2", -60.0 + 20.0 * risen)):
                 recorder.write("decisions", {"node": robot, "t_s": step / 2, "links": [dbm]})
 
