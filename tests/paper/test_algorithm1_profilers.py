@@ -92,7 +92,9 @@ def test_profiles_are_smoothed_by_elapsed_time_where_they_are_measured() -> None
     sampled(profiler, 0.0, cpu=1.0)
     sampled(profiler, 0.2, cpu=4.0)
 
-    assert published(profiler, 0.2).cpu_used_cores == pytest.approx(1.0 + 3.0 * (1 - math.exp(-0.2 / TIMING.smoothing_s)))
+    assert published(profiler, 0.2).cpu_used_cores == pytest.approx(
+        1.0 + 3.0 * (1 - math.exp(-0.2 / TIMING.smoothing_s))
+    )
 
 
 def test_every_robot_s_gateway_holds_edge_data_of_every_edge() -> None:
