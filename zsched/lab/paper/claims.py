@@ -296,11 +296,10 @@ def judged(runs: Sequence[Json]) -> list[tuple[Claim, Difference | None, Verdict
     return found
 
 
-def over_fixed(runs: Sequence[Json], scheme: str, fixed: Sequence[str] = FIXED_SCHEMES) -> list[tuple[str, Difference]]:
-    """(metric, difference) of a scheme to the mean of the fixed ones, where all of them were run often enough."""
-    pairs = [(metric, table_of(runs, metric, (scheme,)), table_of(runs, metric, fixed)) for metric in GAINS]
-    found = [(metric, difference(mine, theirs)) for metric, mine, theirs in pairs]
-    return [(metric, one) for metric, one in found if one is not None and one.runs >= LEAST_RUNS]
+def over_fixed(runs: Sequence[Json], scheme: str, fixed: Sequence[str] = FIXED_SCHEMES) -> dict[str, Difference]:
+    """{metric: difference} of a scheme to the mean of the fixed ones, where all of them were run often enough."""
+    found = {metric: difference(table_of(runs, metric, (scheme,)), table_of(runs, metric, fixed)) for metric in GAINS}
+    return {metric: one for metric, one in found.items() if one is not None and one.runs >= LEAST_RUNS}
 
 
 def better_than_ours(runs: Sequence[Json]) -> list[tuple[str, str, Difference]]:

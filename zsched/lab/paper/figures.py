@@ -90,9 +90,7 @@ def save_gains(path: Path, groups: Mapping[str, Sequence[Json]], title: str) -> 
     ``None``, and no picture, where no group has enough runs.
     """
     found = {
-        (name, scheme): dict(over_fixed(runs, scheme))
-        for name, runs in groups.items()
-        for scheme in ("oracle", "zsched")
+        (name, scheme): over_fixed(runs, scheme) for name, runs in groups.items() for scheme in ("oracle", "zsched")
     }
     rows = [key for key, known in found.items() if known]
     if not rows:

@@ -59,6 +59,8 @@ COLUMNS = (
 
 
 # --- the text --------------------------------------------------------------------------------------------------------
+Gains = Mapping[tuple[str, ...], Mapping[str, Difference]]
+"""{names of a row: {metric: difference}}."""
 
 
 def report(results: Json, pictures: Sequence[str]) -> str:
@@ -131,10 +133,8 @@ def gains_parts(results: Json) -> list[str]:
 
 def gains_text(results: Json, schemes: Sequence[str]) -> str:
     """What the schemes, where they were run, gain over fixed placement in the matrix and in every block."""
-    rows: dict[tuple[str, ...], dict[str, Difference]] = {
-        (title, scheme): dict(over_fixed(runs, scheme))
-        for title, runs in groups_of(results).items()
-        for scheme in schemes
+    rows: Gains = {
+        (title, scheme): over_fixed(runs, scheme) for title, runs in groups_of(results).items() for scheme in schemes
     }
     return gains_table(("where", "scheme"), rows)
 
@@ -172,21 +172,16 @@ def schemes_text(runs: Sequence[Json]) -> str:
 
 def over_fixed_text(runs: Sequence[Json]) -> str:
     """How far the dynamic schemes are from the mean of the fixed ones, zsched from each; empty without runs enough."""
-    to_mean = {name: over_fixed(runs, name) for name in SCHEMES if name not in FIXED_SCHEMES}
-    to_each = {name: over_fixed(runs, "zsched", (name,)) for name in FIXED_SCHEMES}
+    to_mean: Gains = {(name,): over_fixed(runs, name) for name in SCHEMES if name not in FIXED_SCHEMES}
+    to_each: Gains = {(name,): over_fixed(runs, "zsched", (name,)) for name in FIXED_SCHEMES}
     told = (
         ("Against the mean of the three fixed schemes, same runs, 95 %:\n", "scheme", to_mean),
         ("zsched against each of them:\n", "against", to_each),
     )
-    return "\n".join(f"{says}\n{table}" for says, who, rows in told if (table := gains_table((who,), rows_of(rows))))
+    return "\n".join(f"{says}\n{table}" for says, who, rows in told if (table := gains_table((who,), rows)))
 
 
-def rows_of(found: Mapping[str, Sequence[tuple[str, Difference]]]) -> dict[tuple[str, ...], dict[str, Difference]]:
-    """Rows for `gains_table` with one name each."""
-    return {(name,): dict(pairs) for name, pairs in found.items()}
-
-
-def gains_table(titles: Sequence[str], rows: Mapping[tuple[str, ...], Mapping[str, Difference]]) -> str:
+def gains_table(titles: Sequence[str], rows: Gains) -> str:
     """Rows of differences in `GAINS`, those without any left out; ``titles`` head their names. Empty without rows."""
     known = {names: found for names, found in rows.items() if found}
     metrics = [metric for metric in GAINS if any(metric in found for found in known.values())]

@@ -170,8 +170,8 @@ def test_each_table_says_how_far_a_scheme_is_from_the_fixed_ones() -> None:
     runs += [a_run("zsched", run, map_hz=5.0 + run / 8) for run in range(3)]
     runs += [a_run("random", run, map_hz=2.0) for run in range(2)]
 
-    assert dict(over_fixed(runs, "zsched"))["map_hz"].value == pytest.approx(0.25)
-    assert over_fixed(runs, "random") == [], "two runs say nothing"
+    assert over_fixed(runs, "zsched")["map_hz"].value == pytest.approx(0.25)
+    assert over_fixed(runs, "random") == {}, "two runs say nothing"
     text = over_fixed_text(runs)
     assert "| scheme | runs | MB/s | maps/s | task s | p50 s | p95 s |" in text
     assert "+25 % [+25 %, +25 %]" in text
