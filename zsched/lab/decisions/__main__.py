@@ -75,7 +75,7 @@ def show(out: Path, folder: Path | None) -> None:
         figures.options(rows, out / "options.png")
     if any(case.startswith("long-") for case in cases):
         figures.sizes(rows, out / "sizes.png")
-    if cases.intersection(report.GRID_CASES):
+    if report.grid_played(rows):
         figures.grid(rows, out / "grid.png")
     print(f"written: {out / 'report.md'} and the pictures beside it")
 

@@ -14,7 +14,7 @@ from typing import Any, Final
 import matplotlib as mpl
 import numpy as np
 
-from zsched.lab.decisions.report import GRID_CASES, RULES, STARS, Row, grid_regrets, mean_and_spread, of, rate
+from zsched.lab.decisions.report import RULES, STARS, Row, grid_played, grid_regrets, mean_and_spread, of, rate
 from zsched.lab.decisions.rules import Move
 from zsched.lab.decisions.score import owners_by_step
 from zsched.lab.decisions.world import DT_S, World
@@ -124,7 +124,7 @@ def grid(rows: Sequence[Row], path: Path) -> None:
     """The sweep: regret against moves, one point per setting, the `STARS` among them."""
     figure, axis = plt.subplots(figsize=(8, 5), layout="constrained")
     regrets = grid_regrets(rows)
-    cases = [case for case in GRID_CASES if of(rows, case)]
+    cases = grid_played(rows)
     moves = {name: statistics.fmean(rate(of(rows, case, name), "moves") for case in cases) for name in regrets}
     groups = (
         ("time-to-trigger, smoothing 3 s", "#2c6fbb", "s3 ", " t"),

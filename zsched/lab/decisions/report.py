@@ -34,8 +34,6 @@ ERRORS: Final = 1.96
 """Standard errors: a 95 % interval if there are many seeds."""
 GRID_CASES: Final = ("sweep long", "sweep mixed", "sweep radio")
 """The kinds of histories that rank the settings of the grid; between equal nodes there is no regret to rank by."""
-
-
 STARS: Final[Mapping[str, str]] = {"the default": "s1 b0.05 p0.4 c5", "the timer": "s1 b0.1 t2 c10"}
 """Settings of the grid that have a name."""
 
@@ -141,9 +139,14 @@ def sweep_table(rows: Sequence[Row], top: int = 15) -> str:
     return "\n".join(lines) + "\n"
 
 
+def grid_played(rows: Sequence[Row]) -> list[str]:
+    """Those of `GRID_CASES` that were played."""
+    return [case for case in GRID_CASES if of(rows, case)]
+
+
 def grid_regrets(rows: Sequence[Row]) -> dict[str, float]:
     """{setting: mean regret over the cases of the grid that were played, each with the same weight}."""
-    played = [case for case in GRID_CASES if of(rows, case)]
+    played = grid_played(rows)
     names = sorted({str(row["rule"]) for case in played for row in of(rows, case)} - {"oracle"})
     return {
         name: statistics.fmean(

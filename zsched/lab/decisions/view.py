@@ -26,6 +26,7 @@ from zsched.core.model import (
 )
 from zsched.core.profile import Profiler
 from zsched.core.scoring import Standing, compare, score
+from zsched.core.timing import WIFI
 from zsched.lab.decisions.world import DT_S, MEMORY_MB, World
 
 START_S: Final = 100.0
@@ -37,7 +38,7 @@ IDLE: Final = DeviceSample(cpu_cores=4.0, cpu_used_cores=1.0, memory_mb=MEMORY_M
 class Look:
     """How a rule wants to see: seconds of smoothing at the source."""
 
-    smoothing_s: float = 1.0
+    smoothing_s: float = WIFI.smoothing_s
 
 
 class Feed:

@@ -16,6 +16,8 @@ from zsched.lab.paper.scenario import MATRIX, MergeTask
 from zsched.lab.paper.schemes import FIXED_SCHEMES, PAPER_SCHEMES, SCHEMES
 
 Json = Mapping[str, Any]
+Gains = Mapping[tuple[str, ...], Mapping[str, Difference]]
+"""{names of a row: {metric: difference}}."""
 NOT_COMPARED = (
     "Not measured: better map frequency and accuracy of the network variant on the real robots (they replay a log "
     "here). That it follows the strongest signal is under *Robot to robot*.\n"
@@ -59,8 +61,6 @@ COLUMNS = (
 
 
 # --- the text --------------------------------------------------------------------------------------------------------
-Gains = Mapping[tuple[str, ...], Mapping[str, Difference]]
-"""{names of a row: {metric: difference}}."""
 
 
 def report(results: Json, pictures: Sequence[str]) -> str:
