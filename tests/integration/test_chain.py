@@ -177,13 +177,16 @@ def test_late_robot_learns_the_allocation_and_its_streams_start(bed: Testbed, pi
     before = bed.wait_settled()
     bed.kill("robot3")
     bed.kill(before)
-    owner = bed.wait(lambda: _other_owner(bed, before), 20, f"another owner than {before}")
+    bed.wait(lambda: _other_owner(bed, before), 20, f"another owner than {before}")
     epoch = bed.task("robot1")["epoch"]
     bed.start("robot3")
-    bed.wait(lambda: bed.task("robot3")["epoch"] >= epoch, 20, "robot3 to learn")
+
+    def known() -> set[tuple[str, int]]:
+        return {(task["owner"], task["epoch"]) for task in map(bed.task, ("robot1", "robot2", "robot3"))}
+
+    # The others may have moved it once more meanwhile: all nodes share this machine, and it is busy.
+    bed.wait(lambda: bed.task("robot3")["epoch"] >= epoch and len(known()) == 1, 20, "robot3 to know what all know")
     bed.wait(lambda: bed.task("robot3")["phase"] == "settled", 20, "robot3 to settle")
-    block = bed.task("robot3")
-    assert (block["owner"], block["epoch"]) == (owner, epoch)
     pinger = ping("robot3")
     bed.wait(lambda: pinger.has_newer_than(3), 10, "echoes at robot3")
 

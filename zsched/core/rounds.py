@@ -66,6 +66,8 @@ class TaskRound:
     tally_at: float = -math.inf
     commit_at: float = math.inf
     commit: MoveOwner | None = None
+    awaited_until: float = -math.inf
+    """A vote on a move was won: until when its value should be learnt."""
     damping: Damping = field(default_factory=Damping)
     called_at: float = -math.inf
     """When this robot last proposed a planned move of it."""
@@ -256,7 +258,7 @@ class Rounds:
                 now=now,
                 damping=task.damping,
             )
-        judgement = self._take_turn(task, judgement, allocation, is_called=is_called)
+        judgement = self._take_turn(task, judgement, allocation, is_called=is_called, now=now)
         if not is_called:
             judgement = self._spare(judgement, allocation, states)
         task.judgement, task.judged_at = judgement, now
@@ -270,13 +272,13 @@ class Rounds:
         return out
 
     def _take_turn(
-        self, task: TaskRound, judgement: Judgement, allocation: Allocation, *, is_called: bool
+        self, task: TaskRound, judgement: Judgement, allocation: Allocation, *, is_called: bool, now: float
     ) -> Judgement:
         """A planned move waits while another task moves; the figures are read again before it is judged once more."""
         task.is_waiting_its_turn = False
         if judgement.outcome is not Outcome.PROPOSE or judgement.is_escape:
             return judgement
-        first = who_moves_first(self.tasks, task.spec.name, is_called=is_called)
+        first = who_moves_first(self.tasks, task.spec.name, is_called=is_called, now=now)
         if first is None:
             return judgement
         task.is_waiting_its_turn = True
@@ -426,6 +428,7 @@ class Rounds:
         if counted.outcome is VoteOutcome.STAY:
             task.judge.reset()
         if counted.outcome is VoteOutcome.WON and counted.winner is not None:
+            task.awaited_until = now + self._fleet.timing.ballot_s + self._fleet.timing.stagger_s
             self._schedule_commit(task, counted, allocation, fresh, now)
         text = f"{counted.outcome}: {counted.reason} ({', '.join(f'{v}->{c}' for v, c in counted.votes)})"
         return [RecordStory(stage="vote", text=text, task=task.spec.name, epoch=allocation.epoch)]
@@ -453,6 +456,7 @@ class Rounds:
         """Our change was committed, overtaken or given up: votes may be called again."""
         task = self.tasks[name]
         task.commit, task.commit_at = None, math.inf
+        task.awaited_until = -math.inf
 
     def on_moved(self, name: TaskId, left: NodeId | None, *, has_failed: bool, now: float) -> None:
         """A new owner is known: ``left`` is the one before, ``has_failed`` whether it was fled from."""
@@ -471,13 +475,18 @@ class Rounds:
         task = self.tasks[name]
         task.proposals.clear()
         task.vote_opened_at = None
+        task.awaited_until = -math.inf
         task.told = ""
         if task.commit is not None and task.commit_at < math.inf:
             self.on_commit_ended(name)
         task.judge.reset(is_new_owner=is_new_epoch)
         if is_new_epoch:
             task.settled_at = now
-        if any(other.is_waiting_its_turn for other in self.tasks.values()):
+        is_waited_for = any(other.is_waiting_its_turn for other in self.tasks.values())
+        if self._gather is not None and len(self.tasks) > 1:
+            # What was gathered says nothing of what this task will use at its new owner: no other may move by it.
+            self._gather, is_waited_for = None, True
+        if is_waited_for:
             self.hurry(now)
 
 

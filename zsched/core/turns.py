@@ -4,8 +4,9 @@ Knows: which votes are open and which commits are under way at this robot. Does 
 
 Planned moves and first placements take turns; after each the figures are read again, with what the moved task will use
 at its new owner (`zsched.core.scoring.Bookings`). Escapes never wait. Robots that call votes for two tasks at the same
-moment are settled by name: a commit that is under way goes first, then the vote for the lower name. Nothing unsafe
-happens when both get through; then two tasks have moved by the same figures, once.
+moment are settled by name: a commit that is under way goes first, then the vote for the lower name. A vote that was
+won counts as a commit under way, whoever makes it, until its value is learnt or `Turn.awaited_until`. Nothing unsafe
+happens when both get through all the same (messages may be lost); then two tasks have moved by the same figures, once.
 """
 
 from __future__ import annotations
@@ -28,21 +29,26 @@ class Turn(Protocol):
         """A change that this robot will or does propose to the register."""
 
     @property
+    def awaited_until(self) -> float:
+        """Until when the value of a vote that was won should be learnt; in the past: nothing is awaited."""
+
+    @property
     def called_at(self) -> float:
         """When this robot last proposed a planned move of it."""
 
 
-def who_moves_first(tasks: Mapping[TaskId, Turn], mine: TaskId, *, is_called: bool) -> TaskId | None:
+def who_moves_first(tasks: Mapping[TaskId, Turn], mine: TaskId, *, is_called: bool, now: float) -> TaskId | None:
     """The other task whose move ``mine`` must wait for, or ``None``.
 
     Args:
         tasks: {task: its round at this robot}.
         mine: whose planned move this robot would propose.
         is_called: another robot has called the vote on it already; then only a lower name's vote goes first.
+        now: monotonic seconds.
     """
     others = [(name, turn) for name, turn in tasks.items() if name != mine]
     for name, turn in others:
-        if turn.commit is not None:
+        if turn.commit is not None or now < turn.awaited_until:
             return name
     for name, turn in others:
         if turn.vote_opened_at is not None and (not is_called or name < mine):

@@ -399,6 +399,95 @@ def test_learnt_value_leaves_a_handed_out_commit_to_the_register() -> None:
     assert (robot.task.commit, robot.task.commit_at) == (None, math.inf)
 
 
+# --- several tasks ---------------------------------------------------------------------------------------------------
+
+
+class RobotOfTwo(Robot):
+    """A robot of a fleet with the tasks ``merge`` and ``plan``, both unplaced, both best on edge1."""
+
+    def __init__(self, me: str) -> None:
+        (merge,) = FLEET.tasks
+        super().__init__(me, owner=None, fleet=replace(FLEET, tasks=(merge, replace(merge, name="plan"))))
+        self.values = {name: replace(self.value, task=name) for name in ("merge", "plan")}
+
+    def tick(self, seconds: float = 0.0) -> tuple[Instruction, ...]:
+        self.now += seconds
+        return self.rounds.tick(self.values, self.states, self.now)
+
+    def hear_all(self, gather: int) -> list[bool]:
+        """The other robots' answers: edge1 is better."""
+        return [
+            self.rounds.absorb_utilities(
+                gather,
+                Utilities(
+                    voter=voter,
+                    vectors=tuple(
+                        UtilityVector(
+                            voter=voter,
+                            task=name,
+                            revision=value.revision,
+                            utilities=(Utility(candidate="edge1", value=0.9), Utility(candidate="edge2", value=0.7)),
+                        )
+                        for name, value in self.values.items()
+                    ),
+                ),
+            )
+            for voter in ROBOTS
+            if voter != self.me
+        ]
+
+    def vote(self, task: str, voter: str, candidate: str) -> None:
+        value = self.values[task]
+        proposal = Proposal(voter=voter, task=task, base_revision=value.revision, candidate=candidate, aggregate=0.9)
+        self.rounds.absorb_proposal(proposal, value, self.states, self.now)
+
+    def learn(self, task: str, owner: str) -> None:
+        self.values[task] = replace(self.values[task], revision=1, epoch=1, owner=owner)
+        self.rounds.on_learnt(task, is_new_epoch=True, now=self.now)
+
+    def gathered(self) -> tuple[Instruction, ...]:
+        """A whole gather, from its question to what follows from it."""
+        (ask,) = of(self.tick(), AskUtilities)
+        self.hear_all(ask.gather)
+        return self.tick(0.001)
+
+
+def test_what_was_gathered_before_another_task_was_placed_is_gathered_again() -> None:
+    robot = RobotOfTwo("robot2")
+    (ask,) = of(robot.tick(), AskUtilities)
+    robot.learn("plan", "edge1")
+    assert robot.hear_all(ask.gather) == [False, False], "they say nothing of what plan will use on edge1"
+    (again,) = of(robot.tick(), AskUtilities)
+    assert robot.rounds.tasks["merge"].judgement is None
+    assert robot.hear_all(again.gather) == [True, True]
+    assert len(of(robot.tick(), PublishProposal)) == 1
+
+
+def test_a_single_task_needs_no_second_gather() -> None:
+    robot = Robot()
+    (ask,) = of(robot.tick(), AskUtilities)
+    robot.rounds.on_learnt("merge", is_new_epoch=False, now=robot.now)
+    assert robot.hear("robot2", ask.gather)
+
+
+@pytest.mark.parametrize("ends", ["learnt", "given up"])
+def test_no_other_task_moves_between_a_vote_that_others_won_and_its_value(ends: str) -> None:
+    robot = RobotOfTwo("robot1")
+    robot.vote("plan", "robot2", "edge1")
+    robot.vote("plan", "robot3", "edge1")
+    assert robot.rounds.tasks["plan"].commit is None, "the others commit it"
+    assert [one.proposal.task for one in of(robot.gathered(), PublishProposal)] == ["plan"], "it was asked about that"
+    judgement = robot.rounds.tasks["merge"].judgement
+    assert judgement is not None
+    assert judgement.reason.endswith("plan moves first")
+    if ends == "learnt":
+        robot.learn("plan", "edge1")
+    else:
+        robot.rounds.on_commit_ended("plan")
+        robot.rounds.hurry(robot.now)
+    assert "merge" in {one.proposal.task for one in of(robot.gathered(), PublishProposal)}
+
+
 # --- edges -----------------------------------------------------------------------------------------------------------
 
 
