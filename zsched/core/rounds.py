@@ -482,11 +482,11 @@ class Rounds:
         task.judge.reset(is_new_owner=is_new_epoch)
         if is_new_epoch:
             task.settled_at = now
-        is_waited_for = any(other.is_waiting_its_turn for other in self.tasks.values())
         if self._gather is not None and len(self.tasks) > 1:
             # What was gathered says nothing of what this task will use at its new owner: no other may move by it.
-            self._gather, is_waited_for = None, True
-        if is_waited_for:
+            self._gather = None
+            self.hurry(now)
+        if any(other.is_waiting_its_turn for other in self.tasks.values()):
             self.hurry(now)
 
 

@@ -84,9 +84,12 @@ class Robot:
             )
             self.gateway.absorb(replace(profile, **changes) if name == "edge1" else profile, self.now)  # type: ignore[arg-type]
 
+    def values(self) -> dict[str, Allocation]:
+        return {"merge": self.value}
+
     def tick(self, seconds: float = 0.0) -> tuple[Instruction, ...]:
         self.now += seconds
-        return self.rounds.tick({"merge": self.value}, self.states, self.now)
+        return self.rounds.tick(self.values(), self.states, self.now)
 
     def hear(self, voter: str, gather: int, revision: int | None = None, /, **values: float) -> bool:
         return self.rounds.absorb_utilities(gather, self.answer(voter, revision, **values))
@@ -109,17 +112,18 @@ class Robot:
         return (*out, *self.tick())
 
     def paper(
-        self, voter: str, candidate: str, *, base: int | None = None, is_escape: bool = False
+        self, voter: str, candidate: str, *, base: int | None = None, is_escape: bool = False, task: str = "merge"
     ) -> list[Instruction]:
+        value = self.values()[task]
         proposal = Proposal(
             voter=voter,
-            task="merge",
-            base_revision=self.value.revision if base is None else base,
+            task=task,
+            base_revision=value.revision if base is None else base,
             candidate=candidate,
             aggregate=0.5,
             is_escape=is_escape,
         )
-        return self.rounds.absorb_proposal(proposal, self.value, self.states, self.now)
+        return self.rounds.absorb_proposal(proposal, value, self.states, self.now)
 
 
 def of(out: tuple[Instruction, ...] | list[Instruction], kind: type[T]) -> list[T]:
@@ -408,42 +412,22 @@ class RobotOfTwo(Robot):
     def __init__(self, me: str) -> None:
         (merge,) = FLEET.tasks
         super().__init__(me, owner=None, fleet=replace(FLEET, tasks=(merge, replace(merge, name="plan"))))
-        self.values = {name: replace(self.value, task=name) for name in ("merge", "plan")}
+        self.plan = replace(self.value, task="plan")
 
-    def tick(self, seconds: float = 0.0) -> tuple[Instruction, ...]:
-        self.now += seconds
-        return self.rounds.tick(self.values, self.states, self.now)
+    def values(self) -> dict[str, Allocation]:
+        return {"merge": self.value, "plan": self.plan}
+
+    def answer(self, voter: str, revision: int | None = None, /, **values: float) -> Utilities:
+        (merge,) = super().answer(voter, revision, **values).vectors
+        return Utilities(voter=voter, vectors=(merge, replace(merge, task="plan", revision=self.plan.revision)))
 
     def hear_all(self, gather: int) -> list[bool]:
         """The other robots' answers: edge1 is better."""
-        return [
-            self.rounds.absorb_utilities(
-                gather,
-                Utilities(
-                    voter=voter,
-                    vectors=tuple(
-                        UtilityVector(
-                            voter=voter,
-                            task=name,
-                            revision=value.revision,
-                            utilities=(Utility(candidate="edge1", value=0.9), Utility(candidate="edge2", value=0.7)),
-                        )
-                        for name, value in self.values.items()
-                    ),
-                ),
-            )
-            for voter in ROBOTS
-            if voter != self.me
-        ]
+        return [self.hear(voter, gather, edge1=0.9, edge2=0.7) for voter in ROBOTS if voter != self.me]
 
-    def vote(self, task: str, voter: str, candidate: str) -> None:
-        value = self.values[task]
-        proposal = Proposal(voter=voter, task=task, base_revision=value.revision, candidate=candidate, aggregate=0.9)
-        self.rounds.absorb_proposal(proposal, value, self.states, self.now)
-
-    def learn(self, task: str, owner: str) -> None:
-        self.values[task] = replace(self.values[task], revision=1, epoch=1, owner=owner)
-        self.rounds.on_learnt(task, is_new_epoch=True, now=self.now)
+    def learn_plan(self, owner: str) -> None:
+        self.plan = replace(self.plan, revision=1, epoch=1, owner=owner)
+        self.rounds.on_learnt("plan", is_new_epoch=True, now=self.now)
 
     def gathered(self) -> tuple[Instruction, ...]:
         """A whole gather, from its question to what follows from it."""
@@ -455,7 +439,7 @@ class RobotOfTwo(Robot):
 def test_what_was_gathered_before_another_task_was_placed_is_gathered_again() -> None:
     robot = RobotOfTwo("robot2")
     (ask,) = of(robot.tick(), AskUtilities)
-    robot.learn("plan", "edge1")
+    robot.learn_plan("edge1")
     assert robot.hear_all(ask.gather) == [False, False], "they say nothing of what plan will use on edge1"
     (again,) = of(robot.tick(), AskUtilities)
     assert robot.rounds.tasks["merge"].judgement is None
@@ -473,15 +457,15 @@ def test_a_single_task_needs_no_second_gather() -> None:
 @pytest.mark.parametrize("ends", ["learnt", "given up"])
 def test_no_other_task_moves_between_a_vote_that_others_won_and_its_value(ends: str) -> None:
     robot = RobotOfTwo("robot1")
-    robot.vote("plan", "robot2", "edge1")
-    robot.vote("plan", "robot3", "edge1")
+    robot.paper("robot2", "edge1", task="plan")
+    robot.paper("robot3", "edge1", task="plan")
     assert robot.rounds.tasks["plan"].commit is None, "the others commit it"
     assert [one.proposal.task for one in of(robot.gathered(), PublishProposal)] == ["plan"], "it was asked about that"
     judgement = robot.rounds.tasks["merge"].judgement
     assert judgement is not None
     assert judgement.reason.endswith("plan moves first")
     if ends == "learnt":
-        robot.learn("plan", "edge1")
+        robot.learn_plan("edge1")
     else:
         robot.rounds.on_commit_ended("plan")
         robot.rounds.hurry(robot.now)
