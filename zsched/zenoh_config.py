@@ -23,6 +23,15 @@ CONTROL_MAX_MESSAGE: Final = 1 << 20
 """Largest control message a peer may make us assemble, bytes (zenoh's default is 1 GiB)."""
 LOOPBACK_LISTEN: Final = "tcp/127.0.0.1:0"
 
+OPEN_TIMEOUT_S: Final = 1.5
+"""How long zenoh tries one dial: well between the times at which TCP sends a lost packet again (decision 0025).
+
+When it ends just as the handshake succeeds, zenoh drops the dial half done: a link that sends, never reads, never ends,
+and keeps every other link to the same peer out. A redial into a cut that has healed meanwhile succeeds with TCP's next
+SYN, 1 s (then 2 s or 3 s) after the first, and the rest of the handshake 0.2 s, 0.6 s, 1.4 s after a packet was lost.
+"""
+ACCEPT_TIMEOUT_S: Final = 1.0
+"""The other end, which begins with the connection, not with the SYN: between 0.6 s and 1.4 s."""
 RELAY_START_S: Final = 10.0
 """A worker that is started together with its relay, on a busy machine, waits so long for it."""
 DEFAULT_TIMING: Final = Timing()
@@ -196,8 +205,8 @@ def _common(timing: Timing) -> Settings:
         "scouting/multicast/enabled": False,
         "transport/link/tx/lease": round(timing.zenoh_lease_s * 1000),
         "transport/link/tx/keep_alive": 4,
-        "transport/unicast/open_timeout": 1000,
-        "transport/unicast/accept_timeout": 1000,
+        "transport/unicast/open_timeout": round(OPEN_TIMEOUT_S * 1000),
+        "transport/unicast/accept_timeout": round(ACCEPT_TIMEOUT_S * 1000),
         "timestamping/enabled": False,
         # also of clients: a relay that dies is back within 0.3 s, zenoh's default looks after 1 s, then 2, then 4
         "connect/retry": {"period_init_ms": 50, "period_max_ms": 1000, "period_increase_factor": 1.25},

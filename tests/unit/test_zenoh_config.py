@@ -50,6 +50,17 @@ def test_every_session_looks_again_quickly(name: str) -> None:
     assert read(ALL[name], "connect/retry")["period_max_ms"] == 1000
 
 
+@pytest.mark.parametrize("text", ALL.values(), ids=ALL.keys())
+def test_no_dial_is_given_up_at_a_moment_when_tcp_lets_it_succeed(text: str) -> None:
+    """Else it may be dropped half done, and the link is dead one way (`benchmarks/relink.py` makes it happen)."""
+    syn = [0.0, 1.0, 2.0, 3.0, 4.0, 7.0]  # Linux: by doubling, since 6.5 the first four at equal distances
+    data = [0.2, 0.6, 1.4, 3.0]
+    opens = read(text, "transport/unicast/open_timeout") / 1000
+    accepts = read(text, "transport/unicast/accept_timeout") / 1000
+    assert min(abs(opens - (begin + again)) for begin in syn for again in [0.0, *data]) >= 0.09
+    assert min(abs(accepts - again) for again in data) >= 0.09
+
+
 @pytest.mark.parametrize("name", ["control", "data", "worker"])
 def test_peers_gossip_and_wait_for_nobody(name: str) -> None:
     assert read(ALL[name], "mode") == "peer"
