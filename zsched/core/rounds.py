@@ -1,13 +1,12 @@
-"""SCHEDULER and VOTE in motion at one robot: gather, judge, propose, count, and when to commit.
+"""SCHEDULER in motion at one robot, all tasks: gather, judge, propose, and what follows from a vote's end.
 
-Knows: the round's course and its deadlines. Does not know: how scores arise (`scoring`), stickiness (`scheduler`), the
-count's rules (`vote`), the register, bytes.
+Knows: the round's course and its deadlines. Does not know: how scores arise (`scoring`), stickiness (`scheduler`), when
+a vote is open and how it ends (`voting`), the register, bytes.
 
 A robot gathers the others' utilities every ``decide_s``, and at once when an owner is gone or another robot's proposal
 for a move arrives: the first proposal *calls* the vote, so rounds need no synchronised clocks. In a called vote every
 robot answers with today's winner, or with the owner: its own time-to-trigger and cool-down do not count, the caller's
-did (docs/decisions/0004). A proposal counts as fresh for `Rounds.vote_s`: twice a gather, since answering one may take
-a whole gather when a peer is frozen.
+did (docs/decisions/0004).
 """
 
 from __future__ import annotations
@@ -29,9 +28,9 @@ from zsched.core.register import MoveOwner
 from zsched.core.scheduler import Judge, Judgement, Outcome, escape_reason
 from zsched.core.scoring import NO_DOUBTS, Doubts, Standing, book, compare, majority, score
 from zsched.core.turns import in_turn, who_moves_first
-from zsched.core.vote import Tally, VoteOutcome, tally
+from zsched.core.vote import VoteOutcome
+from zsched.core.voting import Voting
 
-VOTE_MARGIN_S = 0.1
 TIMER_MARGIN_S = 0.001
 """Sums of floats: a timer has certainly ended this much later."""
 
@@ -51,6 +50,7 @@ class TaskRound:
     spec: TaskSpec
     judge: Judge
     cost: MoveCost
+    voting: Voting
     settled_at: float
     """When this node learnt the current epoch."""
     is_called: bool = False
@@ -59,18 +59,7 @@ class TaskRound:
     judgement: Judgement | None = None
     judged_at: float = -math.inf
     silent: tuple[NodeId, ...] = ()
-    proposals: dict[NodeId, tuple[Proposal, float]] = field(default_factory=dict)
-    vote_opened_at: float | None = None
-    tally: Tally | None = None
-    tally_base: int = 0
-    tally_at: float = -math.inf
-    commit_at: float = math.inf
-    commit: MoveOwner | None = None
-    awaited_until: float = -math.inf
-    """A vote on a move was won: until when its value should be learnt."""
     damping: Damping = field(default_factory=Damping)
-    called_at: float = -math.inf
-    """When this robot last proposed a planned move of it."""
     is_waiting_its_turn: bool = False
     told: str = ""
     """The last decision written to the journal; the same one again is not."""
@@ -91,11 +80,13 @@ class Rounds:
         self._fleet, self._me, self._gateway, self._rng = fleet, me, gateway, rng
         self._doubts = doubts
         self.is_voter = me in fleet.voters
-        self.vote_s = 2 * fleet.timing.gather_s + VOTE_MARGIN_S
         self.tasks = {
-            spec.name: TaskRound(spec=spec, judge=Judge(spec=spec), cost=MoveCost(spec.name), settled_at=now)
+            spec.name: TaskRound(
+                spec=spec, judge=Judge(spec=spec), cost=MoveCost(spec.name), voting=Voting(fleet, me), settled_at=now
+            )
             for spec in fleet.tasks
         }
+        self._votings = {name: task.voting for name, task in self.tasks.items()}
         self._gather: _Gather | None = None
         self._answer: tuple[int, float, object, Utilities] = (-1, -math.inf, None, Utilities(voter=me, vectors=()))
         """(gateway's version, until when, (states, values, doubts), vectors): the newest answer to a gather."""
@@ -107,17 +98,15 @@ class Rounds:
     def next_deadline(self) -> float:
         """When `tick` may have something to do."""
         due = self._round_at if self._gather is None else self._gather.deadline
-        for task in self.tasks.values():
-            due = min(due, task.commit_at)
-            if task.vote_opened_at is not None:
-                due = min(due, task.vote_opened_at + self.vote_s)
+        for voting in self._votings.values():
+            due = min(due, voting.next_deadline())
         return due
 
     def is_idle(self, now: float) -> bool:
         """Whether `tick` has nothing to do: no gather runs, none is due, no vote is open."""
         if self._gather is not None or now >= self._round_at:
             return False
-        return all(task.vote_opened_at is None for task in self.tasks.values())
+        return all(voting.opened_at is None for voting in self._votings.values())
 
     def hurry(self, now: float) -> None:
         """Something happened that may need a decision: run a round now."""
@@ -168,9 +157,8 @@ class Rounds:
                 out += self._close(values, states, now)
         elif now >= self._round_at:
             out += self._open(values, states, now)
-        for task in self.tasks.values():
-            if task.vote_opened_at is not None:
-                out += self._count(task, values[task.spec.name], states, now)
+        for name, task in self.tasks.items():
+            out += self._count(task, values[name], states, now)
         return tuple(out)
 
     def _open(
@@ -216,7 +204,7 @@ class Rounds:
         assert self._gather is not None
         gathered, self._gather = self._gather, None
         out: list[Instruction] = []
-        for name in in_turn(self.tasks):
+        for name in in_turn(self._votings):
             task = self.tasks[name]
             vectors = {
                 voter: vector
@@ -264,10 +252,11 @@ class Rounds:
         task.judgement, task.judged_at = judgement, now
         self._wake_when_due(task, judgement, allocation, now)
         out: list[Instruction] = [*self._tell(task, judgement, allocation)]
-        if task.commit is not None:
+        if task.voting.commit is not None:
             return out
         if judgement.outcome is Outcome.PROPOSE or is_called:
-            task.called_at = now if not judgement.is_escape else task.called_at
+            if not judgement.is_escape:
+                task.voting.called_at = now
             out += self._propose(task, judgement, allocation, states, now)
         return out
 
@@ -278,7 +267,7 @@ class Rounds:
         task.is_waiting_its_turn = False
         if judgement.outcome is not Outcome.PROPOSE or judgement.is_escape:
             return judgement
-        first = who_moves_first(self.tasks, task.spec.name, is_called=is_called, now=now)
+        first = who_moves_first(self._votings, task.spec.name, is_called=is_called, now=now)
         if first is None:
             return judgement
         task.is_waiting_its_turn = True
@@ -386,77 +375,32 @@ class Rounds:
     ) -> list[Instruction]:
         """A robot's proposal (our own enters here too). On an older or newer base it does not count."""
         task = self.tasks[proposal.task]
-        if proposal.base_revision != allocation.revision:
-            return []
-        task.proposals[proposal.voter] = (proposal, now)
-        is_move = proposal.candidate != allocation.owner
-        if is_move and task.vote_opened_at is None and task.commit is None:
-            task.vote_opened_at = now
-        if is_move and proposal.voter != self._me and self._must_answer(task, now):
+        if task.voting.absorb(proposal, allocation, now):
             task.is_called = True
             task.is_called_escape |= proposal.is_escape
             if self._gather is None:
                 self.hurry(now)
         return self._count(task, allocation, states, now)
 
-    def _must_answer(self, task: TaskRound, now: float) -> bool:
-        mine = task.proposals.get(self._me)
-        return self.is_voter and task.commit is None and (mine is None or now - mine[1] > self.vote_s)
-
     def _count(
         self, task: TaskRound, allocation: Allocation, states: Mapping[NodeId, PeerState], now: float
     ) -> list[Instruction]:
-        if task.vote_opened_at is None:
+        ended = task.voting.count(allocation, self._present(states), now)
+        if ended is None:
             return []
-        fresh = {
-            voter: proposal
-            for voter, (proposal, at) in task.proposals.items()
-            if now - at <= self.vote_s and proposal.base_revision == allocation.revision
-        }
-        is_over = now >= task.vote_opened_at + self.vote_s
-        counted = tally(
-            fresh,
-            voters=self._fleet.voters,
-            present=self._present(states),
-            owner=allocation.owner,
-            is_over=is_over,
-        )
-        task.tally, task.tally_base, task.tally_at = counted, allocation.revision, now
-        if counted.outcome is VoteOutcome.PENDING:
-            return []
-        task.vote_opened_at = None
-        if counted.outcome is VoteOutcome.STAY:
+        if ended.outcome is VoteOutcome.STAY:
             task.judge.reset()
-        if counted.outcome is VoteOutcome.WON and counted.winner is not None:
-            task.awaited_until = now + self._fleet.timing.ballot_s + self._fleet.timing.stagger_s
-            self._schedule_commit(task, counted, allocation, fresh, now)
-        text = f"{counted.outcome}: {counted.reason} ({', '.join(f'{v}->{c}' for v, c in counted.votes)})"
+        text = f"{ended.outcome}: {ended.reason} ({', '.join(f'{v}->{c}' for v, c in ended.votes)})"
         return [RecordStory(stage="vote", text=text, task=task.spec.name, epoch=allocation.epoch)]
-
-    def _schedule_commit(
-        self, task: TaskRound, counted: Tally, allocation: Allocation, fresh: Mapping[NodeId, Proposal], now: float
-    ) -> None:
-        """The winner's voters propose it to the register, staggered by rank so that one usually suffices."""
-        supporters = [voter for voter, candidate in counted.votes if candidate == counted.winner]
-        if self._me not in supporters or counted.winner is None:
-            return
-        task.commit = MoveOwner(base_revision=allocation.revision, owner=counted.winner, reason=fresh[self._me].reason)
-        task.commit_at = now + self._fleet.timing.stagger_s * supporters.index(self._me)
 
     def due_commits(self, now: float) -> list[tuple[TaskId, MoveOwner]]:
         """Changes whose turn has come; each is handed out once."""
-        due = []
-        for name, task in self.tasks.items():
-            if task.commit is not None and now >= task.commit_at:
-                task.commit_at = math.inf
-                due.append((name, task.commit))
-        return due
+        due = ((name, voting.take_commit(now)) for name, voting in self._votings.items())
+        return [(name, change) for name, change in due if change is not None]
 
     def on_commit_ended(self, name: TaskId) -> None:
         """Our change was committed, overtaken or given up: votes may be called again."""
-        task = self.tasks[name]
-        task.commit, task.commit_at = None, math.inf
-        task.awaited_until = -math.inf
+        self._votings[name].end_commit()
 
     def on_moved(self, name: TaskId, left: NodeId | None, *, has_failed: bool, now: float) -> None:
         """A new owner is known: ``left`` is the one before, ``has_failed`` whether it was fled from."""
@@ -473,12 +417,8 @@ class Rounds:
     def on_learnt(self, name: TaskId, *, is_new_epoch: bool, now: float) -> None:
         """A newer revision is known: proposals on older bases are worthless."""
         task = self.tasks[name]
-        task.proposals.clear()
-        task.vote_opened_at = None
-        task.awaited_until = -math.inf
+        task.voting.on_learnt()
         task.told = ""
-        if task.commit is not None and task.commit_at < math.inf:
-            self.on_commit_ended(name)
         task.judge.reset(is_new_owner=is_new_epoch)
         if is_new_epoch:
             task.settled_at = now

@@ -197,15 +197,16 @@ def _decision(standing: TaskRound, now: float) -> DecisionStatus | None:
 
 
 def _vote(standing: TaskRound, now: float) -> VoteStatus | None:
-    counted = standing.tally
+    voting = standing.voting
+    counted = voting.tally
     if counted is None:
         return None
     return VoteStatus(
-        base_revision=standing.tally_base,
+        base_revision=voting.tally_base,
         votes=counted.votes,
         outcome=counted.outcome.value,
         winner=counted.winner,
-        age_s=now - standing.tally_at,
+        age_s=now - voting.tally_at,
     )
 
 

@@ -18,10 +18,10 @@ from zsched.core.model import TaskId
 
 
 class Turn(Protocol):
-    """What a task's round shows of a move that is under way."""
+    """What a task's voting shows of a move that is under way."""
 
     @property
-    def vote_opened_at(self) -> float | None:
+    def opened_at(self) -> float | None:
         """Since when a vote on a move is open."""
 
     @property
@@ -41,7 +41,7 @@ def who_moves_first(tasks: Mapping[TaskId, Turn], mine: TaskId, *, is_called: bo
     """The other task whose move ``mine`` must wait for, or ``None``.
 
     Args:
-        tasks: {task: its round at this robot}.
+        tasks: {task: its voting at this robot}.
         mine: whose planned move this robot would propose.
         is_called: another robot has called the vote on it already; then only a lower name's vote goes first.
         now: monotonic seconds.
@@ -51,7 +51,7 @@ def who_moves_first(tasks: Mapping[TaskId, Turn], mine: TaskId, *, is_called: bo
         if turn.commit is not None or now < turn.awaited_until:
             return name
     for name, turn in others:
-        if turn.vote_opened_at is not None and (not is_called or name < mine):
+        if turn.opened_at is not None and (not is_called or name < mine):
             return name
     return None
 

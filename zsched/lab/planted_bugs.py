@@ -26,7 +26,7 @@ class Bug:
 
 REGISTER, LEASE, TENURE = "zsched.core.register", "zsched.core.lease", "zsched.core.tenure"
 AGREEMENT, MEMBERSHIP, NODE = "zsched.core.agreement", "zsched.core.membership", "zsched.core.node"
-ROUNDS, VOTE = "zsched.core.rounds", "zsched.core.vote"
+ROUNDS, VOTE, VOTING = "zsched.core.rounds", "zsched.core.vote", "zsched.core.voting"
 SCHEDULER, SCORING, EXECUTOR = "zsched.core.scheduler", "zsched.core.scoring", "zsched.core.executor"
 
 _REGISTER = (
@@ -405,9 +405,9 @@ MEMBERSHIP_BUGS = (
 VOTE_BUGS = (
     Bug(
         name="stale proposal counted",
-        module=ROUNDS,
+        module=VOTING,
         changes=(
-            ("if proposal.base_revision != allocation.revision:\n            return []", "pass"),
+            ("if proposal.base_revision != allocation.revision:\n            return False", "pass"),
             ("and proposal.base_revision == allocation.revision", ""),
         ),
         tests=_ROUNDS,
@@ -421,7 +421,7 @@ VOTE_BUGS = (
     ),
     Bug(
         name="commit without supporters",
-        module=ROUNDS,
+        module=VOTING,
         changes=(
             (
                 "if self._me not in supporters or counted.winner is None:\n            return\n",
@@ -433,8 +433,8 @@ VOTE_BUGS = (
     ),
     _bug(
         "called vote ignored",
-        ROUNDS,
-        "return self.is_voter and task.commit is None and (",
+        VOTING,
+        "return self._me in self._voters and self.commit is None and (",
         "return False and (",
         _ROUNDS,
     ),

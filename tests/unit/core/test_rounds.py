@@ -29,6 +29,7 @@ from zsched.core.model import (
 from zsched.core.rounds import TIMER_MARGIN_S, Rounds, TaskRound
 from zsched.core.scheduler import Outcome
 from zsched.core.vote import VoteOutcome
+from zsched.core.voting import vote_time
 
 T = TypeVar("T")
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
@@ -305,7 +306,7 @@ def test_a_proposal_to_stay_calls_nobody() -> None:
     robot = Robot()
     robot.round()
     assert robot.paper("robot2", "edge1") == []
-    assert robot.task.vote_opened_at is None
+    assert robot.task.voting.opened_at is None
     assert proposed(robot.round()) == []
 
 
@@ -314,7 +315,7 @@ def test_proposal_on_an_older_or_newer_base_does_not_count(base: int) -> None:
     robot = Robot()
     robot.round()
     assert robot.paper("robot2", "edge2", base=base) == []
-    assert robot.task.proposals == {}
+    assert robot.task.voting.proposals == {}
     assert proposed(robot.round()) == []
 
 
@@ -324,12 +325,12 @@ def test_vote_that_is_not_completed_ends_without_a_quorum() -> None:
     robot.states.update(robot2=PeerState.SUSPECT, robot3=PeerState.SUSPECT)
     robot.paper("robot2", "edge2")
     opened = robot.now
-    while robot.task.vote_opened_at is not None:
+    while robot.task.voting.opened_at is not None:
         robot.now = max(robot.rounds.next_deadline(), robot.now)
         robot.tick()
-    assert robot.now == pytest.approx(opened + robot.rounds.vote_s)
-    assert robot.task.tally is not None
-    assert robot.task.tally.outcome is VoteOutcome.NO_QUORUM
+    assert robot.now == pytest.approx(opened + vote_time(FLEET.timing))
+    assert robot.task.voting.tally is not None
+    assert robot.task.voting.tally.outcome is VoteOutcome.NO_QUORUM
 
 
 # --- the commit ------------------------------------------------------------------------------------------------------
@@ -342,10 +343,10 @@ def won(me: str, other: str) -> Robot:
     while not proposed(out):
         robot.profiles({"edge1": 3.9})
         out = robot.round(edge1=0.02)
-    assert robot.task.commit is None, "one paper of three is no majority"
+    assert robot.task.voting.commit is None, "one paper of three is no majority"
     robot.paper(other, "edge2")
-    assert robot.task.tally is not None
-    assert robot.task.tally.outcome is VoteOutcome.WON
+    assert robot.task.voting.tally is not None
+    assert robot.task.voting.tally.outcome is VoteOutcome.WON
     return robot
 
 
@@ -369,8 +370,8 @@ def test_who_voted_otherwise_does_not_commit_the_winner() -> None:
     robot.paper("robot2", "edge2")
     assert proposed(robot.round()) == ["edge1"]
     robot.paper("robot3", "edge2")
-    assert robot.task.tally is not None
-    assert robot.task.tally.winner == "edge2"
+    assert robot.task.voting.tally is not None
+    assert robot.task.voting.tally.winner == "edge2"
     assert robot.rounds.due_commits(robot.now + 9.0) == []
 
 
@@ -379,17 +380,17 @@ def test_no_vote_is_called_or_answered_while_a_commit_is_under_way() -> None:
     robot.rounds.due_commits(robot.now)
     assert proposed(robot.round(edge1=0.02)) == []
     robot.paper("robot3", "edge2")
-    assert robot.task.vote_opened_at is None
+    assert robot.task.voting.opened_at is None
     robot.rounds.on_commit_ended("merge")
     robot.paper("robot3", "edge2")
-    assert robot.task.vote_opened_at == robot.now
+    assert robot.task.voting.opened_at == robot.now
 
 
 def test_learnt_value_ends_the_vote_and_a_commit_that_was_not_handed_out() -> None:
     robot = won("robot2", "robot1")
     robot.rounds.on_learnt("merge", is_new_epoch=True, now=robot.now)
     assert robot.rounds.due_commits(robot.now + 9.0) == []
-    assert (robot.task.commit, robot.task.proposals, robot.task.settled_at) == (None, {}, robot.now)
+    assert (robot.task.voting.commit, robot.task.voting.proposals, robot.task.settled_at) == (None, {}, robot.now)
 
 
 def test_learnt_value_leaves_a_handed_out_commit_to_the_register() -> None:
@@ -397,10 +398,10 @@ def test_learnt_value_leaves_a_handed_out_commit_to_the_register() -> None:
     robot = won("robot1", "robot2")
     robot.rounds.due_commits(robot.now)
     robot.rounds.on_learnt("merge", is_new_epoch=False, now=robot.now)
-    under_way = robot.task.commit
+    under_way = robot.task.voting.commit
     robot.rounds.on_commit_ended("merge")
     assert under_way is not None
-    assert (robot.task.commit, robot.task.commit_at) == (None, math.inf)
+    assert (robot.task.voting.commit, robot.task.voting.commit_at) == (None, math.inf)
 
 
 # --- several tasks ---------------------------------------------------------------------------------------------------
@@ -459,7 +460,7 @@ def test_no_other_task_moves_between_a_vote_that_others_won_and_its_value(ends: 
     robot = RobotOfTwo("robot1")
     robot.paper("robot2", "edge1", task="plan")
     robot.paper("robot3", "edge1", task="plan")
-    assert robot.rounds.tasks["plan"].commit is None, "the others commit it"
+    assert robot.rounds.tasks["plan"].voting.commit is None, "the others commit it"
     assert [one.proposal.task for one in of(robot.gathered(), PublishProposal)] == ["plan"], "it was asked about that"
     judgement = robot.rounds.tasks["merge"].judgement
     assert judgement is not None

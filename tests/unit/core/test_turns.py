@@ -26,7 +26,7 @@ from zsched.core.turns import in_turn, who_moves_first
 
 @dataclass
 class Task:
-    vote_opened_at: float | None = None
+    opened_at: float | None = None
     commit: object | None = None
     awaited_until: float = -math.inf
     called_at: float = -math.inf
@@ -37,19 +37,17 @@ def test_nobody_waits_while_nothing_moves() -> None:
 
 
 def test_a_planned_move_waits_for_an_open_vote_and_for_a_commit() -> None:
-    for moving in (Task(vote_opened_at=1.0), Task(commit="move"), Task(awaited_until=2.1)):
+    for moving in (Task(opened_at=1.0), Task(commit="move"), Task(awaited_until=2.1)):
         assert who_moves_first({"a": moving, "b": Task()}, "b", is_called=False, now=2.0) == "a"
         assert who_moves_first({"a": Task(), "b": moving}, "a", is_called=False, now=2.0) == "b"
         assert who_moves_first({"a": moving}, "a", is_called=False, now=2.0) is None, "its own does not count"
 
 
 def test_two_votes_called_at_once_are_settled_by_name_and_a_commit_goes_before_both() -> None:
-    crossed = {"a": Task(vote_opened_at=1.0), "b": Task(vote_opened_at=1.0)}
+    crossed = {"a": Task(opened_at=1.0), "b": Task(opened_at=1.0)}
     assert who_moves_first(crossed, "a", is_called=True, now=2.0) is None
     assert who_moves_first(crossed, "b", is_called=True, now=2.0) == "a"
-    assert (
-        who_moves_first({"a": Task(vote_opened_at=1.0), "b": Task(commit="move")}, "a", is_called=True, now=2.0) == "b"
-    )
+    assert who_moves_first({"a": Task(opened_at=1.0), "b": Task(commit="move")}, "a", is_called=True, now=2.0) == "b"
 
 
 def test_a_vote_that_was_won_goes_first_whoever_commits_it_but_not_for_ever() -> None:
