@@ -8,11 +8,12 @@ The robots and ``edge1`` are the electors, so that the four can be split evenly.
 from __future__ import annotations
 
 import signal
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from zsched.core.model import NodeId
 from zsched.lab.history import Admitted, History, Learnt, Worked
-from zsched.lab.netbed import Netbed, stop_group
+from zsched.lab.netbed import Netbed, Received, owners_of, stop_group
 from zsched.lab.testbed import TASK, Json, echo_fleet
 
 GUARD = "guard"
@@ -107,34 +108,31 @@ class ChaosBed(Netbed):
 
     def seen(self) -> History:
         """Everything since the bed was made: the nodes' logs, the guards' ticks, what the applications were given."""
+        return self._seen(self._received())
+
+    def _received(self) -> dict[NodeId, tuple[Received, ...]]:
+        return {robot: tuple(probe.received) for robot, probe in self.probes.items()}
+
+    def _seen(self, received: Mapping[NodeId, Sequence[Received]]) -> History:
+        worked = [record for file in self._ticks.glob("*.ticks") for record in _intervals(file)]
         history = self.history(electors=(), moves_per_minute={})
-        for file in self._ticks.glob("*.ticks"):
-            for record in _intervals(file):
-                history.record(record)
-        for robot, probe in self.probes.items():
-            for one in tuple(probe.received):
+        for record in worked:
+            history.record(record)
+        for robot, samples in received.items():
+            for one in samples:
                 if one.epoch is not None:
                     history.record(Admitted(at=one.at, node=robot, task=GUARD, epoch=one.epoch, owner=one.node))
         return history
 
     def violations(self) -> list[str]:
-        """What no correct fleet does; empty when all is well. The history is kept in the bed's folder."""
-        history = self.seen()
-        history.save(self.folder / "history.jsonl")
-        return [*history.violations(), *_foreign_ticks(history), *self._foreign_echoes(history)]
+        """What no correct fleet does; empty when all is well. The history is kept in the bed's folder.
 
-    def _foreign_echoes(self, history: History) -> list[str]:
-        """Robots whose application was given an owner's messages out of the order of the owners that they learnt."""
-        found = []
-        for robot, probe in self.probes.items():
-            learnt = [
-                one for one in history.records if isinstance(one, Learnt) and (one.node, one.task) == (robot, TASK)
-            ]
-            owners = [one.owner for one in sorted(learnt, key=lambda one: one.at)]
-            admitted = probe.owners(f"{robot}/out")
-            if not _is_subsequence(admitted, owners):
-                found.append(f"{robot} admitted {admitted}, its owners were {owners}")
-        return found
+        The fleet goes on meanwhile. So the logs are read last: a node writes down an owner before it works or is heard.
+        """
+        received = self._received()
+        history = self._seen(received)
+        history.save(self.folder / "history.jsonl")
+        return [*history.violations(), *_foreign_ticks(history), *_foreign_echoes(history, received)]
 
 
 def _foreign_ticks(history: History) -> list[str]:
@@ -142,6 +140,18 @@ def _foreign_ticks(history: History) -> list[str]:
     owners = {one.epoch: one.owner for one in history.records if isinstance(one, Learnt) and one.task == GUARD}
     admitted = [one for one in history.records if isinstance(one, Admitted) and owners.get(one.epoch) != one.owner]
     return [f"{one.node} admits {one.owner} in epoch {one.epoch} of {owners.get(one.epoch)}" for one in admitted[:5]]
+
+
+def _foreign_echoes(history: History, received: Mapping[NodeId, Sequence[Received]]) -> list[str]:
+    """Robots whose application was given an owner's messages out of the order of the owners that they learnt."""
+    found = []
+    for robot, samples in received.items():
+        learnt = [one for one in history.records if isinstance(one, Learnt) and (one.node, one.task) == (robot, TASK)]
+        owners = [one.owner for one in sorted(learnt, key=lambda one: one.at)]
+        admitted = owners_of(samples, f"{robot}/out")
+        if not _is_subsequence(admitted, owners):
+            found.append(f"{robot} admitted {admitted}, its owners were {owners}")
+    return found
 
 
 def _is_subsequence(part: list[NodeId], whole: list[NodeId | None]) -> bool:

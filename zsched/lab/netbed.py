@@ -101,11 +101,7 @@ class Probe:
 
     def owners(self, key: str) -> list[NodeId]:
         """Whose samples came under ``key``, in order, each run of one node once."""
-        runs: list[NodeId] = []
-        for one in tuple(self.received):
-            if one.key == key and (not runs or runs[-1] != one.node):
-                runs.append(one.node)
-        return runs
+        return owners_of(tuple(self.received), key)
 
     def close(self) -> None:
         """End it."""
@@ -120,6 +116,15 @@ class Probe:
         self._thread.join(5)
         assert self._process.stdout is not None
         self._process.stdout.close()
+
+
+def owners_of(received: Sequence[Received], key: str) -> list[NodeId]:
+    """Whose samples came under ``key``, in order, each run of one node once."""
+    runs: list[NodeId] = []
+    for one in received:
+        if one.key == key and (not runs or runs[-1] != one.node):
+            runs.append(one.node)
+    return runs
 
 
 def _received(key: str, number: str, sent_at: str, epoch: str, at: str, node: str) -> Received:
