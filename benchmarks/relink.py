@@ -149,8 +149,8 @@ def run(record: Record, given: argparse.Namespace) -> None:
                 for fleet in fleets:
                     fleet.network.heal()
                 took = until_whole(fleets, DEAD_S)
-                for seconds, healed_s, fleet in zip(given.open_timeout, took, fleets, strict=True):
-                    record.add({"open_timeout": seconds, "healed_s": healed_s, "dead": len(fleet.missing())})
+                for seconds, healed_s in zip(given.open_timeout, took, strict=True):
+                    record.add({"open_timeout": seconds, "healed_s": healed_s})
                 shown = ", ".join("dead" if one is None else f"{one:.2f} s" for one in took)
                 progress(
                     f"split {len(record.rows) // len(fleets)}/{given.splits} of {length_s:.2f} s, whole after {shown}"

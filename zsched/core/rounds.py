@@ -28,7 +28,7 @@ from zsched.core.register import MoveOwner
 from zsched.core.scheduler import Judge, Judgement, Outcome, escape_reason
 from zsched.core.scoring import NO_DOUBTS, Doubts, Standing, book, compare, majority, score
 from zsched.core.turns import in_turn, who_moves_first
-from zsched.core.vote import VoteOutcome
+from zsched.core.vote import VoteOutcome, present_voters
 from zsched.core.voting import Voting
 
 TIMER_MARGIN_S = 0.001
@@ -232,7 +232,7 @@ class Rounds:
         escape = self._escape(task, standing, allocation, states, is_called_escape, now)
         needed = majority(len(self._fleet.voters))
         if escape is not None:
-            needed = max(min(needed, majority(len(self._present(states)))), 1)
+            needed = max(min(needed, majority(len(present_voters(self._fleet.voters, states)))), 1)
         if standing.voters_heard < needed:
             reason = f"utilities of {standing.voters_heard} robots, {needed} needed"
             judgement = Judgement(outcome=Outcome.NONE, candidate=None, aggregate=0.0, reason=reason)
@@ -328,9 +328,6 @@ class Rounds:
             task.judge.not_ready_since = now
         return now - task.judge.not_ready_since
 
-    def _present(self, states: Mapping[NodeId, PeerState]) -> frozenset[NodeId]:
-        return frozenset(name for name in self._fleet.voters if states[name] is not PeerState.GONE)
-
     def _tell(self, task: TaskRound, judgement: Judgement, allocation: Allocation) -> list[Instruction]:
         text = f"{judgement.outcome} {judgement.candidate or '-'}"
         if text == task.told:
@@ -385,7 +382,7 @@ class Rounds:
     def _count(
         self, task: TaskRound, allocation: Allocation, states: Mapping[NodeId, PeerState], now: float
     ) -> list[Instruction]:
-        ended = task.voting.count(allocation, self._present(states), now)
+        ended = task.voting.count(allocation, states, now)
         if ended is None:
             return []
         if ended.outcome is VoteOutcome.STAY:

@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
-from zsched.core.model import NodeId, Proposal
+from zsched.core.model import NodeId, PeerState, Proposal
 from zsched.core.scoring import majority, rounded
 
 
@@ -39,6 +39,11 @@ class Tally:
     """(voter, candidate), sorted by voter."""
     is_escape: bool
     reason: str
+
+
+def present_voters(voters: tuple[NodeId, ...], states: Mapping[NodeId, PeerState]) -> frozenset[NodeId]:
+    """The robots that are not gone."""
+    return frozenset(name for name in voters if states[name] is not PeerState.GONE)
 
 
 def tally(

@@ -14,9 +14,9 @@ import math
 from collections.abc import Mapping
 
 from zsched.core.fleet import Fleet, Timing
-from zsched.core.model import Allocation, NodeId, Proposal
+from zsched.core.model import Allocation, NodeId, PeerState, Proposal
 from zsched.core.register import MoveOwner
-from zsched.core.vote import Tally, VoteOutcome, tally
+from zsched.core.vote import Tally, VoteOutcome, present_voters, tally
 
 VOTE_MARGIN_S = 0.1
 
@@ -73,12 +73,12 @@ class Voting:
 
     # --- the count -----------------------------------------------------------------------------------------------
 
-    def count(self, allocation: Allocation, present: frozenset[NodeId], now: float) -> Tally | None:
+    def count(self, allocation: Allocation, states: Mapping[NodeId, PeerState], now: float) -> Tally | None:
         """Count the open vote; its tally when it has ended by that, ``None`` while it goes on or none is open.
 
         Args:
             allocation: today's value: whose revision proposals must name, and who the owner is.
-            present: the robots that are not gone.
+            states: what this node holds every node for.
             now: monotonic seconds.
         """
         if self.opened_at is None:
@@ -89,7 +89,13 @@ class Voting:
             if now - at <= self._vote_s and proposal.base_revision == allocation.revision
         }
         is_over = now >= self.opened_at + self._vote_s
-        counted = tally(fresh, voters=self._voters, present=present, owner=allocation.owner, is_over=is_over)
+        counted = tally(
+            fresh,
+            voters=self._voters,
+            present=present_voters(self._voters, states),
+            owner=allocation.owner,
+            is_over=is_over,
+        )
         self.tally, self.tally_base, self.tally_at = counted, allocation.revision, now
         if counted.outcome is VoteOutcome.PENDING:
             return None

@@ -7,12 +7,12 @@ import math
 import pytest
 
 from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing
-from zsched.core.model import Allocation, NodeKind, Proposal, Tuning, Weights
+from zsched.core.model import Allocation, NodeKind, PeerState, Proposal, Tuning, Weights
 from zsched.core.vote import VoteOutcome
 from zsched.core.voting import Voting, vote_time
 
 ROBOTS = ("robot1", "robot2", "robot3")
-ALL = frozenset(ROBOTS)
+ALL = dict.fromkeys(ROBOTS, PeerState.ALIVE)
 TUNING = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
 FLEET = Fleet(
     name="votes",
