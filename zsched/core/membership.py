@@ -4,8 +4,8 @@ Knows: deadlines, confirmation, incarnations, self-doubt. Does not know: what fo
 
 A beat comes out of the peer's decision loop and is the only proof of life; the liveliness token goes within
 milliseconds of a kill, but stays while a wedged process keeps its link, so it can only accuse. Silence or a lost token
-make a peer *suspect*. In fleets of more than three nodes it is *gone* when a second, living observer suspects it too,
-or when nobody speaks for it during the confirmation time; a living observer that still hears it keeps it suspect (a
+make a peer *suspect*. It is *gone* when a second, living observer suspects it too, or when nobody speaks for it during
+the confirmation time; in fleets of more than three nodes a living observer that still hears it keeps it suspect (a
 partial cut). Any beat refutes. A node whose own loop lags doubts itself first: its deadlines lengthen, at most
 threefold, and never stop (after Lifeguard, arXiv 1707.00788). An observer that has watched for a while without ever
 hearing a peer accuses it as well: it must not vouch for what it does not know.
@@ -24,7 +24,7 @@ from zsched.core.fleet import Timing
 from zsched.core.model import Beat, NodeId, PeerState
 
 SMALL_FLEET = 3
-"""Up to so many nodes there is no second observer to wait for."""
+"""Up to so many nodes no second observer is waited for: there is one at most, and it may be the next to go."""
 MAX_DOUBT = 3.0
 IN_FLIGHT_S = 0.03
 """A beat that arrives so soon after its sender's token went was on its way before: it refutes nothing."""
@@ -243,10 +243,9 @@ class Membership:
 
     def _verdict(self, name: NodeId, peer: _Peer, now: float) -> str:
         observers = [(other, at) for other, at in self._peers.items() if other != name and at.state is PeerState.ALIVE]
-        if self._size > SMALL_FLEET:
-            for other, observer in observers:
-                if name in observer.suspects:
-                    return f"{other} misses it too"
+        for other, observer in observers:
+            if name in observer.suspects:
+                return f"{other} misses it too"
         if now < self._review_at(peer):
             return ""
         if self._size > SMALL_FLEET and any(at.beat_at > peer.suspect_since for _, at in observers):

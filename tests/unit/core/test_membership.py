@@ -299,6 +299,13 @@ def test_killed_peer_is_suspect_at_once_and_gone_with_the_second_observer() -> N
     assert ear.beat("b", 0.06, suspects=("a",)) == [GONE]
 
 
+def test_killed_peer_of_three_is_gone_with_the_second_observer_too() -> None:
+    ear = heard(SMALL)
+    (change,) = ear.members.absorb_token_lost("a", 1, 0.05)
+    assert change.after is SUSPECT
+    assert ear.beat("b", 0.06, suspects=("a",)) == [GONE]
+
+
 def test_killed_peer_in_a_small_fleet_is_gone_after_one_and_a_half_beats() -> None:
     ear = heard(SMALL)
     ear.members.absorb_token_lost("a", 1, 0.05)
