@@ -305,6 +305,7 @@ SERVICE: Final = Record(
         "to": Field(Here(_TEMPLATE), "Key under which the owner's worker answers; a template.", required=True),
         "retry": Field(Flag(), "Ask the next owner when the old one did not answer: it may be done twice."),
         "timeout_s": Field(Number(0.05, 3600, "s"), "Every request is answered within this time."),
+        "hold_s": Field(Number(0, 3600, "s"), "How long a request waits for an owner while there is none."),
         "max_pending": Field(Whole(1, 256), "Requests at the owner at one time; the next one is answered `busy`."),
     },
     ServiceSettings,

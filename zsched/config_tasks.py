@@ -259,7 +259,7 @@ def _rule(section: Section, direction: Direction, out: Collector) -> StreamRule 
         settings=StreamSettings(
             **{"stream_class" if name == "class" else name: value for name, value in _settings(section).items()}
         ),
-        service=ServiceSettings(**_of(section, "retry", "timeout_s", "max_pending")),
+        service=ServiceSettings(**_of(section, "retry", "timeout_s", "hold_s", "max_pending")),
     )
     problem = rule_fault(rule)
     if problem is not None:

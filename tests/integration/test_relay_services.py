@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +61,7 @@ with Worker.from_env() as worker:
 """
 
 
-def slot(epoch: int, owner: str, service: ServiceSettings) -> Slot:
+def slot(epoch: int, owner: str, service: ServiceSettings, ready_when: ReadyWhen = ReadyWhen.TOKEN) -> Slot:
     route = Route(
         stream=f"{TASK}/srv/0",
         direction=Direction.SERVICE,
@@ -70,7 +70,7 @@ def slot(epoch: int, owner: str, service: ServiceSettings) -> Slot:
         settings=StreamSettings(),
         service=service,
     )
-    return Slot(epoch=epoch, owner=owner, routes=(route,), ready_when=ReadyWhen.TOKEN)
+    return Slot(epoch=epoch, owner=owner, routes=(route,), ready_when=ready_when)
 
 
 @dataclass
@@ -328,13 +328,32 @@ def test_a_request_that_nobody_has_taken_waits_for_the_next_owner(rig: Rig) -> N
     assert asked.wait().answers == [f"edge2/{TASK} did hello with a=1;b=2"]
 
 
-def test_without_any_owner_there_is_an_error_within_a_second_or_so(rig: Rig) -> None:
-    begin(rig, ONCE)
+@pytest.mark.parametrize("hold_s", [0.0, 0.5])
+def test_without_any_owner_there_is_an_error_after_the_services_hold(rig: Rig, hold_s: float) -> None:
+    begin(rig, replace(ONCE, hold_s=hold_s))
     rig.workers["edge1"].kill()
     rig.wait(SlotReady, epoch=1, is_ready=False)
     asked = rig.ask("hello").wait()
     (error,) = asked.errors
     assert error.startswith("no owner: ")
+    assert hold_s <= asked.took_s < ONCE.timeout_s
+
+
+def test_a_request_that_no_end_of_a_link_ends_is_an_error_soon(rig: Rig) -> None:
+    """As those that leave within a millisecond of the owner's death: zenoh leaves them to their time."""
+    held: list[zenoh.Query] = []
+    config = worker_config(connect=(rig.endpoint(ROBOT),), shared_memory=False)
+    with zenoh.open(zenoh.Config.from_json5(config)) as owner:
+        queryable = owner.declare_queryable(f"edge1/{TASK}/{ROBOT}/job", held.append)
+        foreign = slot(1, "edge1", ONCE, ReadyWhen.MATCHING)
+        rig.flip(foreign)
+        rig.plan(RoutePhase.CLOSE, foreign)
+        asked = rig.ask("hello")
+        until(lambda: held, "the owner has the request")
+        queryable.undeclare()
+        (error,) = asked.wait().errors
+        held.pop().drop()
+    assert error.startswith("owner gone: ")
     assert asked.took_s < SOON_S
 
 

@@ -75,7 +75,7 @@ def test_requests_go_on_over_a_kill_of_the_owner_and_none_is_left_without_a_word
     assert set(words.values()) == {1}, "one answer or one error for each"
     errors = [error for said in asker.errors.values() for error in said]
     assert len(errors) <= 2, errors  # those that were in the owner's hands
-    assert all(error.startswith("owner gone: ") for error in errors)
+    assert all(error.startswith("owner gone: ") for error in errors), errors
 
     def counted() -> int:
         return sum(one["messages"] for one in bed.task("robot1")["streams"] if one["stream"] == "echo/srv/0")

@@ -80,6 +80,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "depth": (1, 100_000),
     "max_hz": (0.01, 10_000),
     "timeout_s": (0.05, 3600),
+    "hold_s": (0, 3600),
     "max_pending": (1, 256),
 }
 

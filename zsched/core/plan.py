@@ -81,11 +81,18 @@ class ServiceSettings:
     """Ask the next owner when the old one did not answer: the work may then be done twice."""
     timeout_s: float = 10.0
     """A request is answered within this time, with an error if need be; 0.05..3600."""
+    hold_s: float = 3.0
+    """A request that nobody has taken waits so long for an owner, 0..3600 (with `retry`: as long as its time lasts).
+
+    The default is what a killed owner's takeover may take at most with the profile ``wifi``, 1.8 s, and an exclusive
+    task's lease on top (docs/timing.md).
+    """
     max_pending: int = 16
     """Requests at the owner at one time, 1..256; the next one is answered "busy"."""
 
     def __post_init__(self) -> None:
         check_range("timeout_s", self.timeout_s, 0.05, 3600.0)
+        check_range("hold_s", self.hold_s, 0.0, 3600.0)
         check_range("max_pending", self.max_pending, 1, 256)
 
 

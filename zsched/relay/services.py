@@ -9,11 +9,14 @@ error reply, its first words one of `ServiceProblem`:
 
 =============  =======================================================================================================
 busy           ``max_pending`` requests are at the owner already
-no owner       nobody has taken the request within `HOLD_S`: it was not carried out
+no owner       nobody has taken the request within ``hold_s``: it was not carried out
 owner gone     the owner died, or its link did, before it answered
 moved          the task moved and the old owner's drain time ended before it answered
 timeout        the owner did not answer within ``timeout_s``
 =============  =======================================================================================================
+
+zenoh ends a request when its owner's link ends, but not one that left within the next milliseconds, before the link's
+queryables went with it: that would wait for its whole time. So `ServiceStream.look_after` ends what nobody can answer.
 
 A thread per request, at most ``max_pending`` of them: a plain callback would serialise all requests, and a stalled
 asker may block its own thread only.
@@ -39,10 +42,10 @@ from zsched.relay.counter import StreamCounter
 from zsched.relay.receive import undeclare
 from zsched.relay.replies import Replies
 
-HOLD_S: Final = 1.0
-"""How long a request that nobody has taken waits for an owner (with ``retry``: as long as its time lasts)."""
 LOOK_AGAIN_S: Final = 0.02
 """How often a waiting request looks for an owner; a flip wakes it at once."""
+UNSERVED_GRACE_S: Final = 0.2
+"""A request whose owner answers no more under its key gets so long: its last words may still be in our queues."""
 JOIN_S: Final = 0.3
 MAX_KEYS: Final = 256
 """Keys of a wildcard service that are looked after; of further ones it is only known when a request has no answer."""
@@ -53,8 +56,20 @@ _log = logging.getLogger("zsched.relay")
 class _Outcome(Enum):
     ANSWERED = "answered"
     REFUSED = "refused"
-    NO_ANSWER = "no answer"
+    LEFT = "left"
+    OWNER_GONE = "owner gone"
     TIMED_OUT = "timed out"
+
+
+@dataclass(slots=True, eq=False)
+class _Asked:
+    """One request at the owner."""
+
+    key: str
+    """The owner's."""
+    replies: Replies
+    unserved_since: float | None = None
+    """When nobody was found to answer under the key, and nobody since."""
 
 
 @dataclass(slots=True, eq=False)
@@ -66,7 +81,7 @@ class _ServiceSlot:
     forwards: Rewriter
     """From a key that was asked for to the owner's."""
     queriers: dict[str, zenoh.Querier] = field(default_factory=dict)
-    pending: set[Replies] = field(default_factory=set)
+    pending: set[_Asked] = field(default_factory=set)
     is_closed: bool = False
 
     @property
@@ -139,6 +154,19 @@ class ServiceStream:
         slot = self._slots.get(epoch)
         return slot is None or not slot.pending
 
+    def look_after(self) -> None:
+        """End the requests that nobody has been there to answer for `UNSERVED_GRACE_S`."""
+        now = monotonic_s()
+        with self._lock:
+            for slot in self._slots.values():
+                for asked in slot.pending:
+                    if slot.serves(asked.key):
+                        asked.unserved_since = None
+                    elif asked.unserved_since is None:
+                        asked.unserved_since = now
+                    elif now - asked.unserved_since >= UNSERVED_GRACE_S:
+                        asked.replies.stop()
+
     def close_slot(self, epoch: int) -> None:
         """Forget a slot; requests it has not answered get an error, or go to the next owner (``retry``)."""
         with self._lock:
@@ -148,8 +176,10 @@ class ServiceStream:
             slot.is_closed = True
             if slot is self._active:
                 self._active = None
-            for replies in slot.pending:
-                replies.stop()
+            for asked in slot.pending:
+                if asked.unserved_since is None and not slot.serves(asked.key):
+                    asked.unserved_since = monotonic_s()
+                asked.replies.stop()
         for querier in slot.queriers.values():
             undeclare(querier)
 
@@ -199,7 +229,7 @@ class ServiceStream:
         """Ask one owner after the other, as far as that is allowed, until there is an answer or an error."""
         settings = self.route.service
         until = monotonic_s() + settings.timeout_s
-        hold_until = until if settings.retry else min(until, monotonic_s() + HOLD_S)
+        hold_until = until if settings.retry else min(until, monotonic_s() + settings.hold_s)
         while True:
             slot = self._await_owner(str(query.key_expr), hold_until)
             if slot is None:
@@ -230,34 +260,38 @@ class ServiceStream:
 
     def _ask(self, query: Query, slot: _ServiceSlot, timeout_s: float) -> _Outcome:
         """Send the request to one owner and hand its answers on."""
-        selector = zenoh.Selector(slot.key_for(str(query.key_expr)), query.parameters)
-        replies = Replies(timeout_s)
+        asked = _Asked(slot.key_for(str(query.key_expr)), Replies(timeout_s))
         with self._lock:  # a slot that closes from here on stops it
             if slot.is_closed:
                 return _Outcome.REFUSED
-            slot.pending.add(replies)
+            slot.pending.add(asked)
         try:
-            replies.send(
+            asked.replies.send(
                 self._session,
-                selector,
+                zenoh.Selector(asked.key, query.parameters),
                 payload=query.payload,
                 encoding=query.encoding,
                 attachment=query.attachment,
             )
-            return self._hand_on(query, replies, slot)
+            return self._hand_on(query, asked, slot)
         finally:
             with self._lock:
-                slot.pending.remove(replies)
+                slot.pending.remove(asked)
 
-    def _hand_on(self, query: Query, replies: Replies, slot: _ServiceSlot) -> _Outcome:
-        answers = 0
+    def _hand_on(self, query: Query, asked: _Asked, slot: _ServiceSlot) -> _Outcome:
+        replies, answers = asked.replies, 0
         for reply in replies:
             error = reply.err
             if error is not None and str(error.encoding) == REFUSED_ENCODING and not answers:
                 return _Outcome.REFUSED
             self._pass_on(query, reply)
             answers += 1
-        outcome = _Outcome.TIMED_OUT if replies.has_timed_out else _Outcome.NO_ANSWER
+        if replies.has_timed_out:
+            outcome = _Outcome.TIMED_OUT
+        elif replies.is_stopped and asked.unserved_since is None:
+            outcome = _Outcome.LEFT
+        else:
+            outcome = _Outcome.OWNER_GONE
         if not answers:
             return outcome
         if replies.has_timed_out or replies.is_stopped:
@@ -302,7 +336,7 @@ def _problem(outcome: _Outcome, slot: _ServiceSlot) -> tuple[ServiceProblem, str
         return ServiceProblem.NO_OWNER, f"the worker at {where} is not the owner: it was not done"
     if outcome is _Outcome.TIMED_OUT:
         return ServiceProblem.TIMEOUT, f"no answer from {where}; it may have been done"
-    if slot.is_closed:
+    if outcome is _Outcome.LEFT:
         return ServiceProblem.MOVED, f"the task has left {where}, which had not answered; it may have been done"
     return ServiceProblem.OWNER_GONE, f"no answer from {where}; it may have been done"
 
@@ -340,6 +374,11 @@ class Services:
     def has_ended(self, epoch: int) -> bool:
         """True when the epoch's owner has answered every request."""
         return all(stream.has_ended(epoch) for stream in self._streams.values())
+
+    def look_after(self) -> None:
+        """End the requests whose owner is gone without a word."""
+        for stream in self._streams.values():
+            stream.look_after()
 
     def close_slot(self, epoch: int) -> None:
         """Close the slots of one epoch."""

@@ -145,6 +145,7 @@ class TaskRelay:
             source.look_after()
         for sink in self._outputs.values():
             sink.look_after()
+        self._services.look_after()
 
     def _problem(self, text: str) -> None:
         self._report(ProblemReported(source=f"relay/{self._task}", problem=text[:400]))

@@ -39,13 +39,13 @@ def task_of(*pairs: tuple[str, str], name: str = "merge", direction: Direction =
 
 def test_a_service_of_the_file_becomes_a_route_of_its_kind() -> None:
     result = check(
-        '{from: "{robot}/now", to: "{target}/merge/{robot}/now", retry: true, timeout_s: 0.5, max_pending: 3}'
+        '{from: "{robot}/now", to: "{target}/merge/{robot}/now", retry: true, timeout_s: 1, hold_s: 0, max_pending: 3}'
     )
     assert result.fleet is not None, result.report()
     (route,) = routes_for(result.fleet.task("merge"), "robot2", "edge1", 4)
     assert (route.stream, route.direction) == ("merge/srv/0", SERVICE)
     assert (route.from_expr, route.to_expr) == ("robot2/now", "edge1/merge/robot2/now")
-    assert route.service == ServiceSettings(retry=True, timeout_s=0.5, max_pending=3)
+    assert route.service == ServiceSettings(retry=True, timeout_s=1.0, hold_s=0.0, max_pending=3)
 
 
 def test_defaults_of_a_service_never_run_it_twice() -> None:
@@ -63,6 +63,7 @@ def test_defaults_of_a_service_never_run_it_twice() -> None:
         ('{from: "{robot}/now", to: "merge/now"}', "it lacks {target}"),
         ('{from: "{robot}/now", to: "{target}/{epoch}/now"}', "may not stand in the 'to' of a service"),
         ('{from: "{robot}/now", to: "{target}/now", timeout_s: 0}', "0.05..3600"),
+        ('{from: "{robot}/now", to: "{target}/now", hold_s: -1}', "0..3600"),
         ('{from: "{robot}/now", to: "{target}/now", max_pending: 0}', "1..256"),
         ('{from: "{robot}/now", to: "{target}/now", class: latest}', "class"),
         ('{from: "{robot}/now"}', "to"),
