@@ -164,7 +164,7 @@ class ServiceStream:
                         asked.unserved_since = None
                     elif asked.unserved_since is None:
                         asked.unserved_since = now
-                    elif now - asked.unserved_since >= UNSERVED_GRACE_S:
+                    elif now - asked.unserved_since >= UNSERVED_GRACE_S and not asked.replies.is_stopped:
                         asked.replies.stop()
 
     def close_slot(self, epoch: int) -> None:
