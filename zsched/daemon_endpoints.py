@@ -5,14 +5,24 @@ Knows: the fleet file's addresses, the seeds, who dials whom. Does not know: zen
 
 from __future__ import annotations
 
+import contextlib
 import errno
+import secrets
 import socket
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
 
 from zsched import zenoh_config
 from zsched.core.fleet import Fleet, NodeSpec, dial_endpoint
 from zsched.core.model import NodeId, NodeKind
+
+PORT_RANGE: Final = Path("/proc/sys/net/ipv4/ip_local_port_range")
+MIN_PORT: Final = 20_000
+"""Below it there are more registered services."""
+MAX_PORT: Final = 65_535
+PORT_TRIES: Final = 64
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -103,9 +113,30 @@ def is_here(host: str) -> bool:
     return True
 
 
-def free_port() -> int:
-    """A TCP port that is free now (a node without a fixed data endpoint: its workers must know it)."""
+def free_port(outgoing: range | None = None) -> int:
+    """A TCP port that is free now (a node without a fixed data endpoint: its workers must know it).
+
+    It is none of those that the kernel gives to ``outgoing`` connections, unless those are all: such a connection may
+    last for hours, and would keep the relay out, before it listens or when it starts again.
+    """
+    outgoing = _outgoing_ports() if outgoing is None else outgoing
+    for ports in (range(outgoing.stop, MAX_PORT + 1), range(MIN_PORT, outgoing.start)):
+        for port in secrets.SystemRandom().sample(ports, min(len(ports), PORT_TRIES)):
+            with contextlib.suppress(OSError):
+                return _bound_port(port)
+    return _bound_port(0)
+
+
+def _outgoing_ports() -> range:
+    try:
+        low, high = (int(word) for word in PORT_RANGE.read_text().split())
+    except (OSError, ValueError):
+        low, high = 32768, 60999  # Linux's default
+    return range(low, high + 1)
+
+
+def _bound_port(port: int) -> int:
     with socket.socket() as probe:
-        probe.bind(("0.0.0.0", 0))  # noqa: S104 - only asks the kernel for a number, never listens
-        port: int = probe.getsockname()[1]
-        return port
+        probe.bind(("0.0.0.0", port))  # noqa: S104 - only asks the kernel, never listens
+        bound: int = probe.getsockname()[1]
+        return bound

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -24,7 +26,7 @@ from zsched.core import events as ev
 from zsched.core.fleet import Fleet, NodeSpec, Timing
 from zsched.core.model import NodeKind
 from zsched.daemon import EXIT_CONFIG, EXIT_FAILED, EXIT_OK, Sampler
-from zsched.daemon_endpoints import Endpoints, endpoints_for, free_port, is_here
+from zsched.daemon_endpoints import MAX_PORT, MIN_PORT, PORT_RANGE, Endpoints, endpoints_for, free_port, is_here
 from zsched.errors import AdapterError
 from zsched.lab.testbed import echo_fleet
 from zsched.places import socket_path
@@ -154,8 +156,29 @@ def test_an_address_is_here_when_it_can_be_bound() -> None:
     assert not is_here("192.0.2.1")  # RFC 5737: nobody's
 
 
-def test_free_port_can_be_bound() -> None:
-    assert 1024 <= free_port() <= 65535
+def test_free_port_is_none_that_an_outgoing_connection_may_get() -> None:
+    low, high = (int(word) for word in PORT_RANGE.read_text().split())
+    if low <= MIN_PORT and high == MAX_PORT:
+        pytest.skip("this machine gives them all to outgoing connections")
+    for _ in range(20):
+        port = free_port()
+        assert MIN_PORT <= port <= MAX_PORT
+        assert not low <= port <= high
+
+
+@pytest.mark.parametrize(
+    ("outgoing", "expected"),
+    [(range(32768, 61000), range(61000, 65536)), (range(32768, 65536), range(MIN_PORT, 32768))],
+)
+def test_free_port_lies_above_the_outgoing_ones_or_below(outgoing: range, expected: range) -> None:
+    assert free_port(outgoing) in expected
+
+
+def test_free_port_is_any_when_no_other_is_free() -> None:
+    with socket.socket() as taken:
+        with contextlib.suppress(OSError):  # somebody else has it: as good
+            taken.bind(("127.0.0.1", MAX_PORT))
+        assert free_port(range(1024, MAX_PORT)) not in (0, MAX_PORT)
 
 
 # --- the sampler -----------------------------------------------------------------------------------------------------
