@@ -6,7 +6,8 @@ import os
 import statistics
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 
 import psutil
 import zenoh
@@ -40,6 +41,26 @@ def machine() -> str:
 def mean(values: Sequence[float]) -> float:
     """Arithmetic mean."""
     return statistics.fmean(values)
+
+
+@contextmanager
+def at_pace(hz: float, act: Callable[[], object]) -> Iterator[None]:
+    """Do something so often, in a thread of its own."""
+    stop = threading.Event()
+
+    def run() -> None:
+        due = time.monotonic()
+        while not stop.wait(max(0.0, due - time.monotonic())):
+            due = max(due + 1 / hz, time.monotonic() - 1.0)
+            act()
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
 
 
 class Pinger:

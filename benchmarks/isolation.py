@@ -11,10 +11,7 @@ from __future__ import annotations
 
 import argparse
 import signal
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,7 +20,7 @@ from typing import Any
 import psutil
 import zenoh
 
-from benchmarks.common import machine, percentile
+from benchmarks.common import at_pace, machine, percentile
 from zsched import places
 from zsched.adapters.operator_socket import ask
 from zsched.lab.testbed import ECHO, Testbed, echo_fleet
@@ -60,26 +57,6 @@ class Small:
 
     def _take(self, sample: zenoh.Sample) -> None:
         self.back.append((self._sent[int(sample.payload.to_bytes())], time.monotonic()))
-
-
-@contextmanager
-def at_pace(hz: float, act: Callable[[], object]) -> Iterator[None]:
-    """Do something so often, in a thread of its own."""
-    stop = threading.Event()
-
-    def run() -> None:
-        due = time.monotonic()
-        while not stop.wait(max(0.0, due - time.monotonic())):
-            due = max(due + 1 / hz, time.monotonic() - 1.0)
-            act()
-
-    thread = threading.Thread(target=run, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join()
 
 
 def worker_of(bed: Testbed, node: str) -> psutil.Process:

@@ -8,19 +8,19 @@ is left to its time by zenoh 1.10.2; the relay ends it. Reported is how long tho
 from __future__ import annotations
 
 import argparse
-import contextlib
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
 import zenoh
 
-from benchmarks.common import machine
+from benchmarks.common import at_pace, machine
 from benchmarks.record import Record, progress, table
+from benchmarks.rig import until
 from zsched.core.plan import Direction, Route, ServiceSettings, StreamSettings
 from zsched.lab.fleet_runner import free_ports
 from zsched.relay.services import ServiceStream
@@ -30,8 +30,8 @@ ASKED, OWNERS = "robot1/ask", "edge1/echo/robot1/ask"
 TIME_S: Final = 2.0
 """What a request may take: those that take as long ended by nothing else."""
 ASKERS: Final = 3
-LOOK_S: Final = 0.01
-"""How often a relay looks while its owner is gone."""
+LOOK_HZ: Final = 100
+"""How often a relay looks after its requests while their owner is gone."""
 
 
 def owner(endpoint: str) -> int:
@@ -79,24 +79,6 @@ class Asking:
             thread.join(2 * TIME_S + 5.0)
 
 
-@contextlib.contextmanager
-def looking_after(stream: ServiceStream) -> Iterator[None]:
-    """Do for the stream what its relay's thread does."""
-    halt = threading.Event()
-
-    def run() -> None:
-        while not halt.wait(LOOK_S):
-            stream.look_after()
-
-    thread = threading.Thread(target=run, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        halt.set()
-        thread.join(5)
-
-
 def run(record: Record, kills: int) -> None:
     """One owner after the other, asked and killed."""
     endpoint, application = (f"tcp/127.0.0.1:{port}" for port in free_ports(2))
@@ -116,7 +98,7 @@ def run(record: Record, kills: int) -> None:
         stream = ServiceStream(relay, route)
         stream.open(1, route)
         stream.flip(1)
-        with looking_after(stream):
+        with at_pace(LOOK_HZ, stream.look_after):
             for number in range(kills):
                 one_kill(record, number, endpoint, relay, app, stream)
                 progress(f"kill {number + 1}/{kills}")
@@ -132,22 +114,16 @@ def one_kill(
         try:
             assert process.stdout is not None
             process.stdout.readline()
-            until = time.monotonic() + 10.0
-            while not stream.is_matching(1):
-                if time.monotonic() > until:
-                    raise RuntimeError("the owner is not found")
-                time.sleep(0.005)
+            until(lambda: stream.is_matching(1), "the owner is found")
             both = {
                 "zenoh's get": Asking(relay, OWNERS, TIME_S, lambda: stream.is_matching(1)),
                 "the relay": Asking(app, ASKED, TIME_S + 1.0, lambda: stream.is_matching(1)),
             }
-            while min(asking.answered for asking in both.values()) < 20 and time.monotonic() < until:
-                time.sleep(0.001)
+            until(lambda: all(asking.answered >= 20 for asking in both.values()), "both kinds are answered")
         finally:
             process.kill()
             process.wait(10)
-    while stream.is_matching(1):
-        time.sleep(0.001)
+    until(lambda: not stream.is_matching(1), "the owner is missed")
     for side, asking in both.items():
         asking.halt()
         record.add({"side": side, "kill": number, "in_vain_ms": [1000 * one for one in asking.in_vain_s]})

@@ -160,11 +160,13 @@ class ServiceStream:
         with self._lock:
             for slot in self._slots.values():
                 for asked in slot.pending:
+                    if asked.replies.is_stopped:
+                        continue  # why it was stopped stays as it is
                     if slot.serves(asked.key):
                         asked.unserved_since = None
                     elif asked.unserved_since is None:
                         asked.unserved_since = now
-                    elif now - asked.unserved_since >= UNSERVED_GRACE_S and not asked.replies.is_stopped:
+                    elif now - asked.unserved_since >= UNSERVED_GRACE_S:
                         asked.replies.stop()
 
     def close_slot(self, epoch: int) -> None:
