@@ -18,10 +18,11 @@ from zsched.core.messages import CommandOutcome, SetWeights
 from zsched.core.model import NodeId
 from zsched.core.scoring import majority
 from zsched.errors import InvariantError
+from zsched.lab.sim_links import SELF_DELAY_S
 from zsched.lab.sim_network import Weather
 from zsched.lab.sim_parts import Machine
 from zsched.lab.sim_swarm import Fault, Plan
-from zsched.lab.simulator import CORES, SELF_DELAY_S, Simulator
+from zsched.lab.simulator import CORES, Simulator
 
 SETTLE_S = 15.0
 """Once faults have stopped and everybody is up, every task has a living owner that all know within this time."""

@@ -59,6 +59,10 @@ class Loops:
         """Do something ``seconds`` from now."""
         heapq.heappush(self._queue, (self.now + seconds, next(self._order), action, arguments))
 
+    def at(self, when: float, action: Callable[..., None], *arguments: Any) -> None:
+        """Do something at a true time: what is due at one time is done in the order in which it was asked for."""
+        heapq.heappush(self._queue, (when, next(self._order), action, arguments))
+
     def rearm(self, machine: Machine) -> None:
         """The machine's clock has changed: its next deadline lies elsewhere in true time."""
         machine.wake_at = math.inf

@@ -31,7 +31,6 @@ class World(Protocol):
     now: float
     rng: Random
     machines: dict[str, Machine]
-    cuts: set[tuple[NodeId, NodeId]]
     invariants: Invariants
 
     def later(self, seconds: float, action: Callable[..., None], *arguments: Any) -> None:
@@ -39,6 +38,9 @@ class World(Protocol):
 
     def deliver(self, machine: Machine, event: ev.Event) -> None:
         """An event reaches a machine."""
+
+    def has_streams(self, source: Machine, target: Machine) -> bool:
+        """Whether the data session of one machine reaches the other's."""
 
 
 class Work:
@@ -108,7 +110,7 @@ class Work:
     def _show(self, machine: Machine, life: int, task: TaskId, target: Machine, target_life: int) -> None:
         if (machine.life, target.life) != (life, target_life) or machine.node is None or task not in machine.workers:
             return
-        if (machine.name, target.name) in self._sim.cuts:
+        if not self._sim.has_streams(machine, target):
             self._sim.later(LOOK_AGAIN_S, self._show, machine, life, task, target, target_life)
             return
         self._sim.deliver(target, ev.WorkerShown(node=machine.name, task=task, incarnation=str(life)))
@@ -176,7 +178,7 @@ class Work:
         owner = self._sim.machines.get(plan.current.owner)
         node = None if owner is None else owner.node
         is_ready = node is not None and node.worker_states.get(plan.task) is WorkerState.READY
-        if is_ready and (plan.current.owner, machine.name) not in self._sim.cuts:
+        if is_ready and owner is not None and self._sim.has_streams(owner, machine):
             self._sim.deliver(machine, ev.SlotReady(task=plan.task, epoch=plan.current.epoch))
             return
         self._sim.later(LOOK_AGAIN_S, self._watch_ready, machine, plan, life)

@@ -23,8 +23,9 @@ from zsched.core.node import Node
 from zsched.core.plan import RoutePlan
 from zsched.errors import InvariantError
 from zsched.lab.sim_checks import Invariants, unsettled
-from zsched.lab.sim_loops import TICK_S, Loops
-from zsched.lab.sim_network import Message, Weather
+from zsched.lab.sim_links import Links
+from zsched.lab.sim_loops import TICK_S
+from zsched.lab.sim_network import Message
 from zsched.lab.sim_parts import Machine, blank_state
 from zsched.lab.sim_work import Work
 
@@ -36,7 +37,6 @@ Make = Callable[[Any], ev.Event]
 
 CORES, MEMORY_MB = 4.0, 4000.0
 TOKEN_DELAY_S = 0.005
-SELF_DELAY_S = 0.0001
 RESTART_S = 0.3
 """A node that crashed in the middle of a batch comes back this much later."""
 WALL_MS = 1_700_000_000_000
@@ -50,23 +50,16 @@ def idle(_node: NodeId, _now: float) -> tuple[float, float]:
 
 
 @dataclass(slots=True, kw_only=True)
-class Simulator(Loops):
+class Simulator(Links):
     """One fleet in one schedule. `run` until a time or a condition; faults in between."""
 
     fleet: Fleet
     seed: int
     load: Load = idle
-    loss: float = 0.0
-    delay_s: tuple[float, float] = (0.0005, 0.003)
-    cuts: set[tuple[NodeId, NodeId]] = field(default_factory=set)
-    """(from, to) pairs that deliver nothing."""
     cut_batch: Cut | None = None
     broken_disks: set[NodeId] = field(default_factory=set)
     """Nodes that cannot write their state."""
-    weather: Weather = field(default_factory=Weather)
     stories: list[str] = field(default_factory=list)
-    machines: dict[str, Machine] = field(default_factory=dict)
-    """{key: machine}; a twin has a key of its own."""
     invariants: Invariants = field(init=False)
     work: Work = field(init=False)
     events: int = 0
@@ -74,7 +67,6 @@ class Simulator(Loops):
     """More than this is a storm: nodes that answer each other without end."""
     answers: list[do.AnswerCommand] = field(default_factory=list)
     """What operators were told."""
-    rng: Random = field(init=False)
     _asked: dict[int, tuple[Machine, Machine, Make]] = field(default_factory=dict)
     _frames: dict[tuple[str, type[Any]], tuple[object, bytes, Any]] = field(default_factory=dict)
     """{(sender, class): (the newest value of this class, its frame, what is read in it)}."""
@@ -141,20 +133,11 @@ class Simulator(Loops):
         incarnation = machine.node.incarnation
         delay_s = self.fleet.timing.zenoh_lease_s if is_power_lost else TOKEN_DELAY_S
         for other in self.machines.values():
-            if other is not machine and (machine.name, other.name) not in self.cuts:
+            if other is not machine and (machine.key, other.key) not in self.cuts:
                 self.work.lose(machine, other, delay_s)
         machine.end()
         machine.disk.lose_power(self.rng)
         self._tell_token(machine, ev.TokenLost(node=machine.name, incarnation=incarnation), delay_s)
-
-    def cut(self, *sides: tuple[NodeId, ...]) -> None:
-        """Nothing passes between the groups any more, in either direction; groups inside stay connected."""
-        for one, other in itertools.permutations(sides, 2):
-            self.cuts.update(itertools.product(one, other))
-
-    def heal(self) -> None:
-        """Everything passes again."""
-        self.cuts.clear()
 
     def node(self, name: NodeId) -> Node:
         """A running node. Raises `KeyError` when it is down."""
@@ -222,7 +205,7 @@ class Simulator(Loops):
 
     def _tell_token(self, machine: Machine, event: ev.Event, delay_s: float) -> None:
         for other in self.machines.values():
-            if other is not machine and (machine.name, other.name) not in self.cuts:
+            if other is not machine and (machine.key, other.key) not in self.cuts:
                 self.later(delay_s, self.deliver, other, event)
 
     def _sample(self, machine: Machine, life: int) -> None:
@@ -330,9 +313,9 @@ class Simulator(Loops):
             case do.SendAccept(accept=accept):
                 self._elect(me, accept, lambda n, value: ev.AcceptAsked(request=n, asker=me.name, accept=value))
             case do.AskLearnt(peer=peer):
-                for other in self._named(peer):
+                for other in self.named(peer):
                     number = self._question(other, me, lambda value: ev.LearntReceived(learnt=value))
-                    self._send(me, other, Message(ev.LearntAsked(request=number)))
+                    self.send(me, other, Message(ev.LearntAsked(request=number)))
             case do.AnswerUtilities(request=request, utilities=value):
                 self._answer(request, value)
             case do.AnswerElection(request=request, answer=vote):
@@ -355,31 +338,6 @@ class Simulator(Loops):
 
     # --- the network -------------------------------------------------------------------------------------------------
 
-    def _named(self, name: NodeId) -> list[Machine]:
-        """Every machine that calls itself so (one, unless it has a twin)."""
-        return [machine for machine in self.machines.values() if machine.name == name]
-
-    def _send(self, source: Machine, target: Machine, message: Message) -> None:
-        """One message on its way: maybe lost, cut or late; in bad weather worse."""
-        if source is target:
-            self.later(SELF_DELAY_S, self.deliver, target, message.event)
-            return
-        pair = (source.name, target.name)
-        if pair in self.cuts or (self.loss and self.rng.random() < self.loss):
-            return
-        low, high = self.delay_s
-        if self.weather.is_calm:
-            self.later(low + (high - low) * self.rng.random(), self._arrive, pair, target, message.event)
-            return
-        for sender, receiver, extra_s, event in self.weather.through(*pair, message, self.rng):
-            for machine in [target] if receiver == target.name else self._named(receiver):
-                delay_s = low + (high - low) * self.rng.random() + extra_s
-                self.later(delay_s, self._arrive, (sender, receiver), machine, event)
-
-    def _arrive(self, pair: tuple[NodeId, NodeId], target: Machine, event: ev.Event) -> None:
-        if pair not in self.cuts:
-            self.deliver(target, event)
-
     def _framed(self, me: Machine, value: object) -> tuple[bytes, Any]:
         """(the frame of a value, what a receiver reads in it); the same value again is the same frame."""
         key = (me.key, type(value))
@@ -391,23 +349,7 @@ class Simulator(Loops):
 
     def _put(self, me: Machine, value: object, make: Make) -> None:
         frame, read = self._framed(me, value)
-        kind = type(value)
-        message = Message(make(read), frame, kind)
-        if self.weather.is_calm:
-            self._spread(me, message.event)
-            return
-        for other in self.machines.values():
-            if other is not me:
-                self._send(me, other, message)
-
-    def _spread(self, me: Machine, event: ev.Event) -> None:
-        """As `_send` in calm weather, to all others: four of five messages travel like this."""
-        (low, high), loss, chance = self.delay_s, self.loss, self.rng.random
-        for other in self.machines.values():
-            pair = (me.name, other.name)
-            if other is me or pair in self.cuts or (loss and chance() < loss):
-                continue
-            self.later(low + (high - low) * chance(), self._arrive, pair, other, event)
+        self.spread(me, Message(make(read), frame, type(value)))
 
     def _question(self, asked: Machine, asker: Machine, make: Make) -> int:
         """A request number whose answers travel back from ``asked`` to ``asker`` (a repeated question's, too)."""
@@ -423,20 +365,20 @@ class Simulator(Loops):
             return
         asked, asker, make = question
         frame, read = self._framed(asked, value)
-        self._send(asked, asker, Message(make(read), frame, type(value)))
+        self.send(asked, asker, Message(make(read), frame, type(value)))
 
     def _gather(self, me: Machine, gather: int) -> None:
         def make(value: Any) -> ev.Event:
             return ev.UtilityReceived(gather=gather, utilities=value)
 
         for name in self.fleet.voters:
-            for other in self._named(name) if name != me.name else ():
+            for other in self.named(name) if name != me.name else ():
                 number = self._question(other, me, make)
-                self._send(me, other, Message(ev.UtilityAsked(request=number, asker=me.name)))
+                self.send(me, other, Message(ev.UtilityAsked(request=number, asker=me.name)))
 
     def _elect(self, me: Machine, question: object, make: Callable[[int, Any], ev.Event]) -> None:
         (frame, value), kind = self._framed(me, question), type(question)
         for elector in me.fleet.electors:
-            for other in self._named(elector):
+            for other in self.named(elector):
                 number = self._question(other, me, lambda answer: ev.ElectorAnswered(answer=answer))
-                self._send(me, other, Message(make(number, value), frame, kind))
+                self.send(me, other, Message(make(number, value), frame, kind))
