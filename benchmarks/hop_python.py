@@ -20,9 +20,10 @@ from typing import Any
 
 import zenoh
 
-from benchmarks.rig import free_port, until
+from benchmarks.rig import until
 from zsched.core.plan import Direction, HandoverRule, Route, StreamClass, StreamSettings
 from zsched.keyspace import Keyspace
+from zsched.lab.loopback import free_endpoint
 from zsched.relay.acks import Acks
 from zsched.relay.inputs import InputStream
 from zsched.relay.outputs import OutputStream
@@ -39,7 +40,7 @@ Way = tuple[Carry, Callable[[], bool], Callable[[], None]]
 @contextmanager
 def sessions() -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
     """A relay's session and an application's."""
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    endpoint = free_endpoint()
     hub = data_config(listen=(endpoint,), connect=(), shared_memory=False)
     beside = worker_config(connect=(endpoint,), shared_memory=False)
     with zenoh.open(zenoh.Config.from_json5(hub)) as relay, zenoh.open(zenoh.Config.from_json5(beside)) as application:

@@ -22,7 +22,7 @@ from benchmarks.common import at_pace, machine
 from benchmarks.record import Record, progress, table
 from benchmarks.rig import until
 from zsched.core.plan import Direction, Route, ServiceSettings, StreamSettings
-from zsched.lab.fleet_runner import free_ports
+from zsched.lab.loopback import free_endpoints
 from zsched.relay.services import ServiceStream
 from zsched.zenoh_config import data_config, worker_config
 
@@ -81,7 +81,7 @@ class Asking:
 
 def run(record: Record, kills: int) -> None:
     """One owner after the other, asked and killed."""
-    endpoint, application = (f"tcp/127.0.0.1:{port}" for port in free_ports(2))
+    endpoint, application = free_endpoints(2)
     route = Route(
         stream="echo/srv/0",
         direction=Direction.SERVICE,

@@ -39,7 +39,7 @@ from zsched.core.plan import (
     WorkerRole,
 )
 from zsched.core.relay_protocol import HandleReport, SlotLost, WorkerSeen
-from zsched.lab.fleet_runner import free_ports
+from zsched.lab.loopback import free_endpoint
 from zsched.zenoh_config import data_config, worker_config
 
 FLEET, ROBOT, TASK = "bench", "robot1", "echo"
@@ -55,11 +55,6 @@ def until(condition: Callable[[], Any], what: str, deadline_s: float = 10.0) -> 
             return value
         time.sleep(0.002)
     raise AssertionError(f"not within {deadline_s} s: {what}")
-
-
-def free_port() -> int:
-    """A TCP port that was free a moment ago."""
-    return free_ports(1)[0]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -122,7 +117,7 @@ class Rig:
 
     def __enter__(self) -> Self:
         nodes = (ROBOT, *self.edges)
-        self.ports = {node: free_port() for node in nodes}
+        self.endpoints = {node: free_endpoint() for node in nodes}
         for node in nodes:
             heard: list[tuple[float, HandleReport]] = []
             self.heard[node] = heard
@@ -148,7 +143,7 @@ class Rig:
 
     def endpoint(self, node: str) -> str:
         """The data endpoint of a node's relay."""
-        return f"tcp/127.0.0.1:{self.ports[node]}"
+        return self.endpoints[node]
 
     def app(self) -> zenoh.Session:
         """An application's session beside the robot."""

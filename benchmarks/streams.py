@@ -26,12 +26,13 @@ import psutil
 import zenoh
 
 from benchmarks.common import machine, percentile
-from benchmarks.rig import FLEET, free_port, until
+from benchmarks.rig import FLEET, until
 from zsched.adapters.streams import RelayHandle
 from zsched.core.events import RelayChanged, SlotFlipped, SlotReady
 from zsched.core.fleet import WorkerLink
 from zsched.core.plan import Direction, ReadyWhen, Route, RoutePhase, RoutePlan, Slot, StreamClass, StreamSettings
 from zsched.core.relay_protocol import HandleReport
+from zsched.lab.loopback import free_endpoint
 from zsched.zenoh_config import data_config, worker_config
 
 HOPS = ("direct", "router", "naive", "best_effort", "reliable")
@@ -120,7 +121,7 @@ class Bench:
 
     def __init__(self, folder: Path, hop: str, *, shared_memory: bool = False) -> None:
         self._hop, self._folder, self._shared = hop, folder, shared_memory
-        self._port = free_port()
+        self._endpoint = free_endpoint()
         self._processes: list[subprocess.Popen[str]] = []
         self._relay: RelayHandle | None = None
         self._heard: list[HandleReport] = []
@@ -157,7 +158,7 @@ class Bench:
         if self._hop in ("router", "naive"):
             process = self._start(NAIVE if self._hop == "naive" else ROUTER, "hop", IN, OUT, is_hub=True)
             return process.pid
-        text = data_config(listen=(self._endpoint(),), connect=(), shared_memory=self._shared)
+        text = data_config(listen=(self._endpoint,), connect=(), shared_memory=self._shared)
         self._relay = RelayHandle(fleet=FLEET, node="robot1", zenoh_config=text, on_report=self._heard.append)
         self._relay.start()
         until(lambda: any(isinstance(r, RelayChanged) and r.is_running for r in self._heard), "the relay runs")
@@ -177,7 +178,7 @@ class Bench:
         return any(isinstance(report, kind) for report in self._heard)
 
     def _start(self, program: str, name: str, *arguments: str, is_hub: bool = False) -> subprocess.Popen[str]:
-        path = self._folder / f"{name}-{self._port}.json5"
+        path = self._folder / f"{name}-{len(self._processes)}.json5"
         path.write_text(self._config(is_hub=is_hub))
         command = [sys.executable, "-c", program, str(path), *arguments]
         process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
@@ -189,15 +190,12 @@ class Bench:
         if not is_hub:
             # Ends of the native hop are clients: peers would find each other and leave the hop out.
             link = WorkerLink.CLIENT if self._hop == "router" else WorkerLink.PEER
-            return worker_config(connect=(self._endpoint(),), shared_memory=self._shared, link=link)
-        text = data_config(listen=(self._endpoint(),), connect=(), shared_memory=self._shared)
+            return worker_config(connect=(self._endpoint,), shared_memory=self._shared, link=link)
+        text = data_config(listen=(self._endpoint,), connect=(), shared_memory=self._shared)
         config = zenoh.Config.from_json5(text)
         if self._hop == "router":
             config.insert_json5("mode", json.dumps("router"))
         return str(config)
-
-    def _endpoint(self) -> str:
-        return f"tcp/127.0.0.1:{self._port}"
 
 
 def _read(process: subprocess.Popen[str]) -> str:

@@ -68,8 +68,8 @@ def worker(where: dict[str, Any], owner: str) -> None:
 
 
 def main() -> None:
-    role, port = sys.argv[1], int(sys.argv[2])
-    where = {"router_ip": "127.0.0.1", "router_port": port, "domain_id": 0}
+    role, address, port = sys.argv[1:]
+    where = {"router_ip": address, "router_port": int(port), "domain_id": 0}
     if role == "robot":
         robot(where)
     else:

@@ -17,7 +17,7 @@ import pytest
 import zenoh
 
 from zsched.lab.explore.worlds import load_world
-from zsched.lab.fleet_runner import free_ports
+from zsched.lab.loopback import free_endpoints
 from zsched.lab.map_metrics import score_map
 from zsched.lab.recorder import Record, read_records
 from zsched.tasks.map_merge.cdr import StampedTransform, decode_grid, encode_grid, encode_transforms
@@ -29,11 +29,11 @@ TARGET = 0.8
 DEADLINE_S = 45.0
 
 
-def peer(port: int, others: tuple[int, ...]) -> zenoh.Session:
+def peer(endpoint: str, others: tuple[str, ...]) -> zenoh.Session:
     config = {
         "mode": "peer",
-        "listen": {"endpoints": [f"tcp/127.0.0.1:{port}"]},
-        "connect": {"endpoints": [f"tcp/127.0.0.1:{other}" for other in others]},
+        "listen": {"endpoints": [endpoint]},
+        "connect": {"endpoints": list(others)},
         "scouting": {"multicast": {"enabled": False}},
         "transport": {"shared_memory": {"enabled": False}},
     }
@@ -43,10 +43,10 @@ def peer(port: int, others: tuple[int, ...]) -> zenoh.Session:
 class Hub:
     """One peer per robot, meshed; merges what the robots publish and sends it back."""
 
-    def __init__(self, ports: list[int]) -> None:
+    def __init__(self, endpoints: list[str]) -> None:
         self._sessions = {
-            robot: peer(port, tuple(ports[:index]))
-            for index, (robot, port) in enumerate(zip(ROBOTS, ports, strict=True))
+            robot: peer(endpoint, tuple(endpoints[:index]))
+            for index, (robot, endpoint) in enumerate(zip(ROBOTS, endpoints, strict=True))
         }
         starts = load_world(WORLD).starts(len(ROBOTS))
         self._merger = Merger(MergerSettings(mode=Mode.KNOWN, poses=dict(zip(ROBOTS, starts, strict=True))))
@@ -101,20 +101,20 @@ def running(*commands: list[str]) -> Iterator[list[subprocess.Popen[bytes]]]:
 
 
 @pytest.fixture
-def ports() -> list[int]:
-    return free_ports(len(ROBOTS))
+def endpoints() -> list[str]:
+    return free_endpoints(len(ROBOTS))
 
 
 @pytest.fixture
-def hub(ports: list[int]) -> Iterator[Hub]:
-    one = Hub(ports)
+def hub(endpoints: list[str]) -> Iterator[Hub]:
+    one = Hub(endpoints)
     yield one
     one.close()
 
 
-def robot(index: int, port: int, records: Path, *more: str) -> list[str]:
+def robot(index: int, endpoint: str, records: Path, *more: str) -> list[str]:
     command = ["zsched.lab.explore.robot", "--robot", ROBOTS[index], "--world", WORLD, "--index", str(index)]
-    command += ["--robots", str(len(ROBOTS)), "--endpoint", f"tcp/127.0.0.1:{port}", "--records", str(records)]
+    command += ["--robots", str(len(ROBOTS)), "--endpoint", endpoint, "--records", str(records)]
     return [*command, "--target", str(TARGET), *more]
 
 
@@ -123,8 +123,8 @@ def records_of(folder: Path, name: str, kind: str) -> list[Record]:
     return [record for record in read_records(path) if record["kind"] == kind] if path.exists() else []
 
 
-def test_two_robots_explore_on_the_merged_map(hub: Hub, ports: list[int], tmp_path: Path) -> None:
-    with running(*(robot(index, port, tmp_path) for index, port in enumerate(ports))):
+def test_two_robots_explore_on_the_merged_map(hub: Hub, endpoints: list[str], tmp_path: Path) -> None:
+    with running(*(robot(index, endpoint, tmp_path) for index, endpoint in enumerate(endpoints))):
         hub.until(
             lambda: all(records_of(tmp_path, name, "covered") for name in ROBOTS),
             "the robots did not cover the world",
@@ -143,9 +143,9 @@ def test_two_robots_explore_on_the_merged_map(hub: Hub, ports: list[int], tmp_pa
         assert (path[0]["x"], path[0]["y"]) != (path[-1]["x"], path[-1]["y"])
 
 
-def test_slam_on_an_edge_maps_for_a_robot_that_only_sends_scans(hub: Hub, ports: list[int], tmp_path: Path) -> None:
-    slam = ["zsched.lab.explore.slam", "--robot", "robot1", "--endpoint", f"tcp/127.0.0.1:{ports[1]}"]
-    with running(robot(0, ports[0], tmp_path, "--slam-on", "edge1"), slam):
+def test_slam_on_an_edge_maps_for_a_robot_that_only_sends_scans(hub: Hub, endpoints: list[str], tmp_path: Path) -> None:
+    slam = ["zsched.lab.explore.slam", "--robot", "robot1", "--endpoint", endpoints[1]]
+    with running(robot(0, endpoints[0], tmp_path, "--slam-on", "edge1"), slam):
         hub.until(
             lambda: any(record["coverage"] > 0.4 for record in records_of(tmp_path, "robot1", "progress")),
             "no map grows out of the robot's scans",
@@ -154,7 +154,7 @@ def test_slam_on_an_edge_maps_for_a_robot_that_only_sends_scans(hub: Hub, ports:
 
 
 def test_a_world_that_is_not_there_exits_78(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", *robot(0, 1, tmp_path, "--world", "nowhere")]
+    command = [sys.executable, "-m", *robot(0, "tcp/127.0.0.1:1", tmp_path, "--world", "nowhere")]
     done = subprocess.run(command, capture_output=True, text=True, timeout=30.0, check=False)
     assert done.returncode == 78
     assert "turtlebot3" in done.stderr

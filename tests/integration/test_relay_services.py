@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from support.waiting import free_port, until
+from support.waiting import free_endpoint, until
 from zsched.adapters.streams import RelayHandle
 from zsched.core.events import RelayChanged, SlotDrained, SlotFlipped, SlotReady, StreamsCounted
 from zsched.core.plan import (
@@ -96,7 +96,7 @@ class Rig:
     """Three nodes' relays on loopback, workers with a service, an application beside the robot."""
 
     folder: Path
-    ports: dict[str, int] = field(default_factory=lambda: {n: free_port() for n in (ROBOT, "edge1", "edge2")})
+    endpoints: dict[str, str] = field(default_factory=lambda: {n: free_endpoint() for n in (ROBOT, "edge1", "edge2")})
     relays: dict[str, RelayHandle] = field(default_factory=dict)
     reports: dict[str, list[HandleReport]] = field(default_factory=dict)
     workers: dict[str, subprocess.Popen[bytes]] = field(default_factory=dict)
@@ -105,18 +105,18 @@ class Rig:
     def start(self) -> None:
         (self.folder / "worker.py").write_text(WORKER)
         seed = self.endpoint(ROBOT)
-        for node in self.ports:
+        for node in self.endpoints:
             self.reports[node] = []
             connect = () if node == ROBOT else (seed,)
             text = data_config(listen=(self.endpoint(node),), connect=connect, shared_memory=False)
             relay = RelayHandle(fleet=FLEET, node=node, zenoh_config=text, on_report=self.reports[node].append)
             self.relays[node] = relay
             relay.start()
-        until(lambda: all(self.find(RelayChanged, node, is_running=True) for node in self.ports), "the relays run")
+        until(lambda: all(self.find(RelayChanged, node, is_running=True) for node in self.endpoints), "the relays run")
         self.app = zenoh.open(zenoh.Config.from_json5(worker_config(connect=(seed,), shared_memory=False)))
 
     def endpoint(self, node: str) -> str:
-        return f"tcp/127.0.0.1:{self.ports[node]}"
+        return self.endpoints[node]
 
     def find(self, kind: type, node: str = ROBOT, **fields: Any) -> HandleReport | None:
         for report in tuple(self.reports[node]):

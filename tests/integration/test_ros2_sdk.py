@@ -41,8 +41,8 @@ tasks:
 class Node:
     """One process with the foreign library."""
 
-    def __init__(self, role: str, port: int) -> None:
-        command = [sys.executable, str(NODE), role, str(port)]
+    def __init__(self, role: str, endpoint: str) -> None:
+        command = [sys.executable, str(NODE), role, *endpoint.removeprefix("tcp/").split(":")]
         self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         self._said: queue.SimpleQueue[list[Any]] = queue.SimpleQueue()
         threading.Thread(target=self._read, daemon=True).start()
@@ -96,7 +96,7 @@ class Rig(RosHost):
         self._stack = stack
 
     def node(self, role: str, endpoint: str) -> Node:
-        made = Node(role, int(endpoint.rpartition(":")[2]))
+        made = Node(role, endpoint)
         self._stack.callback(made.stop)
         return made
 

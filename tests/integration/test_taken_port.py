@@ -13,10 +13,10 @@ WAIT_S = 40.0
 def test_a_taken_data_port_is_named_in_log_and_status_and_used_once_it_is_free(tmp_path: Path) -> None:
     with Testbed(tmp_path, echo_fleet(robots=1, edges=0)) as bed:
         endpoint = bed.fleet.node("robot1").listen_data
-        port = int(endpoint.rpartition(":")[2])
+        host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
         with socket.socket() as other:
             other.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            other.bind(("127.0.0.1", port))
+            other.bind((host, int(port)))
             other.listen()
             bed.init()
             bed.start()

@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 
 import zenoh
 
-from support.waiting import free_port, until
+from support.waiting import free_endpoint, until
 from zsched.adapters.streams import RelayHandle
 from zsched.core.events import RelayChanged, SlotDrained, SlotFlipped, SlotReady, StreamsCounted
 from zsched.core.fleet import Timing
@@ -92,7 +92,7 @@ class Rig:
 
     folder: Path
     timing: Timing = DEFAULT_TIMING
-    ports: dict[str, int] = field(default_factory=lambda: {n: free_port() for n in (ROBOT, "edge1", "edge2")})
+    endpoints: dict[str, str] = field(default_factory=lambda: {n: free_endpoint() for n in (ROBOT, "edge1", "edge2")})
     relays: dict[str, RelayHandle] = field(default_factory=dict)
     reports: dict[str, Reports] = field(default_factory=dict)
     workers: list[subprocess.Popen[bytes]] = field(default_factory=list)
@@ -100,7 +100,7 @@ class Rig:
 
     def start(self) -> None:
         seed = self.endpoint(ROBOT)
-        for node in self.ports:
+        for node in self.endpoints:
             self.reports[node] = Reports()
             connect = () if node == ROBOT else (seed,)
             # no shared memory: a stalled target must fill its socket
@@ -111,7 +111,7 @@ class Rig:
         self.app = zenoh.open(zenoh.Config.from_json5(worker_config(connect=(seed,), shared_memory=False)))
 
     def endpoint(self, node: str) -> str:
-        return f"tcp/127.0.0.1:{self.ports[node]}"
+        return self.endpoints[node]
 
     def start_worker(self, node: str, *options: str, task: str = TASK) -> subprocess.Popen[bytes]:
         self.incarnation += 1

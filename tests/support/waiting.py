@@ -1,4 +1,4 @@
-"""Waits for conditions, and finds ports. Knows: deadlines. Does not know: what is waited for.
+"""Waits for conditions. Knows: deadlines. Does not know: what is waited for.
 
 A deadline costs nothing when the condition comes true, so it is generous: the machine may be busy with other things.
 """
@@ -9,7 +9,9 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from zsched.lab.fleet_runner import free_ports
+from zsched.lab.loopback import free_endpoint
+
+__all__ = ["DEADLINE_S", "POLL_S", "free_endpoint", "until"]
 
 DEADLINE_S = 20.0
 POLL_S = 0.003
@@ -25,13 +27,3 @@ def until(condition: Callable[[], Any], what: str, deadline_s: float = DEADLINE_
         if time.monotonic() > end:
             raise AssertionError(f"not within {deadline_s:g} s: {what}")
         time.sleep(POLL_S)
-
-
-def free_port() -> int:
-    """A TCP port of 127.0.0.1 that was free a moment ago, and that nobody else asks for."""
-    return free_ports(1)[0]
-
-
-def free_endpoint() -> str:
-    """A zenoh endpoint on loopback that was free a moment ago."""
-    return f"tcp/127.0.0.1:{free_port()}"

@@ -23,7 +23,7 @@ from typing import Any
 
 import pytest
 
-from zsched.lab.fleet_runner import free_ports
+from zsched.lab.loopback import free_endpoints
 
 HERE, REPO = Path(__file__).parent, Path(__file__).parents[2]
 SUITE = "bookworm"
@@ -35,7 +35,7 @@ pytestmark = [pytest.mark.root, pytest.mark.timeout(420)]
 FLEET = """
 fleet: boot
 nodes:
-  edge1: {kind: robot, wired: true, listen: {control: tcp/127.0.0.1:CONTROL, data: tcp/127.0.0.1:DATA}}
+  edge1: {kind: robot, wired: true, listen: {control: CONTROL, data: DATA}}
 tasks:
   echo:
     candidates: [edge1]
@@ -124,8 +124,8 @@ def overlaid(debian: Path, folder: Path) -> Iterator[Path]:
 
 def fleet_file() -> str:
     """The fleet file with ports that are free: the machine shares this one's network."""
-    control, data = free_ports(2)
-    return FLEET.replace("CONTROL", str(control)).replace("DATA", str(data))
+    control, data = free_endpoints(2)
+    return FLEET.replace("CONTROL", control).replace("DATA", data)
 
 
 def furnish(root: Path, start: str, expected: str) -> None:

@@ -5,10 +5,6 @@ Knows: the fleet file, the command line, who is up. Does not know: robots' appli
 
 from __future__ import annotations
 
-import contextlib
-import itertools
-import os
-import socket
 import sys
 import time
 from collections.abc import Callable, Collection, Mapping
@@ -22,13 +18,13 @@ from zsched.core.model import NodeId, TaskId
 from zsched.errors import ConfigError
 from zsched.lab.children import Child, ChildError, Children
 from zsched.lab.limits import NodeLimits
+from zsched.lab.loopback import free_endpoints, own_address
 from zsched.lab.schedule import Injection
 
 CLI = (sys.executable, "-m", "zsched.cli")
 INIT_S = 20.0
 UP_S = 30.0
 POLL_S = 0.05
-FIRST_PORT, PORTS = 12_000, 20_000
 
 Tree = dict[str, Any]
 """A fleet file as plain YAML data."""
@@ -56,24 +52,6 @@ class LabFleet:
         return tuple(sorted(name for name, kind in self.kinds.items() if kind == "edge"))
 
 
-_ports = itertools.count(os.getpid() * 97)
-
-
-def free_ports(count: int) -> list[int]:
-    """So many different TCP ports that were free on 127.0.0.1 a moment ago.
-
-    From below the range that the kernel gives to outgoing connections, each once per process, and processes begin at
-    different places: nobody takes one of them between this call and its use.
-    """
-    found: list[int] = []
-    while len(found) < count:
-        port = FIRST_PORT + next(_ports) % PORTS
-        with socket.socket() as probe, contextlib.suppress(OSError):
-            probe.bind(("127.0.0.1", port))
-            found.append(port)
-    return found
-
-
 def read_tree(path: Path) -> Tree:
     """A YAML file as plain data.
 
@@ -90,7 +68,7 @@ def read_tree(path: Path) -> Tree:
 
 
 def write_fleet(template: Path, path: Path, replaced: Mapping[str, tuple[str, ...]]) -> LabFleet:
-    """Write the effective fleet file: the template on free loopback ports, its task's worker with other options.
+    """Write the effective fleet file: the template on loopback endpoints of our own, its worker with other options.
 
     ``replaced`` is {option: values}: every ``option value`` in the worker's command gives way to these.
 
@@ -99,11 +77,10 @@ def write_fleet(template: Path, path: Path, replaced: Mapping[str, tuple[str, ..
     """
     tree = read_tree(template)
     nodes: Tree = tree["nodes"]
-    ports = free_ports(2 * len(nodes))
     endpoints = {}
-    for index, (name, node) in enumerate(sorted(nodes.items())):
-        control, data = (f"tcp/127.0.0.1:{port}" for port in ports[2 * index : 2 * index + 2])
-        node["host"] = "127.0.0.1"
+    for name, node in sorted(nodes.items()):
+        control, data = free_endpoints(2)
+        node["host"] = own_address()
         node["listen"] = {"control": control, "data": data}
         endpoints[name] = data
     if len(tree["tasks"]) != 1:

@@ -191,6 +191,7 @@ class Netbed(Testbed):
     def start(self, *nodes: NodeId) -> None:
         """Start daemons (default: all that do not run), each in its namespace."""
         for node in nodes or tuple(name for name in self.names if name not in self._processes):
+            self._may_end.discard(node)
             self._processes[node] = self.spawn(
                 node, [*self._daemon, "--config", self.file, "--node", node, *self._folders(node)], log=f"{node}.log"
             )

@@ -1,6 +1,6 @@
 """A small real fleet for tests and benchmarks: daemons as processes on loopback, one of which can be killed or frozen.
 
-Knows: fleet files with free ports, daemon processes, signals, waiting for a condition. Does not know: what is tested.
+Knows: fleet files, daemon processes, signals, waiting for a condition. Does not know: what is tested.
 
 Everything that was started is gone when the context ends, whatever happened inside. Workers die with their daemons; a
 relay outlives one that crashed, so `Testbed.kill` ends it, too, unless it is told otherwise.
@@ -15,7 +15,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar
@@ -28,7 +28,7 @@ from zsched.config import load_fleet
 from zsched.core.fleet import Fleet
 from zsched.core.model import NodeId
 from zsched.errors import AdapterError, ZschedError
-from zsched.lab.fleet_runner import free_ports
+from zsched.lab.loopback import free_endpoint, own_address
 from zsched.lifecycle import init_state
 from zsched.relay_door import Door
 
@@ -61,12 +61,11 @@ def echo_fleet(
 ) -> Json:
     """A fleet file as plain data: robots and edges on loopback, one task with the echo worker on every edge."""
     names = [f"robot{i}" for i in range(1, robots + 1)] + [f"edge{i}" for i in range(1, edges + 1)]
-    ports = iter(free_ports(2 * len(names)))
     nodes = {
         name: {
             "kind": name.rstrip("0123456789"),
-            "host": "127.0.0.1",
-            "listen": {"control": f"tcp/127.0.0.1:{next(ports)}", "data": f"tcp/127.0.0.1:{next(ports)}"},
+            "host": own_address(),
+            "listen": {"control": free_endpoint(), "data": free_endpoint()},
             "wired": True,
         }
         for name in names
@@ -96,6 +95,7 @@ class Testbed:
         self.file.write_text(json.dumps(tree, indent=1))  # JSON is YAML
         self.fleet: Fleet = load_fleet(self.file)
         self._processes: dict[NodeId, subprocess.Popen[bytes]] = {}
+        self._may_end: set[NodeId] = set()
         self._sessions: list[zenoh.Session] = []
 
     # --- processes ---------------------------------------------------------------------------------------------------
@@ -113,6 +113,7 @@ class Testbed:
     def start(self, *nodes: NodeId) -> None:
         """Start daemons (default: all that do not run); their stderr goes to ``<node>.log``."""
         for node in nodes or tuple(name for name in self.names if name not in self._processes):
+            self._may_end.discard(node)
             with (self.folder / f"{node}.log").open("ab") as log:
                 self._processes[node] = subprocess.Popen(
                     [*DAEMON, "--config", self.file, "--node", node, *self._folders(node)],
@@ -130,6 +131,8 @@ class Testbed:
 
     def send(self, node: NodeId, number: signal.Signals) -> None:
         """Send a signal to one daemon (not to its relay or workers)."""
+        if number not in (signal.SIGSTOP, signal.SIGCONT):
+            self._may_end.add(node)
         self._processes[node].send_signal(number)
 
     def kill(self, node: NodeId, *, with_relay: bool = True) -> None:
@@ -210,19 +213,31 @@ class Testbed:
         """Poll until ``condition`` is truthy and return it.
 
         Raises:
-            TestbedError: not within ``timeout_s``; the message ends with the last lines of every log.
+            TestbedError: not within ``timeout_s``, or a daemon that nobody asked to end has ended meanwhile; the
+                message ends with the last lines of its log, or of every log.
         """
         deadline = time.monotonic() + timeout_s
         while True:
+            ended = self._ended()  # before the look at the condition: that may be the daemon's end
             try:
                 if result := condition():
                     return result
             except AdapterError:
                 pass  # not up yet: as good as false
+            if ended:
+                codes = ", ".join(f"{node} with {code}" for node, code in ended.items())
+                raise TestbedError(f"waited for {what}, but daemons have ended: {codes}\n{self._tails(ended)}")
             if time.monotonic() > deadline:
-                tails = "\n".join(f"--- {n}\n" + "\n".join(self.log(n).splitlines()[-12:]) for n in self._processes)
-                raise TestbedError(f"waited {timeout_s:g} s for {what}\n{tails}")
+                raise TestbedError(f"waited {timeout_s:g} s for {what}\n{self._tails(self._processes)}")
             time.sleep(POLL_S)
+
+    def _ended(self) -> dict[NodeId, int]:
+        """Daemons that have ended by themselves, with their exit codes."""
+        codes = {node: process.poll() for node, process in self._processes.items() if node not in self._may_end}
+        return {node: code for node, code in codes.items() if code is not None}
+
+    def _tails(self, nodes: Iterable[NodeId]) -> str:
+        return "\n".join(f"--- {node}\n" + "\n".join(self.log(node).splitlines()[-12:]) for node in nodes)
 
     def wait_settled(self, timeout_s: float = 60.0) -> NodeId:
         """Wait until all running nodes agree on a living owner and every robot's streams are settled on it."""

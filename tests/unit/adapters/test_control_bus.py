@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import pytest
 import zenoh
 
-from support.waiting import free_port, until
+from support.waiting import free_endpoint, until
 from zsched import wire
 from zsched.adapters import control_bus, open_questions
 from zsched.adapters.control_bus import ControlBus
@@ -69,11 +69,11 @@ COMMAND = SetWeights(task="merge", cpu=1.0, memory=0.0, network=0.0)
 class Peer:
     """One bus and the events it posted."""
 
-    def __init__(self, name: str, port: int, hub: int | None, incarnation: int = 1, **options: bool) -> None:
+    def __init__(self, name: str, listen: str, hub: str | None, incarnation: int = 1, **options: bool) -> None:
         self.events: list[ev.Event] = []
-        listen, connect = f"tcp/127.0.0.1:{port}", () if hub is None else (f"tcp/127.0.0.1:{hub}",)
+        connect = () if hub is None else (hub,)
         config = control_config(listen=(listen,), connect=connect, timing=TIMING)
-        self.port, self.name = port, name
+        self.listen, self.name = listen, name
         self.bus = ControlBus(
             fleet="f", node=name, incarnation=incarnation, zenoh_config=config, post=self.events.append, **options
         )
@@ -94,8 +94,8 @@ class Peer:
 @pytest.fixture(scope="module")
 def trio() -> Iterator[tuple[Peer, Peer, Peer]]:
     """Three buses, meshed by gossip over the first."""
-    hub = free_port()
-    peers = (Peer("a", hub, None), Peer("b", free_port(), hub), Peer("c", free_port(), hub))
+    hub = free_endpoint()
+    peers = (Peer("a", hub, None), Peer("b", free_endpoint(), hub), Peer("c", free_endpoint(), hub))
     try:
         for peer in peers:
             peer.bus.open()
@@ -117,8 +117,8 @@ def mesh(trio: tuple[Peer, Peer, Peer]) -> tuple[Peer, Peer, Peer]:
 @pytest.fixture(scope="module")
 def stranger(trio: tuple[Peer, Peer, Peer]) -> Iterator[zenoh.Session]:
     """A plain session on the same network that says what it likes."""
-    hub = f"tcp/127.0.0.1:{trio[0].port}"
-    listen = f"tcp/127.0.0.1:{free_port()}"  # of two that meet by gossip either may have to dial
+    hub = trio[0].listen
+    listen = free_endpoint()  # of two that meet by gossip either may have to dial
     session = zenoh.open(zenoh.Config.from_json5(control_config(listen=(listen,), connect=(hub,), timing=TIMING)))
     try:
         until(lambda: all(peer.bus.peers() == 3 for peer in trio), "the stranger is in the mesh")
@@ -152,8 +152,8 @@ def test_every_put_arrives_everywhere_but_at_its_sender(
 
 
 def test_what_comes_in_turn_waits_until_the_loop_asks_and_news_do_not() -> None:
-    hub = free_port()
-    a, b = Peer("a", hub, None), Peer("b", free_port(), hub, hears_all_beats_at_once=False)
+    hub = free_endpoint()
+    a, b = Peer("a", hub, None), Peer("b", free_endpoint(), hub, hears_all_beats_at_once=False)
     try:
         a.bus.open()
         b.bus.open()
@@ -185,8 +185,8 @@ def test_what_comes_in_turn_waits_until_the_loop_asks_and_news_do_not() -> None:
 
 
 def test_edges_are_not_asked_for_utilities_and_answer_everything_else() -> None:
-    hub = free_port()
-    robot, edge = Peer("a", hub, None), Peer("b", free_port(), hub, is_voter=False)
+    hub = free_endpoint()
+    robot, edge = Peer("a", hub, None), Peer("b", free_endpoint(), hub, is_voter=False)
     try:
         robot.bus.open()
         edge.bus.open()

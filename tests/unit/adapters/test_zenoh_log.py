@@ -7,8 +7,8 @@ import os
 import subprocess
 import sys
 
+from support.waiting import free_endpoint
 from zsched.adapters.zenoh_log import PERIOD_S, Digest
-from zsched.daemon_endpoints import free_port
 
 ERROR = (
     "\x1b[2m2026-11-20T08:55:12.368733Z\x1b[0m \x1b[31mERROR\x1b[0m acc-0 ThreadId(04) "
@@ -64,7 +64,7 @@ os._exit(0)
 
 
 def run(**env: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-c", SCRIPT, f"tcp/127.0.0.1:{free_port()}"]
+    command = [sys.executable, "-c", SCRIPT, free_endpoint()]
     inherited = {name: value for name, value in os.environ.items() if name != "RUST_LOG"}
     return subprocess.run(command, capture_output=True, text=True, timeout=30, check=True, env=inherited | env)
 

@@ -12,7 +12,7 @@ from zsched.config import load_fleet
 from zsched.errors import ConfigError
 from zsched.lab.children import ChildError, Children
 from zsched.lab.demo_run import fleet_template, worker_options
-from zsched.lab.fleet_runner import FleetRunner, LabFleet, free_ports, with_options, write_fleet
+from zsched.lab.fleet_runner import FleetRunner, LabFleet, with_options, write_fleet
 from zsched.lab.injector import Injector
 from zsched.lab.limits import LimitKind, NodeLimits
 from zsched.lab.observer import Observer
@@ -60,10 +60,6 @@ def children(tmp_path: Path) -> Iterator[Children]:
     with Children(tmp_path / "logs") as children:
         yield children
     assert children.left_behind == []
-
-
-def test_free_ports_are_different() -> None:
-    assert len(set(free_ports(20))) == 20
 
 
 def test_options_of_the_worker_give_way_to_the_runs() -> None:

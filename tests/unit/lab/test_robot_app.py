@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from support.waiting import free_port
+from support.waiting import free_endpoint
 from zsched.lab.laser_log import LaserLog, load_log, malaga_path
 from zsched.lab.recorder import read_records
 from zsched.lab.robot_app import Drive, parse
@@ -53,10 +53,10 @@ def test_wrong_options_exit_2(wrong: list[str]) -> None:
     assert caught.value.code == 2
 
 
-def peer(port: int) -> zenoh.Session:
+def peer(endpoint: str) -> zenoh.Session:
     config = {
         "mode": "peer",
-        "listen": {"endpoints": [f"tcp/127.0.0.1:{port}"]},
+        "listen": {"endpoints": [endpoint]},
         "scouting": {"multicast": {"enabled": False}},
         "transport": {"shared_memory": {"enabled": False}},
     }
@@ -64,13 +64,16 @@ def peer(port: int) -> zenoh.Session:
 
 
 def test_it_publishes_its_growing_map_and_counts_the_merged_ones(tmp_path: Path) -> None:
-    port = free_port()
+    endpoint = free_endpoint()
     command = [sys.executable, "-m", "zsched.lab.robot_app", "--robot", "robot1", "--index", "0", "--robots", "3"]
-    command += ["--endpoint", f"tcp/127.0.0.1:{port}", "--records", str(tmp_path), "--replay-s", "1.5"]
+    command += ["--endpoint", endpoint, "--records", str(tmp_path), "--replay-s", "1.5"]
     process = subprocess.Popen(command)
     try:
         # The robot's side comes up later than its applications: they must wait for it.
-        with peer(port) as session, session.declare_subscriber("robot1/map", zenoh.handlers.FifoChannel(64)) as maps:
+        with (
+            peer(endpoint) as session,
+            session.declare_subscriber("robot1/map", zenoh.handlers.FifoChannel(64)) as maps,
+        ):
             first = decode_grid(bytes(receive(maps).payload))
             second = decode_grid(bytes(receive(maps).payload))
             payload = bytes(receive(maps).payload)

@@ -14,6 +14,7 @@ from zsched.config import load_fleet
 from zsched.core.model import NodeKind
 from zsched.errors import AdapterError
 from zsched.lab import testbed
+from zsched.lab.loopback import own_address
 from zsched.lab.testbed import TASK, Testbed, TestbedError, echo_fleet
 
 
@@ -39,7 +40,7 @@ def test_file_is_valid_and_every_session_has_a_port_of_its_own(tmp_path: Path) -
     assert bed.names == ("edge1", "edge2", "edge3", "robot1", "robot2", "robot3")
     endpoints = [end for node in bed.fleet.nodes for end in (node.listen_control, node.listen_data)]
     assert len(set(endpoints)) == 12
-    assert all(end.startswith("tcp/127.0.0.1:") for end in endpoints)
+    assert all(end.startswith(f"tcp/{own_address()}:") for end in endpoints)
 
 
 def test_file_can_be_asked_for_otherwise(tmp_path: Path) -> None:
@@ -91,6 +92,18 @@ def test_wait_ends_at_its_deadline_and_says_for_what(tmp_path: Path) -> None:
     assert time.monotonic() - start < 1.0
     with pytest.raises(ZeroDivisionError):  # a mistake in a test is no "not yet"
         bed.wait(lambda: 1 // 0, 5, "nothing")
+
+
+def test_wait_tells_at_once_that_a_daemon_has_ended_and_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    broken = "import sys; print('no port for me', file=sys.stderr); sys.exit(7)"
+    monkeypatch.setattr(testbed, "DAEMON", (testbed.DAEMON[0], "-c", broken))
+    with small(tmp_path) as bed:
+        bed.start("robot1")
+        start = time.monotonic()
+        with pytest.raises(TestbedError, match=r"(?s)for godot, but .*: robot1 with 7\n--- robot1\nno port for me"):
+            bed.wait(lambda: False, 60, "godot")
+        assert time.monotonic() - start < 30.0
+        assert bed.wait(lambda: bed.has_ended("robot1"), 5, "what the condition itself looks for")
 
 
 # --- daemons ---------------------------------------------------------------------------------------------------------

@@ -17,11 +17,10 @@ import zenoh
 from mcap.reader import make_reader
 from rosbags.typesys import Stores, get_typestore
 
-from support.waiting import until
+from support.waiting import free_endpoint, until
 from zsched.adapters.cgroup import LimitedGroup
 from zsched.lab import application
 from zsched.lab.children import Children
-from zsched.lab.fleet_runner import free_ports
 from zsched.lab.limits import LimitKind, NodeLimits
 from zsched.lab.paper.load import Loads, Window
 from zsched.lab.paper.record import (
@@ -88,7 +87,7 @@ def test_the_schema_is_that_of_ros() -> None:
 
 
 def test_the_recorder_hears_what_a_robot_sends_and_ends_whole(tmp_path: Path) -> None:
-    endpoint, out = f"tcp/127.0.0.1:{free_ports(1)[0]}", tmp_path / "streams.mcap"
+    endpoint, out = free_endpoint(), tmp_path / "streams.mcap"
     config = zenoh.Config()
     config.insert_json5("mode", '"peer"')
     config.insert_json5("listen/endpoints", json.dumps([endpoint]))
@@ -121,7 +120,7 @@ def matches(publisher: zenoh.Publisher) -> bool:
 
 def test_a_robot_that_is_not_there_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(application, "CONNECT_S", 0.1)
-    endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
+    endpoint = free_endpoint()
 
     with pytest.raises(zenoh.ZError):
         record({"robot1": endpoint}, tmp_path / "x", StopFlag())
