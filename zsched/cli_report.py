@@ -27,7 +27,7 @@ def degradations(status: Json) -> tuple[str, ...]:
     quorum, reasons = status["quorum"], []
     if not quorum["ok"]:
         reasons.append(
-            f"no quorum: {quorum['alive']} of {quorum['electors']} electors alive, {quorum['needed']} needed"
+            f"no quorum: {quorum['alive']} of {quorum['electors']} electors can answer, {quorum['needed']} needed"
         )
     for task in status["tasks"]:
         if task["owner"] is None:

@@ -243,7 +243,7 @@ def test_healthy_fleet_is_not_degraded() -> None:
 
 def test_lost_quorum_and_lost_owner_are_degraded() -> None:
     assert degradations(recorded("degraded")) == (
-        "no quorum: 1 of 3 electors alive, 2 needed",
+        "no quorum: 1 of 3 electors can answer, 2 needed",
         "echo: its owner edge1 is gone",
     )
 

@@ -450,6 +450,8 @@ class Beat:
     """Of this node's state; what nodes of another generation have learnt means nothing here."""
     lease_terms: str = ""
     """Of a fleet with exclusive tasks: what its leases hang on; an echo under other terms is none."""
+    has_lost_state: bool = False
+    """This node is in the electorate and answers no proposer: its state is lost, disputed or cannot be written."""
 
     def __post_init__(self) -> None:
         check_name("beat.node", self.node)

@@ -122,6 +122,8 @@ class Node:
         self.executors = {
             task.name: Executor(spec=task, me=me, has_streams=self.kind is NodeKind.ROBOT) for task in fleet.tasks
         }
+        self.stateless: set[NodeId] = set()
+        """Electors whose newest beat says that they answer no proposer."""
         self.fleet_file = fleet_hash(fleet)
         self._identity = Identity(me, incarnation, self.fleet_file, now)
         self._introductions = Introductions()
@@ -259,6 +261,7 @@ class Node:
             has_voted=self.agreement.has_voted,
             generation=self.agreement.generation or 0,
             lease_terms=self.agreement.leases.terms,
+            has_lost_state=self.me in self.fleet.electors and not self.agreement.is_elector,
         )
         self.loop_lag_s = 0.0
         is_in_turn = self._beat_at == self._turn_at  # whoever has news has brought the next beat forward
@@ -280,6 +283,10 @@ class Node:
             self._on_transition(change, now)
         self._agree(self.agreement.compare(beat, now), now)
         self._agree(self.agreement.note_voter(beat), now)
+        if beat.has_lost_state:
+            self.stateless.add(beat.node)
+        elif self.stateless:
+            self.stateless.discard(beat.node)
         if beat.fleet_file != self.fleet_file or self.problems:
             self._set_problem(f"fleet/{beat.node}", self._identity.file_complaint(beat))
         self._hear_leases(beat, now)

@@ -110,11 +110,14 @@ class QuorumStatus:
     electors: int
     needed: int
     alive: int
+    """Electors that are alive and have their state."""
     ok: bool
     this_node: str
     """``elector``, ``no_elector`` (not in the electorate) or ``lost_state``."""
     voted: tuple[NodeId, ...] = ()
     """Electors that this node knows to have voted (they must not be initialised anew)."""
+    stateless: tuple[NodeId, ...] = ()
+    """Electors that have lost their state, as they say themselves; also of those that are not alive any more."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -51,6 +51,7 @@ class NodeView(Protocol):
     incarnation: int
     started_at: float
     has_state: bool
+    stateless: set[NodeId]
     agreement: Agreement
     loop_lag_s: float
     counters: Counter[str]
@@ -87,8 +88,11 @@ def build_snapshot(node: NodeView, now: float) -> Snapshot:
 
 def _problems(node: NodeView, quorum: QuorumStatus) -> tuple[str, ...]:
     problems = [f"{source}: {text}" for source, text in sorted({**node.problems, **node.agreement.problems}.items())]
+    if quorum.stateless:
+        names = ", ".join(quorum.stateless)
+        problems.append(f"electors without their state, {len(quorum.stateless)} of {quorum.electors}: {names}")
     if not quorum.ok:
-        problems.append(f"no quorum: {quorum.alive} of {quorum.electors} electors alive, {quorum.needed} needed")
+        problems.append(f"no quorum: {quorum.alive} of {quorum.electors} electors can answer, {quorum.needed} needed")
     if not node.has_state:
         problems.append("no valid state file: this node is no elector (see `zsched init --help`)")
     return tuple(problems)
@@ -96,9 +100,11 @@ def _problems(node: NodeView, quorum: QuorumStatus) -> tuple[str, ...]:
 
 def _quorum(node: NodeView) -> QuorumStatus:
     electors = node.fleet.electors
-    alive = [name for name in electors if node.membership.state(name) is PeerState.ALIVE]
-    if node.me in alive and not node.agreement.is_elector:
-        alive.remove(node.me)
+    stateless = {name for name in node.stateless if name in electors}
+    if node.me in electors and not node.agreement.is_elector:
+        stateless.add(node.me)
+    states = {name: node.membership.state(name) for name in electors}
+    alive = [name for name, state in states.items() if state is PeerState.ALIVE and name not in stateless]
     needed = majority(len(electors))
     role = "elector" if node.agreement.is_elector else ("lost_state" if node.me in electors else "no_elector")
     return QuorumStatus(
@@ -107,6 +113,7 @@ def _quorum(node: NodeView) -> QuorumStatus:
         alive=len(alive),
         ok=len(alive) >= needed,
         this_node=role,
+        stateless=tuple(sorted(stateless)),
         voted=tuple(sorted(node.agreement.voted)),
     )
 

@@ -5,6 +5,7 @@ Knows: what must hold, over all nodes and all their lives. Does not know: what h
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -244,4 +245,18 @@ def unsettled(fleet: Fleet, machines: dict[str, Machine], works: dict[TaskId, tu
                 return f"{task.name}: streams of {machine.key} are {executor.phase} towards {executor.owner}"
         if task.exclusive and (works.get(task.name, ("", 0.0))[0] != value.owner or works[task.name][1] <= now):
             return f"{task.name}: {value.owner} has no lease"
+    return _misjudged_electors(running)
+
+
+def _misjudged_electors(running: list[Machine]) -> str:
+    """What a node believes of an elector's state though that one's beats say otherwise; empty when all are right."""
+    lives = Counter(machine.name for machine in running)
+    for elector in running:
+        if elector.node is None or lives[elector.name] != 1 or elector.name not in elector.node.fleet.electors:
+            continue  # of twins the last beat counts
+        has_lost = not elector.node.agreement.is_elector
+        for machine in running:
+            told = machine.node.stateless if machine.node is not None and machine is not elector else None
+            if told is not None and (elector.name in told) != has_lost:
+                return f"{machine.key} takes {elector.name}'s state for {'there' if has_lost else 'lost'}"
     return ""

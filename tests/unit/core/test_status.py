@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from zsched.core import events as ev
+from zsched.core import instructions as do
 from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, electorate_hash
 from zsched.core.messages import Learnt
 from zsched.core.model import (
@@ -103,6 +104,30 @@ def test_quorum_counts_the_living_electors_and_says_what_this_node_is(
     assert status_line(node).endswith("NO QUORUM") is not expected[1]
 
 
+def test_electors_that_have_lost_their_state_are_named_and_count_for_nothing() -> None:
+    node = make()
+    for sequence, name in enumerate(("robot2", "robot3"), 2):
+        beat = Beat(node=name, incarnation=3, sequence=sequence, loop_lag_s=0.0, has_lost_state=True)
+        node.handle(ev.BeatReceived(beat=beat), 100.0)
+    quorum = build_snapshot(node, 100.0).quorum
+    assert (quorum.alive, quorum.ok, quorum.stateless) == (1, False, ("robot2", "robot3"))
+    assert build_snapshot(node, 100.0).problems == (
+        "electors without their state, 2 of 3: robot2, robot3",
+        "no quorum: 1 of 3 electors can answer, 2 needed",
+    )
+    again = Beat(node="robot2", incarnation=4, sequence=1, loop_lag_s=0.0)
+    node.handle(ev.BeatReceived(beat=again), 100.1)
+    quorum = build_snapshot(node, 100.1).quorum
+    assert (quorum.alive, quorum.ok, quorum.stateless) == (2, True, ("robot3",))
+
+
+@pytest.mark.parametrize(("me", "has_state"), [("robot1", True), ("robot1", False), ("edge1", False)])
+def test_a_beat_says_whether_an_elector_has_lost_its_state(me: str, *, has_state: bool) -> None:
+    node = make(me, has_state=has_state)
+    sent = [one.beat for one in node.handle(ev.DeadlineReached(), 101.0) if isinstance(one, do.PublishBeat)]
+    assert [beat.has_lost_state for beat in sent] == [me in ROBOTS and not has_state]
+
+
 @pytest.mark.parametrize("patience", [None, 0.2])
 def test_a_task_says_whether_it_is_moved_by_patience(patience: float | None) -> None:
     node = make()
@@ -117,7 +142,8 @@ def test_problems_say_what_is_missing_in_words() -> None:
     node.handle(ev.ProblemReported(source="profile", problem="no /proc"), 100.0)
     assert build_snapshot(node, 100.0).problems == (
         "profile: no /proc",
-        "no quorum: 0 of 3 electors alive, 2 needed",
+        "electors without their state, 1 of 3: robot1",
+        "no quorum: 0 of 3 electors can answer, 2 needed",
         "no valid state file: this node is no elector (see `zsched init --help`)",
     )
     assert build_snapshot(make(), 100.0).problems == ()
