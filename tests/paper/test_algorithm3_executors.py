@@ -121,7 +121,7 @@ def test_the_same_winner_as_the_current_allocation_moves_nothing() -> None:
 
 def test_new_weights_move_no_stream() -> None:
     """Reading: the memory of previous allocations is the epoch; it rises only when the owner changes."""
-    tuned = Retune(base_revision=1, tuning=TUNING).apply(allocation("edge1", 1))
+    tuned = Retune(base_revision=1, tuning=replace(TUNING, bonus=0.3)).apply(allocation("edge1", 1))
     moved = MoveOwner(base_revision=2, owner="edge2", reason="").apply(tuned)
     executor = make_executor()
     executor.execute(allocation("edge1", 1), 0.0)

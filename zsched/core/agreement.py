@@ -34,6 +34,7 @@ PARK_SHARE = 0.8
 _RETUNED = {
     RoundOutcome.COMMITTED: (CommandOutcome.OK, "committed by a majority of the electors"),
     RoundOutcome.CONFLICT: (CommandOutcome.CONFLICT, "another change came first; look and try again"),
+    RoundOutcome.UNCHANGED: (CommandOutcome.UNCHANGED, "these are the weights in force"),
     RoundOutcome.NO_QUORUM: (CommandOutcome.NO_QUORUM, "no majority of the electors answered"),
     RoundOutcome.UNKNOWN: (CommandOutcome.UNKNOWN, "the electors fell silent; `zsched status` tells"),
 }

@@ -11,7 +11,8 @@ Synod on a register that can be rewritten (Rystsov, arXiv 1802.07000): no leader
 * among accepted values "newer" means the higher ballot;
 * accepted is not learnt: an elector with an acceptance that it has not learnt runs an *identity round* (it re-accepts
   what it reads), and so does a proposer that does not know how its round ended; it never applies its change twice;
-* every change names the revision that it is based on and is a function of the value read.
+* every change names the revision that it is based on and is a function of the value read; one that leaves owner or
+  tuning as they are writes nothing, so a higher epoch always means another owner.
 """
 
 from __future__ import annotations
@@ -39,7 +40,9 @@ class MoveOwner:
     reason: str
 
     def apply(self, read: Allocation) -> Allocation:
-        """The new value; touches owner, epoch and revision only."""
+        """The new value; touches owner, epoch and revision only. For the owner that is there already: what was read."""
+        if self.owner == read.owner:
+            return read
         return replace(read, revision=read.revision + 1, epoch=read.epoch + 1, owner=self.owner)
 
 
@@ -53,7 +56,9 @@ class Retune:
     """The operator's question that waits for this change."""
 
     def apply(self, read: Allocation) -> Allocation:
-        """The new value; touches tuning and revision only."""
+        """The new value; touches tuning and revision only. For the tuning in force: what was read."""
+        if self.tuning == read.tuning:
+            return read
         return replace(read, revision=read.revision + 1, tuning=self.tuning)
 
 
@@ -65,6 +70,7 @@ class RoundOutcome(StrEnum):
 
     COMMITTED = "committed"
     CONFLICT = "conflict"  # its base is no longer the newest revision
+    UNCHANGED = "unchanged"  # it asks for what is there already: nothing was written
     NO_QUORUM = "no_quorum"  # not started: no majority promised
     UNKNOWN = "unknown"  # some elector may have it, and no majority could be asked
 
@@ -340,8 +346,11 @@ class Register:
         elif running.change.base_revision != read.revision:
             self._finish(step, RoundOutcome.CONFLICT, now)
             return
+        elif (changed := running.change.apply(read)) == read:
+            self._finish(step, RoundOutcome.UNCHANGED, now)
+            return
         else:
-            running.value = running.sent = running.change.apply(read)
+            running.value = running.sent = changed
         assert running.ballot is not None
         running.phase, running.deadline, running.no = _Phase.ACCEPT, now + self._ballot_s, {}
         step.accept = Accept(

@@ -184,8 +184,16 @@ class Checker:
         if first.owner != new.owner:
             found.append(f"two owners for {new.task} epoch {new.epoch}: {first.owner} and {new.owner}")
         if first is new:
-            found += self._on_move(new)
+            found += self._on_same_owner(new) + self._on_move(new)
         return found
+
+    def _on_same_owner(self, new: Learnt) -> list[str]:
+        """A higher epoch means another owner; a generation begins at an epoch that nobody owns."""
+        return [
+            f"{new.task} epoch {max(epoch, new.epoch)} has the owner of the epoch before: {new.owner}"
+            for epoch in (new.epoch - 1, new.epoch + 1)
+            if (new.task, epoch) in self.epochs and self.epochs[new.task, epoch].owner == new.owner
+        ]
 
     def _on_move(self, new: Learnt) -> list[str]:
         limit = self.moves_per_minute.get(new.task)

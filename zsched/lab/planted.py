@@ -46,7 +46,7 @@ class PlantError(Exception):
 
 
 def changed(bug: Bug, source: str) -> str:
-    """The module's source with the bug in it.
+    """The source of the bug's module with the bug in it.
 
     Raises:
         PlantError: a text is not there exactly once.
@@ -82,10 +82,11 @@ class _Planter(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
 
 def plant(bug: Bug) -> None:
-    """From now on this process has the bug (its module must not have been imported yet)."""
-    if bug.module in sys.modules:
-        raise PlantError(f"{bug.name}: {bug.module} is imported already")
-    sys.meta_path.insert(0, _Planter(bug))
+    """From now on this process has the bug (its modules must not have been imported yet)."""
+    for one in bug.parts:
+        if one.module in sys.modules:
+            raise PlantError(f"{one.name}: {one.module} is imported already")
+        sys.meta_path.insert(0, _Planter(one))
 
 
 # --- in the planted process ------------------------------------------------------------------------------------------
@@ -163,8 +164,8 @@ def table(verdicts: Sequence[Verdict]) -> str:
     """The verdicts as Markdown, as docs/planted-bugs.md keeps them."""
     rows = ["| bug | in | found by | s |", "| --- | --- | --- | ---: |"]
     for one in verdicts:
-        module = one.bug.module.removeprefix("zsched.").replace(".", "/")
-        rows.append(f"| {one.bug.name} | `{module}.py` | {_short(one.found_by)} | {one.seconds:.1f} |")
+        modules = ", ".join(f"`{part.module.removeprefix('zsched.').replace('.', '/')}.py`" for part in one.bug.parts)
+        rows.append(f"| {one.bug.name} | {modules} | {_short(one.found_by)} | {one.seconds:.1f} |")
     return "\n".join(rows)
 
 

@@ -22,6 +22,13 @@ class Bug:
     """Directed tests that are run when no schedule has found it within its budget."""
     seed: int | None = None
     """A schedule that has found it before: tried first."""
+    also: Bug | None = None
+    """Its part in another module, for a rule that is kept in two places."""
+
+    @property
+    def parts(self) -> tuple[Bug, ...]:
+        """What is planted, one module each."""
+        return (self,) if self.also is None else (self, *self.also.parts)
 
 
 REGISTER, LEASE, TENURE = "zsched.core.register", "zsched.core.lease", "zsched.core.tenure"
@@ -105,6 +112,14 @@ REGISTER_BUGS = (
             ),
         ),
         tests=_REGISTER + _SCHEDULES,
+    ),
+    _bug(
+        "a retune raises the epoch",
+        REGISTER,
+        "return replace(read, revision=read.revision + 1, tuning=self.tuning)",
+        "return replace(read, revision=read.revision + 1, epoch=read.epoch + 1, tuning=self.tuning)",
+        _REGISTER,
+        seed=15,
     ),
     _bug(
         "a change is applied again after an unknown outcome",
@@ -430,6 +445,22 @@ VOTE_BUGS = (
             ("reason=fresh[self._me].reason", "reason=counted.reason"),
         ),
         tests=_ROUNDS,
+    ),
+    Bug(
+        name="a vote that stays is committed",
+        module=VOTING,
+        changes=(
+            ("if counted.outcome is VoteOutcome.WON and counted.winner is not None:", "if counted.winner is not None:"),
+        ),
+        tests=("tests/unit/core/test_epochs.py",),
+        seed=44,
+        also=_bug(
+            "a move to the owner raises the epoch",
+            REGISTER,
+            "if self.owner == read.owner:",
+            "if False:",
+            _REGISTER,
+        ),
     ),
     _bug(
         "called vote ignored",
