@@ -299,8 +299,8 @@ class ControlBus:
         """Ask one peer for what it has learnt."""
 
         def on_answer(owner: NodeId, value: Learnt) -> None:
-            if owner == value.node:
-                self._post(ev.LearntReceived(learnt=value))
+            if owner == value.node == peer:
+                self._post(ev.LearntReceived(learnt=value, is_answer=True))
             else:
                 self._post(ev.FrameDropped(kind="allocation", reason="foreign"))
 

@@ -14,6 +14,7 @@ from random import Random
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
+from zsched.core.belief import GENERATION_STEP, is_fit, is_proven
 from zsched.core.fleet import Fleet
 from zsched.core.lease import Leases
 from zsched.core.messages import CommandOutcome, CommandResult, Learnt, Promise, Refusal, Refused
@@ -23,8 +24,10 @@ from zsched.core.register import Change, MoveOwner, Register, Retune, RoundOutco
 SETTLE_AFTER_START_S = 0.3
 """A starting elector learns first what was accepted before (an identity round), once its peers are connected."""
 ASK_LEARNT_EVERY_S = 0.3
-GENERATION_STEP = 2**32
-"""Revision and epoch of generation G start at G times this (`zsched init --generation G`)."""
+ASK_AT_ONCE_S = 0.05
+"""One peer is asked so often at most: because of its beats, and because it says that it has just learnt something."""
+READ_EVERY_S = 2.0
+"""A value that no single node's word is enough for is read from a majority so often at most."""
 PREPARES_PER_S = 20.0
 PREPARE_BURST = 40.0
 """What one peer may cost an elector: proposers back off to far less, only a broken one comes near."""
@@ -119,6 +122,7 @@ class Agreement:
         self._foreign = tuple(stored[name] for name in sorted(stored) if name not in self.registers)
         self._settle_at = now + SETTLE_AFTER_START_S if self.is_elector else math.inf
         self._asked_at: dict[NodeId, float] = {}
+        self._read_at: dict[TaskId, float] = {}
         self.leases = Leases(
             fleet=fleet,
             me=me,
@@ -156,7 +160,7 @@ class Agreement:
     def learnt(self) -> Learnt:
         """What this node tells others: learnt values only, never accepted ones."""
         values = tuple(value for value in self.values().values() if value.revision > 0)
-        return Learnt(node=self._me, values=values, generation=self.generation or 0)
+        return Learnt(node=self._me, values=values, generation=self.generation or 0, has_voted=self.has_voted)
 
     def next_deadline(self) -> float:
         """When `tick` may have something to do."""
@@ -222,6 +226,10 @@ class Agreement:
             self.counters["accept_foreign"] += 1
             return Effects()
         effects = Effects()
+        if not is_fit(self._fleet, event.accept.acceptance.value, register):
+            self.counters["accept_unfit"] += 1
+            answer = register.refuse(event.accept.acceptance.ballot, Refusal.BALLOT)
+            return Effects(send=[do.AnswerElection(request=event.request, answer=answer)])
         self._accept_or_park(event, now + PARK_SHARE * self._fleet.timing.ballot_s, effects, now)
         return effects
 
@@ -282,26 +290,42 @@ class Agreement:
 
     # --- learners ----------------------------------------------------------------------------------------------------
 
-    def on_learnt(self, learnt: Learnt, now: float) -> Effects:
-        """A peer told what it has learnt."""
-        effects = Effects()
+    def on_learnt(self, event: ev.LearntReceived, now: float) -> Effects:
+        """A peer told what it has learnt: unasked, that is a reason to ask it; its answer may be believed."""
+        learnt = event.learnt
         if learnt.node == self._me:
-            return effects
+            return NOTHING
         if learnt.node not in self._nodes:
             self.counters["learnt_foreign"] += 1
-            return effects
+            return NOTHING
         if not self._is_our_generation(learnt.node, learnt.generation):
-            return effects
+            return NOTHING
+        if not event.is_answer:
+            newer = [(value.task, value.revision) for value in learnt.values]
+            return self._ask(learnt.node, newer, ASK_AT_ONCE_S, now)
+        effects = Effects()
+        if learnt.has_voted and learnt.node in self._fleet.electors and learnt.node not in self.voted:
+            self.voted.add(learnt.node)
+            effects.is_dirty = self._durable is not None
         for value in learnt.values:
             register = self.registers.get(value.task)
             if register is None:
                 self.counters["learnt_foreign"] += 1
-                continue
-            step = register.learn(value, now)
-            if step.learnt is not None:
-                self.leases.on_newer_value(value.task)
-            self._take(value.task, step, effects)
+            elif is_proven(self._fleet, learnt, value, register, has_generation=self.generation is not None):
+                step = register.learn(value, now)
+                if step.learnt is not None:
+                    self.leases.on_newer_value(value.task)
+                self._take(value.task, step, effects)
+            elif value.revision > register.value.revision:
+                self._read(value.task, register, effects, now)
         return effects
+
+    def _read(self, task: TaskId, register: Register, effects: Effects, now: float) -> None:
+        """Ask a majority what is in force (an identity round), for one peer's word is not enough."""
+        self.counters["learnt_unproven"] += 1
+        if now - self._read_at.get(task, -math.inf) >= READ_EVERY_S:
+            self._read_at[task] = now
+            self._take(task, register.settle(now), effects)
 
     def _is_our_generation(self, node: NodeId, generation: int) -> bool:
         """Whether a node's learnt values mean anything here; the difference is shown."""
@@ -315,13 +339,6 @@ class Agreement:
         self.problems[source] = f"{node} is of generation {generation}, this node of {self.generation}: init them alike"
         return False
 
-    def note_voter(self, beat: Beat) -> Effects:
-        """A peer's beat says that it has voted: remembered on disk, for the day its disk is lost."""
-        if not beat.has_voted or beat.node in self.voted or beat.node not in self._fleet.electors:
-            return NOTHING
-        self.voted.add(beat.node)
-        return Effects(is_dirty=self._durable is not None)
-
     def dispute(self, reason: str) -> Effects:
         """Our name is used by somebody else too: no elector any more, on disk, until the operator settles it."""
         if self._disputed:
@@ -332,18 +349,24 @@ class Agreement:
         return Effects(is_dirty=self._durable is not None)
 
     def compare(self, beat: Beat, now: float) -> Effects:
-        """A peer's beat may show that it has learnt more than we: then ask it."""
+        """A peer's beat may show that it has learnt more than we, or has voted: then ask it."""
         if not self._is_our_generation(beat.node, beat.generation):
             return NOTHING
-        is_behind = False
-        for task, revision, _ in beat.learnt:
+        is_news = beat.has_voted and beat.node not in self.voted and beat.node in self._fleet.electors
+        newer = [(task, revision) for task, revision, _ in beat.learnt]
+        return self._ask(beat.node, newer, ASK_LEARNT_EVERY_S, now, is_news=is_news)
+
+    def _ask(
+        self, peer: NodeId, told: list[tuple[TaskId, int]], every_s: float, now: float, *, is_news: bool = False
+    ) -> Effects:
+        """Ask a peer for what it has learnt, when it tells of a newer revision (or of other news)."""
+        for task, revision in told:
             register = self.registers.get(task)
-            if register is not None and revision > register.value.revision:
-                is_behind = True
-        if not is_behind or now - self._asked_at.get(beat.node, -math.inf) < ASK_LEARNT_EVERY_S:
+            is_news |= register is not None and revision > register.value.revision
+        if not is_news or now - self._asked_at.get(peer, -math.inf) < every_s:
             return NOTHING
-        self._asked_at[beat.node] = now
-        return Effects(send=[do.AskLearnt(peer=beat.node, deadline_s=self._fleet.timing.ballot_s)])
+        self._asked_at[peer] = now
+        return Effects(send=[do.AskLearnt(peer=peer, deadline_s=self._fleet.timing.ballot_s)])
 
     # --- proposers ---------------------------------------------------------------------------------------------------
 

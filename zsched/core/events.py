@@ -93,9 +93,10 @@ class ElectorAnswered:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LearntReceived:
-    """A peer told what it has learnt (put after a commit, or its answer to `AskLearnt`)."""
+    """A peer told what it has learnt: unasked, after a commit, or in answer to our own question (`AskLearnt`)."""
 
     learnt: Learnt
+    is_answer: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -107,6 +107,8 @@ class Learnt:
     node: NodeId
     values: tuple[Allocation, ...]
     generation: int = 0
+    has_voted: bool = False
+    """Whether ``node`` has ever promised anything as an elector."""
 
     def __post_init__(self) -> None:
         check_name("learnt.node", self.node)

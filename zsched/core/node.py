@@ -282,7 +282,6 @@ class Node:
         for change in self.membership.absorb_beat(beat, now):
             self._on_transition(change, now)
         self._agree(self.agreement.compare(beat, now), now)
-        self._agree(self.agreement.note_voter(beat), now)
         if beat.has_lost_state:
             self.stateless.add(beat.node)
         elif self.stateless:
@@ -551,7 +550,7 @@ class Node:
             ev.PrepareAsked: lambda event, now: self._agree(self.agreement.on_prepare(event, now), now),
             ev.AcceptAsked: lambda event, now: self._agree(self.agreement.on_accept(event, now), now),
             ev.ElectorAnswered: lambda event, now: self._agree(self.agreement.on_answer(event, now), now),
-            ev.LearntReceived: lambda event, now: self._agree(self.agreement.on_learnt(event.learnt, now), now),
+            ev.LearntReceived: lambda event, now: self._agree(self.agreement.on_learnt(event, now), now),
             ev.LearntAsked: self._on_learnt_asked,
             ev.PersistFailed: self._on_persist_failed,
             ev.BeatReceived: self._on_beat,

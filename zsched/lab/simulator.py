@@ -314,7 +314,7 @@ class Simulator(Links):
                 self._elect(me, accept, lambda n, value: ev.AcceptAsked(request=n, asker=me.name, accept=value))
             case do.AskLearnt(peer=peer):
                 for other in self.named(peer):
-                    number = self._question(other, me, lambda value: ev.LearntReceived(learnt=value))
+                    number = self._question(other, me, lambda value: ev.LearntReceived(learnt=value, is_answer=True))
                     self.send(me, other, Message(ev.LearntAsked(request=number)))
             case do.AnswerUtilities(request=request, utilities=value):
                 self._answer(request, value)

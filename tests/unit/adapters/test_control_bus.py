@@ -277,7 +277,7 @@ def test_one_peer_is_asked_for_what_it_has_learnt(mesh: tuple[Peer, Peer, Peer])
     a, b, c = mesh
     b.bus.ask_learnt("a", 2.0)
     a.bus.answer(a.next(ev.LearntAsked).request, LEARNT)
-    assert b.next(ev.LearntReceived).learnt == LEARNT
+    assert b.next(ev.LearntReceived) == ev.LearntReceived(learnt=LEARNT, is_answer=True)
     assert c.events == []
 
 

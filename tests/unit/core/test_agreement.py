@@ -10,9 +10,18 @@ import pytest
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.agreement import ASK_LEARNT_EVERY_S, SETTLE_AFTER_START_S, Agreement, Effects
+from zsched.core.agreement import (
+    ASK_AT_ONCE_S,
+    ASK_LEARNT_EVERY_S,
+    READ_EVERY_S,
+    SETTLE_AFTER_START_S,
+    Agreement,
+    Effects,
+)
+from zsched.core.belief import GENERATION_STEP, MAX_AHEAD
 from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing
 from zsched.core.messages import (
+    Accept,
     Accepted,
     CommandOutcome,
     CommandResult,
@@ -46,7 +55,7 @@ FLEET = Fleet(
     nodes=tuple(
         NodeSpec(name=name, kind=NodeKind.ROBOT if name in ROBOTS else NodeKind.EDGE) for name in ("edge1", *ROBOTS)
     ),
-    tasks=tuple(TaskSpec(name=name, candidates=("edge1",), tuning=TUNING) for name in ("merge", "plan")),
+    tasks=tuple(TaskSpec(name=name, candidates=("edge1", "robot2"), tuning=TUNING) for name in ("merge", "plan")),
     electors=ROBOTS,
 )
 
@@ -83,6 +92,11 @@ def command(
         task=task, cpu=cpu, memory=1.0 - cpu if memory is None else memory, network=0.0, base_revision=base
     )
     return ev.WeightsCommanded(request=42, command=weights)
+
+
+def answer(learnt: Learnt) -> ev.LearntReceived:
+    """What a peer says when we ask it."""
+    return ev.LearntReceived(learnt=learnt, is_answer=True)
 
 
 def of(effects: Effects, kind: type[T]) -> list[T]:
@@ -179,7 +193,7 @@ def test_command_on_the_revision_that_is_current_starts_a_round() -> None:
 def test_command_that_another_change_overtakes_is_a_conflict() -> None:
     agreement = make()
     agreement.retune(command(), 100.0)
-    result = told(agreement.on_learnt(Learnt(node="robot2", values=(value(1),)), 100.1))
+    result = told(agreement.on_learnt(answer(Learnt(node="robot2", values=(value(1),))), 100.1))
     assert result is not None
     assert (result.outcome, result.revision) == (CommandOutcome.CONFLICT, 1)
 
@@ -233,26 +247,107 @@ def test_peer_that_knows_no_more_is_not_asked(heard: Beat) -> None:
 def test_only_learnt_values_are_told_never_accepted_ones() -> None:
     held = Acceptance(ballot=Ballot(counter=5, node="robot2", incarnation=1), value=value(4))
     agreement = make(RegisterState(task="merge", promised=held.ballot, accepted=held, learnt=value(3)))
-    assert agreement.learnt() == Learnt(node="robot1", values=(value(3),))
+    assert agreement.learnt() == Learnt(node="robot1", values=(value(3),), has_voted=True)
     assert make().learnt().values == (), "the fleet file's tuning is not agreed"
 
 
 def test_values_of_several_tasks_are_learnt_from_one_message() -> None:
     agreement = make()
-    both = Learnt(node="edge1", values=(value(2), value(5, task="plan"), value(1, task="gone")))
-    effects = agreement.on_learnt(both, 100.0)
+    both = Learnt(node="robot2", values=(value(2), value(5, task="plan"), value(1, task="gone")))
+    effects = agreement.on_learnt(answer(both), 100.0)
     assert [one.task for one, _ in effects.learnt] == ["merge", "plan"]
     assert {reason for _, reason in effects.learnt} == {"learnt from a peer"}
     assert agreement.counters == {"learnt_foreign": 1}
-    assert agreement.on_learnt(both, 100.0) == Effects(), "the same again changes nothing"
+    assert agreement.on_learnt(answer(both), 100.0) == Effects(), "the same again changes nothing"
 
 
 def test_two_values_for_one_revision_are_a_problem_that_is_shown() -> None:
     agreement = make(RegisterState(task="merge", learnt=value(3)))
-    assert agreement.on_learnt(Learnt(node="robot2", values=(value(3, "robot2"),)), 100.0).learnt == []
+    assert agreement.on_learnt(answer(Learnt(node="robot2", values=(value(3, "robot2"),))), 100.0).learnt == []
     assert "two values for revision 3" in agreement.problems["register/merge"]
-    assert agreement.on_learnt(Learnt(node="robot2", values=(value(4, "robot2"),)), 100.1).learnt != []
+    assert agreement.on_learnt(answer(Learnt(node="robot2", values=(value(4, "robot2"),))), 100.1).learnt != []
     assert agreement.problems == {}, "agreement goes on"
+
+
+# --- strangers -------------------------------------------------------------------------------------------------------
+
+
+def test_what_is_said_unasked_is_not_learnt_but_asked_about() -> None:
+    """One put from anybody who can reach the network must not end a task."""
+    agreement = make()
+    said = Learnt(node="robot2", values=(value(3),))
+    effects = agreement.on_learnt(ev.LearntReceived(learnt=said), 100.0)
+    assert (effects.learnt, effects.is_dirty) == ([], False)
+    assert [one.peer for one in of(effects, do.AskLearnt)] == ["robot2"]
+    assert agreement.on_learnt(ev.LearntReceived(learnt=said), 100.01) == Effects(), "it has just been asked"
+    assert of(agreement.on_learnt(ev.LearntReceived(learnt=said), 100.01 + ASK_AT_ONCE_S), do.AskLearnt) != []
+    assert agreement.on_learnt(answer(said), 100.2).learnt != []
+    assert agreement.on_learnt(ev.LearntReceived(learnt=said), 101.0) == Effects(), "nothing new"
+
+
+ABSURD = [
+    value(2**52 - 1, "nobody"),
+    value(3, "nobody"),
+    value(3, "edge9"),
+    value(MAX_AHEAD + 4),
+    replace(value(3), epoch=4),
+]
+
+
+@pytest.mark.parametrize("absurd", ABSURD)
+def test_an_absurd_answer_is_not_learnt_and_a_majority_is_asked_now_and_then(absurd: Allocation) -> None:
+    agreement = make(RegisterState(task="merge", learnt=value(2)))
+    effects = agreement.on_learnt(answer(Learnt(node="robot2", values=(absurd,))), 200.0)
+    assert (effects.learnt, effects.is_dirty) == ([], False)
+    assert [one.prepare.task for one in of(effects, do.SendPrepare)] == ["merge"]
+    for number in range(40):  # the identity round ends unanswered
+        agreement.tick(200.0 + number / 10)
+    again = agreement.on_learnt(answer(Learnt(node="robot2", values=(absurd,))), 200.0 + READ_EVERY_S / 2)
+    assert again.send == []
+    assert agreement.registers["merge"].value == value(2)
+    assert agreement.counters["learnt_unproven"] == 2
+
+
+def test_what_no_single_answer_proves_is_learnt_from_a_majority() -> None:
+    """A candidate left the fleet file here and owns the task: the electors' own word is enough."""
+    held = Acceptance(ballot=Ballot(counter=5, node="robot2", incarnation=1), value=value(4, "edge9"))
+    agreement = make()
+    asked = agreement.on_learnt(answer(Learnt(node="robot2", values=(held.value,))), 100.0)
+    effects = accepts(agreement, promises(agreement, asked, held=held))
+    assert [one for one, _ in effects.learnt] == [held.value]
+
+
+def test_only_an_elector_s_answer_is_believed_or_one_about_what_was_accepted_here() -> None:
+    """edge1 is no elector; if it had committed something, electors would have accepted it."""
+    agreement = make()
+    said = answer(Learnt(node="edge1", values=(value(3),)))
+    assert agreement.on_learnt(said, 100.0).learnt == []
+    held = Acceptance(ballot=Ballot(counter=5, node="edge1", incarnation=1), value=value(3))
+    agreement = make(RegisterState(task="merge", promised=held.ballot, accepted=held))
+    assert [one for one, _ in agreement.on_learnt(said, 100.0).learnt] == [value(3)]
+
+
+def test_a_node_without_a_state_goes_by_the_generation_of_whom_it_asked() -> None:
+    agreement = make(has_state=False)
+    start = 3 * GENERATION_STEP
+    old = answer(Learnt(node="robot2", values=(value(start + 5),), generation=2))
+    assert agreement.on_learnt(old, 100.0).learnt == []
+    new = answer(Learnt(node="robot2", values=(value(start + 5),), generation=3))
+    assert [one for one, _ in agreement.on_learnt(new, 110.0).learnt] == [value(start + 5)]
+
+
+@pytest.mark.parametrize("absurd", ABSURD)
+def test_an_absurd_value_is_not_accepted(absurd: Allocation) -> None:
+    agreement = make(RegisterState(task="merge", learnt=value(2)))
+    asked = Accept(
+        task="merge",
+        acceptance=Acceptance(ballot=Ballot(counter=5, node="robot2", incarnation=1), value=absurd),
+        electorate="e",
+    )
+    effects = agreement.on_accept(ev.AcceptAsked(request=1, asker="robot2", accept=asked), 100.0)
+    (said,) = of(effects, do.AnswerElection)
+    assert isinstance(said.answer, Refused)
+    assert not effects.is_dirty
 
 
 # --- settling at the start -------------------------------------------------------------------------------------------
@@ -290,7 +385,7 @@ def test_registers_of_tasks_that_left_the_file_stay_on_disk() -> None:
     """The task may come back: its promises must not be forgotten."""
     gone = RegisterState(task="gone", promised=Ballot(counter=9, node="robot2", incarnation=1), learnt=value(3))
     agreement = make(gone, RegisterState(task="merge", learnt=value(2)))
-    agreement.on_learnt(Learnt(node="robot2", values=(value(3),)), 100.0)
+    agreement.on_learnt(answer(Learnt(node="robot2", values=(value(3),))), 100.0)
     state = agreement.to_persist()
     assert state is not None
     by_task = {one.task: one for one in state.registers}
@@ -302,7 +397,7 @@ def test_registers_of_tasks_that_left_the_file_stay_on_disk() -> None:
 
 def test_without_a_state_nothing_is_written() -> None:
     agreement = make(has_state=False)
-    assert agreement.on_learnt(Learnt(node="robot2", values=(value(1),)), 100.0).is_dirty
+    assert agreement.on_learnt(answer(Learnt(node="robot2", values=(value(1),))), 100.0).is_dirty
     assert agreement.to_persist() is None
 
 
@@ -380,9 +475,13 @@ def test_prepares_of_one_peer_are_rate_limited_and_others_are_not() -> None:
 def test_who_has_voted_is_remembered_on_disk_once() -> None:
     agreement = make()
     heard = replace(beat("robot2", 0), has_voted=True)
-    assert agreement.note_voter(heard).is_dirty
-    assert not agreement.note_voter(heard).is_dirty
-    assert not agreement.note_voter(replace(beat("edge1", 0), has_voted=True)).is_dirty, "no elector"
+    assert of(agreement.compare(heard, 100.0), do.AskLearnt) == [do.AskLearnt(peer="robot2", deadline_s=0.3)]
+    assert not agreement.to_persist().voted, "nothing durable on the word of a beat"  # type: ignore[union-attr]
+    said = Learnt(node="robot2", values=(), has_voted=True)
+    assert agreement.on_learnt(answer(said), 100.1).is_dirty
+    assert not agreement.on_learnt(answer(said), 100.2).is_dirty
+    assert agreement.compare(heard, 200.0) == Effects(), "nothing to ask"
+    assert not agreement.on_learnt(answer(replace(said, node="edge1")), 100.3).is_dirty, "no elector"
     state = agreement.to_persist()
     assert state is not None
     assert state.voted == ("robot2",)
@@ -403,10 +502,10 @@ def test_disputed_name_is_no_elector_in_this_life_and_the_next() -> None:
 def test_another_generation_teaches_nothing_and_is_shown_until_it_is_gone() -> None:
     agreement = make()
     told_by = Learnt(node="robot2", values=(value(2**32, None),), generation=1)
-    assert agreement.on_learnt(told_by, 100.0) == Effects()
+    assert agreement.on_learnt(answer(told_by), 100.0) == Effects()
     assert agreement.registers["merge"].value.revision == 0
     assert "generation 1" in agreement.problems["generation/robot2"]
-    agreement.on_learnt(Learnt(node="robot2", values=(value(3),)), 100.0)
+    agreement.on_learnt(answer(Learnt(node="robot2", values=(value(3),))), 100.0)
     assert "generation/robot2" not in agreement.problems
     assert agreement.registers["merge"].value.revision == 3
 
@@ -423,12 +522,12 @@ def test_generations_refuse_each_others_ballots() -> None:
 
 def test_node_without_state_believes_whatever_generation_it_is_told() -> None:
     agreement = make(has_state=False)
-    agreement.on_learnt(Learnt(node="robot2", values=(value(2**32 + 1),), generation=1), 100.0)
+    agreement.on_learnt(answer(Learnt(node="robot2", values=(value(2**32 + 1),), generation=1)), 100.0)
     assert agreement.registers["merge"].value.revision == 2**32 + 1
 
 
 def test_revision_that_nothing_could_follow_is_refused_and_shown() -> None:
     agreement = make()
-    agreement.on_learnt(Learnt(node="robot2", values=(value(2**53 - 1),)), 100.0)
+    agreement.on_learnt(answer(Learnt(node="robot2", values=(value(2**53 - 1),))), 100.0)
     assert agreement.registers["merge"].value.revision == 0
-    assert "cannot be" in agreement.problems["register/merge"]
+    assert agreement.counters["learnt_unproven"] == 1

@@ -170,7 +170,7 @@ STRANGERS: dict[str, ev.Event] = {
     "profile of it": profile("ghost"),
     "prepare of it": prepare(5, "ghost"),
     "accept of it": accept(5, "ghost", value(1, "edge1")),
-    "learnt value of it": ev.LearntReceived(learnt=Learnt(node="ghost", values=(value(5, "edge2"),))),
+    "learnt value of it": ev.LearntReceived(learnt=Learnt(node="ghost", values=(value(5, "edge2"),)), is_answer=True),
     "its utilities": ev.UtilityReceived(gather=1, utilities=Utilities(voter="ghost", vectors=())),
     "proposal of it": proposal("ghost", "edge1"),
     "proposal of an edge": proposal("edge1", "edge1"),
@@ -187,7 +187,9 @@ STRANGERS: dict[str, ev.Event] = {
     "answer of a node that is no elector": ev.ElectorAnswered(
         answer=Promise(elector="edge1", task="merge", ballot=ballot(1, "robot1"))
     ),
-    "learnt value of an unknown task": ev.LearntReceived(learnt=Learnt(node="robot2", values=(STRANGER_VALUE,))),
+    "learnt value of an unknown task": ev.LearntReceived(
+        learnt=Learnt(node="robot2", values=(STRANGER_VALUE,)), is_answer=True
+    ),
     "vectors that are another's": ev.UtilityReceived(
         gather=1,
         utilities=Utilities(
@@ -266,7 +268,9 @@ def test_node_whose_disk_refused_is_no_elector_and_says_so() -> None:
 def test_refused_disk_loses_no_route() -> None:
     """The batch that carried the plan was cut off; the plan comes again with the failure."""
     node = started()
-    first = node.handle(ev.LearntReceived(learnt=Learnt(node="robot2", values=(value(1, "edge1"),))), 100.0)
+    first = node.handle(
+        ev.LearntReceived(learnt=Learnt(node="robot2", values=(value(1, "edge1"),)), is_answer=True), 100.0
+    )
     again = node.handle(ev.PersistFailed(reason="read-only"), 100.0)
     assert [one.plan for one in of(again, do.ApplyRoutes)] == [one.plan for one in of(first, do.ApplyRoutes)]
     assert of(again, do.ApplyRoutes)[0].plan.phase is RoutePhase.PREPARE
@@ -274,7 +278,7 @@ def test_refused_disk_loses_no_route() -> None:
 
 def test_refused_disk_loses_no_role_and_no_worker_start() -> None:
     node = started("edge1")
-    node.handle(ev.LearntReceived(learnt=Learnt(node="robot2", values=(value(1, "edge1"),))), 100.0)
+    node.handle(ev.LearntReceived(learnt=Learnt(node="robot2", values=(value(1, "edge1"),)), is_answer=True), 100.0)
     again = node.handle(ev.PersistFailed(reason="read-only"), 100.0)
     assert do.StartWorker(task="merge") in again
     assert [one.role.role for one in of(again, do.SetRole)] == [WorkerRole.ACTIVE]
@@ -282,7 +286,9 @@ def test_refused_disk_loses_no_role_and_no_worker_start() -> None:
 
 def test_learnt_values_apply_on_a_node_without_state_too() -> None:
     node = started(has_state=False)
-    batch = node.handle(ev.LearntReceived(learnt=Learnt(node="robot2", values=(value(1, "edge1"),))), 100.0)
+    batch = node.handle(
+        ev.LearntReceived(learnt=Learnt(node="robot2", values=(value(1, "edge1"),)), is_answer=True), 100.0
+    )
     assert not of(batch, do.PersistState)
     assert of(batch, do.ApplyRoutes)
     (answer,) = of(node.handle(prepare(9, "robot2"), 100.0), do.AnswerElection)

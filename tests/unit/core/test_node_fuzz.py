@@ -222,7 +222,8 @@ class Storm:
     def learnt(self) -> ev.Event:
         if self.rng.random() < 0.9:
             return ev.LearntAsked(request=self.number())
-        return ev.LearntReceived(learnt=Learnt(node=self.name(), values=(self.value(self.task()),)))
+        learnt = Learnt(node=self.name(), values=(self.value(self.task()),))
+        return ev.LearntReceived(learnt=learnt, is_answer=self.rng.random() < 0.8)
 
     def beat(self) -> ev.Event:
         learnt = tuple((name, self.number(), self.number()) for name in TASKS)

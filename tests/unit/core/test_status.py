@@ -76,7 +76,7 @@ def learn(node: Node, revision: int, owner: str | None, now: float = 100.0, *, e
     value = Allocation(
         task="merge", revision=revision, epoch=revision if epoch is None else epoch, owner=owner, tuning=TUNING
     )
-    node.handle(ev.LearntReceived(learnt=Learnt(node="robot2", values=(value,))), now)
+    node.handle(ev.LearntReceived(learnt=Learnt(node="robot2", values=(value,)), is_answer=True), now)
 
 
 # --- the quorum ------------------------------------------------------------------------------------------------------
@@ -240,7 +240,7 @@ def test_ratios_are_bounded_and_none_when_not_measured() -> None:
 def test_counters_of_all_parts_stand_in_one_sorted_list() -> None:
     node = make()
     node.handle(ev.FrameDropped(kind="beat", reason="size"), 100.0)
-    node.handle(ev.LearntReceived(learnt=Learnt(node="ghost", values=())), 100.0)
+    node.handle(ev.LearntReceived(learnt=Learnt(node="ghost", values=()), is_answer=True), 100.0)
     assert build_snapshot(node, 100.0).counters == (("dropped_beat_size", 1), ("learnt_foreign", 1))
 
 
