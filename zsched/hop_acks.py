@@ -7,6 +7,9 @@ control BLOCK: classes ``latest`` and ``reliable``) keeps what is not acknowledg
 that is out of turn has to wait and the missing ones are asked for, at most for `GIVE_UP_S`: then what is missing is
 lost and the stream goes on. Who wants only the newest takes any newer one. Numbers that came before are dropped and
 counted either way.
+
+Where everything is wanted a source begins with number 0, or with what its start marker says (`Acknowledger.skip`): what
+came first is no proof that nothing was before it. Only the lowest 32 bits of a number travel (`zsched.core.serial`).
 """
 
 from __future__ import annotations
@@ -20,6 +23,7 @@ from typing import Final
 
 from zsched.clock import monotonic_s
 from zsched.core.relay_protocol import StreamAck, StreamAcks
+from zsched.core.serial import number_near, serial_of
 
 ACK_S: Final = 0.05
 """Acknowledgements leave so often while anything changes (20 Hz)..."""
@@ -87,14 +91,29 @@ class Acknowledger:
             self._is_closed = True
             self._wake.notify()
 
-    def admit(self, name: SourceName, number: int, *, in_turn: bool) -> bool:
-        """A sample came; ``False``: drop it. ``in_turn``: nothing may be missing before it."""
+    def admit(self, name: SourceName, serial: int, *, in_turn: bool) -> int | None:
+        """A sample came; answers its number, ``None``: drop it. ``in_turn``: nothing may be missing before it."""
         with self._wake:
-            source = self._sources.get(name) or self._add(name, number)
+            source = self._sources.get(name) or self._add(name, 0 if in_turn else serial)
+            number = number_near(serial, source.arrived)
             is_admitted = self._judge(source, number, in_turn=in_turn)
             if not is_admitted:
                 self._mark(name)
-            return is_admitted
+            return number if is_admitted else None
+
+    def number(self, name: SourceName, serial: int) -> int:
+        """The number that a serial of a source stands for."""
+        with self._wake:
+            source = self._sources.get(name)
+            return serial if source is None else number_near(serial, source.arrived)
+
+    def shed(self, name: SourceName) -> None:
+        """A sample that was wanted gives way for want of room: lost, although newer ones are processed."""
+        with self._wake:
+            source = self._sources.get(name)
+            if source is not None:
+                source.lost += 1
+                self._mark(name)
 
     def expect(self, name: SourceName, number: int) -> int:
         """The number that the source comes to next; ``number`` when nothing of it is known yet."""
@@ -124,17 +143,20 @@ class Acknowledger:
             return monotonic_s() - source.gap_since
 
     def skip(self, name: SourceName, number: int) -> int:
-        """Nothing below ``number`` will come any more; answers how many are lost by that."""
+        """Nothing below ``number`` will come any more; answers how many are lost by that. It is always answered."""
         with self._wake:
             source = self._sources.get(name)
-            if source is None or number <= source.arrived:
+            if source is None:
+                source = self._add(name, number)
+            number = number_near(serial_of(number), source.arrived)
+            self._mark(name)
+            if number <= source.arrived:
                 return 0
             is_first = source.arrived == source.first  # nothing has come: the stream begins later for us
             before = source.lost
             self._jump(source, number)
             if is_first:
                 source.first, source.lost = number, before
-            self._mark(name)
             return source.lost - before
 
     def end(self, name: SourceName) -> None:
@@ -203,6 +225,8 @@ class Acknowledger:
         return now - source.gap_since > GIVE_UP_S
 
     def _jump(self, source: _Source, number: int) -> None:
+        if source.processed == source.arrived:  # nothing is in work
+            source.processed = number
         source.lost += number - source.arrived
         source.missing.extend(range(max(source.arrived, number - MAX_MISSING), number))
         source.arrived = number

@@ -163,8 +163,8 @@ class Worker:
         """
         expr = key_expr.replace("{prefix}", self.prefix)
         source = Input(on_sample=on_sample, keep_last=keep_last, depth=depth)
+        ends = self._session.declare_subscriber(f"{expr}/{END_CHUNK}", self._on_marker)  # who sees the other sees this
         data = self._session.declare_subscriber(expr, lambda sample: self._dispatcher.put(source, sample))
-        ends = self._session.declare_subscriber(f"{expr}/{END_CHUNK}", self._on_marker)
         self._declared += [data, ends]
 
     def publisher(

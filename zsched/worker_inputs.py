@@ -25,6 +25,7 @@ import zenoh
 
 from zsched.clock import monotonic_s
 from zsched.core.relay_protocol import EndMarker
+from zsched.core.serial import number_near, serial_of
 from zsched.hop_acks import GIVE_UP_S, Acknowledger, SourceName
 
 END_GRACE_S: Final = 0.1
@@ -143,18 +144,24 @@ class Dispatcher:
         info = sample.source_info
         if info is not None:
             waiting.name = (key, str(info.source_id.zid), info.source_id.eid)
-            waiting.number = info.source_sn
             in_turn = source.keep_last is None and sample.congestion_control == zenoh.CongestionControl.BLOCK
-            if not self._acks.admit(waiting.name, waiting.number, in_turn=in_turn):
+            number = self._acks.admit(waiting.name, info.source_sn, in_turn=in_turn)
+            if number is None:
                 return
+            waiting.number = number
         with self._wake:
             line = source.waiting.setdefault(key, deque())
             line.append(waiting)
             if len(line) > (source.keep_last or source.depth):
-                line.popleft().sample = None
-                source.shed += 1
+                self._shed(source, line.popleft())
             self._queue.append(waiting)
             self._wake.notify()
+
+    def _shed(self, source: Input, oldest: _Waiting) -> None:
+        oldest.sample = None
+        source.shed += 1
+        if source.keep_last is None and oldest.name is not None:
+            self._acks.shed(oldest.name)
 
     def put_marker(self, marker: Marker) -> None:
         """Queue an end marker (zenoh's thread)."""
@@ -316,6 +323,7 @@ class Dispatcher:
             for marker in done:
                 self._markers.remove(marker)
                 self._open.pop(marker.name, None)
+                self._acks.skip(marker.name, marker.end.count)  # what has not come by now is lost, and is said to be
             over = sorted({marker.end.epoch for marker in done if self._is_over(marker.end.epoch)})
         if over:
             self._acks.flush()  # so that what is processed is known to be when the ends arrive
@@ -325,7 +333,7 @@ class Dispatcher:
     def _is_due(self, marker: Marker, now: float) -> bool:
         state = self._open.get(marker.name)
         number = state.number if state is not None else -1
-        if number + 1 >= marker.end.count:
+        if number + 1 >= number_near(serial_of(marker.end.count), number + 1):
             return True
         grace_s = GIVE_UP_S if state is not None and state.in_turn else END_GRACE_S
         return not self._queue and now - marker.came_at > grace_s

@@ -23,6 +23,7 @@ import zenoh
 
 from support.waiting import free_endpoint, until
 from zsched.adapters.streams import RelayHandle
+from zsched.core.books import unaccounted
 from zsched.core.events import RelayChanged, SlotDrained, SlotFlipped, SlotReady, StreamsCounted
 from zsched.core.fleet import Timing
 from zsched.core.plan import (
@@ -168,6 +169,18 @@ class Rig:
         """The newest counters of one stream."""
         return next((count for count in self.counts() if count.stream == stream), StreamCount(stream=stream))
 
+    def assert_nothing_is_unaccounted(self) -> None:
+        """Every sample that came in is somewhere in the counters, of every stream (`zsched.core.books`)."""
+        found: dict[str, tuple[int, StreamCount]] = {}
+
+        def is_balanced() -> bool:
+            books = {count.stream: (unaccounted(count) or 0, count) for count in self.counts()}
+            found.clear()
+            found.update({name: book for name, book in books.items() if book[0]})
+            return not found
+
+        until(is_balanced, f"an account of every sample, missing {found}")
+
     def drops(self) -> Counter[str]:
         """The newest drops, summed over all streams."""
         result: Counter[str] = Counter()
@@ -193,6 +206,7 @@ def relay_rig(folder: Path, timing: Timing = DEFAULT_TIMING) -> Iterator[Rig]:
     try:
         made.start()
         yield made
+        made.assert_nothing_is_unaccounted()
     finally:
         made.stop()
 

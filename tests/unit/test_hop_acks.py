@@ -10,6 +10,7 @@ import pytest
 from support.waiting import until
 from zsched import hop_acks
 from zsched.core.relay_protocol import StreamAck, StreamAcks
+from zsched.core.serial import SPAN, serial_of
 from zsched.hop_acks import Acknowledger
 
 NAME = ("edge1/t/in", "a1", 7)
@@ -26,7 +27,7 @@ class Book:
         return self.sent[-1][2].acks[-1]
 
     def admit(self, *numbers: int, in_turn: bool = True) -> list[bool]:
-        return [self.acks.admit(NAME, number, in_turn=in_turn) for number in numbers]
+        return [self.acks.admit(NAME, serial_of(number), in_turn=in_turn) is not None for number in numbers]
 
     def wait(self, **fields: object) -> StreamAck:
         end = time.monotonic() + 3
@@ -45,6 +46,7 @@ def book() -> Iterator[Book]:
 
 
 def test_what_is_processed_is_acknowledged_to_its_own_relay(book: Book) -> None:
+    book.acks.skip(NAME, 5)
     assert book.admit(5, 6, 7) == [True, True, True]
     for number in (5, 6, 7):
         book.acks.processed(NAME, number, 10)
@@ -102,3 +104,51 @@ def test_at_20_hz_while_it_changes_and_at_once_when_much_was_processed(book: Boo
     while len(book.sent) == before and time.monotonic() < end:
         time.sleep(0.001)
     assert len(book.sent) > before
+
+
+def test_a_source_begins_with_number_0_or_with_what_its_start_marker_says(book: Book) -> None:
+    """What comes first is no proof that nothing was before it."""
+    assert book.admit(5) == [False]
+    ack = book.wait(has_gap=True)
+    assert (ack.first, ack.arrived) == (0, 0)
+    book.acks.skip(NAME, 5)
+    ack = book.wait(arrived=5)
+    assert (ack.first, ack.processed, ack.lost) == (5, 5, 0)
+    assert book.admit(5, 6) == [True, True]
+
+
+def test_a_start_marker_is_answered_each_time(book: Book) -> None:
+    book.acks.skip(NAME, 0)
+    assert book.wait(arrived=0).lost == 0
+    before = len(book.sent)
+    book.acks.skip(NAME, 0)
+    until(lambda: len(book.sent) > before, "another answer")
+
+
+def test_what_is_given_up_with_nothing_in_work_is_not_in_flight_for_ever(book: Book) -> None:
+    assert book.admit(0) == [True]
+    book.acks.processed(NAME, 0, 1)
+    book.acks.skip(NAME, 4)
+    assert book.wait(arrived=4).processed == 4
+
+
+def test_what_gives_way_for_want_of_room_is_lost_although_newer_ones_are_processed(book: Book) -> None:
+    assert book.admit(0, 1, 2) == [True, True, True]
+    book.acks.shed(NAME)
+    book.acks.processed(NAME, 2, 1)
+    assert book.wait(processed=3).lost == 1
+
+
+def test_numbers_go_on_where_their_serials_begin_again(book: Book) -> None:
+    """Resent ones, a gap and a skip on both sides of 2^32."""
+    start = SPAN - 3
+    book.acks.skip(NAME, start)
+    assert book.admit(start, start + 1, start + 5, start + 1) == [True, True, False, False]
+    ack = book.wait(has_gap=True)
+    assert (ack.arrived, ack.doubled) == (start + 2, 1)
+    assert book.admit(start + 2, start + 3, start + 4, start + 5) == [True] * 4
+    book.acks.processed(NAME, book.acks.number(NAME, serial_of(start + 5)), 1)
+    assert book.wait(processed=SPAN + 3).lost == 0
+    book.acks.skip(NAME, start + 9)
+    assert book.wait(arrived=SPAN + 6).lost == 3
+    assert book.admit(SPAN + 6) == [True]

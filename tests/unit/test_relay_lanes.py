@@ -7,7 +7,9 @@ from typing import Any, cast
 import pytest
 
 from zsched.core.relay_protocol import StreamAck
+from zsched.core.serial import SPAN, serial_of
 from zsched.relay.lanes import KEPT_BYTES_LATEST, MAX_RESEND_S, RESEND_S, Lane, Sent
+from zsched.relay.tally import Tally
 
 
 def lane() -> Lane:
@@ -73,3 +75,62 @@ def test_of_large_latest_samples_only_the_newest_are_kept_to_be_put_again(size: 
         sent(books, at=10.0 + number, size=size)
     assert [one.number for one in books.kept] == list(range(20 - kept, 20))
     assert books.kept_bytes == kept * size
+
+
+def ack(first: int, arrived: int, lost: int = 0, processed: int | None = None) -> StreamAck:
+    return StreamAck(
+        eid=1, first=first, arrived=arrived, processed=arrived if processed is None else processed, lost=lost
+    )
+
+
+def test_what_came_before_the_first_number_that_a_worker_saw_is_lost_and_not_forgotten() -> None:
+    books = lane()
+    for _ in range(10):
+        sent(books, at=10.0)
+    assert (books.acknowledged, books.lost, books.in_flight) == (0, 0, 10)
+    books.acknowledge(ack(7, 9), "1", 10.1)
+    assert (books.acknowledged, books.lost, books.in_flight) == (2, 7, 1)
+
+
+def test_each_life_of_a_worker_answers_for_its_own_numbers() -> None:
+    books, tally = lane(), Tally()
+    for _ in range(10):
+        sent(books, at=10.0)
+    books.acknowledge(ack(0, 6, lost=1), "1", 10.1)
+    assert not books.acknowledge(ack(0, 0), "2", 10.2)
+    tally.new_life(books, books.count)
+    books.begin_life("2", books.count)
+    assert (tally.acknowledged, tally.lost, tally.at_most_lost) == (5, 1, 4)
+    assert (books.acknowledged, books.lost, books.in_flight) == (0, 0, 0)
+    sent(books, at=10.3)
+    books.acknowledge(ack(0, 11, lost=10), "2", 10.4)  # it gave up on what was its predecessor's
+    assert (books.acknowledged, books.lost, books.in_flight) == (1, 0, 0)
+
+
+def test_a_lane_is_met_by_the_answer_to_its_greeting_alone() -> None:
+    books = lane()
+    books.part(10.0)
+    books.acknowledge(ack(0, 0), "1", 10.0)
+    assert not books.meet(10.0)  # it was on its way before
+    books.greeted_at = 10.1
+    assert books.meet(10.2)
+    for _ in range(3):
+        sent(books, at=10.3)
+    books.part(11.0)  # its link went, and with it what was on it
+    books.greeted_at = 12.0
+    books.acknowledge(ack(0, 1), "1", 12.1)
+    assert books.meet(12.1)
+    assert (books.resend_from, books.lowest) == (1, 1)
+
+
+@pytest.mark.parametrize("start", [0, SPAN - 2, SPAN, 5 * SPAN - 1])
+def test_an_acknowledgement_is_read_near_our_own_number(start: int) -> None:
+    """A receiver that came late knows the lowest bits of a number only; a stranger's does no harm."""
+    books = lane()
+    books.count = books.base = start
+    for _ in range(5):
+        sent(books, at=10.0)
+    books.acknowledge(ack(serial_of(start), serial_of(start) + 4), "1", 10.1)
+    assert (books.acknowledged, books.lost, books.in_flight) == (4, 0, 1)
+    books.acknowledge(ack(0, 2**51), "1", 10.2)
+    assert books.acknowledged + books.lost + books.in_flight == 5

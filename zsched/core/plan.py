@@ -180,7 +180,7 @@ class StreamCount:
     acknowledged: int | None = None
     """Inputs: samples that workers have processed; ``None``: no worker counts them (a foreign one)."""
     in_flight: int | None = None
-    """Inputs: samples sent and not processed yet."""
+    """Inputs: samples taken and not processed yet: they wait here, or were sent and are not acknowledged."""
     lost: int = 0
     """Numbers that never came over the numbered hop."""
     doubled: int = 0
@@ -191,6 +191,10 @@ class StreamCount:
     """Kept values sent once more to a new owner, and samples sent again for want of an acknowledgement."""
     at_most_lost: int = 0
     """Inputs: in flight to workers that died, so at most so many had no result."""
+    repeated: int = 0
+    """Inputs: samples that were given to one more receiver: kept values, mirrors, replays after a crash."""
+    unsent: int = 0
+    """Inputs of class ``latest``: values that came while there was no owner; the newest are kept for the next one."""
     from_expr: str = ""
     """Filled in by the status: the keys of the newest slot, empty while the task has no owner."""
     to_expr: str = ""

@@ -23,6 +23,8 @@ class StreamCounter:
         self.doubled = 0
         self.reordered = 0
         self.replayed = 0
+        self.repeated = 0
+        self.unsent = 0
 
     def seen(self, size: int) -> None:
         """A sample of ``size`` bytes came in."""
@@ -38,18 +40,24 @@ class StreamCounter:
     def value(self, tally: Tally | None = None) -> StreamCount:
         """The counters now, with what the receivers said; ``last_seen_s`` is an age in seconds."""
         said = tally or Tally()
+        drops = self._drops
+        if said.errors or said.uncounted:
+            more = {"error": drops.get("error", 0) + said.errors, "uncounted": said.uncounted}
+            drops = {**drops, **{reason: count for reason, count in more.items() if count}}
         age = None if self._last_seen is None else round(max(0.0, monotonic_s() - self._last_seen), 3)
         return StreamCount(
             stream=self.stream,
             messages=self._messages,
             bytes=self._bytes,
-            drops=tuple(sorted(self._drops.items())),
+            drops=tuple(sorted(drops.items())),
             last_seen_s=age,
             acknowledged=None if tally is None else said.acknowledged,
-            in_flight=None if tally is None else said.in_flight,
+            in_flight=None if tally is None else said.in_flight + said.waiting,
             lost=self.lost + said.lost,
             doubled=self.doubled + said.doubled,
             reordered=self.reordered + said.reordered,
             replayed=self.replayed + said.resent,
             at_most_lost=said.at_most_lost,
+            repeated=self.repeated,
+            unsent=self.unsent,
         )

@@ -35,6 +35,8 @@ _Kept = tuple[int, Sample, Timestamp | None]
 @dataclass(slots=True)
 class _InputSlot:
     outlet: Outlet
+    is_counted: bool
+    """Its worker acknowledges what it has processed."""
     sent: int = 0
     """Number of the newest sample that went into this slot; kept values above it are still owed."""
 
@@ -77,7 +79,7 @@ class InputStream:
         outlet = Outlet(self._session, route.from_expr, route.to_expr, route.settings, acks)
         with self._lock:
             self._is_counted |= acks is not None
-            self._slots[epoch] = _InputSlot(outlet=outlet)
+            self._slots[epoch] = _InputSlot(outlet=outlet, is_counted=acks is not None)
 
     def is_matching(self, epoch: int) -> bool:
         """True when somebody subscribes to the slot's keys."""
@@ -122,11 +124,20 @@ class InputStream:
         if slot is not None and slot is not self._active and slot is not self._mirror:
             slot.outlet.send_end(epoch)
 
-    def close_slot(self, epoch: int, *, is_drained: bool = False) -> int:
-        """Forget a slot; answers how many samples its worker had not processed when it was last heard of.
+    def part(self, epoch: int, *, is_parted: bool) -> None:
+        """The token of the slot's worker went, or another one has come."""
+        slot = self._slots.get(epoch)
+        if slot is not None:
+            slot.outlet.part(is_parted=is_parted)
 
-        A drained slot has none: the end markers came, they only overtook the acknowledgement.
-        """
+    def has_settled(self, epoch: int) -> bool:
+        """True when the slot's worker has acknowledged everything that it was sent."""
+        with self._lock:
+            slot = self._slots.get(epoch)
+            return slot is None or not slot.is_counted or not slot.outlet.counted().in_flight
+
+    def close_slot(self, epoch: int) -> int:
+        """Forget a slot; answers how many samples its worker had not processed when it was last heard of."""
         with self._lock:
             slot = self._slots.pop(epoch, None)
             if slot is None:
@@ -135,13 +146,14 @@ class InputStream:
                 self._active = None
             if slot is self._mirror:
                 self._mirror = None
-            said = slot.outlet.counted()
-            left, said.in_flight = said.in_flight, 0
-            if is_drained:
-                said.acknowledged, left = said.acknowledged + left, 0
+            said = slot.outlet.undeclare()
+            self._counter.dropped("closed", said.waiting)
+            if not slot.is_counted:
+                return 0
+            left = said.in_flight
             said.at_most_lost += left
+            said.in_flight = said.waiting = 0
             self._closed.add(said)
-            self._counter.dropped("closed", slot.outlet.undeclare())
             return left
 
     def close(self) -> None:
@@ -155,6 +167,7 @@ class InputStream:
         with self._lock:
             if self._pace is not None and self._keep_last and self._active is not None:
                 for sample, stamp in self._pace.overdue(monotonic_s()):
+                    self._counter.repeated += 1  # it has been counted as thinned
                     self._send(sample, stamp)
         for slot in tuple(self._slots.values()):
             slot.outlet.look_after()
@@ -165,7 +178,8 @@ class InputStream:
             total = Tally()
             total.add(self._closed)
             for slot in self._slots.values():
-                total.add(slot.outlet.counted())
+                if slot.is_counted:
+                    total.add(slot.outlet.counted())
             return self._counter.value(total if self._is_counted else None)
 
     # --- one sample --------------------------------------------------------------------------------------------------
@@ -189,6 +203,8 @@ class InputStream:
                 self._send(sample, stamp, size)
             elif not self._keep_last:
                 self._counter.dropped("no_route")
+            else:
+                self._counter.unsent += 1
 
     def _send(self, sample: Sample, stamp: Timestamp | None, size: int | None = None) -> None:
         if self._active is not None:
@@ -196,7 +212,8 @@ class InputStream:
             if dropped:
                 self._counter.dropped(reason, dropped)
         if self._mirror is not None:
-            self._mirror.outlet.send(sample, stamp, size)
+            self._counter.repeated += 1
+            self._counter.dropped(*self._mirror.outlet.send(sample, stamp, size))
 
     def _keep(self, sample: Sample) -> Timestamp | None:
         """Keep a value, with a timestamp of ours where it has none: outputs made of it inherit that, for the gate."""
@@ -218,6 +235,7 @@ class InputStream:
             self._counter.dropped(*slot.outlet.send(sample, stamp))
         slot.sent = self._number
         self._counter.replayed += len(owed)
+        self._counter.repeated += len(owed)
         return len(owed)
 
 

@@ -2,24 +2,32 @@
 
 Knows: how a sample is put on with everything it had, its number, what was sent and what came of it. Does not know:
 queues, slots, when to send again. Its outlet's lock guards what `acknowledge` and `keep` touch.
+
+Class ``reliable`` greets its receiver before the first sample: a start marker says the lowest number that may come, and
+the receiver's acknowledgement of it says who it is and what it waits for. Only then samples go out (the lane is *met*).
+What a receiver has never been told of it refuses, so nothing is ever sent into the blue: not to a worker that stands
+still, has no link or has just begun another life.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple
 
 import zenoh
 from zenoh import CongestionControl, Sample, SampleKind, Session, Timestamp, ext
 
 from zsched.core.relay_protocol import StreamAck
+from zsched.core.serial import number_near, serial_of
 
 KEPT_SAMPLES: Final = 2048
 KEPT_BYTES: Final = 16 << 20
 """Bounds of what one publisher keeps until it is acknowledged."""
 KEPT_BYTES_LATEST: Final = 256 << 10
 """Class ``latest``: so much besides the newest ``keep_last`` samples; large ones are not worth a radio's time again."""
+GREET_S: Final = 0.1
+"""An unanswered start marker is put again after this time, and then after twice as long each time."""
 RESEND_S: Final = 0.3
 MAX_RESEND_S: Final = 10.0
 """Bounds of the time without progress after which what is not acknowledged is put again."""
@@ -52,6 +60,15 @@ class Lane:
     eid: int
     count: int = 0
     """Samples put so far, and the number of the next one."""
+    base: int = 0
+    """The first number that the receiver's present life answers for."""
+    is_met: bool = False
+    """This life of the receiver has answered our start marker, so it knows the first number and misses none."""
+    is_foreign: bool = False
+    """Whoever subscribes here acknowledges nothing."""
+    unmet_since: float = 0.0
+    greeted_at: float | None = None
+    greet_pause_s: float = GREET_S
     ack: StreamAck | None = None
     incarnation: str = ""
     kept: deque[Sent] = field(default_factory=deque)
@@ -64,7 +81,7 @@ class Lane:
     takes; doubled each time."""
 
     def put(self, sample: Sample, stamp: Timestamp | None) -> None:
-        """Put a sample on under the next number, with everything that zenoh lets us keep."""
+        """Put a sample on under the next number (whoever calls it counts), with everything that zenoh lets us keep."""
         publisher = self.publisher
         if sample.kind == _DELETE:
             self._delete(sample, stamp)
@@ -74,16 +91,15 @@ class Lane:
                 encoding=sample.encoding,
                 attachment=sample.attachment,
                 timestamp=stamp,
-                source_info=_SourceInfo(self.source_id, self.count),
+                source_info=_SourceInfo(self.source_id, serial_of(self.count)),
             )
         else:
             publisher.put(sample.payload, encoding=sample.encoding, attachment=sample.attachment, timestamp=stamp)
-        self.count += 1
 
     def _delete(self, sample: Sample, stamp: Timestamp | None) -> None:
         publisher = self.publisher
         if isinstance(publisher, zenoh.Publisher):
-            source = zenoh.SourceInfo(self.source_id, self.count)
+            source = zenoh.SourceInfo(self.source_id, serial_of(self.count))
             publisher.delete(attachment=sample.attachment, timestamp=stamp, source_info=source)
         else:
             publisher.delete(attachment=sample.attachment, timestamp=stamp)
@@ -91,7 +107,7 @@ class Lane:
     def put_again(self, session: Session, sent: Sent) -> None:
         """Put a kept sample on under the number it had (never into a cache a second time)."""
         sample, publisher = sent.sample, self.publisher
-        source = zenoh.SourceInfo(self.source_id, sent.number)
+        source = zenoh.SourceInfo(self.source_id, serial_of(sent.number))
         if sample.kind == _DELETE:
             session.delete(
                 self.key,
@@ -137,10 +153,15 @@ class Lane:
         self.pause_s = min(2 * self.pause_s, MAX_RESEND_S)
 
     def acknowledge(self, ack: StreamAck, incarnation: str, now: float) -> bool:
-        """Take an acknowledgement; ``True`` when it is of another life of the worker, which starts anew."""
-        is_other = bool(self.incarnation) and incarnation != self.incarnation
-        self.incarnation = incarnation
-        if is_other or self.ack is None or ack.processed >= self.ack.processed:
+        """Take an acknowledgement; ``False``, and nothing is taken, when another life of the worker sent it.
+
+        Its numbers are brought near ours: the receiver may have heard only their lowest bits.
+        """
+        if self.incarnation and incarnation != self.incarnation:
+            return False
+        self.incarnation, self.is_foreign = incarnation, False
+        ack = _near(ack, self.count)
+        if self.ack is None or ack.processed >= self.ack.processed:
             self.ack = ack
         newest: Sent | None = None
         while self.kept and self.kept[0].number < ack.arrived:
@@ -148,7 +169,33 @@ class Lane:
             self.kept_bytes -= newest.size
         if newest is not None:
             self.pause_s = min(max(2 * (now - newest.at), newest.took_s, RESEND_S), MAX_RESEND_S)
-        return is_other
+        return True
+
+    def meet(self, now: float) -> bool:
+        """The receiver has said something: whether it answers a start marker, and is met by that."""
+        if self.is_met or self.greeted_at is None or self.ack is None or self.ack.arrived < self.base:
+            return False
+        self.is_met = True
+        if self.arrived < self.count:
+            self.ask_again(self.arrived, now)
+        return True
+
+    def part(self, now: float) -> None:
+        """The receiver is not there (any more), or there is another one: greet it before anything more is sent."""
+        self.is_met = self.is_foreign = False
+        self.unmet_since, self.greeted_at, self.greet_pause_s = now, None, GREET_S
+
+    def begin_life(self, incarnation: str, start: int) -> None:
+        """Another life of the receiver answers from ``start`` on; what the former one left open is the caller's."""
+        self.incarnation, self.base = incarnation, start
+        self.ack, self.resend_from = None, None
+        while self.kept and self.kept[0].number < start:
+            self.kept_bytes -= self.kept.popleft().size
+
+    @property
+    def lowest(self) -> int:
+        """The lowest number that may still be sent: what a start marker says."""
+        return max(self.base, self.kept[0].number) if self.kept else self.count
 
     @property
     def arrived(self) -> int:
@@ -156,12 +203,45 @@ class Lane:
         return self.count if self.ack is None else min(self.ack.arrived, self.count)
 
     @property
+    def processed(self) -> int:
+        """Everything below this number is acknowledged, or known to be lost."""
+        return self.base if self.ack is None else min(max(self.ack.processed, self.ack.first, self.base), self.count)
+
+    @property
     def in_flight(self) -> int:
         """Samples sent and not processed yet, as far as we know."""
-        return 0 if self.ack is None else max(0, self.count - self.ack.processed)
+        return self.count - self.processed
+
+    @property
+    def lost(self) -> int:
+        """What this life of the receiver has not had of that: given up, or before the first number it saw."""
+        if self.ack is None:
+            return 0
+        first = min(self.ack.first, self.count)
+        known = max(0, self.ack.lost - max(0, self.base - first)) + max(0, first - self.base)
+        return min(known, self.processed - self.base)
+
+    @property
+    def acknowledged(self) -> int:
+        """What this life of the receiver has processed."""
+        return self.processed - self.base - self.lost
 
     def is_full(self) -> bool:
         """True when nothing more may be sent before an acknowledgement (class ``reliable``)."""
         if self.ack is None:
             return False
-        return self.count - self.ack.processed >= KEPT_SAMPLES or self.kept_bytes >= KEPT_BYTES
+        return self.count - self.processed >= KEPT_SAMPLES or self.kept_bytes >= KEPT_BYTES
+
+
+def _near(ack: StreamAck, count: int) -> StreamAck:
+    """An acknowledgement in numbers around ``count``."""
+    shift = number_near(serial_of(ack.arrived), count) - ack.arrived
+    if not shift:
+        return ack
+    return replace(
+        ack,
+        first=max(0, ack.first + shift),
+        arrived=ack.arrived + shift,
+        processed=max(0, ack.processed + shift),
+        until=max(0, ack.until + shift) if ack.until else 0,
+    )

@@ -17,7 +17,7 @@ hold Python's global lock until the receiver's lease ends (measured with zenoh 1
 
 Where the receiver is `zsched.worker`, samples are kept until it acknowledges them. A number that did not come, or no
 progress for a while (`Lane.is_late`), and they are put again under the numbers they had; the worker drops what it has
-already.
+already. Class ``reliable`` sends nothing before its receiver has said where it begins (`zsched.relay.greetings`).
 """
 
 from __future__ import annotations
@@ -33,8 +33,10 @@ from zsched.clock import monotonic_s
 from zsched.core.keyexpr import is_wild
 from zsched.core.plan import StreamClass, StreamSettings
 from zsched.core.relay_protocol import EndMarker, StreamAck
+from zsched.core.serial import serial_of
 from zsched.keyspace import END_CHUNK
 from zsched.relay.acks import Acks
+from zsched.relay.greetings import Greetings
 from zsched.relay.lanes import KEPT_BYTES, KEPT_BYTES_LATEST, KEPT_SAMPLES, Lane, Sent
 from zsched.relay.receive import undeclare
 from zsched.relay.rewrite import Rewriter, rewriter
@@ -91,6 +93,13 @@ class Outlet:
         self._lock = threading.Lock()
         self._lanes: dict[tuple[str, str], Lane] = {}
         self.tally = Tally()
+        self._handed = 0
+        """Samples taken and not dropped (the stream's lock guards it)..."""
+        self._left = 0
+        """...and those of them that have left the queue, or could not (our lock)."""
+        self._in_hand = False
+        holds = self._is_reliable and acks is not None
+        self._greetings = Greetings(self._lock, self._put_start) if holds else None
         self._probe = session.declare_publisher(to_expr)
         self._main = None if self._is_wild else self._declare(to_expr, Priority.DATA, is_express=False)
         self._queue = self._make_queue()
@@ -106,7 +115,7 @@ class Outlet:
             sheds=not is_reliable,
             keep_last=self._settings.keep_last,
             is_open=self._is_open if is_reliable and self._acks is not None else None,
-            at_kick=self._resend if self._acks is not None else None,
+            at_kick=self._look if self._acks is not None else None,
         )
 
     @property
@@ -139,10 +148,13 @@ class Outlet:
                 lane.put(sample, stamp)
             except zenoh.ZError:
                 return "error", 1
+            with self._lock:
+                lane.count += 1
             return _ALL_WENT
         size = len(sample.payload) if size is None else size
         action = lambda: self._put(lane, sample, stamp, size)  # noqa: E731 - named for the line's length
         dropped = self._queue.send(lane, action, size, (sample, stamp))
+        self._handed += 1 - dropped
         return ("overflow", dropped) if dropped else _ALL_WENT
 
     def wait_for_room(self, size: int) -> None:
@@ -161,7 +173,9 @@ class Outlet:
 
     def take_back(self) -> list[tuple[Sample, Timestamp | None]]:
         """What class ``reliable`` still holds in its queue, never sent: it may go to another owner instead."""
-        return self._queue.take_back() if self._queue is not None and self._is_reliable else []
+        taken = self._queue.take_back() if self._queue is not None and self._is_reliable else []
+        self._handed -= len(taken)
+        return taken
 
     def key_of(self, sample: Sample) -> str:
         """The key that a sample goes on under (``""``: it does not fit)."""
@@ -174,32 +188,54 @@ class Outlet:
         else:
             self._queue.then(lambda: self._put_ends(epoch))
 
-    def undeclare(self) -> int:
-        """Give the publishers back (a queue's thread its own); answers how many samples still waited."""
+    def undeclare(self) -> Tally:
+        """Give the publishers back (a queue's thread its own); answers the last counts: what waits will not go out."""
         for lane in tuple(self._lanes.values()):
             if self._acks is not None:
                 self._acks.forget(lane.eid)
         if self._queue is None:
             self._undeclare()
-            return 0
-        return self._queue.close(self._undeclare)
+            return self.counted()
+        self._queue.close(self._undeclare)
+        with self._lock:
+            said = self._sum()
+            if self._in_hand:  # nobody will hear whether it still goes out
+                said.waiting, said.in_flight = said.waiting - 1, said.in_flight + 1
+            return said
 
     def look_after(self) -> None:
-        """Have sent again what was not acknowledged in time; call it now and then."""
-        if self._queue is None or self._acks is None or self._queue.is_busy or not self.is_matching:
+        """Have sent again what was not acknowledged in time, and greet who has not answered; call it now and then."""
+        is_matching = self.is_matching
+        greetings = self._greetings
+        is_there = greetings.is_there(self._lanes, is_matching=is_matching) if greetings is not None else is_matching
+        if self._queue is None or self._acks is None or self._queue.is_busy or not is_there:
             return  # what a put waits for now, one more would wait for behind it
         now = monotonic_s()
         with self._lock:
-            late = [lane for lane in self._lanes.values() if lane.is_late(now)]
+            late = [lane for lane in self._lanes.values() if lane.is_late(now) and self._may_resend(lane)]
             for lane in late:
                 lane.ask_again(lane.arrived, now)
-        if late:
+        if late or (greetings is not None and greetings.is_waiting):
+            self._queue.kick()
+
+    def part(self, *, is_parted: bool) -> None:
+        """The worker's token went: send nothing until (``is_parted`` false) another one has come."""
+        if self._greetings is not None and self._queue is not None:
+            self._greetings.part(is_parted=is_parted)
             self._queue.kick()
 
     def counted(self) -> Tally:
-        """What this outlet has sent, and what is known of it."""
+        """What this outlet has taken and sent, and what is known of it (under the stream's lock)."""
         with self._lock:
-            return self.tally.plus(self._lanes.values())
+            return self._sum()
+
+    def _sum(self) -> Tally:
+        total = self.tally.plus(self._lanes.values())
+        total.waiting += self._handed - self._left
+        return total
+
+    def _may_resend(self, lane: Lane) -> bool:
+        return self._greetings is None or lane.is_met
 
     # --- lanes -------------------------------------------------------------------------------------------------------
 
@@ -251,6 +287,8 @@ class Outlet:
         lane = Lane(key=key, publisher=publisher, source_id=publisher.id, eid=publisher.id.eid)
         with self._lock:
             self._lanes[key, f"{priority}{is_express}"] = lane
+            if self._greetings is not None:
+                self._greetings.add(lane)
         if self._acks is not None:
             self._acks.expect(lane.eid, lambda ack, incarnation: self._acknowledged(lane, ack, incarnation))
         return lane
@@ -259,13 +297,16 @@ class Outlet:
         for lane in tuple(self._lanes.values()):
             self._put_marker(lane, epoch, lane.count)
 
+    def _put_start(self, lane: Lane, lowest: int) -> None:
+        self._put_marker(lane, SKIP_EPOCH, lowest)
+
     def _put_marker(self, lane: Lane, epoch: int, count: int) -> None:
         self._session.put(
             f"{lane.key}/{END_CHUNK}",
             encode_end(EndMarker(epoch=epoch, count=count)),
             congestion_control=CongestionControl.BLOCK,
             priority=lane.publisher.priority,
-            source_info=zenoh.SourceInfo(lane.source_id, count),
+            source_info=zenoh.SourceInfo(lane.source_id, serial_of(count)),
         )
 
     def _undeclare(self) -> None:
@@ -279,29 +320,54 @@ class Outlet:
     # --- the queue's thread ------------------------------------------------------------------------------------------
 
     def _put(self, lane: Lane, sample: Sample, stamp: Timestamp | None, size: int) -> None:
-        if self._acks is None:
-            lane.put(sample, stamp)
-            return
+        self._in_hand = True
         began = monotonic_s()
-        lane.put(sample, stamp)
+        try:
+            lane.put(sample, stamp)
+        except zenoh.ZError:
+            with self._lock:
+                self.tally.errors += 1
+                self._left, self._in_hand = self._left + 1, False
+            raise
         with self._lock:
-            now = monotonic_s()
-            sent = Sent(lane.count - 1, sample, stamp, size, now, now - began)
-            lane.keep(sent, samples=self._kept_limit, least=self._kept_least, size=self._kept_bytes)
+            lane.count += 1
+            self._left, self._in_hand = self._left + 1, False
+            if lane.is_foreign:
+                self.tally.uncounted += lane.count - lane.base
+                lane.base = lane.count
+            elif self._acks is not None:
+                now = monotonic_s()
+                sent = Sent(lane.count - 1, sample, stamp, size, now, now - began)
+                lane.keep(sent, samples=self._kept_limit, least=self._kept_least, size=self._kept_bytes)
 
     def _is_open(self) -> bool:
-        """Class ``reliable``: nothing goes out to nobody, and no more than can be sent again."""
+        """Class ``reliable``: nothing goes out to who has not been greeted, and no more than can be sent again."""
+        greetings = self._greetings
+        if greetings is not None:
+            if not greetings.is_there(self._lanes, is_matching=self.is_matching):
+                return False
+            if greetings.is_waiting and not greetings.greet(len(self._lanes)):
+                return False
         main = self._main
         if main is not None and len(self._lanes) == 1:  # the usual case, asked before every sample
-            return main.ack is None or (not main.is_full() and self.is_matching)
+            return not main.is_full()
         with self._lock:
-            lanes = tuple(self._lanes.values())
-        has_acks = any(lane.ack is not None for lane in lanes)
-        return not has_acks or (not any(lane.is_full() for lane in lanes) and self.is_matching)
+            return not any(lane.is_full() for lane in self._lanes.values())
+
+    def _look(self) -> None:
+        greetings = self._greetings
+        if greetings is not None and greetings.is_waiting and self._is_greetable(greetings):
+            greetings.greet(len(self._lanes))
+        self._resend()
+
+    def _is_greetable(self, greetings: Greetings) -> bool:
+        return greetings.is_there(self._lanes, is_matching=self.is_matching)
 
     def _resend(self) -> None:
         for lane in tuple(self._lanes.values()):
             with self._lock:
+                if not self._may_resend(lane):
+                    continue
                 start, lane.resend_from = lane.resend_from, None
                 wanted = tuple(sent for sent in lane.kept if start is not None and sent.number >= start)
             if start is not None:
@@ -323,12 +389,29 @@ class Outlet:
         now = monotonic_s()
         with self._lock:
             before = lane.ack
-            if lane.acknowledge(ack, incarnation, now):
-                self.tally.new_life(before, lane.count)
+            if not lane.acknowledge(ack, incarnation, now):
+                self._begin_life(lane, ack, incarnation, now)
             elif before is None or ack.arrived > before.arrived:
                 lane.moved_at = now
+            if self._greetings is not None and not lane.is_met:
+                self._answered(self._greetings, lane, now)
             is_gap = ack.has_gap and now - lane.moved_at > lane.pause_s / 3
-            if ack.has_gap and (is_gap or before is None or not before.has_gap):
+            if ack.has_gap and (is_gap or before is None or not before.has_gap) and self._may_resend(lane):
                 lane.ask_again(ack.arrived, now)
         if self._queue is not None:
             self._queue.kick()
+
+    def _answered(self, greetings: Greetings, lane: Lane, now: float) -> None:
+        if lane.meet(now):
+            greetings.met(lane)
+        else:
+            greetings.add(lane)
+
+    def _begin_life(self, lane: Lane, ack: StreamAck, incarnation: str, now: float) -> None:
+        """Another worker answers: what the former one left open may be lost; who has not been greeted had nothing."""
+        start = lane.count if self._greetings is not None else min(max(ack.first, lane.processed), lane.count)
+        self.tally.new_life(lane, start)
+        lane.begin_life(incarnation, start)
+        lane.acknowledge(ack, incarnation, now)
+        if self._greetings is not None:
+            lane.part(now)

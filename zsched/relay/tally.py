@@ -1,6 +1,6 @@
 """Adds up what the publishers of a stream have sent and what their receivers said of it.
 
-Knows: `StreamAck`, lanes. Does not know: zenoh, why anything was lost.
+Knows: lanes. Does not know: zenoh, why anything was lost.
 """
 
 from __future__ import annotations
@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 
-from zsched.core.relay_protocol import StreamAck
 from zsched.relay.lanes import Lane
 
 
@@ -18,12 +17,19 @@ class Tally:
 
     acknowledged: int = 0
     in_flight: int = 0
+    """Sent, and not processed as far as we know."""
+    waiting: int = 0
+    """Taken, and not sent yet."""
     lost: int = 0
     doubled: int = 0
     reordered: int = 0
     resent: int = 0
     at_most_lost: int = 0
     """In flight to a worker when it died: so many at most had no result."""
+    errors: int = 0
+    """Refused by zenoh in a queue's thread."""
+    uncounted: int = 0
+    """Put on to whoever subscribes, who acknowledges nothing."""
 
     def add(self, other: Tally) -> None:
         """Add another one to this."""
@@ -36,19 +42,17 @@ class Tally:
         total.add(self)
         for lane in lanes:
             total.in_flight += lane.in_flight
-            if lane.ack is not None:
-                total._take(lane.ack)
+            total._take(lane)
         return total
 
-    def new_life(self, before: StreamAck | None, sent: int) -> None:
-        """The receiver died: what its last word left open may be lost."""
-        if before is None:
-            return
-        self._take(before)
-        self.at_most_lost += max(0, sent - before.processed)
+    def new_life(self, lane: Lane, start: int) -> None:
+        """The receiver died: what its last word left open below ``start`` may be lost."""
+        self._take(lane)
+        self.at_most_lost += max(0, start - lane.processed)
 
-    def _take(self, ack: StreamAck) -> None:
-        self.acknowledged += max(0, ack.processed - ack.first - ack.lost)
-        self.lost += ack.lost
-        self.doubled += ack.doubled
-        self.reordered += ack.reordered
+    def _take(self, lane: Lane) -> None:
+        self.acknowledged += lane.acknowledged
+        self.lost += lane.lost
+        if lane.ack is not None:
+            self.doubled += lane.ack.doubled
+            self.reordered += lane.ack.reordered

@@ -32,6 +32,8 @@ FLIP_WAIT_S: Final = 0.3
 """A flip waits at most so long for a worker that is not ready, or has not heard yet that it is the owner."""
 GONE_GRACE_S: Final = 0.05
 """An old owner whose token went has sent its last; what is still in our queues gets so long."""
+SETTLE_S: Final = 1.0
+"""An old owner that has ended has acknowledged all by then, also when one acknowledgement was dropped on the way."""
 BUSY_S, CARE_S, IDLE_S = 0.01, 0.2, 0.5
 
 _log = logging.getLogger("zsched.relay")
@@ -41,10 +43,12 @@ _log = logging.getLogger("zsched.relay")
 class _OpenSlot:
     slot: Slot
     tokens: frozenset[str] = frozenset()
+    seen: frozenset[str] = frozenset()
     is_ready: bool = False
     is_flipped: bool = False
     is_drained: bool = False
     gone_at: float | None = None
+    ended_at: float | None = None
 
 
 class _Orphaned:
@@ -233,8 +237,7 @@ class TaskRelay:
 
     def _close(self, epoch: int) -> None:
         state = self._slots.pop(epoch, None)
-        is_drained = state is not None and state.is_drained and state.gone_at is None
-        lost = sum(source.close_slot(epoch, is_drained=is_drained) for source in self._inputs.values())
+        lost = sum(source.close_slot(epoch) for source in self._inputs.values())
         if lost and state is not None:
             self._report(SlotLost(task=self._task, epoch=epoch, owner=state.slot.owner, samples=lost))
         for sink in self._outputs.values():
@@ -265,6 +268,10 @@ class TaskRelay:
         has_services = needs_token or self._services.is_matching(slot.epoch)
         is_ready = (bool(tokens) or not needs_token) and has_services and self._is_matching(slot)
         is_new = is_ready and (not state.is_ready or bool(tokens - state.tokens))
+        if needs_token and tokens != state.seen:
+            state.seen = tokens
+            for source in self._inputs.values():
+                source.part(slot.epoch, is_parted=not tokens)
         has_changed = is_ready != state.is_ready
         state.is_ready = is_ready
         if is_ready:
@@ -337,9 +344,16 @@ class TaskRelay:
         for sink, has_ended in zip(tuple(self._outputs.values()), ended, strict=True):
             if has_ended:
                 sink.close_slot(epoch)
-        if all(ended) and (is_gone or self._services.has_ended(epoch)):
+        if all(ended) and (is_gone or (self._services.has_ended(epoch) and self._has_settled(state))):
             state.is_drained = True
             self._report(SlotDrained(task=self._task, epoch=epoch))
+
+    def _has_settled(self, state: _OpenSlot) -> bool:
+        """The ends may overtake the acknowledgements of what came before them, for which it waits a while."""
+        now = monotonic_s()
+        state.ended_at = state.ended_at or now
+        is_over = now - state.ended_at > SETTLE_S
+        return is_over or all(source.has_settled(state.slot.epoch) for source in self._inputs.values())
 
     def _draining(self) -> _OpenSlot | None:
         """The predecessor, while the current slot carries and it has not drained yet."""

@@ -1,0 +1,146 @@
+"""Planned moves to owners that stand still just then: what is lost, and whether the counters know of it.
+
+``python -m benchmarks.frozen_moves [--minutes 30] [--seed 1] [--hz 200]``. Three edges with real relays and echo
+workers, one ``reliable`` stream with ``handover: all``. Each move goes to a random other edge, whose worker is stopped
+(SIGSTOP) between *ready* and the flip, for 0.9 s, for 4 s (longer than its link's lease) or not at all. Every fifth
+minute the workers are slower than the stream (8 ms a sample at 200 Hz): overload may lose, but never silently.
+
+It fails (exit code 1) when a sample is lost that no counter of the robot's relay tells of: neither an input's nor an
+answer's; when the counters of an input do not account for every sample (`zsched.core.books`), looked at every second;
+or when anything was lost, or in flight to a living worker, without overload.
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import signal
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from benchmarks.common import machine
+from benchmarks.rig import ROBOT, TASK, Load, Rig, Traffic, routes, until
+from zsched.core.books import unaccounted
+from zsched.core.events import SlotDrained, SlotFlipped, SlotReady, StreamsCounted
+from zsched.core.plan import RoutePhase, Slot, StreamClass, StreamCount, WorkerRole
+
+EDGES = ("edge1", "edge2", "edge3")
+FREEZES_S = (0.0, 0.9, 4.0)
+DRAIN_S = 20.0
+SLOW = ("--delay-ms", "8")
+
+
+@dataclass
+class Sums:
+    """Of all rounds."""
+
+    moves: Counter[float] = field(default_factory=Counter)
+    sent: int = 0
+    lost: int = 0
+    told: int = 0
+    faults: list[str] = field(default_factory=list)
+
+
+def main() -> int:
+    """Print a line a round and the verdict; the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--minutes", type=float, default=30.0)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--hz", type=float, default=200.0)
+    options = parser.parse_args()
+    print(machine())
+    random_ = random.Random(options.seed)
+    sums = Sums()
+    end = time.monotonic() + options.minutes * 60
+    number = 0
+    while time.monotonic() < end:
+        is_overload = number % 5 == 4 or (end - time.monotonic() < 60 and number < 4)
+        with tempfile.TemporaryDirectory() as folder, Rig(Path(folder), EDGES) as rig:
+            until_s = min(end, time.monotonic() + 60)
+            _round(rig, random_, options.hz, until_s, sums, is_overload=is_overload)
+        number += 1
+    moves = ", ".join(f"{count} frozen for {seconds:g} s" for seconds, count in sorted(sums.moves.items()))
+    print(f"moves: {moves}; sent {sums.sent}, lost {sums.lost}, told of {sums.told}, faults {len(sums.faults)}")
+    print("\n".join(sums.faults[:20]))
+    return 1 if sums.faults else 0
+
+
+def _round(rig: Rig, random_: random.Random, hz: float, until_s: float, sums: Sums, *, is_overload: bool) -> None:
+    load = (Load(name="small", hz=hz, size=100),)
+    for edge in EDGES:
+        rig.start_worker(edge, *(SLOW if is_overload else ()))
+    traffic = Traffic(rig.app(), load[0])
+    now = routes("edge1", 1, load, StreamClass.RELIABLE)
+    rig.move(now)
+    until(lambda: traffic.is_connected, "the application sees the relay")
+    traffic.start()
+    until(lambda: len(traffic.back) > 20, "echoes", 60.0)
+    while time.monotonic() < until_s:
+        time.sleep(random_.uniform(0.2, 1.0))
+        freeze_s = random_.choice(FREEZES_S)
+        owner = random_.choice([edge for edge in EDGES if edge != now.owner])
+        new = routes(owner, now.epoch + 1, load, StreamClass.RELIABLE)
+        _move(rig, new, now, freeze_s)
+        now = new
+        sums.moves[freeze_s] += 1
+    traffic.stop()
+    _judge(rig, traffic, sums, is_overload=is_overload)
+
+
+def _move(rig: Rig, new: Slot, old: Slot, freeze_s: float) -> None:
+    """The executor's table; the new owner's worker stands still from *ready* on."""
+    rig.plan(RoutePhase.PREPARE, new, old)
+    until(lambda: rig.find(SlotReady, epoch=new.epoch, is_ready=True), f"epoch {new.epoch} ready", 30.0)
+    worker = rig.workers[new.owner]
+    if freeze_s:
+        worker.send_signal(signal.SIGSTOP)
+        threading.Timer(freeze_s, lambda: worker.send_signal(signal.SIGCONT)).start()
+    rig.role(new.owner, WorkerRole.ACTIVE, new.epoch)
+    rig.role(old.owner, WorkerRole.DRAINING, old.epoch)
+    rig.plan(RoutePhase.FLIP, new, old)
+    until(lambda: rig.find(SlotFlipped, epoch=new.epoch), f"epoch {new.epoch} flipped", 30.0)
+    end = time.monotonic() + max(DRAIN_S, freeze_s)
+    while not rig.find(SlotDrained, epoch=old.epoch) and time.monotonic() < end:
+        time.sleep(0.01)
+    time.sleep(freeze_s)  # at most; it is awake before the next move
+    rig.plan(RoutePhase.CLOSE, new)
+    rig.role(old.owner, WorkerRole.IDLE)
+
+
+def _judge(rig: Rig, traffic: Traffic, sums: Sums, *, is_overload: bool) -> None:
+    end = time.monotonic() + 60
+    while time.monotonic() < end:
+        counts = rig.counts()
+        inward, outward = counts[f"{TASK}/in/0"], counts[f"{TASK}/out/0"]
+        lost, doubled, reordered = traffic.result()
+        told = inward.lost + inward.at_most_lost + sum(n for _, n in inward.drops)
+        told += outward.lost + sum(n for _, n in outward.drops)
+        if not inward.in_flight and inward.messages == len(traffic.sent) and lost <= told:
+            break
+    faults = [f"{lost} lost, {told} told of"] if lost > told else []
+    if inward.messages != len(traffic.sent):
+        faults.append(f"{len(traffic.sent)} sent, {inward.messages} came in")
+    if (inward.in_flight or lost or told) and not is_overload:
+        faults.append(f"without overload: lost {lost}, told of {told}, in flight {inward.in_flight}")
+    if doubled or reordered:
+        faults.append(f"doubled {doubled}, reordered {reordered}")
+    faults += [f"{missing} unaccounted at {at:.1f}: {count}" for at, count, missing in _unaccounted(rig)]
+    what = "overload" if is_overload else "normal"
+    figures = f"sent {len(traffic.sent)} lost {lost} told of {told} in flight {inward.in_flight}"
+    print(f"{time.strftime('%H:%M:%S')} {what}: {figures}; {inward}; {outward}", flush=True)
+    sums.sent, sums.lost, sums.told = sums.sent + len(traffic.sent), sums.lost + lost, sums.told + told
+    sums.faults += faults
+
+
+def _unaccounted(rig: Rig) -> list[tuple[float, StreamCount, int]]:
+    counts = [(at, one) for at, said in rig.heard[ROBOT] if isinstance(said, StreamsCounted) for one in said.counts]
+    return [(at, one, missing) for at, one in counts if (missing := unaccounted(one))]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,36 @@
+"""Whether counters account for every sample."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from zsched.core.books import unaccounted
+from zsched.core.plan import StreamCount
+
+WHOLE = StreamCount(
+    stream="merge/in/0",
+    messages=100,
+    repeated=5,
+    acknowledged=60,
+    lost=3,
+    drops=(("overflow", 4), ("no_route", 6)),
+    in_flight=20,
+    at_most_lost=10,
+    unsent=2,
+)
+
+
+def test_what_is_in_exactly_one_counter_is_accounted_for() -> None:
+    assert unaccounted(WHOLE) == 0
+
+
+@pytest.mark.parametrize("name", ["acknowledged", "lost", "in_flight", "at_most_lost", "unsent"])
+def test_what_a_counter_lacks_is_missing(name: str) -> None:
+    assert unaccounted(replace(WHOLE, **{name: getattr(WHOLE, name) - 1})) == 1
+    assert unaccounted(replace(WHOLE, **{name: getattr(WHOLE, name) + 1})) == -1
+
+
+def test_a_worker_that_counts_nothing_has_no_books() -> None:
+    assert unaccounted(replace(WHOLE, acknowledged=None)) is None

@@ -1,0 +1,96 @@
+"""Decides when the lanes of a ``reliable`` outlet may send: greets each receiver and waits for its answer.
+
+Knows: which lanes nobody has answered for yet, how long to wait for an answer. Does not know: samples, slots, what the
+answer leads to (`zsched.relay.lanes`).
+
+A start marker (an end marker of epoch 0) says the lowest number that may still come; `zsched.worker` acknowledges it at
+once. Whoever subscribes and never answers is no `zsched.worker`: after `FOREIGN_S`, longer than any lease of a frozen
+process, or after `STRANGE_S` where the worker answers for other keys, its samples go out and are counted ``uncounted``.
+The outlet's lock guards what it holds; `greet` is called in the queue's thread only, because its puts may block.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any, Final
+
+from zsched.clock import monotonic_s
+from zsched.relay.lanes import Lane
+
+MAX_GREET_PAUSE_S: Final = 1.0
+STRANGE_S: Final = 1.0
+FOREIGN_S: Final = 10.0
+
+
+class Greetings:
+    """The lanes of one outlet whose receiver has not answered."""
+
+    def __init__(self, lock: threading.Lock, put_start: Callable[[Lane, int], None]) -> None:
+        """``put_start`` puts the start marker of a lane with the lowest number that may come; it may block."""
+        self._lock = lock
+        self._put_start = put_start
+        self._unmet: dict[int, Lane] = {}
+        self._is_away = False
+        self._is_parted = False
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether an answer is awaited."""
+        return bool(self._unmet)
+
+    def add(self, lane: Lane) -> None:
+        """A lane is new, or its receiver is (under the lock)."""
+        if lane.eid not in self._unmet:
+            lane.part(monotonic_s())
+            self._unmet[lane.eid] = lane
+
+    def met(self, lane: Lane) -> None:
+        """A lane's receiver has answered (under the lock)."""
+        self._unmet.pop(lane.eid, None)
+
+    def part(self, *, is_parted: bool) -> None:
+        """The worker's token went (nothing goes out until another one comes), or a new one came."""
+        self._is_parted = is_parted
+        self._is_away = True
+
+    def is_there(self, lanes: dict[tuple[str, str], Lane], *, is_matching: bool) -> bool:
+        """Whether there is somebody to greet; one who was away is greeted again."""
+        if not is_matching or self._is_parted:
+            self._is_away = True
+            return False
+        if self._is_away:
+            self._is_away = False
+            with self._lock:
+                now = monotonic_s()
+                for lane in lanes.values():
+                    lane.part(now)
+                    self._unmet[lane.eid] = lane
+        return True
+
+    def greet(self, lane_count: int) -> bool:
+        """Greet whose answer is due; true when nobody's is awaited any more."""
+        now = monotonic_s()
+        with self._lock:
+            unmet = tuple(self._unmet.values())
+        has_others = len(unmet) < lane_count
+        for lane in unmet:
+            if lane.greeted_at is None or now - lane.greeted_at > lane.greet_pause_s:
+                lane.greeted_at, lane.greet_pause_s = now, min(2 * lane.greet_pause_s, MAX_GREET_PAUSE_S)
+                with self._lock:
+                    lowest = lane.lowest
+                self._put_start(lane, lowest)
+            if _is_foreign(lane, now, has_others=has_others):
+                with self._lock:
+                    if not lane.is_met:
+                        lane.is_foreign = True
+                        self._unmet.pop(lane.eid, None)
+        return not self._unmet
+
+
+def _is_foreign(lane: Lane, now: float, *, has_others: bool) -> bool:
+    """Whether a lane's receiver will not answer any more; ``has_others``: the worker answers for other keys."""
+    publisher: Any = lane.publisher
+    if has_others and not bool(publisher.matching_status.matching):  # the status itself is always true
+        return True
+    return now - lane.unmet_since > (STRANGE_S if has_others else FOREIGN_S)
