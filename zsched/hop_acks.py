@@ -120,13 +120,16 @@ class Acknowledger:
         with self._wake:
             return (self._sources.get(name) or self._add(name, number)).arrived
 
-    def take(self, name: SourceName, number: int, size: int) -> bool:
-        """The sample that is next came and is processed already; ``False``: it is not that one, nothing happens."""
+    def take(self, name: SourceName, serial: int, size: int) -> bool:
+        """The sample that is next came and is processed already; ``False``: it is not that one, nothing happens.
+
+        ``serial`` may be its whole number, too.
+        """
         with self._wake:
             source = self._sources.get(name)
-            if source is None or number != source.arrived:
+            if source is None or serial_of(serial) != serial_of(source.arrived):
                 return False
-            source.arrived = source.processed = number + 1
+            source.arrived = source.processed = source.arrived + 1
             source.gap_since = None
             self._samples += 1
             self._bytes += size

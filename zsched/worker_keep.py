@@ -25,6 +25,7 @@ from zenoh import CongestionControl, Sample, Session
 from zsched import wire
 from zsched.clock import monotonic_s
 from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks
+from zsched.core.serial import number_near, serial_of
 from zsched.errors import WireError
 from zsched.keyspace import AGAIN_CHUNK, END_CHUNK
 from zsched.relay_pipe import encode_end
@@ -116,10 +117,11 @@ class KeptLane:
                 for old in [name for name, one in self.receivers.items() if one.node == node]:
                     del self.receivers[old]
                 receiver = self.receivers[relay] = _Receiver(node=node, arrived=-1)
-            has_moved = ack.arrived > receiver.arrived
+            arrived = number_near(serial_of(ack.arrived), self.count)  # one that came late knows the lowest bits only
+            has_moved = arrived > receiver.arrived
             receiver.is_ended = ack.is_ended
             if has_moved:
-                receiver.arrived, receiver.moved_at, receiver.pause_s = ack.arrived, now, RESEND_S
+                receiver.arrived, receiver.moved_at, receiver.pause_s = arrived, now, RESEND_S
             self._let_go(now)
             return receiver, has_moved
 
@@ -234,10 +236,11 @@ class Keeper:
         receiver, has_moved = lane.acknowledge(relay, node, ack, now)
         if ack.has_gap:
             if has_moved or now - receiver.moved_at > ASKED_S:
-                self._send_again(lane, relay, receiver, ack.until or lane.count, is_asked=True)
-        elif receiver.batch_end is not None and ack.arrived >= receiver.batch_end:
+                until = number_near(serial_of(ack.until), lane.count) if ack.until else lane.count
+                self._send_again(lane, relay, receiver, until, is_asked=True)
+        elif receiver.batch_end is not None and receiver.arrived >= receiver.batch_end:
             receiver.batch_end = None
-            if ack.arrived < lane.count:
+            if receiver.arrived < lane.count:
                 self._send_again(lane, relay, receiver, lane.count)
         if receiver.publisher is not None and receiver.arrived >= lane.count:
             _undeclare(receiver)
@@ -274,10 +277,10 @@ class Keeper:
             return
         if is_asked and first > receiver.arrived:  # older ones are kept no more: it must not wait for them
             marker = EndMarker(epoch=0, count=first)
-            source = zenoh.SourceInfo(lane.source_id, first)
+            source = zenoh.SourceInfo(lane.source_id, serial_of(first))
             publisher.put(encode_end(marker), encoding=SKIP_ENCODING, source_info=source)
         for one in wanted:
-            source = zenoh.SourceInfo(lane.source_id, one.number)
+            source = zenoh.SourceInfo(lane.source_id, serial_of(one.number))
             publisher.put(
                 one.payload, attachment=one.attachment, encoding=one.encoding, timestamp=one.stamp, source_info=source
             )
@@ -308,7 +311,7 @@ def put_end(session: Session, key: str, source_id: zenoh.EntityGlobalId, marker:
         f"{key}/{END_CHUNK}",
         encode_end(marker),
         congestion_control=CongestionControl.BLOCK,
-        source_info=zenoh.SourceInfo(source_id, marker.count),
+        source_info=zenoh.SourceInfo(source_id, serial_of(marker.count)),
     )
 
 

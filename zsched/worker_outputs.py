@@ -15,6 +15,7 @@ import zenoh
 from zenoh import CongestionControl, ext
 
 from zsched.core.relay_protocol import EndMarker
+from zsched.core.serial import serial_of
 from zsched.send_queue import SendQueue
 from zsched.worker_keep import Keeper, KeptLane, put_end
 
@@ -150,7 +151,7 @@ class Output:
             size = len(payload) if hasattr(payload, "__len__") else 0
             stamped.lane.keep(number, payload, attachment, encoding, timestamp, size)
         if isinstance(publisher, zenoh.Publisher):
-            source = zenoh.SourceInfo(publisher.id, number)
+            source = zenoh.SourceInfo(publisher.id, serial_of(number))
             publisher.put(payload, attachment=attachment, encoding=encoding, timestamp=timestamp, source_info=source)
         else:
             publisher.put(payload, attachment=attachment, encoding=encoding, timestamp=timestamp)

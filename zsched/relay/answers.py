@@ -19,6 +19,7 @@ import zenoh
 from zenoh import Priority, Sample, SampleKind
 
 from zsched.core.relay_protocol import SKIP_ENCODING
+from zsched.core.serial import serial_of
 from zsched.hop_acks import GIVE_UP_S, Acknowledger, SourceName
 from zsched.relay.counter import StreamCounter
 from zsched.relay_pipe import decode_end
@@ -93,14 +94,15 @@ class Answers:
         for name, number in heard.items():
             acks.expect(name, number)
 
-    def take(self, name: SourceName, number: int, sample: Sample, *, is_again: bool = False) -> tuple[Sample, ...]:
+    def take(self, name: SourceName, serial: int, sample: Sample, *, is_again: bool = False) -> tuple[Sample, ...]:
         """A sample came; answers those that go on now, in order."""
         self._names.add(name)
-        if name not in self._early and self._acks.take(name, number, len(sample.payload)):
+        if name not in self._early and self._acks.take(name, serial, len(sample.payload)):
             return (sample,)
+        number = self._acks.number(name, serial)
         expected = self._acks.expect(name, 0 if self._is_from_start and self._in_turn else number)
         if number < expected:
-            self._acks.admit(name, number, in_turn=True)  # dropped, and acknowledged once more
+            self._acks.admit(name, serial_of(number), in_turn=True)  # dropped, and acknowledged once more
             if not is_again and self._in_turn:
                 self._counter.doubled += 1
             return ()
@@ -117,7 +119,7 @@ class Answers:
         name = (key, str(info.source_id.zid), info.source_id.eid)
         if str(sample.encoding) == SKIP_ENCODING:
             marker = decode_end(sample.payload.to_bytes())
-            ready = () if marker is None else self._skip(name, marker.count)
+            ready = () if marker is None else self._skip(name, self._acks.number(name, serial_of(marker.count)))
         else:
             resent = _Resent(
                 key_expr=key,

@@ -18,6 +18,8 @@ from typing import Final
 import zenoh
 from zenoh import Sample, SampleKind, Session
 
+from zsched.core.serial import number_near
+
 TIMEOUT_S: Final = 0.5
 MAX_FETCHES: Final = 8
 """Queries at one time in this process; further ones wait."""
@@ -84,10 +86,17 @@ class History:
                 self._live.add(str(sample.key_expr))
             else:
                 source = _source(sample, info)
-                self._note(self._newest, source, info.source_sn)
-                if self._fetched and info.source_sn <= self._fetched.get(source, -1):
+                number = self._number(source, info)
+                self._note(self._newest, source, number)
+                if self._fetched and number <= self._fetched.get(source, -1):
                     return
             self._deliver(sample)
+
+    def _number(self, source: _Source, info: zenoh.SourceInfo) -> int:
+        """Whole, of which the lowest 32 bits came."""
+        serial: int = info.source_sn
+        newest = self._newest.get(source)
+        return serial if newest is None else number_near(serial, newest)
 
     def _note(self, numbers: dict[_Source, int], source: _Source, number: int) -> None:
         if len(numbers) >= MAX_SOURCES and source not in numbers:
@@ -138,10 +147,11 @@ class History:
                     return
             else:
                 source = _source(sample, info)
-                if info.source_sn <= self._newest.get(source, -1):
+                number = self._number(source, info)
+                if number <= self._newest.get(source, -1):
                     return
                 for numbers in (self._newest, self._fetched):
-                    self._note(numbers, source, info.source_sn)
+                    self._note(numbers, source, number)
             self._deliver(sample)
 
 

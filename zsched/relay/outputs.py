@@ -21,6 +21,7 @@ from zenoh import CongestionControl, Sample, Session
 
 from zsched.clock import monotonic_s
 from zsched.core.plan import HandoverRule, Route, StreamClass, StreamCount
+from zsched.core.serial import number_near, serial_of
 from zsched.hop_acks import SourceName
 from zsched.keyspace import AGAIN_CHUNK, END_CHUNK
 from zsched.relay.acks import Acks
@@ -298,9 +299,10 @@ class OutputStream:
         if number == UNNUMBERED or self._is_next(key, publisher, number):
             self._gate(slot, sample, size)
 
-    def _is_next(self, key: KeyState, publisher: tuple[str, int], number: int) -> bool:
+    def _is_next(self, key: KeyState, publisher: tuple[str, int], serial: int) -> bool:
         """Count what does not fit the numbers of the hop; an old one is dropped."""
         last = key.numbers.get(publisher, -1)
+        number = serial if last < 0 else number_near(serial, last)
         key.last_number = key.numbers[publisher] = max(number, last)
         if number == last:
             self._counter.doubled += 1
@@ -370,7 +372,8 @@ class OutputStream:
             if slot is None or key is None:
                 return
             if key.end is None:
-                key.end, key.end_at = marker, monotonic_s()
+                count = number_near(serial_of(marker.count), key.last_number + 1)
+                key.end, key.end_at = replace(marker, count=count), monotonic_s()
             source = sample.source_info
             if slot.answers is not None and source is not None:
                 key.ender = (name, str(source.source_id.zid), source.source_id.eid)
