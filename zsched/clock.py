@@ -1,7 +1,7 @@
 """The one place that reads clocks: monotonic seconds for decisions, wall time for display only.
 
 CLOCK_BOOTTIME goes on while a machine sleeps, so that a laptop that was shut for a minute does not think its lease,
-its peers' beats or its samples are fresh.
+its peers' beats or its samples are fresh. Who waits for a process of this machine asks `awake_s`: that one slept, too.
 """
 
 from __future__ import annotations
@@ -13,6 +13,11 @@ from datetime import UTC, datetime
 def monotonic_s() -> float:
     """Seconds of CLOCK_BOOTTIME; comparable only on this machine and boot."""
     return time.clock_gettime(time.CLOCK_BOOTTIME)
+
+
+def awake_s() -> float:
+    """Seconds of CLOCK_MONOTONIC, which stands still while the machine is suspended: for waits on this machine only."""
+    return time.clock_gettime(time.CLOCK_MONOTONIC)
 
 
 def wall_time() -> str:

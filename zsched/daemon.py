@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import faulthandler
 import gc
 import logging
 import os
@@ -53,6 +54,7 @@ LEAVE_S = 0.4
 still to come."""
 CLOSE_WORKERS_S = 0.7
 LOOP_MAX_WAIT_S = 1.0
+STDERR = 2
 RESTART_SIGNAL = signal.SIGUSR2
 """As SIGTERM, but the relay stays and carries the streams on for the daemon that follows (`systemctl restart`)."""
 ALERT_S, ALERT_WAIT_S = 1.0, 0.01
@@ -285,6 +287,7 @@ class Daemon:
             context=WorkerContext(fleet=fleet.name, node=me, incarnation=incarnation),
             events=shell,
             environment=lambda task: {
+                "PYTHONFAULTHANDLER": "1",
                 "ZSCHED_ZENOH_CONFIG": str(paths[task]),
                 "ZENOH_SESSION_CONFIG_URI": str(paths[task]),  # a ROS node (rmw_zenoh) joins the data network by this
             },
@@ -370,6 +373,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--log-level", default="INFO", choices=["DEBUG", "INFO", "WARNING", "ERROR"])
     given = parser.parse_args(arguments)
     _set_up_logging(given.log_level)
+    faulthandler.enable(
+        file=STDERR
+    )  # a crash, or systemd's watchdog (SIGABRT), leaves every thread's place in the journal
     options = Options(
         config=places.config_path(given.config, os.environ),
         node=places.node_name(given.node, os.environ),

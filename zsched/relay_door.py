@@ -12,21 +12,27 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import functools
 import json
 import os
+import select
 import socket
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 from hashlib import blake2s
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
 from zsched import __version__, wire
+from zsched.clock import awake_s
 from zsched.core.model import NodeId
 from zsched.core.relay_life import RelayHello, RelayHere, RelayRefused
 from zsched.errors import AdapterError, WireError
 from zsched.relay_pipe import read_frame, write_frame
 
+_NOT_THE_RELAYS: Final = frozenset({"lab", "tasks"})
 PROTOCOL: Final = 1
 """Raised whenever an older relay would misunderstand a newer daemon."""
 GREETING_S: Final = 1.0
@@ -109,8 +115,13 @@ class Door:
         os.ftruncate(claim.lock, 0)
         os.pwrite(claim.lock, json.dumps({"pid": note.pid, "listen": note.listen}).encode(), 0)
 
-    def connect(self, hello: RelayHello) -> tuple[socket.socket, RelayHere] | str:
-        """Take over the relay behind the socket; answers the link to it, or why that cannot be."""
+    def connect(
+        self, hello: RelayHello, goes_on: Callable[[float, float], bool] = lambda _asked_s, _took_s: False
+    ) -> tuple[socket.socket, RelayHere] | str:
+        """Take over the relay behind the socket; answers the link to it, or why that cannot be.
+
+        One that is silent for `GREETING_S` is waited for as long as ``goes_on`` (seconds asked for, seconds taken).
+        """
         link = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
             link.settimeout(GREETING_S)
@@ -118,6 +129,8 @@ class Door:
             link.settimeout(None)
             set_patience(link, GREETING_S)
             write_frame(link.fileno(), wire.encode(hello))
+            if not _is_answered(link, goes_on):
+                raise TimeoutError(f"nothing for {GREETING_S:g} s")
             frame = read_frame(link.fileno())
             answer: RelayHere | RelayRefused | None = None if frame is None else wire.decode(frame, *_ANSWERS)
         except (OSError, WireError) as error:
@@ -148,6 +161,34 @@ def digest_of(*parts: str) -> str:
     for part in (__version__, str(PROTOCOL), *parts):
         state.update(len(part).to_bytes(4, "big") + part.encode())
     return state.hexdigest()
+
+
+@functools.cache
+def code_digest() -> str:
+    """16 hex digits over the code that daemons and relays run: this package's, and which zenoh library it loads."""
+    package = Path(__file__).parent
+    state = blake2s(digest_size=8)
+    for path in sorted(package.rglob("*.py")):
+        name = path.relative_to(package)
+        if name.parts[0] not in _NOT_THE_RELAYS and not name.name.startswith("cli"):
+            state.update(f"{name} {path.stat().st_size}\n".encode() + path.read_bytes())
+    zenoh = find_spec("zenoh")
+    for library in sorted(Path(zenoh.origin).parent.glob("*.so")) if zenoh is not None and zenoh.origin else ():
+        found = library.stat()
+        state.update(f"{library.name} {found.st_size} {found.st_mtime_ns}".encode())
+    return state.hexdigest()
+
+
+def _is_answered(link: socket.socket, goes_on: Callable[[float, float], bool]) -> bool:
+    """Wait for an answer; false once ``goes_on`` says that waiting is of no use."""
+    poller = select.poll()
+    poller.register(link, select.POLLIN)
+    while True:
+        began = awake_s()
+        if poller.poll(GREETING_S * 1000):
+            return True
+        if not goes_on(GREETING_S, awake_s() - began):
+            return False
 
 
 def set_patience(link: socket.socket, seconds: float) -> None:

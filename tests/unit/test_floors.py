@@ -31,7 +31,7 @@ FLOORS: Final[tuple[tuple[str, int, str], ...]] = (
     (r"adapters\.(worker_supervisor|worker_process|launch)", 3, "adapters: worker processes"),
     (r"adapters\.(control_bus|open_questions)", 3, "adapters: control"),
     (r"adapters\.(network_profiler|nl80211)", 3, "adapters: radio"),
-    (r"adapters\.(streams|relay_child)", 3, "adapters: relay"),
+    (r"adapters\.(streams|relay_child|relay_silence)", 3, "adapters: relay"),
     (r"adapters\.(device_profiler|cgroup|shared_memory)", 3, "adapters: machine"),
     (r"adapters(\.\w+)?", 3, "*"),
     (r"relay(\..+)?", 3, "relay"),

@@ -1,7 +1,6 @@
 """The relay's process as a daemon holds it: a child that it has started, or one that an earlier daemon left.
 
-Knows: spawning, waiting, ending, whether a silent process wants the processor. Does not know: the pipe's frames, when a
-relay should end.
+Knows: spawning, waiting, ending. Does not know: the pipe's frames, when a relay should end.
 """
 
 from __future__ import annotations
@@ -13,15 +12,13 @@ import signal
 import socket
 import threading
 import time
-from pathlib import Path
 
-from zsched.clock import monotonic_s
+from zsched.clock import awake_s
 from zsched.relay_door import Claim, Door, Note
 
 POLL_S = 0.01
 ENDING_S = 0.5
 """A relay whose pipe has ended is about to end itself."""
-LOOKS, LOOK_S = 5, 0.02
 _FIRST_FREE = 10
 """Descriptors that the child gets are moved above those it gets them as."""
 
@@ -65,9 +62,9 @@ class RelayChild:
 
     def wait(self, timeout_s: float) -> bool:
         """Whether the process is gone within ``timeout_s``."""
-        until = monotonic_s() + timeout_s
+        until = awake_s() + timeout_s
         while not self.has_ended():
-            if monotonic_s() >= until:
+            if awake_s() >= until:
                 return False
             time.sleep(POLL_S)
         return True
@@ -121,31 +118,6 @@ def start_relay(command: list[str], door: Door | None = None, listen: str = "") 
             door.sign(claim, Note(pid=pid, listen=listen))
         ours = ours.dup()  # the stack closes the other one
     return RelayChild(pid=pid, link=ours, door=door, is_child=True)
-
-
-def is_idle(pid: int) -> bool:
-    """True when no thread of the process runs or wants to: its silence is not for want of a processor.
-
-    A stopped process is idle, too. Looks several times within 0.1 s, so that a thread that wakes up now and then counts
-    as idle; a process that is gone is not.
-    """
-    idle = 0
-    for _ in range(LOOKS):
-        states = _thread_states(pid)
-        if not states:
-            return False
-        idle += not states & {"R", "D"}
-        time.sleep(LOOK_S)
-    return idle > LOOKS // 2
-
-
-def _thread_states(pid: int) -> set[str]:
-    states = set()
-    with contextlib.suppress(OSError):
-        for thread in Path(f"/proc/{pid}/task").iterdir():
-            with contextlib.suppress(OSError, IndexError):
-                states.add((thread / "stat").read_text().rsplit(")", 1)[1].split()[0])
-    return states
 
 
 def _spawn(command: list[str], link: socket.socket, claim: Claim | None) -> int:

@@ -20,15 +20,16 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from zsched import wire
-from zsched.adapters.relay_child import ENDING_S, RelayChild, is_idle, start_relay
-from zsched.clock import monotonic_s
+from zsched.adapters.relay_child import ENDING_S, RelayChild, start_relay
+from zsched.adapters.relay_silence import Silence
+from zsched.clock import awake_s
 from zsched.core.events import ProblemReported, RelayChanged
 from zsched.core.model import NodeId
 from zsched.core.plan import Role, RoutePlan
 from zsched.core.relay_life import RelayHello, RelayPulse
 from zsched.core.relay_protocol import HandleReport, RelayStarted, RelayStop
 from zsched.errors import AdapterError, WireError
-from zsched.relay_door import Door, digest_of
+from zsched.relay_door import GREETING_S, Door, code_digest, digest_of
 from zsched.relay_pipe import REPORTS, read_frame, write_frame
 
 BACKOFF_MIN_S: Final = 0.1
@@ -37,14 +38,15 @@ BACKOFF_FACTOR: Final = 2.0
 CALM_S: Final = 10.0
 """A relay that lived so long is replaced at once; one that did not waits for its backoff."""
 SILENCE_S: Final = 1.5
-"""A relay says something twice a second; after so long without a word it is wedged, unless it lacks a processor..."""
+"""A relay says something twice a second; after so long without a word it is wedged, unless it lacks a processor."""
 START_S: Final = 5.0
 """The same for its first word."""
+OPEN_S: Final = 30.0
+"""The same for its session, which may have to wait for peers."""
 STARVED_S: Final = 15.0
-"""...then it has so long: killing it would only make the machine busier."""
+"""After so long without a word `status` says that it lacks a processor."""
 STILL_S: Final = 8.0
 """Its streams are counted every second; after so long without a count they hang on something, though it lives."""
-LOOK_S: Final = 0.25
 EVICT_S: Final = 2.0
 
 _log = logging.getLogger("zsched.streams")
@@ -126,7 +128,7 @@ class RelayHandle:
         self._command += ["--threads", str(threads), "--parent", str(os.getpid())]
         self._command += ["--local"] if local_config else []
         if bequest is not None:
-            digest = digest_of(bequest.digest, python, str(threads), zenoh_config, local_config)
+            digest = digest_of(bequest.digest, code_digest(), python, str(threads), zenoh_config, local_config)
             self._hello = RelayHello(fleet=fleet, node=node, incarnation=bequest.incarnation, digest=digest)
             self._command += ["--orphan", str(bequest.orphan_s), "--digest", digest]
             self._command += ["--incarnation", str(bequest.incarnation)]
@@ -158,15 +160,15 @@ class RelayHandle:
 
     def stop(self, deadline_s: float = 2.0) -> None:
         """Stop the relay in order, with SIGKILL at the deadline; returns when it is gone."""
-        until = monotonic_s() + deadline_s
+        until = awake_s() + deadline_s
         self._stopping.set()
         relay = self._relay
         if relay is not None:
             self._outbox.close()
-            if not relay.wait(max(0.0, until - monotonic_s())):
+            if not relay.wait(max(0.0, until - awake_s())):
                 relay.kill()
         if self._thread.is_alive():
-            self._thread.join(max(0.5, until - monotonic_s()))
+            self._thread.join(max(0.5, until - awake_s()))
         if self._bequest is not None and self._bequest.door.note() is None:
             self._bequest.door.remove()
 
@@ -195,12 +197,12 @@ class RelayHandle:
         backoff = 0.0
         found = self._take_over()
         while found is not None or not self._stopping.is_set():
-            started_at = monotonic_s()
+            started_at = awake_s()
             reason = self._run_once(found)
             found = None
             if self._stopping.is_set():
                 return
-            backoff = 0.0 if monotonic_s() - started_at > CALM_S else backoff
+            backoff = 0.0 if awake_s() - started_at > CALM_S else backoff
             _log.warning("the relay is gone (%s), next one in %.1f s", reason, backoff)
             self._on_report(RelayChanged(is_running=False, reason=reason))
             self._stopping.wait(backoff)
@@ -212,7 +214,8 @@ class RelayHandle:
         note = None if bequest is None else bequest.door.note()
         if bequest is None or note is None:
             return None
-        found = bequest.door.connect(self._hello)
+        silence = Silence(note.pid, GREETING_S)
+        found = bequest.door.connect(self._hello, lambda asked_s, took_s: not silence.go_on(asked_s, took_s))
         if isinstance(found, str):
             _log.warning("the relay that runs here (pid %d) is replaced: %s", note.pid, found)
             RelayChild(pid=note.pid, link=None, door=bequest.door).end(EVICT_S)
@@ -227,6 +230,13 @@ class RelayHandle:
             relay = found or self._start()
         except (OSError, AdapterError) as error:
             return f"cannot start {self._command[0]}: {error}"
+        try:
+            return self._serve(relay)
+        except Exception as error:  # noqa: BLE001 - whatever it is: streams need a relay, and this thread its life
+            _log.exception("the relay's handle failed, the relay is replaced")
+            return f"its handle failed: {error!r}"
+
+    def _serve(self, relay: RelayChild) -> str:
         with self._lock:
             outbox = self._outbox = _Outbox(items=dict(self._newest))
             self._relay = relay
@@ -236,14 +246,17 @@ class RelayHandle:
             outbox.close()
         writer = threading.Thread(target=self._write, args=(relay, outbox), daemon=True)
         writer.start()
-        reason = self._listen(relay)
-        if not self._is_leaving:
-            if not reason:  # it ends itself: its exit code says more than our SIGKILL's
-                relay.wait(ENDING_S)
-            relay.kill()
-        outbox.close()
-        writer.join()
-        relay.close()
+        reason = "not listened to"
+        try:
+            reason = self._listen(relay)
+        finally:
+            if not self._is_leaving:
+                if not reason:  # it ends itself: its exit code says more than our SIGKILL's
+                    relay.wait(ENDING_S)
+                relay.kill()
+            outbox.close()
+            writer.join()
+            relay.close()
         return reason or relay.ending
 
     def _start(self) -> RelayChild:
@@ -256,12 +269,15 @@ class RelayHandle:
             for text in self._configs if relay.is_child else ():
                 write_frame(relay.descriptor, text)
             while (value := outbox.take()) is not None:
-                write_frame(relay.descriptor, wire.encode(value))
+                try:
+                    frame = wire.encode(value)
+                except WireError as error:
+                    self._on_report(ProblemReported(source="relay", problem=f"a plan is too large: {error}"[:400]))
+                    continue
+                write_frame(relay.descriptor, frame)
             write_frame(relay.descriptor, wire.encode(RelayStop()))
         except OSError:
             return  # it is gone: the reader says so
-        except WireError as error:
-            self._on_report(ProblemReported(source="relay", problem=f"a plan is too large: {error}"[:400]))
 
     def _listen(self, relay: RelayChild) -> str:
         """Hand on reports until the pipe ends; answers what was wrong, or ``""``.
@@ -270,15 +286,11 @@ class RelayHandle:
         """
         poller = select.poll()
         poller.register(relay.descriptor, select.POLLIN)
-        heard_at, patience_s = monotonic_s(), START_S
-        has_started, last_word = False, ""
+        silence, last_word = Silence(relay.pid, START_S), ""
+        opening: Silence | None = Silence(relay.pid, OPEN_S)
         while True:
-            silent_s = monotonic_s() - heard_at
-            if not poller.poll(max(LOOK_S, patience_s - silent_s) * 1000):
-                silent_s = monotonic_s() - heard_at
-                if silent_s >= STARVED_S or (silent_s >= patience_s and is_idle(relay.pid)):
-                    return f"no sign of life for {silent_s:.1f} s"
-                continue
+            if reason := self._await_word(poller, silence, opening):
+                return reason
             try:
                 frame = read_frame(relay.descriptor)
                 if frame is None:
@@ -288,14 +300,39 @@ class RelayHandle:
                 return last_word
             except (WireError, OSError) as error:
                 return f"unreadable report: {error}"
-            heard_at = monotonic_s()
             if isinstance(report, RelayPulse):
                 if report.counted_s > STILL_S:
                     return f"its streams stand still for {report.counted_s:.1f} s"
                 continue
-            if isinstance(report, ProblemReported) and not has_started:
+            if isinstance(report, ProblemReported) and opening is not None:
                 last_word = report.problem or ""
             if isinstance(report, RelayStarted):
-                patience_s, has_started, last_word = self._silence_s, True, ""
+                silence.patience_s, opening, last_word = self._silence_s, None, ""
                 self._on_report(RelayChanged(is_running=True, reason=f"pid {report.pid}"))
             self._on_report(report)
+
+    def _await_word(self, poller: select.poll, silence: Silence, opening: Silence | None) -> str:
+        """Wait for the relay's next word; answers why it is wedged, or ``""``."""
+        is_starved = False
+        try:
+            while True:
+                asked_s, began = silence.left_s, awake_s()
+                is_there = bool(poller.poll(asked_s * 1000))
+                took_s = awake_s() - began
+                if opening is not None and (reason := opening.go_on(asked_s, took_s)):
+                    return f"its session does not open: {reason}"
+                if is_there:
+                    silence.end()
+                    return ""
+                if reason := silence.go_on(asked_s, took_s):
+                    return reason
+                if silence.silent_s >= STARVED_S and not is_starved:
+                    is_starved = True
+                    self._tell_starved(f"no word for {silence.silent_s:.0f} s: it waits for a processor")
+        finally:
+            if is_starved:
+                self._tell_starved(None)
+
+    def _tell_starved(self, problem: str | None) -> None:
+        _log.warning("the relay: %s", problem or "is heard again, or ended")
+        self._on_report(ProblemReported(source="relay/processor", problem=problem))

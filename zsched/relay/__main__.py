@@ -37,6 +37,7 @@ def main() -> None:
     # Both may reach the whole group: the daemon needs us for its own orderly stop, and ends us with it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _stop_soon)
+    faulthandler.enable()
     faulthandler.register(signal.SIGUSR1)  # where every thread stands, for whoever has to ask
     # One stalled target holds one transmit thread: there must be more threads than targets may stall. Read once, when
     # zenoh's runtime starts.

@@ -22,7 +22,7 @@ from typing import Final
 import zenoh
 
 from zsched import wire
-from zsched.clock import monotonic_s
+from zsched.clock import awake_s
 from zsched.core.events import ProblemReported, RoleEnded, StreamsCounted
 from zsched.core.introductions import Introductions
 from zsched.core.model import NodeId, TaskId
@@ -67,16 +67,19 @@ class Reporter:
         self._queue: queue.Queue[RelayReport | None] = queue.Queue(MAX_REPORTS)
         self._writing = threading.Lock()
         self._problems: dict[str, ProblemReported] = {}
-        self._counted_at = monotonic_s()
+        self._still_s: float | None = None
+        """How long nothing was counted, as far as we ran; ``None``: the session is not open yet."""
         self._thread = threading.Thread(target=self._run, name="reports", daemon=True)
         self._thread.start()
 
     def report(self, value: RelayReport) -> None:
         """Send a report; never blocks."""
         if isinstance(value, StreamsCounted):
-            self._counted_at = monotonic_s()
+            self._still_s = 0.0
             if self._queue.qsize() > MAX_REPORTS // 2:
                 return
+        if isinstance(value, RelayStarted):
+            self._still_s = 0.0
         if isinstance(value, ProblemReported):
             self._problems[value.source] = value
         try:
@@ -102,13 +105,15 @@ class Reporter:
 
     def _run(self) -> None:
         while True:
+            began = awake_s()
             try:
-                value = self._queue.get(timeout=PULSE_S)
+                value: RelayReport | RelayPulse | None = self._queue.get(timeout=PULSE_S)
             except queue.Empty:
-                self._write(RelayPulse(counted_s=monotonic_s() - self._counted_at))
-                continue
+                value = RelayPulse(counted_s=self._still_s or 0.0)
             if value is None:
                 return
+            if self._still_s is not None:  # what it took longer we did not run ourselves, and nor did the streams
+                self._still_s += min(awake_s() - began, 2 * PULSE_S)
             self._write(value)
 
     def _write(self, value: RelayReport | RelayPulse) -> None:
@@ -246,16 +251,16 @@ class RelayProcess:
             task.wake()
 
     def _count(self) -> None:
-        due = monotonic_s()
+        due = awake_s()
         pause = threading.Event()
         introductions = Introductions()
         while True:
-            due += COUNT_S
-            pause.wait(max(0.0, due - monotonic_s()))
+            due = max(due + COUNT_S, awake_s())  # none is made up for
+            pause.wait(due - awake_s())
             counts = tuple(count for task in tuple(self._tasks.values()) for count in task.counts())
             self._reporter.report(StreamsCounted(counts=counts))
             is_missing = any(task.misses_its_worker for task in tuple(self._tasks.values()))
-            if introductions.is_due(monotonic_s(), is_missing=is_missing) and self._introducer is not None:
+            if introductions.is_due(awake_s(), is_missing=is_missing) and self._introducer is not None:
                 self._introducer.introduce()
 
 

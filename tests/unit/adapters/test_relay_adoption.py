@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -14,14 +16,15 @@ from typing import Any
 
 import pytest
 
+import zsched
 from support.waiting import until
 from zsched import wire
-from zsched.adapters.relay_child import is_idle
+from zsched.adapters import relay_silence
 from zsched.adapters.streams import Bequest, RelayHandle
 from zsched.core.events import RelayChanged
 from zsched.core.relay_life import RelayHello
 from zsched.core.relay_protocol import HandleReport
-from zsched.relay_door import Door, digest_of
+from zsched.relay_door import GREETING_S, Door, code_digest, digest_of
 from zsched.relay_pipe import read_frame, write_frame
 from zsched.zenoh_config import data_config
 
@@ -61,9 +64,13 @@ def is_there(pid: int) -> bool:
 class First:
     """A daemon in a process of its own; its relay is left to the test."""
 
-    def __init__(self, folder: Path, orphan_s: float = ORPHAN_S) -> None:
+    def __init__(self, folder: Path, orphan_s: float = ORPHAN_S, package: Path | None = None) -> None:
+        """``package``: where the code is that it runs, when not this one's."""
+        env = os.environ if package is None else os.environ | {"PYTHONPATH": str(package)}
         command = [sys.executable, "-c", FIRST_DAEMON, CONFIG, str(folder), str(orphan_s)]
-        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self.process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=package, env=env
+        )
         assert self.process.stdout is not None
         pid, self.zid = self.process.stdout.readline().split()
         self.relay = int(pid)
@@ -146,6 +153,44 @@ def test_a_relay_that_is_not_ours_is_replaced_never_doubled(
         second.handle.stop(2.0)
 
 
+@pytest.mark.parametrize("is_changed", [False, True], ids=["the same code elsewhere", "changed code"])
+def test_code_that_changed_under_one_version_replaces_the_relay(tmp_path: Path, *, is_changed: bool) -> None:
+    package = Path(zsched.__file__).parent
+    copy = shutil.copytree(package, tmp_path / "code" / "zsched", ignore=shutil.ignore_patterns("__pycache__", "lab"))
+    if is_changed:
+        with (copy / "relay" / "inputs.py").open("a") as file:
+            file.write("# a line more\n")
+    run = tmp_path / "run"
+    run.mkdir()
+    first = First(run, package=tmp_path / "code")
+    try:
+        first.crash()
+        second = Second(run)
+        try:
+            assert (second.handle.pid != first.relay) is is_changed
+        finally:
+            second.handle.stop(2.0)
+    finally:
+        first.close()
+
+
+def test_an_orphan_that_waits_for_a_processor_is_waited_for(
+    first: First, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It answers after twice the time in which one that has the processor must."""
+    first.crash()
+    monkeypatch.setattr(relay_silence, "is_idle", lambda _pid: False)
+    os.kill(first.relay, signal.SIGSTOP)
+    goes_on = threading.Timer(2.5 * GREETING_S, os.kill, (first.relay, signal.SIGCONT))
+    goes_on.start()
+    second = Second(tmp_path)
+    try:
+        assert second.handle.pid == first.relay
+    finally:
+        goes_on.join(10)
+        second.handle.stop(2.0)
+
+
 def test_a_wedged_orphan_is_replaced(first: First, tmp_path: Path) -> None:
     os.kill(first.relay, signal.SIGSTOP)
     first.crash()
@@ -185,7 +230,7 @@ def test_a_daemon_that_stops_takes_its_relay_with_it(tmp_path: Path) -> None:
 
 
 def test_a_relay_with_a_daemon_lets_no_other_in(first: First, tmp_path: Path) -> None:
-    digest = digest_of("fleet", sys.executable, "6", CONFIG, "")
+    digest = digest_of("fleet", code_digest(), sys.executable, "6", CONFIG, "")
     hello = RelayHello(fleet="test", node="robot1", incarnation=9, digest=digest)
     found = Door(tmp_path, "robot1").connect(hello)
     assert isinstance(found, str)
@@ -217,18 +262,3 @@ def test_garbage_at_the_door_is_refused_and_survived(first: First, tmp_path: Pat
         assert second.handle.pid == first.relay
     finally:
         second.handle.stop(2.0)
-
-
-def test_a_process_that_wants_the_processor_is_not_idle() -> None:
-    busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
-    asleep = subprocess.Popen(["sleep", "60"])
-    try:
-        until(lambda: not is_idle(busy.pid), "it runs", 3.0)
-        until(lambda: is_idle(asleep.pid), "it sleeps", 3.0)
-        busy.send_signal(signal.SIGSTOP)
-        until(lambda: is_idle(busy.pid), "it is stopped", 3.0)
-    finally:
-        for process in (busy, asleep):
-            process.kill()
-            process.wait(5)
-    assert not is_idle(busy.pid)

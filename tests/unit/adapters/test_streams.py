@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,7 +19,7 @@ from zsched.adapters import streams
 from zsched.adapters.streams import RelayHandle
 from zsched.core.events import RelayChanged
 from zsched.core.plan import Role, WorkerRole
-from zsched.core.relay_protocol import HandleReport
+from zsched.core.relay_protocol import HandleReport, RelayStarted
 from zsched.zenoh_config import data_config
 
 CONFIG = data_config(listen=("tcp/127.0.0.1:0",), connect=())
@@ -141,6 +142,83 @@ def test_a_relay_that_is_wedged_before_its_first_word_is_replaced(monkeypatch: p
         assert any(isinstance(r, RelayChanged) and "no sign of life" in r.reason for r in reports)
     finally:
         handle.stop(2.0)
+
+
+RELAY = """#!{python}
+import os, runpy, sys, time
+sys.path[:0] = {path!r}
+{deed}
+sys.argv[1:3] = []
+runpy.run_module("zsched.relay", run_name="__main__", alter_sys=True)
+"""
+SUSPENDED = """
+real, began = time.clock_gettime, time.monotonic()
+def now(clock):
+    slept = 60.0 * ((time.monotonic() - began) // 0.7) if clock == time.CLOCK_BOOTTIME else 0.0
+    return real(clock) + slept
+time.clock_gettime = now
+"""
+SLOW_TO_OPEN = """
+import zenoh
+real = zenoh.open
+def late(config):
+    time.sleep(3.0)
+    return real(config)
+zenoh.open = late
+"""
+
+
+def changes_with(program: Path, deed: str, seconds: float) -> list[RelayChanged]:
+    """What is heard of a relay whose process does ``deed`` first, until so long after it runs."""
+    program.write_text(RELAY.format(python=sys.executable, path=sys.path, deed=deed))
+    program.chmod(0o755)
+    reports: list[HandleReport] = []
+    handle = RelayHandle(
+        fleet="test", node="robot1", zenoh_config=CONFIG, on_report=reports.append, python=str(program)
+    )
+    handle.start()
+    try:
+        until(lambda: any(isinstance(report, RelayChanged) for report in reports), "it runs, or is replaced")
+        threading.Event().wait(seconds)
+    finally:
+        handle.stop(2.0)
+    return [report for report in reports if isinstance(report, RelayChanged)]
+
+
+def test_a_healthy_relay_stays_when_its_machine_was_suspended(tmp_path: Path) -> None:
+    """Boot time is a minute later every 0.7 s, as the kernel shows it after a suspend; all else goes on."""
+    assert [one.is_running for one in changes_with(tmp_path / "relay", SUSPENDED, 5.0)] == [True]
+
+
+def test_a_relay_whose_session_opens_slowly_is_not_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(streams, "STILL_S", 1.0)
+    assert [one.is_running for one in changes_with(tmp_path / "relay", SLOW_TO_OPEN, 0.5)] == [True]
+
+
+def test_a_relay_whose_session_never_opens_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(streams, "OPEN_S", 1.0)
+    changes = changes_with(tmp_path / "relay", SLOW_TO_OPEN.replace("3.0", "60.0"), 0.0)
+    assert "its session does not open" in changes[0].reason
+
+
+def test_a_handle_that_fails_replaces_the_relay_and_goes_on() -> None:
+    """Whatever the daemon's own side raises, its streams have a relay again, and it is told."""
+    reports: list[HandleReport] = []
+
+    def take(report: HandleReport) -> None:
+        if isinstance(report, RelayStarted) and not any(isinstance(one, RelayStarted) for one in reports):
+            reports.append(report)
+            raise RuntimeError("a bug")
+        reports.append(report)
+
+    handle = RelayHandle(fleet="test", node="robot1", zenoh_config=CONFIG, on_report=take)
+    handle.start()
+    try:
+        until(lambda: sum(isinstance(one, RelayStarted) for one in reports) == 2, "another relay")
+    finally:
+        handle.stop(2.0)
+    ends = [one.reason for one in reports if isinstance(one, RelayChanged) and not one.is_running]
+    assert ends == ["its handle failed: RuntimeError('a bug')"]
 
 
 def test_a_stopped_relay_never_blocks_the_daemon(daemon: Daemon) -> None:

@@ -1,0 +1,51 @@
+"""A relay on a machine that is far too busy: it is given time to start, and nobody begins again for it."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from support.waiting import until
+from zsched.adapters import streams
+from zsched.adapters.cgroup import LimitedGroup
+from zsched.adapters.streams import RelayHandle
+from zsched.core.events import ProblemReported, RelayChanged
+from zsched.core.relay_protocol import HandleReport
+from zsched.errors import AdapterError
+from zsched.zenoh_config import data_config
+
+CONFIG = data_config(listen=("tcp/127.0.0.1:0",), connect=())
+
+
+@pytest.mark.root
+@pytest.mark.timeout(300)
+def test_a_relay_that_starts_with_next_to_no_processor_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """About a hundredth of a core: it takes 20 s to start, and is killed by nobody meanwhile; status says why."""
+    try:
+        group = LimitedGroup.create(f"zsched-starved-{os.getpid()}", cpu_cores=0.01)
+    except AdapterError as error:
+        pytest.skip(str(error))
+    monkeypatch.setattr(streams, "START_S", 0.5)
+    monkeypatch.setattr(streams, "STARVED_S", 1.0)
+    reports: list[HandleReport] = []
+    handle = RelayHandle(fleet="test", node="robot1", zenoh_config=CONFIG, on_report=reports.append)
+    rivals = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(4)]
+    for rival in rivals:  # the kernel gives a group a little more than so small a share
+        group.add(rival.pid)
+    handle.start()
+    try:
+        group.add(until(lambda: handle.pid, "a process"))
+        until(lambda: any(isinstance(one, RelayChanged) for one in reports), "it runs, or is replaced", 240.0)
+    finally:
+        for rival in rivals:
+            rival.kill()
+            rival.wait(20)
+        handle.stop(1.0)
+        group.remove()
+    assert next(one.is_running for one in reports if isinstance(one, RelayChanged))
+    told = [one.problem for one in reports if isinstance(one, ProblemReported) and one.source == "relay/processor"]
+    assert "waits for a processor" in (told[0] or "")
+    assert told[-1] is None
