@@ -34,14 +34,19 @@ def degradations(status: Json) -> tuple[str, ...]:
             reasons.append(f"{task['name']} has no owner")
         elif task["owner_state"] not in ("alive", "suspect"):
             reasons.append(f"{task['name']}: its owner {task['owner']} is {task['owner_state']}")
-        elif _has_failed_worker(status, task):
-            reasons.append(f"{task['name']}: its worker on {task['owner']} has failed")
+        elif (lack := _lack_of_worker(status, task)) is not None:
+            reasons.append(f"{task['name']}: {lack}")
     return tuple(reasons)
 
 
-def _has_failed_worker(status: Json, task: Json) -> bool:
-    workers = (worker for node in status["nodes"] if node["name"] == task["owner"] for worker in node["workers"])
-    return any(worker["task"] == task["name"] and worker["state"] == "failed" for worker in workers)
+def _lack_of_worker(status: Json, task: Json) -> str | None:
+    """Why the owner does no work, in the words of the daemon's own problems; ``None`` when it does, or will soon."""
+    owner = task["owner"]
+    workers = (worker for node in status["nodes"] if node["name"] == owner for worker in node["workers"])
+    state, why = next(((one["state"], one.get("reason")) for one in workers if one["task"] == task["name"]), ("", ""))
+    if state not in ("failed", "stopped"):
+        return None
+    return f"the worker on {owner} {'failed' if state == 'failed' else 'is stopped'}{f': {why}' if why else ''}"
 
 
 def render_status(status: Json, width: int, color: bool) -> str:

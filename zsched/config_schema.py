@@ -268,11 +268,15 @@ WORKER: Final = Record(
         ),
         "standby": Field(Choice.of(Standby), "`warm`: runs on every candidate; `cold`: started on the move."),
         "ready": Field(
-            Choice.of(ReadyWhen), "`token`: zsched.worker says so; `matching`: any zenoh program.", default="`token`"
+            Choice.of(ReadyWhen),
+            "`token`: zsched.worker says so; `matching`: any zenoh program, while it takes every input and service.",
+            default="`token`",
         ),
         "link": Field(Choice.of(WorkerLink), "How workers join the data network."),
         "env": Field(MapOf(Text("a variable", _matches(_ENV_NAME, "letters, digits and '_'")), _TEXT), "Environment."),
-        "start_deadline_s": Field(_SECONDS, "Ready within this time, or the start has failed."),
+        "start_deadline_s": Field(
+            _SECONDS, "Ready within this time, or the start has failed. So long may the owner's be away."
+        ),
         "stop_grace_s": Field(_SECONDS, "Between SIGINT, SIGTERM and SIGKILL."),
         "output_deadline_s": Field(
             _SECONDS, "No output for so long while inputs flow counts as hung.", default="not watched"

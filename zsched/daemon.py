@@ -37,6 +37,7 @@ from zsched.core import events as ev
 from zsched.core.fleet import NodeSpec, electorate_hash, fleet_hash
 from zsched.core.model import DurableState, NodeId, NodeKind, TaskId
 from zsched.core.node import Node
+from zsched.core.route import watch_for
 from zsched.core.status import status_line
 from zsched.core.workers import runs_worker
 from zsched.daemon_access import StreamAccess
@@ -111,7 +112,7 @@ class Sampler:
             self._inbox.post(ev.ProblemReported(source=source, problem=problem))
 
     def _sample(self) -> None:
-        supervisor = self._shell.supervisor
+        supervisor = self._shell.crew.supervisor
         states, pids = (supervisor.states(), supervisor.pids()) if supervisor is not None else ({}, {})
         device = self._device.sample({task: (state, pids.get(task)) for task, state in states.items()})
         links = tuple(reader.read() for reader in self._readers)
@@ -223,12 +224,14 @@ class Daemon:
         stack.callback(door.close)
         bus.open()
         stack.callback(bus.close)
-        shell = Shell(node=me, inbox=self._inbox, bus=bus, state_file=state_file, desk=desk)
+        shell = Shell(node=me, inbox=self._inbox, bus=bus, state_file=state_file, desk=desk, fleet=fleet)
         shell.relay = relay = self._relay(shell, incarnation, points, operator_json5)
-        shell.supervisor = self._supervisor(stack, shell, incarnation, points, operator_json5)
+        shell.crew.supervisor = supervisor = self._supervisor(stack, shell, incarnation, points, operator_json5)
+        for watch in filter(None, (watch_for(fleet, task, me) for task in fleet.tasks)):
+            relay.watch(watch)
         relay.start()
         stack.callback(lambda: relay.leave() if self._is_restart else relay.stop(1.0))
-        stack.callback(shell.supervisor.close, CLOSE_WORKERS_S)
+        stack.callback(supervisor.close, CLOSE_WORKERS_S)
         sampler = Sampler(self._spec, fleet.timing.sample_s, shell, self._inbox)
         sampler.start()
         stack.callback(sampler.stop)
@@ -285,13 +288,14 @@ class Daemon:
         return WorkerSupervisor(
             specs=mine,
             context=WorkerContext(fleet=fleet.name, node=me, incarnation=incarnation),
-            events=shell,
+            events=shell.crew,
             environment=lambda task: {
                 "PYTHONFAULTHANDLER": "1",
                 "ZSCHED_ZENOH_CONFIG": str(paths[task]),
                 "ZENOH_SESSION_CONFIG_URI": str(paths[task]),  # a ROS node (rmw_zenoh) joins the data network by this
             },
             rng=random.Random(f"{me}/{incarnation}/workers"),
+            why_not_ready=shell.crew.why_not_ready,
         )
 
     # --- the loop ----------------------------------------------------------------------------------------------------

@@ -29,6 +29,8 @@ _REGISTERED: Final[tuple[tuple[str, type, int], ...]] = (
     ("relay_here", relay_life.RelayHere, _SMALL),
     ("relay_refused", relay_life.RelayRefused, _SMALL),
     ("worker_seen", relay_protocol.WorkerSeen, _SMALL),
+    ("worker_watch", relay_protocol.WorkerWatch, wire.LARGE),
+    ("worker_matched", relay_protocol.WorkerMatched, _SMALL),
     ("end_marker", relay_protocol.EndMarker, 256),
     ("snapshot_chunk", relay_protocol.SnapshotChunk, 256),
     ("stream_acks", relay_protocol.StreamAcks, wire.LARGE),
@@ -43,11 +45,17 @@ _REGISTERED: Final[tuple[tuple[str, type, int], ...]] = (
 for _kind, _cls, _bound in _REGISTERED:
     wire.register(_kind, _cls, _bound)
 
-COMMANDS: Final[tuple[type[Any], ...]] = (RoutePlan, Role, relay_protocol.RelayStop)
+COMMANDS: Final[tuple[type[Any], ...]] = (
+    RoutePlan,
+    Role,
+    relay_protocol.WorkerWatch,
+    relay_protocol.RelayStop,
+)
 REPORTS: Final[tuple[type[Any], ...]] = (
     relay_protocol.RelayStarted,
     relay_life.RelayPulse,
     relay_protocol.WorkerSeen,
+    relay_protocol.WorkerMatched,
     relay_protocol.SlotLost,
     events.SlotReady,
     events.SlotFlipped,

@@ -24,10 +24,12 @@ from zsched.adapters.worker_supervisor import WorkerSupervisor
 from zsched.clock import monotonic_s
 from zsched.core import events as ev
 from zsched.core import instructions as do
+from zsched.core.fleet import Fleet
 from zsched.core.messages import CommandResult, SetWeights
-from zsched.core.model import NAME, NodeId, TaskId, WorkerState
-from zsched.core.relay_protocol import HandleReport, RelayStarted, SlotLost, WorkerSeen
+from zsched.core.model import NAME, NodeId
+from zsched.core.relay_protocol import HandleReport, RelayStarted, SlotLost, WorkerMatched, WorkerSeen
 from zsched.core.snapshot import Snapshot
+from zsched.crew import Crew
 from zsched.errors import AdapterError, WireError
 from zsched.report import snapshot_json
 
@@ -180,18 +182,17 @@ class Shell:
         bus: ControlBus,
         state_file: StateFile,
         desk: Desk,
+        fleet: Fleet | None = None,
     ) -> None:
+        """``fleet`` says how workers show themselves; see `Crew`."""
         self._node, self._inbox = node, inbox
         self._bus, self._state_file, self._desk = bus, state_file, desk
-        # These two report to this shell, so they are made after it.
-        self.supervisor: WorkerSupervisor | None = None
+        self.crew = Crew(inbox.post, fleet)
         self.relay: RelayHandle | None = None
+        """It reports to this shell, so it is made after it."""
         self.stand_down = ""
         """Why this daemon must end with the exit code of a wrong configuration; empty: it need not."""
         self._failed_at: dict[str, float] = {}
-        self._lives: dict[TaskId, int] = {}
-        """{task: the running process's incarnation}, 0 once it has ended; none for somebody else's worker."""
-        self._lives_lock = threading.Lock()  # an end and a token's end come from two threads
 
     # --- instructions ------------------------------------------------------------------------------------------------
 
@@ -266,7 +267,7 @@ class Shell:
             case do.StopWorker(task=task):
                 self._workers().stop(task)
             case do.RestartWorker(task=task, reason=reason):
-                self._workers().report_hung(task, self._life_of(task), reason)
+                self._workers().report_hung(task, self.crew.life_of(task), reason)
             case do.StandDown(reason=reason):
                 self.stand_down = reason
             case do.RecordStory():
@@ -275,8 +276,8 @@ class Shell:
                 assert_never(instruction)
 
     def _workers(self) -> WorkerSupervisor:
-        assert self.supervisor is not None
-        return self.supervisor
+        assert self.crew.supervisor is not None
+        return self.crew.supervisor
 
     def _streams(self) -> RelayHandle:
         assert self.relay is not None
@@ -291,61 +292,26 @@ class Shell:
     # --- what adapters report (their threads) ------------------------------------------------------------------------
 
     def on_report(self, report: HandleReport) -> None:
-        """The relay's handle: most reports are events; our own workers' tokens go by the supervisor."""
+        """The relay's handle: most reports are events; what is seen of our own workers goes by the crew."""
         if isinstance(report, RelayStarted):
             return
         if isinstance(report, SlotLost):
             text = f"{report.owner} left {report.samples} samples unacknowledged: at most so many had no result"
             _tell(do.RecordStory(stage="route", text=text, task=report.task, epoch=report.epoch))
             return
+        if isinstance(report, WorkerMatched):
+            self.crew.on_matched(report)
+            return
         if not isinstance(report, WorkerSeen):
             self._inbox.post(report)
             return
-        if report.node != self._node:
-            self._inbox.post(
-                ev.WorkerShown(
-                    node=report.node, task=report.task, incarnation=report.incarnation, is_present=report.is_present
-                )
-            )
+        if report.node == self._node:
+            self.crew.on_token(report)
             return
-        if not report.incarnation.isdigit():
-            return
-        supervisor = self.supervisor
-        if supervisor is not None and report.task in supervisor.states():
-            self._on_token(supervisor, report.task, int(report.incarnation), is_present=report.is_present)
-
-    def _on_token(self, supervisor: WorkerSupervisor, task: TaskId, life: int, *, is_present: bool) -> None:
-        """A token of a worker here; one of a process that has ended says nothing (its end was reported)."""
-        with self._lives_lock:
-            current = self._lives.get(task)
-            if current is not None and life != current:
-                return
-            (supervisor.mark_ready if is_present else supervisor.mark_gone)(task, life)
-            absent = WorkerState.STOPPED if current is None else WorkerState.STARTING
-            state = WorkerState.READY if is_present else absent
-            self._inbox.post(ev.WorkerChanged(task=task, state=state, reason="its token"))
-
-    def _life_of(self, task: TaskId) -> int:
-        with self._lives_lock:
-            return self._lives.get(task, 0)
-
-    def on_started(self, task: TaskId, pid: int, incarnation: int) -> None:
-        """The supervisor: a worker process runs; it is not ready yet."""
-        with self._lives_lock:
-            self._lives[task] = incarnation
-            self._inbox.post(ev.WorkerChanged(task=task, state=WorkerState.STARTING, reason=f"pid {pid}"))
-
-    def on_exited(self, task: TaskId, incarnation: int, returncode: int, reason: str) -> None:
-        """The supervisor: a worker process has ended."""
-        detail = reason or f"exit code {returncode}"
-        with self._lives_lock:
-            if self._lives.get(task) == incarnation:
-                self._lives[task] = 0
-                self._inbox.post(ev.WorkerChanged(task=task, state=WorkerState.STOPPED, reason=detail))
-
-    def on_failed(self, task: TaskId, reason: str) -> None:
-        """The supervisor: the worker is not started again."""
-        self._inbox.post(ev.WorkerChanged(task=task, state=WorkerState.FAILED, reason=reason))
+        shown = ev.WorkerShown(
+            node=report.node, task=report.task, incarnation=report.incarnation, is_present=report.is_present
+        )
+        self._inbox.post(shown)
 
 
 def _tell(story: do.RecordStory) -> None:

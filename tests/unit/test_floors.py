@@ -36,7 +36,7 @@ FLOORS: Final[tuple[tuple[str, int, str], ...]] = (
     (r"adapters(\.\w+)?", 3, "*"),
     (r"relay(\..+)?", 3, "relay"),
     (r"(worker|worker_\w+)", 3, "worker"),
-    (r"(daemon|daemon_\w+|shell|lifecycle)", 4, "daemon"),
+    (r"(daemon|daemon_\w+|shell|crew|lifecycle)", 4, "daemon"),
     (r"leftovers", 4, "leftovers"),
     (r"tasks(?:\.(\w+))?(?:\..+)?", 4, "tasks: \\1"),
     (r"lab(\..+)?", 5, "lab"),

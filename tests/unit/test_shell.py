@@ -93,7 +93,7 @@ class House:
         self.shell = Shell(
             node="robot1", inbox=self.inbox, bus=self.adapter, state_file=self.state_file, desk=self.desk
         )
-        self.shell.relay = self.shell.supervisor = self.adapter
+        self.shell.relay = self.shell.crew.supervisor = self.adapter
 
     def events(self) -> list[ev.Event]:
         found = []
@@ -236,9 +236,9 @@ def supervised(house: House) -> Iterator[House]:
     supervisor = WorkerSupervisor(
         specs={"merge": WorkerSpec(command=command), "foreign": WorkerSpec()},
         context=WorkerContext(fleet="f", node="robot1", incarnation=1),
-        events=house.shell,
+        events=house.shell.crew,
     )
-    house.shell.supervisor = supervisor
+    house.shell.crew.supervisor = supervisor
     try:
         yield house
     finally:
@@ -256,7 +256,7 @@ def states(house: House) -> list[WorkerState]:
 def test_token_of_the_running_worker_makes_it_ready_and_its_end_starting(supervised: House) -> None:
     shell = supervised.shell
     shell.carry_out((do.StartWorker(task="merge"),))
-    life = until(lambda: shell._lives.get("merge"), "the worker runs")
+    life = until(lambda: shell.crew._lives.get("merge"), "the worker runs")
     shell.on_report(seen("merge", life))
     shell.on_report(seen("merge", life, is_present=False))
     assert states(supervised) == [WorkerState.STARTING, WorkerState.READY, WorkerState.STARTING]
@@ -265,9 +265,9 @@ def test_token_of_the_running_worker_makes_it_ready_and_its_end_starting(supervi
 def test_real_end_of_a_worker_is_stopped_and_its_late_token_says_nothing(supervised: House) -> None:
     shell = supervised.shell
     shell.carry_out((do.StartWorker(task="merge"),))
-    life = until(lambda: shell._lives.get("merge"), "the worker runs")
+    life = until(lambda: shell.crew._lives.get("merge"), "the worker runs")
     shell.carry_out((do.StopWorker(task="merge"),))
-    until(lambda: shell._lives.get("merge") == 0, "the worker has ended")
+    until(lambda: shell.crew._lives.get("merge") == 0, "the worker has ended")
     shell.on_report(seen("merge", life))
     shell.on_report(seen("merge", life, is_present=False))
     assert states(supervised) == [WorkerState.STARTING, WorkerState.STOPPED]
@@ -276,19 +276,19 @@ def test_real_end_of_a_worker_is_stopped_and_its_late_token_says_nothing(supervi
 def test_token_that_goes_after_the_worker_failed_leaves_it_failed(supervised: House) -> None:
     """Else a broken worker would look startable, and its node would be eligible again."""
     shell = supervised.shell
-    shell.on_started("merge", 1, 100001)
-    shell.on_exited("merge", 100001, 1, "")
-    shell.on_failed("merge", "exit code 1")
+    shell.crew.on_started("merge", 1, 100001)
+    shell.crew.on_exited("merge", 100001, 1, "")
+    shell.crew.on_failed("merge", "exit code 1")
     shell.on_report(seen("merge", 100001, is_present=False))
     assert states(supervised) == [WorkerState.STARTING, WorkerState.STOPPED, WorkerState.FAILED]
 
 
 def test_lives_of_an_earlier_process_are_ignored(supervised: House) -> None:
     shell = supervised.shell
-    shell.on_started("merge", 1, 100002)
+    shell.crew.on_started("merge", 1, 100002)
     shell.on_report(seen("merge", 100001))
     shell.on_report(seen("merge", 100001, is_present=False))
-    shell.on_exited("merge", 100001, 0, "late")
+    shell.crew.on_exited("merge", 100001, 0, "late")
     assert states(supervised) == [WorkerState.STARTING]
 
 
@@ -298,7 +298,7 @@ def test_tokens_that_are_not_ours_are_ignored_and_do_no_harm(supervised: House, 
     shell = supervised.shell
     shell.on_report(report)
     shell.carry_out((do.StartWorker(task="merge"),))
-    until(lambda: shell._lives.get("merge"), "the supervisor still starts workers")
+    until(lambda: shell.crew._lives.get("merge"), "the supervisor still starts workers")
     assert states(supervised) == [WorkerState.STARTING]
 
 

@@ -27,7 +27,7 @@ from zsched.core.events import ProblemReported, RelayChanged
 from zsched.core.model import NodeId
 from zsched.core.plan import Role, RoutePlan
 from zsched.core.relay_life import RelayHello, RelayPulse
-from zsched.core.relay_protocol import HandleReport, RelayStarted, RelayStop
+from zsched.core.relay_protocol import HandleReport, RelayStarted, RelayStop, WorkerWatch
 from zsched.errors import AdapterError, WireError
 from zsched.relay_door import GREETING_S, Door, code_digest, digest_of
 from zsched.relay_pipe import REPORTS, read_frame, write_frame
@@ -52,17 +52,18 @@ EVICT_S: Final = 2.0
 _log = logging.getLogger("zsched.streams")
 
 _Key = tuple[str, str]
+_Told = RoutePlan | Role | WorkerWatch
 
 
 @dataclass(slots=True)
 class _Outbox:
-    """What the relay has not been told yet; at most one plan and one role per task."""
+    """What the relay has not been told yet; at most one plan, one role and one watch per task."""
 
-    items: dict[_Key, RoutePlan | Role] = field(default_factory=dict)
+    items: dict[_Key, _Told] = field(default_factory=dict)
     wake: threading.Condition = field(default_factory=threading.Condition)
     is_closed: bool = False
 
-    def put(self, key: _Key, value: RoutePlan | Role) -> None:
+    def put(self, key: _Key, value: _Told) -> None:
         with self.wake:
             self.items.pop(key, None)  # the newest goes to the end
             self.items[key] = value
@@ -73,7 +74,7 @@ class _Outbox:
             self.is_closed = True
             self.wake.notify()
 
-    def take(self) -> RoutePlan | Role | None:
+    def take(self) -> _Told | None:
         """The next value, waiting for one; ``None`` once closed."""
         with self.wake:
             while not self.items and not self.is_closed:
@@ -133,7 +134,7 @@ class RelayHandle:
             self._command += ["--orphan", str(bequest.orphan_s), "--digest", digest]
             self._command += ["--incarnation", str(bequest.incarnation)]
         self._lock = threading.Lock()
-        self._newest: dict[_Key, RoutePlan | Role] = {}
+        self._newest: dict[_Key, _Told] = {}
         self._outbox = _Outbox()
         self._relay: RelayChild | None = None
         self._stopping = threading.Event()
@@ -157,6 +158,10 @@ class RelayHandle:
     def set_role(self, role: Role) -> None:
         """Let the relay tell this node's worker its newest role."""
         self._tell(("role", role.task), role)
+
+    def watch(self, watch: WorkerWatch) -> None:
+        """Let the relay look after what of a task does not depend on its owner."""
+        self._tell(("watch", watch.task), watch)
 
     def stop(self, deadline_s: float = 2.0) -> None:
         """Stop the relay in order, with SIGKILL at the deadline; returns when it is gone."""
@@ -187,7 +192,7 @@ class RelayHandle:
 
     # --- internals ---------------------------------------------------------------------------------------------------
 
-    def _tell(self, key: _Key, value: RoutePlan | Role) -> None:
+    def _tell(self, key: _Key, value: _Told) -> None:
         with self._lock:
             self._newest[key] = value
             self._outbox.put(key, value)

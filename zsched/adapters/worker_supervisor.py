@@ -127,6 +127,7 @@ class WorkerSupervisor:
         environment: Callable[[TaskId], Mapping[str, str]] = lambda _task: {},
         rng: random.Random | None = None,
         policy: RestartPolicy = RestartPolicy(),
+        why_not_ready: Callable[[TaskId], str] = lambda _task: "",
     ) -> None:
         """Start the supervisor's thread; no worker yet.
 
@@ -138,12 +139,14 @@ class WorkerSupervisor:
                 ``ZSCHED_ZENOH_CONFIG``.
             rng: the source of the jitter; seed it in tests.
             policy: delays between restarts.
+            why_not_ready: asked when a start-up deadline is over: what the worker lacks, in words.
         """
         self._workers = {
             task: _Worker(task=task, spec=spec, logger=log.getChild(task)) for task, spec in sorted(specs.items())
         }
         self._context, self._events, self._environment = context, events, environment
         self._rng, self._policy = rng or random.Random(), policy
+        self._why_not_ready = why_not_ready
         self._started = 0
         self._guard = WorkerGuard()
         self._commands: deque[Callable[[], None]] = deque()
@@ -298,7 +301,8 @@ class WorkerSupervisor:
         if worker.phase is _Phase.BACKOFF:
             self._spawn(worker, now)
         elif worker.phase is _Phase.STARTING:
-            reason = f"not ready within {worker.spec.start_deadline_s:g} s"
+            why = self._why_not_ready(worker.task)
+            reason = f"not ready within {worker.spec.start_deadline_s:g} s{': ' if why else ''}{why}"
             self._begin_stop(worker, worker.spec.stop_grace_s, failure=reason)
         elif worker.phase is _Phase.STOPPING:
             self._signal_stop(worker, min(worker.stop_step + 1, len(STOP_SIGNALS) - 1), now)

@@ -26,6 +26,8 @@ MAX_COUNTER = 2**53
 MAX_CPU_CORES, MAX_MEMORY_MB, MAX_BITRATE_MBPS = 4096.0, 1e8, 1e6
 MAX_TREND_DB_S = 100.0
 """What no machine or link exceeds: a larger figure is a fault of whoever measured or sent it."""
+MAX_REASON = 200
+"""Characters of a worker's reason: it travels with every profile."""
 
 
 def check_name(field: str, value: str) -> None:
@@ -157,9 +159,13 @@ class WorkerLoad:
     state: WorkerState
     cpu_cores: float | None = None
     memory_mb: float | None = None
+    reason: str = ""
+    """Why it is not ready, at most `MAX_REASON` characters; empty while it is."""
 
     def __post_init__(self) -> None:
         check_name("worker.task", self.task)
+        if len(self.reason) > MAX_REASON:
+            raise ValueError(f"worker.reason: {len(self.reason)} characters, at most {MAX_REASON}")
         check_range("worker.cpu_cores", self.cpu_cores, 0.0, MAX_CPU_CORES)
         check_range("worker.memory_mb", self.memory_mb, 0.0, MAX_MEMORY_MB)
 

@@ -124,6 +124,8 @@ class Node:
         }
         self.stateless: set[NodeId] = set()
         """Electors whose newest beat says that they answer no proposer."""
+        self.unready: dict[TaskId, tuple[int, float]] = {}
+        """{task: (epoch, since when)} of the slots whose worker our relay does not see any more."""
         self.fleet_file = fleet_hash(fleet)
         self._identity = Identity(me, incarnation, self.fleet_file, now)
         self._introductions = Introductions()
@@ -356,7 +358,11 @@ class Node:
     def _publish_profile(self, now: float) -> None:
         progress = self._hangs.reports(now)
         profile = self.profiler.publishable(
-            self.worker_states, is_draining=self.is_draining, now=now, progress=progress
+            self.worker_states,
+            is_draining=self.is_draining,
+            now=now,
+            progress=progress,
+            reasons=self._workers.reasons,
         )
         if profile is not None:
             self.gateway.absorb(profile, now)
@@ -493,9 +499,14 @@ class Node:
         if event.is_present and self._is_orphan(self.registers[event.task].value.owner):
             self.rounds.hurry(now)  # this may be the candidate that the task waits for
 
-    def _on_slot_ready(self, event: ev.SlotReady, _now: float) -> None:
-        if event.task in self.executors and event.is_ready:
-            self._batch.add(*self.executors[event.task].on_ready(event.epoch))
+    def _on_slot_ready(self, event: ev.SlotReady, now: float) -> None:
+        if event.task not in self.executors:
+            return
+        if not event.is_ready:
+            self.unready[event.task] = (event.epoch, now)
+            return
+        self.unready.pop(event.task, None)
+        self._batch.add(*self.executors[event.task].on_ready(event.epoch))
 
     def _on_slot_flipped(self, event: ev.SlotFlipped, now: float) -> None:
         if event.task in self.executors:
@@ -510,10 +521,11 @@ class Node:
         self._hangs.absorb(event.counts, self.executors, now)
         self.rounds.absorb_counts(event.counts, now)
 
-    def _on_relay(self, event: ev.RelayChanged, _now: float) -> None:
+    def _on_relay(self, event: ev.RelayChanged, now: float) -> None:
         self._set_problem("relay", None if event.is_running else f"the relay is down: {event.reason}")
         if not event.is_running:
             self._probation.forget_tokens()
+            self.unready |= {name: (one.epoch, now) for name, one in self.executors.items() if one.routes}
             self.counters["relay_exits"] += 1
 
     # --- operators ---------------------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import replace
 
 from zsched.core.fleet import Timing
@@ -40,6 +41,7 @@ RSSI_IMPOSSIBLE_BELOW_DBM = -100.0
 RSSI_OUTLIER_DB = 25.0
 RSSI_WINDOW = 5
 """A reading further than 25 dB from the median of the last 5 is dropped (measured on real drives)."""
+NO_REASONS: Mapping[TaskId, str] = {}
 STALE_S = 5.0
 """What gave no valid reading for so long (a radio, or the whole sampler) counts as not measured."""
 
@@ -183,6 +185,7 @@ class Profiler:
         is_draining: bool,
         now: float,
         progress: tuple[TaskProgress, ...] = (),
+        reasons: Mapping[TaskId, str] = NO_REASONS,
     ) -> Profile | None:
         """The profile to send now, or ``None`` when nothing is due.
 
@@ -191,13 +194,14 @@ class Profiler:
             is_draining: the operator drains this node, or it stops.
             now: monotonic seconds.
             progress: which watched tasks answer this robot.
+            reasons: why workers are not ready.
         """
         is_due = now - self._sent_at >= self._timing.publish_s
-        flags = (is_draining, *states.values(), progress)
+        flags = (is_draining, *states.values(), *reasons.values(), progress)
         if not is_due and not self._is_new and flags == self._flags:
             return None  # nothing was measured since the last look
         self._is_new, self._flags = False, flags
-        profile = self._current(states, is_draining=is_draining, now=now)
+        profile = self._current(states, reasons, is_draining=is_draining, now=now)
         if profile is None:
             return None
         if progress:
@@ -209,7 +213,9 @@ class Profiler:
         self._sent, self._sent_at = profile, now
         return profile
 
-    def _current(self, states: dict[TaskId, WorkerState], *, is_draining: bool, now: float) -> Profile | None:
+    def _current(
+        self, states: dict[TaskId, WorkerState], reasons: Mapping[TaskId, str], *, is_draining: bool, now: float
+    ) -> Profile | None:
         if self._device is None:
             return None
         is_measured = now - self._sampled_at <= STALE_S
@@ -220,6 +226,7 @@ class Profiler:
                 state=states[task],
                 cpu_cores=loads[task].cpu_cores if task in loads else None,
                 memory_mb=loads[task].memory_mb if task in loads else None,
+                reason=reasons.get(task, ""),
             )
             for task in sorted(states)
         )
@@ -282,7 +289,7 @@ def _differs(new: Profile, old: Profile) -> bool:
 
 def _kinds(profile: Profile) -> tuple[object, ...]:
     """What is no figure: every change of it counts."""
-    workers = [(load.task, load.state) for load in profile.workers]
+    workers = [(load.task, load.state, load.reason) for load in profile.workers]
     return profile.draining, workers, profile.progress, [(link.peer, link.source) for link in profile.links]
 
 

@@ -3,9 +3,10 @@
 Knows: what the daemon and its relay tell each other beside plans, roles and the events of `zsched.core.events`; what an
 end marker says. Does not know: pipes, frames, zenoh.
 
-Commands (daemon to relay): `RoutePlan`, `Role`, `RelayStop`. Reports (relay to daemon): `RelayStarted`, `WorkerSeen`,
-`SlotLost` and the events `SlotReady`, `SlotFlipped`, `SlotDrained`, `RoleEnded`, `StreamsCounted`, `ProblemReported`.
-The handle adds `RelayChanged`. Between workers and relays: `EndMarker`, `StreamAcks`.
+Commands (daemon to relay): `RoutePlan`, `Role`, `WorkerWatch`, `RelayStop`. Reports (relay to daemon): `RelayStarted`,
+`WorkerSeen`, `WorkerMatched`, `SlotLost` and the events `SlotReady`, `SlotFlipped`, `SlotDrained`, `RoleEnded`,
+`StreamsCounted`, `ProblemReported`. The handle adds `RelayChanged`. Between workers and relays: `EndMarker`,
+`StreamAcks`.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from zsched.core.events import (
     StreamsCounted,
 )
 from zsched.core.model import NodeId, TaskId, check_counter, check_name
-from zsched.core.plan import Role, RoutePlan
+from zsched.core.plan import Role, Route, RoutePlan
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,6 +53,36 @@ class WorkerSeen:
     def __post_init__(self) -> None:
         check_name("worker.node", self.node)
         check_name("worker.task", self.task)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorkerWatch:
+    """A task's keys that do not depend on its owner; told once, when the daemon starts.
+
+    The first three are for a worker of this node that shows no token (`zsched.relay.matching`).
+    """
+
+    task: TaskId
+    inputs: tuple[str, ...] = ()
+    """What goes to the worker here, over all robots: one key expression per rule."""
+    strangers: tuple[str, ...] = ()
+    """The same for a node that cannot be: who subscribes to these as well is not the worker alone."""
+    services: tuple[tuple[str, ...], ...] = ()
+    """What the worker here is asked: per rule the key of every robot."""
+    standbys: tuple[Route, ...] = ()
+    """Robots: the inputs towards every candidate, to be announced in the ROS graph for warm workers to find."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorkerMatched:
+    """Whether somebody takes all that goes to this node's worker of the task, as far as zenoh tells."""
+
+    task: TaskId
+    is_matched: bool
+    is_certain: bool = True
+    """False: somebody else, who listens to everything, may be all that matches."""
+    missing: str = ""
+    """What nobody takes, in words."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -144,10 +175,11 @@ class SlotLost:
     samples: int
 
 
-RelayCommand = RoutePlan | Role | RelayStop
+RelayCommand = RoutePlan | Role | WorkerWatch | RelayStop
 RelayReport = (
     RelayStarted
     | WorkerSeen
+    | WorkerMatched
     | SlotReady
     | SlotFlipped
     | SlotDrained

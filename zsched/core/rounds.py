@@ -318,10 +318,10 @@ class Rounds:
             self._round_at = min(self._round_at, due)
 
     def _not_ready_for(self, task: TaskRound, owner: NodeId, now: float) -> float:
-        """How long the owner's worker has not been ready (or its profile has been stale)."""
+        """For how long the owner's worker was heard not to be ready; who is not heard says nothing about it."""
         profile = self._gateway.fresh(owner, now)
         load = None if profile is None else profile.worker(task.spec.name)
-        if load is not None and load.state is WorkerState.READY:
+        if profile is None or (load is not None and load.state is WorkerState.READY):
             task.judge.not_ready_since = None
             return 0.0
         if task.judge.not_ready_since is None:

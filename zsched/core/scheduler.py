@@ -212,8 +212,7 @@ def escape_reason(
         owner_state: how this node sees the owner.
         profile: the owner's newest fresh profile.
         standing: the joint view (its veto of the owner is an escape).
-        not_ready_for_s: how long the owner's worker has not been ready (a foreign worker, without a command, never
-            shows whether it is).
+        not_ready_for_s: for how long the owner's worker was heard not to be ready.
     """
     owner = allocation.owner
     if owner is None:
@@ -228,10 +227,12 @@ def escape_reason(
         load = profile.worker(spec.name)
         if profile.draining:
             return f"{owner} is draining"
+        why = "" if load is None or not load.reason else f": {load.reason}"
         if load is not None and load.state is WorkerState.FAILED:
-            return f"the worker on {owner} failed"
-        if spec.worker.command and not_ready_for_s > spec.worker.start_deadline_s:
-            return f"the worker on {owner} is not ready for {not_ready_for_s:.1f} s"
+            return f"the worker on {owner} failed{why}"
+        is_told = load is not None or bool(spec.worker.command)
+        if is_told and not_ready_for_s > spec.worker.start_deadline_s:
+            return f"the worker on {owner} has not been ready for {not_ready_for_s:.1f} s{why}"
         if profile.memory_used_mb is not None:
             free_ratio = 1.0 - profile.memory_used_mb / profile.memory_mb
             if free_ratio < spec.memory_floor_ratio:

@@ -189,12 +189,14 @@ def _refusal(spec: TaskSpec, allocation: Allocation, profile: Profile, demand: D
     state = None if load is None else load.state
     if spec.worker.command and state is None:
         return "runs no worker for it"
+    why = "" if load is None or not load.reason else f": {load.reason}"
     if state is WorkerState.FAILED:
-        return "worker failed"
+        return f"worker failed{why}"
     is_owner = profile.node == allocation.owner
-    is_warm = spec.worker.standby is Standby.WARM
-    if spec.worker.command and is_warm and not is_owner and state is not WorkerState.READY:
-        return f"worker {state}"
+    # what somebody else starts is there or is not, cold or warm
+    is_awaited = spec.worker.standby is Standby.WARM or not spec.worker.command
+    if is_awaited and not is_owner and state not in (None, WorkerState.READY):
+        return f"worker {state}{why}"
     used = _memory_use(profile, spec, demand, unseen)
     if used is not None and used > profile.memory_mb:
         return f"needs {demand.memory_mb:.0f} MiB, has {max(profile.memory_mb - used + demand.memory_mb, 0.0):.0f} free"

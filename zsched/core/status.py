@@ -5,17 +5,19 @@ Knows: which figure stands where. Does not know: how it is shown.
 
 from __future__ import annotations
 
+import math
 from collections import Counter, deque
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Protocol
 
 from zsched.core.agreement import Agreement
-from zsched.core.executor import Executor
+from zsched.core.executor import Executor, Phase
 from zsched.core.fleet import Fleet, NodeSpec, TaskSpec
 from zsched.core.gateway import Gateway
 from zsched.core.membership import Membership
-from zsched.core.model import Allocation, NodeId, NodeKind, PeerState, TaskId
-from zsched.core.plan import Route, StreamCount
+from zsched.core.model import Allocation, NodeId, NodeKind, PeerState, TaskId, WorkerState
+from zsched.core.plan import Direction, ReadyWhen, Route, StreamCount
 from zsched.core.register import Register
 from zsched.core.rounds import Rounds, TaskRound
 from zsched.core.scoring import joined, majority
@@ -29,6 +31,9 @@ from zsched.core.snapshot import (
     TaskStatus,
     VoteStatus,
 )
+
+UNREADY_SHOWN_S = 2.0
+"""A handover takes less; a slot that nobody takes for longer is a problem."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,6 +57,7 @@ class NodeView(Protocol):
     started_at: float
     has_state: bool
     stateless: set[NodeId]
+    unready: dict[TaskId, tuple[int, float]]
     agreement: Agreement
     loop_lag_s: float
     counters: Counter[str]
@@ -163,7 +169,7 @@ def _task_status(node: NodeView, spec: TaskSpec, now: float) -> TaskStatus:
         patience=spec.patience,
         decision=_decision(standing, now),
         vote=_vote(standing, now),
-        problems=(f"cut off from {value.owner}: this robot works alone, degraded",) if executor.is_local else (),
+        problems=tuple(_task_problems(node, spec, value.owner, now)),
         streams=tuple(
             _with_keys(count, routes.get(count.stream))
             for count in node.stream_counts
@@ -180,6 +186,43 @@ def _task_status(node: NodeView, spec: TaskSpec, now: float) -> TaskStatus:
             for past in node.history[spec.name]
         ),
     )
+
+
+def _task_problems(node: NodeView, task: TaskSpec, owner: NodeId | None, now: float) -> Iterator[str]:
+    executor = node.executors[task.name]
+    if executor.is_local:
+        yield f"cut off from {owner}: this robot works alone, degraded"
+    is_owner_ready = True
+    for spec in node.fleet.nodes:
+        data = node.gateway.newest(spec.name, now)
+        load = None if data is None else data.profile.worker(task.name)
+        if load is None or node.membership.state(spec.name) is not PeerState.ALIVE:
+            continue
+        is_owner_ready &= spec.name != owner or load.state is WorkerState.READY
+        why = f": {load.reason}" if load.reason else ""
+        if load.state is WorkerState.FAILED:
+            yield f"the worker on {spec.name} failed{why}"
+        elif spec.name == owner and load.state is not WorkerState.READY:
+            yield f"the worker on {spec.name} is {load.state}{why}"
+    since = _unready_since(node, executor)
+    if is_owner_ready and now - since >= UNREADY_SHOWN_S:
+        waited = f"this robot's streams have waited for {executor.owner} for {now - since:.0f} s"
+        yield f"{waited}: {_untaken(task, executor)}"
+
+
+def _unready_since(node: NodeView, executor: Executor) -> float:
+    """Since when our relay has not seen that the newest slot is taken; infinity when it does."""
+    if executor.phase is Phase.PREPARING:
+        return executor.started_at
+    epoch, since = node.unready.get(executor.spec.name, (-1, math.inf))
+    return since if epoch == executor.epoch else math.inf
+
+
+def _untaken(task: TaskSpec, executor: Executor) -> str:
+    if task.worker.ready_when is ReadyWhen.TOKEN:
+        return "our relay does not see its worker's token, or its subscriptions"
+    keys = [route.to_expr for route in executor.routes if route.direction is not Direction.OUTPUT]
+    return f"our relay sees nobody take {keys[0] if keys else 'them'}"
 
 
 def _with_keys(count: StreamCount, route: Route | None) -> StreamCount:

@@ -5,13 +5,12 @@ Knows: which tasks have a worker here. Does not know: processes, tokens, who own
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from zsched.core import events as ev
 from zsched.core.fleet import Fleet, OnIsolation, TaskSpec
 from zsched.core.instructions import RecordStory
-from zsched.core.model import NodeId, NodeKind, Profile, TaskId, WorkerState
-from zsched.core.plan import ReadyWhen
+from zsched.core.model import MAX_REASON, NodeId, NodeKind, Profile, TaskId, WorkerState
 
 
 def runs_worker(task: TaskSpec, node: NodeId, kind: NodeKind) -> bool:
@@ -27,23 +26,26 @@ def failed_workers(profile: Profile) -> set[TaskId]:
 
 @dataclass(slots=True)
 class Workers:
-    """{task: state} of every worker that this node keeps."""
+    """{task: state} of every worker that this node keeps, and {task: why} of those that are not ready."""
 
     states: dict[TaskId, WorkerState]
+    reasons: dict[TaskId, str] = field(default_factory=dict)
 
     @classmethod
     def of(cls, fleet: Fleet, me: NodeId) -> Workers:
-        """Before anything is started; a foreign worker that shows itself only by matching counts as ready."""
-        states = {}
-        for task in fleet.tasks:
-            if runs_worker(task, me, fleet.node(me).kind):
-                is_foreign = not task.worker.command and task.worker.ready_when is ReadyWhen.MATCHING
-                states[task.name] = WorkerState.READY if is_foreign else WorkerState.STOPPED
-        return cls(states)
+        """Before anything is started or seen."""
+        kind = fleet.node(me).kind
+        return cls({task.name: WorkerState.STOPPED for task in fleet.tasks if runs_worker(task, me, kind)})
 
     def on_changed(self, event: ev.WorkerChanged) -> RecordStory | None:
         """Note a worker's new state; ``None`` when it is no news, or no worker of ours."""
-        if self.states.get(event.task, event.state) is event.state:
+        if event.task not in self.states:
+            return None
+        if event.state is WorkerState.READY:
+            self.reasons.pop(event.task, None)
+        elif event.reason:
+            self.reasons[event.task] = event.reason[:MAX_REASON]
+        if self.states[event.task] is event.state:
             return None
         self.states[event.task] = event.state
         text = f"worker {event.state}{': ' if event.reason else ''}{event.reason}"

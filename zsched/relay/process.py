@@ -26,15 +26,16 @@ from zsched.clock import awake_s
 from zsched.core.events import ProblemReported, RoleEnded, StreamsCounted
 from zsched.core.introductions import Introductions
 from zsched.core.model import NodeId, TaskId
-from zsched.core.plan import Role, RoutePlan
+from zsched.core.plan import Role, Route, RoutePlan
 from zsched.core.relay_life import RelayHello, RelayPulse
-from zsched.core.relay_protocol import RelayReport, RelayStarted, RelayStop, WorkerSeen
+from zsched.core.relay_protocol import RelayReport, RelayStarted, RelayStop, WorkerSeen, WorkerWatch
 from zsched.errors import WireError
 from zsched.introduction import Introducer
 from zsched.keyspace import Keyspace
 from zsched.relay.acks import Acks
 from zsched.relay.graph import GraphMirror
 from zsched.relay.local_side import LocalSide
+from zsched.relay.matching import Matching
 from zsched.relay.opening import why_not_open
 from zsched.relay.roles import RoleServer
 from zsched.relay.successors import Successors
@@ -146,6 +147,7 @@ class RelayProcess:
         self._graph: GraphMirror | None = None
         self._local: zenoh.Session | None = None
         self._waiting: dict[TaskId, RoutePlan] = {}
+        self._standbys: dict[TaskId, tuple[Route, ...]] = {}
         self._node = node
         self._reporter = reporter
         self._introducer = introducer
@@ -154,6 +156,7 @@ class RelayProcess:
         keyspace = Keyspace(fleet)
         self._acks = Acks(session, keyspace, node)
         self._roles = RoleServer(session, keyspace, node)
+        self._matching = Matching(session, reporter.report)
         self._tokens = Tokens(session, keyspace, self._worker_seen, self._role_ended, self._wake)
         reporter.report(RelayStarted(pid=os.getpid(), zid=str(session.zid())))
         threading.Thread(target=self._count, name="counters", daemon=True).start()
@@ -179,6 +182,8 @@ class RelayProcess:
             for plan in self._waiting.values():
                 self._apply(plan, self._graph)
             self._waiting.clear()
+            for task, routes in self._standbys.items():
+                self._graph.set_routes(_standbys_of(task), routes)
 
     def obey(self, commands: int) -> bool:
         """Read commands until the daemon says stop (true) or is gone (false)."""
@@ -211,15 +216,26 @@ class RelayProcess:
         for seen in self._tokens.seen():
             self._reporter.report(seen)
 
-    def _do(self, command: RoutePlan | Role) -> None:
+    def _do(self, command: RoutePlan | Role | WorkerWatch) -> None:
         if isinstance(command, Role):
             self._roles.set(command)
+            return
+        if isinstance(command, WorkerWatch):
+            self._watch(command)
             return
         with self._lock:
             if self._graph is None:
                 self._waiting[command.task] = command
             else:
                 self._apply(command, self._graph)
+
+    def _watch(self, watch: WorkerWatch) -> None:
+        if watch.inputs or watch.services or not watch.standbys:
+            self._matching.watch(watch)
+        with self._lock:
+            self._standbys[watch.task] = watch.standbys
+            if self._graph is not None:
+                self._graph.set_routes(_standbys_of(watch.task), watch.standbys)
 
     def _apply(self, plan: RoutePlan, graph: GraphMirror) -> None:
         task = self._tasks.get(plan.task)
@@ -262,6 +278,11 @@ class RelayProcess:
             is_missing = any(task.misses_its_worker for task in tuple(self._tasks.values()))
             if introductions.is_due(awake_s(), is_missing=is_missing) and self._introducer is not None:
                 self._introducer.introduce()
+
+
+def _standbys_of(task: TaskId) -> str:
+    """Under which name the routes to a task's standbys stand beside those of its slots (no task is called so)."""
+    return f"{task}@standbys"
 
 
 def run(

@@ -297,7 +297,10 @@ def test_sent_at_once_when_a_worker_changes_or_the_node_drains() -> None:
     failed = {"merge": WorkerState.FAILED}
     assert profiler.publishable(failed, is_draining=False, now=0.1) is not None
     assert profiler.publishable(failed, is_draining=False, now=0.2) is None
-    draining = profiler.publishable(failed, is_draining=True, now=0.3)
+    told = profiler.publishable(failed, is_draining=False, now=0.25, reasons={"merge": "no such map"})
+    assert told is not None
+    assert [one.reason for one in told.workers] == ["no such map"]
+    draining = profiler.publishable(failed, is_draining=True, now=0.3, reasons={"merge": "no such map"})
     assert draining is not None
     assert draining.draining
 

@@ -483,3 +483,24 @@ def test_edges_have_no_rounds() -> None:
     assert robot.rounds.next_deadline() == math.inf
     assert robot.tick(1.0) == ()
     assert robot.rounds.vectors({"merge": robot.value}, robot.states, robot.now) == Utilities(voter="edge1", vectors=())
+
+
+def test_a_time_in_which_the_owner_was_not_heard_is_no_time_in_which_its_worker_was_not_ready() -> None:
+    """After a minute of silence "not ready for 64 s" would be a reason to flee from a worker that starts again."""
+    robot = Robot()
+    starting = (WorkerLoad(task="merge", state=WorkerState.STARTING),)
+    robot.profiles({}, workers=starting)
+    robot.round()
+    robot.now += 64.0  # its profile is stale now
+    robot.round()
+    robot.profiles({}, workers=starting)
+    robot.round()
+    judgement = robot.task.judgement
+    assert judgement is not None
+    assert "has not been ready" not in judgement.reason
+    for _ in range(50):
+        robot.now += 0.5
+        robot.profiles({}, workers=starting)
+        robot.round()
+    assert robot.task.judgement is not None
+    assert "has not been ready" in robot.task.judgement.reason

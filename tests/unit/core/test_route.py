@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
-from zsched.core.fleet import StreamRule, TaskSpec, WorkerSpec
-from zsched.core.model import Tuning, Weights
-from zsched.core.plan import Direction, HandoverRule, ReadyWhen, RoutePhase, StreamClass, StreamSettings
-from zsched.core.route import plan_for, slot_for
+from zsched.core.fleet import Fleet, NodeSpec, Standby, StreamRule, TaskSpec, Timing, WorkerSpec
+from zsched.core.model import NodeKind, Tuning, Weights
+from zsched.core.plan import Direction, HandoverRule, ReadyWhen, RosGraph, RoutePhase, StreamClass, StreamSettings
+from zsched.core.relay_protocol import WorkerWatch
+from zsched.core.route import plan_for, slot_for, watch_for
 
 SETTINGS = StreamSettings(stream_class=StreamClass.RELIABLE, depth=7, handover=HandoverRule.ALL)
 SPEC = TaskSpec(
@@ -55,3 +58,43 @@ def test_only_a_closing_plan_drops_the_predecessor(phase: RoutePhase) -> None:
     plan = plan_for(SPEC, phase, new, old)
     assert (plan.task, plan.phase, plan.current) == ("merge", phase, new)
     assert plan.predecessor == (None if phase is RoutePhase.CLOSE else old)
+
+
+# --- what the relay looks after, whoever owns the task ---------------------------------------------------------------
+
+
+def fleet_of(spec: TaskSpec) -> Fleet:
+    kinds = {"edge1": NodeKind.EDGE, "edge2": NodeKind.EDGE, "robot1": NodeKind.ROBOT, "robot2": NodeKind.ROBOT}
+    nodes = tuple(NodeSpec(name=name, kind=kind) for name, kind in kinds.items())
+    return Fleet(name="test", timing=Timing(), nodes=nodes, tasks=(spec,), electors=("robot1", "robot2"))
+
+
+def test_a_worker_without_a_token_is_watched_where_it_may_run_over_all_robots() -> None:
+    ask = StreamRule(
+        direction=Direction.SERVICE, from_template="{robot}/now", to_template="{target}/{task}/{robot}/now"
+    )
+    wild = StreamRule(direction=Direction.SERVICE, from_template="{robot}/x/*", to_template="{target}/{robot}/x/*")
+    spec = replace(SPEC, rules=(*SPEC.rules, ask, wild))
+    assert watch_for(fleet_of(spec), spec, "edge2") == WorkerWatch(
+        task="merge",
+        inputs=("edge2/merge/*/map",),
+        strangers=("Nobody/merge/*/map",),
+        services=(("edge2/merge/robot1/now", "edge2/merge/robot2/now"),),
+    )
+    assert watch_for(fleet_of(spec), spec, "robot1") is None, "no candidate"
+
+
+def test_a_worker_with_a_token_is_not_watched() -> None:
+    spec = replace(SPEC, worker=WorkerSpec())
+    assert all(watch_for(fleet_of(spec), spec, name) is None for name in ("edge1", "robot1"))
+
+
+@pytest.mark.parametrize("standby", Standby)
+def test_robots_announce_a_ros_node_s_inputs_at_every_candidate_that_runs_one(standby: Standby) -> None:
+    """A stock node subscribes to what the graph shows: a standby that was shown nothing would never be ready."""
+    rules = tuple(replace(rule, settings=replace(SETTINGS, graph=RosGraph.RMW_ZENOH)) for rule in SPEC.rules)
+    worker = replace(SPEC.worker, command=("node",), standby=standby)
+    spec = replace(SPEC, rules=rules, worker=worker)
+    watch = watch_for(fleet_of(spec), spec, "robot1")
+    shown = [] if watch is None else [route.to_expr for route in watch.standbys]
+    assert shown == (["edge1/merge/robot1/map", "edge2/merge/robot1/map"] if standby is Standby.WARM else [])

@@ -321,12 +321,20 @@ def test_an_owner_that_is_no_candidate_any_more_is_left() -> None:
 @pytest.mark.parametrize("state", [WorkerState.STARTING, WorkerState.STOPPED, None])
 def test_not_ready_is_an_escape_only_after_the_start_up_deadline(state: WorkerState | None) -> None:
     assert reason(profile(state=state), not_ready=DEADLINE_S) is None
-    assert reason(profile(state=state), not_ready=DEADLINE_S + 0.5) == "the worker on edge1 is not ready for 20.5 s"
+    assert (
+        reason(profile(state=state), not_ready=DEADLINE_S + 0.5) == "the worker on edge1 has not been ready for 20.5 s"
+    )
 
 
-def test_a_foreign_worker_is_never_late() -> None:
-    """It is somebody else's process: no supervisor ever reports it ready."""
-    assert reason(profile(state=None), not_ready=DEADLINE_S + 100.0, spec=FOREIGN) is None
+def test_a_foreign_worker_that_is_not_there_is_an_escape_after_the_same_deadline() -> None:
+    away = profile(state=WorkerState.STOPPED)
+    told = replace(away, workers=(replace(away.workers[0], reason="nobody subscribes to a/key"),))
+    assert reason(told, not_ready=DEADLINE_S, spec=FOREIGN) is None
+    assert (
+        reason(told, not_ready=DEADLINE_S + 0.5, spec=FOREIGN)
+        == "the worker on edge1 has not been ready for 20.5 s: nobody subscribes to a/key"
+    )
+    assert reason(profile(state=None), not_ready=DEADLINE_S + 100.0, spec=FOREIGN) is None, "its daemon does not know"
 
 
 def test_an_owner_below_its_memory_floor_is_left() -> None:

@@ -196,10 +196,16 @@ def test_a_cold_standby_is_startable_and_therefore_scored(state: WorkerState) ->
     assert "edge2" in values(scored(ROBOT, EDGES[0], profile("edge2", state=state), spec=cold))
 
 
-def test_a_foreign_worker_needs_no_process_of_ours() -> None:
-    foreign = replace(SPEC, worker=WorkerSpec())
+@pytest.mark.parametrize("standby", Standby)
+def test_a_foreign_worker_needs_no_process_of_ours_but_must_be_there(standby: Standby) -> None:
+    foreign = replace(SPEC, worker=WorkerSpec(standby=standby))
 
-    assert "edge2" in values(scored(ROBOT, profile("edge2", state=None), spec=foreign))
+    assert "edge2" in values(scored(ROBOT, profile("edge2", state=WorkerState.READY), spec=foreign))
+    assert "edge2" in values(scored(ROBOT, profile("edge2", state=None), spec=foreign)), "its daemon does not know"
+    gone = profile("edge2", state=WorkerState.STOPPED)
+    told = replace(gone, workers=(replace(gone.workers[0], reason="nobody subscribes to a/key"),))
+    assert ("edge2", "worker stopped: nobody subscribes to a/key") in scored(ROBOT, told, spec=foreign).refused
+    assert "edge1" in values(scored(ROBOT, profile("edge1", state=WorkerState.STOPPED), spec=foreign)), "the owner"
 
 
 def test_no_or_old_profile_of_a_living_node_is_refused_not_guessed() -> None:

@@ -149,6 +149,51 @@ def test_problems_say_what_is_missing_in_words() -> None:
     assert build_snapshot(make(), 100.0).problems == ()
 
 
+def test_a_worker_that_failed_or_is_missed_is_told_with_its_reason() -> None:
+    node = make()
+    for name in EDGES:
+        node.handle(ev.BeatReceived(beat=Beat(node=name, incarnation=3, sequence=1, loop_lag_s=0.0)), 100.0)
+    learn(node, 1, "edge1")
+    for name, state, reason in (
+        ("edge1", WorkerState.STOPPED, "nobody subscribes to a/key"),
+        ("edge2", WorkerState.FAILED, "exited with status 1: no such map"),
+    ):
+        profile = Profile(
+            node=name,
+            incarnation=3,
+            sequence=1,
+            cpu_cores=4.0,
+            cpu_used_cores=1.0,
+            memory_mb=4000.0,
+            memory_used_mb=100.0,
+            workers=(WorkerLoad(task="merge", state=state, reason=reason),),
+        )
+        node.handle(ev.ProfileReceived(profile=profile), 100.0)
+    assert build_snapshot(node, 100.0).tasks[0].problems == (
+        "the worker on edge1 is stopped: nobody subscribes to a/key",
+        "the worker on edge2 failed: exited with status 1: no such map",
+    )
+
+
+def test_a_slot_whose_worker_is_not_seen_is_a_problem_until_it_is() -> None:
+    node = make()
+    learn(node, 1, "edge1")
+    assert build_snapshot(node, 101.0).tasks[0].problems == ()
+    waits = "our relay does not see its worker's token, or its subscriptions"
+    assert build_snapshot(node, 103.0).tasks[0].problems == (
+        f"this robot's streams have waited for edge1 for 3 s: {waits}",
+    )
+    node.handle(ev.SlotReady(task="merge", epoch=1), 103.0)
+    node.handle(ev.SlotFlipped(task="merge", epoch=1), 103.0)
+    assert build_snapshot(node, 110.0).tasks[0].problems == ()
+    node.handle(ev.SlotReady(task="merge", epoch=1, is_ready=False), 110.0)
+    assert build_snapshot(node, 114.0).tasks[0].problems == (
+        f"this robot's streams have waited for edge1 for 4 s: {waits}",
+    )
+    node.handle(ev.SlotReady(task="merge", epoch=1), 114.0)
+    assert build_snapshot(node, 120.0).tasks[0].problems == ()
+
+
 # --- the line --------------------------------------------------------------------------------------------------------
 
 

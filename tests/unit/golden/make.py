@@ -158,6 +158,16 @@ SAMPLES: dict[str, object] = {
     "relay_refused": relay_life.RelayRefused(reason="it is not ours"),
     "relay_started": relay_protocol.RelayStarted(pid=4711, zid="a1b2c3"),
     "worker_seen": relay_protocol.WorkerSeen(node="edge1", task="map_merge", incarnation="3-1", is_present=True),
+    "worker_watch": relay_protocol.WorkerWatch(
+        task="map_merge",
+        inputs=("edge1/map_merge/*/map",),
+        strangers=("Nobody/map_merge/*/map",),
+        services=(("edge1/map_merge/robot1/now",),),
+        standbys=(_ROUTE,),
+    ),
+    "worker_matched": relay_protocol.WorkerMatched(
+        task="map_merge", is_matched=False, is_certain=False, missing="nobody subscribes to edge1/map_merge/*/map"
+    ),
     "end_marker": relay_protocol.EndMarker(epoch=4, count=1000),
     "snapshot_chunk": relay_protocol.SnapshotChunk(
         index=1, count=3, size=600_000, checksum="00112233445566778899aabbccddeeff"

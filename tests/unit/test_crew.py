@@ -1,0 +1,111 @@
+"""The crew: processes, tokens and matches of this node's workers become one state each, with its reason."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from support.waiting import until
+from zsched.adapters.worker_supervisor import WorkerContext, WorkerSupervisor
+from zsched.core import events as ev
+from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.model import NodeKind, Tuning, Weights, WorkerState
+from zsched.core.plan import ReadyWhen
+from zsched.core.relay_protocol import WorkerMatched, WorkerSeen
+from zsched.crew import OTHERS, Crew
+
+SLEEPER = ("python", "-c", "import time; time.sleep(600)")
+TUNING = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
+SPECS = {
+    "node": WorkerSpec(command=SLEEPER, ready_when=ReadyWhen.MATCHING, start_deadline_s=0.5, stop_grace_s=0.1),
+    "others": WorkerSpec(ready_when=ReadyWhen.MATCHING),
+    "token": WorkerSpec(command=SLEEPER, start_deadline_s=0.5, stop_grace_s=0.1),
+}
+FLEET = Fleet(
+    name="test",
+    timing=Timing(),
+    nodes=(NodeSpec(name="edge1", kind=NodeKind.EDGE),),
+    tasks=tuple(TaskSpec(name=name, candidates=("edge1",), tuning=TUNING, worker=one) for name, one in SPECS.items()),
+    electors=("edge1",),
+)
+Told = list[tuple[str, WorkerState, str]]
+
+
+class House:
+    """A crew with a real supervisor."""
+
+    def __init__(self) -> None:
+        self.events: list[ev.Event] = []
+        self.crew = Crew(self.events.append, FLEET)
+        self.crew.supervisor = self.supervisor = WorkerSupervisor(
+            specs=SPECS,
+            context=WorkerContext(fleet="test", node="edge1", incarnation=1),
+            events=self.crew,
+            why_not_ready=self.crew.why_not_ready,
+        )
+
+    def states(self, task: str) -> list[WorkerState]:
+        return [one.state for one in tuple(self.events) if isinstance(one, ev.WorkerChanged) and one.task == task]
+
+    def reasons(self, task: str) -> list[str]:
+        return [one.reason for one in tuple(self.events) if isinstance(one, ev.WorkerChanged) and one.task == task]
+
+    def match(self, task: str, *, is_matched: bool = True, is_certain: bool = True) -> None:
+        missing = "" if is_matched else "nobody subscribes to a/key"
+        self.crew.on_matched(WorkerMatched(task=task, is_matched=is_matched, is_certain=is_certain, missing=missing))
+
+
+@pytest.fixture
+def house() -> Iterator[House]:
+    made = House()
+    yield made
+    made.supervisor.close(1.0)
+
+
+def test_a_process_that_matches_is_ready_and_is_not_ended_at_its_deadline(house: House) -> None:
+    house.supervisor.start("node")
+    until(lambda: house.states("node"), "it runs")
+    house.match("node")
+    until(lambda: house.supervisor.states()["node"] is WorkerState.READY, "the supervisor knows")
+    assert house.states("node") == [WorkerState.STARTING, WorkerState.READY]
+    house.match("node", is_matched=False)
+    assert house.states("node")[-1] is WorkerState.STARTING, "its process lives"
+    until(lambda: "not ready within 0.5 s: nobody subscribes to a/key" in str(house.reasons("node")), "the deadline")
+
+
+def test_what_matches_without_a_process_is_not_the_worker(house: House) -> None:
+    house.match("node")
+    assert house.states("node") == []
+    house.supervisor.start("node")
+    until(lambda: WorkerState.READY in house.states("node"), "from its start on it may be")
+    house.supervisor.stop("node")
+    until(lambda: house.states("node")[-1] is WorkerState.STOPPED, "its process has ended")
+    house.match("node")
+    assert house.states("node")[-1] is WorkerState.STOPPED
+
+
+def test_somebody_else_s_worker_comes_and_goes_by_matching(house: House) -> None:
+    house.match("others", is_matched=False)
+    house.match("others")
+    house.match("others", is_matched=False)
+    assert house.states("others") == [WorkerState.STOPPED, WorkerState.READY, WorkerState.STOPPED]
+    assert house.reasons("others")[-1] == "nobody subscribes to a/key"
+
+
+def test_a_token_says_nothing_of_a_worker_that_is_known_by_matching(house: House) -> None:
+    house.crew.on_token(WorkerSeen(node="edge1", task="others", incarnation="1", is_present=True))
+    assert house.states("others") == []
+
+
+def test_who_listens_to_everything_is_told_where_no_process_would_show_the_end(house: House) -> None:
+    house.match("others", is_certain=False)
+    house.match("others")
+    house.match("node", is_certain=False)
+    problems = [one.problem for one in house.events if isinstance(one, ev.ProblemReported)]
+    assert problems == [OTHERS, None, None]
+
+
+def test_a_worker_without_its_token_is_told_what_it_lacks(house: House) -> None:
+    house.supervisor.start("token")
+    until(lambda: "no token: it did not call Worker.ready()" in str(house.reasons("token")), "the deadline")

@@ -1,0 +1,118 @@
+"""This node's workers as their processes, their tokens and the relay's matches show them, joined into one state each.
+
+Knows: which process of a worker counts, by what it is seen to be ready. Does not know: how a process is started, what
+follows from a state. Called from the supervisor's thread and the relay handle's.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Final
+
+from zsched.adapters.worker_supervisor import WorkerSupervisor
+from zsched.core import events as ev
+from zsched.core.fleet import Fleet
+from zsched.core.model import TaskId, WorkerState
+from zsched.core.plan import ReadyWhen
+from zsched.core.relay_protocol import WorkerMatched, WorkerSeen
+
+OTHERS: Final = (
+    "somebody takes every node's inputs (a recorder?): whether a worker is there cannot be told by matching; "
+    "output_deadline_s notices a dead one"
+)
+NO_TOKEN: Final = "no token: it did not call Worker.ready(), or did not open $ZSCHED_ZENOH_CONFIG"
+OTHER_NETWORK: Final = "did it open $ZSCHED_ZENOH_CONFIG?"
+
+
+class Crew:
+    """The workers of one daemon (it implements the supervisor's `WorkerEvents`)."""
+
+    def __init__(self, post: Callable[[ev.Event], None], fleet: Fleet | None = None) -> None:
+        """``fleet`` says which workers show themselves by matching; without one all show tokens."""
+        tasks = () if fleet is None else fleet.tasks
+        self._matching = frozenset(task.name for task in tasks if task.worker.ready_when is ReadyWhen.MATCHING)
+        self._foreign = frozenset(task.name for task in tasks if not task.worker.command)
+        self._post = post
+        self.supervisor: WorkerSupervisor | None = None
+        """It reports to this crew, so it is made after it."""
+        self._lives: dict[TaskId, int] = {}
+        """{task: the running process's incarnation}, 0 once it has ended; none for somebody else's worker."""
+        self._matches: dict[TaskId, WorkerMatched] = {}
+        self._lock = threading.Lock()  # an end and a token's end come from two threads
+
+    def life_of(self, task: TaskId) -> int:
+        """The running process's incarnation, 0 when none runs."""
+        with self._lock:
+            return self._lives.get(task, 0)
+
+    def why_not_ready(self, task: TaskId) -> str:
+        """What its worker lacks, for an operator."""
+        if task not in self._matching:
+            return NO_TOKEN
+        match = self._matches.get(task)
+        return f"{match.missing}; {OTHER_NETWORK}" if match is not None and match.missing else "not seen by the relay"
+
+    # --- the relay's handle ------------------------------------------------------------------------------------------
+
+    def on_token(self, seen: WorkerSeen) -> None:
+        """A token of a worker here; one of a process that has ended says nothing (its end was reported)."""
+        task, is_present = seen.task, seen.is_present
+        supervisor = self._supervisor_of(task)
+        if supervisor is None or not seen.incarnation.isdigit() or task in self._matching:
+            return
+        life = int(seen.incarnation)
+        with self._lock:
+            current = self._lives.get(task)
+            if current is None or life == current:
+                self._tell(supervisor, task, life, is_ready=is_present, reason="its token")
+
+    def on_matched(self, match: WorkerMatched) -> None:
+        """Somebody takes what goes to a worker here, or nobody does."""
+        task = match.task
+        supervisor = self._supervisor_of(task)
+        if supervisor is None or task not in self._matching:
+            return
+        with self._lock:
+            self._matches[task] = match
+            self._doubt(match)
+            life = self._lives.get(task, 0)
+            if life or task in self._foreign:  # without its process nobody who matches is the worker
+                self._tell(supervisor, task, life, is_ready=match.is_matched, reason=match.missing)
+
+    def _supervisor_of(self, task: TaskId) -> WorkerSupervisor | None:
+        supervisor = self.supervisor
+        return supervisor if supervisor is not None and task in supervisor.states() else None
+
+    def _doubt(self, match: WorkerMatched) -> None:
+        """Say that nothing is certain where no process of ours would show a worker's end either."""
+        is_unknown = match.is_matched and not match.is_certain and match.task in self._foreign
+        self._post(ev.ProblemReported(source=f"worker/{match.task}", problem=OTHERS if is_unknown else None))
+
+    def _tell(self, supervisor: WorkerSupervisor, task: TaskId, life: int, *, is_ready: bool, reason: str) -> None:
+        (supervisor.mark_ready if is_ready else supervisor.mark_gone)(task, life)
+        absent = WorkerState.STARTING if task in self._lives else WorkerState.STOPPED
+        self._post(ev.WorkerChanged(task=task, state=WorkerState.READY if is_ready else absent, reason=reason))
+
+    # --- the supervisor ----------------------------------------------------------------------------------------------
+
+    def on_started(self, task: TaskId, pid: int, incarnation: int) -> None:
+        """The supervisor: a worker process runs; it is not ready yet."""
+        with self._lock:
+            self._lives[task] = incarnation
+            self._post(ev.WorkerChanged(task=task, state=WorkerState.STARTING, reason=f"pid {pid}"))
+            match = self._matches.get(task)
+            if match is not None and match.is_matched and self.supervisor is not None:
+                self._tell(self.supervisor, task, incarnation, is_ready=True, reason="it matches already")
+
+    def on_exited(self, task: TaskId, incarnation: int, returncode: int, reason: str) -> None:
+        """The supervisor: a worker process has ended."""
+        detail = reason or f"exit code {returncode}"
+        with self._lock:
+            if self._lives.get(task) == incarnation:
+                self._lives[task] = 0
+                self._post(ev.WorkerChanged(task=task, state=WorkerState.STOPPED, reason=detail))
+
+    def on_failed(self, task: TaskId, reason: str) -> None:
+        """The supervisor: the worker is not started again."""
+        self._post(ev.WorkerChanged(task=task, state=WorkerState.FAILED, reason=reason))
