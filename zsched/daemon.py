@@ -3,7 +3,7 @@
 Knows: which adapter exists for what, and in which order things start and stop. Does not know: how anything is decided.
 
 ``python -m zsched.daemon --config FILE --node NAME``; `zsched up` becomes this process. Exit codes: 0 stopped,
-1 failed, 78 the fleet file or the node's name is wrong.
+1 failed, 75 the node's name is alive elsewhere, 78 the fleet file or the node's name is wrong.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import random
 import signal
 import sys
 import threading
+import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -43,11 +44,12 @@ from zsched.core.workers import runs_worker
 from zsched.daemon_access import StreamAccess
 from zsched.daemon_endpoints import Endpoints, endpoints_for, free_port, is_here
 from zsched.daemon_memory import shared_memory_objection
-from zsched.errors import AdapterError, ConfigError
+from zsched.errors import AdapterError, ConfigError, NameTakenError
 from zsched.relay_door import Door
 from zsched.shell import Desk, Inbox, Shell
 
-EXIT_OK, EXIT_FAILED, EXIT_CONFIG = 0, 1, 78
+EXIT_OK, EXIT_FAILED, EXIT_NAME_TAKEN, EXIT_CONFIG = 0, 1, 75, 78
+NAME_TAKEN_WAIT_S = 5.0
 HAND_OVER_S = 0.8
 """How long a stopping owner waits for its tasks to be moved away."""
 LEAVE_S = 0.4
@@ -324,7 +326,7 @@ class Daemon:
                 self._absorb_waiting(node, shell)  # before the event: they came before it, and nobody may look silent
             now = self._handle(node, shell, event)
             if shell.stand_down:
-                raise ConfigError(f"{node.me}: {shell.stand_down}")
+                raise NameTakenError(f"{node.me}: {shell.stand_down}")
             if isinstance(event, ev.TokenLost):
                 alert_until = now + ALERT_S
             if isinstance(event, ev.StopRequested) and stop_by == float("inf"):
@@ -391,6 +393,11 @@ def main(arguments: list[str] | None = None) -> int:
     except ConfigError as error:
         print(error, file=sys.stderr)
         return EXIT_CONFIG
+    except NameTakenError as error:
+        # It may have been somebody's forgery, so the service tries again; not at once, for each try disturbs the other.
+        print(error, file=sys.stderr, flush=True)
+        time.sleep(NAME_TAKEN_WAIT_S)
+        return EXIT_NAME_TAKEN
     except AdapterError as error:
         print(f"zsched up: {error}", file=sys.stderr)
         return EXIT_FAILED

@@ -2,6 +2,7 @@
 
 ZschedError
 ├── ConfigError          the operator's file or arguments; lists every fault with its place
+├── NameTakenError       another daemon has this node's name
 ├── WireError            a peer's bytes: counted and dropped, never more
 ├── AdapterError         the outside (socket, disk, process) refused; wraps the cause
 └── InvariantError       a bug of ours
@@ -16,6 +17,10 @@ class ZschedError(Exception):
 
 class ConfigError(ZschedError):
     """The fleet file or an argument is wrong; the message lists every fault (file:line:col, why, what to do)."""
+
+
+class NameTakenError(ZschedError):
+    """Another daemon with this node's name was here first; trying again later may help."""
 
 
 class WireError(ZschedError):

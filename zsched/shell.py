@@ -191,7 +191,7 @@ class Shell:
         self.relay: RelayHandle | None = None
         """It reports to this shell, so it is made after it."""
         self.stand_down = ""
-        """Why this daemon must end with the exit code of a wrong configuration; empty: it need not."""
+        """Why this daemon must end, for its name is taken; empty: it need not."""
         self._failed_at: dict[str, float] = {}
 
     # --- instructions ------------------------------------------------------------------------------------------------

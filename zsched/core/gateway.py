@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from zsched.core.fleet import Demand, Fleet, TaskSpec
 from zsched.core.model import NodeId, Profile, TaskId, WorkerState
+from zsched.core.sequence import Order, Track
 
 STARVED_CPU_RATIO = 0.9
 """On an owner busier than this the task gets less than it wants: its measured use is no demand."""
@@ -30,24 +31,26 @@ class Gateway:
         self._names = frozenset(node.name for node in fleet.nodes)
         self._ttl_s = fleet.timing.profile_ttl_s
         self._profiles: dict[NodeId, tuple[Profile, float]] = {}
+        self._tracks: dict[NodeId, Track] = {}
         self._measured: dict[TaskId, Demand] = {}
         self.version = 0
         """Rises with every change; what was computed from an older version may be wrong."""
 
-    def absorb(self, profile: Profile, now: float) -> str | None:
-        """Take a profile in; returns why it was refused (one word for a counter), or ``None``."""
+    def absorb(self, profile: Profile, now: float, life: int | None = None) -> str | None:
+        """Take a profile in; returns why it was refused (one word for a counter), or ``None``.
+
+        ``life`` is the incarnation that the node's beats show: profiles of that life count at once.
+        """
         if profile.node not in self._names:
             return "foreign"
-        known = self._profiles.get(profile.node)
-        if known is not None and _order(profile) <= _order(known[0]) and not self._is_new_life(profile, known, now):
-            return "stale"
+        track = self._tracks.setdefault(profile.node, Track())
+        is_over = now - track.at > self._ttl_s or (profile.incarnation == life != track.incarnation)
+        order = track.judge(profile.incarnation, profile.sequence, now, may_begin=is_over)
+        if order is not Order.NEW:
+            return "stale" if order is Order.OLD else "doubtful"
         self._profiles[profile.node] = (profile, now)
         self.version += 1
         return None
-
-    def _is_new_life(self, profile: Profile, known: tuple[Profile, float], now: float) -> bool:
-        """A lower incarnation counts once the higher one has been silent: its state was made anew."""
-        return profile.incarnation != known[0].incarnation and now - known[1] > self._ttl_s
 
     def newest(self, node: NodeId, now: float) -> EdgeData | None:
         """The newest profile of ``node`` whatever its age, or ``None`` when it never sent one."""
@@ -92,7 +95,3 @@ class Gateway:
             cpu_cores=max(spec.demand.cpu_cores, measured.cpu_cores),
             memory_mb=max(spec.demand.memory_mb, measured.memory_mb),
         )
-
-
-def _order(profile: Profile) -> tuple[int, int]:
-    return profile.incarnation, profile.sequence

@@ -3,11 +3,13 @@
 Knows: beats in our own name, hashes of fleet files. Does not know: what follows (the node stands down, or says so).
 
 Two machines with one name must not both vote as one elector. The younger daemon (it has beaten less often) leaves
-again at its start; if both stay, both stop being electors, on disk, until the operator settles it.
+again at its start; if both stay, both stop being electors, on disk, until the operator settles it. Beats alone prove no
+second machine: anybody can put one. Without that life's liveliness token they are a complaint, and nothing else.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -17,6 +19,10 @@ YOUNG_S = 3.0
 """A daemon that finds its own name alive so soon after its start leaves again."""
 STAYS_S = 5.0
 """A twin that stays so long disputes the name."""
+
+
+QUIET_S = 10.0
+"""Beats in our name that were heard so long ago are no complaint any more."""
 
 
 class Verdict(StrEnum):
@@ -38,11 +44,22 @@ class Identity:
     started_at: float
     _twin: tuple[int, int, float] | None = field(default=None)
     """(incarnation, first sequence, since when) of another daemon with our name."""
+    _tokens: set[int] = field(default_factory=set)
+    """Incarnations of other daemons with our name whose tokens are there."""
+    _heard_at: float = -math.inf
 
-    @property
-    def complaint(self) -> str:
-        """How status says that the name is not ours alone."""
-        return f"another daemon calls itself {self.me!r}"
+    def complaint(self, now: float) -> str | None:
+        """How status says that the name is not ours alone; ``None``: nobody else uses it."""
+        if self._tokens:
+            return f"another daemon calls itself {self.me!r}"
+        if now < self._heard_at + QUIET_S:
+            return f"somebody sends beats in the name of {self.me!r}, and no daemon of that name is seen"
+        return None
+
+    def on_token(self, incarnation: int, *, is_present: bool) -> None:
+        """A token of our name came or went."""
+        if incarnation != self.incarnation:
+            (self._tokens.add if is_present else self._tokens.discard)(incarnation)
 
     def on_own_name(self, beat: Beat, my_sequence: int, now: float) -> Verdict:
         """Judge a beat in our own name.
@@ -54,11 +71,12 @@ class Identity:
         """
         if beat.incarnation == self.incarnation:
             return Verdict.OURS
+        self._heard_at = now
         if self._twin is None or self._twin[0] != beat.incarnation:
             self._twin = (beat.incarnation, beat.sequence, now)
             return Verdict.TWIN
-        if beat.sequence <= self._twin[1]:
-            return Verdict.TWIN  # an echo of an earlier life does not rise
+        if beat.sequence <= self._twin[1] or beat.incarnation not in self._tokens:
+            return Verdict.TWIN  # an echo of an earlier life does not rise, and a stranger has no daemon
         # Beats are as many as a life is old: who has sent fewer came later.
         is_younger = (my_sequence, -self.incarnation) < (beat.sequence, -beat.incarnation)
         if is_younger and now - self.started_at < YOUNG_S:

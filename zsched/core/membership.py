@@ -18,10 +18,11 @@ everybody else hears.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from zsched.core.fleet import Timing
 from zsched.core.model import Beat, NodeId, PeerState
+from zsched.core.sequence import Order, Track
 
 SMALL_FLEET = 3
 """Up to so many nodes no second observer is waited for: there is one at most, and it may be the next to go."""
@@ -45,9 +46,10 @@ class Transition:
 @dataclass(slots=True)
 class _Peer:
     state: PeerState = PeerState.UNKNOWN
-    incarnation: int = -1
+    track: Track = field(default_factory=Track)
+    order: Order = Order.NEW
+    """Of the beat that came last."""
     beat_at: float = -math.inf
-    sequence: int = -1
     suspect_since: float = math.inf
     vouched_until: float = -math.inf
     """A suspect for whom somebody speaks is looked at again then."""
@@ -98,7 +100,11 @@ class Membership:
     def incarnation(self, node: NodeId) -> int | None:
         """The newest incarnation that a peer's beat showed, or ``None``."""
         peer = self._peers.get(node)
-        return None if peer is None or peer.incarnation < 0 else peer.incarnation
+        return None if peer is None or peer.track.incarnation < 0 else peer.track.incarnation
+
+    def is_doubtful(self, node: NodeId) -> bool:
+        """Whether the beat that came last in this peer's name is not to be believed, whatever it says."""
+        return self._peers[node].order is Order.DOUBTFUL
 
     def alive(self) -> tuple[NodeId, ...]:
         """The living peers, sorted, without this node."""
@@ -136,17 +142,22 @@ class Membership:
             self._deadline = None
 
     def absorb_beat(self, beat: Beat, now: float) -> tuple[Transition, ...]:
-        """A peer's loop is alive: it refutes every accusation. Beats of an older incarnation or order are ignored."""
+        """A peer's loop is alive: it refutes every accusation. Old and doubtful ones (`Track`) are ignored."""
         peer = self._peers.get(beat.node)
-        if peer is None or not self._is_newer(peer, beat, now):
+        if peer is None:
             return ()
-        restarted = 0 <= peer.incarnation < beat.incarnation
+        known = peer.track.incarnation
+        peer.order = peer.track.judge(
+            beat.incarnation, beat.sequence, now, may_begin=self._may_begin(peer, beat.incarnation, now)
+        )
+        if peer.order is not Order.NEW:
+            return ()
+        restarted = 0 <= known < beat.incarnation
         if peer.token_lost and not restarted and now < peer.token_lost_at + IN_FLIGHT_S:
-            peer.sequence = beat.sequence
             return ()
         before, is_back = peer.state, peer.has_been_gone and not restarted
         self._deadline = None
-        peer.incarnation, peer.sequence, peer.beat_at = beat.incarnation, beat.sequence, now
+        peer.beat_at = now
         peer.suspects, peer.token_lost = beat.suspects, False
         changes = []
         if before is not PeerState.ALIVE:
@@ -169,12 +180,16 @@ class Membership:
                 peer.vouched_until = now + self._timing.suspect_s * self._doubt
         return changes
 
-    def _is_newer(self, peer: _Peer, beat: Beat, now: float) -> bool:
-        """Newer than what we know; of a peer that is silent also an older life's count (its state was made anew)."""
+    def _may_begin(self, peer: _Peer, incarnation: int, now: float) -> bool:
+        """Whether another life may begin with its first beat.
+
+        The next one when the known one misses its beats; of a peer that is silent also one with a lower count (its
+        state was made anew).
+        """
+        if incarnation > peer.track.incarnation:
+            return peer.state is not PeerState.ALIVE or now >= peer.beat_at + 2 * self._timing.beat_s
         is_silent = peer.state is PeerState.GONE or now >= peer.beat_at + self._timing.suspect_s
-        if is_silent and peer.state is not PeerState.ALIVE and beat.incarnation != peer.incarnation:
-            return True
-        return (beat.incarnation, beat.sequence) > (peer.incarnation, peer.sequence)
+        return is_silent and peer.state is not PeerState.ALIVE
 
     def absorb_token_lost(self, node: NodeId, incarnation: int, now: float) -> tuple[Transition, ...]:
         """A peer's token went: suspect at once, if it is the token of the life we know.
@@ -183,7 +198,7 @@ class Membership:
         the token of the other when it notices. So for a lease only silence counts.
         """
         peer = self._peers.get(node)
-        if peer is None or peer.incarnation != incarnation or peer.state is not PeerState.ALIVE:
+        if peer is None or peer.track.incarnation != incarnation or peer.state is not PeerState.ALIVE:
             return ()
         if now < peer.back_at + self._timing.zenoh_lease_s:
             return ()

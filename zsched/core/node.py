@@ -247,6 +247,8 @@ class Node:
 
     def _beat(self, now: float) -> None:
         self._beat_sequence += 1
+        if "membership" in self.problems:
+            self._complain(now)
         self.membership.fade_doubt()
         parts = self.agreement.leases.on_sent(self._beat_sequence, now)
         beat = Beat(
@@ -283,6 +285,9 @@ class Node:
             return
         for change in self.membership.absorb_beat(beat, now):
             self._on_transition(change, now)
+        if self.membership.is_doubtful(beat.node):
+            self.counters["beat_doubtful"] += 1
+            return
         self._agree(self.agreement.compare(beat, now), now)
         if beat.has_lost_state:
             self.stateless.add(beat.node)
@@ -297,12 +302,17 @@ class Node:
         verdict = self._identity.on_own_name(beat, self._beat_sequence, now)
         if verdict is Verdict.OURS:
             return
-        complaint = self._identity.complaint
-        self.problems["membership"] = complaint
+        complaint = self._complain(now)
         if verdict is Verdict.LEAVE:
             self._batch.add(do.StandDown(reason=f"{complaint}; stop it, or give this machine a name of its own"))
         elif verdict is Verdict.DISPUTE:
             self._agree(self.agreement.dispute(complaint), now)
+
+    def _complain(self, now: float) -> str:
+        """Show whether somebody else uses our name."""
+        complaint = self._identity.complaint(now)
+        self._set_problem("membership", complaint)
+        return complaint or ""
 
     def _hear_leases(self, beat: Beat, now: float) -> None:
         if not self._tenure.exclusive:
@@ -327,15 +337,17 @@ class Node:
             self._beat_at = now
 
     def _on_token_lost(self, event: ev.TokenLost, now: float) -> None:
-        if event.node == self.me and event.incarnation != self.incarnation:
-            self.problems.pop("membership", None)  # the other one, or what was left of our earlier life, is gone
+        if event.node == self.me:
+            self._identity.on_token(event.incarnation, is_present=False)
+            self._complain(now)
         for change in self.membership.absorb_token_lost(event.node, event.incarnation, now):
             self._on_transition(change, now)
 
-    def _on_token_seen(self, event: ev.TokenSeen, _now: float) -> None:
+    def _on_token_seen(self, event: ev.TokenSeen, now: float) -> None:
         self.counters["tokens_seen"] += 1
-        if event.node == self.me and event.incarnation != self.incarnation:
-            self.problems["membership"] = f"another daemon calls itself {self.me!r}"
+        if event.node == self.me:
+            self._identity.on_token(event.incarnation, is_present=True)
+            self._complain(now)
 
     def _on_transition(self, change: Transition, now: float) -> None:
         text = f"{change.node} {change.before} -> {change.after}: {change.reason}"
@@ -373,7 +385,7 @@ class Node:
         profile = event.profile
         if profile.node == self.me:
             return
-        reason = self.gateway.absorb(profile, now)
+        reason = self.gateway.absorb(profile, now, self.membership.incarnation(profile.node))
         if reason is not None:
             self.counters[f"profile_{reason}"] += 1
             return

@@ -31,6 +31,7 @@ class Bug:
         return (self,) if self.also is None else (self, *self.also.parts)
 
 
+SEQUENCE, IDENTITY = "zsched.core.sequence", "zsched.core.identity"
 REGISTER, LEASE, TENURE = "zsched.core.register", "zsched.core.lease", "zsched.core.tenure"
 AGREEMENT, MEMBERSHIP, NODE = "zsched.core.agreement", "zsched.core.membership", "zsched.core.node"
 ROUNDS, VOTE, VOTING = "zsched.core.rounds", "zsched.core.vote", "zsched.core.voting"
@@ -49,6 +50,7 @@ _MEMBERSHIP = (
     "tests/unit/core/test_membership.py",
     "tests/sim/test_simulator.py",
 )
+_NODE = ("tests/unit/core/test_node.py",)
 _ROUNDS = ("tests/sim/test_vote_rules.py", "tests/unit/core/test_rounds.py", "tests/unit/core/test_vote.py")
 _SCHEDULER = ("tests/unit/core/test_scheduler.py", "tests/unit/core/test_scoring.py", "tests/paper")
 _EXECUTOR = ("tests/unit/core/test_executor.py",)
@@ -382,11 +384,28 @@ MEMBERSHIP_BUGS = (
     ),
     _bug(
         "older life's beats count",
-        MEMBERSHIP,
-        "return (beat.incarnation, beat.sequence) > (peer.incarnation, peer.sequence)",
-        "return beat.sequence > peer.sequence",
+        SEQUENCE,
+        "if self.incarnation < 0 or (may_begin and incarnation != self.incarnation):",
+        "if self.incarnation < 0 or incarnation != self.incarnation:",
         _MEMBERSHIP,
     ),
+    _bug(
+        "any number ahead is believed",
+        SEQUENCE,
+        "0 < ahead <= WINDOW + RATE_HZ * (now - self.at)",
+        "0 < ahead",
+        _MEMBERSHIP,
+    ),
+    _bug(
+        "a number that was overtaken never counts again",
+        SEQUENCE,
+        "return other.count >= RUN",
+        "return False",
+        _MEMBERSHIP,
+    ),
+    _bug("a put teaches an allocation", AGREEMENT, "if not event.is_answer:", "if False:", _AGREEMENT),
+    _bug("any answer is believed", AGREEMENT, "elif is_proven(", "elif True or is_proven(", _AGREEMENT),
+    _bug("beats alone dispute a name", IDENTITY, " or beat.incarnation not in self._tokens", "", _NODE),
     _bug(
         "the first node heard after a cut speaks for nobody",
         MEMBERSHIP,

@@ -123,6 +123,48 @@ def test_restart_with_a_higher_incarnation_counts_from_its_first_beat(state: Pee
     assert ear.members.incarnation("a") == 2
 
 
+FORGED = {"far ahead": (1, 10**9), "another life": (10**12, 1), "a little ahead": (1, 10), "a former life": (0, 9)}
+
+
+@pytest.mark.parametrize("timing", [WIRED, WIFI, WAN])
+@pytest.mark.parametrize(("incarnation", "sequence"), FORGED.values(), ids=list(FORGED))
+def test_one_forged_beat_costs_its_node_nothing(timing: Timing, incarnation: int, sequence: int) -> None:
+    """Whatever number it has, the real beats go on being heard, and nobody is suspected meanwhile."""
+    ear = Ear(SMALL, timing)
+    for step in range(4):
+        ear.beat("a", step * timing.beat_s, sequence=step)
+        ear.beat("b", step * timing.beat_s)
+    at = 3.5 * timing.beat_s
+    ear.beat("a", at, incarnation=incarnation, sequence=sequence)
+    assert ear.members.is_doubtful("a") is (sequence != 10)
+    for step in range(4, 40):
+        now = step * timing.beat_s
+        ear.beat("b", now)
+        assert ear.beat("a", now, sequence=step) == []
+        assert ear.members.tick(now) == ()
+    assert not ear.members.is_doubtful("a")
+    assert (ear.members.state("a"), ear.members.incarnation("a")) == (ALIVE, 1)
+
+
+def test_a_course_that_others_interrupt_is_not_believed() -> None:
+    """While the known course goes on, no number of forged beats takes its place."""
+    ear = Ear(SMALL)
+    for step in range(60):
+        now = step * WIFI.beat_s
+        ear.beat("a", now, sequence=step)
+        ear.beat("a", now + 0.01, incarnation=9, sequence=1000 + step)
+        assert ear.members.is_doubtful("a")
+    assert ear.members.incarnation("a") == 1
+
+
+def test_a_restart_that_nobody_saw_go_is_believed_with_its_third_beat() -> None:
+    ear = heard(SMALL)
+    for step, order in enumerate((True, True, False)):
+        ear.beat("a", 0.1 + step / 100, incarnation=2, sequence=step)
+        assert ear.members.is_doubtful("a") is order
+    assert ear.members.incarnation("a") == 2
+
+
 # --- silence ---------------------------------------------------------------------------------------------------------
 
 
@@ -350,8 +392,8 @@ def test_token_of_a_restarted_peer_is_believed_at_once() -> None:
 
 def test_token_of_a_former_life_accuses_nobody() -> None:
     ear = heard(SMALL)
-    ear.beat("a", 0.1, incarnation=2, sequence=0)
-    assert ear.members.absorb_token_lost("a", 1, 0.2) == ()
+    ear.beat("a", 0.5, incarnation=2, sequence=0)
+    assert ear.members.absorb_token_lost("a", 1, 0.6) == ()
     assert ear.members.state("a") is ALIVE
 
 

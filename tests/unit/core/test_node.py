@@ -12,6 +12,7 @@ import pytest
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.fleet import Fleet, NodeSpec, StreamRule, TaskSpec, Timing, WorkerSpec, electorate_hash
+from zsched.core.identity import QUIET_S
 from zsched.core.messages import Accept, Learnt, Prepare, Promise, Refusal, Refused, Utilities
 from zsched.core.model import (
     Acceptance,
@@ -198,7 +199,7 @@ STRANGERS: dict[str, ev.Event] = {
     ),
     "late utilities": ev.UtilityReceived(gather=77, utilities=Utilities(voter="robot2", vectors=())),
     "frame that the bus dropped": ev.FrameDropped(kind="beat", reason="size"),
-    "stale profile": ev.ProfileReceived(profile=replace(profile("edge2").profile, sequence=0)),
+    "stale profile": profile("edge2"),
     "slot of an unknown task": ev.SlotReady(task="other", epoch=1),
     "flip of an unknown task": ev.SlotFlipped(task="other", epoch=1),
     "drain of an unknown task": ev.SlotDrained(task="other", epoch=1),
@@ -354,14 +355,9 @@ def test_relay_that_is_down_is_a_problem_until_it_is_up() -> None:
     assert node.counters["relay_exits"] == 1
 
 
-@pytest.mark.parametrize(
-    "event",
-    [ev.BeatReceived(beat=beat("robot1", incarnation=8)), ev.TokenSeen(node="robot1", incarnation=8)],
-    ids=["beat", "token"],
-)
-def test_our_own_name_elsewhere_is_a_problem_until_its_token_goes(event: ev.Event) -> None:
+def test_our_own_name_elsewhere_is_a_problem_until_its_token_goes() -> None:
     node = started()
-    node.handle(event, 100.0)
+    node.handle(ev.TokenSeen(node="robot1", incarnation=8), 100.0)
     assert node.problems == {"membership": "another daemon calls itself 'robot1'"}
     node.handle(ev.TokenLost(node="robot1", incarnation=7), 100.0)
     assert node.problems, "our own token, seen from outside, says nothing about the other's"
@@ -369,27 +365,45 @@ def test_our_own_name_elsewhere_is_a_problem_until_its_token_goes(event: ev.Even
     assert node.problems == {}
 
 
+def hear_twin(node: Node, start: float, beats: int, *, first: int = 100) -> tuple[do.Instruction, ...]:
+    """Beats in the node's own name, five a second."""
+    batch: tuple[do.Instruction, ...] = ()
+    for step in range(beats):
+        now = start + step * 0.2
+        batch += node.handle(ev.BeatReceived(beat=beat("robot1", first + step, incarnation=8)), now)
+    return batch
+
+
+def test_beats_in_our_name_alone_are_a_complaint_that_ends_and_nothing_else() -> None:
+    """Anybody can put beats: they write nothing to disk, make nobody leave, and are forgotten."""
+    node = started()
+    batch = hear_twin(node, 100.0, 60)
+    assert "somebody sends beats in the name of 'robot1'" in node.problems["membership"]
+    assert of(batch, do.StandDown) == []
+    assert not any(one.state.disputed for one in of(batch, do.PersistState))
+    assert node.agreement.is_elector
+    node.handle(ev.DeadlineReached(), 112.0 + QUIET_S)
+    assert node.problems == {}
+
+
 def test_younger_twin_leaves_and_the_older_one_stays() -> None:
     """Who has beaten less often came later; one beat alone may be an echo of an earlier life."""
-    young = started()
-    young.handle(ev.BeatReceived(beat=beat("robot1", 50, incarnation=8)), 100.5)
-    batch = young.handle(ev.BeatReceived(beat=beat("robot1", 51, incarnation=8)), 100.7)
+    young, old = started(), started()
+    for node in (young, old):
+        node.handle(ev.TokenSeen(node="robot1", incarnation=8), 100.0)
+    batch = hear_twin(young, 100.5, 2)
     assert len(of(batch, do.StandDown)) == 1
-    old = started()
     for step in range(40):
         old.handle(ev.DeadlineReached(), 100.0 + step * 0.2)
-    batch = old.handle(ev.BeatReceived(beat=beat("robot1", 1, incarnation=8)), 108.0)
-    batch += old.handle(ev.BeatReceived(beat=beat("robot1", 2, incarnation=8)), 108.2)
+    batch = hear_twin(old, 108.0, 2, first=1)
     assert of(batch, do.StandDown) == []
     assert old.agreement.is_elector
 
 
 def test_twin_that_stays_disputes_the_name_on_disk() -> None:
     node = started()
-    batch: tuple[do.Instruction, ...] = ()
-    for step in range(40):
-        now = 110.0 + step * 0.2
-        batch += node.handle(ev.BeatReceived(beat=beat("robot1", 100 + step, incarnation=8)), now)
+    node.handle(ev.TokenSeen(node="robot1", incarnation=8), 100.0)
+    batch = hear_twin(node, 110.0, 40)
     assert not node.agreement.is_elector
     assert any(one.state.disputed for one in of(batch, do.PersistState))
     assert of(batch, do.StandDown) == []

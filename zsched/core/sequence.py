@@ -1,0 +1,81 @@
+"""Membership's and the gateway's question about one sender: is a numbered message news, old, or not to be believed?
+
+Knows: lives (incarnations), sequence numbers, how far ahead one can honestly be, the way back from a wrong one. Does
+not know: what the messages say, what silence means.
+
+Whoever can put a frame can put one number, and the highest number wins. So a number far ahead of the last one, or of
+another life than that which is heard, is *doubtful*: it counts only once `RUN` messages in a row have gone on from it
+while nothing more came of the known course. That way, too, a sender is heard again whose number somebody has overtaken.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+WINDOW = 16
+"""No honest message is so many numbers ahead of the one before..."""
+RATE_HZ = 50.0
+"""...beside so many for each second between the two (a cut)."""
+RUN = 3
+"""So many messages in a row make another course believed."""
+STEP = 8
+"""Messages that are so many numbers apart at most are in a row."""
+
+
+class Order(StrEnum):
+    """What a number means."""
+
+    NEW = "new"
+    OLD = "old"
+    DOUBTFUL = "doubtful"
+
+
+@dataclass(slots=True)
+class _Course:
+    """A run of numbers that is not believed yet."""
+
+    incarnation: int
+    sequence: int
+    since: float
+    count: int = 1
+
+
+@dataclass(slots=True)
+class Track:
+    """The newest believed (incarnation, sequence) of one sender, and another course that may take its place."""
+
+    incarnation: int = -1
+    sequence: int = -1
+    at: float = -math.inf
+    """When something of it last came (monotonic seconds)."""
+    _other: _Course | None = None
+
+    def judge(self, incarnation: int, sequence: int, now: float, *, may_begin: bool) -> Order:
+        """Take a number in; `Order.NEW` makes it the newest.
+
+        ``may_begin``: another life may begin with its first message, for the known one is over or was never heard.
+        """
+        if self.incarnation < 0 or (may_begin and incarnation != self.incarnation):
+            return self._take(incarnation, sequence, now)
+        ahead = sequence - self.sequence
+        if incarnation == self.incarnation and 0 < ahead <= WINDOW + RATE_HZ * (now - self.at):
+            return self._take(incarnation, sequence, now)
+        if self._is_believed(incarnation, sequence, now):
+            return self._take(incarnation, sequence, now)
+        return Order.OLD if incarnation == self.incarnation and ahead <= 0 else Order.DOUBTFUL
+
+    def _take(self, incarnation: int, sequence: int, now: float) -> Order:
+        self.incarnation, self.sequence, self.at, self._other = incarnation, sequence, now, None
+        return Order.NEW
+
+    def _is_believed(self, incarnation: int, sequence: int, now: float) -> bool:
+        """Whether this goes on from a course that has run for long enough by now."""
+        other = self._other
+        if other is None or other.incarnation != incarnation or not 0 < sequence - other.sequence <= STEP:
+            if (incarnation, sequence) != (self.incarnation, self.sequence):  # a mere repeat begins nothing
+                self._other = _Course(incarnation, sequence, now)
+            return False
+        other.sequence, other.count = sequence, other.count + 1
+        return other.count >= RUN and now > other.since
