@@ -32,9 +32,10 @@ from zsched.adapters.state_file import StateFile
 from zsched.adapters.streams import SILENCE_S, Bequest, RelayHandle
 from zsched.adapters.systemd import Notifier, watchdog_interval_s
 from zsched.adapters.worker_supervisor import WorkerContext, WorkerSupervisor
-from zsched.clock import monotonic_s, wall_tenths
+from zsched.clock import ClockWatch, monotonic_s, wall_tenths
 from zsched.config import load_fleet
 from zsched.core import events as ev
+from zsched.core.clocks import is_bad
 from zsched.core.fleet import NodeSpec, electorate_hash, fleet_hash
 from zsched.core.model import DurableState, NodeId, NodeKind, TaskId
 from zsched.core.node import Node
@@ -81,7 +82,7 @@ class Sampler:
 
     def __init__(self, spec: NodeSpec, period_s: float, shell: Shell, inbox: Inbox) -> None:
         self._readers = readers_for(spec)
-        self._device = DeviceProfiler()
+        self._device, self._clocks = DeviceProfiler(), ClockWatch()
         self._period_s, self._shell, self._inbox = period_s, shell, inbox
         self._stop = threading.Event()
         self._problems: dict[str, str | None] = {}
@@ -99,6 +100,7 @@ class Sampler:
     def _run(self) -> None:
         while not self._stop.is_set():
             try:
+                self._compare_clocks()
                 self._sample()
             except Exception as error:
                 log.exception("sample_failed")
@@ -112,6 +114,16 @@ class Sampler:
         if self._problems.get(source) != problem:
             self._problems[source] = problem
             self._inbox.post(ev.ProblemReported(source=source, problem=problem))
+
+    def _compare_clocks(self) -> None:
+        drift = self._clocks.look()
+        if drift is None:
+            return
+        event = ev.ClockCompared(error_ratio=drift.error_ratio, jump_s=drift.jump_s, since_s=drift.since_s)
+        if is_bad(event):
+            self._inbox.post(event)
+        else:
+            self._inbox.post_quietly(event)
 
     def _sample(self) -> None:
         supervisor = self._shell.crew.supervisor

@@ -33,7 +33,7 @@ def test_same_seed_same_schedule_to_the_letter() -> None:
 def test_plans_have_every_fault_every_size_and_every_kind_of_task() -> None:
     plans = [plan(seed) for seed in range(300)]
     kinds = {fault.kind for one in plans for fault in one.faults}
-    assert kinds == (set(MAKERS) - {"clock"}) | {"clock_rate", "clock_jump", "load"}
+    assert kinds == (set(MAKERS) - {"clock"}) | {"clock_rate", "clock_jump", "load", "slew"}
     assert {len(one.fleet.nodes) for one in plans} == set(range(MIN_NODES, MAX_NODES + 1))
     tasks = [task for one in plans for task in one.fleet.tasks]
     assert {task.exclusive for task in tasks} == {True, False}

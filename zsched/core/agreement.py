@@ -127,7 +127,7 @@ class Agreement:
             fleet=fleet,
             me=me,
             incarnation=incarnation,
-            standing={name: _owner(register) for name, register in self.registers.items()} if self.is_elector else {},
+            standing=self.standing() if self.is_elector else {},
             now=now,
         )
         self._parked: dict[tuple[TaskId, NodeId], tuple[ev.AcceptAsked, float]] = {}
@@ -178,6 +178,10 @@ class Agreement:
         """
         self._look()
         return self._accepted
+
+    def standing(self) -> dict[TaskId, NodeId | None]:
+        """{task: whom this elector may have echoed}: nobody else is accepted while it does not know when."""
+        return {name: _owner(register) for name, register in self.registers.items()}
 
     def to_persist(self) -> DurableState | None:
         """The state to write now, or ``None`` when this node keeps none."""

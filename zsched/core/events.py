@@ -19,6 +19,18 @@ class DeadlineReached:
     """The time that `Node.next_deadline` named has come (or the loop simply woke up)."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClockCompared:
+    """This machine's clock that may be slewed was held against the one that is not (`zsched.clock.ClockWatch`)."""
+
+    error_ratio: float
+    """How much faster it ran over the last second or less; negative: slower."""
+    jump_s: float = 0.0
+    """How far they moved apart since the comparison before: after a suspend as long as it took."""
+    since_s: float = 0.0
+    """How long ago that was."""
+
+
 # --- PROFILE, GATEWAY ------------------------------------------------------------------------------------------------
 
 
@@ -255,6 +267,7 @@ class StopRequested:
 
 Event = (
     DeadlineReached
+    | ClockCompared
     | ProfileSampled
     | ProfileReceived
     | UtilityAsked

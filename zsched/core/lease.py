@@ -16,6 +16,8 @@ L is the lease, rho the bound on how far two clocks' rates differ. Nobody compar
   which are never granted again. Without this a planned move would never happen.
 * An echo counts only under the same terms (`lease_terms`): the electors and L of both fleet files. The majority of
   another electorate need not meet the one that granted to this owner's earlier life. Such a node gets no such task.
+* A node whose clock's rate is in doubt (`zsched.core.clocks`) neither works nor grants, and its beats name other
+  terms; afterwards it begins like an elector, and an owner, that has just started.
 * The worker's own word that it has stopped ends the owner's wait before the lease does, but only while no earlier word
   of the same epoch is missing: a late one would give back a lease that the worker has been given since.
 
@@ -123,6 +125,12 @@ class Granter:
 
     def _is_silenced(self, owner: NodeId, epoch: int, now: float) -> bool:
         return self._silent_for == (owner, epoch) and now < self._silent_until
+
+    def restart(self, standing: NodeId | None, started_at: float) -> None:
+        """It is not known when this elector granted, only to whom: as after a start."""
+        self.standing, self.started_at = standing, started_at
+        self._last, self._granted_at = None, -math.inf
+        self.on_newer_value()
 
     def may_accept(self, owner: NodeId | None, now: float) -> bool:
         """Whether a value with this owner may be accepted now; a no begins the silence towards the present owner."""
@@ -260,6 +268,8 @@ class Leases:
     standing: Mapping[TaskId, NodeId | None]
     now: float
     terms: str = field(init=False)
+    is_unsure: bool = False
+    """How long anything takes on this node's clock is not known: it holds and grants nothing."""
     _others: dict[NodeId, str] = field(default_factory=dict)
     """{node: its terms} of those that go by other terms than this node."""
     _granters: dict[TaskId, Granter] = field(init=False)
@@ -274,6 +284,27 @@ class Leases:
             for task in self.fleet.tasks
             if task.exclusive and task.name in self.standing
         }
+
+    @property
+    def terms_told(self) -> str:
+        """What this node's beats say that its leases hang on; not the others' terms while it is unsure."""
+        return f"{self.terms}, clock in doubt" if self.is_unsure and self.terms else self.terms
+
+    def doubt(self, standing: Mapping[TaskId, NodeId | None]) -> None:
+        """The clock's rate is in doubt: hold and grant nothing from now on."""
+        self.is_unsure = True
+        for task, granter in self._granters.items():
+            granter.restart(standing[task], math.inf)
+
+    def trust(self, standing: Mapping[TaskId, NodeId | None], number: int, now: float) -> None:
+        """The clock runs right again: begin anew, with beats behind ``number``."""
+        self.is_unsure = False
+        for task, granter in self._granters.items():
+            granter.restart(standing[task], now)
+        for task, holder in tuple(self._holders.items()):
+            self.begin(task, holder.epoch, number + 1)
+            # The worker was told to stop: its word may still come, and until then it may be at work.
+            self._holders[task].is_doubtful, self._holders[task].given_until = True, holder.given_until
 
     # --- electors ----------------------------------------------------------------------------------------------------
 
@@ -315,7 +346,7 @@ class Leases:
     def until(self, task: TaskId) -> float:
         """When this node's lease of the task ends; minus infinity without one."""
         holder = self._holders.get(task)
-        return -math.inf if holder is None else holder.lease_until()
+        return -math.inf if holder is None or self.is_unsure else holder.lease_until()
 
     @property
     def is_holding(self) -> bool:

@@ -59,6 +59,7 @@ _OFTEN_QUIET = frozenset(
         ev.TokenSeen,
         ev.StreamsCounted,
         ev.FrameDropped,
+        ev.ClockCompared,
     }
 )
 
@@ -264,7 +265,7 @@ class Node:
             fleet_file=self.fleet_file,
             has_voted=self.agreement.has_voted,
             generation=self.agreement.generation or 0,
-            lease_terms=self.agreement.leases.terms,
+            lease_terms=self.agreement.leases.terms_told,
             has_lost_state=self.me in self.fleet.electors and not self.agreement.is_elector,
         )
         self.loop_lag_s = 0.0
@@ -331,6 +332,11 @@ class Node:
                 self._beat_at = now
             self._agree(self.agreement.retry_parked(now), now)
         self._batch.add(*self._tenure.tend_isolation(self.membership, now))
+
+    def _on_clock(self, event: ev.ClockCompared, now: float) -> None:
+        if self._tenure.on_clock(event, self.agreement.standing(), self._beat_sequence, now):
+            self._beat_at = now  # the others must hear whether our echoes count
+            self._set_problem("clock", self._tenure.clock.complaint)
 
     def _on_role_ended(self, event: ev.RoleEnded, now: float) -> None:
         if self.agreement.leases.on_stopped(event.task, event.epoch, self._beat_sequence):
@@ -566,6 +572,7 @@ class Node:
     def _table(self) -> dict[type[Any], Callable[[Any, float], None]]:
         return {
             ev.DeadlineReached: lambda _event, _now: None,
+            ev.ClockCompared: self._on_clock,
             ev.ProfileSampled: self._on_sampled,
             ev.ProfileReceived: self._on_profile,
             ev.UtilityAsked: self._on_utility_asked,

@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from zsched.core.clocks import ClockDoubt
+from zsched.core.events import ClockCompared
 from zsched.core.executor import Executor
 from zsched.core.fleet import Fleet, OnIsolation
 from zsched.core.instructions import Instruction
@@ -30,6 +32,7 @@ class Tenure:
     leases: Leases
     executors: Mapping[TaskId, Executor]
     exclusive: tuple[TaskId, ...] = field(init=False)
+    clock: ClockDoubt = field(default_factory=ClockDoubt)
     _alone_since: dict[TaskId, float] = field(default_factory=dict)
     _local: tuple[TaskId, ...] = field(init=False)
 
@@ -65,6 +68,17 @@ class Tenure:
         """A beat (our own too) may grant, echo, release, or ask us to leave. Whether to beat at once."""
         return self.leases.on_beat(beat, accepted, now)
 
+    def on_clock(self, event: ClockCompared, standing: Mapping[TaskId, NodeId | None], number: int, now: float) -> bool:
+        """The clock was compared. Whether that has begun or ended a doubt about it."""
+        is_unsure = self.clock.absorb(event, now)
+        if not self.exclusive or is_unsure == self.leases.is_unsure:
+            return False
+        if is_unsure:
+            self.leases.doubt(standing)
+        else:
+            self.leases.trust(standing, number, now)
+        return True
+
     def tend_leases(self, number: int, now: float) -> tuple[tuple[Instruction, ...], bool]:
         """Prolong our workers' leases; stop who is asked to leave, and give back what has stopped or run out.
 
@@ -78,6 +92,9 @@ class Tenure:
         leaving = self.leases.leaving()
         for task in self.exclusive:
             executor = self.executors[task]
+            if self.leases.is_unsure:
+                result += executor.leave()
+                continue
             if task not in leaving:
                 until = self.leases.until(task)
                 prolonged = executor.set_lease(until, now)

@@ -358,6 +358,13 @@ LEASE_BUGS = (
 
 MEMBERSHIP_BUGS = (
     _bug(
+        "a slewed clock is believed",
+        "zsched.core.clocks",
+        "abs(event.error_ratio) > RHO or",
+        "abs(event.error_ratio) > 1.0 or",
+        ("tests/sim/test_clock_doubt.py",),
+    ),
+    _bug(
         "token resurrects a peer",
         NODE,
         '        self.counters["tokens_seen"] += 1\n',

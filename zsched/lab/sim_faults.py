@@ -18,6 +18,7 @@ from zsched.core.messages import CommandOutcome, SetWeights
 from zsched.core.model import NodeId
 from zsched.core.scoring import majority
 from zsched.errors import InvariantError
+from zsched.lab.sim_clocks import slew
 from zsched.lab.sim_links import SELF_DELAY_S
 from zsched.lab.sim_network import Weather
 from zsched.lab.sim_parts import Machine
@@ -335,6 +336,16 @@ class Stage:
             machine.clock.change(self.sim.now, jump_s=fault.size)
         self.sim.rearm(machine)
 
+    def _slew(self, fault: Fault) -> None:
+        """A time service slews a machine's clock, and its watch says so."""
+        name = fault.nodes[0]
+
+        def tell(event: ev.Event) -> None:
+            if name in self.sim.machines:
+                self.sim.deliver(self.sim.machines[name], event)
+
+        slew(fault.size, fault.seconds, tell=tell, later=self.sim.later, is_over=lambda: self._is_over)
+
     def _twin(self, fault: Fault) -> None:
         """Somebody copied a disk to another machine: its hardware differs, so it starts without a state."""
         key = f"{fault.nodes[0]}~"
@@ -408,6 +419,7 @@ class Stage:
             "slow": self._slow,
             "slow_disk": self._slow_disk,
             "full_disk": self._full_disk,
+            "slew": self._slew,
             "twin": self._twin,
             "electorate": self._electorate,
             "worker": self._worker,

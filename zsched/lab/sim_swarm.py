@@ -16,6 +16,7 @@ from random import Random
 from zsched.core.fleet import Fleet, NodeSpec, OnIsolation, Standby, TaskSpec, WorkerSpec
 from zsched.core.model import Aggregate, NodeId, NodeKind, Tuning, Weights
 from zsched.core.timing import WAN, WIFI, WIRED
+from zsched.lab.sim_clocks import clock_faults
 
 SECONDS = 30.0
 """Virtual seconds of one schedule: faults in the first half, then quiet."""
@@ -66,8 +67,13 @@ def plan(seed: int, *, nodes: int | None = None, seconds: float = SECONDS) -> Pl
     fleet = _fleet(rng, nodes or rng.randint(MIN_NODES, MAX_NODES))
     if seed % LEASE_EVERY == LEASE_OFFSET:
         fleet = _leased(rng, fleet)
-        return Plan(seed=seed, fleet=fleet, faults=_lease_faults(rng, fleet, seconds / 2), seconds=seconds)
-    return Plan(seed=seed, fleet=fleet, faults=_faults(rng, fleet, seconds / 2), seconds=seconds)
+        faults = _lease_faults(rng, fleet, seconds / 2)
+    else:
+        faults = _faults(rng, fleet, seconds / 2)
+    # A generator of its own: the rest of the schedule stays as it is.
+    for at, name, slewed_s, size in clock_faults(Random(f"clocks {seed}"), fleet, seconds / 2):
+        faults += (Fault(at=at, kind="slew", nodes=(name,), seconds=slewed_s, size=size),)
+    return Plan(seed=seed, fleet=fleet, faults=faults, seconds=seconds)
 
 
 # --- fleets ----------------------------------------------------------------------------------------------------------

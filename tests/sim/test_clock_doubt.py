@@ -1,0 +1,227 @@
+"""A clock whose rate is in doubt: its node works on no exclusive task, grants nothing, and begins again afterwards."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from zsched.core.clocks import DOUBT_S, JUMP_S, ClockDoubt
+from zsched.core.events import ClockCompared
+from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.lease import RHO, Leases, hold_s
+from zsched.core.model import Beat, Grant, NodeKind, Tuning, Weights, WorkerState
+from zsched.core.plan import WorkerRole
+from zsched.lab.sim_clocks import LOOK_S, slew
+from zsched.lab.simulator import Simulator
+
+SLEW = ClockCompared(error_ratio=0.083, since_s=0.2)
+WELL = ClockCompared(error_ratio=1e-5, since_s=0.2)
+TASK = TaskSpec(
+    name="guard",
+    candidates=("edge1", "edge2"),
+    tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0), time_to_trigger_s=0.5, cool_down_s=0.0),
+    worker=WorkerSpec(command=("true",)),
+    exclusive=True,
+)
+ROBOTS = ("robot1", "robot2", "robot3")
+
+
+def fleet(*candidates: str) -> Fleet:
+    return Fleet(
+        name="clocks",
+        timing=Timing(),
+        nodes=tuple(
+            NodeSpec(name=name, kind=NodeKind.ROBOT if name in ROBOTS else NodeKind.EDGE)
+            for name in sorted({*candidates, *ROBOTS})
+        ),
+        tasks=(replace(TASK, candidates=candidates),),
+        electors=ROBOTS,
+    )
+
+
+def started(*candidates: str) -> tuple[Simulator, str]:
+    """A fleet whose exclusive worker works, and its owner."""
+    sim = Simulator(fleet=fleet(*candidates), seed=1)
+    sim.start()
+    assert sim.run_until(lambda: working(sim) != "", 20.0)
+    return sim, working(sim)
+
+
+def working(sim: Simulator) -> str:
+    name, until = sim.working.get("guard", ("", -math.inf))
+    return name if until > sim.now else ""
+
+
+def slewed(sim: Simulator, name: str, seconds: float, size: float = 0.083) -> None:
+    """From now on the watch of a machine reports a slew, for so long; time goes on by ``run``."""
+    machine = sim.machines[name]
+    slew(size, seconds, tell=lambda event: sim.deliver(machine, event), later=sim.later, is_over=lambda: False)
+
+
+# --- the judgement ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("event", "is_unsure"),
+    [
+        (WELL, False),
+        (replace(WELL, error_ratio=RHO), False),
+        (replace(WELL, error_ratio=RHO * 1.01), True),
+        (replace(WELL, error_ratio=-RHO * 1.01), True),
+        (replace(WELL, jump_s=JUMP_S), False),
+        (replace(WELL, jump_s=JUMP_S * 1.5), True),
+        (replace(WELL, jump_s=-JUMP_S * 1.5), True),
+        (replace(WELL, jump_s=0.002, since_s=3.0), False),
+        (ClockCompared(error_ratio=0.0, jump_s=60.0), True),
+    ],
+)
+def test_a_rate_beyond_the_lease_s_bound_and_a_jump_are_doubts(event: ClockCompared, is_unsure: bool) -> None:
+    doubt = ClockDoubt()
+    assert doubt.absorb(event, 10.0) is is_unsure
+    assert (doubt.complaint is not None) is is_unsure
+
+
+def test_a_doubt_ends_some_time_after_the_last_bad_comparison() -> None:
+    doubt = ClockDoubt()
+    doubt.absorb(SLEW, 10.0)
+    assert doubt.absorb(WELL, 10.0 + DOUBT_S - 0.01)
+    doubt.absorb(SLEW, 11.5)
+    assert doubt.absorb(WELL, 10.1 + DOUBT_S)
+    assert not doubt.absorb(WELL, 11.5 + DOUBT_S)
+    assert doubt.complaint is None
+
+
+def test_the_operator_reads_what_is_wrong() -> None:
+    doubt = ClockDoubt()
+    doubt.absorb(SLEW, 10.0)
+    assert "slewed by +8.30%" in (doubt.complaint or "")
+    doubt.absorb(ClockCompared(error_ratio=0.0, jump_s=60.0), 11.0)
+    assert "jumped by +60.000 s" in (doubt.complaint or "")
+
+
+# --- leases ----------------------------------------------------------------------------------------------------------
+
+
+def beat(node: str, number: int, echoes: tuple[Grant, ...] = (), terms: str = "") -> Beat:
+    return Beat(
+        node=node,
+        incarnation=1,
+        sequence=number,
+        loop_lag_s=0.0,
+        learnt=(("guard", 7, 3),),
+        echoes=echoes,
+        lease_terms=terms,
+    )
+
+
+def test_an_elector_in_doubt_grants_nothing_and_afterwards_begins_as_after_a_start() -> None:
+    leases = Leases(fleet=fleet("edge1", "edge2"), me="robot1", incarnation=1, standing={"guard": None}, now=0.0)
+    accepted = {"guard": ("edge1", 3)}
+    assert leases.on_beat(beat("edge1", 5), accepted, 10.0)
+    assert leases.on_sent(1, 10.0).echoes
+    leases.doubt({"guard": "edge1"})
+    leases.on_beat(beat("edge1", 6), accepted, 10.1)
+    assert leases.on_sent(2, 10.1).echoes == ()
+    assert leases.may_accept("guard", "edge1", 10.2)
+    assert not leases.may_accept("guard", "edge2", 1e6)
+    assert leases.next_deadline(10.2) == math.inf
+    leases.trust({"guard": "edge1"}, 2, 20.0)
+    leases.on_beat(beat("edge1", 7), accepted, 20.1)
+    assert leases.on_sent(3, 20.1).echoes == ()
+    assert not leases.may_accept("guard", "edge2", 20.0 + hold_s(1.0) - 0.001)
+    assert leases.may_accept("guard", "edge2", 20.0 + hold_s(1.0))
+    assert leases.on_beat(beat("edge1", 8), accepted, 20.0 + hold_s(1.0))
+
+
+def test_an_owner_in_doubt_holds_no_lease_and_afterwards_only_by_new_beats() -> None:
+    leases = Leases(fleet=fleet("edge1", "edge2"), me="edge1", incarnation=1, standing={}, now=0.0)
+    leases.begin("guard", 3, 5)
+
+    def echoed(number: int, now: float) -> None:
+        leases.on_sent(number, now)
+        grant = Grant(task="guard", owner="edge1", incarnation=1, epoch=3, number=number)
+        for elector in ROBOTS[:2]:
+            leases.on_beat(beat(elector, number, (grant,), leases.terms), {}, now)
+
+    echoed(5, 10.0)
+    assert leases.until("guard") == 11.0
+    leases.on_given("guard", 11.0)
+    leases.doubt({})
+    assert leases.until("guard") == -math.inf
+    leases.trust({}, 6, 12.1)
+    assert leases.until("guard") == -math.inf
+    echoed(6, 12.1)
+    assert leases.until("guard") == -math.inf, "sent before the clock was trusted again"
+    assert leases.given_until("guard") == 11.0, "so long the worker may have been at it"
+    echoed(7, 12.2)
+    assert leases.until("guard") == pytest.approx(13.2)
+
+
+def test_beats_say_so_and_the_others_take_it_for_other_terms() -> None:
+    mine = Leases(fleet=fleet("edge1", "edge2"), me="edge1", incarnation=1, standing={}, now=0.0)
+    other = Leases(fleet=fleet("edge1", "edge2"), me="robot1", incarnation=1, standing={}, now=0.0)
+    mine.doubt({})
+    other.on_beat(beat("edge1", 5, terms=mine.terms_told), {}, 10.0)
+    assert "clock in doubt" in other.unfit()["edge1"]
+    mine.trust({}, 5, 12.0)
+    other.on_beat(beat("edge1", 6, terms=mine.terms_told), {}, 12.0)
+    assert other.unfit() == {}
+    assert mine.terms_told == mine.terms
+
+
+# --- a fleet ---------------------------------------------------------------------------------------------------------
+
+
+def test_an_owner_s_worker_stops_at_once_and_the_task_goes_to_a_node_whose_clock_is_right() -> None:
+    sim, owner = started("edge1", "edge2")
+    slewed(sim, owner, 20.0)
+    sim.run(0.1)
+    assert working(sim) == ""
+    assert sim.machines[owner].roles["guard"].role is WorkerRole.IDLE
+    assert "slewed" in sim.node(owner).problems["clock"]
+    assert sim.run_until(lambda: working(sim) not in ("", owner), 10.0)
+    sim.run(25.0)
+    assert "clock" not in sim.node(owner).problems
+    assert sim.unsettled() == ""
+
+
+def test_the_only_candidate_works_again_once_its_clock_is_right() -> None:
+    sim, owner = started("edge1")
+    slewed(sim, owner, 3.0)
+    sim.run(3.0)
+    assert working(sim) == ""
+    assert sim.run_until(lambda: working(sim) == owner, DOUBT_S + 2 * LOOK_S + 1.0)
+    assert sim.agreed("guard") == owner
+
+
+def test_a_majority_of_electors_in_doubt_keeps_nobody_at_work() -> None:
+    sim, owner = started("edge1", "edge2")
+    for name in ROBOTS[:2]:
+        slewed(sim, name, 6.0)
+    sim.run(1.5)
+    assert working(sim) == ""
+    assert sim.run_until(lambda: working(sim) == owner, 15.0)
+
+
+def test_one_elector_in_doubt_is_not_missed() -> None:
+    sim, owner = started("edge1", "edge2")
+    slewed(sim, ROBOTS[0], 6.0)
+    for _ in range(60):
+        sim.run(0.1)
+        assert working(sim) == owner
+
+
+def test_tasks_that_are_not_exclusive_do_not_mind() -> None:
+    shared = replace(fleet("edge1", "edge2"), tasks=(replace(TASK, exclusive=False),))
+    sim = Simulator(fleet=shared, seed=1)
+    sim.start()
+    sim.run(10.0)
+    owner = sim.agreed("guard")
+    assert owner is not None
+    slewed(sim, owner, 5.0)
+    sim.run(5.0)
+    assert sim.agreed("guard") == owner
+    assert sim.node(owner).worker_states["guard"] is WorkerState.READY
+    assert "clock" not in sim.node(owner).problems
