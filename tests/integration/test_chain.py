@@ -11,7 +11,9 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zenoh
@@ -112,6 +114,7 @@ def test_stopping_owner_hands_its_task_over_first(bed: Testbed, ping: Callable[[
     owner = bed.wait_settled()
     pinger = ping("robot1")
     bed.wait(lambda: pinger.has_newer_than(5), 10, "first echoes")
+    held = bed.wait(partial(_next_decision, bed, owner), 10, "a decision")["penalties"].get(owner, 0.0)
     ((code, seconds),) = bed.stop(owner).values()
     assert code == 0
     assert seconds < STOP_S
@@ -121,6 +124,13 @@ def test_stopping_owner_hands_its_task_over_first(bed: Testbed, ping: Callable[[
     pinger.stop()
     history = bed.task("robot1")["history"]
     assert (history[-1]["owner"], history[-1]["epoch"]) == (moved, history[-2]["epoch"] + 1)
+    decision = bed.wait(partial(_next_decision, bed, moved), 10, "a decision about the new owner")
+    assert decision["penalties"].get(owner, 0.0) <= held, "it was told to stop: that is no failure"
+
+
+def _next_decision(bed: Testbed, owner: str) -> dict[str, Any] | None:
+    decision: dict[str, Any] | None = bed.task("robot1")["decision"]
+    return decision if decision is not None and decision["winner"] == owner else None
 
 
 def _other_owner(bed: Testbed, owner: str) -> str | None:

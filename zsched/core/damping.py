@@ -3,9 +3,9 @@
 Knows: what every learnt change of owner says about the node that was left. Does not know: why robots prefer a node.
 
 Route flap damping (RFC 2439) in utility units: every time a node is left it collects a point, one more when it had
-failed, one more when it was left while on probation (that move was wasted); points decay with a half-life, and the
-penalty grows as ``STEP * (2**points - 1)``, at most `MAX_PENALTY`. A penalised node stays eligible: when it is the only
-one, it serves.
+failed, one more when it was left while on probation (that move was wasted), none when it was told to stop; points decay
+with a half-life, and the penalty grows as ``STEP * (2**points - 1)``, at most `MAX_PENALTY`. A penalised node stays
+eligible: when it is the only one, it serves.
 Every robot learns the same allocations, so all come to the same penalties; but one that was cut off has missed some,
 and one that was restarted has forgotten them. So robots tell each other (`UtilityVector.penalties`), and what any of
 them remembers counts (`zsched.core.scoring.joined`).
@@ -37,12 +37,16 @@ class Damping:
     _moves: deque[tuple[float, bool]] = field(default_factory=deque)
     _owner_since: float = 0.0
 
-    def note_move(self, left: NodeId | None, *, has_failed: bool, now: float) -> None:
-        """An epoch was learnt: ``left`` is the owner before (``None``: the first placement, which is no move)."""
+    def note_move(self, left: NodeId | None, *, has_failed: bool, was_draining: bool = False, now: float) -> None:
+        """An epoch was learnt: ``left`` is the owner before (``None``: the first placement, which is no move).
+
+        A node that drained was told to: that says nothing against it, however soon, and though it is gone by now.
+        """
         if left is not None:
             wasted = now - self._owner_since < PROBATION_S
-            gained = 1.0 + float(has_failed) + float(wasted)
-            self._points[left] = (self.points(left, now) + gained, now)
+            gained = 0.0 if was_draining else 1.0 + float(has_failed) + float(wasted)
+            if gained:
+                self._points[left] = (self.points(left, now) + gained, now)
             self._moves.append((now, has_failed))
         self._owner_since = now
 

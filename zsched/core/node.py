@@ -478,7 +478,9 @@ class Node:
         is_new_epoch = value.epoch > executor.epoch
         self.history[task].append(PastValue(value=value, at=now, reason=reason))
         if is_new_epoch:
-            self.rounds.on_moved(task, executor.owner, has_failed=self._has_failed(task, executor.owner, now), now=now)
+            left = executor.owner
+            failed, drained = self._has_failed(task, left, now), self._was_draining(left, now)
+            self.rounds.on_moved(task, left, has_failed=failed, was_draining=drained, now=now)
         self.rounds.on_learnt(task, is_new_epoch=is_new_epoch, now=now)
         text = f"learnt revision {value.revision}: owner {value.owner}, weights {_weights(value.tuning.weights)}"
         self._batch.add(do.RecordStory(stage="vote", text=text, task=task, epoch=value.epoch))
@@ -489,6 +491,11 @@ class Node:
         if old is not None and self.membership.state(old) is PeerState.GONE:
             self._batch.add(*executor.on_gone(old))
         self._beat_at = now
+
+    def _was_draining(self, node: NodeId | None, now: float) -> bool:
+        """Whether an owner was told to stop, by the last that was heard of it."""
+        data = None if node is None else self.gateway.newest(node, now)
+        return data is not None and data.profile.draining
 
     def _has_failed(self, task: TaskId, node: NodeId | None, now: float) -> bool:
         """Whether an owner was fled from: it is not there, or its worker has failed."""

@@ -399,9 +399,11 @@ class Rounds:
         """Our change was committed, overtaken or given up: votes may be called again."""
         self._votings[name].end_commit()
 
-    def on_moved(self, name: TaskId, left: NodeId | None, *, has_failed: bool, now: float) -> None:
+    def on_moved(
+        self, name: TaskId, left: NodeId | None, *, has_failed: bool, now: float, was_draining: bool = False
+    ) -> None:
         """A new owner is known: ``left`` is the one before, ``has_failed`` whether it was fled from."""
-        self.tasks[name].damping.note_move(left, has_failed=has_failed, now=now)
+        self.tasks[name].damping.note_move(left, has_failed=has_failed, was_draining=was_draining, now=now)
         self.tasks[name].cost.on_moved(is_planned=left is not None and not has_failed, now=now)
 
     def absorb_counts(self, counts: tuple[StreamCount, ...], now: float) -> None:

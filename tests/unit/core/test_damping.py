@@ -61,6 +61,16 @@ def test_being_left_on_probation_costs_more_than_later() -> None:
     assert late.penalty("edge1", PROBATION_S * 2) == pytest.approx(STEP)
 
 
+@pytest.mark.parametrize("has_failed", [False, True])
+def test_a_node_that_was_told_to_stop_pays_nothing(has_failed: bool) -> None:
+    """However soon it is left, and though it may be gone by the time that the others learn of its task's new owner."""
+    damping = Damping()
+    damping.note_move(None, has_failed=False, now=0.0)
+    damping.note_move("edge1", has_failed=has_failed, was_draining=True, now=PROBATION_S / 2)
+    assert damping.penalties(PROBATION_S / 2) == {}
+    assert damping.moves_within(WINDOW_S, PROBATION_S / 2, escapes=has_failed) == 1, "a move all the same"
+
+
 def test_a_node_that_failed_is_not_chosen_again_at_once() -> None:
     """Slightly better, but it has just been fled from: the other one keeps the task until the points have decayed."""
     damping, judge = Damping(), Judge(spec=SPEC)
