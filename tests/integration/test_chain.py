@@ -128,7 +128,7 @@ def test_stopping_owner_hands_its_task_over_first(bed: Testbed, ping: Callable[[
     assert decision["penalties"].get(owner, 0.0) <= held, "it was told to stop: that is no failure"
 
 
-def _next_decision(bed: Testbed, owner: str) -> dict[str, Any]:
+def _next_decision(bed: Testbed, owner: str | None) -> dict[str, Any]:
     """The newest decision when it is for ``owner``, else an empty one."""
     decision: dict[str, Any] | None = bed.task("robot1")["decision"]
     return decision if decision is not None and decision["winner"] == owner else {}
