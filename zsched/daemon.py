@@ -46,6 +46,8 @@ from zsched.daemon_access import StreamAccess
 from zsched.daemon_endpoints import Endpoints, endpoints_for, free_port, is_here
 from zsched.daemon_memory import shared_memory_objection
 from zsched.errors import AdapterError, ConfigError, NameTakenError
+from zsched.guard import guarded, on_failure
+from zsched.log_limit import limit_handlers
 from zsched.relay_door import Door
 from zsched.shell import Desk, Inbox, Shell
 
@@ -86,7 +88,7 @@ class Sampler:
         self._period_s, self._shell, self._inbox = period_s, shell, inbox
         self._stop = threading.Event()
         self._problems: dict[str, str | None] = {}
-        self._thread = threading.Thread(target=self._run, name="zsched-sampler", daemon=True)
+        self._thread = guarded(self._run, name="zsched-sampler")
 
     def start(self) -> None:
         """Begin measuring."""
@@ -153,6 +155,7 @@ class Daemon:
             "ZENOH_RUNTIME", zenoh_config.runtime_pools(len(self._fleet.nodes), len(self._fleet.tasks))
         )
         self._inbox = Inbox()
+        on_failure(lambda kind, text: self._inbox.post(ev.ProblemReported(source=f"thread/{kind}", problem=text)))
         self._notify = Notifier()
         self._next_status = 0.0
         self._is_restart = False
@@ -419,6 +422,7 @@ def _set_up_logging(level: str) -> None:
     # journald stamps its own times; elsewhere a person wants them.
     stamp = "" if "JOURNAL_STREAM" in os.environ else "%(asctime)s "
     logging.basicConfig(stream=sys.stderr, level=level, format=f"{stamp}%(levelname)s %(name)s %(message)s")
+    limit_handlers()
 
 
 if __name__ == "__main__":

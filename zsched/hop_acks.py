@@ -24,6 +24,7 @@ from typing import Final
 from zsched.clock import monotonic_s
 from zsched.core.relay_protocol import StreamAck, StreamAcks
 from zsched.core.serial import number_near, serial_of
+from zsched.guard import guarded
 
 ACK_S: Final = 0.05
 """Acknowledgements leave so often while anything changes (20 Hz)..."""
@@ -82,7 +83,7 @@ class Acknowledger:
         self._samples = 0
         self._bytes = 0
         self._is_closed = False
-        self._thread = threading.Thread(target=self._run, name="zsched acks", daemon=True)
+        self._thread = guarded(self._run, name="zsched acks")
         self._thread.start()
 
     def close(self) -> None:

@@ -16,6 +16,7 @@ from functools import cached_property
 
 import zenoh
 
+from zsched.guard import guarded
 from zsched.zenoh_config import introduction_config
 
 STAY_S = 1.0
@@ -43,7 +44,7 @@ class Introducer:
         is_busy = self._thread is not None and self._thread.is_alive()
         if self._ended.is_set() or is_busy or self._config is None:
             return
-        self._thread = threading.Thread(target=self._introduce, args=(self._config,), name="introduction", daemon=True)
+        self._thread = guarded(self._introduce, self._config, name="introduction", is_lasting=False)
         self._thread.start()
 
     def close(self) -> None:

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from zsched.clock import monotonic_s
+from zsched.guard import guarded
 
 MAX_BYTES: Final = 64 << 20
 STALL_S: Final = 0.1
@@ -82,7 +83,7 @@ class SendQueue:
         self._is_closed = False
         self._at_end: Action | None = None
         self._busy_since: float | None = None
-        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread = guarded(self._run, name=name, kind="queue")
         self._thread.start()
 
     @property

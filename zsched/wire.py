@@ -264,12 +264,16 @@ def encode(value: object) -> bytes:
 
     Raises:
         KeyError: the class may not travel.
-        WireError: the frame would be larger than its kind allows (``reason`` "size"): a bug or a fleet too large.
+        WireError: the frame would be larger than its kind allows (``reason`` "size"), or holds what no frame can (an
+            integer over 64 bits: "range"): a bug or a fleet too large.
     """
     kind = _KIND_OF[type(value)]
     cls, bound = KINDS[kind]
     _, write = _CODECS.get(cls) or _codec(cls)
-    frame: bytes = msgpack.packb([VERSION, kind, write(value)], use_bin_type=True)
+    try:
+        frame: bytes = msgpack.packb([VERSION, kind, write(value)], use_bin_type=True)
+    except (ValueError, OverflowError) as error:
+        raise WireError("range", f"{kind}: {error}"[:200]) from error
     if len(frame) > bound:
         raise WireError("size", f"{kind}: {len(frame)} bytes, at most {bound}")
     return frame

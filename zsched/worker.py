@@ -36,8 +36,10 @@ from zsched import wire
 from zsched.clock import monotonic_s
 from zsched.core.plan import Role, WorkerRole
 from zsched.core.relay_protocol import StreamAcks
+from zsched.guard import guarded
 from zsched.hop_acks import Acknowledger
 from zsched.keyspace import END_CHUNK, Keyspace
+from zsched.log_limit import limit_library
 from zsched.relay_pipe import decode_end
 from zsched.worker_epochs import CARRY_S, Epochs
 from zsched.worker_errands import Errands
@@ -78,6 +80,7 @@ class Worker:
         Raises:
             ConfigError: zenoh refuses the configuration.
         """
+        limit_library()
         self.prefix = f"{node}/{task}"
         self._keyspace = Keyspace(fleet)
         self._node, self._task, self._incarnation = node, task, incarnation
@@ -265,7 +268,7 @@ class Worker:
         for output in tuple(self._outputs):
             output.close()
         self._errands.close()
-        closing = threading.Thread(target=self._close_session, name="zsched close", daemon=True)
+        closing = guarded(self._close_session, name="zsched close", is_lasting=False)
         closing.start()
         closing.join(CLOSE_S)
         if closing.is_alive() and self._is_signalled:
@@ -308,9 +311,7 @@ class Worker:
     def _change_role(self, before: Role, role: Role) -> None:
         """Follow a new role: the token that says in which epoch we work; the ends of an epoch that was cut short."""
         if self._epochs.is_carried(before.epoch):
-            carry = threading.Timer(CARRY_S, self._send_ends, (before.epoch,))
-            carry.daemon = True
-            carry.start()
+            guarded(self._end_later, before.epoch, name="zsched carry", is_lasting=False).start()
         elif before.epoch and before.epoch != role.epoch:
             self._send_ends(before.epoch)
         if role.role is WorkerRole.IDLE and before.epoch:
@@ -324,6 +325,10 @@ class Worker:
         is_shown = self._watch is not None and self._watch.is_shown
         if is_active and (not is_shown or was_held):
             self._begin(role)  # also what was withheld for want of a lease
+
+    def _end_later(self, epoch: int) -> None:
+        if not self._stop.wait(CARRY_S):
+            self._send_ends(epoch)
 
     def _begin(self, role: Role) -> None:
         """Work in the role's epoch from now on, behind the predecessor's snapshot if there is one to be had."""

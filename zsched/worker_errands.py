@@ -10,6 +10,8 @@ import queue
 import threading
 from collections.abc import Callable
 
+from zsched.guard import guarded
+
 _log = logging.getLogger("zsched.worker")
 
 Errand = Callable[[], None]
@@ -22,7 +24,7 @@ class Errands:
         """Start; failures are of no interest once ``stop`` is set."""
         self._stop = stop
         self._queue: queue.SimpleQueue[Errand | None] = queue.SimpleQueue()
-        threading.Thread(target=self._run, name="zsched errands", daemon=True).start()
+        guarded(self._run, name="zsched errands").start()
 
     def put(self, errand: Errand) -> None:
         """Run this behind everything that waits."""

@@ -26,6 +26,7 @@ import zenoh
 from zsched.clock import monotonic_s
 from zsched.core.relay_protocol import EndMarker
 from zsched.core.serial import number_near, serial_of
+from zsched.guard import guarded
 from zsched.hop_acks import GIVE_UP_S, Acknowledger, SourceName
 
 END_GRACE_S: Final = 0.1
@@ -123,7 +124,7 @@ class Dispatcher:
         self._is_closed = False
         self._is_held = False
         self._first: Callable[[], bool] | None = None
-        self._thread = threading.Thread(target=self._run, name="zsched dispatch", daemon=True)
+        self._thread = guarded(self._run, name="zsched dispatch")
 
     def start(self) -> None:
         """Start the thread."""

@@ -27,6 +27,7 @@ from zsched.clock import monotonic_s
 from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks
 from zsched.core.serial import number_near, serial_of
 from zsched.errors import WireError
+from zsched.guard import guarded
 from zsched.keyspace import AGAIN_CHUNK, END_CHUNK
 from zsched.relay_pipe import encode_end
 
@@ -191,7 +192,7 @@ class Keeper:
             self._lanes[source_id.eid] = lane
             if self._subscriber is None:
                 self._subscriber = self._session.declare_subscriber(self._acks_key, self._came.put)
-                threading.Thread(target=self._run, name="zsched keeper", daemon=True).start()
+                guarded(self._run, name="zsched keeper").start()
         return lane
 
     def close(self) -> None:

@@ -21,6 +21,7 @@ import zenoh
 from zsched.clock import monotonic_s
 from zsched.core.keyexpr import is_wild
 from zsched.core.relay_protocol import ERROR_ENCODING, REFUSED_ENCODING
+from zsched.guard import guarded
 
 ROLE_WAIT_S: Final = 0.3
 """A request may outrun the word that this worker is the owner; a relay's flip waits as long."""
@@ -77,7 +78,7 @@ class Service:
         self._later = later
         self._requests: queue.Queue[zenoh.Query | None] = queue.Queue(depth)
         self._is_closed = False
-        threading.Thread(target=self._run, name=f"zsched serve {key_expr}", daemon=True).start()
+        guarded(self._run, name=f"zsched serve {key_expr}", kind="zsched serve").start()
         self._queryable = session.declare_queryable(key_expr, self._take, complete=True)
 
     def undeclare(self) -> None:

@@ -24,6 +24,7 @@ from zsched.clock import monotonic_s
 from zsched.core.model import NodeId
 from zsched.core.plan import Role, WorkerRole
 from zsched.core.relay_protocol import ERROR_ENCODING, SnapshotChunk
+from zsched.guard import guarded
 from zsched.relay_pipe import decode_chunk, encode_chunk
 
 CHUNK: Final = 256 * 1024
@@ -94,7 +95,7 @@ class Offer:
         self._snapshot = snapshot
         self._queryable = session.declare_queryable(key, zenoh.handlers.FifoChannel(16), complete=True)
         handler = self._queryable.handler
-        threading.Thread(target=self._run, args=(handler,), name="zsched snapshot", daemon=True).start()
+        guarded(self._run, handler, name="zsched snapshot").start()
 
     def undeclare(self) -> None:
         """Offer it no more."""
@@ -267,7 +268,7 @@ class Restorer:
             self._has_begun = True
             predecessor = noted.predecessor
         arguments = (role.epoch, predecessor, then)
-        threading.Thread(target=self._run, args=arguments, name="zsched restore", daemon=True).start()
+        guarded(self._run, *arguments, name="zsched restore", is_lasting=False).start()
         return True
 
     def deliver(self) -> None:

@@ -25,9 +25,13 @@ FLOORS: Final[tuple[tuple[str, int, str], ...]] = (
     # pattern of the module's name below "zsched.", floor, room ("*": each module is one of its own; \\1: the group)
     (r"__init__", 0, "version"),
     (r"core(\..+)?", 1, "core"),
-    (r"(wire|keyspace|clock|errors|report|places|zenoh_config|relay_pipe|send_queue|hop_acks)", 2, "seams"),
+    (
+        r"(wire|keyspace|clock|errors|report|places|zenoh_config|relay_pipe|send_queue|hop_acks)",
+        2,
+        "seams",
+    ),
     (r"(config|config_\w+)", 2, "seams"),
-    (r"(relay_door|introduction)", 2, "seams"),
+    (r"(relay_door|introduction|guard|log_limit)", 2, "seams"),
     (r"adapters\.(worker_supervisor|worker_process|launch)", 3, "adapters: worker processes"),
     (r"adapters\.(control_bus|open_questions)", 3, "adapters: control"),
     (r"adapters\.(network_profiler|nl80211)", 3, "adapters: radio"),

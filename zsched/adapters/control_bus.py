@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import threading
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -34,6 +33,7 @@ from zsched.core.messages import (
 from zsched.core.model import NAME, Beat, NodeId, Profile, Proposal
 from zsched.core.snapshot import Snapshot
 from zsched.errors import AdapterError, WireError
+from zsched.guard import guarded
 from zsched.introduction import Introducer
 from zsched.keyspace import Keyspace, parse
 
@@ -165,7 +165,7 @@ class ControlBus:
             return
         self._introducer.close()
         kept, self._kept, self._publishers, self._ring = self._kept, [], {}, None
-        closing = threading.Thread(target=self._close, args=(session, kept), name="zsched-bus-close", daemon=True)
+        closing = guarded(self._close, session, kept, name="zsched-bus-close", is_lasting=False)
         closing.start()
         closing.join(CLOSE_S)
         if closing.is_alive():

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from zsched.errors import AdapterError
+from zsched.guard import guarded
 
 MAX_LINE = 1 << 20
 MAX_CONNECTIONS = 16
@@ -36,7 +37,7 @@ class OperatorSocket:
         self._answer = answer
         self._listener: socket.socket | None = None
         self._slots = threading.BoundedSemaphore(MAX_CONNECTIONS)
-        self._thread = threading.Thread(target=self._accept, name="zsched-operator", daemon=True)
+        self._thread = guarded(self._accept, name="zsched-operator")
 
     def open(self) -> None:
         """Bind and listen; a socket file that nobody answers on is replaced.
@@ -92,7 +93,7 @@ class OperatorSocket:
             if not self._slots.acquire(blocking=False):
                 connection.close()
                 continue
-            threading.Thread(target=self._serve, args=(connection,), name="zsched-operator-1", daemon=True).start()
+            guarded(self._serve, connection, name="zsched-operator-1", is_lasting=False).start()
 
     def _serve(self, connection: socket.socket) -> None:
         try:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import queue
-import threading
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import TracebackType
@@ -17,6 +16,7 @@ import zenoh
 
 from zsched.clock import monotonic_s
 from zsched.errors import AdapterError
+from zsched.guard import guarded
 
 DEPTH: Final = 10_000
 """Samples that may wait for who looks at them; beyond it the oldest go, and `StreamTap.missed` stays honest."""
@@ -65,7 +65,7 @@ class StreamTap:
             # a channel and a thread of ours: a callback's thread would hold the process at its end
             subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(DEPTH))
             self._subscribers.append(subscriber)
-            threading.Thread(target=self._run, args=(side, subscriber.handler), name=f"tap {key}", daemon=True).start()
+            guarded(self._run, side, subscriber.handler, name=f"tap {key}", kind="tap").start()
 
     def _run(self, side: str, handler: zenoh.handlers.Handler[zenoh.Sample]) -> None:
         for sample in handler:
@@ -95,7 +95,7 @@ class StreamTap:
 
     def close(self) -> None:
         """Close the sessions, within `CLOSE_S`."""
-        closing = threading.Thread(target=self._close, name="tap close", daemon=True)
+        closing = guarded(self._close, name="tap close", is_lasting=False)
         closing.start()
         closing.join(CLOSE_S)
 

@@ -29,6 +29,7 @@ from zsched.core.plan import Role, RoutePlan
 from zsched.core.relay_life import RelayHello, RelayPulse
 from zsched.core.relay_protocol import HandleReport, RelayStarted, RelayStop, WorkerWatch
 from zsched.errors import AdapterError, WireError
+from zsched.guard import guarded
 from zsched.relay_door import GREETING_S, Door, code_digest, digest_of
 from zsched.relay_pipe import REPORTS, read_frame, write_frame
 
@@ -139,7 +140,7 @@ class RelayHandle:
         self._relay: RelayChild | None = None
         self._stopping = threading.Event()
         self._is_leaving = False
-        self._thread = threading.Thread(target=self._supervise, name="relay", daemon=True)
+        self._thread = guarded(self._supervise, name="relay")
 
     @property
     def pid(self) -> int | None:
@@ -249,7 +250,7 @@ class RelayHandle:
             relay.hang_up()
         if self._stopping.is_set():
             outbox.close()
-        writer = threading.Thread(target=self._write, args=(relay, outbox), daemon=True)
+        writer = guarded(self._write, relay, outbox, name="relay writer", is_lasting=False)
         writer.start()
         reason = "not listened to"
         try:

@@ -22,7 +22,6 @@ import logging
 import os
 import random
 import signal
-import threading
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -35,6 +34,7 @@ from zsched.adapters.worker_process import ProcessWatch, WorkerGuard, WorkerProc
 from zsched.clock import monotonic_s
 from zsched.core.fleet import WorkerSpec
 from zsched.core.model import NodeId, TaskId, WorkerState
+from zsched.guard import guarded
 
 log = logging.getLogger("zsched.worker")
 
@@ -154,7 +154,7 @@ class WorkerSupervisor:
         self._close_by_s: float | None = None
         self._snapshot: tuple[Mapping[TaskId, int], Mapping[TaskId, WorkerState]] = ({}, {})
         self._publish()
-        self._thread = threading.Thread(target=self._run, name="zsched-workers", daemon=True)
+        self._thread = guarded(self._run, name="zsched-workers")
         self._thread.start()
 
     # --- what the daemon says ---

@@ -12,10 +12,10 @@ from __future__ import annotations
 import logging
 import os
 import re
-import threading
 from collections.abc import Mapping
 
 from zsched.clock import monotonic_s
+from zsched.guard import guarded
 
 PERIOD_S = 60.0
 """One line per cause in this time; the others are counted."""
@@ -63,7 +63,7 @@ def capture(environ: Mapping[str, str]) -> bool:
     read_end, write_end = os.pipe()
     os.dup2(write_end, 1)
     os.close(write_end)
-    threading.Thread(target=_read, args=(read_end,), name="zsched-zenoh-log", daemon=True).start()
+    guarded(_read, read_end, name="zsched-zenoh-log").start()
     return True
 
 

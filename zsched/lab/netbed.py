@@ -13,7 +13,6 @@ import re
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -26,6 +25,7 @@ from zsched import zenoh_config
 from zsched.adapters.operator_socket import ask
 from zsched.clock import monotonic_s
 from zsched.core.model import NodeId, PeerState
+from zsched.guard import guarded
 from zsched.lab.history import History, Learnt, Started
 from zsched.lab.netns import Network
 from zsched.lab.testbed import DAEMON, Json, Testbed
@@ -78,7 +78,7 @@ class Probe:
         self.received: list[Received] = []
         self.is_open = False
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log)
-        self._thread = threading.Thread(target=self._read, daemon=True)
+        self._thread = guarded(self._read, name="netbed", is_lasting=False)
         self._thread.start()
 
     def _read(self) -> None:

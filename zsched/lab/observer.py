@@ -13,6 +13,7 @@ from typing import Self
 from zsched.clock import monotonic_s
 from zsched.core.model import NodeId, TaskId
 from zsched.errors import ZschedError
+from zsched.guard import guarded
 from zsched.lab.fleet_runner import Ask
 from zsched.lab.fleet_view import Move, Status, merge_moves, past_allocations
 
@@ -33,7 +34,7 @@ class Observer:
         self._statuses: dict[NodeId, tuple[float, Status]] = {}
         self._moves: dict[int, Move] = {}
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="observer", daemon=True)
+        self._thread = guarded(self._run, name="observer")
 
     def __enter__(self) -> Self:
         self._thread.start()

@@ -21,6 +21,7 @@ import time
 import zenoh
 
 from zsched.clock import monotonic_s
+from zsched.guard import guarded
 
 OPEN_S = 20.0
 
@@ -35,12 +36,12 @@ def main() -> int:
     parser.add_argument("--watch", action="append", default=[])
     given = parser.parse_args()
     stop = threading.Event()
-    threading.Thread(target=_stop_at_end, args=(stop,), daemon=True).start()
+    guarded(_stop_at_end, stop, name="stop", is_lasting=False).start()
     session = _open(given.config, stop)
     if session is None:
         return 1
     lines: queue.SimpleQueue[str] = queue.SimpleQueue()
-    threading.Thread(target=_write, args=(lines,), daemon=True).start()
+    guarded(_write, lines, name="write", is_lasting=False).start()
     kept = [session.declare_subscriber(key, lambda sample: lines.put(_line(sample))) for key in given.watch]
     print("open", flush=True)
     _send(session, given, stop)

@@ -11,6 +11,8 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from zsched.guard import guarded
+
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 LOOK_AGAIN_S = 0.2
 """So often it is looked whether a stop signal's exception was dropped by the code that it hit."""
@@ -65,7 +67,7 @@ def interruptible() -> Iterator[None]:
             signal.pthread_kill(main, raised[0].number)
 
     main = threading.get_ident()
-    reminder = threading.Thread(target=remind, daemon=True)
+    reminder = guarded(remind, name="reminder", is_lasting=False)
     before = {number: signal.signal(number, interrupt) for number in STOP_SIGNALS}
     try:
         yield

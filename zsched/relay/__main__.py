@@ -19,6 +19,7 @@ import signal
 import sys
 
 from zsched.core.relay_life import RelayHello
+from zsched.log_limit import limit_handlers
 
 PR_SET_PDEATHSIG = 1
 M_ARENA_MAX = -8
@@ -31,6 +32,7 @@ def main() -> None:
     """Run the relay; never returns (threads of zenoh must not be waited for at exit)."""
     arguments = _arguments()
     logging.basicConfig(stream=sys.stderr, level=arguments.log_level, format="%(name)s %(levelname)s %(message)s")
+    limit_handlers()
     _few_arenas()
     if arguments.door is None:
         _die_with(arguments.parent)

@@ -6,7 +6,6 @@ Knows: the keys they go on, who waits for which publisher's. Does not know: what
 from __future__ import annotations
 
 import logging
-import threading
 from collections.abc import Callable
 
 import zenoh
@@ -16,6 +15,7 @@ from zsched import wire
 from zsched.core.model import NodeId
 from zsched.core.relay_protocol import StreamAck, StreamAcks
 from zsched.errors import WireError
+from zsched.guard import guarded
 from zsched.hop_acks import Acknowledger
 from zsched.keyspace import Keyspace
 
@@ -37,7 +37,7 @@ class Acks:
         self._listeners: dict[int, Listener] = {}
         key = keyspace.ack("*", "*", "*", str(session.zid()))
         self._subscriber = session.declare_subscriber(key, zenoh.handlers.FifoChannel(1024))
-        threading.Thread(target=self._run, args=(self._subscriber.handler,), name="acks", daemon=True).start()
+        guarded(self._run, self._subscriber.handler, name="acks").start()
 
     def expect(self, eid: int, listener: Listener) -> None:
         """Hand the acknowledgements for our publisher ``eid`` to ``listener``."""

@@ -22,6 +22,7 @@ from zsched.core.model import NodeId, TaskId
 from zsched.core.plan import RosGraph, Route
 from zsched.core.ros2 import Endpoint, endpoint_token, node_token, parse_token, ros_node_name, token_selector
 from zsched.core.ros_mirror import Sides, mirrored
+from zsched.guard import guarded
 from zsched.relay.receive import undeclare
 
 MAX_TOKENS: Final = 20_000
@@ -96,7 +97,7 @@ class GraphMirror:
             if self._thread is None and all(route.settings.graph is RosGraph.NONE for route in routes):
                 return
             if self._thread is None:
-                self._thread = threading.Thread(target=self._run, name="ros graph", daemon=True)
+                self._thread = guarded(self._run, name="ros graph")
                 self._thread.start()
         self._queue.put((task, routes))
 

@@ -19,6 +19,7 @@ import zenoh
 from zenoh import Sample, SampleKind, Session
 
 from zsched.core.serial import number_near
+from zsched.guard import guarded
 
 TIMEOUT_S: Final = 0.5
 MAX_FETCHES: Final = 8
@@ -115,7 +116,7 @@ class History:
         if self._is_closed or self._pending >= MAX_PENDING:
             return
         self._pending += 1
-        threading.Thread(target=self._fetch, args=(key,), name=f"history {key}", daemon=True).start()
+        guarded(self._fetch, key, name=f"history {key}", kind="history", is_lasting=False).start()
 
     def _fetch(self, key: str) -> None:
         try:

@@ -18,6 +18,7 @@ import zenoh
 
 from zsched.core.events import ProblemReported
 from zsched.core.relay_protocol import RelayReport
+from zsched.guard import guarded
 from zsched.relay.opening import why_not_open
 
 RETRY_S: Final = 0.5
@@ -38,7 +39,7 @@ class LocalSide:
         self._on_open = on_open
         self._session: zenoh.Session | None = None
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="local side", daemon=True)
+        self._thread = guarded(self._run, name="local side")
         self._thread.start()
 
     def close(self) -> None:
@@ -52,7 +53,7 @@ class LocalSide:
         told = ""
         while not self._stop.is_set():
             try:
-                session = zenoh.open(zenoh.Config.from_json5(self._config))
+                session = self._session or zenoh.open(zenoh.Config.from_json5(self._config))
             except (zenoh.ZError, ValueError) as error:
                 problem = f"the host's own side {why_not_open(self._config, error)}"
                 if not told:

@@ -24,6 +24,7 @@ from zenoh import Locality, Session
 from zsched.clock import monotonic_s
 from zsched.core.model import TaskId
 from zsched.core.relay_protocol import WorkerMatched, WorkerWatch
+from zsched.guard import guarded
 from zsched.relay.receive import Declared, undeclare
 
 SETTLE_S: Final = 1.5
@@ -77,7 +78,7 @@ class Matching:
         """Watch a task's worker from now on; asked again, say again what is seen."""
         with self._lock:
             if self._thread is None:
-                self._thread = threading.Thread(target=self._run, name="matching", daemon=True)
+                self._thread = guarded(self._run, name="matching")
                 self._thread.start()
         self._queue.put(watch)
 

@@ -30,6 +30,7 @@ from zsched.core.plan import Role, Route, RoutePlan
 from zsched.core.relay_life import RelayHello, RelayPulse
 from zsched.core.relay_protocol import RelayReport, RelayStarted, RelayStop, WorkerSeen, WorkerWatch
 from zsched.errors import WireError
+from zsched.guard import guarded, on_failure
 from zsched.introduction import Introducer
 from zsched.keyspace import Keyspace
 from zsched.relay.acks import Acks
@@ -70,7 +71,7 @@ class Reporter:
         self._problems: dict[str, ProblemReported] = {}
         self._still_s: float | None = None
         """How long nothing was counted, as far as we ran; ``None``: the session is not open yet."""
-        self._thread = threading.Thread(target=self._run, name="reports", daemon=True)
+        self._thread = guarded(self._run, name="reports")
         self._thread.start()
 
     def report(self, value: RelayReport) -> None:
@@ -159,7 +160,7 @@ class RelayProcess:
         self._matching = Matching(session, reporter.report)
         self._tokens = Tokens(session, keyspace, self._worker_seen, self._role_ended, self._wake)
         reporter.report(RelayStarted(pid=os.getpid(), zid=str(session.zid())))
-        threading.Thread(target=self._count, name="counters", daemon=True).start()
+        guarded(self._count, name="counters").start()
         if not local_config:
             self._begin(None)
         self._local_side = LocalSide(local_config, reporter.report, self._begin) if local_config else None
@@ -299,6 +300,7 @@ def run(
     ``door`` is a listening socket: through it the daemon's successor comes, within ``orphan_s`` of the daemon's end.
     """
     reporter = Reporter(reports)
+    on_failure(lambda kind, text: reporter.report(ProblemReported(source=f"{SOURCE}/thread/{kind}", problem=text)))
     text = read_frame(commands)
     local = read_frame(commands) if has_local_side else b""
     if text is None or local is None:
@@ -324,7 +326,7 @@ def run(
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         signal.setitimer(signal.ITIMER_REAL, ALARM_S)
         reporter.flush(0.1)
-        closing = threading.Thread(target=relay.close, name="close", daemon=True)
+        closing = guarded(relay.close, name="close", is_lasting=False)
         closing.start()
         closing.join(CLOSE_S)
     return 0

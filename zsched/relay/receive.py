@@ -16,6 +16,7 @@ import zenoh
 from zenoh import Sample, Session
 
 from zsched.core.plan import StreamClass, StreamSettings
+from zsched.guard import guarded
 from zsched.relay.history import History
 
 JOIN_S: Final = 0.3
@@ -63,7 +64,7 @@ class Receiver:
         self._carry = carry if self._history is None else self._history.live
         self._subscriber = _subscribe(session, expr, settings, origin)
         self._handler = self._subscriber.handler  # the thread's own: undeclare() refuses while recv() borrows
-        self._thread = threading.Thread(target=self._run, name=f"from {expr}", daemon=True)
+        self._thread = guarded(self._run, name=f"from {expr}", kind="from")
         self._thread.start()
         if self._history is not None:
             self._history.start()

@@ -5,14 +5,13 @@ Knows: the newest role per task, the role keys of this node. Does not know: who 
 
 from __future__ import annotations
 
-import threading
-
 import zenoh
 from zenoh import CongestionControl, Priority, Query, Session
 
 from zsched import wire
 from zsched.core.model import NodeId, TaskId
 from zsched.core.plan import Role
+from zsched.guard import guarded
 from zsched.keyspace import Keyspace
 
 
@@ -25,7 +24,7 @@ class RoleServer:
         self._node = node
         self._roles: dict[TaskId, Role] = {}
         self._queryable = session.declare_queryable(keyspace.role(node, "*"), zenoh.handlers.FifoChannel(256))
-        threading.Thread(target=self._serve, args=(self._queryable.handler,), name="roles", daemon=True).start()
+        guarded(self._serve, self._queryable.handler, name="roles").start()
 
     def set(self, role: Role) -> None:
         """Take and tell a task's newest role."""

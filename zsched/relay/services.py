@@ -38,6 +38,7 @@ from zsched.core.capture import Rewriter, rewriter
 from zsched.core.keyexpr import is_wild
 from zsched.core.plan import Route, StreamCount
 from zsched.core.relay_protocol import ERROR_ENCODING, REFUSED_ENCODING, ServiceProblem
+from zsched.guard import guarded
 from zsched.relay.counter import StreamCounter
 from zsched.relay.receive import undeclare
 from zsched.relay.replies import Replies
@@ -122,7 +123,7 @@ class ServiceStream:
             route.from_expr, zenoh.handlers.FifoChannel(256), complete=True, allowed_origin=zenoh.Locality.REMOTE
         )
         handler = self._queryable.handler
-        self._thread = threading.Thread(target=self._run, args=(handler,), name=f"asked {route.from_expr}", daemon=True)
+        self._thread = guarded(self._run, handler, name=f"asked {route.from_expr}", kind="asked")
         self._thread.start()
 
     def open(self, epoch: int, route: Route) -> None:
@@ -215,7 +216,7 @@ class ServiceStream:
             with query:
                 self._fail(query, ServiceProblem.BUSY, f"{self.route.service.max_pending} requests are being answered")
             return
-        threading.Thread(target=self._serve, args=(query,), name=self.route.stream, daemon=True).start()
+        guarded(self._serve, query, name=self.route.stream, kind="request", is_lasting=False).start()
 
     def _serve(self, query: Query) -> None:
         try:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import queue
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
@@ -21,6 +20,7 @@ from zsched.core.events import ProblemReported, SlotDrained, SlotFlipped, SlotRe
 from zsched.core.model import TaskId
 from zsched.core.plan import Direction, ReadyWhen, Route, RoutePhase, RoutePlan, Slot, StreamClass, StreamCount
 from zsched.core.relay_protocol import RelayReport, SlotLost
+from zsched.guard import guarded
 from zsched.relay.acks import Acks
 from zsched.relay.graph import GraphMirror
 from zsched.relay.inputs import InputStream
@@ -87,7 +87,7 @@ class TaskRelay:
         self._flip_by: float | None = None
         self._is_inherited = False
         """What we carry is the work of a daemon that is gone; the next one may not know of an older slot."""
-        threading.Thread(target=self._run, name=f"task {task}", daemon=True).start()
+        guarded(self._run, name=f"task {task}").start()
 
     def apply(self, plan: RoutePlan) -> None:
         """Take the newest plan."""
@@ -324,7 +324,7 @@ class TaskRelay:
         self._report(SlotFlipped(task=self._task, epoch=epoch, replayed=replayed))
         olds = [old for old in self._slots if old < epoch]
         if olds:  # a stalled old owner may hold these up for a lease: not in this thread
-            threading.Thread(target=self._send_ends, args=(olds,), name="ends", daemon=True).start()
+            guarded(self._send_ends, olds, name="ends", is_lasting=False).start()
 
     def _send_ends(self, epochs: list[int]) -> None:
         for epoch in epochs:

@@ -8,7 +8,6 @@ sees the token has also learnt of the subscriptions. (Zenoh's "matching" alone i
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
 
 import zenoh
@@ -17,6 +16,7 @@ from zenoh import Sample, SampleKind, Session
 from zsched.core.events import RoleEnded
 from zsched.core.model import NodeId, TaskId
 from zsched.core.relay_protocol import WorkerSeen
+from zsched.guard import guarded
 from zsched.keyspace import Keyspace, parse
 
 WORKER = "worker"
@@ -42,7 +42,7 @@ class Tokens:
         # one watch for both kinds: a waiting receiver costs ten wake-ups a second
         selector = keyspace.worker("*", "*", "*").replace(f"/{WORKER}/", "/*/")
         self._watch = session.liveliness().declare_subscriber(selector, zenoh.handlers.FifoChannel(1024), history=True)
-        threading.Thread(target=self._run, args=(self._watch.handler,), name="tokens", daemon=True).start()
+        guarded(self._run, self._watch.handler, name="tokens").start()
 
     def workers(self, node: NodeId, task: TaskId) -> frozenset[str]:
         """The tokens of the node's workers for the task: one, or two while one restarts."""

@@ -20,6 +20,7 @@ from enum import StrEnum
 from typing import Any, Protocol
 
 from zsched.core.model import NAME
+from zsched.guard import guarded
 from zsched.tasks.map_merge.cdr import CdrError, StampedTransform, decode_grid, encode_grid, encode_transforms
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid
@@ -52,7 +53,7 @@ class Output(StrEnum):
 
 
 def _in_thread(work: Callable[[], None]) -> None:
-    threading.Thread(target=work, name="map search", daemon=True).start()  # daemon: it must not delay the exit
+    guarded(work, name="map search", is_lasting=False).start()  # daemon: it must not delay the exit
 
 
 def _outcome(job: SearchJob) -> Estimate | None:

@@ -1,0 +1,178 @@
+"""Threads that fail are told, counted and begin again; no line is logged without limit."""
+
+from __future__ import annotations
+
+import ast
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+import zsched
+from zsched import guard
+from zsched.guard import MAX_PAUSE_S, guarded
+from zsched.log_limit import LIBRARY, MAX_PLACES, LogLimit, limit_library
+from zsched.log_limit import LIMIT as SHARED
+
+PACKAGE = Path(zsched.__file__).parent
+
+
+@pytest.fixture
+def told() -> Iterator[list[tuple[str, str]]]:
+    """What the guard tells of this test's threads."""
+    heard: list[tuple[str, str]] = []
+    before = tuple(guard._listeners)
+    guard.on_failure(lambda kind, text: heard.append((kind, text)))
+    yield heard
+    guard._listeners[:] = before
+    guard.failures.clear()
+
+
+def wait(condition: Callable[[], bool], timeout_s: float = 10.0) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def test_every_thread_is_started_by_the_guard() -> None:
+    """Whoever makes a thread by hand makes one that may end in silence."""
+    makers = {"Thread", "Timer", "start_new_thread"}
+    found = []
+    for path in sorted(PACKAGE.rglob("*.py")):
+        if path.name == "guard.py":
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            name = node.func if isinstance(node, ast.Call) else None
+            called = name.attr if isinstance(name, ast.Attribute) else name.id if isinstance(name, ast.Name) else ""
+            if called in makers:
+                found.append(f"{path.relative_to(PACKAGE)}:{node.lineno}")
+    assert found == []
+
+
+def test_a_lasting_thread_that_fails_is_told_and_begins_again(told: list[tuple[str, str]]) -> None:
+    calls: list[int] = []
+
+    def run(number: int) -> None:
+        calls.append(number)
+        if len(calls) < 3:
+            raise KeyError("a bug")
+
+    thread = guarded(run, 7, name="one of many", kind="many")
+    thread.start()
+    thread.join(10)
+    assert not thread.is_alive()
+    assert calls == [7, 7, 7]
+    assert guard.failures["many"] == 2
+    assert told == [
+        ("many", "a thread failed (1 times), last with KeyError: 'a bug'"),
+        ("many", "a thread failed (2 times), last with KeyError: 'a bug'"),
+    ]
+
+
+def test_an_errand_that_fails_is_told_and_ends(told: list[tuple[str, str]]) -> None:
+    def run() -> None:
+        raise ValueError("no")
+
+    thread = guarded(run, name="errand", is_lasting=False)
+    thread.start()
+    thread.join(10)
+    assert not thread.is_alive()
+    assert [kind for kind, _ in told] == ["errand"]
+
+
+def test_a_thread_that_fails_at_once_does_not_spin(told: list[tuple[str, str]]) -> None:
+    stop = threading.Event()
+
+    def run() -> None:
+        if not stop.is_set():
+            raise ValueError("no")
+
+    thread = guarded(run, name="spinning")
+    thread.start()
+    time.sleep(0.5)
+    assert 1 <= len(told) <= 4
+    stop.set()
+    thread.join(MAX_PAUSE_S + 5)
+    assert not thread.is_alive()
+
+
+def test_a_listener_that_fails_itself_changes_nothing(told: list[tuple[str, str]]) -> None:
+    def bad(_kind: str, _text: str) -> None:
+        raise OSError("no")
+
+    guard.on_failure(bad)
+    guard.note("x", ValueError("y"))
+    assert guard.failures["x"] == 1
+    assert told == []
+
+
+# --- log lines -------------------------------------------------------------------------------------------------------
+
+
+class Lines(logging.Handler):
+    """Keeps what is logged."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lines: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.lines.append(record.getMessage())
+
+
+def logger_with(limit: LogLimit, name: str) -> tuple[logging.Logger, Lines]:
+    log, lines = logging.getLogger(name), Lines()
+    log.propagate = False
+    log.setLevel(logging.INFO)
+    lines.addFilter(limit)
+    log.handlers = [lines]
+    return log, lines
+
+
+def test_a_line_that_repeats_is_cut_and_the_rest_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr("zsched.log_limit.monotonic_s", lambda: now[0])
+    log, lines = logger_with(LogLimit(burst=3.0, rate_hz=1.0), "zsched.test.repeats")
+
+    def storm(count: int) -> None:
+        for number in range(count):
+            log.info("sample %d", number)
+
+    storm(1000)
+    assert lines.lines == ["sample 0", "sample 1", "sample 2"]
+    log.info("another place is not held up")
+    now[0] += 1.0
+    storm(10)
+    assert lines.lines[3:] == ["another place is not held up", "sample 0 [997 more from here were left out]"]
+
+
+def test_what_is_remembered_of_places_is_bounded() -> None:
+    limit = LogLimit()
+    for number in range(3 * MAX_PLACES):
+        limit.filter(logging.LogRecord("x", logging.INFO, f"file{number}", 1, "m", None, None))
+    assert len(limit._places) == MAX_PLACES
+
+
+def test_the_library_s_loggers_are_limited() -> None:
+    """Every logger that a worker's process can reach, for its handlers are not ours."""
+    limit_library()
+    assert all(SHARED in logging.getLogger(name).filters for name in LIBRARY)
+    names = set()
+    for path in (*PACKAGE.glob("worker*.py"), *(PACKAGE / f"{one}.py" for one in ("hop_acks", "send_queue", "guard"))):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "getLogger":
+                names |= {one.value for one in node.args if isinstance(one, ast.Constant)}
+    assert names <= set(LIBRARY)
+
+
+def test_a_record_that_passes_two_filters_is_counted_once() -> None:
+    limit = LogLimit(burst=2.0, rate_hz=0.0)
+    log, lines = logger_with(limit, "zsched.test.twice")
+    log.addFilter(limit)
+    for _ in range(5):
+        log.info("m")
+    assert len(lines.lines) == 2

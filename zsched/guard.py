@@ -1,0 +1,80 @@
+"""Every thread of zsched is started through here: none ends in silence.
+
+Knows: what happens when a thread's function raises. Does not know: what threads do.
+
+An exception is logged with its stack, counted under the thread's name, and told to whom `on_failure` names (the daemon
+and the relay show it in `status`). A thread that serves as long as its process lives (``is_lasting``) then begins
+again, after a pause that doubles while it keeps failing; one that has a single errand ends.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Final
+
+from zsched.clock import monotonic_s
+
+PAUSE_S: Final = 0.1
+MAX_PAUSE_S: Final = 5.0
+CALM_S: Final = 60.0
+"""Who has run for so long fails for the first time again."""
+
+_log = logging.getLogger("zsched.guard")
+
+failures: Counter[str] = Counter()
+"""{kind of thread: how often one has failed} of this process."""
+_listeners: list[Callable[[str, str], None]] = []
+
+
+def on_failure(listener: Callable[[str, str], None]) -> None:
+    """Have ``listener(kind, text)`` called, in the failing thread, whenever a thread of this process fails."""
+    _listeners[:] = [listener]
+
+
+def guarded(
+    run: Callable[..., object], *args: Any, name: str, kind: str = "", is_lasting: bool = True
+) -> threading.Thread:
+    """A thread for ``run(*args)``, not started yet; it does not keep the process alive.
+
+    Args:
+        run: its function.
+        args: for it.
+        name: of the thread.
+        kind: what failures are counted under, where ``name`` holds a key or a task.
+        is_lasting: ``run`` returns only when it is meant to end, and may be called again when it has raised.
+    """
+    return threading.Thread(target=_run, args=(partial(run, *args), kind or name, is_lasting), name=name, daemon=True)
+
+
+def _run(run: Callable[[], object], kind: str, is_lasting: bool) -> None:
+    pause_s = PAUSE_S
+    while True:
+        began_at = monotonic_s()
+        try:
+            run()
+        except Exception as error:  # noqa: BLE001 - whatever it is, it must not end in silence
+            note(kind, error)
+        else:
+            return
+        if not is_lasting:
+            return
+        if monotonic_s() - began_at > CALM_S:
+            pause_s = PAUSE_S
+        threading.Event().wait(pause_s)
+        pause_s = min(2 * pause_s, MAX_PAUSE_S)
+
+
+def note(kind: str, error: Exception) -> None:
+    """Log, count and tell that something in a thread has failed."""
+    failures[kind] += 1
+    _log.error("thread %s failed (%d times so far)", kind, failures[kind], exc_info=error)
+    text = f"a thread failed ({failures[kind]} times), last with {type(error).__name__}: {error}"[:400]
+    for listener in _listeners:
+        try:
+            listener(kind, text)
+        except Exception:  # noqa: BLE001 - who tells must not make it worse
+            _log.exception("a failure could not be told")
