@@ -46,7 +46,9 @@ def test_every_thread_is_started_by_the_guard() -> None:
         if path.name == "guard.py":
             continue
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            name = node.func if isinstance(node, ast.Call) else None
+            if not isinstance(node, ast.Call):
+                continue
+            name = node.func
             called = name.attr if isinstance(name, ast.Attribute) else name.id if isinstance(name, ast.Name) else ""
             if called in makers:
                 found.append(f"{path.relative_to(PACKAGE)}:{node.lineno}")
