@@ -329,7 +329,11 @@ TASK: Final = Record(
         "services": Field(ListOf(SERVICE), "Requests of the robots' applications that the owner's worker answers."),
         "ros2": Field(ros2_record(RULE, SERVICE), "The same three by ROS 2 names; they become rules like the others."),
         "on_isolation": Field(Choice.of(OnIsolation), "What a robot does that is cut off from the owner."),
-        "exclusive": Field(Flag(), "The work must never run twice; needs `{epoch}` in every output's `from`."),
+        "exclusive": Field(
+            Flag(),
+            "The work must never run twice; needs `{epoch}` in every output's `from`. "
+            "A task that has worked without it rests until all its candidates have answered by this file.",
+        ),
         "drain_s": Field(Number(0, 600, "s"), "How long the old owner may finish what it has in work."),
     },
     TaskSpec,

@@ -13,7 +13,7 @@ from zsched.adapters.control_bus import ask_fleet
 from zsched.adapters.state_file import StateFile, hardware_id
 from zsched.clock import wall_tenths
 from zsched.core.fleet import Fleet, dial_endpoint, electorate_hash
-from zsched.core.model import NO_BALLOT, Acceptance, Allocation, DurableState, NodeId, RegisterState
+from zsched.core.model import NO_BALLOT, Acceptance, DurableState, NodeId, RegisterState
 from zsched.errors import AdapterError
 
 GENERATION_STEP = 2**32
@@ -30,11 +30,7 @@ def init_state(fleet: Fleet, node: NodeId, folder: Path, generation: int) -> Pat
         AdapterError: there is a state already, or the folder cannot be written.
     """
     start = generation * GENERATION_STEP
-    values = [
-        Allocation(task=task.name, revision=start, epoch=start, owner=None, tuning=task.tuning)
-        for task in fleet.tasks
-        if generation > 0
-    ]
+    values = [task.first_value(start) for task in fleet.tasks if generation > 0]
     # Accepted everywhere, too: a majority that had learnt a value and accepted none would count as one that forgot.
     registers = tuple(
         RegisterState(task=value.task, accepted=Acceptance(ballot=NO_BALLOT, value=value), learnt=value)

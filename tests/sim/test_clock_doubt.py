@@ -11,7 +11,7 @@ from zsched.core.clocks import DOUBT_S, JUMP_S, ClockDoubt
 from zsched.core.events import ClockCompared
 from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
 from zsched.core.lease import RHO, Leases, hold_s
-from zsched.core.model import Beat, Grant, NodeKind, Tuning, Weights, WorkerState
+from zsched.core.model import Allocation, Beat, Grant, NodeKind, Tuning, Weights, WorkerState
 from zsched.core.plan import WorkerRole
 from zsched.lab.sim_clocks import LOOK_S, slew
 from zsched.lab.simulator import Simulator
@@ -116,18 +116,23 @@ def beat(node: str, number: int, echoes: tuple[Grant, ...] = (), terms: str = ""
     )
 
 
+OF_EDGE1 = Allocation(
+    task="guard", revision=7, epoch=3, owner="edge1", tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
+)
+
+
 def test_an_elector_in_doubt_grants_nothing_and_afterwards_begins_as_after_a_start() -> None:
     leases = Leases(fleet=fleet("edge1", "edge2"), me="robot1", incarnation=1, standing={"guard": None}, now=0.0)
     accepted = {"guard": ("edge1", 3)}
     assert leases.on_beat(beat("edge1", 5), accepted, 10.0)
     assert leases.on_sent(1, 10.0).echoes
-    leases.doubt({"guard": "edge1"})
+    leases.doubt({"guard": OF_EDGE1})
     leases.on_beat(beat("edge1", 6), accepted, 10.1)
     assert leases.on_sent(2, 10.1).echoes == ()
     assert leases.may_accept("guard", "edge1", 10.2)
     assert not leases.may_accept("guard", "edge2", 1e6)
     assert leases.next_deadline(10.2) == math.inf
-    leases.trust({"guard": "edge1"}, 2, 20.0)
+    leases.trust({"guard": OF_EDGE1}, 2, 20.0)
     leases.on_beat(beat("edge1", 7), accepted, 20.1)
     assert leases.on_sent(3, 20.1).echoes == ()
     assert not leases.may_accept("guard", "edge2", 20.0 + hold_s(1.0) - 0.001)

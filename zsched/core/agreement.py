@@ -110,7 +110,7 @@ class Agreement:
                 electors=fleet.electors,
                 electorate=electorate,
                 is_elector=self.is_elector,
-                initial=Allocation(task=task.name, revision=start, epoch=start, owner=None, tuning=task.tuning),
+                initial=task.first_value(start),
                 state=stored.get(task.name, RegisterState(task=task.name)),
                 ballot_s=fleet.timing.ballot_s,
                 stagger_s=fleet.timing.stagger_s,
@@ -129,6 +129,7 @@ class Agreement:
             incarnation=incarnation,
             standing=self.standing() if self.is_elector else {},
             now=now,
+            granted_s=0.0 if durable is None else durable.lease_s,
         )
         self._parked: dict[tuple[TaskId, NodeId], tuple[ev.AcceptAsked, float]] = {}
         self._seen: list[RegisterState] = []
@@ -154,7 +155,7 @@ class Agreement:
         self._accepted = {
             name: (value.owner, value.epoch)
             for name, value in newest.items()
-            if value is not None and value.owner is not None
+            if value is not None and value.owner is not None and value.leased
         }
 
     def learnt(self) -> Learnt:
@@ -170,7 +171,7 @@ class Agreement:
         return min(due, *(deadline for _, deadline in self._parked.values())) if self._parked else due
 
     def accepted(self) -> Mapping[TaskId, tuple[NodeId, int]]:
-        """{task: (owner, epoch)} that this elector echoes: of the newest value that it has accepted or learnt.
+        """{leased task: (owner, epoch)} that this elector echoes: of the newest value that it has accepted or learnt.
 
         Learnt counts too: what was committed without this elector would else never be echoed by it, and with another
         elector away no majority could be. An accepted value that is newer than what is learnt comes first, so nobody
@@ -179,11 +180,11 @@ class Agreement:
         self._look()
         return self._accepted
 
-    def standing(self) -> dict[TaskId, NodeId | None]:
-        """{task: whom this elector may have echoed}: nobody else is accepted while it does not know when."""
-        return {name: _owner(register) for name, register in self.registers.items()}
+    def standing(self) -> dict[TaskId, Allocation | None]:
+        """{task: the newest value here}: an elector that does not know when it granted accepts its owner only."""
+        return {name: _newest(register) for name, register in self.registers.items()}
 
-    def to_persist(self) -> DurableState | None:
+    def to_persist(self, now: float) -> DurableState | None:
         """The state to write now, or ``None`` when this node keeps none."""
         if self._durable is None:
             return None
@@ -193,8 +194,14 @@ class Agreement:
             registers=(*states, *self._foreign),
             voted=tuple(sorted(self.voted)),
             disputed=self._disputed,
+            lease_s=self.leases.to_remember_s(now),
         )
         return self._durable
+
+    @property
+    def must_persist(self) -> bool:
+        """Whether the state file must say something before this node's first answer."""
+        return self._durable is not None and self.leases.is_news(self._durable.lease_s)
 
     @property
     def has_voted(self) -> bool:
@@ -252,7 +259,8 @@ class Agreement:
             known = _newest(register)
             step, answer = register.on_accept(accept, now)
             if step.is_dirty and (known is None or accept.acceptance.value.revision > known.revision):
-                self.leases.on_newer_value(accept.task)  # an identity round's is none: the next owner may still wait
+                # An identity round's is none: the next owner may still wait.
+                self.leases.on_newer_value(accept.acceptance.value)
             effects.is_dirty |= step.is_dirty
             effects.send.append(do.AnswerElection(request=event.request, answer=answer))
         elif now >= deadline:
@@ -318,7 +326,7 @@ class Agreement:
             elif is_proven(self._fleet, learnt, value, register, has_generation=self.generation is not None):
                 step = register.learn(value, now)
                 if step.learnt is not None:
-                    self.leases.on_newer_value(value.task)
+                    self.leases.on_newer_value(value)
                 self._take(value.task, step, effects)
             elif value.revision > register.value.revision:
                 self._read(value.task, register, effects, now)
@@ -450,13 +458,13 @@ class Agreement:
         value = self.registers[task].value
         reason = ""
         if outcome is RoundOutcome.COMMITTED:
-            reason = change.reason if isinstance(change, MoveOwner) else "retuned by an operator"
+            reason = _why(change)
             effects.send.append(do.PublishLearnt(learnt=self.learnt()))
         if isinstance(change, MoveOwner):
             effects.ended.append(task)
             text = f"move to {change.owner} on revision {change.base_revision}: {outcome}"
             effects.send.append(do.RecordStory(stage="vote", text=text, task=task, epoch=value.epoch))
-        elif change.request is not None:
+        elif isinstance(change, Retune) and change.request is not None:
             kind, detail = _RETUNED[outcome]
             result = CommandResult(outcome=kind, detail=f"{task}: {detail}", revision=value.revision)
             effects.send.append(do.AnswerCommand(request=change.request, result=result))
@@ -476,7 +484,9 @@ def _newest(register: Register) -> Allocation | None:
     return accepted.value if learnt is None or accepted.value.revision > learnt.revision else learnt
 
 
-def _owner(register: Register) -> NodeId | None:
-    """Whom this elector may have echoed in its life before: nobody else is accepted at its start."""
-    value = _newest(register)
-    return None if value is None else value.owner
+def _why(change: Change) -> str:
+    if isinstance(change, MoveOwner):
+        return change.reason
+    if isinstance(change, Retune):
+        return "retuned by an operator"
+    return "nobody works without a lease any more" if change.leased else "not exclusive any more"

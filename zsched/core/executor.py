@@ -65,8 +65,12 @@ class Executor:
     epoch: int = 0
     owner: NodeId | None = None
     role: Role = field(init=False)
+    is_leased: bool = False
+    """The worker here may work only under a lease: the task is exclusive by this node's file, or for everybody."""
     is_local: bool = False
     """Cut off from the owner and from a quorum, this robot works alone; its output is degraded."""
+    _unleased_epoch: int | None = None
+    """In which epoch the worker here was let work without a lease; ``None`` once it has said that it ended that."""
     _is_owner_gone: bool = False
     """The owner went during its epoch: its worker's state is not asked for."""
     _current: Slot | None = None
@@ -77,6 +81,7 @@ class Executor:
 
     def __post_init__(self) -> None:
         self.role = Role(task=self.spec.name, role=WorkerRole.IDLE)
+        self.is_leased = self.spec.exclusive
 
     @property
     def runs_worker(self) -> bool:
@@ -118,8 +123,11 @@ class Executor:
 
     def execute(self, allocation: Allocation, now: float) -> tuple[Instruction, ...]:
         """A learnt allocation: act if its epoch is newer than what is carried out."""
-        if allocation.owner is None or allocation.epoch <= self.epoch:
+        if allocation.owner is None or allocation.epoch < self.epoch:
             return ()
+        was_leased, self.is_leased = self.is_leased, self.spec.exclusive or allocation.leased
+        if allocation.epoch == self.epoch:
+            return () if self.is_leased is was_leased else self._change_terms()
         back = self._end_local()  # the local slot closes before a committed owner's opens
         before = None if self._is_owner_gone else self.owner
         self.epoch, self.owner, self.started_at, self._is_owner_gone = allocation.epoch, allocation.owner, now, False
@@ -131,18 +139,20 @@ class Executor:
         if allocation.owner == self.me:
             self._role_deadline = math.inf
             # An exclusive task's worker may run at once, but works only from its first lease on.
-            lease = 0.0 if self.spec.exclusive else None
-            self.role = Role(
-                task=self.spec.name,
-                role=WorkerRole.ACTIVE,
-                epoch=allocation.epoch,
-                lease_until_s=lease,
-                predecessor=None if before == self.me else before,
+            lease = 0.0 if self.is_leased else None
+            told = self._become(
+                Role(
+                    task=self.spec.name,
+                    role=WorkerRole.ACTIVE,
+                    epoch=allocation.epoch,
+                    lease_until_s=lease,
+                    predecessor=None if before == self.me else before,
+                )
             )
-            return (*self._wake_worker(), SetRole(role=self.role))
+            return (*self._wake_worker(), told)
         if self.role.role is not WorkerRole.ACTIVE:
             return ()
-        if self.spec.exclusive:
+        if self.is_leased:
             # Whoever owns it now may be working already: nothing of the old epoch may leave any more.
             self._role_deadline = now
             return self.leave()
@@ -150,20 +160,54 @@ class Executor:
         # A cold new owner only starts its worker now, and the robots stay here until it is ready.
         starts_s = worker.start_deadline_s if worker.standby is Standby.COLD else 0.0
         self._role_deadline = now + starts_s + self.spec.drain_s + ROLE_DRAIN_MARGIN_S
-        self.role = Role(task=self.spec.name, role=WorkerRole.DRAINING, epoch=self.role.epoch)
-        return (SetRole(role=self.role),)
+        return (self._become(Role(task=self.spec.name, role=WorkerRole.DRAINING, epoch=self.role.epoch)),)
+
+    def _become(self, role: Role) -> SetRole:
+        """Another role; one that lets the worker work without a lease is remembered until it has stopped."""
+        self.role = role
+        if role.role is WorkerRole.ACTIVE and role.lease_until_s is None:
+            self._unleased_epoch = role.epoch
+        return SetRole(role=role)
+
+    def _change_terms(self) -> tuple[Instruction, ...]:
+        """The owner stays, and its worker needs a lease from now on, or none any more."""
+        if self.is_local and self.is_leased:
+            return self.rejoin()
+        if self.owner != self.me or not self.runs_worker:
+            return ()
+        if self.is_leased:
+            return self.leave()  # it works again with its first lease
+        told = self._become(Role(task=self.spec.name, role=WorkerRole.ACTIVE, epoch=self.epoch))
+        return (*self._wake_worker(), told)
+
+    def on_role_ended(self, epoch: int) -> None:
+        """The worker says that it has left ``epoch``: believed once it was told to."""
+        if epoch == self._unleased_epoch and self.role.role is not WorkerRole.ACTIVE:
+            self._unleased_epoch = None
+
+    def on_worker_ended(self) -> None:
+        """The worker's process is no more: what it was told before is over."""
+        if self.role.role is not WorkerRole.ACTIVE:
+            self._unleased_epoch = None
+
+    @property
+    def may_work_unleased(self) -> bool:
+        """Whether the worker here may be working without a lease: it may, or has not said that it has stopped."""
+        is_let = self.role.role is not WorkerRole.IDLE and self.role.lease_until_s is None
+        return is_let or self._unleased_epoch is not None
 
     def isolate(self) -> tuple[Instruction, ...]:
         """Nobody can be asked and the owner is not heard: this robot's own worker serves its own streams."""
-        can = self.has_streams and self.spec.on_isolation is OnIsolation.LOCAL and self.epoch > 0
+        may_work = self.spec.on_isolation is OnIsolation.LOCAL and not self.is_leased
+        can = self.has_streams and may_work and self.epoch > 0
         if self.is_local or not can or self.owner == self.me:
             return ()
         self.is_local, self._predecessor = True, None
         self._drain_deadline = self._role_deadline = math.inf
-        self.role = Role(task=self.spec.name, role=WorkerRole.ACTIVE, epoch=self.epoch)
+        role = self._become(Role(task=self.spec.name, role=WorkerRole.ACTIVE, epoch=self.epoch))
         self._current = slot_for(self.spec, self.me, self.me, self.epoch)
         plan = self._go(Phase.PREPARING, RoutePhase.PREPARE, f"cut off from {self.owner}: works alone (degraded)")
-        return (*self._wake_worker(), SetRole(role=self.role), *plan)
+        return (*self._wake_worker(), role, *plan)
 
     def rejoin(self) -> tuple[Instruction, ...]:
         """The committed owner is heard again: back to its slot."""

@@ -14,7 +14,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
 from functools import lru_cache
 
-from zsched.core.model import LinkSource, NodeId, NodeKind, TaskId, Tuning, check_range
+from zsched.core.model import Allocation, LinkSource, NodeId, NodeKind, TaskId, Tuning, check_range
 from zsched.core.plan import Direction, ReadyWhen, ServiceSettings, StreamSettings
 
 DEFAULT_PATIENCE = 0.4
@@ -197,6 +197,12 @@ class TaskSpec:
     worker: WorkerSpec = WorkerSpec()
     rules: tuple[StreamRule, ...] = ()
 
+    def first_value(self, start: int) -> Allocation:
+        """What a generation begins with, by this file: nobody has ever worked at the task."""
+        return Allocation(
+            task=self.name, revision=start, epoch=start, owner=None, tuning=self.tuning, leased=self.exclusive
+        )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Timing:
@@ -308,12 +314,12 @@ def electorate_hash(fleet: Fleet) -> str:
 
 
 def lease_terms(fleet: Fleet) -> str:
-    """16 hex digits over all that a lease of an exclusive task hangs on: the electors and its length.
+    """16 hex digits over all that a lease of an exclusive task hangs on and files may say: the electors and its length.
 
     A majority of other electors need not meet the majority that has granted, and an elector that waits for a shorter
-    lease than the owner counts on waits for nothing.
+    lease than the owner counts on waits for nothing. Which tasks are leased is agreed (`Allocation.leased`).
     """
-    return _digest("lease", (fleet.name, fleet.electors, fleet.timing.lease_s))
+    return _digest("lease/2", (fleet.name, fleet.electors, fleet.timing.lease_s))
 
 
 def _digest(kind: str, value: object) -> str:

@@ -8,6 +8,8 @@ L is the lease, rho the bound on how far two clocks' rates differ. Nobody compar
   last *accepted*; the echo is the grant.
 * The owner is active only while a majority has echoed a number that it sent *after learning this epoch*; the lease ends
   L after the *sending* of the largest number that a majority has echoed or exceeded.
+* Only a task that is *leased* for everybody (`Allocation.leased`, `zsched.core.sealing`) is granted.
+* An elector never grants to two owners, or two lives of one, at once: to another only after the hold, or a release.
 * An elector that granted refuses an accept for another owner until L(1+rho)/(1-rho) after its last grant on its own
   clock, or until the owner released; one that has just started refuses every owner but that of its own persisted
   accepted value for as long, and echoes nobody: that owner's life may be another one than it granted to before.
@@ -32,7 +34,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from zsched.core.fleet import Fleet, lease_terms
-from zsched.core.model import Beat, Grant, NodeId, TaskId
+from zsched.core.model import Allocation, Beat, Grant, NodeId, TaskId
 from zsched.core.scoring import majority
 
 RHO = 1e-3
@@ -58,13 +60,13 @@ class Granter:
     Args:
         task: the task.
         lease_s: L.
-        started_at: when this elector started (monotonic seconds).
+        until: until when what this elector granted before it started may last (monotonic seconds).
         standing: owner of the persisted accepted value at the start (``None``: there was none).
     """
 
     task: TaskId
     lease_s: float
-    started_at: float
+    until: float
     standing: NodeId | None
     _last: Grant | None = None
     _granted_at: float = -math.inf
@@ -92,7 +94,7 @@ class Granter:
             return False
         if beat.sequence <= self._released.get((beat.node, beat.incarnation), -1):
             return False
-        if self._is_other_life(beat, now):
+        if self._is_held(beat, now):
             return False
         is_new = self._last is None or (self._last.owner, self._last.incarnation, self._last.epoch) != (
             beat.node,
@@ -107,12 +109,12 @@ class Granter:
         self._granted_at = now
         return is_new
 
-    def _is_other_life(self, beat: Beat, now: float) -> bool:
-        """Whether an earlier life of the same owner may still hold our grant: its worker might outlive it."""
+    def _is_held(self, beat: Beat, now: float) -> bool:
+        """Whether another owner, or an earlier life of this one, may still hold our grant."""
         last = self._last
-        if now < self.started_at + hold_s(self.lease_s):
+        if now < self.until:
             return True  # what this elector granted before it started is forgotten, and to whom
-        if last is None or last.owner != beat.node or last.incarnation == beat.incarnation:
+        if last is None or (last.owner, last.incarnation) == (beat.node, beat.incarnation):
             return False
         return now < self._granted_at + hold_s(self.lease_s)
 
@@ -126,16 +128,16 @@ class Granter:
     def _is_silenced(self, owner: NodeId, epoch: int, now: float) -> bool:
         return self._silent_for == (owner, epoch) and now < self._silent_until
 
-    def restart(self, standing: NodeId | None, started_at: float) -> None:
+    def restart(self, standing: Allocation | None, until: float) -> None:
         """It is not known when this elector granted, only to whom: as after a start."""
-        self.standing, self.started_at = standing, started_at
+        self.standing, self.until = None if standing is None else standing.owner, until
         self._last, self._granted_at = None, -math.inf
         self.on_newer_value()
 
     def may_accept(self, owner: NodeId | None, now: float) -> bool:
         """Whether a value with this owner may be accepted now; a no begins the silence towards the present owner."""
         hold = hold_s(self.lease_s)
-        if now < self.started_at + hold and owner != self.standing:
+        if now < self.until and owner != self.standing:
             return False
         last = self._last
         if last is None or last.owner == owner or now >= self._granted_at + hold:
@@ -164,9 +166,8 @@ class Granter:
 
     def next_deadline(self, now: float) -> float:
         """When `may_accept` may change its mind; infinity when never."""
-        hold = hold_s(self.lease_s)
-        start, grant = self.started_at + hold, self._granted_at + hold
-        return min(start if start > now else math.inf, grant if grant > now else math.inf)
+        grant = self._granted_at + hold_s(self.lease_s)
+        return min(self.until if self.until > now else math.inf, grant if grant > now else math.inf)
 
 
 @dataclass(slots=True)
@@ -258,15 +259,17 @@ class Leases:
         fleet: the fleet file.
         me: this node.
         incarnation: of this daemon.
-        standing: {task: owner of the persisted accepted value, or ``None``}; empty when this node is no elector.
+        standing: {task: the newest persisted value, or ``None``}; empty when this node is no elector.
         now: monotonic seconds.
+        granted_s: how long a lease may last that this elector granted in a life before (0: as long as today's).
     """
 
     fleet: Fleet
     me: NodeId
     incarnation: int
-    standing: Mapping[TaskId, NodeId | None]
+    standing: Mapping[TaskId, Allocation | None]
     now: float
+    granted_s: float = 0.0
     terms: str = field(init=False)
     is_unsure: bool = False
     """How long anything takes on this node's clock is not known: it holds and grants nothing."""
@@ -277,31 +280,36 @@ class Leases:
     _releases: dict[TaskId, Grant] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        lease_s = self.fleet.timing.lease_s
-        self.terms = lease_terms(self.fleet) if any(task.exclusive for task in self.fleet.tasks) else ""
-        self._granters = {
-            task.name: Granter(task=task.name, lease_s=lease_s, started_at=self.now, standing=self.standing[task.name])
-            for task in self.fleet.tasks
-            if task.exclusive and task.name in self.standing
-        }
+        self.terms = lease_terms(self.fleet)
+        self._granters = {}
+        until = self.now + hold_s(max(self.fleet.timing.lease_s, self.granted_s))
+        for task in self.fleet.tasks:
+            value = self.standing.get(task.name)
+            is_leased = task.exclusive or (value is not None and value.leased)
+            if is_leased and task.name in self.standing:
+                self._watch(task.name, None if value is None else value.owner, until)
+
+    def _watch(self, task: TaskId, standing: NodeId | None, until: float) -> None:
+        self._granters[task] = Granter(task=task, lease_s=self.fleet.timing.lease_s, until=until, standing=standing)
 
     @property
     def terms_told(self) -> str:
         """What this node's beats say that its leases hang on; not the others' terms while it is unsure."""
         return f"{self.terms}, clock in doubt" if self.is_unsure and self.terms else self.terms
 
-    def doubt(self, standing: Mapping[TaskId, NodeId | None]) -> None:
+    def doubt(self, standing: Mapping[TaskId, Allocation | None]) -> None:
         """The clock's rate is in doubt: hold and grant nothing from now on."""
         self.is_unsure = True
         for task, granter in self._granters.items():
             granter.restart(standing[task], math.inf)
 
-    def trust(self, standing: Mapping[TaskId, NodeId | None], number: int, now: float) -> None:
+    def trust(self, standing: Mapping[TaskId, Allocation | None], number: int, now: float) -> None:
         """The clock runs right again: begin anew, with beats behind ``number``."""
         self.is_unsure = False
         for task, granter in self._granters.items():
-            granter.restart(standing[task], now)
-        for task, holder in tuple(self._holders.items()):
+            granter.restart(standing[task], now + hold_s(self.fleet.timing.lease_s))
+        for task in tuple(self._holders):
+            holder = self._holders.pop(task)
             self.begin(task, holder.epoch, number + 1)
             # The worker was told to stop: its word may still come, and until then it may be at work.
             self._holders[task].is_doubtful, self._holders[task].given_until = True, holder.given_until
@@ -313,19 +321,34 @@ class Leases:
         granter = self._granters.get(task)
         return granter is None or granter.may_accept(owner, now)
 
-    def on_newer_value(self, task: TaskId) -> None:
+    def on_newer_value(self, value: Allocation) -> None:
         """A newer revision was accepted or learnt."""
-        if task in self._granters:
-            self._granters[task].on_newer_value()
+        if value.task in self._granters:
+            self._granters[value.task].on_newer_value()
+        elif value.leased and value.task in self.standing:
+            # Not leased until now: nothing was granted.
+            self._watch(value.task, None, math.inf if self.is_unsure else -math.inf)
+
+    def is_news(self, remembered_s: float) -> bool:
+        """Whether this elector may grant for longer than its state file says: it must be there before the first one."""
+        return bool(self._granters) and remembered_s < self.fleet.timing.lease_s
+
+    def to_remember_s(self, now: float) -> float:
+        """How long a lease may last that this elector has granted, or its life before: for its next life."""
+        own_s = self.fleet.timing.lease_s
+        return own_s if now >= self.now + hold_s(self.granted_s) else max(own_s, self.granted_s)
 
     def stop_granting(self) -> None:
         """This node is no elector any more: what it granted runs out."""
         self._granters.clear()
+        self.standing = {}
 
     # --- owners ------------------------------------------------------------------------------------------------------
 
     def begin(self, task: TaskId, epoch: int, first_number: int) -> None:
         """This node learnt that it owns the task in ``epoch``; ``first_number`` is its next beat's."""
+        if task in self._holders and self._holders[task].epoch == epoch:
+            return
         self._holders[task] = Holder(
             task=task,
             epoch=epoch,
@@ -429,7 +452,7 @@ class Leases:
         is_new = False
         for task, granter in self._granters.items():
             is_new |= granter.on_beat(beat, accepted.get(task), now)
-        if beat.lease_terms in ("", self.terms):
+        if beat.lease_terms == self.terms:
             self._others.pop(beat.node, None)
         else:
             self._others[beat.node] = beat.lease_terms
@@ -444,7 +467,10 @@ class Leases:
 
     def unfit(self) -> dict[NodeId, str]:
         """{node: why it could never hold a lease that counts here}."""
-        return {node: f"goes by other leases ({terms}, here {self.terms})" for node, terms in self._others.items()}
+        return {
+            node: f"goes by other leases ({terms or 'it does not say'}, here {self.terms})"
+            for node, terms in self._others.items()
+        }
 
     def next_deadline(self, now: float) -> float:
         """When an elector may accept what it refused, or a leaving owner's lease ends."""

@@ -109,6 +109,10 @@ class Learnt:
     generation: int = 0
     has_voted: bool = False
     """Whether ``node`` has ever promised anything as an elector."""
+    lease_terms: str = ""
+    """What its leases hang on."""
+    unleased: tuple[TaskId, ...] = ()
+    """Tasks whose worker there may be working without a lease."""
 
     def __post_init__(self) -> None:
         check_name("learnt.node", self.node)

@@ -334,6 +334,8 @@ class Allocation:
     tuning: Tuning
     pinned: bool = False
     paused: bool = False
+    leased: bool = False
+    """The task is exclusive for everybody, whatever their files say: nobody works without a lease any more."""
 
     def __post_init__(self) -> None:
         check_name("allocation.task", self.task)
@@ -395,6 +397,8 @@ class DurableState:
     """Electors that this node has heard to have voted: such a name must not be initialised anew."""
     disputed: str = ""
     """Why this node stands down as elector until the operator settles it; empty: it does not."""
+    lease_s: float = 0.0
+    """How long a lease may last that this elector granted in a life before (its file may have said another length)."""
 
 
 # --- membership ------------------------------------------------------------------------------------------------------
@@ -455,7 +459,7 @@ class Beat:
     generation: int = 0
     """Of this node's state; what nodes of another generation have learnt means nothing here."""
     lease_terms: str = ""
-    """Of a fleet with exclusive tasks: what its leases hang on; an echo under other terms is none."""
+    """What this node's leases hang on; an echo under other terms is none."""
     has_lost_state: bool = False
     """This node is in the electorate and answers no proposer: its state is lost, disputed or cannot be written."""
 

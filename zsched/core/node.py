@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from random import Random
 from typing import Any
 
@@ -44,6 +45,7 @@ from zsched.core.profile import Profiler
 from zsched.core.progress import HangWatch
 from zsched.core.rounds import Rounds
 from zsched.core.scoring import NO_DOUBTS, Doubts
+from zsched.core.sealing import Sealing
 from zsched.core.status import PastValue, build_snapshot
 from zsched.core.tenure import Tenure
 from zsched.core.workers import Workers, failed_workers
@@ -132,6 +134,7 @@ class Node:
         self._introductions = Introductions()
         self._hangs = HangWatch(fleet)
         self._tenure = Tenure(fleet, me, self.agreement.leases, self.executors)
+        self.sealing = Sealing(fleet, me, self.executors, now)
         self._beat_at = self._turn_at = now
         self._beat_sequence = 0
         self.loop_lag_s = 0.0
@@ -143,6 +146,7 @@ class Node:
 
     def start(self, now: float) -> tuple[do.Instruction, ...]:
         """The first batch: warm workers start, and what was learnt before the restart is carried out again."""
+        self._batch.is_dirty = self.agreement.must_persist
         for name, executor in self.executors.items():
             self._batch.add(*executor.start())
             value = self.registers[name].value
@@ -198,7 +202,7 @@ class Node:
         batch, self._batch = self._batch, Batch()
         # A limit that shrank may lie in the past already; that is no lag of this loop.
         self._promised = max(self._next_deadline(now), now)
-        state = self.agreement.to_persist() if batch.is_dirty else None
+        state = self.agreement.to_persist(now) if batch.is_dirty else None
         first: tuple[do.Instruction, ...] = () if state is None else (do.PersistState(state=state),)
         return (*first, *batch.send, *batch.apply)
 
@@ -272,6 +276,7 @@ class Node:
         is_in_turn = self._beat_at == self._turn_at  # whoever has news has brought the next beat forward
         self._beat_at = self._turn_at = now + self.fleet.timing.beat_s
         self._batch.add(do.PublishBeat(beat=beat, is_news=not is_in_turn))
+        self._seal(now)
         self._hear_leases(beat, now)
         if self._introductions.is_due(now, is_missing=self.membership.misses_anybody):
             self._batch.add(do.IntroducePeers())
@@ -294,6 +299,7 @@ class Node:
             self.stateless.add(beat.node)
         elif self.stateless:
             self.stateless.discard(beat.node)
+        self.sealing.hear(beat)
         if beat.fleet_file != self.fleet_file or self.problems:
             self._set_problem(f"fleet/{beat.node}", self._identity.file_complaint(beat))
         self._hear_leases(beat, now)
@@ -338,7 +344,17 @@ class Node:
             self._beat_at = now  # the others must hear whether our echoes count
             self._set_problem("clock", self._tenure.clock.complaint)
 
+    def _seal(self, now: float) -> None:
+        """As an owner: what our file says of exclusive tasks shall hold for everybody."""
+        for task, change in self.sealing.due(self.values(), now):
+            if not self.registers[task].is_busy:
+                self._agree(self.agreement.propose(task, change, now), now)
+        for peer in self.sealing.to_ask(self.values(), now):
+            self._batch.add(do.AskLearnt(peer=peer, deadline_s=self.fleet.timing.ballot_s))
+
     def _on_role_ended(self, event: ev.RoleEnded, now: float) -> None:
+        if event.task in self.executors:
+            self.executors[event.task].on_role_ended(event.epoch)
         if self.agreement.leases.on_stopped(event.task, event.epoch, self._beat_sequence):
             self._beat_at = now
 
@@ -413,7 +429,7 @@ class Node:
 
     def _doubts(self, spec: TaskSpec, now: float) -> Doubts:
         in_grace, unproven = self.membership.in_grace(), self._probation.doubts(spec, now)
-        unfit = self.agreement.leases.unfit() if spec.exclusive else {}
+        unfit = self.agreement.leases.unfit() if self.executors[spec.name].is_leased else {}
         if not in_grace and not unproven and not unfit:
             return NO_DOUBTS
         return Doubts(in_grace=in_grace, unproven=unproven, unfit=unfit)
@@ -461,8 +477,16 @@ class Node:
         for value, reason in effects.learnt:
             self._apply(value, reason, now)
 
+    def _on_learnt(self, event: ev.LearntReceived, now: float) -> None:
+        self._agree(self.agreement.on_learnt(event, now), now)
+        if event.is_answer and self.membership.is_known(event.learnt.node):
+            self.sealing.on_answer(event.learnt)
+
     def _on_learnt_asked(self, event: ev.LearntAsked, _now: float) -> None:
-        self._batch.add(do.AnswerLearnt(request=event.request, learnt=self.agreement.learnt()))
+        learnt = replace(
+            self.agreement.learnt(), lease_terms=self.agreement.leases.terms, unleased=self.sealing.unleased()
+        )
+        self._batch.add(do.AnswerLearnt(request=event.request, learnt=learnt))
 
     def _on_persist_failed(self, event: ev.PersistFailed, _now: float) -> None:
         """The disk refused: routes and workers go on (what was cut off is given again)."""
@@ -485,8 +509,7 @@ class Node:
         text = f"learnt revision {value.revision}: owner {value.owner}, weights {_weights(value.tuning.weights)}"
         self._batch.add(do.RecordStory(stage="vote", text=text, task=task, epoch=value.epoch))
         self._batch.add(*executor.execute(value, now))
-        if is_new_epoch:
-            self._tenure.hold(value, self._beat_sequence + 1)
+        self._tenure.hold(value, self._beat_sequence + 1)
         old = executor.predecessor
         if old is not None and self.membership.state(old) is PeerState.GONE:
             self._batch.add(*executor.on_gone(old))
@@ -510,6 +533,8 @@ class Node:
         was_ready = self.worker_states.get(event.task) is WorkerState.READY
         story = self._workers.on_changed(event)
         if story is not None:
+            if event.state in (WorkerState.STOPPED, WorkerState.FAILED):
+                self.executors[event.task].on_worker_ended()
             if was_ready:
                 self.agreement.leases.on_worker_lost(event.task)
             self._hangs.note_worker(event.task, event.state, now)
@@ -588,7 +613,7 @@ class Node:
             ev.PrepareAsked: lambda event, now: self._agree(self.agreement.on_prepare(event, now), now),
             ev.AcceptAsked: lambda event, now: self._agree(self.agreement.on_accept(event, now), now),
             ev.ElectorAnswered: lambda event, now: self._agree(self.agreement.on_answer(event, now), now),
-            ev.LearntReceived: lambda event, now: self._agree(self.agreement.on_learnt(event, now), now),
+            ev.LearntReceived: self._on_learnt,
             ev.LearntAsked: self._on_learnt_asked,
             ev.PersistFailed: self._on_persist_failed,
             ev.BeatReceived: self._on_beat,

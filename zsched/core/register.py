@@ -62,7 +62,19 @@ class Retune:
         return replace(read, revision=read.revision + 1, tuning=self.tuning)
 
 
-Change = MoveOwner | Retune
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetLeased:
+    """Change: from now on nobody works at the task without a lease, or everybody may (`zsched.core.sealing`)."""
+
+    base_revision: int
+    leased: bool
+
+    def apply(self, read: Allocation) -> Allocation:
+        """The new value; touches that and the revision only."""
+        return read if read.leased is self.leased else replace(read, revision=read.revision + 1, leased=self.leased)
+
+
+Change = MoveOwner | Retune | SetLeased
 
 
 class RoundOutcome(StrEnum):

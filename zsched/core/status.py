@@ -21,6 +21,7 @@ from zsched.core.plan import Direction, ReadyWhen, Route, StreamCount
 from zsched.core.register import Register
 from zsched.core.rounds import Rounds, TaskRound
 from zsched.core.scoring import joined, majority
+from zsched.core.sealing import Sealing
 from zsched.core.snapshot import (
     SCHEMA,
     DecisionStatus,
@@ -67,6 +68,7 @@ class NodeView(Protocol):
     rounds: Rounds
     registers: dict[TaskId, Register]
     executors: dict[TaskId, Executor]
+    sealing: Sealing
     stream_counts: tuple[StreamCount, ...]
     history: dict[TaskId, deque[PastValue]]
 
@@ -169,7 +171,7 @@ def _task_status(node: NodeView, spec: TaskSpec, now: float) -> TaskStatus:
         patience=spec.patience,
         decision=_decision(standing, now),
         vote=_vote(standing, now),
-        problems=tuple(_task_problems(node, spec, value.owner, now)),
+        problems=tuple(_task_problems(node, spec, value, now)),
         streams=tuple(
             _with_keys(count, routes.get(count.stream))
             for count in node.stream_counts
@@ -188,8 +190,10 @@ def _task_status(node: NodeView, spec: TaskSpec, now: float) -> TaskStatus:
     )
 
 
-def _task_problems(node: NodeView, task: TaskSpec, owner: NodeId | None, now: float) -> Iterator[str]:
-    executor = node.executors[task.name]
+def _task_problems(node: NodeView, task: TaskSpec, value: Allocation, now: float) -> Iterator[str]:
+    executor, owner = node.executors[task.name], value.owner
+    if differs := node.sealing.problem(task, value):
+        yield differs
     if executor.is_local:
         yield f"cut off from {owner}: this robot works alone, degraded"
     is_owner_ready = True

@@ -31,13 +31,14 @@ class Tenure:
     me: NodeId
     leases: Leases
     executors: Mapping[TaskId, Executor]
-    exclusive: tuple[TaskId, ...] = field(init=False)
+    exclusive: tuple[TaskId, ...] = ()
+    """The tasks whose workers need a lease: by this node's file, or for everybody."""
     clock: ClockDoubt = field(default_factory=ClockDoubt)
     _alone_since: dict[TaskId, float] = field(default_factory=dict)
     _local: tuple[TaskId, ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        self.exclusive = tuple(task.name for task in self.fleet.tasks if task.exclusive)
+        self._note_leased()
         self._local = tuple(task.name for task in self.fleet.tasks if task.on_isolation is OnIsolation.LOCAL)
 
     @property
@@ -53,13 +54,15 @@ class Tenure:
                 due = min(due, at + ALONE_AFTER_S)
         return due
 
+    def _note_leased(self) -> None:
+        self.exclusive = tuple(name for name, executor in self.executors.items() if executor.is_leased)
+
     # --- exclusive tasks ---------------------------------------------------------------------------------------------
 
     def hold(self, value: Allocation, next_number: int) -> None:
-        """A new epoch was learnt: begin or end this node's side of an exclusive task's lease."""
-        if value.task not in self.exclusive:
-            return
-        if value.owner == self.me:
+        """A newer value was learnt: begin or end this node's side of an exclusive task's lease."""
+        self._note_leased()
+        if value.task in self.exclusive and value.owner == self.me:
             self.leases.begin(value.task, value.epoch, next_number)
         else:
             self.leases.end(value.task, next_number - 1)
@@ -68,7 +71,9 @@ class Tenure:
         """A beat (our own too) may grant, echo, release, or ask us to leave. Whether to beat at once."""
         return self.leases.on_beat(beat, accepted, now)
 
-    def on_clock(self, event: ClockCompared, standing: Mapping[TaskId, NodeId | None], number: int, now: float) -> bool:
+    def on_clock(
+        self, event: ClockCompared, standing: Mapping[TaskId, Allocation | None], number: int, now: float
+    ) -> bool:
         """The clock was compared. Whether that has begun or ended a doubt about it."""
         is_unsure = self.clock.absorb(event, now)
         if not self.exclusive or is_unsure == self.leases.is_unsure:

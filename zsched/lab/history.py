@@ -76,9 +76,10 @@ class Admitted:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Worked:
-    """An exclusive task's worker worked from ``at`` on; ``until`` is when it stopped or its lease ended.
+    """A task's worker worked from ``at`` on; ``until`` is when it stopped or its lease ended.
 
     Workers of two lives of a node are two workers: the older one may outlive its daemon until its lease ends.
+    Two that work without a lease may do so at once; nobody works beside one that has a lease.
     """
 
     at: float
@@ -87,6 +88,7 @@ class Worked:
     epoch: int
     until: float
     life: int = 0
+    is_leased: bool = True
 
 
 Record = Started | Learnt | Stored | Routed | Admitted | Worked
@@ -219,6 +221,7 @@ class Checker:
             f"{new.at:.4f}) both work on {new.task}"
             for (node, life), other in mine.items()
             if (node, life) != (new.node, new.life)
+            and (other.is_leased or new.is_leased)
             and min(other.until, new.until) - max(other.at, new.at) > self.slack_s
         ]
         mine[new.node, new.life] = new

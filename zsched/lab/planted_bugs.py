@@ -33,6 +33,7 @@ class Bug:
 
 SEQUENCE, IDENTITY = "zsched.core.sequence", "zsched.core.identity"
 REGISTER, LEASE, TENURE = "zsched.core.register", "zsched.core.lease", "zsched.core.tenure"
+SEALING = "zsched.core.sealing"
 AGREEMENT, MEMBERSHIP, NODE = "zsched.core.agreement", "zsched.core.membership", "zsched.core.node"
 ROUNDS, VOTE, VOTING = "zsched.core.rounds", "zsched.core.vote", "zsched.core.voting"
 SCHEDULER, SCORING, EXECUTOR = "zsched.core.scheduler", "zsched.core.scoring", "zsched.core.executor"
@@ -45,6 +46,7 @@ _REGISTER = (
 _SCHEDULES = ("tests/unit/core/test_register_schedules.py",)
 _AGREEMENT = ("tests/unit/core/test_agreement.py",)
 _LEASE = ("tests/sim/test_lease_rules.py", "tests/sim/test_exclusive.py")
+_ROLLOUT = ("tests/sim/test_exclusive_rollout.py",)
 _MEMBERSHIP = (
     "tests/sim/test_membership_rules.py",
     "tests/unit/core/test_membership.py",
@@ -241,7 +243,7 @@ LEASE_BUGS = (
     _bug(
         "grant not honoured after a restart",
         LEASE,
-        "if now < self.started_at + hold and owner != self.standing:",
+        "if now < self.until and owner != self.standing:",
         "if hold < 0.0:",
         _LEASE,
         114,
@@ -293,11 +295,42 @@ LEASE_BUGS = (
         "if beat.sequence < 0:",
         _LEASE,
     ),
-    _bug("next life is granted at once", LEASE, "if self._is_other_life(beat, now):", "if not epoch:", _LEASE, 30),
+    _bug("next life is granted at once", LEASE, "if self._is_held(beat, now):", "if not epoch:", _LEASE, 30),
+    _bug(
+        "next owner is granted at once",
+        LEASE,
+        "if last is None or (last.owner, last.incarnation) == (beat.node, beat.incarnation):",
+        "if last is None or last.owner != beat.node or last.incarnation == beat.incarnation:",
+        _LEASE,
+    ),
+    _bug(
+        "granted although others need no lease",
+        AGREEMENT,
+        "and value.owner is not None and value.leased",
+        "and value.owner is not None",
+        _ROLLOUT,
+    ),
+    _bug(
+        "worker without a lease is not waited for", SEALING, "if spec.name in answer.unleased:", "if False:", _ROLLOUT
+    ),
+    _bug(
+        "old fleet file needs no lease",
+        EXECUTOR,
+        "self.spec.exclusive or allocation.leased",
+        "self.spec.exclusive",
+        _ROLLOUT,
+    ),
+    _bug(
+        "restart forgets a longer lease",
+        LEASE,
+        "hold_s(max(self.fleet.timing.lease_s, self.granted_s))",
+        "hold_s(self.fleet.timing.lease_s)",
+        _ROLLOUT,
+    ),
     _bug(
         "restarted elector echoes at once",
         LEASE,
-        "        if now < self.started_at + hold_s(self.lease_s):\n            return True",
+        "        if now < self.until:\n            return True",
         "        if self.lease_s < 0.0:\n            return True",
         _LEASE,
         74,
@@ -557,8 +590,8 @@ HANDOVER_BUGS = (
     _bug(
         "epoch compared with >=",
         EXECUTOR,
-        "if allocation.owner is None or allocation.epoch <= self.epoch:",
-        "if allocation.owner is None or allocation.epoch < self.epoch:",
+        "        if allocation.epoch == self.epoch:\n            return",
+        "        if self.epoch < 0:\n            return",
         _EXECUTOR,
     ),
     _bug(

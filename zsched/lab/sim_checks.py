@@ -184,9 +184,12 @@ class Invariants:
             self._check_epoch(machine, plan.task, epoch)
             self.take(Routed(at=now, node=machine.key, task=plan.task, epoch=epoch, owner=owner))
 
-    def on_worked(self, machine: Machine, task: TaskId, epoch: int, now: float, until: float) -> None:
-        """An exclusive worker may work until a true time."""
-        self.take(Worked(at=now, node=machine.key, task=task, epoch=epoch, until=until, life=machine.life))
+    def on_worked(
+        self, machine: Machine, task: TaskId, epoch: int, now: float, until: float, *, is_leased: bool = True
+    ) -> None:
+        """A worker may work until a true time; without a lease that is infinity."""
+        life = machine.life
+        self.take(Worked(at=now, node=machine.key, task=task, epoch=epoch, until=until, life=life, is_leased=is_leased))
 
     # --- the loop ----------------------------------------------------------------------------------------------------
 

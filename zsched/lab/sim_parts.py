@@ -162,7 +162,7 @@ def blank_state(machine: Machine, incarnation: int, generation: int) -> DurableS
     registers = tuple(
         RegisterState(
             task=task.name,
-            learnt=Allocation(task=task.name, revision=start, epoch=start, owner=None, tuning=task.tuning),
+            learnt=task.first_value(start),
         )
         for task in machine.fleet.tasks
         if generation > 0

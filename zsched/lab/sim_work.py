@@ -6,6 +6,7 @@ decides that, or how streams really move.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable
 from random import Random
@@ -23,6 +24,11 @@ FLIP_S = 0.005
 WORKER_STOP_S = (0.002,)
 LOOK_AGAIN_S = 0.05
 SHOWN_S = 0.005
+
+
+def _is_free(role: Role) -> bool:
+    """Whether a worker of this role works without a lease."""
+    return role.role is not WorkerRole.IDLE and role.lease_until_s is None
 
 
 class World(Protocol):
@@ -139,6 +145,7 @@ class Work:
         now = self._sim.now
         before = machine.roles.get(role.task)
         machine.roles[role.task] = role
+        self._note_unleased(machine, before, role)
         until = 0.0 if role.lease_until_s is None else machine.clock.true(role.lease_until_s)
         if until > now:
             self._sim.invariants.on_worked(machine, role.task, role.epoch, now, until)
@@ -151,10 +158,29 @@ class Work:
         begun = self._begun[machine.key, role.task]
         self._sim.later(self._sim.rng.choice(self.stop_s), self._stopped, machine, machine.life, before, begun)
 
+    def _note_unleased(self, machine: Machine, before: Role | None, role: Role) -> None:
+        """A worker that needs no lease works until it has heard that it is idle, or needs one."""
+        sim = self._sim
+        if _is_free(role):
+            if before is None or not _is_free(before) or before.epoch != role.epoch:
+                sim.invariants.on_worked(machine, role.task, role.epoch, sim.now, math.inf, is_leased=False)
+        elif before is not None and _is_free(before):
+            sim.later(sim.rng.choice(self.stop_s), self._stopped_free, machine, machine.life, role.task)
+
+    def _stopped_free(self, machine: Machine, life: int, task: TaskId) -> None:
+        if machine.life == life and not _is_free(machine.roles[task]):
+            self._sim.invariants.checker.stop_working(machine.key, task, self._sim.now, life)
+
+    def end(self, machine: Machine) -> None:
+        """A daemon ends, and its workers with it; of one with a lease others cannot know."""
+        for task, role in machine.roles.items():
+            if _is_free(role):
+                self._sim.invariants.checker.stop_working(machine.key, task, self._sim.now, machine.life)
+
     def _stopped(self, machine: Machine, life: int, role: Role, begun: int) -> None:
         if machine.life != life:
             return
-        if begun == self._begun[machine.key, role.task]:
+        if role.lease_until_s is not None and begun == self._begun[machine.key, role.task]:
             self._sim.invariants.checker.stop_working(machine.key, role.task, self._sim.now, life)
             working = self.working.get(role.task)
             if working is not None and working[0] == machine.key:

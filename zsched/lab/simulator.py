@@ -135,6 +135,7 @@ class Simulator(Links):
         for other in self.machines.values():
             if other is not machine and (machine.key, other.key) not in self.cuts:
                 self.work.lose(machine, other, delay_s)
+        self.work.end(machine)
         machine.end()
         machine.disk.lose_power(self.rng)
         self._tell_token(machine, ev.TokenLost(node=machine.name, incarnation=incarnation), delay_s)

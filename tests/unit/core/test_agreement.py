@@ -386,7 +386,7 @@ def test_registers_of_tasks_that_left_the_file_stay_on_disk() -> None:
     gone = RegisterState(task="gone", promised=Ballot(counter=9, node="robot2", incarnation=1), learnt=value(3))
     agreement = make(gone, RegisterState(task="merge", learnt=value(2)))
     agreement.on_learnt(answer(Learnt(node="robot2", values=(value(3),))), 100.0)
-    state = agreement.to_persist()
+    state = agreement.to_persist(100.0)
     assert state is not None
     by_task = {one.task: one for one in state.registers}
     assert sorted(by_task) == ["gone", "merge", "plan"]
@@ -398,14 +398,14 @@ def test_registers_of_tasks_that_left_the_file_stay_on_disk() -> None:
 def test_without_a_state_nothing_is_written() -> None:
     agreement = make(has_state=False)
     assert agreement.on_learnt(answer(Learnt(node="robot2", values=(value(1),))), 100.0).is_dirty
-    assert agreement.to_persist() is None
+    assert agreement.to_persist(100.0) is None
 
 
 def test_refused_write_ends_the_electorship_and_the_writing() -> None:
     agreement = make()
     agreement.on_persist_failed("disk full")
     assert not agreement.is_elector
-    assert agreement.to_persist() is None
+    assert agreement.to_persist(100.0) is None
     assert agreement.problems == {"state": "disk full; this node is no elector until it is restarted"}
     ballot = Ballot(counter=1, node="robot2", incarnation=1)
     effects = agreement.on_prepare(
@@ -476,13 +476,13 @@ def test_who_has_voted_is_remembered_on_disk_once() -> None:
     agreement = make()
     heard = replace(beat("robot2", 0), has_voted=True)
     assert of(agreement.compare(heard, 100.0), do.AskLearnt) == [do.AskLearnt(peer="robot2", deadline_s=0.3)]
-    assert not agreement.to_persist().voted, "nothing durable on the word of a beat"  # type: ignore[union-attr]
+    assert not agreement.to_persist(100.0).voted, "nothing durable on the word of a beat"  # type: ignore[union-attr]
     said = Learnt(node="robot2", values=(), has_voted=True)
     assert agreement.on_learnt(answer(said), 100.1).is_dirty
     assert not agreement.on_learnt(answer(said), 100.2).is_dirty
     assert agreement.compare(heard, 200.0) == Effects(), "nothing to ask"
     assert not agreement.on_learnt(answer(replace(said, node="edge1")), 100.3).is_dirty, "no elector"
-    state = agreement.to_persist()
+    state = agreement.to_persist(100.0)
     assert state is not None
     assert state.voted == ("robot2",)
 
@@ -491,7 +491,7 @@ def test_disputed_name_is_no_elector_in_this_life_and_the_next() -> None:
     agreement = make()
     assert agreement.dispute("another daemon calls itself 'robot1'").is_dirty
     assert not agreement.is_elector
-    state = agreement.to_persist()
+    state = agreement.to_persist(100.0)
     assert state is not None
     assert "another daemon" in state.disputed
     again = Agreement(fleet=FLEET, me="robot1", durable=state, incarnation=8, electorate="e", rng=Random(1), now=0.0)

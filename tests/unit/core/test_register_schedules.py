@@ -236,7 +236,10 @@ class World:
 
 def is_made_by(value: Allocation, change: Change) -> bool:
     """Whether ``value`` holds what ``change`` (each has a name of its own) sets."""
-    return value.owner == change.owner if isinstance(change, MoveOwner) else value.tuning == change.tuning
+    if isinstance(change, MoveOwner):
+        return value.owner == change.owner
+    assert isinstance(change, Retune)
+    return value.tuning == change.tuning
 
 
 def play(seed: int, register_class: type[Register] = Register) -> World:

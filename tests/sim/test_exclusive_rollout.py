@@ -1,0 +1,171 @@
+"""`exclusive: true` brought to a fleet node by node: at no moment two nodes work, one of them maybe without a lease."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from zsched.core import events as ev
+from zsched.core import instructions as do
+from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.model import NodeId, NodeKind, Tuning, Weights
+from zsched.core.plan import WorkerRole
+from zsched.lab.simulator import CORES, Simulator
+
+TASK, LOOK_S = "merge", 0.01
+ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2", "edge3")
+OLD = Fleet(
+    name="sim",
+    timing=Timing(),
+    nodes=tuple(
+        NodeSpec(name=name, kind=NodeKind.EDGE if name in EDGES else NodeKind.ROBOT) for name in sorted(EDGES + ROBOTS)
+    ),
+    tasks=(
+        TaskSpec(
+            name=TASK,
+            candidates=EDGES,
+            tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0), time_to_trigger_s=0.5, cool_down_s=0.0),
+            worker=WorkerSpec(command=("true",)),
+        ),
+    ),
+    electors=ROBOTS,
+)
+NEW = replace(OLD, tasks=(replace(OLD.tasks[0], exclusive=True),))
+
+
+class Rollout:
+    """A fleet that has worked by one file, while others come to it."""
+
+    def __init__(self, seed: int, fleet: Fleet = OLD) -> None:
+        self.busy: set[NodeId] = set()
+        self.sim = Simulator(fleet=fleet, seed=seed, load=self._load)
+        self.sim.start()
+        assert self.sim.run_until(lambda: self.owner() is not None and bool(self.at_work()), 20)
+        self.run(3)
+
+    def _load(self, node: NodeId, _now: float) -> tuple[float, float]:
+        return CORES * (0.9 if node in self.busy else 0.2), 1000.0
+
+    def owner(self, *names: NodeId) -> NodeId | None:
+        return self.sim.agreed(TASK, *names)
+
+    def at_work(self) -> set[NodeId]:
+        """Who may be working at this moment."""
+        found = set()
+        for name in self.sim.running():
+            machine = self.sim.machines[name]
+            role = machine.roles.get(TASK)
+            if role is None or role.role is WorkerRole.IDLE:
+                continue
+            if role.lease_until_s is None or role.lease_until_s > self.sim.now:
+                found.add(name)
+        return found
+
+    def bring(self, fleet: Fleet, *names: NodeId) -> None:
+        """Restart nodes with another fleet file, one after the other."""
+        for name in names:
+            self.sim.crash(name)
+            self.sim.machines[name].fleet = fleet
+            self.sim.start(name)
+            self.run(0.5)
+
+    def run(self, seconds: float) -> float:
+        """Let time pass and look all the while; for how long two were at work."""
+        twice = 0.0
+        for _ in range(round(seconds / LOOK_S)):
+            self.sim.run(LOOK_S)
+            twice += LOOK_S if len(self.at_work()) > 1 else 0.0
+        return twice
+
+    def problems(self, name: NodeId) -> str:
+        """What the task's status says on one node."""
+        batch = self.sim.node(name).handle(ev.StatusAsked(request=1), self.sim.now)
+        (answer,) = [one for one in batch if isinstance(one, do.AnswerStatus)]
+        return " ".join(answer.snapshot.tasks[0].problems)
+
+    def others(self, owner: NodeId) -> tuple[NodeId, ...]:
+        return tuple(name for name in (*ROBOTS, *EDGES) if name != owner)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_an_owner_that_is_cut_off_with_the_old_file_is_waited_for(seed: int) -> None:
+    rollout = Rollout(seed)
+    owner = rollout.owner() or ""
+    others = rollout.others(owner)
+    rollout.bring(NEW, *others)
+    assert rollout.owner() == owner
+    rollout.sim.cut((owner,), others)
+    assert rollout.run(20.0) == 0.0
+    successor = rollout.owner(*others)
+    assert successor not in (None, owner)
+    assert rollout.at_work() == {owner}
+    assert f"{owner} has not answered yet" in rollout.problems(successor or "")
+    assert "not yet for the fleet" in rollout.problems("robot1")
+
+    rollout.sim.heal()
+    assert rollout.run(10.0) == 0.0
+    assert rollout.at_work() == {rollout.owner()}
+    assert rollout.sim.working[TASK][0] == rollout.owner(), "by a lease"
+    assert rollout.problems("robot1") == ""
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_planned_move_away_from_an_owner_with_the_old_file_waits_until_it_has_stopped(seed: int) -> None:
+    rollout = Rollout(seed)
+    owner = rollout.owner() or ""
+    rollout.bring(NEW, *rollout.others(owner))
+    assert "without a lease" in rollout.problems("robot1")
+    rollout.busy.add(owner)
+    assert rollout.run(15.0) == 0.0
+    assert rollout.owner() not in (None, owner)
+    assert rollout.at_work() == {rollout.owner()}
+    assert rollout.sim.working[TASK][0] == rollout.owner()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_whole_rollout_never_lets_two_work_and_ends_with_a_lease(seed: int) -> None:
+    rollout = Rollout(seed)
+    names = [*ROBOTS, *EDGES]
+    rollout.sim.rng.shuffle(names)
+    for name in names:
+        rollout.bring(NEW, name)
+        assert rollout.run(1.0) == 0.0
+    assert rollout.run(8.0) == 0.0
+    assert rollout.at_work() == {rollout.owner()} == {rollout.sim.working[TASK][0]}
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_candidate_that_goes_back_to_the_old_file_works_by_leases_all_the_same(seed: int) -> None:
+    rollout = Rollout(seed, NEW)
+    back = next(name for name in EDGES if name != rollout.owner())
+    rollout.bring(OLD, back)
+    rollout.busy |= set(EDGES) - {back}
+    assert rollout.run(10.0) == 0.0
+    assert rollout.owner() == back == rollout.sim.working[TASK][0]
+    assert "though not by this node's fleet file" in rollout.problems(back)
+    rollout.sim.cut((back,), rollout.others(back))
+    assert rollout.run(6.0) == 0.0
+    assert len(rollout.at_work() - {back}) == 1
+
+
+def test_an_old_elector_s_restart_under_a_shorter_lease_waits_for_the_longer_one() -> None:
+    """An owner with the old file may still work by what was granted before."""
+    rollout = Rollout(1, replace(NEW, timing=replace(NEW.timing, lease_s=3.0)))
+    owner = rollout.owner() or ""
+    rollout.sim.cut((owner,), rollout.others(owner))
+    for name in rollout.others(owner):
+        rollout.sim.crash(name)
+        rollout.sim.machines[name].fleet = NEW
+    rollout.sim.start(*rollout.others(owner))
+    assert rollout.run(10.0) == 0.0
+    assert len(rollout.at_work() - {owner}) == 1
+
+
+def test_the_task_is_everybody_s_again_once_all_have_a_file_that_says_so() -> None:
+    rollout = Rollout(1, NEW)
+    rollout.bring(OLD, *ROBOTS, *EDGES)
+    rollout.run(3.0)
+    machine = rollout.sim.machines[rollout.owner() or ""]
+    assert machine.roles[TASK].lease_until_s is None
+    assert rollout.problems("robot1") == ""
