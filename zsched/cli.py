@@ -43,6 +43,7 @@ app = typer.Typer(
 app.add_typer(stream_app)
 app.add_typer(bench_app)
 
+NOT_ASKED = "no other node reached: nobody could say whether this name has voted"
 LAB_NEEDS = ("cv2", "matplotlib", "numpy", "onnxruntime", "rich")
 """What the extra ``lab`` installs."""
 
@@ -139,7 +140,7 @@ def init(
     """
     from zsched import places  # noqa: PLC0415 - each verb imports what it needs
     from zsched.config import load_fleet  # noqa: PLC0415 - ruamel.yaml is slow to import
-    from zsched.lifecycle import check_never_voted, init_state, settle_dispute  # noqa: PLC0415 - imports zenoh
+    from zsched.lifecycle import check_never_voted, init_state, settle_dispute, standing_generation  # noqa: PLC0415 - imports zenoh
 
     file = places.config_path(config, os.environ)
     fleet = load_fleet(file)
@@ -156,9 +157,13 @@ def init(
         done = settle_dispute(fleet, name, folder)
         typer.echo(f"{name}: {'settled; restart its daemon' if done else 'there was no dispute'}")
         return
+    standing = standing_generation(fleet, name, folder)
+    if standing is not None and generation in (0, standing):
+        typer.echo(f"{folder}: {name} has its state in fleet {fleet.name}, generation {standing}: nothing to do")
+        return
     asked = check_never_voted(fleet, name) if generation == 0 else 0
     path = init_state(fleet, name, folder, generation)
-    typer.echo(f"asked {asked} nodes: none remembers a vote of {name}" if asked else "no other node reached", err=True)
+    typer.echo(f"asked {asked} nodes: none remembers a vote of {name}" if asked else NOT_ASKED, err=True)
     typer.echo(f"{path}: blank state of {name} in fleet {fleet.name}, generation {generation}")
 
 

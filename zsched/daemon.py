@@ -22,7 +22,7 @@ import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from zsched import __version__, places, zenoh_config
+from zsched import __version__, daemon_tls, places, zenoh_config
 from zsched.adapters import zenoh_log
 from zsched.adapters.control_bus import ControlBus
 from zsched.adapters.device_profiler import DeviceProfiler
@@ -161,6 +161,8 @@ class Daemon:
         self._is_restart = False
         self._door = Door(options.runtime_dir, options.node)
         self._is_ready = False
+        self._operator_json5 = daemon_tls.operator_json5(self._fleet)
+        self._protocol = daemon_tls.protocol_of(self._fleet, self._operator_json5)
         self._memory_objection = shared_memory_objection(self._fleet, self._spec)
 
     def run(self) -> int:
@@ -169,7 +171,7 @@ class Daemon:
         with state_file, contextlib.ExitStack() as stack:
             durable, problem = self._restore(state_file)
             incarnation = durable.incarnation if durable is not None else wall_tenths()
-            points = endpoints_for(self._fleet, self._spec, self._data_port, is_here)
+            points = endpoints_for(self._fleet, self._spec, self._data_port, is_here, self._protocol)
             self._handle_signals(stack)  # first: a stop that comes while things open is an orderly one, too
             shell = self._build(stack, state_file, incarnation, points)
             node = Node(
@@ -187,6 +189,8 @@ class Daemon:
             if self._memory_objection:
                 log.warning("shared_memory off why=%s", self._memory_objection)
                 node.problems["shared_memory"] = f"shared memory is off here: {self._memory_objection}"
+            if plain_text := daemon_tls.plain_text_problem(self._spec, self._protocol):
+                node.problems["tls"] = plain_text
             gc.freeze()  # what lives until the end need not be looked at again
             self._loop(node, shell)
         return EXIT_OK
@@ -218,7 +222,7 @@ class Daemon:
         """Open the adapters; each is closed by ``stack`` in the reverse order."""
         zenoh_log.capture(os.environ)
         fleet, me = self._fleet, self._spec.name
-        operator_json5 = Path(fleet.zenoh_config).read_text() if fleet.zenoh_config else ""
+        operator_json5 = self._operator_json5
         bus = ControlBus(
             fleet=fleet.name,
             node=me,

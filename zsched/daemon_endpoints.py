@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from zsched import zenoh_config
 from zsched.core.fleet import Fleet, NodeSpec, dial_endpoint
 from zsched.core.model import NodeId, NodeKind
 
@@ -42,9 +41,15 @@ class Endpoints:
 
 
 def endpoints_for(
-    fleet: Fleet, me: NodeSpec, free_port: Callable[[], int], is_here: Callable[[str], bool] = lambda _host: True
+    fleet: Fleet,
+    me: NodeSpec,
+    free_port: Callable[[], int],
+    is_here: Callable[[str], bool] = lambda _host: True,
+    protocol: str = "tcp",
 ) -> Endpoints:
     """The endpoints of one node: its own to listen on, the others' to dial.
+
+    What the fleet file does not say listens with ``protocol`` (`zsched.daemon_tls`).
 
     A link is dialled by one side only: two that redial each other while a cut heals can end with a link that zenoh
     keeps alive and delivers nothing on. Who gives no address dials everybody who does; only two that give none meet by
@@ -52,18 +57,18 @@ def endpoints_for(
     Our own address on another machine (``is_here``) is dialled too: there a twin of ours may be, and must be heard.
     """
     robots = [node for node in fleet.nodes if node.kind is NodeKind.ROBOT and node.name != me.name]
-    data_listen = me.listen_data or "tcp/0.0.0.0:0"
+    data_listen = me.listen_data or f"{protocol}/0.0.0.0:0"
     if not dial_endpoint(data_listen, "127.0.0.1"):  # any port will do, but workers must know which
         address, _, rest = data_listen.rpartition(":")
         data_listen = f"{address}:{free_port()}{rest.removeprefix('0')}"
     is_loopback = "/127." in data_listen or "/[::1]" in data_listen
     return Endpoints(
-        control_listen=(me.listen_control or "tcp/0.0.0.0:0",),
+        control_listen=(me.listen_control or f"{protocol}/0.0.0.0:0",),
         control_connect=_dialled(_targets(fleet, me, _control, is_here), _control),
         data_listen=(data_listen,),
         data_connect=_dialled(_targets(fleet, me, _data), _data),
         worker_connect=(dial_endpoint(data_listen, "127.0.0.1"), *_dialled(robots, _data)),
-        worker_listen=(zenoh_config.LOOPBACK_LISTEN if is_loopback else "tcp/0.0.0.0:0",),
+        worker_listen=(f"{protocol}/127.0.0.1:0" if is_loopback else f"{protocol}/0.0.0.0:0",),
         control_by_gossip=not _dialled([me], _control) and len(_hidden(list(fleet.nodes), _control)) > 1,
         data_by_gossip=not _dialled([me], _data),  # also for the workers of others, if this is a robot
         worker_by_gossip=bool(_hidden(robots, _data)),

@@ -14,6 +14,7 @@ from zsched.adapters.state_file import StateFile, hardware_id
 from zsched.clock import wall_tenths
 from zsched.core.fleet import Fleet, dial_endpoint, electorate_hash
 from zsched.core.model import NO_BALLOT, Acceptance, DurableState, NodeId, RegisterState
+from zsched.daemon_tls import operator_json5, protocol_of
 from zsched.errors import AdapterError
 
 GENERATION_STEP = 2**32
@@ -27,7 +28,7 @@ def init_state(fleet: Fleet, node: NodeId, folder: Path, generation: int) -> Pat
     fleet that lost too many states to agree, on every node at once.
 
     Raises:
-        AdapterError: there is a state already, or the folder cannot be written.
+        AdapterError: there is a state already, another node's for instance, or the folder cannot be written.
     """
     start = generation * GENERATION_STEP
     values = [task.first_value(start) for task in fleet.tasks if generation > 0]
@@ -50,6 +51,12 @@ def init_state(fleet: Fleet, node: NodeId, folder: Path, generation: int) -> Pat
         return file.path
 
 
+def standing_generation(fleet: Fleet, node: NodeId, folder: Path) -> int | None:
+    """The generation of this node's valid state for this electorate; ``None`` when `init` has something to do."""
+    state = StateFile(folder, fleet=fleet.name, node=node).load().state
+    return state.generation if state is not None and state.electorate == electorate_hash(fleet) else None
+
+
 def check_never_voted(fleet: Fleet, node: NodeId) -> int:
     """Ask every node that can be reached whether ``node`` is known as an elector that has voted.
 
@@ -57,13 +64,17 @@ def check_never_voted(fleet: Fleet, node: NodeId) -> int:
         How many nodes answered; 0 when none could be reached (then nothing is known).
 
     Raises:
+        ConfigError: the operator's zenoh file is not usable.
         AdapterError: somebody remembers its votes: a blank state would make it break its promises.
     """
     others = [spec for spec in fleet.nodes if spec.name != node and spec.listen_control]
     endpoints = tuple(filter(None, (dial_endpoint(spec.listen_control, spec.host) for spec in others)))
     if not endpoints or node not in fleet.electors:
         return 0
-    answers = ask_fleet(fleet.name, node, zenoh_config.client_config(connect=endpoints, timing=fleet.timing))
+    text = operator_json5(fleet)
+    protocol_of(fleet, text)  # with TLS that cannot work nobody would answer
+    config = zenoh_config.client_config(connect=endpoints, timing=fleet.timing, operator_json5=text)
+    answers = ask_fleet(fleet.name, node, config)
     for answer in answers:
         if node in answer.quorum.voted and answer.node != node:
             raise AdapterError(

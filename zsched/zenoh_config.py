@@ -13,9 +13,12 @@ random zids (a fixed one keeps a restarted node out until its old link's lease e
 from __future__ import annotations
 
 import json
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from zsched.core.fleet import LocalMode, LocalSide, Timing, WorkerLink
+
+if TYPE_CHECKING:
+    import zenoh
 
 DATA_SEND_BUFFER: Final = 65536
 """Kernel send buffer of data links in bytes: bounds what lies between a publisher and a slow radio."""
@@ -178,6 +181,18 @@ def introduction_config(session: str) -> str | None:
     return str(config)
 
 
+def tls_settings(operator_json5: str) -> frozenset[str]:
+    """Which settings of ``transport/link/tls`` the operator's own text makes.
+
+    Raises:
+        ValueError: it is not a zenoh configuration.
+    """
+    if not operator_json5.strip():
+        return frozenset()
+    found = json.loads(_parsed(operator_json5).get_json("transport/link/tls"))
+    return frozenset(name for name, value in (found or {}).items() if value is not None)
+
+
 # --- threads ---------------------------------------------------------------------------------------------------------
 
 
@@ -263,13 +278,18 @@ def _render(settings: Settings, operator_json5: str) -> str:
 
 
 def _on_top_of(operator_json5: str, settings: Settings) -> str:
-    """The operator's file with our settings over it; JSON5 is read by zenoh itself, so that its rules hold."""
-    import zenoh  # noqa: PLC0415 - only who passes a file of his own pays for it here
-
-    try:
-        config = zenoh.Config.from_json5(operator_json5)
-    except Exception as error:
-        raise ValueError(f"zenoh: config is not a zenoh configuration: {error}") from error
+    """The operator's file with our settings over it."""
+    config = _parsed(operator_json5)
     for path, value in settings.items():
         config.insert_json5(path, json.dumps(value))
     return str(config)
+
+
+def _parsed(operator_json5: str) -> zenoh.Config:
+    """JSON5 is read by zenoh itself, so that its rules hold."""
+    import zenoh  # noqa: PLC0415 - only who passes a file of his own pays for it here
+
+    try:
+        return zenoh.Config.from_json5(operator_json5)
+    except Exception as error:
+        raise ValueError(f"zenoh: config is not a zenoh configuration: {error}") from error

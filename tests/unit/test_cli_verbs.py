@@ -86,10 +86,28 @@ def test_init_creates_the_state_once(tmp_path: Path) -> None:
     first, second = run(*arguments), run(*arguments)
     assert first.exit_code == 0
     assert first.stdout == f"{state}/state: blank state of robot1 in fleet hall, generation 0\n"
-    assert (second.exit_code, second.stdout) == (1, "")
-    assert "exists already" in second.stderr
-    assert "--generation 1" in second.stderr
+    said = f"{state}: robot1 has its state in fleet hall, generation 0: nothing to do\n"
+    assert (second.exit_code, second.stdout) == (0, said)
     assert run(*arguments, "--generation", 1).exit_code == 0
+    before = (state / "state").read_bytes()
+    for again in ((), ("--generation", 1)):
+        assert "generation 1: nothing to do" in run(*arguments, *again).stdout
+    assert (state / "state").read_bytes() == before
+
+
+@pytest.mark.parametrize("more", [(), ("--generation", 1)], ids=["plain", "as the old advice had it"])
+def test_init_in_another_nodes_folder_says_whose_it_is_and_leaves_it(tmp_path: Path, more: tuple[object, ...]) -> None:
+    file, state = tmp_path / "fleet.yaml", tmp_path / "state"
+    file.write_text(FLEET)
+    arguments = ("init", "--config", file, "--state-dir", state)
+    assert run(*arguments, "--node", "robot1").exit_code == 0
+    before = (state / "state").read_bytes()
+    result = run(*arguments, "--node", "robot2", *more)
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert "belongs to the node 'robot1', not 'robot2', and is left as it is" in result.stderr
+    assert "give robot2 a folder of its own with --state-dir" in result.stderr
+    assert "--generation" not in result.stderr
+    assert (state / "state").read_bytes() == before
 
 
 def test_init_of_a_name_that_is_not_in_the_file_exits_with_78(tmp_path: Path) -> None:

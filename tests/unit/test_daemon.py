@@ -88,6 +88,12 @@ def test_workers_listen_on_loopback_only_when_the_fleet_does(data: str, connect:
     assert (found.worker_connect, found.worker_listen) == ((connect,), (listen,))
 
 
+def test_what_the_file_does_not_say_listens_with_tls_where_there_is_tls() -> None:
+    found = endpoints_for(fleet(spec("a")), spec("a"), lambda: 50000, protocol="tls")
+    assert (found.control_listen, found.data_listen) == (("tls/0.0.0.0:0",), ("tls/0.0.0.0:50000",))
+    assert (found.worker_connect, found.worker_listen) == (("tls/127.0.0.1:50000",), ("tls/0.0.0.0:0",))
+
+
 def test_port_zero_is_replaced_by_a_port_that_workers_can_dial() -> None:
     found = endpoints(spec("a", data="tcp/0.0.0.0:0"))
     assert found.data_listen == ("tcp/0.0.0.0:50000",)

@@ -102,10 +102,16 @@ class StateFile:
         A start counter that can still be read from an older file is kept: incarnations never fall.
 
         Raises:
-            AdapterError: there is a state file already and ``state.generation`` is not above its own (a damaged one
-                counts as generation 0), or it cannot be written.
+            AdapterError: the folder is another node's or fleet's, or there is a state file already and
+                ``state.generation`` is not above its own (a damaged one counts as generation 0), or it cannot be
+                written.
         """
         found = self._read()
+        if found.state is not None and (found.state.fleet, found.state.node) != (self._fleet, self._node):
+            raise AdapterError(
+                f"{self.path} {self._foreign(found.state)}, and is left as it is; "
+                f"give {self._node} a folder of its own with --state-dir, or say whose this is with --node"
+            )
         standing = 0 if found.state is None else found.state.generation
         if self.path.exists() and state.generation <= standing:
             what = f"of generation {standing}" if found.state is not None else f"({found.problem})"

@@ -1,0 +1,69 @@
+"""Whether a fleet is encrypted, and what is wrong with it when it is so by half."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from zsched.core.fleet import Fleet, NodeSpec, Timing
+from zsched.core.model import NodeKind
+from zsched.daemon_tls import operator_json5, plain_text_problem, protocol_of
+from zsched.errors import ConfigError
+
+FILE = "/etc/zsched/zenoh.json5"
+WHOLE = """{transport: {link: {tls: {root_ca_certificate: "a", listen_certificate: "b", listen_private_key: "c"}}}}"""
+PLAIN, TLS = "tcp/0.0.0.0:7457", "tls/0.0.0.0:7457"
+
+
+def fleet(control: str = "") -> Fleet:
+    node = NodeSpec(name="robot1", kind=NodeKind.ROBOT, listen_control=control)
+    return Fleet(name="f", timing=Timing(), nodes=(node,), tasks=(), electors=(), seeds=(), zenoh_config=FILE)
+
+
+@pytest.mark.parametrize(
+    ("text", "control", "protocol"),
+    [
+        ("", "", "tcp"),
+        ("", PLAIN, "tcp"),
+        ("{scouting: {multicast: {enabled: false}}}", PLAIN, "tcp"),
+        (WHOLE, "", "tls"),
+        (WHOLE, PLAIN, "tls"),
+        (WHOLE, TLS, "tls"),
+        (WHOLE, "quic/0.0.0.0:7457", "tls"),
+    ],
+)
+def test_settings_of_tls_or_an_encrypted_endpoint_make_it(text: str, control: str, protocol: str) -> None:
+    assert protocol_of(fleet(control), text) == protocol
+
+
+@pytest.mark.parametrize(
+    ("text", "control", "missing"),
+    [
+        ("", TLS, "listen_certificate and listen_private_key"),
+        ('{transport: {link: {tls: {root_ca_certificate: "a"}}}}', "", "listen_certificate and listen_private_key"),
+        (WHOLE.replace('listen_private_key: "c"', ""), TLS, "listen_private_key"),
+    ],
+)
+def test_tls_that_could_not_listen_is_refused_with_what_is_missing(text: str, control: str, missing: str) -> None:
+    with pytest.raises(ConfigError, match=f"TLS without {missing}, with which"):
+        protocol_of(fleet(control), text)
+
+
+def test_a_file_that_zenoh_cannot_read_is_named() -> None:
+    with pytest.raises(ConfigError, match=f"{FILE}: zenoh: config is not a zenoh configuration"):
+        protocol_of(fleet(), "{transport: 3")
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"gone\.json5: cannot be read: No such file"):
+        operator_json5(replace(fleet(), zenoh_config=str(tmp_path / "gone.json5")))
+    assert operator_json5(replace(fleet(), zenoh_config="")) == ""
+
+
+def test_plain_text_that_the_file_asks_for_is_a_problem_only_beside_tls() -> None:
+    (node,) = fleet(PLAIN).nodes
+    assert plain_text_problem(node, "tcp") is None
+    assert f"lets robot1 listen on {PLAIN}: write tls/" in (plain_text_problem(node, "tls") or "")
+    assert plain_text_problem(fleet(TLS).nodes[0], "tls") is None
