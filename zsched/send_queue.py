@@ -78,6 +78,7 @@ class SendQueue:
         self._lines: dict[Hashable, deque[_Waiting]] = {}
         self._count = 0
         self._bytes = 0
+        self._has_shed = False
         self._left_at = 0.0
         self._is_kicked = False
         self._is_closed = False
@@ -96,6 +97,13 @@ class SendQueue:
     def is_busy(self) -> bool:
         """True while a put is under way."""
         return self._busy_since is not None
+
+    @property
+    def is_pressed(self) -> bool:
+        """True while samples are about to be dropped, or (``sheds``) have been since the queue was last empty."""
+        if self._sheds:
+            return self._has_shed
+        return self._count > self._depth // 2 or self._bytes > MAX_BYTES // 2
 
     def send(self, lane: Hashable, action: Action, size: int, value: Any = None) -> int:
         """Queue a sample of ``size`` bytes; answers how many samples were dropped for it (itself: 1).
@@ -182,6 +190,7 @@ class SendQueue:
             old.action = None
             self._forget(old)
             dropped += 1
+        self._has_shed |= dropped > 0
         return dropped
 
     def _is_full(self, size: int) -> bool:
@@ -245,6 +254,7 @@ class SendQueue:
             self._room.notify()
             if self._sheds:
                 self._lines[waiting.lane].popleft()
+                self._has_shed &= self._count > 0
             return waiting.action
 
     def _do(self, action: Action) -> None:

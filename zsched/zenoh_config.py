@@ -40,6 +40,18 @@ RELAY_START_S: Final = 10.0
 DEFAULT_TIMING: Final = Timing()
 
 Settings = dict[str, Any]
+DROP_WAIT_S: Final = 0.05
+"""How long a put with congestion control DROP waits for room at one link (zenoh's default is 1 ms).
+
+A receiver that keeps up may not run for some milliseconds on a busy machine, and then loses what it could have had.
+One that takes nothing costs this time once: zenoh then drops at its link at once, until it takes something.
+"""
+_RECEIVERS: Final[Settings] = {
+    "transport/link/tx/queue/congestion_control/drop/wait_before_drop": round(DROP_WAIT_S * 1e6),
+    "adminspace/enabled": True,
+    "adminspace/permissions": {"read": True, "write": False},
+}
+"""Of sessions that applications receive outputs from: who subscribes is read there (`zsched.relay.sockets`)."""
 
 
 def control_config(
@@ -88,6 +100,7 @@ def data_config(
     settings = _peer(_small_buffers(listen), _small_buffers(connect), timing)
     _set_shared_memory(settings, is_on=shared_memory)
     _set_gossip(settings, dials=dials_by_gossip)
+    settings.update(_RECEIVERS)
     return _render(settings, operator_json5)
 
 
@@ -132,6 +145,7 @@ def local_config(side: LocalSide, *, timing: Timing = DEFAULT_TIMING) -> str:
         return client_config(connect=side.connect, timing=timing)
     settings = _peer(side.listen or (LOOPBACK_LISTEN,), side.connect, timing)
     _set_shared_memory(settings, is_on=False)
+    settings.update(_RECEIVERS)
     return _render(settings, "")
 
 

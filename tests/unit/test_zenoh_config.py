@@ -68,6 +68,14 @@ def test_peers_gossip_and_wait_for_nobody(name: str) -> None:
     assert read(ALL[name], "connect/exit_on_failure") is False
 
 
+def test_who_receives_can_be_read_where_applications_do_and_nothing_written() -> None:
+    for name in ("control", "data", "worker"):
+        assert read(ALL[name], "adminspace/enabled") is (name == "data")
+    assert read(ALL["data"], "adminspace/permissions") == {"read": True, "write": False}
+    wait = "transport/link/tx/queue/congestion_control/drop/wait_before_drop"
+    assert (read(ALL["data"], wait), read(ALL["worker"], wait)) == (50_000, 1000)
+
+
 def test_only_data_has_small_buffers_and_shared_memory() -> None:
     assert read(ALL["control"], "listen/endpoints") == [HERE]
     assert read(ALL["data"], "listen/endpoints") == [f"{HERE}#so_sndbuf=65536"]

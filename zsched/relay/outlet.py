@@ -22,6 +22,7 @@ already. Class ``reliable`` sends nothing before its receiver has said where it 
 
 from __future__ import annotations
 
+import functools
 import logging
 import threading
 from typing import Final
@@ -36,6 +37,7 @@ from zsched.core.relay_protocol import EndMarker, StreamAck
 from zsched.core.serial import serial_of
 from zsched.keyspace import END_CHUNK
 from zsched.relay.acks import Acks
+from zsched.relay.crowd import Crowd
 from zsched.relay.greetings import Greetings
 from zsched.relay.lanes import KEPT_BYTES, KEPT_BYTES_LATEST, KEPT_SAMPLES, Lane, Sent
 from zsched.relay.receive import undeclare
@@ -72,9 +74,18 @@ class Outlet:
     """The way of one stream to one place; `send` is used by one thread at a time (its stream's lock)."""
 
     def __init__(
-        self, session: Session, from_expr: str, to_expr: str, settings: StreamSettings, acks: Acks | None = None
+        self,
+        session: Session,
+        from_expr: str,
+        to_expr: str,
+        settings: StreamSettings,
+        acks: Acks | None = None,
+        *,
+        has_crowd: bool = False,
     ) -> None:
         """Declare the publishers. With ``acks`` the receiver is `zsched.worker`, which says what it has processed.
+
+        ``has_crowd``: the receivers are applications, as many as like to.
 
         Raises:
             ValueError: ``to_expr`` cannot be filled from ``from_expr``.
@@ -103,6 +114,13 @@ class Outlet:
         self._probe = session.declare_publisher(to_expr)
         self._main = None if self._is_wild else self._declare(to_expr, Priority.DATA, is_express=False)
         self._queue = self._make_queue()
+        self._crowd = self._make_crowd() if has_crowd else None
+
+    def _make_crowd(self) -> Crowd | None:
+        if (queue := self._queue) is None:
+            return None  # class `best_effort` waits for nobody
+        is_latest = self._settings.stream_class is StreamClass.LATEST
+        return Crowd(self._session, self._to, lambda: queue.is_pressed, is_latest=is_latest)
 
     def _make_queue(self) -> SendQueue | None:
         stream_class, depth = self._settings.stream_class, self._settings.depth
@@ -205,6 +223,8 @@ class Outlet:
 
     def look_after(self) -> None:
         """Have sent again what was not acknowledged in time, and greet who has not answered; call it now and then."""
+        if self._crowd is not None:
+            self._look_after_crowd(self._crowd)
         is_matching = self.is_matching
         greetings = self._greetings
         is_there = greetings.is_there(self._lanes, is_matching=is_matching) if greetings is not None else is_matching
@@ -223,6 +243,18 @@ class Outlet:
         if self._greetings is not None and self._queue is not None:
             self._greetings.part(is_parted=is_parted)
             self._queue.kick()
+
+    def _look_after_crowd(self, crowd: Crowd) -> None:
+        crowd.look_after()
+        for lane, sample, stamp in crowd.take_owed():
+            size = len(sample.payload)
+            action = functools.partial(self._put, lane, sample, stamp, size)
+            if self._queue is not None:
+                self._handed += 1 - self._queue.send(lane, action, size, (sample, stamp))
+
+    def take_missed(self) -> int:
+        """How many samples single slow receivers may have missed since the last time."""
+        return 0 if self._crowd is None else self._crowd.take_missed()
 
     def counted(self) -> Tally:
         """What this outlet has taken and sent, and what is known of it (under the stream's lock)."""
@@ -323,7 +355,10 @@ class Outlet:
         self._in_hand = True
         began = monotonic_s()
         try:
-            lane.put(sample, stamp)
+            if self._crowd is None:
+                lane.put(sample, stamp)
+            else:
+                self._crowd.put(lane, sample, stamp, size)
         except zenoh.ZError:
             with self._lock:
                 self.tally.errors += 1

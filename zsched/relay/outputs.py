@@ -71,7 +71,7 @@ class OutputStream:
         self._wake = wake
         self._lock = threading.Lock()
         self._counter = StreamCounter(route.stream)
-        self._outlet = Outlet(local or session, route.from_expr, route.to_expr, route.settings)
+        self._outlet = Outlet(local or session, route.from_expr, route.to_expr, route.settings, has_crowd=True)
         self._slots: dict[int, OutputSlot] = {}
         self._ends: dict[str, zenoh.Subscriber[None]] = {}
         self._carrier: OutputSlot | None = None
@@ -235,6 +235,7 @@ class OutputStream:
 
     def look_after(self) -> None:
         """Let through what waits for answers that never come, or for a highest rate; call it now and then."""
+        self._outlet.look_after()
         with self._lock:
             for slot in tuple(self._slots.values()):
                 for (name, zid, eid), sample in slot.answers.overdue() if slot.answers is not None else ():
@@ -247,6 +248,7 @@ class OutputStream:
     def count(self) -> StreamCount:
         """The counters now."""
         with self._lock:
+            self._counter.dropped("slow_reader", self._outlet.take_missed())
             return self._counter.value()
 
     # --- one sample --------------------------------------------------------------------------------------------------

@@ -1,0 +1,137 @@
+"""`zsched.relay.crowd` and `.sockets`: who is waited for, who is left behind; TCP's own word on real connections."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+from collections.abc import Iterator
+
+import pytest
+import zenoh
+
+from support.waiting import free_endpoint, until
+from zsched.relay.crowd import FITS_BYTES, MAX_REST_S, REST_S, Reader
+from zsched.relay.sockets import LinkSocket, LinkSockets
+from zsched.zenoh_config import client_config, data_config
+
+NOW = 100.0
+
+
+@contextlib.contextmanager
+def connection() -> Iterator[tuple[socket.socket, socket.socket]]:
+    """(ours, theirs)."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        ours = socket.create_connection(server.getsockname())
+        theirs, _ = server.accept()
+        with ours, theirs:
+            yield ours, theirs
+
+
+def link_of(ours: socket.socket) -> LinkSocket:
+    return LinkSocket("1", (ours.getsockname(), ours.getpeername()), ours.fileno())
+
+
+@pytest.fixture
+def pair() -> Iterator[tuple[Reader, socket.socket, socket.socket]]:
+    with connection() as (ours, theirs):
+        yield Reader(link_of(ours), NOW), ours, theirs
+
+
+Pair = tuple[Reader, socket.socket, socket.socket]
+
+
+def test_what_the_other_end_has_taken_is_tcps_word(pair: Pair) -> None:
+    reader, ours, _ = pair
+    before = reader.link.taken()
+    ours.sendall(bytes(1000))
+    until(lambda: reader.link.taken() == before + 1000, "the acknowledgement")
+
+
+def test_a_link_that_is_gone_has_taken_nothing_and_cannot_be_cut() -> None:
+    with connection() as (ours, _):
+        link = link_of(ours)
+    assert (link.taken(), link.cut()) == (0, False)
+
+
+def test_another_ones_descriptor_is_not_cut() -> None:
+    with connection() as (ours, _), connection() as (other, peer):
+        assert not LinkSocket("1", (ours.getsockname(), ours.getpeername()), other.fileno()).cut()
+        other.sendall(b"x")
+        assert peer.recv(1) == b"x"
+
+
+def test_a_link_that_is_cut_ends(pair: Pair) -> None:
+    reader, _, theirs = pair
+    assert reader.link.cut()
+    assert theirs.recv(1) == b""
+
+
+def test_a_reader_moves_as_long_as_it_takes_something(pair: Pair) -> None:
+    reader, ours, _ = pair
+    reader.look(NOW + 1, has_room=False)
+    assert reader.moved_at == NOW + 1, "it has only now no room"
+    reader.look(NOW + 2, has_room=False)
+    assert reader.moved_at == NOW + 1
+    before = reader.link.taken()
+    ours.sendall(b"more")
+    until(lambda: reader.link.taken() > before, "the acknowledgement")
+    reader.look(NOW + 3, has_room=False)
+    assert reader.moved_at == NOW + 3
+    reader.look(NOW + 4, has_room=True)
+    reader.look(NOW + 5, has_room=False)
+    assert reader.moved_at == NOW + 5
+
+
+def test_half_of_the_time_is_forgiven(pair: Pair) -> None:
+    reader, _, _ = pair
+    reader.cost_s = 1.0
+    reader.look(NOW + 1, has_room=False)
+    assert reader.cost_s == 0.5
+    reader.look(NOW + 9, has_room=True)
+    assert reader.cost_s == 0.0
+
+
+def test_who_is_left_again_soon_rests_longer(pair: Pair) -> None:
+    reader, _, _ = pair
+    now, rests = NOW, []
+    for _ in range(6):
+        reader.leave(now)
+        assert reader.left_until is not None
+        rests.append(reader.left_until - now)
+        reader.come_back(reader.left_until)
+        assert reader.left_until is not None, "not before its rest is over"
+        now = reader.left_until + 0.1
+        reader.come_back(now)
+        assert reader.left_until is None
+    assert rests == [REST_S, 2 * REST_S, 4 * REST_S, MAX_REST_S, MAX_REST_S, MAX_REST_S]
+    reader.leave(now + MAX_REST_S)
+    assert reader.left_until == now + MAX_REST_S + REST_S
+
+
+def test_what_still_fits_into_a_full_link_is_not_missed(pair: Pair) -> None:
+    reader, _, _ = pair
+    missed = [reader.misses(10_000) for _ in range(20)]
+    assert missed.count(False) == FITS_BYTES // 10_048
+    assert missed == sorted(missed)
+    reader.look(NOW + 1, has_room=True)
+    assert not reader.misses(10_000)
+
+
+def test_the_sockets_of_those_who_subscribe_are_found() -> None:
+    """A session that subscribes to something else is none of them; of one receiver nobody needs to know."""
+    endpoint = free_endpoint()
+    with contextlib.ExitStack() as stack:
+        texts = [data_config(listen=(endpoint,), connect=(), shared_memory=False)]
+        texts += [client_config(connect=(endpoint,))] * 3
+        hub, *apps = [stack.enter_context(zenoh.open(zenoh.Config.from_json5(text))) for text in texts]
+        sockets = LinkSockets(hub)
+        kept = [apps[0].declare_subscriber("robot1/out", print), apps[2].declare_subscriber("robot1/in", print)]
+        until(lambda: len(hub.info.links()) == 3, "the links")
+        assert sockets.receivers("robot1/out") == ()
+        kept.append(apps[1].declare_subscriber("robot1/*", print))
+        links = until(lambda: sockets.receivers("robot1/out"), "two receivers")
+        assert {link.zid for link in links} == {str(apps[0].zid()), str(apps[1].zid())}
+        assert all(link.taken() > 0 for link in links)
+        assert {link.ends[0][1] for link in links} == {int(endpoint.rsplit(":", 1)[1])}
+        for subscriber in kept:
+            subscriber.undeclare()

@@ -1,0 +1,261 @@
+"""Puts a stream's outputs to all its applications, and leaves behind the one that takes too little.
+
+Knows: whose link has room (`zsched.relay.sockets`), when to wait for it and when not. Does not know: zenoh's queues,
+which stream this is.
+
+zenoh hands a sample to one receiver after the other: a put that waits (BLOCK) for a frozen one makes all of them wait,
+for seconds. So, where there are two or more, each put first waits until every link has room. A receiver whose link has
+none is *left behind*, while another one is ready, when it has taken nothing for `PATIENCE_S`, or when the others have
+waited so long for it and the queue before the put runs full. As long as somebody is left behind, puts do not wait
+(DROP): zenoh drops for this receiver alone. What it may have missed is counted. After a rest, and when its link has
+room again, it is waited for like the others; of class ``latest`` the newest sample is then put once more.
+
+A sample that is larger than what a link holds may have begun when the receiver froze: nothing ends such a put but the
+link's end. `Crowd.look_after` ends the link, when the receiver has taken nothing for `STUCK_S`; it then dials again.
+"""
+
+from __future__ import annotations
+
+import logging
+import select
+import threading
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Final
+
+import zenoh
+from zenoh import CongestionControl, Sample, SampleKind, Session, Timestamp
+
+from zsched.clock import monotonic_s
+from zsched.core.serial import serial_of
+from zsched.relay.lanes import Lane
+from zsched.relay.sockets import LinkSocket, LinkSockets
+from zsched.send_queue import PATIENCE_S
+from zsched.zenoh_config import DROP_WAIT_S
+
+LOOK_S: Final = 1.0
+"""How old our knowledge of who subscribes may be."""
+STUCK_S: Final = 0.5
+SLICE_S: Final = 0.02
+"""How long to wait for room before looking again at everything else."""
+FORGIVEN_RATIO: Final = 0.5
+REST_S, MAX_REST_S = 1.0, 8.0
+"""A receiver is left behind for so long at least; twice as long when it is left again soon."""
+FITS_BYTES: Final = 96 << 10
+"""So much still fits into zenoh's queue of a link whose socket is full (two batches of 48 KiB)."""
+OVERHEAD_BYTES: Final = 48
+SLOW_PUT_S: Final = 0.005
+MAX_CHARGE_S: Final = 0.5
+
+_log = logging.getLogger("zsched.relay")
+
+
+@dataclass(slots=True, eq=False)
+class Reader:
+    """One application that receives the stream."""
+
+    link: LinkSocket
+    looked_at: float
+    """When it was last seen to have no room, or to have it."""
+    is_full: bool = False
+    taken: int = 0
+    moved_at: float = 0.0
+    """Since when it is full and has taken nothing."""
+    cost_s: float = 0.0
+    """How long the others have waited for it; half of the time that passes is forgiven."""
+    left_until: float | None = None
+    """It is left behind, at least until then (monotonic seconds)."""
+    rest_s: float = 0.0
+    back_at: float = 0.0
+    fits: int = FITS_BYTES
+    """Bytes that its link would still take although its socket is full."""
+
+    def look(self, now: float, *, has_room: bool) -> None:
+        """Note whether it takes anything, and what that costs the others."""
+        passed, self.looked_at = now - self.looked_at, now
+        was_full, self.is_full = self.is_full, not has_room
+        self.cost_s = max(0.0, self.cost_s - passed * FORGIVEN_RATIO)
+        if has_room:
+            self.fits = FITS_BYTES
+            return
+        taken = self.link.taken()
+        if not was_full or taken != self.taken:
+            self.taken, self.moved_at = taken, now
+
+    def leave(self, now: float) -> None:
+        """Wait for it no more, for a while."""
+        is_soon = now - self.back_at < MAX_REST_S
+        self.rest_s = min(2 * self.rest_s, MAX_REST_S) if is_soon and self.rest_s else REST_S
+        self.left_until, self.cost_s = now + self.rest_s, 0.0
+
+    def come_back(self, now: float) -> None:
+        """Wait for it again, if it has rested."""
+        if self.left_until is not None and now > self.left_until:
+            self.left_until, self.back_at = None, now
+
+    def misses(self, size: int) -> bool:
+        """Whether a sample that is put now is lost to it, its socket being full."""
+        self.fits -= size + OVERHEAD_BYTES
+        return self.fits < 0
+
+
+class Crowd:
+    """The applications that receive one output stream. `put` belongs to one thread, the rest to any."""
+
+    def __init__(self, session: Session, expr: str, is_pressed: Callable[[], bool], *, is_latest: bool) -> None:
+        """``is_pressed`` says whether samples wait before `put`, so many that some will be dropped for all."""
+        self._session = session
+        self._expr = expr
+        self._is_pressed = is_pressed
+        self._is_latest = is_latest
+        self._sockets = LinkSockets(session)
+        self._readers: dict[LinkSocket, Reader] = {}
+        self._looked_at = -LOOK_S
+        self._cared_at = 0.0
+        self._lock = threading.Lock()
+        self._is_smooth = True
+        """Everybody had room at the last look, and nobody is left behind."""
+        self._putting_since: float | None = None
+        self._owed: dict[Lane, tuple[Sample, Timestamp | None]] = {}
+        self._missed = 0
+
+    def put(self, lane: Lane, sample: Sample, stamp: Timestamp | None, size: int) -> None:
+        """Put a sample, waiting for everybody who is not left behind."""
+        is_alone = self._look(monotonic_s())
+        left = () if is_alone else self._wait()
+        began = self._putting_since = monotonic_s()
+        try:
+            if left:
+                self._put_dropping(lane, sample, stamp)
+            else:
+                lane.put(sample, stamp)
+        finally:
+            self._putting_since = None
+        if left:
+            is_doubtful = monotonic_s() - began >= DROP_WAIT_S * 0.9  # zenoh has given up at somebody's link
+            self._missed += sum(reader.misses(size) for reader in left) + is_doubtful
+        if left and self._is_latest:
+            self._owed[lane] = (sample, stamp)
+        elif self._owed:
+            self._owed.pop(lane, None)
+
+    def take_missed(self) -> int:
+        """How many samples single receivers may have missed since the last time, summed over them."""
+        missed, self._missed = self._missed, 0
+        return missed
+
+    def take_owed(self) -> list[tuple[Lane, Sample, Timestamp | None]]:
+        """The newest samples that somebody may have missed, once nobody is left behind any more."""
+        if not self._owed:
+            return []
+        self._full()
+        if any(reader.left_until is not None for reader in tuple(self._readers.values())):
+            return []
+        owed, self._owed = self._owed, {}
+        return [(lane, sample, stamp) for lane, (sample, stamp) in owed.items()]
+
+    def look_after(self) -> None:
+        """See whom a put waits for that is under way; call it a few times a second.
+
+        A receiver that froze in the middle of a sample loses its link, if others wait for it.
+        """
+        since, now = self._putting_since, monotonic_s()
+        period_s, self._cared_at = now - self._cared_at, now
+        if since is None or now - since < SLOW_PUT_S or len(self._readers) < 2:
+            return
+        full = self._full()
+        self._charge(full, min(period_s, MAX_CHARGE_S))
+        if now - since < STUCK_S or len(full) == len(self._readers):
+            return
+        for reader in full:
+            if now - reader.moved_at >= STUCK_S and reader.link.cut():
+                _log.warning("%s: %s took nothing of a sample: its link is ended", self._expr, reader.link.name)
+                self._missed += 1
+
+    # --- one put -----------------------------------------------------------------------------------------------------
+
+    def _look(self, now: float) -> bool:
+        """Know who receives, now and then; ``True`` when there is nobody to protect from anybody."""
+        if now - self._looked_at >= LOOK_S:
+            self._looked_at = now
+            links = self._sockets.receivers(self._expr)
+            self._readers = {link: self._readers.get(link) or Reader(link, now) for link in links}
+        return len(self._readers) < 2
+
+    def _wait(self) -> tuple[Reader, ...]:
+        """Wait for room at everybody's link; answers who is left behind and has none."""
+        began = looked_at = monotonic_s()
+        while True:
+            full = self._full()
+            now = monotonic_s()
+            self._charge(full, now - looked_at)
+            looked_at = now
+            waiting = [reader for reader in full if reader.left_until is None]
+            is_nobody_ready = len(full) == len(self._readers)
+            if not waiting or (is_nobody_ready and now - began > PATIENCE_S):
+                break
+            _ready(waiting, SLICE_S)
+        return tuple(reader for reader in full if reader.left_until is not None)
+
+    def _full(self) -> list[Reader]:
+        """Whose link has no room now; whoever has rested and has room is waited for again."""
+        with self._lock:
+            readers = tuple(self._readers.values())
+            ready = _ready(readers, 0.0)  # one that is closed is ready, too: nothing waits for it
+            if len(ready) == len(readers) and self._is_smooth:
+                return []
+            now = monotonic_s()
+            for reader in readers:
+                reader.look(now, has_room=reader.link.fd in ready)
+                if not reader.is_full:
+                    reader.come_back(now)
+            self._is_smooth = not any(reader.is_full or reader.left_until is not None for reader in readers)
+            return [reader for reader in readers if reader.is_full]
+
+    def _charge(self, full: list[Reader], waited_s: float) -> None:
+        """Leave behind who is stalled, or has cost the others more than they can wait; ``full``: who has no room."""
+        if not full or len(full) == len(self._readers):
+            return  # nobody who is ready waits for them
+        now, is_pressed = monotonic_s(), self._is_pressed()
+        for reader in full:
+            reader.cost_s += waited_s
+            is_stalled = now - reader.moved_at > PATIENCE_S
+            if reader.left_until is None and (is_stalled or (is_pressed and reader.cost_s > PATIENCE_S)):
+                reader.leave(now)
+                what = "stalled" if is_stalled else "too slow"
+                _log.info("%s: %s is %s: nobody waits for it", self._expr, reader.link.name, what)
+
+    def _put_dropping(self, lane: Lane, sample: Sample, stamp: Timestamp | None) -> None:
+        """Put without waiting, under the next number; an advanced publisher numbers only what its cache has."""
+        is_numbered = isinstance(lane.publisher, zenoh.Publisher)
+        source = zenoh.SourceInfo(lane.source_id, serial_of(lane.count)) if is_numbered else None
+        if sample.kind == SampleKind.DELETE:
+            self._session.delete(
+                lane.key,
+                attachment=sample.attachment,
+                timestamp=stamp,
+                source_info=source,
+                congestion_control=CongestionControl.DROP,
+                priority=sample.priority,
+                express=sample.express,
+            )
+        else:
+            self._session.put(
+                lane.key,
+                sample.payload,
+                encoding=sample.encoding,
+                attachment=sample.attachment,
+                timestamp=stamp,
+                source_info=source,
+                congestion_control=CongestionControl.DROP,
+                priority=sample.priority,
+                express=sample.express,
+            )
+
+
+def _ready(readers: Iterable[Reader], wait_s: float) -> set[int]:
+    """The descriptors with room (or gone), waiting at most so long for the first one."""
+    poll = select.poll()
+    for reader in readers:
+        poll.register(reader.link.fd, select.POLLOUT)
+    return {fd for fd, _ in poll.poll(wait_s * 1000)}

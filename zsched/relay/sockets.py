@@ -1,0 +1,138 @@
+"""Finds the sockets beneath a zenoh session's links, and says how far their receivers are.
+
+Knows: this process's descriptors, TCP's own counters, who subscribes to a key (zenoh's admin space). Does not know:
+streams, what is done about a slow receiver.
+
+zenoh tells nobody that a receiver takes nothing: a put waits, or drops, in silence. The kernel knows it for every link:
+whether there is room in its send buffer, and how many bytes the other end has taken. The descriptors are zenoh's; they
+are only looked at, and `cut` looks twice.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+import socket
+import struct
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import zenoh
+from zenoh import Session
+
+_BYTES_ACKED: Final = struct.Struct("<Q")
+_BYTES_ACKED_AT: Final = 120
+"""Where ``tcpi_bytes_acked`` stands in Linux's ``struct tcp_info`` (4.1 and later)."""
+_ADDRESS: Final = re.compile(r"(?:tcp|tls)/\[?([^\]#?]+)\]?:(\d+)")
+QUESTION_S: Final = 0.5
+
+_Ends = tuple[tuple[str, int], tuple[str, int]]
+
+
+@dataclass(frozen=True, slots=True)
+class LinkSocket:
+    """One TCP (or TLS) link of a session."""
+
+    zid: str
+    """The session at the other end."""
+    ends: _Ends
+    """(our address, theirs)."""
+    fd: int
+
+    @property
+    def name(self) -> str:
+        """Where the other end is."""
+        host, port = self.ends[1]
+        return f"{host}:{port}"
+
+    def taken(self) -> int:
+        """How many bytes the other end has taken so far; 0 when the socket is gone."""
+        with contextlib.suppress(OSError, struct.error), _borrowed(self.fd) as held:
+            info = held.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _BYTES_ACKED_AT + _BYTES_ACKED.size)
+            return int(_BYTES_ACKED.unpack_from(info, _BYTES_ACKED_AT)[0])
+        return 0
+
+    def cut(self) -> bool:
+        """End the connection; ``False`` when the descriptor is another one's by now."""
+        with contextlib.suppress(OSError), _borrowed(self.fd) as held:
+            if _ends_of(held) == self.ends:
+                held.shutdown(socket.SHUT_RDWR)
+                return True
+        return False
+
+
+class LinkSockets:
+    """The sockets of one session's links, found once for every link; used by one thread at a time."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._known: dict[_Ends, int] = {}
+
+    def receivers(self, expr: str) -> tuple[LinkSocket, ...]:
+        """The links to sessions that subscribe to ``expr`` or a part of it, as far as they are TCP."""
+        wanted = self._subscribers(expr)
+        if len(wanted) < 2:
+            return ()
+        found = {(str(link.zid), _ends(link)) for link in self._session.info.links() if str(link.zid) in wanted}
+        links = {ends: zid for zid, ends in found if ends is not None}
+        self._find(links)
+        return tuple(LinkSocket(zid, ends, self._known[ends]) for ends, zid in links.items() if ends in self._known)
+
+    def _subscribers(self, expr: str) -> set[str]:
+        answers = self._session.get(
+            f"@/{self._session.zid()}/*/subscriber/{expr}",
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            accept_replies=zenoh.ReplyKeyExpr.ANY,
+            timeout=QUESTION_S,
+        )
+        texts = [answer.ok.payload.to_bytes() for answer in answers if answer.ok is not None]
+        found: set[str] = set()
+        for text in texts:
+            with contextlib.suppress(ValueError, AttributeError):
+                found.update(zid for zids in json.loads(text).values() for zid in zids)
+        return found - {str(self._session.zid())}
+
+    def _find(self, links: Iterable[_Ends]) -> None:
+        """Look up the descriptors of links that are new."""
+        wanted = set(links)
+        self._known = {ends: fd for ends, fd in self._known.items() if ends in wanted}
+        if wanted == self._known.keys():
+            return
+        for path in Path("/proc/self/fd").iterdir():
+            with contextlib.suppress(OSError), _borrowed(int(path.name)) as held:
+                ends = _ends_of(held)
+                if ends in wanted:
+                    self._known[ends] = int(path.name)
+
+
+@contextlib.contextmanager
+def _borrowed(fd: int) -> Iterator[socket.socket]:
+    """A socket of zenoh's as one of Python's, which does not close it."""
+    held = socket.socket(fileno=fd)  # raises OSError for what is no socket
+    try:
+        yield held
+    finally:
+        held.detach()
+
+
+def _ends_of(held: socket.socket) -> _Ends:
+    ours, theirs = held.getsockname(), held.getpeername()
+    if not isinstance(ours, tuple) or not isinstance(theirs, tuple):
+        raise OSError("no internet socket")
+    return (_plain(ours[0]), ours[1]), (_plain(theirs[0]), theirs[1])
+
+
+def _ends(link: zenoh.Link) -> _Ends | None:
+    ours, theirs = _ADDRESS.match(str(link.src)), _ADDRESS.match(str(link.dst))
+    if ours is None or theirs is None:
+        return None
+    return (_plain(ours[1]), int(ours[2])), (_plain(theirs[1]), int(theirs[2]))
+
+
+def _plain(host: str) -> str:
+    """An address as both sides write it: an IPv4 one without IPv6's prefix."""
+    return host.removeprefix("::ffff:").partition("%")[0]
