@@ -3,7 +3,7 @@
 ``python -m benchmarks.frozen_moves [--minutes 30] [--seed 1] [--hz 200]``. Three edges with real relays and echo
 workers, one ``reliable`` stream with ``handover: all``. Each move goes to a random other edge, whose worker is stopped
 (SIGSTOP) between *ready* and the flip, for 0.9 s, for 4 s (longer than its link's lease) or not at all. Every fifth
-minute the workers are slower than the stream (8 ms a sample at 200 Hz): overload may lose, but never silently.
+minute the stream is five times as fast and the workers half as fast as it: overload may lose, but never silently.
 
 It fails (exit code 1) when a sample is lost that no counter of the robot's relay tells of: neither an input's nor an
 answer's; when the counters of an input do not account for every sample (`zsched.core.books`), looked at every second;
@@ -32,7 +32,8 @@ from zsched.core.plan import RoutePhase, Slot, StreamClass, StreamCount, WorkerR
 EDGES = ("edge1", "edge2", "edge3")
 FREEZES_S = (0.0, 0.9, 4.0)
 DRAIN_S = 20.0
-SLOW = ("--delay-ms", "8")
+OVERLOAD = 5
+"""So many times the rate."""
 
 
 @dataclass
@@ -71,9 +72,10 @@ def main() -> int:
 
 
 def _round(rig: Rig, random_: random.Random, hz: float, until_s: float, sums: Sums, *, is_overload: bool) -> None:
-    load = (Load(name="small", hz=hz, size=100),)
+    load = (Load(name="small", hz=hz * (OVERLOAD if is_overload else 1), size=100),)
+    slow = ("--delay-ms", str(2000 / load[0].hz)) if is_overload else ()
     for edge in EDGES:
-        rig.start_worker(edge, *(SLOW if is_overload else ()))
+        rig.start_worker(edge, *slow)
     traffic = Traffic(rig.app(), load[0])
     now = routes("edge1", 1, load, StreamClass.RELIABLE)
     rig.move(now)

@@ -48,7 +48,7 @@ from zsched.core.fleet import (
     WorkerSpec,
 )
 from zsched.core.model import RSSI_MAX_DBM, RSSI_MIN_DBM, Aggregate, NodeKind, Tuning
-from zsched.core.plan import HandoverRule, ReadyWhen, ServiceSettings, StreamClass, StreamSettings
+from zsched.core.plan import HandoverRule, OnCrash, ReadyWhen, ServiceSettings, StreamClass, StreamSettings
 from zsched.core.timing import PROFILES
 
 _HOST_PORT: Final = ("tcp", "udp", "tls", "quic", "ws")
@@ -298,6 +298,11 @@ RULE: Final = Record(
         "handover": Field(Choice.of(HandoverRule), "Outputs: switch at the new owner's first sample, or lose nothing."),
         "max_hz": Field(Number(0.01, 10_000, "Hz"), "Highest rate per key; not for `reliable`.", default="no limit"),
         "mirror": Field(Flag(), "Inputs: feed both owners during a move (outputs with handover `latest` only)."),
+        "on_crash": Field(
+            Choice.of(OnCrash),
+            "Inputs of class `reliable`: what a dead owner had not acknowledged is reported (done at most once), "
+            "or replayed to the next owner (at least once).",
+        ),
     },
     StreamSettings,
 )

@@ -25,7 +25,16 @@ from zsched.core.fleet import (
     WorkerSpec,
 )
 from zsched.core.model import NodeKind, Tuning, Weights
-from zsched.core.plan import Direction, HandoverRule, ReadyWhen, RosGraph, ServiceSettings, StreamClass, StreamSettings
+from zsched.core.plan import (
+    Direction,
+    HandoverRule,
+    OnCrash,
+    ReadyWhen,
+    RosGraph,
+    ServiceSettings,
+    StreamClass,
+    StreamSettings,
+)
 from zsched.core.rulecheck import RuleConflict, rule_conflicts
 from zsched.core.templates import (
     PLACEHOLDERS,
@@ -269,7 +278,7 @@ def _rule(section: Section, direction: Direction, out: Collector) -> StreamRule 
 
 
 def _settings(section: Section) -> dict[str, Any]:
-    return _of(section, "class", "keep_last", "depth", "handover", "max_hz", "mirror", "graph")
+    return _of(section, "class", "keep_last", "depth", "handover", "max_hz", "mirror", "graph", "on_crash")
 
 
 def _check_settings(section: Section, direction: Direction, out: Collector) -> None:
@@ -279,6 +288,9 @@ def _check_settings(section: Section, direction: Direction, out: Collector) -> N
         out.error(section.where("handover"), "only outputs have a handover: an input switches in one step", "delete it")
     if direction is not Direction.INPUT and section.get("mirror"):
         out.error(section.where("mirror"), "only inputs are mirrored: an output has one owner at a time", "delete it")
+    is_reliable_input = direction is Direction.INPUT and section.get("class") is StreamClass.RELIABLE
+    if section.get("on_crash") is OnCrash.REPLAY and not is_reliable_input and section.is_whole:
+        out.error(section.where("on_crash"), "only inputs of class reliable have something to replay", "delete it")
     if section.get("max_hz") is not None and section.get("class") is StreamClass.RELIABLE:
         out.error(section.where("max_hz"), "class reliable loses nothing, max_hz drops", "class: best_effort")
     if section.get("class") is StreamClass.LATEST and section.get("handover") is HandoverRule.ALL:

@@ -27,7 +27,7 @@ from zsched.clock import monotonic_s
 from zsched.core.relay_protocol import EndMarker
 from zsched.core.serial import number_near, serial_of
 from zsched.guard import guarded
-from zsched.hop_acks import GIVE_UP_S, Acknowledger, SourceName
+from zsched.hop_acks import GIVE_UP_S, MAX_SOURCES, Acknowledger, SourceName
 
 END_GRACE_S: Final = 0.1
 MAX_WITHHELD: Final = 256
@@ -47,6 +47,8 @@ class Received:
     payload: zenoh.ZBytes
     attachment: zenoh.ZBytes | None = None
     deleted: bool = False
+    replayed: bool = False
+    """An owner that died had this sample, too, and may have done it (`on_crash: replay`)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,6 +80,7 @@ class _Waiting:
     sample: zenoh.Sample | None
     name: SourceName | None = None
     number: int = 0
+    replayed: bool = False
 
 
 class _Done(NamedTuple):
@@ -86,6 +89,7 @@ class _Done(NamedTuple):
     sample: zenoh.Sample
     quiet_at: float | None
     """When it was processed, if nothing was withheld of it: it counts where the state that it went into is replaced."""
+    replayed: bool = False
 
     def is_over(self, *, is_restored: bool, now: float) -> bool:
         """True when it need not be processed again."""
@@ -115,6 +119,8 @@ class Dispatcher:
         self._queue: deque[_Waiting] = deque()
         self._markers: list[Marker] = []
         self._open: dict[SourceName, _Open] = {}
+        self._replays: dict[SourceName, int] = {}
+        """Numbers of a source below this one went to an earlier owner (zenoh's thread alone touches it)."""
         self._epoch = 0
         self._begun = 0
         self._has_withheld = False
@@ -150,6 +156,7 @@ class Dispatcher:
             if number is None:
                 return
             waiting.number = number
+            waiting.replayed = number < self._replays.get(waiting.name, 0)
         with self._wake:
             line = source.waiting.setdefault(key, deque())
             line.append(waiting)
@@ -168,10 +175,19 @@ class Dispatcher:
         """Queue an end marker (zenoh's thread)."""
         if marker.end.epoch == 0:  # it ends nothing: what is below its number was given up by the relay
             self._acks.skip(marker.name, marker.end.count)
+            if marker.end.replayed:
+                self._note_replay(marker)
             return
         with self._wake:
             self._markers.append(marker)
             self._wake.notify()
+
+    def _note_replay(self, marker: Marker) -> None:
+        first = self._acks.number(marker.name, serial_of(marker.end.count))
+        self._replays.pop(marker.name, None)
+        self._replays[marker.name] = first + marker.end.replayed
+        if len(self._replays) > MAX_SOURCES:
+            self._replays.pop(next(iter(self._replays)))
 
     def epoch_in_hand(self) -> int | None:
         """In the dispatch thread: the epoch in which the source of the input in hand was first heard."""
@@ -253,7 +269,7 @@ class Dispatcher:
         """Take the next sample out of its key's line (under the lock): from here on nothing sheds it."""
         if self._again:
             source, done = self._again.popleft()
-            return _Waiting(source, done.sample)
+            return _Waiting(source, done.sample, replayed=done.replayed)
         waiting = self._queue.popleft() if self._queue else None
         if waiting is None or waiting.sample is None:
             return None
@@ -267,13 +283,13 @@ class Dispatcher:
         self._has_withheld = False
         begun, was_standby = self._begun, self._is_standby()
         self._in_hand = self._hear(waiting.name, sample) if waiting.name is not None else self._epoch
-        self._dispatch(source, sample)
+        self._dispatch(source, sample, replayed=waiting.replayed)
         self._in_hand = None
         if waiting.name is not None:
             self._note(waiting.name, waiting.number, sample)
         if not self._has_withheld and not was_standby:
             return
-        done = _Done(sample, None if self._has_withheld else monotonic_s())
+        done = _Done(sample, None if self._has_withheld else monotonic_s(), waiting.replayed)
         with self._wake:
             if self._begun != begun:  # it became the owner meanwhile
                 self._again.append((source, done))
@@ -282,13 +298,14 @@ class Dispatcher:
             empty: deque[_Done] = deque(maxlen=source.keep_last or MAX_WITHHELD)
             self._withheld.setdefault(name, (source, empty))[1].append(done)
 
-    def _dispatch(self, source: Input, sample: zenoh.Sample) -> None:
+    def _dispatch(self, source: Input, sample: zenoh.Sample, *, replayed: bool) -> None:
         key = str(sample.key_expr)
         received = Received(
             key=key,
             payload=sample.payload,
             attachment=sample.attachment,
             deleted=sample.kind == zenoh.SampleKind.DELETE,
+            replayed=replayed,
         )
         self._stamp = sample.timestamp
         try:

@@ -29,6 +29,7 @@ from zsched.core.fleet import Timing
 from zsched.core.plan import (
     Direction,
     HandoverRule,
+    OnCrash,
     ReadyWhen,
     Role,
     Route,
@@ -47,8 +48,17 @@ Kind = TypeVar("Kind")
 FLEET, ROBOT, TASK = "test", "robot1", "echo"
 
 
-def slot(epoch: int, owner: str, stream_class: StreamClass, keep_last: int, ready: ReadyWhen = ReadyWhen.TOKEN) -> Slot:
-    settings = StreamSettings(stream_class=stream_class, keep_last=keep_last, depth=4000, handover=HandoverRule.ALL)
+def slot(
+    epoch: int,
+    owner: str,
+    stream_class: StreamClass,
+    keep_last: int,
+    ready: ReadyWhen = ReadyWhen.TOKEN,
+    on_crash: OnCrash = OnCrash.REPORT,
+) -> Slot:
+    settings = StreamSettings(
+        stream_class=stream_class, keep_last=keep_last, depth=4000, handover=HandoverRule.ALL, on_crash=on_crash
+    )
     routes = (
         Route(
             stream=f"{TASK}/in/0",

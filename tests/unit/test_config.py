@@ -449,6 +449,7 @@ ONE_FAULT = [
     ("keep_last: 1", "handover: all", "only outputs have a handover", "all}]"),
     ("keep_last: 1", "max_hz: 0", "not in the allowed range 0.01..10000 Hz", "0}]"),
     ("class: latest, keep_last: 1", "class: reliable, max_hz: 5", "class reliable loses nothing", "5}]"),
+    ("class: latest, keep_last: 1", "class: latest, on_crash: replay", "only inputs of class reliable", "replay}]"),
     ('"{robot}/map"', '"{target}/map"', "whoever owns", '"{target}/map"'),
     ("{target}/map_merge/{robot}/map", "{target}/map_merge/map", "would both publish", '"{target}/map_merge/map"'),
     ('"{robot}/map"', '"@zsched/x"', "belong to zsched itself", '"@zsched/x"'),

@@ -288,3 +288,16 @@ def test_a_signalled_worker_is_gone_within_a_second(tmp_path: Path, is_relay_sto
             process.wait(5)
         if peer.stdout is not None:
             peer.stdout.close()
+
+
+def test_what_an_owner_that_died_may_have_done_is_marked(relay: Relay, echo: Echo) -> None:
+    """The start marker says how many samples went to it; what a standby took of them keeps the mark."""
+    payload = encode_end(EndMarker(epoch=0, count=0, replayed=2))
+    relay.session.put(f"{INPUT}/{END_CHUNK}", payload, source_info=zenoh.SourceInfo(relay.publisher.id, 0))
+    for name in (b"a", b"b", b"c"):
+        relay.put(name)
+    until(lambda: len(echo.taken) == 3, "the inputs")
+    relay.tell(WorkerRole.ACTIVE, epoch=4)
+    until(lambda: len(echo.taken) == 6, "once more, as the owner")
+    marks = [(received.payload.to_bytes(), received.replayed) for received in echo.taken]
+    assert marks == [(b"a", True), (b"b", True), (b"c", False)] * 2

@@ -34,6 +34,13 @@ class HandoverRule(StrEnum):
     ALL = "all"
 
 
+class OnCrash(StrEnum):
+    """Inputs of class ``reliable``: what becomes of samples that an owner had not acknowledged when it died."""
+
+    REPORT = "report"  # they are counted: each is done at most once
+    REPLAY = "replay"  # the next owner gets them: each is done at least once
+
+
 class RosGraph(StrEnum):
     """In which ROS graph a stream's endpoints are announced (`zsched.core.ros2`)."""
 
@@ -65,6 +72,7 @@ class StreamSettings:
     """Inputs: until the old slot closes, both owners are fed (outputs with handover ``latest`` only)."""
     graph: RosGraph = RosGraph.NONE
     """Set by the fleet file's `ros2:` sections."""
+    on_crash: OnCrash = OnCrash.REPORT
 
     def __post_init__(self) -> None:
         check_range("keep_last", self.keep_last, 0, 1000)
@@ -188,11 +196,12 @@ class StreamCount:
     reordered: int = 0
     """Numbers that came behind newer ones and were dropped."""
     replayed: int = 0
-    """Kept values sent once more to a new owner, and samples sent again for want of an acknowledgement."""
+    """Kept values sent once more to a new owner, and samples sent again for want of an acknowledgement, or after a
+    crash (`OnCrash.REPLAY`)."""
     at_most_lost: int = 0
     """Inputs: in flight to workers that died, so at most so many had no result."""
     repeated: int = 0
-    """Inputs: samples that were given to one more receiver: kept values, mirrors, replays after a crash."""
+    """Inputs: samples that were given to one more receiver: kept values and mirrors."""
     unsent: int = 0
     """Inputs of class ``latest``: values that came while there was no owner; the newest are kept for the next one."""
     from_expr: str = ""

@@ -87,14 +87,20 @@ class WorkerMatched:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EndMarker:
-    """Behind a stream's last sample of ``epoch``: ``count`` samples went before it on this key (source number - 1)."""
+    """Behind a stream's last sample of ``epoch``: ``count`` samples went before it on this key (source number - 1).
+
+    With epoch 0 it ends nothing and is a *start marker*: no number below ``count`` will come any more.
+    """
 
     epoch: int
     count: int
+    replayed: int = 0
+    """Start markers: so many samples from ``count`` on went to an earlier owner, which died."""
 
     def __post_init__(self) -> None:
         check_counter("end.epoch", self.epoch)
         check_counter("end.count", self.count)
+        check_counter("end.replayed", self.replayed)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -98,12 +98,6 @@ class ChaosBed(Netbed):
         self.wait(self.is_calm, timeout_s, "a calm fleet")
         return self.owner_of(TASK) or ""
 
-    def power_off(self, node: NodeId) -> None:
-        """The machine is gone at once: nobody sees its sockets close."""
-        self.network.link(node, is_up=False)
-        stop_group(self.pid(node), signal.SIGKILL)
-        self._processes.pop(node).wait(10)
-
     # --- judging -----------------------------------------------------------------------------------------------------
 
     def seen(self) -> History:

@@ -229,6 +229,13 @@ class Netbed(Testbed):
         endpoints: list[str] = ask(socket_path(self.folder, node), {"verb": "access"}, 3.0)["endpoints"]
         return endpoints[0]
 
+    def power_off(self, node: NodeId, *, is_seen: bool = False) -> None:
+        """The machine is gone at once: nobody sees its sockets close, unless ``is_seen``: only its processes die."""
+        if not is_seen:
+            self.network.link(node, is_up=False)
+        stop_group(self.pid(node), signal.SIGKILL)
+        self._processes.pop(node).wait(10)
+
     # --- what the logs tell ------------------------------------------------------------------------------------------
 
     def history(self, **arguments: object) -> History:

@@ -4,13 +4,15 @@ Knows: which slots are open and which one the stream feeds. Does not know: why o
 
 Everything happens under the stream's lock, the sample that just came included: between the kept values that a flip
 sends and the first sample behind it there is no gap. A kept value reaches a new owner at least once; it may have
-reached the old one too.
+reached the old one too. With ``on_crash: replay`` the same holds for what an owner that died had not acknowledged,
+unless its answer, known by the sample's timestamp, has passed; and what comes while there is no owner waits for one.
 """
 
 from __future__ import annotations
 
 import threading
 from collections import OrderedDict, deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -18,18 +20,23 @@ import zenoh
 from zenoh import Sample, Session, Timestamp
 
 from zsched.clock import monotonic_s
-from zsched.core.plan import Route, StreamClass, StreamCount
+from zsched.core.plan import OnCrash, Route, StreamClass, StreamCount
 from zsched.relay.acks import Acks
 from zsched.relay.counter import StreamCounter
-from zsched.relay.outlet import Outlet
+from zsched.relay.outlet import MAX_OWED, Outlet, Owed
 from zsched.relay.pace import Pace
 from zsched.relay.receive import Receiver
 from zsched.relay.tally import Tally
+from zsched.send_queue import MAX_BYTES
 
 MAX_KEYS: Final = 4096
 """Concrete keys of one wildcard stream whose values are kept; the oldest give way."""
 
 _Kept = tuple[int, Sample, Timestamp | None]
+
+
+def _never(_stamp: Timestamp) -> bool:
+    return False
 
 
 @dataclass(slots=True)
@@ -58,6 +65,10 @@ class InputStream:
         self._pace: Pace[tuple[Sample, Timestamp | None]] | None = (
             None if max_hz is None else Pace(max_hz, remembers=is_latest)
         )
+        self._replays = route.settings.on_crash is OnCrash.REPLAY
+        self._owed_bytes = 0
+        self._owed: list[Owed] = []
+        """What waits for the next owner: an owner that died had not acknowledged it, or there was none."""
         self._is_patient = route.settings.stream_class is StreamClass.RELIABLE
         self._number = 0
         self._keep_last = route.settings.keep_last if is_latest else 0
@@ -103,13 +114,19 @@ class InputStream:
                 number > slot.sent for values in self._kept.values() for number, _, _ in values
             )
 
-    def flip(self, epoch: int) -> int:
-        """Feed the slot from now on, behind the kept values it has not had; answers how many those were."""
+    def flip(self, epoch: int, *, is_old_dead: bool = False, is_done: Callable[[Timestamp], bool] = _never) -> int:
+        """Feed the slot from now on, behind the kept values it has not had; answers how many those were.
+
+        ``is_old_dead``: the worker of the slot that carried is gone. ``is_done`` answers for the timestamp of a sample
+        that such a worker had not acknowledged, whether its answer has passed.
+        """
         with self._lock:
             slot = self._slots.get(epoch)
             if slot is None or slot is self._active:
                 return 0
-            replayed = self._catch_up(slot)
+            if is_old_dead and self._replays:
+                self._abandon(self._active)
+            replayed = self._catch_up(slot) + self._replay(slot, is_done)
             if self.route.settings.mirror:
                 self._mirror = self._active
             elif self._active is not None:
@@ -136,8 +153,11 @@ class InputStream:
             slot = self._slots.get(epoch)
             return slot is None or not slot.is_counted or not slot.outlet.counted().in_flight
 
-    def close_slot(self, epoch: int) -> int:
-        """Forget a slot; answers how many samples its worker had not processed when it was last heard of."""
+    def close_slot(self, epoch: int, *, is_done: Callable[[Timestamp], bool] = _never) -> int:
+        """Forget a slot; answers how many samples its worker had not processed when it was last heard of.
+
+        With `OnCrash.REPLAY` the next owner gets those instead (``is_done`` as in `flip`).
+        """
         with self._lock:
             slot = self._slots.pop(epoch, None)
             if slot is None:
@@ -146,6 +166,8 @@ class InputStream:
                 self._active = None
             if slot is self._mirror:
                 self._mirror = None
+            if self._replays and slot.is_counted:
+                return self._leave(slot, is_done)
             said = slot.outlet.undeclare()
             self._counter.dropped("closed", said.waiting)
             if not slot.is_counted:
@@ -162,6 +184,48 @@ class InputStream:
         for epoch in tuple(self._slots):
             self.close_slot(epoch)
 
+    # --- a crash, with `OnCrash.REPLAY` (under the lock) --------------------------------------------------------------
+
+    def _leave(self, slot: _InputSlot, is_done: Callable[[Timestamp], bool]) -> int:
+        """A slot closes: what its worker has not processed waits for the next owner, or goes to the one there is."""
+        left = self._settle(slot)
+        if self._active is not None:
+            self._replay(self._active, is_done)
+        return left
+
+    def _abandon(self, slot: _InputSlot | None) -> None:
+        """The worker that carried is gone: its slot counts nothing from here on, and the next one gets what it had."""
+        for epoch in [epoch for epoch, one in self._slots.items() if one is slot]:
+            self._settle(self._slots.pop(epoch))
+        self._active = None
+
+    def _settle(self, slot: _InputSlot) -> int:
+        said, owed = slot.outlet.abandon()
+        left = max(0, said.in_flight)  # what was not kept: nothing, while bounds hold
+        said.at_most_lost += left
+        said.in_flight = said.waiting = 0
+        self._closed.add(said)
+        self._owe(owed)
+        return left
+
+    def _owe(self, owed: list[Owed]) -> None:
+        for one in owed:
+            size = len(one[0].payload)
+            if len(self._owed) < MAX_OWED and self._owed_bytes + size <= MAX_BYTES:
+                self._owed.append(one)
+                self._owed_bytes += size
+            else:
+                self._counter.dropped("overflow")
+
+    def _replay(self, slot: _InputSlot, is_done: Callable[[Timestamp], bool]) -> int:
+        owed, self._owed, self._owed_bytes = self._owed, [], 0
+        left = [one for one in owed if one[1] is None or not is_done(one[1])]
+        self._closed.acknowledged += len(owed) - len(left)
+        if left:
+            self._counter.replayed += len(left)
+            self._counter.dropped("overflow", slot.outlet.replay(left))
+        return len(left)
+
     def look_after(self) -> None:
         """Have sent (again) what workers have not acknowledged in time, or a rate held back; call it now and then."""
         with self._lock:
@@ -177,6 +241,7 @@ class InputStream:
         with self._lock:
             total = Tally()
             total.add(self._closed)
+            total.waiting += len(self._owed)
             for slot in self._slots.values():
                 if slot.is_counted:
                     total.add(slot.outlet.counted())
@@ -194,13 +259,15 @@ class InputStream:
                 self._counter.dropped("loop")
                 return
             self._number += 1
-            stamp = self._keep(sample) if self._keep_last else None
+            stamp = self._keep(sample) if self._keep_last else self._stamp(sample)
             pace = self._pace
             if pace is not None and not pace.passes(str(sample.key_expr), (sample, stamp), monotonic_s()):
                 self._counter.dropped("thinned")
             elif self._active is not None:
                 self._active.sent = self._number
                 self._send(sample, stamp, size)
+            elif self._replays:
+                self._owe([(sample, stamp)])
             elif not self._keep_last:
                 self._counter.dropped("no_route")
             else:
@@ -214,6 +281,10 @@ class InputStream:
         if self._mirror is not None:
             self._counter.repeated += 1
             self._counter.dropped(*self._mirror.outlet.send(sample, stamp, size))
+
+    def _stamp(self, sample: Sample) -> Timestamp | None:
+        """With `OnCrash.REPLAY` every sample has a timestamp, by which its answer is known."""
+        return sample.timestamp or self._session.new_timestamp() if self._replays else None
 
     def _keep(self, sample: Sample) -> Timestamp | None:
         """Keep a value, with a timestamp of ours where it has none: outputs made of it inherit that, for the gate."""

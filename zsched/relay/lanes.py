@@ -67,6 +67,10 @@ class Lane:
     is_foreign: bool = False
     """Whoever subscribes here acknowledges nothing."""
     unmet_since: float = 0.0
+    keeps_work: bool = False
+    """Keep samples until they are processed, not only until they have arrived: the next owner may have to do them."""
+    replay_end: int = 0
+    """Numbers below this one went to a receiver that died."""
     greeted_at: float | None = None
     greet_pause_s: float = GREET_S
     ack: StreamAck | None = None
@@ -164,7 +168,8 @@ class Lane:
         if self.ack is None or ack.processed >= self.ack.processed:
             self.ack = ack
         newest: Sent | None = None
-        while self.kept and self.kept[0].number < ack.arrived:
+        limit = ack.processed if self.keeps_work else ack.arrived
+        while self.kept and self.kept[0].number < limit:
             newest = self.kept.popleft()
             self.kept_bytes -= newest.size
         if newest is not None:
@@ -188,6 +193,7 @@ class Lane:
     def begin_life(self, incarnation: str, start: int) -> None:
         """Another life of the receiver answers from ``start`` on; what the former one left open is the caller's."""
         self.incarnation, self.base = incarnation, start
+        self.replay_end = self.count if self.keeps_work else 0
         self.ack, self.resend_from = None, None
         while self.kept and self.kept[0].number < start:
             self.kept_bytes -= self.kept.popleft().size
@@ -196,6 +202,10 @@ class Lane:
     def lowest(self) -> int:
         """The lowest number that may still be sent: what a start marker says."""
         return max(self.base, self.kept[0].number) if self.kept else self.count
+
+    def unprocessed(self) -> list[Sent]:
+        """What is kept of the samples that the receiver has not acknowledged as processed."""
+        return [sent for sent in self.kept if sent.number >= self.processed]
 
     @property
     def arrived(self) -> int:

@@ -25,6 +25,7 @@ from __future__ import annotations
 import functools
 import logging
 import threading
+from collections import Counter
 from typing import Final
 
 import zenoh
@@ -32,7 +33,7 @@ from zenoh import CongestionControl, Priority, Reliability, Sample, Session, Tim
 
 from zsched.clock import monotonic_s
 from zsched.core.keyexpr import is_wild
-from zsched.core.plan import StreamClass, StreamSettings
+from zsched.core.plan import OnCrash, StreamClass, StreamSettings
 from zsched.core.relay_protocol import EndMarker, StreamAck
 from zsched.core.serial import serial_of
 from zsched.keyspace import END_CHUNK
@@ -51,6 +52,8 @@ QUEUE_DEPTH: Final = 1024
 MAX_LANES: Final = 4096
 """Publishers of one wildcard stream towards one place: keys come from the applications, memory is ours."""
 KEPT_OWNERS: Final = 4
+MAX_OWED: Final = 4096
+"""Samples that wait for the next owner after a crash (`OnCrash.REPLAY`); a queue has room for them besides its own."""
 SKIP_EPOCH: Final = 0
 """Epoch of a marker that ends nothing: no number below its count will come any more."""
 
@@ -59,6 +62,9 @@ MAX_PATIENT: Final = 3
 
 _log = logging.getLogger("zsched.relay")
 _patient = threading.BoundedSemaphore(MAX_PATIENT)
+
+Owed = tuple[Sample, Timestamp | None]
+"""A sample on its way to an owner, with its timestamp."""
 
 _ALL_WENT: Final = ("", 0)
 _DATA: Final = Priority.DATA
@@ -108,7 +114,8 @@ class Outlet:
         """Samples taken and not dropped (the stream's lock guards it)..."""
         self._left = 0
         """...and those of them that have left the queue, or could not (our lock)."""
-        self._in_hand = False
+        self._in_hand: Owed | None = None
+        self._replays = settings.on_crash is OnCrash.REPLAY and acks is not None
         holds = self._is_reliable and acks is not None
         self._greetings = Greetings(self._lock, self._put_start) if holds else None
         self._probe = session.declare_publisher(to_expr)
@@ -129,7 +136,7 @@ class Outlet:
         is_reliable = stream_class is StreamClass.RELIABLE
         return SendQueue(
             f"to {self._to}",
-            depth=max(depth, QUEUE_DEPTH) if is_reliable else depth,
+            depth=max(depth, QUEUE_DEPTH) + (MAX_OWED if self._replays else 0) if is_reliable else depth,
             sheds=not is_reliable,
             keep_last=self._settings.keep_last,
             is_open=self._is_open if is_reliable and self._acks is not None else None,
@@ -189,7 +196,7 @@ class Outlet:
             finally:
                 _patient.release()
 
-    def take_back(self) -> list[tuple[Sample, Timestamp | None]]:
+    def take_back(self) -> list[Owed]:
         """What class ``reliable`` still holds in its queue, never sent: it may go to another owner instead."""
         taken = self._queue.take_back() if self._queue is not None and self._is_reliable else []
         self._handed -= len(taken)
@@ -206,6 +213,35 @@ class Outlet:
         else:
             self._queue.then(lambda: self._put_ends(epoch))
 
+    def replay(self, owed: list[Owed]) -> int:
+        """Send what an owner that died left open, behind a marker that says so; answers how many were dropped."""
+        if self._queue is None:
+            return len(owed)
+        counts = Counter(id(lane) for sample, _ in owed if (lane := self._lane(sample)) is not None)
+        lanes = [(lane, counts[id(lane)]) for lane in tuple(self._lanes.values()) if counts[id(lane)]]
+        self._queue.then(lambda: self._announce(lanes))
+        return sum(self.send(sample, stamp)[1] for sample, stamp in owed)
+
+    def _announce(self, lanes: list[tuple[Lane, int]]) -> None:
+        for lane, count in lanes:
+            with self._lock:
+                lane.replay_end = lane.count + count
+            self._put_start(lane, lane.count)
+
+    def abandon(self) -> tuple[Tally, list[Owed]]:
+        """The receiver died: the last counts, and what it has not processed, in order; nobody else counts that."""
+        waiting = self.take_back()
+        said = self.undeclare()
+        with self._lock:
+            kept = sorted(
+                (sent for lane in self._lanes.values() for sent in lane.unprocessed()), key=lambda one: one.at
+            )
+            owed = [(one.sample, one.stamp) for one in kept]
+            if self._in_hand is not None:
+                owed.append(self._in_hand)
+        said.in_flight -= len(owed)
+        return said, owed + waiting
+
     def undeclare(self) -> Tally:
         """Give the publishers back (a queue's thread its own); answers the last counts: what waits will not go out."""
         for lane in tuple(self._lanes.values()):
@@ -217,7 +253,7 @@ class Outlet:
         self._queue.close(self._undeclare)
         with self._lock:
             said = self._sum()
-            if self._in_hand:  # nobody will hear whether it still goes out
+            if self._in_hand is not None:  # nobody will hear whether it still goes out
                 said.waiting, said.in_flight = said.waiting - 1, said.in_flight + 1
             return said
 
@@ -316,7 +352,8 @@ class Outlet:
                 express=is_express,
                 reliability=Reliability.RELIABLE if is_reliable else Reliability.BEST_EFFORT,
             )
-        lane = Lane(key=key, publisher=publisher, source_id=publisher.id, eid=publisher.id.eid)
+        eid = publisher.id.eid
+        lane = Lane(key=key, publisher=publisher, source_id=publisher.id, eid=eid, keeps_work=self._replays)
         with self._lock:
             self._lanes[key, f"{priority}{is_express}"] = lane
             if self._greetings is not None:
@@ -335,7 +372,7 @@ class Outlet:
     def _put_marker(self, lane: Lane, epoch: int, count: int) -> None:
         self._session.put(
             f"{lane.key}/{END_CHUNK}",
-            encode_end(EndMarker(epoch=epoch, count=count)),
+            encode_end(EndMarker(epoch=epoch, count=count, replayed=max(0, lane.replay_end - count))),
             congestion_control=CongestionControl.BLOCK,
             priority=lane.publisher.priority,
             source_info=zenoh.SourceInfo(lane.source_id, serial_of(count)),
@@ -352,7 +389,7 @@ class Outlet:
     # --- the queue's thread ------------------------------------------------------------------------------------------
 
     def _put(self, lane: Lane, sample: Sample, stamp: Timestamp | None, size: int) -> None:
-        self._in_hand = True
+        self._in_hand = (sample, stamp)
         began = monotonic_s()
         try:
             if self._crowd is None:
@@ -362,11 +399,11 @@ class Outlet:
         except zenoh.ZError:
             with self._lock:
                 self.tally.errors += 1
-                self._left, self._in_hand = self._left + 1, False
+                self._left, self._in_hand = self._left + 1, None
             raise
         with self._lock:
             lane.count += 1
-            self._left, self._in_hand = self._left + 1, False
+            self._left, self._in_hand = self._left + 1, None
             if lane.is_foreign:
                 self.tally.uncounted += lane.count - lane.base
                 lane.base = lane.count
@@ -445,6 +482,8 @@ class Outlet:
     def _begin_life(self, lane: Lane, ack: StreamAck, incarnation: str, now: float) -> None:
         """Another worker answers: what the former one left open may be lost; who has not been greeted had nothing."""
         start = lane.count if self._greetings is not None else min(max(ack.first, lane.processed), lane.count)
+        if self._replays and lane.kept:
+            start = max(lane.kept[0].number, lane.processed)
         self.tally.new_life(lane, start)
         lane.begin_life(incarnation, start)
         lane.acknowledge(ack, incarnation, now)

@@ -17,7 +17,7 @@ from dataclasses import replace
 from typing import Final
 
 import zenoh
-from zenoh import CongestionControl, Sample, Session
+from zenoh import CongestionControl, Sample, Session, Timestamp
 
 from zsched.clock import monotonic_s
 from zsched.core.plan import HandoverRule, Route, StreamClass, StreamCount
@@ -36,6 +36,7 @@ from zsched.relay_pipe import decode_end
 
 HOLD_SAMPLES: Final = 10_000
 HOLD_BYTES: Final = 64 << 20
+MAX_STAMPS: Final = 8192
 UNNUMBERED: Final = -1
 HEARD_SLOTS: Final = 4
 """Closed slots of which is known how far they came: an owner may be left and come back in one epoch (isolation)."""
@@ -77,6 +78,8 @@ class OutputStream:
         self._carrier: OutputSlot | None = None
         self._fence = Fence()
         self._heard: OrderedDict[tuple[int, str], dict[SourceName, int]] = OrderedDict()  # {(epoch, from): numbers}
+        self._notes_stamps = False
+        self._stamps: OrderedDict[Timestamp, None] = OrderedDict()
         self._is_paused = False
         self._is_latest = route.settings.stream_class is StreamClass.LATEST
         max_hz = route.settings.max_hz
@@ -133,14 +136,22 @@ class OutputStream:
                 f"{expr}/{END_CHUNK}", self._end, allowed_origin=zenoh.Locality.REMOTE
             )
 
-    def know(self, from_expr: str) -> None:
+    def know(self, from_expr: str, *, notes_stamps: bool = False) -> None:
         """Hear of another owner's ``from`` before a slot opens on it: its captures fill the wildcards of ``to``.
+
+        ``notes_stamps``: `has_passed` will be asked.
 
         Raises:
             ValueError: ``to`` cannot be filled from it.
         """
         with self._lock:
             self._outlet.also_from(from_expr)
+            self._notes_stamps = notes_stamps
+
+    def has_passed(self, stamp: Timestamp) -> bool:
+        """Whether an answer with this timestamp, its input's, has passed; of the newest `MAX_STAMPS`."""
+        with self._lock:
+            return stamp in self._stamps
 
     def flip(self, epoch: int, *, drops_held: bool) -> None:
         """Let the slot's samples through, by the stream's handover rule.
@@ -358,6 +369,10 @@ class OutputStream:
         if self._pace is not None and not self._pace.passes(str(sample.key_expr), sample, monotonic_s()):
             self._counter.dropped("thinned")
             return
+        if self._notes_stamps and sample.timestamp is not None:
+            self._stamps[sample.timestamp] = None
+            if len(self._stamps) > MAX_STAMPS:
+                self._stamps.popitem(last=False)
         reason, dropped = self._outlet.send(sample, None, size)
         if dropped:
             self._counter.dropped(reason, dropped)

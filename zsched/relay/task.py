@@ -13,12 +13,12 @@ from dataclasses import dataclass
 from typing import Final
 
 import zenoh
-from zenoh import Session
+from zenoh import Session, Timestamp
 
 from zsched.clock import monotonic_s
 from zsched.core.events import ProblemReported, SlotDrained, SlotFlipped, SlotReady
 from zsched.core.model import TaskId
-from zsched.core.plan import Direction, ReadyWhen, Route, RoutePhase, RoutePlan, Slot, StreamClass, StreamCount
+from zsched.core.plan import Direction, OnCrash, ReadyWhen, Route, RoutePhase, RoutePlan, Slot, StreamClass, StreamCount
 from zsched.core.relay_protocol import RelayReport, SlotLost
 from zsched.guard import guarded
 from zsched.relay.acks import Acks
@@ -232,12 +232,13 @@ class TaskRelay:
             sink = self._outputs[route.stream] = OutputStream(
                 self._session, route, self._own_ids, self.wake, self._local
             )
-        sink.know(route.from_expr)
+        replays = any(one.settings.on_crash is OnCrash.REPLAY for one in slot.routes)
+        sink.know(route.from_expr, notes_stamps=replays)
         sink.open(epoch, route, acks, is_from_start=is_from_start)
 
     def _close(self, epoch: int) -> None:
         state = self._slots.pop(epoch, None)
-        lost = sum(source.close_slot(epoch) for source in self._inputs.values())
+        lost = sum(source.close_slot(epoch, is_done=self._is_answered) for source in self._inputs.values())
         if lost and state is not None:
             self._report(SlotLost(task=self._task, epoch=epoch, owner=state.slot.owner, samples=lost))
         for sink in self._outputs.values():
@@ -316,15 +317,23 @@ class TaskRelay:
         is_behind = any(source.is_behind(epoch) for source in self._inputs.values())
         for sink in self._outputs.values():
             sink.flip(epoch, drops_held=is_behind)
-        replayed = sum(source.flip(epoch) for source in self._inputs.values())
+        olds = [one for old, one in self._slots.items() if old < epoch]
+        is_old_dead = bool(olds) and all(one.gone_at is not None for one in olds)
+        replayed = sum(
+            source.flip(epoch, is_old_dead=is_old_dead, is_done=self._is_answered) for source in self._inputs.values()
+        )
         self._services.flip(epoch)
         state.is_flipped = True
         if not is_reported:
             return
         self._report(SlotFlipped(task=self._task, epoch=epoch, replayed=replayed))
-        olds = [old for old in self._slots if old < epoch]
         if olds:  # a stalled old owner may hold these up for a lease: not in this thread
-            guarded(self._send_ends, olds, name="ends", is_lasting=False).start()
+            epochs = [old.slot.epoch for old in olds]
+            guarded(self._send_ends, epochs, name="ends", is_lasting=False).start()
+
+    def _is_answered(self, stamp: Timestamp) -> bool:
+        """Whether an answer made of the input with this timestamp has passed."""
+        return any(sink.has_passed(stamp) for sink in self._outputs.values())
 
     def _send_ends(self, epochs: list[int]) -> None:
         for epoch in epochs:

@@ -1,0 +1,133 @@
+"""What an owner's death costs a ``reliable`` stream, with `on_crash: report` and with `replay`.
+
+``python -m benchmarks.crash_loss [--n 20] [--hz 100] [--only kill|cut] [--rule report|replay]``. Real daemons in
+network namespaces (root). The application on robot1 publishes numbers, the echo worker answers each. *kill*: the
+owner's daemon, relay and worker are killed (SIGKILL): their sockets close at once. *cut*: the owner's link goes and
+then everything on it, as when its power fails: nobody sees a socket close. Per death: how many numbers have no answer
+at all, how many have two, and what the robot's status says of it.
+
+It fails (exit code 1) when more is lost than the status tells of, or anything at all with `replay`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from benchmarks.common import machine
+from zsched.clock import monotonic_s
+from zsched.core.books import unaccounted
+from zsched.core.plan import StreamCount
+from zsched.lab.netbed import Netbed, Probe
+from zsched.lab.testbed import TASK, Json, echo_fleet
+
+SETTLE_S = 1.0
+ROBOT = "robot1"
+
+
+def main() -> int:
+    """Print a line a death, and the sums; the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--n", type=int, default=20)
+    parser.add_argument("--hz", type=float, default=100.0)
+    parser.add_argument("--timing", default="wifi", choices=["wifi", "wired"])
+    parser.add_argument("--only", choices=["kill", "cut"])
+    parser.add_argument("--rule", choices=["report", "replay"])
+    options = parser.parse_args()
+    print(machine())
+    faults = 0
+    for rule in [options.rule] if options.rule else ["report", "replay"]:
+        for death in [options.only] if options.only else ["kill", "cut"]:
+            faults += _case(options, rule, death)
+    return 1 if faults else 0
+
+
+def _tree(rule: str, timing: str) -> Json:
+    tree = echo_fleet(robots=3, edges=3, timing=timing, stream_class="reliable")
+    task = tree["tasks"][TASK]
+    task["inputs"][0]["on_crash"] = rule
+    task["outputs"][0]["handover"] = "all"
+    return tree
+
+
+def _case(options: argparse.Namespace, rule: str, death: str) -> int:
+    lost: list[int] = []
+    doubled: list[int] = []
+    told: list[int] = []
+    silent = 0
+    with tempfile.TemporaryDirectory() as folder, Netbed(Path(folder), _tree(rule, options.timing)) as bed:
+        bed.init()
+        bed.start()
+        bed.wait_settled()
+        probe = bed.probe(ROBOT, put=f"{ROBOT}/in", hz=options.hz, watch=[f"{ROBOT}/out"])
+        bed.wait(probe.is_flowing, 20, "echoes")
+        for number in range(options.n):
+            figures = _death(bed, probe, death)
+            for series, figure in zip((lost, doubled, told), figures, strict=True):
+                series.append(figure)
+            silent += max(0, figures[0] - figures[2])
+            print(
+                f"  {rule} {death} {number + 1}/{options.n}: lost {figures[0]} doubled {figures[1]} told {figures[2]}"
+            )
+            sys.stdout.flush()
+        count = _count(bed)
+    missing = unaccounted(count)
+    print(
+        f"on_crash: {rule}, {death}, {options.hz:g} Hz, n {options.n}: lost a death {_spread(lost)}, doubled"
+        f" {_spread(doubled)}, status told of {_spread(told)}; silently {silent}, unaccounted {missing}",
+        flush=True,
+    )
+    return silent + abs(missing or 0) + (sum(lost) if rule == "replay" else 0)
+
+
+def _spread(values: list[int]) -> str:
+    ordered = sorted(values)
+    return f"median {ordered[len(ordered) // 2]} ({ordered[0]} to {ordered[-1]})"
+
+
+def _death(bed: Netbed, probe: Probe, death: str) -> tuple[int, int, int]:
+    """One cycle; (numbers without an answer, numbers with two, samples that the status says may be lost)."""
+    owner = bed.wait_whole()
+    bed.wait(lambda: (probe.is_flowing() and not _count(bed).in_flight) or None, 20, "a calm stream")
+    before, seen = _told(bed), len(probe.received)
+    first = max(one.number for one in probe.received[-200:]) + 1
+    start = monotonic_s()
+    bed.power_off(owner, is_seen=death == "kill")
+    bed.wait(lambda: probe.first_after(start, but_of=owner), 30, "an answer of the next owner")
+    time.sleep(SETTLE_S)
+    last = max(one.number for one in probe.received[-200:])
+    bed.wait(lambda: _count(bed).last_seen_s is not None, 5, "counters")
+    time.sleep(SETTLE_S)
+    times = Counter(one.number for one in probe.received[seen:])
+    lost = sum(number not in times for number in range(first, last + 1))
+    doubled = sum(count > 1 for count in times.values())
+    told = _told(bed) - before
+    bed.network.link(owner, is_up=True)
+    return lost, doubled, told
+
+
+def _count(bed: Netbed) -> StreamCount:
+    streams: list[dict[str, Any]] = bed.task(ROBOT)["streams"]
+    found = next(one for one in streams if one["stream"] == f"{TASK}/in/0")
+    names = ("messages", "acknowledged", "in_flight", "lost", "at_most_lost", "repeated", "unsent", "last_seen_s")
+    drops = tuple(sorted(found["drops"].items()))
+    return StreamCount(stream=found["stream"], drops=drops, **{name: found[name] for name in names})
+
+
+def _told(bed: Netbed) -> int:
+    """What the robot says may be lost of its input, and of the answers."""
+    count = _count(bed)
+    streams: list[dict[str, Any]] = bed.task(ROBOT)["streams"]
+    answers = next(one for one in streams if one["stream"] == f"{TASK}/out/0")
+    dropped = sum(number for _, number in count.drops) + sum(answers["drops"].values())
+    told: int = count.lost + count.at_most_lost + dropped + answers["lost"]
+    return told
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,103 @@
+"""`on_crash: replay`: what an owner that died had not acknowledged is done by the next one, at least once."""
+
+from __future__ import annotations
+
+import signal
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from support.relay_rig import Application, Rig, relay_rig, slot
+from support.waiting import until
+from zsched.core.plan import OnCrash, RoutePhase, Slot, StreamClass, WorkerRole
+from zsched.core.relay_protocol import SlotLost
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    with relay_rig(tmp_path) as made:
+        yield made
+
+
+def replaying(epoch: int, owner: str) -> Slot:
+    return slot(epoch, owner, StreamClass.RELIABLE, 1, on_crash=OnCrash.REPLAY)
+
+
+def first_ones(numbers: list[int]) -> list[int]:
+    """Without those that came once more."""
+    return list(dict.fromkeys(numbers))
+
+
+def is_whole(rig: Rig, app: Application) -> bool:
+    until(lambda: len(set(app.back)) == app.sent, "an answer to everything", deadline_s=30.0)
+    until(lambda: rig.told("echo/in/0").in_flight == 0, "every acknowledgement")
+    told = rig.told("echo/in/0")
+    assert (told.lost, told.at_most_lost, told.drops) == (0, 0, ())
+    assert rig.reports["robot1"].find(SlotLost) is None
+    return first_ones(app.back) == list(range(app.sent))
+
+
+@pytest.mark.parametrize("is_dropped_first", [False, True])
+def test_the_next_owner_does_what_the_dead_one_had_not(rig: Rig, is_dropped_first: bool) -> None:
+    """Also what came while there was none, in order; what the dead one's answers prove done is done once."""
+    worker = rig.start_worker("edge1", "--delay-ms", "5")
+    rig.start_worker("edge2")
+    app = Application(rig.app)
+    first, second = replaying(1, "edge1"), replaying(2, "edge2")
+    rig.move(first)
+    until(app.connected, "the application sees the relay's subscription")
+    thread = app.stream(400)
+    until(lambda: len(app.back) > 50, "the stream through edge1")
+    worker.kill()
+    worker.wait(5)
+    if is_dropped_first:  # as the executor does with a node that is gone
+        sent = app.sent
+        rig.plan(RoutePhase.PREPARE, second)
+        until(lambda: app.sent > sent + 100, "samples without an owner")
+        rig.move(second)
+    else:
+        rig.move(second, first, drains=False)
+    until(lambda: app.nodes[-1] == "edge2", "the stream through edge2")
+    app.halt(thread)
+    assert is_whole(rig, app)
+    assert rig.told("echo/in/0").replayed > 0
+    twice = [number for number, times in Counter(app.back).items() if times > 1]
+    assert len(twice) <= 2  # the answer on its way when the worker died
+
+
+def test_a_worker_that_restarts_in_place_does_what_its_former_life_had_not(rig: Rig) -> None:
+    worker = rig.start_worker("edge1", "--delay-ms", "5")
+    app = Application(rig.app)
+    rig.move(replaying(1, "edge1"))
+    until(app.connected, "the application sees the relay's subscription")
+    thread = app.stream(150)
+    until(lambda: len(app.back) > 50, "the stream through edge1")
+    worker.kill()
+    worker.wait(5)
+    rig.start_worker("edge1")
+    before = len(app.back)
+    until(lambda: len(app.back) > before + 50, "the stream through its second life")
+    app.halt(thread)
+    assert is_whole(rig, app)
+
+
+def test_an_owner_that_hangs_until_it_is_left_has_its_work_done_by_the_next(rig: Rig) -> None:
+    """It is alive when the task moves, and never ends its slot."""
+    worker = rig.start_worker("edge1")
+    rig.start_worker("edge2")
+    app = Application(rig.app)
+    first, second = replaying(1, "edge1"), replaying(2, "edge2")
+    rig.move(first)
+    until(app.connected, "the application sees the relay's subscription")
+    thread = app.stream(200)
+    until(lambda: len(app.back) > 50, "the stream through edge1")
+    worker.send_signal(signal.SIGSTOP)
+    sent = app.sent
+    until(lambda: app.sent > sent + 40, "samples to a worker that stands still")
+    rig.role("edge2", WorkerRole.ACTIVE, 2)
+    rig.move(second, first, drains=False)
+    until(lambda: app.nodes[-1] == "edge2", "the stream through edge2")
+    app.halt(thread)
+    is_whole(rig, app)
