@@ -113,7 +113,9 @@ def _death(bed: Netbed, probe: Probe, death: str) -> tuple[int, int, int]:
 
 def _count(bed: Netbed) -> StreamCount:
     streams: list[dict[str, Any]] = bed.task(ROBOT)["streams"]
-    found = next(one for one in streams if one["stream"] == f"{TASK}/in/0")
+    found = next((one for one in streams if one["stream"] == f"{TASK}/in/0"), None)
+    if found is None:  # the relay has not counted yet
+        return StreamCount(stream=f"{TASK}/in/0", in_flight=1)
     names = ("messages", "acknowledged", "in_flight", "lost", "at_most_lost", "repeated", "unsent", "last_seen_s")
     drops = tuple(sorted(found["drops"].items()))
     return StreamCount(stream=found["stream"], drops=drops, **{name: found[name] for name in names})

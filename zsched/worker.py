@@ -334,12 +334,13 @@ class Worker:
         """Work in the role's epoch from now on, behind the predecessor's snapshot if there is one to be had."""
         then = partial(self._errands.put, lambda: self._begin(role))
         now = self._role
-        is_stale = now.role is not WorkerRole.ACTIVE or now.epoch != role.epoch
+        is_stale = now.role is WorkerRole.IDLE or now.epoch != role.epoch
         if not is_stale and self._restorer.begin(role, then):
             return
         if not is_stale:
             self._dispatcher.begin(role.epoch)
-            self._show_role(role.epoch)
+            if now.role is WorkerRole.ACTIVE:
+                self._show_role(role.epoch)
         self._restorer.deliver()
 
     def _show_role(self, epoch: int) -> None:
@@ -358,6 +359,10 @@ class Worker:
         """The epoch that outputs are stamped with, ``None`` while they go nowhere."""
         role = self._role
         if role.role is WorkerRole.IDLE or self._restorer.is_pending:
+            self._dispatcher.note_withheld()
+            return None
+        is_early = role.role is WorkerRole.ACTIVE and self._dispatcher.is_ahead_of(role.epoch)
+        if is_early and not self._is_standalone:  # what was withheld before comes first
             self._dispatcher.note_withheld()
             return None
         epoch = self._epochs.stamp(role, self._dispatcher.epoch_in_hand())

@@ -193,6 +193,10 @@ class Dispatcher:
         """In the dispatch thread: the epoch in which the source of the input in hand was first heard."""
         return self._in_hand if threading.current_thread() is self._thread else None
 
+    def is_ahead_of(self, epoch: int) -> bool:
+        """In the dispatch thread: the role of ``epoch`` has come, and `begin` not yet."""
+        return threading.current_thread() is self._thread and self._epoch != epoch
+
     def stamp(self) -> zenoh.Timestamp | None:
         """The timestamp for an output: of the input in hand (in the dispatch thread), else of the newest processed."""
         return self._stamp if threading.current_thread() is self._thread else self._newest_stamp

@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -301,3 +302,24 @@ def test_what_an_owner_that_died_may_have_done_is_marked(relay: Relay, echo: Ech
     until(lambda: len(echo.taken) == 6, "once more, as the owner")
     marks = [(received.payload.to_bytes(), received.replayed) for received in echo.taken]
     assert marks == [(b"a", True), (b"b", True), (b"c", False)] * 2
+
+
+def _wait(gate: threading.Event) -> None:
+    gate.wait(10)
+
+
+def test_what_was_withheld_goes_out_before_what_comes_with_the_role(relay: Relay, echo: Echo) -> None:
+    """A worker that was told late has a backlog: the role is known before the backlog is processed once more."""
+    gate = threading.Event()
+    for name in (b"a", b"b"):
+        relay.put(name)
+    until(lambda: len(echo.taken) == 2, "the backlog")
+    echo.worker._errands.put(partial(_wait, gate))
+    relay.tell(WorkerRole.ACTIVE, epoch=4)
+    until(lambda: echo.worker.role.epoch == 4, "the role")
+    relay.put(b"c")
+    until(lambda: len(echo.taken) == 3, "the next sample")
+    gate.set()
+    relay.put(b"d")
+    until(lambda: len(relay.outputs) >= 4, "all outputs")
+    assert [payload for _, payload in relay.outputs] == [b"a", b"b", b"c", b"d"]
