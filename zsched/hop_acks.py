@@ -35,11 +35,35 @@ GIVE_UP_S: Final = 1.0
 MAX_MISSING: Final = 256
 MAX_SOURCES: Final = 8192
 MAX_PER_FRAME: Final = 500
+RETURN: Final = 3
+"""So many numbers in a row take a jump back that nothing has followed."""
 
 SourceName = tuple[str, str, int]
 """(key, session id, entity id) of a publisher as zenoh names it."""
 
 _log = logging.getLogger("zsched.streams")
+
+
+@dataclass(slots=True)
+class Jump:
+    """The newest jump over numbers that have not come: where it began and ended, what has come of them since.
+
+    Anybody can put one number. So a jump stands once something newer follows; when `RETURN` numbers in a row go on
+    where it began instead, it was nobody of ours who made it.
+    """
+
+    at: int
+    to: int
+    lost: int = 0
+    """What was lost before it."""
+    count: int = 0
+
+    def is_back(self, number: int, newest: int) -> bool:
+        """Whether the source goes on where the jump began, with ``number``; ``newest`` is the highest that has come."""
+        if newest > self.to or number != self.at + self.count:
+            return False
+        self.count += 1
+        return self.count >= RETURN
 
 
 @dataclass(slots=True)
@@ -53,6 +77,8 @@ class _Source:
     gap_since: float | None = None
     until: int = 0
     is_ended: bool = False
+    jump: Jump | None = None
+    """The newest jump, until it is confirmed."""
     missing: deque[int] = field(default_factory=lambda: deque(maxlen=MAX_MISSING))
     """The newest of the numbers given up, to tell a late sample from a double one."""
 
@@ -212,6 +238,8 @@ class Acknowledger:
             source.gap_since = None
             return True
         if number < source.arrived:
+            if self._is_back(source, number):
+                return True
             if number in source.missing:
                 source.reordered += 1
             else:
@@ -231,10 +259,21 @@ class Acknowledger:
     def _jump(self, source: _Source, number: int) -> None:
         if source.processed == source.arrived:  # nothing is in work
             source.processed = number
+        source.jump = Jump(at=source.arrived, to=number, lost=source.lost)
         source.lost += number - source.arrived
         source.missing.extend(range(max(source.arrived, number - MAX_MISSING), number))
         source.arrived = number
         source.gap_since = None
+
+    def _is_back(self, source: _Source, number: int) -> bool:
+        """Whether the source goes on where the newest jump began, so that the jump is taken back."""
+        jump = source.jump
+        if jump is None or not jump.is_back(number, source.arrived - 1):
+            return False
+        source.lost = jump.lost + jump.count - 1
+        source.arrived, source.processed, source.jump = number + 1, number, None
+        source.missing.clear()
+        return True
 
     # --- the thread --------------------------------------------------------------------------------------------------
 

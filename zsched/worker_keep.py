@@ -118,7 +118,8 @@ class KeptLane:
                 for old in [name for name, one in self.receivers.items() if one.node == node]:
                     del self.receivers[old]
                 receiver = self.receivers[relay] = _Receiver(node=node, arrived=-1)
-            arrived = number_near(serial_of(ack.arrived), self.count)  # one that came late knows the lowest bits only
+            # one that came late knows the lowest bits only; nobody can have more than was sent
+            arrived = min(number_near(serial_of(ack.arrived), self.count), self.count)
             has_moved = arrived > receiver.arrived
             receiver.is_ended = ack.is_ended
             if has_moved:

@@ -152,3 +152,39 @@ def test_numbers_go_on_where_their_serials_begin_again(book: Book) -> None:
     book.acks.skip(NAME, start + 9)
     assert book.wait(arrived=SPAN + 6).lost == 3
     assert book.admit(SPAN + 6) == [True]
+
+
+# --- strangers -------------------------------------------------------------------------------------------------------
+
+
+FAR = (40, 5000, 10**6, SPAN // 2 - 20)
+
+
+@pytest.mark.parametrize("far", FAR)
+def test_a_forged_number_is_taken_back_by_three_real_ones(book: Book, far: int) -> None:
+    """Where only the newest is wanted a jump is made at once: one sample from anybody must not end the stream."""
+    assert book.admit(*range(10), in_turn=False) == [True] * 10
+    assert book.admit(far, in_turn=False) == [True]
+    assert book.admit(10, 11, 12, 13, in_turn=False) == [False, False, True, True]
+    book.acks.processed(NAME, 13, 1)
+    assert book.wait(processed=14).lost == 2
+
+
+@pytest.mark.parametrize("far", FAR)
+@pytest.mark.parametrize("in_turn", [True, False])
+def test_a_forged_skip_marker_is_taken_back_by_three_real_ones(book: Book, far: int, *, in_turn: bool) -> None:
+    assert book.admit(*range(10), in_turn=in_turn) == [True] * 10
+    book.acks.skip(NAME, far)
+    assert book.admit(10, 11, 12, 13, in_turn=in_turn) == [False, False, True, True]
+    book.acks.processed(NAME, 13, 1)
+    ack = book.wait(processed=14)
+    assert (ack.arrived, ack.lost) == (14, 2)
+
+
+def test_a_jump_that_something_newer_has_followed_stands(book: Book) -> None:
+    """Late samples of an honest gap come in a row, too: they must not begin the stream anew."""
+    assert book.admit(0, 1, in_turn=False) == [True, True]
+    assert book.admit(8, 9, in_turn=False) == [True, True]
+    assert book.admit(2, 3, 4, 5, in_turn=False) == [False] * 4
+    book.acks.processed(NAME, 9, 1)
+    assert book.wait(processed=10).reordered == 4

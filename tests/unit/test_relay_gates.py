@@ -427,3 +427,30 @@ def test_one_epoch_after_another_of_the_same_owner_doubles_nothing(bench: Bench)
     expected = [f"{when} {epoch}" for epoch in (2, 3) for when in ("before", "between", "after")]
     until(lambda: got == expected, f"each once: {got}")
     kept.undeclare()
+
+
+def test_a_forged_number_does_not_end_an_output(bench: Bench) -> None:
+    """Whoever hears a stream knows its publisher: one sample in its name must not make the rest old."""
+    out = bench.output(way_out(1, HandoverRule.LATEST, StreamClass.BEST_EFFORT))
+    out.open(1, way_out(1, HandoverRule.LATEST, StreamClass.BEST_EFFORT))
+    out.flip(1, drops_held=False)
+    heard: list[int] = []
+    got = bench.outside.declare_subscriber("robot1/out", lambda one: heard.append(int(one.payload.to_bytes())))
+    publisher = bench.publisher("edge1/t/1/out")
+    stranger = bench.another()
+    until(lambda: matches(stranger.declare_publisher("edge1/t/1/out")), "the stranger reaches the relay")
+
+    def put(number: int, session: zenoh.Session) -> None:
+        session.put("edge1/t/1/out", str(number).encode(), source_info=zenoh.SourceInfo(publisher.id, number))
+
+    for number in range(3):
+        put(number, bench.outside)
+    until(lambda: len(heard) == 3, "the first ones")
+    put(10**6, stranger)
+    until(lambda: len(heard) == 4, "the forged one")
+    for number in range(3, 8):
+        put(number, bench.outside)
+    until(lambda: len(heard) == 7, "the stream to go on")
+    assert heard == [0, 1, 2, 10**6, 5, 6, 7]
+    assert out.count().lost == 2
+    got.undeclare()  # type: ignore[no-untyped-call] # zenoh's stubs

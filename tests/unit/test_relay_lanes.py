@@ -134,3 +134,23 @@ def test_an_acknowledgement_is_read_near_our_own_number(start: int) -> None:
     assert (books.acknowledged, books.lost, books.in_flight) == (4, 0, 1)
     books.acknowledge(ack(0, 2**51), "1", 10.2)
     assert books.acknowledged + books.lost + books.in_flight == 5
+
+
+@pytest.mark.parametrize(
+    "forged",
+    [
+        StreamAck(eid=1, first=0, arrived=10**12, processed=10**12),
+        StreamAck(eid=1, first=0, arrived=500, processed=500),
+        StreamAck(eid=1, first=0, arrived=3, processed=5),
+    ],
+)
+def test_an_acknowledgement_of_what_was_never_sent_is_nobody_s(forged: StreamAck) -> None:
+    """It would let go of everything that is kept, and make every real acknowledgement an old one."""
+    books = lane()
+    for _ in range(5):
+        sent(books, at=10.0)
+    acknowledged(books, 2, 10.1)
+    assert books.acknowledge(forged, "1", 10.2)
+    assert (books.arrived, books.in_flight, len(books.kept)) == (2, 3, 3)
+    acknowledged(books, 4, 10.3)
+    assert (books.arrived, books.in_flight, len(books.kept)) == (4, 1, 1)

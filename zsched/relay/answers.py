@@ -102,7 +102,11 @@ class Answers:
         number = self._acks.number(name, serial)
         expected = self._acks.expect(name, 0 if self._is_from_start and self._in_turn else number)
         if number < expected:
-            self._acks.admit(name, serial_of(number), in_turn=True)  # dropped, and acknowledged once more
+            if self._acks.admit(name, serial_of(number), in_turn=True) is not None:  # a jump is taken back
+                self._acks.processed(name, number, len(sample.payload))
+                self._early.pop(name, None)
+                return (sample,)
+            # else it is dropped, and acknowledged once more
             if not is_again and self._in_turn:
                 self._counter.doubled += 1
             return ()
@@ -177,7 +181,8 @@ class Answers:
             self._acks.take(name, number, len(sample.payload))
             return (sample,)
         early = self._early.setdefault(name, _Early())
-        if not early.put(number, sample):
+        is_far = number - self._acks.arrived(name) > MAX_WAITING  # more than is ever sent again: it need not wait
+        if is_far or not early.put(number, sample):
             early.pop(number)
         first = min(early.samples, default=number)
         if self._acks.ask_for(name, first) > GIVE_UP_S:

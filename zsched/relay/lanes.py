@@ -163,8 +163,10 @@ class Lane:
         """
         if self.incarnation and incarnation != self.incarnation:
             return False
-        self.incarnation, self.is_foreign = incarnation, False
         ack = _near(ack, self.count)
+        if not ack.processed <= ack.arrived <= self.count + 1:
+            return True  # of what was never sent (one may be on its way and not counted yet): nobody of ours says so
+        self.incarnation, self.is_foreign = incarnation, False
         if self.ack is None or ack.processed >= self.ack.processed:
             self.ack = ack
         newest: Sent | None = None

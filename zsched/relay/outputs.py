@@ -22,7 +22,7 @@ from zenoh import CongestionControl, Sample, Session, Timestamp
 from zsched.clock import monotonic_s
 from zsched.core.plan import HandoverRule, Route, StreamClass, StreamCount
 from zsched.core.serial import number_near, serial_of
-from zsched.hop_acks import SourceName
+from zsched.hop_acks import Jump, SourceName
 from zsched.keyspace import AGAIN_CHUNK, END_CHUNK
 from zsched.relay.acks import Acks
 from zsched.relay.answers import Answers
@@ -309,20 +309,32 @@ class OutputStream:
         size = len(sample.payload)
         self._counter.seen(size)
         key.received += 1
-        if number == UNNUMBERED or self._is_next(key, publisher, number):
+        if number == UNNUMBERED or self._is_next(key, publisher, number, in_order=slot.answers is not None):
             self._gate(slot, sample, size)
 
-    def _is_next(self, key: KeyState, publisher: tuple[str, int], serial: int) -> bool:
-        """Count what does not fit the numbers of the hop; an old one is dropped."""
+    def _is_next(self, key: KeyState, publisher: tuple[str, int], serial: int, *, in_order: bool) -> bool:
+        """Count what does not fit the numbers of the hop; an old one is dropped, unless a jump is taken back by it.
+
+        ``in_order``: `Answers` has seen to the order, and to that, already.
+        """
         last = key.numbers.get(publisher, -1)
         number = serial if last < 0 else number_near(serial, last)
+        jump = key.jumps.get(publisher)
+        if number < last and jump is not None:
+            is_back = in_order and jump.at <= number and last <= jump.to
+            if is_back or jump.is_back(number, last):
+                self._counter.lost -= jump.to - number
+                key.last_number = key.numbers[publisher] = number
+                del key.jumps[publisher]
+                return True
         key.last_number = key.numbers[publisher] = max(number, last)
         if number == last:
             self._counter.doubled += 1
         elif number < last:
             self._counter.reordered += 1
-        elif last >= 0:
+        elif last >= 0 and number > last + 1:
             self._counter.lost += number - last - 1
+            key.jumps[publisher] = Jump(at=last + 1, to=number)
         return number > last
 
     def _gate(self, slot: OutputSlot, sample: Sample, size: int) -> None:

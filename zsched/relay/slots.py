@@ -13,7 +13,7 @@ from zenoh import Sample
 
 from zsched.core import keyexpr
 from zsched.core.relay_protocol import EndMarker
-from zsched.hop_acks import SourceName
+from zsched.hop_acks import Jump, SourceName
 from zsched.relay.answers import Answers
 from zsched.relay.receive import Receiver
 
@@ -33,6 +33,8 @@ class KeyState:
     last_number: int = -1
     numbers: dict[tuple[str, int], int] = field(default_factory=dict)
     """{publisher: its newest number}; a worker that restarted in place is another publisher."""
+    jumps: dict[tuple[str, int], Jump] = field(default_factory=dict)
+    """{publisher: the newest jump in its numbers}."""
 
     def is_ended(self, now: float, answers: Answers | None) -> bool:
         """True when everything up to the end marker has come, or will not come any more."""
