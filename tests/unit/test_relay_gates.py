@@ -453,4 +453,4 @@ def test_a_forged_number_does_not_end_an_output(bench: Bench) -> None:
     until(lambda: len(heard) == 7, "the stream to go on")
     assert heard == [0, 1, 2, 10**6, 5, 6, 7]
     assert out.count().lost == 2
-    got.undeclare()  # type: ignore[no-untyped-call] # zenoh's stubs
+    got.undeclare()
