@@ -219,6 +219,25 @@ def weights(
     raise typer.Exit(change_weights(find_door(runtime_dir, node), task, wanted, revision, is_json=json_))
 
 
+@app.command(cls=Verb)
+def retry(
+    task: Annotated[str, typer.Argument(metavar="TASK", help="A task of the fleet file.")],
+    whose: Annotated[
+        str | None, typer.Argument(metavar="[NODE]", help="Whose failures are forgotten; without it everybody's.")
+    ] = None,
+    json_: JsonOption = False,
+    runtime_dir: RuntimeOption = None,
+) -> None:
+    """Forget a task's failures: a failed worker is started again, and nodes pay no penalty any more.
+
+    Exits with 5 when some nodes could not be asked: they remember.
+    """
+    from zsched.cli_ask import find_door  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.cli_retry import retry as ask_all  # noqa: PLC0415 - as above
+
+    raise typer.Exit(ask_all(find_door(runtime_dir, None), task, whose, is_json=json_))
+
+
 # --- the fleet file --------------------------------------------------------------------------------------------------
 
 

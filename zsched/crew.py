@@ -15,7 +15,7 @@ from zsched.core import events as ev
 from zsched.core.fleet import Fleet
 from zsched.core.model import TaskId, WorkerState
 from zsched.core.plan import ReadyWhen
-from zsched.core.relay_protocol import WorkerMatched, WorkerSeen
+from zsched.core.relay_protocol import WorkerMatched, WorkerSeen, WorkerTrouble
 
 OTHERS: Final = (
     "somebody takes every node's inputs (a recorder?): whether a worker is there cannot be told by matching; "
@@ -80,6 +80,14 @@ class Crew:
             if life or task in self._foreign:  # without its process nobody who matches is the worker
                 self._tell(supervisor, task, life, is_ready=match.is_matched, reason=match.missing)
 
+    def on_trouble(self, trouble: WorkerTrouble) -> None:
+        """A worker here says that its callbacks raise; of a process that has ended that is no news."""
+        with self._lock:
+            current = self._lives.get(trouble.task)
+            if current is None or str(current) == trouble.incarnation:
+                told = ev.WorkerTroubled(task=trouble.task, count=trouble.count, text=trouble.text)
+                self._post(told)
+
     def _supervisor_of(self, task: TaskId) -> WorkerSupervisor | None:
         supervisor = self.supervisor
         return supervisor if supervisor is not None and task in supervisor.states() else None
@@ -116,3 +124,7 @@ class Crew:
     def on_failed(self, task: TaskId, reason: str) -> None:
         """The supervisor: the worker is not started again."""
         self._post(ev.WorkerChanged(task=task, state=WorkerState.FAILED, reason=reason))
+
+    def on_reset(self, task: TaskId) -> None:
+        """The supervisor: the worker may be started again."""
+        self._post(ev.WorkerChanged(task=task, state=WorkerState.STOPPED, reason="its failures are forgotten"))

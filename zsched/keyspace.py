@@ -110,6 +110,10 @@ class Keyspace:
         """Put and queryable, to the worker from its own node: idle, active or draining."""
         return self._key("role", node, task)
 
+    def trouble(self, node: NodeId, task: TaskId, incarnation: int | str) -> str:
+        """Put of a worker, to its own node's relay: its callbacks raise."""
+        return self._key("trouble", node, task, str(incarnation))
+
     def ack(self, node: NodeId, task: TaskId, incarnation: int | str, relay: str) -> str:
         """Put of a worker, to the relay with that zenoh id: how far it has processed that relay's samples."""
         return self._key("ack", node, task, str(incarnation), relay)

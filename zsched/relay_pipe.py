@@ -31,6 +31,7 @@ _REGISTERED: Final[tuple[tuple[str, type, int], ...]] = (
     ("worker_seen", relay_protocol.WorkerSeen, _SMALL),
     ("worker_watch", relay_protocol.WorkerWatch, wire.LARGE),
     ("worker_matched", relay_protocol.WorkerMatched, _SMALL),
+    ("worker_trouble", relay_protocol.WorkerTrouble, _SMALL),
     ("end_marker", relay_protocol.EndMarker, 256),
     ("snapshot_chunk", relay_protocol.SnapshotChunk, 256),
     ("stream_acks", relay_protocol.StreamAcks, wire.LARGE),
@@ -56,6 +57,7 @@ REPORTS: Final[tuple[type[Any], ...]] = (
     relay_life.RelayPulse,
     relay_protocol.WorkerSeen,
     relay_protocol.WorkerMatched,
+    relay_protocol.WorkerTrouble,
     relay_protocol.SlotLost,
     events.SlotReady,
     events.SlotFlipped,
@@ -104,6 +106,14 @@ def decode_end(payload: bytes) -> relay_protocol.EndMarker | None:
     """The end marker in a payload, or ``None`` when it is none."""
     try:
         return wire.decode(payload, relay_protocol.EndMarker)
+    except WireError:
+        return None
+
+
+def decode_trouble(payload: bytes) -> relay_protocol.WorkerTrouble | None:
+    """A worker's word about itself in a payload, or ``None`` when it is none."""
+    try:
+        return wire.decode(payload, relay_protocol.WorkerTrouble)
     except WireError:
         return None
 

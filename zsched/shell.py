@@ -25,9 +25,9 @@ from zsched.clock import monotonic_s
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.fleet import Fleet
-from zsched.core.messages import CommandResult, SetWeights
+from zsched.core.messages import Command, CommandResult, RetryTask, SetWeights
 from zsched.core.model import NAME, NodeId
-from zsched.core.relay_protocol import HandleReport, RelayStarted, SlotLost, WorkerMatched, WorkerSeen
+from zsched.core.relay_protocol import HandleReport, RelayStarted, SlotLost, WorkerMatched, WorkerSeen, WorkerTrouble
 from zsched.core.snapshot import Snapshot
 from zsched.crew import Crew
 from zsched.errors import AdapterError, WireError
@@ -106,25 +106,28 @@ class Desk:
         self._lock = threading.Lock()
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Answer one request of the socket (``status``, ``weights``, ``access``); with ``node``, for another node."""
+        """Answer one request of the socket (``status``, ``weights``, ``retry``, ``access``).
+
+        With ``node``: what another node answers.
+        """
         verb, node = request["verb"], request.get("node") or self._node
         if not isinstance(node, str) or not NAME.fullmatch(node):
             return {"error": f"node: {node!r:.80} is not a name"}
         if verb == "status":
             return self._ask(node, None)
-        if verb == "weights":
+        if verb in _COMMANDS:
             try:
-                command = _weights_of(request)
+                command = _COMMANDS[verb](request)
             except KeyError as error:
-                return {"error": f"weights: {error} is missing"}
+                return {"error": f"{verb}: {error} is missing"}
             except (TypeError, ValueError) as error:
-                return {"error": f"weights: {error}"}
+                return {"error": f"{verb}: {error}"}
             return self._ask(node, command)
         if verb == "access" and self._access is not None:
             return self._access(node)
-        return {"error": f"unknown verb {verb!r:.80}; known: access, status, weights"}
+        return {"error": f"unknown verb {verb!r:.80}; known: access, retry, status, weights"}
 
-    def _ask(self, node: NodeId, command: SetWeights | None) -> dict[str, Any]:
+    def _ask(self, node: NodeId, command: Command | None) -> dict[str, Any]:
         if node != self._node:
             try:
                 return _as_json(self._bus.ask_node(node, command))
@@ -134,10 +137,7 @@ class Desk:
         slot: queue.SimpleQueue[object] = queue.SimpleQueue()
         with self._lock:
             self._waiting[number] = slot
-        event: ev.Event = ev.StatusAsked(request=number)
-        if command is not None:
-            event = ev.WeightsCommanded(request=number, command=command)
-        self._inbox.post(event)
+        self._inbox.post(ev.StatusAsked(request=number) if command is None else ev.commanded(number, command))
         try:
             return _as_json(slot.get(timeout=ANSWER_TIMEOUT_S))
         except queue.Empty:
@@ -162,6 +162,13 @@ def _weights_of(request: dict[str, Any]) -> SetWeights:
     if not all(map(math.isfinite, (cpu, memory, network))):
         raise ValueError("expected finite numbers")
     return SetWeights(task=str(request["task"]), cpu=cpu, memory=memory, network=network, base_revision=base)
+
+
+def _retry_of(request: dict[str, Any]) -> RetryTask:
+    return RetryTask(task=str(request["task"]), node=str(request.get("whose") or ""))
+
+
+_COMMANDS: dict[str, Callable[[dict[str, Any]], Command]] = {"weights": _weights_of, "retry": _retry_of}
 
 
 def _as_json(value: object) -> dict[str, Any]:
@@ -266,6 +273,8 @@ class Shell:
                 self._workers().start(task)
             case do.StopWorker(task=task):
                 self._workers().stop(task)
+            case do.ResetWorker(task=task):
+                self._workers().reset(task)
             case do.RestartWorker(task=task, reason=reason):
                 self._workers().report_hung(task, self.crew.life_of(task), reason)
             case do.StandDown(reason=reason):
@@ -301,6 +310,9 @@ class Shell:
             return
         if isinstance(report, WorkerMatched):
             self.crew.on_matched(report)
+            return
+        if isinstance(report, WorkerTrouble):
+            self.crew.on_trouble(report)
             return
         if not isinstance(report, WorkerSeen):
             self._inbox.post(report)

@@ -45,6 +45,7 @@ KINDS: dict[str, tuple[type, int]] = {
     "refused": (messages.Refused, SMALL),
     "learnt": (messages.Learnt, LARGE),
     "set_weights": (messages.SetWeights, SMALL),
+    "retry_task": (messages.RetryTask, SMALL),
     "command_result": (messages.CommandResult, SMALL),
     "status": (snapshot.Snapshot, LARGE),
     "state": (model.DurableState, LARGE),

@@ -35,7 +35,7 @@ import zenoh
 from zsched import wire
 from zsched.clock import monotonic_s
 from zsched.core.plan import Role, WorkerRole
-from zsched.core.relay_protocol import StreamAcks
+from zsched.core.relay_protocol import StreamAcks, WorkerTrouble
 from zsched.guard import guarded
 from zsched.hop_acks import Acknowledger
 from zsched.keyspace import END_CHUNK, Keyspace
@@ -50,6 +50,7 @@ from zsched.worker_roles import RoleWatch
 from zsched.worker_services import Answer, Handler, Request, Service
 from zsched.worker_snapshot import TIMEOUT_S, Offer, Restorer, StateLink, fetch
 from zsched.worker_start import open_session, surroundings
+from zsched.worker_troubles import Troubles
 
 __all__ = ["Answer", "Output", "Received", "Request", "Worker"]
 
@@ -100,7 +101,8 @@ class Worker:
         self._state_link = StateLink(self._session, zenoh_config)
         self._keeper = Keeper(self._session, self._keyspace.received("*", "*", str(self._session.zid())))
         self._acks = Acknowledger(self._send_acks)
-        self._dispatcher = Dispatcher(self._inputs_ended, self._acks)
+        self._troubles = Troubles(self._tell_trouble)
+        self._dispatcher = Dispatcher(self._inputs_ended, self._acks, self._troubles)
         self._restorer = Restorer(self._fetch_snapshot, node, self._dispatcher)
         self._dispatcher.start()
         self._watch: RoleWatch | None = None
@@ -208,7 +210,15 @@ class Worker:
         one is answered "busy". What it raises becomes an error reply. It is only called while this worker is the owner.
         """
         expr = key_expr.replace("{prefix}", self.prefix)
-        service = Service(self._session, expr, handler, is_owner=self._is_owner, later=self._errands.put, depth=depth)
+        service = Service(
+            self._session,
+            expr,
+            handler,
+            is_owner=self._is_owner,
+            later=self._errands.put,
+            troubles=self._troubles,
+            depth=depth,
+        )
         self._declared.append(service)
 
     def offer_snapshot(self, snapshot: Callable[[], bytes]) -> None:
@@ -263,6 +273,7 @@ class Worker:
             signal.signal(signal.SIGALRM, signal.SIG_DFL)
             signal.setitimer(signal.ITIMER_REAL, ALARM_S)
         self._dispatcher.close()
+        self._troubles.close()
         self._acks.close()
         self._keeper.close()
         for output in tuple(self._outputs):
@@ -379,6 +390,11 @@ class Worker:
             priority=zenoh.Priority.INTERACTIVE_HIGH,
             congestion_control=zenoh.CongestionControl.DROP,
         )
+
+    def _tell_trouble(self, count: int, text: str) -> None:
+        trouble = WorkerTrouble(task=self._task, incarnation=self._incarnation, count=count, text=text)
+        key = self._keyspace.trouble(self._node, self._task, self._incarnation)
+        self._session.put(key, wire.encode(trouble), congestion_control=zenoh.CongestionControl.DROP)
 
     # --- ends --------------------------------------------------------------------------------------------------------
 

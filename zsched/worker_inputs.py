@@ -28,6 +28,7 @@ from zsched.core.relay_protocol import EndMarker
 from zsched.core.serial import number_near, serial_of
 from zsched.guard import guarded
 from zsched.hop_acks import GIVE_UP_S, MAX_SOURCES, Acknowledger, SourceName
+from zsched.worker_troubles import Troubles
 
 END_GRACE_S: Final = 0.1
 MAX_WITHHELD: Final = 256
@@ -109,8 +110,9 @@ class _Open:
 class Dispatcher:
     """The worker's own thread. ``on_ended(epoch)`` is called in it when every input seen in the epoch has ended."""
 
-    def __init__(self, on_ended: Callable[[int], None], acks: Acknowledger) -> None:
+    def __init__(self, on_ended: Callable[[int], None], acks: Acknowledger, troubles: Troubles) -> None:
         self._on_ended = on_ended
+        self._troubles = troubles
         self._acks = acks
         self._stamp: zenoh.Timestamp | None = None
         self._newest_stamp: zenoh.Timestamp | None = None
@@ -314,8 +316,8 @@ class Dispatcher:
         self._stamp = sample.timestamp
         try:
             source.on_sample(received)
-        except Exception:  # noqa: BLE001 - the worker's own bug must not end its dispatch
-            _log.exception("%s: the worker's callback failed", key)
+        except Exception as error:  # noqa: BLE001 - the worker's own bug must not end its dispatch
+            self._troubles.note(key, error)
         newest = self._newest_stamp
         if self._stamp is not None and (newest is None or newest < self._stamp):  # type: ignore[operator] # zenoh's stubs
             self._newest_stamp = self._stamp

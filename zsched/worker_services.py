@@ -22,6 +22,7 @@ from zsched.clock import monotonic_s
 from zsched.core.keyexpr import is_wild
 from zsched.core.relay_protocol import ERROR_ENCODING, REFUSED_ENCODING
 from zsched.guard import guarded
+from zsched.worker_troubles import Troubles
 
 ROLE_WAIT_S: Final = 0.3
 """A request may outrun the word that this worker is the owner; a relay's flip waits as long."""
@@ -65,6 +66,7 @@ class Service:
         *,
         is_owner: Callable[[], bool],
         later: Callable[[Callable[[], None]], None],
+        troubles: Troubles,
         depth: int,
     ) -> None:
         """Declare the queryable; ``later`` runs a call in another thread (zenoh's own must only enqueue).
@@ -76,6 +78,7 @@ class Service:
         self._handler = handler
         self._is_owner = is_owner
         self._later = later
+        self._troubles = troubles
         self._requests: queue.Queue[zenoh.Query | None] = queue.Queue(depth)
         self._is_closed = False
         guarded(self._run, name=f"zsched serve {key_expr}", kind="zsched serve").start()
@@ -121,7 +124,7 @@ class Service:
             try:
                 given = self._handler(request)
             except Exception as error:  # noqa: BLE001 - the asker must hear of it, whatever it is
-                _log.exception("%s: the service's handler failed", request.key)
+                self._troubles.note(request.key, error)
                 query.reply_err(f"failed: {type(error).__name__}: {error}"[:400], encoding=ERROR_ENCODING)
                 return
             answer = given if isinstance(given, Answer) else Answer(payload=given)

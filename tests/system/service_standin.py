@@ -58,6 +58,9 @@ class Events:
     def on_failed(self, task: str, reason: str) -> None:
         print("failed", task, reason, flush=True)
 
+    def on_reset(self, task: str) -> None:
+        print("reset", task, flush=True)
+
 
 def load_state(file: StateFile) -> DurableState:
     result = file.load()

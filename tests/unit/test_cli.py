@@ -44,7 +44,7 @@ class Daemon:
     def _answer(self, request: Json) -> Json:
         self.asked.append(request)
         time.sleep(self.delay_s)
-        if request["verb"] == "weights":
+        if request["verb"] in ("weights", "retry"):
             return self.result
         if "error" in self.status:
             return self.status
@@ -254,6 +254,29 @@ def test_screen_that_is_too_low_keeps_the_problems(monkeypatch: pytest.MonkeyPat
 def test_screen_that_is_high_enough_shows_all(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LINES", "10")
     assert _fitted("\n".join("abcdefghij")).count("\n") == 9
+
+
+# --- retry -----------------------------------------------------------------------------------------------------------
+
+
+def test_retry_asks_every_node_that_is_there_and_names_the_others(daemon: Daemon) -> None:
+    daemon.status["nodes"][-1]["state"] = "gone"
+    names = [node["name"] for node in daemon.status["nodes"]]
+    result = run("retry", "echo", "edge1")
+    assert result.exit_code == 5
+    asked = [request for request in daemon.asked if request["verb"] == "retry"]
+    assert asked == [{"verb": "retry", "task": "echo", "whose": "edge1", "node": name} for name in names[:-1]]
+    assert result.stdout.splitlines()[-1] == f"echo on {names[-1]}: not asked, it is gone"
+    daemon.status["nodes"][-1]["state"] = "alive"
+    assert run("retry", "echo").exit_code == 0
+
+
+@pytest.mark.parametrize(("words", "says"), [(("ehco",), "did you mean echo?"), (("echo", "egde1"), "edge1")])
+def test_retry_of_what_there_is_not_is_a_usage_error(daemon: Daemon, words: tuple[str, ...], says: str) -> None:
+    result = run("retry", *words)
+    assert result.exit_code == 2
+    assert says in result.stderr
+    assert [request["verb"] for request in daemon.asked] == ["status"]
 
 
 # --- weights ---------------------------------------------------------------------------------------------------------

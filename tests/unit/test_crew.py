@@ -12,7 +12,7 @@ from zsched.core import events as ev
 from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
 from zsched.core.model import NodeKind, Tuning, Weights, WorkerState
 from zsched.core.plan import ReadyWhen
-from zsched.core.relay_protocol import WorkerMatched, WorkerSeen
+from zsched.core.relay_protocol import WorkerMatched, WorkerSeen, WorkerTrouble
 from zsched.crew import OTHERS, Crew
 
 SLEEPER = ("python", "-c", "import time; time.sleep(600)")
@@ -104,6 +104,15 @@ def test_who_listens_to_everything_is_told_where_no_process_would_show_the_end(h
     house.match("node", is_certain=False)
     problems = [one.problem for one in house.events if isinstance(one, ev.ProblemReported)]
     assert problems == [OTHERS, None, None]
+
+
+def test_only_the_running_process_complains(house: House) -> None:
+    house.supervisor.start("token")
+    life = until(lambda: house.crew.life_of("token"), "it runs")
+    for incarnation in (str(life - 1), str(life)):
+        house.crew.on_trouble(WorkerTrouble(task="token", incarnation=incarnation, count=2, text="ValueError"))
+    told = [one for one in tuple(house.events) if isinstance(one, ev.WorkerTroubled)]
+    assert told == [ev.WorkerTroubled(task="token", count=2, text="ValueError")]
 
 
 def test_a_worker_without_its_token_is_told_what_it_lacks(house: House) -> None:

@@ -19,14 +19,17 @@ import zenoh
 from zsched import wire
 from zsched.adapters.open_questions import Questions
 from zsched.core import events as ev
+from zsched.core.events import commanded
 from zsched.core.messages import (
     Accept,
     Accepted,
+    Command,
     CommandResult,
     Learnt,
     Prepare,
     Promise,
     Refused,
+    RetryTask,
     SetWeights,
     Utilities,
 )
@@ -244,9 +247,8 @@ class ControlBus:
         if kind == "status":
             return ev.StatusAsked(request=self._questions.keep(query, keys.status(node, asker)))
         if kind == "command":
-            command = wire.decode(payload, SetWeights)
-            number = self._questions.keep(query, keys.command(node, asker))
-            return ev.WeightsCommanded(request=number, command=command)
+            command: Any = wire.decode(payload, SetWeights, RetryTask)
+            return commanded(self._questions.keep(query, keys.command(node, asker)), command)
         raise WireError("key", "unknown kind")
 
     # --- what goes out (the loop) ------------------------------------------------------------------------------------
@@ -348,7 +350,7 @@ class ControlBus:
 
     # --- for operators (a thread of their own) -----------------------------------------------------------------------
 
-    def ask_node(self, node: NodeId, command: SetWeights | None) -> Snapshot | CommandResult:
+    def ask_node(self, node: NodeId, command: Command | None) -> Snapshot | CommandResult:
         """Ask another node for its status, or give it a command; blocks up to 3 s, never called from the loop.
 
         Raises:

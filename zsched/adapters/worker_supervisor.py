@@ -59,6 +59,9 @@ class WorkerEvents(Protocol):
     def on_failed(self, task: TaskId, reason: str) -> None:
         """The worker is not started again until `WorkerSupervisor.reset`."""
 
+    def on_reset(self, task: TaskId) -> None:
+        """The worker may be started again: its failures are forgotten."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorkerContext:
@@ -278,6 +281,7 @@ class WorkerSupervisor:
         worker.failures.clear()
         if worker.phase in {_Phase.FAILED, _Phase.BACKOFF}:
             worker.phase, worker.deadline_s = _Phase.IDLE, None
+            self._tell(self._events.on_reset, task)
 
     def _on_close(self, within_s: float) -> None:
         self._close_by_s = monotonic_s() + within_s + 0.5

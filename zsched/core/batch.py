@@ -15,6 +15,7 @@ _LOCAL = frozenset(
         do.SetRole,
         do.StartWorker,
         do.StopWorker,
+        do.ResetWorker,
         do.RestartWorker,
         do.RecordStory,
         do.StandDown,

@@ -50,6 +50,11 @@ class Damping:
             self._moves.append((now, has_failed))
         self._owner_since = now
 
+    def forgive(self, node: NodeId | None) -> None:
+        """An operator has mended ``node`` (``None``: whatever was wrong anywhere); the caps still count the moves."""
+        for name in tuple(self._points) if node is None else (node,):
+            self._points.pop(name, None)
+
     def points(self, node: NodeId, now: float) -> float:
         """What a node has collected, decayed to ``now``."""
         points, at = self._points.get(node, (0.0, now))

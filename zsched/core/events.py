@@ -9,7 +9,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from zsched.core.messages import Accept, Accepted, Learnt, Prepare, Promise, Refused, SetWeights, Utilities
+from zsched.core.messages import (
+    Accept,
+    Accepted,
+    Command,
+    Learnt,
+    Prepare,
+    Promise,
+    Refused,
+    RetryTask,
+    SetWeights,
+    Utilities,
+)
 from zsched.core.model import Beat, DeviceSample, LinkSample, NodeId, Profile, Proposal, TaskId, WorkerState
 from zsched.core.plan import StreamCount
 
@@ -164,6 +175,15 @@ class WorkerChanged:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class WorkerTroubled:
+    """A worker of this node says that ``count`` of its callbacks have raised; ``text`` is the newest error."""
+
+    task: TaskId
+    count: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class WorkerShown:
     """The relay saw the token of another node's worker come over a living link, or go."""
 
@@ -245,6 +265,14 @@ class WeightsCommanded:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class RetryCommanded:
+    """An operator wants failures to be forgotten."""
+
+    request: int
+    command: RetryTask
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FrameDropped:
     """Bytes came that are no valid frame, or not for us: only a counter moves."""
 
@@ -283,6 +311,7 @@ Event = (
     | TokenSeen
     | TokenLost
     | WorkerChanged
+    | WorkerTroubled
     | WorkerShown
     | SlotReady
     | SlotFlipped
@@ -292,7 +321,15 @@ Event = (
     | RelayChanged
     | StatusAsked
     | WeightsCommanded
+    | RetryCommanded
     | FrameDropped
     | ProblemReported
     | StopRequested
 )
+
+
+def commanded(request: int, command: Command) -> Event:
+    """The event of an operator's command."""
+    if isinstance(command, RetryTask):
+        return RetryCommanded(request=request, command=command)
+    return WeightsCommanded(request=request, command=command)

@@ -133,6 +133,13 @@ class StopWorker:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ResetWorker:
+    """Forget the failures of this node's worker for the task; it is started again if it is wanted."""
+
+    task: TaskId
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RestartWorker:
     """This node's worker for the task hangs: kill it, count a failure, start it again."""
 
@@ -204,6 +211,7 @@ Instruction = (
     | IntroducePeers
     | StartWorker
     | StopWorker
+    | ResetWorker
     | RestartWorker
     | SetRole
     | ApplyRoutes

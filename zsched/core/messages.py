@@ -147,6 +147,25 @@ class SetWeights:
         check_name("weights.task", self.task)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RetryTask:
+    """Operator command to one node: forget what failures of the task's workers have led to there.
+
+    Given to every node: each remembers something else. ``node`` is whose failures; empty means everybody's.
+    """
+
+    task: TaskId
+    node: NodeId = ""
+
+    def __post_init__(self) -> None:
+        check_name("retry.task", self.task)
+        if self.node:
+            check_name("retry.node", self.node)
+
+
+Command = SetWeights | RetryTask
+
+
 class CommandOutcome(StrEnum):
     """How a command ended; `OK` and `UNCHANGED` are success."""
 

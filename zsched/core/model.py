@@ -160,7 +160,7 @@ class WorkerLoad:
     cpu_cores: float | None = None
     memory_mb: float | None = None
     reason: str = ""
-    """Why it is not ready, at most `MAX_REASON` characters; empty while it is."""
+    """Why it is not ready, or what is wrong with it though it is; at most `MAX_REASON` characters."""
 
     def __post_init__(self) -> None:
         check_name("worker.task", self.task)

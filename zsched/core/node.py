@@ -27,6 +27,7 @@ from zsched.core.gateway import Gateway
 from zsched.core.identity import Identity, Verdict
 from zsched.core.introductions import Introductions
 from zsched.core.membership import Membership, Transition
+from zsched.core.messages import CommandOutcome, CommandResult
 from zsched.core.model import (
     Allocation,
     Beat,
@@ -60,6 +61,7 @@ _OFTEN_QUIET = frozenset(
         ev.LearntAsked,
         ev.TokenSeen,
         ev.StreamsCounted,
+        ev.WorkerTroubled,
         ev.FrameDropped,
         ev.ClockCompared,
     }
@@ -396,7 +398,7 @@ class Node:
             is_draining=self.is_draining,
             now=now,
             progress=progress,
-            reasons=self._workers.reasons,
+            reasons=self._workers.told(now),
         )
         if profile is not None:
             self.gateway.absorb(profile, now)
@@ -583,6 +585,22 @@ class Node:
     def _on_status(self, event: ev.StatusAsked, now: float) -> None:
         self._batch.add(do.AnswerStatus(request=event.request, snapshot=build_snapshot(self, now)))
 
+    def _on_retry(self, event: ev.RetryCommanded, now: float) -> None:
+        """Forget failures: of our own worker if it is meant, and what we hold against nodes."""
+        task, whose = event.command.task, event.command.node
+        if task not in self.executors or (whose and not self.membership.is_known(whose)):
+            detail = f"no task {task!r}" if task not in self.executors else f"no node {whose!r}"
+            result = CommandResult(outcome=CommandOutcome.INVALID, detail=detail)
+            self._batch.add(do.AnswerCommand(request=event.request, result=result))
+            return
+        self.rounds.forgive(task, whose or None, now)
+        state = self.worker_states.get(task) if whose in ("", self.me) else None
+        if state is not None:
+            self._batch.add(do.ResetWorker(task=task))
+        detail = "its penalties are forgotten" if state is None else f"its failures are forgotten, it was {state}"
+        result = CommandResult(outcome=CommandOutcome.OK, detail=detail)
+        self._batch.add(do.AnswerCommand(request=event.request, result=result))
+
     def _on_dropped(self, event: ev.FrameDropped, _now: float) -> None:
         self.counters[f"dropped_{event.kind}_{event.reason}"] += 1
 
@@ -620,6 +638,7 @@ class Node:
             ev.TokenSeen: self._on_token_seen,
             ev.TokenLost: self._on_token_lost,
             ev.WorkerChanged: self._on_worker,
+            ev.WorkerTroubled: self._workers.on_troubled,
             ev.WorkerShown: self._on_worker_shown,
             ev.SlotReady: self._on_slot_ready,
             ev.SlotFlipped: self._on_slot_flipped,
@@ -629,6 +648,7 @@ class Node:
             ev.RelayChanged: self._on_relay,
             ev.StatusAsked: self._on_status,
             ev.WeightsCommanded: lambda event, now: self._agree(self.agreement.retune(event, now), now),
+            ev.RetryCommanded: self._on_retry,
             ev.FrameDropped: self._on_dropped,
             ev.ProblemReported: self._on_problem,
             ev.StopRequested: self._on_stop,

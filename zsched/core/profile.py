@@ -289,7 +289,11 @@ def _differs(new: Profile, old: Profile) -> bool:
 
 def _kinds(profile: Profile) -> tuple[object, ...]:
     """What is no figure: every change of it counts."""
-    workers = [(load.task, load.state, load.reason) for load in profile.workers]
+    workers = [
+        # what a worker that is ready complains of is a count: it goes along with the figures
+        (load.task, load.state, bool(load.reason) if load.state is WorkerState.READY else load.reason)
+        for load in profile.workers
+    ]
     return profile.draining, workers, profile.progress, [(link.peer, link.source) for link in profile.links]
 
 

@@ -4,9 +4,9 @@ Knows: what the daemon and its relay tell each other beside plans, roles and the
 end marker says. Does not know: pipes, frames, zenoh.
 
 Commands (daemon to relay): `RoutePlan`, `Role`, `WorkerWatch`, `RelayStop`. Reports (relay to daemon): `RelayStarted`,
-`WorkerSeen`, `WorkerMatched`, `SlotLost` and the events `SlotReady`, `SlotFlipped`, `SlotDrained`, `RoleEnded`,
-`StreamsCounted`, `ProblemReported`. The handle adds `RelayChanged`. Between workers and relays: `EndMarker`,
-`StreamAcks`.
+`WorkerSeen`, `WorkerMatched`, `WorkerTrouble`, `SlotLost` and the events `SlotReady`, `SlotFlipped`, `SlotDrained`,
+`RoleEnded`, `StreamsCounted`, `ProblemReported`. The handle adds `RelayChanged`. Between workers and relays:
+`WorkerTrouble`, `EndMarker`, `StreamAcks`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from zsched.core.events import (
     SlotReady,
     StreamsCounted,
 )
-from zsched.core.model import NodeId, TaskId, check_counter, check_name
+from zsched.core.model import MAX_REASON, NodeId, TaskId, check_counter, check_name
 from zsched.core.plan import Role, Route, RoutePlan
 
 
@@ -83,6 +83,24 @@ class WorkerMatched:
     """False: somebody else, who listens to everything, may be all that matches."""
     missing: str = ""
     """What nobody takes, in words."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorkerTrouble:
+    """The worker's own callbacks raise: a worker's word to its node's relay, and the relay's to the daemon."""
+
+    task: TaskId
+    incarnation: str
+    count: int
+    """How many of them have failed in this life."""
+    text: str
+    """The newest error, in one line."""
+
+    def __post_init__(self) -> None:
+        check_name("trouble.task", self.task)
+        check_counter("trouble.count", self.count)
+        if len(self.text) > MAX_REASON:
+            raise ValueError(f"trouble.text: {len(self.text)} characters, at most {MAX_REASON}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -186,6 +204,7 @@ RelayReport = (
     RelayStarted
     | WorkerSeen
     | WorkerMatched
+    | WorkerTrouble
     | SlotReady
     | SlotFlipped
     | SlotDrained

@@ -406,6 +406,11 @@ class Rounds:
         self.tasks[name].damping.note_move(left, has_failed=has_failed, was_draining=was_draining, now=now)
         self.tasks[name].cost.on_moved(is_planned=left is not None and not has_failed, now=now)
 
+    def forgive(self, name: TaskId, node: NodeId | None, now: float) -> None:
+        """An operator has mended what was held against a node (``None``: against any); judge again at once."""
+        self.tasks[name].damping.forgive(node)
+        self.hurry(now)
+
     def absorb_counts(self, counts: tuple[StreamCount, ...], now: float) -> None:
         """This robot's relay has counted its streams: what did the last moves cost?"""
         for task in self.tasks.values():

@@ -208,6 +208,8 @@ def _task_problems(node: NodeView, task: TaskSpec, value: Allocation, now: float
             yield f"the worker on {spec.name} failed{why}"
         elif spec.name == owner and load.state is not WorkerState.READY:
             yield f"the worker on {spec.name} is {load.state}{why}"
+        elif load.state is WorkerState.READY and load.reason:
+            yield f"the worker on {spec.name}{why}"
     since = _unready_since(node, executor)
     if is_owner_ready and now - since >= UNREADY_SHOWN_S:
         waited = f"this robot's streams have waited for {executor.owner} for {now - since:.0f} s"

@@ -5,12 +5,16 @@ Knows: which tasks have a worker here. Does not know: processes, tokens, who own
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from zsched.core import events as ev
 from zsched.core.fleet import Fleet, OnIsolation, TaskSpec
 from zsched.core.instructions import RecordStory
 from zsched.core.model import MAX_REASON, NodeId, NodeKind, Profile, TaskId, WorkerState
+
+TROUBLE_S = 60.0
+"""A callback that has raised is shown for so long behind the last time."""
 
 
 def runs_worker(task: TaskSpec, node: NodeId, kind: NodeKind) -> bool:
@@ -30,6 +34,8 @@ class Workers:
 
     states: dict[TaskId, WorkerState]
     reasons: dict[TaskId, str] = field(default_factory=dict)
+    _troubles: dict[TaskId, tuple[str, float]] = field(default_factory=dict)
+    """{task: (what a worker that is ready complains of, since when it has not again)}."""
 
     @classmethod
     def of(cls, fleet: Fleet, me: NodeId) -> Workers:
@@ -41,6 +47,8 @@ class Workers:
         """Note a worker's new state; ``None`` when it is no news, or no worker of ours."""
         if event.task not in self.states:
             return None
+        if event.state is not WorkerState.READY:
+            self._troubles.pop(event.task, None)
         if event.state is WorkerState.READY:
             self.reasons.pop(event.task, None)
         elif event.reason:
@@ -50,3 +58,16 @@ class Workers:
         self.states[event.task] = event.state
         text = f"worker {event.state}{': ' if event.reason else ''}{event.reason}"
         return RecordStory(stage="executor", text=text, task=event.task)
+
+    def on_troubled(self, event: ev.WorkerTroubled, now: float) -> None:
+        """A worker that is ready says that its callbacks raise."""
+        if self.states.get(event.task) is WorkerState.READY:
+            times = "once" if event.count == 1 else f"{event.count} times"
+            self._troubles[event.task] = (f"callback raised {times}: {event.text}"[:MAX_REASON], now)
+
+    def told(self, now: float) -> Mapping[TaskId, str]:
+        """{task: why its worker is not ready, or what is wrong with it though it is}."""
+        if not self._troubles:
+            return self.reasons
+        self._troubles = {task: one for task, one in self._troubles.items() if now - one[1] <= TROUBLE_S}
+        return {**{task: text for task, (text, _) in self._troubles.items()}, **self.reasons}

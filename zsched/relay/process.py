@@ -42,6 +42,7 @@ from zsched.relay.roles import RoleServer
 from zsched.relay.successors import Successors
 from zsched.relay.task import TaskRelay
 from zsched.relay.tokens import Tokens
+from zsched.relay.troubles import Troubles
 from zsched.relay_pipe import COMMANDS, read_frame, write_frame
 
 COUNT_S: Final = 1.0
@@ -158,6 +159,7 @@ class RelayProcess:
         self._acks = Acks(session, keyspace, node)
         self._roles = RoleServer(session, keyspace, node)
         self._matching = Matching(session, reporter.report)
+        self._troubles = Troubles(session, keyspace, node, reporter.report)
         self._tokens = Tokens(session, keyspace, self._worker_seen, self._role_ended, self._wake)
         reporter.report(RelayStarted(pid=os.getpid(), zid=str(session.zid())))
         guarded(self._count, name="counters").start()

@@ -42,6 +42,9 @@ class Recorder:
     def on_failed(self, task: str, reason: str) -> None:
         self._add("failed", task, reason)
 
+    def on_reset(self, task: str) -> None:
+        self._add("reset", task)
+
     def _add(self, *call: object) -> None:
         with self._changed:
             self.calls.append(call)
@@ -186,6 +189,7 @@ def test_worker_that_keeps_failing_fails_for_good_until_reset() -> None:
         supervisor.start("merge")
         supervisor.reset("merge")
         recorder.wait("started", 4)
+        assert [call[0] for call in recorder.calls][7:9] == ["reset", "started"]
 
 
 @pytest.mark.parametrize(

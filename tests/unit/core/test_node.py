@@ -13,7 +13,17 @@ from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.fleet import Fleet, NodeSpec, StreamRule, TaskSpec, Timing, WorkerSpec, electorate_hash
 from zsched.core.identity import QUIET_S
-from zsched.core.messages import Accept, Learnt, Prepare, Promise, Refusal, Refused, Utilities
+from zsched.core.messages import (
+    Accept,
+    CommandOutcome,
+    Learnt,
+    Prepare,
+    Promise,
+    Refusal,
+    Refused,
+    RetryTask,
+    Utilities,
+)
 from zsched.core.model import (
     Acceptance,
     Allocation,
@@ -477,3 +487,32 @@ def test_profiles_with_other_figures_are_no_news() -> None:
     node = started()
     (told,) = of(node.handle(ev.ProfileSampled(device=replace(SAMPLE, cpu_used_cores=3.5)), 102.0), do.PublishProfile)
     assert not told.is_news
+
+
+# --- an operator who has mended something ----------------------------------------------------------------------------
+
+
+def test_a_retry_resets_the_worker_that_is_meant_and_forgives_its_node() -> None:
+    node = make("robot1")
+    damping = node.rounds.tasks["merge"].damping
+    for left in EDGES:
+        damping.note_move(left, has_failed=True, now=100.0)
+    batch = node.handle(ev.RetryCommanded(request=7, command=RetryTask(task="merge", node="edge1")), 100.0)
+    assert of(batch, do.ResetWorker) == [], "a robot runs no worker of it"
+    assert of(batch, do.AnswerCommand)[0].result.outcome is CommandOutcome.OK
+    assert set(damping.penalties(100.0)) == set(EDGES) - {"edge1"}
+    node.handle(ev.RetryCommanded(request=8, command=RetryTask(task="merge")), 100.0)
+    assert damping.penalties(100.0) == {}
+
+    edge = make("edge1")
+    for whose, resets in (("", 1), ("edge1", 1), ("edge2", 0)):
+        batch = edge.handle(ev.RetryCommanded(request=9, command=RetryTask(task="merge", node=whose)), 100.0)
+        assert len(of(batch, do.ResetWorker)) == resets
+
+
+@pytest.mark.parametrize("command", [RetryTask(task="other"), RetryTask(task="merge", node="ghost")])
+def test_a_retry_of_what_there_is_not_is_refused(command: RetryTask) -> None:
+    node = make("edge1")
+    batch = node.handle(ev.RetryCommanded(request=7, command=command), 100.0)
+    assert of(batch, do.ResetWorker) == []
+    assert of(batch, do.AnswerCommand)[0].result.outcome is CommandOutcome.INVALID

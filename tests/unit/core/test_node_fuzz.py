@@ -12,7 +12,18 @@ from zsched import wire
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.fleet import Fleet, NodeSpec, Standby, StreamRule, TaskSpec, Timing, WorkerSpec, electorate_hash
-from zsched.core.messages import Accept, Accepted, Learnt, Prepare, Promise, Refusal, Refused, SetWeights, Utilities
+from zsched.core.messages import (
+    Accept,
+    Accepted,
+    Learnt,
+    Prepare,
+    Promise,
+    Refusal,
+    Refused,
+    RetryTask,
+    SetWeights,
+    Utilities,
+)
 from zsched.core.model import (
     Acceptance,
     Allocation,
@@ -265,7 +276,10 @@ class Storm:
         return kind(node=self.name(), incarnation=self.rng.choice((3, 7, 8)))
 
     def worker(self) -> ev.Event:
-        return ev.WorkerChanged(task=self.task(), state=self.rng.choice(list(WorkerState)))
+        if self.rng.random() < 0.2:
+            return ev.WorkerTroubled(task=self.task(), count=self.number(), text="x" * self.rng.choice((0, 3, 400)))
+        reason = self.rng.choice(("", "its token", "x" * 400))
+        return ev.WorkerChanged(task=self.task(), state=self.rng.choice(tuple(WorkerState)), reason=reason)
 
     def slot(self) -> ev.Event:
         """Mostly what the relay would say to one of the last plans."""
@@ -287,6 +301,9 @@ class Storm:
         return ev.StatusAsked(request=self.number())
 
     def command(self) -> ev.Event:
+        if self.rng.random() < 0.2:
+            whose = self.rng.choice(("", self.name()))
+            return ev.RetryCommanded(request=self.number(), command=RetryTask(task=self.task(), node=whose))
         base = self.rng.choice((None, self.number()))
         cpu = self.rng.choice((0.25, 0.75, 2.0))
         command = SetWeights(task=self.task(), cpu=cpu, memory=1.0 - cpu, network=0.0, base_revision=base)

@@ -305,6 +305,17 @@ def test_sent_at_once_when_a_worker_changes_or_the_node_drains() -> None:
     assert draining.draining
 
 
+def test_what_a_ready_worker_complains_of_goes_along_with_the_figures() -> None:
+    """Its count rises with every sample: that is no reason to wake everybody up."""
+    profiler = make_profiler()
+    profiler.absorb(device(), (), now=0.0)
+    taken(profiler, 0.0)
+    first = profiler.publishable(READY, is_draining=False, now=0.1, reasons={"merge": "callback raised once"})
+    assert first is not None
+    assert [one.reason for one in first.workers] == ["callback raised once"]
+    assert profiler.publishable(READY, is_draining=False, now=0.2, reasons={"merge": "raised 200 times"}) is None
+
+
 def test_sent_at_once_when_a_link_falls_silent_or_is_taken_away() -> None:
     profiler = make_profiler(replace(TIMING, publish_s=60.0))
     profiler.absorb(device(), (radio(-60.0),), now=0.0)

@@ -122,6 +122,7 @@ SAMPLES: dict[str, object] = {
     ),
     "learnt": messages.Learnt(node="robot2", values=(_VALUE,)),
     "set_weights": messages.SetWeights(task="map_merge", cpu=0.5, memory=0.25, network=0.25, base_revision=7),
+    "retry_task": messages.RetryTask(task="map_merge", node="edge1"),
     "command_result": messages.CommandResult(
         outcome=messages.CommandOutcome.CONFLICT, detail="the value had changed", revision=8
     ),
@@ -167,6 +168,9 @@ SAMPLES: dict[str, object] = {
     ),
     "worker_matched": relay_protocol.WorkerMatched(
         task="map_merge", is_matched=False, is_certain=False, missing="nobody subscribes to edge1/map_merge/*/map"
+    ),
+    "worker_trouble": relay_protocol.WorkerTrouble(
+        task="map_merge", incarnation="12300001", count=2088, text="ValueError: no such map"
     ),
     "end_marker": relay_protocol.EndMarker(epoch=4, count=1000),
     "snapshot_chunk": relay_protocol.SnapshotChunk(

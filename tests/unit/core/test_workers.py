@@ -1,0 +1,41 @@
+"""The states of this node's workers, and why they are what they are."""
+
+from __future__ import annotations
+
+from zsched.core import events as ev
+from zsched.core.model import MAX_REASON, WorkerState
+from zsched.core.workers import TROUBLE_S, Workers
+
+
+def changed(state: WorkerState, reason: str = "") -> ev.WorkerChanged:
+    return ev.WorkerChanged(task="merge", state=state, reason=reason)
+
+
+def test_a_reason_stays_until_the_worker_is_ready_and_is_no_longer_than_can_be_carried() -> None:
+    workers = Workers({"merge": WorkerState.STARTING})
+    workers.on_changed(changed(WorkerState.STOPPED, "x" * 10_000))
+    assert workers.told(0.0) == {"merge": "x" * MAX_REASON}
+    assert workers.on_changed(changed(WorkerState.STOPPED, "another")) is None, "no news for the journal"
+    assert workers.told(0.0) == {"merge": "another"}
+    workers.on_changed(changed(WorkerState.READY, "its token"))
+    assert workers.told(0.0) == {}
+
+
+def test_a_complaint_of_a_worker_that_is_ready_is_shown_for_a_minute_and_ends_with_it() -> None:
+    workers = Workers({"merge": WorkerState.READY})
+    workers.on_troubled(ev.WorkerTroubled(task="merge", count=1, text="ValueError: x"), 10.0)
+    assert workers.told(10.0) == {"merge": "callback raised once: ValueError: x"}
+    workers.on_troubled(ev.WorkerTroubled(task="merge", count=2088, text="ValueError: x"), 20.0)
+    assert workers.told(20.0 + TROUBLE_S) == {"merge": "callback raised 2088 times: ValueError: x"}
+    assert workers.told(20.1 + TROUBLE_S) == {}
+    workers.on_troubled(ev.WorkerTroubled(task="merge", count=2089, text="ValueError: x"), 100.0)
+    workers.on_changed(changed(WorkerState.STARTING, "pid 7"))
+    workers.on_troubled(ev.WorkerTroubled(task="merge", count=2090, text="late"), 100.0)
+    assert workers.told(100.0) == {"merge": "pid 7"}
+
+
+def test_an_unknown_task_is_nobody_s_worker() -> None:
+    workers = Workers({})
+    assert workers.on_changed(changed(WorkerState.READY)) is None
+    workers.on_troubled(ev.WorkerTroubled(task="merge", count=1, text="x"), 0.0)
+    assert (workers.states, workers.told(0.0)) == ({}, {})

@@ -1,0 +1,118 @@
+"""A worker's own failures: all are counted, few are logged, and the node is told once a second at most."""
+
+from __future__ import annotations
+
+import logging
+from functools import partial
+from typing import cast
+
+import pytest
+import zenoh
+
+from support.sessions import hub_and_neighbour, matches
+from support.waiting import until
+from zsched import wire
+from zsched.core.model import MAX_REASON
+from zsched.core.relay_protocol import WorkerTrouble
+from zsched.hop_acks import Acknowledger
+from zsched.keyspace import Keyspace
+from zsched.relay.troubles import Troubles as Heard
+from zsched.worker_inputs import Dispatcher, Input, Received
+from zsched.worker_troubles import MAX_KINDS, Troubles
+
+KEYS = Keyspace("test")
+
+
+def fail(error: Exception) -> None:
+    raise error
+
+
+def raised(troubles: Troubles, error: Exception, times: int = 1) -> None:
+    for _ in range(times):
+        try:
+            fail(error)
+        except Exception as caught:  # noqa: BLE001 - as the callers do
+            troubles.note("robot1/map", caught)
+
+
+def test_every_failure_is_counted_and_the_last_count_is_told_though_nothing_fails_any_more() -> None:
+    told: list[tuple[int, str]] = []
+    troubles = Troubles(lambda count, text: told.append((count, text)))
+    raised(troubles, ValueError("no such map\nin this office"))
+    until(lambda: told, "the first one is told at once")
+    raised(troubles, KeyError("frame"), times=2000)
+    until(lambda: told[-1][0] == 2001, "the last count")
+    assert told[0] == (1, "ValueError: no such map")
+    assert told[-1][1] == "KeyError: 'frame'"
+    assert len(told) <= 3, "not one message a failure"
+    troubles.close()
+
+
+def test_a_callback_that_raises_every_time_writes_one_line_per_kind_of_error(caplog: pytest.LogCaptureFixture) -> None:
+    troubles = Troubles(lambda _count, _text: None)
+    with caplog.at_level(logging.ERROR, "zsched.worker"):
+        raised(troubles, ValueError("no such map"), times=500)
+        raised(troubles, KeyError("frame"), times=500)
+    assert [record.message for record in caplog.records] == [
+        "robot1/map: the worker's callback failed",
+        "robot1/map: the worker's callback failed, 501 times in all; at most one line in 10 s",
+    ]
+    kinds = [type(f"Error{number}", (Exception,), {}) for number in range(3 * MAX_KINDS)]
+    caplog.clear()
+    for kind in kinds * 2:
+        raised(troubles, kind())
+    assert len(caplog.records) < 2 * MAX_KINDS, "nor are kinds of errors without end"
+    troubles.close()
+
+
+def test_an_error_of_any_length_fits_what_is_carried() -> None:
+    told: list[str] = []
+    troubles = Troubles(lambda _count, text: told.append(text))
+    raised(troubles, ValueError("x" * 10_000))
+    until(lambda: told, "it is told")
+    WorkerTrouble(task="t", incarnation="1", count=1, text=told[0])
+    assert len(told[0]) < MAX_REASON
+    troubles.close()
+
+
+def test_the_dispatch_goes_on_behind_a_callback_that_raises() -> None:
+    told: list[int] = []
+    troubles = Troubles(lambda count, _text: told.append(count))
+    dispatcher = Dispatcher(lambda _epoch: None, cast("Acknowledger", None), troubles)
+    dispatcher.start()
+
+    def refuse(sample: Received) -> None:
+        raise ValueError(sample.key)
+
+    source = Input(on_sample=refuse, keep_last=None)
+    with hub_and_neighbour() as (hub, neighbour):
+        subscriber = hub.declare_subscriber("in", lambda sample: dispatcher.put(source, sample))
+        publisher = neighbour.declare_publisher("in")
+        until(partial(matches, publisher), "they match")
+        for _ in range(20):
+            publisher.put("x")
+        until(lambda: told and told[-1] == 20, "all have failed, and are told")
+        subscriber.undeclare()
+    dispatcher.close()
+    troubles.close()
+
+
+def test_the_relay_hands_on_what_its_own_node_s_workers_say_and_no_flood() -> None:
+    heard: list[WorkerTrouble] = []
+    trouble = WorkerTrouble(task="t", incarnation="7", count=3, text="ValueError")
+    with hub_and_neighbour() as (hub, neighbour):
+        kept = [Heard(hub, KEYS, "edge1", heard.append)]
+        until(partial(matches, neighbour.declare_publisher(KEYS.trouble("edge1", "t", "7"))), "the relay listens")
+
+        def say(node: str, value: bytes, incarnation: str = "7") -> None:
+            neighbour.put(KEYS.trouble(node, "t", incarnation), value, congestion_control=zenoh.CongestionControl.BLOCK)
+
+        say("edge1", b"\x00 garbage")
+        say("edge1", wire.encode(trouble), incarnation="8")
+        say("edge2", wire.encode(trouble))
+        for _ in range(200):
+            say("edge1", wire.encode(trouble))
+        until(lambda: heard, "the word of the worker here")
+        assert heard[0] == trouble
+        assert len(heard) < 100
+        kept.clear()
