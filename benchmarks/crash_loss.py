@@ -17,7 +17,6 @@ import tempfile
 import time
 from collections import Counter
 from pathlib import Path
-from typing import Any
 
 from benchmarks.common import machine
 from zsched.clock import monotonic_s
@@ -27,6 +26,8 @@ from zsched.lab.netbed import Netbed, Probe
 from zsched.lab.testbed import TASK, Json, echo_fleet
 
 SETTLE_S = 1.0
+IN_FLIGHT = 40
+"""A calm stream has no more than this between two acknowledgements."""
 ROBOT = "robot1"
 
 
@@ -93,7 +94,7 @@ def _spread(values: list[int]) -> str:
 def _death(bed: Netbed, probe: Probe, death: str) -> tuple[int, int, int]:
     """One cycle; (numbers without an answer, numbers with two, samples that the status says may be lost)."""
     owner = bed.wait_whole()
-    bed.wait(lambda: (probe.is_flowing() and not _count(bed).in_flight) or None, 20, "a calm stream")
+    bed.wait(lambda: probe.is_flowing() and _in_flight(bed) < IN_FLIGHT, 20, "a calm stream")
     before, seen = _told(bed), len(probe.received)
     first = max(one.number for one in probe.received[-200:]) + 1
     start = monotonic_s()
@@ -111,24 +112,21 @@ def _death(bed: Netbed, probe: Probe, death: str) -> tuple[int, int, int]:
     return lost, doubled, told
 
 
-def _count(bed: Netbed) -> StreamCount:
-    streams: list[dict[str, Any]] = bed.task(ROBOT)["streams"]
-    found = next((one for one in streams if one["stream"] == f"{TASK}/in/0"), None)
-    if found is None:  # the relay has not counted yet
-        return StreamCount(stream=f"{TASK}/in/0", in_flight=1)
-    names = ("messages", "acknowledged", "in_flight", "lost", "at_most_lost", "repeated", "unsent", "last_seen_s")
-    drops = tuple(sorted(found["drops"].items()))
-    return StreamCount(stream=found["stream"], drops=drops, **{name: found[name] for name in names})
+def _in_flight(bed: Netbed) -> int:
+    in_flight = _count(bed).in_flight
+    return IN_FLIGHT if in_flight is None else in_flight
+
+
+def _count(bed: Netbed, stream: str = f"{TASK}/in/0") -> StreamCount:
+    found = [count for count in bed.counts(ROBOT) if count.stream == stream]
+    return found[0] if found else StreamCount(stream=stream)  # the relay has not counted yet
 
 
 def _told(bed: Netbed) -> int:
     """What the robot says may be lost of its input, and of the answers."""
-    count = _count(bed)
-    streams: list[dict[str, Any]] = bed.task(ROBOT)["streams"]
-    answers = next(one for one in streams if one["stream"] == f"{TASK}/out/0")
-    dropped = sum(number for _, number in count.drops) + sum(answers["drops"].values())
-    told: int = count.lost + count.at_most_lost + dropped + answers["lost"]
-    return told
+    count, answers = _count(bed), _count(bed, f"{TASK}/out/0")
+    dropped = sum(number for one in (count, answers) for _, number in one.drops)
+    return count.lost + count.at_most_lost + dropped + answers.lost
 
 
 if __name__ == "__main__":

@@ -126,7 +126,8 @@ class ChaosBed(Netbed):
         received = self._received()
         history = self._seen(received)
         history.save(self.folder / "history.jsonl")
-        return [*history.violations(), *_foreign_ticks(history), *_foreign_echoes(history, received)]
+        found = [*history.violations(), *_foreign_ticks(history), *_foreign_echoes(history, received)]
+        return [*found, *self.unaccounted()]
 
 
 def _foreign_ticks(history: History) -> list[str]:

@@ -25,8 +25,10 @@ import zenoh
 from zsched import places, zenoh_config
 from zsched.adapters.operator_socket import ask
 from zsched.config import load_fleet
+from zsched.core.books import unaccounted
 from zsched.core.fleet import Fleet
 from zsched.core.model import NodeId
+from zsched.core.plan import StreamCount
 from zsched.errors import AdapterError, ZschedError
 from zsched.lab.loopback import free_endpoint, own_address
 from zsched.lifecycle import init_state
@@ -201,6 +203,22 @@ class Testbed:
         """The first task's block in one daemon's status."""
         found: Json = self.status(node)["tasks"][0]
         return found
+
+    def counts(self, node: NodeId) -> tuple[StreamCount, ...]:
+        """What one daemon's relay has counted, of all tasks."""
+        streams = [stream for task in self.status(node)["tasks"] for stream in task["streams"]]
+        return tuple(StreamCount(**{**stream, "drops": tuple(sorted(stream["drops"].items()))}) for stream in streams)
+
+    def unaccounted(self) -> list[str]:
+        """Input streams whose counters do not account for every sample (`zsched.core.books`); none, at any time."""
+        counts = [(node, count) for node in self.running() for count in self._counts_if_there(node)]
+        return [f"{node}: {missing} unaccounted: {one}" for node, one in counts if (missing := unaccounted(one))]
+
+    def _counts_if_there(self, node: NodeId) -> tuple[StreamCount, ...]:
+        try:
+            return self.counts(node)
+        except AdapterError:  # it is down, or stands still
+            return ()
 
     def owner(self, *nodes: NodeId) -> NodeId | None:
         """The owner that ``nodes`` (default: all running) agree on, settled on every robot; else ``None``."""

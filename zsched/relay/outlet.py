@@ -7,13 +7,7 @@ timestamp, kind, priority and express. The source info becomes the publisher's o
 number is what the next hop checks and acknowledges.
 
 ``best_effort`` is put at once and dropped where it would wait. ``latest`` and ``reliable`` have a queue and a thread
-(`zsched.send_queue`) and wait there, so that only this target waits when its receiver stalls. ``latest`` is not put
-with zenoh's BLOCK_FIRST: that drops a sample whenever the one before is still on its way (1 in 40 at 1 kHz on an idle
-machine, 42 µs a put), and what is put with BLOCK overtakes it.
-
-Advanced publishers (``latest``) have a cache and numbers, but no heartbeat: towards a frozen receiver a heartbeat
-blocks zenoh's own runtime (tokens and samples of every other peer came more than 0.3 s late) and makes ``undeclare``
-hold Python's global lock until the receiver's lease ends (measured with zenoh 1.10.2: 4 s of an 8 s lease).
+(`zsched.send_queue`) and wait there, so that only this target waits when its receiver stalls.
 
 Where the receiver is `zsched.worker`, samples are kept until it acknowledges them. A number that did not come, or no
 progress for a while (`Lane.is_late`), and they are put again under the numbers they had; the worker drops what it has
@@ -29,22 +23,20 @@ from collections import Counter
 from typing import Final
 
 import zenoh
-from zenoh import CongestionControl, Priority, Reliability, Sample, Session, Timestamp, ext
+from zenoh import Priority, Sample, Session, Timestamp
 
 from zsched.clock import monotonic_s
 from zsched.core.keyexpr import is_wild
 from zsched.core.plan import OnCrash, StreamClass, StreamSettings
 from zsched.core.relay_protocol import EndMarker, StreamAck
-from zsched.core.serial import serial_of
-from zsched.keyspace import END_CHUNK
 from zsched.relay.acks import Acks
 from zsched.relay.crowd import Crowd
 from zsched.relay.greetings import Greetings
 from zsched.relay.lanes import KEPT_BYTES, KEPT_BYTES_LATEST, KEPT_SAMPLES, Lane, Sent
+from zsched.relay.publishers import declare_publisher, put_marker
 from zsched.relay.receive import undeclare
 from zsched.relay.rewrite import Rewriter, rewriter
 from zsched.relay.tally import Tally
-from zsched.relay_pipe import encode_end
 from zsched.send_queue import SendQueue
 
 QUEUE_DEPTH: Final = 1024
@@ -68,12 +60,6 @@ Owed = tuple[Sample, Timestamp | None]
 
 _ALL_WENT: Final = ("", 0)
 _DATA: Final = Priority.DATA
-
-_CONGESTION: Final = {
-    StreamClass.BEST_EFFORT: CongestionControl.DROP,
-    StreamClass.LATEST: CongestionControl.BLOCK,
-    StreamClass.RELIABLE: CongestionControl.BLOCK,
-}
 
 
 class Outlet:
@@ -328,30 +314,7 @@ class Outlet:
         return None
 
     def _declare(self, key: str, priority: Priority, *, is_express: bool) -> Lane:
-        stream_class = self._settings.stream_class
-        congestion = _CONGESTION[stream_class]
-        publisher: zenoh.Publisher | ext.AdvancedPublisher
-        if stream_class is StreamClass.LATEST:
-            publisher = ext.declare_advanced_publisher(
-                self._session,
-                key,
-                congestion_control=congestion,
-                priority=priority,
-                express=is_express,
-                reliability=Reliability.RELIABLE,
-                cache=ext.CacheConfig(max(1, self._settings.keep_last)),
-                sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),
-                publisher_detection=True,
-            )
-        else:
-            is_reliable = stream_class is StreamClass.RELIABLE
-            publisher = self._session.declare_publisher(
-                key,
-                congestion_control=congestion,
-                priority=priority,
-                express=is_express,
-                reliability=Reliability.RELIABLE if is_reliable else Reliability.BEST_EFFORT,
-            )
+        publisher = declare_publisher(self._session, key, self._settings, priority, is_express=is_express)
         eid = publisher.id.eid
         lane = Lane(key=key, publisher=publisher, source_id=publisher.id, eid=eid, keeps_work=self._replays)
         with self._lock:
@@ -370,13 +333,8 @@ class Outlet:
         self._put_marker(lane, SKIP_EPOCH, lowest)
 
     def _put_marker(self, lane: Lane, epoch: int, count: int) -> None:
-        self._session.put(
-            f"{lane.key}/{END_CHUNK}",
-            encode_end(EndMarker(epoch=epoch, count=count, replayed=max(0, lane.replay_end - count))),
-            congestion_control=CongestionControl.BLOCK,
-            priority=lane.publisher.priority,
-            source_info=zenoh.SourceInfo(lane.source_id, serial_of(count)),
-        )
+        marker = EndMarker(epoch=epoch, count=count, replayed=max(0, lane.replay_end - count))
+        put_marker(self._session, lane.key, lane.source_id, lane.publisher.priority, marker)
 
     def _undeclare(self) -> None:
         try:
@@ -428,12 +386,10 @@ class Outlet:
 
     def _look(self) -> None:
         greetings = self._greetings
-        if greetings is not None and greetings.is_waiting and self._is_greetable(greetings):
+        is_awaited = greetings is not None and greetings.is_waiting
+        if greetings is not None and is_awaited and greetings.is_there(self._lanes, is_matching=self.is_matching):
             greetings.greet(len(self._lanes))
         self._resend()
-
-    def _is_greetable(self, greetings: Greetings) -> bool:
-        return greetings.is_there(self._lanes, is_matching=self.is_matching)
 
     def _resend(self) -> None:
         for lane in tuple(self._lanes.values()):

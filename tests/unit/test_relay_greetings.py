@@ -1,0 +1,215 @@
+"""When a reliable outlet may send: whom it greets, what it makes of an answer, and of none."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import zenoh
+
+from support.sessions import hub_and_neighbour
+from support.waiting import until
+from zsched import wire
+from zsched.core.plan import StreamClass, StreamSettings
+from zsched.core.relay_protocol import EndMarker, StreamAck, StreamAcks
+from zsched.keyspace import END_CHUNK, Keyspace
+from zsched.relay import greetings
+from zsched.relay.acks import Acks
+from zsched.relay.outlet import Outlet
+from zsched.relay_pipe import decode_end
+
+KEYS = Keyspace("t")
+RELIABLE = StreamSettings(stream_class=StreamClass.RELIABLE, depth=100)
+
+
+class Receiver:
+    """Stands where a worker is; answers what the test wants."""
+
+    def __init__(self, session: zenoh.Session, relay: zenoh.Session, key: str) -> None:
+        self.session, self.key, self._relay = session, key, str(relay.zid())
+        self.got: list[int] = []
+        self.starts: list[EndMarker] = []
+        self.eid = 0
+        self._ends = session.declare_subscriber(f"{key}/{END_CHUNK}", self._start)
+        self._data = session.declare_subscriber(key, lambda sample: self.got.append(_number(sample)))
+
+    def _start(self, sample: zenoh.Sample) -> None:
+        marker, info = decode_end(sample.payload.to_bytes()), sample.source_info
+        assert marker is not None
+        assert info is not None
+        self.starts.append(marker)
+        self.eid = info.source_id.eid
+
+    def greeted(self, count: int = 1) -> EndMarker:
+        until(lambda: len(self.starts) >= count, "a start marker")
+        return self.starts[-1]
+
+    def ack(self, arrived: int, *, first: int = 0, incarnation: str = "1") -> None:
+        ack = StreamAck(eid=self.eid, first=first, arrived=arrived, processed=arrived)
+        self.session.put(KEYS.ack("edge1", "t", incarnation, self._relay), wire.encode(StreamAcks(acks=(ack,))))
+
+    def leave(self) -> None:
+        self._data.undeclare()
+
+    def come_back(self) -> None:
+        self._data = self.session.declare_subscriber(self.key, lambda sample: self.got.append(_number(sample)))
+
+
+def _number(sample: zenoh.Sample) -> int:
+    info: Any = sample.source_info
+    number: int = info.source_sn
+    return number
+
+
+class Bench:
+    """An outlet, and samples for it."""
+
+    def __init__(self, relay: zenoh.Session, other: zenoh.Session) -> None:
+        self.relay, self.other = relay, other
+        self.acks = Acks(relay, KEYS, "robot1")
+        self._samples: list[zenoh.Sample] = []
+        self._subscriber = relay.declare_subscriber("robot1/**", self._samples.append)
+
+    def outlet(self, from_expr: str, to_expr: str) -> Outlet:
+        return Outlet(self.relay, from_expr, to_expr, RELIABLE, self.acks)
+
+    def sample(self, key: str = "robot1/in") -> zenoh.Sample:
+        before = len(self._samples)
+        self.relay.put(key, b"x")
+        until(lambda: len(self._samples) > before, "a sample")
+        return self._samples[-1]
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    with hub_and_neighbour() as (relay, other):
+        made = Bench(relay, other)
+        yield made
+        made.acks.answers.close()
+
+
+def cared(outlet: Outlet) -> bool:
+    outlet.look_after()
+    return True
+
+
+def settled(outlet: Outlet, **fields: int) -> None:
+    def holds() -> bool:
+        outlet.look_after()
+        said = outlet.counted()
+        return all(getattr(said, name) == value for name, value in fields.items())
+
+    until(holds, f"{fields}")
+
+
+def test_nothing_goes_out_before_the_answer_and_everything_behind_it(bench: Bench) -> None:
+    receiver = Receiver(bench.other, bench.relay, "edge1/in")
+    outlet = bench.outlet("robot1/in", "edge1/in")
+    sample = bench.sample()
+    for _ in range(5):
+        outlet.send(sample)
+    assert receiver.greeted(2).count == 0  # it is repeated
+    assert receiver.got == []
+    settled(outlet, waiting=5, in_flight=0)
+    receiver.ack(0)
+    until(lambda: receiver.got == [0, 1, 2, 3, 4], "all of them")
+    receiver.ack(5)
+    settled(outlet, waiting=0, in_flight=0, acknowledged=5)
+    outlet.undeclare()
+
+
+def test_who_lost_its_link_is_greeted_again_and_gets_what_it_lacks(bench: Bench) -> None:
+    receiver = Receiver(bench.other, bench.relay, "edge1/in")
+    outlet = bench.outlet("robot1/in", "edge1/in")
+    sample = bench.sample()
+    outlet.send(sample)
+    receiver.greeted()
+    receiver.ack(0)
+    until(lambda: receiver.got == [0], "the first")
+    receiver.leave()  # what it got has not been acknowledged
+    until(lambda: not outlet.is_matching, "nobody there")
+    outlet.look_after()
+    outlet.send(sample)
+    before = len(receiver.starts)
+    receiver.come_back()
+    assert receiver.greeted(before + 1).count == 0
+    receiver.ack(0)
+    until(lambda: receiver.got == [0, 0, 1], "the first once more, and the second")
+    outlet.undeclare()
+
+
+def test_another_life_begins_behind_what_the_former_one_may_have_done(bench: Bench) -> None:
+    receiver = Receiver(bench.other, bench.relay, "edge1/in")
+    outlet = bench.outlet("robot1/in", "edge1/in")
+    sample = bench.sample()
+    for _ in range(3):
+        outlet.send(sample)
+    receiver.greeted()
+    receiver.ack(0)
+    until(lambda: receiver.got == [0, 1, 2], "three")
+    before = len(receiver.starts)
+    receiver.ack(0, incarnation="2")
+    settled(outlet, at_most_lost=3, in_flight=0)
+    outlet.send(sample)
+    assert receiver.greeted(before + 1).count == 3
+    receiver.ack(3, first=3, incarnation="2")
+    until(lambda: receiver.got == [0, 1, 2, 3], "the fourth")
+    receiver.ack(4, first=3, incarnation="2")
+    settled(outlet, acknowledged=1, at_most_lost=3, lost=0, in_flight=0)
+    outlet.undeclare()
+
+
+def test_nothing_goes_to_a_recorder_while_the_worker_is_gone(bench: Bench) -> None:
+    """Somebody matches; the worker's token is gone, and comes again."""
+    receiver = Receiver(bench.other, bench.relay, "edge1/in")
+    outlet = bench.outlet("robot1/in", "edge1/in")
+    until(lambda: cared(outlet) and receiver.starts, "a greeting before there is anything to send")
+    receiver.ack(0)
+    outlet.part(is_parted=True)
+    outlet.send(bench.sample())
+    settled(outlet, waiting=1)
+    before = len(receiver.starts)
+    outlet.look_after()
+    assert (receiver.got, len(receiver.starts)) == ([], before)
+    outlet.part(is_parted=False)
+    receiver.greeted(before + 1)
+    receiver.ack(0)
+    until(lambda: receiver.got == [0], "what waited")
+    outlet.undeclare()
+
+
+def test_a_subscriber_that_never_answers_gets_its_samples_and_they_are_counted(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(greetings, "FOREIGN_S", 0.3)
+    receiver = Receiver(bench.other, bench.relay, "edge1/in")
+    outlet = bench.outlet("robot1/in", "edge1/in")
+    sample = bench.sample()
+    outlet.send(sample)
+    outlet.send(sample)
+    until(lambda: receiver.got == [0, 1], "both")
+    settled(outlet, uncounted=2, in_flight=0, waiting=0)
+    before = len(receiver.starts)
+    receiver.ack(0)  # a worker after all: it has not known where to begin
+    until(lambda: cared(outlet) and len(receiver.starts) > before, "another greeting")
+    assert receiver.starts[-1].count == 2
+    outlet.send(sample)
+    receiver.ack(2, first=2)
+    until(lambda: receiver.got == [0, 1, 2], "the third")
+    outlet.undeclare()
+
+
+def test_a_key_that_the_worker_does_not_take_holds_up_no_other(bench: Bench) -> None:
+    receiver = Receiver(bench.other, bench.relay, "edge1/a")
+    outlet = bench.outlet("robot1/*", "edge1/*")
+    outlet.send(bench.sample("robot1/a"))
+    receiver.greeted()
+    receiver.ack(0)
+    until(lambda: receiver.got == [0], "the key that it takes")
+    receiver.ack(1)
+    outlet.send(bench.sample("robot1/b"))
+    outlet.send(bench.sample("robot1/a"))
+    until(lambda: receiver.got == [0, 1], "the next of that key")
+    settled(outlet, uncounted=1, waiting=0)
+    outlet.undeclare()
