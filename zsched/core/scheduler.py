@@ -164,7 +164,7 @@ class Judge:
             self.beaten_since = None  # nobody looked meanwhile: afterwards the whole time-to-trigger counts again
             return Outcome.STAY, "paused by the operator" if allocation.paused else "pinned by the operator"
         if owner is None:
-            return self._initial(winner, scored, now)
+            return self._initial(winner, scored, is_called=is_called, now=now)
         if escape is not None:
             return Outcome.PROPOSE, escape
         if winner == owner:
@@ -186,12 +186,14 @@ class Judge:
             return Outcome.WAIT, f"{why}; for {led_for:.1f} of {tuning.time_to_trigger_s:g} s"
         return Outcome.PROPOSE, f"{why} for {led_for:.1f} s"
 
-    def _initial(self, winner: NodeId, scored: Mapping[NodeId, float], now: float) -> tuple[Outcome, str]:
+    def _initial(
+        self, winner: NodeId, scored: Mapping[NodeId, float], *, is_called: bool, now: float
+    ) -> tuple[Outcome, str]:
         if self.seen_first_at is None:
             self.seen_first_at = now
         waited = now - self.seen_first_at
         missing = [name for name in self.spec.candidates if name not in scored]
-        if missing and waited < INITIAL_SETTLE_S:
+        if missing and waited < INITIAL_SETTLE_S and not is_called:  # who calls has waited for all of us
             return Outcome.WAIT, f"first placement waits for {', '.join(missing)}"
         return Outcome.PROPOSE, f"first placement: {winner} has the highest utility"
 
