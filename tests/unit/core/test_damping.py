@@ -118,3 +118,15 @@ def test_what_any_robot_remembers_counts_and_nothing_counts_for_a_judge_without_
     own.note_move("edge2", has_failed=False, now=100.0)
     assert Judge(spec=SPEC).judge(joint, OWNED, **given, damping=own).aggregates["edge2"] == pytest.approx(0.3)
     assert Judge(spec=SPEC).judge(joint, OWNED, **given).aggregates["edge2"] == pytest.approx(0.6)
+
+
+def test_moves_are_counted_by_kind_within_the_asked_time_its_end_included() -> None:
+    damping = Damping()
+    for at, has_failed in ((100.0, False), (110.0, True), (120.0, False), (130.0, False)):
+        damping.note_move("edge1", has_failed=has_failed, now=at)
+    assert damping.moves_within(20.0, 140.0, escapes=False) == 2
+    assert damping.moves_within(19.9, 140.0, escapes=False) == 1
+    assert damping.moves_within(30.0, 140.0, escapes=True) == 1
+    assert damping.moves_within(29.9, 140.0, escapes=True) == 0
+    assert damping.moves_within(WINDOW_S, 160.0, escapes=False) == 3
+    assert damping.moves_within(WINDOW_S, 160.1, escapes=False) == 2

@@ -504,3 +504,44 @@ def test_a_time_in_which_the_owner_was_not_heard_is_no_time_in_which_its_worker_
         robot.round()
     assert robot.task.judgement is not None
     assert "has not been ready" in robot.task.judgement.reason
+
+
+# --- what ends a lead ------------------------------------------------------------------------------------------------
+
+
+def test_a_vote_that_stays_starts_the_caller_s_time_to_trigger_again() -> None:
+    """Else a robot with a nervous view would call a vote in every round."""
+    robot = Robot(owner_cpu=3.9)
+    robot.round(edge1=0.02)
+    began = robot.task.judge.beaten_since
+    assert began is not None
+    for voter in ("robot2", "robot3"):
+        robot.paper(voter, "edge1")
+    robot.paper("robot1", "edge2")
+    assert robot.task.voting.tally is not None
+    assert robot.task.voting.tally.outcome is VoteOutcome.STAY
+    assert robot.task.judge.beaten_since is None
+    robot.now = began + TUNING.time_to_trigger_s
+    robot.profiles({"edge1": 3.9})
+    assert proposed(robot.round(edge1=0.02)) == []
+    assert robot.outcome() is Outcome.WAIT
+
+
+def test_a_vote_without_a_quorum_does_not() -> None:
+    robot = Robot(owner_cpu=3.9)
+    robot.round(edge1=0.02)
+    robot.paper("robot1", "edge2")
+    robot.tick(vote_time(FLEET.timing))
+    assert robot.task.voting.tally is not None
+    assert robot.task.voting.tally.outcome is VoteOutcome.NO_QUORUM
+    assert robot.task.judge.beaten_since is not None
+
+
+@pytest.mark.parametrize("is_new_epoch", [True, False])
+def test_a_new_owner_has_all_its_time_to_get_ready_and_new_weights_give_none(is_new_epoch: bool) -> None:
+    robot = Robot(owner_cpu=3.9)
+    robot.round(edge1=0.02)
+    robot.task.judge.not_ready_since = 90.0
+    robot.rounds.on_learnt("merge", is_new_epoch=is_new_epoch, now=robot.now)
+    assert robot.task.judge.beaten_since is None
+    assert robot.task.judge.not_ready_since == (None if is_new_epoch else 90.0)

@@ -1,0 +1,105 @@
+"""What is counted as used on a candidate: the task's own worker once, other tasks' demand as far as it does not show."""
+
+from __future__ import annotations
+
+import pytest
+
+from zsched.core.fleet import Demand, Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.gateway import Gateway
+from zsched.core.model import (
+    Allocation,
+    NodeKind,
+    PeerState,
+    Profile,
+    Tuning,
+    Utility,
+    Weights,
+    WorkerLoad,
+    WorkerState,
+)
+from zsched.core.scoring import score
+
+TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
+TASKS = tuple(
+    TaskSpec(
+        name=name,
+        candidates=("edge1",),
+        tuning=TUNING,
+        worker=WorkerSpec(command=("work",)),
+        demand=Demand(cpu_cores=0.5, memory_mb=200.0),
+    )
+    for name in ("map", "plan", "watch")
+)
+FLEET = Fleet(
+    name="books",
+    timing=Timing(),
+    nodes=(NodeSpec(name="edge1", kind=NodeKind.EDGE), NodeSpec(name="robot1", kind=NodeKind.ROBOT)),
+    tasks=TASKS,
+    electors=("robot1",),
+)
+NOBODY = Allocation(task="map", revision=1, epoch=1, owner=None, tuning=TUNING)
+READY = WorkerState.READY
+
+
+def load(task: str, cpu: float | None = None, memory: float | None = None) -> WorkerLoad:
+    return WorkerLoad(task=task, state=READY, cpu_cores=cpu, memory_mb=memory)
+
+
+def seen(
+    *workers: WorkerLoad, cpu: float = 1.0, memory: float = 1000.0, booked: tuple[tuple[str, Demand], ...] = ()
+) -> Utility:
+    """How robot1 scores edge1 for the task ``map``."""
+    gateway = Gateway(FLEET)
+    profile = Profile(
+        node="edge1",
+        incarnation=1,
+        sequence=1,
+        cpu_cores=4.0,
+        cpu_used_cores=cpu,
+        memory_mb=4000.0,
+        memory_used_mb=memory,
+        workers=(load("map"), *workers) if not any(one.task == "map" for one in workers) else workers,
+    )
+    assert gateway.absorb(profile, 10.0) is None
+    states = {"edge1": PeerState.ALIVE, "robot1": PeerState.ALIVE}
+    (utility,) = score(
+        TASKS[0], NOBODY, "robot1", gateway, states, 10.0, {"edge1": booked} if booked else None
+    ).utilities
+    return utility
+
+
+def test_what_the_task_s_own_worker_uses_is_not_counted_twice() -> None:
+    idle = seen(load("map"), cpu=1.0, memory=1000.0)
+    assert seen(load("map", cpu=0.4, memory=150.0), cpu=1.4, memory=1150.0) == idle
+    assert seen(load("map", cpu=0.0, memory=0.0), cpu=1.0, memory=1000.0) == idle
+    assert seen(load("map"), cpu=1.4).cpu != idle.cpu
+    assert seen(load("map"), memory=1150.0).memory != idle.memory
+
+
+@pytest.mark.parametrize(
+    ("shown", "cpu", "memory"),
+    [
+        (load("plan"), 0.5, 200.0),
+        (load("plan", 0.0, 0.0), 0.5, 200.0),
+        (load("plan", 0.2, 50.0), 0.3, 150.0),
+        (load("plan", 0.5, 200.0), 0.0, 0.0),
+        (load("plan", 0.9, 900.0), 0.0, 0.0),
+    ],
+)
+def test_what_another_task_will_use_counts_as_far_as_its_worker_does_not_show_it(
+    shown: WorkerLoad, cpu: float, memory: float
+) -> None:
+    booked = (("plan", Demand(cpu_cores=0.5, memory_mb=200.0)),)
+    utility = seen(shown, booked=booked)
+    same = seen(shown, cpu=1.0 + cpu, memory=1000.0 + memory)
+    assert (utility.cpu, utility.memory) == pytest.approx((same.cpu, same.memory))
+
+
+def test_several_tasks_add_up_and_our_own_and_a_stranger_s_do_not_count() -> None:
+    each = Demand(cpu_cores=0.5, memory_mb=200.0)
+    both = seen(load("plan"), load("watch"), booked=(("plan", each), ("watch", each)))
+    same = seen(load("plan"), load("watch"), cpu=2.0, memory=1400.0)
+    assert (both.cpu, both.memory) == pytest.approx((same.cpu, same.memory))
+    plain = seen(load("plan"))
+    assert seen(load("plan"), booked=(("map", each),)) == plain
+    assert seen(load("plan"), booked=(("watch", each),)) == plain, "it runs no worker that zsched would see"

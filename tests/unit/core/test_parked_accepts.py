@@ -1,0 +1,113 @@
+"""An accept that an exclusive task's lease forbids waits; a newer one of the same asker takes its place."""
+
+from __future__ import annotations
+
+from random import Random
+
+from zsched.core import events as ev
+from zsched.core import instructions as do
+from zsched.core.agreement import PARK_SHARE, Agreement, Effects
+from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing
+from zsched.core.lease import hold_s
+from zsched.core.messages import Accept, Accepted, Refusal, Refused
+from zsched.core.model import Acceptance, Allocation, Ballot, DurableState, NodeKind, RegisterState, Tuning, Weights
+
+ROBOTS = ("robot1", "robot2", "robot3")
+TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
+FLEET = Fleet(
+    name="parks",
+    timing=Timing(),
+    nodes=tuple(NodeSpec(name=name, kind=NodeKind.ROBOT) for name in ROBOTS),
+    tasks=(TaskSpec(name="guard", candidates=ROBOTS, tuning=TUNING, exclusive=True),),
+    electors=ROBOTS,
+)
+HOLD_S = hold_s(FLEET.timing.lease_s)
+PARKED_S = PARK_SHARE * FLEET.timing.ballot_s
+
+
+def value(revision: int, owner: str) -> Allocation:
+    return Allocation(task="guard", revision=revision, epoch=revision, owner=owner, tuning=TUNING)
+
+
+def elector() -> Agreement:
+    """An elector that has just started, with robot2 as owner on its disk: nobody else is accepted for a hold."""
+    state = DurableState(
+        fleet="parks",
+        node="robot1",
+        incarnation=7,
+        generation=0,
+        hardware="h",
+        electorate="e",
+        registers=(RegisterState(task="guard", learnt=value(3, "robot2")),),
+    )
+    return Agreement(fleet=FLEET, me="robot1", durable=state, incarnation=7, electorate="e", rng=Random(1), now=100.0)
+
+
+def asks(agreement: Agreement, request: int, counter: int, now: float, asker: str = "robot3") -> Effects:
+    ballot = Ballot(counter=counter, node=asker, incarnation=1)
+    accept = Accept(task="guard", acceptance=Acceptance(ballot=ballot, value=value(4, "robot3")), electorate="e")
+    return agreement.on_accept(ev.AcceptAsked(request=request, asker=asker, accept=accept), now)
+
+
+def answers(effects: Effects) -> list[tuple[int, str]]:
+    found = []
+    for one in effects.send:
+        assert isinstance(one, do.AnswerElection)
+        assert isinstance(one.answer, Accepted | Refused)
+        found.append((one.request, one.answer.refusal.value if isinstance(one.answer, Refused) else "accepted"))
+    return found
+
+
+def test_it_waits_for_the_lease_and_is_refused_when_its_ballot_is_nearly_over() -> None:
+    agreement = elector()
+    effects = asks(agreement, 1, 5, 100.1)
+    assert (answers(effects), effects.is_urgent, agreement.has_parked) == ([], True, True)
+    effects = agreement.retry_parked(100.1 + PARKED_S / 2)
+    assert (answers(effects), effects.is_urgent, agreement.has_parked) == ([], False, True)
+    assert agreement.next_deadline() <= 100.1 + PARKED_S
+    assert answers(agreement.retry_parked(100.1 + PARKED_S)) == [(1, Refusal.LEASE)]
+    assert not agreement.has_parked
+
+
+def test_it_is_accepted_as_soon_as_the_lease_is_over() -> None:
+    agreement = elector()
+    at = 100.0 + HOLD_S
+    asks(agreement, 1, 5, at - PARKED_S / 2)
+    effects = agreement.retry_parked(at)
+    assert (answers(effects), effects.is_dirty, agreement.has_parked) == ([(1, "accepted")], True, False)
+
+
+def test_the_asker_s_next_ballot_ends_the_wait_of_the_one_before_and_an_echo_of_it_does_not() -> None:
+    agreement = elector()
+    asks(agreement, 1, 5, 100.1)
+    effects = asks(agreement, 1, 5, 100.15)
+    assert (answers(effects), effects.is_urgent) == ([], False), "the same question once more"
+    effects = asks(agreement, 2, 6, 100.2)
+    assert (answers(effects), effects.is_urgent) == ([(1, Refusal.LEASE)], False)
+    assert agreement.has_parked
+    assert answers(agreement.retry_parked(100.2 + PARKED_S)) == [(2, Refusal.LEASE)]
+
+
+def test_two_askers_wait_beside_each_other() -> None:
+    agreement = elector()
+    asks(agreement, 1, 5, 100.1)
+    assert answers(asks(agreement, 2, 5, 100.1, "robot2")) == []
+    assert sorted(answers(agreement.retry_parked(100.1 + PARKED_S))) == [(1, Refusal.LEASE), (2, Refusal.LEASE)]
+
+
+def test_a_question_that_would_be_refused_anyway_does_not_wait() -> None:
+    agreement = elector()
+    asks(agreement, 1, 5, 100.1)
+    effects = agreement.on_accept(
+        ev.AcceptAsked(
+            request=9,
+            asker="robot3",
+            accept=Accept(
+                task="guard",
+                acceptance=Acceptance(ballot=Ballot(counter=7, node="robot3", incarnation=1), value=value(4, "robot3")),
+                electorate="another",
+            ),
+        ),
+        100.2,
+    )
+    assert answers(effects) == [(1, Refusal.LEASE), (9, Refusal.ELECTORATE)]

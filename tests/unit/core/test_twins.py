@@ -1,0 +1,53 @@
+"""Beats in our own name: whose wait is whose, when several others have used it."""
+
+from __future__ import annotations
+
+from zsched.core.identity import STAYS_S, YOUNG_S, Identity, Verdict
+from zsched.core.model import Beat
+
+
+def beat(incarnation: int, sequence: int) -> Beat:
+    return Beat(node="robot1", incarnation=incarnation, sequence=sequence, loop_lag_s=0.0)
+
+
+def old() -> Identity:
+    """A daemon that has run for a long time; two others of its name are there."""
+    identity = Identity(me="robot1", incarnation=7, fleet_file="abc", started_at=0.0)
+    for incarnation in (8, 9):
+        identity.on_token(incarnation, is_present=True)
+    return identity
+
+
+def test_the_next_twin_s_wait_begins_with_its_own_first_beat() -> None:
+    identity = old()
+    assert identity.on_own_name(beat(8, 10), 5000, 100.0) is Verdict.TWIN
+    after = 100.0 + STAYS_S + 1.0
+    assert identity.on_own_name(beat(9, 50), 5000, after) is Verdict.TWIN
+    assert identity.on_own_name(beat(9, 51), 5000, after + 0.1) is Verdict.TWIN
+    assert identity.on_own_name(beat(9, 60), 5000, after + STAYS_S) is Verdict.DISPUTE
+
+
+def test_a_twin_that_stays_disputes_the_name_at_the_very_end_of_its_time() -> None:
+    identity = old()
+    assert identity.on_own_name(beat(8, 10), 5000, 100.0) is Verdict.TWIN
+    assert identity.on_own_name(beat(8, 11), 5000, 100.0 + STAYS_S - 0.01) is Verdict.TWIN
+    assert identity.on_own_name(beat(8, 10), 5000, 100.0 + STAYS_S) is Verdict.TWIN, "it has not risen"
+    assert identity.on_own_name(beat(8, 12), 5000, 100.0 + STAYS_S) is Verdict.DISPUTE
+
+
+def test_our_own_beats_say_nothing() -> None:
+    identity = old()
+    assert identity.on_own_name(beat(7, 3), 5000, 100.0) is Verdict.OURS
+    assert identity.complaint(100.0) == "another daemon calls itself 'robot1'"
+
+
+def test_of_two_that_meet_the_one_that_has_beaten_less_leaves_while_it_is_young() -> None:
+    for mine, theirs, verdict in ((5, 11, Verdict.LEAVE), (20, 11, Verdict.TWIN)):
+        identity = Identity(me="robot1", incarnation=7, fleet_file="abc", started_at=100.0)
+        identity.on_token(8, is_present=True)
+        assert identity.on_own_name(beat(8, theirs - 1), mine, 100.5) is Verdict.TWIN
+        assert identity.on_own_name(beat(8, theirs), mine, 100.0 + YOUNG_S - 0.01) is verdict
+    identity = Identity(me="robot1", incarnation=7, fleet_file="abc", started_at=100.0)
+    identity.on_token(8, is_present=True)
+    identity.on_own_name(beat(8, 10), 5, 100.5)
+    assert identity.on_own_name(beat(8, 11), 5, 100.0 + YOUNG_S) is Verdict.TWIN, "not young any more"

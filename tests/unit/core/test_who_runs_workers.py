@@ -1,0 +1,35 @@
+"""Which nodes keep a worker of a task: its candidates, and robots that may have to work alone; no other edge."""
+
+from __future__ import annotations
+
+import pytest
+
+from zsched.core.executor import Executor
+from zsched.core.fleet import OnIsolation, TaskSpec, WorkerSpec
+from zsched.core.instructions import StartWorker
+from zsched.core.model import Tuning, Weights
+
+
+@pytest.mark.parametrize(
+    ("me", "is_robot", "isolation", "runs"),
+    [
+        ("edge1", False, OnIsolation.HOLD, True),
+        ("edge2", False, OnIsolation.HOLD, False),
+        ("edge2", False, OnIsolation.LOCAL, False),
+        ("robot1", True, OnIsolation.HOLD, False),
+        ("robot1", True, OnIsolation.LOCAL, True),
+    ],
+)
+def test_candidates_and_robots_that_work_alone_start_a_warm_worker(
+    me: str, is_robot: bool, isolation: OnIsolation, runs: bool
+) -> None:
+    spec = TaskSpec(
+        name="merge",
+        candidates=("edge1",),
+        tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0)),
+        worker=WorkerSpec(command=("work",)),
+        on_isolation=isolation,
+    )
+    executor = Executor(spec=spec, me=me, has_streams=is_robot)
+    assert executor.runs_worker is runs
+    assert executor.start() == ((StartWorker(task="merge"),) if runs else ())
