@@ -1,4 +1,4 @@
-"""What is counted as used on a candidate: the task's own worker once, other tasks' demand as far as it does not show."""
+"""What counts as used on a candidate: the task's own worker once, other tasks' demand as far as it does not show."""
 
 from __future__ import annotations
 
