@@ -16,6 +16,7 @@ from zsched.core.fleet import Fleet
 from zsched.core.model import TaskId, WorkerState
 from zsched.core.plan import ReadyWhen
 from zsched.core.relay_protocol import WorkerMatched, WorkerSeen, WorkerTrouble
+from zsched.keyspace import counter
 
 OTHERS: Final = (
     "somebody takes every node's inputs (a recorder?): whether a worker is there cannot be told by matching; "
@@ -59,9 +60,9 @@ class Crew:
         """A token of a worker here; one of a process that has ended says nothing (its end was reported)."""
         task, is_present = seen.task, seen.is_present
         supervisor = self._supervisor_of(task)
-        if supervisor is None or not seen.incarnation.isdigit() or task in self._matching:
+        life = counter(seen.incarnation)
+        if supervisor is None or life is None or task in self._matching:
             return
-        life = int(seen.incarnation)
         with self._lock:
             current = self._lives.get(task)
             if current is None or life == current:

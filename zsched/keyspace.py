@@ -12,9 +12,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from zsched.core.model import NAME, NodeId, TaskId
+from zsched.core.model import MAX_COUNTER, NAME, NodeId, TaskId
 
 ROOT = "@zsched"
+MAX_DIGITS = len(str(MAX_COUNTER))
 END_CHUNK = "@zsched/end"
 """Suffix of the in-band end markers behind a stream's last sample: ``{to}/@zsched/end``."""
 AGAIN_CHUNK = "@zsched/again"
@@ -39,6 +40,18 @@ def parse(key: str) -> ParsedKey | None:
     if not all(NAME.fullmatch(chunk) for chunk in chunks[1:]):
         return None
     return ParsedKey(fleet=chunks[1], kind=chunks[2], owner=chunks[3], rest=tuple(chunks[4:]))
+
+
+def counter(chunk: str) -> int | None:
+    """The number in a key's chunk (an incarnation, an epoch); ``None`` when it is none that any node may have.
+
+    >>> counter("12"), counter("9" * 25), counter("-1"), counter("")
+    (12, None, None, None)
+    """
+    if not chunk.isascii() or not chunk.isdigit() or len(chunk) > MAX_DIGITS:
+        return None
+    number = int(chunk)
+    return number if number <= MAX_COUNTER else None
 
 
 @dataclass(frozen=True, slots=True)

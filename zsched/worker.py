@@ -49,7 +49,7 @@ from zsched.worker_outputs import OUTPUT_DEPTH, Output
 from zsched.worker_roles import RoleWatch
 from zsched.worker_services import Answer, Handler, Request, Service
 from zsched.worker_snapshot import TIMEOUT_S, Offer, Restorer, StateLink, fetch
-from zsched.worker_start import open_session, surroundings
+from zsched.worker_start import open_session, relay_endpoint, surroundings
 from zsched.worker_troubles import Troubles
 
 __all__ = ["Answer", "Output", "Received", "Request", "Worker"]
@@ -108,10 +108,9 @@ class Worker:
         self._watch: RoleWatch | None = None
         if not is_standalone:
             key = self._keyspace.role(node, task)
-            self._watch = RoleWatch(self._session, key, self._on_role, self._stop)
+            self._watch = RoleWatch(self._session, key, self._on_role, self._stop, relay_endpoint(zenoh_config))
             self._declared.append(self._watch)
             self._watch.start()
-            self._errands.put(self._watch.ask)
 
     @classmethod
     def from_env(

@@ -33,6 +33,9 @@ MAX_SNAPSHOT: Final = 32 << 20
 FIRST_S: Final = 0.3
 """Silence after which the predecessor is taken for dead; a relay's flip waits as long for the new owner."""
 TIMEOUT_S: Final = 2.0
+CONTEST_S: Final = 0.1
+"""So long a whole state waits for whoever else answers the same question."""
+MAX_OFFERS: Final = 2
 RELAY_S: Final = 5.0
 """So long a worker that starts waits for its node's relay, which may start later than it does (or again)."""
 
@@ -147,16 +150,29 @@ class Assembly:
     def __init__(self) -> None:
         self._parts: dict[tuple[str, int, int], dict[int, bytes]] = {}
 
+    @property
+    def is_contested(self) -> bool:
+        """Whether two different states are offered: one of them is a stranger's."""
+        return len(self._parts) > 1
+
     def add(self, chunk: SnapshotChunk, part: bytes) -> bytes | str | None:
-        """The whole content once it is complete, why it cannot be (``str``), ``None`` while something is missing."""
+        """The whole content once it is complete, why it cannot be (``str``), ``None`` while something is missing.
+
+        What is kept is bounded: `MAX_OFFERS` states of `MAX_SNAPSHOT` bytes.
+        """
         if chunk.size > MAX_SNAPSHOT or chunk.count != max(1, -(-chunk.size // CHUNK)) or chunk.index >= chunk.count:
             return f"a chunk that fits no snapshot ({chunk.index} of {chunk.count}, {chunk.size} bytes)"
-        parts = self._parts.setdefault((chunk.checksum, chunk.count, chunk.size), {})
+        if len(part) != min(CHUNK, chunk.size - chunk.index * CHUNK):
+            return f"corrupt: piece {chunk.index} of {chunk.count} has {len(part)} bytes"
+        name = (chunk.checksum, chunk.count, chunk.size)
+        if name not in self._parts and len(self._parts) >= MAX_OFFERS:
+            return "too many different states"
+        parts = self._parts.setdefault(name, {})
         parts[chunk.index] = part
         if len(parts) < chunk.count:
             return None
         content = b"".join(parts[index] for index in range(chunk.count))
-        if len(content) != chunk.size or _checksum(content) != chunk.checksum:
+        if _checksum(content) != chunk.checksum:
             return "corrupt: its checksum does not match"
         return content
 
@@ -170,6 +186,7 @@ def fetch(session: zenoh.Session, key: str, timeout_s: float) -> bytes | str:
         session.get(
             key,
             zenoh.handlers.Callback(replies.put, lambda: replies.put(None), indirect=False),
+            target=zenoh.QueryTarget.ALL,  # a stranger's offer may call itself complete, and must not be the only one
             timeout=timeout_s + 1.0,
             consolidation=zenoh.ConsolidationMode.NONE,
             cancellation_token=token,
@@ -182,22 +199,32 @@ def fetch(session: zenoh.Session, key: str, timeout_s: float) -> bytes | str:
 
 
 def _assembled(replies: queue.SimpleQueue[zenoh.Reply | None], until: float) -> bytes | str:
+    """The one state that is offered. Who answers beside it is waited for, shortly: two states are one too many."""
     assembly = Assembly()
-    has_come = False
+    has_come, whole, problem = False, b"", ""
+    is_whole = False
     while True:
         left_s = until - monotonic_s()
         try:
-            reply = replies.get(timeout=max(0.0, min(left_s, FIRST_S)))
+            reply = replies.get(timeout=max(0.0, min(left_s, CONTEST_S if is_whole else FIRST_S)))
         except queue.Empty:
-            return "late: it had not come in time" if has_come else f"no answer within {FIRST_S:g} s"
+            if is_whole:
+                break
+            return problem or ("late: it had not come in time" if has_come else f"no answer within {FIRST_S:g} s")
         if reply is None:
-            return "incomplete: its worker died meanwhile" if has_come else "nobody offers one"
+            break
         has_come = True
-        whole = _added(assembly, reply)
-        if whole is not None:
-            return whole
+        result = _added(assembly, reply)
+        if isinstance(result, bytes):
+            is_whole, whole = True, result
+        problem = result if isinstance(result, str) else problem
         if left_s <= 0:
             return "late: it had not come in time"
+    if assembly.is_contested:
+        return "contested: two different states are offered"
+    if is_whole:
+        return whole
+    return problem or ("incomplete: its worker died meanwhile" if has_come else "nobody offers one")
 
 
 def _added(assembly: Assembly, reply: zenoh.Reply) -> bytes | str | None:

@@ -5,6 +5,7 @@ Knows: the variables that the daemon sets. Does not know: roles, inputs, outputs
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -59,6 +60,13 @@ def open_session(zenoh_config: str) -> zenoh.Session:
         return zenoh.open(zenoh.Config.from_json5(zenoh_config))
     except (zenoh.ZError, ValueError) as error:
         raise ConfigError(f"the worker's zenoh session cannot be opened: {error}") from error
+
+
+def relay_endpoint(zenoh_config: str) -> str:
+    """Where a worker's session dials its own node's relay (the first of ``connect``); empty: nowhere."""
+    endpoints = json.loads(zenoh.Config.from_json5(zenoh_config).get_json("connect/endpoints"))
+    first = endpoints[0] if isinstance(endpoints, list) and endpoints else ""
+    return first if isinstance(first, str) else ""
 
 
 def _read(path: str) -> str:

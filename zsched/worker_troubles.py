@@ -16,6 +16,7 @@ from typing import Final
 
 from zsched.clock import monotonic_s
 from zsched.core.model import MAX_REASON
+from zsched.guard import guarded
 
 TELL_S: Final = 1.0
 """The node is told no more often."""
@@ -38,9 +39,9 @@ class Troubles:
         self._count = 0
         self._text = ""
         self._told_at = -TELL_S
-        self._timer: threading.Timer | None = None
+        self._timer: threading.Thread | None = None
         self._log_at: dict[str, float] = {}
-        self._is_closed = False
+        self._closed = threading.Event()
 
     def note(self, where: str, error: Exception) -> None:
         """A callback for ``where`` raised (to be called while the error is handled)."""
@@ -53,9 +54,9 @@ class Troubles:
             is_worth_a_line = now >= self._log_at.get(known, now)
             if is_worth_a_line:
                 self._log_at[known] = now + LOG_S
-            if self._timer is None and not self._is_closed:
-                self._timer = threading.Timer(max(self._told_at + TELL_S - now, 0.0), self._send)
-                self._timer.daemon = True
+            if self._timer is None and not self._closed.is_set():
+                delay_s = max(self._told_at + TELL_S - now, 0.0)
+                self._timer = guarded(self._send_after, delay_s, name="zsched troubles", is_lasting=False)
                 self._timer.start()
         if is_worth_a_line:
             so_far = "" if count == 1 else f", {count} times in all; at most one line in {LOG_S:g} s"
@@ -63,12 +64,11 @@ class Troubles:
 
     def close(self) -> None:
         """Tell nothing any more."""
-        with self._lock:
-            self._is_closed = True
-            if self._timer is not None:
-                self._timer.cancel()
+        self._closed.set()
 
-    def _send(self) -> None:
+    def _send_after(self, delay_s: float) -> None:
+        if self._closed.wait(delay_s):
+            return
         with self._lock:
             self._timer, self._told_at = None, monotonic_s()
             count, text = self._count, self._text

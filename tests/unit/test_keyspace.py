@@ -9,7 +9,7 @@ from collections.abc import Callable
 import pytest
 import zenoh
 
-from zsched.keyspace import END_CHUNK, ROOT, Keyspace, ParsedKey, parse
+from zsched.keyspace import END_CHUNK, ROOT, Keyspace, ParsedKey, counter, parse
 
 KEYS = Keyspace("warehouse")
 KIND_OF = {"learnt": "allocation", "beat_in_turn": "beat", "profile_in_turn": "profile"}
@@ -147,3 +147,13 @@ def test_end_marker_is_hidden_from_the_streams_own_subscribers() -> None:
     assert str(marker) == f"{stream}/{END_CHUNK}"
     for user in (stream, "**", "edge1/**", f"{stream}/**", f"{stream}/*/*"):
         assert not zenoh.KeyExpr(user).intersects(marker)
+
+
+@pytest.mark.parametrize(
+    ("chunk", "number"),
+    [("0", 0), ("17", 17), (str(2**53), 2**53), (str(2**53 + 1), None), ("9" * 25, None), ("9" * 5000, None)]
+    + [(text, None) for text in ("", "-1", "+1", "1_0", " 1", "1e3", "\u0663", "x", "0x1")],
+)
+def test_a_counter_in_a_key_is_one_that_a_node_may_have(chunk: str, number: int | None) -> None:
+    """A role token with an epoch of 25 digits ended every relay that saw it."""
+    assert counter(chunk) == number

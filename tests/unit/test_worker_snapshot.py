@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from support.sessions import opened
-from support.waiting import free_endpoint
+from support.waiting import free_endpoint, until
 from zsched.core.plan import Role, WorkerRole
 from zsched.core.relay_protocol import SnapshotChunk
 from zsched.relay_pipe import encode_chunk
@@ -67,6 +67,21 @@ def test_chunks_of_two_workers_do_not_mix() -> None:
 def test_an_impossible_chunk_is_refused_before_anything_is_kept(index: int, count: int, size: int) -> None:
     chunk = SnapshotChunk(index=index, count=count, size=size, checksum="00")
     assert isinstance(Assembly().add(chunk, b"x"), str)
+
+
+def test_pieces_of_a_wrong_size_and_of_a_third_state_are_refused() -> None:
+    """Else a stranger could fill the memory of a new owner with pieces that fit no whole."""
+    assembly = Assembly()
+    (chunk, _), *_ = chunks(content_of(2 * CHUNK, 1))
+    for part in (b"", b"x" * (CHUNK - 1), b"x" * (8 * CHUNK)):
+        assert "bytes" in str(assembly.add(chunk, part))
+    contested = []
+    for seed in (1, 2):
+        piece = chunks(content_of(2 * CHUNK, seed))[0]
+        assert assembly.add(*piece) is None
+        contested.append(assembly.is_contested)
+    assert contested == [False, True]
+    assert assembly.add(*chunks(content_of(2 * CHUNK, 3))[0]) == "too many different states"
 
 
 # --- over zenoh ------------------------------------------------------------------------------------------------------
@@ -169,6 +184,26 @@ def test_a_snapshot_that_cannot_be_sent_is_refused_with_the_reason(
     until_offered(sessions[1], key)
     assert said in str(asked(sessions[1], key=key)[0])
     offer.undeclare()
+
+
+def test_a_stranger_s_state_beside_the_predecessor_s_is_a_cold_start() -> None:
+    """Nobody can tell which of the two is its own."""
+    key = f"{KEY}-contested"
+    endpoint = free_endpoint()
+    with (
+        zenoh.open(
+            zenoh.Config.from_json5(worker_config(connect=(), listen=(endpoint,), shared_memory=False))
+        ) as asker,
+        zenoh.open(zenoh.Config.from_json5(worker_config(connect=(endpoint,), shared_memory=False))) as worker,
+        zenoh.open(zenoh.Config.from_json5(worker_config(connect=(endpoint,), shared_memory=False))) as stranger,
+    ):
+        offer = Offer(worker, key, lambda: content_of(50, 1))
+        until_offered(asker, key)
+        assert asked(asker, key=key)[0] == content_of(50, 1)
+        false = Offer(stranger, key, lambda: content_of(50, 2))
+        until(lambda: asked(asker, key=key)[0] == "contested: two different states are offered", "both to be asked")
+        for one in (offer, false):
+            one.undeclare()
 
 
 def test_garbage_is_corrupt(sessions: tuple[zenoh.Session, zenoh.Session]) -> None:

@@ -38,7 +38,7 @@ from zsched.core.snapshot import Snapshot
 from zsched.errors import AdapterError, WireError
 from zsched.guard import guarded
 from zsched.introduction import Introducer
-from zsched.keyspace import Keyspace, parse
+from zsched.keyspace import Keyspace, counter, parse
 
 OPERATOR_TIMEOUT_S = 3.0
 CLOSE_S = 0.5
@@ -208,10 +208,10 @@ class ControlBus:
 
     def _on_token(self, sample: zenoh.Sample) -> None:
         key = parse(str(sample.key_expr))
-        if key is None or key.kind != "alive" or len(key.rest) != 1 or not key.rest[0].isdigit():
+        incarnation = counter(key.rest[0]) if key is not None and len(key.rest) == 1 else None
+        if key is None or key.kind != "alive" or incarnation is None:
             self._post(ev.FrameDropped(kind="alive", reason="key"))
             return
-        incarnation = int(key.rest[0])
         if sample.kind == zenoh.SampleKind.PUT:
             self._post(ev.TokenSeen(node=key.owner, incarnation=incarnation))
         else:

@@ -264,6 +264,7 @@ class RelayProcess:
     def _role_ended(self, node: NodeId, ended: RoleEnded) -> None:
         if node == self._node:
             self._reporter.report(ended)
+            self._roles.remind(ended.task, ended.epoch)
 
     def _wake(self) -> None:
         for task in tuple(self._tasks.values()):

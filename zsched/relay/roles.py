@@ -10,7 +10,7 @@ from zenoh import CongestionControl, Priority, Query, Session
 
 from zsched import wire
 from zsched.core.model import NodeId, TaskId
-from zsched.core.plan import Role
+from zsched.core.plan import Role, WorkerRole
 from zsched.guard import guarded
 from zsched.keyspace import Keyspace
 
@@ -30,6 +30,12 @@ class RoleServer:
         """Take and tell a task's newest role."""
         self._roles[role.task] = role
         self.tell(role.task)
+
+    def remind(self, task: TaskId, epoch: int) -> None:
+        """The worker does not work in an epoch any more: if it should, tell it once more (somebody told it else)."""
+        role = self._roles.get(task)
+        if role is not None and role.role is WorkerRole.ACTIVE and role.epoch == epoch:
+            self.tell(task)
 
     def forget(self) -> None:
         """Tell nobody anything any more, until the next `set`: the daemon whose word these roles were is gone."""

@@ -17,8 +17,10 @@ from zsched.core.events import RoleEnded
 from zsched.core.model import NodeId, TaskId
 from zsched.core.relay_protocol import WorkerSeen
 from zsched.guard import guarded
-from zsched.keyspace import Keyspace, parse
+from zsched.keyspace import Keyspace, counter, parse
 
+MAX_TOKENS = 16_384
+"""Tokens that are remembered: a fleet has one or two per worker."""
 WORKER = "worker"
 ROLE = "role"
 
@@ -63,14 +65,17 @@ class Tokens:
             self._note(str(sample.key_expr), is_present=sample.kind == SampleKind.PUT)
 
     def _note(self, key: str, *, is_present: bool) -> None:
+        if is_present and len(self._present) >= MAX_TOKENS:
+            return
         self._present = self._present | {key} if is_present else self._present - {key}
         if (worker := _worker(key, is_present=is_present)) is not None:
             self._on_worker(worker)
         parsed = parse(key)
         if parsed is not None and parsed.kind == ROLE and len(parsed.rest) == 2 and not is_present:
             task, epoch = parsed.rest
-            if epoch.isdigit():
-                self._on_role_ended(parsed.owner, RoleEnded(task=task, epoch=int(epoch)))
+            number = counter(epoch)
+            if number is not None:
+                self._on_role_ended(parsed.owner, RoleEnded(task=task, epoch=number))
         self._wake()
 
 
