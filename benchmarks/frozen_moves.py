@@ -1,9 +1,10 @@
 """Planned moves to owners that stand still just then: what is lost, and whether the counters know of it.
 
-``python -m benchmarks.frozen_moves [--minutes 30] [--seed 1] [--hz 200]``. Three edges with real relays and echo
-workers, one ``reliable`` stream with ``handover: all``. Each move goes to a random other edge, whose worker is stopped
-(SIGSTOP) between *ready* and the flip, for 0.9 s, for 4 s (longer than its link's lease) or not at all. Every fifth
-minute the stream is five times as fast and the workers half as fast as it: overload may lose, but never silently.
+``python -m benchmarks.frozen_moves [--minutes 30] [--seed 1] [--hz 200] [--hogs 0]``. Three edges with real relays and
+echo workers, one ``reliable`` stream with ``handover: all``. Each move goes to a random other edge, whose worker is
+stopped (SIGSTOP) between *ready* and the flip, for 0.9 s, for 4 s (longer than its link's lease) or not at all. Every
+fifth minute the stream is five times as fast and the workers half as fast as it, and with ``--hogs`` so many endless
+loops take the processor all the time: overload may lose, but never silently.
 
 It fails (exit code 1) when a sample is lost that no counter of the robot's relay tells of: neither an input's nor an
 answer's; when the counters of an input do not account for every sample (`zsched.core.books`), looked at every second;
@@ -15,6 +16,7 @@ from __future__ import annotations
 import argparse
 import random
 import signal
+import subprocess
 import sys
 import tempfile
 import threading
@@ -53,16 +55,28 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=30.0)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--hz", type=float, default=200.0)
+    parser.add_argument("--hogs", type=int, default=0, help="so many endless loops beside it: overload all the time")
     options = parser.parse_args()
     print(machine())
     random_ = random.Random(options.seed)
     sums = Sums()
+    hogs = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(options.hogs)]
+    try:
+        return _rounds(options, random_, sums)
+    finally:
+        for hog in hogs:
+            hog.kill()
+            hog.wait(10)
+
+
+def _rounds(options: argparse.Namespace, random_: random.Random, sums: Sums) -> int:
     end = time.monotonic() + options.minutes * 60
     number = 0
     while time.monotonic() < end:
         is_overload = number % 5 == 4 or (end - time.monotonic() < 60 and number < 4)
         with tempfile.TemporaryDirectory() as folder, Rig(Path(folder), EDGES) as rig:
             until_s = min(end, time.monotonic() + 60)
+            is_overload |= options.hogs > 0
             _round(rig, random_, options.hz, until_s, sums, is_overload=is_overload)
         number += 1
     moves = ", ".join(f"{count} frozen for {seconds:g} s" for seconds, count in sorted(sums.moves.items()))

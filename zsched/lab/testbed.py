@@ -2,7 +2,8 @@
 
 Knows: fleet files, daemon processes, signals, waiting for a condition. Does not know: what is tested.
 
-Everything that was started is gone when the context ends, whatever happened inside. Workers die with their daemons; a
+Everything that was started is gone when the context ends, whatever happened inside; an end without an error checks that
+the relays' counters account for every sample. Workers die with their daemons; a
 relay outlives one that crashed, so `Testbed.kill` ends it, too, unless it is told otherwise.
 """
 
@@ -292,6 +293,7 @@ class Testbed:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        missing = self.unaccounted() if kind is None else []
         for session in self._sessions:
             session.close()
         if self._processes:
@@ -299,3 +301,5 @@ class Testbed:
         for node in self.names:
             if (relay := self.relay_pid(node)) is not None:
                 self._end_relay(node, relay)
+        if missing:
+            raise TestbedError("\n".join(missing))

@@ -157,13 +157,9 @@ class Lane:
         self.pause_s = min(2 * self.pause_s, MAX_RESEND_S)
 
     def acknowledge(self, ack: StreamAck, incarnation: str, now: float) -> bool:
-        """Take an acknowledgement; ``False``, and nothing is taken, when another life of the worker sent it.
-
-        Its numbers are brought near ours: the receiver may have heard only their lowest bits.
-        """
+        """Take an acknowledgement (`near` our count); ``False``, and nothing is taken: another life of it sent it."""
         if self.incarnation and incarnation != self.incarnation:
             return False
-        ack = _near(ack, self.count)
         if not ack.processed <= ack.arrived <= self.count + 1:
             return True  # of what was never sent (one may be on its way and not counted yet): nobody of ours says so
         self.incarnation, self.is_foreign = incarnation, False
@@ -245,8 +241,8 @@ class Lane:
         return self.count - self.processed >= KEPT_SAMPLES or self.kept_bytes >= KEPT_BYTES
 
 
-def _near(ack: StreamAck, count: int) -> StreamAck:
-    """An acknowledgement in numbers around ``count``."""
+def near(ack: StreamAck, count: int) -> StreamAck:
+    """An acknowledgement in numbers around ``count``: the receiver may have heard only their lowest bits."""
     shift = number_near(serial_of(ack.arrived), count) - ack.arrived
     if not shift:
         return ack

@@ -32,7 +32,7 @@ from zsched.core.relay_protocol import EndMarker, StreamAck
 from zsched.relay.acks import Acks
 from zsched.relay.crowd import Crowd
 from zsched.relay.greetings import Greetings
-from zsched.relay.lanes import KEPT_BYTES, KEPT_BYTES_LATEST, KEPT_SAMPLES, Lane, Sent
+from zsched.relay.lanes import KEPT_BYTES, KEPT_BYTES_LATEST, KEPT_SAMPLES, Lane, Sent, near
 from zsched.relay.publishers import declare_publisher, put_marker
 from zsched.relay.receive import undeclare
 from zsched.relay.rewrite import Rewriter, rewriter
@@ -368,7 +368,8 @@ class Outlet:
             elif self._acks is not None:
                 now = monotonic_s()
                 sent = Sent(lane.count - 1, sample, stamp, size, now, now - began)
-                lane.keep(sent, samples=self._kept_limit, least=self._kept_least, size=self._kept_bytes)
+                bound = self._kept_bytes + size if self._is_reliable else self._kept_bytes  # full lanes put no more
+                lane.keep(sent, samples=self._kept_limit, least=self._kept_least, size=bound)
 
     def _is_open(self) -> bool:
         """Class ``reliable``: nothing goes out to who has not been greeted, and no more than can be sent again."""
@@ -416,7 +417,7 @@ class Outlet:
     def _acknowledged(self, lane: Lane, ack: StreamAck, incarnation: str) -> None:
         now = monotonic_s()
         with self._lock:
-            before = lane.ack
+            before, ack = lane.ack, near(ack, lane.count)
             if not lane.acknowledge(ack, incarnation, now):
                 self._begin_life(lane, ack, incarnation, now)
             elif before is None or ack.arrived > before.arrived:
