@@ -102,7 +102,17 @@ def inward(relay: zenoh.Session, stream_class: StreamClass) -> Way:
     stream = InputStream(relay, route, frozenset({str(relay.zid())}))
     stream.open(1, route, acks)
     stream.flip(1)
+    _meet(stream)
     return stream._carry, lambda: _sent(stream), stream.close  # noqa: SLF001 - what its receiver's thread calls
+
+
+def _meet(stream: InputStream) -> None:
+    """As if the worker had answered its greeting: nobody is there."""
+    active = stream._active  # noqa: SLF001
+    greetings = None if active is None else active.outlet._greetings  # noqa: SLF001
+    if greetings is not None:
+        setattr(greetings, "is_there", lambda *_, **__: True)  # noqa: B010 - a method of this one alone
+        greetings._unmet.clear()  # noqa: SLF001
 
 
 def _sent(stream: InputStream) -> bool:

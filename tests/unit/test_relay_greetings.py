@@ -45,8 +45,8 @@ class Receiver:
         until(lambda: len(self.starts) >= count, "a start marker")
         return self.starts[-1]
 
-    def ack(self, arrived: int, *, first: int = 0, incarnation: str = "1") -> None:
-        ack = StreamAck(eid=self.eid, first=first, arrived=arrived, processed=arrived)
+    def ack(self, arrived: int, *, first: int = 0, lost: int = 0, incarnation: str = "1") -> None:
+        ack = StreamAck(eid=self.eid, first=first, arrived=arrived, processed=arrived, lost=lost)
         self.session.put(KEYS.ack("edge1", "t", incarnation, self._relay), wire.encode(StreamAcks(acks=(ack,))))
 
     def leave(self) -> None:
@@ -212,4 +212,35 @@ def test_a_key_that_the_worker_does_not_take_holds_up_no_other(bench: Bench) -> 
     outlet.send(bench.sample("robot1/a"))
     until(lambda: receiver.got == [0, 1], "the next of that key")
     settled(outlet, uncounted=1, waiting=0)
+    outlet.undeclare()
+
+
+def test_a_worker_that_answers_late_is_not_forgiven_what_it_loses_afterwards(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It had some, was silent for so long that it passed for a stranger, and answers again."""
+    monkeypatch.setattr(greetings, "FOREIGN_S", 0.3)
+    receiver = Receiver(bench.other, bench.relay, "edge1/in")
+    outlet = bench.outlet("robot1/in", "edge1/in")
+    sample = bench.sample()
+    until(lambda: cared(outlet) and receiver.starts, "a greeting")
+    receiver.ack(0)
+    for _ in range(4):
+        outlet.send(sample)
+    until(lambda: len(receiver.got) == 4, "four")
+    receiver.ack(3)
+    settled(outlet, acknowledged=3, in_flight=1)
+    outlet.part(is_parted=False)
+    outlet.send(sample)
+    until(lambda: len(receiver.got) == 5, "the fifth, to a stranger")
+    settled(outlet, acknowledged=3, at_most_lost=1, uncounted=1, in_flight=0, waiting=0)
+    before = len(receiver.starts)
+    receiver.ack(3)
+    until(lambda: cared(outlet) and len(receiver.starts) > before, "another greeting")
+    receiver.ack(5, lost=2)
+    for _ in range(3):
+        outlet.send(sample)
+    until(lambda: len(receiver.got) == 8, "three more")
+    receiver.ack(8, lost=3)
+    settled(outlet, acknowledged=5, lost=1, at_most_lost=1, uncounted=1, in_flight=0)
     outlet.undeclare()

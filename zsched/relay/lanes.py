@@ -66,6 +66,9 @@ class Lane:
     """This life of the receiver has answered our start marker, so it knows the first number and misses none."""
     is_foreign: bool = False
     """Whoever subscribes here acknowledges nothing."""
+    was_foreign: bool = False
+    forgiven: int | None = None
+    """What this receiver counts as lost of numbers below `base`; ``None``: all of them, if it began before."""
     unmet_since: float = 0.0
     keeps_work: bool = False
     """Keep samples until they are processed, not only until they have arrived: the next owner may have to do them."""
@@ -179,6 +182,8 @@ class Lane:
         if self.is_met or self.greeted_at is None or self.ack is None or self.ack.arrived < self.base:
             return False
         self.is_met = True
+        if self.was_foreign:
+            self.was_foreign, self.forgiven = False, self.ack.lost
         if self.arrived < self.count:
             self.ask_again(self.arrived, now)
         return True
@@ -188,9 +193,13 @@ class Lane:
         self.is_met = self.is_foreign = False
         self.unmet_since, self.greeted_at, self.greet_pause_s = now, None, GREET_S
 
-    def begin_life(self, incarnation: str, start: int) -> None:
-        """Another life of the receiver answers from ``start`` on; what the former one left open is the caller's."""
+    def begin_life(self, incarnation: str, start: int, *, is_foreign: bool = False) -> None:
+        """Another life of the receiver answers from ``start`` on; what the former one left open is the caller's.
+
+        ``is_foreign``: so far nobody does, and whoever does later may be the former one.
+        """
         self.incarnation, self.base = incarnation, start
+        self.was_foreign, self.forgiven = is_foreign, None
         self.replay_end = self.count if self.keeps_work else 0
         self.ack, self.resend_from = None, None
         while self.kept and self.kept[0].number < start:
@@ -226,7 +235,8 @@ class Lane:
         if self.ack is None:
             return 0
         first = min(self.ack.first, self.count)
-        known = max(0, self.ack.lost - max(0, self.base - first)) + max(0, first - self.base)
+        before = max(0, self.base - first) if self.forgiven is None else self.forgiven
+        known = max(0, self.ack.lost - before) + max(0, first - self.base)
         return min(known, self.processed - self.base)
 
     @property

@@ -159,8 +159,7 @@ class Outlet:
                 lane.put(sample, stamp)
             except zenoh.ZError:
                 return "error", 1
-            with self._lock:
-                lane.count += 1
+            lane.count += 1  # by one thread at a time, that of the stream's lock
             return _ALL_WENT
         size = len(sample.payload) if size is None else size
         action = lambda: self._put(lane, sample, stamp, size)  # noqa: E731 - named for the line's length
@@ -347,29 +346,35 @@ class Outlet:
     # --- the queue's thread ------------------------------------------------------------------------------------------
 
     def _put(self, lane: Lane, sample: Sample, stamp: Timestamp | None, size: int) -> None:
-        self._in_hand = (sample, stamp)
-        began = monotonic_s()
-        try:
+        if self._acks is None:  # nobody asks what became of it
             if self._crowd is None:
                 lane.put(sample, stamp)
             else:
                 self._crowd.put(lane, sample, stamp, size)
+            lane.count += 1
+            return
+        self._in_hand = (sample, stamp)
+        began = monotonic_s()
+        try:
+            lane.put(sample, stamp)
         except zenoh.ZError:
             with self._lock:
                 self.tally.errors += 1
                 self._left, self._in_hand = self._left + 1, None
             raise
         with self._lock:
-            lane.count += 1
             self._left, self._in_hand = self._left + 1, None
             if lane.is_foreign:
-                self.tally.uncounted += lane.count - lane.base
-                lane.base = lane.count
-            elif self._acks is not None:
-                now = monotonic_s()
-                sent = Sent(lane.count - 1, sample, stamp, size, now, now - began)
-                bound = self._kept_bytes + size if self._is_reliable else self._kept_bytes  # full lanes put no more
-                lane.keep(sent, samples=self._kept_limit, least=self._kept_least, size=bound)
+                self.tally.new_life(lane, lane.count)
+                lane.count += 1
+                lane.begin_life("", lane.count, is_foreign=True)
+                self.tally.uncounted += 1
+                return
+            lane.count += 1
+            now = monotonic_s()
+            sent = Sent(lane.count - 1, sample, stamp, size, now, now - began)
+            bound = self._kept_bytes + size if self._is_reliable else self._kept_bytes  # full lanes put no more
+            lane.keep(sent, samples=self._kept_limit, least=self._kept_least, size=bound)
 
     def _is_open(self) -> bool:
         """Class ``reliable``: nothing goes out to who has not been greeted, and no more than can be sent again."""
