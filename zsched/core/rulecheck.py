@@ -19,16 +19,19 @@ are expanded.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final
 
 from zsched.core import keyexpr
 from zsched.core.fleet import StreamRule, TaskSpec
+from zsched.core.keytree import KeyTree
 from zsched.core.model import NodeId, TaskId
 from zsched.core.plan import Direction
 from zsched.core.templates import named_rules, widened
+
+MAX_COMPARED: Final = 200_000
+"""Pairs of rules and expanded rules that are looked at, together: some seconds' worth."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,12 +48,25 @@ class _Rule:
     stream: str
     task: TaskSpec
     rule: StreamRule
+    open_from: str
+    """With every placeholder left open; as ``open_to``."""
+    open_to: str
 
-    def open_from(self) -> str:
-        return widened(self.rule.from_template, task=self.task.name)
 
-    def open_to(self) -> str:
-        return widened(self.rule.to_template, task=self.task.name)
+class _TooMany(Exception):  # noqa: N818 - an outcome, caught where the search began
+    """The rules could meet in more ways than are looked at."""
+
+
+class _Budget:
+    """How much is compared before a file is refused: nobody waits for minutes."""
+
+    def __init__(self) -> None:
+        self._left = MAX_COMPARED
+
+    def spend(self, count: int) -> None:
+        self._left -= count
+        if self._left < 0:
+            raise _TooMany
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +88,7 @@ _LOCAL: Final = "@local"
 
 @dataclass(frozen=True, slots=True)
 class _Robots:
+    budget: _Budget
     names: tuple[NodeId, ...]
     split: frozenset[NodeId]
     """Those with a local side."""
@@ -94,9 +111,33 @@ _WORKER: Final = "worker "
 def rule_conflicts(
     tasks: Iterable[TaskSpec], robots: Iterable[NodeId], with_local_side: Collection[NodeId] = ()
 ) -> tuple[RuleConflict, ...]:
-    """Every loop and clash among the rules of ``tasks`` for ``robots``; empty when there is none."""
-    rules = [_Rule(stream, task, rule) for task in tasks for stream, rule in named_rules(task)]
-    cast = _Robots(names=tuple(robots), split=frozenset(with_local_side))
+    """Every loop and clash among the rules of ``tasks`` for ``robots``; empty when there is none.
+
+    Rules that could meet in more ways than `MAX_COMPARED` are refused as one conflict.
+    """
+    rules = [_rule(stream, task, rule) for task in tasks for stream, rule in named_rules(task)]
+    cast = _Robots(budget=_Budget(), names=tuple(robots), split=frozenset(with_local_side))
+    try:
+        return _conflicts(rules, cast)
+    except _TooMany:
+        message = (
+            f"{len(rules)} rules could meet in so many ways that they are not checked: put a word of its own, "
+            "such as the task's name, in front of the wildcards and placeholders of each"
+        )
+        return (RuleConflict(streams=tuple(rule.stream for rule in rules[:1]), message=message),)
+
+
+def _rule(stream: str, task: TaskSpec, rule: StreamRule) -> _Rule:
+    return _Rule(
+        stream=stream,
+        task=task,
+        rule=rule,
+        open_from=widened(rule.from_template, task=task.name),
+        open_to=widened(rule.to_template, task=task.name),
+    )
+
+
+def _conflicts(rules: list[_Rule], cast: _Robots) -> tuple[RuleConflict, ...]:
     services = [rule for rule in rules if rule.rule.direction is Direction.SERVICE]
     streams = [rule for rule in rules if rule.rule.direction is not Direction.SERVICE]
     return (
@@ -112,18 +153,31 @@ def rule_conflicts(
 
 def _clashes(rules: list[_Rule], robots: _Robots) -> Iterator[RuleConflict]:
     """One conflict per pair of rules (or per rule that meets itself on another robot)."""
+    tree = KeyTree((rule.open_to for rule in rules), robots.budget.spend)
     for index, first in enumerate(rules):
         own = _self_clash(first, robots)
         if own is not None:
             yield own
-        for second in rules[index + 1 :]:
-            if keyexpr.intersects(first.open_to(), second.open_to()):
-                yield from _pair_clash(first, second, robots)
+        for other in tree.meeting(first.open_to):
+            if other > index:
+                yield from _pair_clash(first, rules[other], robots)
+
+
+def _names_its_robot(template: str) -> bool:
+    """Whether one chunk, at a place that no ``**`` moves, is the robot's name alone: no two robots' keys meet."""
+    for chunk in template.split("/"):
+        if chunk in ("{robot}", "{node}"):
+            return True
+        if chunk == keyexpr.DOUBLE:
+            return False
+    return False
 
 
 def _self_clash(rule: _Rule, robots: _Robots) -> RuleConflict | None:
+    if _names_its_robot(rule.rule.to_template):
+        return None
     relays = list(_expand(rule, robots))
-    index = _Index(relays, lambda relay: relay.to_expr)
+    index = _Index(relays, lambda relay: relay.to_expr, robots.budget)
     for relay in relays:
         for other in index.meeting(relay.to_expr):
             if other.robot == relay.robot:
@@ -136,7 +190,7 @@ def _self_clash(rule: _Rule, robots: _Robots) -> RuleConflict | None:
 
 
 def _pair_clash(first: _Rule, second: _Rule, robots: _Robots) -> Iterator[RuleConflict]:
-    index = _Index(_expand(second, robots), lambda relay: relay.to_expr)
+    index = _Index(_expand(second, robots), lambda relay: relay.to_expr, robots.budget)
     for relay in _expand(first, robots):
         for other in index.meeting(relay.to_expr):
             message = f"two rules publish {_shown(relay.to_expr)!r}; a receiver could not tell their streams apart"
@@ -145,10 +199,10 @@ def _pair_clash(first: _Rule, second: _Rule, robots: _Robots) -> Iterator[RuleCo
 
 
 def _service_clashes(rules: list[_Rule], robots: _Robots) -> Iterator[RuleConflict]:
-    for first, second in itertools.combinations(rules, 2):
-        if not keyexpr.intersects(first.open_from(), second.open_from()):
-            continue
-        index = _Index(_expand(second, robots), lambda relay: relay.from_expr)
+    tree = KeyTree((rule.open_from for rule in rules), robots.budget.spend)
+    pairs = ((number, other) for number, rule in enumerate(rules) for other in tree.meeting(rule.open_from))
+    for first, second in ((rules[number], rules[other]) for number, other in pairs if other > number):
+        index = _Index(_expand(second, robots), lambda relay: relay.from_expr, robots.budget)
         both = ((relay, other) for relay in _expand(first, robots) for other in index.meeting(relay.from_expr))
         relay, other = next(both, (None, None))
         if relay is not None and other is not None:
@@ -165,17 +219,15 @@ def _on(message: str, first: _Relay, second: _Relay) -> str:
 
 
 def _loops(rules: list[_Rule], robots: _Robots) -> Iterator[RuleConflict]:
-    relay_graph = {
-        rule.stream: [to.stream for to in rules if keyexpr.intersects(rule.open_to(), to.open_from())] for rule in rules
-    }
+    tree = KeyTree((rule.open_from for rule in rules), robots.budget.spend)
+    relay_graph = {rule.stream: [rules[number].stream for number in tree.meeting(rule.open_to)] for rule in rules}
     fatal: set[str] = set()
     for part in _circles(relay_graph):
         chain = _loop_in([rule for rule in rules if rule.stream in part], robots, with_workers=False)
         if chain:
             fatal.update(part)
             yield RuleConflict(streams=_streams(chain), message=_loop_text("relays feed each other", chain))
-    whole = {rule.stream: [*relay_graph[rule.stream], *_behind_worker(rule, rules)] for rule in rules}
-    for part in _circles(whole):
+    for part in _circles(_with_workers(relay_graph, rules)):
         if part & fatal:
             continue
         chain = _loop_in([rule for rule in rules if rule.stream in part], robots, with_workers=True)
@@ -184,17 +236,23 @@ def _loops(rules: list[_Rule], robots: _Robots) -> Iterator[RuleConflict]:
             yield RuleConflict(streams=_streams(chain), message=text, is_fatal=False)
 
 
-def _behind_worker(rule: _Rule, rules: list[_Rule]) -> list[str]:
-    if rule.rule.direction is not Direction.INPUT:
-        return []
-    return [to.stream for to in rules if to.task is rule.task and to.rule.direction is Direction.OUTPUT]
+def _with_workers(relay_graph: _Graph, rules: list[_Rule]) -> _Graph:
+    """The graph with a node per task's worker, behind its inputs and in front of its outputs."""
+    graph = {stream: list(targets) for stream, targets in relay_graph.items()}
+    for rule in rules:
+        worker = graph.setdefault(f"{_WORKER}{rule.task.name}", [])
+        if rule.rule.direction is Direction.INPUT:
+            graph[rule.stream].append(f"{_WORKER}{rule.task.name}")
+        elif rule.rule.direction is Direction.OUTPUT:
+            worker.append(rule.stream)
+    return graph
 
 
 def _loop_in(rules: list[_Rule], robots: _Robots, *, with_workers: bool) -> list[_Relay]:
     """One circle among the expanded ``rules``, in its order; empty when there is none."""
     relays = [relay for rule in rules for relay in _expand(rule, robots)]
     by_name = {str(number): relay for number, relay in enumerate(relays)}
-    index = _Index(relays, lambda relay: relay.from_expr)
+    index = _Index(relays, lambda relay: relay.from_expr, robots.budget)
     name_of = {id(relay): name for name, relay in by_name.items()}
     graph: dict[str, list[str]] = {
         name: [name_of[id(other)] for other in index.meeting(relay.to_expr)] for name, relay in by_name.items()
@@ -230,6 +288,7 @@ def _loop_text(what: str, chain: list[_Relay]) -> str:
 
 def _expand(rule: _Rule, robots: _Robots) -> Iterator[_Relay]:
     is_output = rule.rule.direction is Direction.OUTPUT
+    robots.budget.spend(len(robots.names) * len(rule.task.candidates))
     for robot in robots.names:
         for candidate in rule.task.candidates:
             names = {"robot": robot, "node": robot, "target": candidate, "task": rule.task.name}
@@ -246,27 +305,15 @@ def _expand(rule: _Rule, robots: _Robots) -> Iterator[_Relay]:
 
 
 class _Index:
-    """Relays by one of their key expressions: those without wildcards are found by looking up, the rest by trying."""
+    """Relays by one of their key expressions."""
 
-    def __init__(self, relays: Iterable[_Relay], key: Callable[[_Relay], str]) -> None:
-        self._plain: dict[str, list[_Relay]] = {}
-        self._wild: dict[str, list[_Relay]] = {}
-        for relay in relays:
-            expr = key(relay)
-            table = self._wild if keyexpr.is_wild(expr) else self._plain
-            table.setdefault(expr, []).append(relay)
+    def __init__(self, relays: Iterable[_Relay], key: Callable[[_Relay], str], budget: _Budget) -> None:
+        self._relays = tuple(relays)
+        self._tree = KeyTree((key(relay) for relay in self._relays), budget.spend)
 
     def meeting(self, expr: str) -> Iterator[_Relay]:
         """All relays whose expression shares a key with ``expr``."""
-        if keyexpr.is_wild(expr):
-            for other, relays in self._plain.items():
-                if keyexpr.intersects(expr, other):
-                    yield from relays
-        else:
-            yield from self._plain.get(expr, ())
-        for other, relays in self._wild.items():
-            if keyexpr.intersects(expr, other):
-                yield from relays
+        return (self._relays[number] for number in self._tree.meeting(expr))
 
 
 def _circles(graph: _Graph) -> Iterator[set[str]]:

@@ -233,3 +233,28 @@ def test_a_large_fleet_is_checked_quickly() -> None:
 @pytest.mark.parametrize("robots", [(), ("robot1",)])
 def test_few_robots_are_no_problem(robots: tuple[str, ...]) -> None:
     assert conflicts(task("merge", (MAP_IN,), (MAP_OUT,)), robots=robots) == ()
+
+
+def test_thousands_of_rules_are_checked_in_seconds() -> None:
+    """8000 took over a minute, for each was compared with each."""
+    ways_in = tuple((f"{{robot}}/in{i}", f"{{target}}/t/{{robot}}/in{i}") for i in range(4000))
+    ways_out = tuple((f"{{target}}/t/{{epoch}}/{{robot}}/out{i}", f"{{robot}}/out{i}") for i in range(4000))
+    began = time.process_time()
+    assert conflicts(task("t", ways_in, ways_out)) == ()
+    assert time.process_time() - began < 10.0
+
+
+def test_a_clash_among_thousands_is_found() -> None:
+    ways_in = tuple((f"{{robot}}/in{i}", f"{{target}}/t/{{robot}}/in{min(i, 3998)}") for i in range(4000))
+    (found,) = conflicts(task("t", ways_in))
+    assert found.streams == ("t/in/3998", "t/in/3999")
+
+
+@pytest.mark.parametrize("shape", ["{{robot}}/**/x{}", "{{robot}}/**/x{}/**", "**/{{robot}}/x{}"])
+def test_rules_that_could_meet_in_too_many_ways_are_refused_in_seconds(shape: str) -> None:
+    ways_in = tuple((shape.format(i), "{target}/" + shape.format(i)) for i in range(3000))
+    began = time.process_time()
+    (found,) = conflicts(task("t", ways_in))
+    assert time.process_time() - began < 30.0
+    assert found.is_fatal
+    assert found.message.startswith("3000 rules could meet in so many ways")
