@@ -335,9 +335,13 @@ def _node_name(given: str | None) -> str:
 
 def _need_file(file: Path) -> None:
     """Raise `CliError` (78) unless the fleet file can be read."""
+    from zsched.config_reader import MAX_FILE_BYTES  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.files import owner_of, read_regular  # noqa: PLC0415 - as above
+
     try:
-        with file.open("rb"):
-            return
+        read_regular(file, MAX_FILE_BYTES)
+    except PermissionError as error:
+        raise CliError(EXIT_CONFIG, f"{file}: cannot be read: {error.strerror}; {owner_of(file)}") from error
     except OSError as error:
         raise CliError(
             EXIT_CONFIG, f"{file}: cannot be read: {error.strerror}; name the fleet file with --config or ZSCHED_CONFIG"

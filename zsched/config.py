@@ -6,19 +6,21 @@ Knows: how the values of the file relate to each other. Does not know: keys and 
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from zsched.config_blocks import Located, Section
 from zsched.config_nodes import Cast, read_nodes, select, warn_missing
-from zsched.config_reader import Collector, Fault, Place, read_yaml, render_all
+from zsched.config_reader import MAX_FILE_BYTES, Collector, Fault, Place, read_yaml, render_all
 from zsched.config_schema import FLEET
 from zsched.config_tasks import read_tasks
 from zsched.core.fleet import Fleet, NodeSpec, Timing, dial_endpoint
 from zsched.core.model import NodeId, NodeKind
 from zsched.core.timing import WIFI, timing_faults
 from zsched.errors import ConfigError
+from zsched.files import owner_of, read_regular
 
 __all__ = ["CheckResult", "Fault", "check_bytes", "check_file", "load_fleet"]
 
@@ -57,12 +59,22 @@ def check_file(path: str | Path) -> CheckResult:
     """Read and check the file at ``path``; never raises for what the file holds or for its absence."""
     file = Path(path)
     try:
-        data = file.read_bytes()
+        data = read_regular(file, MAX_FILE_BYTES)
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        fault = Fault(line=0, col=0, message=f"cannot be read: {reason}", hint="give the path of a fleet file")
+        fault = Fault(line=0, col=0, message=f"cannot be read: {reason}", hint=_unread_hint(file, error))
         return CheckResult(file=str(path), fleet=None, faults=(fault,), warnings=())
     return check_bytes(data, str(path))
+
+
+def _unread_hint(file: Path, error: OSError | ValueError) -> str:
+    """What to do about a fleet file that cannot be read."""
+    number = error.errno if isinstance(error, OSError) else None
+    if number in (errno.EACCES, errno.EPERM):
+        return f"{owner_of(file)}; run as that user, or let others read it (chmod a+r), on the way there too"
+    if number == errno.EFBIG:
+        return "a rule stands for every robot and candidate: write {robot} and {target} in place of their names"
+    return "give the path of a fleet file"
 
 
 def check_bytes(data: bytes, file: str = "fleet.yaml") -> CheckResult:

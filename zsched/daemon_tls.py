@@ -13,7 +13,9 @@ from typing import Final
 from zsched import zenoh_config
 from zsched.core.fleet import Fleet, NodeSpec
 from zsched.errors import ConfigError
+from zsched.files import read_regular
 
+MAX_BYTES: Final = 1 << 20
 PLAIN: Final = "tcp"
 ENCRYPTED: Final = ("tls", "quic")
 TO_LISTEN: Final = ("listen_certificate", "listen_private_key")
@@ -28,7 +30,7 @@ def operator_json5(fleet: Fleet) -> str:
     if not fleet.zenoh_config:
         return ""
     try:
-        return Path(fleet.zenoh_config).read_text(encoding="utf-8")
+        return read_regular(Path(fleet.zenoh_config), MAX_BYTES).decode("utf-8")
     except (OSError, ValueError) as error:
         reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
         raise ConfigError(

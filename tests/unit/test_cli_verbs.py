@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import time
 from pathlib import Path
 
 import pytest
@@ -77,6 +79,32 @@ def test_check_of_a_missing_file_exits_with_78(tmp_path: Path) -> None:
     result = run("check", tmp_path / "none.yaml")
     assert result.exit_code == 78
     assert "cannot be read" in result.stderr
+
+
+def test_check_of_what_is_no_file_answers_at_once(tmp_path: Path) -> None:
+    """A pipe was waited for, and /dev/zero was a traceback."""
+    os.mkfifo(tmp_path / "pipe")
+    for path, kind in ((tmp_path / "pipe", "a pipe"), (Path("/dev/zero"), "a device"), (tmp_path, "a folder")):
+        for arguments in (("check", path), ("up", "--config", path, "--node", "robot1")):
+            result = run(*arguments)
+            assert result.exit_code == 78
+            assert f"cannot be read: it is {kind}, not a regular file" in result.stderr
+
+
+def test_check_of_thousands_of_rules_ends_in_seconds(tmp_path: Path) -> None:
+    """Checked, or refused for their size with what to do: 8000 took over a minute."""
+    file = tmp_path / "fleet.yaml"
+    for count, code in ((2000, 0), (8000, 78)):
+        rules = "".join(
+            f'      - {{from: "{{robot}}/i{i}", to: "{{target}}/m/{{robot}}/i{i}"}}\n' for i in range(count)
+        )
+        file.write_text(FLEET[: FLEET.index("    inputs")] + f"    inputs:\n{rules}")
+        began = time.process_time()
+        result = run("check", file)
+        assert result.exit_code == code, result.stderr[:500]
+        assert time.process_time() - began < 20.0
+    assert "it holds more than 256 KiB" in result.stderr
+    assert "write {robot} and {target}" in result.stderr
 
 
 def test_init_creates_the_state_once(tmp_path: Path) -> None:

@@ -11,10 +11,8 @@ from __future__ import annotations
 
 import bisect
 import csv
-import gzip
 import io
 import math
-import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,9 +22,12 @@ from zsched.adapters.nl80211 import GenericNetlink, Nl80211Error, Station
 from zsched.clock import monotonic_s
 from zsched.core.fleet import LinkSpec, NodeSpec
 from zsched.core.model import LinkSample, LinkSource
+from zsched.files import read_packed
 
 NO_SAMPLE = frozenset({-2.0, -256.0})
 """In recorded drives: no sample yet, interface absent."""
+MAX_TRACE_BYTES = 32 << 20
+"""A recorded drive, unpacked: a day at 5 Hz takes 20 MB."""
 TRACE_HOLD_S = 2.0
 """A recorded value stands for so long when the rows behind it have none; then nothing is measured."""
 
@@ -283,8 +284,9 @@ class TraceReader:
         self._trace: Trace | None = None
         try:
             self._trace = parse_trace(read_text(Path(spec.value)), spec.column)
-        except (OSError, EOFError, ValueError, csv.Error, zlib.error) as error:
-            self.problem = f"trace {spec.value}: {error}"
+        except (OSError, ValueError, csv.Error) as error:
+            reason = (error.strerror if isinstance(error, OSError) else None) or error
+            self.problem = f"trace {spec.value}: {reason}"
 
     def read(self) -> LinkSample:
         """The recorded signal at this point of the drive."""
@@ -298,8 +300,5 @@ class TraceReader:
 
 
 def read_text(path: Path) -> str:
-    """A drive's CSV, unpacked if its name ends in ``.gz``. Raises `OSError`, `EOFError` or `zlib.error`."""
-    if path.suffix != ".gz":
-        return path.read_text(encoding="utf-8", errors="replace")
-    with gzip.open(path, "rt", encoding="utf-8", errors="replace") as file:
-        return file.read()
+    """A drive's CSV, unpacked if its name ends in ``.gz``. Raises `OSError`, also over `MAX_TRACE_BYTES`."""
+    return read_packed(path, MAX_TRACE_BYTES).decode("utf-8", errors="replace")

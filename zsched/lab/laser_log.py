@@ -10,7 +10,7 @@ logs: the order of the lines is the order of the scans.
 
 from __future__ import annotations
 
-import gzip
+import io
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -20,8 +20,10 @@ from pathlib import Path
 import numpy as np
 
 from zsched.errors import ConfigError
+from zsched.files import read_packed
 from zsched.tasks.map_merge.geometry import FloatArray, Pose2
 
+MAX_LOG_BYTES = 256 << 20
 CARMEN_MAX_RANGE_M = 20.0
 """Longer readings are dropped: the limits of the recorded sensors (about 50 or 81 m) mean "no echo"."""
 MALAGA_MAX_RANGE_M = 30.0
@@ -107,11 +109,9 @@ def split_log(log: LaserLog, n: int) -> tuple[LaserLog, ...]:
 
 
 def _lines(path: Path) -> Iterator[str]:
-    opener: Callable[..., object] = gzip.open if path.name.endswith(".gz") else open
     try:
-        with opener(path, "rt", encoding="ascii", errors="strict") as stream:  # type: ignore[attr-defined]  # both give text streams
-            yield from stream
-    except (OSError, EOFError, UnicodeDecodeError) as error:
+        yield from io.StringIO(read_packed(path, MAX_LOG_BYTES).decode("ascii"))
+    except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: not readable as a laser log: {error}") from error
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from zsched.adapters.network_profiler import (
+    MAX_TRACE_BYTES,
     LinkReader,
     choose_station,
     parse_trace,
@@ -172,7 +173,8 @@ def test_trace_rows_out_of_order_or_broken_do_no_harm() -> None:
         (HEADER.encode(), "no row"),
         (b"time_stamp,other\n1,2\n", "c_rssi"),
         (b"\x1f\x8b\x08\x00 damaged", ""),
-        (gzip.compress(DRIVE.encode())[:-20], ""),
+        (gzip.compress(DRIVE.encode())[:-20], "no whole gzip file"),
+        (gzip.compress(bytes(MAX_TRACE_BYTES + 1)), "unpacked it holds more than 32 MiB"),
     ],
 )
 def test_unusable_trace_is_a_reader_with_a_problem(tmp_path: Path, content: bytes, word: str) -> None:

@@ -9,7 +9,6 @@ The constants fit the recorded drives: -80 .. -40 dBm in a hall, single readings
 from __future__ import annotations
 
 import csv
-import gzip
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from zsched.adapters.network_profiler import parse_trace
+from zsched.adapters.network_profiler import parse_trace, read_text
 
 Array = npt.NDArray[np.float64]
 
@@ -117,8 +116,7 @@ def read_drive(path: Path, dt_s: float = 0.2, rssi_column: str = "c_rssi") -> Dr
         OSError: the file cannot be read.
         ValueError: a column is missing.
     """
-    content = path.read_bytes()
-    text = (gzip.decompress(content) if path.suffix == ".gz" else content).decode("utf-8", errors="replace")
+    text = read_text(path)
     signal = parse_trace(text, rssi_column)
     steps = int(signal.duration_s / dt_s)
     values = [signal.at(step * dt_s) for step in range(steps)]

@@ -1,0 +1,71 @@
+"""Files that an operator names are read whole, or refused with a sentence: no pipe hangs, no bomb bursts."""
+
+from __future__ import annotations
+
+import errno
+import gzip
+import os
+import tracemalloc
+from pathlib import Path
+
+import pytest
+
+from zsched.files import owner_of, read_packed, read_regular
+
+TEXT = b"time_stamp,c_rssi\n" * 100
+
+
+def test_a_regular_file_is_read_up_to_its_bound(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    path.write_bytes(TEXT)
+    assert read_regular(path, len(TEXT)) == TEXT
+    with pytest.raises(OSError, match="it holds more than 1 KiB") as caught:
+        read_regular(path, 1024)
+    assert caught.value.errno == errno.EFBIG
+
+
+def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for path, kind in ((tmp_path / "pipe", "a pipe"), (Path("/dev/zero"), "a device"), (tmp_path, "a folder")):
+        with pytest.raises(OSError, match=f"it is {kind}, not a regular file"):
+            read_regular(path, 1024)
+    with pytest.raises(FileNotFoundError):
+        read_regular(tmp_path / "nothing", 1024)
+
+
+@pytest.mark.parametrize("packed", [gzip.compress(TEXT), gzip.compress(TEXT[:18]) + gzip.compress(TEXT[18:])])
+def test_a_packed_file_is_unpacked_every_part_of_it(tmp_path: Path, packed: bytes) -> None:
+    path = tmp_path / "file.gz"
+    path.write_bytes(packed)
+    assert read_packed(path, len(TEXT)) == TEXT
+    with pytest.raises(OSError, match="unpacked it holds more than 1 KiB"):
+        read_packed(path, 1024)
+
+
+def test_a_bomb_is_refused_before_it_bursts(tmp_path: Path) -> None:
+    path = tmp_path / "bomb.gz"
+    path.write_bytes(gzip.compress(bytes(64 << 20)))
+    tracemalloc.start()
+    try:
+        with pytest.raises(OSError, match="unpacked it holds more than 1 MiB"):
+            read_packed(path, 1 << 20)
+        assert tracemalloc.get_traced_memory()[1] < 8 << 20
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    ("packed", "why"), [(b"plain", "no gzip file"), (gzip.compress(TEXT)[:-9], "no whole"), (b"", "no whole")]
+)
+def test_what_is_no_gzip_file_is_refused(tmp_path: Path, packed: bytes, why: str) -> None:
+    path = tmp_path / "file.gz"
+    path.write_bytes(packed)
+    with pytest.raises(OSError, match=why):
+        read_packed(path, 1 << 20)
+
+
+def test_whose_a_file_is_can_be_told(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    path.touch(0o600)
+    assert owner_of(path) == f"it belongs to user {os.getuid()} (mode 0600), this is user {os.geteuid()}"
+    assert "may not look" in owner_of(tmp_path / "nothing")

@@ -1,0 +1,86 @@
+"""Reads files that an operator names, and never more of them than they may hold.
+
+Knows: what kinds of files there are, sizes, gzip. Does not know: what is in them.
+
+A pipe would be waited for, a device never ends, and a small packed file may unpack to all the memory there is: each is
+an `OSError` with a sentence, like a file that is not there.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+import zlib
+from pathlib import Path
+from typing import Final
+
+_KINDS: Final = (
+    (stat.S_ISDIR, "a folder"),
+    (stat.S_ISFIFO, "a pipe"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+    (stat.S_ISSOCK, "a socket"),
+)
+_GZIP: Final = 31
+"""zlib's number for a gzip header."""
+
+
+def read_regular(path: Path, most_bytes: int) -> bytes:
+    """What a regular file holds.
+
+    Raises:
+        OSError: it cannot be read, is no regular file, or holds more than ``most_bytes``; ``strerror`` says which.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    mode = os.fstat(descriptor).st_mode
+    if not stat.S_ISREG(mode):
+        os.close(descriptor)
+        kind = next((name for is_kind, name in _KINDS if is_kind(mode)), "something else")
+        raise OSError(errno.EINVAL, f"it is {kind}, not a regular file", str(path))
+    with os.fdopen(descriptor, "rb") as file:
+        data = file.read(most_bytes + 1)
+    if len(data) > most_bytes:
+        raise OSError(errno.EFBIG, f"it holds more than {_shown(most_bytes)}", str(path))
+    return data
+
+
+def read_packed(path: Path, most_bytes: int) -> bytes:
+    """The same, unpacked when its name ends in ``.gz``; packed or not, at most ``most_bytes`` of content.
+
+    Raises:
+        OSError: as `read_regular`; also: it is no whole gzip file.
+    """
+    data = read_regular(path, most_bytes)
+    if path.suffix != ".gz":
+        return data
+    parts: list[bytes] = []
+    room = most_bytes
+    if not data:
+        raise OSError(errno.EINVAL, "it is no whole gzip file", str(path))
+    try:
+        while data:
+            unpacker = zlib.decompressobj(_GZIP)
+            parts.append(unpacker.decompress(data, room + 1))
+            room -= len(parts[-1])
+            if room < 0:
+                raise OSError(errno.EFBIG, f"unpacked it holds more than {_shown(most_bytes)}", str(path))
+            if not unpacker.eof:
+                raise OSError(errno.EINVAL, "it is no whole gzip file", str(path))
+            data = unpacker.unused_data.lstrip(b"\0")
+    except zlib.error as error:
+        raise OSError(errno.EINVAL, f"it is no gzip file ({error})", str(path)) from error
+    return b"".join(parts)
+
+
+def owner_of(path: Path) -> str:
+    """Whose a file is and who may read it, as far as that can be seen; for a hint."""
+    try:
+        found = path.stat()
+    except OSError:
+        return f"user {os.geteuid()} may not look into its folder"
+    return f"it belongs to user {found.st_uid} (mode {stat.S_IMODE(found.st_mode):04o}), this is user {os.geteuid()}"
+
+
+def _shown(count: int) -> str:
+    return f"{count >> 20} MiB" if count >= 1 << 20 else f"{count >> 10} KiB"
