@@ -43,6 +43,7 @@ from zsched.core.route import watch_for
 from zsched.core.status import status_line
 from zsched.core.workers import runs_worker
 from zsched.daemon_access import StreamAccess
+from zsched.daemon_descriptors import take_descriptors
 from zsched.daemon_endpoints import Endpoints, endpoints_for, free_port, is_here
 from zsched.daemon_memory import shared_memory_objection
 from zsched.errors import AdapterError, ConfigError, NameTakenError
@@ -398,6 +399,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--log-level", default="INFO", choices=["DEBUG", "INFO", "WARNING", "ERROR"])
     given = parser.parse_args(arguments)
     _set_up_logging(given.log_level)
+    take_descriptors()
     faulthandler.enable(
         file=STDERR
     )  # a crash, or systemd's watchdog (SIGABRT), leaves every thread's place in the journal

@@ -23,20 +23,29 @@ from zsched.guard import guarded
 
 MAX_LINE = 1 << 20
 MAX_CONNECTIONS = 16
-IDLE_S = 30.0
+IDLE_S = 10.0
+"""A connection that says nothing for so long, or does not take its answer, is closed..."""
+RETRY_S = 0.2
+"""Pause after a connection that could not be taken (no descriptors, no memory, no thread)."""
 
 Json = dict[str, Any]
 log = logging.getLogger("zsched.operator")
 
 
 class OperatorSocket:
-    """Serves ``answer(request) -> response`` on a unix socket, one thread per connection, at most 16."""
+    """Serves ``answer(request) -> response`` on a unix socket, one thread per connection, at most 16.
+
+    ...or at once when another wants its place: who asks nothing keeps nobody from asking.
+    """
 
     def __init__(self, path: Path, answer: Callable[[Json], Json]) -> None:
         self.path = path
         self._answer = answer
         self._listener: socket.socket | None = None
-        self._slots = threading.BoundedSemaphore(MAX_CONNECTIONS)
+        self._lock = threading.Lock()
+        self._open: dict[socket.socket, bool] = {}
+        """{connection: whether it is being answered}, in the order of their last words."""
+        self._closing = threading.Event()
         self._thread = guarded(self._accept, name="zsched-operator")
 
     def open(self) -> None:
@@ -74,40 +83,84 @@ class OperatorSocket:
 
     def close(self) -> None:
         """Stop listening and remove the file."""
-        if self._listener is None:
+        listener, self._listener = self._listener, None
+        if listener is None:
             return
+        self._closing.set()
         with contextlib.suppress(OSError):
-            self._listener.shutdown(socket.SHUT_RDWR)
-        self._listener.close()
-        self._listener = None
+            listener.shutdown(socket.SHUT_RDWR)
+        listener.close()
         with contextlib.suppress(OSError):
             self.path.unlink()
 
     def _accept(self) -> None:
-        listener = self._listener
-        while listener is not None and self._listener is not None:
+        is_failing = False
+        while (listener := self._listener) is not None:
             try:
                 connection, _ = listener.accept()
-            except OSError:
-                return
-            if not self._slots.acquire(blocking=False):
-                connection.close()
-                continue
+                self._take(connection)
+            except (OSError, RuntimeError) as error:  # the second: no thread could be started
+                if self._closing.is_set():
+                    return
+                if not is_failing:
+                    log.warning("no_connection_taken why=%s; trying on every %g s", error, RETRY_S)
+                is_failing = True
+                self._closing.wait(RETRY_S)
+            else:
+                if is_failing:
+                    log.warning("connections are taken again")
+                is_failing = False
+
+    def _take(self, connection: socket.socket) -> None:
+        """Serve it, in the place of the one that has been silent for longest if need be."""
+        with self._lock:
+            silent = next((one for one, is_busy in self._open.items() if not is_busy), None)
+            is_full = len(self._open) >= MAX_CONNECTIONS
+            if not is_full or silent is not None:
+                self._open[connection] = False
+            if is_full and silent is not None:
+                del self._open[silent]
+                with contextlib.suppress(OSError):  # its thread sees the end, and closes it
+                    silent.shutdown(socket.SHUT_RDWR)
+            is_taken = connection in self._open
+        if not is_taken:
+            with connection, contextlib.suppress(OSError):
+                connection.settimeout(RETRY_S)
+                connection.sendall(b'{"error": "busy with other questions; ask again"}\n')
+            return
+        try:
             guarded(self._serve, connection, name="zsched-operator-1", is_lasting=False).start()
+        except RuntimeError:
+            self._forget(connection)
+            connection.close()
+            raise
+
+    def _forget(self, connection: socket.socket) -> None:
+        with self._lock:
+            self._open.pop(connection, None)
+
+    def _mark(self, connection: socket.socket, *, is_busy: bool) -> bool:
+        """Note that it has spoken, or has its answer; false when its place was given to another."""
+        with self._lock:
+            if self._open.pop(connection, None) is None:
+                return False
+            self._open[connection] = is_busy
+            return True
 
     def _serve(self, connection: socket.socket) -> None:
         try:
             with connection, connection.makefile("rb") as lines:
                 connection.settimeout(IDLE_S)
-                while line := lines.readline(MAX_LINE):
+                while (line := lines.readline(MAX_LINE)) and self._mark(connection, is_busy=True):
                     if not line.endswith(b"\n"):  # half a request, or longer than any: not ours to guess at
                         connection.sendall(b'{"error": "expected one line of less than 1 MiB"}\n')
                         return
                     connection.sendall(json.dumps(self._respond(line)).encode() + b"\n")
+                    self._mark(connection, is_busy=False)
         except OSError:
             pass  # the operator went away
         finally:
-            self._slots.release()
+            self._forget(connection)
 
     def _respond(self, line: bytes) -> Json:
         try:
@@ -133,7 +186,8 @@ def ask(path: Path, request: Json, timeout_s: float = 5.0) -> Json:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
             connection.settimeout(timeout_s)
             connection.connect(str(path))
-            connection.sendall(json.dumps(request).encode() + b"\n")
+            with contextlib.suppress(BrokenPipeError):  # it has said why already
+                connection.sendall(json.dumps(request).encode() + b"\n")
             with connection.makefile("rb") as lines:
                 answer = json.loads(lines.readline())
     except (BlockingIOError, TimeoutError) as error:  # the first: its queue of connections is full

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import resource
 import socket
 import stat
 import threading
@@ -16,7 +17,7 @@ import pytest
 
 from support.waiting import until
 from zsched.adapters import operator_socket
-from zsched.adapters.operator_socket import MAX_CONNECTIONS, MAX_LINE, OperatorSocket, ask
+from zsched.adapters.operator_socket import MAX_CONNECTIONS, MAX_LINE, RETRY_S, OperatorSocket, ask
 from zsched.errors import AdapterError
 
 Json = dict[str, Any]
@@ -128,7 +129,7 @@ def test_operator_that_goes_without_reading_harms_nobody(door: OperatorSocket) -
         with connected(door) as connection:
             connection.sendall(b'{"verb": "status"}\n{"verb"')
     until(lambda: is_answered(door), "an answer, once the queue is empty")
-    until(lambda: door._slots._value == MAX_CONNECTIONS, "every connection's thread has ended")
+    until(lambda: not door._open, "every connection's thread has ended")
 
 
 def is_answered(door: OperatorSocket) -> bool:
@@ -165,19 +166,63 @@ def test_slow_answers_do_not_hold_each_other_up(tmp_path: Path) -> None:
     assert answers == [{"ok": True}] * MAX_CONNECTIONS
 
 
-def test_one_too_many_is_turned_away_until_a_place_is_free(door: OperatorSocket) -> None:
+def test_who_is_silent_keeps_nobody_from_asking(door: OperatorSocket) -> None:
+    """Also after thousands of connections, of which none is given up by its owner."""
     with contextlib.ExitStack() as stack:
         held = [stack.enter_context(connected(door)) for _ in range(MAX_CONNECTIONS)]
         for connection in held:
             connection.sendall(b'{"verb": "status"}\n')
             read_line(connection)
-        with connected(door) as extra:
-            assert read_line(extra) == b""
-        with pytest.raises(AdapterError, match="no daemon answers"):
-            ask(door.path, {"verb": "status"})
-        held[0].close()
-        until(lambda: door._slots._value == 1, "the place is free")
-        assert ask(door.path, {"verb": "status"})
+        for _ in range(20 * MAX_CONNECTIONS):
+            stack.enter_context(connected(door))
+        until(lambda: is_answered(door), "an answer")
+        assert read_line(held[0]) == b"", "the first of them had to go"
+    until(lambda: not door._open, "every connection's thread has ended")
+
+
+def test_one_more_than_can_be_answered_at_once_is_told_so(tmp_path: Path) -> None:
+    goes_on = threading.Event()
+    door = OperatorSocket(tmp_path / "s", lambda _request: {"ok": goes_on.wait(20)})
+    door.open()
+    try:
+        with contextlib.ExitStack() as stack:
+            for _ in range(MAX_CONNECTIONS):
+                stack.enter_context(connected(door)).sendall(b'{"verb": "x"}\n')
+            until(lambda: list(door._open.values()) == [True] * MAX_CONNECTIONS, "all are being answered")
+            assert "busy" in ask(door.path, {"verb": "status"})["error"]
+            goes_on.set()
+            until(lambda: "ok" in ask(door.path, {"verb": "status"}), "a place, once they have their answers")
+    finally:
+        goes_on.set()
+        door.close()
+
+
+def test_a_time_without_descriptors_is_outlived(door: OperatorSocket, caplog: pytest.LogCaptureFixture) -> None:
+    """Nobody can be taken meanwhile, and afterwards everybody can, as well who waits since then."""
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    taken: list[int] = []
+    with contextlib.ExitStack() as stack:
+        waiting = [stack.enter_context(socket.socket(socket.AF_UNIX)) for _ in range(3)]
+        highest = max(int(path.name) for path in Path("/proc/self/fd").iterdir())
+        resource.setrlimit(resource.RLIMIT_NOFILE, (highest + 2, before[1]))
+        try:
+            with contextlib.suppress(OSError):
+                while True:
+                    taken.append(os.open("/dev/null", os.O_RDONLY))
+            for connection in waiting:  # the kernel may have kept a descriptor for the first
+                connection.connect(str(door.path))
+                connection.sendall(b'{"verb": "status"}\n')
+            until(lambda: "no_connection_taken" in caplog.text, "the daemon notices")
+            threading.Event().wait(5 * RETRY_S)
+            assert caplog.text.count("no_connection_taken") == 1, "it says so once"
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, before)
+            for descriptor in taken:
+                os.close(descriptor)
+        for connection in waiting:
+            connection.settimeout(10)
+            assert read_line(connection), "it is answered now"
+    assert is_answered(door)
 
 
 def test_silent_connection_is_closed_after_a_while(door: OperatorSocket, monkeypatch: pytest.MonkeyPatch) -> None:
