@@ -33,7 +33,9 @@ def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path) -> None:
         read_regular(tmp_path / "nothing", 1024)
 
 
-@pytest.mark.parametrize("packed", [gzip.compress(TEXT), gzip.compress(TEXT[:18]) + gzip.compress(TEXT[18:])])
+@pytest.mark.parametrize(
+    "packed", [gzip.compress(TEXT), gzip.compress(TEXT[:18]) + gzip.compress(TEXT[18:])], ids=["whole", "in parts"]
+)
 def test_a_packed_file_is_unpacked_every_part_of_it(tmp_path: Path, packed: bytes) -> None:
     path = tmp_path / "file.gz"
     path.write_bytes(packed)
@@ -55,7 +57,9 @@ def test_a_bomb_is_refused_before_it_bursts(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("packed", "why"), [(b"plain", "no gzip file"), (gzip.compress(TEXT)[:-9], "no whole"), (b"", "no whole")]
+    ("packed", "why"),
+    [(b"plain", "no gzip file"), (gzip.compress(TEXT)[:-9], "no whole"), (b"", "no whole")],
+    ids=["plain", "cut", "empty"],
 )
 def test_what_is_no_gzip_file_is_refused(tmp_path: Path, packed: bytes, why: str) -> None:
     path = tmp_path / "file.gz"

@@ -176,6 +176,7 @@ def test_trace_rows_out_of_order_or_broken_do_no_harm() -> None:
         (gzip.compress(DRIVE.encode())[:-20], "no whole gzip file"),
         (gzip.compress(bytes(MAX_TRACE_BYTES + 1)), "unpacked it holds more than 32 MiB"),
     ],
+    ids=["empty", "no row", "no column", "damaged", "cut", "bomb"],
 )
 def test_unusable_trace_is_a_reader_with_a_problem(tmp_path: Path, content: bytes, word: str) -> None:
     path = tmp_path / ("drive.csv.gz" if content.startswith(b"\x1f\x8b") else "drive.csv")
