@@ -192,7 +192,7 @@ def test_free_port_is_any_when_no_other_is_free() -> None:
 
 def test_samplers_problem_is_told_once_and_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     """A driver that fails for a while: one problem, one end, and samples again."""
-    inbox, shell = Inbox(), SimpleNamespace(supervisor=None)
+    inbox, shell = Inbox(), SimpleNamespace(crew=SimpleNamespace(supervisor=None))
     sampler = Sampler(spec("a"), 0.001, shell, inbox)  # type: ignore[arg-type]
     sample, failures = sampler._device.sample, iter([True] * 3)
 
