@@ -194,7 +194,8 @@ class SendQueue:
         return dropped
 
     def _is_full(self, size: int) -> bool:
-        return self._count >= self._depth or self._bytes + size > MAX_BYTES
+        """A sample that is larger than `MAX_BYTES` goes alone."""
+        return self._count >= self._depth or (self._count > 0 and self._bytes + size > MAX_BYTES)
 
     def _forget(self, waiting: _Waiting) -> None:
         self._count -= 1

@@ -245,3 +245,20 @@ def test_a_stalled_worker_delays_no_other_robots_stream(rig: Rig, stream_class: 
     finally:
         halt.set()
         foreign.close()
+
+
+@pytest.mark.parametrize("mib", [40, 70])
+def test_a_sample_larger_than_every_bound_is_carried_alone(rig: Rig, mib: int) -> None:
+    """Above what queues hold (64 MiB), and above what is kept of answers (32 MiB): there and back, and counted once."""
+    rig.start_worker("edge1")
+    app, _ = through(rig)
+    app.put()
+    until(lambda: len(app.back) == 1, "a small one")
+    app.padding = bytes(mib << 20)
+    for _ in range(2):
+        app.put()
+    app.padding = b""
+    app.put()
+    until(lambda: app.back == [0, 1, 2, 3], "all of them", 60)
+    until(lambda: told(rig).acknowledged == 4, "every sample processed")
+    assert rig.drops() == {}

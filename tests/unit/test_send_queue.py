@@ -107,6 +107,22 @@ def test_behind_a_stalled_receiver_only_the_newest_of_each_lane_wait() -> None:
     queue.close()
 
 
+def test_a_sample_larger_than_the_queue_goes_alone() -> None:
+    receiver = Receiver()
+    receiver.gate.clear()
+    queue = SendQueue("t", depth=10, sheds=False)
+    queue.send("a", receiver.take(0), 1)
+    until(lambda: queue.is_stalled, "the put blocks")
+    assert queue.has_room(2 * send_queue.MAX_BYTES)
+    assert queue.send("a", receiver.take(1), 2 * send_queue.MAX_BYTES) == 0
+    assert not queue.has_room(1), "nothing beside it"
+    assert queue.send("a", receiver.take(2), 1) == 1
+    receiver.gate.set()
+    until(lambda: receiver.got == [0, 1], "both")
+    assert queue.has_room(1)
+    queue.close()
+
+
 def test_while_it_is_shut_samples_wait_and_a_kick_looks_again() -> None:
     receiver, is_open, looks = Receiver(), threading.Event(), []
     queue = SendQueue("t", depth=10, sheds=False, is_open=is_open.is_set, at_kick=lambda: looks.append(1))

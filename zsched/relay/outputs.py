@@ -353,7 +353,7 @@ class OutputStream:
     def _hold(self, slot: OutputSlot, sample: Sample) -> None:
         slot.held.append(sample)
         slot.held_bytes += len(sample.payload)
-        while len(slot.held) > HOLD_SAMPLES or slot.held_bytes > HOLD_BYTES:
+        while len(slot.held) > HOLD_SAMPLES or (slot.held_bytes > HOLD_BYTES and len(slot.held) > 1):
             slot.held_bytes -= len(slot.held.popleft().payload)
             self._counter.dropped("overflow")
 
