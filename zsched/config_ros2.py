@@ -10,6 +10,7 @@ worker is a ROS node) or a plain key (`worker_key`: it is a zenoh program).
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from typing import Final
 
 from zsched.config_blocks import Choice, Field, Here, ListOf, Located, Record, Section, Text, Whole
@@ -43,12 +44,13 @@ def ros2_record(rule: Record, service: Record) -> Record:
 
 
 def _entry(what: str, word: str, plain: Record) -> Record:
+    fault = partial(type_fault, is_service=word == "service")
     rest = {name: item for name, item in plain.items.items() if name not in ("from", "to")}
     return Record(
         what,
         {
             word: Field(Here(_NAME), "The name that the robot's nodes use; a template.", required=True),
-            "type": Field(Here(Text("a ROS type", type_fault)), "As `nav_msgs/msg/OccupancyGrid`.", default="`any`"),
+            "type": Field(Here(Text("a ROS type", fault)), "As `nav_msgs/msg/OccupancyGrid`.", default="`any`"),
             "hash": Field(Here(Text("a type hash", hash_fault)), "As in the key of rmw_zenoh.", default="`any`"),
             f"worker_{word}": Field(Here(_NAME), "The name that the worker uses, a ROS node; a template."),
             "worker_key": Field(Here(_KEY), "Or its key, when it is a plain zenoh program; a template."),
@@ -98,6 +100,11 @@ def _ends(
     if direction is Direction.OUTPUT and key is not None and is_open:
         hint = "in a running system: ros2 topic info --verbose"
         out.error(name.place, "a plain key has neither type nor hash: say both, the robots' nodes need them", hint)
+        return None
+
+    if name.value.endswith("/**") and type_name.value == ANY and key is not None and "*" in key.value:
+        what = f"where {word} ends in '**' and its type is open, it cannot be told where the name ends"
+        out.error(name.place, what, f"say the type, or worker_{word} in place of worker_key")
         return None
 
     def made(held: Located[str]) -> Located[str]:

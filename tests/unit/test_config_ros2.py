@@ -8,6 +8,7 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from zsched.config import CheckResult, check_bytes
+from zsched.core.capture import rewriter
 from zsched.core.fleet import Fleet, LocalMode, LocalSide
 from zsched.core.plan import Direction, RosGraph, StreamClass
 from zsched.core.templates import routes_for
@@ -107,7 +108,17 @@ def test_robots_that_all_publish_map_need_their_local_sides() -> None:
         ('{topic: "/{robot}/map"}', "say one of worker_topic and worker_key", "11:21"),
         ('{topic: "/{robot}/m", worker_key: "{target}/x", worker_topic: "/{target}/x"}', "say one of", "11:21"),
         ('{topic: "/{robot}/m", worker_key: "{target}/{robot}", type: nav_msgs/Odometry}', "PACKAGE/msg/NAME", ""),
-        ('{topic: "/{robot}/m", worker_key: "{target}/{robot}", type: a/action/B}', "an action is made of", ""),
+        (
+            '{topic: "/{robot}/m", worker_key: "{target}/{robot}", type: a/action/B}',
+            "an action is made of services",
+            "",
+        ),
+        ('{topic: "/{robot}/m", worker_key: "{target}/{robot}", type: a/srv/B}', "the type of a service, this is", ""),
+        (
+            '{topic: "/{robot}/**", worker_key: "{target}/{robot}/**"}',
+            "say the type, or worker_topic",
+            "11:29",
+        ),
         ('{topic: "/{robot}/m", worker_key: "{target}/{robot}", hash: abc}', "64 hex digits", ""),
         ('{topic: "/{robt}/m", worker_key: "{target}/{robot}"}', "no placeholder {robt}", "11:29"),
         ('{topic: "/{robot}/m", worker_key: "x/{robot}"}', "lacks {target}", "11:55"),
@@ -118,6 +129,38 @@ def test_a_fault_stands_at_the_name(entry: str, said: str, line_col: str) -> Non
     report = faults(f"ros2: {{inputs: [{entry}]}}")
     assert said in report
     assert line_col in report
+
+
+def test_all_topics_below_a_name_pass_whatever_their_types() -> None:
+    """What the fault's advice says: with the worker's topic, or with the type."""
+    entries = """ros2:
+      inputs: [{topic: "/{robot}/a/**", worker_topic: "/{target}/m/{robot}/**"},
+               {topic: "/{robot}/b/**", worker_key: "{target}/n/{robot}/**", type: nav_msgs/msg/OccupancyGrid},
+               {topic: "/{robot}/c/**", worker_key: "{target}/o/{robot}"}]
+"""
+    routes = routes_for(fleet_of(entries).tasks[0], "robot1", "edge1", 7)
+    assert [(route.from_expr, route.to_expr) for route in routes] == [
+        ("0/robot1/a/*/*/**", "0/edge1/m/robot1/*/*/**"),
+        (f"0/robot1/b/**/{GRID}/*", "edge1/n/robot1/**"),
+        ("0/robot1/c/*/*/**", "edge1/o/robot1"),
+    ]
+    rewrite = rewriter(routes[0].from_expr, routes[0].to_expr)
+    assert rewrite(f"0/robot1/a/front/scan/{GRID}/{HASH}") == f"0/edge1/m/robot1/front/scan/{GRID}/{HASH}"
+
+
+def test_an_action_is_five_entries() -> None:
+    """Three services and two topics, by the names that ROS gives them."""
+    entries = """ros2:
+      inputs: []
+      outputs:
+        - {topic: "/{robot}/spin/_action/feedback", worker_topic: "/{target}/spin/_action/feedback", type: nav2_msgs/action/Spin_FeedbackMessage}
+        - {topic: "/{robot}/spin/_action/status", worker_topic: "/{target}/spin/_action/status", type: action_msgs/msg/GoalStatusArray}
+      services:
+        - {service: "/{robot}/spin/_action/send_goal", worker_service: "/{target}/spin/_action/send_goal", type: nav2_msgs/action/Spin_SendGoal}
+        - {service: "/{robot}/spin/_action/get_result", worker_service: "/{target}/spin/_action/get_result", type: nav2_msgs/action/Spin_GetResult}
+        - {service: "/{robot}/spin/_action/cancel_goal", worker_service: "/{target}/spin/_action/cancel_goal", type: action_msgs/srv/CancelGoal}
+"""  # noqa: E501 - one line per entry, as operators write it
+    assert len(fleet_of(entries).tasks[0].rules) == 5
 
 
 def test_an_output_from_a_plain_key_needs_type_and_hash() -> None:

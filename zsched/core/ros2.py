@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
+from zsched.core import keyexpr
 from zsched.core.plan import RosGraph
 
 ANY: Final = "any"
@@ -30,9 +31,16 @@ TRANSIENT_LOCAL: Final = 1
 
 _PLACEHOLDER: Final = re.compile(r"\{[a-z]+\}")
 _TOKEN: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
-_TYPE: Final = re.compile(r"([a-z][a-z0-9_]*)/(msg|srv)/([A-Z][A-Za-z0-9]*)")
+_TYPE: Final = re.compile(
+    r"(?P<package>[a-z][a-z0-9_]*)/(?:(?P<kind>msg|srv)/(?P<name>[A-Z][A-Za-z0-9]*)"
+    r"|action/(?P<action>[A-Z][A-Za-z0-9]*_(?P<part>SendGoal|GetResult|FeedbackMessage)))"
+)
+"""An action brings three types of its own (its cancel service and status topic have types of `action_msgs`)."""
+_FEEDBACK: Final = "FeedbackMessage"
 _HASH: Final = re.compile(r"RIHS[0-9]{2}_[0-9a-f]{64}|TypeHashNotSupported")
-_RMW_KEY: Final = re.compile(r"[0-9]+/.+/([A-Za-z0-9_]+(::[A-Za-z0-9_]+)+|\*)/(RIHS[^/]*|TypeHashNotSupported|\*)")
+_RMW_KEY: Final = re.compile(
+    r"[0-9]+/.+/([A-Za-z0-9_]+(::[A-Za-z0-9_]+)+|\*\*?)/(RIHS[^/]*|TypeHashNotSupported|\*\*?)"
+)
 
 
 class EndpointKind(StrEnum):
@@ -86,13 +94,24 @@ def node_name_fault(node: str) -> str | None:
     return "letters, digits and single '_', and no digit first"
 
 
-def type_fault(type_name: str) -> str | None:
-    """Why ``type_name`` is neither ``any`` nor a type like ``nav_msgs/msg/OccupancyGrid``; ``None`` when it is."""
-    if type_name == ANY or _TYPE.fullmatch(type_name) is not None:
+def type_fault(type_name: str, *, is_service: bool) -> str | None:
+    """Why ``type_name`` is neither ``any`` nor the type of a service (or topic); ``None`` when it is.
+
+    >>> type_fault("nav_msgs/msg/OccupancyGrid", is_service=False)
+    >>> type_fault("nav2_msgs/action/Spin_SendGoal", is_service=True)
+    """
+    match = _TYPE.fullmatch(type_name)
+    if type_name == ANY:
         return None
-    if "/action/" in type_name:
-        return "an action is made of services and topics: write a rule for each"
-    return "a type is PACKAGE/msg/NAME or PACKAGE/srv/NAME"
+    if match is None:
+        if "/action/" in type_name:
+            return "an action is made of services (NAME_SendGoal, NAME_GetResult) and a topic (NAME_FeedbackMessage)"
+        return f"a type is PACKAGE/{'srv' if is_service else 'msg'}/NAME"
+    is_of_service = match["kind"] == "srv" or (match["part"] is not None and match["part"] != _FEEDBACK)
+    if is_of_service == is_service:
+        return None
+    ours, theirs = ("service", "topic") if is_service else ("topic", "service")
+    return f"it is the type of a {theirs}, this is a {ours}"
 
 
 def hash_fault(type_hash: str) -> str | None:
@@ -112,8 +131,11 @@ def ros_key(graph: RosGraph, name: str, *, domain: int, type_name: str = ANY, ty
     if graph is RosGraph.ROS2DDS:
         return bare
     match = _TYPE.fullmatch(type_name)
-    written = "*" if match is None else f"{match[1]}::{match[2]}::dds_::{match[3]}_"
-    return f"{domain}/{bare}/{written}/{'*' if type_hash == ANY else type_hash}"
+    written = "*"
+    if match is not None:
+        kind, end = (match["kind"], match["name"]) if match["kind"] else ("action", match["action"])
+        written = f"{match['package']}::{kind}::dds_::{end}_"
+    return keyexpr.canonical(f"{domain}/{bare}/{written}/{'*' if type_hash == ANY else type_hash}")
 
 
 def is_rmw_key(expr: str) -> bool:

@@ -10,7 +10,7 @@ import zenoh.ext
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zsched.core import ros2
+from zsched.core import keyexpr, ros2
 from zsched.core.keyexpr import includes, is_valid
 from zsched.core.plan import RosGraph
 from zsched.core.ros2 import (
@@ -146,10 +146,44 @@ def test_a_ros_name_makes_a_valid_key(name: str) -> None:
 
 
 def test_types_and_hashes() -> None:
-    assert type_fault("std_msgs/msg/String") is None
-    assert type_fault("any") is None
-    assert "services and topics" in (type_fault("a/action/B") or "")
-    assert type_fault("std_msgs/String")
+    for is_service in (False, True):
+        assert type_fault("any", is_service=is_service) is None
+        assert "NAME_SendGoal" in (type_fault("a/action/B", is_service=is_service) or "")
+        assert type_fault("a/msg/B_SendGoal", is_service=is_service)
+        assert type_fault("std_msgs/String", is_service=is_service)
+
+
+@pytest.mark.parametrize("name", ["std_msgs/msg/String", "nav2_msgs/action/Spin_FeedbackMessage"])
+def test_the_type_of_a_topic_is_none_of_a_service(name: str) -> None:
+    assert type_fault(name, is_service=False) is None
+    assert type_fault(name, is_service=True) == "it is the type of a topic, this is a service"
+
+
+@pytest.mark.parametrize("name", ["a/srv/B", "nav2_msgs/action/Spin_SendGoal", "nav2_msgs/action/Spin_GetResult"])
+def test_the_type_of_a_service_is_none_of_a_topic(name: str) -> None:
+    assert type_fault(name, is_service=True) is None
+    assert type_fault(name, is_service=False) == "it is the type of a service, this is a topic"
+
+
+def test_an_actions_services_have_keys_like_others() -> None:
+    key = ros_key(RosGraph.RMW_ZENOH, "/spin/_action/send_goal", domain=3, type_name="nav2_msgs/action/Spin_SendGoal")
+    assert key == "3/spin/_action/send_goal/nav2_msgs::action::dds_::Spin_SendGoal_/*"
+    assert is_rmw_key(key)
+
+
+@pytest.mark.parametrize(
+    ("type_name", "type_hash", "key"),
+    [
+        ("any", "any", "0/sensors/*/*/**"),
+        ("any", "TypeHashNotSupported", "0/sensors/*/**/TypeHashNotSupported"),
+        ("std_msgs/msg/String", "any", "0/sensors/**/std_msgs::msg::dds_::String_/*"),
+    ],
+)
+def test_a_name_that_ends_in_two_asterisks_makes_a_canonical_key(type_name: str, type_hash: str, key: str) -> None:
+    made = ros_key(RosGraph.RMW_ZENOH, "/sensors/**", domain=0, type_name=type_name, type_hash=type_hash)
+    assert made == key
+    assert keyexpr.fault(made) is None
+    assert is_rmw_key(made)
     assert hash_fault(STRING_HASH) is None
     assert hash_fault("TypeHashNotSupported") is None
     assert hash_fault("RIHS01_df")
