@@ -108,6 +108,33 @@ def test_wild_keys_have_caches_each(net: Net) -> None:
     until(lambda: sorted(net.got) == ["a", "b"], "both caches")
 
 
+def test_all_of_many_publishers_that_appear_at_once_are_asked(net: Net) -> None:
+    """A relay that comes back finds an application with 600 of them: each one's value is there."""
+    endpoint, names = free_endpoint(), [f"robot1/{number}/map" for number in range(600)]
+    with zenoh.open(zenoh.Config.from_json5(worker_config(connect=(endpoint,)))) as app:
+        kept = [
+            ext.declare_advanced_publisher(
+                app,
+                name,
+                cache=ext.CacheConfig(1),
+                sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),
+                publisher_detection=True,
+            )
+            for name in names
+        ]
+        for name, one in zip(names, kept, strict=True):
+            one.put(name)
+        with zenoh.open(zenoh.Config.from_json5(data_config(listen=(endpoint,), connect=()))) as relay:
+            settings = StreamSettings(stream_class=StreamClass.LATEST, keep_last=1, depth=2000)
+            take = lambda sample: net.got.append(sample.payload.to_string())  # noqa: E731 - named for its use below
+            receiver = Receiver(relay, "robot1/*/map", settings, take, with_history=True)
+            until(lambda: len(set(net.got)) == len(names), "every value", 30)
+            assert sorted(net.got) == sorted(names), "and each once"
+            receiver.close()
+        for one in kept:
+            one.undeclare()
+
+
 def test_a_publisher_without_numbers_is_not_taken_for_double(net: Net) -> None:
     net.receive()
     plain = net.app.declare_publisher(KEY)

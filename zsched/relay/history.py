@@ -4,7 +4,7 @@ Knows: the tokens and caches of advanced publishers, how long to wait for an ans
 
 Zenoh's own advanced subscriber would do it too, but holds back every live sample of the stream while such a query is
 open, for 10 s when the publisher is frozen (1.10.2; the time has no parameter in Python). Here live samples never wait:
-a query lasts `TIMEOUT_S` at most, in a thread of its own, and what it brings is let in only where it is newer than what
+a query lasts `TIMEOUT_S` at most, in a thread of ours, and what it brings is let in only where it is newer than what
 has come live.
 """
 
@@ -24,7 +24,10 @@ from zsched.guard import guarded
 TIMEOUT_S: Final = 0.5
 MAX_FETCHES: Final = 8
 """Queries at one time in this process; further ones wait."""
-MAX_PENDING: Final = 256
+MAX_PENDING: Final = 64
+"""Keys of one expression that wait to be asked; behind that one question for all is less work."""
+MAX_ASKERS: Final = 4
+"""Threads of one expression; a frozen publisher holds one for `TIMEOUT_S`."""
 MAX_SOURCES: Final = 4096
 ADVANCED: Final = "@adv"
 
@@ -56,7 +59,10 @@ class History:
         self._deliver = deliver
         self._origin = origin
         self._own_id = str(session.zid())
-        self._pending = 0
+        self._everything = f"{expr}/{ADVANCED}/**"
+        self._asking = threading.Lock()
+        self._wanted: dict[str, None] = {}  # in order
+        self._askers = 0
         self._is_closed = False
         self.lock = threading.Lock()
         self._newest: dict[_Source, int] = {}  # numbers that came either way
@@ -71,7 +77,7 @@ class History:
         """
         watch = f"{self._expr}/{ADVANCED}/pub/**"
         self._tokens = self._session.liveliness().declare_subscriber(watch, self._token, history=False)
-        self._ask(f"{self._expr}/{ADVANCED}/**")
+        self._ask(self._everything)
 
     def close(self) -> None:
         """Ask nobody any more; answers on their way are dropped."""
@@ -113,19 +119,36 @@ class History:
             self._ask(key)
 
     def _ask(self, key: str) -> None:
-        if self._is_closed or self._pending >= MAX_PENDING:
-            return
-        self._pending += 1
-        guarded(self._fetch, key, name=f"history {key}", kind="history", is_lasting=False).start()
+        """Have a key's caches asked; where too many wait, one question for all of them takes their place."""
+        with self._asking:
+            if self._is_closed or self._everything in self._wanted:
+                return
+            if len(self._wanted) >= MAX_PENDING:
+                self._wanted.clear()
+                key = self._everything
+            self._wanted[key] = None
+            if self._askers >= MAX_ASKERS:
+                return
+            self._askers += 1
+        guarded(self._fetch, name=f"history {self._expr}", kind="history", is_lasting=False).start()
 
-    def _fetch(self, key: str) -> None:
-        try:
-            with _turn:
-                self._take_answers(key)
-        except zenoh.ZError as error:  # the session closes
-            _log.debug("%s: %s", key, error)
-        finally:
-            self._pending -= 1
+    def _fetch(self) -> None:
+        while (key := self._next()) is not None:
+            try:
+                with _turn:
+                    self._take_answers(key)
+            except zenoh.ZError as error:  # the session closes
+                _log.debug("%s: %s", key, error)
+
+    def _next(self) -> str | None:
+        """What to ask for now; ``None`` and one asker less when that is nothing."""
+        with self._asking:
+            key = None if self._is_closed else next(iter(self._wanted), None)
+            if key is None:
+                self._askers -= 1
+            else:
+                del self._wanted[key]
+            return key
 
     def _take_answers(self, key: str) -> None:
         answers = self._session.get(
