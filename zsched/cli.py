@@ -127,7 +127,7 @@ def init(
     state_dir: StateOption = None,
     generation: Annotated[
         int,
-        typer.Option("--generation", metavar="G", min=0, max=2**20, help="Above 0: start anew, on every node at once."),
+        typer.Option("--generation", metavar="G", min=0, help="Above 0: start anew, on every node at once."),
     ] = 0,
     settle: Annotated[
         bool, typer.Option("--settle", help="The other machine of this name is gone: be an elector again.")

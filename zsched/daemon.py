@@ -206,7 +206,8 @@ class Daemon:
             return None, loaded.problem
         if loaded.state.electorate != electorate_hash(self._fleet):
             return None, "the fleet file names another electorate than the state file; this node is no elector"
-        state = replace(loaded.state, incarnation=loaded.state.incarnation + 1)
+        # Not just one more: a folder that was brought back from a backup must not live one of its lives again.
+        state = replace(loaded.state, incarnation=max(loaded.state.incarnation + 1, wall_tenths()))
         try:
             state_file.save(state)
         except AdapterError as error:

@@ -12,13 +12,11 @@ from zsched import zenoh_config
 from zsched.adapters.control_bus import ask_fleet
 from zsched.adapters.state_file import StateFile, hardware_id
 from zsched.clock import wall_tenths
+from zsched.core.belief import GENERATION_STEP, MAX_GENERATION
 from zsched.core.fleet import Fleet, dial_endpoint, electorate_hash
 from zsched.core.model import NO_BALLOT, Acceptance, DurableState, NodeId, RegisterState
 from zsched.daemon_tls import operator_json5, protocol_of
 from zsched.errors import AdapterError
-
-GENERATION_STEP = 2**32
-"""Revision and epoch of generation G start at G times this, so they only rise."""
 
 
 def init_state(fleet: Fleet, node: NodeId, folder: Path, generation: int) -> Path:
@@ -30,6 +28,8 @@ def init_state(fleet: Fleet, node: NodeId, folder: Path, generation: int) -> Pat
     Raises:
         AdapterError: there is a state already, another node's for instance, or the folder cannot be written.
     """
+    if not 0 <= generation <= MAX_GENERATION:
+        raise AdapterError(f"generation {generation}: at most {MAX_GENERATION}, or no revision could follow its first")
     start = generation * GENERATION_STEP
     values = [task.first_value(start) for task in fleet.tasks if generation > 0]
     # Accepted everywhere, too: a majority that had learnt a value and accepted none would count as one that forgot.
@@ -79,7 +79,7 @@ def check_never_voted(fleet: Fleet, node: NodeId) -> int:
         if node in answer.quorum.voted and answer.node != node:
             raise AdapterError(
                 f"{answer.node} knows {node} as an elector that has voted; a blank state would let it vote twice. "
-                "Restore its state folder, or start a new generation on every node with `zsched init --generation G`"
+                "Start a new generation on every node with `zsched init --generation G`"
             )
     return len(answers)
 

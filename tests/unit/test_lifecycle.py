@@ -8,10 +8,12 @@ import pytest
 
 from zsched.adapters.state_file import StateFile, hardware_id
 from zsched.config import check_bytes
+from zsched.core.belief import GENERATION_STEP, MAX_GENERATION
 from zsched.core.fleet import Fleet, electorate_hash
 from zsched.core.model import MAX_COUNTER, NO_BALLOT, DurableState
+from zsched.core.register import MAX_REVISION
 from zsched.errors import AdapterError
-from zsched.lifecycle import GENERATION_STEP, init_state
+from zsched.lifecycle import init_state
 
 TEXT = b"""
 fleet: hall
@@ -94,11 +96,18 @@ def test_generation_that_is_not_newer_is_refused(fleet: Fleet, tmp_path: Path) -
             init_state(fleet, "robot1", tmp_path, generation)
 
 
-def test_highest_generation_of_the_command_line_leaves_room_to_count(fleet: Fleet, tmp_path: Path) -> None:
-    init_state(fleet, "robot1", tmp_path, 2**20)
+def test_a_generation_that_leaves_no_room_to_count_is_refused(fleet: Fleet, tmp_path: Path) -> None:
+    """Its first revision would be the highest there is: a fleet of that generation could agree on nothing."""
+    with pytest.raises(AdapterError, match="at most 1048575"):
+        init_state(fleet, "robot1", tmp_path, MAX_GENERATION + 1)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_highest_generation_leaves_room_to_count(fleet: Fleet, tmp_path: Path) -> None:
+    init_state(fleet, "robot1", tmp_path, MAX_GENERATION)
     (learnt, _) = (register.learnt for register in load(fleet, tmp_path).registers)
     assert learnt is not None
-    assert learnt.revision + GENERATION_STEP <= MAX_COUNTER
+    assert learnt.revision + GENERATION_STEP <= MAX_REVISION < MAX_COUNTER
 
 
 def test_state_folder_of_a_running_daemon_is_refused(fleet: Fleet, tmp_path: Path) -> None:

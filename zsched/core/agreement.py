@@ -14,12 +14,13 @@ from random import Random
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.belief import GENERATION_STEP, is_fit, is_proven
+from zsched.core.belief import GENERATION_STEP, MAX_GENERATION, is_fit, is_proven
 from zsched.core.fleet import Fleet
 from zsched.core.lease import Leases
 from zsched.core.messages import CommandOutcome, CommandResult, Learnt, Promise, Refusal, Refused
 from zsched.core.model import NO_BALLOT, Allocation, Ballot, Beat, DurableState, NodeId, RegisterState, TaskId, Weights
 from zsched.core.register import Change, MoveOwner, Register, Retune, RoundOutcome, Step
+from zsched.core.witness import Witness, as_seen, as_tuple
 
 SETTLE_AFTER_START_S = 0.3
 """A starting elector learns first what was accepted before (an identity round), once its peers are connected."""
@@ -89,13 +90,26 @@ class Agreement:
         self._nodes = frozenset(node.name for node in fleet.nodes)
         self._durable = durable
         self.generation = None if durable is None else durable.generation
-        """``None``: this node has no state, and goes by whatever it is told."""
-        if self.generation:
-            electorate = f"{electorate}/{self.generation}"  # generations refuse each other's ballots
+        """``None``: this node has no state, and has not been told yet which one the fleet is of."""
+        self.newest_generation = self.generation or 0
+        """That any beat has named: what the operator's next one must exceed."""
+        self._has_state, self._electorate = durable is not None, electorate
         self._disputed = "" if durable is None else durable.disputed
+        self._lost = "" if durable is None else durable.lost
+        self.witness = Witness(
+            me=me,
+            electors=fleet.electors,
+            nodes=self._nodes,
+            incarnation=incarnation,
+            votes=0 if durable is None else durable.votes,
+            started_at=now,
+            seen={} if durable is None else as_seen(durable.seen),
+        )
         self.voted = set() if durable is None else set(durable.voted)
-        self.is_elector = durable is not None and me in fleet.electors and not self._disputed
+        self.is_elector = durable is not None and me in fleet.electors and not self._disputed and not self._lost
         self.problems: dict[str, str] = {}
+        if self._lost:
+            self.problems["state"] = _lost_text(self._lost)
         if self._disputed:
             self.problems["state"] = f"{self._disputed}; no elector until `zsched init --settle`"
         self.counters: Counter[str] = Counter()
@@ -108,7 +122,7 @@ class Agreement:
                 me=me,
                 incarnation=incarnation,
                 electors=fleet.electors,
-                electorate=electorate,
+                electorate=self._of_generation(),
                 is_elector=self.is_elector,
                 initial=task.first_value(start),
                 state=stored.get(task.name, RegisterState(task=task.name)),
@@ -137,6 +151,10 @@ class Agreement:
         self._values: dict[TaskId, Allocation] = {}
         self._accepted: dict[TaskId, tuple[NodeId, int]] = {}
 
+    def _of_generation(self) -> str:
+        """The electorate's hash; generations refuse each other's ballots."""
+        return f"{self._electorate}/{self.generation}" if self.generation else self._electorate
+
     # --- queries -----------------------------------------------------------------------------------------------------
 
     def values(self) -> Mapping[TaskId, Allocation]:
@@ -162,6 +180,16 @@ class Agreement:
         """What this node tells others: learnt values only, never accepted ones."""
         values = tuple(value for value in self.values().values() if value.revision > 0)
         return Learnt(node=self._me, values=values, generation=self.generation or 0, has_voted=self.has_voted)
+
+    def answer(self) -> Learnt:
+        """What this node answers a peer: what it has learnt, and what it remembers of electors and of itself."""
+        return replace(
+            self.learnt(),
+            incarnation=0 if self._durable is None else self.witness.incarnation,
+            votes=self.witness.votes,
+            seen=as_tuple(self.witness.seen),
+            lease_terms=self.leases.terms,
+        )
 
     def next_deadline(self) -> float:
         """When `tick` may have something to do."""
@@ -195,6 +223,9 @@ class Agreement:
             voted=tuple(sorted(self.voted)),
             disputed=self._disputed,
             lease_s=self.leases.to_remember_s(now),
+            votes=self.witness.votes,
+            seen=as_tuple(self.witness.seen),
+            lost=self._lost,
         )
         return self._durable
 
@@ -220,7 +251,11 @@ class Agreement:
             self.counters["prepare_rate"] += 1
             answer: Promise | Refused = register.refuse(event.prepare.ballot, Refusal.RATE)
             return Effects(send=[do.AnswerElection(request=event.request, answer=answer)])
+        if self.is_elector and not self.witness.may_vote(now):
+            answer = register.refuse(event.prepare.ballot, Refusal.YOUNG)
+            return Effects(send=[do.AnswerElection(request=event.request, answer=answer)])
         step, answer = register.on_prepare(event.prepare)
+        self.witness.votes += step.is_dirty
         return Effects(is_dirty=step.is_dirty, send=[do.AnswerElection(request=event.request, answer=answer)])
 
     def _may_ask(self, asker: NodeId, now: float) -> bool:
@@ -240,6 +275,9 @@ class Agreement:
         if not is_fit(self._fleet, event.accept.acceptance.value, register):
             self.counters["accept_unfit"] += 1
             answer = register.refuse(event.accept.acceptance.ballot, Refusal.BALLOT)
+            return Effects(send=[do.AnswerElection(request=event.request, answer=answer)])
+        if self.is_elector and not self.witness.may_vote(now):
+            answer = register.refuse(event.accept.acceptance.ballot, Refusal.YOUNG)
             return Effects(send=[do.AnswerElection(request=event.request, answer=answer)])
         self._accept_or_park(event, now + PARK_SHARE * self._fleet.timing.ballot_s, effects, now)
         return effects
@@ -262,6 +300,7 @@ class Agreement:
                 # An identity round's is none: the next owner may still wait.
                 self.leases.on_newer_value(accept.acceptance.value)
             effects.is_dirty |= step.is_dirty
+            self.witness.votes += step.is_dirty
             effects.send.append(do.AnswerElection(request=event.request, answer=answer))
         elif now >= deadline:
             effects.send.append(do.AnswerElection(request=event.request, answer=self._leased(event)))
@@ -310,15 +349,17 @@ class Agreement:
         if learnt.node not in self._nodes:
             self.counters["learnt_foreign"] += 1
             return NOTHING
+        if event.is_answer:
+            self._follow(learnt)
         if not self._is_our_generation(learnt.node, learnt.generation):
             return NOTHING
         if not event.is_answer:
             newer = [(value.task, value.revision) for value in learnt.values]
             return self._ask(learnt.node, newer, ASK_AT_ONCE_S, now)
-        effects = Effects()
+        effects = self._lose(self.witness.on_answer(learnt))
         if learnt.has_voted and learnt.node in self._fleet.electors and learnt.node not in self.voted:
             self.voted.add(learnt.node)
-            effects.is_dirty = self._durable is not None
+            effects.is_dirty |= self._durable is not None
         for value in learnt.values:
             register = self.registers.get(value.task)
             if register is None:
@@ -341,7 +382,7 @@ class Agreement:
 
     def _is_our_generation(self, node: NodeId, generation: int) -> bool:
         """Whether a node's learnt values mean anything here; the difference is shown."""
-        is_ours = self.generation is None or generation == self.generation
+        is_ours = generation == self.generation or self._is_guest_of(generation)
         if is_ours and not self.problems:
             return True  # thirty beats a second come by here
         source = f"generation/{node}"
@@ -350,6 +391,21 @@ class Agreement:
             return True
         self.problems[source] = f"{node} is of generation {generation}, this node of {self.generation}: init them alike"
         return False
+
+    def _is_guest_of(self, generation: int) -> bool:
+        """Whether this node, without a state, goes by what a newer generation says."""
+        return not self._has_state and (self.generation is None or generation > self.generation)
+
+    def _follow(self, learnt: Learnt) -> None:
+        """An elector that keeps a state has answered: without one this node is of the newest generation it hears of."""
+        is_elector = learnt.node in self._fleet.electors and (learnt.incarnation > 0 or learnt.has_voted)
+        if not is_elector or learnt.generation > MAX_GENERATION or not self._is_guest_of(learnt.generation):
+            return
+        self.generation = learnt.generation
+        self.witness.seen.clear()  # of another generation's states
+        for task in self._fleet.tasks:
+            initial = task.first_value(learnt.generation * GENERATION_STEP)
+            self.registers[task.name].follow(self._of_generation(), initial)
 
     def dispute(self, reason: str) -> Effects:
         """Our name is used by somebody else too: no elector any more, on disk, until the operator settles it."""
@@ -360,11 +416,23 @@ class Agreement:
         self._stop_electing()
         return Effects(is_dirty=self._durable is not None)
 
+    def _lose(self, why: str) -> Effects:
+        """Our state has forgotten what others have seen of it: no elector any more, on disk."""
+        if not why or self._lost or not self.is_elector:
+            return Effects()
+        self._lost = why
+        self.problems["state"] = _lost_text(why)
+        self._stop_electing()
+        return Effects(is_dirty=True)
+
     def compare(self, beat: Beat, now: float) -> Effects:
         """A peer's beat may show that it has learnt more than we, or has voted: then ask it."""
+        self.newest_generation = max(self.newest_generation, min(beat.generation, MAX_GENERATION))
         if not self._is_our_generation(beat.node, beat.generation):
             return NOTHING
         is_news = beat.has_voted and beat.node not in self.voted and beat.node in self._fleet.electors
+        is_news |= self.witness.must_ask(beat)
+        is_news |= self._is_guest_of(beat.generation) and beat.node in self._fleet.electors
         newer = [(task, revision) for task, revision, _ in beat.learnt]
         return self._ask(beat.node, newer, ASK_LEARNT_EVERY_S, now, is_news=is_news)
 
@@ -385,6 +453,9 @@ class Agreement:
     def propose(self, task: TaskId, change: Change, now: float) -> Effects:
         """Try to commit a change."""
         effects = Effects()
+        if self.generation is None:  # nobody would answer, for every ballot names the generation
+            self._end(task, change, RoundOutcome.NO_QUORUM, effects)
+            return effects
         self._take(task, self.registers[task].propose(change, now), effects)
         return effects
 
@@ -482,6 +553,13 @@ def _newest(register: Register) -> Allocation | None:
     if accepted is None:
         return learnt
     return accepted.value if learnt is None or accepted.value.revision > learnt.revision else learnt
+
+
+def _lost_text(why: str) -> str:
+    return (
+        f"{why}: it was brought back from a backup, or its disk has lost what it said was written; "
+        "no elector until a new generation (`zsched init --generation G` on every node)"
+    )
 
 
 def _why(change: Change) -> str:

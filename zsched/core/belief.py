@@ -12,10 +12,12 @@ from __future__ import annotations
 from zsched.core.fleet import Fleet
 from zsched.core.messages import Learnt
 from zsched.core.model import Allocation
-from zsched.core.register import Register
+from zsched.core.register import MAX_REVISION, Register
 
 GENERATION_STEP = 2**32
 """Revision and epoch of generation G start at G times this (`zsched init --generation G`)."""
+MAX_GENERATION = MAX_REVISION // GENERATION_STEP - 1
+"""The last one that leaves room to count: above `MAX_REVISION` nothing can follow (`Register`)."""
 MAX_AHEAD = 2**20
 """No honest revision is so far ahead of what a node knows: at one move a second that is a cut of twelve days."""
 

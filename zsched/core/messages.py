@@ -83,6 +83,7 @@ class Refusal(StrEnum):
     LEASE = "lease"  # an exclusive task's grant is still running
     RATE = "rate"  # this proposer asks too often
     DISK = "disk"  # it could not persist
+    YOUNG = "young"  # it has just started, and asks the others first what they remember of it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,6 +114,12 @@ class Learnt:
     """What its leases hang on."""
     unleased: tuple[TaskId, ...] = ()
     """Tasks whose worker there may be working without a lease."""
+    incarnation: int = 0
+    """Of its state; 0: it has none."""
+    votes: int = 0
+    """How many promises and acceptances it has ever given."""
+    seen: tuple[tuple[NodeId, int, int], ...] = ()
+    """(elector, incarnation, votes): what it remembers of others (`zsched.core.witness`)."""
 
     def __post_init__(self) -> None:
         check_name("learnt.node", self.node)

@@ -399,6 +399,12 @@ class DurableState:
     """Why this node stands down as elector until the operator settles it; empty: it does not."""
     lease_s: float = 0.0
     """How long a lease may last that this elector granted in a life before (its file may have said another length)."""
+    votes: int = 0
+    """How many promises and acceptances this elector has ever given."""
+    seen: tuple[tuple[NodeId, int, int], ...] = ()
+    """(elector, incarnation, votes), as others answered: they may lose their state (`zsched.core.witness`)."""
+    lost: str = ""
+    """Why this state is older than what others have seen of it; empty: it is not."""
 
 
 # --- membership ------------------------------------------------------------------------------------------------------
@@ -463,8 +469,12 @@ class Beat:
     has_lost_state: bool = False
     """This node is in the electorate and answers no proposer: its state is lost, disputed or cannot be written."""
 
+    votes: int = 0
+    """How many promises and acceptances this elector has ever given."""
+
     def __post_init__(self) -> None:
         check_name("beat.node", self.node)
+        check_counter("beat.votes", self.votes)
         check_counter("beat.incarnation", self.incarnation)
         check_counter("beat.sequence", self.sequence)
         check_range("beat.loop_lag_s", self.loop_lag_s, 0.0, 86400.0)

@@ -272,6 +272,7 @@ class Node:
             has_voted=self.agreement.has_voted,
             generation=self.agreement.generation or 0,
             lease_terms=self.agreement.leases.terms_told,
+            votes=self.agreement.witness.votes,
             has_lost_state=self.me in self.fleet.electors and not self.agreement.is_elector,
         )
         self.loop_lag_s = 0.0
@@ -485,9 +486,7 @@ class Node:
             self.sealing.on_answer(event.learnt)
 
     def _on_learnt_asked(self, event: ev.LearntAsked, _now: float) -> None:
-        learnt = replace(
-            self.agreement.learnt(), lease_terms=self.agreement.leases.terms, unleased=self.sealing.unleased()
-        )
+        learnt = replace(self.agreement.answer(), unleased=self.sealing.unleased())
         self._batch.add(do.AnswerLearnt(request=event.request, learnt=learnt))
 
     def _on_persist_failed(self, event: ev.PersistFailed, _now: float) -> None:

@@ -171,6 +171,13 @@ class Register:
         """This node lost its right to be an elector (disk, duplicate name): it answers no more."""
         self._is_elector = False
 
+    def follow(self, electorate: str, initial: Allocation) -> None:
+        """A node without a state has been told which generation the fleet is of: count, and begin, with that one's."""
+        self._electorate, self._initial = electorate, initial
+        learnt = self.state.learnt
+        if learnt is not None and learnt.revision < initial.revision:
+            self.state = RegisterState(task=self.state.task)  # it never promised anything, and this was another fleet's
+
     # --- acceptor ----------------------------------------------------------------------------------------------
 
     def on_prepare(self, prepare: Prepare) -> tuple[Step, Promise | Refused]:

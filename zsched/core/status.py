@@ -101,6 +101,10 @@ def _problems(node: NodeView, quorum: QuorumStatus) -> tuple[str, ...]:
         problems.append(f"electors without their state, {len(quorum.stateless)} of {quorum.electors}: {names}")
     if not quorum.ok:
         problems.append(f"no quorum: {quorum.alive} of {quorum.electors} electors can answer, {quorum.needed} needed")
+    if quorum.electors - len(quorum.stateless) < quorum.needed:
+        number = node.agreement.newest_generation + 1
+        way_out = f"if these are lost, stop every daemon, and `zsched init --generation {number}` on every node"
+        problems.append(f"nothing can be agreed: too many electors without their states (each says why); {way_out}")
     if not node.has_state:
         problems.append("no valid state file: this node is no elector (see `zsched init --help`)")
     return tuple(problems)

@@ -33,7 +33,7 @@ class Bug:
 
 SEQUENCE, IDENTITY = "zsched.core.sequence", "zsched.core.identity"
 REGISTER, LEASE, TENURE = "zsched.core.register", "zsched.core.lease", "zsched.core.tenure"
-SEALING = "zsched.core.sealing"
+SEALING, WITNESS = "zsched.core.sealing", "zsched.core.witness"
 AGREEMENT, MEMBERSHIP, NODE = "zsched.core.agreement", "zsched.core.membership", "zsched.core.node"
 ROUNDS, VOTE, VOTING = "zsched.core.rounds", "zsched.core.vote", "zsched.core.voting"
 SCHEDULER, SCORING, EXECUTOR = "zsched.core.scheduler", "zsched.core.scoring", "zsched.core.executor"
@@ -46,6 +46,8 @@ _REGISTER = (
 _SCHEDULES = ("tests/unit/core/test_register_schedules.py",)
 _AGREEMENT = ("tests/unit/core/test_agreement.py",)
 _LEASE = ("tests/sim/test_lease_rules.py", "tests/sim/test_exclusive.py")
+_GENERATIONS = ("tests/sim/test_generations.py",)
+_RESTORED = ("tests/sim/test_restored_state.py",)
 _ROLLOUT = ("tests/sim/test_exclusive_rollout.py",)
 _MEMBERSHIP = (
     "tests/sim/test_membership_rules.py",
@@ -442,6 +444,28 @@ MEMBERSHIP_BUGS = (
         "return other.count >= RUN",
         "return False",
         _MEMBERSHIP,
+    ),
+    _bug(
+        "restored state votes on",
+        AGREEMENT,
+        "effects = self._lose(self.witness.on_answer(learnt))",
+        "effects = Effects()",
+        _RESTORED,
+    ),
+    _bug(
+        "votes of an earlier life are not compared",
+        WITNESS,
+        'if votes > known else ""',
+        'if votes > known + 10**9 else ""',
+        _RESTORED,
+    ),
+    _bug("starting elector asks nobody", WITNESS, "return is_enough and (", "return True or (", _RESTORED),
+    _bug(
+        "node without state proposes by generation 0",
+        AGREEMENT,
+        "self.registers[task.name].follow(self._of_generation(), initial)",
+        "self.registers[task.name].follow(self._electorate, initial)",
+        _GENERATIONS,
     ),
     _bug("a put teaches an allocation", AGREEMENT, "if not event.is_answer:", "if False:", _AGREEMENT),
     _bug("any answer is believed", AGREEMENT, "elif is_proven(", "elif True or is_proven(", _AGREEMENT),

@@ -179,7 +179,7 @@ class Simulator(Links):
         if state is not None and (state.electorate != electorate or self._is_refused(machine)):
             state = None
         if state is not None:
-            state = replace(state, incarnation=state.incarnation + 1)
+            state = replace(state, incarnation=max(state.incarnation + 1, self.wall_count))
             machine.disk.write(state)
             machine.disk.sync()
         machine.life += 1

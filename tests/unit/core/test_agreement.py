@@ -74,7 +74,7 @@ def make(*registers: RegisterState, me: str = "robot1", has_state: bool = True) 
         electorate="e",
         registers=registers,
     )
-    return Agreement(
+    agreement = Agreement(
         fleet=FLEET,
         me=me,
         durable=state if has_state else None,
@@ -83,6 +83,10 @@ def make(*registers: RegisterState, me: str = "robot1", has_state: bool = True) 
         rng=Random(1),
         now=100.0,
     )
+    for name in ("edge1", *ROBOTS):  # who starts asks all others what they remember of it
+        if name != me:
+            agreement.witness.on_answer(Learnt(node=name, values=()))
+    return agreement
 
 
 def command(

@@ -102,6 +102,7 @@ def started(me: str = "robot1", *, has_state: bool = True, learnt: Allocation | 
     node.start(100.0)
     for name in (*ROBOTS, *EDGES):
         if name != me:
+            node.handle(ev.LearntReceived(learnt=Learnt(node=name, values=()), is_answer=True), 100.0)
             node.handle(ev.BeatReceived(beat=beat(name)), 100.0)
     node.handle(ev.ProfileSampled(device=SAMPLE), 100.0)
     return node

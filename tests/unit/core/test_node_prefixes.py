@@ -17,7 +17,7 @@ from zsched.core import instructions as do
 from zsched.core.executor import Phase
 from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, electorate_hash
 from zsched.core.lease import hold_s
-from zsched.core.messages import Accept, Accepted, Promise
+from zsched.core.messages import Accept, Accepted, Learnt, Promise
 from zsched.core.model import (
     NO_BALLOT,
     Acceptance,
@@ -287,6 +287,8 @@ def test_elector_that_has_just_started_grants_nobody_new_before_its_old_grant_ha
             now=100.0,
         )
         node.start(100.0)
+        for name in {one.name for one in EXCLUSIVE.nodes} - {"robot1"}:  # who starts asks all what they remember of it
+            node.handle(ev.LearntReceived(learnt=Learnt(node=name, values=()), is_answer=True), 100.0)
         ballot = Ballot(counter=6, node="robot2", incarnation=1)
         value = replace(old, revision=2, epoch=2 if owner != "edge1" else 1, owner=owner)
         asked = Accept(task=TASK, acceptance=Acceptance(ballot=ballot, value=value), electorate=electorate)

@@ -114,6 +114,10 @@ def test_electors_that_have_lost_their_state_are_named_and_count_for_nothing() -
     assert build_snapshot(node, 100.0).problems == (
         "electors without their state, 2 of 3: robot2, robot3",
         "no quorum: 1 of 3 electors can answer, 2 needed",
+        (
+            "nothing can be agreed: too many electors without their states (each says why); "
+            "if these are lost, stop every daemon, and `zsched init --generation 1` on every node"
+        ),
     )
     again = Beat(node="robot2", incarnation=4, sequence=1, loop_lag_s=0.0)
     node.handle(ev.BeatReceived(beat=again), 100.5)
