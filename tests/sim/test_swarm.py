@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from random import Random
 
@@ -12,8 +13,10 @@ from zsched.core.register import Register
 from zsched.errors import InvariantError
 from zsched.lab import simulate
 from zsched.lab.sim_faults import SETTLE_S, Stage, play
+from zsched.lab.sim_files import CHANGES
+from zsched.lab.sim_links import Held
 from zsched.lab.sim_parts import GENERATION_STEP, Clock, Disk
-from zsched.lab.sim_swarm import MAKERS, MAX_NODES, MIN_NODES, Plan, plan
+from zsched.lab.sim_swarm import LATER, MAKERS, MAX_NODES, MIN_NODES, PENDING, Fault, Plan, plan
 from zsched.lab.simulate import Job, main, shrink
 from zsched.lab.simulator import Simulator
 
@@ -31,9 +34,12 @@ def test_same_seed_same_schedule_to_the_letter() -> None:
 
 
 def test_plans_have_every_fault_every_size_and_every_kind_of_task() -> None:
-    plans = [plan(seed) for seed in range(300)]
+    plans = [plan(seed, kinds=frozenset(LATER)) for seed in range(400)]
     kinds = {fault.kind for one in plans for fault in one.faults}
-    assert kinds == (set(MAKERS) - {"clock"}) | {"clock_rate", "clock_jump", "load", "slew"}
+    assert kinds == (set(MAKERS) - {"clock"}) | {"clock_rate", "clock_jump", "load", "slew"} | set(LATER) - {"fsync"}
+    assert {one.generation for one in plans} == {0, 1, 2}
+    assert any(not set(one.fleet.electors) & set(one.fleet.voters) for one in plans), "edges alone"
+    assert {fault.size for one in plans for fault in one.faults if fault.kind == "rollout"} == set(range(len(CHANGES)))
     assert {len(one.fleet.nodes) for one in plans} == set(range(MIN_NODES, MAX_NODES + 1))
     tasks = [task for one in plans for task in one.fleet.tasks]
     assert {task.exclusive for task in tasks} == {True, False}
@@ -44,8 +50,8 @@ def test_plans_have_every_fault_every_size_and_every_kind_of_task() -> None:
 def test_every_fault_that_is_planned_is_carried_out() -> None:
     done: set[str] = set()
     planned: set[str] = set()
-    for seed in range(12):
-        one = plan(seed)
+    for seed in range(20):
+        one = plan(seed, kinds=frozenset(LATER))
         done |= set(play(one).faults)
         planned |= {fault.kind for fault in one.faults}
     assert planned <= done
@@ -146,6 +152,85 @@ def test_clock_runs_at_its_rate_jumps_and_never_goes_back() -> None:
     clock.change(104.0, jump_s=3.0)
     assert clock.local(104.0) == pytest.approx(108.0)
     assert clock.true(clock.local(110.0)) == pytest.approx(110.0)
+
+
+def test_a_link_that_holds_back_keeps_its_order() -> None:
+    link = Held(until=5.0)
+    assert [link.arrival(1.0, 0.2), link.arrival(4.99, 0.001), link.arrival(5.1, 0.2)] == [5.0, 5.0, pytest.approx(5.3)]
+    assert link.arrival(5.2, 0.01) == pytest.approx(5.3), "nothing overtakes what was sent before"
+    burst = Held(every_s=0.5)
+    assert [burst.arrival(at, 0.01) for at in (1.0, 1.2, 1.495, 1.6)] == [1.5, 1.5, 2.0, 2.0]
+
+
+def test_a_cut_is_a_machine_s_and_a_twin_may_be_apart_from_its_original() -> None:
+    fault = Fault(at=0.5, kind="apart", nodes=("robot1",), seconds=20.0, size=2.0)
+    stage = Stage(Plan(seed=1, fleet=plan(1, nodes=6).fleet, faults=(fault,), seconds=30.0))
+    sim = stage.sim
+    sim.start()
+    sim.later(fault.at, stage._begin, fault)
+    sim.run(5.0)
+    assert {"robot1", "robot1~"} <= set(sim.running())
+    lives = {key: sim.node(key).incarnation for key in ("robot1", "robot1~")}
+    heard = {
+        key: sim.node(key).membership.incarnation("robot1") for key in sim.running() if not key.startswith("robot1")
+    }
+    assert set(heard.values()) == set(lives.values()), "some hear the one, some the other"
+
+
+def test_a_frozen_machine_s_clock_stands_still() -> None:
+    sim = Simulator(fleet=plan(1).fleet, seed=1)
+    sim.start()
+    sim.run(1.0)
+    machine = sim.machines["robot1"]
+    before = machine.clock.local(sim.now)
+    sim.freeze(machine, 3.0)
+    sim.run(3.5)
+    assert machine.clock.local(sim.now) - before == pytest.approx(0.5)
+    assert not machine.is_paused
+
+
+def test_a_backup_and_a_lying_disk_give_back_an_older_file() -> None:
+    state = next(iter(Stage(plan(1)).sim.machines.values())).disk.state
+    assert state is not None
+
+    def written(lies_from: int) -> Disk:
+        disk = Disk()
+        for count in range(6):
+            if count == lies_from:
+                disk.begin_to_lie()
+            disk.write(replace(state, incarnation=count))
+            disk.sync()
+        return disk
+
+    found = set()
+    for seed in range(30):
+        disk = written(lies_from=4)
+        lost = disk.forget(Random(seed))
+        assert disk.state is not None
+        assert lost == (disk.state.incarnation < 5)
+        found.add(disk.state.incarnation)
+    assert found == {3, 4, 5}, "what it wrote before it lied is kept"
+    disks = [written(lies_from=9) for _ in range(60)]
+    older = {disk.restore(Random(seed)) for seed, disk in enumerate(disks)}
+    assert older == {True, False}
+    assert {disk.state.incarnation for disk in disks if disk.state is not None} == set(range(6))
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_every_change_of_a_fleet_file_makes_another_fleet_file(name: str) -> None:
+    for seed in range(20):
+        fleet = plan(seed).fleet
+        changed = CHANGES[name](Random(seed), fleet)
+        assert changed != fleet or name in ("limits", "weights", "candidates", "exclusive"), name
+        assert [task.name for task in changed.tasks] == sorted(task.name for task in changed.tasks)
+
+
+def test_pending_faults_are_played_only_when_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
+    assert set(LATER) >= PENDING
+    assert main(["--seed", "5", "--runs", "3", "--seconds", "2", "--with", "amnesia"]) in (0, 1)
+    again = Job(seed=5, pending=frozenset({"amnesia", "lie"})).command
+    assert again.endswith("--with amnesia,lie")
+    assert capsys.readouterr().out
 
 
 def test_disk_keeps_the_old_or_the_new_file_and_a_damaged_one_is_none() -> None:

@@ -14,8 +14,17 @@ from zsched.core.damping import ESCAPES_PER_MINUTE, WINDOW_S
 from zsched.core.executor import Phase
 from zsched.core.fleet import Fleet
 from zsched.core.messages import Accepted, Promise
-from zsched.core.model import Allocation, Ballot, DurableState, NodeId, Proposal, RegisterState, TaskId, WorkerState
-from zsched.core.plan import RoutePlan, WorkerRole
+from zsched.core.model import (
+    Allocation,
+    Ballot,
+    DurableState,
+    NodeId,
+    Proposal,
+    RegisterState,
+    TaskId,
+    WorkerState,
+)
+from zsched.core.plan import Role, RoutePlan, WorkerRole
 from zsched.errors import InvariantError
 from zsched.lab.history import Checker, Learnt, Record, Routed, Started, Stored, Worked
 from zsched.lab.sim_parts import GENERATION_STEP, Machine
@@ -34,14 +43,26 @@ class Invariants:
 
     fleet: Fleet
     checker: Checker = field(init=False)
+    limits: dict[TaskId, int] = field(default_factory=dict)
+    """{task: most moves within a minute, planned or not}."""
     told: dict[tuple[TaskId, int], Allocation] = field(default_factory=dict)
     """{(task, revision): the one value}."""
     ballots: dict[tuple[TaskId, Ballot], tuple[str, Allocation | None]] = field(default_factory=dict)
     """{(task, ballot): (whose it is, what it carries)}."""
 
     def __post_init__(self) -> None:
-        limits = {task.name: task.max_moves_per_minute + ESCAPES_PER_MINUTE for task in self.fleet.tasks}
-        self.checker = Checker(electors=self.fleet.electors, moves_per_minute=limits)
+        self.checker = Checker(electors=self.fleet.electors, moves_per_minute=self.limits)
+        self.allow(self.fleet)
+
+    def expect(self, generation: int, electors: tuple[NodeId, ...]) -> None:
+        """A state of this generation was written under these electors: their majority may agree in it."""
+        self.checker.electorates.setdefault(generation, set()).add(electors)
+
+    def allow(self, fleet: Fleet) -> None:
+        """Another fleet file is being rolled out: until all have it, the larger of its limits and the old ones hold."""
+        for task in fleet.tasks:
+            limit = task.max_moves_per_minute + ESCAPES_PER_MINUTE
+            self.limits[task.name] = max(self.limits.get(task.name, 0), limit)
 
     def take(self, record: Record) -> None:
         """Check one record of the history."""
@@ -164,8 +185,8 @@ class Invariants:
             raise InvariantError(f"{machine.key} proposes move {planned + 1} of {proposal.task} within a minute")
 
     def _check_told(self, machine: Machine, task: TaskId, revision: int) -> None:
-        if not revision or not _keeps_state(machine):
-            return
+        if not revision % GENERATION_STEP or not _keeps_state(machine):
+            return  # a generation's first value is no secret: a task that is new in the fleet file begins with it
         learnt = self._register(machine, task).learnt
         if learnt is None or learnt.revision < revision:
             raise InvariantError(f"{machine.key} told of {task} revision {revision}, which is not on its disk")
@@ -184,12 +205,20 @@ class Invariants:
             self._check_epoch(machine, plan.task, epoch)
             self.take(Routed(at=now, node=machine.key, task=plan.task, epoch=epoch, owner=owner))
 
-    def on_worked(
-        self, machine: Machine, task: TaskId, epoch: int, now: float, until: float, *, is_leased: bool = True
-    ) -> None:
+    def on_worked(self, machine: Machine, role: Role, now: float, until: float) -> None:
         """A worker may work until a true time; without a lease that is infinity."""
-        life = machine.life
-        self.take(Worked(at=now, node=machine.key, task=task, epoch=epoch, until=until, life=life, is_leased=is_leased))
+        lease = role.lease_until_s
+        work = Worked(
+            at=now,
+            node=machine.key,
+            task=role.task,
+            epoch=role.epoch,
+            until=until,
+            life=machine.life,
+            is_leased=lease is not None,
+            is_late=lease is not None and lease <= machine.late_until,
+        )
+        self.take(work)
 
     # --- the loop ----------------------------------------------------------------------------------------------------
 

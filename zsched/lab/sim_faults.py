@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from random import Random
 
 from zsched.core import events as ev
@@ -19,9 +19,13 @@ from zsched.core.model import NodeId
 from zsched.core.scoring import majority
 from zsched.errors import InvariantError
 from zsched.lab.sim_clocks import slew
-from zsched.lab.sim_links import SELF_DELAY_S
+from zsched.lab.sim_disk_faults import DiskFaults
+from zsched.lab.sim_link_faults import SMALL_DELAY_S, LinkFaults
+from zsched.lab.sim_links import Pair
 from zsched.lab.sim_network import Weather
 from zsched.lab.sim_parts import Machine
+from zsched.lab.sim_rollout import Rollouts
+from zsched.lab.sim_scene import Carry, Scene
 from zsched.lab.sim_swarm import Fault, Plan
 from zsched.lab.simulator import CORES, Simulator
 
@@ -35,7 +39,6 @@ AFTERMATH_S = 1.0
 """What was under way when the faults ended has arrived."""
 STOP_S = 0.8
 """What a daemon that was told to stop waits for its tasks to move."""
-SMALL_DELAY_S = (0.0005, 0.003)
 STOP_WORK_S = (0.002, 0.02, 0.1, 0.4)
 """Exclusive workers stop at once, or are slower than a commit's stagger, or slower than a whole ballot."""
 
@@ -75,7 +78,7 @@ def play(plan: Plan, keep: frozenset[int] | None = None, calm_at: float | None =
         violation=violation,
         events=sim.events,
         revisions=len(sim.learnt),
-        faults=stage.done + sim.weather.counts,
+        faults=stage.scene.done + sim.weather.counts,
         stories=tuple(sim.stories),
         settled_s=settled_s,
     )
@@ -87,20 +90,32 @@ class Stage:
 
     plan: Plan
     sim: Simulator = field(init=False)
-    done: Counter[str] = field(default_factory=Counter)
+    scene: Scene = field(init=False)
+    _links: LinkFaults = field(init=False)
+    _rollouts: Rollouts = field(init=False)
+    _carriers: dict[str, Carry] = field(init=False)
     _busy: dict[NodeId, float] = field(default_factory=dict)
     _rng: Random = field(init=False)
     _prefix: float = 0.0
     _requests: dict[int, SetWeights] = field(default_factory=dict)
-    _is_over: bool = False
 
     def __post_init__(self) -> None:
+        plan = self.plan
         self.sim = Simulator(
-            fleet=self.plan.fleet, seed=self.plan.seed, load=self._load, delay_s=SMALL_DELAY_S, weather=Weather()
+            fleet=plan.fleet,
+            seed=plan.seed,
+            generation=plan.generation,
+            load=self._load,
+            delay_s=SMALL_DELAY_S,
+            weather=Weather(),
         )
         self.sim.work.stop_s = STOP_WORK_S
-        self.sim.most_events = EVENTS_PER_S * len(self.plan.fleet.nodes) * self.plan.seconds
-        self._rng = Random(f"stage {self.plan.seed}")
+        self.sim.most_events = EVENTS_PER_S * len(plan.fleet.nodes) * plan.seconds
+        self._rng = Random(f"stage {plan.seed}")
+        self.scene = Scene(plan=plan, sim=self.sim, rng=self._rng, fleet=plan.fleet, generation=plan.generation)
+        self._links, self._rollouts = LinkFaults(self.scene), Rollouts(self.scene)
+        tables = (self._links.table(), DiskFaults(self.scene).table(), self._rollouts.table(), self._table())
+        self._carriers = {kind: carry for table in tables for kind, carry in table.items()}
 
     def play(self, keep: frozenset[int] | None, calm_at: float) -> float:
         """Run it all; how long the fleet took to come to rest."""
@@ -112,6 +127,8 @@ class Stage:
         sim.run(calm_at)
         self.calm()
         at = sim.now
+        if self.scene.is_memory_false:
+            sim.run(AFTERMATH_S)  # whoever has lost some of its state is told so
         if not self.can_agree():
             sim.run(LOST_S)  # nothing may be agreed meanwhile that a majority does not remember
             self._start_generation()
@@ -125,22 +142,22 @@ class Stage:
 
     def calm(self) -> None:
         """Faults end: the air clears, twins go, everybody runs, by the right fleet file, on a disk that works."""
-        sim = self.sim
-        self._is_over = True
-        sim.heal()
-        sim.weather.calm()
-        sim.loss, sim.delay_s, sim.cut_batch = 0.0, SMALL_DELAY_S, None
+        sim, scene = self.sim, self.scene
+        scene.is_over, sim.fleet = True, scene.fleet
+        self._links.calm()
+        sim.cut_batch = None
         missing = self._one_too_few()
         for key in [key for key, machine in sim.machines.items() if key != machine.name]:
             self._remove(key)
         for machine in tuple(sim.machines.values()):
             machine.event_s, machine.disk_s = 0.0, (0.0, 0.0)
             sim.unpause(machine, machine.life)
-            is_wrong = machine.fleet is not sim.fleet or machine.key in sim.broken_disks or self._is_stopping(machine)
-            machine.fleet = sim.fleet
+            is_wrong = machine.fleet != scene.fleet or machine.key in sim.broken_disks or self._is_stopping(machine)
+            machine.fleet = scene.fleet
             sim.broken_disks.discard(machine.key)
             if is_wrong or machine.key == missing:
                 sim.crash(machine.key)
+            self._rollouts.complete(machine)
             if machine.key != missing:
                 sim.start(machine.key)
         sim.later(AFTERMATH_S, self._start_again, missing)
@@ -156,7 +173,9 @@ class Stage:
         electors = [other for other in fleet.electors if other != name and self.sim.disk(other) is not None]
         voters = [other for other in fleet.voters if other != name]
         is_missed = len(electors) < majority(len(fleet.electors)) or len(voters) < majority(len(fleet.voters))
-        is_missed |= any(set(task.candidates) <= {name} for task in fleet.tasks)
+        # Who may still work by an older file is waited for until it is heard (docs/decisions/0026).
+        is_waited_for = self.scene.done["rollout of exclusive"] > 0
+        is_missed |= any(set(task.candidates) <= {name} or is_waited_for for task in fleet.tasks)
         return None if is_missed or self._rng.random() < 0.5 else name
 
     @staticmethod
@@ -172,13 +191,14 @@ class Stage:
 
     def _start_generation(self) -> None:
         """Too many states are lost: the operator stops every daemon and starts a new generation everywhere."""
-        sim = self.sim
-        self.done["new generation"] += 1
-        running = sim.running()
-        for machine in sim.machines.values():
-            sim.crash(machine.key)
-            sim.initialise(machine, incarnation=sim.wall_count, generation=1)
-        sim.start(*running)
+        self.scene.done["new generation"] += 1
+        running = self.sim.running()
+        for name in running:
+            self.sim.crash(name)
+        self.scene.begin_generation()
+        for machine in self.sim.machines.values():
+            self.scene.bring(machine, self.scene.generation)
+        self.sim.start(*running)
 
     def _check_answers(self) -> None:
         """An operator who was told "committed" finds the weights in that revision."""
@@ -196,140 +216,57 @@ class Stage:
         return CORES * self._busy.get(node, 0.25), 1000.0
 
     def _begin(self, fault: Fault) -> None:
-        self.done[fault.kind] += 1
+        self.scene.done[fault.kind] += 1
         self.sim.stories.append(f"{self.sim.now:9.3f} FAULT {fault}")
-        self._table()[fault.kind](fault)
-
-    def _then(self, seconds: float, action: Callable[[], None]) -> None:
-        """Do something later, unless the faults are over by then."""
-        self.sim.later(seconds, lambda: None if self._is_over else action())
-
-    def _air(self, fault: Fault) -> None:
-        """A chance per message."""
-        values = {"spike": 0.02}
-        weather, name = self.sim.weather, fault.kind
-        if name == "spike":
-            weather.spike_s = fault.size
-        setattr(weather, name, values.get(name, fault.size))
-        self._then(fault.seconds, lambda: setattr(weather, name, 0.0))
-
-    def _loss(self, fault: Fault) -> None:
-        self.sim.loss = fault.size
-        self._then(fault.seconds, lambda: setattr(self.sim, "loss", 0.0))
-
-    def _delay(self, fault: Fault) -> None:
-        self.sim.delay_s = (SMALL_DELAY_S[0], fault.size)
-        self._then(fault.seconds, lambda: setattr(self.sim, "delay_s", SMALL_DELAY_S))
-
-    def _cut(self, fault: Fault) -> None:
-        """Between some nodes and the rest, one way or both; or only between two."""
-        here = set(fault.nodes)
-        rest = [node.name for node in self.sim.fleet.nodes if node.name not in here]
-        if fault.kind == "partial":
-            pairs = set(itertools.permutations(fault.nodes, 2))
-        else:
-            pairs = set(itertools.product(fault.nodes, rest))
-            back = {(b, a) for a, b in pairs}
-            if fault.kind == "cut":
-                pairs |= back
-            elif fault.size < 0.5:
-                pairs = back
-        self.sim.cuts |= pairs
-        self._then(self.sim.fleet.timing.zenoh_lease_s, lambda: self._links_end(pairs))
-        self._then(fault.seconds, lambda: self.sim.cuts.difference_update(pairs))
-
-    def _links_end(self, pairs: set[tuple[NodeId, NodeId]]) -> None:
-        """Links that are still cut end with zenoh's lease: whoever hears nothing loses the other's token."""
-        for source, target in sorted(pairs & self.sim.cuts):
-            node = self.sim.machines[source].node
-            if node is not None and target in self.sim.machines:
-                event = ev.TokenLost(node=source, incarnation=node.incarnation)
-                self.sim.later(SELF_DELAY_S, self.sim.deliver, self.sim.machines[target], event)
-                self.sim.work.lose(self.sim.machines[source], self.sim.machines[target])
-
-    def _version(self, fault: Fault) -> None:
-        names = set(fault.nodes)
-        self.sim.weather.foreign_version |= names
-        self._then(fault.seconds, lambda: self.sim.weather.foreign_version.difference_update(names))
-
-    def _machine(self, fault: Fault) -> Machine:
-        return self.sim.machines[fault.nodes[0]]
+        self._carriers[fault.kind](fault)
 
     def _pause(self, fault: Fault) -> None:
-        self.sim.pause(self._machine(fault), fault.seconds)
+        self.sim.pause(self.scene.machine(fault), fault.seconds)
+
+    def _freeze(self, fault: Fault) -> None:
+        """The whole machine stands still, its clock and its workers too (a VM that is not scheduled)."""
+        self.sim.freeze(self.scene.machine(fault), fault.seconds)
 
     def _kill(self, fault: Fault) -> None:
         self.sim.crash(fault.nodes[0], is_power_lost=fault.kind == "power")
-        self._start_later(fault)
-
-    def _start_later(self, fault: Fault) -> None:
-        self._then(fault.seconds, lambda: self.sim.start(*fault.nodes))
+        self.scene.start_later(fault)
 
     def _blackout(self, fault: Fault) -> None:
         for name in self.sim.running():
             self.sim.crash(name, is_power_lost=True)
-            self._then(self._rng.uniform(0.0, fault.seconds), lambda name=name: self._start_if_there(name))  # type: ignore[misc]
+            self.scene.then(self._rng.uniform(0.0, fault.seconds), lambda name=name: self._start_if_there(name))  # type: ignore[misc]
 
     def _start_if_there(self, name: NodeId) -> None:
         if name in self.sim.machines:
             self.sim.start(name)
 
-    def _lose_state(self, fault: Fault) -> None:
-        """The state is damaged or gone. `zsched init` is refused to an elector that may have voted."""
-        machine = self._machine(fault)
-        self.sim.crash(machine.key, is_power_lost=True)
-        machine.is_durable = False
-        if fault.kind == "damage":
-            machine.disk.damage(self._rng)
-        else:
-            machine.disk.wipe()
-            if machine.name not in self.sim.fleet.electors:
-                self.sim.initialise(machine, incarnation=self.sim.wall_count)
-        self._start_later(fault)
-
     def _storm(self, fault: Fault) -> None:
         """One node dies and comes back again and again."""
         at = 0.0
         while at < fault.seconds:
-            self._then(at, lambda: self.sim.crash(fault.nodes[0]))
-            self._then(at + self._rng.uniform(0.01, 0.3), lambda: self.sim.start(fault.nodes[0]))
+            self.scene.then(at, lambda: self.sim.crash(fault.nodes[0]))
+            self.scene.then(at + self._rng.uniform(0.01, 0.3), lambda: self.sim.start(fault.nodes[0]))
             at += self._rng.uniform(0.3, 0.8)
 
     def _prefix_crashes(self, fault: Fault) -> None:
         """Nodes crash after some prefix of a batch, mostly of one that was to be written."""
         self._prefix, self.sim.cut_batch = fault.size, self._cut_batch
-        self._then(fault.seconds, lambda: setattr(self.sim, "cut_batch", None))
+        self.scene.then(fault.seconds, lambda: setattr(self.sim, "cut_batch", None))
 
     def _cut_batch(self, _name: NodeId, batch: tuple[do.Instruction, ...]) -> int | None:
         is_dirty = bool(batch) and isinstance(batch[0], do.PersistState)
         if not batch or self._rng.random() > (self._prefix if is_dirty else self._prefix / 50):
             return None
-        self.done["cut batch"] += 1
+        self.scene.done["cut batch"] += 1
         return self._rng.randint(0, len(batch))
 
     def _slow(self, fault: Fault) -> None:
-        machine = self._machine(fault)
+        machine = self.scene.machine(fault)
         machine.event_s = fault.size
-        self._then(fault.seconds, lambda: setattr(machine, "event_s", 0.0))
-
-    def _slow_disk(self, fault: Fault) -> None:
-        machine = self._machine(fault)
-        machine.disk_s = (0.001, fault.size)
-        self._then(fault.seconds, lambda: setattr(machine, "disk_s", (0.0, 0.0)))
-
-    def _full_disk(self, fault: Fault) -> None:
-        """It refuses writes; afterwards the operator makes room and restarts the daemon."""
-        name = fault.nodes[0]
-        self.sim.broken_disks.add(name)
-        self._then(fault.seconds, lambda: self._mend(name))
-
-    def _mend(self, name: NodeId) -> None:
-        self.sim.broken_disks.discard(name)
-        self.sim.crash(name)
-        self.sim.start(name)
+        self.scene.then(fault.seconds, lambda: setattr(machine, "event_s", 0.0))
 
     def _clock(self, fault: Fault) -> None:
-        machine = self._machine(fault)
+        machine = self.scene.machine(fault)
         if fault.kind == "clock_rate":
             machine.clock.change(self.sim.now, rate=fault.size)
         else:
@@ -344,39 +281,35 @@ class Stage:
             if name in self.sim.machines:
                 self.sim.deliver(self.sim.machines[name], event)
 
-        slew(fault.size, fault.seconds, tell=tell, later=self.sim.later, is_over=lambda: self._is_over)
+        slew(fault.size, fault.seconds, tell=tell, later=self.sim.later, is_over=lambda: self.scene.is_over)
 
     def _twin(self, fault: Fault) -> None:
-        """Somebody copied a disk to another machine: its hardware differs, so it starts without a state."""
-        key = f"{fault.nodes[0]}~"
-        if key in self.sim.machines:
+        """Somebody copied a disk to another machine: its hardware differs, so it starts without a state.
+
+        The two hear each other; or they do not; or each hears one half of the fleet.
+        """
+        sim, name = self.sim, fault.nodes[0]
+        key = f"{name}~"
+        if key in sim.machines:
             return
-        self.sim.machines[key] = Machine(key=key, name=fault.nodes[0], fleet=self.sim.fleet)
-        self.sim.start(key)
-        self._then(fault.seconds, lambda: self._remove(key))
+        sim.machines[key] = Machine(key=key, name=name, fleet=sim.machines[name].fleet)
+        others = [other for other in sorted(sim.machines) if other not in (name, key)]
+        apart: set[Pair] = {(name, key), (key, name)} if fault.size > 0.0 else set()
+        if fault.size > 1.0:
+            ends = {*itertools.product((name,), others[::2]), *itertools.product((key,), others[1::2])}
+            apart |= ends | {(b, a) for a, b in ends}
+        sim.cuts |= apart
+        sim.start(key)
+        self.scene.then(fault.seconds, lambda: self._remove(key))
+        self.scene.then(fault.seconds, lambda: sim.cuts.difference_update(apart))
 
     def _remove(self, key: str) -> None:
         if key in self.sim.machines:
             self.sim.crash(key)
             del self.sim.machines[key]
 
-    def _electorate(self, fault: Fault) -> None:
-        """A node is restarted with a fleet file that names other electors, and later with the right one."""
-        machine = self._machine(fault)
-        names = tuple(node.name for node in self.sim.fleet.nodes)
-        count = self._rng.randint(1, len(names))
-        others = tuple(sorted(self._rng.sample(names, count)))
-        self._restart_with(machine, others if others != self.sim.fleet.electors else names[:1])
-        self._then(fault.seconds, lambda: self._restart_with(machine, self.sim.fleet.electors))
-
-    def _restart_with(self, machine: Machine, electors: tuple[NodeId, ...]) -> None:
-        self.sim.crash(machine.key)
-        fleet = self.sim.fleet
-        machine.fleet = fleet if electors == fleet.electors else replace(fleet, electors=electors)
-        self.sim.start(machine.key)
-
     def _worker(self, fault: Fault) -> None:
-        machine, is_final = self._machine(fault), fault.size > 0.0
+        machine, is_final = self.scene.machine(fault), fault.size > 0.0
         for task in tuple(machine.workers):
             self.sim.work.fail(machine, task, is_final=is_final)
             if is_final:
@@ -384,7 +317,7 @@ class Stage:
 
     def _retune(self, fault: Fault) -> None:
         """An operator changes weights, and looks at the status."""
-        machine, task = self._machine(fault), self._rng.choice(self.sim.fleet.tasks)
+        machine, task = self.scene.machine(fault), self._rng.choice(self.sim.fleet.tasks)
         number = len(self._requests) + 1
         cpu = fault.size + number / 1024  # every command has weights of its own
         command = SetWeights(task=task.name, cpu=cpu, memory=1.0 - cpu, network=0.0)
@@ -397,31 +330,23 @@ class Stage:
 
     def _drain(self, fault: Fault) -> None:
         """The daemon is told to stop, hands over for a moment, leaves, and comes back later."""
-        machine = self._machine(fault)
+        machine = self.scene.machine(fault)
         self.sim.deliver(machine, ev.StopRequested())
-        self._then(STOP_S, lambda: self.sim.crash(machine.key))
-        self._then(STOP_S + fault.seconds, lambda: self.sim.start(machine.key))
+        self.scene.then(STOP_S, lambda: self.sim.crash(machine.key))
+        self.scene.then(STOP_S + fault.seconds, lambda: self.sim.start(machine.key))
 
-    def _table(self) -> dict[str, Callable[[Fault], None]]:
+    def _table(self) -> dict[str, Carry]:
         return {
-            **dict.fromkeys(("duplicate", "spike", "mutate", "forge", "replay"), self._air),
-            **dict.fromkeys(("cut", "one_way", "partial"), self._cut),
             **dict.fromkeys(("kill", "power"), self._kill),
-            **dict.fromkeys(("damage", "wipe"), self._lose_state),
             **dict.fromkeys(("clock_rate", "clock_jump"), self._clock),
-            "loss": self._loss,
-            "delay": self._delay,
-            "version": self._version,
             "pause": self._pause,
             "blackout": self._blackout,
             "storm": self._storm,
             "prefix": self._prefix_crashes,
             "slow": self._slow,
-            "slow_disk": self._slow_disk,
-            "full_disk": self._full_disk,
             "slew": self._slew,
-            "twin": self._twin,
-            "electorate": self._electorate,
+            **dict.fromkeys(("twin", "apart"), self._twin),
+            "freeze": self._freeze,
             "worker": self._worker,
             "retune": self._retune,
             "load": self._set_load,

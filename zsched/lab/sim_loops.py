@@ -112,10 +112,29 @@ class Loops:
             self.later(seconds, self.unpause, machine, machine.life)
 
     def unpause(self, machine: Machine, life: int) -> None:
-        """The loop goes on with what has queued up."""
-        if machine.life == life and machine.is_paused:
-            machine.is_paused = False
-            self.pump_later(machine)
+        """The loop goes on with what has queued up; a frozen machine's clock goes on where it stood."""
+        if machine.life != life or not machine.is_paused:
+            return
+        machine.is_paused = False
+        if machine.frozen_at is not None:
+            machine.clock.change(self.now, jump_s=machine.frozen_at - self.now)
+            machine.frozen_at = None
+            self.thawed(machine)
+            self.rearm(machine)
+        self.pump_later(machine)
+
+    def freeze(self, machine: Machine, seconds: float) -> None:
+        """The machine stands still as a whole: loop, workers, clock."""
+        if machine.node is not None and not machine.is_paused:
+            machine.frozen_at = self.now
+            self.frozen(machine)
+            self.pause(machine, seconds)
+
+    def frozen(self, machine: Machine) -> None:
+        """A machine has begun to stand still."""
+
+    def thawed(self, machine: Machine) -> None:
+        """A machine goes on after it stood still."""
 
     def pump_later(self, machine: Machine) -> None:
         """Come to what has queued up, as soon as the machine is free."""

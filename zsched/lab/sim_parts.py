@@ -20,11 +20,12 @@ from zsched.errors import WireError
 
 GENERATION_STEP = 2**32
 """Revision and epoch of generation G start at G times this."""
+PAST_KEPT = 64
 
 
 @dataclass(slots=True)
 class Clock:
-    """A machine's CLOCK_BOOTTIME against true time; it may run fast, slow or jump forward, never back."""
+    """A machine's CLOCK_BOOTTIME against true time; it may run fast, slow, jump ahead or stand still, never go back."""
 
     rate: float = 1.0
     is_true: bool = True
@@ -60,7 +61,11 @@ class Disk:
     """What ``state`` holds, by task."""
     is_broken: bool = False
     """Full or read-only: it refuses every write."""
+    past: deque[bytes] = field(default_factory=lambda: deque(maxlen=PAST_KEPT))
+    """What the file held before: what a backup may bring back."""
     _unsynced: DurableState | None = None
+    _in_cache: int | None = None
+    """How many of the newest contents only the cache of a lying disk holds; ``None``: it does not lie."""
 
     def write(self, state: DurableState) -> None:
         """The new file is written and renamed, but not synced yet."""
@@ -69,6 +74,9 @@ class Disk:
     def sync(self) -> None:
         """What was written survives a power cut from now on."""
         if self._unsynced is not None:
+            if self.content is not None:
+                self.past.append(self.content)
+                self._in_cache = None if self._in_cache is None else self._in_cache + 1
             self.state, self._unsynced = self._unsynced, None
             self.content = wire.encode_state(self.state)
             self._index()
@@ -78,6 +86,31 @@ class Disk:
         if rng.random() < 0.5:
             self._unsynced = None
         self.sync()
+
+    def begin_to_lie(self) -> None:
+        """From now on a sync returns before the platter has anything."""
+        self._in_cache = 0
+
+    def forget(self, rng: Random) -> bool:
+        """The power of a lying disk went: some of the newest writes are lost. Whether any is; it lies no more."""
+        lost, self._in_cache = rng.randint(0, self._in_cache or 0), None
+        return self._go_back(lost)
+
+    def restore(self, rng: Random) -> bool:
+        """A backup is brought back, of any moment of this generation. Whether it is older than what was there."""
+        return self._go_back(rng.randint(0, len(self.past)))
+
+    def _go_back(self, writes: int) -> bool:
+        """To what the file held so many writes ago."""
+        self._unsynced = None
+        if not 0 < writes <= len(self.past):
+            return False
+        self.content = self.past[-writes]
+        for _ in range(writes):
+            self.past.pop()
+        self.state = self.read()
+        self._index()
+        return True
 
     def damage(self, rng: Random) -> None:
         """The card is worn out: the file is cut short, or one of its bits is another one."""
@@ -95,7 +128,8 @@ class Disk:
 
     def wipe(self) -> None:
         """The disk is new."""
-        self.state = self.content = self._unsynced = None
+        self.state = self.content = self._unsynced = self._in_cache = None
+        self.past.clear()
         self._index()
 
     def _index(self) -> None:
@@ -135,6 +169,10 @@ class Machine:
     inbox: deque[ev.Event] = field(default_factory=deque)
     busy_until: float = -math.inf
     is_paused: bool = False
+    frozen_at: float | None = None
+    """Since when the whole machine stands still, its clock too; ``None``: it does not."""
+    late_until: float = -math.inf
+    """By its own clock: leases until then were begun before it last stood still."""
     is_pumping: bool = False
     event_s: float = 0.0
     """What handling one event costs."""
@@ -154,6 +192,7 @@ class Machine:
         self.roles.clear()
         self.inbox.clear()
         self.busy_until, self.is_paused, self.wake_at = -math.inf, False, math.inf
+        self.frozen_at = None
 
 
 def blank_state(machine: Machine, incarnation: int, generation: int) -> DurableState:

@@ -17,6 +17,7 @@ from zsched.core.fleet import Fleet, NodeSpec, OnIsolation, Standby, TaskSpec, W
 from zsched.core.model import Aggregate, NodeId, NodeKind, Tuning, Weights
 from zsched.core.timing import WAN, WIFI, WIRED
 from zsched.lab.sim_clocks import clock_faults
+from zsched.lab.sim_files import CHANGES
 
 SECONDS = 30.0
 """Virtual seconds of one schedule: faults in the first half, then quiet."""
@@ -53,27 +54,35 @@ class Plan:
     fleet: Fleet
     faults: tuple[Fault, ...]
     seconds: float = SECONDS
+    generation: int = 0
+    """The generation that the fleet begins with."""
 
 
-def plan(seed: int, *, nodes: int | None = None, seconds: float = SECONDS) -> Plan:
+def plan(seed: int, *, nodes: int | None = None, seconds: float = SECONDS, kinds: frozenset[str] | None = None) -> Plan:
     """The schedule of a seed.
 
     Args:
         seed: any whole number.
         nodes: the fleet's size, 3 to 7 (``None``: by seed).
         seconds: virtual seconds; faults begin in the first half only.
+        kinds: which of `LATER` there may be (``None``: all but `PENDING`).
     """
-    rng = Random(f"schedule {seed}")
+    rng, later, until = Random(f"schedule {seed}"), Random(f"later {seed}"), seconds / 2
     fleet = _fleet(rng, nodes or rng.randint(MIN_NODES, MAX_NODES))
-    if seed % LEASE_EVERY == LEASE_OFFSET:
+    is_leased = seed % LEASE_EVERY == LEASE_OFFSET
+    if is_leased:
         fleet = _leased(rng, fleet)
-        faults = _lease_faults(rng, fleet, seconds / 2)
-    else:
-        faults = _faults(rng, fleet, seconds / 2)
-    # A generator of its own: the rest of the schedule stays as it is.
-    for at, name, slewed_s, size in clock_faults(Random(f"clocks {seed}"), fleet, seconds / 2):
+    kinds = frozenset(LATER) - PENDING if kinds is None else kinds
+    faults = (_lease_faults if is_leased else _faults)(rng, fleet, until)
+    fleet, generation = _varied(later, fleet)
+    faults += _later_faults(later, fleet, until, kinds, fleet.tasks[0].candidates if is_leased else ())
+    for at, name, slewed_s, size in clock_faults(Random(f"clocks {seed}"), fleet, until):
         faults += (Fault(at=at, kind="slew", nodes=(name,), seconds=slewed_s, size=size),)
-    return Plan(seed=seed, fleet=fleet, faults=faults, seconds=seconds)
+    if is_leased and "rollout" in kinds and later.random() < 0.25:
+        fleet, rollout = _made_exclusive(later, fleet)
+        faults += (rollout,)
+    faults = tuple(sorted(faults, key=lambda fault: (fault.at, fault.kind, fault.nodes)))
+    return Plan(seed=seed, fleet=fleet, faults=faults, seconds=seconds, generation=generation)
 
 
 # --- fleets ----------------------------------------------------------------------------------------------------------
@@ -144,6 +153,15 @@ def _leased(rng: Random, fleet: Fleet) -> Fleet:
     return replace(fleet, tasks=tasks, timing=quick)
 
 
+def _varied(rng: Random, fleet: Fleet) -> tuple[Fleet, int]:
+    """Some fleets are in a later generation; in some the edges alone are electors, so that no robot is needed."""
+    generation = rng.choice((0, 0, 1, 2))
+    edges = tuple(node.name for node in fleet.nodes if node.kind is NodeKind.EDGE)
+    if edges and rng.random() < 0.15:
+        fleet = replace(fleet, electors=edges)
+    return fleet, generation
+
+
 # --- faults ----------------------------------------------------------------------------------------------------------
 
 Maker = Callable[[Random, Fleet, float], list[Fault]]
@@ -174,6 +192,30 @@ def _lease_faults(rng: Random, fleet: Fleet, until: float) -> tuple[Fault, ...]:
         busy = rng.choice(candidates)
         found += [Fault(at=at, kind="load", nodes=(name,), size=0.95 if name == busy else 0.05) for name in candidates]
     return tuple(sorted(found, key=lambda fault: (fault.at, fault.kind, fault.nodes)))
+
+
+def _made_exclusive(rng: Random, fleet: Fleet) -> tuple[Fleet, Fault]:
+    """The task becomes exclusive only on the way, node by node."""
+    tasks = tuple(replace(task, exclusive=False) for task in fleet.tasks)
+    rollout = Fault(
+        at=rng.uniform(1.0, 5.0), kind="rollout", nodes=(fleet.nodes[0].name,), seconds=rng.uniform(1.0, 30.0)
+    )
+    return replace(fleet, tasks=tasks), rollout
+
+
+def _later_faults(
+    rng: Random, fleet: Fleet, until: float, kinds: frozenset[str], candidates: tuple[NodeId, ...]
+) -> tuple[Fault, ...]:
+    """A random subset of `LATER`, in every second schedule; with chances of their own, so that no other fault moves."""
+    share = rng.choice((0.0, 0.0, 0.1, 0.25))
+    found: list[Fault] = []
+    for kind, make in LATER.items():
+        is_likely = kind == "amnesia" and not set(fleet.electors) & set(fleet.voters)  # they remember without robots
+        is_chosen, chance = rng.random() < (0.5 if is_likely else share), Random(rng.random())
+        if is_chosen and kind in kinds:
+            faults = make(chance, fleet, until)
+            found += [_at_candidate(chance, fault, candidates) for fault in faults] if candidates else faults
+    return tuple(found)
 
 
 def _at_candidate(rng: Random, fault: Fault, candidates: tuple[NodeId, ...]) -> Fault:
@@ -238,6 +280,11 @@ def _cuts(kind: str, fewest: int, most: int) -> Maker:
     return make
 
 
+def _bursts(rng: Random, fleet: Fleet, until: float) -> list[Fault]:
+    """Some nodes' links deliver in bursts."""
+    return [replace(fault, size=rng.choice((0.05, 0.2, 0.6))) for fault in _cuts("burst", 1, 3)(rng, fleet, until)]
+
+
 def _clocks(rng: Random, fleet: Fleet, until: float) -> list[Fault]:
     """Every clock runs at its own rate: within the lease's bound, or far beyond it where nothing is exclusive."""
     is_leased = any(task.exclusive for task in fleet.tasks)
@@ -297,3 +344,23 @@ MAKERS: dict[str, Maker] = {
     "retune": _one_node("retune", 6, 1.0, (0.2, 0.4, 0.6, 0.8)),
     "drain": _one_node("drain", 2, 3.0),
 }
+LATER: dict[str, Maker] = {
+    "stall": _cuts("stall", 1, 3),
+    "burst": _bursts,
+    "data": _cuts("data", 1, 4),
+    "apart": _one_node("apart", 1, 8.0, (1.0, 2.0)),
+    "fsync": _one_node("slow_disk", 2, 8.0, (0.5, 1.5)),
+    "rollback": _one_node("rollback", 2, 2.0),
+    "lie": _one_node("lie", 2, 2.0, (0.3, 1.0, 3.0)),
+    "amnesia": _one_node("amnesia", 1, 2.0),
+    "freeze": _one_node("freeze", 3, 5.0),
+    "rollout": _one_node("rollout", 2, 8.0, tuple(float(number) for number in range(len(CHANGES)))),
+    "generation": _one_node("generation", 1, 8.0),
+}
+"""Faults that came later, drawn apart from `MAKERS`."""
+PENDING: frozenset[str] = frozenset({"rollback", "lie", "amnesia", "rollout"})
+"""Faults whose mend has not landed: only ``--with`` plays them.
+
+Seeds that are violated without it, each with ``--with`` its fault: rollback, lie: 5, 64, 172; amnesia: 280, 320, 371;
+rollout of `exclusive`: 958, 1270; of a shorter lease: 1114.
+"""

@@ -57,6 +57,8 @@ class Work:
         self.plans: dict[tuple[NodeId, TaskId], RoutePlan] = {}
         self.working: dict[TaskId, tuple[NodeId, float]] = {}
         """{exclusive task: (who works, until when at most)}."""
+        self._free: set[tuple[str, TaskId]] = set()
+        """(machine, task) of the workers that work without a lease, or have not stopped yet."""
         self._begun: Counter[tuple[str, TaskId]] = Counter()
         """{(machine, task): how often its worker was made active}: one that is again before it has stopped works on."""
         self.stop_s: tuple[float, ...] = WORKER_STOP_S
@@ -142,14 +144,10 @@ class Work:
 
     def _set_role(self, machine: Machine, role: Role) -> None:
         """The worker follows its role; an exclusive one works only under its lease, and says when it has stopped."""
-        now = self._sim.now
         before = machine.roles.get(role.task)
         machine.roles[role.task] = role
         self._note_unleased(machine, before, role)
-        until = 0.0 if role.lease_until_s is None else machine.clock.true(role.lease_until_s)
-        if until > now:
-            self._sim.invariants.on_worked(machine, role.task, role.epoch, now, until)
-            self.working[role.task] = (machine.key, until)
+        self._note_leased(machine, role)
         was_active = before is not None and before.role is WorkerRole.ACTIVE
         if role.role is WorkerRole.ACTIVE and not was_active:
             self._begun[machine.key, role.task] += 1
@@ -158,23 +156,45 @@ class Work:
         begun = self._begun[machine.key, role.task]
         self._sim.later(self._sim.rng.choice(self.stop_s), self._stopped, machine, machine.life, before, begun)
 
+    def _note_leased(self, machine: Machine, role: Role) -> None:
+        """A worker works until its lease ends, by its machine's clock."""
+        until = 0.0 if role.lease_until_s is None else machine.clock.true(role.lease_until_s)
+        if until > self._sim.now:
+            self._sim.invariants.on_worked(machine, role, self._sim.now, until)
+            self.working[role.task] = (machine.key, until)
+
     def _note_unleased(self, machine: Machine, before: Role | None, role: Role) -> None:
         """A worker that needs no lease works until it has heard that it is idle, or needs one."""
         sim = self._sim
         if _is_free(role):
             if before is None or not _is_free(before) or before.epoch != role.epoch:
-                sim.invariants.on_worked(machine, role.task, role.epoch, sim.now, math.inf, is_leased=False)
+                sim.invariants.on_worked(machine, role, sim.now, math.inf)
+                self._free.add((machine.key, role.task))
         elif before is not None and _is_free(before):
             sim.later(sim.rng.choice(self.stop_s), self._stopped_free, machine, machine.life, role.task)
 
     def _stopped_free(self, machine: Machine, life: int, task: TaskId) -> None:
         if machine.life == life and not _is_free(machine.roles[task]):
+            self._free.discard((machine.key, task))
             self._sim.invariants.checker.stop_working(machine.key, task, self._sim.now, life)
+
+    def freeze(self, machine: Machine) -> None:
+        """The machine stands still, and its workers with it."""
+        for task in machine.roles:
+            self._sim.invariants.checker.stop_working(machine.key, task, self._sim.now, machine.life)
+
+    def thaw(self, machine: Machine, lease_s: float) -> None:
+        """It goes on: what is left of a lease by its own clock lies later in true time."""
+        machine.late_until = machine.clock.local(self._sim.now) + lease_s
+        for role in machine.roles.values():
+            self._note_unleased(machine, None, role)
+            self._note_leased(machine, role)
 
     def end(self, machine: Machine) -> None:
         """A daemon ends, and its workers with it; of one with a lease others cannot know."""
-        for task, role in machine.roles.items():
-            if _is_free(role):
+        for task in machine.roles:
+            if (machine.key, task) in self._free:
+                self._free.discard((machine.key, task))
                 self._sim.invariants.checker.stop_working(machine.key, task, self._sim.now, machine.life)
 
     def _stopped(self, machine: Machine, life: int, role: Role, begun: int) -> None:

@@ -19,11 +19,11 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from zsched.lab.sim_faults import Result, play
-from zsched.lab.sim_swarm import MAX_NODES, MIN_NODES, SECONDS, Plan, plan
+from zsched.lab.sim_swarm import LATER, MAX_NODES, MIN_NODES, PENDING, SECONDS, Plan, plan
 
 CHUNK = 10
 STORIES_SHOWN = 40
@@ -43,11 +43,14 @@ class Job:
     seconds: float = SECONDS
     keep: frozenset[int] | None = None
     calm_at: float | None = None
+    pending: frozenset[str] = frozenset()
+    """Faults of `PENDING` that there may be all the same."""
 
     @property
     def plan(self) -> Plan:
         """Its schedule."""
-        return plan(self.seed, nodes=self.nodes, seconds=self.seconds)
+        kinds = frozenset(LATER) - PENDING | self.pending
+        return plan(self.seed, nodes=self.nodes, seconds=self.seconds, kinds=kinds)
 
     @property
     def command(self) -> str:
@@ -57,6 +60,8 @@ class Job:
             words.append(f"--nodes {self.nodes}")
         if self.seconds != SECONDS:
             words.append(f"--seconds {self.seconds:g}")
+        if self.pending:
+            words.append(f"--with {','.join(sorted(self.pending))}")
         if self.keep is not None:
             words.append(f"--keep {','.join(map(str, sorted(self.keep))) or 'none'}")
         if self.calm_at is not None:
@@ -141,7 +146,7 @@ def _end_at_once() -> None:
 def shrink(job: Job) -> Job:
     """The smallest job found that is still violated: faults left out, then an earlier end of the faults."""
     keep = frozenset(range(len(job.plan.faults))) if job.keep is None else job.keep
-    best = Job(seed=job.seed, nodes=job.nodes, seconds=job.seconds, keep=keep, calm_at=job.calm_at)
+    best = replace(job, keep=keep)
     size = max(len(keep) // 2, 1)
     while True:
         smaller = _without_some(best, size)
@@ -160,7 +165,7 @@ def _without_some(job: Job, size: int) -> Job | None:
     indices = sorted(job.keep)
     for start in range(0, len(indices), size):
         less = job.keep - frozenset(indices[start : start + size])
-        smaller = Job(seed=job.seed, nodes=job.nodes, seconds=job.seconds, keep=less, calm_at=job.calm_at)
+        smaller = replace(job, keep=less)
         if smaller.play().violation:
             return smaller
     return None
@@ -170,7 +175,7 @@ def _shorter(job: Job) -> Job:
     until = job.seconds / 2 if job.calm_at is None else job.calm_at
     step = until / 2
     while step > 0.5:
-        shorter = Job(seed=job.seed, nodes=job.nodes, seconds=job.seconds, keep=job.keep, calm_at=until - step)
+        shorter = replace(job, calm_at=until - step)
         if shorter.play().violation:
             job, until = shorter, until - step
         step /= 2
@@ -197,6 +202,14 @@ def _arguments(arguments: list[str] | None) -> argparse.Namespace:
         "--resume", type=Path, help="go on behind the last seed in this file, and keep the totals there"
     )
     parser.add_argument("--shrink", action="store_true", help="make each failing schedule smaller")
+    parser.add_argument(
+        "--with",
+        dest="pending",
+        type=lambda text: [*filter(None, text.split(","))],
+        default=(),
+        metavar="KINDS",
+        help=f"faults that are left out until their mend has landed: {', '.join(sorted(PENDING)) or 'none today'}",
+    )
     parser.add_argument("--keep", help="only these faults of the schedule (indices with commas, or 'none')")
     parser.add_argument("--calm-at", type=float, help="end the faults after so many seconds")
     parser.add_argument("--story", action="store_true", help="print everything that happened")
@@ -208,7 +221,14 @@ def _jobs(given: argparse.Namespace, first: int) -> Iterator[Job]:
     if given.keep is not None:
         keep = frozenset(int(part) for part in given.keep.split(",") if part != "none")
     for seed in range(first, first + given.runs):
-        yield Job(seed=seed, nodes=given.nodes, seconds=given.seconds, keep=keep, calm_at=given.calm_at)
+        yield Job(
+            seed=seed,
+            nodes=given.nodes,
+            seconds=given.seconds,
+            keep=keep,
+            calm_at=given.calm_at,
+            pending=frozenset(given.pending),
+        )
 
 
 def _explain(job: Job, result: Result, *, is_shrinking: bool) -> None:

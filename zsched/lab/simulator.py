@@ -55,6 +55,8 @@ class Simulator(Links):
 
     fleet: Fleet
     seed: int
+    generation: int = 0
+    """The generation that the fleet begins with."""
     load: Load = idle
     cut_batch: Cut | None = None
     broken_disks: set[NodeId] = field(default_factory=set)
@@ -78,10 +80,12 @@ class Simulator(Links):
         self.work = Work(self)
         for spec in self.fleet.nodes:
             machine = self.machines[spec.name] = Machine(key=spec.name, name=spec.name, fleet=self.fleet)
-            self.initialise(machine)
+            self.initialise(machine, generation=self.generation)
 
     def initialise(self, machine: Machine, *, incarnation: int = 0, generation: int = 0) -> None:
         """`zsched init`: a blank durable state, which says that this name has never voted."""
+        machine.disk.wipe()
+        self.invariants.expect(generation, machine.fleet.electors)
         machine.disk.write(blank_state(machine, incarnation, generation))
         machine.disk.sync()
 
@@ -216,6 +220,14 @@ class Simulator(Links):
         sample = DeviceSample(cpu_cores=CORES, cpu_used_cores=cpu, memory_mb=MEMORY_MB, memory_used_mb=memory)
         self.later(self.fleet.timing.sample_s, self._sample, machine, life)
         self.deliver(machine, ev.ProfileSampled(device=sample))
+
+    def frozen(self, machine: Machine) -> None:
+        """Its workers stand still with it."""
+        self.work.freeze(machine)
+
+    def thawed(self, machine: Machine) -> None:
+        """Its workers go on by a clock that stood still."""
+        self.work.thaw(machine, self.fleet.timing.lease_s)
 
     # --- events ------------------------------------------------------------------------------------------------------
 

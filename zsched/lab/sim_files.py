@@ -1,0 +1,75 @@
+"""What two fleet files of one fleet may differ in: one function for each, by chance.
+
+Knows: fleet files. Does not know: who has which (`zsched.lab.sim_rollout`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from random import Random
+
+from zsched.core.fleet import Fleet, OnIsolation, TaskSpec
+from zsched.core.model import Weights
+from zsched.core.timing import PROFILES
+
+Change = Callable[[Random, Fleet], Fleet]
+
+
+def other_electors(rng: Random, fleet: Fleet) -> Fleet:
+    """The same fleet file with an electorate that differs."""
+    names = tuple(node.name for node in fleet.nodes)
+    others = tuple(sorted(rng.sample(names, rng.randint(1, len(names)))))
+    return replace(fleet, electors=others if others != fleet.electors else names[:1])
+
+
+def _with_task(fleet: Fleet, change: Callable[[TaskSpec], TaskSpec]) -> Fleet:
+    return replace(fleet, tasks=(change(fleet.tasks[0]), *fleet.tasks[1:]))
+
+
+def _other_exclusive(_rng: Random, fleet: Fleet) -> Fleet:
+    """Not of a task that a robot which is cut off may work at alone: that has to be changed first."""
+    is_held = fleet.tasks[0].on_isolation is OnIsolation.HOLD
+    return _with_task(fleet, lambda task: replace(task, exclusive=task.exclusive is not is_held))
+
+
+def _other_timing(rng: Random, fleet: Fleet) -> Fleet:
+    timing = PROFILES[rng.choice([name for name in PROFILES if name != fleet.timing.name])]
+    decide_s = max(timing.decide_s, fleet.timing.decide_s)
+    return replace(fleet, timing=replace(timing, sample_s=fleet.timing.sample_s, decide_s=decide_s))
+
+
+def _other_weights(rng: Random, fleet: Fleet) -> Fleet:
+    cpu = rng.choice((0.0, 0.25, 0.75, 1.0))
+    weights = Weights(cpu=cpu, memory=1.0 - cpu, network=0.0)
+    return _with_task(fleet, lambda task: replace(task, tuning=replace(task.tuning, weights=weights)))
+
+
+def _other_candidates(rng: Random, fleet: Fleet) -> Fleet:
+    names = [node.name for node in fleet.nodes]
+    chosen = tuple(sorted(rng.sample(names, rng.randint(2, len(names)))))
+    return _with_task(fleet, lambda task: replace(task, candidates=chosen))
+
+
+def _other_limits(rng: Random, fleet: Fleet) -> Fleet:
+    moves, drain_s = rng.choice((2, 60)), rng.choice((0.1, 1.0, 2.0))
+    return _with_task(fleet, lambda task: replace(task, max_moves_per_minute=moves, drain_s=drain_s))
+
+
+def _other_tasks(_rng: Random, fleet: Fleet) -> Fleet:
+    """A second task comes, or goes."""
+    if len(fleet.tasks) > 1:
+        return replace(fleet, tasks=fleet.tasks[1:])
+    return replace(fleet, tasks=(replace(fleet.tasks[0], name="extra"), *fleet.tasks))
+
+
+CHANGES: dict[str, Change] = {
+    "exclusive": _other_exclusive,
+    "timing": _other_timing,
+    "weights": _other_weights,
+    "candidates": _other_candidates,
+    "electors": other_electors,
+    "limits": _other_limits,
+    "tasks": _other_tasks,
+}
+"""In the order of a fault's size."""
