@@ -169,3 +169,17 @@ def test_the_task_is_everybody_s_again_once_all_have_a_file_that_says_so() -> No
     machine = rollout.sim.machines[rollout.owner() or ""]
     assert machine.roles[TASK].lease_until_s is None
     assert rollout.problems("robot1") == ""
+
+
+def test_an_owner_that_needs_a_lease_no_more_waits_for_the_one_of_its_life_before_however_long_it_was() -> None:
+    """Found by the simulator (seed 594): a file with shorter leases in which the task is not exclusive either."""
+    rollout = Rollout(1, replace(NEW, timing=replace(NEW.timing, lease_s=3.0)))
+    owner = rollout.owner() or ""
+    names = [node.name for node in NEW.nodes]
+    rollout.sim.crash(owner)
+    for name in names:
+        rollout.sim.crash(name)
+        rollout.sim.machines[name].fleet = OLD
+    rollout.sim.start()
+    rollout.run(8.0)  # the simulator raises when two lives of the owner work at once
+    assert rollout.sim.machines[rollout.owner() or ""].roles[TASK].lease_until_s is None

@@ -261,7 +261,7 @@ class Leases:
         incarnation: of this daemon.
         standing: {task: the newest persisted value, or ``None``}; empty when this node is no elector.
         now: monotonic seconds.
-        granted_s: how long a lease may last that this elector granted in a life before (0: as long as today's).
+        granted_s: how long a lease may last from this node's life before (0: as long as today's).
     """
 
     fleet: Fleet
@@ -282,15 +282,19 @@ class Leases:
     def __post_init__(self) -> None:
         self.terms = lease_terms(self.fleet)
         self._granters = {}
-        until = self.now + hold_s(max(self.fleet.timing.lease_s, self.granted_s))
         for task in self.fleet.tasks:
             value = self.standing.get(task.name)
             is_leased = task.exclusive or (value is not None and value.leased)
             if is_leased and task.name in self.standing:
-                self._watch(task.name, None if value is None else value.owner, until)
+                self._watch(task.name, None if value is None else value.owner, self.over_at)
 
     def _watch(self, task: TaskId, standing: NodeId | None, until: float) -> None:
         self._granters[task] = Granter(task=task, lease_s=self.fleet.timing.lease_s, until=until, standing=standing)
+
+    @property
+    def over_at(self) -> float:
+        """When whatever was granted, to or by a life of this node before, is over."""
+        return self.now + hold_s(max(self.fleet.timing.lease_s, self.granted_s))
 
     @property
     def terms_told(self) -> str:

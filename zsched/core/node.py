@@ -136,7 +136,7 @@ class Node:
         self._introductions = Introductions()
         self._hangs = HangWatch(fleet)
         self._tenure = Tenure(fleet, me, self.agreement.leases, self.executors)
-        self.sealing = Sealing(fleet, me, self.executors, now)
+        self.sealing = Sealing(fleet, me, self.executors, self.agreement.leases.over_at)
         self._beat_at = self._turn_at = now
         self._beat_sequence = 0
         self.loop_lag_s = 0.0

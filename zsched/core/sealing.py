@@ -23,7 +23,6 @@ from dataclasses import dataclass, field
 
 from zsched.core.executor import Executor
 from zsched.core.fleet import Fleet, TaskSpec, fleet_hash, lease_terms
-from zsched.core.lease import hold_s
 from zsched.core.messages import Learnt
 from zsched.core.model import Allocation, Beat, NodeId, TaskId
 from zsched.core.register import SetLeased
@@ -38,7 +37,8 @@ class Sealing:
     fleet: Fleet
     me: NodeId
     executors: Mapping[TaskId, Executor]
-    started_at: float
+    over_at: float
+    """When a lease of an earlier life of this node is over."""
     _files: dict[NodeId, str] = field(default_factory=dict)
     """{peer that was heard: its fleet file}."""
     _answers: dict[NodeId, Learnt] = field(default_factory=dict)
@@ -62,7 +62,7 @@ class Sealing:
 
         What an earlier life of its own was granted is over before it lets its worker do without a lease.
         """
-        is_young = now < self.started_at + hold_s(self.fleet.timing.lease_s)
+        is_young = now < self.over_at
         return [
             (spec.name, SetLeased(base_revision=values[spec.name].revision, leased=spec.exclusive))
             for spec in self._open(values)

@@ -358,7 +358,7 @@ LATER: dict[str, Maker] = {
     "generation": _one_node("generation", 1, 8.0),
 }
 """Faults that came later, drawn apart from `MAKERS`."""
-PENDING: frozenset[str] = frozenset({"rollback", "lie", "amnesia", "rollout"})
+PENDING: frozenset[str] = frozenset({"rollback", "lie", "amnesia"})
 """Faults whose mend has not landed: only ``--with`` plays them.
 
 Seeds that are violated without it, each with ``--with`` its fault: rollback, lie: 5, 64, 172; amnesia: 280, 320, 371;
