@@ -14,7 +14,8 @@ from zsched.core.workers import runs_worker
 def shared_memory_objection(fleet: Fleet, me: NodeSpec) -> str | None:
     """Why shared memory stays off although the fleet file says ``auto``; ``""``: it is on; ``None``: it says ``off``.
 
-    A session uses it for all its large puts or for none, so one stream of class ``reliable`` keeps it off.
+    A session uses it for all its large puts or for none, so one stream of class ``reliable`` keeps it off: what a relay
+    keeps to send it again would be the sender's, who takes it back from a holder that stood still for 0.1 s.
     """
     if fleet.shared_memory is SharedMemory.OFF:
         return None
