@@ -27,6 +27,7 @@ from zsched.lab.sim_swarm import LATER, MAX_NODES, MIN_NODES, PENDING, SECONDS, 
 
 CHUNK = 10
 STORIES_SHOWN = 40
+QUANTILES = (50, 90, 99)
 PROGRESS_EVERY = 500
 GARBAGE = (100_000, 10, 10)
 """So many new values before the collector looks at them."""
@@ -82,7 +83,8 @@ class Totals:
     events: int = 0
     generations: int = 0
     """Schedules in which too many electors lost their state: the operator started a new generation."""
-    slowest_s: float = 0.0
+    settled_s: dict[str, list[float]] = field(default_factory=dict)
+    """{timing profile: how long each of its schedules took to come to rest}."""
     violations: dict[str, str] = field(default_factory=dict)
     """{seed: what was violated}."""
     faults: Counter[str] = field(default_factory=Counter)
@@ -95,7 +97,7 @@ class Totals:
         self.faults += result.faults
         self.generations += "new generation" in result.faults
         if result.settled_s is not None:
-            self.slowest_s = max(self.slowest_s, result.settled_s)
+            self.settled_s.setdefault(job.plan.fleet.timing.name, []).append(round(result.settled_s, 3))
         if result.violation:
             self.violations[str(job.seed)] = result.violation
 
@@ -231,6 +233,14 @@ def _jobs(given: argparse.Namespace, first: int) -> Iterator[Job]:
         )
 
 
+def _spread(times: list[float]) -> str:
+    """Quantiles of some times."""
+    ranked = sorted(times)
+    at = {share: ranked[min(len(ranked) * share // 100, len(ranked) - 1)] for share in QUANTILES}
+    found = ", ".join(f"p{share} {value:.2f}" for share, value in at.items())
+    return f"{found}, most {ranked[-1]:.2f} s, of {len(ranked)}"
+
+
 def _explain(job: Job, result: Result, *, is_shrinking: bool) -> None:
     print(f"\nseed {job.seed}: {result.violation}\n  again: {job.command}")
     if is_shrinking:
@@ -270,8 +280,10 @@ def main(arguments: list[str] | None = None) -> int:
     played, took_s = totals.schedules - before, time.monotonic() - began_at
     counts = ", ".join(f"{name} {count}" for name, count in sorted(totals.faults.items()))
     print(f"faults: {counts}")
-    print(f"{totals.events} events; slowest to come to rest: {totals.slowest_s:.2f} s;", end=" ")
-    print(f"{totals.generations} new generations; {60 * played / max(took_s, 1e-9):.0f} schedules a minute")
+    for name, times in sorted(totals.settled_s.items()):
+        print(f"came to rest, {name}: {_spread(times)}")
+    pace = 60 * played / max(took_s, 1e-9)
+    print(f"{totals.events} events; {totals.generations} new generations; {pace:.0f} schedules a minute")
     print(f"{played} schedules, {violations} violations")
     return 1 if violations else 0
 

@@ -1,0 +1,153 @@
+"""Mutants: what is changed, what is left alone, and that the command tells a killed one from a survivor."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from zsched.lab.mutant_tests import KILLED, SURVIVED, TIMEOUT
+from zsched.lab.mutants import Mutant, mutants_of, mutated
+from zsched.lab.mutate import CORE, Results, Verdict, choose, score, table
+
+ROOT = Path(__file__).parents[3]
+
+
+def changes(source: str) -> set[tuple[str, str]]:
+    return {(one.before, one.after) for one in mutants_of("m", source)}
+
+
+@pytest.mark.parametrize(
+    ("source", "expected"),
+    [
+        ("a < b", {("a < b", "a <= b"), ("a < b", "a >= b")}),
+        ("a is not b", {("a is not b", "a is b")}),
+        ("a and b", {("a and b", "a or b"), ("a and b", "b"), ("a and b", "a")}),
+        ("a + 2.0", {("a + 2.0", "a - 2.0"), ("2.0", "4.0"), ("2.0", "1.0")}),
+        ("a -= b", {("a -= b", "a += b"), ("a -= b", "pass")}),
+        ("x = True", {("True", "False")}),
+        ("x = max(a, b)", {("max(a, b)", "min(a, b)")}),
+        ("x = a if b else c", {("a if b else c", "a if not b else c")}),
+        ("def f():\n return a", {("return a", "return None")}),
+        ("self.x = a", {("self.x = a", "pass")}),
+        ("a.b(c)", {("a.b(c)", "pass")}),
+        ("x = [a for a in b if c]", {("for a if c", "for a")}),
+    ],
+)
+def test_every_operator_makes_its_small_faults(source: str, expected: set[tuple[str, str]]) -> None:
+    assert changes(source) == expected
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        '"""Words, 1 < 2."""',
+        "import a",
+        "x: int | None = a",
+        "def f(a: int | None) -> str | None:\n pass",
+        "@d(a=True)\nclass C:\n pass",
+        "raise ValueError(a + b)",
+        "assert a is not b",
+        "x = f'{a + b}'",
+        "RecordStory(text=a + b)",
+        "T = A | B",
+        "x = cast(A, b)",
+        "a, b = c",
+        "a = b",
+    ],
+)
+def test_what_only_people_or_types_read_is_left_alone(source: str) -> None:
+    assert changes(source) == set()
+
+
+def test_a_mutant_knows_where_it_runs() -> None:
+    source = "N = 1\nclass C:\n  M = 2.0\n  def f(self, a=3.0):\n    g = lambda: self.x < 4.0\n    return g\n"
+    places = {one.before: one.function for one in mutants_of("m", source)}
+    assert places["1"] == ""
+    assert places["2.0"] == places["3.0"] == "C."
+    assert places["4.0"] == places["return g"] == "=C.f"
+
+
+def test_a_mutated_module_differs_in_one_thing_and_the_same_code_is_none() -> None:
+    source = "def f(a, b):\n    return a < b\n"
+    (first, *_) = [one for one in mutants_of("m", source) if one.after == "a <= b"]
+    code = mutated(first, source, "m.py")
+    assert code is not None
+    names: dict[str, object] = {}
+    exec(code, names)  # noqa: S102 - two lines of this test
+    assert names["f"](1, 1) is True  # type: ignore[operator]
+    with pytest.raises(ValueError, match="not in the source any more"):
+        mutated(first, source.replace("<", ">"), "m.py")
+    (unused,) = mutants_of("m", "1\n")
+    assert mutated(unused, "1\n", "m.py") is None
+
+
+def test_a_seed_chooses_the_same_mutants_again_and_another_one_others() -> None:
+    first, again, other = choose(1, 20), choose(1, 20), choose(2, 20)
+    assert [one.key for one in first] == [one.key for one in again]
+    assert {one.key for one in first} != {one.key for one in other}
+    assert len({one.module for one in first}) > 5
+    assert {one.path for one in choose(3, 1000, ["core/turns.py"])} == {"core/turns.py"}
+    (line, *_) = choose(3, 1000, ["core/turns.py"])
+    assert {one.line for one in choose(3, 1000, [f"core/turns.py:{line.line}"])} == {line.line}
+
+
+def verdict(number: int, kind: str) -> Verdict:
+    return Verdict(
+        key=str(number), path="core/a.py", text=f"core/a.py:{number}", verdict=kind, found_by="", seconds=1.0
+    )
+
+
+def test_the_table_counts_and_names_survivors_and_what_never_ends_is_found(tmp_path: Path) -> None:
+    verdicts = [verdict(1, KILLED), verdict(2, SURVIVED), verdict(3, TIMEOUT), verdict(4, KILLED)]
+    rows = table(verdicts).splitlines()
+    assert "| `core/a.py` | 4 | 2 | 1 | 1 |" in rows
+    assert rows[-1] == "survived: core/a.py:2"
+    assert score(verdicts) == 75.0
+    results = Results.load(tmp_path / "kept.json")
+    for one in verdicts:
+        results.take(one)
+    assert Results.load(tmp_path / "kept.json").verdicts == {one.key: one for one in verdicts}
+
+
+def run(tmp_path: Path, tests: Path, *mutants: Mutant) -> str:
+    """The command on the line of one mutant, with tests of our own."""
+    lines = sorted({f"{one.path}:{one.line}" for one in mutants})
+    words = [word for line in lines for word in ("--module", line)]
+    command = [sys.executable, "-m", "zsched.lab.mutate", *words, "--mutants", "50", "--tests", str(tests)]
+    done = subprocess.run(
+        command,
+        cwd=ROOT,
+        env={"PATH": "/usr/bin:/bin", "XDG_CACHE_HOME": str(tmp_path / "cache"), "HOME": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        timeout=110,
+        check=False,
+    )
+    assert "mutants found" in done.stdout, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_the_command_plants_into_functions_and_into_what_the_import_runs(tmp_path: Path) -> None:
+    """Both ways: `majority` is called, `PROBATION_S` is made at the import; an empty test finds neither."""
+    scoring, damping = (
+        mutants_of(f"zsched.core.{name}", (CORE / f"{name}.py").read_text(encoding="utf-8"))
+        for name in ("scoring", "damping")
+    )
+    found = [one for one in scoring if one.function == "=majority"]
+    made = [one for one in damping if one.before == "30.0"]
+    assert found
+    assert made
+    good = tmp_path / "test_good.py"
+    good.write_text(
+        "from zsched.core.damping import PROBATION_S\n"
+        "from zsched.core.scoring import majority\n"
+        "def test_majority():\n    assert [majority(n) for n in range(1, 6)] == [1, 2, 2, 3, 3]\n"
+        "def test_made():\n    assert PROBATION_S == 30.0\n",
+        encoding="utf-8",
+    )
+    text = run(tmp_path, good, found[0], made[0])
+    assert "survived:" not in text
+    assert " 100.0 %" in text

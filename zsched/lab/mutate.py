@@ -1,0 +1,350 @@
+"""Mutates the core and counts what the tests find: ``python -m zsched.lab.mutate --seed S --mutants N``.
+
+Knows: the choice by seed, processes, what was tried before, the table. Does not know: what a mutant is
+(`zsched.lab.mutants`), which tests may find it and how it is planted (`zsched.lab.mutant_tests`).
+
+Each mutant has a process of its own, which first runs the tests of its module, then all others that reach its function,
+then a few schedules of the simulator, and ends with the first that fails. The last line is the score; the exit code is
+1 when it is below ``--least``. Must be run in the source tree: the tests are there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from random import Random
+
+import pytest
+
+from zsched.lab.mutant_tests import (
+    KILLED,
+    OPTIONS,
+    SURVIVED,
+    TESTS,
+    TIMEOUT,
+    Calls,
+    Functions,
+    Loop,
+    Planter,
+    Reach,
+    hunt,
+    measure,
+    merged,
+    silence,
+    source_hash,
+)
+from zsched.lab.mutants import Mutant, mutants_of, mutated
+
+ROOT = Path(__file__).parents[2]
+CORE = ROOT / "zsched" / "core"
+LEAST_PERCENT = 97.0
+LONGEST_S = 1800.0
+"""Of the wall clock, for one mutant on a machine that is busy with other work."""
+POLL_S = 0.01
+PROGRESS_EVERY_S = 20.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verdict:
+    """What became of one mutant."""
+
+    key: str
+    path: str
+    text: str
+    verdict: str
+    found_by: str
+    seconds: float
+
+
+@dataclass(slots=True)
+class Results:
+    """The verdicts so far, kept in a file with ``--resume``."""
+
+    file: Path | None
+    verdicts: dict[str, Verdict] = field(default_factory=dict)
+
+    @classmethod
+    def load(cls, file: Path | None) -> Results:
+        """What an earlier run has found out."""
+        results = cls(file)
+        if file is not None and file.exists():
+            for body in json.loads(file.read_text(encoding="utf-8")):
+                results.verdicts[body["key"]] = Verdict(**body)
+        return results
+
+    def take(self, verdict: Verdict) -> None:
+        """One more; written down whole or not at all."""
+        self.verdicts[verdict.key] = verdict
+        if self.file is not None:
+            new = self.file.with_suffix(".new")
+            new.write_text(json.dumps([asdict(one) for one in self.verdicts.values()], indent=1), encoding="utf-8")
+            new.replace(self.file)
+
+
+# --- the choice ------------------------------------------------------------------------------------------------------
+
+
+def choose(seed: int, count: int, only: Sequence[str] = ()) -> list[Mutant]:
+    """Mutants of the core, all equally likely; the same ones for the same seed and source.
+
+    Args:
+        seed: any number.
+        count: how many (fewer when there are no more).
+        only: modules ("core/voting.py") or lines ("core/voting.py:103"); none: the whole core.
+    """
+    sources = {path: path.read_text(encoding="utf-8") for path in sorted(CORE.glob("*.py"))}
+    found = [
+        mutant
+        for path, source in sources.items()
+        for mutant in mutants_of(f"zsched.core.{path.stem}", source)
+        if not only or mutant.path in only or f"{mutant.path}:{mutant.line}" in only
+    ]
+    Random(seed).shuffle(found)
+    chosen: list[Mutant] = []
+    for mutant in found:
+        if len(chosen) == count:
+            break
+        path = CORE / Path(mutant.path).name
+        if mutated(mutant, sources[path], str(path)) is not None:
+            chosen.append(mutant)
+    return chosen
+
+
+# --- processes -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class Fork:
+    """A child that writes one line and ends."""
+
+    pid: int
+    pipe: int
+    began_at: float
+
+    def result(self, status: int) -> tuple[str, str]:
+        """(verdict, what has found it)."""
+        with os.fdopen(self.pipe, encoding="utf-8") as pipe:
+            text = pipe.read()
+        if os.WIFSIGNALED(status):
+            number = os.WTERMSIG(status)
+            return (TIMEOUT, "") if number in {signal.SIGPROF, signal.SIGKILL} else (KILLED, f"signal {number}")
+        if not text:
+            return KILLED, "the process broke down"
+        return (KILLED, text.strip()) if text.strip() != "-" else (SURVIVED, "")
+
+
+def _fork(work: Sequence[object]) -> Fork:
+    """Run ``work`` (session, mutant, reach, functions) in a child."""
+    session, mutant, reach, functions = work
+    assert isinstance(session, pytest.Session)
+    assert isinstance(mutant, Mutant)
+    assert isinstance(reach, Reach)
+    assert isinstance(functions, Functions)
+    reading, writing = os.pipe()
+    pid = os.fork()
+    if pid:
+        os.close(writing)
+        return Fork(pid, reading, time.monotonic())
+    found = "broken"
+    try:
+        silence()
+        if reach.is_cold(mutant):
+            found = _cold(mutant, session.config.args)
+        else:
+            path = CORE / Path(mutant.path).name
+            code = mutated(mutant, path.read_text(encoding="utf-8"), str(path))
+            assert code is not None
+            functions.plant(code)
+            found = hunt(session, mutant, reach)
+        os.write(writing, (found or "-").encode())
+    except MemoryError:
+        os.write(writing, b"out of memory")
+    finally:
+        os._exit(0)
+
+
+def _cold(mutant: Mutant, tests: Sequence[str]) -> str:
+    """What has found a mutant that must be there from the first import on: in a new process."""
+    command = [sys.executable, "-m", "zsched.lab.mutate", "--cold", json.dumps(asdict(mutant)), "--tests", *tests]
+    with tempfile.TemporaryFile("w+") as said:
+        run = subprocess.Popen(command, cwd=ROOT, stdout=said)
+        try:
+            code = run.wait(LONGEST_S)
+        except subprocess.TimeoutExpired:
+            run.kill()
+            run.wait()
+            os.kill(os.getpid(), signal.SIGKILL)
+        if code == -signal.SIGPROF:
+            os.kill(os.getpid(), signal.SIGKILL)
+        said.seek(0)
+        lines = [line for line in said.read().splitlines() if line.startswith("found: ")]
+    if not lines:
+        return "it cannot be imported"
+    return lines[-1].removeprefix("found: ").strip()
+
+
+def cold(mutant: Mutant, tests: Sequence[str]) -> int:
+    """Try a mutant in this process, which has not imported the core."""
+    sys.meta_path.insert(0, Planter(mutant))
+    reach = Reach(**json.loads(cache_file(tests).read_text(encoding="utf-8")))
+
+    def work(session: pytest.Session) -> None:
+        if {item.nodeid for item in session.items} < set(reach.seconds):
+            print("\nfound: some tests cannot be collected", flush=True)
+            return
+        print(f"\nfound: {hunt(session, mutant, reach)}", flush=True)  # behind pytest's dots
+
+    code = pytest.main([*OPTIONS, *tests], plugins=[Loop(work)])
+    return 0 if code in {pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED} else 1
+
+
+def cache_file(tests: Sequence[str]) -> Path:
+    """Where is kept what the tests of this source reach."""
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return home / "zsched" / f"reach-{source_hash(ROOT, tests)}.json"
+
+
+def reach_of(session: pytest.Session, file: Path, at_import: list[str], jobs: int) -> Reach:
+    """What each test reaches: from the cache, or measured now in ``jobs`` processes."""
+    if not file.exists():
+        print(f"{len(session.items)} tests are run once to see what they reach", flush=True)
+        modules: dict[str, list[pytest.Item]] = {}
+        for item in session.items:
+            modules.setdefault(item.nodeid.partition("::")[0], []).append(item)
+        shares: list[list[pytest.Item]] = [[] for _ in range(jobs)]
+        for items in sorted(modules.values(), key=len, reverse=True):
+            min(shares, key=len).extend(items)
+        with tempfile.TemporaryDirectory() as folder:
+            files = [Path(folder) / str(number) for number in range(jobs)]
+            pids = [_fork_measuring(session, share, path) for share, path in zip(shares, files, strict=True)]
+            for pid in pids:
+                os.waitpid(pid, 0)
+            whole = merged(Reach(**json.loads(path.read_text(encoding="utf-8"))) for path in files)
+        whole.at_import = at_import
+        whole.save(file)
+    reach = Reach(**json.loads(file.read_text(encoding="utf-8")))
+    for test in reach.broken:
+        print(f"fails without any mutant, left out: {test}", flush=True)
+    return reach
+
+
+def _fork_measuring(session: pytest.Session, items: list[pytest.Item], path: Path) -> int:
+    pid = os.fork()
+    if pid:
+        return pid
+    try:
+        silence()
+        measure(session, items, CORE).save(path)
+    finally:
+        os._exit(0)
+
+
+def try_all(session: pytest.Session, mutants: Sequence[Mutant], reach: Reach, jobs: int, results: Results) -> None:
+    """Try every mutant that has no verdict yet, ``jobs`` at a time."""
+    functions = Functions(CORE)
+    gc.freeze()
+    waiting = [mutant for mutant in mutants if mutant.key not in results.verdicts]
+    running: dict[int, tuple[Mutant, Fork]] = {}
+    told_at = time.monotonic()
+    while waiting or running:
+        while waiting and len(running) < jobs:
+            mutant = waiting.pop(0)
+            fork = _fork((session, mutant, reach, functions))
+            running[fork.pid] = (mutant, fork)
+        for pid, status in _ended(running):
+            mutant, fork = running.pop(pid)
+            verdict, found_by = fork.result(status)
+            seconds = round(time.monotonic() - fork.began_at, 2)
+            one = Verdict(
+                key=mutant.key, path=mutant.path, text=str(mutant), verdict=verdict, found_by=found_by, seconds=seconds
+            )
+            results.take(one)
+            if verdict == SURVIVED:
+                print(f"survived: {mutant}", flush=True)
+        if time.monotonic() - told_at > PROGRESS_EVERY_S:
+            told_at = time.monotonic()
+            counts = Counter(results.verdicts[one.key].verdict for one in mutants if one.key in results.verdicts)
+            print(f"{counts.total()} of {len(mutants)}: {dict(counts)}", flush=True)
+        time.sleep(POLL_S)
+
+
+def _ended(running: dict[int, tuple[Mutant, Fork]]) -> Iterator[tuple[int, int]]:
+    """Children that have ended; one that takes too long is ended."""
+    for pid, (_, fork) in list(running.items()):
+        if time.monotonic() - fork.began_at > LONGEST_S:
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        ended, status = os.waitpid(pid, os.WNOHANG)
+        if ended:
+            yield pid, status
+
+
+# --- the table -------------------------------------------------------------------------------------------------------
+
+
+def table(verdicts: Sequence[Verdict]) -> str:
+    """Killed, survived and stuck by module, and every survivor, as Markdown."""
+    rows = ["| module | mutants | killed | timeout | survived |", "| --- | ---: | ---: | ---: | ---: |"]
+    for path in sorted({one.path for one in verdicts}):
+        counts = Counter(one.verdict for one in verdicts if one.path == path)
+        rows.append(f"| `{path}` | {counts.total()} | {counts[KILLED]} | {counts[TIMEOUT]} | {counts[SURVIVED]} |")
+    rows += [f"survived: {one.text}" for one in verdicts if one.verdict == SURVIVED]
+    return "\n".join(rows)
+
+
+def score(verdicts: Sequence[Verdict]) -> float:
+    """How many percent were found; one that never ends is found."""
+    return 100.0 * sum(one.verdict != SURVIVED for one in verdicts) / max(len(verdicts), 1)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Try mutants, print the table, return the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m zsched.lab.mutate", description=__doc__)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--mutants", type=int, default=100, help="how many")
+    parser.add_argument("--jobs", type=int, default=1, help="mutants at a time")
+    parser.add_argument("--module", action="append", default=[], help="core/voting.py, or core/voting.py:103")
+    parser.add_argument("--resume", type=Path, help="keep the verdicts there, and try only what has none")
+    parser.add_argument("--least", type=float, default=LEAST_PERCENT, help="percent that must be found")
+    parser.add_argument("--tests", nargs="+", default=TESTS, help="files or folders; the whole core's by default")
+    parser.add_argument("--cold", help=argparse.SUPPRESS)
+    given = parser.parse_args(arguments)
+    if given.cold:
+        return cold(Mutant(**json.loads(given.cold)), given.tests)
+    file = cache_file(given.tests)
+    mutants = choose(given.seed, given.mutants, given.module)
+    results, calls = Results.load(given.resume), Calls(CORE)
+
+    def work(session: pytest.Session) -> None:
+        sys.settrace(None)
+        reach = reach_of(session, file, calls.taken(), given.jobs)
+        try_all(session, mutants, reach, given.jobs, results)
+
+    sys.settrace(None if file.exists() else calls)
+    code = pytest.main([*OPTIONS, *given.tests], plugins=[Loop(work)])
+    sys.settrace(None)
+    verdicts = [results.verdicts[mutant.key] for mutant in mutants if mutant.key in results.verdicts]
+    if code != pytest.ExitCode.OK or len(verdicts) < len(mutants):
+        print("the tests cannot be collected", file=sys.stderr)
+        return 2
+    print("\n" + table(verdicts))
+    found = score(verdicts)
+    caught = sum(one.verdict != SURVIVED for one in verdicts)
+    print(f"seed {given.seed}: {caught} of {len(verdicts)} mutants found, {found:.1f} %")
+    return 0 if found >= given.least else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
