@@ -17,7 +17,7 @@ from zsched.core.model import MAX_COUNTER, NAME, NodeId, TaskId
 ROOT = "@zsched"
 MAX_DIGITS = len(str(MAX_COUNTER))
 END_CHUNK = "@zsched/end"
-"""Suffix of the in-band end markers behind a stream's last sample: ``{to}/@zsched/end``."""
+"""Suffix of the in-band end markers behind a stream's last sample, and the start markers: ``{to}/@zsched/end``."""
 AGAIN_CHUNK = "@zsched/again"
 """Behind an output's key, with a relay's zenoh id behind it: what that relay has missed, sent once more."""
 
