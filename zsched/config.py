@@ -16,6 +16,7 @@ from zsched.config_nodes import Cast, read_nodes, select, warn_missing
 from zsched.config_reader import MAX_FILE_BYTES, Collector, Fault, Place, read_yaml, render_all
 from zsched.config_schema import FLEET
 from zsched.config_tasks import read_tasks
+from zsched.core.beat_room import MAX_BEAT_BYTES, most_bytes
 from zsched.core.fleet import Fleet, NodeSpec, Timing, dial_endpoint
 from zsched.core.model import NodeId, NodeKind
 from zsched.core.timing import WIFI, timing_faults
@@ -98,7 +99,7 @@ def _fleet(section: Section, folder: Path, out: Collector) -> Fleet | None:
     zenoh_config = _zenoh_config(section, folder, out)
     if out.count:
         return None
-    return Fleet(
+    fleet = Fleet(
         name=section.get("fleet"),
         timing=timing,
         nodes=tuple(sorted(cast.nodes, key=lambda node: node.name)),
@@ -108,6 +109,18 @@ def _fleet(section: Section, folder: Path, out: Collector) -> Fleet | None:
         zenoh_config=zenoh_config,
         **{name: section.get(name) for name in ("relay_orphan_s", "shared_memory") if name in section.values},
     )
+    _check_beats(fleet, section.where("tasks"), out)
+    return fleet
+
+
+def _check_beats(fleet: Fleet, place: Place, out: Collector) -> None:
+    """Every beat holds a part for each task and each node: all of them must have room in one."""
+    needed = most_bytes(fleet)
+    if needed > MAX_BEAT_BYTES:
+        count = sum(task.exclusive for task in fleet.tasks)
+        message = f"a beat of this fleet may take {needed} bytes, at most {MAX_BEAT_BYTES} are sent"
+        hint = f"fewer tasks ({len(fleet.tasks)}, {count} of them exclusive) or shorter names; or two fleets"
+        out.error(place, message, hint)
 
 
 # --- timing ----------------------------------------------------------------------------------------------------------

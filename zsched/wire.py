@@ -22,6 +22,7 @@ from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 import msgpack
 
 from zsched.core import messages, model, plan, snapshot
+from zsched.core.beat_room import MAX_BEAT_BYTES
 from zsched.errors import WireError
 
 VERSION = 1
@@ -34,7 +35,7 @@ Reader = Callable[[Any], Any]
 Writer = Callable[[Any], Any]
 
 KINDS: dict[str, tuple[type, int]] = {
-    "beat": (model.Beat, SMALL),
+    "beat": (model.Beat, MAX_BEAT_BYTES),
     "profile": (model.Profile, 4 * SMALL),
     "proposal": (model.Proposal, SMALL),
     "utilities": (messages.Utilities, LARGE),

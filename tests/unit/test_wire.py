@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 
 from zsched import relay_pipe, wire
 from zsched.core import messages, model
+from zsched.core.beat_room import MAX_BEAT_BYTES
 from zsched.errors import WireError
 
 GOLDEN = Path(__file__).parent / "golden"
@@ -295,16 +296,16 @@ def test_frame_larger_than_its_kind_allows_is_neither_sent_nor_read() -> None:
     with pytest.raises(WireError) as caught:
         wire.encode(big)
     assert caught.value.reason == "size"
-    body = {"node": "r1", "incarnation": 1, "sequence": 1, "loop_lag_s": 0.0, "new": "x" * wire.SMALL}
+    body = {"node": "r1", "incarnation": 1, "sequence": 1, "loop_lag_s": 0.0, "new": "x" * MAX_BEAT_BYTES}
     assert reason_of(frame_of(body), model.Beat) == "size"
     assert reason_of(frame_of(body), model.Beat, messages.Learnt) == "size"  # a large kind beside it does not help
 
 
 def test_frame_of_the_largest_allowed_size_is_read() -> None:
     body = {"node": "r1", "incarnation": 1, "sequence": 1, "loop_lag_s": 0.0, "new": ""}
-    body["new"] = "x" * (wire.SMALL - len(frame_of(body)) - 2)
+    body["new"] = "x" * (MAX_BEAT_BYTES - len(frame_of(body)) - 2)
     frame = frame_of(body)
-    assert len(frame) == wire.SMALL
+    assert len(frame) == MAX_BEAT_BYTES
     assert wire.decode(frame, model.Beat) == BEAT
 
 

@@ -21,6 +21,7 @@ from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.agreement import NOTHING, Agreement, Effects
 from zsched.core.batch import Batch
+from zsched.core.beat_room import BeatRoom
 from zsched.core.executor import Executor
 from zsched.core.fleet import Fleet, TaskSpec, fleet_hash
 from zsched.core.gateway import Gateway
@@ -139,6 +140,7 @@ class Node:
         self.sealing = Sealing(fleet, me, self.executors, self.agreement.leases.over_at)
         self._beat_at = self._turn_at = now
         self._beat_sequence = 0
+        self._beat_room = BeatRoom()
         self.loop_lag_s = 0.0
         self._promised = math.inf
         self._batch = Batch()
@@ -278,11 +280,21 @@ class Node:
         self.loop_lag_s = 0.0
         is_in_turn = self._beat_at == self._turn_at  # whoever has news has brought the next beat forward
         self._beat_at = self._turn_at = now + self.fleet.timing.beat_s
-        self._batch.add(do.PublishBeat(beat=beat, is_news=not is_in_turn))
+        self._batch.add(do.PublishBeat(beat=self._fitting(beat), is_news=not is_in_turn))
         self._seal(now)
         self._hear_leases(beat, now)
         if self._introductions.is_due(now, is_missing=self.membership.misses_anybody):
             self._batch.add(do.IntroducePeers())
+
+    def _fitting(self, beat: Beat) -> Beat:
+        """The beat as it is sent: never too large to be sent."""
+        sent, left_out = self._beat_room.fit(beat)
+        if left_out:
+            self.counters["beat_parts_left_out"] += left_out
+        if left_out or "beat" in self.problems:
+            text = f"{left_out} parts have no room in a beat and come in turn: fewer exclusive tasks, or shorter names"
+            self._set_problem("beat", text if left_out else None)
+        return sent
 
     def _on_beat(self, event: ev.BeatReceived, now: float) -> None:
         beat = event.beat
