@@ -135,20 +135,58 @@ def mutated(frame: bytes, rng: Random) -> bytes:
     return bytes(body)
 
 
-def forge(message: Message, rng: Random) -> ev.Event:
-    """A stranger's message: the same one in a name that the fleet does not know, or in another's name.
+FAR = (1, 3, 12, 1000, 10**9, 2**52)
+"""How far ahead a forged number is: within the window of honest ones, and beyond it."""
 
-    The bus compares a value's sender with its key: in somebody else's name it ends there.
+
+def forge(message: Message, rng: Random) -> ev.Event:
+    """A stranger's message: the same one in a name that the fleet does not know, or a valid one in its sender's name.
+
+    The bus compares a value's sender with its key: under another key it ends there.
     """
     value, event = wire.decode(message.frame, message.kind), message.event
     if isinstance(event, ev.PrepareAsked | ev.AcceptAsked):
         return _forged_question(event, rng)
+    if rng.random() < 0.5 and (forged := _in_its_name(event, rng)) is not None:
+        return forged
     if rng.random() < 0.3:
         return ev.FrameDropped(kind=message.kind.__name__.lower(), reason="foreign")
     sender = next(name for name in SENDER_FIELDS if hasattr(value, name))
     other = replace(value, **{sender: GHOST})
     slot = next(name for name in type(event).__dataclass_fields__ if getattr(event, name) == value)
     return replace(event, **{slot: other})
+
+
+def _in_its_name(event: ev.Event, rng: Random) -> ev.Event | None:
+    """What anybody can put under the sender's own key; ``None``: such a thing is only an answer.
+
+    It says nothing about leases: who forges grants is an insider.
+    """
+    if isinstance(event, ev.BeatReceived):
+        beat = event.beat
+        learnt = tuple((task, min(revision + rng.choice(FAR), 2**53), epoch) for task, revision, epoch in beat.learnt)
+        life, number = _ahead(beat.incarnation, beat.sequence, rng)
+        beat = replace(beat, incarnation=life, sequence=number, learnt=learnt, has_voted=True)
+        return ev.BeatReceived(beat=replace(beat, suspects=(), echoes=(), released=(), asked_to_leave=()))
+    if isinstance(event, ev.ProfileReceived):
+        life, number = _ahead(event.profile.incarnation, event.profile.sequence, rng)
+        return ev.ProfileReceived(profile=replace(event.profile, incarnation=life, sequence=number))
+    if isinstance(event, ev.LearntReceived):
+        values = tuple(
+            replace(value, revision=number, epoch=number, owner=GHOST)
+            for value in event.learnt.values
+            for number in (min(value.revision + rng.choice(FAR), 2**53),)
+        )
+        learnt_by = replace(event.learnt, values=values)
+        return ev.LearntReceived(learnt=learnt_by, is_answer=rng.random() < 0.5)
+    return None
+
+
+def _ahead(life: int, number: int, rng: Random) -> tuple[int, int]:
+    """(incarnation, sequence) of a forged message: of the same life, or of another one."""
+    if rng.random() < 0.3:
+        return min(life + rng.choice(FAR), 2**53), rng.choice(FAR)
+    return life, min(number + rng.choice(FAR), 2**53)
 
 
 def _forged_question(event: ev.PrepareAsked | ev.AcceptAsked, rng: Random) -> ev.Event:
