@@ -35,6 +35,8 @@ GIVE_UP_S: Final = 1.0
 MAX_MISSING: Final = 256
 MAX_SOURCES: Final = 8192
 MAX_PER_FRAME: Final = 500
+MAX_AHEAD: Final = 1 << 30
+"""No source is so far ahead: at 1 kHz that is a cut of twelve days. Of what is further nobody knows which way it is."""
 RETURN: Final = 3
 """So many numbers in a row take a jump back that nothing has followed."""
 
@@ -180,7 +182,7 @@ class Acknowledger:
                 source = self._add(name, number)
             number = number_near(serial_of(number), source.arrived)
             self._mark(name)
-            if number <= source.arrived:
+            if not 0 < number - source.arrived <= MAX_AHEAD:
                 return 0
             is_first = source.arrived == source.first  # nothing has come: the stream begins later for us
             before = source.lost
@@ -245,7 +247,7 @@ class Acknowledger:
             else:
                 source.doubled += 1
             return False
-        if in_turn and not self._is_given_up(source):
+        if number - source.arrived > MAX_AHEAD or (in_turn and not self._is_given_up(source)):
             return False
         self._jump(source, number)
         source.arrived += 1
