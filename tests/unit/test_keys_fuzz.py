@@ -44,7 +44,6 @@ def test_what_was_broken_from_outside_is_found(monkeypatch: pytest.MonkeyPatch) 
         assert "_track" in found()
     with monkeypatch.context() as patch:  # an acknowledgement of what was never sent
         patch.setattr(lanes.Lane, "arrived", property(lambda lane: 0 if lane.ack is None else lane.ack.arrived))
-        patch.setattr(lanes, "_near", lambda ack, _count: ack)
         assert "_lane" in found()
 
 
