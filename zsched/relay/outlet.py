@@ -26,7 +26,6 @@ import zenoh
 from zenoh import Priority, Sample, Session, Timestamp
 
 from zsched.clock import monotonic_s
-from zsched.core.keyexpr import is_wild
 from zsched.core.plan import OnCrash, StreamClass, StreamSettings
 from zsched.core.relay_protocol import EndMarker, StreamAck
 from zsched.relay.acks import Acks
@@ -35,7 +34,7 @@ from zsched.relay.greetings import Greetings
 from zsched.relay.lanes import KEPT_BYTES, KEPT_BYTES_LATEST, KEPT_SAMPLES, Lane, Sent, near
 from zsched.relay.publishers import declare_publisher, put_marker
 from zsched.relay.receive import undeclare
-from zsched.relay.rewrite import Rewriter, rewriter
+from zsched.relay.rewrite import Rewriting
 from zsched.relay.tally import Tally
 from zsched.send_queue import SendQueue
 
@@ -43,7 +42,6 @@ QUEUE_DEPTH: Final = 1024
 """A reliable outlet's queue holds at least so many samples, whatever its depth says."""
 MAX_LANES: Final = 4096
 """Publishers of one wildcard stream towards one place: keys come from the applications, memory is ours."""
-KEPT_OWNERS: Final = 4
 MAX_OWED: Final = 4096
 """Samples that wait for the next owner after a crash (`OnCrash.REPLAY`); a queue has room for them besides its own."""
 SKIP_EPOCH: Final = 0
@@ -86,12 +84,11 @@ class Outlet:
         self._session = session
         self._settings = settings
         self._acks = acks
-        self._rewriters: dict[str, Rewriter] = {from_expr: rewriter(from_expr, to_expr)}
+        self._rewriting = Rewriting(from_expr, to_expr)
         self._is_reliable = settings.stream_class is StreamClass.RELIABLE
         self._kept_limit = KEPT_SAMPLES if self._is_reliable else max(settings.depth, settings.keep_last)
         self._kept_least = 1 if self._is_reliable else settings.keep_last
         self._kept_bytes = KEPT_BYTES if self._is_reliable else KEPT_BYTES_LATEST
-        self._is_wild = is_wild(to_expr)
         self._to = to_expr
         self._lock = threading.Lock()
         self._lanes: dict[tuple[str, str], Lane] = {}
@@ -105,7 +102,7 @@ class Outlet:
         holds = self._is_reliable and acks is not None
         self._greetings = Greetings(self._lock, self._put_start) if holds else None
         self._probe = session.declare_publisher(to_expr)
-        self._main = None if self._is_wild else self._declare(to_expr, Priority.DATA, is_express=False)
+        self._main = None if self._rewriting.is_wild else self._declare(to_expr, Priority.DATA, is_express=False)
         self._queue = self._make_queue()
         self._crowd = self._make_crowd() if has_crowd else None
 
@@ -141,9 +138,7 @@ class Outlet:
         Raises:
             ValueError: ``to`` cannot be filled from it.
         """
-        self._rewriters[from_expr] = rewriter(from_expr, self._to)
-        while len(self._rewriters) > KEPT_OWNERS:
-            self._rewriters.pop(next(iter(self._rewriters)))
+        self._rewriting.also_from(from_expr)
 
     def send(self, sample: Sample, stamp: Timestamp | None = None, size: int | None = None) -> tuple[str, int]:
         """Put one sample; answers (why something was dropped, how much of it), with 0 when nothing was.
@@ -189,7 +184,7 @@ class Outlet:
 
     def key_of(self, sample: Sample) -> str:
         """The key that a sample goes on under (``""``: it does not fit)."""
-        return (self._rewritten(str(sample.key_expr)) or "") if self._is_wild else self._to
+        return self._rewriting.key(str(sample.key_expr)) or "" if self._rewriting.is_wild else self._to
 
     def send_end(self, epoch: int) -> None:
         """Put the end marker behind the last sample of every key; ``best_effort`` blocks while the link is full."""
@@ -296,7 +291,7 @@ class Outlet:
         priority, is_express = sample.priority, sample.express
         if self._main is not None and not is_express and priority == _DATA:
             return self._main
-        key = self._rewritten(str(sample.key_expr)) if self._is_wild else self._to
+        key = self._rewriting.key(str(sample.key_expr))
         if key is None:
             return None
         name = (key, f"{priority}{is_express}")
@@ -304,13 +299,6 @@ class Outlet:
         if lane is None and len(self._lanes) >= MAX_LANES:
             return None
         return lane if lane is not None else self._declare(key, priority, is_express=is_express)
-
-    def _rewritten(self, key: str) -> str | None:
-        """The new key, by the newest owner whose ``from`` the old one matches."""
-        for rewrite in reversed(tuple(self._rewriters.values())):
-            if (result := rewrite(key)) is not None:
-                return result
-        return None
 
     def _declare(self, key: str, priority: Priority, *, is_express: bool) -> Lane:
         publisher = declare_publisher(self._session, key, self._settings, priority, is_express=is_express)
