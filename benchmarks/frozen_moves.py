@@ -83,9 +83,8 @@ def _rounds(options: argparse.Namespace, random_: random.Random, sums: Sums) -> 
             _round(rig, random_, options.hz, until_s, sums, is_overload=is_overload)
         number += 1
     moves = ", ".join(f"{count} frozen for {seconds:g} s" for seconds, count in sorted(sums.moves.items()))
-    print(
-        f"moves: {moves}; sent {sums.sent}, lost {sums.lost}, told of {sums.told}, faults {len(sums.faults)}, void {sums.void}"
-    )
+    figures = f"sent {sums.sent}, lost {sums.lost}, told of {sums.told}"
+    print(f"moves: {moves}; {figures}, faults {len(sums.faults)}, void {sums.void}")
     print("\n".join(sums.faults[:20]))
     return 1 if sums.faults else 0
 
