@@ -37,6 +37,7 @@ ACCEPT_TIMEOUT_S: Final = 1.0
 """The other end, which begins with the connection, not with the SYN: between 0.6 s and 1.4 s."""
 RELAY_START_S: Final = 10.0
 """A worker that is started together with its relay, on a busy machine, waits so long for it."""
+TX_THREADS: Final = 4
 DEFAULT_TIMING: Final = Timing()
 
 Settings = dict[str, Any]
@@ -211,7 +212,7 @@ def tls_settings(operator_json5: str) -> frozenset[str]:
 
 
 def pool_threads(nodes: int, tasks: int = 0) -> int:
-    """How many threads zenoh's receive pool of one process needs in a fleet of so many nodes and tasks (4..64).
+    """How many threads zenoh's pools of one process need in a fleet of so many nodes and tasks (4..64).
 
     A link that falls silent holds one of them when its lease ends: about a second, or 10 s (zenoh's SO_LINGER) where
     something was still to be sent. With fewer threads than links, a split that takes all of them also silences those
@@ -222,8 +223,14 @@ def pool_threads(nodes: int, tasks: int = 0) -> int:
 
 
 def runtime_pools(nodes: int, tasks: int = 0) -> str:
-    """The value of ``ZENOH_RUNTIME`` for a process with links to so many nodes (zenoh reads it once)."""
-    return f"(rx: (worker_threads: {pool_threads(nodes, tasks)}), tx: (worker_threads: 4))"
+    """The value of ``ZENOH_RUNTIME`` for a process with links to so many nodes (zenoh reads it once).
+
+    ``net`` closes links and dials, ``acc`` shakes hands with who dials us; both have one thread by default. Closing a
+    link that is dead one way holds a thread for zenoh's SO_LINGER, 10 s, in which no other link came or went.
+    """
+    threads = pool_threads(nodes, tasks)
+    pools = {"rx": threads, "tx": TX_THREADS, "net": threads, "acc": threads}
+    return f"({', '.join(f'{name}: (worker_threads: {count})' for name, count in pools.items())})"
 
 
 # --- parts -----------------------------------------------------------------------------------------------------------

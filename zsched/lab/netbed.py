@@ -24,6 +24,7 @@ from typing import IO
 from zsched import zenoh_config
 from zsched.adapters.operator_socket import ask
 from zsched.clock import monotonic_s
+from zsched.core.fleet import Timing
 from zsched.core.model import NodeId, PeerState
 from zsched.guard import guarded
 from zsched.lab.history import History, Learnt, Started
@@ -102,6 +103,10 @@ class Probe:
     def owners(self, key: str) -> list[NodeId]:
         """Whose samples came under ``key``, in order, each run of one node once."""
         return owners_of(tuple(self.received), key)
+
+    def send(self, number: signal.Signals) -> None:
+        """Send it a signal."""
+        self._process.send_signal(number)
 
     def close(self) -> None:
         """End it."""
@@ -211,10 +216,18 @@ class Netbed(Testbed):
             )
 
     def probe(
-        self, node: NodeId, *, put: str = "", hz: float = 50.0, size: int = 0, watch: Sequence[str] = ()
+        self,
+        node: NodeId,
+        *,
+        put: str = "",
+        hz: float = 50.0,
+        size: int = 0,
+        watch: Sequence[str] = (),
+        timing: Timing | None = None,
     ) -> Probe:
         """An application on ``node``: a client of its data endpoint; ended with the bed."""
-        config = zenoh_config.client_config(connect=(self._data_endpoint(node),), timing=self.fleet.timing)
+        endpoints = (self._data_endpoint(node),)
+        config = zenoh_config.client_config(connect=endpoints, timing=timing or self.fleet.timing)
         watched = [word for key in watch for word in ("--watch", key)]
         command = [*PROBE, config, "--put", put, "--hz", str(hz), "--size", str(size), *watched]
         with (self.folder / f"probe-{node}.log").open("ab") as log:
