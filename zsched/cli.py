@@ -9,8 +9,10 @@ live owner), 5 timed out, 78 bad configuration.
 
 from __future__ import annotations
 
+import errno
 import io
 import os
+import signal
 import sys
 from enum import StrEnum
 from pathlib import Path
@@ -44,6 +46,9 @@ app.add_typer(stream_app)
 app.add_typer(bench_app)
 
 NOT_ASKED = "no other node reached: nobody could say whether this name has voted"
+UNWRITABLE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
+"""Why stdout takes no more: the disk behind ``>`` is full, or gone."""
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 LAB_NEEDS = ("cv2", "matplotlib", "numpy", "onnxruntime", "rich")
 """What the extra ``lab`` installs."""
 
@@ -100,22 +105,17 @@ def up(
 ) -> None:
     """Run this machine's daemon in the foreground (what systemd runs)."""
     from zsched import places  # noqa: PLC0415 - each verb imports what it needs
-    from zsched.adapters.state_file import STATE_NAME  # noqa: PLC0415 - as above
 
     file = places.config_path(config, os.environ)
     _need_file(file)
     name = _node_name(node)
     state = places.state_folder(state_dir, os.environ)
     runtime = places.runtime_folder(runtime_dir, os.environ)
-    if not (state / STATE_NAME).exists():
-        _say(
-            f"zsched up: no state in {state}: {name} will not be an elector. If this name never voted in this fleet, "
-            f"stop and run `zsched init --config {file} --node {name} --state-dir {state}`"
-        )
     daemon = [sys.executable, "-m", "zsched.daemon", "--config", str(file), "--node", name]
     daemon += ["--state-dir", str(state), "--runtime-dir", str(runtime), "--log-level", log_level.value]
     sys.stdout.flush()
     sys.stderr.flush()
+    signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)  # the daemon takes what comes while it loads, see there
     # the same process id (systemd's main process), without this command line's memory
     os.execv(sys.executable, daemon)  # noqa: S606 - no shell is wanted
 
@@ -243,13 +243,15 @@ def retry(
 
 @app.command(cls=Verb)
 def check(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Fleet file.")],
+    file: Annotated[Path | None, typer.Argument(metavar="[FILE]", help="Fleet file; as --config.")] = None,
+    config: ConfigOption = None,
     json_: JsonOption = False,
 ) -> None:
     """Check a fleet file: every fault at once, each with file:line:col; exits with 78 when there is one."""
+    from zsched import places  # noqa: PLC0415 - each verb imports what it needs
     from zsched.config import check_file  # noqa: PLC0415 - ruamel.yaml is slow to import
 
-    result = check_file(file)
+    result = check_file(places.config_path(file or config, os.environ))
     fleet = result.fleet
     counts: Json | None = None
     if fleet is not None:
@@ -357,7 +359,19 @@ def main() -> None:
     """The console entry point."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # bars in a terminal without UTF-8
-    app(prog_name="zsched")
+    code: str | int | None = EXIT_FAILED
+    try:
+        try:
+            app(prog_name="zsched")
+        except SystemExit as end:
+            code = end.code
+        sys.stdout.flush()
+    except OSError as error:
+        if error.errno not in UNWRITABLE or error.filename is not None:
+            raise
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the interpreter will try once more
+        _say(f"zsched: the answer cannot be written: {error.strerror}; see where stdout goes")
+    sys.exit(code)
 
 
 if __name__ == "__main__":

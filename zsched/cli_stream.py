@@ -5,6 +5,7 @@ Knows: how a word becomes keys, windows, tables and JSON lines. Does not know: z
 
 from __future__ import annotations
 
+import re
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 WIDTH: Final = 100
 PREVIEW: Final = 64
 """Bytes of a payload that `tail` shows."""
+_STREAM_NAME: Final = re.compile(r"[a-z0-9_-]+/(in|out|srv)/\d+")
 KINDS: Final = {"in": "input", "out": "output", "srv": "service"}
 
 
@@ -164,6 +166,9 @@ def keys_for(status: Json, word: str | None) -> tuple[str, ...]:
             raise CliError(EXIT_FAILED, f"{word} leads nowhere: its task has no owner")
         return (stream["from_expr"], stream["to_expr"])
     _check_key(word)
+    if _STREAM_NAME.fullmatch(word):
+        names = ", ".join(stream["stream"] for stream in streams) or "none"
+        sys.stderr.write(harmless(f"no stream is named {word} (there are {names}): taken for a key\n"))
     return (word,)
 
 

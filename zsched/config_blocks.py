@@ -216,7 +216,8 @@ class ListOf(Generic[T]):
     def read(self, node: Node, out: Collector) -> tuple[T, ...] | None:
         """The items that could be read."""
         if not isinstance(node, Sequence):
-            hint = f"write a list: [{node.text}]" if isinstance(node, Scalar) and not node.is_null else ""
+            words = ", ".join(node.text.split()) if isinstance(node, Scalar) and not node.is_null else ""
+            hint = f"write a list: [{words}]" if words else ""
             _refuse(node, out, self.says(), hint)
             return None
         if len(node.items) < self.least:

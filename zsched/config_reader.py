@@ -114,9 +114,15 @@ def render_all(file: str, faults: tuple[Fault, ...], severity: str = "error") ->
     return "\n".join(shown)
 
 
+_MEANT: Final = {"wlan": "wifi", "wi-fi": "wifi", "wireless": "wifi", "lan": "wired", "ethernet": "wired"}
+"""Other words for what a fleet file says, which are spelled like something else."""
+
+
 def nearest(name: str, names: Iterable[str]) -> str:
     """A hint naming what of ``names`` was probably meant, or all of them when they are few."""
     known = sorted(names)
+    if _MEANT.get(name.lower()) in known:
+        return f"did you mean {_MEANT[name.lower()]!r}?"
     if len(known) > _MAX_COMPARED:
         return ""
     close = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
@@ -289,7 +295,11 @@ def _compose(text: str, out: Collector) -> Node | None:
     else:
         if raw is not None:
             return _Conversion(out).node(raw, 0)
-        out.error(NOWHERE, "the file is empty", "begin with the annotated configs/fleet.yaml of zsched's sources")
+        out.error(
+            NOWHERE,
+            "the file is empty",
+            "begin with the annotated one: share/zsched/fleet.yaml where zsched is installed",
+        )
     return None
 
 

@@ -202,7 +202,9 @@ class Daemon:
         """The durable state with this start's incarnation on disk, or why there is none."""
         loaded = state_file.load()
         if loaded.state is None:
-            log.warning("no_state why=%s", loaded.problem)
+            here = self._options
+            command = f"zsched init --config {here.config} --node {here.node} --state-dir {here.state_dir}"
+            log.warning("no_state why=%s (here: `%s`); no elector", loaded.problem, command)
             return None, loaded.problem
         if loaded.state.electorate != electorate_hash(self._fleet):
             return None, "the fleet file names another electorate than the state file; this node is no elector"
@@ -331,6 +333,8 @@ class Daemon:
         for number in (signal.SIGTERM, signal.SIGINT, RESTART_SIGNAL):
             previous = signal.signal(number, stop)
             stack.callback(signal.signal, number, previous)
+        # `zsched up` has held them back since before we loaded: an early Ctrl-C is an orderly stop, and no traceback
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGTERM, signal.SIGINT))
 
     def _loop(self, node: Node, shell: Shell) -> None:
         """Take an event, handle it, carry the batch out; wake up in time for the node's next deadline."""

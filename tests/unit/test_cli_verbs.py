@@ -81,6 +81,51 @@ def test_check_of_a_missing_file_exits_with_78(tmp_path: Path) -> None:
     assert "cannot be read" in result.stderr
 
 
+def test_check_takes_the_file_that_up_would(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "fleet.yaml"
+    file.write_text(FLEET)
+    monkeypatch.setenv("ZSCHED_CONFIG", str(file))
+    for arguments in (("check",), ("check", "-c", file), ("check", "--config", file)):
+        assert run(*arguments).stdout == "ok: 3 nodes, 1 task, 3 electors\n"
+    monkeypatch.setenv("ZSCHED_CONFIG", str(tmp_path / "none.yaml"))
+    result = run("check")
+    assert result.exit_code == 78
+    assert f"{tmp_path / 'none.yaml'}: error: cannot be read" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "hint"),
+    [
+        ("fleet: hall", "fleet: hall\ntiming: wlan", "did you mean 'wifi'?"),
+        ("fleet: hall", "fleet: hall\ntiming: ethernet", "did you mean 'wired'?"),
+        ("    weights", "    worker: {command: python stats.py}\n    weights", "write a list: [python, stats.py]"),
+    ],
+)
+def test_check_advises_what_would_work(tmp_path: Path, old: str, new: str, hint: str) -> None:
+    file = tmp_path / "fleet.yaml"
+    file.write_text(FLEET.replace(old, new))
+    assert f"hint: {hint}\n" in run("check", file).stderr
+
+
+@pytest.mark.root
+def test_check_of_a_file_that_only_another_may_read_says_whose_it_is(tmp_path: Path) -> None:
+    file = tmp_path / "fleet.yaml"
+    file.write_text(FLEET)
+    file.chmod(0o600)
+    os.chown(file, 65533, 65533)
+    os.setegid(65534)
+    os.seteuid(65534)
+    try:
+        for arguments in (("check", file), ("up", "--config", file, "--node", "robot1")):
+            result = run(*arguments)
+            assert result.exit_code == 78
+            assert "Permission denied" in result.stderr
+            assert "user 65534" in result.stderr
+    finally:
+        os.seteuid(0)
+        os.setegid(0)
+
+
 def test_check_of_what_is_no_file_answers_at_once(tmp_path: Path) -> None:
     """A pipe was waited for, and /dev/zero was a traceback."""
     os.mkfifo(tmp_path / "pipe")
@@ -185,7 +230,7 @@ def test_version_names_what_a_bug_report_needs() -> None:
     assert run("version").stdout.splitlines()[0] == f"zsched {__version__}"
 
 
-@pytest.mark.parametrize("arguments", [("fly",), ("status", "--jsn"), ("check",), ("demo", "--mode", "guess")])
+@pytest.mark.parametrize("arguments", [("fly",), ("status", "--jsn"), ("demo", "--mode", "guess")])
 def test_wrong_usage_exits_with_2_and_explains_on_stderr(arguments: tuple[str, ...]) -> None:
     result = run(*arguments)
     assert (result.exit_code, result.stdout) == (2, "")

@@ -31,7 +31,7 @@ FLOORS: Final[tuple[tuple[str, int, str], ...]] = (
         "seams",
     ),
     (r"(config|config_\w+)", 2, "seams"),
-    (r"(relay_door|introduction|guard|log_limit|files)", 2, "seams"),
+    (r"(relay_door|introduction|guard|log_limit|files|opening)", 2, "seams"),
     (r"adapters\.(worker_supervisor|worker_process|launch)", 3, "adapters: worker processes"),
     (r"adapters\.(control_bus|open_questions)", 3, "adapters: control"),
     (r"adapters\.(network_profiler|nl80211)", 3, "adapters: radio"),

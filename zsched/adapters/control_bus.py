@@ -39,6 +39,7 @@ from zsched.errors import AdapterError, WireError
 from zsched.guard import guarded
 from zsched.introduction import Introducer
 from zsched.keyspace import Keyspace, counter, parse
+from zsched.opening import why_not_open
 
 OPERATOR_TIMEOUT_S = 3.0
 CLOSE_S = 0.5
@@ -107,7 +108,7 @@ class ControlBus:
         try:
             session = zenoh.open(zenoh.Config.from_json5(self._config))
         except zenoh.ZError as error:
-            raise AdapterError(f"cannot open the control session: {error}; is its port taken?") from error
+            raise AdapterError(f"the control session {why_not_open(self._config, error)}") from error
         self._session = session
         keys, node = self._keys, self._node
         self._publishers = {

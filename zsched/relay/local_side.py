@@ -19,7 +19,7 @@ import zenoh
 from zsched.core.events import ProblemReported
 from zsched.core.relay_protocol import RelayReport
 from zsched.guard import guarded
-from zsched.relay.opening import why_not_open
+from zsched.opening import why_not_open
 
 RETRY_S: Final = 0.5
 SOURCE: Final = "relay/local"

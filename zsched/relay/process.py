@@ -33,11 +33,11 @@ from zsched.errors import WireError
 from zsched.guard import guarded, on_failure
 from zsched.introduction import Introducer
 from zsched.keyspace import Keyspace
+from zsched.opening import why_not_open
 from zsched.relay.acks import Acks
 from zsched.relay.graph import GraphMirror
 from zsched.relay.local_side import LocalSide
 from zsched.relay.matching import Matching
-from zsched.relay.opening import why_not_open
 from zsched.relay.roles import RoleServer
 from zsched.relay.successors import Successors
 from zsched.relay.task import TaskRelay

@@ -8,12 +8,14 @@ import re
 import shutil
 import socket
 import subprocess
+import tomllib
 from pathlib import Path
 
 import pytest
 
 from zsched.adapters.systemd import Notifier, watchdog_interval_s
 from zsched.daemon import RESTART_SIGNAL
+from zsched.daemon_descriptors import WANTED
 
 UNIT = Path(__file__).parents[3] / "systemd" / "zsched.service"
 MAX_EXPOSURE = 1.5
@@ -89,6 +91,20 @@ def test_unit_promises_what_the_daemon_keeps() -> None:
     assert service["RestartKillSignal"] == RESTART_SIGNAL.name
     assert service["RuntimeDirectoryPreserve"] == "restart"
     assert service["ExecStopPost"].endswith("-m zsched.leftovers")
+    assert int(service["LimitNOFILE"]) == WANTED
+
+
+def test_what_the_unit_names_as_its_documentation_is_installed() -> None:
+    unit = configparser.RawConfigParser(strict=False)
+    unit.read(UNIT)
+    page = unit["Unit"]["Documentation"].removeprefix("file:///opt/zsched/")
+    project = tomllib.loads((UNIT.parents[1] / "pyproject.toml").read_text())
+    installed = project["tool"]["setuptools"]["data-files"]
+    pages = {
+        f"{folder}/{Path(file).name}": UNIT.parents[1] / file for folder, files in installed.items() for file in files
+    }
+    assert page in pages
+    assert all(file.is_file() for file in pages.values())
 
 
 def analyze(*arguments: str) -> subprocess.CompletedProcess[str]:

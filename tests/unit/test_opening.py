@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 import zenoh
 
-from zsched.relay.opening import why_not_open
+from zsched.opening import why_not_open
 from zsched.zenoh_config import client_config, data_config
 
 

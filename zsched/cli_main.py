@@ -1,0 +1,21 @@
+"""The console entry point: an interrupt while the command line is still loading is no bug, and gets no traceback.
+
+Knows: nothing but that. Does not know: verbs (`zsched.cli`, whose imports take a fifth of a second).
+"""
+
+from __future__ import annotations
+
+import sys
+
+EXIT_INTERRUPTED = 130
+"""As a shell counts SIGINT."""
+
+
+def main() -> None:
+    """Run the command line."""
+    try:
+        from zsched.cli import main as run  # noqa: PLC0415 - what may be interrupted
+
+        run()
+    except KeyboardInterrupt:
+        sys.exit(EXIT_INTERRUPTED)
