@@ -100,7 +100,7 @@ class Voting:
         if counted.outcome is VoteOutcome.PENDING:
             return None
         self.opened_at = None
-        if counted.outcome is VoteOutcome.WON and counted.winner is not None:
+        if counted.outcome is VoteOutcome.WON:
             self.awaited_until = now + self._timing.ballot_s + self._timing.stagger_s
             self._schedule_commit(counted, allocation, fresh, now)
         return counted

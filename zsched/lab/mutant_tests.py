@@ -18,6 +18,7 @@ import importlib.abc
 import importlib.machinery
 import importlib.util
 import json
+import math
 import os
 import resource
 import signal
@@ -296,26 +297,37 @@ class Planter(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 # --- the hunt --------------------------------------------------------------------------------------------------------
 
 
-def hunt(session: pytest.Session, mutant: Mutant, reach: Reach) -> str:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Effort:
+    """What is tried to find a mutant."""
+
+    tests: tuple[str, ...] = TESTS
+    longest_s: float = math.inf
+    """Tests that take more CPU time are left out."""
+    schedules: int = SCHEDULES
+
+
+def hunt(session: pytest.Session, mutant: Mutant, reach: Reach, effort: Effort) -> str:
     """Run the tests that may find the planted mutant, then schedules; what has found it, empty when nothing has."""
     limit = resource.getrlimit(resource.RLIMIT_AS)
     used = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + MORE_MEMORY, limit[1]))
     items = {item.nodeid: item for item in session.items}
-    chosen = [items[test] for test in reach.chosen(mutant) if test in items]
+    tests = [test for test in reach.chosen(mutant) if test in items and reach.seconds[test] <= effort.longest_s]
+    chosen = [items[test] for test in tests]
     for item, following in _with_next(chosen):
         _limit_cpu(reach.seconds[item.nodeid])
         item.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
         if session.testsfailed:
             return item.nodeid
-    return _by_schedules()
+    return _by_schedules(effort.schedules)
 
 
-def _by_schedules() -> str:
+def _by_schedules(count: int) -> str:
     from zsched.lab.sim_faults import play  # noqa: PLC0415 - only now may the core be imported
     from zsched.lab.sim_swarm import plan  # noqa: PLC0415 - as above
 
-    for seed in range(SCHEDULES):
+    for seed in range(count):
         _limit_cpu(2.0)
         result = play(plan(seed))
         if result.violation:

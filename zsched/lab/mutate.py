@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import gc
 import json
+import math
 import os
 import signal
 import subprocess
@@ -31,10 +32,12 @@ import pytest
 from zsched.lab.mutant_tests import (
     KILLED,
     OPTIONS,
+    SCHEDULES,
     SURVIVED,
     TESTS,
     TIMEOUT,
     Calls,
+    Effort,
     Functions,
     Loop,
     Planter,
@@ -145,13 +148,8 @@ class Fork:
         return (KILLED, text.strip()) if text.strip() != "-" else (SURVIVED, "")
 
 
-def _fork(work: Sequence[object]) -> Fork:
-    """Run ``work`` (session, mutant, reach, functions) in a child."""
-    session, mutant, reach, functions = work
-    assert isinstance(session, pytest.Session)
-    assert isinstance(mutant, Mutant)
-    assert isinstance(reach, Reach)
-    assert isinstance(functions, Functions)
+def _fork(session: pytest.Session, mutant: Mutant, reach: Reach, functions: Functions, effort: Effort) -> Fork:
+    """Try a mutant in a child."""
     reading, writing = os.pipe()
     pid = os.fork()
     if pid:
@@ -161,13 +159,13 @@ def _fork(work: Sequence[object]) -> Fork:
     try:
         silence()
         if reach.is_cold(mutant):
-            found = _cold(mutant, session.config.args)
+            found = _cold(mutant, effort)
         else:
             path = CORE / Path(mutant.path).name
             code = mutated(mutant, path.read_text(encoding="utf-8"), str(path))
             assert code is not None
             functions.plant(code)
-            found = hunt(session, mutant, reach)
+            found = hunt(session, mutant, reach, effort)
         os.write(writing, (found or "-").encode())
     except MemoryError:
         os.write(writing, b"out of memory")
@@ -175,9 +173,10 @@ def _fork(work: Sequence[object]) -> Fork:
         os._exit(0)
 
 
-def _cold(mutant: Mutant, tests: Sequence[str]) -> str:
+def _cold(mutant: Mutant, effort: Effort) -> str:
     """What has found a mutant that must be there from the first import on: in a new process."""
-    command = [sys.executable, "-m", "zsched.lab.mutate", "--cold", json.dumps(asdict(mutant)), "--tests", *tests]
+    command = [sys.executable, "-m", "zsched.lab.mutate", "--cold", json.dumps(asdict(mutant))]
+    command += ["--longest", str(effort.longest_s), "--schedules", str(effort.schedules), "--tests", *effort.tests]
     with tempfile.TemporaryFile("w+") as said:
         run = subprocess.Popen(command, cwd=ROOT, stdout=said)
         try:
@@ -195,18 +194,18 @@ def _cold(mutant: Mutant, tests: Sequence[str]) -> str:
     return lines[-1].removeprefix("found: ").strip()
 
 
-def cold(mutant: Mutant, tests: Sequence[str]) -> int:
+def cold(mutant: Mutant, effort: Effort) -> int:
     """Try a mutant in this process, which has not imported the core."""
     sys.meta_path.insert(0, Planter(mutant))
-    reach = Reach(**json.loads(cache_file(tests).read_text(encoding="utf-8")))
+    reach = Reach(**json.loads(cache_file(effort.tests).read_text(encoding="utf-8")))
 
     def work(session: pytest.Session) -> None:
         if {item.nodeid for item in session.items} < set(reach.seconds):
             print("\nfound: some tests cannot be collected", flush=True)
             return
-        print(f"\nfound: {hunt(session, mutant, reach)}", flush=True)  # behind pytest's dots
+        print(f"\nfound: {hunt(session, mutant, reach, effort)}", flush=True)  # behind pytest's dots
 
-    code = pytest.main([*OPTIONS, *tests], plugins=[Loop(work)])
+    code = pytest.main([*OPTIONS, *effort.tests], plugins=[Loop(work)])
     return 0 if code in {pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED} else 1
 
 
@@ -251,7 +250,9 @@ def _fork_measuring(session: pytest.Session, items: list[pytest.Item], path: Pat
         os._exit(0)
 
 
-def try_all(session: pytest.Session, mutants: Sequence[Mutant], reach: Reach, jobs: int, results: Results) -> None:
+def try_all(
+    session: pytest.Session, mutants: Sequence[Mutant], reach: Reach, effort: Effort, jobs: int, results: Results
+) -> None:
     """Try every mutant that has no verdict yet, ``jobs`` at a time."""
     functions = Functions(CORE)
     gc.freeze()
@@ -261,7 +262,7 @@ def try_all(session: pytest.Session, mutants: Sequence[Mutant], reach: Reach, jo
     while waiting or running:
         while waiting and len(running) < jobs:
             mutant = waiting.pop(0)
-            fork = _fork((session, mutant, reach, functions))
+            fork = _fork(session, mutant, reach, functions, effort)
             running[fork.pid] = (mutant, fork)
         for pid, status in _ended(running):
             mutant, fork = running.pop(pid)
@@ -320,20 +321,23 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--least", type=float, default=LEAST_PERCENT, help="percent that must be found")
     parser.add_argument("--tests", nargs="+", default=TESTS, help="files or folders; the whole core's by default")
     parser.add_argument("--cold", help=argparse.SUPPRESS)
+    parser.add_argument("--longest", type=float, default=math.inf, help="leave out tests of more CPU seconds")
+    parser.add_argument("--schedules", type=int, default=SCHEDULES, help="of the simulator, for what no test finds")
     given = parser.parse_args(arguments)
+    effort = Effort(tests=tuple(given.tests), longest_s=given.longest, schedules=given.schedules)
     if given.cold:
-        return cold(Mutant(**json.loads(given.cold)), given.tests)
-    file = cache_file(given.tests)
+        return cold(Mutant(**json.loads(given.cold)), effort)
+    file = cache_file(effort.tests)
     mutants = choose(given.seed, given.mutants, given.module)
     results, calls = Results.load(given.resume), Calls(CORE)
 
     def work(session: pytest.Session) -> None:
         sys.settrace(None)
         reach = reach_of(session, file, calls.taken(), given.jobs)
-        try_all(session, mutants, reach, given.jobs, results)
+        try_all(session, mutants, reach, effort, given.jobs, results)
 
     sys.settrace(None if file.exists() else calls)
-    code = pytest.main([*OPTIONS, *given.tests], plugins=[Loop(work)])
+    code = pytest.main([*OPTIONS, *effort.tests], plugins=[Loop(work)])
     sys.settrace(None)
     verdicts = [results.verdicts[mutant.key] for mutant in mutants if mutant.key in results.verdicts]
     if code != pytest.ExitCode.OK or len(verdicts) < len(mutants):

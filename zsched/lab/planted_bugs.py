@@ -532,9 +532,7 @@ VOTE_BUGS = (
     Bug(
         name="a vote that stays is committed",
         module=VOTING,
-        changes=(
-            ("if counted.outcome is VoteOutcome.WON and counted.winner is not None:", "if counted.winner is not None:"),
-        ),
+        changes=(("if counted.outcome is VoteOutcome.WON:", "if counted.winner is not None:"),),
         tests=("tests/unit/core/test_epochs.py",),
         seed=44,
         also=_bug(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from zsched.core.fleet import Demand, Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
@@ -103,3 +105,29 @@ def test_several_tasks_add_up_and_our_own_and_a_stranger_s_do_not_count() -> Non
     plain = seen(load("plan"))
     assert seen(load("plan"), booked=(("map", each),)) == plain
     assert seen(load("plan"), booked=(("watch", each),)) == plain, "it runs no worker that zsched would see"
+
+
+def test_where_somebody_else_starts_the_worker_its_whole_demand_is_added() -> None:
+    """No load of the task is in the profile: nothing of what is used is its own."""
+    unseen, seen_idle = (
+        Profile(
+            node="edge1",
+            incarnation=1,
+            sequence=1,
+            cpu_cores=4.0,
+            cpu_used_cores=1.0,
+            memory_mb=4000.0,
+            memory_used_mb=1000.0,
+            workers=workers,
+        )
+        for workers in ((), (load("map", 0.0, 0.0),))
+    )
+    terms = []
+    for profile in (unseen, seen_idle):
+        gateway = Gateway(FLEET)
+        gateway.absorb(profile, 10.0)
+        states = {"edge1": PeerState.ALIVE, "robot1": PeerState.ALIVE}
+        spec = replace(TASKS[0], worker=WorkerSpec())
+        (utility,) = score(spec, NOBODY, "robot1", gateway, states, 10.0).utilities
+        terms.append((utility.cpu, utility.memory))
+    assert terms[0] == terms[1]

@@ -9,7 +9,7 @@ from zsched.core import instructions as do
 from zsched.core.agreement import PARK_SHARE, Agreement, Effects
 from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing
 from zsched.core.lease import hold_s
-from zsched.core.messages import Accept, Accepted, Refusal, Refused
+from zsched.core.messages import Accept, Accepted, Learnt, Refusal, Refused
 from zsched.core.model import Acceptance, Allocation, Ballot, DurableState, NodeKind, RegisterState, Tuning, Weights
 
 ROBOTS = ("robot1", "robot2", "robot3")
@@ -40,7 +40,12 @@ def elector() -> Agreement:
         electorate="e",
         registers=(RegisterState(task="guard", learnt=value(3, "robot2")),),
     )
-    return Agreement(fleet=FLEET, me="robot1", durable=state, incarnation=7, electorate="e", rng=Random(1), now=100.0)
+    agreement = Agreement(
+        fleet=FLEET, me="robot1", durable=state, incarnation=7, electorate="e", rng=Random(1), now=100.0
+    )
+    for name in ROBOTS[1:]:
+        agreement.witness.on_answer(Learnt(node=name, values=()))  # they remember no later life of it
+    return agreement
 
 
 def asks(agreement: Agreement, request: int, counter: int, now: float, asker: str = "robot3") -> Effects:
