@@ -88,6 +88,7 @@ def test_partial_cut_makes_nobody_gone_and_an_ordinary_vote_decides(bed: ChaosBe
 
 def test_frozen_machine_loses_its_task_and_wakes_as_a_stranger(bed: ChaosBed) -> None:
     owner, start = bed.calm(), monotonic_s()
+    relays = bed.status(owner)["counters"].get("relay_exits", 0)
     stop_group(bed.pid(owner), signal.SIGSTOP)
     bed.wait(lambda: bed.moved_from(owner), 10, "another owner")
     bed.wait(lambda: bed.moved_from(owner, "robot1", "robot2", "robot3", task=GUARD), 10, "another guard")
@@ -95,6 +96,8 @@ def test_frozen_machine_loses_its_task_and_wakes_as_a_stranger(bed: ChaosBed) ->
     assert {node for _, node in gone(bed, start)} == {owner}
     stop_group(bed.pid(owner), signal.SIGCONT)
     bed.wait(lambda: learns(bed, owner), 10, "the sleeper to learn the newer epoch")
+    bed.wait(bed.is_calm, 20, "everybody to be well")
+    assert bed.status(owner)["counters"].get("relay_exits", 0) == relays, "its relay slept too, and was not wedged"
 
 
 def test_wedged_owner_is_replaced_although_its_token_stays(bed: ChaosBed) -> None:

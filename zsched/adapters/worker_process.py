@@ -22,7 +22,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
-from zsched.clock import monotonic_s
+from zsched.clock import awake_s
 
 LAUNCHER = str(Path(__file__).with_name("launch.py"))
 MAX_LINE_BYTES = 2048
@@ -264,13 +264,13 @@ class ProcessWatch:
 
     def wait(self, deadline_s: float | None) -> None:
         """Return at ``deadline_s`` (monotonic seconds; ``None``: never), or when woken or something happened."""
-        now = monotonic_s()
+        now = awake_s()
         times = [*self._paused.values(), *([deadline_s] if deadline_s is not None else [])]
         if self._polled:
             times.append(now + POLL_S)
         for key, _ in self._selector.select(max(0.0, min(times) - now) if times else None):
             key.data()
-        for process in [process for process, resume_s in self._paused.items() if monotonic_s() >= resume_s]:
+        for process in [process for process, resume_s in self._paused.items() if awake_s() >= resume_s]:
             del self._paused[process]
             self._register_output(process)
 
@@ -301,7 +301,7 @@ class ProcessWatch:
         self._selector.register(process.output_fd, selectors.EVENT_READ, partial(self._read, process))
 
     def _read(self, process: WorkerProcess) -> None:
-        is_open = process.read_output(monotonic_s())
+        is_open = process.read_output(awake_s())
         resume_s = process.resume_reading_s()
         if is_open and resume_s is None:
             return

@@ -31,7 +31,7 @@ from typing import Protocol
 
 from zsched.adapters.launch import EXIT_CANNOT
 from zsched.adapters.worker_process import ProcessWatch, WorkerGuard, WorkerProcess
-from zsched.clock import monotonic_s
+from zsched.clock import awake_s
 from zsched.core.fleet import WorkerSpec
 from zsched.core.model import NodeId, TaskId, WorkerState
 from zsched.guard import guarded
@@ -213,7 +213,7 @@ class WorkerSupervisor:
             self._watch.wait(self._next_deadline_s())
             while self._commands:
                 self._commands.popleft()()
-            now = monotonic_s()
+            now = awake_s()
             for worker in self._workers.values():
                 self._advance(worker, now)
             self._publish()
@@ -226,7 +226,7 @@ class WorkerSupervisor:
         running = [worker.task for worker in self._workers.values() if worker.process is not None]
         if not running:
             return True
-        if monotonic_s() < self._close_by_s:
+        if awake_s() < self._close_by_s:
             return False
         log.error("workers_not_stopped tasks=%s why=kernel does not end them; they die with this process", running)
         return True
@@ -268,7 +268,7 @@ class WorkerSupervisor:
         if not worker.spec.command:
             worker.phase = _Phase.IDLE
         elif worker.phase is _Phase.READY and incarnation == worker.incarnation:
-            worker.phase, worker.deadline_s = _Phase.STARTING, monotonic_s() + worker.spec.start_deadline_s
+            worker.phase, worker.deadline_s = _Phase.STARTING, awake_s() + worker.spec.start_deadline_s
 
     def _on_hung(self, task: TaskId, incarnation: int, reason: str) -> None:
         worker = self._workers[task]
@@ -284,7 +284,7 @@ class WorkerSupervisor:
             self._tell(self._events.on_reset, task)
 
     def _on_close(self, within_s: float) -> None:
-        self._close_by_s = monotonic_s() + within_s + 0.5
+        self._close_by_s = awake_s() + within_s + 0.5
         for worker in self._workers.values():
             worker.is_wanted = False
             if worker.process is not None:
@@ -351,7 +351,7 @@ class WorkerSupervisor:
         if worker.phase is not _Phase.STOPPING:
             worker.failure = failure
         worker.phase = _Phase.STOPPING
-        now = monotonic_s()
+        now = awake_s()
         worker.stop_grace_s = grace_s
         self._signal_stop(worker, first_step, now)
         worker.stop_grace_s = grace_s if next_grace_s is None else next_grace_s

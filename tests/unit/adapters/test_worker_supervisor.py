@@ -299,6 +299,23 @@ def test_handler_that_raises_does_not_stop_the_supervisor(caplog: pytest.LogCapt
     assert "event_handler_failed" in caplog.text
 
 
+def test_a_worker_that_starts_keeps_its_time_when_the_machine_is_suspended(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It slept, too: boot time is a minute later at once, its 20 s to start are not over."""
+    real, slept = time.clock_gettime, [0.0]
+    monkeypatch.setattr(
+        time, "clock_gettime", lambda clock: real(clock) + (slept[0] if clock == time.CLOCK_BOOTTIME else 0.0)
+    )
+    with supervised(python(SLEEP)) as (supervisor, recorder):
+        supervisor.start("merge")
+        recorder.wait("started")
+        slept[0] = 60.0
+        for _ in range(20):
+            supervisor.start("merge")  # its thread looks at the clock
+            time.sleep(0.02)
+        assert [call for call in recorder.calls if call[0] == "exited"] == []
+        assert supervisor.states() == {"merge": WorkerState.STARTING}
+
+
 def test_flooding_worker_is_bounded_in_log_lines_and_cpu(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "zsched.worker.merge")
     code = "import sys\nwhile True: sys.stdout.write('x' * 99 + '\\n')"
