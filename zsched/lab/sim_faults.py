@@ -216,6 +216,8 @@ class Stage:
         return CORES * self._busy.get(node, 0.25), 1000.0
 
     def _begin(self, fault: Fault) -> None:
+        if self.scene.is_over:
+            return  # they were ended early, to make the schedule smaller
         self.scene.done[fault.kind] += 1
         self.sim.stories.append(f"{self.sim.now:9.3f} FAULT {fault}")
         self._carriers[fault.kind](fault)

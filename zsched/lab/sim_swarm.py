@@ -358,9 +358,5 @@ LATER: dict[str, Maker] = {
     "generation": _one_node("generation", 1, 8.0),
 }
 """Faults that came later, drawn apart from `MAKERS`."""
-PENDING: frozenset[str] = frozenset({"rollback", "lie", "amnesia"})
-"""Faults whose mend has not landed: only ``--with`` plays them.
-
-Seeds that are violated without it, each with ``--with`` its fault: rollback, lie: 5, 64, 172; amnesia: 280, 320, 371;
-rollout of `exclusive`: 958, 1270; of a shorter lease: 1114.
-"""
+PENDING: frozenset[str] = frozenset()
+"""Faults whose mend has not landed: only ``--with`` plays them."""
