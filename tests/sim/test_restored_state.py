@@ -209,3 +209,17 @@ def test_a_beat_is_a_reason_to_ask_and_nothing_more() -> None:
     assert not own.must_ask(beat)
     assert own.must_ask(replace(beat, votes=10**9))
     assert own.seen == {"robot2": (3, 5)}
+
+
+def test_a_vote_that_the_disk_refused_is_not_remembered_by_others() -> None:
+    """Found by the simulator (seed 517): an elector whose disk was full was taken for a restored one afterwards."""
+    site = Site(1)
+    site.sim.broken_disks.add("robot1")
+    site.move("robot2", "robot3")
+    site.sim.run(2.0)
+    site.sim.broken_disks.discard("robot1")
+    site.sim.crash("robot1")
+    site.sim.start("robot1")
+    site.sim.run(3.0)
+    assert site.sim.node("robot1").agreement.problems == {}
+    assert site.sim.node("robot1").agreement.is_elector

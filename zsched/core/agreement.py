@@ -186,7 +186,7 @@ class Agreement:
         return replace(
             self.learnt(),
             incarnation=0 if self._durable is None else self.witness.incarnation,
-            votes=self.witness.votes,
+            votes=0 if self._durable is None else self.witness.votes,  # what the disk refused was never voted
             seen=as_tuple(self.witness.seen),
             lease_terms=self.leases.terms,
         )
