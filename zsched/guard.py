@@ -14,7 +14,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from zsched.clock import monotonic_s
 
@@ -22,6 +22,8 @@ PAUSE_S: Final = 0.1
 MAX_PAUSE_S: Final = 5.0
 CALM_S: Final = 60.0
 """Who has run for so long fails for the first time again."""
+
+T = TypeVar("T")
 
 _log = logging.getLogger("zsched.guard")
 
@@ -48,6 +50,18 @@ def guarded(
         is_lasting: ``run`` returns only when it is meant to end, and may be called again when it has raised.
     """
     return threading.Thread(target=_run, args=(partial(run, *args), kind or name, is_lasting), name=name, daemon=True)
+
+
+def tolerant(callback: Callable[[T], object], kind: str) -> Callable[[T], None]:
+    """``callback`` for one of zenoh's threads: what it raises is noted (zenoh would print every one, without limit)."""
+
+    def call(value: T) -> None:
+        try:
+            callback(value)
+        except Exception as error:  # noqa: BLE001 - one frame must not end what follows it, nor fill the log
+            note(kind, error)
+
+    return call
 
 
 def _run(run: Callable[[], object], kind: str, is_lasting: bool) -> None:

@@ -36,7 +36,7 @@ from zsched import wire
 from zsched.clock import monotonic_s
 from zsched.core.plan import Role, WorkerRole
 from zsched.core.relay_protocol import StreamAcks, WorkerTrouble
-from zsched.guard import guarded
+from zsched.guard import guarded, tolerant
 from zsched.hop_acks import Acknowledger
 from zsched.keyspace import END_CHUNK, Keyspace
 from zsched.log_limit import limit_library
@@ -167,8 +167,10 @@ class Worker:
         """
         expr = key_expr.replace("{prefix}", self.prefix)
         source = Input(on_sample=on_sample, keep_last=keep_last, depth=depth)
-        ends = self._session.declare_subscriber(f"{expr}/{END_CHUNK}", self._on_marker)  # who sees the other sees this
-        data = self._session.declare_subscriber(expr, lambda sample: self._dispatcher.put(source, sample))
+        marker = tolerant(self._on_marker, "marker")
+        ends = self._session.declare_subscriber(f"{expr}/{END_CHUNK}", marker)  # who sees the other sees this
+        put = tolerant(partial(self._dispatcher.put, source), "input")
+        data = self._session.declare_subscriber(expr, put)
         self._declared += [data, ends]
 
     def publisher(

@@ -21,7 +21,7 @@ import zenoh
 from zsched.clock import monotonic_s
 from zsched.core.keyexpr import is_wild
 from zsched.core.relay_protocol import ERROR_ENCODING, REFUSED_ENCODING
-from zsched.guard import guarded
+from zsched.guard import guarded, tolerant
 from zsched.worker_troubles import Troubles
 
 ROLE_WAIT_S: Final = 0.3
@@ -82,7 +82,7 @@ class Service:
         self._requests: queue.Queue[zenoh.Query | None] = queue.Queue(depth)
         self._is_closed = False
         guarded(self._run, name=f"zsched serve {key_expr}", kind="zsched serve").start()
-        self._queryable = session.declare_queryable(key_expr, self._take, complete=True)
+        self._queryable = session.declare_queryable(key_expr, tolerant(self._take, "request"), complete=True)
 
     def undeclare(self) -> None:
         """Take no more requests; those that wait are refused."""

@@ -102,6 +102,19 @@ def test_a_thread_that_fails_at_once_does_not_spin(told: list[tuple[str, str]]) 
     assert not thread.is_alive()
 
 
+def test_what_a_callback_raises_in_zenoh_s_thread_is_told_and_the_next_one_comes(told: list[tuple[str, str]]) -> None:
+    heard: list[int] = []
+
+    def hear(number: int) -> None:
+        heard.append(10 // number)
+
+    callback = guard.tolerant(hear, "put")
+    for number in (1, 0, 5):
+        callback(number)
+    assert heard == [10, 2]
+    assert [kind for kind, _ in told] == ["put"]
+
+
 def test_a_listener_that_fails_itself_changes_nothing(told: list[tuple[str, str]]) -> None:
     def bad(_kind: str, _text: str) -> None:
         raise OSError("no")

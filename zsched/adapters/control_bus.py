@@ -36,7 +36,7 @@ from zsched.core.messages import (
 from zsched.core.model import NAME, Beat, NodeId, Profile, Proposal
 from zsched.core.snapshot import Snapshot
 from zsched.errors import AdapterError, WireError
-from zsched.guard import guarded
+from zsched.guard import guarded, tolerant
 from zsched.introduction import Introducer
 from zsched.keyspace import Keyspace, counter, parse
 from zsched.opening import why_not_open
@@ -122,10 +122,12 @@ class ControlBus:
         token = keys.alive(node, self._incarnation)
         # The token goes last: who sees it may ask, and must find the queryable.
         self._kept = [
-            session.declare_subscriber(keys.all_puts(), self._on_sample),
+            session.declare_subscriber(keys.all_puts(), tolerant(self._on_sample, "put")),
             *self._hear_in_turn(session),
-            *(session.declare_queryable(key, self._on_query) for key in self._questions_to_us()),
-            session.liveliness().declare_subscriber(keys.alive("*", "*"), self._on_token, history=True),
+            *(session.declare_queryable(key, tolerant(self._on_query, "question")) for key in self._questions_to_us()),
+            session.liveliness().declare_subscriber(
+                keys.alive("*", "*"), tolerant(self._on_token, "token"), history=True
+            ),
             session.liveliness().declare_token(token),
         ]
 
@@ -133,7 +135,7 @@ class ControlBus:
         """Subscribe to what comes in turn: thirty frames a second in a small fleet, not worth waking up for each."""
         key = self._keys.all_in_turn()
         if self._hears_all_at_once:
-            return [session.declare_subscriber(key, self._on_sample)]
+            return [session.declare_subscriber(key, tolerant(self._on_sample, "put"))]
         self._ring = session.declare_subscriber(key, zenoh.handlers.RingChannel(RING))
         return [self._ring]
 
@@ -337,7 +339,7 @@ class ControlBus:
         try:
             self._session.get(
                 selector,
-                on_reply,
+                tolerant(on_reply, "answer"),
                 payload=payload,
                 target=zenoh.QueryTarget.ALL,
                 consolidation=zenoh.ConsolidationMode.NONE,  # the default withholds all answers for a frozen peer

@@ -19,7 +19,7 @@ import zenoh
 from zenoh import Sample, SampleKind, Session
 
 from zsched.core.serial import number_near
-from zsched.guard import guarded
+from zsched.guard import guarded, tolerant
 
 TIMEOUT_S: Final = 0.5
 MAX_FETCHES: Final = 8
@@ -76,7 +76,9 @@ class History:
         The watch comes first: a publisher that was linked between a question and the watch would never be asked.
         """
         watch = f"{self._expr}/{ADVANCED}/pub/**"
-        self._tokens = self._session.liveliness().declare_subscriber(watch, self._token, history=False)
+        self._tokens = self._session.liveliness().declare_subscriber(
+            watch, tolerant(self._token, "history"), history=False
+        )
         self._ask(self._everything)
 
     def close(self) -> None:

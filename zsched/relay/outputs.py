@@ -22,6 +22,7 @@ from zenoh import CongestionControl, Sample, Session, Timestamp
 from zsched.clock import monotonic_s
 from zsched.core.plan import HandoverRule, Route, StreamClass, StreamCount
 from zsched.core.serial import number_near, serial_of
+from zsched.guard import tolerant
 from zsched.hop_acks import Jump, SourceName
 from zsched.keyspace import AGAIN_CHUNK, END_CHUNK
 from zsched.relay.acks import Acks
@@ -133,7 +134,7 @@ class OutputStream:
         expr = _with_epoch(from_expr, epoch, "*")
         if expr not in self._ends:
             self._ends[expr] = self._session.declare_subscriber(
-                f"{expr}/{END_CHUNK}", self._end, allowed_origin=zenoh.Locality.REMOTE
+                f"{expr}/{END_CHUNK}", tolerant(self._end, "marker"), allowed_origin=zenoh.Locality.REMOTE
             )
 
     def know(self, from_expr: str, *, notes_stamps: bool = False) -> None:

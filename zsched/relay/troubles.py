@@ -13,6 +13,7 @@ from zenoh import Sample, Session
 from zsched.clock import monotonic_s
 from zsched.core.model import NodeId
 from zsched.core.relay_protocol import WorkerTrouble
+from zsched.guard import tolerant
 from zsched.keyspace import Keyspace, parse
 from zsched.relay_pipe import decode_trouble
 
@@ -28,7 +29,7 @@ class Troubles:
     ) -> None:
         self._report = report
         self._reported_at = -PAUSE_S
-        self._subscriber = session.declare_subscriber(keyspace.trouble(node, "*", "*"), self._hear)
+        self._subscriber = session.declare_subscriber(keyspace.trouble(node, "*", "*"), tolerant(self._hear, "trouble"))
 
     def _hear(self, sample: Sample) -> None:
         now, parsed = monotonic_s(), parse(str(sample.key_expr))

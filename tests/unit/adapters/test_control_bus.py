@@ -224,7 +224,7 @@ def test_frame_that_is_too_large_to_send_is_an_error_of_the_adapter(mesh: tuple[
         ("beat/a", wire.encode(PROFILE), ("beat", "kind")),
         ("beat/a", b"\xff\x00garbage", ("beat", "garbage")),
         ("beat/a", b"", ("beat", "garbage")),
-        ("beat/a", b"\x00" * 9000, ("beat", "size")),
+        ("beat/a", b"\x00" * (wire.KINDS["beat"][1] + 1), ("beat", "size")),
         ("nonsense/a", wire.encode(BEAT), ("key", "unknown")),
         ("beat/No.Name", wire.encode(BEAT), ("key", "unknown")),
     ],
