@@ -12,10 +12,11 @@ import pytest
 from zsched.core.register import Register
 from zsched.errors import InvariantError
 from zsched.lab import simulate
-from zsched.lab.sim_faults import SETTLE_S, Stage, play
+from zsched.lab.sim_faults import Stage, play
 from zsched.lab.sim_files import CHANGES
 from zsched.lab.sim_links import Held
 from zsched.lab.sim_parts import GENERATION_STEP, Clock, Disk
+from zsched.lab.sim_rest import AT_MOST_S
 from zsched.lab.sim_swarm import LATER, MAKERS, MAX_NODES, MIN_NODES, PENDING, Fault, Plan, plan
 from zsched.lab.simulate import Job, main, shrink
 from zsched.lab.simulator import Simulator
@@ -25,7 +26,7 @@ from zsched.lab.simulator import Simulator
 def test_a_schedule_of_faults_violates_nothing_and_ends_at_rest(seed: int) -> None:
     result = play(plan(seed))
     assert result.violation == "", f"{Job(seed=seed).command}\n" + "\n".join(result.stories[-40:])
-    assert result.settled_s is None or result.settled_s <= SETTLE_S
+    assert result.settled_s is None or result.settled_s <= AT_MOST_S[plan(seed).fleet.timing.name]
 
 
 def test_same_seed_same_schedule_to_the_letter() -> None:
@@ -63,7 +64,7 @@ def test_a_fleet_whose_electors_lost_their_state_is_started_anew_and_gets_an_own
     for machine in sim.machines.values():
         sim.initialise(machine, generation=3)
     sim.start()
-    assert sim.run_until(lambda: not sim.unsettled(), SETTLE_S), sim.unsettled()
+    assert sim.run_until(lambda: not sim.unsettled(), AT_MOST_S[sim.fleet.timing.name]), sim.unsettled()
     assert min(revision for _, revision in sim.learnt if revision % GENERATION_STEP) == 3 * GENERATION_STEP + 1
 
 

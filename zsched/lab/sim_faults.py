@@ -24,13 +24,12 @@ from zsched.lab.sim_link_faults import SMALL_DELAY_S, LinkFaults
 from zsched.lab.sim_links import Pair
 from zsched.lab.sim_network import Weather
 from zsched.lab.sim_parts import Machine
+from zsched.lab.sim_rest import AT_MOST_S
 from zsched.lab.sim_rollout import Rollouts
 from zsched.lab.sim_scene import Carry, Scene
 from zsched.lab.sim_swarm import Fault, Plan
 from zsched.lab.simulator import CORES, Simulator
 
-SETTLE_S = 15.0
-"""Once faults have stopped and everybody is up, every task has a living owner that all know within this time."""
 EVENTS_PER_S = 500.0
 """A node handles about 50 a second; ten times that, on average over a whole schedule, is a storm."""
 LOST_S = 3.0
@@ -133,8 +132,9 @@ class Stage:
             sim.run(LOST_S)  # nothing may be agreed meanwhile that a majority does not remember
             self._start_generation()
             at = sim.now
-        if not sim.run_until(_every(50, lambda: not sim.unsettled()), SETTLE_S) and sim.unsettled():
-            raise InvariantError(f"not at rest {SETTLE_S:g} s after the faults: {sim.unsettled()}")
+        most_s = AT_MOST_S[sim.fleet.timing.name]
+        if not sim.run_until(_every(50, lambda: not sim.unsettled()), most_s) and sim.unsettled():
+            raise InvariantError(f"not at rest {most_s:g} s after the faults: {sim.unsettled()}")
         settled_s = sim.now - at
         sim.run(max(self.plan.seconds / 2 - settled_s, 0.0))
         self._check_answers()

@@ -3,8 +3,8 @@
 Knows: seeds, processes, what was played before, how to make a failing schedule smaller. Does not know: what a schedule
 is or what must hold.
 
-The last line is ``N schedules, V violations``; the exit code is 1 when there is any. A failing seed prints the one
-command that plays it again exactly.
+The last line is ``N schedules, V violations``; the exit code is 1 when there is any, and when too many fleets took too
+long to come to rest (`zsched.lab.sim_rest`). A failing seed prints the one command that plays it again exactly.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from zsched.lab.sim_faults import Result, play
+from zsched.lab.sim_rest import spread, too_slow
 from zsched.lab.sim_swarm import LATER, MAX_NODES, MIN_NODES, PENDING, SECONDS, Plan, plan
 
 CHUNK = 10
 STORIES_SHOWN = 40
-QUANTILES = (50, 90, 99)
 PROGRESS_EVERY = 500
 GARBAGE = (100_000, 10, 10)
 """So many new values before the collector looks at them."""
@@ -233,14 +233,6 @@ def _jobs(given: argparse.Namespace, first: int) -> Iterator[Job]:
         )
 
 
-def _spread(times: list[float]) -> str:
-    """Quantiles of some times."""
-    ranked = sorted(times)
-    at = {share: ranked[min(len(ranked) * share // 100, len(ranked) - 1)] for share in QUANTILES}
-    found = ", ".join(f"p{share} {value:.2f}" for share, value in at.items())
-    return f"{found}, most {ranked[-1]:.2f} s, of {len(ranked)}"
-
-
 def _explain(job: Job, result: Result, *, is_shrinking: bool) -> None:
     print(f"\nseed {job.seed}: {result.violation}\n  again: {job.command}")
     if is_shrinking:
@@ -281,11 +273,14 @@ def main(arguments: list[str] | None = None) -> int:
     counts = ", ".join(f"{name} {count}" for name, count in sorted(totals.faults.items()))
     print(f"faults: {counts}")
     for name, times in sorted(totals.settled_s.items()):
-        print(f"came to rest, {name}: {_spread(times)}")
+        print(f"came to rest, {name}: {spread(times)}")
     pace = 60 * played / max(took_s, 1e-9)
     print(f"{totals.events} events; {totals.generations} new generations; {pace:.0f} schedules a minute")
+    slow = too_slow(totals.settled_s)
+    for one in slow:
+        print(f"too slow: {one}")
     print(f"{played} schedules, {violations} violations")
-    return 1 if violations else 0
+    return 1 if violations or slow else 0
 
 
 if __name__ == "__main__":
