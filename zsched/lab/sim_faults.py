@@ -145,6 +145,7 @@ class Stage:
         sim, scene = self.sim, self.scene
         scene.is_over, sim.fleet = True, scene.fleet
         self._links.calm()
+        sim.work.all_come()
         sim.cut_batch = None
         missing = self._one_too_few()
         for key in [key for key, machine in sim.machines.items() if key != machine.name]:
@@ -317,6 +318,12 @@ class Stage:
             if is_final:
                 self.sim.later(fault.seconds, self.sim.work.mend, machine, task, machine.life)
 
+    def _absence(self, fault: Fault) -> None:
+        """The workers that somebody else runs beside a node end, and are back later."""
+        machine, work = self.scene.machine(fault), self.sim.work
+        work.leave(machine)
+        self.scene.then(fault.seconds, lambda: work.come(machine))
+
     def _retune(self, fault: Fault) -> None:
         """An operator changes weights, and looks at the status."""
         machine, task = self.scene.machine(fault), self._rng.choice(self.sim.fleet.tasks)
@@ -350,6 +357,7 @@ class Stage:
             **dict.fromkeys(("twin", "apart"), self._twin),
             "freeze": self._freeze,
             "worker": self._worker,
+            "absence": self._absence,
             "retune": self._retune,
             "load": self._set_load,
             "drain": self._drain,

@@ -18,6 +18,7 @@ from zsched.core.model import Aggregate, NodeId, NodeKind, Tuning, Weights
 from zsched.core.timing import WAN, WIFI, WIRED
 from zsched.lab.sim_clocks import clock_faults
 from zsched.lab.sim_files import CHANGES
+from zsched.lab.sim_foreign import absences, with_foreign_workers
 
 SECONDS = 30.0
 """Virtual seconds of one schedule: faults in the first half, then quiet."""
@@ -81,6 +82,10 @@ def plan(seed: int, *, nodes: int | None = None, seconds: float = SECONDS, kinds
     if is_leased and "rollout" in kinds and later.random() < 0.25:
         fleet, rollout = _made_exclusive(later, fleet)
         faults += (rollout,)
+    others = Random(f"foreign {seed}")
+    fleet = with_foreign_workers(others, fleet)
+    for at, name, away_s in absences(others, fleet, until):
+        faults += (Fault(at=at, kind="absence", nodes=(name,), seconds=away_s),)
     faults = tuple(sorted(faults, key=lambda fault: (fault.at, fault.kind, fault.nodes)))
     return Plan(seed=seed, fleet=fleet, faults=faults, seconds=seconds, generation=generation)
 

@@ -61,6 +61,8 @@ class Work:
         """(machine, task) of the workers that work without a lease, or have not stopped yet."""
         self._begun: Counter[tuple[str, TaskId]] = Counter()
         """{(machine, task): how often its worker was made active}: one that is again before it has stopped works on."""
+        self._absent: Counter[str] = Counter()
+        """{machine: how many reasons the workers that somebody else runs there have to be away}."""
         self.stop_s: tuple[float, ...] = WORKER_STOP_S
         """What an exclusive worker may take to stop, one of these each time."""
 
@@ -90,6 +92,31 @@ class Work:
             self._sim.deliver(machine, ev.WorkerChanged(task=task, state=WorkerState.READY))
             for other in tuple(self._sim.machines.values()):
                 self._show_later(machine, task, other)
+
+    def meet(self, machine: Machine) -> None:
+        """A daemon has started beside workers that somebody else runs."""
+        states = {} if machine.node is None else machine.node.worker_states
+        for task in machine.fleet.tasks if not self._absent[machine.key] else ():
+            if not task.worker.command and task.name in states:
+                self._start(machine, task.name)
+
+    def leave(self, machine: Machine) -> None:
+        """The workers that somebody else runs on a machine end."""
+        self._absent[machine.key] += 1
+        for task in machine.fleet.tasks:
+            if not task.worker.command:
+                self._stop(machine, task.name)
+
+    def come(self, machine: Machine) -> None:
+        """They are back, unless there is another reason for them to be away."""
+        self._absent[machine.key] -= 1
+        self.meet(machine)
+
+    def all_come(self) -> None:
+        """There is no reason for any of them to be away any more."""
+        for machine in tuple(self._sim.machines.values()):
+            if self._absent.pop(machine.key, 0):
+                self.meet(machine)
 
     # --- tokens ------------------------------------------------------------------------------------------------------
 

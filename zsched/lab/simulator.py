@@ -202,6 +202,7 @@ class Simulator(Links):
         self._tell_token(machine, ev.TokenSeen(node=machine.name, incarnation=machine.node.incarnation), TOKEN_DELAY_S)
         self._carry_out(machine, machine.node.start(local), 0)
         self.work.greet(machine)
+        self.work.meet(machine)
         self.later(self.rng.uniform(0, machine.fleet.timing.sample_s), self._sample, machine, machine.life)
         self.arm(machine)
 

@@ -1,0 +1,60 @@
+"""Workers that somebody else runs: a node that has none gets no task, and an owner without one is left."""
+
+from __future__ import annotations
+
+from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.model import NodeKind, Tuning, Weights
+from zsched.core.plan import ReadyWhen
+from zsched.core.status import build_snapshot
+from zsched.lab.sim_swarm import plan
+from zsched.lab.simulator import Simulator
+
+ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
+DEADLINE_S = 3.0
+
+
+def fleet() -> Simulator:
+    task = TaskSpec(
+        name="merge",
+        candidates=EDGES,
+        tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0), time_to_trigger_s=0.0, cool_down_s=0.0),
+        worker=WorkerSpec(ready_when=ReadyWhen.MATCHING, start_deadline_s=DEADLINE_S),
+    )
+    kinds = {**dict.fromkeys(EDGES, NodeKind.EDGE), **dict.fromkeys(ROBOTS, NodeKind.ROBOT)}
+    nodes = tuple(NodeSpec(name=name, kind=kind) for name, kind in kinds.items())
+    return Simulator(fleet=Fleet(name="sim", timing=Timing(), nodes=nodes, tasks=(task,), electors=ROBOTS), seed=3)
+
+
+def problems(sim: Simulator, node: str) -> tuple[str, ...]:
+    return build_snapshot(sim.node(node), sim.now).tasks[0].problems
+
+
+def test_nobody_owns_a_task_that_nobody_can_do() -> None:
+    sim = fleet()
+    for edge in EDGES:
+        sim.work.leave(sim.machines[edge])
+    sim.start()
+    sim.run(15)
+    assert sim.agreed("merge") is None
+    sim.work.come(sim.machines["edge2"])
+    assert sim.run_until(lambda: sim.agreed("merge") == "edge2" and not sim.unsettled(), 5), sim.unsettled()
+
+
+def test_an_owner_whose_worker_is_away_is_left_at_its_deadline_and_not_before() -> None:
+    sim = fleet()
+    sim.start()
+    assert sim.run_until(lambda: sim.agreed("merge") is not None and not sim.unsettled(), 15), sim.unsettled()
+    owner = sim.agreed("merge") or ""
+    sim.work.leave(sim.machines[owner])
+    at = sim.now
+    assert sim.run_until(lambda: all(problems(sim, robot) for robot in ROBOTS), 1.5), "everybody says what is wrong"
+    assert sim.run_until(lambda: sim.agreed("merge") not in (None, owner), 2 * DEADLINE_S)
+    assert DEADLINE_S < sim.now - at < DEADLINE_S + 1.5
+    assert sim.run_until(lambda: not sim.unsettled(), 3), sim.unsettled()
+    sim.run(10)
+    assert sim.agreed("merge") != owner, "nobody goes back to where no worker is"
+
+
+def test_random_schedules_have_such_workers_too() -> None:
+    kinds = [{fault.kind for fault in plan(seed).faults} for seed in range(100)]
+    assert 5 <= sum("absence" in one for one in kinds) <= 40

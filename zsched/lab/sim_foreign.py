@@ -1,0 +1,38 @@
+"""Fleets whose workers somebody else runs, and when those are away: the node sees them come and go, and starts none.
+
+Knows: which schedules have such workers, when one ends and is back. Does not know: how a node sees a worker.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from random import Random
+from typing import Final
+
+from zsched.core.fleet import Fleet
+from zsched.core.model import NodeId
+from zsched.core.plan import ReadyWhen
+
+SHARE: Final = 0.2
+"""Of the schedules without an exclusive task."""
+LONGEST_S: Final = 8.0
+"""Longer than a start-up deadline in the simulator: the task must have moved by then, if it can."""
+
+
+def with_foreign_workers(rng: Random, fleet: Fleet) -> Fleet:
+    """The same fleet, in some schedules with workers that it does not start."""
+    if any(task.exclusive for task in fleet.tasks) or rng.random() > SHARE:
+        return fleet
+    tasks = tuple(
+        replace(task, worker=replace(task.worker, command=(), ready_when=ReadyWhen.MATCHING)) for task in fleet.tasks
+    )
+    return replace(fleet, tasks=tasks)
+
+
+def absences(rng: Random, fleet: Fleet, until: float) -> list[tuple[float, NodeId, float]]:
+    """(at, node, seconds) of the ends of its workers; none where the fleet starts its workers itself."""
+    if all(task.worker.command for task in fleet.tasks):
+        return []
+    candidates = sorted({name for task in fleet.tasks for name in task.candidates})
+    count = rng.randint(1, 2 * len(candidates))
+    return [(rng.uniform(0.0, until), rng.choice(candidates), rng.uniform(0.05, LONGEST_S)) for _ in range(count)]
