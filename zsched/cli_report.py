@@ -16,6 +16,8 @@ Json = dict[str, Any]
 BUSY, FULL = 0.6, 0.85
 """From here a bar is yellow, from here red."""
 MAX_CANDIDATES, MAX_HISTORY = 12, 3
+DROPS_OVER_S = 60.0
+"""Drops that have not risen for so long are history."""
 STATE_STYLES = {"alive": "green", "ready": "green"} | dict.fromkeys(
     ("draining", "starting", "stopped", "suspect", "unknown"), "yellow"
 )
@@ -191,7 +193,7 @@ def _task(page: Page, status: Json, task: Json) -> None:
     _vote(page, task)
     is_quiet = task["phase"] in ("idle", "settled")
     page.block("EXECUTOR", (str(task["phase"]), "" if is_quiet else "yellow"))
-    _route(page, task)
+    _route(page, status, task)
 
 
 def _scheduler(page: Page, status: Json, task: Json) -> None:
@@ -305,7 +307,7 @@ def _vote(page: Page, task: Json) -> None:
         page.lines.append(" " * page.indent + page.paint(cut(what, page.width - page.indent), "dim"))
 
 
-def _route(page: Page, task: Json) -> None:
+def _route(page: Page, status: Json, task: Json) -> None:
     prefix, parts = f"{task['name']}/", []
     for stream in task["streams"]:
         name, drops = stream["stream"].removeprefix(prefix), stream["drops"]
@@ -319,9 +321,14 @@ def _route(page: Page, task: Json) -> None:
             "at most lost": stream.get("at_most_lost"),
         }
         text += "".join(f", {count} {what}" for what, count in told.items() if count)
+        is_over = (stream.get("dropped_s") or 0.0) > DROPS_OVER_S
         if drops:
             text += ", dropped " + " ".join(f"{count} {reason}" for reason, count in drops.items())
-        parts.append((text, "yellow" if drops else ""))
+            text += f" (none for {span(stream['dropped_s'])})" if is_over else ""
+        parts.append((text, "yellow" if drops and not is_over else ""))
+    unheard = [one for one in task["streams"] if one["last_seen_s"] is None and f"{prefix}in/" in one["stream"]]
+    if unheard and status.get("joins_at"):  # a later field of the schema's major version
+        parts.append((f"applications here join at {', '.join(status['joins_at'])} (mode client)", "dim"))
     page.block("ROUTE", *(parts or [("no streams here", "dim")]))
 
 

@@ -42,7 +42,7 @@ from zsched.core.node import Node
 from zsched.core.route import watch_for
 from zsched.core.status import status_line
 from zsched.core.workers import runs_worker
-from zsched.daemon_access import StreamAccess
+from zsched.daemon_access import StreamAccess, joins_at
 from zsched.daemon_descriptors import take_descriptors
 from zsched.daemon_endpoints import Endpoints, endpoints_for, free_port, is_here
 from zsched.daemon_memory import shared_memory_objection
@@ -185,6 +185,7 @@ class Daemon:
                 now=monotonic_s(),
                 version=__version__,
             )
+            node.joins_at = joins_at(self._spec, points.worker_connect[:1])
             if problem is not None:
                 node.problems["state"] = problem
             if self._memory_objection:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import Any
 
 from zsched import zenoh_config
-from zsched.core.fleet import Fleet, LocalSide, dial_endpoint
+from zsched.core.fleet import Fleet, LocalSide, NodeSpec, dial_endpoint
 from zsched.core.model import NodeId
 
 Json = dict[str, Any]
@@ -48,6 +48,11 @@ class StreamAccess:
         return zenoh_config.client_config(
             connect=connect, timing=self._fleet.timing, shared_memory=False, operator_json5=self._operator_json5
         )
+
+
+def joins_at(spec: NodeSpec, own_endpoints: tuple[str, ...]) -> tuple[str, ...]:
+    """Where applications on this machine join its streams: their own network where there is one, else our relay."""
+    return own_endpoints if spec.local is None else _ways_to(spec.local)
 
 
 def _ways_to(side: LocalSide) -> tuple[str, ...]:

@@ -107,6 +107,10 @@ class Node:
         self._workers = Workers.of(fleet, me)
         self.worker_states = self._workers.states
         self.stream_counts: tuple[StreamCount, ...] = ()
+        self.dropped: dict[str, tuple[int, float]] = {}
+        """{stream: (how many samples it has dropped, when that last rose)}."""
+        self.joins_at: tuple[str, ...] = ()
+        """Where applications on this machine join its streams, for the status."""
         self.history: dict[TaskId, deque[PastValue]] = {task.name: deque(maxlen=HISTORY) for task in fleet.tasks}
 
         names = tuple(node.name for node in fleet.nodes)
@@ -581,6 +585,10 @@ class Node:
 
     def _on_counted(self, event: ev.StreamsCounted, now: float) -> None:
         self.stream_counts = event.counts
+        for count in event.counts:
+            dropped = sum(number for _, number in count.drops)
+            if dropped and self.dropped.get(count.stream, (0, 0.0))[0] != dropped:
+                self.dropped[count.stream] = (dropped, now)
         self._hangs.absorb(event.counts, self.executors, now)
         self.rounds.absorb_counts(event.counts, now)
 

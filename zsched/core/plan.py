@@ -183,6 +183,8 @@ class StreamCount:
     bytes: int = 0
     drops: tuple[tuple[str, int], ...] = ()
     """(reason, count): ``overflow``, ``no_route``, ``stale_epoch``, ``loop``, ``stalled``..."""
+    dropped_s: float | None = None
+    """Filled in by the status: seconds since the drops last rose."""
     last_seen_s: float | None = None
     """Seconds since the newest message, ``None`` before the first."""
     acknowledged: int | None = None

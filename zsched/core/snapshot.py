@@ -137,5 +137,7 @@ class Snapshot:
     tasks: tuple[TaskStatus, ...]
     fleet_file: str = ""
     """Hash of the fleet file that the answering node goes by."""
+    joins_at: tuple[str, ...] = ()
+    """Where applications on this machine join its streams: zenoh endpoints for a client to dial."""
     counters: tuple[tuple[str, int], ...] = ()
     problems: tuple[str, ...] = ()

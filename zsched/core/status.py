@@ -70,6 +70,8 @@ class NodeView(Protocol):
     executors: dict[TaskId, Executor]
     sealing: Sealing
     stream_counts: tuple[StreamCount, ...]
+    dropped: dict[str, tuple[int, float]]
+    joins_at: tuple[str, ...]
     history: dict[TaskId, deque[PastValue]]
 
 
@@ -89,6 +91,7 @@ def build_snapshot(node: NodeView, now: float) -> Snapshot:
         nodes=tuple(_node_status(node, spec, now) for spec in node.fleet.nodes),
         tasks=tuple(_task_status(node, spec, now) for spec in node.fleet.tasks),
         fleet_file=node.fleet_file,
+        joins_at=node.joins_at,
         counters=tuple(sorted((node.counters + node.agreement.counters).items())),
         problems=_problems(node, quorum),
     )
@@ -177,7 +180,7 @@ def _task_status(node: NodeView, spec: TaskSpec, now: float) -> TaskStatus:
         vote=_vote(standing, now),
         problems=tuple(_task_problems(node, spec, value, now)),
         streams=tuple(
-            _with_keys(count, routes.get(count.stream))
+            _with_keys(_with_age(count, node.dropped, now), routes.get(count.stream))
             for count in node.stream_counts
             if count.stream.startswith(prefix)
         ),
@@ -233,6 +236,12 @@ def _untaken(task: TaskSpec, executor: Executor) -> str:
         return "our relay does not see its worker's token, or its subscriptions"
     keys = [route.to_expr for route in executor.routes if route.direction is not Direction.OUTPUT]
     return f"our relay sees nobody take {keys[0] if keys else 'them'}"
+
+
+def _with_age(count: StreamCount, dropped: dict[str, tuple[int, float]], now: float) -> StreamCount:
+    return (
+        replace(count, dropped_s=now - dropped[count.stream][1]) if count.drops and count.stream in dropped else count
+    )
 
 
 def _with_keys(count: StreamCount, route: Route | None) -> StreamCount:

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from zsched.cli_report import render_status
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, electorate_hash
@@ -196,6 +197,21 @@ def test_a_slot_whose_worker_is_not_seen_is_a_problem_until_it_is() -> None:
     )
     node.handle(ev.SlotReady(task="merge", epoch=1), 114.0)
     assert build_snapshot(node, 120.0).tasks[0].problems == ()
+
+
+def test_drops_have_an_age_and_an_input_its_way_in() -> None:
+    node = make()
+    node.joins_at = ("tcp/127.0.0.1:7458",)
+    for now, dropped in ((100.0, 3), (110.0, 3), (120.0, 4), (190.0, 4)):
+        count = StreamCount(stream="merge/in/0", drops=(("overflow", dropped),))
+        node.handle(ev.StreamsCounted(counts=(count, StreamCount(stream="merge/in/1"))), now)
+    snapshot = build_snapshot(node, 190.0)
+    assert [count.dropped_s for count in snapshot.tasks[0].streams] == [70.0, None]
+    text = render_status(snapshot_json(snapshot), 100, color=False)
+    assert "dropped 4 overflow (none for 1m" in text
+    assert "applications here join at tcp/127.0.0.1:7458 (mode client)" in text
+    node.handle(ev.StreamsCounted(counts=(StreamCount(stream="merge/in/0", drops=(("overflow", 5),)),)), 191.0)
+    assert "(none for" not in render_status(snapshot_json(build_snapshot(node, 191.0)), 100, color=False)
 
 
 # --- the line --------------------------------------------------------------------------------------------------------
