@@ -313,7 +313,12 @@ LEASE_BUGS = (
         _ROLLOUT,
     ),
     _bug(
-        "worker without a lease is not waited for", SEALING, "if spec.name in answer.unleased:", "if False:", _ROLLOUT
+        "worker without a lease is not waited for",
+        SEALING,
+        "if spec.name in answer.unleased:",
+        "if False:",
+        _ROLLOUT,
+        38,
     ),
     _bug(
         "old fleet file needs no lease",
@@ -321,6 +326,7 @@ LEASE_BUGS = (
         "self.spec.exclusive or allocation.leased",
         "self.spec.exclusive",
         _ROLLOUT,
+        42,
     ),
     _bug(
         "restart forgets a longer lease",
@@ -451,6 +457,7 @@ MEMBERSHIP_BUGS = (
         "effects = self._lose(self.witness.on_answer(learnt))",
         "effects = Effects()",
         _RESTORED,
+        2,
     ),
     _bug(
         "votes of an earlier life are not compared",
