@@ -32,7 +32,11 @@ from zsched.worker_troubles import Troubles
 
 END_GRACE_S: Final = 0.1
 MAX_WITHHELD: Final = 256
-"""Samples per key of an input without ``keep_last`` that are kept for the day this worker becomes the owner."""
+"""Samples per key of an input without ``keep_last`` that a predecessor's state may want again."""
+MAX_BACKLOG: Final = 4096
+MAX_BACKLOG_BYTES: Final = 32 << 20
+"""Of such an input, whose output was withheld, that are kept for the day this worker becomes the owner; older ones are
+lost, and said to be."""
 QUIET_S: Final = 10.0
 """What was processed longer ago than this came with another move, or the predecessor had it, too."""
 JOIN_S: Final = 0.2
@@ -91,6 +95,7 @@ class _Done(NamedTuple):
     quiet_at: float | None
     """When it was processed, if nothing was withheld of it: it counts where the state that it went into is replaced."""
     replayed: bool = False
+    name: SourceName | None = None
 
     def is_over(self, *, is_restored: bool, now: float) -> bool:
         """True when it need not be processed again."""
@@ -126,6 +131,7 @@ class Dispatcher:
         self._epoch = 0
         self._begun = 0
         self._has_withheld = False
+        self._backlog_bytes = 0
         self._withheld: dict[tuple[int, str], tuple[Input, deque[_Done]]] = {}
         self._again: deque[tuple[Input, _Done]] = deque()
         self._is_standby: Callable[[], bool] = _never
@@ -215,6 +221,7 @@ class Dispatcher:
             for source, samples in self._withheld.values():
                 self._again.extend((source, done) for done in samples)
             self._withheld.clear()
+            self._backlog_bytes = 0
             if not self._is_held and self._first is None:
                 self._settle_state(is_restored=False)
             self._wake.notify()
@@ -295,14 +302,25 @@ class Dispatcher:
             self._note(waiting.name, waiting.number, sample)
         if not self._has_withheld and not was_standby:
             return
-        done = _Done(sample, None if self._has_withheld else monotonic_s(), waiting.replayed)
+        done = _Done(sample, None if self._has_withheld else monotonic_s(), waiting.replayed, waiting.name)
         with self._wake:
             if self._begun != begun:  # it became the owner meanwhile
                 self._again.append((source, done))
                 return
-            name = (id(source), str(sample.key_expr))
-            empty: deque[_Done] = deque(maxlen=source.keep_last or MAX_WITHHELD)
-            self._withheld.setdefault(name, (source, empty))[1].append(done)
+            self._keep(source, done)
+
+    def _keep(self, source: Input, done: _Done) -> None:
+        """For the day this worker becomes the owner (under the lock)."""
+        name = (id(source), str(done.sample.key_expr))
+        line = self._withheld.setdefault(name, (source, deque()))[1]
+        line.append(done)
+        self._backlog_bytes += len(done.sample.payload)
+        limit = source.keep_last or (MAX_BACKLOG if done.quiet_at is None else MAX_WITHHELD)
+        while len(line) > limit or (self._backlog_bytes > MAX_BACKLOG_BYTES and len(line) > 1):
+            oldest = line.popleft()
+            self._backlog_bytes -= len(oldest.sample.payload)
+            if source.keep_last is None and oldest.quiet_at is None and oldest.name is not None:
+                self._acks.shed(oldest.name)
 
     def _dispatch(self, source: Input, sample: zenoh.Sample, *, replayed: bool) -> None:
         key = str(sample.key_expr)

@@ -17,14 +17,15 @@ import pytest
 import zenoh
 
 from support.waiting import free_endpoint, until
-from zsched import wire
+from zsched import wire, worker_inputs
 from zsched.clock import monotonic_s
 from zsched.core.plan import Role, WorkerRole
-from zsched.core.relay_protocol import EndMarker
+from zsched.core.relay_protocol import EndMarker, StreamAck, StreamAcks
 from zsched.errors import ConfigError
 from zsched.keyspace import END_CHUNK, Keyspace
 from zsched.relay_pipe import decode_end, encode_end
 from zsched.worker import Output, Received, Worker
+from zsched.worker_inputs import MAX_WITHHELD
 from zsched.zenoh_config import data_config, worker_config
 
 KEYS = Keyspace("test")
@@ -323,3 +324,32 @@ def test_what_was_withheld_goes_out_before_what_comes_with_the_role(relay: Relay
     relay.put(b"d")
     until(lambda: len(relay.outputs) >= 4, "all outputs")
     assert [payload for _, payload in relay.outputs] == [b"a", b"b", b"c", b"d"]
+
+
+def test_a_long_backlog_of_a_worker_that_was_told_late_is_answered_whole(relay: Relay, echo: Echo) -> None:
+    """More than the samples that a predecessor's state would want again."""
+    count = 2 * MAX_WITHHELD
+    for number in range(count):
+        relay.put(str(number).encode())
+    until(lambda: len(echo.taken) == count, "the backlog")
+    relay.tell(WorkerRole.ACTIVE, epoch=4)
+    until(lambda: len(relay.outputs) == count, "an answer to all of it")
+    assert [int(payload) for _, payload in relay.outputs] == list(range(count))
+
+
+def test_what_a_backlog_has_no_room_for_is_said_to_be_lost(
+    relay: Relay, echo: Echo, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(worker_inputs, "MAX_BACKLOG", 10)
+    told: list[StreamAck] = []
+    key = KEYS.ack("edge1", "t", "3", str(relay.session.zid()))
+    heard = relay.session.declare_subscriber(
+        key, lambda sample: told.extend(wire.decode(sample.payload.to_bytes(), StreamAcks).acks)
+    )
+    while relay.count < 40:
+        relay.put(b"x")
+    until(lambda: len(echo.taken) == relay.count, "the backlog")
+    until(lambda: told[-1].processed == relay.count and told[-1].lost == relay.count - 10, "what is lost")
+    relay.tell(WorkerRole.ACTIVE, epoch=4)
+    until(lambda: len(relay.outputs) == 10, "the newest")
+    heard.undeclare()
