@@ -39,14 +39,18 @@ def slew(
     tell: Callable[[ev.Event], None],
     later: Callable[[float, Callable[[], None]], None],
     is_over: Callable[[], bool],
+    is_believed: Callable[[], bool] = lambda: True,
 ) -> None:
-    """Report a slew for some seconds, or until the faults are over, and then that all is well until it is believed."""
+    """Report a slew for some seconds, or until the faults are over, and then that all is well until it is believed.
+
+    That may take longer than `DOUBT_S`: a machine that stood still hears it all at once when it goes on.
+    """
     left = DOUBT_S + 2 * LOOK_S
 
     def look(elapsed_s: float, well_s: float) -> None:
         is_bad = well_s == 0.0 and elapsed_s < seconds and not is_over()
         tell(ev.ClockCompared(error_ratio=size if is_bad else 0.0, since_s=LOOK_S))
-        if well_s < left:
+        if well_s < left or not is_believed():
             later(LOOK_S, lambda: look(elapsed_s + LOOK_S, 0.0 if is_bad else well_s + LOOK_S))
 
     look(0.0, 0.0)

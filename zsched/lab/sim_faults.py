@@ -284,7 +284,18 @@ class Stage:
             if name in self.sim.machines:
                 self.sim.deliver(self.sim.machines[name], event)
 
-        slew(fault.size, fault.seconds, tell=tell, later=self.sim.later, is_over=lambda: self.scene.is_over)
+        def is_believed() -> bool:
+            node = self.sim.machines[name].node if name in self.sim.machines else None
+            return node is None or "clock" not in node.problems
+
+        slew(
+            fault.size,
+            fault.seconds,
+            tell=tell,
+            later=self.sim.later,
+            is_over=lambda: self.scene.is_over,
+            is_believed=is_believed,
+        )
 
     def _twin(self, fault: Fault) -> None:
         """Somebody copied a disk to another machine: its hardware differs, so it starts without a state.
