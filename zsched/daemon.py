@@ -17,7 +17,6 @@ import os
 import random
 import signal
 import sys
-import threading
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,18 +24,15 @@ from pathlib import Path
 from zsched import __version__, daemon_tls, places, zenoh_config
 from zsched.adapters import zenoh_log
 from zsched.adapters.control_bus import ControlBus
-from zsched.adapters.device_profiler import DeviceProfiler
-from zsched.adapters.network_profiler import readers_for
 from zsched.adapters.operator_socket import OperatorSocket
 from zsched.adapters.state_file import StateFile
 from zsched.adapters.streams import SILENCE_S, Bequest, RelayHandle
 from zsched.adapters.systemd import Notifier, watchdog_interval_s
 from zsched.adapters.worker_supervisor import WorkerContext, WorkerSupervisor
-from zsched.clock import ClockWatch, monotonic_s, wall_tenths
+from zsched.clock import monotonic_s, wall_tenths
 from zsched.config import load_fleet
 from zsched.core import events as ev
-from zsched.core.clocks import is_bad
-from zsched.core.fleet import NodeSpec, electorate_hash, fleet_hash
+from zsched.core.fleet import electorate_hash, fleet_hash
 from zsched.core.model import DurableState, NodeId, NodeKind, TaskId
 from zsched.core.node import Node
 from zsched.core.route import watch_for
@@ -46,8 +42,9 @@ from zsched.daemon_access import StreamAccess, joins_at
 from zsched.daemon_descriptors import take_descriptors
 from zsched.daemon_endpoints import Endpoints, endpoints_for, free_port, is_here
 from zsched.daemon_memory import shared_memory_objection
+from zsched.daemon_sampler import Sampler
 from zsched.errors import AdapterError, ConfigError, NameTakenError
-from zsched.guard import guarded, on_failure
+from zsched.guard import on_failure
 from zsched.log_limit import limit_handlers
 from zsched.relay_door import Door
 from zsched.shell import Desk, Inbox, Shell
@@ -78,64 +75,6 @@ class Options:
     node: NodeId
     state_dir: Path
     runtime_dir: Path
-
-
-class Sampler:
-    """Measures the machine and its links in a thread of its own: a slow driver must not stop the beats."""
-
-    def __init__(self, spec: NodeSpec, period_s: float, shell: Shell, inbox: Inbox) -> None:
-        self._readers = readers_for(spec)
-        self._device, self._clocks = DeviceProfiler(), ClockWatch()
-        self._period_s, self._shell, self._inbox = period_s, shell, inbox
-        self._stop = threading.Event()
-        self._problems: dict[str, str | None] = {}
-        self._thread = guarded(self._run, name="zsched-sampler")
-
-    def start(self) -> None:
-        """Begin measuring."""
-        self._thread.start()
-
-    def stop(self) -> None:
-        """End measuring; the thread ends with its current reading."""
-        self._stop.set()
-        self._thread.join(timeout=0.5)
-
-    def _run(self) -> None:
-        while not self._stop.is_set():
-            try:
-                self._compare_clocks()
-                self._sample()
-            except Exception as error:
-                log.exception("sample_failed")
-                self._report("profile", f"cannot measure: {error}")
-            else:
-                self._report("profile", None)
-            self._stop.wait(self._period_s)
-
-    def _report(self, source: str, problem: str | None) -> None:
-        """Report a problem, or its end, when it is news."""
-        if self._problems.get(source) != problem:
-            self._problems[source] = problem
-            self._inbox.post(ev.ProblemReported(source=source, problem=problem))
-
-    def _compare_clocks(self) -> None:
-        drift = self._clocks.look()
-        if drift is None:
-            return
-        event = ev.ClockCompared(error_ratio=drift.error_ratio, jump_s=drift.jump_s, since_s=drift.since_s)
-        if is_bad(event):
-            self._inbox.post(event)
-        else:
-            self._inbox.post_quietly(event)
-
-    def _sample(self) -> None:
-        supervisor = self._shell.crew.supervisor
-        states, pids = (supervisor.states(), supervisor.pids()) if supervisor is not None else ({}, {})
-        device = self._device.sample({task: (state, pids.get(task)) for task, state in states.items()})
-        links = tuple(reader.read() for reader in self._readers)
-        self._inbox.post_quietly(ev.ProfileSampled(device=device, links=links))
-        for index, reader in enumerate(self._readers):
-            self._report(f"profile/link{index}", reader.problem)
 
 
 class Daemon:
@@ -208,7 +147,10 @@ class Daemon:
             log.warning("no_state why=%s (here: `%s`); no elector", loaded.problem, command)
             return None, loaded.problem
         if loaded.state.electorate != electorate_hash(self._fleet):
-            return None, "the fleet file names another electorate than the state file; this node is no elector"
+            return None, (
+                "the fleet file names another electorate than the state file; this node is no elector. With the new "
+                f"file everywhere stop all, `zsched init --generation {loaded.state.generation + 1}` on each, and start all"
+            )
         # Not just one more: a folder that was brought back from a backup must not live one of its lives again.
         state = replace(loaded.state, incarnation=max(loaded.state.incarnation + 1, wall_tenths()))
         try:

@@ -25,8 +25,9 @@ from zsched.adapters.state_file import StateFile
 from zsched.core import events as ev
 from zsched.core.fleet import Fleet, NodeSpec, Timing
 from zsched.core.model import NodeKind
-from zsched.daemon import EXIT_CONFIG, EXIT_FAILED, EXIT_OK, Sampler
+from zsched.daemon import EXIT_CONFIG, EXIT_FAILED, EXIT_OK
 from zsched.daemon_endpoints import MAX_PORT, MIN_PORT, PORT_RANGE, Endpoints, endpoints_for, free_port, is_here
+from zsched.daemon_sampler import Sampler
 from zsched.errors import AdapterError
 from zsched.lab.testbed import echo_fleet
 from zsched.places import socket_path
