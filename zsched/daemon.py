@@ -147,9 +147,10 @@ class Daemon:
             log.warning("no_state why=%s (here: `%s`); no elector", loaded.problem, command)
             return None, loaded.problem
         if loaded.state.electorate != electorate_hash(self._fleet):
+            generation = loaded.state.generation + 1
             return None, (
                 "the fleet file names another electorate than the state file; this node is no elector. With the new "
-                f"file everywhere stop all, `zsched init --generation {loaded.state.generation + 1}` on each, and start all"
+                f"file everywhere stop all, `zsched init --generation {generation}` on each, and start all"
             )
         # Not just one more: a folder that was brought back from a backup must not live one of its lives again.
         state = replace(loaded.state, incarnation=max(loaded.state.incarnation + 1, wall_tenths()))
