@@ -49,10 +49,8 @@ One that takes nothing costs this time once: zenoh then drops at its link at onc
 """
 _RECEIVERS: Final[Settings] = {
     "transport/link/tx/queue/congestion_control/drop/wait_before_drop": round(DROP_WAIT_S * 1e6),
-    "adminspace/enabled": True,
-    "adminspace/permissions": {"read": True, "write": False},
 }
-"""Of sessions that applications receive outputs from: who subscribes is read there (`zsched.relay.sockets`)."""
+"""Of sessions that applications receive outputs from."""
 
 
 def control_config(

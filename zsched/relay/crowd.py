@@ -1,7 +1,7 @@
 """Puts a stream's outputs to all its applications, and leaves behind the one that takes too little.
 
 Knows: whose link has room (`zsched.relay.sockets`), when to wait for it and when not. Does not know: zenoh's queues,
-which stream this is.
+which stream this is, who of those that are linked receives it: whose link fills up receives something.
 
 zenoh hands a sample to one receiver after the other: a put that waits (BLOCK) for a frozen one makes all of them wait,
 for seconds. So, where there are two or more, each put first waits until every link has room. A receiver whose link has
@@ -34,7 +34,7 @@ from zsched.send_queue import PATIENCE_S
 from zsched.zenoh_config import DROP_WAIT_S
 
 LOOK_S: Final = 1.0
-"""How old our knowledge of who subscribes may be."""
+"""How old our knowledge of the links may be."""
 STUCK_S: Final = 0.5
 SLICE_S: Final = 0.02
 """How long to wait for room before looking again at everything else."""
@@ -52,7 +52,7 @@ _log = logging.getLogger("zsched.relay")
 
 @dataclass(slots=True, eq=False)
 class Reader:
-    """One application that receives the stream."""
+    """A link that may lead to an application that receives the stream."""
 
     link: LinkSocket
     looked_at: float
@@ -175,10 +175,10 @@ class Crowd:
     # --- one put -----------------------------------------------------------------------------------------------------
 
     def _look(self, now: float) -> bool:
-        """Know who receives, now and then; ``True`` when there is nobody to protect from anybody."""
+        """Know the links, now and then; ``True`` when there is nobody to protect from anybody."""
         if now - self._looked_at >= LOOK_S:
             self._looked_at = now
-            links = self._sockets.receivers(self._expr)
+            links = self._sockets.links()
             self._readers = {link: self._readers.get(link) or Reader(link, now) for link in links}
         return len(self._readers) < 2
 

@@ -241,6 +241,7 @@ class Outlet:
         """Have sent again what was not acknowledged in time, and greet who has not answered; call it now and then."""
         if self._crowd is not None:
             self._look_after_crowd(self._crowd)
+            return
         is_matching = self.is_matching
         greetings = self._greetings
         is_there = greetings.is_there(self._lanes, is_matching=is_matching) if greetings is not None else is_matching

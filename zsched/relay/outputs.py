@@ -33,6 +33,7 @@ from zsched.relay.outlet import Outlet
 from zsched.relay.pace import Pace
 from zsched.relay.receive import Receiver, undeclare
 from zsched.relay.slots import Feed, KeyState, OutputSlot
+from zsched.relay.sockets import note_feeder
 from zsched.relay_pipe import decode_end
 
 HOLD_SAMPLES: Final = 10_000
@@ -319,6 +320,8 @@ class OutputStream:
         ``in_order``: `Answers` has seen to the order, and to that, already.
         """
         last = key.numbers.get(publisher, -1)
+        if last < 0:
+            note_feeder(publisher[0])
         number = serial if last < 0 else number_near(serial, last)
         jump = key.jumps.get(publisher)
         if number < last and jump is not None:

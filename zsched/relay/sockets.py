@@ -1,17 +1,17 @@
 """Finds the sockets beneath a zenoh session's links, and says how far their receivers are.
 
-Knows: this process's descriptors, TCP's own counters, who subscribes to a key (zenoh's admin space). Does not know:
-streams, what is done about a slow receiver.
+Knows: this process's descriptors, TCP's own counters, which sessions are workers'. Does not know: streams, who
+subscribes to what, what is done about a slow receiver.
 
 zenoh tells nobody that a receiver takes nothing: a put waits, or drops, in silence. The kernel knows it for every link:
 whether there is room in its send buffer, and how many bytes the other end has taken. The descriptors are zenoh's; they
-are only looked at, and `cut` looks twice.
+are only looked at, and `cut` looks twice. Who subscribes would be said by zenoh's admin space; but a question to it
+from within its own process stops for ever when somebody declares something at the same moment (1.10.2).
 """
 
 from __future__ import annotations
 
 import contextlib
-import json
 import re
 import socket
 import struct
@@ -27,8 +27,10 @@ _BYTES_ACKED: Final = struct.Struct("<Q")
 _BYTES_ACKED_AT: Final = 120
 """Where ``tcpi_bytes_acked`` stands in Linux's ``struct tcp_info`` (4.1 and later)."""
 _ADDRESS: Final = re.compile(r"(?:tcp|tls)/\[?([^\]#?]+)\]?:(\d+)")
-QUESTION_S: Final = 0.5
+MAX_FEEDERS: Final = 1024
 
+_feeders: dict[str, None] = {}
+"""Sessions of workers, in order; of this process."""
 _Ends = tuple[tuple[str, int], tuple[str, int]]
 
 
@@ -71,30 +73,12 @@ class LinkSockets:
         self._session = session
         self._known: dict[_Ends, int] = {}
 
-    def receivers(self, expr: str) -> tuple[LinkSocket, ...]:
-        """The links to sessions that subscribe to ``expr`` or a part of it, as far as they are TCP."""
-        wanted = self._subscribers(expr)
-        if len(wanted) < 2:
-            return ()
-        found = {(str(link.zid), _ends(link)) for link in self._session.info.links() if str(link.zid) in wanted}
-        links = {ends: zid for zid, ends in found if ends is not None}
+    def links(self) -> tuple[LinkSocket, ...]:
+        """The links there are now, as far as they are TCP, but to those that feed us."""
+        found = {(str(link.zid), _ends(link)) for link in self._session.info.links()}
+        links = {ends: zid for zid, ends in found if ends is not None and zid not in _feeders}
         self._find(links)
         return tuple(LinkSocket(zid, ends, self._known[ends]) for ends, zid in links.items() if ends in self._known)
-
-    def _subscribers(self, expr: str) -> set[str]:
-        answers = self._session.get(
-            f"@/{self._session.zid()}/*/subscriber/{expr}",
-            target=zenoh.QueryTarget.ALL,
-            consolidation=zenoh.ConsolidationMode.NONE,
-            accept_replies=zenoh.ReplyKeyExpr.ANY,
-            timeout=QUESTION_S,
-        )
-        texts = [answer.ok.payload.to_bytes() for answer in answers if answer.ok is not None]
-        found: set[str] = set()
-        for text in texts:
-            with contextlib.suppress(ValueError, AttributeError):
-                found.update(zid for zids in json.loads(text).values() for zid in zids)
-        return found - {str(self._session.zid())}
 
     def _find(self, links: Iterable[_Ends]) -> None:
         """Look up the descriptors of links that are new."""
@@ -107,6 +91,15 @@ class LinkSockets:
                 ends = _ends_of(held)
                 if ends in wanted:
                     self._known[ends] = int(path.name)
+
+
+def note_feeder(zid: str) -> None:
+    """A session puts answers to this process: it is a worker's, and none of those that receive outputs."""
+    if zid in _feeders:
+        return
+    if len(_feeders) >= MAX_FEEDERS:
+        _feeders.pop(next(iter(_feeders)))
+    _feeders[zid] = None
 
 
 @contextlib.contextmanager
