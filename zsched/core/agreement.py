@@ -135,7 +135,8 @@ class Agreement:
         # A task that left the fleet file may come back: its promises must not be forgotten.
         self._foreign = tuple(stored[name] for name in sorted(stored) if name not in self.registers)
         self._settle_at = now + SETTLE_AFTER_START_S if self.is_elector else math.inf
-        self._asked_at: dict[NodeId, float] = {}
+        self._asked_at: dict[tuple[NodeId, bool], float] = {}
+        """{(peer, whether for a newer revision): when}: a vote that was heard of delays nobody who is behind."""
         self._read_at: dict[TaskId, float] = {}
         self.leases = Leases(
             fleet=fleet,
@@ -440,12 +441,15 @@ class Agreement:
         self, peer: NodeId, told: list[tuple[TaskId, int]], every_s: float, now: float, *, is_news: bool = False
     ) -> Effects:
         """Ask a peer for what it has learnt, when it tells of a newer revision (or of other news)."""
+        is_behind = False
         for task, revision in told:
             register = self.registers.get(task)
-            is_news |= register is not None and revision > register.value.revision
-        if not is_news or now - self._asked_at.get(peer, -math.inf) < every_s:
+            is_behind |= register is not None and revision > register.value.revision
+        if not is_behind and not is_news:
             return NOTHING
-        self._asked_at[peer] = now
+        if now - self._asked_at.get((peer, is_behind), -math.inf) < every_s:
+            return NOTHING
+        self._asked_at[peer, is_behind] = now
         return Effects(send=[do.AskLearnt(peer=peer, deadline_s=self._fleet.timing.ballot_s)])
 
     # --- proposers ---------------------------------------------------------------------------------------------------
