@@ -311,6 +311,7 @@ LEASE_BUGS = (
         "and value.owner is not None and value.leased",
         "and value.owner is not None",
         _ROLLOUT,
+        150,
     ),
     _bug(
         "worker without a lease is not waited for",
@@ -473,6 +474,7 @@ MEMBERSHIP_BUGS = (
         "self.registers[task.name].follow(self._of_generation(), initial)",
         "self.registers[task.name].follow(self._electorate, initial)",
         _GENERATIONS,
+        26,
     ),
     _bug("a put teaches an allocation", AGREEMENT, "if not event.is_answer:", "if False:", _AGREEMENT),
     _bug("any answer is believed", AGREEMENT, "elif is_proven(", "elif True or is_proven(", _AGREEMENT),
