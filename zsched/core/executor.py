@@ -41,6 +41,8 @@ from zsched.core.workers import runs_worker
 
 ROLE_DRAIN_MARGIN_S = 1.0
 """The old owner's worker goes idle this much after the robots' drain time (a cold standby's start comes on top)."""
+LEAVES_S = 1.0
+"""A worker whose draining is over hears so within this time (it says nothing more)."""
 
 
 class Phase(StrEnum):
@@ -71,6 +73,8 @@ class Executor:
     """Cut off from the owner and from a quorum, this robot works alone; its output is degraded."""
     _unleased_epoch: int | None = None
     """In which epoch the worker here was let work without a lease; ``None`` once it has said that it ended that."""
+    _leaves_until: float = -math.inf
+    """Until when a worker that drained, and so had said already that it left its epoch, hears that it is idle."""
     _is_owner_gone: bool = False
     """The owner went during its epoch: its worker's state is not asked for."""
     _current: Slot | None = None
@@ -190,11 +194,10 @@ class Executor:
         if self.role.role is not WorkerRole.ACTIVE:
             self._unleased_epoch = None
 
-    @property
-    def may_work_unleased(self) -> bool:
+    def may_work_unleased(self, now: float) -> bool:
         """Whether the worker here may be working without a lease: it may, or has not said that it has stopped."""
         is_let = self.role.role is not WorkerRole.IDLE and self.role.lease_until_s is None
-        return is_let or self._unleased_epoch is not None
+        return is_let or self._unleased_epoch is not None or now < self._leaves_until
 
     def isolate(self) -> tuple[Instruction, ...]:
         """Nobody can be asked and the owner is not heard: this robot's own worker serves its own streams."""
@@ -312,6 +315,8 @@ class Executor:
             result += self._close(f"drain time of {self.spec.drain_s:g} s over")
         if now >= self._role_deadline:
             self._role_deadline = math.inf
+            if self.role.role is WorkerRole.DRAINING:
+                self._leaves_until = now + LEAVES_S
             self.role = Role(task=self.spec.name, role=WorkerRole.IDLE)
             result += (SetRole(role=self.role),)
             if self.spec.worker.standby is Standby.COLD:

@@ -501,8 +501,8 @@ class Node:
         if event.is_answer and self.membership.is_known(event.learnt.node):
             self.sealing.on_answer(event.learnt)
 
-    def _on_learnt_asked(self, event: ev.LearntAsked, _now: float) -> None:
-        learnt = replace(self.agreement.answer(), unleased=self.sealing.unleased())
+    def _on_learnt_asked(self, event: ev.LearntAsked, now: float) -> None:
+        learnt = replace(self.agreement.answer(), unleased=self.sealing.unleased(now))
         self._batch.add(do.AnswerLearnt(request=event.request, learnt=learnt))
 
     def _on_persist_failed(self, event: ev.PersistFailed, _now: float) -> None:

@@ -53,9 +53,9 @@ class Sealing:
         if self._asked_at > -math.inf:
             self._answers[learnt.node] = learnt
 
-    def unleased(self) -> tuple[TaskId, ...]:
+    def unleased(self, now: float) -> tuple[TaskId, ...]:
         """The tasks whose worker here may be working without a lease: our answers say so."""
-        return tuple(name for name, executor in self.executors.items() if executor.may_work_unleased)
+        return tuple(name for name, executor in self.executors.items() if executor.may_work_unleased(now))
 
     def due(self, values: Mapping[TaskId, Allocation], now: float) -> list[tuple[TaskId, SetLeased]]:
         """What this node proposes as an owner.
