@@ -12,9 +12,10 @@ from zsched import zenoh_config
 from zsched.adapters.control_bus import ask_fleet
 from zsched.adapters.state_file import StateFile, hardware_id
 from zsched.clock import wall_tenths
-from zsched.core.belief import GENERATION_STEP, MAX_GENERATION
+from zsched.core.belief import MAX_GENERATION
 from zsched.core.fleet import Fleet, dial_endpoint, electorate_hash
-from zsched.core.model import NO_BALLOT, Acceptance, DurableState, NodeId, RegisterState
+from zsched.core.generations import first_registers
+from zsched.core.model import DurableState, NodeId
 from zsched.daemon_tls import operator_json5, protocol_of
 from zsched.errors import AdapterError
 
@@ -30,13 +31,8 @@ def init_state(fleet: Fleet, node: NodeId, folder: Path, generation: int) -> Pat
     """
     if not 0 <= generation <= MAX_GENERATION:
         raise AdapterError(f"generation {generation}: at most {MAX_GENERATION}, or no revision could follow its first")
-    start = generation * GENERATION_STEP
-    values = [task.first_value(start) for task in fleet.tasks if generation > 0]
-    # Accepted everywhere, too: a majority that had learnt a value and accepted none would count as one that forgot.
-    registers = tuple(
-        RegisterState(task=value.task, accepted=Acceptance(ballot=NO_BALLOT, value=value), learnt=value)
-        for value in values
-    )
+    before = StateFile(folder, fleet=fleet.name, node=node).load().state
+    registers = first_registers(fleet, generation, () if before is None else before.registers)
     state = DurableState(
         fleet=fleet.name,
         node=node,

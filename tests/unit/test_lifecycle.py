@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from zsched.adapters.state_file import StateFile, hardware_id
 from zsched.config import check_bytes
 from zsched.core.belief import GENERATION_STEP, MAX_GENERATION
 from zsched.core.fleet import Fleet, electorate_hash
-from zsched.core.model import MAX_COUNTER, NO_BALLOT, DurableState
+from zsched.core.model import MAX_COUNTER, NO_BALLOT, DurableState, RegisterState
 from zsched.core.register import MAX_REVISION
 from zsched.errors import AdapterError
 from zsched.lifecycle import init_state
@@ -116,3 +117,23 @@ def test_state_folder_of_a_running_daemon_is_refused(fleet: Fleet, tmp_path: Pat
         pytest.raises(AdapterError, match="in use by process"),
     ):
         init_state(fleet, "robot1", tmp_path, 0)
+
+
+def test_a_generation_after_an_owner_that_needed_no_lease_is_not_leased_from_the_start(tmp_path: Path) -> None:
+    """That owner may still work, with the old file; an exclusive task's owner before has worked by leases."""
+    old = check_bytes(TEXT).fleet
+    assert old is not None
+    new = replace(old, tasks=tuple(replace(task, exclusive=True) for task in old.tasks))
+    init_state(old, "robot1", tmp_path, 0)
+    owned = {
+        "merge": replace(old.task("merge").first_value(0), revision=1, epoch=1, owner="robot2"),
+        "slam": replace(new.task("slam").first_value(0), revision=1, epoch=1, owner="robot2"),
+    }
+    with StateFile(tmp_path, fleet=old.name, node="robot1") as file:
+        registers = tuple(RegisterState(task=name, learnt=value) for name, value in owned.items())
+        state = file.load().state
+        assert state is not None
+        file.save(replace(state, registers=registers))
+    init_state(new, "robot1", tmp_path, 1)
+    found = {register.task: register.learnt for register in load(new, tmp_path).registers}
+    assert {name: value is not None and value.leased for name, value in found.items()} == {"merge": False, "slam": True}

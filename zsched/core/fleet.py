@@ -197,11 +197,10 @@ class TaskSpec:
     worker: WorkerSpec = WorkerSpec()
     rules: tuple[StreamRule, ...] = ()
 
-    def first_value(self, start: int) -> Allocation:
-        """What a generation begins with, by this file: nobody has ever worked at the task."""
-        return Allocation(
-            task=self.name, revision=start, epoch=start, owner=None, tuning=self.tuning, leased=self.exclusive
-        )
+    def first_value(self, start: int, *, is_new: bool = True) -> Allocation:
+        """What a generation begins with, by this file; ``is_new`` unless somebody may work at the task by another."""
+        leased = self.exclusive and is_new
+        return Allocation(task=self.name, revision=start, epoch=start, owner=None, tuning=self.tuning, leased=leased)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -347,7 +347,8 @@ class Register:
     def _read(self, running: _Round, step: Step, now: float) -> None:
         """A majority promised: decide what this ballot carries."""
         accepted = [acceptance for acceptance in running.promises.values() if acceptance is not None]
-        newest = max(accepted, key=lambda acceptance: acceptance.ballot, default=None)
+        # First values of a generation are equal but for their leases: what is not leased for one is so for nobody.
+        newest = max(accepted, key=lambda acceptance: (acceptance.ballot, not acceptance.value.leased), default=None)
         read = self._initial if newest is None else newest.value
         if read.revision < running.known:
             step.problem = f"a majority of electors has forgotten revision {running.known}"

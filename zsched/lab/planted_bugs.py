@@ -93,15 +93,15 @@ REGISTER_BUGS = (
     _bug(
         "accepted value not re-accepted",
         REGISTER,
-        "newest = max(accepted, key=lambda acceptance: acceptance.ballot, default=None)",
+        "newest = max(accepted, key=lambda acceptance: (acceptance.ballot, not acceptance.value.leased), default=None)",
         "newest = None",
         _SCHEDULES,
     ),
     _bug(
         "newest by revision instead of ballot",
         REGISTER,
-        "key=lambda acceptance: acceptance.ballot,",
-        "key=lambda acceptance: (-acceptance.value.revision, acceptance.ballot),",
+        "key=lambda acceptance: (acceptance.ballot, not",
+        "key=lambda acceptance: (-acceptance.value.revision, acceptance.ballot, not",
         _REGISTER + _SCHEDULES,
     ),
     Bug(

@@ -13,6 +13,7 @@ from random import Random
 from zsched import wire
 from zsched.core import events as ev
 from zsched.core.fleet import Fleet, electorate_hash
+from zsched.core.generations import first_registers
 from zsched.core.model import Allocation, DurableState, NodeId, RegisterState, TaskId
 from zsched.core.node import Node
 from zsched.core.plan import Role
@@ -197,15 +198,7 @@ class Machine:
 
 def blank_state(machine: Machine, incarnation: int, generation: int) -> DurableState:
     """What `zsched init` writes: this name has never voted (``generation`` above 0: the fleet starts anew)."""
-    start = generation * GENERATION_STEP
-    registers = tuple(
-        RegisterState(
-            task=task.name,
-            learnt=task.first_value(start),
-        )
-        for task in machine.fleet.tasks
-        if generation > 0
-    )
+    registers = first_registers(machine.fleet, generation, machine.disk.registers.values())
     return DurableState(
         fleet=machine.fleet.name,
         node=machine.name,

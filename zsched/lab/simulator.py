@@ -84,9 +84,10 @@ class Simulator(Links):
 
     def initialise(self, machine: Machine, *, incarnation: int = 0, generation: int = 0) -> None:
         """`zsched init`: a blank durable state, which says that this name has never voted."""
+        blank = blank_state(machine, incarnation, generation)
         machine.disk.wipe()
         self.invariants.expect(generation, machine.fleet.electors)
-        machine.disk.write(blank_state(machine, incarnation, generation))
+        machine.disk.write(blank)
         machine.disk.sync()
 
     # --- what a test does --------------------------------------------------------------------------------------------
