@@ -230,3 +230,19 @@ def test_tasks_that_are_not_exclusive_do_not_mind() -> None:
     assert sim.agreed("guard") == owner
     assert sim.node(owner).worker_states["guard"] is WorkerState.READY
     assert "clock" not in sim.node(owner).problems
+
+
+def test_an_owner_of_two_exclusive_tasks_stops_both_and_works_on_both_again() -> None:
+    both = replace(fleet("edge1"), tasks=tuple(replace(TASK, name=name, candidates=("edge1",)) for name in ("a", "b")))
+    sim = Simulator(fleet=both, seed=1)
+    sim.start()
+
+    def at_work() -> set[str]:
+        return {task for task, (_, until) in sim.working.items() if until > sim.now}
+
+    assert sim.run_until(lambda: at_work() == {"a", "b"}, 20.0)
+    slewed(sim, "edge1", 3.0)
+    sim.run(0.1)
+    assert at_work() == set()
+    assert {role.role for role in sim.machines["edge1"].roles.values()} == {WorkerRole.IDLE}
+    assert sim.run_until(lambda: at_work() == {"a", "b"}, 10.0)

@@ -517,3 +517,17 @@ def test_a_retry_of_what_there_is_not_is_refused(command: RetryTask) -> None:
     batch = node.handle(ev.RetryCommanded(request=7, command=command), 100.0)
     assert of(batch, do.ResetWorker) == []
     assert of(batch, do.AnswerCommand)[0].result.outcome is CommandOutcome.INVALID
+
+
+def test_a_profile_that_comes_late_hurries_no_decision_by_what_it_says() -> None:
+    node = started(learnt=value(1, "edge1"))
+    new = replace(profile("edge1").profile, sequence=5)
+    node.handle(ev.ProfileReceived(profile=new), 100.0)
+    now = node.rounds.next_deadline()
+    node.handle(ev.DeadlineReached(), now)  # nobody answers: the gather that ran is over
+    due = node.rounds.next_deadline()
+    assert due > now + 0.001
+    for sequence in (5, 4):
+        late = replace(new, sequence=sequence, draining=True)
+        assert not of(node.handle(ev.ProfileReceived(profile=late), now + 0.001), do.AskUtilities)
+        assert node.rounds.next_deadline() == due

@@ -300,6 +300,11 @@ def test_ratios_are_bounded_and_none_when_not_measured() -> None:
     node.handle(ev.ProfileReceived(profile=profile), 100.0)
     edge = build_snapshot(node, 100.25).nodes[0]
     assert (edge.cpu_ratio, edge.memory_ratio, edge.age_s) == (1.0, None, 0.25)
+    for sequence, cpu, memory, ratios in ((2, 0.5, 250.0, (0.25, 0.25)), (3, 1.0, 1200.0, (0.5, 1.0))):
+        later = replace(profile, sequence=sequence, cpu_used_cores=cpu, memory_used_mb=memory)
+        node.handle(ev.ProfileReceived(profile=later), 100.25)
+        edge = build_snapshot(node, 100.25).nodes[0]
+        assert (edge.cpu_ratio, edge.memory_ratio) == ratios
 
 
 def test_counters_of_all_parts_stand_in_one_sorted_list() -> None:
