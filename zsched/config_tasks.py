@@ -83,6 +83,7 @@ def _task(
     limits = _limits(given, out)
     streams = tuple(_streams(given, cast, candidates, out))
     _check_exclusive(given, worker, streams, out)
+    _advise_ready(given, worker, streams, out)
     _check_mirrors(given, streams, out)
     if not candidates:
         return None
@@ -194,6 +195,15 @@ def _check_exclusive(
         message = "an exclusive task's worker must hold the lease: only one that uses zsched.worker (ready: token) does"
         section: Section | None = given.get("worker")
         out.error(section.where("ready") if section is not None else given.where("exclusive"), message)
+
+
+def _advise_ready(given: Section, worker: WorkerSpec, streams: tuple[Located[StreamRule], ...], out: Collector) -> None:
+    section: Section | None = given.get("worker")
+    if worker.ready_when is not ReadyWhen.MATCHING or section is None:
+        return
+    if all(stream.value.direction is Direction.OUTPUT for stream in streams):
+        message = "nothing goes to this worker, so nothing tells whether it is there: it always counts as ready"
+        out.warn(section.where("ready"), message, "give it an input or a service, or use zsched.worker (ready: token)")
 
 
 def _advise_network(tuning: Tuning, given: Section, cast: Cast, out: Collector) -> None:

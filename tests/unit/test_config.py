@@ -518,6 +518,14 @@ def test_exclusive_task_needs_a_worker_that_holds_the_lease() -> None:
     assert "cut off" in result.report()
 
 
+def test_a_worker_that_shows_itself_by_matching_must_be_given_something() -> None:
+    told = "nothing tells whether it is there"
+    text = swapped("standby: warm", "standby: warm, ready: matching")
+    assert not [warning for warning in check(text).warnings if told in warning.message]
+    without = "\n".join(line for line in text.splitlines() if not line.startswith("    inputs:"))
+    assert [warning for warning in check(without).warnings if told in warning.message]
+
+
 def test_fleet_without_robots_is_refused() -> None:
     text = GOOD.replace("kind: robot", "kind: edge")
     assert "nobody would vote" in check(text).report()
