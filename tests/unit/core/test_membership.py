@@ -473,3 +473,15 @@ def test_deadline_reached_exactly_is_served() -> None:
         ear.beat("a", Random(seed).uniform(0.0, 1e6))
         now = ear.members.next_deadline()
         assert [change.node for change in ear.members.tick(now)][:1] == ["a"]
+
+
+def test_somebody_is_missed_as_long_as_one_peer_is_not_alive() -> None:
+    ear = Ear(("me", "a", "b"))
+    assert ear.members.misses_anybody
+    ear.beat("a", 0.0)
+    assert ear.members.misses_anybody, "b was never heard"
+    ear.beat("b", 0.0)
+    assert not ear.members.misses_anybody
+    ear.run(0.0, 5.0, ("a",))
+    assert ear.members.state("b") is GONE
+    assert ear.members.misses_anybody

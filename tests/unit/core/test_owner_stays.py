@@ -1,0 +1,40 @@
+"""The owner stays and only the terms change: its worker stops and waits for a lease, or needs none any more."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from zsched.core.executor import Executor
+from zsched.core.fleet import TaskSpec, WorkerSpec
+from zsched.core.instructions import SetRole, StartWorker
+from zsched.core.model import Allocation, Tuning, Weights
+from zsched.core.plan import Role, WorkerRole
+
+TUNING = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
+SPEC = TaskSpec(name="guard", candidates=("edge1", "edge2"), tuning=TUNING, worker=WorkerSpec(command=("work",)))
+FIRST = Allocation(task="guard", revision=1, epoch=1, owner="edge1", tuning=TUNING)
+
+
+def roles(instructions: tuple[object, ...]) -> list[Role]:
+    return [one.role for one in instructions if isinstance(one, SetRole)]
+
+
+def test_an_owner_s_worker_stops_for_its_first_lease_and_works_without_one_afterwards() -> None:
+    owner = Executor(spec=SPEC, me="edge1", has_streams=False)
+    (role,) = roles(owner.execute(FIRST, 10.0))
+    assert (role.role, role.lease_until_s) == (WorkerRole.ACTIVE, None)
+    (role,) = roles(owner.execute(replace(FIRST, revision=2, leased=True), 11.0))
+    assert role.role is WorkerRole.IDLE
+    (role,) = roles(owner.set_lease(13.0, 12.0))
+    assert (role.role, role.epoch, role.lease_until_s) == (WorkerRole.ACTIVE, 1, 13.0)
+    again = owner.execute(replace(FIRST, revision=3), 12.5)
+    (role,) = roles(again)
+    assert (role.role, role.epoch, role.lease_until_s) == (WorkerRole.ACTIVE, 1, None)
+    assert StartWorker(task="guard") in again
+    assert owner.execute(replace(FIRST, revision=4), 13.0) == (), "nothing has changed"
+
+
+def test_who_does_not_own_it_does_nothing() -> None:
+    other = Executor(spec=SPEC, me="edge2", has_streams=False)
+    other.execute(FIRST, 10.0)
+    assert other.execute(replace(FIRST, revision=2, leased=True), 11.0) == ()
