@@ -115,6 +115,15 @@ def test_only_the_running_process_complains(house: House) -> None:
     assert told == [ev.WorkerTroubled(task="token", count=2, text="ValueError")]
 
 
+def test_a_failed_worker_that_nobody_wants_now_may_be_chosen_again_after_a_reset(house: House) -> None:
+    """A cold standby that failed as the owner: its node stays out until an operator says otherwise."""
+    house.crew.on_started("token", 7, 100001)
+    house.crew.on_exited("token", 100001, 1, "no map")
+    house.crew.on_failed("token", "no map")
+    house.crew.on_reset("token")
+    assert house.states("token")[-2:] == [WorkerState.FAILED, WorkerState.STOPPED]
+
+
 def test_a_worker_without_its_token_is_told_what_it_lacks(house: House) -> None:
     house.supervisor.start("token")
     until(lambda: "no token: it did not call Worker.ready()" in str(house.reasons("token")), "the deadline")
