@@ -91,6 +91,8 @@ class Worker:
         idle = Role(task=task, role=WorkerRole.IDLE)
         self._role = Role(task=task, role=WorkerRole.ACTIVE, epoch=1) if is_standalone else idle
         self._epochs = Epochs()
+        self._early_end = 0
+        """The epoch whose inputs have ended although our role in it has not."""
         self._stop = threading.Event()
         self._is_signalled = False
         self._outputs: list[Output] = []
@@ -326,6 +328,8 @@ class Worker:
             guarded(self._end_later, before.epoch, name="zsched carry", is_lasting=False).start()
         elif before.epoch and before.epoch != role.epoch:
             self._send_ends(before.epoch)
+        if role.role is WorkerRole.DRAINING and role.epoch == self._early_end and self._dispatcher.is_over(role.epoch):
+            self._send_ends(role.epoch)
         if role.role is WorkerRole.IDLE and before.epoch:
             self._dispatcher.forget(before.epoch)
         is_active = role.role is WorkerRole.ACTIVE
@@ -409,8 +413,17 @@ class Worker:
         self._dispatcher.put_marker(Marker(name=name, end=marker, came_at=monotonic_s()))
 
     def _inputs_ended(self, epoch: int) -> None:
-        """Every input seen in ``epoch`` has ended and is processed (dispatch thread)."""
-        if not self._drains_itself:
+        """Every input seen in ``epoch`` has ended and is processed (dispatch thread).
+
+        While we are to work in it, that is somebody's forgery, or our daemon learns of the move later than the robots:
+        its word decides.
+        """
+        if self._drains_itself:
+            return
+        with self._lock:
+            role = self._role
+            self._early_end = epoch if role.role is WorkerRole.ACTIVE and role.epoch == epoch else 0
+        if not self._early_end:
             self._send_ends(epoch)
 
     def _send_ends(self, epoch: int) -> None:

@@ -250,6 +250,11 @@ class Dispatcher:
             self._is_held, self._first = False, first
             self._wake.notify()
 
+    def is_over(self, epoch: int) -> bool:
+        """Whether every input that was heard in the epoch has ended."""
+        with self._wake:
+            return self._is_over(epoch)
+
     def note_withheld(self) -> None:
         """An output went nowhere because this worker is not the owner (any thread; ours means: of this sample)."""
         if threading.current_thread() is self._thread:

@@ -242,7 +242,8 @@ def test_one_frame_on_the_data_network_ends_nothing(bed: Testbed, application: A
         for number in (FAR, 2**31 - 5, 2**32 - 1):
             source = zenoh.SourceInfo(heard.source_info.source_id, number)
             session.put(key, b"forged", source_info=source, congestion_control=zenoh.CongestionControl.BLOCK)
-            session.put(f"{key}/{END_CHUNK}", encode_end(EndMarker(epoch=0, count=number)), source_info=source)
+            for ended in (0, epoch):
+                session.put(f"{key}/{END_CHUNK}", encode_end(EndMarker(epoch=ended, count=number)), source_info=source)
             application.goes_on(bed, f"number {number} on {key}")
     # acknowledgements of what was never sent, in the worker's name and in another one's
     for incarnation, number in ((ack.split("/")[-2], 10**12), ("zz", 0), ("zz", 10**12)):

@@ -178,6 +178,7 @@ def test_the_end_marker_comes_behind_the_last_output(relay: Relay, echo: Echo) -
     until(lambda: echo.worker.role.epoch == 4, "the role")
     for number in range(50):
         relay.put(str(number).encode())
+    relay.tell(WorkerRole.DRAINING, 4)
     relay.end(4)
     until(lambda: relay.ends, "the end marker")
     assert relay.ends == [(f"edge1/t/4/robot1/out/{END_CHUNK}", EndMarker(epoch=4, count=50))]
@@ -191,6 +192,7 @@ def test_an_end_that_overtakes_its_data_waits_for_it(relay: Relay, echo: Echo) -
     until(lambda: echo.worker.role.epoch == 4, "the role")
     relay.put(b"0")
     until(lambda: len(relay.outputs) == 1, "the first")
+    relay.tell(WorkerRole.DRAINING, 4)
     relay.end(4, count=2)
     relay.put(b"1")
     until(lambda: relay.ends, "the end marker")
@@ -201,8 +203,25 @@ def test_an_end_whose_data_was_dropped_comes_after_a_grace_time(relay: Relay, ec
     relay.tell(WorkerRole.ACTIVE, 4)
     until(lambda: echo.worker.role.epoch == 4, "the role")
     relay.put(b"0")
+    relay.tell(WorkerRole.DRAINING, 4)
+    until(lambda: echo.worker.role.role is WorkerRole.DRAINING, "the role")
     relay.end(4, count=9)
     until(lambda: relay.ends, "the end marker all the same", deadline_s=1.0)
+
+
+def test_an_end_marker_ends_nothing_while_the_role_holds(relay: Relay, echo: Echo) -> None:
+    """Anybody can put one; where it has only outrun the role, the ends follow with that."""
+    relay.tell(WorkerRole.ACTIVE, 4)
+    until(lambda: echo.worker.role.epoch == 4, "the role")
+    relay.put(b"0")
+    until(lambda: len(relay.outputs) == 1, "the first")
+    relay.end(4, count=1)
+    until(lambda: echo.worker._dispatcher.is_over(4), "the inputs to have ended")
+    until(lambda: echo.worker._early_end == 4, "the worker to know it")
+    assert echo.output.put(b"still the owner")
+    assert relay.ends == []
+    relay.tell(WorkerRole.DRAINING, 4)
+    until(lambda: relay.ends, "the end marker")
 
 
 def test_draining_sends_what_is_in_work(relay: Relay, echo: Echo) -> None:
