@@ -477,11 +477,11 @@ def test_deadline_reached_exactly_is_served() -> None:
 
 def test_somebody_is_missed_as_long_as_one_peer_is_not_alive() -> None:
     ear = Ear(("me", "a", "b"))
-    assert ear.members.misses_anybody
-    ear.beat("a", 0.0)
-    assert ear.members.misses_anybody, "b was never heard"
-    ear.beat("b", 0.0)
-    assert not ear.members.misses_anybody
+    seen = [ear.members.misses_anybody]
+    for node in ("a", "b"):
+        ear.beat(node, 0.0)
+        seen.append(ear.members.misses_anybody)
+    assert seen == [True, True, False]
     ear.run(0.0, 5.0, ("a",))
     assert ear.members.state("b") is GONE
-    assert ear.members.misses_anybody
+    assert [ear.members.misses_anybody] == [True]
