@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 DEMO_ARGS ?=
+# How the tests with real processes are run; `.ci/run` gives failed ones a second chance, alone.
+PYTEST_REAL ?= -m pytest
 
 .PHONY: help demo test test-quick lint types format bench clean
 
@@ -29,7 +31,7 @@ demo: $(VENV)/.lab  ## Watch six machines merge laser maps (DEMO_ARGS="--headles
 # Two modules at a time: the real fleets of the second half mostly wait. In their order, for the longest come first.
 test: $(VENV)/.dev  ## All tests: unit, paper, simulator, integration and system (real daemons on localhost)
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile tests/unit tests/paper tests/sim tests/planted
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder --durations=15 tests/system tests/integration
+	$(BIN)/python $(PYTEST_REAL) -q -n 2 --dist loadfile --no-loadscope-reorder --durations=15 tests/system tests/integration
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile tests/bench
 
 test-quick: $(VENV)/.dev  ## Unit and paper tests only
