@@ -14,6 +14,8 @@ from zsched.clock import monotonic_s
 BURST: Final = 100.0
 RATE_HZ: Final = 5.0
 MAX_PLACES: Final = 1024
+PASSED: Final = {"zsched_limited": True}
+"""``extra`` of lines that have a limit of their own: a worker's output comes from one place in our source."""
 
 
 class LogLimit(logging.Filter):

@@ -98,11 +98,15 @@ def test_a_role_is_told_again_when_its_token_goes_and_it_should_not(scene: Scene
         KEY, lambda sample: told.append(wire.decode(sample.payload.to_bytes(), Role))
     )
 
+    idle = Role(task="task", role=WorkerRole.IDLE)
+
     def tell() -> bool:
-        server.set(ACTIVE)
+        server.set(idle)
         return bool(told)
 
-    until(tell, "the role is heard")
+    until(tell, "a role is heard")
+    server.set(ACTIVE)
+    until(lambda: told[-1] == ACTIVE, "the newest role, behind all that was told before")
     told.clear()
     for epoch in (2, 4):
         server.remind("task", epoch)

@@ -22,6 +22,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
+from zsched import log_limit
 from zsched.clock import awake_s
 
 LAUNCHER = str(Path(__file__).with_name("launch.py"))
@@ -83,7 +84,7 @@ class LineLog:
         self._tokens -= 1.0
         self._remember(line[:MAX_LINE_BYTES])
         cut = " ..." if len(line) > MAX_LINE_BYTES else ""
-        self._logger.info("%s%s", _printable(line[:MAX_LINE_BYTES]).rstrip(), cut)
+        self._logger.info("%s%s", _printable(line[:MAX_LINE_BYTES]).rstrip(), cut, extra=log_limit.PASSED)
 
     def _remember(self, line: bytes) -> None:
         text = _printable(line).strip()

@@ -12,6 +12,7 @@ import psutil
 import pytest
 
 from zsched.adapters.worker_process import LAUNCHER, LINES_BURST, LineLog, WorkerGuard
+from zsched.log_limit import LogLimit
 
 
 def test_line_log_cuts_long_lines_and_counts_suppressed_ones(caplog: pytest.LogCaptureFixture) -> None:
@@ -34,6 +35,20 @@ def test_line_log_disarms_control_characters(caplog: pytest.LogCaptureFixture) -
     lines.feed(b"\x1b[2Jgone\tbad: \xff\r\n", 0.0)
     assert caplog.messages == ["\ufffd[2Jgone\tbad: \ufffd"]
     assert lines.last_line == caplog.messages[0]
+
+
+def test_a_worker_s_output_has_one_limit_and_not_that_of_the_daemon_s_own_lines_too(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """All of it comes from one place of the daemon's source."""
+    caplog.set_level(logging.INFO, "chatty")
+    limit = LogLimit(burst=2.0, rate_hz=0.0)
+    caplog.handler.addFilter(limit)
+    try:
+        LineLog(logging.getLogger("chatty")).feed(b"line\n" * 50, 0.0)
+    finally:
+        caplog.handler.removeFilter(limit)
+    assert len(caplog.messages) == 50
 
 
 def test_guard_that_was_killed_is_replaced_and_knows_all_groups() -> None:

@@ -23,6 +23,7 @@ class Moving(ChaosBed):
 
     def __init__(self, folder: Path, owners: list[NodeId], received: list[Received]) -> None:
         self.folder = folder
+        self._processes = {}
         self._ticks = folder / "ticks"
         self._ticks.mkdir()
         self._owners, self._given = owners, received

@@ -72,7 +72,7 @@ def test_a_set_frame_rate_is_kept() -> None:
     total = run(synthetic_network(), LoadOptions(hz=20.0, side=32, duration_s=0.5), StopFlag(), lambda _: None)
 
     assert 5 <= total <= 12
-    assert time.monotonic() - start < 2.0
+    assert time.monotonic() - start < 15.0  # and not for ever, on however busy a machine
 
 
 @pytest.mark.parametrize("wrong", [["--threads", "0"], ["--side", "100"], ["--hz", "-1"]])
