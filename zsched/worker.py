@@ -92,7 +92,7 @@ class Worker:
         self._role = Role(task=task, role=WorkerRole.ACTIVE, epoch=1) if is_standalone else idle
         self._epochs = Epochs()
         self._early_end = 0
-        """The epoch whose inputs have ended although our role in it has not."""
+        """The newest epoch whose inputs have ended although our role in it has not, or has not come yet."""
         self._stop = threading.Event()
         self._is_signalled = False
         self._outputs: list[Output] = []
@@ -328,8 +328,10 @@ class Worker:
             guarded(self._end_later, before.epoch, name="zsched carry", is_lasting=False).start()
         elif before.epoch and before.epoch != role.epoch:
             self._send_ends(before.epoch)
-        if role.role is WorkerRole.DRAINING and role.epoch == self._early_end and self._dispatcher.is_over(role.epoch):
-            self._send_ends(role.epoch)
+        if role.role is WorkerRole.DRAINING:
+            if before.epoch != role.epoch:  # that we work in it was told us too late: what was withheld is answered now
+                self._begin(role)
+            self._look_for_end(role.epoch)
         if role.role is WorkerRole.IDLE and before.epoch:
             self._dispatcher.forget(before.epoch)
         is_active = role.role is WorkerRole.ACTIVE
@@ -357,6 +359,7 @@ class Worker:
             self._dispatcher.begin(role.epoch)
             if now.role is WorkerRole.ACTIVE:
                 self._show_role(role.epoch)
+            self._look_for_end(role.epoch)
         self._restorer.deliver()
 
     def _show_role(self, epoch: int) -> None:
@@ -377,7 +380,7 @@ class Worker:
         if role.role is WorkerRole.IDLE or self._restorer.is_pending:
             self._dispatcher.note_withheld()
             return None
-        is_early = role.role is WorkerRole.ACTIVE and self._dispatcher.is_ahead_of(role.epoch)
+        is_early = self._dispatcher.is_ahead_of(role.epoch)
         if is_early and not self._is_standalone:  # what was withheld before comes first
             self._dispatcher.note_withheld()
             return None
@@ -416,15 +419,23 @@ class Worker:
         """Every input seen in ``epoch`` has ended and is processed (dispatch thread).
 
         While we are to work in it, that is somebody's forgery, or our daemon learns of the move later than the robots:
-        its word decides.
+        its word decides. So it is before we have begun with it, and then what was withheld is not answered yet.
         """
         if self._drains_itself:
             return
         with self._lock:
-            role = self._role
-            self._early_end = epoch if role.role is WorkerRole.ACTIVE and role.epoch == epoch else 0
-        if not self._early_end:
-            self._send_ends(epoch)
+            is_at_work = self._role.role is WorkerRole.ACTIVE and self._role.epoch == epoch
+            if is_at_work or not self._dispatcher.has_begun(epoch):
+                self._early_end = epoch
+                return
+        self._send_ends(epoch)
+
+    def _look_for_end(self, epoch: int) -> None:
+        """Our role has changed: an end that came too early for it may count now."""
+        with self._lock:
+            is_early = self._early_end == epoch
+        if is_early:
+            self._dispatcher.look_for_end(epoch)
 
     def _send_ends(self, epoch: int) -> None:
         with self._lock:

@@ -125,6 +125,8 @@ class Dispatcher:
         self._wake = threading.Condition()
         self._queue: deque[_Waiting] = deque()
         self._markers: list[Marker] = []
+        self._asked: set[int] = set()
+        """Epochs whose end is to be told again if they are over."""
         self._open: dict[SourceName, _Open] = {}
         self._replays: dict[SourceName, int] = {}
         """Numbers of a source below this one went to an earlier owner (zenoh's thread alone touches it)."""
@@ -255,6 +257,16 @@ class Dispatcher:
         with self._wake:
             return self._is_over(epoch)
 
+    def has_begun(self, epoch: int) -> bool:
+        """Whether `begin` has come for the epoch, or a newer one."""
+        return self._epoch >= epoch
+
+    def look_for_end(self, epoch: int) -> None:
+        """Call ``on_ended`` once more if the epoch is over, behind what was withheld."""
+        with self._wake:
+            self._asked.add(epoch)
+            self._wake.notify()
+
     def note_withheld(self) -> None:
         """An output went nowhere because this worker is not the owner (any thread; ours means: of this sample)."""
         if threading.current_thread() is self._thread:
@@ -277,11 +289,12 @@ class Dispatcher:
                     self._settle_state(is_restored=is_restored)
             if claimed is not None:
                 self._process(claimed)
-            if self._markers:
+            if (self._markers or self._asked) and not self._again:  # what was withheld is answered before any end
                 self._settle()
 
     def _has_work(self) -> bool:
-        return self._first is not None or bool(not self._is_held and (self._queue or self._again))
+        is_asked = bool(self._asked) and not self._again
+        return self._first is not None or is_asked or bool(not self._is_held and (self._queue or self._again))
 
     def _claim(self) -> _Waiting | None:
         """Take the next sample out of its key's line (under the lock): from here on nothing sheds it."""
@@ -371,7 +384,9 @@ class Dispatcher:
                 self._markers.remove(marker)
                 self._open.pop(marker.name, None)
                 self._acks.skip(marker.name, marker.end.count)  # what has not come by now is lost, and is said to be
-            over = sorted({marker.end.epoch for marker in done if self._is_over(marker.end.epoch)})
+            ended = {marker.end.epoch for marker in done} | self._asked
+            self._asked.clear()
+            over = sorted(epoch for epoch in ended if self._is_over(epoch))
         if over:
             self._acks.flush()  # so that what is processed is known to be when the ends arrive
         for epoch in over:

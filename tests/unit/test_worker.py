@@ -356,6 +356,57 @@ def test_a_long_backlog_of_a_worker_that_was_told_late_is_answered_whole(relay: 
     assert [int(payload) for _, payload in relay.outputs] == list(range(count))
 
 
+@pytest.mark.parametrize("is_end_first", [False, True], ids=["role first", "end first"])
+def test_who_hears_of_an_epoch_only_that_it_drains_answers_its_backlog_first(
+    relay: Relay, echo: Echo, *, is_end_first: bool
+) -> None:
+    """Two roles within the time of one question: the worker hears the second only."""
+    count = 2 * MAX_WITHHELD
+    for number in range(count):
+        relay.put(str(number).encode())
+    until(lambda: len(echo.taken) == count, "the backlog")
+    if is_end_first:
+        relay.end(4)
+        until(lambda: echo.worker._dispatcher.is_over(4), "the inputs to have ended")
+    relay.tell(WorkerRole.DRAINING, epoch=4)
+    until(lambda: echo.worker.role.epoch == 4, "the role")
+    if not is_end_first:
+        relay.end(4)
+    until(lambda: relay.ends, "the end marker")
+    assert relay.ends == [(f"edge1/t/4/robot1/out/{END_CHUNK}", EndMarker(epoch=4, count=count))]
+    until(lambda: len(relay.outputs) == count, "an answer to all of it")
+    assert [int(payload) for _, payload in relay.outputs] == list(range(count))
+
+
+def test_an_end_marker_of_an_epoch_that_never_came_ends_nothing(relay: Relay, echo: Echo) -> None:
+    relay.put(b"a")
+    until(lambda: len(echo.taken) == 1, "the input")
+    relay.end(10**6)
+    until(lambda: echo.worker._dispatcher.is_over(10**6), "the forged marker")
+    relay.tell(WorkerRole.ACTIVE, epoch=4)
+    until(lambda: f"{ROLE_KEY}/4" in relay.tokens, "the token of the epoch")
+    relay.put(b"b")
+    until(lambda: relay.outputs == [("edge1/t/4/robot1/out", name) for name in (b"a", b"b")], "the outputs")
+
+
+def test_the_end_waits_for_a_backlog_that_is_processed_once_more(relay: Relay, echo: Echo) -> None:
+    """Told that it works and at once that it does not: the end of the inputs came long ago."""
+    gate = threading.Event()
+    for name in (b"a", b"b", b"c"):
+        relay.put(name)
+    until(lambda: len(echo.taken) == 3, "the backlog")
+    echo.worker._errands.put(partial(_wait, gate))
+    relay.tell(WorkerRole.ACTIVE, epoch=4)
+    until(lambda: echo.worker.role.epoch == 4, "the role")
+    relay.tell(WorkerRole.DRAINING, epoch=4)
+    until(lambda: echo.worker.role.role is WorkerRole.DRAINING, "the next role")
+    relay.end(4)
+    until(lambda: echo.worker._dispatcher.is_over(4), "the inputs to have ended")
+    gate.set()
+    until(lambda: relay.ends, "the end marker")
+    assert relay.ends[0][1].count == 3
+
+
 def test_what_a_backlog_has_no_room_for_is_said_to_be_lost(
     relay: Relay, echo: Echo, monkeypatch: pytest.MonkeyPatch
 ) -> None:
