@@ -419,7 +419,7 @@ def test_what_a_backlog_has_no_room_for_is_said_to_be_lost(
     while relay.count < 40:
         relay.put(b"x")
     until(lambda: len(echo.taken) == relay.count, "the backlog")
-    until(lambda: told[-1].processed == relay.count and told[-1].lost == relay.count - 10, "what is lost")
+    until(lambda: told and told[-1].processed == relay.count and told[-1].lost == relay.count - 10, "what is lost")
     relay.tell(WorkerRole.ACTIVE, epoch=4)
     until(lambda: len(relay.outputs) == 10, "the newest")
     heard.undeclare()

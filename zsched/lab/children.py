@@ -74,12 +74,14 @@ class Janitor:
         self._process.stdin.write(json.dumps({"remove": str(folder)}) + "\n")
         self._process.stdin.flush()
 
-    def finish(self, timeout_s: float = 10.0) -> list[str]:
+    def finish(self, timeout_s: float = 60.0) -> list[str]:
         """Set the janitor off and wait for it; returns what it could not remove."""
         try:
             answer, _ = self._process.communicate(timeout=timeout_s)
         except subprocess.TimeoutExpired:
-            return [f"janitor (pid {self._process.pid}) is still at work"]
+            self._process.kill()
+            self._process.communicate()
+            return [f"the janitor was at work for {timeout_s:g} s and was ended"]
         with contextlib.suppress(ValueError, KeyError):
             return [str(item) for item in json.loads(answer)["left"]]
         return ["janitor gave no answer"]
