@@ -7,6 +7,8 @@ class ``reliable`` is kept, at most ``limit`` of an output and `KEPT_BYTES`, of 
 a gap asks at once; one that makes no progress for `RESEND_S`, longer each time, is sent what it lacks once its link is
 there again. Both go to that relay alone, under `AGAIN_CHUNK`: other robots' radios carry nothing twice. Who cannot be
 reached for `FORGET_S` is forgotten. A plain subscriber never acknowledges; for it nothing is kept longer than that.
+
+Anybody can acknowledge under any relay's name. So a lane remembers at most `MAX_RECEIVERS` of them.
 """
 
 from __future__ import annotations
@@ -28,7 +30,7 @@ from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, Stre
 from zsched.core.serial import number_near, serial_of
 from zsched.errors import WireError
 from zsched.guard import guarded
-from zsched.keyspace import AGAIN_CHUNK, END_CHUNK
+from zsched.keyspace import AGAIN_CHUNK, END_CHUNK, parse
 from zsched.relay_pipe import encode_end
 
 KEPT_BYTES: Final = 32 << 20
@@ -37,6 +39,8 @@ MAX_PAUSE_S: Final = 2.0
 ASKED_S: Final = 0.1
 """A relay that asks for the same once more within this time has it on its way."""
 FORGET_S: Final = 10.0
+MAX_RECEIVERS: Final = 256
+"""Relays that a lane remembers; beyond, the longest silent one goes, first of those that were never reached."""
 NEWCOMERS_S: Final = 3.0
 """So long after an epoch's first answer a robot may begin with it: one that learnt of the move late, or had no link."""
 TICK_S: Final = 0.1
@@ -68,7 +72,10 @@ class _Receiver:
     pause_s: float = RESEND_S
     batch_end: int | None = None
     unreached_since: float | None = None
+    heard_at: float = 0.0
     is_ended: bool = False
+    is_confirmed: bool = False
+    """It was seen to subscribe to what is sent again."""
     publisher: zenoh.Publisher | None = None
     """Of what is sent again; there while something is owed."""
 
@@ -90,6 +97,10 @@ class KeptLane:
     ended_at: float = 0.0
     began_at: float | None = None
     is_closed: bool = False
+    crowded_out: int = 0
+    """Relays that were forgotten for want of room."""
+    gone: list[_Receiver] = field(default_factory=list)
+    """Relays that were forgotten, their publishers not given back yet."""
 
     def keep(self, number: int, payload: Any, attachment: Any, encoding: Any, stamp: Any, size: int) -> None:
         """Keep what is about to be put under a number; the oldest give way."""
@@ -116,16 +127,31 @@ class KeptLane:
             receiver = self.receivers.get(relay)
             if receiver is None:  # a relay that restarted is another session of the same node
                 for old in [name for name, one in self.receivers.items() if one.node == node]:
-                    del self.receivers[old]
+                    self.gone.append(self.receivers.pop(old))
+                if len(self.receivers) >= MAX_RECEIVERS:
+                    self._make_room()
                 receiver = self.receivers[relay] = _Receiver(node=node, arrived=-1)
             # one that came late knows the lowest bits only; nobody can have more than was sent
             arrived = min(number_near(serial_of(ack.arrived), self.count), self.count)
             has_moved = arrived > receiver.arrived
-            receiver.is_ended = ack.is_ended
+            receiver.heard_at, receiver.is_ended = now, ack.is_ended
             if has_moved:
                 receiver.arrived, receiver.moved_at, receiver.pause_s = arrived, now, RESEND_S
             self._let_go(now)
             return receiver, has_moved
+
+    def _make_room(self) -> None:
+        least = min(self.receivers, key=lambda name: (self.receivers[name].is_confirmed, self.receivers[name].heard_at))
+        self.gone.append(self.receivers.pop(least))
+        self.crowded_out += 1
+        if self.crowded_out == 1:
+            _log.warning("%s: more than %d relays acknowledge answers: some are strangers", self.key, MAX_RECEIVERS)
+
+    def take_gone(self) -> list[_Receiver]:
+        """Relays that were forgotten since the last time."""
+        with self.lock:
+            gone, self.gone = self.gone, []
+            return gone
 
     def _let_go(self, now: float) -> None:
         """Of what every relay that we know of has, once those that we do not know have had time to come."""
@@ -227,15 +253,20 @@ class Keeper:
         except WireError as error:
             _log.warning("an unreadable acknowledgement was ignored (%s)", error)
             return
-        node, relay = str(sample.key_expr).split("/")[-3:-1]
+        key = parse(str(sample.key_expr))
+        if key is None or len(key.rest) != 2:
+            _log.warning("an acknowledgement under a malformed key was ignored")
+            return
         for ack in frame.acks:
             lane = self._lanes.get(ack.eid)
             if lane is not None:
-                self._acknowledged(lane, relay, node, ack)
+                self._acknowledged(lane, key.rest[0], key.owner, ack)
 
     def _acknowledged(self, lane: KeptLane, relay: str, node: str, ack: StreamAck) -> None:
         now = monotonic_s()
         receiver, has_moved = lane.acknowledge(relay, node, ack, now)
+        for gone in lane.take_gone():
+            _undeclare(gone)
         if ack.has_gap:
             if has_moved or now - receiver.moved_at > ASKED_S:
                 until = number_near(serial_of(ack.until), lane.count) if ack.until else lane.count
@@ -297,7 +328,7 @@ class Keeper:
             )
         status: Any = receiver.publisher.matching_status
         if bool(status.matching):  # the object itself is always true
-            receiver.unreached_since = None
+            receiver.unreached_since, receiver.is_confirmed = None, True
             return True
         receiver.unreached_since = receiver.unreached_since or now
         if now - receiver.unreached_since > FORGET_S:

@@ -200,3 +200,33 @@ def test_bytes_are_bounded_too(monkeypatch: pytest.MonkeyPatch, bench: Bench) ->
     lane = bench.lane()
     keep(lane, 0, 1, 2)
     assert [one.number for one in lane.kept] == [1, 2]
+
+
+def test_strangers_who_acknowledge_are_bounded_and_a_robot_that_was_reached_stays(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(worker_keep, "MAX_RECEIVERS", 4)
+    lane = bench.lane()
+    robot = bench.robot("robot1")
+    keep(lane, 0, 1, 2)
+    robot.ack(bench.eid, 1, has_gap=True, until=2)
+    until(lambda: robot.got == [1], "the robot is sent what it lacks")
+    word = wire.encode(StreamAcks(acks=(StreamAck(eid=bench.eid, first=0, arrived=0, processed=0, has_gap=True),)))
+    for number in range(40):
+        bench.outside.put(KEYS.received(f"ghost{number}", f"bad{number}", str(bench.worker.zid())), word)
+    until(lambda: "bad39" in lane.receivers, "the last stranger's word")
+    assert len(lane.receivers) == 4
+    assert robot.relay in lane.receivers
+    assert lane.crowded_out == 40 - 3
+    until(lambda: not lane.gone, "the others' publishers are given back")
+
+
+def test_an_acknowledgement_under_a_malformed_key_is_nobody_s(bench: Bench) -> None:
+    lane = bench.lane()
+    robot = bench.robot("robot1")
+    keep(lane, 0, 1)
+    for node, relay in (("*", "aa1"), ("robot9", "*"), ("robot9", "b" * 500)):
+        bench.robot(node, relay).ack(bench.eid, 2)
+    robot.ack(bench.eid, 1)
+    until(lambda: lane.receivers, "the robot's word, behind those")
+    assert list(lane.receivers) == [robot.relay]

@@ -36,7 +36,7 @@ from zsched.lab.fuzz_wire import NAMES
 from zsched.relay.lanes import Lane, Sent, near
 from zsched.relay.tokens import Tokens
 from zsched.relay_pipe import decode_chunk, decode_end, encode_chunk, encode_end
-from zsched.worker_keep import KeptLane
+from zsched.worker_keep import MAX_RECEIVERS, KeptLane
 from zsched.worker_snapshot import CHUNK, MAX_OFFERS, MAX_SNAPSHOT, Assembly
 
 KEYS = Keyspace("fuzz")
@@ -228,10 +228,15 @@ class KeyFuzz:
         lane = KeptLane(key="k", source_id=cast("Any", None), limit=8, wake=threading.Event())
         for number in range(20):
             lane.keep(number, b"", None, None, None, 1)
-            receiver, _ = lane.acknowledge("a1", "robot1", self._ack(), 1.0)
+            name = str(self._rng.randrange(3 * MAX_RECEIVERS))
+            receiver, _ = lane.acknowledge(f"a{name}", f"robot{name}", self._ack(), 1.0)
             assert receiver.arrived <= lane.count
             lane.wanted(receiver.arrived, self._number())
         assert len(lane.kept) <= lane.limit
+        if self._rng.random() < 0.05:
+            for number in range(MAX_RECEIVERS + 9):
+                lane.acknowledge(f"b{number}", f"robot{number}", self._ack(), 2.0)
+        assert len(lane.receivers) <= MAX_RECEIVERS
 
     def _hop(self) -> None:
         """The receiving side: after hostile numbers and markers an honest stream is admitted again within a few."""
