@@ -260,11 +260,12 @@ class Agreement:
         return Effects(is_dirty=step.is_dirty, send=[do.AnswerElection(request=event.request, answer=answer)])
 
     def _may_ask(self, asker: NodeId, now: float) -> bool:
-        """One token of the asker's bucket (`PREPARES_PER_S`, at most `PREPARE_BURST` saved)."""
+        """One token of the asker's bucket (`PREPARES_PER_S`, at most `PREPARE_BURST` saved); a no costs none."""
         tokens, at = self._buckets.get(asker, (PREPARE_BURST, now))
         tokens = min(tokens + (now - at) * PREPARES_PER_S, PREPARE_BURST)
-        self._buckets[asker] = (max(tokens - 1.0, 0.0), now)
-        return tokens >= 1.0
+        may_ask = tokens >= 1.0
+        self._buckets[asker] = (tokens - may_ask, now)
+        return may_ask
 
     def on_accept(self, event: ev.AcceptAsked, now: float) -> Effects:
         """A proposer asks to accept a value; only under its own ballots."""

@@ -18,7 +18,7 @@ from zsched.core.agreement import (
     Agreement,
     Effects,
 )
-from zsched.core.belief import GENERATION_STEP, MAX_AHEAD
+from zsched.core.belief import GENERATION_STEP, MAX_AHEAD, MAX_GENERATION
 from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing
 from zsched.core.messages import (
     Accept,
@@ -470,10 +470,28 @@ def test_prepares_of_one_peer_are_rate_limited_and_others_are_not() -> None:
     )
     assert isinstance(answer.answer, Promise)
     again = Prepare(task="merge", ballot=Ballot(counter=100, node="robot2", incarnation=1), electorate="e")
+    (soon,) = of(
+        agreement.on_prepare(ev.PrepareAsked(request=1, asker="robot2", prepare=again), 100.04), do.AnswerElection
+    )
+    assert isinstance(soon.answer, Refused), "one is saved in a twentieth of a second"
     (later,) = of(
         agreement.on_prepare(ev.PrepareAsked(request=1, asker="robot2", prepare=again), 101.0), do.AnswerElection
     )
     assert isinstance(later.answer, Promise)
+
+
+def test_a_broken_proposer_costs_an_elector_twenty_promises_a_second_and_an_honest_one_waits_for_nothing() -> None:
+    """Ten seconds: one asks a hundred times a second, the other nineteen times, far more than back-off ever lets it."""
+    for per_s, promised in ((100, range(235, 246)), (19, range(190, 191))):
+        agreement, count = make(), 0
+        for number in range(10 * per_s):
+            ballot = Ballot(counter=number + 1, node="robot2", incarnation=1)
+            asked = ev.PrepareAsked(
+                request=number, asker="robot2", prepare=Prepare(task="merge", ballot=ballot, electorate="e")
+            )
+            (said,) = of(agreement.on_prepare(asked, 100.0 + number / per_s), do.AnswerElection)
+            count += isinstance(said.answer, Promise)
+        assert count in promised, per_s
 
 
 def test_who_has_voted_is_remembered_on_disk_once() -> None:
@@ -528,6 +546,48 @@ def test_node_without_state_believes_whatever_generation_it_is_told() -> None:
     agreement = make(has_state=False)
     agreement.on_learnt(answer(Learnt(node="robot2", values=(value(2**32 + 1),), generation=1)), 100.0)
     assert agreement.registers["merge"].value.revision == 2**32 + 1
+
+
+@pytest.mark.parametrize(
+    ("said", "follows"),
+    [
+        (Learnt(node="robot2", values=(), generation=3, incarnation=5), True),
+        (Learnt(node="robot2", values=(), generation=3, incarnation=1), True),
+        (Learnt(node="robot2", values=(), generation=3, has_voted=True), True),
+        (Learnt(node="robot2", values=(), generation=3), False),  # it keeps no state and goes by what it heard itself
+        (Learnt(node="edge1", values=(), generation=3, incarnation=5, has_voted=True), False),
+        (Learnt(node="robot2", values=(), generation=MAX_GENERATION, incarnation=5), True),
+        (Learnt(node="robot2", values=(), generation=MAX_GENERATION + 1, incarnation=5), False),
+    ],
+)
+def test_a_node_without_a_state_follows_an_elector_that_keeps_one(said: Learnt, *, follows: bool) -> None:
+    agreement = make(me="edge2", has_state=False)
+    agreement.on_learnt(answer(said), 100.0)
+    assert agreement.generation == (said.generation if follows else None)
+    unasked = make(me="edge2", has_state=False)
+    unasked.on_learnt(ev.LearntReceived(learnt=said), 100.0)
+    assert unasked.generation is None, "whatever is said unasked is no answer"
+
+
+def test_a_node_without_a_state_goes_to_a_newer_generation_only_and_forgets_what_it_saw_of_the_older() -> None:
+    agreement = make(me="edge2", has_state=False)
+
+    def hear(generation: int, votes: int) -> tuple[int | None, dict[str, tuple[int, int]]]:
+        said = Learnt(node="robot2", values=(), generation=generation, incarnation=5, votes=votes)
+        agreement.on_learnt(answer(said), 100.0)
+        return agreement.generation, {name: seen for name, seen in agreement.witness.seen.items() if seen != (0, 0)}
+
+    assert hear(3, 8) == (3, {"robot2": (5, 8)})
+    assert hear(3, 7) == (3, {"robot2": (5, 8)}), "nothing is forgotten within one"
+    assert hear(2, 9) == (3, {"robot2": (5, 8)})
+    assert hear(4, 2) == (4, {"robot2": (5, 2)})
+
+
+def test_a_node_with_a_state_follows_nobody() -> None:
+    agreement = make()
+    agreement.on_learnt(answer(Learnt(node="robot2", values=(), generation=3, incarnation=5)), 100.0)
+    assert agreement.generation == 0
+    assert "generation 3" in agreement.problems["generation/robot2"]
 
 
 def test_revision_that_nothing_could_follow_is_refused_and_shown() -> None:
