@@ -175,8 +175,8 @@ class Executor:
 
     def _change_terms(self) -> tuple[Instruction, ...]:
         """The owner stays, and its worker needs a lease from now on, or none any more."""
-        if self.is_local and self.is_leased:
-            return self.rejoin()
+        if self.is_local:
+            return self.rejoin()  # whoever works alone needed no lease until now
         if self.owner != self.me or not self.runs_worker:
             return ()
         if self.is_leased:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from zsched.core.executor import Executor
-from zsched.core.fleet import TaskSpec, WorkerSpec
-from zsched.core.instructions import SetRole, StartWorker
+from zsched.core.fleet import OnIsolation, TaskSpec, WorkerSpec
+from zsched.core.instructions import ApplyRoutes, SetRole, StartWorker
 from zsched.core.model import Allocation, Tuning, Weights
 from zsched.core.plan import Role, WorkerRole
 
@@ -38,3 +38,19 @@ def test_who_does_not_own_it_does_nothing() -> None:
     other = Executor(spec=SPEC, me="edge2", has_streams=False)
     other.execute(FIRST, 10.0)
     assert other.execute(replace(FIRST, revision=2, leased=True), 11.0) == ()
+
+
+def test_a_robot_that_works_alone_stops_and_goes_back_when_the_task_is_leased() -> None:
+    """What it has begun without a lease would else go on beside the owner's lease."""
+    spec = replace(SPEC, candidates=("edge1", "robot1"), on_isolation=OnIsolation.LOCAL)
+    robot = Executor(spec=spec, me="robot1", has_streams=True)
+    robot.execute(FIRST, 10.0)
+    (role,) = roles(robot.isolate())
+    assert (role.role, role.lease_until_s) == (WorkerRole.ACTIVE, None)
+    back = robot.execute(replace(FIRST, revision=2, leased=True), 11.0)
+    (role,) = roles(back)
+    assert role.role is WorkerRole.IDLE
+    (plan,) = [one.plan for one in back if isinstance(one, ApplyRoutes)]
+    assert plan.current is not None
+    assert plan.current.owner == "edge1"
+    assert robot.isolate() == (), "from now on it needs a lease, and alone it gets none"
