@@ -32,4 +32,4 @@ def _is_unleased(state: RegisterState) -> bool:
     values: list[Allocation] = [] if state.learnt is None else [state.learnt]
     values += [] if state.accepted is None else [state.accepted.value]
     newest = max(values, key=lambda value: value.revision, default=None)
-    return newest is not None and not newest.leased and (newest.owner is not None or newest.revision > 0)
+    return newest is not None and not newest.leased and newest.revision > 0

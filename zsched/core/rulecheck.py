@@ -19,6 +19,7 @@ are expanded.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final
@@ -204,8 +205,7 @@ def _service_clashes(rules: list[_Rule], robots: _Robots) -> Iterator[RuleConfli
     for first, second in ((rules[number], rules[other]) for number, other in pairs if other > number):
         index = _Index(_expand(second, robots), lambda relay: relay.from_expr, robots.budget)
         both = ((relay, other) for relay in _expand(first, robots) for other in index.meeting(relay.from_expr))
-        relay, other = next(both, (None, None))
-        if relay is not None and other is not None:
+        for relay, other in itertools.islice(both, 1):
             message = f"two services answer {_shown(relay.from_expr)!r}: one request would be carried out twice"
             yield RuleConflict(streams=(first.stream, second.stream), message=_on(message, relay, other))
 
