@@ -1,0 +1,119 @@
+"""Belief: which values could be true, and whose word is enough for one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from random import Random
+
+import pytest
+
+from zsched.core.belief import GENERATION_STEP, MAX_AHEAD, MAX_GENERATION, is_fit, is_proven
+from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing
+from zsched.core.messages import Learnt
+from zsched.core.model import Acceptance, Allocation, Ballot, NodeKind, RegisterState, Tuning, Weights
+from zsched.core.register import MAX_REVISION, Register
+
+TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
+TASK = TaskSpec(name="merge", candidates=("edge1", "robot2"), tuning=TUNING)
+NAMES = ("edge1", "robot1", "robot2")
+FLEET = Fleet(
+    name="test",
+    timing=Timing(),
+    nodes=tuple(NodeSpec(name=name, kind=NodeKind.EDGE if "edge" in name else NodeKind.ROBOT) for name in NAMES),
+    tasks=(TASK,),
+    electors=("robot1", "robot2"),
+)
+STRAY = MAX_AHEAD * 3
+
+
+def value(revision: int, owner: str | None = "edge1", epoch: int | None = None) -> Allocation:
+    return Allocation(
+        task="merge", revision=revision, epoch=revision if epoch is None else epoch, owner=owner, tuning=TUNING
+    )
+
+
+def register(learnt: Allocation | None = None, accepted: Allocation | None = None) -> Register:
+    ballot = Ballot(counter=5, node="robot1", incarnation=1)
+    held = None if accepted is None else Acceptance(ballot=ballot, value=accepted)
+    return Register(
+        me="robot1",
+        incarnation=1,
+        electors=FLEET.electors,
+        electorate="e",
+        is_elector=True,
+        initial=TASK.first_value(0),
+        state=RegisterState(task="merge", promised=ballot, accepted=held, learnt=learnt),
+        ballot_s=1.0,
+        stagger_s=0.1,
+        rng=Random(1),
+    )
+
+
+@pytest.mark.parametrize(
+    ("new", "fits"),
+    [
+        (value(11), True),
+        (value(11, None), True),
+        (value(11, "robot1"), False),
+        (value(11, epoch=11), True),
+        (value(11, epoch=12), False),
+        (value(10 + MAX_AHEAD), True),
+        (value(10 + MAX_AHEAD + 1), False),
+    ],
+)
+def test_a_value_names_a_candidate_and_is_not_absurdly_far_ahead(new: Allocation, fits: bool) -> None:
+    assert is_fit(FLEET, new, register(learnt=value(10))) is fits
+
+
+def test_ahead_is_counted_from_whatever_is_newest() -> None:
+    assert is_fit(FLEET, value(20 + MAX_AHEAD), register(learnt=value(10), accepted=value(20)))
+    assert is_fit(FLEET, value(20 + MAX_AHEAD), register(learnt=value(20), accepted=value(10)))
+    assert is_fit(FLEET, value(30 + MAX_AHEAD), register(learnt=value(20)), start=30)
+    assert not is_fit(FLEET, value(31 + MAX_AHEAD), register(learnt=value(20)), start=30)
+    assert is_fit(FLEET, value(MAX_AHEAD), register())
+    assert not is_fit(FLEET, value(MAX_AHEAD + 1), register())
+
+
+def test_what_is_known_here_already_fits_whatever_it_is() -> None:
+    """A fleet file that names other candidates must not make a node refuse what it has agreed to."""
+    old = value(7, "robot1")
+    assert is_fit(FLEET, old, register(learnt=old))
+    assert is_fit(FLEET, old, register(learnt=value(8), accepted=old))
+    assert not is_fit(FLEET, old, register(learnt=value(8)))
+
+
+@pytest.mark.parametrize(
+    ("by", "new", "accepted", "is_enough"),
+    [
+        ("robot2", value(3), None, True),
+        ("edge1", value(3), None, False),
+        ("edge1", value(3), value(3), True),
+        ("edge1", value(3), value(4), False),
+        ("robot2", value(STRAY), None, False),
+        ("robot2", value(STRAY), value(STRAY), True),
+    ],
+)
+def test_an_elector_s_answer_is_enough_or_what_was_accepted_here(
+    by: str, new: Allocation, accepted: Allocation | None, is_enough: bool
+) -> None:
+    said = Learnt(node=by, values=(new,))
+    assert is_proven(FLEET, said, new, register(accepted=accepted), has_generation=True) is is_enough
+
+
+def test_only_a_node_without_a_state_counts_from_the_generation_that_it_is_told() -> None:
+    new = value(3 * GENERATION_STEP + 5)
+    said = Learnt(node="robot2", values=(new,), generation=3)
+    assert is_proven(FLEET, said, new, register(), has_generation=False)
+    assert not is_proven(FLEET, said, new, register(), has_generation=True)
+    ahead = value(MAX_AHEAD + 1)
+    assert not is_proven(FLEET, replace(said, values=(ahead,)), ahead, register(), has_generation=True)
+    assert not is_proven(FLEET, replace(said, generation=2), new, register(), has_generation=False)
+
+
+def test_a_node_that_was_cut_off_for_twelve_days_of_a_move_a_second_believes_what_it_hears_then() -> None:
+    assert is_fit(FLEET, value(10 + 12 * 86400), register(learnt=value(10)))
+
+
+def test_the_last_generation_has_room_to_count_like_any_other() -> None:
+    assert (MAX_GENERATION + 1) * GENERATION_STEP <= MAX_REVISION
+    assert (MAX_GENERATION + 2) * GENERATION_STEP > MAX_REVISION, "and the next one would not"
