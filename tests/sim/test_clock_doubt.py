@@ -75,6 +75,9 @@ def slewed(sim: Simulator, name: str, seconds: float, size: float = 0.083) -> No
         (replace(WELL, jump_s=-JUMP_S * 1.5), True),
         (replace(WELL, jump_s=0.002, since_s=3.0), False),
         (ClockCompared(error_ratio=0.0, jump_s=60.0), True),
+        (ClockCompared(error_ratio=0.0, jump_s=JUMP_S), False),
+        (ClockCompared(error_ratio=0.0, jump_s=-JUMP_S), False),
+        (ClockCompared(error_ratio=-RHO), False),
     ],
 )
 def test_a_rate_beyond_the_lease_s_bound_and_a_jump_are_doubts(event: ClockCompared, is_unsure: bool) -> None:
@@ -99,6 +102,8 @@ def test_the_operator_reads_what_is_wrong() -> None:
     assert "slewed by +8.30%" in (doubt.complaint or "")
     doubt.absorb(ClockCompared(error_ratio=0.0, jump_s=60.0), 11.0)
     assert "jumped by +60.000 s" in (doubt.complaint or "")
+    doubt.absorb(ClockCompared(error_ratio=RHO, jump_s=60.0), 12.0)
+    assert "jumped by +60.000 s" in (doubt.complaint or ""), "so much slew is no fault"
 
 
 # --- leases ----------------------------------------------------------------------------------------------------------

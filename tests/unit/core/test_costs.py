@@ -17,8 +17,9 @@ from zsched.core.rounds import Rounds
 class Relay:
     """Counts as a relay does: once a second, of a task that answers every input, but for its silences."""
 
-    def __init__(self, hz: float = 10.0) -> None:
-        self.cost, self.now, self.hz = MoveCost("merge"), 100.0, hz
+    def __init__(self, hz: float = 10.0, outputs: float = 1.0) -> None:
+        """``outputs`` of one input."""
+        self.cost, self.now, self.hz, self.outputs = MoveCost("merge"), 100.0, hz, outputs
         self.taken = self.given = 0.0
 
     def run(self, seconds: int, *, silent_s: float = 0.0, asks: bool = True) -> None:
@@ -27,7 +28,7 @@ class Relay:
             quiet = min(silent_s, 1.0)
             silent_s -= quiet
             self.taken += self.hz if asks else 0.0
-            self.given += self.hz * (1.0 - quiet) if asks else 0.0
+            self.given += self.hz * self.outputs * (1.0 - quiet) if asks else 0.0
             self.now += 1.0
             counts = (
                 StreamCount(stream="merge/in/0", messages=round(self.taken)),
@@ -49,6 +50,36 @@ def test_the_cost_is_the_work_that_is_missing_at_any_rate(hz: float, silent_s: f
     relay.run(8, silent_s=silent_s)
     assert relay.cost.moves == 1
     assert relay.cost.seconds == pytest.approx(silent_s, abs=0.05)
+
+
+@pytest.mark.parametrize("outputs", [0.1, 10.0])
+def test_inputs_and_outputs_have_each_a_rate_of_their_own(outputs: float) -> None:
+    relay = Relay(100.0, outputs)
+    relay.run(20)
+    relay.move()
+    relay.run(8, silent_s=2.0)
+    assert relay.cost.seconds == pytest.approx(2.0, abs=0.05)
+    relay.hz = 30.0
+    relay.move()
+    relay.run(8, silent_s=2.0)
+    assert relay.cost.moves == 1, "so few inputs as these are not usual: nothing was missing that anybody asked for"
+
+
+def test_what_is_usual_follows_the_rate_and_not_one_odd_second() -> None:
+    relay = Relay()
+    relay.run(20)
+    relay.hz = 100.0
+    relay.run(60)
+    relay.hz = 50.0
+    relay.run(1)
+    relay.hz = 100.0
+    relay.move()
+    relay.run(8, silent_s=2.0)
+    assert relay.cost.seconds == pytest.approx(2.0, abs=0.4)
+    relay.hz = 30.0
+    relay.move()
+    relay.run(8)
+    assert relay.cost.moves == 1, "many at the beginning, few now"
 
 
 def test_a_silence_shorter_than_the_relays_reports_is_seen() -> None:

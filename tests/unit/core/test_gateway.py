@@ -164,6 +164,15 @@ def test_a_starved_owner_shows_too_little_and_is_not_learnt_from() -> None:
     assert learnt(busy) == TASK.demand
 
 
+@pytest.mark.parametrize(("cpu", "is_learnt"), [(2.0, True), (3.5, True), (3.8, False), (4.0, False)])
+def test_a_busy_owner_is_learnt_from_until_next_to_nothing_of_its_processor_is_left(
+    cpu: float, *, is_learnt: bool
+) -> None:
+    """Of 4 cores: one that is half busy gives its worker what it wants."""
+    demand = learnt(profile(cpu=cpu, used=(1.5, 600.0)))
+    assert demand == (Demand(cpu_cores=1.5, memory_mb=600.0) if is_learnt else TASK.demand)
+
+
 @pytest.mark.parametrize("state", [WorkerState.STOPPED, WorkerState.STARTING, WorkerState.FAILED])
 def test_a_task_does_not_cost_less_because_its_worker_restarts(state: WorkerState) -> None:
     restarting = profile(1, state=state, used=(0.0, 20.0))

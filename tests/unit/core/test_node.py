@@ -462,6 +462,17 @@ def test_changes_of_peers_are_told_at_once() -> None:
     assert node.membership.state("edge1") is PeerState.SUSPECT
 
 
+def test_whoever_is_heard_again_is_no_suspect_in_the_same_batch() -> None:
+    """A suspect that goes on being named by this node could be held for gone by another one."""
+    node = started()
+    node.handle(ev.TokenLost(node="edge1", incarnation=3), 100.1)
+    batch = node.handle(ev.BeatReceived(beat=beat("edge1", 2)), 100.15)
+    assert node.membership.state("edge1") is PeerState.ALIVE
+    (told,) = of(batch, do.PublishBeat)
+    assert told.beat.suspects == ()
+    assert any("suspect -> alive" in one.text for one in of(batch, do.RecordStory) if one.stage == "membership")
+
+
 def test_beats_in_turn_are_no_news() -> None:
     node = started()
     told = [

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from random import Random
 
+import pytest
+
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.agreement import PARK_SHARE, Agreement, Effects
@@ -80,6 +82,17 @@ def test_it_is_accepted_as_soon_as_the_lease_is_over() -> None:
     asks(agreement, 1, 5, at - PARKED_S / 2)
     effects = agreement.retry_parked(at)
     assert (answers(effects), effects.is_dirty, agreement.has_parked) == ([(1, "accepted")], True, False)
+
+
+@pytest.mark.parametrize(("waited", "expected"), [(0.7, "accepted"), (0.9, Refusal.LEASE)])
+def test_it_waits_for_most_of_its_ballot_s_time_and_the_no_still_comes_before_the_end(
+    waited: float, expected: str
+) -> None:
+    agreement = elector()
+    at = 100.0 + HOLD_S
+    asks(agreement, 1, 5, at - waited * FLEET.timing.ballot_s)
+    early = answers(agreement.retry_parked(at - 0.01))
+    assert early + answers(agreement.retry_parked(at)) == [(1, expected)]
 
 
 def test_the_asker_s_next_ballot_ends_the_wait_of_the_one_before_and_an_echo_of_it_does_not() -> None:

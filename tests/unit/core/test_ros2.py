@@ -91,6 +91,9 @@ def test_recorded_tokens_are_read() -> None:
         "f9980ee0495eaafb3e38f0d19e2eae12",
         Endpoint(kind=EndpointKind.PUBLISHER, key="robot1/map", type_name="nav_msgs/msg/OccupancyGrid", qos=":1:1:0,1"),
     )
+    without_qos = parse_token(BRIDGED.rpartition("/")[0])
+    assert without_qos is not None
+    assert (without_qos[1].key, without_qos[1].qos) == ("robot1/map", "")
     assert parse_token(LISTENER) is None
 
 
@@ -122,7 +125,19 @@ def test_any_token_is_read_or_not_never_an_exception(token: str) -> None:
     parse_token(token)
 
 
-@pytest.mark.parametrize("token", ["@ros2_lv/0/z/0/1/XX/%/%/n/%t/a::b/h/q", "@/z/@ros2_lv/XX/a/b", "@ros2_lv", ""])
+@pytest.mark.parametrize(
+    "token",
+    [
+        "@ros2_lv/0/z/0/1/XX/%/%/n/%t/a::b/h/q",
+        "@/z/@ros2_lv/XX/a/b",
+        "@/z/@ros2_lv/MP/a",
+        "@/z/@ros2_lv/MP/a/b/q/more",
+        "a/z/@ros2_lv/MP/a/b/q",
+        "@/z/@other/MP/a/b/q",
+        "@ros2_lv",
+        "",
+    ],
+)
 def test_tokens_of_other_kinds_are_none(token: str) -> None:
     assert parse_token(token) is None
 

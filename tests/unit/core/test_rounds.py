@@ -180,6 +180,8 @@ def test_late_foreign_doubled_and_forged_answers_do_not_count() -> None:
     assert not robot.hear("robot1", 1)
     forged = replace(robot.answer("robot3"), voter="robot2")
     assert not robot.rounds.absorb_utilities(1, forged)
+    stuffed = replace(robot.answer("robot2"), vectors=robot.answer("robot2").vectors + forged.vectors)
+    assert not robot.rounds.absorb_utilities(1, stuffed), "its own vector does not cover another one's"
     assert robot.hear("robot2", 1)
     assert not robot.hear("robot2", 1), "once per gather"
     robot.tick(GATHER_S)
