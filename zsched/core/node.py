@@ -181,7 +181,7 @@ class Node:
         others for silent.
         """
         if now > self._promised:
-            self._note_lag(now - self._promised)
+            self._note_lag(now - self._promised, now)
         self._handlers[type(event)](event, now)
 
     def _is_quiet(self, now: float) -> bool:
@@ -226,9 +226,10 @@ class Node:
             due = min(due, executor.next_deadline())
         return due
 
-    def _note_lag(self, lag_s: float) -> None:
+    def _note_lag(self, lag_s: float, now: float) -> None:
         self.loop_lag_s = max(self.loop_lag_s, lag_s)
         self.membership.note_lag(lag_s)
+        self._hangs.note_lag(lag_s, now)
 
     def _advance(self, now: float) -> None:
         """Let every stage act on the time that has passed, in the data's order."""

@@ -5,6 +5,9 @@ Knows: what every robot's relay counts, when a worker was last given time. Does 
 Inputs and outputs pass through the robots' relays, never through the owner's, and they are the same for a worker that
 uses our library and for any other zenoh program. So a robot says in its profile whether a task answers it
 (`Progress`), and the owner's daemon puts what the robots say together (`HangJudge`).
+
+A node that did not run for a while (its machine was suspended, its daemon stopped) begins to count again, on both
+sides: time counts on while it sleeps, and a worker that slept with it owes nothing for that.
 """
 
 from __future__ import annotations
@@ -88,6 +91,12 @@ class Progress:
             return 0, 0  # nobody can tell
         return taken, sum(count.acknowledged or 0 for count in inputs)
 
+    def begin_again(self, task: TaskId, now: float) -> None:
+        """What waits has waited since now only."""
+        seen = self._seen.get(task)
+        if seen is not None and seen.waits_since is not None:
+            seen.waits_since = now
+
     def reports(self, now: float) -> tuple[TaskProgress, ...]:
         """What this robot can say now: served, or waiting for longer than the deadline while inputs go on."""
         found = []
@@ -116,6 +125,11 @@ class HangJudge:
             self._given_time_at[task] = now
         elif state is not WorkerState.STARTING:
             self._given_time_at.pop(task, None)
+
+    def begin_again(self, task: TaskId, now: float) -> None:
+        """A worker that owes an answer has its whole time again."""
+        if task in self._given_time_at:
+            self._given_time_at[task] = now
 
     def hangs(self, spec: TaskSpec, executor: Executor, profiles: Iterable[Profile], now: float) -> str:
         """Why this node's worker counts as hung; empty when it does not.
@@ -162,6 +176,13 @@ class HangWatch:
         """A worker of this node has changed."""
         if task in self._specs:
             self._judge.note_worker(task, state, now)
+
+    def note_lag(self, lag_s: float, now: float) -> None:
+        """This node did not run for so long (seconds); what is half a deadline or more is nobody's fault."""
+        for task, spec in self._specs.items():
+            if lag_s >= max(spec.worker.output_deadline_s or 0.0, COUNT_S) / 2:
+                self._progress.begin_again(task, now)
+                self._judge.begin_again(task, now)
 
     def reports(self, now: float) -> tuple[TaskProgress, ...]:
         """What our profile shall say."""

@@ -3,14 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from random import Random
 
 import pytest
 
+from zsched.core import events as ev
 from zsched.core.executor import Executor, Phase
-from zsched.core.fleet import Fleet, NodeSpec, StreamRule, TaskSpec, Timing, WorkerSpec
+from zsched.core.fleet import Fleet, NodeSpec, StreamRule, TaskSpec, Timing, WorkerSpec, electorate_hash
 from zsched.core.gateway import Gateway
 from zsched.core.instructions import Instruction, RecordStory, RestartWorker
-from zsched.core.model import NodeKind, Profile, TaskProgress, Tuning, Weights, WorkerState
+from zsched.core.model import (
+    Allocation,
+    DurableState,
+    NodeKind,
+    Profile,
+    RegisterState,
+    TaskProgress,
+    Tuning,
+    Weights,
+    WorkerState,
+)
+from zsched.core.node import Node
 from zsched.core.plan import Direction, StreamCount
 from zsched.core.progress import COUNT_S, MARGIN_S, HangWatch, Progress
 
@@ -113,6 +126,19 @@ def test_only_robots_watch_and_only_tasks_that_say_so(worker: WorkerSpec) -> Non
 # --- the owner -------------------------------------------------------------------------------------------------------
 
 
+def profile(robot: str, sequence: int, *progress: TaskProgress) -> Profile:
+    return Profile(
+        node=robot,
+        incarnation=1,
+        sequence=sequence,
+        cpu_cores=1.0,
+        cpu_used_cores=0.1,
+        memory_mb=100.0,
+        memory_used_mb=10.0,
+        progress=progress,
+    )
+
+
 class Owner:
     """The daemon whose worker is judged; its worker became ready at 100 s."""
 
@@ -132,17 +158,7 @@ class Owner:
 
     def hear(self, robot: str, now: float, *progress: TaskProgress) -> tuple[Instruction, ...]:
         self.sequence += 1
-        profile = Profile(
-            node=robot,
-            incarnation=1,
-            sequence=self.sequence,
-            cpu_cores=1.0,
-            cpu_used_cores=0.1,
-            memory_mb=100.0,
-            memory_used_mb=10.0,
-            progress=progress,
-        )
-        assert self.gateway.absorb(profile, now) is None
+        assert self.gateway.absorb(profile(robot, self.sequence, *progress), now) is None
         return self.watch.look(["merge"], {"merge": self.executor}, self.gateway, now)
 
 
@@ -183,6 +199,56 @@ def test_a_worker_whose_token_went_still_owes() -> None:
     owner = Owner()
     owner.watch.note_worker("merge", WorkerState.STARTING, 101.0)
     assert owner.hear("robot1", LATE, UNSERVED) != ()
+
+
+def test_a_robot_that_slept_does_not_count_its_sleep_as_waiting() -> None:
+    """It wakes up with an input that is not answered yet."""
+    robot = Robot()
+    robot.run(2)
+    robot.now += 60.0
+    robot.progress.begin_again("merge", robot.now)
+    assert robot.run(3) == ()
+    assert robot.run(1) == (UNSERVED,), "it hangs all the same"
+
+
+def test_an_owner_that_slept_gives_its_worker_the_whole_time_again() -> None:
+    owner = Owner()
+    owner.watch.note_lag(DEADLINE_S / 2, 200.0)
+    assert owner.hear("robot1", 200.0, UNSERVED) == ()
+    assert owner.hear("robot1", 200.0 + DEADLINE_S + MARGIN_S + 0.1, UNSERVED) != (), "it hangs all the same"
+
+
+def test_a_daemon_that_lags_a_little_still_notices() -> None:
+    owner = Owner()
+    owner.watch.note_lag(DEADLINE_S / 2 - 0.1, LATE)
+    assert owner.hear("robot1", LATE, UNSERVED) != ()
+
+
+@pytest.mark.parametrize("is_suspended", [False, True])
+def test_a_suspended_owner_takes_no_complaint_about_its_sleep(*, is_suspended: bool) -> None:
+    """The whole node: the robots' complaint is the first thing it hears when it wakes up."""
+    fleet = Owner().fleet
+    learnt = Allocation(task="merge", revision=3, epoch=3, owner="edge1", tuning=SPEC.tuning)
+    electorate = electorate_hash(fleet)
+    state = DurableState(
+        fleet="test",
+        node="edge1",
+        incarnation=7,
+        generation=0,
+        hardware="",
+        electorate=electorate,
+        registers=(RegisterState(task="merge", learnt=learnt),),
+    )
+    node = Node(fleet=fleet, me="edge1", durable=state, incarnation=7, electorate=electorate, rng=Random(1), now=100.0)
+    node.start(100.0)
+    now = 100.0
+    node.handle(ev.WorkerChanged(task="merge", state=WorkerState.READY), now)
+    while now < 120.0:
+        now = min(max(node.next_deadline(), now + 0.01), 120.0)
+        node.handle(ev.DeadlineReached(), now)
+    now = node.next_deadline() + (60.0 if is_suspended else 0.0)
+    told = node.handle(ev.ProfileReceived(profile=profile("robot1", 1, UNSERVED)), now)
+    assert any(isinstance(one, RestartWorker) for one in told) != is_suspended
 
 
 def test_somebody_else_s_worker_is_told_of_and_left_alone() -> None:
