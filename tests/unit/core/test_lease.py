@@ -1,0 +1,201 @@
+"""Leases, what the schedules seldom show: who is watched, what is remembered, when somebody must look again."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, lease_terms
+from zsched.core.lease import HURRY_S, Granter, Leases, hold_s
+from zsched.core.model import Allocation, Beat, Grant, NodeKind, Tuning, Weights
+
+NAMES = ("r1", "r2", "r3")
+TUNING = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
+GUARD = TaskSpec(name="guard", candidates=NAMES, tuning=TUNING, exclusive=True)
+FLEET = Fleet(
+    name="rules",
+    timing=Timing(),
+    nodes=tuple(NodeSpec(name=name, kind=NodeKind.ROBOT) for name in NAMES),
+    tasks=(GUARD,),
+    electors=NAMES,
+)
+OPEN = replace(FLEET, tasks=(replace(GUARD, exclusive=False),))
+L, HOLD_S = FLEET.timing.lease_s, hold_s(FLEET.timing.lease_s)
+ACCEPTED = {"guard": ("r2", 3)}
+
+
+def value(owner: str | None = "r2", *, leased: bool = True) -> Allocation:
+    return Allocation(task="guard", revision=7, epoch=3, owner=owner, tuning=TUNING, leased=leased)
+
+
+def beat(node: str = "r2", number: int = 5, released: tuple[Grant, ...] = ()) -> Beat:
+    return Beat(node=node, incarnation=1, sequence=number, loop_lag_s=0.0, learnt=(("guard", 7, 3),), released=released)
+
+
+def grant(number: int, owner: str = "r2", epoch: int = 3) -> Grant:
+    return Grant(task="guard", owner=owner, incarnation=1, epoch=epoch, number=number)
+
+
+def elector(fleet: Fleet = FLEET, standing: Allocation | None = None, granted_s: float = 0.0) -> Leases:
+    return Leases(fleet=fleet, me="r1", incarnation=1, standing={"guard": standing}, now=0.0, granted_s=granted_s)
+
+
+def granter() -> Granter:
+    """One that grants to r2 since 10 s."""
+    one = Granter(task="guard", lease_s=L, until=-math.inf, standing=None)
+    assert one.on_beat(beat(), ("r2", 3), 10.0)
+    return one
+
+
+def owner(*, echoed: int | None = 5) -> Leases:
+    held = Leases(fleet=FLEET, me="r1", incarnation=1, standing={}, now=0.0)
+    held.begin("guard", 3, 5)
+    held.on_sent(5, 10.0)
+    for name in NAMES[1:] if echoed is not None else ():
+        echo = (grant(echoed or 0, "r1"),)
+        held.on_beat(replace(beat(name, 9), echoes=echo, lease_terms=lease_terms(FLEET)), {}, 10.1)
+    return held
+
+
+def asked() -> Beat:
+    return replace(beat(number=9), asked_to_leave=(("guard", "r1", 3),))
+
+
+# --- electors --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("leased", "may"), [(True, False), (False, True)])
+def test_a_task_that_is_leased_for_everybody_is_watched_whatever_the_elector_s_file_says(
+    *, leased: bool, may: bool
+) -> None:
+    restarted = elector(OPEN, value(leased=leased))
+    assert restarted.may_accept("guard", "r2", 0.1)
+    assert restarted.may_accept("guard", "r3", 0.1) is may
+
+
+def test_a_task_that_becomes_leased_is_granted_from_then_on_and_not_in_doubt() -> None:
+    one = elector(OPEN)
+    assert not one.on_beat(beat(), ACCEPTED, 10.0)
+    one.on_newer_value(value(leased=False))
+    assert not one.on_beat(beat(), ACCEPTED, 10.0)
+    one.on_newer_value(value())
+    assert one.on_beat(beat(), ACCEPTED, 10.0)
+    assert one.on_sent(1, 10.0).echoes == (grant(5),)
+    unsure = elector(OPEN)
+    unsure.doubt({"guard": None})
+    unsure.on_newer_value(value())
+    assert not unsure.on_beat(beat(), ACCEPTED, 10.0)
+
+
+def test_a_newer_value_ends_the_wait_for_which_the_owner_was_silenced() -> None:
+    one = elector(standing=value())
+    one.on_beat(beat(), ACCEPTED, 10.0)
+    assert not one.may_accept("guard", "r3", 10.1)
+    assert one.on_sent(1, 10.1).asked_to_leave == (("guard", "r2", 3),)
+    one.on_newer_value(value())
+    said = one.on_sent(2, 10.2)
+    assert (said.asked_to_leave, said.echoes) == ((), (grant(5),))
+
+
+def test_a_grant_is_echoed_as_long_as_the_lease_and_asked_back_for_twice_the_hold() -> None:
+    one = granter()
+    assert one.echo(10.0 + L - 0.001) == grant(5)
+    assert one.echo(10.0 + L) is None
+    assert not one.may_accept("r3", 10.1)
+    assert one.asked_to_leave(10.1 + 2 * HOLD_S - 0.001) == ("guard", "r2", 3)
+
+
+def test_only_a_grant_that_begins_is_worth_a_beat_at_once() -> None:
+    one = granter()
+    assert not one.on_beat(beat(number=6), ("r2", 3), 10.1)
+    assert not one.on_beat(beat("r3"), ("r2", 3), 10.1)
+    assert not one.on_beat(beat(), None, 10.1)
+    assert one.echo(10.1) == grant(6)
+
+
+@pytest.mark.parametrize(("number", "is_free"), [(4, False), (5, True), (6, True)])
+def test_a_release_frees_what_it_covers(number: int, *, is_free: bool) -> None:
+    one = granter()
+    one.on_beat(beat("r2", 5, released=(grant(number),)), None, 10.1)
+    assert (one.echo(10.1) is None) is is_free
+    assert one.may_accept("r3", 10.1) is is_free
+
+
+def test_a_release_before_any_grant_holds_too() -> None:
+    one = Granter(task="guard", lease_s=L, until=-math.inf, standing=None)
+    assert not one.on_beat(beat("r2", 5, released=(grant(5),)), ("r2", 3), 10.0)
+    assert one.on_beat(beat("r2", 6), ("r2", 3), 10.0)
+
+
+def test_what_may_be_granted_is_on_disk_before_it_is() -> None:
+    assert elector().is_news(L / 2)
+    assert not elector().is_news(L)
+    assert not elector(OPEN).is_news(0.0), "nothing is granted here"
+
+
+def test_a_longer_lease_of_the_life_before_is_remembered_until_it_is_over() -> None:
+    long_s = 5 * L
+    one = elector(granted_s=long_s)
+    assert one.to_remember_s(hold_s(long_s) - 0.001) == long_s
+    assert one.to_remember_s(hold_s(long_s)) == L
+    assert elector(granted_s=L / 2).to_remember_s(0.0) == L
+    assert one.over_at == hold_s(long_s)
+
+
+def test_an_elector_looks_again_when_it_could_accept_another_owner() -> None:
+    one = elector(standing=value())
+    assert one.next_deadline(0.1) == HOLD_S
+    assert one.next_deadline(HOLD_S) == math.inf
+    one.on_beat(beat(), ACCEPTED, 10.0)
+    assert one.next_deadline(10.1) == 10.0 + HOLD_S
+    assert one.next_deadline(10.0 + HOLD_S) == math.inf
+
+
+# --- owners ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_same_epoch_once_more_keeps_the_lease_and_another_one_begins_without() -> None:
+    held = owner()
+    held.begin("guard", 3, 9)
+    assert held.until("guard") == 10.0 + L
+    held.begin("guard", 4, 9)
+    assert held.until("guard") == -math.inf
+
+
+def test_a_leaving_owner_looks_again_when_what_its_worker_was_given_is_over() -> None:
+    held = owner()
+    held.on_given("guard", 11.0)
+    assert held.next_deadline(10.2) == math.inf, "nobody asked it to leave"
+    held.on_beat(asked(), {}, 10.2)
+    assert held.next_deadline(10.2) == 11.0
+    assert held.next_deadline(11.0) == math.inf
+
+
+def test_a_worker_s_word_counts_only_when_it_was_asked_to_stop_and_ends_what_it_was_given() -> None:
+    held = owner()
+    held.on_given("guard", 11.0)
+    assert not held.on_stopped("guard", 3, 5), "nobody asked"
+    assert not held.on_stopped("other", 3, 5)
+    assert not held.on_run_out("other", 5, 12.0)
+    held.on_beat(asked(), {}, 10.2)
+    assert not held.on_stopped("guard", 2, 5)
+    assert held.on_stopped("guard", 3, 5)
+    assert held.given_until("guard") == -math.inf
+    assert held.leaving() == ()
+    assert held.on_sent(6, 10.3).released == (grant(5, "r1"),)
+
+
+def test_what_was_given_is_worth_a_beat_when_it_has_run_out_and_nothing_only_now_and_then() -> None:
+    held = owner()
+
+    def run_out(number: int, now: float) -> bool:
+        held.on_sent(number, now)
+        held.on_beat(asked(), {}, now)
+        return held.on_run_out("guard", number, now)
+
+    held.on_given("guard", 11.0)
+    assert [run_out(6, 11.0), run_out(7, 11.0), run_out(8, 11.0 + HURRY_S / 2)] == [True, True, False]
+    assert run_out(9, 11.0 + 1.5 * HURRY_S)
+    assert not run_out(10, 11.0 + 2 * HURRY_S)
