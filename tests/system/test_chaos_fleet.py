@@ -122,7 +122,7 @@ def test_power_loss_of_the_owner_is_silence_and_it_returns_with_its_state(bed: C
     assert all(reason.startswith("silent") for reason in reasons)
     bed.calm()
     after = {entry["name"]: entry["incarnation"] for entry in bed.status("robot1")["nodes"]}
-    assert after[owner] == before[owner] + 1
+    assert after[owner] > before[owner]
     assert bed.status(owner)["quorum"]["this_node"] in {"elector", "no_elector"}
 
 

@@ -113,6 +113,7 @@ class Crowd:
         self._looked_at = -LOOK_S
         self._cared_at = 0.0
         self._lock = threading.Lock()
+        self._looking = threading.Lock()
         self._is_smooth = True
         """Everybody had room at the last look, and nobody is left behind."""
         self._putting_since: float | None = None
@@ -161,8 +162,8 @@ class Crowd:
         """
         since, now = self._putting_since, monotonic_s()
         period_s, self._cared_at = now - self._cared_at, now
-        if since is None or now - since < SLOW_PUT_S or len(self._readers) < 2:
-            return
+        if since is None or now - since < SLOW_PUT_S or self._look(now, period_s=SLOW_PUT_S):
+            return  # it may wait for one that has come since the put thread's own look
         full = self._full()
         self._charge(full, min(period_s, MAX_CHARGE_S))
         if now - since < STUCK_S or len(full) == len(self._readers):
@@ -174,13 +175,14 @@ class Crowd:
 
     # --- one put -----------------------------------------------------------------------------------------------------
 
-    def _look(self, now: float) -> bool:
+    def _look(self, now: float, period_s: float = LOOK_S) -> bool:
         """Know the links, now and then; ``True`` when there is nobody to protect from anybody."""
-        if now - self._looked_at >= LOOK_S:
-            self._looked_at = now
-            links = self._sockets.links()
-            self._readers = {link: self._readers.get(link) or Reader(link, now) for link in links}
-        return len(self._readers) < 2
+        with self._looking:
+            if now - self._looked_at >= period_s:
+                self._looked_at = now
+                links = self._sockets.links()
+                self._readers = {link: self._readers.get(link) or Reader(link, now) for link in links}
+            return len(self._readers) < 2
 
     def _wait(self) -> tuple[Reader, ...]:
         """Wait for room at everybody's link; answers who is left behind and has none."""
