@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, lease_terms
-from zsched.core.lease import HURRY_S, Granter, Leases, hold_s
+from zsched.core.lease import HURRY_S, RHO, Granter, Leases, hold_s
 from zsched.core.model import Allocation, Beat, Grant, NodeKind, Tuning, Weights
 
 NAMES = ("r1", "r2", "r3")
@@ -123,6 +123,51 @@ def test_a_release_frees_what_it_covers(number: int, *, is_free: bool) -> None:
     assert one.may_accept("r3", 10.1) is is_free
 
 
+@pytest.mark.parametrize(
+    ("by", "given_back"), [("r3", grant(5)), ("r2", replace(grant(5), task="other")), ("r2", grant(5, "r3"))]
+)
+def test_nobody_gives_back_another_one_s_grant_or_another_task_s(by: str, given_back: Grant) -> None:
+    one = granter()
+    one.on_beat(beat(by, 5, released=(given_back,)), None, 10.1)
+    assert one.echo(10.1) == grant(5)
+    assert not one.may_accept("r3", 10.1)
+
+
+def test_a_beat_that_is_repeated_or_of_a_silenced_owner_prolongs_no_hold() -> None:
+    one = granter()
+    assert not one.on_beat(beat(), ("r2", 3), 10.5)
+    assert one.echo(10.0 + L) is None
+    assert not one.may_accept("r3", 10.6)
+    assert not one.on_beat(beat(number=6), ("r2", 3), 10.7)
+    assert one.may_accept("r3", 10.0 + HOLD_S)
+
+
+def test_silence_is_towards_the_owner_that_was_asked_only() -> None:
+    one = granter()
+    assert not one.may_accept("r3", 10.0 + HOLD_S - 0.1)
+    assert one.on_beat(beat("r3"), ("r3", 3), 10.0 + HOLD_S)
+    assert one.echo(10.0 + HOLD_S) == grant(5, "r3")
+
+
+def test_the_epoch_that_counts_is_that_of_the_task() -> None:
+    one = Granter(task="guard", lease_s=L, until=-math.inf, standing=None)
+    told = replace(beat(), learnt=(("other", 9, 3), ("guard", 7, 2)))
+    assert not one.on_beat(told, ("r2", 3), 10.0)
+    assert one.on_beat(replace(told, learnt=(("other", 9, 2), ("guard", 7, 3))), ("r2", 3), 10.0)
+
+
+def test_who_is_no_elector_grants_nothing() -> None:
+    one = Leases(fleet=FLEET, me="r1", incarnation=1, standing={}, now=0.0)
+    one.on_newer_value(value())
+    assert not one.on_beat(beat(), ACCEPTED, 10.0)
+    assert one.on_sent(1, 10.0).echoes == ()
+    assert elector().on_sent(1, 10.0).echoes == (), "nor an elector before the first beat"
+
+
+def test_the_hold_outlasts_a_lease_on_the_two_clocks_that_differ_most() -> None:
+    assert hold_s(L) / (1 + RHO) >= L / (1 - RHO) - 1e-12
+
+
 def test_a_release_before_any_grant_holds_too() -> None:
     one = Granter(task="guard", lease_s=L, until=-math.inf, standing=None)
     assert not one.on_beat(beat("r2", 5, released=(grant(5),)), ("r2", 3), 10.0)
@@ -185,6 +230,15 @@ def test_a_worker_s_word_counts_only_when_it_was_asked_to_stop_and_ends_what_it_
     assert held.given_until("guard") == -math.inf
     assert held.leaving() == ()
     assert held.on_sent(6, 10.3).released == (grant(5, "r1"),)
+    assert not held.on_run_out("guard", 6, 12.0), "it has given everything back"
+    held.begin("guard", 4, 7)
+    assert held.on_sent(7, 12.0).released == (), "what another epoch gave back is over"
+
+
+def test_a_node_that_owns_nothing_has_no_lease_and_is_asked_for_none() -> None:
+    held = Leases(fleet=FLEET, me="r1", incarnation=1, standing={}, now=0.0)
+    assert not held.on_beat(asked(), {}, 10.2)
+    assert (held.until("guard"), held.given_until("guard"), held.leaving()) == (-math.inf, -math.inf, ())
 
 
 def test_what_was_given_is_worth_a_beat_when_it_has_run_out_and_nothing_only_now_and_then() -> None:
