@@ -315,6 +315,7 @@ def test_what_an_owner_that_died_may_have_done_is_marked(relay: Relay, echo: Ech
     """The start marker says how many samples went to it; what a standby took of them keeps the mark."""
     payload = encode_end(EndMarker(epoch=0, count=0, replayed=2))
     relay.session.put(f"{INPUT}/{END_CHUNK}", payload, source_info=zenoh.SourceInfo(relay.publisher.id, 0))
+    until(lambda: echo.worker._dispatcher._replays, "the start marker: a relay sends nothing before its answer")
     for name in (b"a", b"b", b"c"):
         relay.put(name)
     until(lambda: len(echo.taken) == 3, "the inputs")
