@@ -158,7 +158,7 @@ def _judge(rig: Rig, traffic: Traffic, sums: Sums, *, is_overload: bool) -> None
     figures = f"sent {len(traffic.sent)} lost {lost} told of {told} in flight {inward.in_flight}"
     print(f"{time.strftime('%H:%M:%S')} {what}: {figures}; {inward}; {outward}", flush=True)
     sums.sent, sums.lost, sums.told = sums.sent + len(traffic.sent), sums.lost + lost, sums.told + told
-    sums.faults += faults
+    sums.faults += [f"{time.strftime('%H:%M:%S')} {what}: {fault}" for fault in faults]
 
 
 def _unaccounted(rig: Rig) -> list[tuple[float, StreamCount, int]]:
