@@ -356,7 +356,8 @@ class Node:
             self._batch.add(*instructions)
             if has_released:
                 self._beat_at = now
-            self._agree(self.agreement.retry_parked(now), now)
+        # Also where no task is exclusive any more: the question may have come while one was.
+        self._agree(self.agreement.retry_parked(now), now)
         self._batch.add(*self._tenure.tend_isolation(self.membership, now))
 
     def _on_clock(self, event: ev.ClockCompared, now: float) -> None:

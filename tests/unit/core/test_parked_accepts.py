@@ -13,6 +13,7 @@ from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing
 from zsched.core.lease import hold_s
 from zsched.core.messages import Accept, Accepted, Learnt, Refusal, Refused
 from zsched.core.model import Acceptance, Allocation, Ballot, DurableState, NodeKind, RegisterState, Tuning, Weights
+from zsched.core.node import Node
 
 ROBOTS = ("robot1", "robot2", "robot3")
 TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
@@ -31,9 +32,9 @@ def value(revision: int, owner: str) -> Allocation:
     return Allocation(task="guard", revision=revision, epoch=revision, owner=owner, tuning=TUNING)
 
 
-def elector() -> Agreement:
-    """An elector that has just started, with robot2 as owner on its disk: nobody else is accepted for a hold."""
-    state = DurableState(
+def disk() -> DurableState:
+    """With robot2 as owner."""
+    return DurableState(
         fleet="parks",
         node="robot1",
         incarnation=7,
@@ -42,8 +43,12 @@ def elector() -> Agreement:
         electorate="e",
         registers=(RegisterState(task="guard", learnt=value(3, "robot2")),),
     )
+
+
+def elector() -> Agreement:
+    """An elector that has just started, with robot2 as owner on its disk: nobody else is accepted for a hold."""
     agreement = Agreement(
-        fleet=FLEET, me="robot1", durable=state, incarnation=7, electorate="e", rng=Random(1), now=100.0
+        fleet=FLEET, me="robot1", durable=disk(), incarnation=7, electorate="e", rng=Random(1), now=100.0
     )
     for name in ROBOTS[1:]:
         agreement.witness.on_answer(Learnt(node=name, values=()))  # they remember no later life of it
@@ -129,3 +134,22 @@ def test_a_question_that_would_be_refused_anyway_does_not_wait() -> None:
         100.2,
     )
     assert answers(effects) == [(1, Refusal.LEASE), (9, Refusal.ELECTORATE)]
+
+
+def test_a_question_that_waits_is_answered_though_no_task_is_exclusive_any_more() -> None:
+    """The task may cease to be leased meanwhile. Its deadline must not lie behind us for ever: the loop would spin."""
+    node = Node(
+        fleet=FLEET, me="robot1", durable=disk(), incarnation=7, electorate="e", rng=Random(1), now=100.0, version="t"
+    )
+    node.start(100.0)
+    for name in ROBOTS[1:]:
+        node.agreement.witness.on_answer(Learnt(node=name, values=()))
+    ballot = Ballot(counter=5, node="robot3", incarnation=1)
+    accept = Accept(task="guard", acceptance=Acceptance(ballot=ballot, value=value(4, "robot3")), electorate="e")
+    node.handle(ev.AcceptAsked(request=1, asker="robot3", accept=accept), 100.1)
+    assert node.agreement.has_parked
+    node._tenure.exclusive = ()
+    now = 100.1 + PARKED_S
+    told = [one for one in node.handle(ev.DeadlineReached(), now) if isinstance(one, do.AnswerElection)]
+    assert [one.request for one in told] == [1]
+    assert node.next_deadline() > now
