@@ -29,9 +29,9 @@ demo: $(VENV)/.lab  ## Watch six machines merge laser maps (DEMO_ARGS="--headles
 	$(BIN)/zsched demo $(DEMO_ARGS)
 
 # Two modules at a time: the real fleets of the second half mostly wait. In their order, for the longest come first.
-test: $(VENV)/.dev  ## All tests: unit, paper, simulator, integration and system (real daemons on localhost)
+test: $(VENV)/.dev  ## All tests: unit, paper, simulator, parts, integration and system (real daemons on localhost)
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile tests/unit tests/paper tests/sim tests/planted
-	$(BIN)/python $(PYTEST_REAL) -q -n 2 --dist loadfile --no-loadscope-reorder --durations=15 tests/system tests/integration
+	$(BIN)/python $(PYTEST_REAL) -q -n 2 --dist loadfile --no-loadscope-reorder --durations=15 tests/system tests/integration tests/parts
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile tests/bench
 
 test-quick: $(VENV)/.dev  ## Unit and paper tests only

@@ -137,7 +137,7 @@ def test_ready_is_believed_only_from_the_running_incarnation() -> None:
 
 
 def test_stop_uses_sigint_first_and_start_runs_it_again() -> None:
-    with supervised(python(SLEEP)) as (supervisor, recorder):
+    with supervised(python(SLEEP, stop_grace_s=10.0)) as (supervisor, recorder):
         supervisor.start("merge")
         recorder.wait("started")
         supervisor.mark_ready("merge", 700001)
