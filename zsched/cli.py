@@ -139,19 +139,13 @@ def init(
     voted. If too many states are lost to agree, run it on every node at once with a higher --generation.
     """
     from zsched import places  # noqa: PLC0415 - each verb imports what it needs
-    from zsched.config import load_fleet  # noqa: PLC0415 - ruamel.yaml is slow to import
+    from zsched.config import load_fleet, require_node  # noqa: PLC0415 - ruamel.yaml is slow to import
     from zsched.lifecycle import check_never_voted, init_state, settle_dispute, standing_generation  # noqa: PLC0415 - imports zenoh
 
     file = places.config_path(config, os.environ)
     fleet = load_fleet(file)
     name = _node_name(node)
-    known = [spec.name for spec in fleet.nodes]
-    if name not in known:
-        raise CliError(
-            EXIT_CONFIG,
-            f"{file}: no node {name!r} under 'nodes' (there are {', '.join(known)}); say which one this machine is "
-            "with --node NAME or ZSCHED_NODE",
-        )
+    require_node(fleet, name, file)
     folder = places.state_folder(state_dir, os.environ)
     if settle:
         done = settle_dispute(fleet, name, folder)

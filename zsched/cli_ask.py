@@ -6,7 +6,7 @@ Knows: which of several sockets is meant, what each refusal means as an exit cod
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,10 +30,11 @@ class Door:
 def find_door(runtime_dir: Path | None, node: str | None, env: Mapping[str, str] = os.environ) -> Door:
     """The socket that is meant: ``node``'s own, else any other that passes the question on.
 
-    Without ``node``: the only socket, or this node's own of several (``ZSCHED_NODE``, host name).
+    Without ``node``: this node's own (``ZSCHED_NODE``, host name). Where nothing but the host name says which is this
+    node, the only one there is.
 
     Raises:
-        CliError: there is no daemon, or there are several and none of them is meant.
+        CliError: there is no daemon, not the one that is meant (3), or there are several and none is meant (2).
     """
     runtime = places.runtime_folder(runtime_dir, env)
     sockets = {path.stem: path for path in places.local_sockets(runtime)}
@@ -49,12 +50,33 @@ def find_door(runtime_dir: Path | None, node: str | None, env: Mapping[str, str]
             return Door(socket=sockets[node])
         nearer = sorted(sockets, key=lambda name: name != own)
         return _through([sockets[name] for name in nearer], node)
-    if len(sockets) == 1:
-        return Door(socket=next(iter(sockets.values())))
     if own in sockets:
         return Door(socket=sockets[own])
-    names = ", ".join(sockets)
-    raise CliError(EXIT_USAGE, f"several daemons in {runtime}: {names}; say which one with --node or ZSCHED_NODE")
+    here = ", ".join(sockets)
+    is_told = bool(env.get("ZSCHED_NODE"))
+    if len(sockets) == 1 and not is_told:
+        return Door(socket=next(iter(sockets.values())))
+    fleet, names = _their_fleet(sockets.values())
+    if own in names or (is_told and not names):
+        raise CliError(
+            EXIT_UNREACHABLE,
+            f"no daemon of {own} in {runtime} (here: {here}); start it with `zsched up --node {own}`, "
+            "or ask another one with --node",
+        )
+    if is_told:
+        raise CliError(EXIT_USAGE, f"ZSCHED_NODE: fleet {fleet} has no node {own!r}{nearest(own, names)}")
+    raise CliError(EXIT_USAGE, f"several daemons in {runtime}: {here}; say which one with --node or ZSCHED_NODE")
+
+
+def _their_fleet(sockets: Iterable[Path]) -> tuple[str, tuple[str, ...]]:
+    """The fleet's name and nodes, by the first daemon here that answers; empty when none does."""
+    for path in sockets:
+        try:
+            status = ask_door(Door(socket=path), {"verb": "status"})
+        except CliError:
+            continue
+        return str(status["fleet"]), tuple(str(node["name"]) for node in status["nodes"])
+    return "", ()
 
 
 def _through(sockets: Sequence[Path], node: str) -> Door:

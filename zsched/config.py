@@ -13,7 +13,7 @@ from pathlib import Path
 
 from zsched.config_blocks import Located, Section
 from zsched.config_nodes import Cast, read_nodes, select, warn_missing
-from zsched.config_reader import MAX_FILE_BYTES, Collector, Fault, Place, read_yaml, render_all
+from zsched.config_reader import MAX_FILE_BYTES, Collector, Fault, Place, nearest, read_yaml, render_all
 from zsched.config_schema import FLEET
 from zsched.config_tasks import read_tasks
 from zsched.core.beat_room import MAX_BEAT_BYTES, most_bytes
@@ -23,7 +23,7 @@ from zsched.core.timing import WIFI, timing_faults
 from zsched.errors import ConfigError
 from zsched.files import owner_of, read_regular
 
-__all__ = ["CheckResult", "Fault", "check_bytes", "check_file", "load_fleet"]
+__all__ = ["CheckResult", "Fault", "check_bytes", "check_file", "load_fleet", "require_node"]
 
 _SEEDS = 2
 """How many nodes are seeds when the file names none: one may be down."""
@@ -54,6 +54,23 @@ def load_fleet(path: str | Path) -> Fleet:
     if result.fleet is None:
         raise ConfigError(render_all(result.file, result.faults))
     return result.fleet
+
+
+def require_node(fleet: Fleet, name: NodeId, path: str | Path) -> None:
+    """Refuse a name for this machine that the fleet file at ``path`` does not hold.
+
+    Raises:
+        ConfigError: names the nodes that there are, and the nearest.
+    """
+    known = [node.name for node in fleet.nodes]
+    if name in known:
+        return
+    close = nearest(name, known)
+    hint = f"{close} Say" if close.startswith("did you mean") else "say"
+    raise ConfigError(
+        f"{path}: no node {name!r} under 'nodes' (there are {', '.join(known)}); "
+        f"{hint} which one this machine is with --node NAME or ZSCHED_NODE"
+    )
 
 
 def check_file(path: str | Path) -> CheckResult:

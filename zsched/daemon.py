@@ -30,7 +30,7 @@ from zsched.adapters.streams import SILENCE_S, Bequest, RelayHandle
 from zsched.adapters.systemd import Notifier, watchdog_interval_s
 from zsched.adapters.worker_supervisor import WorkerContext, WorkerSupervisor
 from zsched.clock import monotonic_s, wall_tenths
-from zsched.config import load_fleet
+from zsched.config import load_fleet, require_node
 from zsched.core import events as ev
 from zsched.core.fleet import electorate_hash, fleet_hash
 from zsched.core.model import DurableState, NodeId, NodeKind, TaskId
@@ -83,12 +83,7 @@ class Daemon:
     def __init__(self, options: Options) -> None:
         self._options = options
         self._fleet = load_fleet(options.config)
-        if all(node.name != options.node for node in self._fleet.nodes):
-            known = ", ".join(node.name for node in self._fleet.nodes)
-            raise ConfigError(
-                f"{options.config}: no node {options.node!r} under 'nodes' (there are {known}); "
-                "say which one this machine is with --node NAME or ZSCHED_NODE"
-            )
+        require_node(self._fleet, options.node, options.config)
         self._spec = self._fleet.node(options.node)
         # Read once, when zenoh's runtime starts; the workers inherit it. An operator's own setting wins.
         os.environ.setdefault(

@@ -280,6 +280,9 @@ def test_wrong_file_and_wrong_name_end_with_78_and_say_why(place: Place) -> None
     code, error = place.run(node="ghost")
     assert code == EXIT_CONFIG
     assert "no node 'ghost' under 'nodes' (there are edge1, robot1)" in error
+    code, error = place.run(node="robott1")
+    assert code == EXIT_CONFIG
+    assert "did you mean 'robot1'? Say which one this machine is" in error
     place.file.write_text("fleet: [")
     code, error = place.run()
     assert code == EXIT_CONFIG

@@ -5,10 +5,12 @@ The daemon's side is its real operator socket; what stands behind it answers wit
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -154,11 +156,46 @@ def test_status_of_several_daemons_needs_a_name(daemon: Daemon, folder: Path, mo
         refused = run("status")
         assert refused.exit_code == 2
         assert "robot1, robot2" in refused.stderr
+        daemon.asked.clear()
         monkeypatch.setenv("ZSCHED_NODE", "robot2")
         assert run("status").exit_code == 0
         assert len(other.asked) == 1
         assert run("status", "--node", "robot1").exit_code == 0
         assert daemon.asked == [{"verb": "status"}]
+
+
+@pytest.mark.parametrize("others", [("robot2",), ("robot2", "edge1")], ids=["one other", "two others"])
+def test_the_machine_s_own_daemon_is_down_while_others_run(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, others: tuple[str, ...]
+) -> None:
+    """It is not one of several that the user must choose from, and no other is shown in its place."""
+    monkeypatch.setenv("ZSCHED_NODE", "robot1")
+    with contextlib.ExitStack() as stack:
+        for name in others:
+            stack.enter_context(Daemon(folder, name))
+        for verb in (("status",), ("weights", "echo"), ("retry", "echo")):
+            result = run(*verb)
+            assert (result.exit_code, result.stdout) == (3, ""), result.stderr
+            assert f"no daemon of robot1 in {folder} (here: {', '.join(sorted(others))})" in result.stderr
+            assert "start it with `zsched up --node robot1`" in result.stderr
+
+
+def test_a_host_name_that_is_a_node_s_is_this_machine_s(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(socket, "gethostname", lambda: "robot1.local")
+    with Daemon(folder, "robot2"), Daemon(folder, "edge1"):
+        result = run("status")
+    assert result.exit_code == 3
+    assert f"no daemon of robot1 in {folder} (here: edge1, robot2)" in result.stderr
+
+
+def test_a_zsched_node_that_the_fleet_has_not_is_refused_with_the_nearest_name(
+    daemon: Daemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ZSCHED_NODE", "robt1")
+    result = run("status")
+    assert result.exit_code == 2
+    assert "ZSCHED_NODE: fleet testbed has no node 'robt1'; did you mean robot1?" in result.stderr
+    assert daemon.asked == [{"verb": "status"}], "only for the names"
 
 
 def test_status_of_a_node_elsewhere_goes_through_a_daemon_here(daemon: Daemon) -> None:

@@ -192,6 +192,16 @@ def test_init_of_a_name_that_is_not_in_the_file_exits_with_78(tmp_path: Path) ->
     assert not (tmp_path / "state").exists()
 
 
+@pytest.mark.parametrize(("name", "said"), [("robt2", "did you mean 'robot2'? Say which"), ("hut", "); say which")])
+def test_init_of_a_name_that_is_not_in_the_file_suggests_the_nearest(tmp_path: Path, name: str, said: str) -> None:
+    file = tmp_path / "fleet.yaml"
+    file.write_text(FLEET)
+    result = run("init", "--config", file, "--node", name, "--state-dir", tmp_path / "state")
+    assert result.exit_code == 78
+    assert f"no node {name!r} under 'nodes' (there are robot1, robot2, robot3); " in result.stderr
+    assert said in result.stderr
+
+
 @pytest.mark.parametrize("verb", ["up", "init"])
 def test_word_that_is_no_name_is_a_usage_error(tmp_path: Path, verb: str) -> None:
     file = tmp_path / "fleet.yaml"
