@@ -49,6 +49,8 @@ LEAST_CPU_S = 10.0
 """A test that takes so many times its usual CPU time and so much more does not end."""
 MORE_MEMORY = 2 << 30
 KILLED, SURVIVED, TIMEOUT = "killed", "survived", "timeout"
+UNJUDGED = "not judged"
+"""By no fault of the mutant: the machine was too busy, or somebody has ended its process. Never counted as found."""
 PROBE = "_zsched_probe"
 _CACHE = type(functools.cache(len))
 OPTIONS = ("-qq", "-p", "no:cacheprovider", "-p", "no:xdist", "--timeout=0", "-s", "--no-header", "--tb=no")
@@ -65,13 +67,23 @@ class Reach:
     """Functions that are called when tests are collected: what they have made is there before a mutant is."""
     broken: list[str] = field(default_factory=list)
     """Tests that fail without any mutant."""
+    finders: dict[str, list[str]] = field(default_factory=dict)
+    """{"module:function": tests that have found a mutant of it}: they are run first."""
+
+    def learn(self, mutant: Mutant, found_by: str) -> None:
+        """A test has found a mutant: it may find others of the same function."""
+        if found_by in self.functions:
+            known = self.finders.setdefault(_place(mutant), [])
+            if found_by in known:
+                known.remove(found_by)
+            known.insert(0, found_by)
 
     def is_cold(self, mutant: Mutant) -> bool:
         """Whether the mutant must be there before anything is imported."""
         return not mutant.function.startswith("=") or _place(mutant) in self.at_import
 
     def chosen(self, mutant: Mutant) -> list[str]:
-        """The tests that may find a mutant: those of its module first, then the quick ones."""
+        """The tests that may find it: what found one of its function, those of its module, then the quick ones."""
         place, module = _place(mutant), f"{mutant.module}:"
         name = mutant.module.rpartition(".")[2]
         if mutant.function.startswith("="):
@@ -79,10 +91,12 @@ class Reach:
         else:
             reaching = list(self.functions)
 
-        def rank(test: str) -> tuple[bool, bool, float]:
+        known = self.finders.get(place, [])
+
+        def rank(test: str) -> tuple[bool, bool, bool, float]:
             is_directed = Path(test.partition("::")[0]).name in {f"test_{name}.py", f"test_{name}_rules.py"}
             is_near = any(one.startswith(module) for one in self.functions[test])
-            return not is_directed, not is_near, self.seconds[test]
+            return test not in known, not is_directed, not is_near, self.seconds[test]
 
         return sorted((test for test in reaching if test not in self.broken), key=rank)
 

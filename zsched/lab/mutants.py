@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import ast
 import copy
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from types import CodeType
@@ -53,6 +54,8 @@ class Mutant:
 
     module: str
     index: int
+    number: int
+    """Which one of the same changes in the same function."""
     operator: str
     line: int
     function: str
@@ -62,8 +65,8 @@ class Mutant:
 
     @property
     def key(self) -> str:
-        """What tells it apart from all others, also after lines have moved."""
-        return f"{self.module}:{self.function}:{self.operator}:{self.index}:{self.before} -> {self.after}"
+        """What tells it apart from all others, also after lines have moved or another function has changed."""
+        return f"{self.module}:{self.function}:{self.operator}:{self.number}:{self.before} -> {self.after}"
 
     @property
     def path(self) -> str:
@@ -87,17 +90,21 @@ class _Place:
 
 def mutants_of(module: str, source: str) -> list[Mutant]:
     """All mutants of a module's source, in its order."""
-    found = []
+    found: list[Mutant] = []
+    same: Counter[tuple[str, ...]] = Counter()
     for index, place in enumerate(_places(ast.parse(source))):
         before, after = _told(place.node), _told(place.make(copy.deepcopy(place.node)))
         line = getattr(place.node, "lineno", 0) or min(
             (one.lineno for one in ast.walk(place.node) if isinstance(one, ast.expr)), default=1
         )
         if before != after:
+            what = (place.function, place.operator, before, after)
+            same[what] += 1
             found.append(
                 Mutant(
                     module=module,
                     index=index,
+                    number=same[what],
                     operator=place.operator,
                     line=line,
                     function=place.function,

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import gc
+import hashlib
 import json
 import math
 import os
@@ -25,7 +26,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from random import Random
 
 import pytest
 
@@ -36,6 +36,7 @@ from zsched.lab.mutant_tests import (
     SURVIVED,
     TESTS,
     TIMEOUT,
+    UNJUDGED,
     Calls,
     Effort,
     Functions,
@@ -55,6 +56,8 @@ CORE = ROOT / "zsched" / "core"
 LEAST_PERCENT = 97.0
 LONGEST_S = 1800.0
 """Of the wall clock, for one mutant on a machine that is busy with other work."""
+GRACE_S = 60.0
+"""A child whose own process is ended at that time needs so much to say so."""
 POLL_S = 0.01
 PROGRESS_EVERY_S = 20.0
 
@@ -87,6 +90,10 @@ class Results:
                 results.verdicts[body["key"]] = Verdict(**body)
         return results
 
+    def forget_survivors(self) -> None:
+        """Try them once more: there are other tests now."""
+        self.verdicts = {key: one for key, one in self.verdicts.items() if one.verdict != SURVIVED}
+
     def take(self, verdict: Verdict) -> None:
         """One more; written down whole or not at all."""
         self.verdicts[verdict.key] = verdict
@@ -102,6 +109,8 @@ class Results:
 def choose(seed: int, count: int, only: Sequence[str] = ()) -> list[Mutant]:
     """Mutants of the core, all equally likely; the same ones for the same seed and source.
 
+    After a change of the source most of them are the same still: what is drawn hangs on each mutant alone.
+
     Args:
         seed: any number.
         count: how many (fewer when there are no more).
@@ -114,7 +123,7 @@ def choose(seed: int, count: int, only: Sequence[str] = ()) -> list[Mutant]:
         for mutant in mutants_of(f"zsched.core.{path.stem}", source)
         if not only or mutant.path in only or f"{mutant.path}:{mutant.line}" in only
     ]
-    Random(seed).shuffle(found)
+    found.sort(key=lambda mutant: hashlib.sha256(f"{seed} {mutant.key}".encode()).digest())
     chosen: list[Mutant] = []
     for mutant in found:
         if len(chosen) == count:
@@ -137,12 +146,14 @@ class Fork:
     began_at: float
 
     def result(self, status: int) -> tuple[str, str]:
-        """(verdict, what has found it)."""
+        """(verdict, what has found it): too much CPU time finds a mutant, too much of the wall clock judges nothing."""
         with os.fdopen(self.pipe, encoding="utf-8") as pipe:
             text = pipe.read()
         if os.WIFSIGNALED(status):
             number = os.WTERMSIG(status)
-            return (TIMEOUT, "") if number in {signal.SIGPROF, signal.SIGKILL} else (KILLED, f"signal {number}")
+            if number in {signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP}:
+                return UNJUDGED, ""
+            return (TIMEOUT, "") if number == signal.SIGPROF else (KILLED, f"signal {number}")
         if not text:
             return KILLED, "the process broke down"
         return (KILLED, text.strip()) if text.strip() != "-" else (SURVIVED, "")
@@ -185,8 +196,10 @@ def _cold(mutant: Mutant, effort: Effort) -> str:
             run.kill()
             run.wait()
             os.kill(os.getpid(), signal.SIGKILL)
-        if code == -signal.SIGPROF:
-            os.kill(os.getpid(), signal.SIGKILL)
+        if code < 0:
+            with suppress(OSError):
+                signal.signal(-code, signal.SIG_DFL)
+            os.kill(os.getpid(), -code)
         said.seek(0)
         lines = [line for line in said.read().splitlines() if line.startswith("found: ")]
     if not lines:
@@ -256,6 +269,9 @@ def try_all(
     """Try every mutant that has no verdict yet, ``jobs`` at a time."""
     functions = Functions(CORE)
     gc.freeze()
+    for mutant in mutants:
+        if mutant.key in results.verdicts:
+            reach.learn(mutant, results.verdicts[mutant.key].found_by)
     waiting = [mutant for mutant in mutants if mutant.key not in results.verdicts]
     running: dict[int, tuple[Mutant, Fork]] = {}
     told_at = time.monotonic()
@@ -271,9 +287,13 @@ def try_all(
             one = Verdict(
                 key=mutant.key, path=mutant.path, text=str(mutant), verdict=verdict, found_by=found_by, seconds=seconds
             )
+            if verdict == UNJUDGED:
+                print(f"not judged within {LONGEST_S:g} s, or ended by somebody: {mutant}", flush=True)
+                continue
             results.take(one)
+            reach.learn(mutant, found_by)
             if verdict == SURVIVED:
-                print(f"survived: {mutant}", flush=True)
+                print(f"survived ({seconds:g} s): {mutant}", flush=True)
         if time.monotonic() - told_at > PROGRESS_EVERY_S:
             told_at = time.monotonic()
             counts = Counter(results.verdicts[one.key].verdict for one in mutants if one.key in results.verdicts)
@@ -284,7 +304,7 @@ def try_all(
 def _ended(running: dict[int, tuple[Mutant, Fork]]) -> Iterator[tuple[int, int]]:
     """Children that have ended; one that takes too long is ended."""
     for pid, (_, fork) in list(running.items()):
-        if time.monotonic() - fork.began_at > LONGEST_S:
+        if time.monotonic() - fork.began_at > LONGEST_S + GRACE_S:
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
         ended, status = os.waitpid(pid, os.WNOHANG)
@@ -318,6 +338,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--jobs", type=int, default=1, help="mutants at a time")
     parser.add_argument("--module", action="append", default=[], help="core/voting.py, or core/voting.py:103")
     parser.add_argument("--resume", type=Path, help="keep the verdicts there, and try only what has none")
+    parser.add_argument("--again", action="store_true", help="with --resume: try once more what has survived")
     parser.add_argument("--least", type=float, default=LEAST_PERCENT, help="percent that must be found")
     parser.add_argument("--tests", nargs="+", default=TESTS, help="files or folders; the whole core's by default")
     parser.add_argument("--cold", help=argparse.SUPPRESS)
@@ -330,6 +351,8 @@ def main(arguments: list[str] | None = None) -> int:
     file = cache_file(effort.tests)
     mutants = choose(given.seed, given.mutants, given.module)
     results, calls = Results.load(given.resume), Calls(CORE)
+    if given.again:
+        results.forget_survivors()
 
     def work(session: pytest.Session) -> None:
         sys.settrace(None)
@@ -340,13 +363,16 @@ def main(arguments: list[str] | None = None) -> int:
     code = pytest.main([*OPTIONS, *effort.tests], plugins=[Loop(work)])
     sys.settrace(None)
     verdicts = [results.verdicts[mutant.key] for mutant in mutants if mutant.key in results.verdicts]
-    if code != pytest.ExitCode.OK or len(verdicts) < len(mutants):
+    if code != pytest.ExitCode.OK:
         print("the tests cannot be collected", file=sys.stderr)
         return 2
     print("\n" + table(verdicts))
     found = score(verdicts)
     caught = sum(one.verdict != SURVIVED for one in verdicts)
     print(f"seed {given.seed}: {caught} of {len(verdicts)} mutants found, {found:.1f} %")
+    if len(verdicts) < len(mutants):
+        print(f"{len(mutants) - len(verdicts)} were not judged: start the command again with --resume", file=sys.stderr)
+        return 2
     return 0 if found >= given.least else 1
 
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from zsched.lab.mutant_tests import KILLED, SURVIVED, TIMEOUT
+from zsched.lab.mutant_tests import KILLED, SURVIVED, TIMEOUT, UNJUDGED, Reach
 from zsched.lab.mutants import Mutant, mutants_of, mutated
-from zsched.lab.mutate import CORE, Results, Verdict, choose, score, table
+from zsched.lab.mutate import CORE, Fork, Results, Verdict, choose, score, table
 
 ROOT = Path(__file__).parents[3]
 
@@ -110,6 +112,50 @@ def test_the_table_counts_and_names_survivors_and_what_never_ends_is_found(tmp_p
     for one in verdicts:
         results.take(one)
     assert Results.load(tmp_path / "kept.json").verdicts == {one.key: one for one in verdicts}
+
+
+def test_survivors_are_tried_again_and_the_others_keep_their_verdicts(tmp_path: Path) -> None:
+    results = Results.load(tmp_path / "kept.json")
+    for one in (verdict(1, KILLED), verdict(2, SURVIVED), verdict(3, TIMEOUT)):
+        results.take(one)
+    results.forget_survivors()
+    assert sorted(results.verdicts) == ["1", "3"]
+
+
+@pytest.mark.parametrize(
+    ("said", "number", "expected"),
+    [
+        ("", signal.SIGPROF, TIMEOUT),
+        ("", signal.SIGKILL, UNJUDGED),
+        ("", signal.SIGTERM, UNJUDGED),
+        ("", signal.SIGSEGV, KILLED),
+        ("-", 0, SURVIVED),
+        ("tests/a.py::test_b", 0, KILLED),
+    ],
+)
+def test_only_cpu_time_finds_a_mutant_that_does_not_end(said: str, number: int, expected: str) -> None:
+    """A busy machine, or somebody who ends a process, has not found anything."""
+    reading, writing = os.pipe()
+    os.write(writing, said.encode())
+    os.close(writing)
+    assert Fork(1, reading, 0.0).result(number)[0] == expected
+
+
+def test_a_change_of_one_function_leaves_the_keys_of_all_others_alone() -> None:
+    before = "def f(a):\n    return a < 1\ndef g(a):\n    return a < 1 or a < 1\n"
+    after = before.replace("return a < 1\ndef", "a += 3\n    return a < 1\ndef")
+    keys = {one.key for one in mutants_of("m", before)}
+    assert len(keys) == len(mutants_of("m", before))
+    assert keys < {one.key for one in mutants_of("m", after)}
+
+
+def test_what_found_a_mutant_is_tried_first_at_the_next_one_of_its_function() -> None:
+    first, second = mutants_of("m", "def f(a):\n    return a < 1 and b\n")[:2]
+    reach = Reach(functions={"quick": ["m:f"], "slow": ["m:f"]}, seconds={"quick": 0.1, "slow": 2.0})
+    assert reach.chosen(first) == ["quick", "slow"]
+    reach.learn(first, "slow")
+    reach.learn(first, "seed 3: a violation")
+    assert reach.chosen(second) == ["slow", "quick"]
 
 
 def run(tmp_path: Path, tests: Path, *mutants: Mutant) -> str:
