@@ -61,7 +61,6 @@ class BeatRoom:
         Whom it suspects is always in it: who is not named there is vouched for.
         """
         if beat_bytes(beat) <= MAX_BEAT_BYTES:
-            self._next = 0
             return beat, 0
         parts = [(kind, part) for kind in _PARTS for part in getattr(beat, kind)]
         room = MAX_BEAT_BYTES - FRAME_BYTES - sum(map(_text, beat.suspects))

@@ -70,6 +70,86 @@ def test_every_part_of_a_beat_that_is_too_large_is_sent_in_turn_and_suspects_alw
     assert len(said) == 4 * tasks
 
 
+@pytest.mark.parametrize("kind", ["learnt", "released", "asked_to_leave", "echoes", "suspects"])
+def test_one_part_more_takes_as_many_bytes_as_are_reckoned_for_it(kind: str) -> None:
+    """Numbers and names are as long as they may be; 17 and 18 of each, for the length of a list changes at 16."""
+    beat = replace(full(18), suspects=tuple(map(name, range(18))))
+    fewer = replace(beat, **{kind: getattr(beat, kind)[:-1]})
+    assert beat_bytes(beat) - beat_bytes(fewer) == encoded(beat) - encoded(fewer)
+
+
+def encoded(beat: Beat) -> int:
+    """Its bytes, in halves, for a whole one may be too large to be sent."""
+    halves = (replace(beat, learnt=(), released=()), replace(beat, echoes=(), asked_to_leave=()))
+    return sum(len(wire.encode(half)) for half in halves) - len(
+        wire.encode(replace(halves[0], echoes=(), asked_to_leave=()))
+    )
+
+
+def beats_of(big: Fleet) -> Beat:
+    """What an elector's beat may hold in the long run, in a fleet whose nodes have names of several lengths."""
+    most, longest = MAX_COUNTER, max((node.name for node in big.nodes), key=len)
+    names = tuple(task.name for task in big.tasks if task.exclusive)
+    grants = tuple(Grant(task=one, owner=longest, incarnation=most, epoch=most, number=most) for one in names)
+    learnt = tuple((task.name, most, most) for task in big.tasks)
+    return replace(full(0), learnt=learnt, echoes=grants, released=grants, suspects=tuple(n.name for n in big.nodes))
+
+
+def test_the_most_that_a_fleet_s_beats_take_is_reckoned_from_its_names() -> None:
+    big = fleet(3, 20)
+    nodes = (*big.nodes, NodeSpec(name="r2", kind=NodeKind.ROBOT))
+    plain = replace(big.tasks[0], name="plain", exclusive=False)
+    mixed = replace(big, nodes=nodes, tasks=(*big.tasks, plain))
+    for one in (big, mixed, replace(big, tasks=())):
+        assert most_bytes(one) == beat_bytes(beats_of(one))
+    assert most_bytes(replace(big, tasks=(), nodes=())) == FRAME_BYTES == 640
+    nobody, somebody = (replace(big, nodes=nodes) for nodes in ((), big.nodes[:1]))
+    assert most_bytes(somebody) - most_bytes(nobody) == (2 * len(big.tasks) + 1) * len(ROBOTS[0]) + 2
+
+
+# --- in turn ---------------------------------------------------------------------------------------------------------
+
+
+def sized(room: int, *sizes: int) -> Beat:
+    """A beat without suspects that has ``room`` bytes left beside parts of these sizes."""
+    left = MAX_BEAT_BYTES - FRAME_BYTES - room - sum(sizes)
+    parts = [OVER + MIN_NAME for _ in range(left // (OVER + MIN_NAME))]
+    parts[-1] += left - sum(parts)
+    return replace(full(0), suspects=(), learnt=tuple(("x" * (size - OVER), 1, 1) for size in (*parts, *sizes)))
+
+
+OVER, MIN_NAME = 1 + 2 + 2 * 9, 4
+
+
+def test_a_beat_that_fills_its_room_to_the_last_byte_is_sent_whole_whosever_turn_it_is() -> None:
+    room = BeatRoom()
+    whole = sized(0)
+    assert beat_bytes(whole) == MAX_BEAT_BYTES
+    for _ in range(2):
+        _, left_out = room.fit(sized(-60, 60))
+        assert left_out > 0
+    assert room.fit(whole) == (whole, 0)
+
+
+def test_what_is_chosen_fills_the_room_to_the_last_byte() -> None:
+    """Too large by the last part: all the others fill the beat exactly."""
+    beat = sized(-60, 60)
+    sent, left_out = BeatRoom().fit(beat)
+    assert (sent.learnt, left_out) == (beat.learnt[:-1], 1)
+    assert beat_bytes(sent) == MAX_BEAT_BYTES
+
+
+def test_a_part_that_has_no_room_is_the_next_beat_s_first() -> None:
+    """Smaller ones behind it wait, though there is room for them: else a large one's turn might never come."""
+    beat = sized(60)
+    beat = replace(beat, learnt=(*beat.learnt, ("y" * 60, 1, 1), ("z", 1, 1), ("w", 1, 1)))
+    room = BeatRoom()
+    first, left_out = room.fit(beat)
+    assert (first.learnt, left_out) == (beat.learnt[:-3], 3)
+    second, _ = room.fit(beat)
+    assert second.learnt[:3] == beat.learnt[-3:]
+
+
 def fleet(tasks: int, length: int) -> Fleet:
     tuning = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
     return Fleet(
@@ -124,7 +204,7 @@ def test_check_refuses_a_fleet_whose_beats_have_no_room(tasks: int, is_good: boo
     assert (result.fleet is not None) is is_good, result.faults[:2]
     if not is_good:
         (fault,) = result.faults
-        assert f"at most {MAX_BEAT_BYTES}" in fault.message
+        assert "at most 16384" in fault.message
         assert "300 of them exclusive" in fault.hint
 
 
