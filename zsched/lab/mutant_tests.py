@@ -38,7 +38,9 @@ TESTS = (
     "tests/paper",
     "tests/sim",
     "tests/unit/test_config.py",
+    "tests/unit/test_config_docs.py",
     "tests/unit/test_config_ros2.py",
+    "tests/unit/test_docs.py",
     "tests/unit/test_report.py",
     "tests/unit/test_wire.py",
 )

@@ -1,0 +1,46 @@
+"""docs/built-in-values.md tells every number that the core goes by, and tells it as it is."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).parents[3]
+ROW = re.compile(r"^\| `(\w+)` \| ([^|]+) \| `core/(\w+)\.py` \| (.+) \|$", re.MULTILINE)
+
+
+def told() -> dict[tuple[str, str], str]:
+    """{(module, name): value} of the table."""
+    text = (ROOT / "docs" / "built-in-values.md").read_text(encoding="utf-8")
+    return {(module, name): value for name, value, module, _ in ROW.findall(text)}
+
+
+def built_in() -> dict[tuple[str, str], str]:
+    """The same of the modules: numbers with a public name that are made at the import, where they are made."""
+    found = {}
+    for path in sorted((ROOT / "zsched" / "core").glob("*.py")):
+        module = importlib.import_module(f"zsched.core.{path.stem}")
+        for name in assigned(path.read_text(encoding="utf-8")):
+            value = getattr(module, name)
+            if isinstance(value, int | float) and not name.startswith("_"):
+                found[path.stem, name] = f"{value:g}" if isinstance(value, float) else str(value)
+    return found
+
+
+def assigned(source: str) -> list[str]:
+    """The names that a module's own body gives a value."""
+    names: list[str] = []
+    for node in ast.parse(source).body:
+        match node:
+            case ast.Assign(targets=[ast.Name(id=name)]) | ast.AnnAssign(target=ast.Name(id=name)):
+                names.append(name)
+            case _:
+                pass
+    return names
+
+
+def test_the_table_tells_every_value_as_the_code_has_it() -> None:
+    assert told() == built_in()
+    assert len(told()) > 50
