@@ -79,10 +79,12 @@ class MoveCost:
         self._usual = (before[0] + USUAL * (taken_hz - before[0]), before[1] + USUAL * (given_hz - before[1]))
 
     def _measure(self, before: _Counted, after: _Counted) -> None:
+        if self._usual is None:
+            return  # nothing to compare with
         length_s = after.at - before.at
-        taken_hz, given_hz = self._usual or (0.0, 0.0)
+        taken_hz, given_hz = self._usual
         if given_hz <= 0.0 or after.taken - before.taken < 0.5 * taken_hz * length_s:
-            return  # nothing to compare with, or nothing was asked of the task
+            return  # no outputs to miss, or nothing was asked of the task
         missing_s = max(length_s - (after.given - before.given) / given_hz, 0.0)
         self.seconds += (NEWEST if self.moves else 1.0) * (missing_s - self.seconds)
         self.moves += 1

@@ -186,7 +186,7 @@ class HangWatch:
 
     def reports(self, now: float) -> tuple[TaskProgress, ...]:
         """What our profile shall say."""
-        return self._progress.reports(now) if self._specs else ()
+        return self._progress.reports(now)
 
     def look(
         self, owned: Iterable[TaskId], executors: Mapping[TaskId, Executor], gateway: Gateway, now: float

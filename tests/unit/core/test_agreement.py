@@ -521,6 +521,18 @@ def test_disputed_name_is_no_elector_in_this_life_and_the_next() -> None:
     assert "--settle" in again.problems["state"]
 
 
+def test_a_state_that_was_brought_back_says_so_in_this_life_and_the_next() -> None:
+    state = make().to_persist(100.0)
+    assert state is not None
+    lost = replace(state, lost="peers remember 9 votes, here are 3")
+    again = Agreement(fleet=FLEET, me="robot1", durable=lost, incarnation=8, electorate="e", rng=Random(1), now=0.0)
+    assert not again.is_elector
+    assert again.problems["state"].startswith("peers remember 9 votes, here are 3: it was brought back from a backup")
+    kept = again.to_persist(100.0)
+    assert kept is not None
+    assert kept.lost == lost.lost
+
+
 def test_another_generation_teaches_nothing_and_is_shown_until_it_is_gone() -> None:
     agreement = make()
     told_by = Learnt(node="robot2", values=(value(2**32, None),), generation=1)

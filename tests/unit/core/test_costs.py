@@ -115,6 +115,14 @@ def test_a_task_that_nobody_asks_anything_costs_nothing() -> None:
     assert relay.cost.moves == 0
 
 
+def test_a_move_before_anything_is_usual_is_not_measured() -> None:
+    relay = Relay()
+    relay.run(1)
+    relay.move()
+    relay.run(8, silent_s=2.0)
+    assert relay.cost.moves == 0
+
+
 @pytest.mark.parametrize(("horizon_s", "known_s"), [(60.0, 2.0), (None, 0.0)])
 def test_a_robots_rounds_tell_the_judge_what_planned_moves_have_cost(horizon_s: float | None, known_s: float) -> None:
     spec = TaskSpec(

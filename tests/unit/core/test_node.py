@@ -473,6 +473,15 @@ def test_whoever_is_heard_again_is_no_suspect_in_the_same_batch() -> None:
     assert any("suspect -> alive" in one.text for one in of(batch, do.RecordStory) if one.stage == "membership")
 
 
+def test_beats_are_numbered_one_by_one() -> None:
+    """A gap would look like lost beats."""
+    node, numbers, now = started(), [], 100.0
+    while len(numbers) < 4:
+        now = max(node.next_deadline(), now)
+        numbers += [one.beat.sequence for one in of(node.handle(ev.DeadlineReached(), now), do.PublishBeat)]
+    assert numbers == list(range(numbers[0], numbers[0] + 4))
+
+
 def test_beats_in_turn_are_no_news() -> None:
     node = started()
     told = [
@@ -520,6 +529,8 @@ def test_a_retry_resets_the_worker_that_is_meant_and_forgives_its_node() -> None
     for whose, resets in (("", 1), ("edge1", 1), ("edge2", 0)):
         batch = edge.handle(ev.RetryCommanded(request=9, command=RetryTask(task="merge", node=whose)), 100.0)
         assert len(of(batch, do.ResetWorker)) == resets
+        detail = of(batch, do.AnswerCommand)[0].result.detail
+        assert detail == ("its failures are forgotten, it was stopped" if resets else "its penalties are forgotten")
 
 
 @pytest.mark.parametrize("command", [RetryTask(task="other"), RetryTask(task="merge", node="ghost")])

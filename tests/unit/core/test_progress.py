@@ -195,6 +195,24 @@ def test_a_worker_that_has_just_become_ready_or_owner_has_its_time() -> None:
     assert owner.hear("robot1", LATE + DEADLINE_S + MARGIN_S + 3.1, UNSERVED) != ()
 
 
+def test_a_complaint_counts_from_the_very_end_of_the_time_on() -> None:
+    assert Owner().hear("robot1", LATE - 0.1, UNSERVED) != ()
+    assert Owner().hear("robot1", LATE - 0.101, UNSERVED) == ()
+
+
+def test_a_robot_s_profile_tells_what_its_relay_has_counted_of_tasks_with_a_deadline() -> None:
+    for worker, told in ((SPEC.worker, (UNSERVED,)), (WorkerSpec(command=("merge",)), ())):
+        spec = replace(SPEC, worker=worker)
+        watch, executor = HangWatch(replace(Owner().fleet, tasks=(spec,))), settled(spec)
+        for second in range(10):
+            counts = (
+                StreamCount(stream="merge/in/0", messages=10 * second),
+                StreamCount(stream="merge/out/0", messages=0),
+            )
+            watch.absorb(counts, {"merge": executor}, 100.0 + second)
+        assert watch.reports(110.0) == told
+
+
 def test_a_worker_whose_token_went_still_owes() -> None:
     owner = Owner()
     owner.watch.note_worker("merge", WorkerState.STARTING, 101.0)

@@ -180,6 +180,36 @@ def test_a_worker_that_failed_or_is_missed_is_told_with_its_reason() -> None:
     )
 
 
+def told_by(node: Node, name: str, sequence: int, state: WorkerState) -> None:
+    """A node's profile says how its worker is."""
+    profile = Profile(
+        node=name,
+        incarnation=3,
+        sequence=sequence,
+        cpu_cores=4.0,
+        cpu_used_cores=1.0,
+        memory_mb=4000.0,
+        memory_used_mb=100.0,
+        workers=(WorkerLoad(task="merge", state=state),),
+    )
+    node.handle(ev.ProfileReceived(profile=profile), 100.0)
+
+
+def test_a_slot_that_is_not_taken_is_told_of_only_once_the_owner_s_own_worker_is_ready() -> None:
+    """Else the worker is what is told of; another node's worker excuses nothing."""
+    node = make()
+    for name in EDGES:
+        node.handle(ev.BeatReceived(beat=Beat(node=name, incarnation=3, sequence=1, loop_lag_s=0.0)), 100.0)
+    learn(node, 1, "edge1")
+    told_by(node, "edge1", 1, WorkerState.READY)
+    told_by(node, "edge2", 1, WorkerState.STARTING)
+    (waits,) = build_snapshot(node, 103.0).tasks[0].problems
+    assert waits.startswith("this robot's streams have waited for edge1 for 3 s")
+    told_by(node, "edge1", 2, WorkerState.STARTING)
+    told_by(node, "edge2", 2, WorkerState.READY)
+    assert build_snapshot(node, 103.0).tasks[0].problems == ("the worker on edge1 is starting",)
+
+
 def test_a_slot_whose_worker_is_not_seen_is_a_problem_until_it_is() -> None:
     node = make()
     learn(node, 1, "edge1")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from zsched.core.identity import STAYS_S, YOUNG_S, Identity, Verdict
+from zsched.core.identity import QUIET_S, STAYS_S, YOUNG_S, Identity, Verdict
 from zsched.core.model import Beat
 
 
@@ -39,6 +39,14 @@ def test_our_own_beats_say_nothing() -> None:
     identity = old()
     assert identity.on_own_name(beat(7, 3), 5000, 100.0) is Verdict.OURS
     assert identity.complaint(100.0) == "another daemon calls itself 'robot1'"
+
+
+def test_beats_in_our_name_are_shown_until_they_have_stopped_for_long_enough() -> None:
+    identity = Identity(me="robot1", incarnation=7, fleet_file="abc", started_at=0.0)
+    assert identity.complaint(100.0) is None
+    identity.on_own_name(beat(8, 10), 5000, 100.0)
+    assert "no daemon of that name is seen" in (identity.complaint(100.0 + QUIET_S - 0.001) or "")
+    assert identity.complaint(100.0 + QUIET_S) is None
 
 
 def test_of_two_that_meet_the_one_that_has_beaten_less_leaves_while_it_is_young() -> None:
