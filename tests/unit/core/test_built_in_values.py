@@ -36,6 +36,8 @@ def assigned(source: str) -> list[str]:
         match node:
             case ast.Assign(targets=[ast.Name(id=name)]) | ast.AnnAssign(target=ast.Name(id=name)):
                 names.append(name)
+            case ast.Assign(targets=[ast.Tuple(elts=several)]):
+                names += [one.id for one in several if isinstance(one, ast.Name)]
             case _:
                 pass
     return names

@@ -450,6 +450,16 @@ def test_what_was_gathered_before_another_task_was_placed_is_gathered_again() ->
     assert len(of(robot.tick(), PublishProposal)) == 1
 
 
+def test_a_value_that_comes_while_nothing_is_gathered_hurries_nobody() -> None:
+    robot = RobotOfTwo("robot2")
+    robot.value, robot.plan = (replace(one, revision=5, owner="edge1") for one in (robot.value, robot.plan))
+    robot.gathered()
+    due = robot.rounds.next_deadline()
+    assert due > robot.now
+    robot.rounds.on_learnt("plan", is_new_epoch=False, now=robot.now)
+    assert robot.rounds.next_deadline() == due
+
+
 def test_a_single_task_needs_no_second_gather() -> None:
     robot = Robot()
     (ask,) = of(robot.tick(), AskUtilities)

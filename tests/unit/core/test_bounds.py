@@ -1,0 +1,154 @@
+"""Every bound of every value that comes from outside: its ends pass, what is beyond is refused by the field's name."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from zsched.core import model
+from zsched.core.messages import Accept, Accepted, Learnt, Prepare, Promise, Refusal, Refused, RetryTask, SetWeights
+from zsched.core.model import (
+    MAX_COUNTER,
+    Acceptance,
+    Allocation,
+    Ballot,
+    Beat,
+    Grant,
+    Link,
+    LinkSource,
+    Profile,
+    Proposal,
+    TaskProgress,
+    Tuning,
+    Utility,
+    UtilityVector,
+    Weights,
+    WorkerLoad,
+    WorkerState,
+)
+
+TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
+BALLOT = Ballot(counter=1, node="r1", incarnation=1)
+VALUE = Allocation(task="merge", revision=1, epoch=1, owner="e1", tuning=TUNING)
+ACCEPT = Accept(task="merge", acceptance=Acceptance(ballot=BALLOT, value=VALUE), electorate="x")
+LINK = Link(source=LinkSource.FIXED)
+LOAD = WorkerLoad(task="merge", state=WorkerState.READY)
+PROFILE = Profile(
+    node="e1", incarnation=1, sequence=1, cpu_cores=4.0, cpu_used_cores=1.0, memory_mb=100.0, memory_used_mb=1.0
+)
+UTILITY = Utility(candidate="e1", value=0.5)
+VECTOR = UtilityVector(voter="r1", task="merge", revision=1, utilities=())
+PROPOSAL = Proposal(voter="r1", task="merge", base_revision=1, candidate="e1", aggregate=0.5)
+GRANT = Grant(task="merge", owner="e1", incarnation=1, epoch=1, number=1)
+BEAT = Beat(node="e1", incarnation=1, sequence=1, loop_lag_s=0.0)
+PROGRESS = TaskProgress(task="merge", epoch=1, is_served=True)
+PROMISE = Promise(elector="r1", task="merge", ballot=BALLOT)
+ACCEPTED = Accepted(elector="r1", task="merge", ballot=BALLOT)
+REFUSED = Refused(elector="r1", task="merge", ballot=BALLOT, refusal=Refusal.BALLOT, promised=BALLOT)
+
+COUNTERS = [
+    (PROGRESS, "epoch", "progress"),
+    (PROFILE, "incarnation", "profile"),
+    (PROFILE, "sequence", "profile"),
+    (VECTOR, "revision", "vector"),
+    (PROPOSAL, "base_revision", "proposal"),
+    (VALUE, "revision", "allocation"),
+    (VALUE, "epoch", "allocation"),
+    (BALLOT, "counter", "ballot"),
+    (BALLOT, "incarnation", "ballot"),
+    (GRANT, "incarnation", "grant"),
+    (GRANT, "epoch", "grant"),
+    (GRANT, "number", "grant"),
+    (BEAT, "votes", "beat"),
+    (BEAT, "incarnation", "beat"),
+    (BEAT, "sequence", "beat"),
+    (BEAT, "generation", "beat"),
+    (Learnt(node="e1", values=()), "generation", "learnt"),
+]
+NAMES = [
+    (LINK, "peer", "link"),
+    (LOAD, "task", "worker"),
+    (PROGRESS, "task", "progress"),
+    (PROFILE, "node", "profile"),
+    (UTILITY, "candidate", "utility"),
+    (VECTOR, "voter", "vector"),
+    (VECTOR, "task", "vector"),
+    (PROPOSAL, "voter", "proposal"),
+    (PROPOSAL, "task", "proposal"),
+    (PROPOSAL, "candidate", "proposal"),
+    (VALUE, "task", "allocation"),
+    (VALUE, "owner", "allocation"),
+    (BALLOT, "node", "ballot"),
+    (GRANT, "task", "grant"),
+    (GRANT, "owner", "grant"),
+    (BEAT, "node", "beat"),
+    (Prepare(task="merge", ballot=BALLOT, electorate="x"), "task", "prepare"),
+    (PROMISE, "elector", "promise"),
+    (PROMISE, "task", "promise"),
+    (ACCEPTED, "elector", "accepted"),
+    (ACCEPTED, "task", "accepted"),
+    (REFUSED, "elector", "refused"),
+    (REFUSED, "task", "refused"),
+    (Learnt(node="e1", values=()), "node", "learnt"),
+    (SetWeights(task="merge", cpu=1.0, memory=0.0, network=0.0), "task", "weights"),
+    (RetryTask(task="merge"), "task", "retry"),
+    (RetryTask(task="merge"), "node", "retry"),
+]
+RATIO = (0.0, 1.0)
+RANGES = [
+    (TUNING, "bonus", "bonus", RATIO),
+    (TUNING, "time_to_trigger_s", "time_to_trigger_s", (0.0, 3600.0)),
+    (TUNING, "cool_down_s", "cool_down_s", (0.0, 86400.0)),
+    (LINK, "rssi_dbm", "link.rssi_dbm", (-120.0, 0.0)),
+    (LINK, "trend_db_s", "link.trend_db_s", (-100.0, 100.0)),
+    (LINK, "bitrate_mbps", "link.bitrate_mbps", (0.0, model.MAX_BITRATE_MBPS)),
+    (LINK, "retry_ratio", "link.retry_ratio", RATIO),
+    (LOAD, "cpu_cores", "worker.cpu_cores", (0.0, model.MAX_CPU_CORES)),
+    (LOAD, "memory_mb", "worker.memory_mb", (0.0, model.MAX_MEMORY_MB)),
+    (PROFILE, "cpu_cores", "profile.cpu_cores", (0.001, model.MAX_CPU_CORES)),
+    (PROFILE, "cpu_used_cores", "profile.cpu_used_cores", (0.0, model.MAX_CPU_CORES)),
+    (PROFILE, "memory_mb", "profile.memory_mb", (1.0, model.MAX_MEMORY_MB)),
+    (PROFILE, "memory_used_mb", "profile.memory_used_mb", (0.0, model.MAX_MEMORY_MB)),
+    (UTILITY, "value", "utility.value", RATIO),
+    (UTILITY, "cpu", "utility.cpu", RATIO),
+    (UTILITY, "memory", "utility.memory", RATIO),
+    (UTILITY, "network", "utility.network", RATIO),
+    (PROPOSAL, "aggregate", "proposal.aggregate", (0.0, 2.0)),
+    (BEAT, "loop_lag_s", "beat.loop_lag_s", (0.0, 86400.0)),
+]
+
+
+@pytest.mark.parametrize(("value", "field", "kind"), COUNTERS)
+def test_counters_go_from_zero_to_the_largest(value: Any, field: str, kind: str) -> None:
+    for good in (0, MAX_COUNTER):
+        assert getattr(replace(value, **{field: good}), field) == good
+    for bad in (-1, MAX_COUNTER + 1):
+        with pytest.raises(ValueError, match=f"{kind}.{field}"):
+            replace(value, **{field: bad})
+
+
+@pytest.mark.parametrize(("value", "field", "kind"), NAMES)
+def test_names_are_of_the_alphabet(value: Any, field: str, kind: str) -> None:
+    assert getattr(replace(value, **{field: "other-1"}), field) == "other-1"
+    for bad in ("*", "Robot", "a" * 64):
+        with pytest.raises(ValueError, match=f"{kind}.{field}"):
+            replace(value, **{field: bad})
+
+
+@pytest.mark.parametrize(("value", "field", "told", "ends"), RANGES)
+def test_figures_keep_within_both_ends(value: Any, field: str, told: str, ends: tuple[float, float]) -> None:
+    low, high = ends
+    for good in ends:
+        assert getattr(replace(value, **{field: good}), field) == good
+    for bad in (low - 0.0001, high + 0.01, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match=told):
+            replace(value, **{field: bad})
+
+
+def test_a_penalty_is_a_ratio() -> None:
+    for bad in (-0.01, 1.01):
+        with pytest.raises(ValueError, match=r"vector\.penalties"):
+            replace(VECTOR, penalties=(("e1", 0.5), ("e2", bad)))
+    assert replace(VECTOR, penalties=(("e1", 0.0), ("e2", 1.0))).penalties
