@@ -28,6 +28,7 @@ from zsched.core.model import (
     WorkerLoad,
     WorkerState,
 )
+from zsched.core.plan import ServiceSettings, StreamSettings
 
 TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
 BALLOT = Ballot(counter=1, node="r1", incarnation=1)
@@ -116,6 +117,12 @@ RANGES = [
     (UTILITY, "memory", "utility.memory", RATIO),
     (UTILITY, "network", "utility.network", RATIO),
     (PROPOSAL, "aggregate", "proposal.aggregate", (0.0, 2.0)),
+    (ServiceSettings(), "timeout_s", "timeout_s", (0.05, 3600.0)),
+    (ServiceSettings(), "hold_s", "hold_s", (0.0, 3600.0)),
+    (ServiceSettings(), "max_pending", "max_pending", (1, 256)),
+    (StreamSettings(), "keep_last", "keep_last", (0, 1000)),
+    (StreamSettings(), "depth", "depth", (1, 100_000)),
+    (StreamSettings(), "max_hz", "max_hz", (0.01, 10_000)),
     (BEAT, "loop_lag_s", "beat.loop_lag_s", (0.0, 86400.0)),
 ]
 

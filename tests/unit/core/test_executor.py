@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import pytest
 
-from zsched.core.executor import ROLE_DRAIN_MARGIN_S, Executor, Phase
+from zsched.core.executor import LEAVES_S, ROLE_DRAIN_MARGIN_S, Executor, Phase
 from zsched.core.fleet import Standby, StreamRule, TaskSpec, WorkerSpec
 from zsched.core.instructions import ApplyRoutes, Instruction, RecordStory, SetRole, StartWorker, StopWorker
 from zsched.core.model import Allocation, Tuning, Weights
@@ -344,3 +344,53 @@ def test_again_repeats_the_workers_wish_and_role(
     out = one.again()
     assert [type(step) for step in out] == expected
     assert roles(out) == [(one.role.role, one.role.epoch)]
+
+
+# --- who may be working without a lease ------------------------------------------------------------------------------
+
+
+def test_a_worker_may_work_without_a_lease_until_it_has_said_that_it_has_stopped() -> None:
+    one = edge()
+    assert not one.may_work_unleased(0.0)
+    one.execute(allocation("edge1", 1), 0.0)
+    one.on_role_ended(1)
+    assert one.may_work_unleased(0.0), "nobody told it to stop"
+    one.execute(replace(allocation("edge1", 1), leased=True), 1.0)
+    assert one.role.role is WorkerRole.IDLE
+    assert one.may_work_unleased(100.0), "it has not said that it has"
+    one.on_role_ended(0)
+    assert one.may_work_unleased(100.0), "that was of another epoch"
+    one.on_role_ended(1)
+    assert not one.may_work_unleased(100.0)
+
+
+def test_a_worker_whose_process_ended_works_no_more_unless_the_next_one_may() -> None:
+    one = edge()
+    one.execute(allocation("edge1", 1), 0.0)
+    one.on_worker_ended()
+    assert one.may_work_unleased(0.0), "the next process may work at once"
+    one.execute(replace(allocation("edge1", 1), leased=True), 1.0)
+    one.on_worker_ended()
+    assert not one.may_work_unleased(1.0)
+
+
+def test_a_worker_that_has_drained_hears_of_its_end_a_little_later() -> None:
+    one = edge()
+    one.execute(allocation("edge1", 1), 0.0)
+    one.execute(allocation("edge2", 2), 1.0)
+    assert one.role.role is WorkerRole.DRAINING
+    ends_at = one.next_deadline()
+    (told,) = [out.role.role for out in one.tick(ends_at) if isinstance(out, SetRole)]
+    assert told is WorkerRole.IDLE
+    one.on_role_ended(1)
+    assert one.may_work_unleased(ends_at + LEAVES_S - 0.001)
+    assert not one.may_work_unleased(ends_at + LEAVES_S)
+
+
+def test_a_worker_that_was_told_to_stop_at_once_has_nothing_to_hear() -> None:
+    one = edge(spec=replace(SPEC, exclusive=True))
+    one.execute(replace(allocation("edge1", 1), leased=True), 0.0)
+    one.set_lease(2.0, 0.0)
+    one.execute(replace(allocation("edge2", 2), leased=True), 1.0)
+    one.tick(one.next_deadline())
+    assert not one.may_work_unleased(1.0)

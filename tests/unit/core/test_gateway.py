@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import math
+
 import pytest
 
 from zsched.core.fleet import Demand, Fleet, NodeSpec, TaskSpec, Timing
@@ -52,6 +54,22 @@ def gateway_with(*profiles: Profile, now: float = 0.0) -> Gateway:
     for one in profiles:
         assert gateway.absorb(one, now) is None
     return gateway
+
+
+def test_what_is_fresh_now_is_fresh_until_then_also_at_the_very_end() -> None:
+    gateway = gateway_with(profile(0))
+    for now in (0.0, TTL_S):
+        assert gateway.fresh("edge1", now) is not None
+        assert gateway.fresh_until(now) == TTL_S
+    assert gateway.fresh_until(TTL_S + 0.001) == math.inf
+
+
+def test_each_new_figure_is_one_more_version() -> None:
+    gateway = gateway_with(profile(0))
+    before = gateway.version
+    gateway.learn_demand("merge", "edge1", 0.0)
+    gateway.learn_demand("merge", "edge1", 0.0)
+    assert gateway.version == before + 1, "the second look found nothing new"
 
 
 # --- newest, fresh -------------------------------------------------------------------------------------------------

@@ -168,6 +168,11 @@ def test_the_hold_outlasts_a_lease_on_the_two_clocks_that_differ_most() -> None:
     assert hold_s(L) / (1 + RHO) >= L / (1 - RHO) - 1e-12
 
 
+def test_any_number_is_granted_before_anything_was_given_back() -> None:
+    one = Granter(task="guard", lease_s=L, until=-math.inf, standing=None)
+    assert one.on_beat(beat(number=0), ("r2", 3), 10.0)
+
+
 def test_a_release_before_any_grant_holds_too() -> None:
     one = Granter(task="guard", lease_s=L, until=-math.inf, standing=None)
     assert not one.on_beat(beat("r2", 5, released=(grant(5),)), ("r2", 3), 10.0)

@@ -366,6 +366,19 @@ def test_relay_that_is_down_is_a_problem_until_it_is_up() -> None:
     assert node.counters["relay_exits"] == 1
 
 
+def test_a_relay_that_has_gone_leaves_every_slot_to_be_taken_again() -> None:
+    node = started(learnt=value(1, "edge1"))
+    for event in (ev.SlotReady(task="merge", epoch=1), ev.SlotFlipped(task="merge", epoch=1)):
+        node.handle(event, 101.0)
+    assert build_snapshot(node, 110.0).tasks[0].problems == ()
+    node.handle(ev.RelayChanged(is_running=False, reason="exited"), 110.0)
+    node.handle(ev.RelayChanged(is_running=True), 110.5)
+    (problem,) = build_snapshot(node, 115.0).tasks[0].problems
+    assert problem.startswith("this robot's streams have waited for edge1 for 5 s")
+    node.handle(ev.SlotReady(task="merge", epoch=1), 116.0)
+    assert build_snapshot(node, 120.0).tasks[0].problems == ()
+
+
 def test_our_own_name_elsewhere_is_a_problem_until_its_token_goes() -> None:
     node = started()
     node.handle(ev.TokenSeen(node="robot1", incarnation=8), 100.0)
@@ -475,7 +488,8 @@ def test_whoever_is_heard_again_is_no_suspect_in_the_same_batch() -> None:
 
 def test_beats_are_numbered_one_by_one() -> None:
     """A gap would look like lost beats."""
-    node, numbers, now = started(), [], 100.0
+    node, now = started(), 100.0
+    numbers: list[int] = []
     while len(numbers) < 4:
         now = max(node.next_deadline(), now)
         numbers += [one.beat.sequence for one in of(node.handle(ev.DeadlineReached(), now), do.PublishBeat)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from random import Random
 
 import pytest
@@ -10,7 +11,17 @@ from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, lease_terms
 from zsched.core.messages import Learnt
-from zsched.core.model import Allocation, Beat, DurableState, Grant, NodeKind, RegisterState, Tuning, Weights
+from zsched.core.model import (
+    Allocation,
+    Beat,
+    DurableState,
+    Grant,
+    NodeKind,
+    RegisterState,
+    Tuning,
+    Weights,
+    WorkerState,
+)
 from zsched.core.node import Node
 
 ROBOTS = ("robot1", "robot2", "robot3")
@@ -25,8 +36,8 @@ FLEET = Fleet(
 )
 
 
-def value(revision: int) -> Allocation:
-    return Allocation(task="guard", revision=revision, epoch=revision, owner="robot1", tuning=TUNING, leased=True)
+def value(revision: int, owner: str = "robot1") -> Allocation:
+    return Allocation(task="guard", revision=revision, epoch=revision, owner=owner, tuning=TUNING, leased=True)
 
 
 class Owner:
@@ -49,12 +60,23 @@ class Owner:
         self.now, self.sequence = 100.0, 0
         self.sent: dict[int, float] = {}
         """{number of a beat: when it left}."""
+        self.released: list[int] = []
+        """What the newest beat gives back."""
         for _ in range(3):
             self.beat()
         self.last_before = max(self.sent)
+        self.learn(value(4))
+
+    def learn(self, new: Allocation) -> None:
         for name in ROBOTS[1:]:
-            learnt = Learnt(node=name, values=(value(4),), lease_terms=lease_terms(FLEET))
+            learnt = Learnt(node=name, values=(new,), lease_terms=lease_terms(FLEET))
             self.handle(ev.LearntReceived(learnt=learnt, is_answer=True))
+
+    def work(self) -> None:
+        """Its worker is ready, and works by a lease."""
+        self.handle(ev.WorkerChanged(task="guard", state=WorkerState.READY))
+        self.beat()
+        assert self.echoed(max(self.sent)) is not None
 
     def handle(self, event: ev.Event) -> tuple[do.Instruction, ...]:
         batch = self.node.handle(event, self.now)
@@ -66,24 +88,34 @@ class Owner:
         before = len(self.sent)
         while len(self.sent) == before:
             self.now = max(self.now, self.node.next_deadline())
-            self.handle(ev.DeadlineReached())
+            self.released = [
+                grant.number
+                for one in self.handle(ev.DeadlineReached())
+                if isinstance(one, do.PublishBeat)
+                for grant in one.beat.released
+            ]
+
+    def heard(self, name: str, *, echoes: tuple[Grant, ...] = (), is_asked: bool = False) -> tuple[do.Instruction, ...]:
+        """A peer's beat, which may ask this owner to leave."""
+        self.sequence += 1
+        beat = Beat(
+            node=name,
+            incarnation=1,
+            sequence=self.sequence,
+            loop_lag_s=0.0,
+            learnt=(("guard", 4, 4),),
+            echoes=echoes,
+            asked_to_leave=(("guard", "robot1", 4),) if is_asked else (),
+            lease_terms=lease_terms(FLEET),
+        )
+        return self.handle(ev.BeatReceived(beat=beat))
 
     def echoed(self, number: int) -> float | None:
         """Both others echo one of our numbers; until when the worker is then told that it may work."""
         told = None
-        self.sequence += 1
         grant = Grant(task="guard", owner="robot1", incarnation=7, epoch=4, number=number)
         for name in ROBOTS[1:]:
-            beat = Beat(
-                node=name,
-                incarnation=1,
-                sequence=self.sequence,
-                loop_lag_s=0.0,
-                learnt=(("guard", 4, 4),),
-                echoes=(grant,),
-                lease_terms=lease_terms(FLEET),
-            )
-            for one in self.handle(ev.BeatReceived(beat=beat)):
+            for one in self.heard(name, echoes=(grant,)):
                 if isinstance(one, do.SetRole) and one.role.lease_until_s:
                     told = one.role.lease_until_s
         return told
@@ -96,3 +128,50 @@ def test_the_first_beat_after_an_epoch_was_learnt_counts_and_the_last_one_before
     if first not in owner.sent:
         owner.beat()
     assert owner.echoed(first) == pytest.approx(owner.sent[first] + FLEET.timing.lease_s)
+
+
+def test_whoever_is_followed_gives_back_every_number_up_to_the_last_one_sent() -> None:
+    owner = Owner()
+    owner.work()
+    last = max(owner.sent)
+    owner.learn(value(5, "robot2"))
+    owner.beat()
+    assert owner.released == [last]
+
+
+@pytest.mark.parametrize("has_died", [False, True])
+def test_the_word_of_a_worker_whose_process_ended_meanwhile_gives_nothing_back(*, has_died: bool) -> None:
+    """It may be the dead one's, and the next one at work already: then only the end of the lease counts."""
+    owner = Owner()
+    owner.work()
+    if has_died:
+        owner.handle(ev.WorkerChanged(task="guard", state=WorkerState.STOPPED))
+        owner.work()
+    for name in ROBOTS[1:]:
+        owner.heard(name, is_asked=True)
+    owner.handle(ev.RoleEnded(task="guard", epoch=4))
+    owner.beat()
+    assert bool(owner.released) is not has_died
+
+
+def test_a_worker_that_was_not_at_work_when_its_process_ended_leaves_no_word_behind() -> None:
+    owner = Owner()
+    owner.handle(ev.WorkerChanged(task="guard", state=WorkerState.STARTING))
+    owner.handle(ev.WorkerChanged(task="guard", state=WorkerState.STOPPED))
+    owner.work()
+    for name in ROBOTS[1:]:
+        owner.heard(name, is_asked=True)
+    owner.handle(ev.RoleEnded(task="guard", epoch=4))
+    owner.beat()
+    assert owner.released
+
+
+def test_a_stranger_s_answer_is_none_of_those_that_an_owner_waits_for() -> None:
+    owner = Owner()
+    owner.learn(replace(value(5), leased=False))
+    owner.beat()
+    for name in ("robot2", "ghost"):
+        learnt = Learnt(node=name, values=(), lease_terms=lease_terms(FLEET))
+        owner.handle(ev.LearntReceived(learnt=learnt, is_answer=True))
+    assert "robot2" in owner.node.sealing._answers
+    assert "ghost" not in owner.node.sealing._answers
