@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from zsched.lab.planted import PlantError, Verdict, changed, judge, plant, table
-from zsched.lab.planted_bugs import BUGS, REGISTER, Bug
+from zsched.lab.planted import BUGS, PlantError, Verdict, changed, for_children, judge, plant, table
+from zsched.lab.planted_bugs import REGISTER, Bug
+from zsched.lab.planted_stream_bugs import STREAM_BUGS
 
 ROOT = Path(__file__).parents[2]
 QUICK = ("quorum off by one", "promise not persisted", "node without state is an elector", "silence rule left out")
@@ -36,7 +37,8 @@ def test_every_bug_can_be_planted_in_today_s_source(bug: Bug) -> None:
 def test_there_are_enough_bugs_each_with_a_name_of_its_own_and_tests_that_exist() -> None:
     assert len(BUGS) >= 25
     assert len({bug.name for bug in BUGS}) == len(BUGS)
-    assert [test for bug in BUGS for test in bug.tests if not (ROOT / test).exists()] == []
+    assert [test for bug in BUGS for test in bug.tests if not (ROOT / test.partition("::")[0]).exists()] == []
+    assert [bug.name for bug in STREAM_BUGS if not bug.tests] == [], "no schedule could find them"
 
 
 @pytest.mark.parametrize("name", QUICK)
@@ -44,6 +46,25 @@ def test_a_planted_bug_is_found(name: str, monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.chdir(ROOT)
     (bug,) = [bug for bug in BUGS if bug.name == name]
     assert judge(bug, budget_s=20.0).found_by.startswith("seed ")
+
+
+def test_a_stream_bug_is_found_by_its_tests(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
+    (bug,) = [bug for bug in STREAM_BUGS if bug.name == "a sample that was shed counts as acknowledged"]
+    found = judge(bug).found_by
+    assert "test_what_gives_way_for_want_of_room_is_lost" in found
+
+
+def test_processes_that_a_test_starts_have_the_bug_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setenv("PYTHONPATH", "")
+    (bug,) = [bug for bug in STREAM_BUGS if bug.name == "numbers are compared without their wrap"]
+    code = "from zsched.core.serial import number_near; print(number_near(2, 2**32 - 1))"
+    command = [sys.executable, "-c", code]
+    sound = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=50, check=True).stdout
+    for_children(bug, tmp_path)
+    planted = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=50, check=True).stdout
+    assert (int(sound), int(planted)) == (2**32 + 2, 2)
 
 
 def test_a_change_without_effect_is_not_called_found() -> None:

@@ -1,7 +1,7 @@
 """Plants one bug at a time into the code and lets the suite find it: ``python -m zsched.lab.planted``.
 
 Knows: how a bug is planted (an import hook in a process of its own; no file is touched), the budget of each, the table.
-Does not know: what the bugs are (`zsched.lab.planted_bugs`), what finds them.
+Does not know: what the bugs are (`zsched.lab.planted_bugs`, `zsched.lab.planted_stream_bugs`), what finds them.
 
 For every bug the simulator plays schedules until one is violated; when none is within the budget, the bug's directed
 tests are run. The last line is ``F of N planted bugs found``; the exit code is 1 when one survives.
@@ -14,10 +14,12 @@ import argparse
 import importlib.abc
 import importlib.machinery
 import importlib.util
+import os
 import resource
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 import types
 from collections.abc import Sequence
@@ -26,7 +28,10 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from zsched.lab.planted_bugs import BUGS, Bug
+from zsched.lab.planted_bugs import CORE_BUGS, Bug
+from zsched.lab.planted_stream_bugs import STREAM_BUGS
+
+BUGS: tuple[Bug, ...] = (*CORE_BUGS, *STREAM_BUGS)
 
 BUDGET_S = 30.0
 """What the schedules may take for one bug; the directed tests come on top."""
@@ -111,8 +116,22 @@ def hunt(bug: Bug, budget_s: float) -> int:
 
 
 def run_tests(bug: Bug, tests: Sequence[str]) -> int:
-    """Run directed tests: `FOUND` when one fails, else 0."""
+    """Run directed tests: `FOUND` when one fails, else 0. Processes that a test starts have the bug, too."""
     plant(bug)
+    with tempfile.TemporaryDirectory(prefix="zsched-planted-") as folder:
+        for_children(bug, Path(folder))
+        return _run_tests(tests)
+
+
+def for_children(bug: Bug, folder: Path) -> None:
+    """From now on every Python process that this one starts has the bug, by way of the ``site`` module."""
+    lines = f"import sys; sys.path.insert(0, {str(Path.cwd())!r})\nfrom zsched.lab.planted import BUGS, plant\n"
+    lines += f"plant(next(bug for bug in BUGS if bug.name == {bug.name!r}))\n"
+    (folder / "sitecustomize.py").write_text(lines, encoding="utf-8")
+    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (str(folder), os.environ.get("PYTHONPATH"))))
+
+
+def _run_tests(tests: Sequence[str]) -> int:
     import pytest  # noqa: PLC0415 - a lab without tests needs none
 
     # A busy machine must not look like a bug: CPU time is limited, not the wall clock.
@@ -139,6 +158,8 @@ def judge(bug: Bug, budget_s: float = BUDGET_S) -> Verdict:
     for how in ("hunt", "tests"):
         if found or (how == "tests" and not bug.tests):
             break
+        if how == "hunt" and not bug.has_schedules:
+            continue
         found = _found(bug, how, budget_s)
     return Verdict(bug=bug, found_by=found, seconds=time.monotonic() - began_at)
 

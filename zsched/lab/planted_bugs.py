@@ -1,6 +1,7 @@
 """The bugs that the suite must find: one per rule of the agreement, the lease, membership, vote and handover.
 
-Knows: which text of which module each bug replaces, and which tests may find it. Does not know: how it is planted.
+Knows: which text of which module each bug replaces, and which tests may find it. Does not know: how it is planted, the
+bugs in relays and workers (`zsched.lab.planted_stream_bugs`).
 
 A bug is a few words of source. When the source changes so that the words are no longer there, planting fails and says
 so: then the bug is written anew for the new source.
@@ -22,6 +23,8 @@ class Bug:
     """Directed tests that are run when no schedule has found it within its budget."""
     seed: int | None = None
     """A schedule that has found it before: tried first."""
+    has_schedules: bool = True
+    """Whether the simulator runs the module at all."""
     also: Bug | None = None
     """Its part in another module, for a rule that is kept in two places."""
 
@@ -641,4 +644,4 @@ HANDOVER_BUGS = (
     ),
 )
 
-BUGS: tuple[Bug, ...] = (*REGISTER_BUGS, *LEASE_BUGS, *MEMBERSHIP_BUGS, *VOTE_BUGS, *HANDOVER_BUGS)
+CORE_BUGS: tuple[Bug, ...] = (*REGISTER_BUGS, *LEASE_BUGS, *MEMBERSHIP_BUGS, *VOTE_BUGS, *HANDOVER_BUGS)

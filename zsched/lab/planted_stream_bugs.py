@@ -1,0 +1,87 @@
+"""Bugs in relays and workers that the tests with real sessions and processes must find.
+
+Knows: which text of which module each bug replaces, and which tests must find it. Does not know: how it is planted. The
+simulator has no streams, so no schedules are played for these.
+"""
+
+from __future__ import annotations
+
+from zsched.lab.planted_bugs import Bug
+
+ACKS, SERIAL = "zsched.hop_acks", "zsched.core.serial"
+GREETINGS, LANES, OUTLET = "zsched.relay.greetings", "zsched.relay.lanes", "zsched.relay.outlet"
+
+_GREETINGS = ("tests/parts/test_relay_greetings.py",)
+_ACKS = ("tests/unit/test_hop_acks.py",)
+_LANES = ("tests/unit/test_relay_lanes.py",)
+
+
+def _bug(name: str, module: str, old: str, new: str, tests: tuple[str, ...]) -> Bug:
+    return Bug(name=name, module=module, changes=((old, new),), tests=tests, has_schedules=False)
+
+
+STREAM_BUGS = (
+    _bug(
+        "a new lane does not wait for its greeting's answer",
+        OUTLET,
+        "if greetings.is_waiting and not greetings.greet(len(self._lanes)):\n                return False",
+        "if greetings.is_waiting:\n                greetings.greet(len(self._lanes))",
+        _GREETINGS,
+    ),
+    _bug(
+        "a worker that lost its link is not greeted again",
+        GREETINGS,
+        "                for lane in lanes.values():\n                    lane.part(now)\n",
+        "                for lane in ():\n                    lane.part(now)\n",
+        _GREETINGS,
+    ),
+    _bug(
+        "any word of a receiver answers its greeting",
+        LANES,
+        "if self.is_met or self.greeted_at is None or self.ack is None or self.ack.arrived < self.base:",
+        "if self.is_met or self.ack is None:",
+        _LANES,
+    ),
+    _bug(
+        "a new life's first number is not asked for",
+        OUTLET,
+        "start = lane.count if self._greetings is not None else min(",
+        "start = lane.processed if self._greetings is not None else min(",
+        _GREETINGS,
+    ),
+    _bug(
+        "a sample that was shed counts as acknowledged",
+        ACKS,
+        "            if source is not None:\n                source.lost += 1\n                self._mark(name)",
+        "            if source is not None:\n                self._mark(name)",
+        _ACKS,
+    ),
+    _bug(
+        "what was given up is not counted",
+        LANES,
+        "known = max(0, self.ack.lost - before) + max(0, first - self.base)",
+        "known = max(0, first - self.base)",
+        (*_LANES, *_GREETINGS),
+    ),
+    _bug(
+        "numbers are compared without their wrap",
+        SERIAL,
+        "number = reference + (ahead if ahead < _HALF else ahead - SPAN)",
+        "number = serial",
+        ("tests/unit/core/test_serial.py", *_ACKS),
+    ),
+    _bug(
+        "a forged jump stands",
+        ACKS,
+        "        return self.count >= RETURN",
+        "        return False",
+        _ACKS,
+    ),
+    _bug(
+        "applications are not asked whether they have room",
+        OUTLET,
+        "self._crowd = self._make_crowd() if has_crowd else None",
+        "self._crowd = None",
+        ("tests/integration/test_relay_receivers.py::test_a_frozen_application_delays_no_other",),
+    ),
+)
