@@ -16,13 +16,16 @@ import signal
 import sys
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from zsched.cli_bench import bench_app
 from zsched.cli_common import EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, CliError, Json, Verb, Verbs, print_json
 from zsched.cli_stream_verbs import stream_app
+
+if TYPE_CHECKING:
+    from zsched.lifecycle import Heard  # imports zenoh
 
 EPILOG = (
     "Exit codes: 0 fine, 1 failed, 2 usage, 3 daemon not reachable, 4 reachable but degraded, 5 timed out, "
@@ -45,7 +48,6 @@ app = typer.Typer(
 app.add_typer(stream_app)
 app.add_typer(bench_app)
 
-NOT_ASKED = "no other node reached: nobody could say whether this name has voted"
 UNWRITABLE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 """Why stdout takes no more: the disk behind ``>`` is full, or gone."""
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -127,20 +129,24 @@ def init(
     state_dir: StateOption = None,
     generation: Annotated[
         int,
-        typer.Option("--generation", metavar="G", min=0, help="Above 0: start anew, on every node at once."),
+        typer.Option("--generation", metavar="G", min=0, help="Above 0: start anew, on every node."),
     ] = 0,
+    force: Annotated[
+        bool, typer.Option("--force", help="With --generation: although nobody says that it is needed.")
+    ] = False,
     settle: Annotated[
         bool, typer.Option("--settle", help="The other machine of this name is gone: be an elector again.")
     ] = False,
 ) -> None:
     """Create this node's blank state: "this name has never voted here".
 
-    Refuses when there is a state already, or when a node that can be reached knows this name as an elector that has
-    voted. If too many states are lost to agree, run it on every node at once with a higher --generation.
+    Refuses in another node's folder, and when a node that can be reached knows this name as an elector that has voted.
+    If too many states are lost to agree, stop every daemon, and run it on every node with the --generation that
+    `zsched status` names. That is refused while the fleet agrees, and where a good state would be lost.
     """
     from zsched import places  # noqa: PLC0415 - each verb imports what it needs
     from zsched.config import load_fleet, require_node  # noqa: PLC0415 - ruamel.yaml is slow to import
-    from zsched.lifecycle import check_never_voted, init_state, settle_dispute, standing_generation  # noqa: PLC0415 - imports zenoh
+    from zsched.lifecycle import check_blank, init_state, settle_dispute, standing_state  # noqa: PLC0415 - imports zenoh
 
     file = places.config_path(config, os.environ)
     fleet = load_fleet(file)
@@ -151,14 +157,29 @@ def init(
         done = settle_dispute(fleet, name, folder)
         typer.echo(f"{name}: {'settled; restart its daemon' if done else 'there was no dispute'}")
         return
-    standing = standing_generation(fleet, name, folder)
-    if standing is not None and generation in (0, standing):
-        typer.echo(f"{folder}: {name} has its state in fleet {fleet.name}, generation {standing}: nothing to do")
+    if force and not generation:
+        raise CliError(EXIT_USAGE, "--force goes with --generation G")
+    standing = standing_state(fleet, name, folder)
+    if standing is not None and generation in (0, standing.generation):
+        text = f"{name} has its state in fleet {fleet.name}, generation {standing.generation}: nothing to do"
+        typer.echo(f"{folder}: {text}")
         return
-    asked = check_never_voted(fleet, name) if generation == 0 else 0
+    heard = check_blank(fleet, name, folder, generation, standing, is_forced=force)
     path = init_state(fleet, name, folder, generation)
-    typer.echo(f"asked {asked} nodes: none remembers a vote of {name}" if asked else NOT_ASKED, err=True)
+    _say(_heard(heard, name, generation, is_elector=name in fleet.electors))
     typer.echo(f"{path}: blank state of {name} in fleet {fleet.name}, generation {generation}")
+
+
+def _heard(heard: Heard, name: str, generation: int, *, is_elector: bool) -> str:
+    """Who was asked before a blank state was written, and what that says."""
+    if not heard.asked:
+        return "no other node has an address in the fleet file: nobody was asked"
+    asked = f"asked {_count(heard.asked, 'other nodes')}"
+    if not heard.answers:
+        return f"{asked}: none answered" + (f", so nobody could say whether {name} has voted" if is_elector else "")
+    said = f"{asked}, {len(heard.answers)} answered"
+    where = f" in generation {generation}" if generation else ""
+    return f"{said}: none remembers a vote of {name}{where}" if is_elector else said
 
 
 # --- questions -------------------------------------------------------------------------------------------------------

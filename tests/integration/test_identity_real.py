@@ -43,6 +43,48 @@ def test_init_refuses_a_name_that_the_fleet_remembers_as_a_voter(bed: Testbed) -
     assert not (bed.folder / "robot3" / "state").exists()
     edge = run_init(bed, "edge1", bed.folder / "edge1-again")
     assert edge.returncode == 0, edge.stderr
+    assert edge.stderr == "asked 3 other nodes, 2 answered\n", "each address by a session of its own"
+    whose = run_init(bed, "robot3", bed.folder / "edge1-again")
+    assert whose.returncode == 1
+    assert "belongs to the node 'edge1'" in whose.stderr, "before anybody is asked"
+    assert "has voted" not in whose.stderr
+
+
+def test_a_new_generation_is_refused_while_the_fleet_agrees(bed: Testbed) -> None:
+    """robot3 is down for a moment, with a good state: it asks the others, and keeps what it has."""
+    bed.stop("robot3")
+    before = (bed.folder / "robot3" / "state").read_bytes()
+    refused = run_init(bed, "robot3", bed.folder / "robot3", "--generation", "1")
+    assert (refused.returncode, refused.stdout) == (1, "")
+    assert "the fleet lives in generation 0 and agrees" in refused.stderr
+    assert (bed.folder / "robot3" / "state").read_bytes() == before
+    bed.start("robot3")
+    bed.wait(lambda: bed.status("robot3")["quorum"]["this_node"] == "elector", 20, "robot3 as the elector it was")
+
+
+def test_a_new_generation_is_made_node_by_node_where_too_many_states_are_lost(bed: Testbed) -> None:
+    """Two of three robots have lost theirs. Only the first elector with a good state needs --force, if it is first."""
+    lost = ("robot1", "robot2")
+    for node in lost:
+        bed.kill(node)
+        shutil.rmtree(bed.folder / node)
+    bed.start()
+    bed.wait(lambda: any("--generation 1" in one for one in bed.status("edge1")["problems"]), 20, "the way out")
+    bed.stop()
+    refused = run_init(bed, "robot3", bed.folder / "robot3", "--generation", "1")
+    assert "good state of generation 0 here, and no other node answered" in refused.stderr
+    for node in ("robot1", "edge1", "robot3", "robot2"):
+        done = run_init(bed, node, bed.folder / node, "--generation", "1")
+        assert done.returncode == 0, done.stderr
+        bed.start(node)
+        bed.wait(lambda node=node: bed.status(node)["up_s"] > 0.0, 20, f"{node} to answer")
+    bed.wait_settled()
+    assert bed.task("robot1")["epoch"] > 2**32
+    twice = run_init(bed, "robot2", bed.folder / "robot2-again", "--generation", "1")
+    assert twice.returncode == 1, "it has voted in this generation"
+    assert "knows robot2 as an elector that has voted" in twice.stderr
+    behind = run_init(bed, "robot2", bed.folder / "robot2-again")
+    assert "the fleet lives in generation 1; join it with `zsched init --generation 1`" in behind.stderr
 
 
 def test_init_without_a_reachable_node_goes_on(tmp_path: Path) -> None:
@@ -50,7 +92,7 @@ def test_init_without_a_reachable_node_goes_on(tmp_path: Path) -> None:
     bed = Testbed(tmp_path, echo_fleet())
     done = run_init(bed, "robot1", tmp_path / "robot1")
     assert done.returncode == 0
-    assert "no other node reached" in done.stderr
+    assert "asked 5 other nodes: none answered" in done.stderr
 
 
 def test_second_machine_of_a_name_leaves_again_with_75(tmp_path: Path) -> None:

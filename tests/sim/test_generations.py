@@ -91,6 +91,20 @@ def test_a_robot_without_a_state_follows_the_fleet_into_the_next_generation() ->
     until_owned(sim, but=owner)
 
 
+def test_a_robot_without_a_state_forgets_who_has_voted_in_the_generation_before() -> None:
+    """`zsched init` asks it who has: an elector of the new generation must not be refused for votes of the old one."""
+    sim = started(BY_EDGES, 1)
+    lose_state(sim, "robot1")
+    sim.run(5)
+    assert sim.node("robot1").agreement.voted == set(EDGES)
+    for name in (*EDGES, "robot2", "robot3"):
+        sim.crash(name)
+    sim.initialise(sim.machines["edge1"], incarnation=sim.wall_count, generation=2)
+    sim.start("edge1")
+    assert sim.run_until(lambda: sim.node("robot1").agreement.generation == 2, 10)
+    assert sim.node("robot1").agreement.voted <= {"edge1"}
+
+
 def test_electors_that_have_all_lost_their_state_say_what_the_operator_does() -> None:
     sim = started(BY_ROBOTS, 1)
     sim.run(1)

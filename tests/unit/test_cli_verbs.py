@@ -161,11 +161,49 @@ def test_init_creates_the_state_once(tmp_path: Path) -> None:
     assert first.stdout == f"{state}/state: blank state of robot1 in fleet hall, generation 0\n"
     said = f"{state}: robot1 has its state in fleet hall, generation 0: nothing to do\n"
     assert (second.exit_code, second.stdout) == (0, said)
-    assert run(*arguments, "--generation", 1).exit_code == 0
+    assert run(*arguments, "--generation", 1, "--force").exit_code == 0
     before = (state / "state").read_bytes()
     for again in ((), ("--generation", 1)):
         assert "generation 1: nothing to do" in run(*arguments, *again).stdout
     assert (state / "state").read_bytes() == before
+
+
+def test_init_of_a_new_generation_keeps_a_good_state_unless_told(tmp_path: Path) -> None:
+    """Nobody answers here, so nobody says that the fleet needs a new generation."""
+    file, state = tmp_path / "fleet.yaml", tmp_path / "state"
+    file.write_text(FLEET)
+    arguments = ("init", "--config", file, "--node", "robot2", "--state-dir", state)
+    assert run(*arguments).exit_code == 0
+    before = (state / "state").read_bytes()
+    refused = run(*arguments, "--generation", 1)
+    assert (refused.exit_code, refused.stdout) == (1, "")
+    assert "robot2 has a good state of generation 0 here, and no other node answered" in refused.stderr
+    assert "If `zsched status` has said so, add --force" in refused.stderr
+    assert (state / "state").read_bytes() == before
+    done = run(*arguments, "--generation", 2, "--force")
+    assert (done.exit_code, done.stderr.count("asked 1 other node: none answered")) == (0, 1), done.stderr
+    older = run(*arguments, "--generation", 1, "--force")
+    assert older.exit_code == 1
+    assert "which is newer than 1" in older.stderr
+
+
+def test_init_with_force_alone_is_a_usage_error(tmp_path: Path) -> None:
+    file = tmp_path / "fleet.yaml"
+    file.write_text(FLEET)
+    result = run("init", "--config", file, "--node", "robot1", "--state-dir", tmp_path / "state", "--force")
+    assert result.exit_code == 2
+    assert "--generation" in result.stderr
+    assert not (tmp_path / "state").exists()
+
+
+def test_init_says_whom_it_asked(tmp_path: Path) -> None:
+    """The only node with an address asks nobody, and says so; another one asks that one."""
+    file = tmp_path / "fleet.yaml"
+    file.write_text(FLEET)
+    first = run("init", "--config", file, "--node", "robot1", "--state-dir", tmp_path / "one")
+    assert first.stderr == "no other node has an address in the fleet file: nobody was asked\n"
+    second = run("init", "--config", file, "--node", "robot2", "--state-dir", tmp_path / "two")
+    assert second.stderr == "asked 1 other node: none answered, so nobody could say whether robot2 has voted\n"
 
 
 @pytest.mark.parametrize("more", [(), ("--generation", 1)], ids=["plain", "as the old advice had it"])
@@ -178,7 +216,7 @@ def test_init_in_another_nodes_folder_says_whose_it_is_and_leaves_it(tmp_path: P
     result = run(*arguments, "--node", "robot2", *more)
     assert (result.exit_code, result.stdout) == (1, "")
     assert "belongs to the node 'robot1', not 'robot2', and is left as it is" in result.stderr
-    assert "give robot2 a folder of its own with --state-dir" in result.stderr
+    assert "give robot2 a folder of its own with --state-dir, or say with --node robot1" in result.stderr
     assert "--generation" not in result.stderr
     assert (state / "state").read_bytes() == before
 

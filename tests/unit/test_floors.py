@@ -33,7 +33,7 @@ FLOORS: Final[tuple[tuple[str, int, str], ...]] = (
     (r"(config|config_\w+)", 2, "seams"),
     (r"(relay_door|introduction|guard|log_limit|files|opening)", 2, "seams"),
     (r"adapters\.(worker_supervisor|worker_process|launch)", 3, "adapters: worker processes"),
-    (r"adapters\.(control_bus|open_questions)", 3, "adapters: control"),
+    (r"adapters\.(control_bus|open_questions|fleet_poll)", 3, "adapters: control"),
     (r"adapters\.(network_profiler|nl80211)", 3, "adapters: radio"),
     (r"adapters\.(streams|relay_child|relay_silence)", 3, "adapters: relay"),
     (r"adapters\.(device_profiler|cgroup|shared_memory)", 3, "adapters: machine"),
@@ -60,7 +60,10 @@ IMPURE_CALLS: Final = frozenset({"open", "print", "input", "exec", "eval", "comp
 HEAVY: Final = frozenset({"numpy", "cv2", "matplotlib", "onnxruntime", "rich", "pydantic", "asyncio"})
 OUTSIDE: Final[dict[str, str]] = {
     # library: who alone may import it, besides lab and tasks
-    "zenoh": r"adapters\.(control_bus|open_questions|stream_tap)|relay\..+|worker|worker_\w+|zenoh_config|introduction",
+    "zenoh": (
+        r"adapters\.(control_bus|open_questions|fleet_poll|stream_tap)|relay\..+|worker|worker_\w+"
+        r"|zenoh_config|introduction"
+    ),
     "psutil": r"adapters\.\w+",
     "msgpack": r"wire",
     "ruamel": r"config_reader",

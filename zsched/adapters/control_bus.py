@@ -379,28 +379,3 @@ class ControlBus:
             except WireError as error:
                 raise AdapterError(f"{node} answered something else ({error}); is it another version?") from error
         raise AdapterError(f"{node} did not answer within {OPERATOR_TIMEOUT_S:g} s; is it up and reachable?")
-
-
-def ask_fleet(fleet: str, asker: NodeId, zenoh_config: str, timeout_s: float = 1.0) -> tuple[Snapshot, ...]:
-    """The status of every node that can be reached, asked from outside of any daemon (`zsched init`).
-
-    ``zenoh_config`` is a client's; when nobody listens there, nobody answers. Blocks up to ``timeout_s`` and the time
-    that connecting takes.
-    """
-    zenoh.init_log_from_env_or("off")
-    found = []
-    try:
-        with zenoh.open(zenoh.Config.from_json5(zenoh_config)) as session:
-            replies = session.get(
-                Keyspace(fleet).status("*", asker),
-                target=zenoh.QueryTarget.ALL,
-                consolidation=zenoh.ConsolidationMode.NONE,
-                timeout=timeout_s,
-            )
-            for reply in replies:
-                if reply.ok is not None:
-                    with contextlib.suppress(WireError):
-                        found.append(wire.decode(reply.ok.payload.to_bytes(), Snapshot))
-    except zenoh.ZError:
-        return ()  # nobody listens
-    return tuple(found)

@@ -96,6 +96,23 @@ class StateFile:
     ) -> None:
         self.release()
 
+    def check_owner(self) -> None:
+        """Look whose folder it is; it is left as it is.
+
+        Raises:
+            AdapterError: another node's or fleet's.
+        """
+        state = self._read().state
+        if state is None or (state.fleet, state.node) == (self._fleet, self._node):
+            return
+        whose = f"or say with --node {state.node} that this machine is {state.node}"
+        if state.fleet != self._fleet:
+            whose = "or name that fleet's file with --config"
+        raise AdapterError(
+            f"{self.path} {self._foreign(state)}, and is left as it is; "
+            f"give {self._node} a folder of its own with --state-dir, {whose}"
+        )
+
     def create(self, state: DurableState) -> None:
         """Write a node's blank state (`zsched init`): "this name has never voted in this generation".
 
@@ -106,18 +123,15 @@ class StateFile:
                 ``state.generation`` is not above its own (a damaged one counts as generation 0), or it cannot be
                 written.
         """
+        self.check_owner()
         found = self._read()
-        if found.state is not None and (found.state.fleet, found.state.node) != (self._fleet, self._node):
-            raise AdapterError(
-                f"{self.path} {self._foreign(found.state)}, and is left as it is; "
-                f"give {self._node} a folder of its own with --state-dir, or say whose this is with --node"
-            )
         standing = 0 if found.state is None else found.state.generation
         if self.path.exists() and state.generation <= standing:
             what = f"of generation {standing}" if found.state is not None else f"({found.problem})"
             raise AdapterError(
-                f"{self.path} exists already {what}: this name may have voted; "
-                f"start a new generation on every node with `zsched init --generation {standing + 1}`"
+                f"{self.path} exists already {what}: this name may have voted. Without this state the node works all "
+                "the same and votes no more. To make it an elector again, stop every daemon, and run "
+                f"`zsched init --generation {standing + 1}` on every node"
             )
         if found.state is not None:
             state = replace(state, incarnation=max(state.incarnation, found.state.incarnation))

@@ -405,6 +405,7 @@ class Agreement:
             return
         self.generation = learnt.generation
         self.witness.seen.clear()  # of another generation's states
+        self.voted.clear()
         for task in self._fleet.tasks:
             initial = task.first_value(learnt.generation * GENERATION_STEP)
             self.registers[task.name].follow(self._of_generation(), initial)

@@ -1,15 +1,16 @@
-"""VOTE, a new generation: what `zsched init --generation G` writes for each task, on every node.
+"""VOTE, a node's blank state: what speaks against it, and what it holds of each task in a new generation.
 
-Knows: what the state before said of leases. Does not know: disks, who is initialised when.
+Knows: what the state before says, and what the fleet answers. Does not know: disks, how anybody is asked.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from zsched.core.belief import GENERATION_STEP
 from zsched.core.fleet import Fleet
-from zsched.core.model import NO_BALLOT, Acceptance, Allocation, RegisterState
+from zsched.core.model import NO_BALLOT, Acceptance, Allocation, DurableState, NodeId, RegisterState
+from zsched.core.snapshot import Snapshot
 
 
 def first_registers(fleet: Fleet, generation: int, before: Iterable[RegisterState]) -> tuple[RegisterState, ...]:
@@ -33,3 +34,71 @@ def _is_unleased(state: RegisterState) -> bool:
     values += [] if state.accepted is None else [state.accepted.value]
     newest = max(values, key=lambda value: value.revision, default=None)
     return newest is not None and not newest.leased and newest.revision > 0
+
+
+# --- what speaks against a blank state -------------------------------------------------------------------------------
+
+
+def generation_of(answer: Snapshot) -> int:
+    """The generation that a node goes by, as its status shows it: revisions of generation G start at G * 2^32."""
+    return max((task.revision for task in answer.tasks), default=0) // GENERATION_STEP
+
+
+def objection(
+    node: NodeId,
+    generation: int,
+    good: DurableState | None,
+    answers: Sequence[Snapshot],
+    *,
+    is_elector: bool,
+    is_forced: bool,
+) -> str | None:
+    """Why ``node`` must not get a blank state of ``generation``, and what to do instead; ``None``: nothing is known.
+
+    Args:
+        node: whose state it would be.
+        generation: 0, or a new one for a fleet that cannot agree any more.
+        good: its valid state of an older generation, which would be lost with it.
+        answers: what the other nodes say.
+        is_elector: whether ``node`` is one.
+        is_forced: the operator knows better whether the fleet needs a new generation. That a node has voted in this
+            one, or that the fleet is ahead of it, no operator can change.
+    """
+    newest = max(map(generation_of, answers), default=0)
+    current = [answer for answer in answers if generation_of(answer) == newest]
+    if newest > generation:
+        return (
+            f"{current[0].node} says that the fleet lives in generation {newest}; join it with "
+            f"`zsched init --generation {newest}`"
+        )
+    knows = next((answer.node for answer in current if node in answer.quorum.voted), None)
+    if newest == generation:
+        if knows is None:
+            return None
+        return (
+            f"{knows} knows {node} as an elector that has voted; a blank state would let it vote twice. Without a "
+            "state it works all the same and votes no more. To make it an elector again, stop every daemon, and run "
+            f"`zsched init --generation {newest + 1}` on every node"
+        )
+    if is_forced:
+        return None
+    agreeing = next((answer for answer in current if answer.quorum.ok), None)
+    if agreeing is not None:
+        quorum = agreeing.quorum
+        return (
+            f"the fleet lives in generation {newest} and agrees ({agreeing.node}: {quorum.alive} of {quorum.electors} "
+            f"electors can answer, {quorum.needed} needed); it needs no generation {generation}. "
+            "To make one all the same, stop every daemon first, or add --force"
+        )
+    if good is None or not is_elector or any(_has_lost_too_many(answer) for answer in current):
+        return None
+    heard = "nobody who answered says" if answers else "no other node answered, so nobody says"
+    return (
+        f"{node} has a good state of generation {good.generation} here, and {heard} that the fleet needs a new "
+        "generation. If `zsched status` has said so, add --force"
+    )
+
+
+def _has_lost_too_many(answer: Snapshot) -> bool:
+    quorum = answer.quorum
+    return quorum.electors - len(quorum.stateless) < quorum.needed
