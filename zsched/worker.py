@@ -41,7 +41,7 @@ from zsched.hop_acks import Acknowledger
 from zsched.keyspace import END_CHUNK, Keyspace
 from zsched.log_limit import limit_library
 from zsched.relay_pipe import decode_end
-from zsched.worker_epochs import CARRY_S, Epochs
+from zsched.worker_epochs import CARRY_S, Epochs, lets_out
 from zsched.worker_errands import Errands
 from zsched.worker_inputs import Dispatcher, Input, Marker, Received
 from zsched.worker_keep import Keeper
@@ -316,7 +316,10 @@ class Worker:
     def _on_role(self, role: Role) -> None:
         with self._lock:
             self._restorer.note(role)  # first: from the moment that we are the owner, inputs wait for the snapshot
-            before, self._role = self._role, role
+            before = self._role
+            if role.role is WorkerRole.IDLE or lets_out(before, role, monotonic_s()):
+                self._dispatcher.expect_begin(is_due=role.role is not WorkerRole.IDLE)
+            self._role = role
             if not self._drains_itself:
                 self._epochs.follow(before, role)
         if role != before:
@@ -380,8 +383,7 @@ class Worker:
         if role.role is WorkerRole.IDLE or self._restorer.is_pending:
             self._dispatcher.note_withheld()
             return None
-        is_early = self._dispatcher.is_ahead_of(role.epoch)
-        if is_early and not self._is_standalone:  # what was withheld before comes first
+        if self._dispatcher.must_wait(role.epoch) and not self._is_standalone:  # what was withheld before comes first
             self._dispatcher.note_withheld()
             return None
         epoch = self._epochs.stamp(role, self._dispatcher.epoch_in_hand())

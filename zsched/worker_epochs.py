@@ -54,3 +54,13 @@ class Epochs:
         if self.is_carried(self._carried) and (in_hand is None or in_hand <= self._carried):
             return self._carried
         return role.epoch if role.epoch > self.ended or self.is_carried(self._carried) else None
+
+
+def lets_out(before: Role, role: Role, now: float) -> bool:
+    """Whether a role follows on which what was withheld under the one ``before`` it is answered first of all."""
+    if role.role is WorkerRole.IDLE or role == before:
+        return False
+    if role.role is WorkerRole.DRAINING:
+        return before.epoch != role.epoch
+    was_held = before.lease_until_s is not None and now >= before.lease_until_s
+    return before.role is not WorkerRole.ACTIVE or before.epoch != role.epoch or was_held

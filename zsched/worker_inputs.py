@@ -6,10 +6,8 @@ An end marker travels behind the data on the same link but enters through anothe
 It carries its source and how many samples that source put before it: it takes effect when the last of them has been
 processed, or, should some have been dropped on the way, a grace time after it came.
 
-A sample whose output was withheld because the worker was not the owner (a warm-up, or one that outran the role) is kept
-and processed again when it becomes the owner: else the newest map of a crashed owner would have no result at all.
-So is, where a predecessor's state takes the place of its own, every sample processed before: it was sent to nobody else
-(a flip waits only so long for the role), and what it had done to the state is gone.
+What was processed while the worker was not the owner is processed again when it is (`zsched.worker_backlog`), before
+anything newer is answered.
 """
 
 from __future__ import annotations
@@ -19,7 +17,7 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from typing import Final
 
 import zenoh
 
@@ -28,17 +26,10 @@ from zsched.core.relay_protocol import EndMarker
 from zsched.core.serial import number_near, serial_of
 from zsched.guard import guarded
 from zsched.hop_acks import GIVE_UP_S, MAX_SOURCES, Acknowledger, SourceName
+from zsched.worker_backlog import Backlog, Done
 from zsched.worker_troubles import Troubles
 
 END_GRACE_S: Final = 0.1
-MAX_WITHHELD: Final = 256
-"""Samples per key of an input without ``keep_last`` that a predecessor's state may want again."""
-MAX_BACKLOG: Final = 4096
-MAX_BACKLOG_BYTES: Final = 32 << 20
-"""Of such an input, whose output was withheld, that are kept for the day this worker becomes the owner; older ones are
-lost, and said to be."""
-QUIET_S: Final = 10.0
-"""What was processed longer ago than this came with another move, or the predecessor had it, too."""
 JOIN_S: Final = 0.2
 
 _log = logging.getLogger("zsched.worker")
@@ -86,20 +77,8 @@ class _Waiting:
     name: SourceName | None = None
     number: int = 0
     replayed: bool = False
-
-
-class _Done(NamedTuple):
-    """A sample processed while this worker was not the owner."""
-
-    sample: zenoh.Sample
-    quiet_at: float | None
-    """When it was processed, if nothing was withheld of it: it counts where the state that it went into is replaced."""
-    replayed: bool = False
-    name: SourceName | None = None
-
-    def is_over(self, *, is_restored: bool, now: float) -> bool:
-        """True when it need not be processed again."""
-        return self.quiet_at is not None and not (is_restored and now - self.quiet_at < QUIET_S)
+    again: Done[Input] | None = None
+    """It is processed again: this is what it was the first time."""
 
 
 @dataclass(slots=True)
@@ -132,10 +111,11 @@ class Dispatcher:
         """Numbers of a source below this one went to an earlier owner (zenoh's thread alone touches it)."""
         self._epoch = 0
         self._begun = 0
+        self._is_begin_due = False
+        self._turn = 0
+        self._turn_in_hand = 0
         self._has_withheld = False
-        self._backlog_bytes = 0
-        self._withheld: dict[tuple[int, str], tuple[Input, deque[_Done]]] = {}
-        self._again: deque[tuple[Input, _Done]] = deque()
+        self._backlog = Backlog[Input]()
         self._is_standby: Callable[[], bool] = _never
         self._is_closed = False
         self._is_held = False
@@ -203,9 +183,17 @@ class Dispatcher:
         """In the dispatch thread: the epoch in which the source of the input in hand was first heard."""
         return self._in_hand if threading.current_thread() is self._thread else None
 
-    def is_ahead_of(self, epoch: int) -> bool:
-        """In the dispatch thread: the role of ``epoch`` has come, and `begin` not yet."""
-        return threading.current_thread() is self._thread and self._epoch != epoch
+    def must_wait(self, epoch: int) -> bool:
+        """In the dispatch thread: what is made of the input in hand must not go out yet, though the role allows it.
+
+        The role of ``epoch`` has come and `begin` not yet; or an older input is still to be answered, or another output
+        of this one was withheld, and it is processed again in its turn.
+        """
+        if threading.current_thread() is not self._thread:
+            return False
+        is_early = self._is_begin_due or self._epoch != epoch
+        is_behind = self._in_hand is not None and (self._has_withheld or self._backlog.is_before(self._turn_in_hand))
+        return is_early or is_behind
 
     def stamp(self) -> zenoh.Timestamp | None:
         """The timestamp for an output: of the input in hand (in the dispatch thread), else of the newest processed."""
@@ -215,26 +203,24 @@ class Dispatcher:
         """Keep every sample that is processed while ``is_standby``: a predecessor's state may take over from ours."""
         self._is_standby = is_standby
 
+    def expect_begin(self, *, is_due: bool) -> None:
+        """A role comes that `begin` follows, and until then outputs are withheld; or one that takes that back."""
+        self._is_begin_due = is_due
+
     def begin(self, epoch: int) -> None:
         """This worker is the owner from now on: sources heard first from here on belong to ``epoch``."""
         with self._wake:
             self._epoch = epoch
+            self._is_begin_due = False
             self._begun += 1
-            for source, samples in self._withheld.values():
-                self._again.extend((source, done) for done in samples)
-            self._withheld.clear()
-            self._backlog_bytes = 0
+            self._backlog.begin()
             if not self._is_held and self._first is None:
                 self._settle_state(is_restored=False)
             self._wake.notify()
 
     def _settle_state(self, *, is_restored: bool) -> None:
         """Our state stays, or a predecessor's has taken its place."""
-        now = monotonic_s()
-        again = self._again
-        self._again = deque(
-            (source, done) for source, done in again if not done.is_over(is_restored=is_restored, now=now)
-        )
+        self._backlog.settle(is_restored=is_restored, now=monotonic_s())
 
     def forget(self, epoch: int) -> None:
         """The epoch is over for this worker: what has not ended will not."""
@@ -289,18 +275,18 @@ class Dispatcher:
                     self._settle_state(is_restored=is_restored)
             if claimed is not None:
                 self._process(claimed)
-            if (self._markers or self._asked) and not self._again:  # what was withheld is answered before any end
+            if (self._markers or self._asked) and not self._backlog.is_due:  # that is answered before any end
                 self._settle()
 
     def _has_work(self) -> bool:
-        is_asked = bool(self._asked) and not self._again
-        return self._first is not None or is_asked or bool(not self._is_held and (self._queue or self._again))
+        is_due = self._backlog.is_due
+        is_asked = bool(self._asked) and not is_due
+        return self._first is not None or is_asked or (not self._is_held and (bool(self._queue) or is_due))
 
     def _claim(self) -> _Waiting | None:
         """Take the next sample out of its key's line (under the lock): from here on nothing sheds it."""
-        if self._again:
-            source, done = self._again.popleft()
-            return _Waiting(source, done.sample, replayed=done.replayed)
+        if (done := self._backlog.take()) is not None:
+            return _Waiting(done.source, done.sample, replayed=done.replayed, again=done)
         waiting = self._queue.popleft() if self._queue else None
         if waiting is None or waiting.sample is None:
             return None
@@ -312,33 +298,28 @@ class Dispatcher:
         if sample is None:
             return
         self._has_withheld = False
-        begun, was_standby = self._begun, self._is_standby()
-        self._in_hand = self._hear(waiting.name, sample) if waiting.name is not None else self._epoch
+        begun, was_standby, again = self._begun, self._is_standby(), waiting.again
+        if again is None:
+            self._turn = self._turn_in_hand = self._turn + 1
+            epoch = self._hear(waiting.name, sample) if waiting.name is not None else self._epoch
+        else:
+            self._turn_in_hand, epoch = again.turn, again.epoch
+        self._in_hand = epoch
         self._dispatch(source, sample, replayed=waiting.replayed)
         self._in_hand = None
         if waiting.name is not None:
             self._note(waiting.name, waiting.number, sample)
         if not self._has_withheld and not was_standby:
             return
-        done = _Done(sample, None if self._has_withheld else monotonic_s(), waiting.replayed, waiting.name)
+        quiet_at = None if self._has_withheld else monotonic_s()
+        name = waiting.name if again is None else again.name
+        done = Done(source, sample, self._turn_in_hand, epoch, quiet_at, waiting.replayed, name)
         with self._wake:
             if self._begun != begun:  # it became the owner meanwhile
-                self._again.append((source, done))
+                self._backlog.put_back(done)
                 return
-            self._keep(source, done)
-
-    def _keep(self, source: Input, done: _Done) -> None:
-        """For the day this worker becomes the owner (under the lock)."""
-        name = (id(source), str(done.sample.key_expr))
-        line = self._withheld.setdefault(name, (source, deque()))[1]
-        line.append(done)
-        self._backlog_bytes += len(done.sample.payload)
-        limit = source.keep_last or (MAX_BACKLOG if done.quiet_at is None else MAX_WITHHELD)
-        while len(line) > limit or (self._backlog_bytes > MAX_BACKLOG_BYTES and len(line) > 1):
-            oldest = line.popleft()
-            self._backlog_bytes -= len(oldest.sample.payload)
-            if source.keep_last is None and oldest.quiet_at is None and oldest.name is not None:
-                self._acks.shed(oldest.name)
+            for lost in self._backlog.keep(done):
+                self._acks.shed(lost)
 
     def _dispatch(self, source: Input, sample: zenoh.Sample, *, replayed: bool) -> None:
         key = str(sample.key_expr)

@@ -17,7 +17,7 @@ import pytest
 import zenoh
 
 from support.waiting import free_endpoint, until
-from zsched import wire, worker_inputs
+from zsched import wire, worker_backlog
 from zsched.clock import monotonic_s
 from zsched.core.plan import Role, WorkerRole
 from zsched.core.relay_protocol import EndMarker, StreamAck, StreamAcks
@@ -25,7 +25,7 @@ from zsched.errors import ConfigError
 from zsched.keyspace import END_CHUNK, Keyspace
 from zsched.relay_pipe import decode_end, encode_end
 from zsched.worker import Output, Received, Worker
-from zsched.worker_inputs import MAX_WITHHELD
+from zsched.worker_backlog import MAX_WITHHELD
 from zsched.zenoh_config import data_config, worker_config
 
 KEYS = Keyspace("test")
@@ -346,6 +346,81 @@ def test_what_was_withheld_goes_out_before_what_comes_with_the_role(relay: Relay
     assert [payload for _, payload in relay.outputs] == [b"a", b"b", b"c", b"d"]
 
 
+class Slow(Echo):
+    """One that stands still in its callback, before the output, as long as ``gate`` is shut."""
+
+    def __init__(self, worker: Worker) -> None:
+        self.gate = threading.Event()
+        self.gate.set()
+        super().__init__(worker)
+
+    def _take(self, received: Received) -> None:
+        self.taken.append(received)
+        self.gate.wait(10)
+        self.output.put(received.payload)
+
+
+def test_the_sample_in_hand_when_the_role_comes_does_not_overtake_what_was_withheld(
+    relay: Relay, tmp_path: Path
+) -> None:
+    """A worker that was frozen at the move: its inputs come before its role, and one of them is in work then."""
+    with Worker.from_env(environment(relay, tmp_path), handles_signals=False) as worker:
+        slow = Slow(worker)
+        until(lambda: KEYS.worker("edge1", "t", 3) in relay.tokens, "the ready token")
+        for name in (b"a", b"b"):
+            relay.put(name)
+        until(lambda: slow.output.withheld == 2, "the backlog")
+        slow.gate.clear()
+        relay.put(b"c")
+        until(lambda: len(slow.taken) == 3, "the next sample is in hand")
+        relay.tell(WorkerRole.ACTIVE, epoch=4)
+        until(lambda: f"{ROLE_KEY}/4" in relay.tokens, "the worker has begun")
+        relay.put(b"d")
+        slow.gate.set()
+        until(lambda: len(relay.outputs) >= 4, "all outputs")
+        assert [payload for _, payload in relay.outputs] == [b"a", b"b", b"c", b"d"]
+
+
+def test_what_was_withheld_for_want_of_a_lease_goes_out_before_what_comes_with_it(relay: Relay, echo: Echo) -> None:
+    gate = threading.Event()
+
+    def tell(lease_until_s: float) -> None:
+        relay.role = Role(task="t", role=WorkerRole.ACTIVE, epoch=3, lease_until_s=lease_until_s)
+        relay.session.put(ROLE_KEY, wire.encode(relay.role))
+        until(lambda: echo.worker.role == relay.role, "the role")
+
+    tell(0.0)
+    until(lambda: f"{ROLE_KEY}/3" in relay.tokens, "the worker has begun")
+    relay.put(b"a")
+    until(lambda: echo.output.withheld == 1, "the withheld output")
+    echo.worker._errands.put(partial(_wait, gate))
+    tell(monotonic_s() + 60.0)
+    relay.put(b"b")
+    until(lambda: len(echo.taken) == 2, "the next sample")
+    gate.set()
+    until(lambda: len(relay.outputs) >= 2, "both outputs")
+    assert [payload for _, payload in relay.outputs] == [b"a", b"b"]
+
+
+def test_what_an_owner_withheld_between_two_epochs_is_answered_in_the_one_it_came_in(relay: Relay, echo: Echo) -> None:
+    """One epoch follows another on the same owner: the robots let the older one's answers pass first."""
+    gate = threading.Event()
+    relay.tell(WorkerRole.ACTIVE, epoch=4)
+    until(lambda: f"{ROLE_KEY}/4" in relay.tokens, "the worker has begun")
+    relay.put(b"a")
+    until(lambda: len(relay.outputs) == 1, "the first output")
+    echo.worker._errands.put(partial(_wait, gate))
+    relay.tell(WorkerRole.ACTIVE, epoch=5)
+    until(lambda: echo.worker.role.epoch == 5, "the next role")
+    relay.put(b"b")
+    until(lambda: echo.output.withheld == 1, "the withheld output")
+    gate.set()
+    until(lambda: f"{ROLE_KEY}/5" in relay.tokens, "the worker has begun with it")
+    relay.put(b"c")
+    until(lambda: len(relay.outputs) >= 3, "all outputs")
+    assert relay.outputs == [("edge1/t/4/robot1/out", name) for name in (b"a", b"b", b"c")]
+
+
 def test_a_long_backlog_of_a_worker_that_was_told_late_is_answered_whole(relay: Relay, echo: Echo) -> None:
     """More than the samples that a predecessor's state would want again."""
     count = 2 * MAX_WITHHELD
@@ -411,7 +486,7 @@ def test_the_end_waits_for_a_backlog_that_is_processed_once_more(relay: Relay, e
 def test_what_a_backlog_has_no_room_for_is_said_to_be_lost(
     relay: Relay, echo: Echo, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(worker_inputs, "MAX_BACKLOG", 10)
+    monkeypatch.setattr(worker_backlog, "MAX_BACKLOG", 10)
     told: list[StreamAck] = []
     key = KEYS.ack("edge1", "t", "3", str(relay.session.zid()))
     heard = relay.session.declare_subscriber(

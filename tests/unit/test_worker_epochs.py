@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import pytest
+
 from zsched.core.plan import Role, WorkerRole
-from zsched.worker_epochs import Epochs
+from zsched.worker_epochs import Epochs, lets_out
 
 
 def role(kind: WorkerRole, epoch: int) -> Role:
@@ -67,3 +71,27 @@ def test_asked_to_leave_and_staying_after_all() -> None:
     epochs.close(1)
     epochs.resume(1)
     assert epochs.stamp(FIRST, 1) == 1
+
+
+DRAINING = role(WorkerRole.DRAINING, 1)
+LEASED = replace(FIRST, lease_until_s=10.0)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "expected"),
+    [
+        (IDLE, FIRST, True),
+        (FIRST, SECOND, True),
+        (FIRST, FIRST, False),
+        (FIRST, IDLE, False),
+        (FIRST, DRAINING, False),
+        (IDLE, DRAINING, True),
+        (DRAINING, FIRST, True),
+        (replace(LEASED, lease_until_s=4.0), LEASED, True),
+        (replace(LEASED, lease_until_s=6.0), LEASED, False),
+    ],
+)
+def test_what_was_withheld_is_answered_once_a_role_allows_what_the_one_before_did_not(
+    before: Role, after: Role, expected: bool
+) -> None:
+    assert lets_out(before, after, now=5.0) is expected

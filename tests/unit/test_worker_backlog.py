@@ -1,0 +1,85 @@
+"""What a worker had to withhold: given back in the order in which it came, whatever happens meanwhile."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import cast
+
+import zenoh
+
+from zsched.worker_backlog import QUIET_S, Backlog, Done
+from zsched.worker_inputs import Input
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What the backlog reads of a sample (zenoh lets nobody make one)."""
+
+    key_expr: str = "edge1/t/robot1/in"
+    payload: bytes = b"x"
+
+
+SOURCE = Input(on_sample=lambda _: None, keep_last=None)
+
+
+def done(
+    turn: int, key: str = "edge1/t/robot1/in", quiet_at: float | None = None, source: Input = SOURCE
+) -> Done[Input]:
+    return Done(source, cast("zenoh.Sample", Sample(key)), turn, epoch=0, quiet_at=quiet_at, name=(key, "zid", 1))
+
+
+def turns(backlog: Backlog[Input]) -> list[int]:
+    taken = []
+    while (one := backlog.take()) is not None:
+        taken.append(one.turn)
+    return taken
+
+
+def test_nothing_is_processed_again_before_the_worker_is_the_owner() -> None:
+    backlog = Backlog[Input]()
+    assert backlog.keep(done(1)) == []
+    assert (backlog.take(), backlog.is_due, backlog.is_before(2)) == (None, False, False)
+    backlog.begin()
+    assert (backlog.is_due, backlog.is_before(2), backlog.is_before(1)) == (True, True, False)
+    assert turns(backlog) == [1]
+
+
+def test_keys_are_given_back_in_the_order_in_which_they_came() -> None:
+    backlog = Backlog[Input]()
+    for turn, key in ((1, "a"), (2, "b"), (3, "a"), (4, "b")):
+        backlog.keep(done(turn, key))
+    backlog.begin()
+    assert turns(backlog) == [1, 2, 3, 4]
+
+
+def test_a_role_that_goes_and_comes_back_in_the_middle_changes_no_order() -> None:
+    backlog = Backlog[Input]()
+    for turn in (1, 2, 3):
+        backlog.keep(done(turn))
+    backlog.begin()
+    first, second = backlog.take(), backlog.take()
+    assert first is not None
+    assert second is not None
+    backlog.keep(first)  # the role went while it was processed again
+    backlog.begin()
+    backlog.put_back(second)  # the role came back while the next one was in hand
+    backlog.put_back(done(4))
+    assert turns(backlog) == [1, 2, 3, 4]
+
+
+def test_what_was_answered_is_processed_again_only_for_a_state_that_took_the_place_of_ours() -> None:
+    for is_restored, expected in ((True, [2, 3]), (False, [3])):
+        backlog = Backlog[Input]()
+        backlog.keep(done(1, quiet_at=100.0 - QUIET_S))
+        backlog.keep(done(2, quiet_at=99.0))
+        backlog.keep(done(3))
+        backlog.begin()
+        backlog.settle(is_restored=is_restored, now=100.0)
+        assert turns(backlog) == expected
+
+
+def test_of_an_input_that_keeps_the_newest_only_those_wait_and_nothing_is_lost() -> None:
+    backlog, newest = Backlog[Input](), Input(on_sample=lambda _: None, keep_last=2)
+    assert [backlog.keep(done(turn, source=newest)) for turn in range(4)] == [[], [], [], []]
+    backlog.begin()
+    assert turns(backlog) == [2, 3]
