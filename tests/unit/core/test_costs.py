@@ -115,6 +115,33 @@ def test_a_task_that_nobody_asks_anything_costs_nothing() -> None:
     assert relay.cost.moves == 0
 
 
+def test_half_of_the_usual_inputs_is_enough_to_miss_outputs() -> None:
+    relay = Relay()
+    relay.run(20)
+    relay.move()
+    relay.hz = 5.0
+    relay.run(8)
+    assert relay.cost.moves == 1
+
+
+@pytest.mark.parametrize("second", [(5, 20), (2000, 5)])
+def test_a_relay_that_counts_from_the_beginning_again_has_no_usual_rate_yet(second: tuple[int, int]) -> None:
+    cost = MoveCost("merge")
+
+    def absorb(taken: int, given: int, now: float) -> None:
+        names = ("merge/in/0", "merge/out/0")
+        cost.absorb(tuple(map(counted, names, (taken, given))), now)
+
+    def counted(name: str, messages: int) -> StreamCount:
+        return StreamCount(stream=name, messages=messages)
+
+    absorb(1000, 10, 1.0)
+    absorb(*second, 2.0)
+    cost.on_moved(is_planned=True, now=2.5)
+    absorb(second[0] + 100, second[1] + 100, 10.0)
+    assert cost.moves == 0
+
+
 def test_a_move_before_anything_is_usual_is_not_measured() -> None:
     relay = Relay()
     relay.run(1)

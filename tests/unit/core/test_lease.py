@@ -240,6 +240,23 @@ def test_a_worker_s_word_counts_only_when_it_was_asked_to_stop_and_ends_what_it_
     assert held.on_sent(7, 12.0).released == (), "what another epoch gave back is over"
 
 
+def test_a_word_that_has_come_is_not_waited_for_any_more() -> None:
+    """Else the next beat would give back at once what nobody has used, and the next word would not be believed."""
+    held = owner()
+    held.on_beat(asked(), {}, 10.2)
+    held.on_told_to_stop("guard")
+    assert held.on_stopped("guard", 3, 5)
+    held.on_sent(6, 10.3)
+    held.on_beat(asked(), {}, 10.3)
+    assert held.on_run_out("guard", 6, 10.3), "now and then it is worth a beat"
+    held.on_sent(7, 10.31)
+    held.on_beat(asked(), {}, 10.31)
+    assert not held.on_run_out("guard", 7, 10.31)
+    held.on_sent(8, 10.32)
+    held.on_beat(asked(), {}, 10.32)
+    assert held.on_stopped("guard", 3, 8)
+
+
 def test_a_node_that_owns_nothing_has_no_lease_and_is_asked_for_none() -> None:
     held = Leases(fleet=FLEET, me="r1", incarnation=1, standing={}, now=0.0)
     assert not held.on_beat(asked(), {}, 10.2)

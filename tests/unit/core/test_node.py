@@ -555,6 +555,16 @@ def test_a_retry_of_what_there_is_not_is_refused(command: RetryTask) -> None:
     assert of(batch, do.AnswerCommand)[0].result.outcome is CommandOutcome.INVALID
 
 
+@pytest.mark.parametrize("is_draining", [False, True])
+def test_an_owner_that_drains_hurries_the_next_round(*, is_draining: bool) -> None:
+    node = started(learnt=value(1, "edge1"))
+    node.handle(ev.DeadlineReached(), node.rounds.next_deadline())  # the gather that ran is over
+    now = node.rounds.next_deadline() - 0.1
+    new = replace(profile("edge1", draining=is_draining).profile, sequence=5)
+    asked = of(node.handle(ev.ProfileReceived(profile=new), now), do.AskUtilities)
+    assert bool(asked) is is_draining
+
+
 def test_a_profile_that_comes_late_hurries_no_decision_by_what_it_says() -> None:
     node = started(learnt=value(1, "edge1"))
     new = replace(profile("edge1").profile, sequence=5)

@@ -93,6 +93,13 @@ def test_without_inputs_nobody_can_tell() -> None:
     assert robot.run(DEADLINE_S + 1, inputs=0) == ()
 
 
+def test_an_answer_of_long_ago_says_nothing() -> None:
+    robot = Robot()
+    assert robot.run(3, outputs=1) == (SERVED,)
+    assert robot.run(DEADLINE_S, inputs=0) == (SERVED,)
+    assert robot.run(1, inputs=0) == ()
+
+
 def test_a_handover_a_new_epoch_and_a_new_relay_start_anew() -> None:
     robot = Robot()
     robot.run(10)

@@ -73,6 +73,13 @@ def test_a_worker_with_plain_keys_is_stood_in_for() -> None:
     assert mirrored([served], NOBODY).local == frozenset({one(SS, "robot1/now", "::,10:,:,:,,")})
 
 
+def test_keys_that_are_none_of_ros_or_that_nobody_can_name_are_not_announced() -> None:
+    plain = route(Direction.OUTPUT, "edge1/m/7/map", "robot1/merged")
+    wild = route(Direction.OUTPUT, "edge1/m/7/map", f"0/robot1/merged/{TYPE}/*")
+    for silent in (plain, wild):
+        assert mirrored([silent], NOBODY) == NOBODY
+
+
 def test_one_session_for_both_sides_shows_both_there() -> None:
     everything = frozenset({one(MP, "robot1/map"), one(MS, "edge1/m/robot1/map")})
     shown = mirrored([INPUT], Sides(local=everything, fleet=everything))

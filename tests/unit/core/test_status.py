@@ -215,6 +215,7 @@ def test_a_slot_whose_worker_is_not_seen_is_a_problem_until_it_is() -> None:
     learn(node, 1, "edge1")
     assert build_snapshot(node, 101.0).tasks[0].problems == ()
     waits = "our relay does not see its worker's token, or its subscriptions"
+    assert len(build_snapshot(node, 102.0).tasks[0].problems) == 1
     assert build_snapshot(node, 103.0).tasks[0].problems == (
         f"this robot's streams have waited for edge1 for 3 s: {waits}",
     )
