@@ -71,6 +71,15 @@ def test_no_time_constant_means_no_smoothing_and_no_elapsed_time_no_weight() -> 
     assert smooth.update(5.0, now=0.5) == 1.0, "a clock that stands is no reason for a jump"
 
 
+def test_a_worker_without_a_figure_uses_nothing_for_that_sample() -> None:
+    profiler = make_profiler()
+    profiler.absorb(device(2.0, 1000.0, load(1.0, 200.0)), (), 100.0)
+    profiler.absorb(device(2.0, 1000.0, load(None, None)), (), 100.0 + TIMING.smoothing_s)
+    (worker,) = taken(profiler, 101.0).workers
+    assert worker.cpu_cores == pytest.approx(math.exp(-1.0))
+    assert worker.memory_mb == pytest.approx(200.0 * math.exp(-1.0))
+
+
 # --- signals -------------------------------------------------------------------------------------------------------
 
 

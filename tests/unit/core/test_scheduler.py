@@ -18,7 +18,7 @@ from zsched.core.model import (
     WorkerLoad,
     WorkerState,
 )
-from zsched.core.scheduler import INITIAL_SETTLE_S, Judge, Judgement, Outcome, escape_reason
+from zsched.core.scheduler import FORGIVEN_IN_S, INITIAL_SETTLE_S, Judge, Judgement, Outcome, escape_reason
 from zsched.core.scoring import Standing, compare
 
 TUNING = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0), bonus=0.10, time_to_trigger_s=2.0, cool_down_s=10.0)
@@ -379,6 +379,15 @@ def test_patience_is_given_back_while_nobody_leads() -> None:
         aggregates = lead if tick % 7 < 3 else EQUAL
         assert judged(judge, aggregates, 100.0 + tick / 2).outcome is not Outcome.PROPOSE
     assert judge.spent < 0.2
+
+
+def test_half_of_the_time_to_forgive_gives_half_of_the_patience_back() -> None:
+    judge = Judge(spec=PATIENT)
+    for tick in range(4):
+        judged(judge, {"edge1": 0.5, "edge2": 0.9}, 100.0 + tick / 2)
+    assert judge.spent == pytest.approx(0.2)
+    judged(judge, EQUAL, 101.5 + FORGIVEN_IN_S / 2)
+    assert judge.spent == pytest.approx(0.1)
 
 
 def test_a_long_lead_within_the_cool_down_is_forgiven_as_soon_as_a_short_one() -> None:
