@@ -251,3 +251,16 @@ def test_lost_accept_is_not_sent_again() -> None:
 def test_what_a_peer_learnt_ends_a_round_whose_outcome_was_unknown(learnt: Allocation, outcome: RoundOutcome) -> None:
     proposer = sent_and_unanswered([make("r2"), make("r3")])
     assert proposer.learn(learnt, 1.0).finished == (FIRST, outcome)
+
+
+def test_an_elector_that_nobody_answers_asks_more_and_more_seldom_what_became_of_an_acceptance() -> None:
+    register = make("r1")
+    register.on_accept(accept(1, allocation(1)), 0.0)
+    now = 0.0
+    asked_at: list[float] = []
+    while now < 80.0:
+        if register.tick(now).prepare is not None:
+            asked_at.append(now)
+        now = max(register.next_deadline(), now + 0.001)
+    early, late = (sum(start <= at < start + 10.0 for at in asked_at) for start in (0.0, 70.0))
+    assert early > 2 * late > 0, (early, late)
