@@ -346,6 +346,17 @@ def test_again_repeats_the_workers_wish_and_role(
     assert roles(out) == [(one.role.role, one.role.epoch)]
 
 
+def test_an_owner_that_went_stays_gone_whoever_goes_next() -> None:
+    """Its worker's state is not asked for by the next owner."""
+    for gone in ((), ("edge1",), ("edge1", "edge3"), ("edge3",)):
+        one = edge("edge2")
+        one.execute(allocation("edge1", 1), 0.0)
+        for node in gone:
+            one.on_gone(node)
+        (told,) = [out.role for out in one.execute(allocation("edge2", 2), 1.0) if isinstance(out, SetRole)]
+        assert told.predecessor == (None if "edge1" in gone else "edge1")
+
+
 # --- who may be working without a lease ------------------------------------------------------------------------------
 
 

@@ -1,6 +1,7 @@
 """zenoh's own KeyExpr is the reference for every answer."""
 
 import doctest
+import itertools
 
 import pytest
 import zenoh
@@ -69,6 +70,26 @@ def test_relations_of_related_expressions_are_zenohs(left: tuple[str, str], righ
             one, two = zenoh.KeyExpr(first), zenoh.KeyExpr(second)
             assert keyexpr.intersects(first, second) == one.intersects(two), (first, second)
             assert keyexpr.includes(first, second) == one.includes(two), (first, second)
+
+
+FEW = [
+    "/".join(parts)
+    for parts in (
+        *itertools.product(("a", "ab", "*", "**", "$*b", "a$*", "@a")),
+        *itertools.product(("a", "*", "**", "a$*b", "@a"), ("b", "*", "**", "$*b")),
+        *itertools.product(("a", "**"), ("*", "b$*b"), ("a", "**", "@b")),
+        *itertools.product(("$*a$*", "a$*a", "$*a$*b", "aab", "ba")),
+    )
+]
+
+
+def test_relations_of_all_pairs_of_few_expressions_are_zenohs() -> None:
+    """Each shape against each other one: quick, and whole where random pairs are neither."""
+    known = {text: key for text in FEW if (key := reference(text)) is not None}
+    assert len(known) > 30
+    for (first, one), (second, two) in itertools.product(known.items(), repeat=2):
+        assert keyexpr.intersects(first, second) == one.intersects(two), (first, second)
+        assert keyexpr.includes(first, second) == one.includes(two), (first, second)
 
 
 def test_matches_hides_verbatim_chunks_from_wildcards() -> None:

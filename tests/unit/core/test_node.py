@@ -337,6 +337,23 @@ def test_draining_is_told_in_the_same_batch() -> None:
     assert published.is_news
 
 
+def test_a_robot_that_drains_what_it_owns_asks_at_once_who_shall_have_it() -> None:
+    (task,) = FLEET.tasks
+    fleet = replace(FLEET, tasks=(replace(task, candidates=(*EDGES, "robot1")),))
+    for owner, asks in (("robot1", True), ("edge1", False)):
+        node = Node(
+            fleet=fleet, me="robot1", durable=durable("robot1"), incarnation=7, electorate="e", rng=Random(1), now=100.0
+        )
+        learnt = Learnt(node="robot2", values=(value(1, owner),))
+        node.handle(ev.LearntReceived(learnt=learnt, is_answer=True), 100.0)
+        for name in ("robot2", "robot3"):
+            node.handle(ev.BeatReceived(beat=beat(name)), 100.0)
+        node.handle(ev.DeadlineReached(), node.rounds.next_deadline())
+        node.handle(ev.DeadlineReached(), node.rounds.next_deadline())  # the gather that ran is over
+        now = node.rounds.next_deadline() - 0.1
+        assert bool(of(node.handle(ev.StopRequested(), now), do.AskUtilities)) is asks
+
+
 def test_stopped_worker_is_told_in_the_same_batch_and_once() -> None:
     node = started("edge1")
     batch = node.handle(ev.WorkerChanged(task="merge", state=WorkerState.FAILED, reason="exit code 1"), 100.1)
