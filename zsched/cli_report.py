@@ -48,7 +48,10 @@ def _lack_of_worker(status: Json, task: Json) -> str | None:
     state, why = next(((one["state"], one.get("reason")) for one in workers if one["task"] == task["name"]), ("", ""))
     if state not in ("failed", "stopped"):
         return None
-    return f"the worker on {owner} {'failed' if state == 'failed' else 'is stopped'}{f': {why}' if why else ''}"
+    because = f": {why}" if why else ""
+    if state == "stopped":
+        return f"the worker on {owner} is stopped{because}"
+    return f"the worker on {owner} failed{because}; mend it, then `zsched retry {task['name']} {owner}`"
 
 
 def render_status(status: Json, width: int, color: bool) -> str:
@@ -82,6 +85,9 @@ def printable(value: Any) -> Any:
 def _header(page: Page, status: Json) -> None:
     quorum, troubles = status["quorum"], _problems(status)
     health, style = (f"{len(troubles)} problem{'s'[: len(troubles) != 1]}", "yellow") if troubles else ("ok", "green")
+    away = sum(node["state"] in ("gone", "unknown") for node in status["nodes"])
+    if away and not troubles:
+        health, style = f"ok, {away} node{'s'[: away != 1]} away", "yellow"
     if degradations(status):
         health, style = "DEGRADED", "alarm"
     role = "" if quorum["this_node"] == "no_elector" else ", " + quorum["this_node"].replace("_", " ")
@@ -327,7 +333,8 @@ def _route(page: Page, status: Json, task: Json) -> None:
             text += f" (none for {span(stream['dropped_s'])})" if is_over else ""
         parts.append((text, "yellow" if drops and not is_over else ""))
     unheard = [one for one in task["streams"] if one["last_seen_s"] is None and f"{prefix}in/" in one["stream"]]
-    if unheard and status.get("joins_at"):  # a later field of the schema's major version
+    first = next((one["name"] for one in status["tasks"] if one["streams"]), None)
+    if (unheard or task["name"] == first) and status.get("joins_at"):  # a later field of the schema's major version
         parts.append((f"applications here join at {', '.join(status['joins_at'])} (mode client)", "dim"))
     page.block("ROUTE", *(parts or [("no streams here", "dim")]))
 

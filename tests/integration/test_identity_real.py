@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -77,7 +78,7 @@ def test_a_new_generation_is_made_node_by_node_where_too_many_states_are_lost(be
         done = run_init(bed, node, bed.folder / node, "--generation", "1")
         assert done.returncode == 0, done.stderr
         bed.start(node)
-        bed.wait(lambda node=node: bed.status(node)["up_s"] > 0.0, 20, f"{node} to answer")
+        bed.wait(partial(bed.status, node), 20, f"{node} to answer")
     bed.wait_settled()
     assert bed.task("robot1")["epoch"] > 2**32
     twice = run_init(bed, "robot2", bed.folder / "robot2-again", "--generation", "1")

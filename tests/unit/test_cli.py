@@ -301,7 +301,7 @@ def test_retry_asks_every_node_that_is_there_and_names_the_others(daemon: Daemon
     names = [node["name"] for node in daemon.status["nodes"]]
     result = run("retry", "echo", "edge1")
     assert result.exit_code == 5
-    asked = [request for request in daemon.asked if request["verb"] == "retry"]
+    asked = sorted((request for request in daemon.asked if request["verb"] == "retry"), key=lambda one: one["node"])
     assert asked == [{"verb": "retry", "task": "echo", "whose": "edge1", "node": name} for name in names[:-1]]
     assert result.stdout.splitlines()[-1] == f"echo on {names[-1]}: not asked, it is gone"
     daemon.status["nodes"][-1]["state"] = "alive"
@@ -317,6 +317,14 @@ def test_retry_of_what_there_is_not_is_a_usage_error(daemon: Daemon, words: tupl
 
 
 # --- weights ---------------------------------------------------------------------------------------------------------
+
+
+def test_retry_waits_for_silent_nodes_all_at_once(daemon: Daemon) -> None:
+    daemon.delay_s = 1.0
+    began = time.monotonic()
+    assert run("retry", "echo").exit_code == 0
+    assert len([request for request in daemon.asked if request["verb"] == "retry"]) == 5
+    assert time.monotonic() - began < 5.0, "one second for the status, one for the five nodes"
 
 
 def test_weights_without_values_shows_those_in_force(daemon: Daemon) -> None:

@@ -233,6 +233,28 @@ def test_nothing_known_yet_is_shown_as_such() -> None:
     assert "None" not in text
 
 
+@pytest.mark.parametrize(
+    ("states", "said"), [(("gone",), "ok, 1 node away"), (("gone", "unknown"), "ok, 2 nodes away")]
+)
+def test_the_first_line_tells_of_nodes_that_are_away(states: tuple[str, ...], said: str) -> None:
+    """A robot may be switched off: that is no problem, and not just "ok"."""
+    status = recorded("healthy")
+    for node, state in zip(status["nodes"][1:], states, strict=False):
+        node["state"] = state
+    assert render_status(status, 100, color=False).splitlines()[0].endswith(f" {said}")
+    assert degradations(status) == ()
+    status["problems"] = ["something"]
+    assert render_status(status, 100, color=False).splitlines()[0].endswith(" 1 problem")
+
+
+def test_where_applications_join_stays_once_messages_flow() -> None:
+    status = recorded("healthy")
+    status["joins_at"] = ["tcp/127.0.0.1:7458"]
+    status["tasks"].append({**status["tasks"][0], "name": "slam", "streams": []})
+    assert all(stream["last_seen_s"] is not None for stream in status["tasks"][0]["streams"])
+    assert render_status(status, 100, color=False).count("applications here join at tcp/127.0.0.1:7458") == 1
+
+
 # --- degraded --------------------------------------------------------------------------------------------------------
 
 
@@ -267,7 +289,7 @@ def test_failed_worker_of_the_owner_is_degraded_and_one_elsewhere_is_not() -> No
     status["nodes"][1]["workers"][0]["state"] = "failed"
     assert degradations(status) == ()
     status["nodes"][0]["workers"][0]["state"] = "failed"
-    assert degradations(status) == ("echo: the worker on edge1 failed",)
+    assert degradations(status) == ("echo: the worker on edge1 failed; mend it, then `zsched retry echo edge1`",)
     status["nodes"][0]["workers"][0] |= {"state": "stopped", "reason": "nobody subscribes to a/key"}
     assert degradations(status) == ("echo: the worker on edge1 is stopped: nobody subscribes to a/key",)
 

@@ -104,6 +104,12 @@ def _problems(node: NodeView, quorum: QuorumStatus) -> tuple[str, ...]:
         problems.append(f"electors without their state, {len(quorum.stateless)} of {quorum.electors}: {names}")
     if not quorum.ok:
         problems.append(f"no quorum: {quorum.alive} of {quorum.electors} electors can answer, {quorum.needed} needed")
+    elif quorum.alive == quorum.needed < quorum.electors:
+        missing = ", ".join(name for name in node.fleet.electors if not _can_answer(node, name))
+        problems.append(
+            f"no elector to spare: {quorum.alive} of {quorum.electors} can answer, {quorum.needed} needed; "
+            f"not {missing}. With one more away nothing is decided"
+        )
     if quorum.electors - len(quorum.stateless) < quorum.needed:
         number = node.agreement.newest_generation + 1
         way_out = f"if these are lost, stop every daemon, and `zsched init --generation {number}` on every node"
@@ -113,13 +119,18 @@ def _problems(node: NodeView, quorum: QuorumStatus) -> tuple[str, ...]:
     return tuple(problems)
 
 
+def _has_lost_state(node: NodeView, name: NodeId) -> bool:
+    return not node.agreement.is_elector if name == node.me else name in node.stateless
+
+
+def _can_answer(node: NodeView, name: NodeId) -> bool:
+    return node.membership.state(name) is PeerState.ALIVE and not _has_lost_state(node, name)
+
+
 def _quorum(node: NodeView) -> QuorumStatus:
     electors = node.fleet.electors
-    stateless = {name for name in node.stateless if name in electors}
-    if node.me in electors and not node.agreement.is_elector:
-        stateless.add(node.me)
-    states = {name: node.membership.state(name) for name in electors}
-    alive = [name for name, state in states.items() if state is PeerState.ALIVE and name not in stateless]
+    stateless = [name for name in electors if _has_lost_state(node, name)]
+    alive = [name for name in electors if _can_answer(node, name)]
     needed = majority(len(electors))
     role = "elector" if node.agreement.is_elector else ("lost_state" if node.me in electors else "no_elector")
     return QuorumStatus(
@@ -212,7 +223,7 @@ def _task_problems(node: NodeView, task: TaskSpec, value: Allocation, now: float
         is_owner_ready &= spec.name != owner or load.state is WorkerState.READY
         why = f": {load.reason}" if load.reason else ""
         if load.state is WorkerState.FAILED:
-            yield f"the worker on {spec.name} failed{why}"
+            yield f"the worker on {spec.name} failed{why}; mend it, then `zsched retry {task.name} {spec.name}`"
         elif spec.name == owner and load.state is not WorkerState.READY:
             yield f"the worker on {spec.name} is {load.state}{why}"
         elif load.state is WorkerState.READY and load.reason:

@@ -154,6 +154,15 @@ def test_problems_say_what_is_missing_in_words() -> None:
     assert build_snapshot(make(), 100.0).problems == ()
 
 
+def test_a_quorum_without_a_margin_is_a_problem_that_names_who_is_missing() -> None:
+    (problem,) = build_snapshot(make(alive=("robot2",)), 100.0).problems
+    assert problem == (
+        "no elector to spare: 2 of 3 can answer, 2 needed; not robot3. With one more away nothing is decided"
+    )
+    (_, problem) = build_snapshot(make(has_state=False), 100.0).problems[:2]
+    assert "not robot1" in problem, "an elector without its state is none"
+
+
 def test_a_worker_that_failed_or_is_missed_is_told_with_its_reason() -> None:
     node = make()
     for name in EDGES:
@@ -176,7 +185,7 @@ def test_a_worker_that_failed_or_is_missed_is_told_with_its_reason() -> None:
         node.handle(ev.ProfileReceived(profile=profile), 100.0)
     assert build_snapshot(node, 100.0).tasks[0].problems == (
         "the worker on edge1 is stopped: nobody subscribes to a/key",
-        "the worker on edge2 failed: exited with status 1: no such map",
+        "the worker on edge2 failed: exited with status 1: no such map; mend it, then `zsched retry merge edge2`",
     )
 
 
