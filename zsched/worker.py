@@ -386,11 +386,11 @@ class Worker:
         if self._dispatcher.must_wait(role.epoch) and not self._is_standalone:  # what was withheld before comes first
             self._dispatcher.note_withheld()
             return None
-        epoch = self._epochs.stamp(role, self._dispatcher.epoch_in_hand())
         has_lease = role.lease_until_s is None or monotonic_s() < role.lease_until_s
-        if not has_lease:
+        epoch = self._epochs.stamp(role, self._dispatcher.epoch_in_hand()) if has_lease else None
+        if epoch is None:  # without a lease, or behind our own end: the next role answers it
             self._dispatcher.note_withheld()
-        return epoch if has_lease else None
+        return epoch
 
     def _send_acks(self, relay: str, frame: StreamAcks) -> None:
         """Tell a relay how far its samples are; what is dropped here is mended by the next one."""

@@ -402,6 +402,25 @@ def test_what_was_withheld_for_want_of_a_lease_goes_out_before_what_comes_with_i
     assert [payload for _, payload in relay.outputs] == [b"a", b"b"]
 
 
+def test_what_comes_behind_the_end_of_an_epoch_is_answered_in_the_next_one(relay: Relay, echo: Echo) -> None:
+    """A worker that is frozen while it is left and chosen again: its inputs come before it hears of either."""
+    relay.tell(WorkerRole.ACTIVE, epoch=4)
+    until(lambda: f"{ROLE_KEY}/4" in relay.tokens, "the worker has begun")
+    relay.put(b"a")
+    until(lambda: len(relay.outputs) == 1, "the first output")
+    relay.tell(WorkerRole.DRAINING, epoch=4)
+    relay.end(4)
+    until(lambda: relay.ends, "the end marker")
+    for name in (b"b", b"c"):
+        relay.put(name)
+    until(lambda: echo.output.withheld == 2, "what belongs to no epoch yet")
+    relay.tell(WorkerRole.ACTIVE, epoch=6)
+    until(lambda: f"{ROLE_KEY}/6" in relay.tokens, "the worker has begun with the next one")
+    relay.put(b"d")
+    until(lambda: len(relay.outputs) >= 4, "all outputs")
+    assert [payload for _, payload in relay.outputs] == [b"a", b"b", b"c", b"d"]
+
+
 def test_what_an_owner_withheld_between_two_epochs_is_answered_in_the_one_it_came_in(relay: Relay, echo: Echo) -> None:
     """One epoch follows another on the same owner: the robots let the older one's answers pass first."""
     gate = threading.Event()
