@@ -8,8 +8,9 @@ loops take the processor all the time: overload may lose, but never silently.
 
 It fails (exit code 1) when a sample is lost that no counter of the robot's relay tells of: neither an input's nor an
 answer's; when the counters of an input do not account for every sample (`zsched.core.books`), looked at every second;
-or when anything was lost, or in flight to a living worker, without overload. A round in which the robot's own relay was
-replaced (the machine gave it no processor for seconds) says nothing, and is counted *void*.
+when anything was lost, or in flight to a living worker, without overload; or when an answer came twice or out of order,
+under overload, too. A round in which the robot's own relay was replaced (the machine gave it no processor for seconds)
+says nothing, and is counted *void*.
 """
 
 from __future__ import annotations

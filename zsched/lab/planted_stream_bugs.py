@@ -9,11 +9,13 @@ from __future__ import annotations
 from zsched.lab.planted_bugs import Bug
 
 ACKS, SERIAL = "zsched.hop_acks", "zsched.core.serial"
+INPUTS = "zsched.worker_inputs"
 GREETINGS, LANES, OUTLET = "zsched.relay.greetings", "zsched.relay.lanes", "zsched.relay.outlet"
 
 _GREETINGS = ("tests/parts/test_relay_greetings.py",)
 _ACKS = ("tests/unit/test_hop_acks.py",)
 _LANES = ("tests/unit/test_relay_lanes.py",)
+_WORKER = "tests/parts/test_worker.py"
 
 
 def _bug(name: str, module: str, old: str, new: str, tests: tuple[str, ...]) -> Bug:
@@ -83,5 +85,33 @@ STREAM_BUGS = (
         "self._crowd = self._make_crowd() if has_crowd else None",
         "self._crowd = None",
         ("tests/integration/test_relay_receivers.py::test_a_frozen_application_delays_no_other",),
+    ),
+    _bug(
+        "a sample in hand overtakes what a worker withheld",
+        INPUTS,
+        "return is_early or is_behind",
+        "return is_early",
+        (f"{_WORKER}::test_the_sample_in_hand_when_the_role_comes_does_not_overtake_what_was_withheld",),
+    ),
+    _bug(
+        "a lease that is back lets newer samples out first",
+        INPUTS,
+        "is_early = self._is_begin_due or self._epoch != epoch",
+        "is_early = self._epoch != epoch",
+        (f"{_WORKER}::test_what_was_withheld_for_want_of_a_lease_goes_out_before_what_comes_with_it",),
+    ),
+    _bug(
+        "a backlog is answered by keys",
+        "zsched.worker_backlog",
+        "deque(sorted((*self._again, *kept), key=_turn_of))",
+        "deque((*self._again, *kept))",
+        ("tests/unit/test_worker_backlog.py",),
+    ),
+    _bug(
+        "what comes behind a worker's own end goes nowhere",
+        "zsched.worker",
+        "if epoch is None:  # without",
+        "if not has_lease:  # without",
+        (f"{_WORKER}::test_what_comes_behind_the_end_of_an_epoch_is_answered_in_the_next_one",),
     ),
 )
