@@ -74,14 +74,14 @@ def test_a_hung_worker_is_restarted_in_place_and_left_when_it_hangs_again(bed: B
     first = bed.worker_pid(owner)
     assert first is not None
     os.kill(first, way)
-    second = bed.wait(lambda: (pid := bed.worker_pid(owner)) != first and pid, 15, "another worker process")
+    second = bed.wait(lambda: (pid := bed.worker_pid(owner)) != first and pid, 30, "another worker process")
     assert isinstance(second, int)
     assert f"no output for {DEADLINE_S:g} s while inputs flow" in bed.log(owner)
     before = bed.heard
     bed.wait(lambda: bed.heard > before + 20, 10, "answers of the new process")
     assert bed.task("robot1")["epoch"] == epoch, "the task stays where it is"
     os.kill(second, way)
-    bed.wait(lambda: bed.owner() not in (None, owner), 15, "another owner")
+    bed.wait(lambda: bed.owner() not in (None, owner), 30, "another owner")
     before = bed.heard
     bed.wait(lambda: bed.heard > before + 20, 10, "answers of the next owner")
 

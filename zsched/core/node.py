@@ -398,6 +398,8 @@ class Node:
         self._beat_at = now  # tell the others at once: they wait for a second observer
         if change.after is PeerState.ALIVE:
             self._probation.on_back(change.node, now)
+            if change.before in (PeerState.SUSPECT, PeerState.GONE):
+                self._hangs.on_back(change.node, now)
         if change.after is PeerState.GONE:
             self._probation.on_gone(change.node, now)
             for executor in self.executors.values():

@@ -6,6 +6,9 @@ Inputs and outputs pass through the robots' relays, never through the owner's, a
 uses our library and for any other zenoh program. So a robot says in its profile whether a task answers it
 (`Progress`), and the owner's daemon puts what the robots say together (`HangJudge`).
 
+A robot that was not heard and is back has waited for a link, not for the worker: its complaints count again once links
+have had the time to heal (`zsched.core.probation`) and the worker the time to answer.
+
 A node that did not run for a while (its machine was suspended, its daemon stopped) begins to count again, on both
 sides: time counts on while it sleeps, and a worker that slept with it owes nothing for that.
 """
@@ -13,14 +16,16 @@ sides: time counts on while it sleeps, and a worker that slept with it owes noth
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 
 from zsched.core.executor import Executor, Phase
 from zsched.core.fleet import Fleet, TaskSpec
 from zsched.core.gateway import Gateway
 from zsched.core.instructions import Instruction, RecordStory, RestartWorker
-from zsched.core.model import Profile, TaskId, TaskProgress, WorkerState
+from zsched.core.model import NodeId, Profile, TaskId, TaskProgress, WorkerState
 from zsched.core.plan import Direction, StreamCount
+from zsched.core.probation import LIMIT_S
 
 COUNT_S = 1.0
 """Relays count so often: what they say is at most so old."""
@@ -131,7 +136,14 @@ class HangJudge:
         if task in self._given_time_at:
             self._given_time_at[task] = now
 
-    def hangs(self, spec: TaskSpec, executor: Executor, profiles: Iterable[Profile], now: float) -> str:
+    def hangs(
+        self,
+        spec: TaskSpec,
+        executor: Executor,
+        profiles: Iterable[Profile],
+        now: float,
+        unproven: AbstractSet[NodeId] = frozenset(),
+    ) -> str:
         """Why this node's worker counts as hung; empty when it does not.
 
         Args:
@@ -139,6 +151,7 @@ class HangJudge:
             executor: carries it out here.
             profiles: the robots' fresh ones.
             now: monotonic seconds.
+            unproven: the robots whose complaints may be about their links; that one is served counts all the same.
         """
         deadline_s = spec.worker.output_deadline_s
         ready_at = self._given_time_at.get(spec.name)
@@ -150,7 +163,7 @@ class HangJudge:
             one.is_served
             for profile in profiles
             for one in profile.progress
-            if (one.task, one.epoch) == (spec.name, executor.epoch)
+            if (one.task, one.epoch) == (spec.name, executor.epoch) and (one.is_served or profile.node not in unproven)
         ]
         if not said or any(said):
             return ""
@@ -166,6 +179,8 @@ class HangWatch:
         self._voters = fleet.voters
         self._progress = Progress(self._specs.values())
         self._judge = HangJudge()
+        self._back_at: dict[NodeId, float] = {}
+        """{robot: when it was heard again after it had not been}."""
 
     def absorb(self, counts: tuple[StreamCount, ...], executors: Mapping[TaskId, Executor], now: float) -> None:
         """Our relay has counted."""
@@ -184,6 +199,15 @@ class HangWatch:
                 self._progress.begin_again(task, now)
                 self._judge.begin_again(task, now)
 
+    def on_back(self, node: NodeId, now: float) -> None:
+        """A peer that was suspect or gone is heard again."""
+        if self._specs and node in self._voters:
+            self._back_at[node] = now
+
+    def _unproven(self, spec: TaskSpec, now: float) -> frozenset[NodeId]:
+        excused_s = LIMIT_S + (spec.worker.output_deadline_s or 0.0) + MARGIN_S
+        return frozenset(node for node, at in self._back_at.items() if now < at + excused_s)
+
     def reports(self, now: float) -> tuple[TaskProgress, ...]:
         """What our profile shall say."""
         return self._progress.reports(now)
@@ -195,7 +219,7 @@ class HangWatch:
         result: list[Instruction] = []
         for spec in [self._specs[task] for task in owned if task in self._specs]:
             profiles = [profile for robot in self._voters if (profile := gateway.fresh(robot, now)) is not None]
-            reason = self._judge.hangs(spec, executors[spec.name], profiles, now)
+            reason = self._judge.hangs(spec, executors[spec.name], profiles, now, self._unproven(spec, now))
             if not reason:
                 continue
             if spec.worker.command:

@@ -25,8 +25,8 @@ from zsched.core.messages import Utilities
 from zsched.core.model import Allocation, NodeId, PeerState, Proposal, TaskId, UtilityVector, WorkerState
 from zsched.core.plan import StreamCount
 from zsched.core.register import MoveOwner
-from zsched.core.scheduler import Judge, Judgement, Outcome, escape_reason
-from zsched.core.scoring import NO_DOUBTS, Doubts, Standing, book, compare, majority, score
+from zsched.core.scheduler import Judge, Judgement, Outcome, escape_ahead, escape_reason
+from zsched.core.scoring import NO_DOUBTS, Doubts, Standing, book, compare, is_out, majority, score
 from zsched.core.turns import in_turn, who_moves_first
 from zsched.core.vote import VoteOutcome, present_voters
 from zsched.core.voting import Voting
@@ -237,6 +237,7 @@ class Rounds:
             reason = f"utilities of {standing.voters_heard} robots, {needed} needed"
             judgement = Judgement(outcome=Outcome.NONE, candidate=None, aggregate=0.0, reason=reason)
         else:
+            task.judge.out = self._out(task.spec, now) if allocation.owner is None else frozenset()
             judgement = task.judge.judge(
                 standing,
                 allocation,
@@ -246,6 +247,8 @@ class Rounds:
                 now=now,
                 damping=task.damping,
             )
+        if escape is None:
+            judgement = self._look_ahead(task, judgement, allocation, now)
         judgement = self._take_turn(task, judgement, allocation, is_called=is_called, now=now)
         if not is_called:
             judgement = self._spare(judgement, allocation, states)
@@ -259,6 +262,19 @@ class Rounds:
                 task.voting.called_at = now
             out += self._propose(task, judgement, allocation, states, now)
         return out
+
+    def _out(self, spec: TaskSpec, now: float) -> frozenset[NodeId]:
+        """The candidates that say themselves that they cannot have the task now: they are not waited for."""
+        profiles = ((name, self._gateway.fresh(name, now)) for name in spec.candidates)
+        return frozenset(name for name, profile in profiles if profile is not None and is_out(spec, profile))
+
+    def _look_ahead(self, task: TaskRound, judgement: Judgement, allocation: Allocation, now: float) -> Judgement:
+        """While an owner whose worker is not ready has its start-up deadline: say that, and when it will be left."""
+        since, owner = task.judge.not_ready_since, allocation.owner
+        if since is None or owner is None or judgement.outcome is Outcome.PROPOSE:
+            return judgement
+        ahead = escape_ahead(task.spec, allocation, self._gateway.fresh(owner, now), now - since)
+        return replace(judgement, reason=f"{judgement.reason}; {ahead}") if ahead else judgement
 
     def _take_turn(
         self, task: TaskRound, judgement: Judgement, allocation: Allocation, *, is_called: bool, now: float

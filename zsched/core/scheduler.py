@@ -10,6 +10,7 @@ to propose, or the owner, always with the reason.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -64,6 +65,9 @@ class Judge:
     """What the last moves have cost, in seconds of the task's work (`zsched.core.costs`; tasks with a horizon)."""
     seen_first_at: float | None = None
     """When a first candidate could be scored (a task that nobody owns waits for the others)."""
+
+    out: AbstractSet[NodeId] = frozenset()
+    """The candidates that a first placement does not wait for: they cannot have the task."""
 
     def reset(self, *, is_new_owner: bool = False) -> None:
         """A vote was lost or the value changed: wait the whole time-to-trigger again."""
@@ -192,7 +196,7 @@ class Judge:
         if self.seen_first_at is None:
             self.seen_first_at = now
         waited = now - self.seen_first_at
-        missing = [name for name in self.spec.candidates if name not in scored]
+        missing = [name for name in self.spec.candidates if name not in scored and name not in self.out]
         if missing and waited < INITIAL_SETTLE_S and not is_called:  # who calls has waited for all of us
             return Outcome.WAIT, f"first placement waits for {', '.join(missing)}"
         return Outcome.PROPOSE, f"first placement: {winner} has the highest utility"
@@ -232,8 +236,7 @@ def escape_reason(
         why = "" if load is None or not load.reason else f": {load.reason}"
         if load is not None and load.state is WorkerState.FAILED:
             return f"the worker on {owner} failed{why}"
-        is_told = load is not None or bool(spec.worker.command)
-        if is_told and not_ready_for_s > spec.worker.start_deadline_s:
+        if _is_told(spec, profile) and not_ready_for_s > spec.worker.start_deadline_s:
             return f"the worker on {owner} has not been ready for {not_ready_for_s:.1f} s{why}"
         if profile.memory_used_mb is not None:
             free_ratio = 1.0 - profile.memory_used_mb / profile.memory_mb
@@ -241,3 +244,20 @@ def escape_reason(
                 return f"memory of {owner} is {max(free_ratio, 0.0) * 100:.0f} % free"
     veto = standing.vetoed.get(owner)
     return None if veto is None or not veto.startswith("reached by") else f"{owner} is {veto}"
+
+
+def _is_told(spec: TaskSpec, profile: Profile) -> bool:
+    """Whether a node's profile says how its worker is: of a foreign one its daemon may not know."""
+    return profile.worker(spec.name) is not None or bool(spec.worker.command)
+
+
+def escape_ahead(spec: TaskSpec, allocation: Allocation, profile: Profile | None, not_ready_for_s: float) -> str:
+    """Since its worker is not ready, when the owner will be left, and why; empty when it is not on the way to that."""
+    is_held = allocation.paused or allocation.pinned
+    if profile is None or is_held or not _is_told(spec, profile):
+        return ""
+    load = profile.worker(spec.name)
+    state = "not there" if load is None else load.state.value
+    why = "" if load is None or not load.reason else f": {load.reason}"
+    left_s = max(spec.worker.start_deadline_s - not_ready_for_s, 0.0)
+    return f"{allocation.owner} will be left in {left_s:.0f} s, for its worker is {state}{why}"

@@ -181,6 +181,12 @@ def _unseen(spec: TaskSpec, profile: Profile, bookings: Bookings | None) -> Dema
     return Demand(cpu_cores=cpu, memory_mb=memory)
 
 
+def is_out(spec: TaskSpec, profile: Profile) -> bool:
+    """Whether a node cannot have the task until an operator or a restart changes something there."""
+    load = profile.worker(spec.name)
+    return profile.draining or (load is not None and load.state is WorkerState.FAILED)
+
+
 def _refusal(spec: TaskSpec, allocation: Allocation, profile: Profile, demand: Demand, unseen: Demand) -> str:
     """Why the node may not have the task; empty when it may."""
     if profile.draining:

@@ -14,6 +14,7 @@ from zsched.core.gateway import Gateway
 from zsched.core.instructions import Instruction, RecordStory, RestartWorker
 from zsched.core.model import (
     Allocation,
+    Beat,
     DurableState,
     NodeKind,
     Profile,
@@ -25,6 +26,7 @@ from zsched.core.model import (
 )
 from zsched.core.node import Node
 from zsched.core.plan import Direction, StreamCount
+from zsched.core.probation import LIMIT_S
 from zsched.core.progress import COUNT_S, MARGIN_S, HangWatch, Progress
 
 ROBOTS = ("robot1", "robot2")
@@ -252,6 +254,17 @@ def test_a_daemon_that_lags_a_little_still_notices() -> None:
 @pytest.mark.parametrize("is_suspended", [False, True])
 def test_a_suspended_owner_takes_no_complaint_about_its_sleep(*, is_suspended: bool) -> None:
     """The whole node: the robots' complaint is the first thing it hears when it wakes up."""
+    node, now = owner_node(), 100.0
+    while now < 120.0:
+        now = min(max(node.next_deadline(), now + 0.01), 120.0)
+        node.handle(ev.DeadlineReached(), now)
+    now = node.next_deadline() + (60.0 if is_suspended else 0.0)
+    told = node.handle(ev.ProfileReceived(profile=profile("robot1", 1, UNSERVED)), now)
+    assert any(isinstance(one, RestartWorker) for one in told) != is_suspended
+
+
+def owner_node() -> Node:
+    """The whole daemon of the only candidate, which owns the task and whose worker became ready at 100 s."""
     fleet = Owner().fleet
     learnt = Allocation(task="merge", revision=3, epoch=3, owner="edge1", tuning=SPEC.tuning)
     electorate = electorate_hash(fleet)
@@ -266,14 +279,52 @@ def test_a_suspended_owner_takes_no_complaint_about_its_sleep(*, is_suspended: b
     )
     node = Node(fleet=fleet, me="edge1", durable=state, incarnation=7, electorate=electorate, rng=Random(1), now=100.0)
     node.start(100.0)
-    now = 100.0
-    node.handle(ev.WorkerChanged(task="merge", state=WorkerState.READY), now)
-    while now < 120.0:
-        now = min(max(node.next_deadline(), now + 0.01), 120.0)
-        node.handle(ev.DeadlineReached(), now)
-    now = node.next_deadline() + (60.0 if is_suspended else 0.0)
-    told = node.handle(ev.ProfileReceived(profile=profile("robot1", 1, UNSERVED)), now)
-    assert any(isinstance(one, RestartWorker) for one in told) != is_suspended
+    node.handle(ev.WorkerChanged(task="merge", state=WorkerState.READY), 100.0)
+    return node
+
+
+class Fates:
+    """An owner's daemon and what it hears of both robots: beats every 0.2 s and a profile every second, or nothing."""
+
+    def __init__(self) -> None:
+        self.node, self.now, self.sequence = owner_node(), 100.0, 0
+
+    def run(self, seconds: float, said: TaskProgress | None) -> list[RestartWorker]:
+        """Both robots are heard and say that (``None``: they are cut off); returns what became of the worker."""
+        batch: list[Instruction] = []
+        for _ in range(round(seconds / 0.2)):
+            self.now += 0.2
+            batch += self.node.handle(ev.DeadlineReached(), self.now)
+            self.sequence += 1
+            for robot in ROBOTS if said is not None else ():
+                beat = Beat(node=robot, incarnation=1, sequence=self.sequence, loop_lag_s=0.0)
+                batch += self.node.handle(ev.BeatReceived(beat=beat), self.now)
+                if said is not None and self.sequence % 5 == 0:
+                    told = profile(robot, self.sequence, said)
+                    batch += self.node.handle(ev.ProfileReceived(profile=told), self.now)
+        return [one for one in batch if isinstance(one, RestartWorker)]
+
+
+def test_a_link_that_heals_does_not_restart_the_healthy_worker_of_an_owner_without_another_candidate() -> None:
+    """While it was cut off its robots waited for it; their streams come back some seconds after their beats."""
+    fates = Fates()
+    assert fates.run(20.0, SERVED) == []
+    assert fates.run(15.0, None) == []
+    assert fates.run(8.0, UNSERVED) == [], "the streams' links heal"
+    assert fates.run(60.0, SERVED) == []
+
+
+def test_a_worker_that_hangs_after_a_heal_is_restarted_all_the_same() -> None:
+    fates = Fates()
+    fates.run(20.0, SERVED)
+    fates.run(15.0, None)
+    assert fates.run(LIMIT_S + DEADLINE_S, UNSERVED) == []
+    assert len(fates.run(MARGIN_S + 2.0, UNSERVED)) == 1
+
+
+def test_a_robot_that_is_heard_for_the_first_time_is_believed_at_once() -> None:
+    fates = Fates()
+    assert len(fates.run(DEADLINE_S + MARGIN_S + 2.0, UNSERVED)) == 1
 
 
 def test_somebody_else_s_worker_is_told_of_and_left_alone() -> None:

@@ -497,6 +497,56 @@ def test_edges_have_no_rounds() -> None:
     assert robot.rounds.vectors({"merge": robot.value}, robot.states, robot.now) == Utilities(voter="edge1", vectors=())
 
 
+def test_while_an_owner_s_worker_is_not_ready_the_decision_says_when_it_will_be_left_and_why() -> None:
+    robot = Robot()
+    robot.round()
+    assert robot.task.judgement is not None
+    assert robot.task.judgement.reason == "nobody better"
+    load = WorkerLoad(task="merge", state=WorkerState.STARTING, reason="no token yet")
+    robot.profiles({}, workers=(load,))
+    robot.round()
+    since = robot.task.judge.not_ready_since
+    assert since is not None
+    robot.now = since + 5.0
+    robot.profiles({}, workers=(load,))
+    robot.round()
+    left_s = FLEET.tasks[0].worker.start_deadline_s - (robot.task.judged_at - since)
+    assert (robot.outcome(), robot.task.judgement.candidate) == (Outcome.STAY, "edge1")
+    said = robot.task.judgement.reason
+    assert said == f"nobody better; edge1 will be left in {left_s:.0f} s, for its worker is starting: no token yet"
+    robot.value = replace(robot.value, pinned=True)
+    robot.round()
+    assert robot.task.judgement.reason == "pinned by the operator", "it will not be left"
+    robot.value = replace(robot.value, pinned=False)
+    robot.profiles({})
+    robot.round()
+    assert robot.task.judgement.reason == "nobody better"
+
+
+@pytest.mark.parametrize(
+    ("state", "is_draining", "votes"),
+    [
+        (WorkerState.FAILED, False, ["edge2"]),
+        (WorkerState.READY, True, ["edge2"]),
+        (WorkerState.STARTING, False, []),
+    ],
+)
+def test_a_first_placement_does_not_wait_for_a_node_that_cannot_have_the_task(
+    state: WorkerState, is_draining: bool, votes: list[str]
+) -> None:
+    robot = Robot(owner=None)
+    robot.profiles({}, workers=(WorkerLoad(task="merge", state=state),), draining=is_draining)
+    robot.now = robot.rounds.next_deadline()
+    (ask,) = of(robot.tick(), AskUtilities)
+    for voter in ("robot2", "robot3"):
+        seen = (
+            UtilityVector(voter=voter, task="merge", revision=0, utilities=(Utility(candidate="edge2", value=0.5),)),
+        )
+        assert robot.rounds.absorb_utilities(ask.gather, Utilities(voter=voter, vectors=seen))
+    assert proposed(robot.tick()) == votes
+    assert robot.outcome() is (Outcome.PROPOSE if votes else Outcome.WAIT)
+
+
 def test_a_time_in_which_the_owner_was_not_heard_is_no_time_in_which_its_worker_was_not_ready() -> None:
     """After a minute of silence "not ready for 64 s" would be a reason to flee from a worker that starts again."""
     robot = Robot()
