@@ -43,10 +43,11 @@ from zsched.log_limit import limit_library
 from zsched.relay_pipe import decode_end
 from zsched.worker_epochs import CARRY_S, Epochs, lets_out
 from zsched.worker_errands import Errands
-from zsched.worker_inputs import Dispatcher, Input, Marker, Received
+from zsched.worker_inputs import Dispatcher
 from zsched.worker_keep import Keeper
 from zsched.worker_outputs import OUTPUT_DEPTH, Output
 from zsched.worker_roles import RoleWatch
+from zsched.worker_samples import BY_CLASS, Input, KeepLast, Marker, Received
 from zsched.worker_services import Answer, Handler, Request, Service
 from zsched.worker_snapshot import TIMEOUT_S, Offer, Restorer, StateLink, fetch
 from zsched.worker_start import open_session, relay_endpoint, surroundings
@@ -160,12 +161,17 @@ class Worker:
         return self._session
 
     def subscribe(
-        self, key_expr: str, on_sample: Callable[[Received], None], keep_last: int | None = 1, depth: int = 4096
+        self, key_expr: str, on_sample: Callable[[Received], None], keep_last: KeepLast = BY_CLASS, depth: int = 4096
     ) -> None:
         """Take an input; call it before `ready`. ``{prefix}`` is filled in.
 
-        ``on_sample`` runs in the dispatch thread. When it falls behind, only the ``keep_last`` newest samples per key
-        wait (``None``: all, up to ``depth``, then the oldest go); end markers are never shown to it.
+        ``on_sample`` runs in the dispatch thread. When it falls behind, samples wait: of an input of class ``reliable``
+        all, of any other the newest per key. ``keep_last`` says otherwise: so many of the newest per key, ``None``:
+        all. Of all, at most ``depth`` per key wait, then the oldest go. What goes of a ``reliable`` input is counted
+        `lost` in `zsched status`; of others, what gives way to something newer counts as processed.
+
+        Raises:
+            ValueError: ``keep_last`` or ``depth`` is below 1.
         """
         expr = key_expr.replace("{prefix}", self.prefix)
         source = Input(on_sample=on_sample, keep_last=keep_last, depth=depth)

@@ -36,9 +36,13 @@ _turn_of = attrgetter("turn")
 
 
 class Source(Protocol):
-    """An input: what of it is kept."""
+    """An input: what of it is kept; ``is_whole``: the sample's publisher is of class ``reliable``."""
 
-    keep_last: int | None
+    def newest(self, *, is_whole: bool) -> int | None:
+        """How many samples of a key are kept, ``None``: all."""
+
+    def wants(self, *, is_whole: bool) -> bool:
+        """Whether a sample that gives way is lost."""
 
 
 SourceT = TypeVar("SourceT", bound=Source)
@@ -56,6 +60,8 @@ class Done(NamedTuple, Generic[SourceT]):
     """When it was processed, if nothing was withheld of it: it counts where the state that it went into is replaced."""
     replayed: bool = False
     name: SourceName | None = None
+    is_whole: bool = False
+    """Its publisher is of class ``reliable``."""
 
     def is_over(self, *, is_restored: bool, now: float) -> bool:
         """True when it need not be processed again."""
@@ -86,12 +92,13 @@ class Backlog(Generic[SourceT]):
         line = self._kept.setdefault((id(source), str(done.sample.key_expr)), deque())
         line.append(done)
         self._bytes += len(done.sample.payload)
-        limit = source.keep_last or (MAX_BACKLOG if done.quiet_at is None else MAX_WITHHELD)
+        limit = source.newest(is_whole=done.is_whole) or (MAX_BACKLOG if done.quiet_at is None else MAX_WITHHELD)
         lost = []
         while len(line) > limit or (self._bytes > MAX_BACKLOG_BYTES and len(line) > 1):
             oldest = line.popleft()
             self._bytes -= len(oldest.sample.payload)
-            if source.keep_last is None and oldest.quiet_at is None and oldest.name is not None:
+            is_lost = oldest.quiet_at is None and source.wants(is_whole=oldest.is_whole)
+            if is_lost and oldest.name is not None:
                 lost.append(oldest.name)
         return lost
 

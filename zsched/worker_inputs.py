@@ -16,79 +16,22 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import Final
 
 import zenoh
 
 from zsched.clock import monotonic_s
-from zsched.core.relay_protocol import EndMarker
 from zsched.core.serial import number_near, serial_of
 from zsched.guard import guarded
 from zsched.hop_acks import GIVE_UP_S, MAX_SOURCES, Acknowledger, SourceName
 from zsched.worker_backlog import Backlog, Done
+from zsched.worker_samples import Input, Marker, OpenSource, Received, Waiting
 from zsched.worker_troubles import Troubles
 
 END_GRACE_S: Final = 0.1
 JOIN_S: Final = 0.2
 
 _log = logging.getLogger("zsched.worker")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Received:
-    """One input sample. ``payload`` and ``attachment`` are zenoh's own bytes (``to_bytes()`` copies)."""
-
-    key: str
-    payload: zenoh.ZBytes
-    attachment: zenoh.ZBytes | None = None
-    deleted: bool = False
-    replayed: bool = False
-    """An owner that died had this sample, too, and may have done it (`on_crash: replay`)."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Marker:
-    """An end marker and the source it ends."""
-
-    name: SourceName
-    end: EndMarker
-    came_at: float
-
-
-@dataclass(slots=True, eq=False)
-class Input:
-    """One subscription: where its samples go, how many may wait."""
-
-    on_sample: Callable[[Received], None]
-    keep_last: int | None = 1
-    depth: int = 4096
-    waiting: dict[str, deque[_Waiting]] = field(default_factory=dict)
-    shed: int = 0
-    """Samples that gave way to newer ones."""
-
-
-@dataclass(slots=True, eq=False)
-class _Waiting:
-    """A sample in the queue; ``None`` once a newer one has taken its place."""
-
-    source: Input
-    sample: zenoh.Sample | None
-    name: SourceName | None = None
-    number: int = 0
-    replayed: bool = False
-    again: Done[Input] | None = None
-    """It is processed again: this is what it was the first time."""
-
-
-@dataclass(slots=True)
-class _Open:
-    """A source that has sent something: its newest number, and the epoch it was first heard in (0: standby)."""
-
-    epoch: int
-    number: int = -1
-    in_turn: bool = False
-    """Its publisher sends again what is missing: worth waiting for."""
 
 
 class Dispatcher:
@@ -102,13 +45,15 @@ class Dispatcher:
         self._newest_stamp: zenoh.Timestamp | None = None
         self._in_hand: int | None = None
         self._wake = threading.Condition()
-        self._queue: deque[_Waiting] = deque()
+        self._queue: deque[Waiting] = deque()
         self._markers: list[Marker] = []
         self._asked: set[int] = set()
         """Epochs whose end is to be told again if they are over."""
-        self._open: dict[SourceName, _Open] = {}
+        self._open: dict[SourceName, OpenSource] = {}
         self._replays: dict[SourceName, int] = {}
         """Numbers of a source below this one went to an earlier owner (zenoh's thread alone touches it)."""
+        self._whole: dict[SourceName, None] = {}
+        """Sources of class ``reliable``, the oldest first (zenoh's thread alone touches it)."""
         self._epoch = 0
         self._begun = 0
         self._is_begin_due = False
@@ -137,11 +82,12 @@ class Dispatcher:
     def put(self, source: Input, sample: zenoh.Sample) -> None:
         """Queue a sample (zenoh's thread)."""
         key = str(sample.key_expr)
-        waiting = _Waiting(source, sample)
+        waiting = Waiting(source, sample)
         info = sample.source_info
         if info is not None:
             waiting.name = (key, str(info.source_id.zid), info.source_id.eid)
-            in_turn = source.keep_last is None and sample.congestion_control == zenoh.CongestionControl.BLOCK
+            waiting.is_whole = waiting.name in self._whole
+            in_turn = waiting.is_wanted and sample.congestion_control == zenoh.CongestionControl.BLOCK
             number = self._acks.admit(waiting.name, info.source_sn, in_turn=in_turn)
             if number is None:
                 return
@@ -150,20 +96,22 @@ class Dispatcher:
         with self._wake:
             line = source.waiting.setdefault(key, deque())
             line.append(waiting)
-            if len(line) > (source.keep_last or source.depth):
+            if len(line) > (source.newest(is_whole=waiting.is_whole) or source.depth):
                 self._shed(source, line.popleft())
             self._queue.append(waiting)
             self._wake.notify()
 
-    def _shed(self, source: Input, oldest: _Waiting) -> None:
+    def _shed(self, source: Input, oldest: Waiting) -> None:
         oldest.sample = None
         source.shed += 1
-        if source.keep_last is None and oldest.name is not None:
+        if oldest.is_wanted and oldest.name is not None:
             self._acks.shed(oldest.name)
 
     def put_marker(self, marker: Marker) -> None:
         """Queue an end marker (zenoh's thread)."""
         if marker.end.epoch == 0:  # it ends nothing: what is below its number was given up by the relay
+            if marker.end.is_whole:
+                self._note_whole(marker.name)
             self._acks.skip(marker.name, marker.end.count)
             if marker.end.replayed:
                 self._note_replay(marker)
@@ -171,6 +119,11 @@ class Dispatcher:
         with self._wake:
             self._markers.append(marker)
             self._wake.notify()
+
+    def _note_whole(self, name: SourceName) -> None:
+        self._whole[name] = None
+        if len(self._whole) > MAX_SOURCES:
+            self._whole.pop(next(iter(self._whole)))
 
     def _note_replay(self, marker: Marker) -> None:
         first = self._acks.number(marker.name, serial_of(marker.end.count))
@@ -283,17 +236,17 @@ class Dispatcher:
         is_asked = bool(self._asked) and not is_due
         return self._first is not None or is_asked or (not self._is_held and (bool(self._queue) or is_due))
 
-    def _claim(self) -> _Waiting | None:
+    def _claim(self) -> Waiting | None:
         """Take the next sample out of its key's line (under the lock): from here on nothing sheds it."""
         if (done := self._backlog.take()) is not None:
-            return _Waiting(done.source, done.sample, replayed=done.replayed, again=done)
+            return Waiting(done.source, done.sample, replayed=done.replayed, is_whole=done.is_whole, again=done)
         waiting = self._queue.popleft() if self._queue else None
         if waiting is None or waiting.sample is None:
             return None
         waiting.source.waiting[str(waiting.sample.key_expr)].remove(waiting)
         return waiting
 
-    def _process(self, waiting: _Waiting) -> None:
+    def _process(self, waiting: Waiting) -> None:
         source, sample = waiting.source, waiting.sample
         if sample is None:
             return
@@ -313,7 +266,7 @@ class Dispatcher:
             return
         quiet_at = None if self._has_withheld else monotonic_s()
         name = waiting.name if again is None else again.name
-        done = Done(source, sample, self._turn_in_hand, epoch, quiet_at, waiting.replayed, name)
+        done = Done(source, sample, self._turn_in_hand, epoch, quiet_at, waiting.replayed, name, waiting.is_whole)
         with self._wake:
             if self._begun != begun:  # it became the owner meanwhile
                 self._backlog.put_back(done)
@@ -345,7 +298,7 @@ class Dispatcher:
             state = self._open.get(name)
             if state is None:
                 in_turn = sample.congestion_control == zenoh.CongestionControl.BLOCK
-                state = self._open[name] = _Open(epoch=self._epoch, in_turn=in_turn)
+                state = self._open[name] = OpenSource(epoch=self._epoch, in_turn=in_turn)
             return state.epoch
 
     def _note(self, name: SourceName, number: int, sample: zenoh.Sample) -> None:

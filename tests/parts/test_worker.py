@@ -50,7 +50,20 @@ class Relay:
             self.session.declare_subscriber(f"edge1/t/*/*/out/{END_CHUNK}", self._end),
         ]
         self.publisher = self.session.declare_publisher(INPUT)
+        self.acks: list[StreamAck] = []
+        own = str(self.session.zid())
+        self._kept.append(self.session.declare_subscriber(KEYS.ack("*", "*", "*", own), self._acknowledged))
         self.count = 0
+
+    def _acknowledged(self, sample: zenoh.Sample) -> None:
+        self.acks += wire.decode(sample.payload.to_bytes(), StreamAcks).acks
+
+    def greet(self, *, is_whole: bool) -> None:
+        """The start marker of a stream; a relay sends nothing of class ``reliable`` before its answer."""
+        self.publisher = self.session.declare_publisher(INPUT, congestion_control=zenoh.CongestionControl.BLOCK)
+        payload = encode_end(EndMarker(epoch=0, count=self.count, is_whole=is_whole))
+        self.session.put(f"{INPUT}/{END_CHUNK}", payload, source_info=zenoh.SourceInfo(self.publisher.id, self.count))
+        until(lambda: self.acks, "the answer")
 
     def _answer(self, query: zenoh.Query) -> None:
         with query:
@@ -260,6 +273,52 @@ def test_a_slow_worker_keeps_the_newest(relay: Relay, tmp_path: Path) -> None:
         gate.set()
         until(lambda: seen[-1] == b"9", "the newest")
         assert len(seen) <= 3
+
+
+SHEDDING: list[tuple[dict[str, Any], bool, list[int], int]] = [
+    ({}, True, list(range(10)), 0),
+    ({}, False, [0, 9], 0),
+    ({"keep_last": 1}, True, [0, 9], 8),
+    ({"keep_last": 3}, True, [0, 7, 8, 9], 6),
+    ({"keep_last": None, "depth": 4}, True, [0, 6, 7, 8, 9], 5),
+    ({"depth": 4}, True, [0, 6, 7, 8, 9], 5),
+    ({"keep_last": None}, False, list(range(10)), 0),
+]
+
+
+@pytest.mark.parametrize(("options", "is_whole", "taken", "lost"), SHEDDING)
+def test_what_a_slow_worker_keeps_follows_the_class_and_what_it_sheds_of_a_reliable_input_is_lost(
+    relay: Relay, tmp_path: Path, options: dict[str, Any], is_whole: bool, taken: list[int], lost: int
+) -> None:
+    gate, seen = threading.Event(), list[int]()
+
+    def slow(received: Received) -> None:
+        seen.append(int(received.payload.to_bytes()))
+        gate.wait(10)
+
+    with Worker.from_env(environment(relay, tmp_path), handles_signals=False) as worker:
+        worker.subscribe("{prefix}/*/in", slow, **options)
+        worker.ready()
+        until(lambda: relay.tokens, "the ready token")
+        relay.greet(is_whole=is_whole)
+        relay.put(b"0")
+        until(lambda: seen == [0], "the first")
+        for number in range(1, 10):
+            relay.put(str(number).encode())
+        until(lambda: relay.acks[-1].arrived == 10, "all have come")
+        gate.set()
+        until(lambda: relay.acks[-1].processed == 10, "the last is processed")
+        until(lambda: relay.acks[-1].lost == lost, f"{lost} lost, {relay.acks[-1]}")
+        assert seen == taken
+
+
+@pytest.mark.parametrize("options", [{"keep_last": 0}, {"keep_last": -1}, {"keep_last": "all"}, {"depth": 0}])
+def test_an_input_that_could_keep_nothing_is_refused(relay: Relay, tmp_path: Path, options: dict[str, Any]) -> None:
+    with (
+        Worker.from_env(environment(relay, tmp_path), handles_signals=False) as worker,
+        pytest.raises(ValueError, match="is n"),
+    ):
+        worker.subscribe("{prefix}/*/in", print, **options)
 
 
 def test_without_a_daemon_it_says_how_to_run_by_hand() -> None:

@@ -17,7 +17,8 @@ from zsched.core.relay_protocol import WorkerTrouble
 from zsched.hop_acks import Acknowledger
 from zsched.keyspace import Keyspace
 from zsched.relay.troubles import Troubles as Heard
-from zsched.worker_inputs import Dispatcher, Input, Received
+from zsched.worker_inputs import Dispatcher
+from zsched.worker_samples import Input, Received
 from zsched.worker_troubles import MAX_KINDS, Troubles
 
 KEYS = Keyspace("test")

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import cast
 
+import pytest
 import zenoh
 
 from zsched.worker_backlog import QUIET_S, Backlog, Done
-from zsched.worker_inputs import Input
+from zsched.worker_samples import Input, KeepLast
 
 
 @dataclass(frozen=True)
@@ -83,3 +84,16 @@ def test_of_an_input_that_keeps_the_newest_only_those_wait_and_nothing_is_lost()
     assert [backlog.keep(done(turn, source=newest)) for turn in range(4)] == [[], [], [], []]
     backlog.begin()
     assert turns(backlog) == [2, 3]
+
+
+@pytest.mark.parametrize(
+    ("keep_last", "is_whole", "kept", "lost"),
+    [("by_class", True, [1, 2], 0), ("by_class", False, [2], 0), (1, True, [2], 1), (1, False, [2], 0)],
+)
+def test_how_much_is_kept_goes_by_the_class_and_what_gives_way_of_a_reliable_source_is_lost(
+    keep_last: KeepLast, is_whole: bool, kept: list[int], lost: int
+) -> None:
+    backlog, source = Backlog[Input](), Input(on_sample=lambda _: None, keep_last=keep_last)
+    gone = [name for turn in (1, 2) for name in backlog.keep(done(turn, source=source)._replace(is_whole=is_whole))]
+    backlog.begin()
+    assert (turns(backlog), len(gone)) == (kept, lost)

@@ -114,11 +114,16 @@ class EndMarker:
     count: int
     replayed: int = 0
     """Start markers: so many samples from ``count`` on went to an earlier owner, which died."""
+    is_whole: bool = False
+    """Start markers: the stream is of class ``reliable``, every sample is wanted."""
+    had: int = 0
+    """Start markers among answers: the numbers below this one an earlier life of the same relay has acknowledged."""
 
     def __post_init__(self) -> None:
         check_counter("end.epoch", self.epoch)
         check_counter("end.count", self.count)
         check_counter("end.replayed", self.replayed)
+        check_counter("end.had", self.had)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

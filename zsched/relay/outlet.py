@@ -321,7 +321,10 @@ class Outlet:
         self._put_marker(lane, SKIP_EPOCH, lowest)
 
     def _put_marker(self, lane: Lane, epoch: int, count: int) -> None:
-        marker = EndMarker(epoch=epoch, count=count, replayed=max(0, lane.replay_end - count))
+        replayed = max(0, lane.replay_end - count)
+        marker = EndMarker(
+            epoch=epoch, count=count, replayed=replayed, is_whole=self._is_reliable and epoch == SKIP_EPOCH
+        )
         put_marker(self._session, lane.key, lane.source_id, lane.publisher.priority, marker)
 
     def _undeclare(self) -> None:
