@@ -68,6 +68,10 @@ class _Receiver:
 
     node: str
     arrived: int = 0
+    had: int = 0
+    """The numbers below this one an earlier life of it has acknowledged; it is not sent them."""
+    waits_for: int = 0
+    """What it comes to next by its own word: a new life begins at 0."""
     moved_at: float = 0.0
     pause_s: float = RESEND_S
     batch_end: int | None = None
@@ -93,6 +97,8 @@ class KeptLane:
     size: int = 0
     count: int = 0
     receivers: dict[str, _Receiver] = field(default_factory=dict)
+    had: dict[str, tuple[str, int]] = field(default_factory=dict)
+    """{relay that was forgotten: (its node, how far it has acknowledged)}, the oldest first."""
     end: EndMarker | None = None
     ended_at: float = 0.0
     began_at: float | None = None
@@ -127,12 +133,13 @@ class KeptLane:
             receiver = self.receivers.get(relay)
             if receiver is None:  # a relay that restarted is another session of the same node
                 for old in [name for name, one in self.receivers.items() if one.node == node]:
-                    self.gone.append(self.receivers.pop(old))
+                    self.forget(old)
                 if len(self.receivers) >= MAX_RECEIVERS:
                     self._make_room()
-                receiver = self.receivers[relay] = _Receiver(node=node, arrived=-1)
+                receiver = self.receivers[relay] = _Receiver(node=node, arrived=-1, had=self._had_by(relay, node))
             # one that came late knows the lowest bits only; nobody can have more than was sent
-            arrived = min(number_near(serial_of(ack.arrived), self.count), self.count)
+            receiver.waits_for = min(number_near(serial_of(ack.arrived), self.count), self.count)
+            arrived = max(receiver.waits_for, receiver.had)
             has_moved = arrived > receiver.arrived
             receiver.heard_at, receiver.is_ended = now, ack.is_ended
             if has_moved:
@@ -140,9 +147,25 @@ class KeptLane:
             self._let_go(now)
             return receiver, has_moved
 
+    def forget(self, relay: str) -> None:
+        """A relay is another one by now, or cannot be reached (under the lock); what it had is remembered."""
+        gone = self.receivers.pop(relay, None)
+        if gone is None:
+            return
+        self.gone.append(gone)
+        self.had[relay] = (gone.node, gone.arrived)
+        if len(self.had) > MAX_RECEIVERS:
+            self.had.pop(next(iter(self.had)))
+
+    def _had_by(self, relay: str, node: str) -> int:
+        """How far a relay's node has come by another relay; one that is known knows that itself."""
+        if self.had.pop(relay, None) is not None:
+            return 0
+        return max((arrived for of, arrived in self.had.values() if of == node), default=0)
+
     def _make_room(self) -> None:
         least = min(self.receivers, key=lambda name: (self.receivers[name].is_confirmed, self.receivers[name].heard_at))
-        self.gone.append(self.receivers.pop(least))
+        self.forget(least)
         self.crowded_out += 1
         if self.crowded_out == 1:
             _log.warning("%s: more than %d relays acknowledge answers: some are strangers", self.key, MAX_RECEIVERS)
@@ -308,8 +331,8 @@ class Keeper:
         publisher = receiver.publisher
         if publisher is None:
             return
-        if is_asked and first > receiver.arrived:  # older ones are kept no more: it must not wait for them
-            marker = EndMarker(epoch=0, count=first)
+        if is_asked and first > receiver.waits_for:  # older ones it has had, or they are kept no more
+            marker = EndMarker(epoch=0, count=first, had=receiver.had)
             source = zenoh.SourceInfo(lane.source_id, serial_of(first))
             publisher.put(encode_end(marker), encoding=SKIP_ENCODING, source_info=source)
         for one in wanted:
@@ -333,7 +356,7 @@ class Keeper:
         receiver.unreached_since = receiver.unreached_since or now
         if now - receiver.unreached_since > FORGET_S:
             with lane.lock:
-                lane.receivers.pop(relay, None)
+                lane.forget(relay)
             _undeclare(receiver)
         return False
 

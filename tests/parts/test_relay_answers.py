@@ -137,6 +137,19 @@ def test_first_answers_that_the_worker_has_no_more_are_counted_too(bench: Bench)
     assert stream.count().lost == 3
 
 
+@pytest.mark.parametrize(("had", "lost"), [(60, 0), (50, 10), (70, 0)])
+def test_what_an_earlier_life_of_this_relay_has_had_is_not_lost(bench: Bench, had: int, lost: int) -> None:
+    stream = bench.open()
+    bench.put(60)
+    bench.wait_ack(arrived=0, has_gap=True, until=60)
+    marker = encode_end(EndMarker(epoch=0, count=60, had=had))
+    bench.again.put(marker, encoding=SKIP_ENCODING, source_info=zenoh.SourceInfo(bench.publisher.id, 60))
+    assert bench.is_through(60)
+    bench.put(61, 62)
+    assert bench.is_through(60, 61, 62)
+    assert stream.count().lost == lost
+
+
 def test_a_relay_that_came_later_counts_nothing_of_what_was_before(bench: Bench) -> None:
     stream = bench.open(is_from_start=False)
     bench.put(7, 8)

@@ -28,6 +28,7 @@ class Robot:
         self.relay = relay or str(session.zid())
         self.got: list[int] = []
         self.skipped: list[int] = []
+        self.had: list[int] = []
         self.ends: list[int] = []
         self._key = KEYS.received(node, self.relay, str(worker.zid()))
         self._again = session.declare_subscriber(f"{KEY}/{AGAIN_CHUNK}/{self.relay}", self._take)
@@ -38,6 +39,7 @@ class Robot:
             marker = decode_end(sample.payload.to_bytes())
             assert marker is not None
             self.skipped.append(marker.count)
+            self.had.append(marker.had)
             return
         source: Any = sample.source_info
         assert sample.payload.to_string() == f"answer {source.source_sn}"
@@ -180,6 +182,34 @@ def test_a_relay_that_restarted_takes_the_place_of_its_former_life(
     until(lambda: "aa1" in lane.receivers, "the first life")
     after.ack(bench.eid, 3)
     until(lambda: not lane.kept, "nobody waits for the first life")
+
+
+def test_another_life_of_a_relay_is_told_what_the_former_one_has_had_and_is_sent_only_the_rest(bench: Bench) -> None:
+    lane = bench.lane()
+    keep(lane, 0, 1, 2, 3)
+    bench.robot("robot1", relay="f0").ack(bench.eid, 3)
+    until(lambda: "f0" in lane.receivers, "the former life's word")
+    other = bench.robot("robot2", relay="f2")
+    other.ack(bench.eid, 0, has_gap=True, until=3)
+    until(lambda: other.got == [0, 1, 2], "another robot has had nothing")
+    robot = bench.robot("robot1", relay="f1")
+    robot.ack(bench.eid, 0, has_gap=True, until=4)  # it begins at 0, as every life of a relay
+    until(lambda: robot.got, "the rest")
+    assert (robot.got, robot.skipped, robot.had) == ([3], [3], [3])
+    assert other.skipped == []
+
+
+def test_a_strangers_word_about_a_relay_that_lives_keeps_nothing_from_it(bench: Bench) -> None:
+    lane = bench.lane()
+    keep(lane, 0, 1, 2)
+    robot = bench.robot("robot1")
+    robot.ack(bench.eid, 0)
+    until(lambda: robot.relay in lane.receivers, "the relay is known")
+    bench.robot("robot1", relay="dead").ack(bench.eid, 3)
+    until(lambda: "dead" in lane.receivers, "the stranger has taken its place")
+    robot.ack(bench.eid, 0, has_gap=True, until=3)
+    until(lambda: robot.got == [0, 1, 2], "everything")
+    assert robot.skipped == []
 
 
 def test_who_cannot_be_reached_is_forgotten_and_what_nobody_acknowledges_too(

@@ -18,7 +18,7 @@ from typing import Final, cast
 import zenoh
 from zenoh import Priority, Sample, SampleKind
 
-from zsched.core.relay_protocol import SKIP_ENCODING
+from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker
 from zsched.core.serial import serial_of
 from zsched.hop_acks import GIVE_UP_S, Acknowledger, SourceName
 from zsched.relay.counter import StreamCounter
@@ -123,7 +123,7 @@ class Answers:
         name = (key, str(info.source_id.zid), info.source_id.eid)
         if str(sample.encoding) == SKIP_ENCODING:
             marker = decode_end(sample.payload.to_bytes())
-            ready = () if marker is None else self._skip(name, self._acks.number(name, serial_of(marker.count)))
+            ready = () if marker is None else self._begin_later(name, marker)
         else:
             resent = _Resent(
                 key_expr=key,
@@ -189,9 +189,17 @@ class Answers:
             return self._skip(name, first)
         return ()
 
+    def _begin_later(self, name: SourceName, marker: EndMarker) -> tuple[Sample, ...]:
+        """The worker's word: nothing below the marker comes; what an earlier life of this relay had is not lost."""
+        number = self._acks.number(name, serial_of(marker.count))
+        if self._start_of(name) == 0 == self._acks.arrived(name):
+            self._starts[name] = min(marker.had, number)
+        return self._skip(name, number)
+
     def _skip(self, name: SourceName, number: int) -> tuple[Sample, ...]:
         is_known = self._in_turn and name in self._names
-        if is_known and self._acks.arrived(name) == self._start_of(name):  # the gate counts between two that came
+        start = self._start_of(name)
+        if is_known and start is not None and self._acks.arrived(name) <= start:  # the gate counts what is later
             self._counter.lost += self.missing(name, number)
         self._acks.skip(name, number)
         early = self._early.get(name)
