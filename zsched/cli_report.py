@@ -325,6 +325,7 @@ def _route(page: Page, status: Json, task: Json) -> None:
             "doubled": stream.get("doubled"),
             "out of order": stream.get("reordered"),
             "at most lost": stream.get("at_most_lost"),
+            "unconfirmed": stream.get("unconfirmed"),
         }
         text += "".join(f", {count} {what}" for what, count in told.items() if count)
         is_over = (stream.get("dropped_s") or 0.0) > DROPS_OVER_S

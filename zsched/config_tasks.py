@@ -204,6 +204,15 @@ def _advise_ready(given: Section, worker: WorkerSpec, streams: tuple[Located[Str
     if all(stream.value.direction is Direction.OUTPUT for stream in streams):
         message = "nothing goes to this worker, so nothing tells whether it is there: it always counts as ready"
         out.warn(section.where("ready"), message, "give it an input or a service, or use zsched.worker (ready: token)")
+    for stream in streams:
+        settings = stream.value.settings
+        if settings.on_crash is OnCrash.REPLAY:
+            message = "a worker that acknowledges nothing (ready: matching) does not say what it left undone"
+            out.error(stream.place, message, "on_crash: report, or use zsched.worker (ready: token)")
+        elif settings.stream_class is StreamClass.RELIABLE:
+            message = "class reliable, but this worker (ready: matching) acknowledges nothing: what is lost on its link"
+            message += " is not sent again, and what it is sent counts as unconfirmed"
+            out.warn(stream.place, message, "use zsched.worker (ready: token), or class: latest or best_effort")
 
 
 def _advise_network(tuning: Tuning, given: Section, cast: Cast, out: Collector) -> None:

@@ -283,3 +283,31 @@ def test_a_foreign_worker_needs_only_its_subscription(rig: Rig) -> None:
         until(lambda: got == [b"0 ", b"1 ", b"2 "], "both, once each: class latest waits instead of dropping")
     finally:
         foreign.close()
+
+
+@pytest.mark.parametrize("stream_class", StreamClass)
+def test_what_a_foreign_worker_was_sent_is_unconfirmed_and_never_dropped(rig: Rig, stream_class: StreamClass) -> None:
+    """It acknowledges nothing; a move used to count all it had been sent, and had answered, as dropped (closed)."""
+    app = Application(rig.app)
+    foreign = zenoh.open(zenoh.Config.from_json5(worker_config(connect=(rig.endpoint("edge1"),))))
+    try:
+        got: list[str] = []
+        for edge in ("edge1", "edge2"):
+            foreign.declare_subscriber(f"{edge}/{TASK}/{ROBOT}/in", lambda sample: got.append(str(sample.key_expr)))
+        keep_last = 1 if stream_class is StreamClass.LATEST else 0
+        first, second = (
+            slot(number, f"edge{number}", stream_class, keep_last, ReadyWhen.MATCHING) for number in (1, 2)
+        )
+        rig.move(first)
+        until(app.connected, "the application sees the relay's subscription")
+        for count in range(1, 41):
+            app.put()
+            until(lambda count=count: len(got) == count, f"{count} of them")  # type: ignore[misc]
+        rig.move(second, first, drains=False)
+        app.put()
+        until(lambda: f"edge2/{TASK}/{ROBOT}/in" in got, "the next owner")
+        until(lambda: rig.told(f"{TASK}/in/0").unconfirmed == len(got), "as many unconfirmed as sent")
+        told = rig.told(f"{TASK}/in/0")
+        assert (told.drops, told.lost, told.at_most_lost, told.acknowledged) == ((), 0, 0, None)
+    finally:
+        foreign.close()

@@ -526,6 +526,20 @@ def test_a_worker_that_shows_itself_by_matching_must_be_given_something() -> Non
     assert [warning for warning in check(without).warnings if told in warning.message]
 
 
+def test_a_worker_that_acknowledges_nothing_cannot_be_reliable() -> None:
+    told = "acknowledges nothing"
+    text = swapped("class: latest, keep_last: 1", "class: reliable")
+    assert not [warning for warning in check(text).warnings if told in warning.message]
+    foreign = check(swapped("standby: warm", "standby: warm, ready: matching", text))
+    assert foreign.fleet is not None
+    warning = next(warning for warning in foreign.warnings if told in warning.message)
+    assert (warning.line, "zsched.worker" in warning.hint) == (17, True)
+    replay = swapped("class: reliable", "class: reliable, on_crash: replay", text)
+    assert check(replay).fleet is not None
+    faults = check(swapped("standby: warm", "standby: warm, ready: matching", replay)).faults
+    assert ["left undone" in fault.message for fault in faults] == [True]
+
+
 def test_fleet_without_robots_is_refused() -> None:
     text = GOOD.replace("kind: robot", "kind: edge")
     assert "nobody would vote" in check(text).report()

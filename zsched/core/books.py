@@ -6,7 +6,9 @@ Every sample that came, or was given to one owner more, is somewhere: its worker
 it was dropped for a reason, it is on its way (queued, or sent and not acknowledged), it was on its way to a worker that
 died, or it waits for the first owner (class ``latest``)::
 
-    messages + repeated = acknowledged + lost + drops + in flight + at most lost + unsent
+    messages + repeated = acknowledged + lost + drops + in flight + at most lost + unsent + unconfirmed
+
+The last is what went to workers that acknowledge nothing; towards `zsched.worker` it is 0.
 
 What is missing on the right was lost silently; what is too much was counted twice. Both are bugs of ours.
 """
@@ -17,12 +19,11 @@ from zsched.core.plan import StreamCount
 
 
 def unaccounted(count: StreamCount) -> int | None:
-    """Samples that the counters say nothing of (below 0: counted twice); ``None``: this stream's worker counts nothing.
+    """Samples that the counters say nothing of (below 0: counted twice); ``None``: no input, or never had an owner.
 
     Counters are read while samples move; one that is in a thread's hand is accounted for, so 0 holds at any time.
     """
-    if count.acknowledged is None or count.in_flight is None:
+    if count.in_flight is None:
         return None
-    dropped = sum(number for _, number in count.drops)
-    found = count.acknowledged + count.lost + dropped + count.in_flight + count.at_most_lost + count.unsent
-    return count.messages + count.repeated - found
+    known = (count.acknowledged or 0) + count.lost + sum(number for _, number in count.drops) + count.unconfirmed
+    return count.messages + count.repeated - known - count.in_flight - count.at_most_lost - count.unsent

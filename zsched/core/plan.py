@@ -206,6 +206,8 @@ class StreamCount:
     """Inputs: samples that were given to one more receiver: kept values and mirrors."""
     unsent: int = 0
     """Inputs of class ``latest``: values that came while there was no owner; the newest are kept for the next one."""
+    unconfirmed: int = 0
+    """Inputs: sent to a worker that acknowledges nothing (a foreign one): nobody knows what came of them."""
     from_expr: str = ""
     """Filled in by the status: the keys of the newest slot, empty while the task has no owner."""
     to_expr: str = ""

@@ -37,8 +37,11 @@ class StreamCounter:
         if count:
             self._drops[reason] = self._drops.get(reason, 0) + count
 
-    def value(self, tally: Tally | None = None) -> StreamCount:
-        """The counters now, with what the receivers said; ``last_seen_s`` is an age in seconds."""
+    def value(self, tally: Tally | None = None, *, has_acks: bool = False) -> StreamCount:
+        """The counters now, with what became of the samples of an input; ``last_seen_s`` is an age in seconds.
+
+        ``has_acks``: a worker has acknowledged some, or will.
+        """
         said = tally or Tally()
         drops = self._drops
         if said.errors or said.uncounted:
@@ -51,7 +54,7 @@ class StreamCounter:
             bytes=self._bytes,
             drops=tuple(sorted(drops.items())),
             last_seen_s=age,
-            acknowledged=None if tally is None else said.acknowledged,
+            acknowledged=said.acknowledged if has_acks else None,
             in_flight=None if tally is None else said.in_flight + said.waiting,
             lost=self.lost + said.lost,
             doubled=self.doubled + said.doubled,
@@ -60,4 +63,5 @@ class StreamCounter:
             at_most_lost=said.at_most_lost,
             repeated=self.repeated,
             unsent=self.unsent,
+            unconfirmed=said.unconfirmed,
         )

@@ -75,6 +75,8 @@ class InputStream:
         self._kept: OrderedDict[str, deque[_Kept]] = OrderedDict()
         self._closed = Tally()  # what slots that are closed have counted
         self._is_counted = False
+        """Some worker has acknowledged what it has processed, or will."""
+        self._has_opened = False
         side = local or session
         self._loop_ids = own_ids - {str(side.zid())}
         self._receiver = Receiver(
@@ -90,6 +92,7 @@ class InputStream:
         outlet = Outlet(self._session, route.from_expr, route.to_expr, route.settings, acks)
         with self._lock:
             self._is_counted |= acks is not None
+            self._has_opened = True
             self._slots[epoch] = _InputSlot(outlet=outlet, is_counted=acks is not None)
 
     def is_matching(self, epoch: int) -> bool:
@@ -170,10 +173,9 @@ class InputStream:
                 return self._leave(slot, is_done)
             said = slot.outlet.undeclare()
             self._counter.dropped("closed", said.waiting)
-            if not slot.is_counted:
-                return 0
-            left = said.in_flight
+            left = said.in_flight if slot.is_counted else 0
             said.at_most_lost += left
+            said.unconfirmed += said.in_flight - left
             said.in_flight = said.waiting = 0
             self._closed.add(said)
             return left
@@ -243,9 +245,8 @@ class InputStream:
             total.add(self._closed)
             total.waiting += len(self._owed)
             for slot in self._slots.values():
-                if slot.is_counted:
-                    total.add(slot.outlet.counted())
-            return self._counter.value(total if self._is_counted else None)
+                total.add(slot.outlet.counted())
+            return self._counter.value(total if self._has_opened else None, has_acks=self._is_counted)
 
     # --- one sample --------------------------------------------------------------------------------------------------
 

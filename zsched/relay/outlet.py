@@ -155,6 +155,8 @@ class Outlet:
             except zenoh.ZError:
                 return "error", 1
             lane.count += 1  # by one thread at a time, that of the stream's lock
+            if self._acks is None:
+                self._leave_unconfirmed(lane)
             return _ALL_WENT
         size = len(sample.payload) if size is None else size
         action = lambda: self._put(lane, sample, stamp, size)  # noqa: E731 - named for the line's length
@@ -338,11 +340,8 @@ class Outlet:
     # --- the queue's thread ------------------------------------------------------------------------------------------
 
     def _put(self, lane: Lane, sample: Sample, stamp: Timestamp | None, size: int) -> None:
-        if self._acks is None:  # nobody asks what became of it
-            if self._crowd is None:
-                lane.put(sample, stamp)
-            else:
-                self._crowd.put(lane, sample, stamp, size)
+        if self._crowd is not None:  # of an output nobody asks what became of it
+            self._crowd.put(lane, sample, stamp, size)
             lane.count += 1
             return
         self._in_hand = (sample, stamp)
@@ -356,6 +355,10 @@ class Outlet:
             raise
         with self._lock:
             self._left, self._in_hand = self._left + 1, None
+            if self._acks is None:
+                lane.count += 1
+                self._leave_unconfirmed(lane)
+                return
             if lane.is_foreign:
                 self.tally.new_life(lane, lane.count)
                 lane.count += 1
@@ -367,6 +370,11 @@ class Outlet:
             sent = Sent(lane.count - 1, sample, stamp, size, now, now - began)
             bound = self._kept_bytes + size if self._is_reliable else self._kept_bytes  # full lanes put no more
             lane.keep(sent, samples=self._kept_limit, least=self._kept_least, size=bound)
+
+    def _leave_unconfirmed(self, lane: Lane) -> None:
+        """What was just put is in flight no more: its receiver will say nothing of it."""
+        lane.base = lane.count
+        self.tally.unconfirmed += 1
 
     def _is_open(self) -> bool:
         """Class ``reliable``: nothing goes out to who has not been greeted, and no more than can be sent again."""

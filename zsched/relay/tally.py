@@ -29,7 +29,9 @@ class Tally:
     errors: int = 0
     """Refused by zenoh in a queue's thread."""
     uncounted: int = 0
-    """Put on to whoever subscribes, who acknowledges nothing."""
+    """Put on to whoever subscribes beside the worker, who acknowledges nothing."""
+    unconfirmed: int = 0
+    """Put on to a worker that acknowledges nothing."""
 
     def add(self, other: Tally) -> None:
         """Add another one to this."""

@@ -11,7 +11,7 @@ from zsched.core.plan import StreamCount
 
 WHOLE = StreamCount(
     stream="merge/in/0",
-    messages=100,
+    messages=107,
     repeated=5,
     acknowledged=60,
     lost=3,
@@ -19,6 +19,7 @@ WHOLE = StreamCount(
     in_flight=20,
     at_most_lost=10,
     unsent=2,
+    unconfirmed=7,
 )
 
 
@@ -26,11 +27,17 @@ def test_what_is_in_exactly_one_counter_is_accounted_for() -> None:
     assert unaccounted(WHOLE) == 0
 
 
-@pytest.mark.parametrize("name", ["acknowledged", "lost", "in_flight", "at_most_lost", "unsent"])
+@pytest.mark.parametrize("name", ["acknowledged", "lost", "in_flight", "at_most_lost", "unsent", "unconfirmed"])
 def test_what_a_counter_lacks_is_missing(name: str) -> None:
     assert unaccounted(replace(WHOLE, **{name: getattr(WHOLE, name) - 1})) == 1
     assert unaccounted(replace(WHOLE, **{name: getattr(WHOLE, name) + 1})) == -1
 
 
-def test_a_worker_that_counts_nothing_has_no_books() -> None:
-    assert unaccounted(replace(WHOLE, acknowledged=None)) is None
+def test_what_a_worker_without_acknowledgements_was_sent_is_unconfirmed() -> None:
+    foreign = StreamCount(stream="merge/in/0", messages=40, acknowledged=None, in_flight=0, unconfirmed=40)
+    assert unaccounted(foreign) == 0
+    assert unaccounted(replace(foreign, unconfirmed=0, drops=(("closed", 39),))) == 1
+
+
+def test_an_output_has_no_books() -> None:
+    assert unaccounted(StreamCount(stream="merge/out/0", messages=3)) is None
