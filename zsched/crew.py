@@ -13,24 +13,27 @@ from typing import Final
 from zsched.adapters.worker_supervisor import WorkerSupervisor
 from zsched.core import events as ev
 from zsched.core.fleet import Fleet
-from zsched.core.model import TaskId, WorkerState
+from zsched.core.model import NodeId, TaskId, WorkerState
 from zsched.core.plan import ReadyWhen
 from zsched.core.relay_protocol import WorkerMatched, WorkerSeen, WorkerTrouble
-from zsched.keyspace import counter
+from zsched.keyspace import Keyspace, counter
 
 OTHERS: Final = (
     "somebody takes every node's inputs (a recorder?): whether a worker is there cannot be told by matching; "
     "output_deadline_s notices a dead one"
 )
-NO_TOKEN: Final = "no token: it did not call Worker.ready(), or did not open $ZSCHED_ZENOH_CONFIG"
+NO_TOKEN: Final = (
+    "no token: without zsched.worker say `ready: matching`; with it, Worker.ready() on $ZSCHED_ZENOH_CONFIG declares"
+)
 OTHER_NETWORK: Final = "did it open $ZSCHED_ZENOH_CONFIG?"
 
 
 class Crew:
     """The workers of one daemon (it implements the supervisor's `WorkerEvents`)."""
 
-    def __init__(self, post: Callable[[ev.Event], None], fleet: Fleet | None = None) -> None:
+    def __init__(self, post: Callable[[ev.Event], None], fleet: Fleet | None = None, node: NodeId = "") -> None:
         """``fleet`` says which workers show themselves by matching; without one all show tokens."""
+        self._keys, self._node = Keyspace("" if fleet is None else fleet.name), node
         tasks = () if fleet is None else fleet.tasks
         self._matching = frozenset(task.name for task in tasks if task.worker.ready_when is ReadyWhen.MATCHING)
         self._foreign = frozenset(task.name for task in tasks if not task.worker.command)
@@ -40,6 +43,8 @@ class Crew:
         self._lives: dict[TaskId, int] = {}
         """{task: the running process's incarnation}, 0 once it has ended; none for somebody else's worker."""
         self._matches: dict[TaskId, WorkerMatched] = {}
+        self._strays: dict[TaskId, str] = {}
+        """{task: the incarnation of a token here that is not the running process's}."""
         self._lock = threading.Lock()  # an end and a token's end come from two threads
 
     def life_of(self, task: TaskId) -> int:
@@ -50,9 +55,24 @@ class Crew:
     def why_not_ready(self, task: TaskId) -> str:
         """What its worker lacks, for an operator."""
         if task not in self._matching:
-            return NO_TOKEN
+            return self._no_token(task)
         match = self._matches.get(task)
         return f"{match.missing}; {OTHER_NETWORK}" if match is not None and match.missing else "not seen by the relay"
+
+    def _no_token(self, task: TaskId) -> str:
+        """The key that it should be at, and one of the task that is at another: who declared it by hand errs there."""
+        key = self._keys.worker(self._node, task, self._lives.get(task) or "NUMBER")
+        stray = self._strays.get(task)
+        if stray is None:
+            return f"{NO_TOKEN} {key}"
+        return f"its token ends in /{stray}, and should be {key} ($ZSCHED_INCARNATION)"
+
+    def begin(self) -> None:
+        """Say what is missing of the workers that somebody else starts; the relay says it of those seen by matching."""
+        for task in sorted(self._foreign - self._matching):
+            if self._supervisor_of(task) is not None:
+                reason = self._no_token(task)
+                self._post(ev.WorkerChanged(task=task, state=WorkerState.STOPPED, reason=reason))
 
     # --- the relay's handle ------------------------------------------------------------------------------------------
 
@@ -66,7 +86,12 @@ class Crew:
         with self._lock:
             current = self._lives.get(task)
             if current is None or life == current:
-                self._tell(supervisor, task, life, is_ready=is_present, reason="its token")
+                reason = "its token" if is_present else "its token went"
+                self._tell(supervisor, task, life, is_ready=is_present, reason=reason)
+            elif is_present:
+                self._strays[task] = seen.incarnation
+            elif self._strays.get(task) == seen.incarnation:
+                del self._strays[task]
 
     def on_matched(self, match: WorkerMatched) -> None:
         """Somebody takes what goes to a worker here, or nobody does."""

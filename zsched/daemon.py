@@ -191,6 +191,7 @@ class Daemon:
         shell = Shell(node=me, inbox=self._inbox, bus=bus, state_file=state_file, desk=desk, fleet=fleet)
         shell.relay = relay = self._relay(shell, incarnation, points, operator_json5)
         shell.crew.supervisor = supervisor = self._supervisor(stack, shell, incarnation, points, operator_json5)
+        shell.crew.begin()
         for watch in filter(None, (watch_for(fleet, task, me) for task in fleet.tasks)):
             relay.watch(watch)
         relay.start()

@@ -194,7 +194,7 @@ class Shell:
         """``fleet`` says how workers show themselves; see `Crew`."""
         self._node, self._inbox = node, inbox
         self._bus, self._state_file, self._desk = bus, state_file, desk
-        self.crew = Crew(inbox.post, fleet)
+        self.crew = Crew(inbox.post, fleet, node)
         self.relay: RelayHandle | None = None
         """It reports to this shell, so it is made after it."""
         self.stand_down = ""

@@ -10,7 +10,7 @@ from support.waiting import until
 from zsched.adapters.worker_supervisor import WorkerContext, WorkerSupervisor
 from zsched.core import events as ev
 from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.model import NodeKind, Tuning, Weights, WorkerState
+from zsched.core.model import MAX_REASON, NodeKind, Tuning, Weights, WorkerState
 from zsched.core.plan import ReadyWhen
 from zsched.core.relay_protocol import WorkerMatched, WorkerSeen, WorkerTrouble
 from zsched.crew import OTHERS, Crew
@@ -20,6 +20,7 @@ TUNING = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
 SPECS = {
     "node": WorkerSpec(command=SLEEPER, ready_when=ReadyWhen.MATCHING, start_deadline_s=0.5, stop_grace_s=0.1),
     "others": WorkerSpec(ready_when=ReadyWhen.MATCHING),
+    "alone": WorkerSpec(),
     "token": WorkerSpec(command=SLEEPER, start_deadline_s=0.5, stop_grace_s=0.1),
 }
 FLEET = Fleet(
@@ -37,7 +38,7 @@ class House:
 
     def __init__(self) -> None:
         self.events: list[ev.Event] = []
-        self.crew = Crew(self.events.append, FLEET)
+        self.crew = Crew(self.events.append, FLEET, "edge1")
         self.crew.supervisor = self.supervisor = WorkerSupervisor(
             specs=SPECS,
             context=WorkerContext(fleet="test", node="edge1", incarnation=1),
@@ -126,4 +127,26 @@ def test_a_failed_worker_that_nobody_wants_now_may_be_chosen_again_after_a_reset
 
 def test_a_worker_without_its_token_is_told_what_it_lacks(house: House) -> None:
     house.supervisor.start("token")
-    until(lambda: "no token: it did not call Worker.ready()" in str(house.reasons("token")), "the deadline")
+    life = until(lambda: house.crew.life_of("token"), "it runs")
+    until(lambda: "not ready within" in str(house.reasons("token")), "the deadline")
+    reason = next(reason for reason in house.reasons("token") if "not ready" in reason)
+    assert "without zsched.worker say `ready: matching`" in reason
+    assert reason.endswith(f"@zsched/test/worker/edge1/token/{life}")
+    assert len(reason) <= MAX_REASON
+
+
+def test_a_worker_whose_token_is_at_another_key_is_told_both(house: House) -> None:
+    house.supervisor.start("token")
+    life = until(lambda: house.crew.life_of("token"), "it runs")
+    house.crew.on_token(WorkerSeen(node="edge1", task="token", incarnation="1", is_present=True))
+    until(lambda: "not ready within" in str(house.reasons("token")), "the deadline")
+    assert f"its token ends in /1, and should be @zsched/test/worker/edge1/token/{life}" in str(house.reasons("token"))
+    house.crew.on_token(WorkerSeen(node="edge1", task="token", incarnation="1", is_present=False))
+    assert "no token" in house.crew.why_not_ready("token")
+
+
+def test_who_has_to_start_a_worker_with_a_token_is_told_its_key(house: House) -> None:
+    house.crew.begin()
+    assert "`ready: matching`" in house.reasons("alone")[0]
+    assert "worker/edge1/alone/NUMBER" in house.reasons("alone")[0]
+    assert house.reasons("others") == house.reasons("node") == house.reasons("token") == []

@@ -16,7 +16,7 @@ from zsched.core.executor import Executor, Phase
 from zsched.core.fleet import Fleet, NodeSpec, TaskSpec
 from zsched.core.gateway import Gateway
 from zsched.core.membership import Membership
-from zsched.core.model import Allocation, NodeId, NodeKind, PeerState, TaskId, WorkerState
+from zsched.core.model import Allocation, NodeId, NodeKind, PeerState, TaskId, WorkerLoad, WorkerState
 from zsched.core.plan import Direction, ReadyWhen, Route, StreamCount
 from zsched.core.register import Register
 from zsched.core.rounds import Rounds, TaskRound
@@ -224,7 +224,7 @@ def _task_problems(node: NodeView, task: TaskSpec, value: Allocation, now: float
         why = f": {load.reason}" if load.reason else ""
         if load.state is WorkerState.FAILED:
             yield f"the worker on {spec.name} failed{why}; mend it, then `zsched retry {task.name} {spec.name}`"
-        elif spec.name == owner and load.state is not WorkerState.READY:
+        elif (spec.name == owner and load.state is not WorkerState.READY) or (owner is None and _is_missed(task, load)):
             yield f"the worker on {spec.name} is {load.state}{why}"
         elif load.state is WorkerState.READY and load.reason:
             yield f"the worker on {spec.name}{why}"
@@ -232,6 +232,11 @@ def _task_problems(node: NodeView, task: TaskSpec, value: Allocation, now: float
     if is_owner_ready and now - since >= UNREADY_SHOWN_S:
         waited = f"this robot's streams have waited for {executor.owner} for {now - since:.0f} s"
         yield f"{waited}: {_untaken(task, executor)}"
+
+
+def _is_missed(task: TaskSpec, load: WorkerLoad) -> bool:
+    """Whether somebody else has to start a node's worker, and it is not seen."""
+    return not task.worker.command and load.state is WorkerState.STOPPED and bool(load.reason)
 
 
 def _unready_since(node: NodeView, executor: Executor) -> float:

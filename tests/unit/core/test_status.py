@@ -189,7 +189,16 @@ def test_a_worker_that_failed_or_is_missed_is_told_with_its_reason() -> None:
     )
 
 
-def told_by(node: Node, name: str, sequence: int, state: WorkerState) -> None:
+def test_a_task_without_an_owner_says_which_workers_somebody_else_has_to_start() -> None:
+    node = make()
+    node.handle(ev.BeatReceived(beat=Beat(node="edge1", incarnation=3, sequence=1, loop_lag_s=0.0)), 100.0)
+    told_by(node, "edge1", 1, WorkerState.STOPPED, "no token")
+    assert build_snapshot(node, 100.0).tasks[0].problems == (), "our own standby, which a move starts"
+    node.fleet = replace(FLEET, tasks=tuple(replace(task, worker=WorkerSpec()) for task in FLEET.tasks))
+    assert build_snapshot(node, 100.0).tasks[0].problems == ("the worker on edge1 is stopped: no token",)
+
+
+def told_by(node: Node, name: str, sequence: int, state: WorkerState, reason: str = "") -> None:
     """A node's profile says how its worker is."""
     profile = Profile(
         node=name,
@@ -199,7 +208,7 @@ def told_by(node: Node, name: str, sequence: int, state: WorkerState) -> None:
         cpu_used_cores=1.0,
         memory_mb=4000.0,
         memory_used_mb=100.0,
-        workers=(WorkerLoad(task="merge", state=state),),
+        workers=(WorkerLoad(task="merge", state=state, reason=reason),),
     )
     node.handle(ev.ProfileReceived(profile=profile), 100.0)
 
