@@ -59,6 +59,8 @@ class Dispatcher:
         self._is_begin_due = False
         self._turn = 0
         self._turn_in_hand = 0
+        self._is_whole = False
+        """Of the input in hand everything is wanted; of any other the gates drop what comes too late."""
         self._has_withheld = False
         self._backlog = Backlog[Input]()
         self._is_standby: Callable[[], bool] = _never
@@ -139,13 +141,14 @@ class Dispatcher:
     def must_wait(self, epoch: int) -> bool:
         """In the dispatch thread: what is made of the input in hand must not go out yet, though the role allows it.
 
-        The role of ``epoch`` has come and `begin` not yet; or an older input is still to be answered, or another output
-        of this one was withheld, and it is processed again in its turn.
+        The role of ``epoch`` has come and `begin` not yet; or another output of this input was withheld, or an older
+        one is still to be answered and nothing may be skipped: then it is processed again in its turn.
         """
         if threading.current_thread() is not self._thread:
             return False
         is_early = self._is_begin_due or self._epoch != epoch
-        is_behind = self._in_hand is not None and (self._has_withheld or self._backlog.is_before(self._turn_in_hand))
+        is_late = self._is_whole and self._backlog.is_before(self._turn_in_hand)
+        is_behind = self._in_hand is not None and (self._has_withheld or is_late)
         return is_early or is_behind
 
     def stamp(self) -> zenoh.Timestamp | None:
@@ -257,7 +260,7 @@ class Dispatcher:
             epoch = self._hear(waiting.name, sample) if waiting.name is not None else self._epoch
         else:
             self._turn_in_hand, epoch = again.turn, again.epoch
-        self._in_hand = epoch
+        self._in_hand, self._is_whole = epoch, waiting.is_wanted
         self._dispatch(source, sample, replayed=waiting.replayed)
         self._in_hand = None
         if waiting.name is not None:

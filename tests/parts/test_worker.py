@@ -120,11 +120,11 @@ def environment(relay: Relay, folder: Path) -> dict[str, str]:
 class Echo:
     """A worker in this process that answers every input under its epoch."""
 
-    def __init__(self, worker: Worker) -> None:
+    def __init__(self, worker: Worker, keep_last: int | None = None) -> None:
         self.worker = worker
         self.taken: list[Received] = []
         self.output: Output = worker.publisher("{prefix}/{epoch}/robot1/out", reliable=True)
-        worker.subscribe("{prefix}/*/in", self._take, keep_last=None)
+        worker.subscribe("{prefix}/*/in", self._take, keep_last=keep_last)
         worker.ready()
 
     def _take(self, received: Received) -> None:
@@ -408,10 +408,10 @@ def test_what_was_withheld_goes_out_before_what_comes_with_the_role(relay: Relay
 class Slow(Echo):
     """One that stands still in its callback, before the output, as long as ``gate`` is shut."""
 
-    def __init__(self, worker: Worker) -> None:
+    def __init__(self, worker: Worker, keep_last: int | None = None) -> None:
         self.gate = threading.Event()
         self.gate.set()
-        super().__init__(worker)
+        super().__init__(worker, keep_last)
 
     def _take(self, received: Received) -> None:
         self.taken.append(received)
@@ -438,6 +438,23 @@ def test_the_sample_in_hand_when_the_role_comes_does_not_overtake_what_was_withh
         slow.gate.set()
         until(lambda: len(relay.outputs) >= 4, "all outputs")
         assert [payload for _, payload in relay.outputs] == [b"a", b"b", b"c", b"d"]
+
+
+def test_the_newest_value_in_hand_when_the_role_comes_goes_out_at_once(relay: Relay, tmp_path: Path) -> None:
+    """Where older values need no answer, a takeover does not wait for them: the gate drops them behind it."""
+    with Worker.from_env(environment(relay, tmp_path), handles_signals=False) as worker:
+        slow = Slow(worker, keep_last=1)
+        until(lambda: KEYS.worker("edge1", "t", 3) in relay.tokens, "the ready token")
+        relay.put(b"a")
+        until(lambda: slow.output.withheld == 1, "the warm-up")
+        slow.gate.clear()
+        relay.put(b"b")
+        until(lambda: len(slow.taken) == 2, "the next value is in hand")
+        relay.tell(WorkerRole.ACTIVE, epoch=4)
+        until(lambda: f"{ROLE_KEY}/4" in relay.tokens, "the worker has begun")
+        slow.gate.set()
+        until(lambda: relay.outputs, "its result")
+        assert relay.outputs[0] == ("edge1/t/4/robot1/out", b"b")
 
 
 def test_what_was_withheld_for_want_of_a_lease_goes_out_before_what_comes_with_it(relay: Relay, echo: Echo) -> None:
