@@ -105,6 +105,8 @@ class Acknowledger:
     def __init__(self, send: Callable[[str, StreamAcks], None]) -> None:
         """``send`` puts a frame for the session with that zenoh id; it must not block long."""
         self._send = send
+        self.born_at = monotonic_s()
+        """When this process began to listen."""
         self._sources: dict[SourceName, _Source] = {}
         self._dirty: set[SourceName] = set()
         self._wake = threading.Condition()

@@ -68,7 +68,7 @@ class _Receiver:
 
     node: str
     arrived: int = 0
-    had: int = 0
+    had: int | None = None
     """The numbers below this one an earlier life of it has acknowledged; it is not sent them."""
     waits_for: int = 0
     """What it comes to next by its own word: a new life begins at 0."""
@@ -139,7 +139,7 @@ class KeptLane:
                 receiver = self.receivers[relay] = _Receiver(node=node, arrived=-1, had=self._had_by(relay, node))
             # one that came late knows the lowest bits only; nobody can have more than was sent
             receiver.waits_for = min(number_near(serial_of(ack.arrived), self.count), self.count)
-            arrived = max(receiver.waits_for, receiver.had)
+            arrived = max(receiver.waits_for, receiver.had or 0)
             has_moved = arrived > receiver.arrived
             receiver.heard_at, receiver.is_ended = now, ack.is_ended
             if has_moved:
@@ -157,11 +157,11 @@ class KeptLane:
         if len(self.had) > MAX_RECEIVERS:
             self.had.pop(next(iter(self.had)))
 
-    def _had_by(self, relay: str, node: str) -> int:
-        """How far a relay's node has come by another relay; one that is known knows that itself."""
+    def _had_by(self, relay: str, node: str) -> int | None:
+        """How far a relay's node has come by another relay, ``None``: by none; one that is known knows it itself."""
         if self.had.pop(relay, None) is not None:
-            return 0
-        return max((arrived for of, arrived in self.had.values() if of == node), default=0)
+            return None
+        return max((arrived for of, arrived in self.had.values() if of == node), default=None)
 
     def _make_room(self) -> None:
         least = min(self.receivers, key=lambda name: (self.receivers[name].is_confirmed, self.receivers[name].heard_at))
@@ -332,7 +332,8 @@ class Keeper:
         if publisher is None:
             return
         if is_asked and first > receiver.waits_for:  # older ones it has had, or they are kept no more
-            marker = EndMarker(epoch=0, count=first, had=receiver.had)
+            age_s = None if lane.began_at is None else now - lane.began_at
+            marker = EndMarker(epoch=0, count=first, had=receiver.had, age_s=age_s)
             source = zenoh.SourceInfo(lane.source_id, serial_of(first))
             publisher.put(encode_end(marker), encoding=SKIP_ENCODING, source_info=source)
         for one in wanted:

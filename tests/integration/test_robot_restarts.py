@@ -54,3 +54,29 @@ def test_what_a_former_life_of_the_relay_has_had_is_neither_lost_nor_given_twice
                 (f"{TASK}/out/0", 0, 0),
             ]
         assert bed.task("robot1")["epoch"] == epoch, "all in one epoch"
+
+
+def test_a_robot_that_joins_late_has_lost_nothing_of_what_was_before_it(tmp_path: Path) -> None:
+    """An output that all robots share: the others have had its beginning, and the worker keeps that no more."""
+    tree = echo_fleet(robots=3, edges=1, timing="wired", stream_class="reliable")
+    tree["tasks"][TASK]["outputs"][0]["from"] = "{target}/echo/{epoch}/robot1/out"
+    with Testbed(tmp_path, tree) as bed:
+        bed.init()
+        bed.start("robot1", "robot2", "edge1")
+        bed.wait_settled()
+        feed(bed, 0)
+        time.sleep(NEWCOMERS_S + 2 * TICK_S)  # what everybody has acknowledged is let go of
+        bed.start("robot3")
+        bed.wait_settled()
+        late = bed.app("robot3")
+        heard: list[int] = []
+        kept = late.declare_subscriber("robot3/out", lambda sample: heard.append(int(sample.payload.to_bytes())))
+        feed(bed, COUNT)
+        bed.wait(lambda: heard == list(range(COUNT, 2 * COUNT)), 20, "what came since, and nothing twice")
+
+        def told() -> tuple[int, int] | None:
+            count = next((one for one in bed.counts("robot3") if one.stream == f"{TASK}/out/0"), None)
+            return None if count is None or count.messages < COUNT else (count.messages, count.lost)
+
+        assert bed.wait(told, 10, "the counters") == (COUNT, 0)
+        kept.undeclare()

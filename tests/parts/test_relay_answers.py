@@ -137,12 +137,16 @@ def test_first_answers_that_the_worker_has_no_more_are_counted_too(bench: Bench)
     assert stream.count().lost == 3
 
 
-@pytest.mark.parametrize(("had", "lost"), [(60, 0), (50, 10), (70, 0)])
-def test_what_an_earlier_life_of_this_relay_has_had_is_not_lost(bench: Bench, had: int, lost: int) -> None:
+@pytest.mark.parametrize(
+    ("had", "age_s", "lost"), [(60, 900.0, 0), (50, 900.0, 10), (70, 0.0, 0), (None, 900.0, 0), (None, 0.0, 60)]
+)
+def test_what_an_earlier_life_of_this_relay_has_had_or_was_before_it_is_not_lost(
+    bench: Bench, had: int | None, age_s: float, lost: int
+) -> None:
     stream = bench.open()
     bench.put(60)
     bench.wait_ack(arrived=0, has_gap=True, until=60)
-    marker = encode_end(EndMarker(epoch=0, count=60, had=had))
+    marker = encode_end(EndMarker(epoch=0, count=60, had=had, age_s=age_s))
     bench.again.put(marker, encoding=SKIP_ENCODING, source_info=zenoh.SourceInfo(bench.publisher.id, 60))
     assert bench.is_through(60)
     bench.put(61, 62)

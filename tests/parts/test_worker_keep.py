@@ -28,7 +28,7 @@ class Robot:
         self.relay = relay or str(session.zid())
         self.got: list[int] = []
         self.skipped: list[int] = []
-        self.had: list[int] = []
+        self.had: list[int | None] = []
         self.ends: list[int] = []
         self._key = KEYS.received(node, self.relay, str(worker.zid()))
         self._again = session.declare_subscriber(f"{KEY}/{AGAIN_CHUNK}/{self.relay}", self._take)

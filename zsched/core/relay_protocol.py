@@ -116,14 +116,17 @@ class EndMarker:
     """Start markers: so many samples from ``count`` on went to an earlier owner, which died."""
     is_whole: bool = False
     """Start markers: the stream is of class ``reliable``, every sample is wanted."""
-    had: int = 0
-    """Start markers among answers: the numbers below this one an earlier life of the same relay has acknowledged."""
+    had: int | None = None
+    """Start markers among answers: the numbers below this one an earlier life of the same relay has acknowledged;
+    ``None``: no other life of it is known."""
+    age_s: float | None = None
+    """Start markers among answers: number 0 was put so long ago."""
 
     def __post_init__(self) -> None:
         check_counter("end.epoch", self.epoch)
         check_counter("end.count", self.count)
         check_counter("end.replayed", self.replayed)
-        check_counter("end.had", self.had)
+        check_counter("end.had", self.had or 0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

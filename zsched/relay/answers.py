@@ -18,6 +18,7 @@ from typing import Final, cast
 import zenoh
 from zenoh import Priority, Sample, SampleKind
 
+from zsched.clock import monotonic_s
 from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker
 from zsched.core.serial import serial_of
 from zsched.hop_acks import GIVE_UP_S, Acknowledger, SourceName
@@ -190,10 +191,15 @@ class Answers:
         return ()
 
     def _begin_later(self, name: SourceName, marker: EndMarker) -> tuple[Sample, ...]:
-        """The worker's word: nothing below the marker comes; what an earlier life of this relay had is not lost."""
+        """The worker's word: nothing below the marker comes.
+
+        What an earlier life of this relay had is not lost, nor is, where it had none, a beginning before its time.
+        """
         number = self._acks.number(name, serial_of(marker.count))
         if self._start_of(name) == 0 == self._acks.arrived(name):
-            self._starts[name] = min(marker.had, number)
+            is_late = marker.age_s is not None and monotonic_s() - marker.age_s < self._acks.born_at
+            before = number if is_late else 0
+            self._starts[name] = min(before if marker.had is None else marker.had, number)
         return self._skip(name, number)
 
     def _skip(self, name: SourceName, number: int) -> tuple[Sample, ...]:
