@@ -6,9 +6,7 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
-from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -19,12 +17,13 @@ from support.sessions import matches
 from support.waiting import free_endpoint, until
 from zsched.core.plan import StreamClass, StreamSettings
 from zsched.relay import history
+from zsched.relay.questions import Question, Questions
 from zsched.relay.receive import Receiver
 from zsched.zenoh_config import data_config, worker_config
 
 KEY = "robot1/map"
-QUERY_S = 8.0
-"""How long the cache of a dead publisher is asked in one test; a stream that waited for it would show."""
+QUERY_S = 90.0
+"""How long the cache of a dead publisher is asked in one test; a stream that waited for it would not come in time."""
 SETTINGS = StreamSettings(stream_class=StreamClass.LATEST, keep_last=2, depth=100)
 PUBLISHER = """
 import sys, zenoh
@@ -100,6 +99,30 @@ def test_a_publisher_that_comes_late_is_asked_too(net: Net, tmp_path: Path) -> N
     assert net.got == sorted(set(net.got))
 
 
+def test_a_publisher_that_stood_still_while_it_was_asked_is_asked_again(
+    net: Net, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else the value that it holds would never come: it does not put it again."""
+    monkeypatch.setattr(history, "TIMEOUT_S", 0.1)
+    unanswered: list[str] = []
+    ended = Questions.ended
+
+    def note(questions: Questions, question: Question, now: float, *, is_whole: bool) -> None:
+        if not is_whole:
+            unanswered.append(question.selector)
+        ended(questions, question, now, is_whole=is_whole)
+
+    monkeypatch.setattr(Questions, "ended", note)
+    with publisher(net, tmp_path) as process:
+        until(lambda: any(net.relay.liveliness().get(f"{KEY}/@adv/**")), "the publisher's token")
+        process.send_signal(signal.SIGSTOP)
+        net.receive()
+        until(lambda: any("**" not in one for one in unanswered), "the question to itself has no answer either")
+        assert not net.got
+        process.send_signal(signal.SIGCONT)
+        until(lambda: net.got == ["frozen 1", "frozen 2"], "what it holds")
+
+
 def test_wild_keys_have_caches_each(net: Net) -> None:
     publishers = {name: net.advanced(f"robot1/{name}/map") for name in "ab"}
     for name, one in publishers.items():
@@ -128,7 +151,7 @@ def test_all_of_many_publishers_that_appear_at_once_are_asked(net: Net) -> None:
             settings = StreamSettings(stream_class=StreamClass.LATEST, keep_last=1, depth=2000)
             take = lambda sample: net.got.append(sample.payload.to_string())  # noqa: E731 - named for its use below
             receiver = Receiver(relay, "robot1/*/map", settings, take, with_history=True)
-            until(lambda: len(set(net.got)) == len(names), "every value", 30)
+            until(lambda: len(set(net.got)) == len(names), "every value", 60.0)
             assert sorted(net.got) == sorted(names), "and each once"
             receiver.close()
         for one in kept:
@@ -160,7 +183,7 @@ class publisher:  # noqa: N801 - reads as a verb in a with statement
 
     def __exit__(self, *_: object) -> None:
         self.process.kill()
-        self.process.communicate(timeout=5)
+        self.process.communicate(timeout=30)
 
 
 @pytest.mark.parametrize("fault", [signal.SIGSTOP, signal.SIGKILL])
@@ -170,7 +193,7 @@ def test_a_publisher_that_dies_with_a_query_open_holds_no_stream(
     """The stream of another publisher goes on although a cache that is being asked never answers."""
     monkeypatch.setattr(history, "TIMEOUT_S", QUERY_S)
     live = net.app.declare_publisher(KEY)
-    arrivals: list[float] = []
+    arrivals: list[str] = []
     halt = threading.Event()
 
     def stream() -> None:
@@ -182,13 +205,10 @@ def test_a_publisher_that_dies_with_a_query_open_holds_no_stream(
         until(lambda: str(process.pid) and net.relay.info.links(), "links")
         thread.start()
         process.send_signal(fault)
-        take = lambda _sample: arrivals.append(time.monotonic())  # noqa: E731 - used once
-        started = time.monotonic()
+        take = lambda sample: arrivals.append(sample.payload.to_string())  # noqa: E731 - used once
         net.receivers.append(Receiver(net.relay, KEY, SETTINGS, take, with_history=True))
         try:
-            until(lambda: len(arrivals) > 100, "the live stream", deadline_s=20.0)
+            until(lambda: len(arrivals) > 100, "the live stream", deadline_s=60.0)
         finally:
             halt.set()
-            thread.join(3)
-    gaps = [later - earlier for earlier, later in pairwise([started, *arrivals])]
-    assert max(gaps) < QUERY_S / 4
+            thread.join(30)

@@ -1,6 +1,7 @@
 """Fetches what publishers still hold of a key: the cached values that a late subscriber has missed.
 
-Knows: the tokens and caches of advanced publishers, how long to wait for an answer. Does not know: streams, slots.
+Knows: the tokens and caches of advanced publishers, how long to wait for an answer. Does not know: streams, slots,
+who is asked next (`Questions`).
 
 Zenoh's own advanced subscriber would do it too, but holds back every live sample of the stream while such a query is
 open, for 10 s when the publisher is frozen (1.10.2; the time has no parameter in Python). Here live samples never wait:
@@ -18,18 +19,19 @@ from typing import Final
 import zenoh
 from zenoh import Sample, SampleKind, Session
 
+from zsched.clock import monotonic_s
 from zsched.core.serial import number_near
 from zsched.guard import guarded, tolerant
+from zsched.relay.questions import ADVANCED, Publisher, Question, Questions
 
 TIMEOUT_S: Final = 0.5
 MAX_FETCHES: Final = 8
 """Queries at one time in this process; further ones wait."""
-MAX_PENDING: Final = 64
-"""Keys of one expression that wait to be asked; behind that one question for all is less work."""
 MAX_ASKERS: Final = 4
 """Threads of one expression; a frozen publisher holds one for `TIMEOUT_S`."""
 MAX_SOURCES: Final = 4096
-ADVANCED: Final = "@adv"
+UNNUMBERED: Final = "uhlc"
+"""In the token of a publisher whose samples have times instead of numbers."""
 
 _log = logging.getLogger("zsched.relay")
 _turn = threading.BoundedSemaphore(MAX_FETCHES)
@@ -59,10 +61,13 @@ class History:
         self._deliver = deliver
         self._origin = origin
         self._own_id = str(session.zid())
-        self._everything = f"{expr}/{ADVANCED}/**"
-        self._asking = threading.Lock()
-        self._wanted: dict[str, None] = {}  # in order
+        self._questions = Questions(expr, self._depth)
+        self._asking = threading.Condition()
+        self._sending = threading.Lock()
+        """Held while `session.get` runs: a session that is closed meanwhile raises "Already borrowed"."""
         self._askers = 0
+        self._waits = False
+        """One of the askers waits until a question is due again."""
         self._is_closed = False
         self.lock = threading.Lock()
         self._newest: dict[_Source, int] = {}  # numbers that came either way
@@ -73,17 +78,21 @@ class History:
     def start(self) -> None:
         """Ask every cache there is, and later those of publishers that appear.
 
-        The watch comes first: a publisher that was linked between a question and the watch would never be asked.
+        The watch also tells of publishers that are there: who fails to answer is known, and is asked again.
         """
         watch = f"{self._expr}/{ADVANCED}/pub/**"
+        with self._asking:
+            self._questions.ask_all(monotonic_s())
+            self._have_asked()
         self._tokens = self._session.liveliness().declare_subscriber(
-            watch, tolerant(self._token, "history"), history=False
+            watch, tolerant(self._token, "history"), history=True
         )
-        self._ask(self._everything)
 
     def close(self) -> None:
-        """Ask nobody any more; answers on their way are dropped."""
-        self._is_closed = True
+        """Ask nobody any more; answers on their way are dropped, and the session may be closed."""
+        with self._sending, self._asking:
+            self._is_closed = True
+            self._asking.notify_all()
         if self._tokens is not None:
             self._tokens.undeclare()
 
@@ -115,55 +124,78 @@ class History:
     # --- asking ------------------------------------------------------------------------------------------------------
 
     def _token(self, sample: Sample) -> None:
-        """A publisher with a cache came (zenoh's callback thread: start a thread, nothing else)."""
+        """A publisher with a cache came or went (zenoh's callback thread: start a thread, nothing else)."""
         key = str(sample.key_expr)
-        if sample.kind == SampleKind.PUT and self._own_id not in key.split("/"):
-            self._ask(key)
-
-    def _ask(self, key: str) -> None:
-        """Have a key's caches asked; where too many wait, one question for all of them takes their place."""
+        if self._own_id in key.split("/"):
+            return
         with self._asking:
-            if self._is_closed or self._everything in self._wanted:
-                return
-            if len(self._wanted) >= MAX_PENDING:
-                self._wanted.clear()
-                key = self._everything
-            self._wanted[key] = None
-            if self._askers >= MAX_ASKERS:
-                return
+            if sample.kind == SampleKind.PUT:
+                self._questions.appeared(key, monotonic_s())
+                self._have_asked()
+            else:
+                self._questions.disappeared(key)
+
+    def _have_asked(self) -> None:
+        """See to it that somebody asks; `_asking` is held."""
+        if self._is_closed:
+            return
+        self._asking.notify()
+        if self._askers < MAX_ASKERS:
             self._askers += 1
-        guarded(self._fetch, name=f"history {self._expr}", kind="history", is_lasting=False).start()
+            guarded(self._fetch, name=f"history {self._expr}", kind="history", is_lasting=False).start()
 
     def _fetch(self) -> None:
-        while (key := self._next()) is not None:
+        while (question := self._next()) is not None:
+            is_whole = False
             try:
                 with _turn:
-                    self._take_answers(key)
+                    is_whole = self._take_answers(question)
             except zenoh.ZError as error:  # the session closes
-                _log.debug("%s: %s", key, error)
+                _log.debug("%s: %s", question.selector, error)
+            finally:
+                with self._asking:
+                    self._questions.ended(question, monotonic_s(), is_whole=is_whole)
+                    self._asking.notify()
 
-    def _next(self) -> str | None:
-        """What to ask for now; ``None`` and one asker less when that is nothing."""
+    def _next(self) -> Question | None:
+        """What to ask for; waits where something is due later; ``None`` and one asker less when there is nothing."""
         with self._asking:
-            key = None if self._is_closed else next(iter(self._wanted), None)
-            if key is None:
-                self._askers -= 1
-            else:
-                del self._wanted[key]
-            return key
+            while not self._is_closed:
+                now = monotonic_s()
+                if (question := self._questions.next(now)) is not None:
+                    return question
+                due_s = self._questions.next_due_s()
+                if due_s is None or self._waits:
+                    break
+                self._waits = True
+                self._asking.wait(max(0.0, due_s - now))
+                self._waits = False
+            self._askers -= 1
+            return None
 
-    def _take_answers(self, key: str) -> None:
-        answers = self._session.get(
-            f"{key}?_max={self._depth}",
-            target=zenoh.QueryTarget.ALL,
-            consolidation=zenoh.ConsolidationMode.NONE,
-            accept_replies=zenoh.ReplyKeyExpr.ANY,
-            allowed_destination=self._origin,
-            timeout=TIMEOUT_S,
-        )
+    def _take_answers(self, question: Question) -> bool:
+        """Whether all who were asked have answered."""
+        with self._sending:
+            if self._is_closed:
+                return False
+            answers = self._session.get(
+                f"{question.selector}?_max={self._depth}",
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                accept_replies=zenoh.ReplyKeyExpr.ANY,
+                allowed_destination=self._origin,
+                timeout=TIMEOUT_S,
+            )
+        is_whole = True
         for answer in answers:
-            if answer.ok is not None and not self._is_closed:
+            if answer.ok is None:
+                is_whole = False
+            elif not self._is_closed:
                 self._cached(answer.ok)
+                publisher = _publisher(answer.ok, answer.replier_id)
+                with self._asking:
+                    question.answers[publisher] += 1
+        return is_whole
 
     def _cached(self, sample: Sample) -> None:
         with self.lock:
@@ -183,3 +215,11 @@ class History:
 
 def _source(sample: Sample, info: zenoh.SourceInfo) -> _Source:
     return str(sample.key_expr), str(info.source_id.zid), info.source_id.eid
+
+
+def _publisher(sample: Sample, replier: zenoh.EntityGlobalId | None) -> Publisher:
+    """Who has answered, as its token names it."""
+    info = sample.source_info
+    if info is not None:
+        return str(sample.key_expr), str(info.source_id.zid), str(info.source_id.eid)
+    return str(sample.key_expr), "" if replier is None else str(replier.zid), UNNUMBERED
