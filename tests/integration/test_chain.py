@@ -18,6 +18,7 @@ from typing import Any
 import pytest
 import zenoh
 
+from support.waiting import within
 from zsched import wire, zenoh_config
 from zsched.adapters.cgroup import LimitedGroup
 from zsched.adapters.operator_socket import ask
@@ -91,7 +92,7 @@ class Pinger:
 
     def stop(self) -> None:
         self._stop.set()
-        self._thread.join(5)
+        self._thread.join(60)
         self.session.close()
 
     def has_newer_than(self, number: int) -> bool:
@@ -103,7 +104,7 @@ def test_allocation_is_reached_and_streams_flow_through_the_owner(bed: Testbed, 
     owner = bed.wait_settled()
     assert owner in {"edge1", "edge2", "edge3"}
     pinger = ping("robot1")
-    bed.wait(lambda: pinger.has_newer_than(20), 10, "echoes at robot1")
+    bed.wait(lambda: pinger.has_newer_than(20), 60, "echoes at robot1")
     pinger.stop()
     numbers = list(pinger.received)
     assert numbers == sorted(set(numbers)), "doubled or out of order"
@@ -113,18 +114,18 @@ def test_stopping_owner_hands_its_task_over_first(bed: Testbed, ping: Callable[[
     """SIGTERM: the owner says that it drains, the robots move the task while it still runs, then it leaves."""
     owner = bed.wait_settled()
     pinger = ping("robot1")
-    bed.wait(lambda: pinger.has_newer_than(5), 10, "first echoes")
-    held = bed.wait(partial(_next_decision, bed, owner), 10, "a decision")["penalties"].get(owner, 0.0)
+    bed.wait(lambda: pinger.has_newer_than(5), 60, "first echoes")
+    held = bed.wait(partial(_next_decision, bed, owner), 60, "a decision")["penalties"].get(owner, 0.0)
     ((code, seconds),) = bed.stop(owner).values()
     assert code == 0
-    assert seconds < STOP_S
-    moved = bed.wait(lambda: _other_owner(bed, owner), 10, f"a move away from {owner}")
+    within(seconds, STOP_S)
+    moved = bed.wait(lambda: _other_owner(bed, owner), 60, f"a move away from {owner}")
     last = pinger.sent
-    bed.wait(lambda: pinger.has_newer_than(last), 10, "echoes through the new owner")
+    bed.wait(lambda: pinger.has_newer_than(last), 60, "echoes through the new owner")
     pinger.stop()
     history = bed.task("robot1")["history"]
     assert (history[-1]["owner"], history[-1]["epoch"]) == (moved, history[-2]["epoch"] + 1)
-    decision = bed.wait(partial(_next_decision, bed, moved), 10, "a decision about the new owner")
+    decision = bed.wait(partial(_next_decision, bed, moved), 60, "a decision about the new owner")
     assert decision["penalties"].get(owner, 0.0) <= held, "it was told to stop: that is no failure"
 
 
@@ -162,7 +163,7 @@ def test_injected_load_moves_the_task_to_a_quiet_edge(tmp_path: Path) -> None:
         stack.callback(busy.wait, 10)
         stack.callback(busy.kill)
         groups[owner].add(busy.pid)
-        moved = bed.wait(lambda: _other_owner(bed, owner), 40, f"a move away from {owner}")
+        moved = bed.wait(lambda: _other_owner(bed, owner), 60, f"a move away from {owner}")
         assert moved in {"edge1", "edge2", "edge3"} - {owner}
         reasons = [bed.task(robot)["history"][-1]["reason"] for robot in ("robot1", "robot2", "robot3")]
         assert any("leads by" in reason for reason in reasons), reasons
@@ -172,11 +173,11 @@ def test_killed_owner_is_replaced_and_messages_flow_again(bed: Testbed, ping: Ca
     """SIGKILL of the owner's daemon: its workers die with it, the robots commit another edge, the stream goes on."""
     owner = bed.wait_settled()
     pinger = ping("robot2")
-    bed.wait(lambda: pinger.has_newer_than(5), 10, "first echoes")
+    bed.wait(lambda: pinger.has_newer_than(5), 60, "first echoes")
     bed.kill(owner)
     at, sent = time.monotonic(), pinger.sent
-    bed.wait(lambda: pinger.has_newer_than(sent), 10, "echoes after the kill")
-    assert time.monotonic() - at < 5.0
+    bed.wait(lambda: pinger.has_newer_than(sent), 60, "echoes after the kill")
+    within(time.monotonic() - at, 5.0, "until another owner answers")
     pinger.stop()
     assert bed.wait_settled() != owner
     reason = bed.task("robot1")["history"][-1]["reason"]
@@ -188,7 +189,7 @@ def test_late_robot_learns_the_allocation_and_its_streams_start(bed: Testbed, pi
     before = bed.wait_settled()
     bed.kill("robot3")
     bed.kill(before)
-    bed.wait(lambda: _other_owner(bed, before), 20, f"another owner than {before}")
+    bed.wait(lambda: _other_owner(bed, before), 60, f"another owner than {before}")
     epoch = bed.task("robot1")["epoch"]
     bed.start("robot3")
 
@@ -196,10 +197,10 @@ def test_late_robot_learns_the_allocation_and_its_streams_start(bed: Testbed, pi
         return {(task["owner"], task["epoch"]) for task in map(bed.task, ("robot1", "robot2", "robot3"))}
 
     # The others may have moved it once more meanwhile: all nodes share this machine, and it is busy.
-    bed.wait(lambda: bed.task("robot3")["epoch"] >= epoch and len(known()) == 1, 20, "robot3 to know what all know")
-    bed.wait(lambda: bed.task("robot3")["phase"] == "settled", 20, "robot3 to settle")
+    bed.wait(lambda: bed.task("robot3")["epoch"] >= epoch and len(known()) == 1, 60, "robot3 to know what all know")
+    bed.wait(lambda: bed.task("robot3")["phase"] == "settled", 60, "robot3 to settle")
     pinger = ping("robot3")
-    bed.wait(lambda: pinger.has_newer_than(3), 10, "echoes at robot3")
+    bed.wait(lambda: pinger.has_newer_than(3), 60, "echoes at robot3")
 
 
 def test_restart_with_state_keeps_allocation_and_counts_lives(bed: Testbed) -> None:
@@ -208,7 +209,7 @@ def test_restart_with_state_keeps_allocation_and_counts_lives(bed: Testbed) -> N
     before = bed.status("robot1")
     codes = bed.stop()
     assert {code for code, _ in codes.values()} == {0}
-    assert max(seconds for _, seconds in codes.values()) < STOP_S
+    within(max(seconds for _, seconds in codes.values()), STOP_S)
     bed.start()
     bed.wait_settled()
     after = bed.status("robot1")
@@ -239,8 +240,8 @@ def test_bad_frames_only_raise_counters(bed: Testbed) -> None:
     with zenoh.open(zenoh.Config.from_json5(config)) as session:
         for body in (b"", b"\xc1", good):
             list(session.get(keys.register("robot1", "ghost"), payload=body, timeout=0.3))
-        bed.wait(lambda: counted_after_more(session), 10, "counters")
-    bed.wait(lambda: bed.status("robot1")["loop_lag_s"] < 0.5, 10, "the loop not held up")
+        bed.wait(lambda: counted_after_more(session), 60, "counters")
+    bed.wait(lambda: bed.status("robot1")["loop_lag_s"] < 0.5, 60, "the loop not held up")
     bed.wait_whole()
     status = bed.status("robot1")
     assert any(name.startswith("dropped_") for name in status["counters"])
@@ -258,7 +259,7 @@ def test_weights_change_on_the_running_fleet_for_every_robot(bed: Testbed) -> No
         expected = {"cpu": 0.2, "memory": 0.7, "network": 0.1}
         return all(bed.task(node)["tuning"]["weights"] == expected for node in bed.names)
 
-    bed.wait(everywhere, 5, "the weights everywhere")
+    bed.wait(everywhere, 60, "the weights everywhere")
     assert bed.task("robot1")["owner"] == owner
     bad = ask(socket_path(bed.folder, "edge3"), {**request, "cpu": 0.9})
     assert bad["outcome"] == "invalid"
@@ -270,7 +271,7 @@ def test_remote_status_answers_for_any_node(bed: Testbed) -> None:
     answer = ask(socket_path(bed.folder, "robot1"), {"verb": "status", "node": other})
     assert answer["node"] == other
     bed.kill(away)
-    missing = ask(socket_path(bed.folder, "robot1"), {"verb": "status", "node": away}, timeout_s=10.0)
+    missing = ask(socket_path(bed.folder, "robot1"), {"verb": "status", "node": away}, timeout_s=60.0)
     assert "did not answer" in missing["error"]
 
 
@@ -320,8 +321,8 @@ def test_sigterm_right_after_start_leaves_nothing(fresh: Testbed) -> None:
     for delay_s in (0.0, 0.15, 0.4, 0.8):
         bed.start("edge1")
         deadline = time.monotonic() + delay_s
-        bed.wait(lambda end=deadline: time.monotonic() >= end, 5, "the delay")  # type: ignore[misc]
+        bed.wait(lambda end=deadline: time.monotonic() >= end, 60, "the delay")  # type: ignore[misc]
         ((code, seconds),) = bed.stop("edge1").values()
-        assert seconds < STOP_S, f"after {delay_s} s"
+        within(seconds, STOP_S, f"after {delay_s} s")
         assert code in {0, -signal.SIGTERM}
     assert not list(bed.folder.glob("*.sock"))

@@ -51,7 +51,7 @@ class Witness:
 
     def stop(self) -> None:
         self._stop.set()
-        self._thread.join(5)
+        self._thread.join(60)
 
     def newest(self, node: str) -> float | None:
         return max((at for name, at in self.raw if name == node), default=None)
@@ -64,14 +64,14 @@ def test_frozen_owner_stops_working_before_the_next_one_starts(bed: Testbed) -> 
     """SIGSTOP of the owner's daemon only: its worker runs on, but its lease ends; no two workers' outputs overlap."""
     owner = bed.wait_settled()
     witness = Witness(bed)
-    bed.wait(lambda: len(witness.admitted) > 50, 15, "echoes")
+    bed.wait(lambda: len(witness.admitted) > 50, 60, "echoes")
     bed.send(owner, signal.SIGSTOP)
     others = [node for node in bed.names if node != owner]
-    moved = bed.wait(lambda: _next_owner(bed, owner, others), 20, "another owner") or ""
-    bed.wait(lambda: witness.newest(moved), 10, f"outputs of {moved}")
+    moved = bed.wait(lambda: _next_owner(bed, owner, others), 60, "another owner") or ""
+    bed.wait(lambda: witness.newest(moved), 60, f"outputs of {moved}")
     bed.send(owner, signal.SIGCONT)
     at = time.monotonic()
-    bed.wait(lambda: time.monotonic() > at + 2, 5, "two more seconds")
+    bed.wait(lambda: time.monotonic() > at + 2, 60, "two more seconds")
     witness.stop()
     last, first = witness.newest(owner), witness.first(moved)
     assert last is not None
@@ -89,11 +89,11 @@ def test_planned_move_of_an_exclusive_task_hands_over_without_overlap(bed: Testb
     """SIGTERM drains the owner: it releases its lease, so the move does not wait for the lease to end."""
     owner = bed.wait_settled()
     witness = Witness(bed)
-    bed.wait(lambda: len(witness.admitted) > 50, 15, "echoes")
+    bed.wait(lambda: len(witness.admitted) > 50, 60, "echoes")
     bed.stop(owner)
     others = [node for node in bed.names if node != owner]
-    moved = bed.wait(lambda: _next_owner(bed, owner, others), 20, "another owner") or ""
-    bed.wait(lambda: witness.newest(moved), 10, f"outputs of {moved}")
+    moved = bed.wait(lambda: _next_owner(bed, owner, others), 60, "another owner") or ""
+    bed.wait(lambda: witness.newest(moved), 60, f"outputs of {moved}")
     witness.stop()
     last, first = witness.newest(owner), witness.first(moved)
     assert last is not None

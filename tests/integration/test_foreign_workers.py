@@ -135,7 +135,7 @@ class Merging:
 
 def end(process: subprocess.Popen[bytes]) -> None:
     process.kill()
-    process.wait(10)
+    process.wait(60)
 
 
 @pytest.fixture
@@ -160,12 +160,12 @@ def test_a_stock_node_that_zsched_starts_is_warm_serves_and_is_followed_when_it_
     fleet = Merging(tmp_path, stack, has_command=True)
     owner = fleet.serving()
     other = "edge2" if owner == "edge1" else "edge1"
-    fleet.bed.wait(lambda: fleet.worker(other)["state"] == "ready", 30, "the standby is ready though it owns nothing")
+    fleet.bed.wait(lambda: fleet.worker(other)["state"] == "ready", 60, "the standby is ready though it owns nothing")
     assert [len(pids_of(fleet.bed, node)) for node in (owner, other)] == [1, 1], "none was ended at its deadline"
     for life in (1, 2, 3):  # as often as the default lets a worker fail
         until(partial(has_started, fleet.bed, owner, life), "the next process runs")
         os.kill(pids_of(fleet.bed, owner)[-1], signal.SIGKILL)
-    fleet.bed.wait(lambda: fleet.task()["owner"] == other, 30, "the task leaves a worker that failed")
+    fleet.bed.wait(lambda: fleet.task()["owner"] == other, 60, "the task leaves a worker that failed")
     assert fleet.serving() == other
     load = fleet.worker(owner, seen_by=other)
     assert load["state"] == "failed"
@@ -179,10 +179,10 @@ def test_a_cold_stock_node_is_started_for_its_task_and_serves(tmp_path: Path, st
     other = "edge2" if owner == "edge1" else "edge1"
     assert len(pids_of(fleet.bed, owner)) == 1
     assert pids_of(fleet.bed, other) == []
-    fleet.bed.wait(lambda: fleet.worker(owner)["state"] == "ready", 30, "no deadline runs for it any more")
+    fleet.bed.wait(lambda: fleet.worker(owner)["state"] == "ready", 60, "no deadline runs for it any more")
     assert len(pids_of(fleet.bed, owner)) == 1
     fleet.bed.stop(owner)
-    fleet.bed.wait(lambda: fleet.task()["owner"] == other, 30, "the task moves")
+    fleet.bed.wait(lambda: fleet.task()["owner"] == other, 60, "the task moves")
     assert fleet.serving() == other
 
 
@@ -198,7 +198,7 @@ def test_without_any_worker_nobody_owns_the_task_and_status_says_who_is_missed(
     decision = fleet.bed.wait(judged, 60, "a decision about both edges") or {}
     assert fleet.task()["owner"] is None
     for node in ("edge1", "edge2"):
-        why = fleet.bed.wait(partial(fleet.why, node), 30, "why there is no worker")
+        why = fleet.bed.wait(partial(fleet.why, node), 60, "why there is no worker")
         assert f"nobody subscribes to 0/{node}/map_merge/" in why
     assert decision["outcome"] == "none"
     assert set(decision["vetoed"]) == {"edge1", "edge2"}
@@ -209,7 +209,7 @@ def test_a_worker_that_somebody_else_starts_is_seen_to_come_and_to_go(tmp_path: 
     first = fleet.start_worker("edge2")
     assert fleet.serving() == "edge2", "the only node that has a worker"
     second = fleet.start_worker("edge1")
-    fleet.bed.wait(lambda: fleet.worker("edge1")["state"] == "ready", 30, "the other one is seen, too")
+    fleet.bed.wait(lambda: fleet.worker("edge1")["state"] == "ready", 60, "the other one is seen, too")
     assert fleet.task()["owner"] == "edge2"
 
     end(first)
@@ -218,19 +218,19 @@ def test_a_worker_that_somebody_else_starts_is_seen_to_come_and_to_go(tmp_path: 
         AWAY_S,
         "the owner's status says that nobody is there",
     )
-    fleet.bed.wait(lambda: fleet.task()["owner"] == "edge1", 30, "an escape after the deadline")
+    fleet.bed.wait(lambda: fleet.task()["owner"] == "edge1", 60, "an escape after the deadline")
     assert fleet.serving() == "edge1"
 
     end(second)
-    fleet.bed.wait(lambda: fleet.worker("edge1")["state"] == "stopped", 30, "its end is seen")
+    fleet.bed.wait(lambda: fleet.worker("edge1")["state"] == "stopped", 60, "its end is seen")
     fleet.start_worker("edge1")
-    fleet.bed.wait(lambda: fleet.worker("edge1")["state"] == "ready", 30, "it is back")
+    fleet.bed.wait(lambda: fleet.worker("edge1")["state"] == "ready", 60, "it is back")
     assert fleet.serving() == "edge1"
 
 
 def test_a_recorder_of_everything_is_not_taken_for_a_worker_without_a_word(tmp_path: Path, stack: ExitStack) -> None:
     fleet = Merging(tmp_path, stack, has_command=False)
-    fleet.bed.wait(lambda: fleet.worker("edge1")["reason"], 30, "nobody is there")
+    fleet.bed.wait(lambda: fleet.worker("edge1")["reason"], 60, "nobody is there")
     recorder = fleet.bed.app("edge1").declare_subscriber("**", lambda _sample: None)
     told = "somebody takes every node's inputs"
     fleet.bed.wait(
@@ -240,4 +240,4 @@ def test_a_recorder_of_everything_is_not_taken_for_a_worker_without_a_word(tmp_p
     fleet.bed.wait(
         lambda: not [text for text in fleet.bed.status("edge1")["problems"] if told in text], 30, "and ends with it"
     )
-    fleet.bed.wait(lambda: fleet.worker("edge1")["state"] == "stopped", 30, "nobody is there")
+    fleet.bed.wait(lambda: fleet.worker("edge1")["state"] == "stopped", 60, "nobody is there")

@@ -35,7 +35,7 @@ def run_init(bed: Testbed, node: str, folder: Path, *more: str) -> subprocess.Co
 
 def test_init_refuses_a_name_that_the_fleet_remembers_as_a_voter(bed: Testbed) -> None:
     """robot3's disk is lost after it has voted: a blank state is refused, a new generation is not."""
-    bed.wait(lambda: "robot3" in bed.status("robot1")["quorum"]["voted"], 10, "robot1 to remember robot3's vote")
+    bed.wait(lambda: "robot3" in bed.status("robot1")["quorum"]["voted"], 60, "robot1 to remember robot3's vote")
     bed.kill("robot3")
     shutil.rmtree(bed.folder / "robot3")
     refused = run_init(bed, "robot3", bed.folder / "robot3")
@@ -133,4 +133,4 @@ def test_another_fleet_file_is_shown(bed: Testbed) -> None:
     def told() -> bool:
         return any("another fleet file" in problem for problem in bed.status("robot1")["problems"])
 
-    bed.wait(told, 15, "robot1 to notice")
+    bed.wait(told, 60, "robot1 to notice")

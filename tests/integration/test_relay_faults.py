@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
+from support.waiting import within
 from zsched.core.model import NodeId
 from zsched.lab.testbed import Testbed, echo_fleet
 
@@ -41,7 +42,7 @@ def fleets(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str],
 def bed(fleets: Callable[[str], Testbed]) -> Testbed:
     """The idempotent fleet, whole again whatever the last test did to it."""
     testbed = fleets("idempotent")
-    testbed.wait(lambda: not any("relay" in text for text in relay_problems(testbed)), 30, "every relay runs")
+    testbed.wait(lambda: not any("relay" in text for text in relay_problems(testbed)), 60, "every relay runs")
     return testbed
 
 
@@ -91,16 +92,15 @@ def test_a_lost_relay_is_replaced_and_the_task_stays(bed: Testbed, whose: str, f
     owner = bed.wait_settled()
     epoch = bed.task("robot1")["epoch"]
     pinger = Pinger(bed)
-    pinger.silence_after(time.monotonic(), 10)
+    pinger.silence_after(time.monotonic(), 60)
     node = owner if whose == "owner" else whose
     old = relay_of(bed, node)
     os.kill(old, fault)
-    silence_s = pinger.silence_after(time.monotonic(), 12)
-    bed.wait(lambda: _is_replaced(bed, node, old), 12, "another relay")
-    pinger.silence_after(time.monotonic(), 10)
+    silence_s = pinger.silence_after(time.monotonic(), 60)
+    bed.wait(lambda: _is_replaced(bed, node, old), 60, "another relay")
+    pinger.silence_after(time.monotonic(), 60)
     print(f"\nrelay of {whose} {fault.name}: silence {silence_s:.2f} s")
-    if whose == "owner":
-        assert silence_s < 1.0
+    within(silence_s, 1.0 if whose == "owner" else 12.0, "of silence")
     assert bed.task("robot1")["epoch"] == epoch
 
 
@@ -151,7 +151,7 @@ def end_daemon(bed: Testbed, node: NodeId, how: str) -> None:
         bed.kill(node, with_relay=False)
     else:
         bed.send(node, signal.SIGUSR2)
-        bed.wait(lambda: bed.has_ended(node), 5, "the daemon has ended")
+        bed.wait(lambda: bed.has_ended(node), 60, "the daemon has ended")
 
 
 @pytest.mark.parametrize("how", ["crashed", "restarted"])
@@ -160,18 +160,18 @@ def test_a_robots_streams_run_on_while_its_daemon_restarts(bed: Testbed, how: st
     owner, epoch, relay = bed.wait_settled(), bed.task("robot1")["epoch"], relay_of(bed, "robot1")
     talker = Talker(bed)
     try:
-        bed.wait(lambda: len(talker.back) > 20, 10, "echoes")
+        bed.wait(lambda: len(talker.back) > 20, 60, "echoes")
         moment = time.monotonic()
         end_daemon(bed, "robot1", how)
         bed.start("robot1")
         assert bed.wait_settled() == owner
-        bed.wait(lambda: time.monotonic() > moment + 2, 5, "a while")
+        bed.wait(lambda: time.monotonic() > moment + 2, 60, "a while")
     finally:
         talker.stop()
-    bed.wait(lambda: not talker.missing(moment), 5, "every answer")
+    bed.wait(lambda: not talker.missing(moment), 60, "every answer")
     gap_s = talker.longest_gap_s(moment)
     print(f"\ndaemon {how}: longest gap {gap_s * 1000:.0f} ms, lost 0 of {len(talker.sent)}")
-    assert gap_s < 0.5
+    within(gap_s, 0.5, "between two answers")
     assert relay_of(bed, "robot1") == relay
     assert bed.task("robot1")["epoch"] == epoch
     assert "taken over" in bed.log("robot1")
@@ -183,17 +183,17 @@ def test_an_exclusive_tasks_answers_wait_until_a_daemon_says_whose_count(fleets:
     owner = bed.wait_settled()
     talker = Talker(bed)
     try:
-        bed.wait(lambda: len(talker.back) > 20, 10, "echoes")
+        bed.wait(lambda: len(talker.back) > 20, 60, "echoes")
         moment = time.monotonic()
         bed.kill("robot1", with_relay=False)
-        bed.wait(lambda: time.monotonic() > moment + 1, 5, "a while without a daemon")
+        bed.wait(lambda: time.monotonic() > moment + 1, 60, "a while without a daemon")
         alone = [at for at in tuple(talker.back.values()) if at > moment + 0.3]
         assert not alone
         bed.start("robot1")
         assert bed.wait_settled() == owner
     finally:
         talker.stop()
-    bed.wait(lambda: not talker.missing(moment), 5, "every answer")
+    bed.wait(lambda: not talker.missing(moment), 60, "every answer")
 
 
 def test_an_orphaned_relay_follows_a_move_once_its_next_daemon_knows(bed: Testbed) -> None:
@@ -201,15 +201,15 @@ def test_an_orphaned_relay_follows_a_move_once_its_next_daemon_knows(bed: Testbe
     first = bed.wait_settled()
     talker = Talker(bed)
     try:
-        bed.wait(lambda: len(talker.back) > 20, 10, "echoes")
+        bed.wait(lambda: len(talker.back) > 20, 60, "echoes")
         bed.kill("robot1", with_relay=False)
         bed.kill(first)
-        bed.wait(lambda: bed.owner("robot2", "robot3") not in (None, first), 20, "another owner")
+        bed.wait(lambda: bed.owner("robot2", "robot3") not in (None, first), 60, "another owner")
         bed.start("robot1")
         second = bed.wait_settled()
         moment = time.monotonic()
-        bed.wait(lambda: any(at > moment for at in tuple(talker.back.values())), 10, "echoes of the new owner")
+        bed.wait(lambda: any(at > moment for at in tuple(talker.back.values())), 60, "echoes of the new owner")
     finally:
         talker.stop()
     assert second != first
-    bed.wait(lambda: not talker.missing(moment), 5, "every answer")
+    bed.wait(lambda: not talker.missing(moment), 60, "every answer")

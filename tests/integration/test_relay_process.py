@@ -39,7 +39,7 @@ def process() -> Iterator[subprocess.Popen[bytes]]:
         yield child
     finally:
         child.kill()
-        child.wait(5)
+        child.wait(60)
         for pipe in (child.stdin, child.stdout):
             if pipe is not None:
                 pipe.close()
@@ -127,7 +127,7 @@ def test_a_port_that_is_taken_is_a_problem_in_words(process: subprocess.Popen[by
         problem = next_report(reports)
     assert isinstance(problem, ProblemReported)
     assert f"cannot listen on tcp/127.0.0.1:{port}: another program has that port" in str(problem.problem)
-    assert process.wait(5) == 1
+    assert process.wait(60) == 1
 
 
 def test_garbage_and_bad_plans_are_reported_and_survived(process: subprocess.Popen[bytes]) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from support.relay_rig import ROBOT, Application, Rig, relay_rig, slot
-from support.waiting import until
+from support.waiting import until, within
 from zsched.core.fleet import Timing
 from zsched.core.plan import StreamClass
 from zsched.zenoh_config import client_config
@@ -57,7 +57,7 @@ class Reader:
 
     def end(self) -> None:
         self.process.kill()
-        self.process.wait(5)
+        self.process.wait(60)
 
 
 @pytest.fixture
@@ -99,12 +99,12 @@ def test_a_slow_application_loses_only_its_own(rig: Rig, hz: float, size: int) -
     try:
         began = time.monotonic()
         thread = app.stream(hz)
-        until(lambda: time.monotonic() > began + 10, "ten seconds", 15)
+        until(lambda: time.monotonic() > began + 10, "ten seconds")
         app.halt(thread)
         until(lambda: len(app.back) >= app.sent, "every answer")
         until(lambda: len(other.numbers) >= app.sent, "every answer at the other reader, too")
         assert app.back == other.numbers == list(range(app.sent))
-        assert app.longest_pause_s(began) < 2.0
+        within(app.longest_pause_s(began), 2.0, "without an answer")
         until(lambda: dict(rig.told("echo/out/0").drops).get("slow_reader", 0) > 0, "what it missed is counted")
         assert "overflow" not in dict(rig.told("echo/out/0").drops)
         until(lambda: slow.numbers[-1] > app.sent - 2000, "the slow one goes on")
@@ -121,7 +121,7 @@ def test_a_slow_application_gets_the_newest_of_class_latest_in_the_end(rig: Rig)
         thread = app.stream(200)
         began = time.monotonic()
         until(lambda: dict(rig.told("echo/out/0").drops).get("slow_reader", 0) > 0, "what it missed is counted")
-        until(lambda: time.monotonic() > began + 6, "six seconds", 10)
+        until(lambda: time.monotonic() > began + 6, "six seconds")
         app.halt(thread)
         until(lambda: app.back[-1] == app.sent - 1, "the newest answer")
         assert len(app.back) > 0.4 * app.sent, "more than twice what the slow one takes"
@@ -141,13 +141,13 @@ def test_a_frozen_application_delays_no_other(rig: Rig, hz: float, size: int) ->
         until(lambda: len(app.back) > 20 and len(frozen.numbers) > 20, "the stream")
         frozen.process.send_signal(signal.SIGSTOP)
         began = time.monotonic()
-        until(lambda: time.monotonic() > began + 6, "six seconds", 10)
+        until(lambda: time.monotonic() > began + 6, "six seconds")
         app.halt(thread)
         print(f"\nlongest pause {app.longest_pause_s(began):.2f} s, {rig.told('echo/out/0').drops}")
         until(lambda: len(app.back) >= app.sent, "every answer")
         until(lambda: len(other.numbers) >= app.sent, "every answer at the other reader, too")
         assert app.back == other.numbers == list(range(app.sent))
-        assert app.longest_pause_s(began) < 2.0
+        within(app.longest_pause_s(began), 2.0, "without an answer")
         until(lambda: dict(rig.told("echo/out/0").drops).get("slow_reader", 0) > 0, "what it missed is counted")
         assert "overflow" not in dict(rig.told("echo/out/0").drops)
     finally:

@@ -17,7 +17,7 @@ import zenoh
 
 from support.relay_rig import BESIDE, ROBOT, Application, Rig, relay_rig, slot
 from support.sessions import matches
-from support.waiting import until
+from support.waiting import until, within
 from zsched.core.plan import ReadyWhen, RoutePhase, RoutePlan, StreamClass, StreamCount
 from zsched.core.relay_protocol import SlotLost, WorkerSeen
 from zsched.zenoh_config import worker_config
@@ -93,7 +93,7 @@ def test_a_killed_worker_leaves_at_most_what_is_reported(rig: Rig) -> None:
     thread = app.stream(400)
     until(lambda: len(app.back) > 50, "the stream through edge1")
     worker.kill()
-    worker.wait(5)
+    worker.wait(60)
     second = slot(2, "edge2", StreamClass.RELIABLE, 1)
     rig.move(second, first, drains=False)
     until(lambda: app.nodes[-1] == "edge2", "the stream through edge2")
@@ -112,7 +112,7 @@ def test_a_worker_that_restarts_in_place_is_not_sent_what_its_former_life_may_ha
     thread = app.stream(400)
     until(lambda: len(app.back) > 50, "the stream through edge1")
     worker.kill()
-    worker.wait(5)
+    worker.wait(60)
     rig.start_worker("edge1")
     before = len(app.back)
     until(lambda: len(app.back) > before + 50, "the stream through its second life")
@@ -155,7 +155,7 @@ class Beside:
 
     def close(self) -> None:
         self._halt.set()
-        self._thread.join(5)
+        self._thread.join(60)
         for session in (self._far, self._near):
             session.close()
 
@@ -174,7 +174,7 @@ def test_a_stalled_workers_full_queue_delays_no_other_stream(rig: Rig) -> None:
         before = len(beside.arrivals)
         until(lambda: len(beside.arrivals) > before + 100, "the stream beside goes on, and the application too")
         app.halt(thread)
-        assert beside.longest_gap() < 0.9
+        within(beside.longest_gap(), 0.9, "without a sample")
     finally:
         beside.close()
 
@@ -202,7 +202,7 @@ def test_a_slow_workers_full_queue_slows_its_own_application_and_no_other(rig: R
         assert coupled[0] + dropped > MORE_THAN_FITS - WHAT_FITS
         until(lambda: len(app.back) + rig.drops()["overflow"] >= app.sent, "every answer", deadline_s=60.0)
         assert app.back == sorted(set(app.back))
-        assert beside.longest_gap() < 0.9
+        within(beside.longest_gap(), 0.9, "without a sample")
     finally:
         beside.close()
 
@@ -238,10 +238,10 @@ def test_a_stalled_worker_delays_no_other_robots_stream(rig: Rig, stream_class: 
         until(lambda: len(arrivals) > before + 100, "the live stream goes on behind the lease, too")
         app.halt(thread)
         halt.set()
-        live.join(5)
+        live.join(60)
         gaps = [later - earlier for earlier, later in pairwise(arrivals)]
         assert len(gaps) > 200
-        assert max(gaps[10:]) < 0.9
+        within(max(gaps[10:]), 0.9, "without a sample")
     finally:
         halt.set()
         foreign.close()

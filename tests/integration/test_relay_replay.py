@@ -51,7 +51,7 @@ def test_the_next_owner_does_what_the_dead_one_had_not(rig: Rig, is_dropped_firs
     thread = app.stream(400)
     until(lambda: len(app.back) > 50, "the stream through edge1")
     worker.kill()
-    worker.wait(5)
+    worker.wait(60)
     if is_dropped_first:  # as the executor does with a node that is gone
         sent = app.sent
         rig.plan(RoutePhase.PREPARE, second)
@@ -75,7 +75,7 @@ def test_a_worker_that_restarts_in_place_does_what_its_former_life_had_not(rig: 
     thread = app.stream(150)
     until(lambda: len(app.back) > 50, "the stream through edge1")
     worker.kill()
-    worker.wait(5)
+    worker.wait(60)
     rig.start_worker("edge1")
     before = len(app.back)
     until(lambda: len(app.back) > before + 50, "the stream through its second life")

@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 import zenoh
 
+from support.sessions import matches
 from support.waiting import free_endpoint, until
 from zsched.adapters.streams import RelayHandle
 from zsched.core.events import RelayChanged, SlotDrained, SlotFlipped, SlotReady, StreamsCounted
@@ -36,7 +37,7 @@ from zsched.zenoh_config import data_config, worker_config
 
 FLEET, ROBOT, TASK = "test", "robot1", "jobs"
 SERVICE = f"{ROBOT}/job"
-DEADLINE_S = 10.0
+DEADLINE_S = 90.0
 
 WORKER = """
 import sys, time
@@ -201,7 +202,7 @@ class Rig:
         for worker in self.workers.values():
             worker.send_signal(signal.SIGCONT)
             worker.kill()
-            worker.wait(5)
+            worker.wait(60)
         for relay in self.relays.values():
             relay.stop(2.0)
 
@@ -216,9 +217,9 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
         made.stop()
 
 
-ONCE = ServiceSettings(timeout_s=5.0, max_pending=8)
-RETRY = ServiceSettings(timeout_s=5.0, max_pending=8, retry=True)
-SOON_S = 4.0
+ONCE = ServiceSettings(timeout_s=40.0, max_pending=8)
+RETRY = ServiceSettings(timeout_s=40.0, max_pending=8, retry=True)
+SOON_S = 30.0
 """Well before a service's own time is over; on a quiet machine milliseconds."""
 
 
@@ -229,6 +230,9 @@ def begin(rig: Rig, settings: ServiceSettings) -> Slot:
     first = slot(1, "edge1", settings)
     rig.flip(first)
     rig.plan(RoutePhase.CLOSE, first)
+    querier = rig.app.declare_querier(SERVICE)
+    until(lambda: matches(querier), "the application sees the relay's offer: else a request has no answer at all")
+    querier.undeclare()
     return first
 
 
@@ -269,20 +273,20 @@ def test_requests_in_a_stream_of_moves_are_each_done_once(rig: Rig) -> None:
 
 def test_the_old_owner_answers_what_it_has_in_hand_within_its_drain_time(rig: Rig) -> None:
     first = begin(rig, ONCE)
-    asked = rig.ask("sleep 0.6")
+    asked = rig.ask("sleep 3")
     until(lambda: rig.done_by("edge1"), "the old owner has begun")
     second = slot(2, "edge2", ONCE)
     rig.flip(second, first)
     assert rig.find(SlotDrained, epoch=1) is None, "drained with a request in hand"
     assert rig.ask("new").wait().answers == [f"edge2/{TASK} did new with a=1;b=2"]
     rig.wait(SlotDrained, epoch=1)
-    assert asked.wait().answers == [f"edge1/{TASK} did sleep 0.6 with a=1;b=2"]
+    assert asked.wait().answers == [f"edge1/{TASK} did sleep 3 with a=1;b=2"]
     assert rig.done_by("edge2") == ["new"]
 
 
 def test_what_the_old_owner_has_not_answered_by_then_is_an_error_and_not_done_again(rig: Rig) -> None:
     first = begin(rig, ONCE)
-    asked = rig.ask("sleep 3")
+    asked = rig.ask("sleep 10")
     until(lambda: rig.done_by("edge1"), "the old owner has begun")
     second = slot(2, "edge2", ONCE)
     rig.flip(second, first)
@@ -297,12 +301,12 @@ def test_what_the_old_owner_has_not_answered_by_then_is_an_error_and_not_done_ag
 
 def test_with_retry_the_new_owner_is_asked_instead(rig: Rig) -> None:
     first = begin(rig, RETRY)
-    asked = rig.ask("sleep 0.9")
+    asked = rig.ask("sleep 4")
     until(lambda: rig.done_by("edge1"), "the old owner has begun")
     second = slot(2, "edge2", RETRY)
     rig.flip(second, first)
     rig.plan(RoutePhase.CLOSE, second)
-    assert asked.wait().answers == [f"edge2/{TASK} did sleep 0.9 with a=1;b=2"]
+    assert asked.wait().answers == [f"edge2/{TASK} did sleep 4 with a=1;b=2"]
     assert asked.errors == []
 
 
@@ -321,7 +325,7 @@ def test_a_killed_owner_is_an_error_at_once(rig: Rig) -> None:
 def test_a_request_that_nobody_has_taken_waits_for_the_next_owner(rig: Rig) -> None:
     first = begin(rig, ONCE)
     rig.workers["edge1"].kill()
-    rig.workers["edge1"].wait(5)
+    rig.workers["edge1"].wait(60)
     rig.wait(SlotReady, epoch=1, is_ready=False)
     asked = rig.ask("hello")
     rig.flip(slot(2, "edge2", ONCE), first)
@@ -380,17 +384,18 @@ def test_a_frozen_owner_with_retry_costs_the_move_only(rig: Rig) -> None:
 
 
 def test_an_owner_that_takes_too_long_is_an_error_in_time(rig: Rig) -> None:
-    begin(rig, ServiceSettings(timeout_s=0.4, retry=True))
-    asked = rig.ask("sleep 2").wait()
+    begin(rig, ServiceSettings(timeout_s=2.0, retry=True))
+    asked = rig.ask("sleep 5").wait()
+    assert not asked.answers
     (error,) = asked.errors
     assert error.startswith("timeout: ")
-    assert asked.took_s > 0.35
-    assert rig.done_by("edge1") == ["sleep 2"]
+    assert asked.took_s > 1.9
+    assert rig.done_by("edge1") == ["sleep 5"]
 
 
 def test_one_request_too_many_is_answered_busy(rig: Rig) -> None:
-    begin(rig, ServiceSettings(timeout_s=5.0, max_pending=2))
-    asked = [rig.ask("sleep 0.5") for _ in range(4)]
+    begin(rig, ServiceSettings(timeout_s=60.0, max_pending=2))
+    asked = [rig.ask("sleep 3") for _ in range(4)]
     for one in asked:
         one.wait()
     errors = [error for one in asked for error in one.errors]
@@ -402,7 +407,7 @@ def test_one_request_too_many_is_answered_busy(rig: Rig) -> None:
 
 def test_a_standby_refuses_and_does_nothing(rig: Rig) -> None:
     begin(rig, ONCE)
-    replies = list(rig.app.get(f"edge2/{TASK}/{ROBOT}/job", payload=b"sneaky", timeout=3.0))
+    replies = list(rig.app.get(f"edge2/{TASK}/{ROBOT}/job", payload=b"sneaky", timeout=60.0))
     (error,) = [reply.err for reply in replies]
     assert error is not None
     assert error.payload.to_string().startswith("not owner")
@@ -411,8 +416,8 @@ def test_a_standby_refuses_and_does_nothing(rig: Rig) -> None:
 
 def test_the_queue_of_a_worker_is_bounded_too(rig: Rig) -> None:
     """One in hand, four wait, two are told at once."""
-    begin(rig, ServiceSettings(timeout_s=5.0, max_pending=16))
-    first = rig.ask("sleep 1.5")
+    begin(rig, ServiceSettings(timeout_s=60.0, max_pending=16))
+    first = rig.ask("sleep 5")
     until(lambda: rig.done_by("edge1"), "the owner has begun")
     others = [rig.ask(f"job{number}") for number in range(6)]
     first.wait()

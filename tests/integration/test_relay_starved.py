@@ -42,7 +42,7 @@ def test_a_relay_that_starts_with_next_to_no_processor_is_left_alone(monkeypatch
     finally:
         for rival in rivals:
             rival.kill()
-            rival.wait(20)
+            rival.wait(60)
         handle.stop(1.0)
         group.remove()
     assert next(one.is_running for one in reports if isinstance(one, RelayChanged))

@@ -14,7 +14,7 @@ import zenoh
 
 from support.relay_rig import BESIDE, ROBOT, TASK, Application, Rig, relay_rig, slot
 from support.sessions import matches
-from support.waiting import until
+from support.waiting import until, within
 from zsched.core.events import RelayChanged, SlotDrained, SlotFlipped, SlotReady
 from zsched.core.plan import (
     ReadyWhen,
@@ -123,7 +123,7 @@ def test_a_frozen_owner_does_not_hold_up_its_successor(patient_rig: Rig, stream_
     started = time.monotonic()
     rig.move(second, first, drains=False)
     until(lambda: app.nodes[-1] == "edge2", "the stream through edge2")
-    assert time.monotonic() - started < WAITS_S
+    within(time.monotonic() - started, WAITS_S)
     app.halt(thread)
 
 
@@ -153,7 +153,7 @@ def test_a_stalled_owner_delays_no_other_stream(patient_rig: Rig) -> None:
             return len(arrivals) > before + 250
 
         until(put, "the live stream goes on")
-        assert time.monotonic() - started < WAITS_S
+        within(time.monotonic() - started, WAITS_S)
     finally:
         foreign.close()
 
@@ -181,7 +181,7 @@ def test_a_worker_that_restarts_in_place_gets_the_last_value_again(rig: Rig) -> 
     app.put()
     until(lambda: app.back == [0], "the value through the first incarnation")
     worker.kill()
-    worker.wait(5)
+    worker.wait(60)
     rig.wait(SlotReady, epoch=1, is_ready=False)
     rig.start_worker("edge1", "--latest")
     until(lambda: app.back == [0, 0], "the value again, from the second incarnation, which asked for its role")
@@ -219,7 +219,7 @@ def test_a_killed_owner_is_replaced_within_the_goal(rig: Rig) -> None:
     thread = app.stream(200)
     until(lambda: len(app.back) > 50, "the stream through edge1")
     owner.kill()
-    owner.wait(5)
+    owner.wait(60)
     rig.wait(SlotReady, epoch=1, is_ready=False)
     rig.move(second, first)
     until(lambda: app.nodes and app.nodes[-1] == "edge2", "the stream through edge2")

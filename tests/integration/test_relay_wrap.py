@@ -171,4 +171,4 @@ def test_a_stream_goes_on_across_the_end_of_its_numbers() -> None:
         assert process.exitcode == 0
     finally:
         process.kill()
-        process.join(10)
+        process.join(60)

@@ -120,7 +120,7 @@ def _start_worker(folder: Path, edge: str) -> subprocess.Popen[bytes]:
 
 def _reap(worker: subprocess.Popen[bytes]) -> None:
     worker.kill()
-    worker.wait(5)
+    worker.wait(60)
 
 
 def test_ros_nodes_get_the_merged_map_with_their_attachment(hosts: dict[str, Host]) -> None:

@@ -57,7 +57,7 @@ def test_requests_go_on_over_a_kill_of_the_owner_and_none_is_left_without_a_word
     for thread in threads:
         thread.start()
     try:
-        bed.wait(lambda: sum(map(bool, asker.answers.values())) > 100, 10.0, "requests are answered")
+        bed.wait(lambda: sum(map(bool, asker.answers.values())) > 100, 60, "requests are answered")
         bed.kill(first)
         second = bed.wait_settled()
         assert second != first
@@ -65,11 +65,11 @@ def test_requests_go_on_over_a_kill_of_the_owner_and_none_is_left_without_a_word
         def by_second() -> int:
             return sum(node == second for got in tuple(asker.answers.values()) for _, node in got)
 
-        bed.wait(lambda: by_second() > 100, 10.0, "the new owner answers")
+        bed.wait(lambda: by_second() > 100, 60, "the new owner answers")
     finally:
         asker.halt.set()
         for thread in threads:
-            thread.join(15)
+            thread.join(60)
     assert not any(thread.is_alive() for thread in threads)
     words = {number: len(asker.answers[number]) + len(asker.errors[number]) for number in asker.answers}
     assert set(words.values()) == {1}, "one answer or one error for each"
@@ -80,4 +80,4 @@ def test_requests_go_on_over_a_kill_of_the_owner_and_none_is_left_without_a_word
     def counted() -> int:
         return sum(one["messages"] for one in bed.task("robot1")["streams"] if one["stream"] == "echo/srv/0")
 
-    bed.wait(lambda: counted() == len(words), 5.0, "the status counts every request")
+    bed.wait(lambda: counted() == len(words), 60, "the status counts every request")

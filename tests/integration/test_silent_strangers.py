@@ -41,12 +41,12 @@ def test_status_answers_after_thousands_of_silent_connections(tmp_path: Path) ->
         for thread in threads:
             thread.start()
         try:
-            bed.wait(lambda: asked_in_vain(bed), 40, "the daemon to be without descriptors")
+            bed.wait(lambda: asked_in_vain(bed), 60, "the daemon to be without descriptors")
         finally:
             stop.set()
             for thread in threads:
                 thread.join(30)
-        bed.wait(lambda: bed.status("robot1"), 20, "an answer once the strangers are gone")
+        bed.wait(lambda: bed.status("robot1"), 60, "an answer once the strangers are gone")
         assert bed.wait_settled() == "robot1"
 
 

@@ -54,13 +54,13 @@ def test_the_state_moves_with_the_task(tmp_path: Path, link: str) -> None:
             "robot1/out", lambda sample: totals.append(int(sample.payload.to_bytes()))
         )
         publisher = session.declare_publisher("robot1/in")
-        bed.wait(lambda: publisher.put(b"x") or totals, 10.0, "the first count")
-        bed.wait(lambda: publisher.put(b"x") or totals[-1] >= 50, 30.0, "a count worth keeping")
+        bed.wait(lambda: publisher.put(b"x") or totals, 60, "the first count")
+        bed.wait(lambda: publisher.put(b"x") or totals[-1] >= 50, 60, "a count worth keeping")
         bed.stop(first)
         second = bed.wait_settled()
         assert second != first
         before = max(totals)
-        bed.wait(lambda: publisher.put(b"x") or totals[-1] > before, 10.0, "the new owner counts on")
+        bed.wait(lambda: publisher.put(b"x") or totals[-1] > before, 60, "the new owner counts on")
         assert min(totals[totals.index(before) :]) >= before - 5, bed.log(second) + bed.log(first)
         log = bed.log(second)
         assert f"from={first} bytes=" in log, log

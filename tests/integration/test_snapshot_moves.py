@@ -130,14 +130,14 @@ class Hub:
         """All that a worker wrote on stderr; ends it."""
         worker = self.workers[node]
         worker.kill()
-        _, text = worker.communicate(timeout=10)
+        _, text = worker.communicate(timeout=60)
         return text
 
     def stop(self) -> None:
         for worker in self.workers.values():
             worker.send_signal(signal.SIGCONT)
             worker.kill()
-            worker.communicate(timeout=10)
+            worker.communicate(timeout=60)
         self.session.close()
 
 

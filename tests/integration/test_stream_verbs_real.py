@@ -42,7 +42,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
         bed.init()
         bed.start()
         bed.wait_settled()
-        bed.wait(lambda: bed.task("robot1")["streams"], 10.0, "the first counters")
+        bed.wait(lambda: bed.task("robot1")["streams"], 60, "the first counters")
         halt = threading.Event()
         thread = threading.Thread(target=_publish, args=(bed.app("robot1"), halt))
         thread.start()
@@ -50,7 +50,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
             yield Site(runtime=folder)
         finally:
             halt.set()
-            thread.join(5)
+            thread.join(60)
 
 
 def _publish(session: zenoh.Session, halt: threading.Event) -> None:
@@ -139,6 +139,6 @@ def test_ctrl_c_ends_a_window_at_once(site: Site) -> None:
             assert process.stdout is not None
             assert "robot1/" in process.stdout.readline()
             process.send_signal(signal.SIGINT)
-            assert process.wait(5) == 0
+            assert process.wait(60) == 0
         finally:
             process.kill()

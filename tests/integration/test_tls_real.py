@@ -99,7 +99,7 @@ def test_every_socket_of_every_process_speaks_tls(bed: Testbed) -> None:
 
 def test_init_asks_the_fleet_over_tls(bed: Testbed) -> None:
     """A blank state for a name that has voted is refused, as it is without certificates."""
-    bed.wait(lambda: "robot2" in bed.status("robot1")["quorum"]["voted"], 20, "robot1 to remember robot2's vote")
+    bed.wait(lambda: "robot2" in bed.status("robot1")["quorum"]["voted"], 60, "robot1 to remember robot2's vote")
     bed.kill("robot2")
     shutil.rmtree(bed.folder / "robot2")
     command = [sys.executable, "-m", "zsched.cli", "init", "--config", str(bed.file), "--node", "robot2"]

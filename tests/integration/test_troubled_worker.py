@@ -63,14 +63,14 @@ def test_a_callback_that_raises_is_in_every_node_s_status(bed: Testbed) -> None:
         return bool(told(bed, node, f"the worker on {owner}: callback raised", "ValueError: no such map"))
 
     for node in bed.names:
-        bed.wait(partial(complains, node), 30, f"{node} knows")
+        bed.wait(partial(complains, node), 60, f"{node} knows")
     assert worker(bed, owner)["state"] == "ready"
 
     def answers() -> bool:
         publisher.put("good")
         return b"good" in heard
 
-    bed.wait(answers, 30, "what does not raise is answered all the same")
+    bed.wait(answers, 60, "what does not raise is answered all the same")
     assert bed.log(owner).count("Traceback") <= 3, "not one a sample"
     kept.undeclare()
 
@@ -82,19 +82,19 @@ def test_a_failed_worker_is_told_everywhere_and_comes_back_when_it_is_tried_agai
     assert bed.wait_settled() == "edge2"
     why = ("the worker on edge1 failed", "exited with status 78: no model file here")
     for node in bed.names:
-        bed.wait(partial(told, bed, node, *why), 30, f"{node} knows why")
+        bed.wait(partial(told, bed, node, *why), 60, f"{node} knows why")
 
     code, _ = retry(bed, "edge1")
     assert code == 0
-    bed.wait(lambda: "no model" in worker(bed, "edge1")["reason"], 30, "it fails again")
+    bed.wait(lambda: "no model" in worker(bed, "edge1")["reason"], 60, "it fails again")
     broken.unlink()
     code, answer = retry(bed, "edge1")
     assert (code, set(answer["done"]), answer["missed"]) == (0, set(bed.names), {})
-    bed.wait(lambda: worker(bed, "edge1")["state"] == "ready", 30, "it runs, without a restart of the daemon")
-    bed.wait(lambda: not told(bed, "robot2", "failed"), 30, "nothing is told any more")
+    bed.wait(lambda: worker(bed, "edge1")["state"] == "ready", 60, "it runs, without a restart of the daemon")
+    bed.wait(lambda: not told(bed, "robot2", "failed"), 60, "nothing is told any more")
 
     assert retry(bed, "edge7")[0] == 2
     bed.kill("edge2")
-    bed.wait(lambda: bed.owner() == "edge1", 30, "it takes the task")
+    bed.wait(lambda: bed.owner() == "edge1", 60, "it takes the task")
     code, answer = retry(bed)
     assert (code, set(answer["missed"])) == (5, {"edge2"})

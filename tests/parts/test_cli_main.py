@@ -59,7 +59,7 @@ def test_an_interrupt_while_the_daemon_loads_is_an_orderly_stop(tmp_path: Path) 
         _, said = process.communicate(timeout=60)
     finally:
         process.kill()
-        process.wait(10)
+        process.wait(60)
     assert process.returncode == 0, said
     assert "Traceback" not in said
     assert "stopping node=robot1" in said
@@ -89,7 +89,7 @@ def test_up_without_a_state_gives_the_command_that_makes_it(tmp_path: Path) -> N
     with Testbed(tmp_path, echo_fleet(robots=1, edges=0)) as bed:
         bed.start()
         wanted = f"`zsched init --config {bed.file} --node robot1 --state-dir {tmp_path / 'robot1'}`"
-        bed.wait(lambda: wanted in bed.log("robot1"), 30, "the command in the log")
+        bed.wait(lambda: wanted in bed.log("robot1"), 60, "the command in the log")
 
 
 @pytest.mark.root

@@ -333,7 +333,7 @@ def test_an_end_whose_samples_were_dropped_counts_after_a_grace_time(bench: Benc
     move.stream.flip(2, drops_held=False)
     move.end(1, count=9)
     assert not move.stream.has_ended(1)
-    until(lambda: move.stream.has_ended(1), "the grace time", deadline_s=1.0)
+    until(lambda: move.stream.has_ended(1), "the grace time")
 
 
 def test_a_marker_of_another_epoch_ends_nothing(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,6 +15,7 @@ from zenoh import ext
 
 from support.sessions import matches
 from support.waiting import free_endpoint, until
+from zsched.core.fleet import Timing
 from zsched.core.plan import StreamClass, StreamSettings
 from zsched.relay import history
 from zsched.relay.questions import Question, Questions
@@ -24,6 +25,8 @@ from zsched.zenoh_config import data_config, worker_config
 KEY = "robot1/map"
 QUERY_S = 90.0
 """How long the cache of a dead publisher is asked in one test; a stream that waited for it would not come in time."""
+PATIENT = Timing(zenoh_lease_s=60.0)
+"""A frozen publisher stays linked: what it owes is not told again by the end of its lease."""
 SETTINGS = StreamSettings(stream_class=StreamClass.LATEST, keep_last=2, depth=100)
 PUBLISHER = """
 import sys, zenoh
@@ -48,8 +51,10 @@ class Net:
 
     def __init__(self) -> None:
         self.endpoint = free_endpoint()
-        self.relay = zenoh.open(zenoh.Config.from_json5(data_config(listen=(self.endpoint,), connect=())))
-        self.app = zenoh.open(zenoh.Config.from_json5(worker_config(connect=(self.endpoint,))))
+        self.relay = zenoh.open(
+            zenoh.Config.from_json5(data_config(listen=(self.endpoint,), connect=(), timing=PATIENT))
+        )
+        self.app = zenoh.open(zenoh.Config.from_json5(worker_config(connect=(self.endpoint,), timing=PATIENT)))
         self.got: list[str] = []
         self.receivers: list[Receiver] = []
 
@@ -172,7 +177,7 @@ class publisher:  # noqa: N801 - reads as a verb in a with statement
 
     def __init__(self, net: Net, folder: Path) -> None:
         path = folder / "config.json5"
-        path.write_text(worker_config(connect=(net.endpoint,)))
+        path.write_text(worker_config(connect=(net.endpoint,), timing=PATIENT))
         command = [sys.executable, "-c", PUBLISHER, str(path)]
         self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
 

@@ -363,7 +363,7 @@ def test_desk_answers_several_at_once_each_with_its_own(house: House) -> None:
         result = CommandResult(outcome=CommandOutcome.OK, detail="done", revision=event.command.base_revision)
         house.shell.carry_out((do.AnswerCommand(request=event.request, result=result),))
     for thread in threads:
-        thread.join(5)
+        thread.join(60)
     assert answers == {number: {"outcome": "ok", "detail": "done", "revision": number} for number in range(8)}
     assert house.calls == [], "nothing went over the bus"
 

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from support.waiting import free_endpoint, until
+from support.waiting import free_endpoint, until, within
 from zsched import wire, worker_backlog
 from zsched.clock import monotonic_s
 from zsched.core.plan import Role, WorkerRole
@@ -219,7 +219,7 @@ def test_an_end_whose_data_was_dropped_comes_after_a_grace_time(relay: Relay, ec
     relay.tell(WorkerRole.DRAINING, 4)
     until(lambda: echo.worker.role.role is WorkerRole.DRAINING, "the role")
     relay.end(4, count=9)
-    until(lambda: relay.ends, "the end marker all the same", deadline_s=1.0)
+    until(lambda: relay.ends, "the end marker all the same")
 
 
 def test_an_end_marker_ends_nothing_while_the_role_holds(relay: Relay, echo: Echo) -> None:
@@ -251,7 +251,7 @@ def test_draining_sends_what_is_in_work(relay: Relay, echo: Echo) -> None:
 def test_a_late_worker_learns_its_role_at_once(relay: Relay, tmp_path: Path) -> None:
     relay.role = Role(task="t", role=WorkerRole.ACTIVE, epoch=9)
     with Worker.from_env(environment(relay, tmp_path), handles_signals=False) as worker:
-        until(lambda: worker.role.epoch == 9, "the role", deadline_s=2.0)
+        until(lambda: worker.role.epoch == 9, "the role")
 
 
 def test_a_slow_worker_keeps_the_newest(relay: Relay, tmp_path: Path) -> None:
@@ -259,7 +259,7 @@ def test_a_slow_worker_keeps_the_newest(relay: Relay, tmp_path: Path) -> None:
 
     def slow(received: Received) -> None:
         seen.append(received.payload.to_bytes())
-        gate.wait(5)
+        gate.wait(60)
 
     with Worker.from_env(environment(relay, tmp_path), handles_signals=False) as worker:
         worker.subscribe("{prefix}/*/in", slow, keep_last=1)
@@ -361,11 +361,13 @@ def test_a_signalled_worker_is_gone_within_a_second(tmp_path: Path, is_relay_sto
         if is_relay_stopped:
             peer.send_signal(signal.SIGSTOP)
         worker.send_signal(signal.SIGTERM)
-        assert worker.wait(1.5) == 0
+        signalled = time.monotonic()
+        assert worker.wait(60) == 0
+        within(time.monotonic() - signalled, 1.5)
     finally:
         for process in (peer, worker):
             process.kill()
-            process.wait(5)
+            process.wait(60)
         if peer.stdout is not None:
             peer.stdout.close()
 
@@ -385,7 +387,7 @@ def test_what_an_owner_that_died_may_have_done_is_marked(relay: Relay, echo: Ech
 
 
 def _wait(gate: threading.Event) -> None:
-    gate.wait(10)
+    gate.wait(60)
 
 
 def test_what_was_withheld_goes_out_before_what_comes_with_the_role(relay: Relay, echo: Echo) -> None:

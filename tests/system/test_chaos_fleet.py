@@ -75,9 +75,9 @@ def test_partial_cut_makes_nobody_gone_and_an_ordinary_vote_decides(bed: ChaosBe
     """
     owner, start = bed.calm(), monotonic_s()
     bed.network.separate(["robot1"], [owner])
-    bed.wait(lambda: bed.peer("robot1", owner) == "suspect", 5, "robot1 to suspect the owner")
-    bed.wait(lambda: bed.moved_from(owner, *others(bed)), 15, "a move to where all reach")
-    bed.wait(bed.probes["robot1"].is_flowing, 5, "echoes at robot1")
+    bed.wait(lambda: bed.peer("robot1", owner) == "suspect", 60, "robot1 to suspect the owner")
+    bed.wait(lambda: bed.moved_from(owner, *others(bed)), 60, "a move to where all reach")
+    bed.wait(bed.probes["robot1"].is_flowing, 60, "echoes at robot1")
     assert gone(bed, start) == set()
     reasons = [bed.task(robot)["history"][-1]["reason"] for robot in ("robot1", "robot2", "robot3")]
     assert not any("gone" in reason for reason in reasons), reasons
@@ -90,33 +90,33 @@ def test_frozen_machine_loses_its_task_and_wakes_as_a_stranger(bed: ChaosBed) ->
     owner, start = bed.calm(), monotonic_s()
     relays = bed.status(owner)["counters"].get("relay_exits", 0)
     stop_group(bed.pid(owner), signal.SIGSTOP)
-    bed.wait(lambda: bed.moved_from(owner), 10, "another owner")
-    bed.wait(lambda: bed.moved_from(owner, "robot1", "robot2", "robot3", task=GUARD), 10, "another guard")
-    bed.wait(bed.probes["robot1"].is_flowing, 5, "echoes")
+    bed.wait(lambda: bed.moved_from(owner), 60, "another owner")
+    bed.wait(lambda: bed.moved_from(owner, "robot1", "robot2", "robot3", task=GUARD), 60, "another guard")
+    bed.wait(bed.probes["robot1"].is_flowing, 60, "echoes")
     assert {node for _, node in gone(bed, start)} == {owner}
     stop_group(bed.pid(owner), signal.SIGCONT)
-    bed.wait(lambda: learns(bed, owner), 10, "the sleeper to learn the newer epoch")
-    bed.wait(bed.is_calm, 20, "everybody to be well")
+    bed.wait(lambda: learns(bed, owner), 60, "the sleeper to learn the newer epoch")
+    bed.wait(bed.is_calm, 60, "everybody to be well")
     assert bed.status(owner)["counters"].get("relay_exits", 0) == relays, "its relay slept too, and was not wedged"
 
 
 def test_wedged_owner_is_replaced_although_its_token_stays(bed: ChaosBed) -> None:
     owner, start = bed.calm(), monotonic_s()
     bed.send(owner, signal.SIGUSR1)
-    bed.wait(lambda: bed.moved_from(owner), 10, "another owner")
-    bed.wait(bed.probes["robot1"].is_flowing, 5, "echoes")
+    bed.wait(lambda: bed.moved_from(owner), 60, "another owner")
+    bed.wait(bed.probes["robot1"].is_flowing, 60, "echoes")
     found = [one for one in bed.changes(since=start) if one.node == owner and one.after is PeerState.SUSPECT]
     assert found
     assert all(one.reason.startswith("silent") for one in found), found
-    bed.wait(lambda: learns(bed, owner), 10, "the wedged one to learn the newer epoch")
+    bed.wait(lambda: learns(bed, owner), 60, "the wedged one to learn the newer epoch")
 
 
 def test_power_loss_of_the_owner_is_silence_and_it_returns_with_its_state(bed: ChaosBed) -> None:
     owner, start = bed.calm(), monotonic_s()
     before = {entry["name"]: entry["incarnation"] for entry in bed.status("robot1")["nodes"]}
     bed.power_off(owner)
-    bed.wait(lambda: bed.moved_from(owner), 10, "another owner")
-    bed.wait(bed.probes["robot1"].is_flowing, 5, "echoes")
+    bed.wait(lambda: bed.moved_from(owner), 60, "another owner")
+    bed.wait(bed.probes["robot1"].is_flowing, 60, "echoes")
     reasons = [one.reason for one in bed.changes(since=start) if one.node == owner and one.after is PeerState.SUSPECT]
     assert reasons
     assert all(reason.startswith("silent") for reason in reasons)
@@ -136,9 +136,9 @@ def test_slow_node_accuses_nobody_to_death(bed: ChaosBed) -> None:
     try:
         for pid in (bed.pid(owner), *descendants(bed.pid(owner))):
             group.add(pid)
-        bed.wait(lambda: monotonic_s() > start + 4, 10, "four seconds of it")
+        bed.wait(lambda: monotonic_s() > start + 4, 60, "four seconds of it")
         assert {node for observer, node in gone(bed, start) if observer != owner} <= {owner}
-        bed.wait(bed.probes["robot1"].is_flowing, 5, "echoes, however late: its owner rests for up to 0.1 s at a time")
+        bed.wait(bed.probes["robot1"].is_flowing, 60, "echoes, however late: its owner rests for up to 0.1 s at a time")
     finally:
         for pid in group.pids():
             with contextlib.suppress(OSError):
@@ -167,11 +167,11 @@ def test_restart_storm_breaks_no_promise(bed: ChaosBed) -> None:
 def test_cut_off_owner_is_replaced_and_learns_it_when_the_cut_heals(bed: ChaosBed) -> None:
     owner, start = bed.calm(), monotonic_s()
     bed.network.cut(owner)
-    bed.wait(lambda: bed.moved_from(owner), 10, "another owner")
-    bed.wait(bed.probes["robot1"].is_flowing, 5, "echoes")
+    bed.wait(lambda: bed.moved_from(owner), 60, "another owner")
+    bed.wait(bed.probes["robot1"].is_flowing, 60, "echoes")
     assert bed.owner_of(TASK, owner) == owner, "it cannot know better"
     bed.network.heal()
-    bed.wait(lambda: learns(bed, owner), 10, "the old owner to learn the newer epoch")
+    bed.wait(lambda: learns(bed, owner), 60, "the old owner to learn the newer epoch")
     assert {node for observer, node in gone(bed, start) if observer != owner} == {owner}
 
 
@@ -179,21 +179,21 @@ def test_cut_off_robot_moves_nothing_and_the_others_go_on(bed: ChaosBed) -> None
     owner, start = bed.calm(), monotonic_s()
     epoch = bed.task("robot2")["epoch"]
     bed.network.cut("robot2")
-    bed.wait(lambda: not bed.status("robot2")["quorum"]["ok"], 10, "robot2 to miss the quorum")
+    bed.wait(lambda: not bed.status("robot2")["quorum"]["ok"], 60, "robot2 to miss the quorum")
     assert any(text.startswith("no quorum") for text in bed.status("robot2")["problems"])
-    bed.wait(lambda: ("robot1", "robot2") in gone(bed, start), 10, "robot2 gone")
-    bed.wait(bed.probes["robot1"].is_flowing, 2, "robot1's echoes")
+    bed.wait(lambda: ("robot1", "robot2") in gone(bed, start), 60, "robot2 gone")
+    bed.wait(bed.probes["robot1"].is_flowing, 60, "robot1's echoes")
     assert (bed.task("robot2")["owner"], bed.task("robot2")["epoch"]) == (owner, epoch)
-    bed.wait(lambda: not bed.probes["robot2"].is_flowing(), 3, "robot2's stream to stop")
+    bed.wait(lambda: not bed.probes["robot2"].is_flowing(), 60, "robot2's stream to stop")
 
 
 @pytest.mark.parametrize("way", ["deaf", "mute"])
 def test_owner_cut_off_one_way_is_replaced(bed: ChaosBed, way: str) -> None:
     owner = bed.calm()
     (bed.network.deafen if way == "deaf" else bed.network.mute)(owner)
-    bed.wait(lambda: bed.moved_from(owner), 15, "another owner")
-    bed.wait(lambda: bed.moved_from(owner, "robot1", "robot2", "robot3", task=GUARD), 15, "another guard")
-    bed.wait(bed.probes["robot1"].is_flowing, 5, "echoes")
+    bed.wait(lambda: bed.moved_from(owner), 60, "another owner")
+    bed.wait(lambda: bed.moved_from(owner, "robot1", "robot2", "robot3", task=GUARD), 60, "another guard")
+    bed.wait(bed.probes["robot1"].is_flowing, 60, "echoes")
 
 
 def test_even_split_moves_nothing_on_either_side(bed: ChaosBed) -> None:
@@ -203,15 +203,15 @@ def test_even_split_moves_nothing_on_either_side(bed: ChaosBed) -> None:
     theirs = {"robot3", "edge1", owner}
     ours = others(bed, *theirs)
     bed.network.separate(ours, theirs)
-    bed.wait(lambda: bed.peer("robot1", owner) == "gone", 10, "the owner gone for robot1")
+    bed.wait(lambda: bed.peer("robot1", owner) == "gone", 60, "the owner gone for robot1")
     start = monotonic_s()
-    bed.wait(lambda: monotonic_s() > start + 1.5, 5, "time for three rounds")
+    bed.wait(lambda: monotonic_s() > start + 1.5, 60, "time for three rounds")
     for robot in ("robot1", "robot3"):
         status = bed.status(robot)
         assert not status["quorum"]["ok"], robot
         assert status["tasks"][0]["epoch"] == epoch
     bed.network.heal()
-    bed.wait(lambda: bed.owner_of(TASK), 10, "one agreed value")
+    bed.wait(lambda: bed.owner_of(TASK), 60, "one agreed value")
 
 
 def test_saturated_uplink_takes_nobody_for_dead(bed: ChaosBed) -> None:
@@ -220,9 +220,9 @@ def test_saturated_uplink_takes_nobody_for_dead(bed: ChaosBed) -> None:
     start = monotonic_s()
     bed.network.narrow("robot3", 4)
     probe = bed.probe("robot3", put="robot3/in", size=60_000, watch=["robot3/out"])
-    bed.wait(lambda: probe.is_open, 10, "the application")
+    bed.wait(lambda: probe.is_open, 60, "the application")
     began = monotonic_s()
-    bed.wait(lambda: monotonic_s() > began + 3, 10, "three seconds of it")
+    bed.wait(lambda: monotonic_s() > began + 3, 60, "three seconds of it")
     probe.close()
     assert gone(bed, start) == set()
 

@@ -13,6 +13,7 @@ from typing import Final
 
 import pytest
 
+from support.waiting import within
 from zsched.clock import monotonic_s
 from zsched.core.fleet import Timing
 from zsched.core.model import NodeId
@@ -66,7 +67,7 @@ def test_no_robot_stands_still_when_the_owner_is_deaf(bed: ChaosBed) -> None:
         )
         pauses.append({robot: round(pause_s(probe, cut), 2) for robot, probe in bed.probes.items()})
         print(f"cut {number}: {owner} deaf, pauses {pauses[-1]}", flush=True)
-    assert max(one for found in pauses for one in found.values()) < LONGEST_S, pauses
+    within(max(one for found in pauses for one in found.values()), LONGEST_S, f"without an answer: {pauses}")
 
 
 def test_a_frozen_application_holds_up_no_other_of_its_robot(bed: ChaosBed) -> None:
@@ -76,17 +77,17 @@ def test_a_frozen_application_holds_up_no_other_of_its_robot(bed: ChaosBed) -> N
     frozen = bed.probe("robot1", watch=["robot1/out"], timing=patient)
     awake = bed.probe("robot1", put="robot1/in", hz=100, size=30_000, watch=["robot1/out"])
     others = (frozen, awake)
-    bed.wait(lambda: all(one.received for one in others), 20, "answers at all three")
+    bed.wait(lambda: all(one.received for one in others), 60, "answers at all three")
     frozen.send(signal.SIGSTOP)
     try:
         began = monotonic_s()
-        bed.wait(lambda: monotonic_s() > began + 6, 10, "six seconds")
+        bed.wait(lambda: monotonic_s() > began + 6, 60, "six seconds")
         for probe in (bed.probes["robot1"], awake):
-            bed.wait(probe.is_flowing, 5, "answers")
-            assert pause_s(probe, began) < 2.0
+            bed.wait(probe.is_flowing, 60, "answers")
+            within(pause_s(probe, began), 2.0, "without an answer")
     finally:
         frozen.send(signal.SIGCONT)
-    bed.wait(lambda: is_back(frozen, began + 6), 20, "answers at the one that woke up")
+    bed.wait(lambda: is_back(frozen, began + 6), 60, "answers at the one that woke up")
     for probe in others:
         probe.close()
 

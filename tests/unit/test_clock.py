@@ -82,7 +82,7 @@ def test_two_readings_at_once_tell_nothing_and_a_long_gap_is_compared_all_the_sa
 
 
 def test_this_machine_s_clocks_can_be_compared_within_a_tenth_of_what_leases_allow_for() -> None:
-    compared, until, found = ClockWatch(), time.monotonic() + 30.0, []
+    compared, until, found = ClockWatch(), time.monotonic() + 90.0, []
     while time.monotonic() < until:
         drift = compared.look()
         found += [] if drift is None else [abs(drift.jump_s)]

@@ -13,7 +13,7 @@ import pytest
 
 import zsched
 from zsched import guard
-from zsched.guard import MAX_PAUSE_S, guarded
+from zsched.guard import guarded
 from zsched.log_limit import LIBRARY, MAX_PLACES, LogLimit, limit_library
 from zsched.log_limit import LIMIT as SHARED
 
@@ -65,7 +65,7 @@ def test_a_lasting_thread_that_fails_is_told_and_begins_again(told: list[tuple[s
 
     thread = guarded(run, 7, name="one of many", kind="many")
     thread.start()
-    thread.join(10)
+    thread.join(60)
     assert not thread.is_alive()
     assert calls == [7, 7, 7]
     assert guard.failures["many"] == 2
@@ -81,7 +81,7 @@ def test_an_errand_that_fails_is_told_and_ends(told: list[tuple[str, str]]) -> N
 
     thread = guarded(run, name="errand", is_lasting=False)
     thread.start()
-    thread.join(10)
+    thread.join(60)
     assert not thread.is_alive()
     assert [kind for kind, _ in told] == ["errand"]
 
@@ -96,9 +96,9 @@ def test_a_thread_that_fails_at_once_does_not_spin(told: list[tuple[str, str]]) 
     thread = guarded(run, name="spinning")
     thread.start()
     time.sleep(0.5)
-    assert 1 <= len(told) <= 4
+    assert 1 <= len(told) <= 10  # 3 or 4, and a few more on a busy machine; thousands without a pause
     stop.set()
-    thread.join(MAX_PAUSE_S + 5)
+    thread.join(60)
     assert not thread.is_alive()
 
 

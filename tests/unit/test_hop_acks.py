@@ -30,7 +30,7 @@ class Book:
         return [self.acks.admit(NAME, serial_of(number), in_turn=in_turn) is not None for number in numbers]
 
     def wait(self, **fields: object) -> StreamAck:
-        end = time.monotonic() + 3
+        end = time.monotonic() + 60
         while time.monotonic() < end:
             if self.sent and all(getattr(self.last(), name) == value for name, value in fields.items()):
                 return self.last()
@@ -89,18 +89,18 @@ def test_an_input_that_wants_the_newest_takes_it(book: Book) -> None:
 
 
 def test_at_20_hz_while_it_changes_and_at_once_when_much_was_processed(book: Book) -> None:
-    end = time.monotonic() + 0.5
+    began = time.monotonic()
     number = 0
-    while time.monotonic() < end:
+    while time.monotonic() < began + 0.5 or len(book.sent) < 5:
         book.admit(number)
         book.acks.processed(NAME, number, 10)
         number += 1
         time.sleep(0.005)
-    assert 5 <= len(book.sent) <= 13
+    assert len(book.sent) <= 3 + 20 * (time.monotonic() - began)
     before = len(book.sent)
     book.admit(number)
     book.acks.processed(NAME, number, hop_acks.ACK_BYTES)
-    end = time.monotonic() + 0.5
+    end = time.monotonic() + 60
     while len(book.sent) == before and time.monotonic() < end:
         time.sleep(0.001)
     assert len(book.sent) > before

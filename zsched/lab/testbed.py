@@ -165,7 +165,7 @@ class Testbed:
         while self.relay_pid(node) == pid and time.monotonic() < deadline:
             time.sleep(POLL_S)
 
-    def stop(self, *nodes: NodeId, within_s: float = 5.0) -> dict[NodeId, tuple[int, float]]:
+    def stop(self, *nodes: NodeId, within_s: float = 30.0) -> dict[NodeId, tuple[int, float]]:
         """SIGTERM daemons (default: all that run) and wait; {node: (exit code, seconds)}."""
         stopping = {node: self._processes.pop(node) for node in nodes or tuple(self._processes)}
         start = time.monotonic()

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from support.waiting import free_endpoint, until
+from support.waiting import free_endpoint, until, within
 from zsched.adapters.control_bus import ControlBus
 from zsched.core import events as ev
 from zsched.core.fleet import Timing
@@ -93,37 +93,32 @@ def spawn(parent: Parent) -> Iterator[Spawn]:
     yield start
     for child in children:
         child.kill()
-        child.communicate(timeout=10)
+        child.communicate(timeout=60)
 
 
 def test_token_of_a_killed_process_goes_within_milliseconds_and_names_its_life(parent: Parent, spawn: Spawn) -> None:
-    first, second = (ev.TokenLost(node="child", incarnation=number) for number in (5, 6))
-    start = killed(spawn(5))
-    until(lambda: parent.has(first), "the first token's end")
-    assert time.monotonic() - start < 0.5
-    start = killed(spawn(6))
-    until(lambda: parent.has(second), "the second token's end")
-    assert time.monotonic() - start < 0.5
+    for incarnation in (5, 6):
+        within(until_lost(parent, spawn, incarnation, signal.SIGKILL), 0.5)
 
 
-def killed(child: subprocess.Popen[str]) -> float:
-    child.kill()
-    return time.monotonic()
+def until_lost(parent: Parent, spawn: Spawn, incarnation: int, fault: signal.Signals) -> float:
+    """Seconds from the fault of a child to the end of the token of just this life."""
+    child = spawn(incarnation)
+    child.send_signal(fault)
+    start = time.monotonic()
+    until(lambda: parent.has(ev.TokenLost(node="child", incarnation=incarnation)), "the token's end")
+    return time.monotonic() - start
 
 
 def test_token_of_a_stopped_process_goes_within_its_lease(parent: Parent, spawn: Spawn) -> None:
-    child = spawn(5)
-    child.send_signal(signal.SIGSTOP)
-    start = time.monotonic()
-    until(lambda: parent.has(ev.TokenLost(node="child", incarnation=5)), "the token's end")
-    assert time.monotonic() - start < Timing().zenoh_lease_s + 1.0
+    within(until_lost(parent, spawn, 5, signal.SIGSTOP), Timing().zenoh_lease_s + 1.0)
 
 
 def test_orderly_close_withdraws_the_token(parent: Parent, spawn: Spawn) -> None:
     child = spawn(5)
-    out, _ = child.communicate("close\n", timeout=10)
+    out, _ = child.communicate("close\n", timeout=60)
     assert out == "open\nclosed\n"
-    until(lambda: parent.has(ev.TokenLost(node="child", incarnation=5)), "the token's end", 2.0)
+    until(lambda: parent.has(ev.TokenLost(node="child", incarnation=5)), "the token's end")
 
 
 @pytest.mark.parametrize("what", ["close", "twice", "ask"])
@@ -131,9 +126,9 @@ def test_interpreter_exits_by_itself_after_close(spawn: Spawn, what: str) -> Non
     """No thread of zenoh's is left that it would wait for, not even with questions open."""
     child = spawn(5)
     start = time.monotonic()
-    out, _ = child.communicate(f"{what}\n", timeout=10)
+    out, _ = child.communicate(f"{what}\n", timeout=60)
     assert (child.returncode, out) == (0, "open\nclosed\n")
-    assert time.monotonic() - start < 3.0
+    within(time.monotonic() - start, 3.0)
 
 
 def closed_within(bus: ControlBus, seconds: float) -> None:

@@ -143,7 +143,7 @@ def is_answered(door: OperatorSocket) -> bool:
 
 def test_slow_answers_do_not_hold_each_other_up(tmp_path: Path) -> None:
     """As many as there are places are answered at the same time."""
-    together = threading.Barrier(MAX_CONNECTIONS, timeout=10)
+    together = threading.Barrier(MAX_CONNECTIONS, timeout=60)
 
     def wait(_request: Json) -> Json:
         together.wait()
@@ -153,14 +153,14 @@ def test_slow_answers_do_not_hold_each_other_up(tmp_path: Path) -> None:
     door.open()
     answers: list[Json] = []
     threads = [
-        threading.Thread(target=lambda: answers.append(ask(door.path, {"verb": "x"}, 10)))
+        threading.Thread(target=lambda: answers.append(ask(door.path, {"verb": "x"}, 60)))
         for _ in range(MAX_CONNECTIONS)
     ]
     try:
         for thread in threads:
             thread.start()
         for thread in threads:
-            thread.join(15)
+            thread.join(60)
     finally:
         door.close()
     assert answers == [{"ok": True}] * MAX_CONNECTIONS
@@ -182,7 +182,7 @@ def test_who_is_silent_keeps_nobody_from_asking(door: OperatorSocket) -> None:
 
 def test_one_more_than_can_be_answered_at_once_is_told_so(tmp_path: Path) -> None:
     goes_on = threading.Event()
-    door = OperatorSocket(tmp_path / "s", lambda _request: {"ok": goes_on.wait(20)})
+    door = OperatorSocket(tmp_path / "s", lambda _request: {"ok": goes_on.wait(60)})
     door.open()
     try:
         with contextlib.ExitStack() as stack:
@@ -327,5 +327,5 @@ def test_ask_refuses_answers_that_are_no_object(tmp_path: Path, answer: bytes, s
         thread.start()
         with pytest.raises(AdapterError, match=says):
             ask(path, {"verb": "status"})
-        thread.join(5)
+        thread.join(60)
     assert os.path.lexists(path)

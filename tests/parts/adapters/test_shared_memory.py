@@ -89,6 +89,6 @@ def test_large_puts_go_through_it_when_both_ends_have_it_on(*, is_on: bool) -> N
             until(sent, "ten messages")
         finally:
             process.stdin.close()
-            process.wait(10)
+            process.wait(60)
         subscriber.undeclare()
     assert any(taken) is is_on  # the first ones may come before the pool is made

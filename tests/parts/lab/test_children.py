@@ -55,7 +55,7 @@ except Interrupted:
 """
 
 
-def wait_for(condition: Callable[[], bool], deadline_s: float = 15.0) -> bool:
+def wait_for(condition: Callable[[], bool], deadline_s: float = 60.0) -> bool:
     end = time.monotonic() + deadline_s
     while not condition():
         if time.monotonic() > end:
@@ -68,10 +68,8 @@ def test_stop_ends_a_child_within_its_grace(tmp_path: Path) -> None:
     with Children(tmp_path) as children:
         child = children.start("sleeper", SLEEP)
         assert [running.name for running in children.running()] == ["sleeper"]
-        start = time.monotonic()
-        children.stop(child)
-        assert time.monotonic() - start < 2.0
-        assert child.process.returncode is not None
+        children.stop(child, grace_s=60.0)
+        assert child.process.returncode == -signal.SIGTERM, "within its grace: else it would have been killed"
         assert children.running() == []
     assert children.left_behind == []
 
@@ -105,7 +103,7 @@ def test_a_killed_lab_leaves_no_process_and_no_folder(tmp_path: Path, number: si
     finally:
         lab.send_signal(number)
         lab.stdout.close()
-        lab.wait(timeout=5)
+        lab.wait(timeout=60)
 
     assert wait_for(lambda: not tagged_processes(token))
     assert wait_for(lambda: not runtime.exists())
@@ -122,7 +120,7 @@ def test_a_signal_into_the_clean_up_does_not_cut_it(tmp_path: Path) -> None:
     time.sleep(0.1)
     lab.send_signal(signal.SIGINT)
 
-    assert lab.wait(timeout=15) == 130
+    assert lab.wait(timeout=60) == 130
     assert tagged_processes(token) == []
 
 

@@ -76,7 +76,7 @@ def test_processes_at_once_have_nothing_in_common() -> None:
     finally:
         for process in processes:
             process.kill()
-            process.communicate(timeout=10)
+            process.communicate(timeout=60)
     assert len(found) == 6 * 300
     assert len(set(found)) == len(found)
 
@@ -90,14 +90,14 @@ def test_a_taken_address_is_passed_over_and_comes_back_when_its_process_is_kille
         assert second.address != address
     finally:
         process.send_signal(signal.SIGKILL)
-        process.communicate(timeout=10)
+        process.communicate(timeout=60)
     third = loopback._take(process.pid)
     os.close(third.descriptor)
     assert third.address == address
 
 
 def test_a_forked_child_has_an_address_of_its_own() -> None:
-    done = subprocess.run([sys.executable, "-c", FORK], capture_output=True, text=True, timeout=30, check=True)
+    done = subprocess.run([sys.executable, "-c", FORK], capture_output=True, text=True, timeout=60, check=True)
     parents, childs, parents_again = done.stdout.split()
     assert parents == parents_again != childs
 

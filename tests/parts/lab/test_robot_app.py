@@ -84,7 +84,7 @@ def test_it_publishes_its_growing_map_and_counts_the_merged_ones(tmp_path: Path)
             session.put("robot1/map_merge/status", json.dumps({"robot1": "attached"}))
             wait_for_kinds(tmp_path / "robot1.ndjson", {"map", "bad_map", "status"})
             process.send_signal(signal.SIGTERM)
-            assert process.wait(timeout=5.0) == 0
+            assert process.wait(timeout=60.0) == 0
     finally:
         process.kill()
         process.wait()
@@ -102,7 +102,7 @@ def test_it_publishes_its_growing_map_and_counts_the_merged_ones(tmp_path: Path)
 
 
 def receive(subscriber: zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]) -> zenoh.Sample:
-    end = time.monotonic() + 20.0
+    end = time.monotonic() + 60
     while time.monotonic() < end:
         sample = subscriber.try_recv()
         if sample is not None:
@@ -113,14 +113,14 @@ def receive(subscriber: zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]) 
 
 def wait_for_subscriber(session: zenoh.Session) -> None:
     with session.declare_publisher("robot1/global_map") as publisher:
-        end = time.monotonic() + 10.0
+        end = time.monotonic() + 60
         while not publisher.matching_status.matching:  # type: ignore[attr-defined]  # the stub says bool, it is none
             assert time.monotonic() < end, "the robot does not listen"
             time.sleep(0.01)
 
 
 def wait_for_kinds(path: Path, kinds: set[str]) -> None:
-    end = time.monotonic() + 10.0
+    end = time.monotonic() + 60
     while not kinds <= {record["kind"] for record in read_records(path)}:
         assert time.monotonic() < end, "the robot did not record what it saw"
         time.sleep(0.05)

@@ -98,7 +98,7 @@ class _Hub:
     def stop(self) -> None:
         for worker in self.workers:
             worker.kill()
-            worker.wait(5)
+            worker.wait(60)
         self.session.close()
 
 
@@ -143,10 +143,10 @@ def test_merge_now_answers_with_the_status_of_the_owner_only(hub: _Hub, view: Vi
     hub.feed("edge1", view)
     merges = _first_merge(hub, "edge1")["merges"]
     key = f"{_TASK}/robot1/merge_now"
-    (reply,) = hub.session.get(f"edge1/{key}", timeout=5.0)
+    (reply,) = hub.session.get(f"edge1/{key}", timeout=60.0)
     assert reply.ok is not None
     assert json.loads(reply.ok.payload.to_bytes())["schema"] == "zsched.map_merge.status/1"
     until(lambda: hub.of("edge1")[-1]["merges"] > merges, "one more merge, though nothing has changed")
-    (refused,) = hub.session.get(f"edge2/{key}", timeout=5.0)
+    (refused,) = hub.session.get(f"edge2/{key}", timeout=60.0)
     assert refused.err is not None
     assert refused.err.payload.to_string().startswith("not owner")

@@ -103,7 +103,7 @@ class _Rig:
 
     def stop(self) -> None:
         self.worker.kill()
-        self.worker.wait(5)
+        self.worker.wait(60)
         self.app.close()
         for relay in self.relays.values():
             relay.stop()
@@ -148,7 +148,7 @@ def test_map_goes_in_and_merged_map_comes_out_at_the_robot(rig: _Rig, view: View
     assert status()["robots"]["robot1"]["state"] == "attached"
     watch.undeclare()
     rig.worker.send_signal(signal.SIGTERM)
-    assert rig.worker.wait(5) == 0
+    assert rig.worker.wait(60) == 0
 
 
 @pytest.mark.parametrize(
@@ -163,6 +163,6 @@ def test_map_goes_in_and_merged_map_comes_out_at_the_robot(rig: _Rig, view: View
 def test_bad_arguments_end_with_a_code_and_a_reason(arguments: list[str], code: int, words: str) -> None:
     env = {name: value for name, value in os.environ.items() if not name.startswith("ZSCHED_")}
     command = [sys.executable, "-m", "zsched.tasks.map_merge", *arguments]
-    done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=20, check=False)
+    done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == code
     assert words in done.stderr

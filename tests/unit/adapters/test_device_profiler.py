@@ -11,12 +11,27 @@ from pathlib import Path
 import psutil
 import pytest
 
+from support.waiting import until
+from zsched.adapters import device_profiler
 from zsched.adapters.cgroup import LimitedGroup
 from zsched.adapters.device_profiler import DeviceProfiler, parse_cpu_list, parse_cpu_stat, parse_process_stat
 from zsched.core.model import WorkerState
 
 MEMINFO = "MemTotal:        4096000 kB\nMemFree: 100 kB\nMemAvailable:    3072000 kB\nHugePages_Total: 0\n"
 V2 = "30 25 0:26 / /sys/fs/cgroup rw - cgroup2 cgroup2 rw\n"
+
+
+class Clock:
+    """The profiler's, moved by hand."""
+
+    now = 1000.0
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    made = Clock()
+    monkeypatch.setattr(device_profiler, "monotonic_s", lambda: made.now)
+    return made
 
 
 def stat(*cpus: str) -> str:
@@ -55,7 +70,7 @@ def test_only_allowed_cpus_count(tmp_path: Path) -> None:
     assert profiler.sample({}).cpu_used_cores == pytest.approx(0.5)
 
 
-def test_quota_makes_the_group_the_machine(tmp_path: Path) -> None:
+def test_quota_makes_the_group_the_machine(tmp_path: Path, clock: Clock) -> None:
     files = {
         "proc/self/mountinfo": V2,
         "proc/self/cgroup": "0::/a\n",
@@ -66,12 +81,11 @@ def test_quota_makes_the_group_the_machine(tmp_path: Path) -> None:
         "sys/fs/cgroup/a/memory.stat": f"inactive_file {100 * 2**20}\n",
     }
     profiler = machine(tmp_path, **files)
-    first, begin_s = profiler.sample({}), time.monotonic()
+    first = profiler.sample({})
     assert (first.cpu_cores, first.memory_mb, first.memory_used_mb) == (0.5, 512.0, 200.0)
-    time.sleep(0.1)
+    clock.now += 0.1
     write(tmp_path, {"sys/fs/cgroup/a/cpu.stat": "usage_usec 1030000\n"})
-    used = profiler.sample({}).cpu_used_cores
-    assert used == pytest.approx(0.03 / (time.monotonic() - begin_s), rel=0.2)
+    assert profiler.sample({}).cpu_used_cores == pytest.approx(0.3)
 
 
 def test_machine_with_less_memory_left_than_the_group_may_use_tells_so(tmp_path: Path) -> None:
@@ -122,18 +136,16 @@ def process(pid: int, parent: int, *, own: int, waited: int = 0, start: int = 10
     return {f"proc/{pid}/stat": f"{pid} (w) S {parent} 1 1 0 -1 0 0 0 0 0 {times} 20 0 1 0 {start} 0 {pages}\n"}
 
 
-def test_tree_keeps_the_time_of_a_child_that_ended(tmp_path: Path) -> None:
+def test_tree_keeps_the_time_of_a_child_that_ended(tmp_path: Path, clock: Clock) -> None:
     profiler = machine(tmp_path, **process(10, 1, own=100), **process(11, 10, own=50), **process(12, 1, own=7))
     workers = {"merge": (WorkerState.READY, 10)}
     load = profiler.sample(workers).workers[0]
     assert (load.cpu_cores, load.memory_mb) == (None, 2.0)
-    begin_s = time.monotonic()
-    time.sleep(0.1)
+    clock.now += 0.1
     (tmp_path / "proc/11/stat").unlink()
     write(tmp_path, process(10, 1, own=102, waited=51))
     load = profiler.sample(workers).workers[0]
-    elapsed_s = time.monotonic() - begin_s
-    assert load.cpu_cores == pytest.approx(0.03 / elapsed_s, rel=0.2)
+    assert load.cpu_cores == pytest.approx(0.3)
     assert load.memory_mb == 1.0
 
 
@@ -146,6 +158,11 @@ def test_adopted_old_process_does_not_make_a_spike(tmp_path: Path) -> None:
     load = profiler.sample(workers).workers[0]
     assert load.cpu_cores is not None
     assert load.cpu_cores < 1000.0 / time.clock_gettime(time.CLOCK_BOOTTIME) * 2.0
+
+
+def used_s(process: psutil.Process) -> float:
+    times = process.cpu_times()
+    return float(times.user + times.system)
 
 
 BUSY_TREE = """
@@ -164,18 +181,20 @@ def test_real_busy_child_is_measured_like_psutil_does() -> None:
             worker.stdout.readline()
             child = psutil.Process(worker.pid).children()[0]
             workers = {"merge": (WorkerState.READY, worker.pid)}
+            outer, began = used_s(child), time.monotonic()
             profiler.sample(workers)
-            before, begin_s = child.cpu_times(), time.monotonic()
-            time.sleep(0.6)
-            sample, after, elapsed_s = profiler.sample(workers), child.cpu_times(), time.monotonic() - begin_s
+            inner, began_within = used_s(child), time.monotonic()
+            until(lambda: used_s(child) > inner + 0.3, "it works")
+            within_s, inner = time.monotonic() - began_within, used_s(child) - inner
+            sample = profiler.sample(workers)
+            longest_s, outer = time.monotonic() - began, used_s(child) - outer
             load = sample.workers[0]
-            expected = (after.user + after.system - before.user - before.system) / elapsed_s
             rss_mb = (child.memory_info().rss + psutil.Process(worker.pid).memory_info().rss) / 2**20
-            assert load.cpu_cores == pytest.approx(expected, abs=0.1)
-            assert expected > 0.1
+            assert load.cpu_cores is not None
+            assert inner / longest_s - 0.1 < load.cpu_cores < outer / within_s + 0.1
             assert load.memory_mb == pytest.approx(rss_mb, abs=2.0)
             assert sample.cpu_used_cores is not None
-            assert sample.cpu_used_cores > expected - 0.15
+            assert sample.cpu_used_cores > inner / longest_s - 0.15
             assert sample.memory_mb == pytest.approx(psutil.virtual_memory().total / 2**20, rel=0.001)
         finally:
             if child is not None:
@@ -201,11 +220,13 @@ def test_real_group_is_what_its_processes_measure() -> None:
                 worker.stdout.readline()
                 profiler = DeviceProfiler(pid=str(worker.pid))
                 profiler.sample({})
-                time.sleep(0.6)
+                child = psutil.Process(worker.pid).children()[0]
+                before = used_s(child)
+                until(lambda: used_s(child) > before + 0.1, "it works")
                 sample = profiler.sample({})
                 assert (sample.cpu_cores, sample.memory_mb) == (0.3, 256.0)
                 assert sample.cpu_used_cores is not None
-                assert 0.05 < sample.cpu_used_cores < 0.4
+                assert 0 < sample.cpu_used_cores < 0.45
                 assert sample.memory_used_mb is not None
                 assert 60.0 < sample.memory_used_mb < 120.0
             finally:

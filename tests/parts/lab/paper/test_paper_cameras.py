@@ -37,12 +37,12 @@ def test_streams_run_side_by_side_and_end_on_sigterm(tmp_path: Path) -> None:
         ]
         process = subprocess.Popen(command, stdout=file, stderr=subprocess.DEVNULL)
     try:
-        deadline = time.monotonic() + 40.0
+        deadline = time.monotonic() + 90.0
         while output.read_bytes().count(b"\n") < 2 and time.monotonic() < deadline:
             time.sleep(0.05)
         threads = len(list(Path(f"/proc/{process.pid}/task").iterdir()))
         process.send_signal(signal.SIGTERM)
-        assert process.wait(timeout=10.0) == 0
+        assert process.wait(timeout=60.0) == 0
     finally:
         process.kill()
         process.wait()
@@ -65,12 +65,12 @@ def test_streams_take_the_cpu_that_they_are_given() -> None:
     began, before = time.monotonic(), time.process_time()
     for camera in cameras:
         camera.start()
-    deadline = began + 30.0
+    deadline = began + 90.0
     while min(camera.frames for camera in cameras) < 6 and time.monotonic() < deadline:
         time.sleep(0.05)
     stop.is_set = True
     for camera in cameras:
-        camera.join(5.0)
+        camera.join(60.0)
     used = (time.process_time() - before) / (time.monotonic() - began)
 
     assert min(camera.frames for camera in cameras) >= 6

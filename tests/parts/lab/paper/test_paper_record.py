@@ -97,14 +97,14 @@ def test_the_recorder_hears_what_a_robot_sends_and_ends_whole(tmp_path: Path) ->
         process = subprocess.Popen(command, stderr=subprocess.PIPE)
         try:
             publisher = session.declare_publisher("robot1/map")
-            deadline = time.monotonic() + 20.0
+            deadline = time.monotonic() + 60
             while not matches(publisher) and time.monotonic() < deadline:
                 time.sleep(0.02)
             for number in range(5):
                 publisher.put(a_map(number))
                 time.sleep(0.02)
             process.send_signal(signal.SIGTERM)
-            _, told = process.communicate(timeout=20.0)
+            _, told = process.communicate(timeout=60)
         finally:
             process.kill()
             process.wait()
@@ -194,7 +194,7 @@ def test_the_gauge_sees_that_the_host_is_short() -> None:
         for spinner in spinners:
             gauge.add(spinner.pid)
         gauge.start()
-        deadline = time.monotonic() + 10.0
+        deadline = time.monotonic() + 60
         while (gauge.result()["pressure"] or 0.0) < 0.3 and time.monotonic() < deadline:
             time.sleep(0.1)
         pressure = gauge.result()["pressure"]
@@ -221,7 +221,7 @@ def test_loads_come_and_go_by_the_schedule_and_ballast_stays(tmp_path: Path) -> 
         loads.ballast("edge3", NodeShare(cpu_cores=0.1, memory_mb=256, ballast_mb=64))
         loads.ballast("edge2", NodeShare(cpu_cores=0.1, memory_mb=256))
         ballast = children.running("ballast-")
-        deadline = time.monotonic() + 10.0
+        deadline = time.monotonic() + 60
         while resident_mb(ballast[0].process.pid) < 64 and time.monotonic() < deadline:
             time.sleep(0.05)
         assert [child.name for child in ballast] == ["ballast-edge3"]

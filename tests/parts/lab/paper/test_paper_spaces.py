@@ -54,19 +54,19 @@ def is_told(path: Path) -> bool:
 @needs_spaces
 @pytest.mark.root
 def test_a_nodes_processes_are_in_its_namespace_behind_its_link(tmp_path: Path) -> None:
-    taken = {}
-    for rate in (2.0, 1000.0):
-        told = tmp_path / f"told-{rate:g}"
-        with narrow_links(NODES, rate) as network, NodeChildren(tmp_path / f"{rate:g}", network, NODES) as children:
+    taken: dict[float, float] = {}
+    for round_, rate in enumerate((2.0, 1000.0, 1000.0, 1000.0)):  # a wide one may be held up by a busy machine
+        told = tmp_path / f"told-{round_}"
+        with narrow_links(NODES, rate) as network, NodeChildren(tmp_path / f"{round_}", network, NODES) as children:
             assert network is not None
             children.start("serve-edge1", [sys.executable, "-c", SERVE])
             command = [sys.executable, "-c", TAKE, network.address("edge1"), str(SIZE)]
             children.start("take-robot1", command, output=told)
-            until(partial(is_told, told), "all bytes came", 40.0)
+            until(partial(is_told, told), "all bytes came")
         assert children.left_behind == []
         size, seconds = told.read_text().split()
         assert int(size) == SIZE
-        taken[rate] = float(seconds)
+        taken[rate] = min(float(seconds), taken.get(rate, float("inf")))
 
     assert taken[2.0] > 0.8  # 1 s less what the bucket holds
     assert taken[1000.0] < taken[2.0]

@@ -283,7 +283,7 @@ def test_search_in_its_own_thread_comes_back(view: View) -> None:
     wire = _Wire()
     service = MapMergeService(MergerSettings(mode=Mode.ESTIMATE), wire.publish, clock=wire.clock)
     _feed(service, view, "robot1", "robot2")
-    deadline = time.monotonic() + 20.0
+    deadline = time.monotonic() + 60
     while time.monotonic() < deadline:
         wire.now_s += 1.0
         service.step(is_active=True)
