@@ -68,9 +68,8 @@ class BeatRoom:
         chosen: list[tuple[str, object]] = []
         for kind, part in (*parts[first:], *parts[:first]):
             room -= _part_bytes(part)
-            if room < 0:
-                break
-            chosen.append((kind, part))
+            if room >= 0:  # it only shrinks: nothing is chosen behind the first part that has no room
+                chosen.append((kind, part))
         self._next = first + len(chosen)
         held = {kind: tuple(part for of, part in chosen if of == kind) for kind in _PARTS}
         return replace(beat, **held), len(parts) - len(chosen)  # type: ignore[arg-type]

@@ -385,9 +385,8 @@ class Leases:
         return tuple(task for task, holder in self._holders.items() if holder.is_leaving)
 
     def on_given(self, task: TaskId, until: float) -> None:
-        """The worker here is told that it may work ``until`` then."""
-        if task in self._holders:
-            self._holders[task].given_until = until
+        """The worker here, of a task that this node holds, is told that it may work ``until`` then."""
+        self._holders[task].given_until = until
 
     def given_until(self, task: TaskId) -> float:
         """Until when the worker here may be working; minus infinity when it is not."""
@@ -395,9 +394,8 @@ class Leases:
         return -math.inf if holder is None else holder.given_until
 
     def on_told_to_stop(self, task: TaskId) -> None:
-        """The worker here is told to stop: it will say when it has."""
-        if task in self._holders:
-            self._holders[task].awaits_report = True
+        """The worker here, of a task that this node holds, is told to stop: it will say when it has."""
+        self._holders[task].awaits_report = True
 
     def on_worker_lost(self, task: TaskId) -> None:
         """The worker's process here has ended; another one may be given leases before its end is told."""

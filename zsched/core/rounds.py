@@ -152,8 +152,9 @@ class Rounds:
         """Time has passed: start or close a gather, close votes."""
         out: list[Instruction] = []
         if self._gather is not None:
-            self._forget_silent(states)
-            if not self._gather.expected or now >= self._gather.deadline:
+            running = self._gather  # a robot that is not alive any more is not waited for
+            running.expected = [name for name in running.expected if states[name] is PeerState.ALIVE]
+            if not running.expected or now >= running.deadline:
                 out += self._close(values, states, now)
         elif now >= self._round_at:
             out += self._open(values, states, now)
@@ -178,11 +179,6 @@ class Rounds:
         if not expected:
             return self._close(values, states, now)
         return [AskUtilities(gather=self._number, deadline_s=timing.gather_s)]
-
-    def _forget_silent(self, states: Mapping[NodeId, PeerState]) -> None:
-        """Do not wait for a robot that is not alive any more."""
-        if self._gather is not None:
-            self._gather.expected = [name for name in self._gather.expected if states[name] is PeerState.ALIVE]
 
     def absorb_utilities(self, gather: int, utilities: Utilities) -> bool:
         """A robot answered; false when the answer is late, foreign or not its own."""

@@ -354,11 +354,11 @@ def _cut(held: list[str], node: str) -> set[str]:
 
 
 def _walk(graph: _Graph, part: set[str]) -> list[str]:
-    """A shortest circle through the first node (by name) of a strongly connected ``part``."""
+    """A shortest circle through the first node (by name) of a strongly connected ``part``: there always is one."""
     start = min(part)
     came_from: dict[str, str] = {}
     row = [start]
-    while row:
+    while True:
         ahead: list[str] = []
         for node in row:
             for target in graph[node]:
@@ -368,7 +368,6 @@ def _walk(graph: _Graph, part: set[str]) -> list[str]:
                     came_from[target] = node
                     ahead.append(target)
         row = ahead
-    return []
 
 
 def _path_back(came_from: Mapping[str, str], start: str, end: str) -> list[str]:

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from zsched.core import model
+from zsched.core.events import RetryCommanded, WeightsCommanded, commanded
 from zsched.core.messages import Accept, Accepted, Learnt, Prepare, Promise, Refusal, Refused, RetryTask, SetWeights
 from zsched.core.model import (
     MAX_COUNTER,
@@ -29,6 +30,7 @@ from zsched.core.model import (
     WorkerState,
 )
 from zsched.core.plan import ServiceSettings, StreamSettings
+from zsched.core.relay_protocol import EndMarker, SnapshotChunk, StreamAck, WorkerTrouble
 
 TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
 BALLOT = Ballot(counter=1, node="r1", incarnation=1)
@@ -48,6 +50,9 @@ PROGRESS = TaskProgress(task="merge", epoch=1, is_served=True)
 PROMISE = Promise(elector="r1", task="merge", ballot=BALLOT)
 ACCEPTED = Accepted(elector="r1", task="merge", ballot=BALLOT)
 REFUSED = Refused(elector="r1", task="merge", ballot=BALLOT, refusal=Refusal.BALLOT, promised=BALLOT)
+TROUBLE = WorkerTrouble(task="merge", incarnation="1", count=1, text="")
+END = EndMarker(epoch=1, count=1)
+PIECE = SnapshotChunk(index=0, count=1, size=1, checksum="")
 
 COUNTERS = [
     (PROGRESS, "epoch", "progress"),
@@ -67,6 +72,15 @@ COUNTERS = [
     (BEAT, "sequence", "beat"),
     (BEAT, "generation", "beat"),
     (Learnt(node="e1", values=()), "generation", "learnt"),
+    (TROUBLE, "count", "trouble"),
+    (END, "epoch", "end"),
+    (END, "count", "end"),
+    (END, "replayed", "end"),
+    *((PIECE, name, "snapshot") for name in ("index", "count", "size")),
+    *(
+        (StreamAck(eid=1, first=0, arrived=0, processed=0), name, "ack")
+        for name in ("eid", "first", "arrived", "processed", "lost", "doubled", "reordered", "until")
+    ),
 ]
 NAMES = [
     (LINK, "peer", "link"),
@@ -94,6 +108,7 @@ NAMES = [
     (REFUSED, "task", "refused"),
     (Learnt(node="e1", values=()), "node", "learnt"),
     (SetWeights(task="merge", cpu=1.0, memory=0.0, network=0.0), "task", "weights"),
+    (TROUBLE, "task", "trouble"),
     (RetryTask(task="merge"), "task", "retry"),
     (RetryTask(task="merge"), "node", "retry"),
 ]
@@ -159,3 +174,16 @@ def test_a_penalty_is_a_ratio() -> None:
         with pytest.raises(ValueError, match=r"vector\.penalties"):
             replace(VECTOR, penalties=(("e1", 0.5), ("e2", bad)))
     assert replace(VECTOR, penalties=(("e1", 0.0), ("e2", 1.0))).penalties
+
+
+def test_what_a_worker_says_of_itself_has_a_length() -> None:
+    for value, field in ((LOAD, "reason"), (TROUBLE, "text")):
+        assert replace(value, **{field: "x" * 200})
+        with pytest.raises(ValueError, match="201 characters, at most 200"):
+            replace(value, **{field: "x" * 201})
+
+
+def test_each_command_is_its_own_event() -> None:
+    weights = SetWeights(task="merge", cpu=1.0, memory=0.0, network=0.0)
+    assert commanded(7, weights) == WeightsCommanded(request=7, command=weights)
+    assert commanded(8, RetryTask(task="merge")) == RetryCommanded(request=8, command=RetryTask(task="merge"))

@@ -142,6 +142,16 @@ def test_a_relay_that_counts_from_the_beginning_again_has_no_usual_rate_yet(seco
     assert cost.moves == 0
 
 
+def test_two_reports_at_the_same_time_have_no_rate() -> None:
+    relay = Relay()
+    relay.run(20)
+    relay.now -= 1.0
+    relay.run(1)
+    relay.move()
+    relay.run(8, silent_s=2.0)
+    assert relay.cost.seconds == pytest.approx(2.0, abs=0.05)
+
+
 def test_a_move_before_anything_is_usual_is_not_measured() -> None:
     relay = Relay()
     relay.run(1)

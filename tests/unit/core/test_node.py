@@ -42,7 +42,7 @@ from zsched.core.model import (
     WorkerState,
 )
 from zsched.core.node import Node
-from zsched.core.plan import Direction, RoutePhase, StreamCount, WorkerRole
+from zsched.core.plan import Direction, ReadyWhen, RoutePhase, StreamCount, WorkerRole
 from zsched.core.status import build_snapshot
 
 T = TypeVar("T")
@@ -394,6 +394,21 @@ def test_a_relay_that_has_gone_leaves_every_slot_to_be_taken_again() -> None:
     assert problem.startswith("this robot's streams have waited for edge1 for 5 s")
     node.handle(ev.SlotReady(task="merge", epoch=1), 116.0)
     assert build_snapshot(node, 120.0).tasks[0].problems == ()
+
+
+def test_a_slot_of_a_foreign_worker_says_which_key_nobody_takes() -> None:
+    (task,) = FLEET.tasks
+    foreign = replace(task, worker=WorkerSpec(ready_when=ReadyWhen.MATCHING))
+    answers = replace(RULE, direction=Direction.OUTPUT)
+    for rules, what in (((answers, RULE), "edge1/"), ((answers,), "them")):
+        fleet = replace(FLEET, tasks=(replace(foreign, rules=rules),))
+        node = Node(
+            fleet=fleet, me="robot1", durable=durable("robot1"), incarnation=7, electorate="e", rng=Random(1), now=100.0
+        )
+        learnt = Learnt(node="robot2", values=(value(1, "edge1"),))
+        node.handle(ev.LearntReceived(learnt=learnt, is_answer=True), 100.0)
+        (problem,) = build_snapshot(node, 105.0).tasks[0].problems
+        assert f"our relay sees nobody take {what}" in problem
 
 
 def test_our_own_name_elsewhere_is_a_problem_until_its_token_goes() -> None:

@@ -80,6 +80,13 @@ def test_a_worker_without_a_figure_uses_nothing_for_that_sample() -> None:
     assert worker.memory_mb == pytest.approx(200.0 * math.exp(-1.0))
 
 
+def test_before_the_first_sample_there_is_no_profile_however_due() -> None:
+    profiler = make_profiler()
+    assert profiler.publishable(READY, is_draining=True, now=100.0) is None
+    profiler.absorb(device(), (), 100.1)
+    assert taken(profiler, 100.1).cpu_used_cores == 1.0
+
+
 # --- signals -------------------------------------------------------------------------------------------------------
 
 

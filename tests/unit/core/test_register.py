@@ -17,6 +17,7 @@ from support.registers import (
     BLANK,
     ELECTORS,
     FIRST,
+    INITIAL,
     STAGGER_S,
     accept,
     accept_all,
@@ -30,7 +31,7 @@ from support.registers import (
 )
 from zsched.core.messages import Accepted, Prepare, Promise, Refusal, Refused
 from zsched.core.model import MAX_COUNTER, Acceptance
-from zsched.core.register import BACKOFF_CAP_S, MAX_JUMP, Register, RoundOutcome, Step
+from zsched.core.register import BACKOFF_CAP_S, MAX_JUMP, MAX_REVISION, Register, RoundOutcome, Step
 
 # --- acceptor --------------------------------------------------------------------------------------------------------
 
@@ -224,6 +225,21 @@ def test_identity_round_of_a_blank_fleet_writes_nothing() -> None:
     step = promise_all(electors[0], electors[0].settle(0.0), electors)
     assert (step.accept, step.finished, step.learnt) == (None, None, None)
     assert electors[0].next_deadline() == math.inf
+
+
+@pytest.mark.parametrize("field", ["revision", "epoch"])
+def test_a_value_that_nothing_could_follow_is_not_learnt(field: str) -> None:
+    register = make("r1")
+    step = register.learn(replace(allocation(1), **{field: MAX_REVISION + 1}), 0.0)
+    assert "cannot be" in (step.problem or "")
+    assert register.value == INITIAL
+    assert register.learn(replace(allocation(1), **{field: MAX_REVISION}), 0.0).problem == ""
+
+
+def test_time_alone_changes_nothing_where_nothing_waits() -> None:
+    register = make("r1")
+    assert register.next_deadline() == math.inf
+    assert register.tick(1e9) == Step()
 
 
 def test_settle_leaves_a_round_under_way_alone() -> None:

@@ -160,6 +160,14 @@ def test_a_ros_name_makes_a_valid_key(name: str) -> None:
         assert is_valid(ros2.ros_key(RosGraph.RMW_ZENOH, name.replace("{", "").replace("}", ""), domain=0))
 
 
+@pytest.mark.parametrize(
+    ("node", "may"), [("robot_1", True), ("r", True), ("a__b", False), ("7up", False), ("a-b", False)]
+)
+def test_a_node_s_name_may_stand_in_a_ros_name_or_not(node: str, *, may: bool) -> None:
+    assert (ros2.node_name_fault(node) is None) is may
+    assert (name_fault(f"/{node}/map") is None) is may
+
+
 def test_types_and_hashes() -> None:
     for is_service in (False, True):
         assert type_fault("any", is_service=is_service) is None

@@ -80,6 +80,27 @@ def test_keys_that_are_none_of_ros_or_that_nobody_can_name_are_not_announced() -
         assert mirrored([silent], NOBODY) == NOBODY
 
 
+def test_a_plain_service_is_stood_in_for_where_its_clients_ask() -> None:
+    """Its name is open: only who asks says for what."""
+    wild = route(Direction.SERVICE, "0/robot1/now/*/*", "edge1/m/now")
+    others = {one(SC, "robot2/now"), one(SS, "robot1/now"), one(MS, "robot1/now")}
+    seen = Sides(local=frozenset({one(SC, "robot1/now")} | others), fleet=frozenset())
+    assert mirrored([wild], seen) == Sides(local=frozenset({one(SS, "robot1/now")}), fleet=frozenset())
+
+
+def test_a_plain_worker_is_stood_in_for_only_where_it_is_meant() -> None:
+    plain = route(Direction.INPUT, f"0/robot1/map/{TYPE}/*", "edge1/m/robot1/map")
+    seen = Sides(local=frozenset({one(MP, "robot1/map"), one(MP, "robot1/scan")}), fleet=frozenset())
+    assert mirrored([plain], seen).local == frozenset({one(MS, "robot1/map")})
+
+
+def test_a_subscription_is_not_shown_where_its_key_cannot_be_told() -> None:
+    """The type is open on one side only: which one it is there, nobody knows."""
+    dropped = route(Direction.INPUT, "0/robot1/*/*/*", f"0/edge1/m/{TYPE}/*")
+    seen = Sides(local=frozenset(), fleet=frozenset({one(MS, "edge1/m")}))
+    assert mirrored([dropped], seen) == NOBODY
+
+
 def test_one_session_for_both_sides_shows_both_there() -> None:
     everything = frozenset({one(MP, "robot1/map"), one(MS, "edge1/m/robot1/map")})
     shown = mirrored([INPUT], Sides(local=everything, fleet=everything))

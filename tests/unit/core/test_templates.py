@@ -48,6 +48,12 @@ GLOBAL = rule(OUT, "{target}/{task}/{epoch}/global_map", "{robot}/global_map")
 STATUS = rule(OUT, "{target}/{task}/{epoch}/status", "{node}/{task}/status")
 
 
+def test_a_stream_that_feeds_itself_is_refused() -> None:
+    same = "{robot}/{target}/map"
+    assert "feed itself" in (rule_fault(rule(IN, same, same)) or "")
+    assert rule_fault(MAP) is None
+
+
 def test_routes_for_fills_every_placeholder() -> None:
     routes = routes_for(task_of(GLOBAL, MAP, STATUS), "robot2", "edge1", 7)
     assert [(route.stream, route.from_expr, route.to_expr) for route in routes] == [
