@@ -9,6 +9,7 @@ import pytest
 
 from zsched.core import model
 from zsched.core.events import RetryCommanded, WeightsCommanded, commanded
+from zsched.core.fleet import Demand
 from zsched.core.messages import Accept, Accepted, Learnt, Prepare, Promise, Refusal, Refused, RetryTask, SetWeights
 from zsched.core.model import (
     MAX_COUNTER,
@@ -132,6 +133,8 @@ RANGES = [
     (UTILITY, "memory", "utility.memory", RATIO),
     (UTILITY, "network", "utility.network", RATIO),
     (PROPOSAL, "aggregate", "proposal.aggregate", (0.0, 2.0)),
+    (Demand(), "cpu_cores", "demand.cpu_cores", (0.0, 4096.0)),
+    (Demand(), "memory_mb", "demand.memory_mb", (0.0, 1e8)),
     (ServiceSettings(), "timeout_s", "timeout_s", (0.05, 3600.0)),
     (ServiceSettings(), "hold_s", "hold_s", (0.0, 3600.0)),
     (ServiceSettings(), "max_pending", "max_pending", (1, 256)),
@@ -177,10 +180,11 @@ def test_a_penalty_is_a_ratio() -> None:
 
 
 def test_what_a_worker_says_of_itself_has_a_length() -> None:
-    for value, field in ((LOAD, "reason"), (TROUBLE, "text")):
-        assert replace(value, **{field: "x" * 200})
-        with pytest.raises(ValueError, match="201 characters, at most 200"):
-            replace(value, **{field: "x" * 201})
+    assert len(replace(LOAD, reason="x" * 200).reason) == len(replace(TROUBLE, text="x" * 200).text) == 200
+    with pytest.raises(ValueError, match=r"worker\.reason: 201 characters, at most 200"):
+        replace(LOAD, reason="x" * 201)
+    with pytest.raises(ValueError, match=r"trouble\.text: 201 characters, at most 200"):
+        replace(TROUBLE, text="x" * 201)
 
 
 def test_each_command_is_its_own_event() -> None:

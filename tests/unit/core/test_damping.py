@@ -109,6 +109,15 @@ def test_planned_moves_are_capped_per_minute_and_escapes_are_not_by_that_cap() -
     assert free.outcome is Outcome.PROPOSE
 
 
+def test_the_cap_is_no_matter_where_nobody_wants_to_move() -> None:
+    damping, judge = Damping(), Judge(spec=SPEC)
+    for at in (100.0, 110.0):
+        damping.note_move("edge3", has_failed=False, now=at)
+    joint = standing(edge1=0.9, edge2=0.2)
+    stays = judge.judge(joint, OWNED, settled_for_s=99, escape=None, is_called=True, now=120.0, damping=damping)
+    assert (stays.outcome, "last minute" in stays.reason) == (Outcome.STAY, False)
+
+
 def test_what_any_robot_remembers_counts_and_nothing_counts_for_a_judge_without_damping() -> None:
     joint = replace(standing(edge1=0.5, edge2=0.6), penalties={"edge2": 0.3})
     given: dict[str, Any] = {"settled_for_s": 99.0, "escape": None, "is_called": False, "now": 100.0}

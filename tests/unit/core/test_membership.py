@@ -485,3 +485,15 @@ def test_somebody_is_missed_as_long_as_one_peer_is_not_alive() -> None:
     ear.run(0.0, 5.0, ("a",))
     assert ear.members.state("b") is GONE
     assert [ear.members.misses_anybody] == [True]
+
+
+def test_a_restart_of_the_very_first_life_refutes_the_end_of_its_token_at_once() -> None:
+    """A beat of the same life may have been on its way when the token went; one of the next life was not."""
+    for incarnation, expected in ((0, []), (1, [ALIVE])):
+        ear = Ear(SMALL)
+        ear.members.tick(-60.0)
+        ear.beat("b", 0.0)
+        ear.beat("a", 0.0, incarnation=0)
+        ear.members.absorb_token_lost("a", 0, 0.01)
+        assert ear.members.state("a") is SUSPECT
+        assert ear.beat("a", 0.02, incarnation=incarnation) == expected

@@ -354,6 +354,24 @@ def test_a_robot_that_drains_what_it_owns_asks_at_once_who_shall_have_it() -> No
         assert bool(of(node.handle(ev.StopRequested(), now), do.AskUtilities)) is asks
 
 
+def test_a_newer_profile_in_our_name_is_not_ours_either() -> None:
+    node = make()
+    (published,) = of(node.handle(ev.ProfileSampled(device=SAMPLE), 100.0), do.PublishProfile)
+    before, counters = node.gateway.newest("robot1", 100.0), dict(node.counters)
+    forged = replace(published.profile, sequence=published.profile.sequence + 1, cpu_used_cores=4.0)
+    assert node.handle(ev.ProfileReceived(profile=forged), 100.0) == ()
+    assert node.gateway.newest("robot1", 100.0) == before
+    assert node.counters == counters
+
+
+@pytest.mark.parametrize(("base", "counted"), [(3, "proposal_stale"), (5, "proposal_ahead"), (4, None)])
+def test_proposals_on_another_base_are_counted_by_which_side_is_behind(base: int, counted: str | None) -> None:
+    node = started(learnt=value(4, "edge1"))
+    node.handle(proposal("robot2", "edge2", base=base), 100.0)
+    assert [name for name in node.counters if name.startswith("proposal_")] == ([] if counted is None else [counted])
+    assert counted is None or node.counters[counted] == 1
+
+
 def test_stopped_worker_is_told_in_the_same_batch_and_once() -> None:
     node = started("edge1")
     batch = node.handle(ev.WorkerChanged(task="merge", state=WorkerState.FAILED, reason="exit code 1"), 100.1)

@@ -125,6 +125,14 @@ def test_a_task_without_outputs_is_judged_by_acknowledgements_if_there_are_any()
     assert robot.run(1) == (SERVED,)
 
 
+def test_the_first_acknowledgement_is_an_answer() -> None:
+    robot = Robot(replace(SPEC, rules=(INPUT,)))
+    robot.acknowledged = 0
+    assert robot.run(3) == ()
+    robot.acknowledged = 1
+    assert robot.run(1) == (SERVED,)
+
+
 @pytest.mark.parametrize("worker", [WorkerSpec(command=("merge",)), SPEC.worker])
 def test_only_robots_watch_and_only_tasks_that_say_so(worker: WorkerSpec) -> None:
     robot = Robot(replace(SPEC, worker=worker))

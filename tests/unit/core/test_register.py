@@ -227,13 +227,30 @@ def test_identity_round_of_a_blank_fleet_writes_nothing() -> None:
     assert electors[0].next_deadline() == math.inf
 
 
-@pytest.mark.parametrize("field", ["revision", "epoch"])
-def test_a_value_that_nothing_could_follow_is_not_learnt(field: str) -> None:
+def test_a_value_that_nothing_could_follow_is_not_learnt() -> None:
     register = make("r1")
-    step = register.learn(replace(allocation(1), **{field: MAX_REVISION + 1}), 0.0)
-    assert "cannot be" in (step.problem or "")
-    assert register.value == INITIAL
-    assert register.learn(replace(allocation(1), **{field: MAX_REVISION}), 0.0).problem == ""
+    for beyond in (replace(allocation(1), revision=MAX_REVISION + 1), replace(allocation(1), epoch=MAX_REVISION + 1)):
+        assert "cannot be" in register.learn(beyond, 0.0).problem
+        assert register.value == INITIAL
+    last_one = allocation(MAX_REVISION)
+    assert register.learn(last_one, 0.0).problem == ""
+    assert register.value == last_one
+
+
+def test_an_acceptance_is_asked_about_only_once_its_proposer_has_had_its_time() -> None:
+    for _ in range(5):
+        register = make("r1")
+        register.on_accept(accept(1, allocation(1)), 10.0)
+        assert register.next_deadline() > 10.0 + 2 * BALLOT_S
+
+
+def test_who_hears_of_a_later_generation_forgets_what_another_fleet_has_learnt() -> None:
+    register = make("r1", state=replace(BLANK, learnt=allocation(3)), is_elector=False)
+    register.follow("def", allocation(3))
+    assert register.state.learnt == allocation(3), "it may be this one's"
+    register.follow("def", allocation(4))
+    assert register.state == BLANK
+    assert register.value == allocation(4)
 
 
 def test_time_alone_changes_nothing_where_nothing_waits() -> None:
