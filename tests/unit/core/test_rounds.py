@@ -460,6 +460,16 @@ def test_a_value_that_comes_while_nothing_is_gathered_hurries_nobody() -> None:
     assert robot.rounds.next_deadline() == due
 
 
+def test_only_a_planned_move_costs_a_task_its_turn() -> None:
+    """Who has called longest ago is judged first; fleeing is no privilege that is used up."""
+    for owner, is_planned in ((None, True), ("edge1", False)):
+        robot = Robot(owner=owner)
+        robot.states["edge1"] = PeerState.ALIVE if is_planned else PeerState.GONE
+        robot.round(edge1=0.5, edge2=0.9)
+        assert robot.outcome() is Outcome.PROPOSE
+        assert (robot.task.voting.called_at > -math.inf) is is_planned
+
+
 def test_a_single_task_needs_no_second_gather() -> None:
     robot = Robot()
     (ask,) = of(robot.tick(), AskUtilities)

@@ -72,6 +72,23 @@ def test_cycle_through_workers_is_a_warning_with_all_its_rules() -> None:
     assert set(found.streams) == {"a/in/0", "a/out/0", "b/in/0", "b/out/0"}
 
 
+def test_a_circle_through_a_worker_is_none_of_relays_though_their_open_keys_meet() -> None:
+    """No robot is called like the task: only with any name for {robot} would the two relays feed each other."""
+    (found,) = conflicts(task("t", (("{robot}/x", "{target}/{robot}/m"),), (("{target}/{task}/m", "{robot}/x"),)))
+    assert not found.is_fatal
+    assert "a worker's output comes back" in found.message
+
+
+@pytest.mark.parametrize(("pairs", "more"), [(3, ""), (4, "then 2 more")])
+def test_a_long_loop_is_told_by_its_first_six_steps(pairs: int, more: str) -> None:
+    inputs = tuple((f"{{robot}}/k{number}", f"{{target}}/k{number}") for number in range(pairs))
+    outputs = tuple((f"{{target}}/k{number}", f"{{robot}}/k{(number + 1) % pairs}") for number in range(pairs))
+    (found,) = conflicts(task("t", inputs, outputs, candidates=("edge1",)), robots=("robot1",))
+    assert found.is_fatal
+    assert found.message.count("->") == 6
+    assert found.message.endswith(more) if more else "more" not in found.message
+
+
 def test_loop_of_relays_across_two_tasks_is_refused_with_both_rules() -> None:
     first = task("a", (("{robot}/x", "{target}/ping/{robot}"),))
     second = task("b", (), (("{target}/ping/{robot}", "{robot}/x"),))
