@@ -102,10 +102,10 @@ class _Source:
 class Acknowledger:
     """The numbers of every publisher heard, and a thread that sends what changed: ``send(session id, frame)``."""
 
-    def __init__(self, send: Callable[[str, StreamAcks], None]) -> None:
+    def __init__(self, send: Callable[[str, StreamAcks], None], *, born_at: float | None = None) -> None:
         """``send`` puts a frame for the session with that zenoh id; it must not block long."""
         self._send = send
-        self.born_at = monotonic_s()
+        self.born_at = monotonic_s() if born_at is None else born_at
         """When this process began to listen."""
         self._sources: dict[SourceName, _Source] = {}
         self._dirty: set[SourceName] = set()

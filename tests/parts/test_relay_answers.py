@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -75,7 +76,6 @@ def bench() -> Iterator[Bench]:
         made = Bench(relay, worker)
         yield made
         made.stream.close()
-        made.acks.answers.close()
 
 
 def test_answers_are_acknowledged_to_the_worker_that_gave_them(bench: Bench) -> None:
@@ -83,6 +83,27 @@ def test_answers_are_acknowledged_to_the_worker_that_gave_them(bench: Bench) -> 
     bench.put(0, 1, 2)
     assert bench.is_through(0, 1, 2)
     bench.wait_ack(eid=bench.publisher.id.eid, arrived=3, processed=3, has_gap=False)
+
+
+@pytest.mark.parametrize("stream_class", [StreamClass.RELIABLE, StreamClass.LATEST])
+def test_two_outputs_of_one_key_get_every_answer_each(bench: Bench, stream_class: StreamClass) -> None:
+    """They shared one count: what one had taken was a double for the other, and dropped."""
+    first, heard = bench.open(stream_class), list[str]()
+    app = bench.worker.declare_subscriber("robot1/also", lambda sample: heard.append(sample.payload.to_string()))
+    route = replace(first.route, stream="t/out/1", to_expr="robot1/also")
+    other = OutputStream(bench.relay, route, frozenset(), lambda: None)
+    other.open(1, route, bench.acks, is_from_start=True)
+    other.flip(1, drops_held=False)
+    until(lambda: other._outlet.is_matching, "the application hears it")
+    for number in range(20):
+        bench.put(number)
+        until(lambda number=number: heard[-1:] == bench.passed[-1:] == [str(number)], f"{number}")  # type: ignore[misc]
+    assert heard == bench.passed == [str(number) for number in range(20)]
+    for stream in (first, other):
+        count = stream.count()
+        assert (count.messages, count.lost, count.doubled) == (20, 0, 0)
+    other.close()
+    app.undeclare()
 
 
 def test_what_is_missing_is_asked_for_and_what_came_early_waits(bench: Bench) -> None:

@@ -86,7 +86,6 @@ def bench() -> Iterator[Bench]:
     with hub_and_neighbour() as (relay, other):
         made = Bench(relay, other)
         yield made
-        made.acks.answers.close()
 
 
 def cared(outlet: Outlet) -> bool:

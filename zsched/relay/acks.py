@@ -6,12 +6,15 @@ Knows: the keys they go on, who waits for which publisher's. Does not know: what
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Callable
+from weakref import WeakSet
 
 import zenoh
 from zenoh import Sample, Session
 
 from zsched import wire
+from zsched.clock import monotonic_s
 from zsched.core.model import NodeId
 from zsched.core.relay_protocol import StreamAck, StreamAcks
 from zsched.errors import WireError
@@ -26,18 +29,36 @@ Listener = Callable[[StreamAck, str], None]
 
 
 class Acks:
-    """One subscription and one thread for each direction per relay process; listeners are called in the first one."""
+    """What workers say: one subscription and one thread per relay process, in which listeners are called.
+
+    What we say goes stream by stream: two outputs may take the answers of one key, and each has its own count.
+    """
 
     def __init__(self, session: Session, keyspace: Keyspace, node: NodeId) -> None:
         """Subscribe and start."""
         self._session = session
         self._keyspace, self._node, self._own_id = keyspace, node, str(session.zid())
-        self.answers = Acknowledger(self._send)
-        """How far we are with every answer that comes numbered."""
+        self._born_at = monotonic_s()
+        self._answers: WeakSet[Acknowledger] = WeakSet()
+        self._lock = threading.Lock()
         self._listeners: dict[int, Listener] = {}
         key = keyspace.ack("*", "*", "*", str(session.zid()))
         self._subscriber = session.declare_subscriber(key, zenoh.handlers.FifoChannel(1024))
         guarded(self._run, self._subscriber.handler, name="acks").start()
+
+    def answers(self) -> Acknowledger:
+        """How far one output stream is with the answers that come numbered; two may be given the same ones."""
+        made = Acknowledger(self._send, born_at=self._born_at)
+        with self._lock:
+            self._answers.add(made)
+        return made
+
+    def flush(self) -> None:
+        """Tell the workers at once how far we are with their answers."""
+        with self._lock:
+            made = tuple(self._answers)
+        for one in made:
+            one.flush()
 
     def expect(self, eid: int, listener: Listener) -> None:
         """Hand the acknowledgements for our publisher ``eid`` to ``listener``."""

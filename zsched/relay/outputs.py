@@ -23,7 +23,7 @@ from zsched.clock import monotonic_s
 from zsched.core.plan import HandoverRule, Route, StreamClass, StreamCount
 from zsched.core.serial import number_near, serial_of
 from zsched.guard import tolerant
-from zsched.hop_acks import Jump, SourceName
+from zsched.hop_acks import Acknowledger, Jump, SourceName
 from zsched.keyspace import AGAIN_CHUNK, END_CHUNK
 from zsched.relay.acks import Acks
 from zsched.relay.answers import Answers
@@ -78,6 +78,7 @@ class OutputStream:
         self._slots: dict[int, OutputSlot] = {}
         self._ends: dict[str, zenoh.Subscriber[None]] = {}
         self._carrier: OutputSlot | None = None
+        self._acks: Acknowledger | None = None
         self._fence = Fence()
         self._heard: OrderedDict[tuple[int, str], dict[SourceName, int]] = OrderedDict()  # {(epoch, from): numbers}
         self._notes_stamps = False
@@ -100,8 +101,9 @@ class OutputStream:
         slot = OutputSlot(epoch=epoch, expr=route.from_expr)
         stream_class = route.settings.stream_class
         if acks is not None and stream_class is not StreamClass.BEST_EFFORT:
+            self._acks = self._acks or acks.answers()
             slot.answers = Answers(
-                acks.answers,
+                self._acks,
                 self._counter,
                 is_from_start=is_from_start and has_epoch,
                 in_turn=stream_class is StreamClass.RELIABLE,
@@ -245,6 +247,8 @@ class OutputStream:
             undeclare(ends)
         self._ends.clear()
         self._outlet.undeclare()
+        if self._acks is not None:
+            self._acks.close()
 
     def look_after(self) -> None:
         """Let through what waits for answers that never come, or for a highest rate; call it now and then."""

@@ -169,7 +169,7 @@ class RelayProcess:
 
     def close(self) -> None:
         """Close both sessions; may take as long as a stopped peer holds them."""
-        self._acks.answers.flush()  # what we have had, the next life of this relay need not be sent
+        self._acks.flush()  # what we have had, the next life of this relay need not be sent
         if self._local_side is not None:
             self._local_side.close()
         if self._introducer is not None:
