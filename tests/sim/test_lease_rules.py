@@ -288,10 +288,14 @@ def test_a_worker_that_never_says_that_it_has_stopped_is_waited_for_once() -> No
     assert held.on_sent(6, 11.0).released == (grant(5, owner="r1"),)
     held.on_beat(ask(), {}, 11.01)
     held.on_run_out("guard", 6, 11.01)
+    held.on_sent(7, 11.02)
     held.on_beat(ask(), {}, 11.02)
+    assert held.leaving() == ("guard",)
     assert not held.on_run_out("guard", 7, 11.02)
+    held.on_sent(8, 11.03)
     held.on_beat(ask(), {}, 11.03)
-    assert not held.on_stopped("guard", 1, 8), "when it comes, it is of a stop that is over"
+    assert held.leaving() == ("guard",)
+    assert not held.on_stopped("guard", 3, 8), "when it comes, it is of a stop that is over"
 
 
 def test_an_owner_is_not_asked_to_leave_for_another_epoch_s_sake() -> None:

@@ -397,7 +397,6 @@ LEASE_BUGS = (
         "        holder.awaits_report = False  # when it comes",
         "        pass  # when it comes",
         _LEASE,
-        seed=1073981,
     ),
 )
 
