@@ -185,7 +185,9 @@ class KeyFuzz:
         parse_token(_graph_token(self._rng))
 
     def _marker(self) -> None:
-        frame = bytearray(encode_end(EndMarker(epoch=self._counter(), count=self._counter())))
+        frame = bytearray(
+            encode_end(EndMarker(epoch=self._counter(), count=self._counter(), had=self._counter(), age_s=1.0))
+        )
         for _ in range(self._rng.randrange(3)):
             frame[self._rng.randrange(len(frame))] = self._rng.randrange(256)
         marker = decode_end(bytes(frame))

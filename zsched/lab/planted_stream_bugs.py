@@ -16,6 +16,7 @@ _GREETINGS = ("tests/parts/test_relay_greetings.py",)
 _ACKS = ("tests/unit/test_hop_acks.py",)
 _LANES = ("tests/unit/test_relay_lanes.py",)
 _WORKER = "tests/parts/test_worker.py"
+_RELAY_STREAMS = "tests/integration/test_relay_streams.py"
 
 
 def _bug(name: str, module: str, old: str, new: str, tests: tuple[str, ...]) -> Bug:
@@ -113,5 +114,40 @@ STREAM_BUGS = (
         "if epoch is None:  # without",
         "if not has_lease:  # without",
         (f"{_WORKER}::test_what_comes_behind_the_end_of_an_epoch_is_answered_in_the_next_one",),
+    ),
+    _bug(
+        "a worker skips what a reliable input brings",
+        INPUTS,
+        "if marker.end.is_whole:",
+        "if marker.end.replayed:",
+        (f"{_WORKER}::test_what_a_slow_worker_keeps_follows_the_class_and_what_it_sheds_of_a_reliable_input_is_lost",),
+    ),
+    _bug(
+        "what a worker skips of a reliable input counts as processed",
+        "zsched.worker_samples",
+        "return is_whole or self.keep_last is None",
+        "return self.keep_last is None",
+        (f"{_WORKER}::test_what_a_slow_worker_keeps_follows_the_class_and_what_it_sheds_of_a_reliable_input_is_lost",),
+    ),
+    _bug(
+        "what a relay's former life has had is lost",
+        "zsched.relay.answers",
+        "before if marker.had is None else marker.had",
+        "before",
+        ("tests/parts/test_relay_answers.py",),
+    ),
+    _bug(
+        "a relay's next life is sent what the former one has had",
+        "zsched.worker_keep",
+        "arrived = max(receiver.waits_for, receiver.had or 0)",
+        "arrived = receiver.waits_for",
+        ("tests/parts/test_worker_keep.py",),
+    ),
+    _bug(
+        "what a foreign worker was sent is in no counter",
+        OUTLET,
+        "self.tally.unconfirmed += 1",
+        "self.tally.unconfirmed += 0",
+        (f"{_RELAY_STREAMS}::test_what_a_foreign_worker_was_sent_is_unconfirmed_and_never_dropped",),
     ),
 )
