@@ -10,6 +10,7 @@ import pytest
 import zenoh
 
 from support.waiting import free_endpoint, until
+from zsched.relay import crowd
 from zsched.relay.crowd import FITS_BYTES, MAX_REST_S, REST_S, Reader
 from zsched.relay.sockets import LinkSocket, LinkSockets, note_feeder
 from zsched.zenoh_config import client_config, data_config
@@ -64,6 +65,21 @@ def test_a_link_that_is_cut_ends(pair: Pair) -> None:
     reader, _, theirs = pair
     assert reader.link.cut()
     assert theirs.recv(1) == b""
+
+
+def test_the_kernel_says_whose_link_has_room() -> None:
+    with connection() as (full, theirs), connection() as (free, _):
+        readers = [Reader(link_of(one), NOW) for one in (full, free)]
+        assert crowd._ready(readers, 0.0) == {full.fileno(), free.fileno()}
+        full.setblocking(False)
+        sent = 0
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                sent += full.send(bytes(1 << 20))
+        until(lambda: crowd._ready(readers, 0.0) == {free.fileno()}, "no room at the one that takes nothing")
+        while sent:
+            sent -= len(theirs.recv(sent))
+        until(lambda: crowd._ready(readers, 0.0) == {full.fileno(), free.fileno()}, "room again")
 
 
 def test_a_reader_moves_as_long_as_it_takes_something(pair: Pair) -> None:
