@@ -12,7 +12,7 @@ import pytest
 import zenoh
 
 from support.sessions import hub_and_neighbour, matches
-from support.waiting import free_endpoint, until
+from support.waiting import between, free_endpoint, until
 from zsched import send_queue
 from zsched.core.plan import Direction, HandoverRule, Route, StreamClass, StreamSettings
 from zsched.core.relay_protocol import EndMarker
@@ -250,9 +250,11 @@ def test_a_thinned_stream_ends_with_its_newest_value(bench: Bench) -> None:
     until(lambda: stream.is_matching(1), "the target subscribes")
     stream.flip(1)
     publisher = bench.publisher("robot1/in")
+    began = time.monotonic()
     for number in range(30):
         publisher.put(str(number))
         time.sleep(0.005)
+    took_s = time.monotonic() - began
 
     def newest_came() -> bool:
         stream.look_after()
@@ -260,8 +262,8 @@ def test_a_thinned_stream_ends_with_its_newest_value(bench: Bench) -> None:
 
     until(newest_came, "the newest")
     assert got == sorted(set(got), key=int)
-    assert len(got) <= 6
-    assert drops(stream)["thinned"] >= 25
+    between(0, len(got), 5 + 10 * took_s)
+    assert drops(stream)["thinned"] >= 30 - len(got), "also the newest, which went out later"
     kept.undeclare()
 
 

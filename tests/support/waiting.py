@@ -11,7 +11,7 @@ from typing import Any
 
 from zsched.lab.loopback import free_endpoint
 
-__all__ = ["DEADLINE_S", "POLL_S", "TooSlowError", "free_endpoint", "until", "within"]
+__all__ = ["DEADLINE_S", "POLL_S", "TooSlowError", "between", "free_endpoint", "until", "within"]
 
 DEADLINE_S = 60.0
 POLL_S = 0.003
@@ -32,6 +32,12 @@ def until(condition: Callable[[], Any], what: str, deadline_s: float = DEADLINE_
 class TooSlowError(AssertionError):
     """What was measured took longer than it may: the test is run again (``tests/conftest.py``), for a machine is busy
     once, a fault each time."""
+
+
+def between(low: float, value: float, high: float) -> None:
+    """A measured rate is in its range, in one of three runs of the test."""
+    if not low < value < high:
+        raise TooSlowError(f"{value:g}, not between {low:g} and {high:g}")
 
 
 def within(took_s: float, bound_s: float, what: str = "") -> None:
