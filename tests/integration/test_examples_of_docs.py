@@ -69,7 +69,7 @@ def test_a_worker_of_the_documents_answers_the_application_of_the_documents(
         bed.init()
         bed.start()
         assert bed.wait_settled() == "edge1"
-        bed.wait(lambda: not bed.task("robot1")["problems"], 20, "the worker takes its inputs")
+        bed.wait(lambda: not bed.task("robot1")["problems"], 60, "the worker takes its inputs")
         said = run_application(bed)
         # the first ones may be put before the relay's subscription is known to the application
         assert said == [text.upper() if is_loud else text for text in QUESTIONS][-len(said) :]
@@ -83,7 +83,7 @@ def test_a_program_without_the_library_is_told_to_say_ready_matching(tmp_path: P
     with Testbed(tmp_path, tree) as bed:
         bed.init()
         bed.start()
-        told = bed.wait(lambda: bed.task("robot1")["problems"], 30, "the problem line")
+        told = bed.wait(lambda: bed.task("robot1")["problems"], 60, "the problem line")
         assert "the worker on edge1 failed: not ready within 2 s" in told[0]
         assert "`ready: matching`" in told[0]
         assert "@zsched/testbed/worker/edge1/shout/" in told[0]

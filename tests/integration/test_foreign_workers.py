@@ -234,10 +234,10 @@ def test_a_recorder_of_everything_is_not_taken_for_a_worker_without_a_word(tmp_p
     recorder = fleet.bed.app("edge1").declare_subscriber("**", lambda _sample: None)
     told = "somebody takes every node's inputs"
     fleet.bed.wait(
-        lambda: [text for text in fleet.bed.status("edge1")["problems"] if told in text], 30, "the doubt is told"
+        lambda: [text for text in fleet.bed.status("edge1")["problems"] if told in text], 60, "the doubt is told"
     )
     recorder.undeclare()
     fleet.bed.wait(
-        lambda: not [text for text in fleet.bed.status("edge1")["problems"] if told in text], 30, "and ends with it"
+        lambda: not [text for text in fleet.bed.status("edge1")["problems"] if told in text], 60, "and ends with it"
     )
     fleet.bed.wait(lambda: fleet.worker("edge1")["state"] == "stopped", 60, "nobody is there")

@@ -89,7 +89,7 @@ def test_a_move_to_a_frozen_worker_loses_nothing_in_silence(bed: Testbed, second
     before = len(app.back)
     bed.wait(lambda: len(app.back) > before + 50, 60, "answers of the next owner")
     app.halt()
-    until(lambda: not count(bed, "in").in_flight, "every acknowledgement", deadline_s=30.0)
+    until(lambda: not count(bed, "in").in_flight, "every acknowledgement", deadline_s=60.0)
     time.sleep(1.5)  # the newest counters, and the last answers
     inward, outward = count(bed, "in"), count(bed, "out")
     lost = app.sent - first - len(set(app.back))

@@ -60,7 +60,7 @@ def test_a_new_generation_is_refused_while_the_fleet_agrees(bed: Testbed) -> Non
     assert "the fleet lives in generation 0 and agrees" in refused.stderr
     assert (bed.folder / "robot3" / "state").read_bytes() == before
     bed.start("robot3")
-    bed.wait(lambda: bed.status("robot3")["quorum"]["this_node"] == "elector", 20, "robot3 as the elector it was")
+    bed.wait(lambda: bed.status("robot3")["quorum"]["this_node"] == "elector", 60, "robot3 as the elector it was")
 
 
 def test_a_new_generation_is_made_node_by_node_where_too_many_states_are_lost(bed: Testbed) -> None:
@@ -70,7 +70,7 @@ def test_a_new_generation_is_made_node_by_node_where_too_many_states_are_lost(be
         bed.kill(node)
         shutil.rmtree(bed.folder / node)
     bed.start()
-    bed.wait(lambda: any("--generation 1" in one for one in bed.status("edge1")["problems"]), 20, "the way out")
+    bed.wait(lambda: any("--generation 1" in one for one in bed.status("edge1")["problems"]), 60, "the way out")
     bed.stop()
     refused = run_init(bed, "robot3", bed.folder / "robot3", "--generation", "1")
     assert "good state of generation 0 here, and no other node answered" in refused.stderr
@@ -78,7 +78,7 @@ def test_a_new_generation_is_made_node_by_node_where_too_many_states_are_lost(be
         done = run_init(bed, node, bed.folder / node, "--generation", "1")
         assert done.returncode == 0, done.stderr
         bed.start(node)
-        bed.wait(partial(bed.status, node), 20, f"{node} to answer")
+        bed.wait(partial(bed.status, node), 60, f"{node} to answer")
     bed.wait_settled()
     assert bed.task("robot1")["epoch"] > 2**32
     twice = run_init(bed, "robot2", bed.folder / "robot2-again", "--generation", "1")

@@ -19,10 +19,10 @@ def feed(bed: Testbed, first: int) -> list[int]:
     app, back = bed.app("robot1"), list[int]()
     kept = app.declare_subscriber("robot1/out", lambda sample: back.append(int(sample.payload.to_bytes())))
     publisher = app.declare_publisher("robot1/in", congestion_control=zenoh.CongestionControl.BLOCK)
-    bed.wait(lambda: matches(publisher), 10, "the relay subscribes")
+    bed.wait(lambda: matches(publisher), 60, "the relay subscribes")
     for number in range(first, first + COUNT):
         publisher.put(str(number).encode())
-    bed.wait(lambda: len(back) >= COUNT, 20, f"{COUNT} answers")
+    bed.wait(lambda: len(back) >= COUNT, 60, f"{COUNT} answers")
     kept.undeclare()
     return back
 
@@ -40,7 +40,7 @@ def test_what_a_former_life_of_the_relay_has_had_is_neither_lost_nor_given_twice
             if life == 2:
                 time.sleep(max(0.0, kept_until - time.monotonic()))
             bed.stop("robot1")
-            bed.wait(lambda: bed.relay_pid("robot1") is None, 10, "the relay has ended, too")
+            bed.wait(lambda: bed.relay_pid("robot1") is None, 60, "the relay has ended, too")
             bed.start("robot1")
             bed.wait_settled()
             assert feed(bed, life * COUNT) == list(range(life * COUNT, (life + 1) * COUNT))
@@ -48,7 +48,7 @@ def test_what_a_former_life_of_the_relay_has_had_is_neither_lost_nor_given_twice
             def has_counted() -> bool:
                 return [count.messages for count in bed.counts("robot1")] == [COUNT, COUNT]
 
-            bed.wait(has_counted, 10, "the counters of this life")
+            bed.wait(has_counted, 60, "the counters of this life")
             assert [(count.stream, count.lost, count.doubled) for count in bed.counts("robot1")] == [
                 (f"{TASK}/in/0", 0, 0),
                 (f"{TASK}/out/0", 0, 0),
@@ -72,11 +72,11 @@ def test_a_robot_that_joins_late_has_lost_nothing_of_what_was_before_it(tmp_path
         heard: list[int] = []
         kept = late.declare_subscriber("robot3/out", lambda sample: heard.append(int(sample.payload.to_bytes())))
         feed(bed, COUNT)
-        bed.wait(lambda: heard == list(range(COUNT, 2 * COUNT)), 20, "what came since, and nothing twice")
+        bed.wait(lambda: heard == list(range(COUNT, 2 * COUNT)), 60, "what came since, and nothing twice")
 
         def told() -> tuple[int, int] | None:
             count = next((one for one in bed.counts("robot3") if one.stream == f"{TASK}/out/0"), None)
             return None if count is None or count.messages < COUNT else (count.messages, count.lost)
 
-        assert bed.wait(told, 10, "the counters") == (COUNT, 0)
+        assert bed.wait(told, 60, "the counters") == (COUNT, 0)
         kept.undeclare()

@@ -84,7 +84,7 @@ class Node:
             self.process.wait(3.0)
         except subprocess.TimeoutExpired:
             self.process.kill()
-            self.process.wait(3.0)
+            self.process.wait(60)
         self.process.stdout.close()
 
 

@@ -29,7 +29,7 @@ def test_what_a_slow_worker_skips_of_a_reliable_input_is_counted_lost(tmp_path: 
         app, back = bed.app("robot1"), list[int]()
         kept = app.declare_subscriber("robot1/out", lambda sample: back.append(int(sample.payload.to_bytes())))
         publisher = app.declare_publisher("robot1/in", congestion_control=zenoh.CongestionControl.BLOCK)
-        bed.wait(lambda: matches(publisher), 10, "the relay subscribes")
+        bed.wait(lambda: matches(publisher), 60, "the relay subscribes")
         for number in range(SENT):
             publisher.put(str(number).encode())
             time.sleep(PERIOD_S)
@@ -39,7 +39,7 @@ def test_what_a_slow_worker_skips_of_a_reliable_input_is_counted_lost(tmp_path: 
             is_done = count.messages == SENT and not count.in_flight and count.acknowledged == len(back)
             return count if is_done else None
 
-        count = bed.wait(settled, 20, "as many acknowledged as answered, nothing in flight")
+        count = bed.wait(settled, 60, "as many acknowledged as answered, nothing in flight")
         assert count is not None
         assert unaccounted(count) == 0
         assert count.lost == SENT - len(back)

@@ -220,7 +220,7 @@ def test_twins_that_meet_after_a_cut_both_stop_electing(bed: Bed) -> None:
         bed.wait(lambda: ask(twin, {"verb": "status"})["up_s"] > 3.5, 60, "a twin that is not young any more")
         bed.network.heal()
         bed.wait(
-            lambda: ask(twin, {"verb": "status"})["quorum"]["this_node"] != "elector", 20, "the twin to stand down"
+            lambda: ask(twin, {"verb": "status"})["quorum"]["this_node"] != "elector", 60, "the twin to stand down"
         )
         bed.wait(lambda: bed.role("robot3") != "elector", 60, "the original to stand down")
         assert "another daemon calls itself" in bed.problems("robot3")
