@@ -61,9 +61,9 @@ def test_processes_that_a_test_starts_have_the_bug_too(tmp_path: Path, monkeypat
     (bug,) = [bug for bug in STREAM_BUGS if bug.name == "numbers are compared without their wrap"]
     code = "from zsched.core.serial import number_near; print(number_near(2, 2**32 - 1))"
     command = [sys.executable, "-c", code]
-    sound = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=50, check=True).stdout
+    sound = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=110, check=True).stdout
     for_children(bug, tmp_path)
-    planted = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=50, check=True).stdout
+    planted = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=110, check=True).stdout
     assert (int(sound), int(planted)) == (2**32 + 2, 2)
 
 
@@ -73,7 +73,7 @@ def test_a_change_without_effect_is_not_called_found() -> None:
         "import sys; from zsched.lab.planted import hunt; from zsched.lab.planted_bugs import Bug\n"
         f"sys.exit(hunt({HARMLESS!r}, 0.2))"
     )
-    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, timeout=50, check=False).returncode == 0
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, timeout=110, check=False).returncode == 0
 
 
 def test_a_bug_whose_text_is_gone_says_so() -> None:

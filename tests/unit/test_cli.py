@@ -21,6 +21,7 @@ from typing import Any, Self
 import pytest
 from typer.testing import CliRunner, Result
 
+from support.waiting import within
 from zsched.adapters.operator_socket import OperatorSocket
 from zsched.cli import app
 from zsched.cli_ask import ask_door, find_door
@@ -246,7 +247,7 @@ def test_watch_with_json_gives_a_line_each_until_interrupted(folder: Path) -> No
         assert process.stdout is not None
         lines = [json.loads(process.stdout.readline()) for _ in range(3)]
         process.send_signal(signal.SIGINT)
-        _, error = process.communicate(timeout=10)
+        _, error = process.communicate(timeout=60)
     assert {line["schema"] for line in lines} == {"zsched.status/1"}
     assert (process.returncode, error) == (4, "")
 
@@ -263,7 +264,7 @@ def test_watch_outlives_a_restart_of_the_daemon(folder: Path) -> None:
             if json.loads(process.stdout.readline())["node"] == "robot1":
                 break
         process.send_signal(signal.SIGINT)
-        process.communicate(timeout=10)
+        process.communicate(timeout=60)
     assert process.returncode == 0
 
 
@@ -324,7 +325,7 @@ def test_retry_waits_for_silent_nodes_all_at_once(daemon: Daemon) -> None:
     began = time.monotonic()
     assert run("retry", "echo").exit_code == 0
     assert len([request for request in daemon.asked if request["verb"] == "retry"]) == 5
-    assert time.monotonic() - began < 5.0, "one second for the status, one for the five nodes"
+    within(time.monotonic() - began, 5.0, "instead of one second for the status, one for the five nodes")
 
 
 def test_weights_without_values_shows_those_in_force(daemon: Daemon) -> None:
@@ -423,7 +424,7 @@ finally:
 def loaded_by(folder: Path, *arguments: str) -> tuple[int, set[str]]:
     """(exit code, top packages) of one run in an interpreter of its own."""
     code = LOADED.format(arguments=[*arguments, "--runtime-dir", str(folder)])
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30, check=False)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
     (line,) = [line for line in done.stderr.splitlines() if line.startswith("LOADED")]
     return done.returncode, set(line.split()[1:])
 
@@ -445,5 +446,5 @@ def test_status_and_weights_load_nothing_heavy(daemon: Daemon, folder: Path) -> 
 
 def test_command_line_has_no_side_effect_on_import() -> None:
     command = [sys.executable, "-c", "import zsched.cli"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=30, check=True)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
     assert (done.stdout, done.stderr) == ("", "")

@@ -339,7 +339,7 @@ def test_hashes_are_the_same_in_another_process(tmp_path: Path) -> None:
         "f = load_fleet(sys.argv[1]); print(fleet_hash(f), electorate_hash(f))"
     )
     run = [sys.executable, "-c", code, str(tmp_path / "fleet.yaml")]
-    printed = subprocess.run(run, capture_output=True, text=True, check=True, timeout=30).stdout.split()
+    printed = subprocess.run(run, capture_output=True, text=True, check=True, timeout=60).stdout.split()
     fleet = load_fleet(tmp_path / "fleet.yaml")
     assert printed == [fleet_hash(fleet), electorate_hash(fleet)]
 
@@ -568,6 +568,6 @@ tasks: {t: {candidates: [r1], weights: {cpu: 0.5, network: 0.5}}}
 def test_importing_config_loads_neither_the_yaml_reader_nor_anything_heavy() -> None:
     code = "import sys, zsched.config; print(*sorted({name.split('.')[0] for name in sys.modules}))"
     printed = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=30
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
     ).stdout
     assert not set(printed.split()) & {"ruamel", "pydantic", "numpy", "asyncio", "zenoh", "msgpack"}

@@ -132,8 +132,8 @@ def test_second_daemon_is_refused_and_told_who_holds_the_folder(tmp_path: Path) 
     )
     command = [sys.executable, "-c", code, str(tmp_path)]
     with state_file(tmp_path):
-        held = subprocess.run(command, capture_output=True, text=True, timeout=20, check=True)
-    free = subprocess.run(command, capture_output=True, text=True, timeout=20, check=True)
+        held = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    free = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
     assert f"in use by process {os.getpid()}" in held.stdout
     assert free.stdout == ""
 
@@ -171,7 +171,7 @@ def test_killed_while_saving_leaves_a_whole_state(tmp_path: Path) -> None:
             with pytest.raises(subprocess.TimeoutExpired):
                 saver.wait(timeout=0.01 + 0.007 * round_number)
             saver.kill()
-            saver.wait(timeout=5)
+            saver.wait(timeout=60)
         with state_file(tmp_path) as file:
             state = file.load().state
         assert state is not None
@@ -195,7 +195,7 @@ def test_full_disk_leaves_the_old_state_whole(tmp_path: Path) -> None:
     folder = tmp_path / "small"
     folder.mkdir()
     command = ["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", str(folder)]
-    mounted = subprocess.run(command, capture_output=True, text=True, timeout=10, check=False)
+    mounted = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     if mounted.returncode != 0:
         pytest.skip(f"cannot mount a small disk: {mounted.stderr.strip()}")
     try:
@@ -207,11 +207,11 @@ def test_full_disk_leaves_the_old_state_whole(tmp_path: Path) -> None:
             assert file.load().state == STATE
             assert not (folder / "state.new").exists()
         remount = ["mount", "-o", "remount,ro", str(folder)]
-        subprocess.run(remount, check=True, timeout=10)
+        subprocess.run(remount, check=True, timeout=60)
         with pytest.raises(AdapterError, match="Read-only"):
             state_file(folder).acquire()
     finally:
-        subprocess.run(["umount", str(folder)], check=True, timeout=10)
+        subprocess.run(["umount", str(folder)], check=True, timeout=60)
 
 
 def test_hardware_is_told_by_what_can_be_read(tmp_path: Path) -> None:
