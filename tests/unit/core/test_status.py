@@ -331,6 +331,19 @@ def test_vote_shows_who_proposed_whom() -> None:
 # --- nodes -----------------------------------------------------------------------------------------------------------
 
 
+def test_a_decision_and_a_vote_have_an_age() -> None:
+    node = make()
+    learn(node, 1, "edge1")
+    paper = Proposal(voter="robot2", task="merge", base_revision=1, candidate="edge1", aggregate=0.5)
+    assert not paper.is_escape, "unless it says so"
+    for _ in range(2):
+        node.handle(ev.DeadlineReached(), node.rounds.next_deadline())
+    judged_at = node.rounds.tasks["merge"].judged_at
+    decision = build_snapshot(node, judged_at + 1.5).tasks[0].decision
+    assert decision is not None
+    assert decision.age_s == pytest.approx(1.5)
+
+
 def test_nodes_never_heard_are_listed_without_figures() -> None:
     snapshot = build_snapshot(make(alive=("robot2",)), 100.0)
     by_name = {node.name: node for node in snapshot.nodes}
