@@ -275,6 +275,7 @@ class Acknowledger:
         if jump is None or not jump.is_back(number, source.arrived - 1):
             return False
         source.lost = jump.lost + jump.count - 1
+        source.first = min(source.first, jump.at)
         source.arrived, source.processed, source.jump = number + 1, number, None
         source.missing.clear()
         return True

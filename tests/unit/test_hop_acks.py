@@ -181,6 +181,15 @@ def test_a_forged_skip_marker_is_taken_back_by_three_real_ones(book: Book, far: 
     assert (ack.arrived, ack.lost) == (14, 2)
 
 
+def test_a_forged_start_that_is_taken_back_leaves_nothing_before_the_first(book: Book) -> None:
+    book.acks.skip(NAME, 0)
+    book.acks.skip(NAME, 40)
+    assert book.admit(0, 1, 2, 3) == [False, False, True, True]
+    book.acks.processed(NAME, 3, 1)
+    ack = book.wait(processed=4)
+    assert (ack.first, ack.arrived, ack.lost) == (0, 4, 2)
+
+
 def test_a_jump_that_something_newer_has_followed_stands(book: Book) -> None:
     """Late samples of an honest gap come in a row, too: they must not begin the stream anew."""
     assert book.admit(0, 1, in_turn=False) == [True, True]
