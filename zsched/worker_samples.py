@@ -33,7 +33,7 @@ class Received:
     attachment: zenoh.ZBytes | None = None
     deleted: bool = False
     replayed: bool = False
-    """An owner that died had this sample, too, and may have done it (`on_crash: replay`)."""
+    """An owner that died may have had this sample, too, and have done it (`on_crash: replay`)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -11,7 +11,7 @@ import zenoh
 from support.sessions import hub_and_neighbour
 from support.waiting import until
 from zsched import wire
-from zsched.core.plan import StreamClass, StreamSettings
+from zsched.core.plan import OnCrash, StreamClass, StreamSettings
 from zsched.core.relay_protocol import EndMarker, StreamAck, StreamAcks
 from zsched.keyspace import END_CHUNK, Keyspace
 from zsched.relay import greetings
@@ -21,6 +21,7 @@ from zsched.relay_pipe import decode_end
 
 KEYS = Keyspace("t")
 RELIABLE = StreamSettings(stream_class=StreamClass.RELIABLE, depth=100)
+REPLAYED = StreamSettings(stream_class=StreamClass.RELIABLE, depth=100, on_crash=OnCrash.REPLAY)
 
 
 class Receiver:
@@ -71,8 +72,8 @@ class Bench:
         self._samples: list[zenoh.Sample] = []
         self._subscriber = relay.declare_subscriber("robot1/**", self._samples.append)
 
-    def outlet(self, from_expr: str, to_expr: str) -> Outlet:
-        return Outlet(self.relay, from_expr, to_expr, RELIABLE, self.acks)
+    def outlet(self, from_expr: str, to_expr: str, settings: StreamSettings = RELIABLE) -> Outlet:
+        return Outlet(self.relay, from_expr, to_expr, settings, self.acks)
 
     def sample(self, key: str = "robot1/in") -> zenoh.Sample:
         before = len(self._samples)
@@ -242,4 +243,30 @@ def test_a_worker_that_answers_late_is_not_forgiven_what_it_loses_afterwards(
     until(lambda: len(receiver.got) == 8, "three more")
     receiver.ack(8, lost=3)
     settled(outlet, acknowledged=5, lost=1, at_most_lost=1, uncounted=1, in_flight=0)
+    outlet.undeclare()
+
+
+def test_a_replay_behind_newer_samples_skips_none_of_them(bench: Bench) -> None:
+    """An owner that hangs is left: its successor has newer samples before it gets the old ones.
+
+    The marker that announces those comes by another subscription, so it may be seen before the newer samples.
+    """
+    receiver = Receiver(bench.other, bench.relay, "edge1/in")
+    outlet = bench.outlet("robot1/in", "edge1/in", REPLAYED)
+    sample = bench.sample()
+    for _ in range(3):
+        outlet.send(sample)
+    receiver.greeted()
+    receiver.ack(0)
+    until(lambda: receiver.got == [0, 1, 2], "newer samples")
+    receiver.ack(1)
+    settled(outlet, acknowledged=1, in_flight=2)
+    assert outlet.replay([(sample, None), (sample, None)]) == 0
+    until(lambda: receiver.starts[-1].replayed, "the announcement")
+    marker = receiver.starts[-1]
+    assert marker.count == 1  # it has not said that it has number 1
+    assert marker.count + marker.replayed == 5
+    until(lambda: set(receiver.got) == {0, 1, 2, 3, 4}, "the old ones")
+    receiver.ack(5)
+    settled(outlet, acknowledged=5, lost=0, in_flight=0, waiting=0)
     outlet.undeclare()

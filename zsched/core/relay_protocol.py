@@ -113,7 +113,7 @@ class EndMarker:
     epoch: int
     count: int
     replayed: int = 0
-    """Start markers: so many samples from ``count`` on went to an earlier owner, which died."""
+    """Start markers: so many samples from ``count`` on may have gone to an earlier owner, which died."""
     is_whole: bool = False
     """Start markers: the stream is of class ``reliable``, every sample is wanted."""
     had: int | None = None

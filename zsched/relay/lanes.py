@@ -73,7 +73,7 @@ class Lane:
     keeps_work: bool = False
     """Keep samples until they are processed, not only until they have arrived: the next owner may have to do them."""
     replay_end: int = 0
-    """Numbers below this one went to a receiver that died."""
+    """Numbers below this one may have gone to a receiver that died."""
     greeted_at: float | None = None
     greet_pause_s: float = GREET_S
     ack: StreamAck | None = None

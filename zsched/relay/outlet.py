@@ -205,10 +205,11 @@ class Outlet:
         return sum(self.send(sample, stamp)[1] for sample, stamp in owed)
 
     def _announce(self, lanes: list[tuple[Lane, int]]) -> None:
+        """The marker may be seen before samples that were put before it: what may still come is not skipped by it."""
         for lane, count in lanes:
             with self._lock:
-                lane.replay_end = lane.count + count
-            self._put_start(lane, lane.count)
+                lane.replay_end, lowest = lane.count + count, lane.lowest
+            self._put_start(lane, lowest)
 
     def abandon(self) -> tuple[Tally, list[Owed]]:
         """The receiver died: the last counts, and what it has not processed, in order; nobody else counts that."""
