@@ -84,6 +84,7 @@ class SendQueue:
         self._is_closed = False
         self._at_end: Action | None = None
         self._busy_since: float | None = None
+        self._in_hand: Any = None
         self._thread = guarded(self._run, name=name, kind="queue")
         self._thread.start()
 
@@ -97,6 +98,11 @@ class SendQueue:
     def is_busy(self) -> bool:
         """True while a put is under way."""
         return self._busy_since is not None
+
+    @property
+    def in_hand(self) -> Any:
+        """The value of the sample whose action is about to begin, or has not ended."""
+        return self._in_hand
 
     @property
     def is_pressed(self) -> bool:
@@ -207,6 +213,7 @@ class SendQueue:
             if action is None:
                 break
             self._do(action)
+            self._in_hand = None
         if self._at_end is not None:
             self._do(self._at_end)
 
@@ -245,13 +252,13 @@ class SendQueue:
 
     def _take(self) -> Action | None:
         with self._lock:
-            if not self._items:  # taken back
+            if self._is_closed or not self._items:  # taken back
                 return None
             waiting = self._items.popleft()
             if waiting.action is None or waiting.lane is None:
                 return waiting.action
             self._forget(waiting)
-            self._left_at = monotonic_s()
+            self._in_hand, self._left_at = waiting.value, monotonic_s()
             self._room.notify()
             if self._sheds:
                 self._lines[waiting.lane].popleft()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from typing import Any
 
@@ -270,3 +271,29 @@ def test_a_replay_behind_newer_samples_skips_none_of_them(bench: Bench) -> None:
     receiver.ack(5)
     settled(outlet, acknowledged=5, lost=0, in_flight=0, waiting=0)
     outlet.undeclare()
+
+
+def test_the_sample_that_the_thread_has_just_taken_goes_to_the_next_owner(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It waits no more, and its put has not begun."""
+    receiver = Receiver(bench.other, bench.relay, "edge1/in")
+    outlet = bench.outlet("robot1/in", "edge1/in", REPLAYED)
+    until(lambda: cared(outlet) and receiver.starts, "a greeting before there is anything to send")
+    receiver.ack(0)
+    taken, gate, put = threading.Event(), threading.Event(), outlet._put
+
+    def held(*given: Any) -> None:
+        taken.set()
+        gate.wait(60)
+        put(*given)
+
+    monkeypatch.setattr(outlet, "_put", held)
+    first, second = bench.sample(), bench.sample()
+    outlet.send(first)
+    assert taken.wait(60)
+    outlet.send(second)
+    said, owed = outlet.abandon()
+    gate.set()
+    assert [sample for sample, _ in owed] == [first, second]
+    assert (said.waiting, said.in_flight) == (0, 0)

@@ -53,6 +53,27 @@ STREAM_BUGS = (
         _GREETINGS,
     ),
     _bug(
+        "a replay skips what is on its way",
+        OUTLET,
+        "lane.replay_end, lowest = lane.count + count, lane.lowest",
+        "lane.replay_end, lowest = lane.count + count, lane.count",
+        _GREETINGS,
+    ),
+    _bug(
+        "a sample that the thread has just taken is not replayed",
+        OUTLET,
+        "                owed.append(self._queue.in_hand)",
+        "                pass",
+        _GREETINGS,
+    ),
+    _bug(
+        "a forged start that is taken back leaves a loss",
+        ACKS,
+        "source.first = min(source.first, jump.at)",
+        "pass",
+        _ACKS,
+    ),
+    _bug(
         "a sample that was shed counts as acknowledged",
         ACKS,
         "            if source is not None:\n                source.lost += 1\n                self._mark(name)",

@@ -97,7 +97,6 @@ class Outlet:
         """Samples taken and not dropped (the stream's lock guards it)..."""
         self._left = 0
         """...and those of them that have left the queue, or could not (our lock)."""
-        self._in_hand: Owed | None = None
         self._replays = settings.on_crash is OnCrash.REPLAY and acks is not None
         holds = self._is_reliable and acks is not None
         self._greetings = Greetings(self._lock, self._put_start) if holds else None
@@ -220,8 +219,8 @@ class Outlet:
                 (sent for lane in self._lanes.values() for sent in lane.unprocessed()), key=lambda one: one.at
             )
             owed = [(one.sample, one.stamp) for one in kept]
-            if self._in_hand is not None:
-                owed.append(self._in_hand)
+            if self._queue is not None and self._handed > self._left:  # its put has not ended, or not begun
+                owed.append(self._queue.in_hand)
         said.in_flight -= len(owed)
         return said, owed + waiting
 
@@ -233,11 +232,11 @@ class Outlet:
         if self._queue is None:
             self._undeclare()
             return self.counted()
-        self._queue.close(self._undeclare)
+        left = self._queue.close(self._undeclare)
         with self._lock:
             said = self._sum()
-            if self._in_hand is not None:  # nobody will hear whether it still goes out
-                said.waiting, said.in_flight = said.waiting - 1, said.in_flight + 1
+            in_hand = max(0, said.waiting - left)  # nobody will hear whether it still goes out
+            said.waiting, said.in_flight = said.waiting - in_hand, said.in_flight + in_hand
             return said
 
     def look_after(self) -> None:
@@ -345,17 +344,16 @@ class Outlet:
             self._crowd.put(lane, sample, stamp, size)
             lane.count += 1
             return
-        self._in_hand = (sample, stamp)
         began = monotonic_s()
         try:
             lane.put(sample, stamp)
         except zenoh.ZError:
             with self._lock:
                 self.tally.errors += 1
-                self._left, self._in_hand = self._left + 1, None
+                self._left += 1
             raise
         with self._lock:
-            self._left, self._in_hand = self._left + 1, None
+            self._left += 1
             if self._acks is None:
                 lane.count += 1
                 self._leave_unconfirmed(lane)
