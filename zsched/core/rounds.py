@@ -269,7 +269,8 @@ class Rounds:
         since, owner = task.judge.not_ready_since, allocation.owner
         if since is None or owner is None or judgement.outcome is Outcome.PROPOSE:
             return judgement
-        ahead = escape_ahead(task.spec, allocation, self._gateway.fresh(owner, now), now - since)
+        profile, has_other = self._gateway.fresh(owner, now), any(name != owner for name in judgement.aggregates)
+        ahead = escape_ahead(task.spec, allocation, profile, now - since, has_other=has_other)
         return replace(judgement, reason=f"{judgement.reason}; {ahead}") if ahead else judgement
 
     def _take_turn(

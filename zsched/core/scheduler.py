@@ -251,13 +251,20 @@ def _is_told(spec: TaskSpec, profile: Profile) -> bool:
     return profile.worker(spec.name) is not None or bool(spec.worker.command)
 
 
-def escape_ahead(spec: TaskSpec, allocation: Allocation, profile: Profile | None, not_ready_for_s: float) -> str:
-    """Since its worker is not ready, when the owner will be left, and why; empty when it is not on the way to that."""
+def escape_ahead(
+    spec: TaskSpec, allocation: Allocation, profile: Profile | None, not_ready_for_s: float, *, has_other: bool
+) -> str:
+    """What comes of an owner whose worker is not ready, and why; empty when nothing will.
+
+    With ``has_other`` (somebody else can have the task) it says when the owner will be left.
+    """
     is_held = allocation.paused or allocation.pinned
     if profile is None or is_held or not _is_told(spec, profile):
         return ""
     load = profile.worker(spec.name)
     state = "not there" if load is None else load.state.value
     why = "" if load is None or not load.reason else f": {load.reason}"
+    if not has_other:
+        return f"the worker on {allocation.owner} is {state}{why}; nobody else can have the task"
     left_s = max(spec.worker.start_deadline_s - not_ready_for_s, 0.0)
     return f"{allocation.owner} will be left in {left_s:.0f} s, for its worker is {state}{why}"

@@ -18,7 +18,15 @@ from zsched.core.model import (
     WorkerLoad,
     WorkerState,
 )
-from zsched.core.scheduler import FORGIVEN_IN_S, INITIAL_SETTLE_S, Judge, Judgement, Outcome, escape_reason
+from zsched.core.scheduler import (
+    FORGIVEN_IN_S,
+    INITIAL_SETTLE_S,
+    Judge,
+    Judgement,
+    Outcome,
+    escape_ahead,
+    escape_reason,
+)
 from zsched.core.scoring import Standing, compare
 
 TUNING = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0), bonus=0.10, time_to_trigger_s=2.0, cool_down_s=10.0)
@@ -300,6 +308,14 @@ def test_a_healthy_owner_is_not_left_however_busy() -> None:
     assert reason(profile()) is None
     assert reason(None) is None, "a lost profile is no proof"
     assert reason(profile(), owner=None) is None
+
+
+def test_an_owner_that_is_not_ready_is_only_said_to_be_left_when_somebody_else_can_have_the_task() -> None:
+    starting = profile(state=WorkerState.STARTING)
+    left = escape_ahead(SPEC, allocation(), starting, DEADLINE_S - 4.0, has_other=True)
+    assert left == "edge1 will be left in 4 s, for its worker is starting"
+    stays = escape_ahead(SPEC, allocation(), starting, DEADLINE_S - 4.0, has_other=False)
+    assert stays == "the worker on edge1 is starting; nobody else can have the task"
 
 
 def test_a_gone_or_silent_owner_is_left() -> None:
