@@ -30,8 +30,10 @@ def until(condition: Callable[[], Any], what: str, deadline_s: float = DEADLINE_
 
 
 class TooSlowError(AssertionError):
-    """What was measured took longer than it may: the test is run again (``tests/conftest.py``), for a machine is busy
-    once, a fault each time."""
+    """What was measured took longer than it may: the test is run again, three times in all (``pyproject.toml``).
+
+    A machine is busy once, a fault is slow each time.
+    """
 
 
 def between(low: float, value: float, high: float) -> None:
