@@ -55,6 +55,7 @@ def test_only_what_was_too_slow_is_run_again(tmp_path: Path) -> None:
         check=False,
     )
     assert "2 failed, 1 passed, 3 rerun" in done.stdout, done.stdout
+    assert done.stdout.count("RERUN ") == 3, "each is named"
     assert {name: len((tmp_path / name).read_text()) for name in ("once", "always", "wrong")} == {
         "once": 2,
         "always": 3,
