@@ -27,7 +27,6 @@ DRIVE_S = 5.0
 
 
 @pytest.mark.root
-@pytest.mark.timeout(150)
 @pytest.mark.skipif(WHY_NOT is not None, reason=f"no control groups: {WHY_NOT}")
 def test_a_cell_is_run_and_measured_and_leaves_nothing(tmp_path: Path) -> None:
     plan = LoadPlan(lanes=1, busy_s=(3.0, 3.0), idle_s=(0.0, 0.0), first_s=1.0)
@@ -60,7 +59,6 @@ def test_a_cell_is_run_and_measured_and_leaves_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.root
-@pytest.mark.timeout(240)
 @pytest.mark.skipif(NO_SPACES is not None, reason=f"no control groups or namespaces: {NO_SPACES}")
 def test_a_cell_in_closed_loop_behind_narrow_links_ends_at_its_target(tmp_path: Path) -> None:
     scenario = replace(load_scenario(scenario_path()), duration_s=60.0, target_coverage=0.3)

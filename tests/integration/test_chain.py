@@ -27,8 +27,6 @@ from zsched.keyspace import Keyspace
 from zsched.lab.testbed import DAEMON, Testbed, echo_fleet
 from zsched.places import socket_path
 
-pytestmark = pytest.mark.timeout(180)
-
 STOP_S = 4.0
 """A daemon gives its children 1.5 s; the rest is for a machine that is busy with other things."""
 

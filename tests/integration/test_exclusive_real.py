@@ -13,8 +13,6 @@ import zenoh
 
 from zsched.lab.testbed import Testbed, echo_fleet
 
-pytestmark = pytest.mark.timeout(180)
-
 
 @pytest.fixture
 def bed(tmp_path: Path) -> Iterator[Testbed]:

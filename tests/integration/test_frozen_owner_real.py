@@ -18,7 +18,6 @@ from zsched.core.plan import StreamCount
 from zsched.lab.netbed import descendants_running
 from zsched.lab.testbed import TASK, Json, Testbed, echo_fleet
 
-pytestmark = pytest.mark.timeout(180)
 HZ = 200
 
 

@@ -15,8 +15,6 @@ import pytest
 from zsched.lab.testbed import DAEMON, Testbed, echo_fleet
 from zsched.lifecycle import init_state
 
-pytestmark = pytest.mark.timeout(180)
-
 
 @pytest.fixture
 def bed(tmp_path: Path) -> Iterator[Testbed]:

@@ -13,8 +13,6 @@ import pytest
 
 from zsched.lab.testbed import Testbed, echo_fleet
 
-pytestmark = pytest.mark.timeout(180)
-
 TASKS = ("task1", "task2", "task3")
 SHARE = 0.1
 """Of the machine's memory that each task is said to need: what tells a node with a task from one without."""

@@ -17,8 +17,6 @@ from support.waiting import within
 from zsched.core.model import NodeId
 from zsched.lab.testbed import Testbed, echo_fleet
 
-pytestmark = pytest.mark.timeout(180)
-
 
 @pytest.fixture(scope="module")
 def fleets(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str], Testbed]]:

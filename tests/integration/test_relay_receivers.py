@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -14,12 +14,10 @@ from typing import Any
 import pytest
 
 from support.relay_rig import ROBOT, Application, Rig, relay_rig, slot
-from support.waiting import until, within
+from support.waiting import POLL_S, TooSlowError, until, within
 from zsched.core.fleet import Timing
 from zsched.core.plan import StreamClass
 from zsched.zenoh_config import client_config
-
-pytestmark = pytest.mark.timeout(120)
 
 READER = """
 import sys, time
@@ -91,6 +89,15 @@ def healthy(rig: Rig, stream_class: StreamClass, size: int) -> Healthy:
     return app
 
 
+def gets_all(got: Callable[[], int], sent: int) -> None:
+    """Who is healthy gets everything, unless the machine is too busy for him to be: that is tried again."""
+    end = time.monotonic() + 20.0
+    while got() < sent:
+        if time.monotonic() > end:
+            raise TooSlowError(f"{got()} of {sent}")
+        time.sleep(POLL_S)
+
+
 @pytest.mark.parametrize(("hz", "size"), [(500, 20_000), (20, 1 << 20)], ids=["small", "large"])
 def test_a_slow_application_loses_only_its_own(rig: Rig, hz: float, size: int) -> None:
     """It takes 100 of 500 a second, through full buffers: the others get everything, at the full rate."""
@@ -101,8 +108,8 @@ def test_a_slow_application_loses_only_its_own(rig: Rig, hz: float, size: int) -
         thread = app.stream(hz)
         until(lambda: time.monotonic() > began + 10, "ten seconds")
         app.halt(thread)
-        until(lambda: len(app.back) >= app.sent, "every answer")
-        until(lambda: len(other.numbers) >= app.sent, "every answer at the other reader, too")
+        gets_all(lambda: len(app.back), app.sent)
+        gets_all(lambda: len(other.numbers), app.sent)
         assert app.back == other.numbers == list(range(app.sent))
         within(app.longest_pause_s(began), 2.0, "without an answer")
         until(lambda: dict(rig.told("echo/out/0").drops).get("slow_reader", 0) > 0, "what it missed is counted")

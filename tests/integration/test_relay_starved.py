@@ -21,7 +21,6 @@ CONFIG = data_config(listen=("tcp/127.0.0.1:0",), connect=())
 
 
 @pytest.mark.root
-@pytest.mark.timeout(300)
 def test_a_relay_that_starts_with_next_to_no_processor_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """About a hundredth of a core: it takes 20 s to start, and is killed by nobody meanwhile; status says why."""
     try:

@@ -11,7 +11,6 @@ from support.waiting import until
 from zsched.lab.testbed import Testbed, echo_fleet
 from zsched.zenoh_config import client_config
 
-pytestmark = pytest.mark.timeout(120)
 LARGE = bytes(1 << 18)
 
 

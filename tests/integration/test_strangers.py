@@ -25,8 +25,6 @@ from zsched.keyspace import END_CHUNK, Keyspace
 from zsched.lab.testbed import TASK, Testbed, echo_fleet
 from zsched.relay_pipe import encode_end
 
-pytestmark = pytest.mark.timeout(300)
-
 KEYS = Keyspace("testbed")
 FAR = 10**6
 

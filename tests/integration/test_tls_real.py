@@ -18,7 +18,6 @@ from support.certificates import make_tls
 from zsched.lab.netbed import descendants
 from zsched.lab.testbed import Json, Testbed, echo_fleet
 
-pytestmark = pytest.mark.timeout(180)
 LISTENING = "0A"
 SOCKET = re.compile(r"socket:\[(\d+)\]")
 

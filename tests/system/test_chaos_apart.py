@@ -28,7 +28,7 @@ from zsched.lab.netbed import Netbed, Probe, Received
 from zsched.lab.testbed import TASK, Json, echo_fleet
 from zsched.places import socket_path
 
-pytestmark = [pytest.mark.timeout(120), pytest.mark.root]
+pytestmark = pytest.mark.root
 
 HIDDEN = ("edge1", "edge2", "robot3")
 ROBOTS_TASK: Json = {

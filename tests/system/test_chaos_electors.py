@@ -28,7 +28,7 @@ from zsched.lab.testbed import DAEMON, TASK, Json, echo_fleet
 from zsched.lifecycle import init_state
 from zsched.places import socket_path
 
-pytestmark = [pytest.mark.timeout(180), pytest.mark.root]
+pytestmark = pytest.mark.root
 
 GUEST = "guest"
 """A machine on the network that the fleet file does not name."""

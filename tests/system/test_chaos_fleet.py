@@ -25,7 +25,7 @@ from zsched.lab.chaos import GUARD, ChaosBed
 from zsched.lab.netbed import descendants, stop_group
 from zsched.lab.testbed import TASK
 
-pytestmark = [pytest.mark.timeout(180), pytest.mark.root]
+pytestmark = pytest.mark.root
 
 STORM_S = float(os.environ.get("ZSCHED_STORM_S", "8"))
 """Length of the restart storm; the long form: 20 and more."""

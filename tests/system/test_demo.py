@@ -81,7 +81,6 @@ def run(tmp_path: Path) -> Iterator[Callable[[float], Run]]:
         one.process.wait()
 
 
-@pytest.mark.timeout(240)
 def test_the_demo_moves_the_task_and_merges_the_map(run: Callable[[float], Run]) -> None:
     demo = run(45.0)
     demo.wait_for(lambda: bool(demo.tokens), 60.0)
@@ -114,7 +113,6 @@ MOMENTS = {
 }
 
 
-@pytest.mark.timeout(180)
 @pytest.mark.parametrize(
     ("number", "moment"),
     [
