@@ -158,7 +158,7 @@ def test_restart_storm_breaks_no_promise(bed: ChaosBed) -> None:
             bed.kill(victim)
             down.append(victim)
         time.sleep(rng.uniform(0.05, 0.7))
-    bed.calm(30.0)
+    bed.calm()
 
 
 # --- the network -----------------------------------------------------------------------------------------------------

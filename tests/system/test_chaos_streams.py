@@ -55,7 +55,7 @@ def test_no_robot_stands_still_when_the_owner_is_deaf(bed: ChaosBed) -> None:
     """Its links end while something is still to be sent; closing them took the only thread that opens others."""
     pauses: list[dict[NodeId, float]] = []
     for number in range(CUTS):
-        owner = bed.calm(60.0)
+        owner = bed.calm()
         bed.network.deafen(owner)
         cut = monotonic_s()
         bed.wait(lambda: bed.moved_from(owner), GIVE_UP_S, "another owner")  # noqa: B023 - called at once
@@ -72,7 +72,7 @@ def test_no_robot_stands_still_when_the_owner_is_deaf(bed: ChaosBed) -> None:
 
 def test_a_frozen_application_holds_up_no_other_of_its_robot(bed: ChaosBed) -> None:
     """Two more receive what robot1's application does; one of them takes nothing for six seconds."""
-    bed.calm(60.0)
+    bed.calm()
     patient = Timing(zenoh_lease_s=20.0)  # the end of its lease helps nobody
     frozen = bed.probe("robot1", watch=["robot1/out"], timing=patient)
     awake = bed.probe("robot1", put="robot1/in", hz=100, size=30_000, watch=["robot1/out"])
@@ -93,5 +93,5 @@ def test_a_frozen_application_holds_up_no_other_of_its_robot(bed: ChaosBed) -> N
 
 
 def test_what_was_seen_breaks_no_rule(bed: ChaosBed) -> None:
-    bed.calm(60.0)
+    bed.calm()
     assert bed.violations() == []

@@ -86,7 +86,7 @@ class ChaosBed(Netbed):
 
     # --- mending -----------------------------------------------------------------------------------------------------
 
-    def calm(self, timeout_s: float = 20.0) -> NodeId:
+    def calm(self, timeout_s: float = 60.0) -> NodeId:
         """End every fault, start who is down, wait until all is well; the owner of ``echo``."""
         self.network.heal()
         for node in self.names:
