@@ -120,7 +120,7 @@ class Granter:
 
     def _release(self, grant: Grant) -> None:
         key = (grant.owner, grant.incarnation)
-        self._released[key] = max(self._released.get(key, -1), grant.number)
+        self._released[key] = max(self._released.get(key, grant.number), grant.number)
         last = self._last
         if last is not None and (last.owner, last.incarnation) == key and last.number <= grant.number:
             self._last, self._granted_at = None, -math.inf

@@ -318,6 +318,18 @@ def test_an_owner_that_is_not_ready_is_only_said_to_be_left_when_somebody_else_c
     assert stays == "the worker on edge1 is starting; nobody else can have the task"
 
 
+@pytest.mark.parametrize("held", [allocation(paused=True), allocation(pinned=True)])
+def test_an_owner_that_is_held_is_not_said_to_be_left(held: Allocation) -> None:
+    starting = profile(state=WorkerState.STARTING)
+    assert not escape_ahead(SPEC, held, starting, 0.0, has_other=True)
+
+
+def test_of_an_owner_without_a_profile_or_a_word_of_its_foreign_worker_nothing_is_foretold() -> None:
+    assert not escape_ahead(SPEC, allocation(), None, 0.0, has_other=True)
+    assert not escape_ahead(FOREIGN, allocation(), profile(state=None), 0.0, has_other=True)
+    assert escape_ahead(SPEC, allocation(), profile(state=None), 0.0, has_other=True), "our own worker is not there"
+
+
 def test_a_gone_or_silent_owner_is_left() -> None:
     assert reason(profile(), state=PeerState.GONE) == "edge1 is gone"
     assert reason(None, state=PeerState.SUSPECT) == "edge1 is silent"
