@@ -30,7 +30,7 @@ def until(condition: Callable[[], Any], what: str, deadline_s: float = DEADLINE_
 
 
 class TooSlowError(AssertionError):
-    """What was measured took longer than it may: the test is run again, three times in all (``pyproject.toml``).
+    """What was measured took longer than it may: the test is run again, three times in all (``tests/conftest.py``).
 
     A machine is busy once, a fault is slow each time.
     """

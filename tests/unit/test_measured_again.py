@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -37,6 +38,7 @@ def test_wrong():
 
 def test_only_what_was_too_slow_is_run_again(tmp_path: Path) -> None:
     (tmp_path / "test_cases.py").write_text(CASES)
+    shutil.copy(TESTS / "conftest.py", tmp_path)
     command = [
         sys.executable,
         "-m",
