@@ -3,8 +3,9 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 DEMO_ARGS ?=
-# Test modules at a time: the real fleets mostly wait. TEST_JOBS=2 on a machine that is busy with other work.
-TEST_JOBS ?= 4
+# Test modules at a time; the real fleets of the second half mostly wait.
+TEST_JOBS ?= 2
+REAL_JOBS ?= 3
 # How the tests with real processes are run; `.ci/run` gives failed ones a second chance, alone.
 PYTEST_REAL ?= -m pytest
 
@@ -33,7 +34,7 @@ demo: $(VENV)/.lab  ## Watch six machines merge laser maps (DEMO_ARGS="--headles
 # The second half in its order, for the longest come first.
 test: $(VENV)/.dev  ## All tests: unit, paper, simulator, parts, integration and system (real daemons on localhost)
 	$(BIN)/python -m pytest -q -n $(TEST_JOBS) --dist loadfile tests/unit tests/paper tests/sim tests/planted
-	$(BIN)/python $(PYTEST_REAL) -q -n $(TEST_JOBS) --dist loadfile --no-loadscope-reorder --durations=15 tests/system tests/integration tests/parts
+	$(BIN)/python $(PYTEST_REAL) -q -n $(REAL_JOBS) --dist loadfile --no-loadscope-reorder --durations=15 tests/system tests/integration tests/parts
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile tests/bench
 
 test-quick: $(VENV)/.dev  ## Unit and paper tests only
