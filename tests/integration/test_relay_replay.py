@@ -32,6 +32,7 @@ def first_ones(numbers: list[int]) -> list[int]:
 
 def is_whole(rig: Rig, app: Application) -> bool:
     until(lambda: len(set(app.back)) == app.sent, "an answer to everything", deadline_s=60.0)
+    until(lambda: rig.told("echo/in/0").messages >= app.sent, "the count of everything")
     until(lambda: rig.told("echo/in/0").in_flight == 0, "every acknowledgement")
     told = rig.told("echo/in/0")
     assert (told.lost, told.at_most_lost, told.drops) == (0, 0, ())

@@ -153,7 +153,8 @@ def test_stop_uses_sigint_first_and_start_runs_it_again() -> None:
 def test_a_worker_that_is_starting_is_stopped_without_a_traceback(caplog: pytest.LogCaptureFixture) -> None:
     """It has no handlers yet: Python would answer SIGINT with a KeyboardInterrupt in the middle of an import."""
     caplog.set_level("INFO")
-    with supervised(python("print('up', flush=True); import time; time.sleep(60)")) as (supervisor, recorder):
+    code = "print('up', flush=True); import time; time.sleep(60)"
+    with supervised(python(code, stop_grace_s=10.0)) as (supervisor, recorder):
         supervisor.start("merge")
         wait_until(lambda: "up" in caplog.text)
         supervisor.stop("merge")
