@@ -1,12 +1,16 @@
 """What an owner's death costs a ``reliable`` stream, with `on_crash: report` and with `replay`.
 
-``python -m benchmarks.crash_loss [--n 20] [--hz 100] [--only kill|cut] [--rule report|replay]``. Real daemons in
-network namespaces (root). The application on robot1 publishes numbers, the echo worker answers each. *kill*: the
-owner's daemon, relay and worker are killed (SIGKILL): their sockets close at once. *cut*: the owner's link goes and
-then everything on it, as when its power fails: nobody sees a socket close. Per death: how many numbers have no answer
-at all, how many have two, and what the robot's status says of it.
+``python -m benchmarks.crash_loss [--n 20] [--hz 100] [--only kill|cut] [--rule report|replay]
+[--mbit 12 --size 10000 --burst 50]``. Real daemons in network namespaces (root). The application on robot1 publishes
+numbers, the echo worker answers each. *kill*: the owner's daemon, relay and worker are killed (SIGKILL): their sockets
+close at once. *cut*: the owner's link goes and then everything on it, as when its power fails: nobody sees a socket
+close. Per death: how many numbers have no answer at all, how many have two, and what the robot's status says of it.
 
-It fails (exit code 1) when more is lost than the status tells of, or anything at all with `replay`.
+``--mbit``: what leaves the edges goes over links of so many Mbit/s, which the answers to a burst fill: they wait there,
+acknowledgements do not. The owner dies while answers come.
+
+Samples and answers are in order. So what is lost beyond what the status tells of had been acknowledged. It fails (exit
+code 1) when there is any of that, or when anything at all is lost with `replay`.
 """
 
 from __future__ import annotations
@@ -26,6 +30,9 @@ from zsched.lab.netbed import Netbed, Probe
 from zsched.lab.testbed import TASK, Json, echo_fleet
 
 SETTLE_S = 1.0
+JUST_S = 0.03
+SHARES = 6
+"""A burst is cut in so many different places."""
 IN_FLIGHT = 40
 """A calm stream has no more than this between two acknowledgements."""
 ROBOT = "robot1"
@@ -36,6 +43,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--n", type=int, default=20)
     parser.add_argument("--hz", type=float, default=100.0)
+    parser.add_argument("--size", type=int, default=0)
+    parser.add_argument("--burst", type=int, default=1, help="messages that are put at once")
+    parser.add_argument("--mbit", type=float)
     parser.add_argument("--timing", default="wifi", choices=["wifi", "wired"])
     parser.add_argument("--only", choices=["kill", "cut"])
     parser.add_argument("--rule", choices=["report", "replay"])
@@ -60,18 +70,30 @@ def _case(options: argparse.Namespace, rule: str, death: str) -> int:
     lost: list[int] = []
     doubled: list[int] = []
     told: list[int] = []
-    silent = 0
+    silent = deaths = 0
     with tempfile.TemporaryDirectory() as folder, Netbed(Path(folder), _tree(rule, options.timing)) as bed:
         bed.init()
         bed.start()
         bed.wait_settled()
-        probe = bed.probe(ROBOT, put=f"{ROBOT}/in", hz=options.hz, watch=[f"{ROBOT}/out"])
+        is_full = options.mbit is not None
+        for edge in [name for name in bed.names if name.startswith("edge")] if is_full else []:
+            bed.network.narrow(edge, options.mbit)
+        probe = bed.probe(
+            ROBOT,
+            put=f"{ROBOT}/in",
+            hz=options.hz,
+            size=options.size,
+            burst=options.burst,
+            watch=[f"{ROBOT}/out"],
+            blocks=is_full,
+        )
         bed.wait(probe.is_flowing, 20, "echoes")
         for number in range(options.n):
-            figures = _death(bed, probe, death)
+            figures = _death(bed, probe, death, options, number)
             for series, figure in zip((lost, doubled, told), figures, strict=True):
                 series.append(figure)
             silent += max(0, figures[0] - figures[2])
+            deaths += figures[0] > figures[2]
             print(
                 f"  {rule} {death} {number + 1}/{options.n}: lost {figures[0]} doubled {figures[1]} told {figures[2]}"
             )
@@ -80,7 +102,8 @@ def _case(options: argparse.Namespace, rule: str, death: str) -> int:
     missing = unaccounted(count)
     print(
         f"on_crash: {rule}, {death}, {options.hz:g} Hz, n {options.n}: lost a death {_spread(lost)}, doubled"
-        f" {_spread(doubled)}, status told of {_spread(told)}; silently {silent}, unaccounted {missing}",
+        f" {_spread(doubled)}, status told of {_spread(told)}; silently {silent} in {deaths} deaths,"
+        f" unaccounted {missing}",
         flush=True,
     )
     return silent + abs(missing or 0) + (sum(lost) if rule == "replay" else 0)
@@ -91,15 +114,20 @@ def _spread(values: list[int]) -> str:
     return f"median {ordered[len(ordered) // 2]} ({ordered[0]} to {ordered[-1]})"
 
 
-def _death(bed: Netbed, probe: Probe, death: str) -> tuple[int, int, int]:
+def _death(bed: Netbed, probe: Probe, death: str, options: argparse.Namespace, number: int) -> tuple[int, int, int]:
     """One cycle; (numbers without an answer, numbers with two, samples that the status says may be lost)."""
     owner = bed.wait_whole()
-    bed.wait(lambda: probe.is_flowing() and _in_flight(bed) < IN_FLIGHT, 20, "a calm stream")
+    _wait_calm(bed, probe, options.burst)
     before, seen = _told(bed), len(probe.received)
+    bed.wait(lambda: _comes_back(probe, monotonic_s() - JUST_S), 20, "answers that come just now")
+    if options.mbit is not None:  # a burst is on its way: now somewhere within it
+        busy_s = options.burst * options.size * 8e-6 / options.mbit
+        time.sleep(0.9 * busy_s * (number % SHARES + 0.5) / SHARES)
     first = max(one.number for one in probe.received[-200:]) + 1
     start = monotonic_s()
     bed.power_off(owner, is_seen=death == "kill")
-    bed.wait(lambda: probe.first_after(start, but_of=owner), 30, "an answer of the next owner")
+    bed.wait(lambda: probe.first_after(start, but_of=owner), 60, "an answer of the next owner")
+    _wait_calm(bed, probe, options.burst)  # what is done again takes its time, too
     time.sleep(SETTLE_S)
     last = max(one.number for one in probe.received[-200:])
     bed.wait(lambda: _count(bed).last_seen_s is not None, 5, "counters")
@@ -110,6 +138,14 @@ def _death(bed: Netbed, probe: Probe, death: str) -> tuple[int, int, int]:
     told = _told(bed) - before
     bed.network.link(owner, is_up=True)
     return lost, doubled, told
+
+
+def _wait_calm(bed: Netbed, probe: Probe, burst: int) -> None:
+    bed.wait(lambda: probe.is_flowing() and _in_flight(bed) < IN_FLIGHT + 2 * burst, 60, "a calm stream")
+
+
+def _comes_back(probe: Probe, since: float) -> bool:
+    return any(one.at > since for one in probe.received[-5:])
 
 
 def _in_flight(bed: Netbed) -> int:

@@ -79,8 +79,11 @@ class _Source:
     gap_since: float | None = None
     until: int = 0
     is_ended: bool = False
+    has_left: bool = False
     jump: Jump | None = None
     """The newest jump, until it is confirmed."""
+    gaps: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=MAX_MISSING))
+    """Jumps (from, to) that were made while something before them was not processed yet."""
     missing: deque[int] = field(default_factory=lambda: deque(maxlen=MAX_MISSING))
     """The newest of the numbers given up, to tell a late sample from a double one."""
 
@@ -96,6 +99,7 @@ class _Source:
             has_gap=self.gap_since is not None,
             until=self.until if self.gap_since is not None else 0,
             is_ended=self.is_ended,
+            has_left=self.has_left,
         )
 
 
@@ -199,8 +203,14 @@ class Acknowledger:
             (self._sources.get(name) or self._add(name, 0)).is_ended = True
             self._mark(name)
 
-    def forget(self, names: Iterable[SourceName]) -> None:
-        """Tell how far these are, and then nothing more."""
+    def leave(self, names: Iterable[SourceName]) -> None:
+        """Tell how far these are, that nothing more of them is wanted, and then nothing more."""
+        with self._wake:
+            for name in names:
+                source = self._sources.get(name)
+                if source is not None:
+                    source.has_left = True
+                    self._dirty.add(name)
         self.flush()
         with self._wake:
             for name in names:
@@ -212,12 +222,14 @@ class Acknowledger:
         return 0 if source is None else source.arrived
 
     def processed(self, name: SourceName, number: int, size: int) -> None:
-        """A sample's callback has returned, or it gave way to a newer one that is processed now."""
+        """A sample is done, or it gave way to a newer one that is; not one whose jump was taken back meanwhile."""
         with self._wake:
             source = self._sources.get(name)
-            if source is None or number < source.processed:
+            if source is None or not source.processed <= number < source.arrived:
                 return
             source.processed = number + 1
+            while source.gaps and source.gaps[0][0] <= source.processed:
+                source.processed = max(source.processed, source.gaps.popleft()[1])
             self._samples += 1
             self._bytes += size
             self._mark(name)
@@ -263,6 +275,8 @@ class Acknowledger:
     def _jump(self, source: _Source, number: int) -> None:
         if source.processed == source.arrived:  # nothing is in work
             source.processed = number
+        else:
+            source.gaps.append((source.arrived, number))
         source.jump = Jump(at=source.arrived, to=number, lost=source.lost)
         source.lost += number - source.arrived
         source.missing.extend(range(max(source.arrived, number - MAX_MISSING), number))
@@ -276,7 +290,11 @@ class Acknowledger:
             return False
         source.lost = jump.lost + jump.count - 1
         source.first = min(source.first, jump.at)
-        source.arrived, source.processed, source.jump = number + 1, number, None
+        if source.gaps and source.gaps[-1] == (jump.at, jump.to):  # what was in work before it still is
+            source.gaps[-1] = jump.at, number
+        else:
+            source.processed = number
+        source.arrived, source.jump = number + 1, None
         source.missing.clear()
         return True
 

@@ -41,6 +41,7 @@ from zsched.hop_acks import Acknowledger
 from zsched.keyspace import END_CHUNK, Keyspace
 from zsched.log_limit import limit_library
 from zsched.relay_pipe import decode_end
+from zsched.worker_debts import Debts
 from zsched.worker_epochs import CARRY_S, Epochs, lets_out
 from zsched.worker_errands import Errands
 from zsched.worker_inputs import Dispatcher
@@ -102,10 +103,12 @@ class Worker:
         self._token: zenoh.LivelinessToken | None = None
         self._session = open_session(zenoh_config)
         self._state_link = StateLink(self._session, zenoh_config)
-        self._keeper = Keeper(self._session, self._keyspace.received("*", "*", str(self._session.zid())))
         self._acks = Acknowledger(self._send_acks)
+        self._debts = Debts(self._acks)
+        acks_key = self._keyspace.received("*", "*", str(self._session.zid()))
+        self._keeper = Keeper(self._session, acks_key, self._debts)
         self._troubles = Troubles(self._tell_trouble)
-        self._dispatcher = Dispatcher(self._inputs_ended, self._acks, self._troubles)
+        self._dispatcher = Dispatcher(self._inputs_ended, self._acks, self._troubles, self._debts)
         self._restorer = Restorer(self._fetch_snapshot, node, self._dispatcher)
         self._dispatcher.start()
         self._watch: RoleWatch | None = None
@@ -128,7 +131,8 @@ class Worker:
 
         ``standalone`` names the task of a worker started by hand: without ``ZSCHED_*`` it is then the owner on node
         ``local``, epoch 1, on zenoh's default session. ``drains_itself`` says that outputs also leave outside of the
-        input callbacks: the end markers then wait for `drained`. SIGTERM and SIGINT end `wait` (main thread only).
+        input callbacks: the end markers then wait for `drained`; no input waits until what another thread puts has
+        reached the robots. SIGTERM and SIGINT end `wait` (main thread only).
 
         Raises:
             ConfigError: a variable is missing, or the zenoh configuration cannot be read.
@@ -194,7 +198,7 @@ class Worker:
 
         ``latest``: the last ``keep_last`` values are cached for who comes late; a put never waits, behind a stalled
         receiver the newest wait. ``reliable``: a put waits for a slow receiver (up to a lease) instead of dropping, and
-        the last ``depth`` answers (at most `zsched.worker_keep.KEPT_BYTES`) are kept until the robots' relays have
+        the last ``depth`` answers (at most `zsched.worker_lanes.KEPT_BYTES`) are kept until the robots' relays have
         acknowledged them: what a broken link lost is sent again.
         """
         output = Output(
@@ -207,6 +211,7 @@ class Worker:
             keeper=self._keeper,
             epoch_now=self._epoch_now,
             stamp_now=self._dispatcher.stamp,
+            owe=self._dispatcher.owe,
         )
         with self._lock:
             self._outputs.append(output)
@@ -283,6 +288,7 @@ class Worker:
             signal.setitimer(signal.ITIMER_REAL, ALARM_S)
         self._dispatcher.close()
         self._troubles.close()
+        self._debts.settle(monotonic_s())
         self._acks.close()
         self._keeper.close()
         for output in tuple(self._outputs):

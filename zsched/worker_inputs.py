@@ -25,6 +25,8 @@ from zsched.core.serial import number_near, serial_of
 from zsched.guard import guarded
 from zsched.hop_acks import GIVE_UP_S, MAX_SOURCES, Acknowledger, SourceName
 from zsched.worker_backlog import Backlog, Done
+from zsched.worker_debts import Debts
+from zsched.worker_lanes import KeptLane
 from zsched.worker_samples import Input, Marker, OpenSource, Received, Waiting
 from zsched.worker_troubles import Troubles
 
@@ -37,10 +39,13 @@ _log = logging.getLogger("zsched.worker")
 class Dispatcher:
     """The worker's own thread. ``on_ended(epoch)`` is called in it when every input seen in the epoch has ended."""
 
-    def __init__(self, on_ended: Callable[[int], None], acks: Acknowledger, troubles: Troubles) -> None:
+    def __init__(self, on_ended: Callable[[int], None], acks: Acknowledger, troubles: Troubles, debts: Debts) -> None:
         self._on_ended = on_ended
         self._troubles = troubles
         self._acks = acks
+        self._debts = debts
+        self._owed: dict[KeptLane, int] = {}
+        """What the callback in hand has answered: {where: the number of the next answer} (the dispatch thread's)."""
         self._stamp: zenoh.Timestamp | None = None
         self._newest_stamp: zenoh.Timestamp | None = None
         self._in_hand: int | None = None
@@ -151,6 +156,11 @@ class Dispatcher:
         is_behind = self._in_hand is not None and (self._has_withheld or is_late)
         return is_early or is_behind
 
+    def owe(self, lane: KeptLane, number: int) -> None:
+        """An answer is put (any thread; in ours it belongs to the input in hand, which is not done without it)."""
+        if threading.current_thread() is self._thread:
+            self._owed[lane] = number + 1
+
     def stamp(self) -> zenoh.Timestamp | None:
         """The timestamp for an output: of the input in hand (in the dispatch thread), else of the newest processed."""
         return self._stamp if threading.current_thread() is self._thread else self._newest_stamp
@@ -254,6 +264,7 @@ class Dispatcher:
         if sample is None:
             return
         self._has_withheld = False
+        self._owed.clear()
         begun, was_standby, again = self._begun, self._is_standby(), waiting.again
         if again is None:
             self._turn = self._turn_in_hand = self._turn + 1
@@ -264,7 +275,7 @@ class Dispatcher:
         self._dispatch(source, sample, replayed=waiting.replayed)
         self._in_hand = None
         if waiting.name is not None:
-            self._note(waiting.name, waiting.number, sample)
+            self._note(waiting, waiting.name, sample)
         if not self._has_withheld and not was_standby:
             return
         quiet_at = None if self._has_withheld else monotonic_s()
@@ -304,13 +315,17 @@ class Dispatcher:
                 state = self._open[name] = OpenSource(epoch=self._epoch, in_turn=in_turn)
             return state.epoch
 
-    def _note(self, name: SourceName, number: int, sample: zenoh.Sample) -> None:
-        """A numbered sample is processed."""
+    def _note(self, waiting: Waiting, name: SourceName, sample: zenoh.Sample) -> None:
+        """A numbered sample is processed; where it must not be lost, when its answers have reached the robots."""
+        number = waiting.number
         with self._wake:
             state = self._open.get(name)
             if state is not None:
                 state.number = max(state.number, number)
-        self._acks.processed(name, number, len(sample.payload))
+        if waiting.is_wanted and sample.congestion_control == zenoh.CongestionControl.BLOCK:
+            self._debts.processed(name, number, len(sample.payload), self._owed)
+        else:
+            self._acks.processed(name, number, len(sample.payload))
 
     def _settle(self) -> None:
         """Let every marker take effect whose samples are processed, then tell which epochs are over."""

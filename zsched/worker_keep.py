@@ -7,8 +7,6 @@ class ``reliable`` is kept, at most ``limit`` of an output and `KEPT_BYTES`, of 
 a gap asks at once; one that makes no progress for `RESEND_S`, longer each time, is sent what it lacks once its link is
 there again. Both go to that relay alone, under `AGAIN_CHUNK`: other robots' radios carry nothing twice. Who cannot be
 reached for `FORGET_S` is forgotten. A plain subscriber never acknowledges; for it nothing is kept longer than that.
-
-Anybody can acknowledge under any relay's name. So a lane remembers at most `MAX_RECEIVERS` of them.
 """
 
 from __future__ import annotations
@@ -16,9 +14,6 @@ from __future__ import annotations
 import logging
 import queue
 import threading
-from collections import deque
-from dataclasses import dataclass, field
-from itertools import islice
 from typing import Any, Final
 
 import zenoh
@@ -32,202 +27,30 @@ from zsched.errors import WireError
 from zsched.guard import guarded
 from zsched.keyspace import AGAIN_CHUNK, END_CHUNK, parse
 from zsched.relay_pipe import encode_end
+from zsched.worker_debts import Debts
+from zsched.worker_lanes import FORGET_S, Expected, KeptLane, Receiver
 
-KEPT_BYTES: Final = 32 << 20
-RESEND_S: Final = 0.3
 MAX_PAUSE_S: Final = 2.0
 ASKED_S: Final = 0.1
 """A relay that asks for the same once more within this time has it on its way."""
-FORGET_S: Final = 10.0
-MAX_RECEIVERS: Final = 256
-"""Relays that a lane remembers; beyond, the longest silent one goes, first of those that were never reached."""
-NEWCOMERS_S: Final = 3.0
-"""So long after an epoch's first answer a robot may begin with it: one that learnt of the move late, or had no link."""
+LOOK_S: Final = 0.1
+"""Nothing was heard of a robot whose input an answer was made of: then it is looked whether it subscribes at all."""
 TICK_S: Final = 0.1
-BATCH: Final = 512
-BATCH_BYTES: Final = 4 << 20
-"""So much is sent again at one time; progress brings the next."""
 
 _log = logging.getLogger("zsched.worker")
-
-
-@dataclass(frozen=True, slots=True)
-class _Kept:
-    number: int
-    payload: Any
-    attachment: Any
-    encoding: Any
-    stamp: zenoh.Timestamp | None
-    size: int
-    at: float
-
-
-@dataclass(slots=True, eq=False)
-class _Receiver:
-    """A relay that acknowledges: ``arrived`` is the number it comes to next."""
-
-    node: str
-    arrived: int = 0
-    had: int | None = None
-    """The numbers below this one an earlier life of it has acknowledged; it is not sent them."""
-    waits_for: int = 0
-    """What it comes to next by its own word: a new life begins at 0."""
-    moved_at: float = 0.0
-    pause_s: float = RESEND_S
-    batch_end: int | None = None
-    unreached_since: float | None = None
-    heard_at: float = 0.0
-    is_ended: bool = False
-    is_confirmed: bool = False
-    """It was seen to subscribe to what is sent again."""
-    publisher: zenoh.Publisher | None = None
-    """Of what is sent again; there while something is owed."""
-
-
-@dataclass(slots=True, eq=False)
-class KeptLane:
-    """One publisher's answers. Its lock guards it; `keep` may be called from any thread, the rest is the keeper's."""
-
-    key: str
-    source_id: zenoh.EntityGlobalId
-    limit: int
-    wake: threading.Event
-    lock: threading.Lock = field(default_factory=threading.Lock)
-    kept: deque[_Kept] = field(default_factory=deque)
-    size: int = 0
-    count: int = 0
-    receivers: dict[str, _Receiver] = field(default_factory=dict)
-    had: dict[str, tuple[str, int]] = field(default_factory=dict)
-    """{relay that was forgotten: (its node, how far it has acknowledged)}, the oldest first."""
-    end: EndMarker | None = None
-    ended_at: float = 0.0
-    began_at: float | None = None
-    is_closed: bool = False
-    crowded_out: int = 0
-    """Relays that were forgotten for want of room."""
-    gone: list[_Receiver] = field(default_factory=list)
-    """Relays that were forgotten, their publishers not given back yet."""
-
-    def keep(self, number: int, payload: Any, attachment: Any, encoding: Any, stamp: Any, size: int) -> None:
-        """Keep what is about to be put under a number; the oldest give way."""
-        now = monotonic_s()
-        with self.lock:
-            self.count, self.end = number + 1, None
-            self.began_at = now if self.began_at is None else self.began_at
-            self.kept.append(_Kept(number, payload, attachment, encoding, stamp, size, now))
-            self.size += size
-            while len(self.kept) > self.limit or (self.size > KEPT_BYTES and len(self.kept) > 1):
-                self.size -= self.kept.popleft().size
-        if not self.wake.is_set():
-            self.wake.set()
-
-    def note_end(self, marker: EndMarker) -> None:
-        """The end marker was put behind the last answer."""
-        with self.lock:
-            self.end, self.ended_at = marker, monotonic_s()
-        self.wake.set()
-
-    def acknowledge(self, relay: str, node: str, ack: StreamAck, now: float) -> tuple[_Receiver, bool]:
-        """Take a relay's word; answers (it, whether it has come further)."""
-        with self.lock:
-            receiver = self.receivers.get(relay)
-            if receiver is None:  # a relay that restarted is another session of the same node
-                for old in [name for name, one in self.receivers.items() if one.node == node]:
-                    self.forget(old)
-                if len(self.receivers) >= MAX_RECEIVERS:
-                    self._make_room()
-                receiver = self.receivers[relay] = _Receiver(node=node, arrived=-1, had=self._had_by(relay, node))
-            # one that came late knows the lowest bits only; nobody can have more than was sent
-            receiver.waits_for = min(number_near(serial_of(ack.arrived), self.count), self.count)
-            arrived = max(receiver.waits_for, receiver.had or 0)
-            has_moved = arrived > receiver.arrived
-            receiver.heard_at, receiver.is_ended = now, ack.is_ended
-            if has_moved:
-                receiver.arrived, receiver.moved_at, receiver.pause_s = arrived, now, RESEND_S
-            self._let_go(now)
-            return receiver, has_moved
-
-    def forget(self, relay: str) -> None:
-        """A relay is another one by now, or cannot be reached (under the lock); what it had is remembered."""
-        gone = self.receivers.pop(relay, None)
-        if gone is None:
-            return
-        self.gone.append(gone)
-        self.had[relay] = (gone.node, gone.arrived)
-        if len(self.had) > MAX_RECEIVERS:
-            self.had.pop(next(iter(self.had)))
-
-    def _had_by(self, relay: str, node: str) -> int | None:
-        """How far a relay's node has come by another relay, ``None``: by none; one that is known knows it itself."""
-        if self.had.pop(relay, None) is not None:
-            return None
-        return max((arrived for of, arrived in self.had.values() if of == node), default=None)
-
-    def _make_room(self) -> None:
-        least = min(self.receivers, key=lambda name: (self.receivers[name].is_confirmed, self.receivers[name].heard_at))
-        self.forget(least)
-        self.crowded_out += 1
-        if self.crowded_out == 1:
-            _log.warning("%s: more than %d relays acknowledge answers: some are strangers", self.key, MAX_RECEIVERS)
-
-    def take_gone(self) -> list[_Receiver]:
-        """Relays that were forgotten since the last time."""
-        with self.lock:
-            gone, self.gone = self.gone, []
-            return gone
-
-    def _let_go(self, now: float) -> None:
-        """Of what every relay that we know of has, once those that we do not know have had time to come."""
-        if not self.receivers or (self.began_at is not None and now - self.began_at < NEWCOMERS_S):
-            return
-        low = min(one.arrived for one in self.receivers.values())
-        while self.kept and self.kept[0].number < low:
-            self.size -= self.kept.popleft().size
-
-    def wanted(self, start: int, until: int) -> tuple[_Kept, ...]:
-        """What is kept of the numbers from ``start`` to before ``until``, as much as goes at one time."""
-        with self.lock:
-            first = self.kept[0].number if self.kept else self.count
-            chosen: list[_Kept] = []
-            size = 0
-            for one in islice(self.kept, max(0, start - first), None):
-                if one.number >= until or len(chosen) >= BATCH or size > BATCH_BYTES:
-                    break
-                chosen.append(one)
-                size += one.size
-            return tuple(chosen)
-
-    def late(self, now: float) -> list[tuple[str, _Receiver]]:
-        """Relays that lack something and have made no progress for a while."""
-        with self.lock:
-            first = self.kept[0].number if self.kept else self.count
-            return [(relay, one) for relay, one in self.receivers.items() if self._is_late(one, first, now)]
-
-    def _is_late(self, receiver: _Receiver, first: int, now: float) -> bool:
-        if now - receiver.moved_at < receiver.pause_s:
-            return False
-        if receiver.arrived >= self.count:
-            return self.end is not None and not receiver.is_ended and now - self.ended_at > RESEND_S
-        at = receiver.arrived - first
-        return at < 0 or (at < len(self.kept) and now - self.kept[at].at > RESEND_S)
-
-    def expire(self, now: float) -> bool:
-        """Let go of what nobody will acknowledge; ``True`` when the lane has nothing left to do."""
-        with self.lock:
-            self._let_go(now)
-            while self.kept and not self.receivers and now - self.kept[0].at > FORGET_S:
-                self.size -= self.kept.popleft().size
-            is_told = all(one.is_ended for one in self.receivers.values()) or now - self.ended_at > FORGET_S
-            return not self.kept and (self.end is None or is_told)
 
 
 class Keeper:
     """The answers of one worker, and the thread that takes acknowledgements and sends again."""
 
-    def __init__(self, session: Session, acks_key: str) -> None:
-        """``acks_key``: where relays acknowledge, ``.../received/*/*/<our zenoh id>``. Starts with the first lane."""
+    def __init__(self, session: Session, acks_key: str, debts: Debts) -> None:
+        """``acks_key``: where relays acknowledge, ``.../received/*/*/<our zenoh id>``. Starts with the first lane.
+
+        ``debts`` are settled whenever more may have reached the robots.
+        """
         self._session = session
         self._acks_key = acks_key
+        self._debts = debts
         self._lock = threading.Lock()
         self._lanes: dict[int, KeptLane] = {}
         self._came: queue.SimpleQueue[Sample | None] = queue.SimpleQueue()
@@ -264,6 +87,7 @@ class Keeper:
             try:
                 if sample is not None:
                     self._take(sample)
+                    self._debts.settle(monotonic_s())
                 if monotonic_s() >= due:
                     self._look_after()
                     due = monotonic_s() + TICK_S
@@ -310,18 +134,42 @@ class Keeper:
             for relay, receiver in lane.late(now):
                 self._send_again(lane, relay, receiver, lane.count)
                 receiver.pause_s = min(2 * receiver.pause_s, MAX_PAUSE_S)
+            lane.note_debts(now)
+            self._look_for_expected(lane, now)
             is_done = lane.expire(now)
             is_idle &= is_done
             if is_done and lane.is_closed:
+                self._give_up(lane)
                 with self._lock:
                     self._lanes.pop(eid, None)
-        if is_idle:
+        self._debts.settle(now)
+        if is_idle and not self._debts.is_waiting:
             self._wake.clear()
             if any(lane.kept for _, lane in lanes):  # one that came just now
                 self._wake.set()
 
+    def _look_for_expected(self, lane: KeptLane, now: float) -> None:
+        """Find out which relays that have said nothing are told of the lane's answers; what they said tells, too."""
+        with lane.lock:
+            expected = tuple(lane.expected.items())
+        for relay, one in expected:
+            if one.is_decided or now - one.since < LOOK_S:
+                continue
+            is_heard = relay in lane.receivers
+            if one.publisher is None and not is_heard:
+                one.publisher = self._publisher_to(lane, relay)  # it is known at the next tick whether it matches
+                continue
+            if not is_heard and _matches(one.publisher) and now - one.since <= FORGET_S:
+                continue
+            _decide(one)
+
+    def _give_up(self, lane: KeptLane) -> None:
+        lane.is_over = True
+        for one in lane.expected.values():
+            _decide(one)
+
     def _send_again(
-        self, lane: KeptLane, relay: str, receiver: _Receiver, until: int, *, is_asked: bool = False
+        self, lane: KeptLane, relay: str, receiver: Receiver, until: int, *, is_asked: bool = False
     ) -> None:
         now = receiver.moved_at = monotonic_s()
         if not self._is_reached(lane, relay, receiver, now):
@@ -345,13 +193,10 @@ class Keeper:
         if lane.end is not None and not receiver.is_ended and not wanted:
             put_end(self._session, lane.key, lane.source_id, lane.end)
 
-    def _is_reached(self, lane: KeptLane, relay: str, receiver: _Receiver, now: float) -> bool:
+    def _is_reached(self, lane: KeptLane, relay: str, receiver: Receiver, now: float) -> bool:
         if receiver.publisher is None:
-            receiver.publisher = self._session.declare_publisher(
-                f"{lane.key}/{AGAIN_CHUNK}/{relay}", congestion_control=CongestionControl.BLOCK
-            )
-        status: Any = receiver.publisher.matching_status
-        if bool(status.matching):  # the object itself is always true
+            receiver.publisher = self._publisher_to(lane, relay)
+        if _matches(receiver.publisher):
             receiver.unreached_since, receiver.is_confirmed = None, True
             return True
         receiver.unreached_since = receiver.unreached_since or now
@@ -360,6 +205,10 @@ class Keeper:
                 lane.forget(relay)
             _undeclare(receiver)
         return False
+
+    def _publisher_to(self, lane: KeptLane, relay: str) -> zenoh.Publisher:
+        key = f"{lane.key}/{AGAIN_CHUNK}/{relay}"
+        return self._session.declare_publisher(key, congestion_control=CongestionControl.BLOCK)
 
 
 def put_end(session: Session, key: str, source_id: zenoh.EntityGlobalId, marker: EndMarker) -> None:
@@ -372,7 +221,18 @@ def put_end(session: Session, key: str, source_id: zenoh.EntityGlobalId, marker:
     )
 
 
-def _undeclare(receiver: _Receiver) -> None:
+def _matches(publisher: Any) -> bool:
+    return bool(publisher.matching_status.matching)  # the status itself is always true
+
+
+def _decide(expected: Expected) -> None:
+    expected.is_decided = True
+    if expected.publisher is not None:
+        expected.publisher.undeclare()
+        expected.publisher = None
+
+
+def _undeclare(receiver: Receiver) -> None:
     if receiver.publisher is not None:
         receiver.publisher.undeclare()
         receiver.publisher = None

@@ -17,7 +17,8 @@ from zenoh import CongestionControl, ext
 from zsched.core.relay_protocol import EndMarker
 from zsched.core.serial import serial_of
 from zsched.send_queue import SendQueue
-from zsched.worker_keep import Keeper, KeptLane, put_end
+from zsched.worker_keep import Keeper, put_end
+from zsched.worker_lanes import KeptLane
 
 LATEST_DEPTH: Final = 16
 """Values of class ``latest`` that may wait for a receiver that keeps up; behind a stalled one, ``keep_last`` do."""
@@ -55,7 +56,9 @@ class Output:
         keeper: Keeper,
         epoch_now: Callable[[], int | None],
         stamp_now: Callable[[], zenoh.Timestamp | None],
+        owe: Callable[[KeptLane, int], None],
     ) -> None:
+        """``owe`` is told of an answer of class ``reliable`` before it is put: (its lane, its number)."""
         self._session = session
         self._template = template
         self.is_latest = latest
@@ -66,6 +69,7 @@ class Output:
         self._congestion = CongestionControl.BLOCK if latest or reliable else CongestionControl.DROP
         self._epoch_now = epoch_now
         self._stamp_now = stamp_now
+        self._owe = owe
         self._lock = threading.Lock()
         self._epochs: dict[int, _Stamped] = {}
         self._queue: SendQueue | None = None
@@ -150,6 +154,8 @@ class Output:
             payload, attachment = _own(payload), _own(attachment)
             size = len(payload) if hasattr(payload, "__len__") else 0
             stamped.lane.keep(number, payload, attachment, encoding, timestamp, size)
+            if not self.is_latest:
+                self._owe(stamped.lane, number)
         if isinstance(publisher, zenoh.Publisher):
             source = zenoh.SourceInfo(publisher.id, serial_of(number))
             publisher.put(payload, attachment=attachment, encoding=encoding, timestamp=timestamp, source_info=source)

@@ -10,6 +10,8 @@ import zenoh
 
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import until
+from zsched.hop_acks import Acknowledger
+from zsched.worker_debts import Debts
 from zsched.worker_keep import Keeper
 from zsched.worker_outputs import OUTPUT_DEPTH, Output
 
@@ -29,7 +31,8 @@ def has_sent(output: Output, count: int) -> bool:
 def test_an_answer_that_is_an_input_does_not_hold_the_buffer_in_which_it_came() -> None:
     """Zenoh's is 64 KiB, of which 100 B touch two pages when it is new: kept as they came, these took 12 MB."""
     with hub_and_neighbour() as (application, worker):
-        keeper = Keeper(worker, "t/acks/*")
+        acks = Acknowledger(lambda _relay, _frame: None)
+        keeper = Keeper(worker, "t/acks/*", Debts(acks))
         output = Output(
             worker,
             "edge1/t/{epoch}/out",
@@ -40,6 +43,7 @@ def test_an_answer_that_is_an_input_does_not_hold_the_buffer_in_which_it_came() 
             keeper=keeper,
             epoch_now=lambda: 1,
             stamp_now=lambda: None,
+            owe=lambda _lane, _number: None,
         )
         taken = worker.declare_subscriber("t/in", lambda sample: output.put(sample.payload))
         publisher = application.declare_publisher(
@@ -56,3 +60,4 @@ def test_an_answer_that_is_an_input_does_not_hold_the_buffer_in_which_it_came() 
         taken.undeclare()
         output.close()
         keeper.close()
+        acks.close()

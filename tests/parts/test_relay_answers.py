@@ -261,6 +261,15 @@ def test_an_owner_that_is_left_and_comes_back_in_its_epoch_doubles_nothing(bench
     assert stream.count().lost == 0
 
 
+def test_a_slot_that_closes_says_that_nothing_more_is_wanted(bench: Bench) -> None:
+    """What comes behind it is cut: no input may wait until it is here."""
+    stream = bench.open()
+    bench.put(0, 1)
+    assert bench.is_through(0, 1)
+    stream.close_slot(1)
+    bench.wait_ack(eid=bench.publisher.id.eid, arrived=2, has_left=True)
+
+
 def test_an_answer_in_hand_while_its_slot_closes_starts_no_count_of_its_own(bench: Bench) -> None:
     """The receiver's thread waited for the lock; its sample was counted from 0 on, and all before it came again."""
     stream = bench.open()

@@ -10,11 +10,14 @@ import zenoh
 
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import until
-from zsched import wire, worker_keep
+from zsched import wire, worker_keep, worker_lanes
 from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks
+from zsched.hop_acks import Acknowledger
 from zsched.keyspace import AGAIN_CHUNK, END_CHUNK, Keyspace
 from zsched.relay_pipe import decode_end
-from zsched.worker_keep import Keeper, KeptLane
+from zsched.worker_debts import Debts
+from zsched.worker_keep import Keeper
+from zsched.worker_lanes import KeptLane
 
 KEY = "edge1/t/1/out"
 KEYS = Keyspace("t")
@@ -60,7 +63,10 @@ class Robot:
 class Bench:
     def __init__(self, worker: zenoh.Session, outside: zenoh.Session) -> None:
         self.worker, self.outside = worker, outside
-        self.keeper = Keeper(worker, KEYS.received("*", "*", str(worker.zid())))
+        self.told: list[StreamAcks] = []
+        self.acks = Acknowledger(lambda _relay, frame: self.told.append(frame))
+        self.debts = Debts(self.acks)
+        self.keeper = Keeper(worker, KEYS.received("*", "*", str(worker.zid())), self.debts)
         self.publisher = worker.declare_publisher(KEY)
         self.eid = self.publisher.id.eid
 
@@ -85,10 +91,11 @@ def bench() -> Iterator[Bench]:
         made = Bench(worker, outside)
         yield made
         made.keeper.close()
+        made.acks.close()
 
 
 def test_what_every_robot_has_acknowledged_is_kept_no_more(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(worker_keep, "NEWCOMERS_S", 0.0)
+    monkeypatch.setattr(worker_lanes, "NEWCOMERS_S", 0.0)
     lane = bench.lane()
     first, second = bench.robot("robot1", "aa1"), bench.robot("robot2", "aa2")
     keep(lane, 0, 1, 2, 3)
@@ -114,7 +121,7 @@ def test_a_robot_that_follows_the_move_last_is_given_what_the_first_has_acknowle
 
 def test_the_first_answers_of_an_epoch_do_not_stay_for_ever(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also when nobody says anything any more."""
-    monkeypatch.setattr(worker_keep, "NEWCOMERS_S", 0.3)
+    monkeypatch.setattr(worker_lanes, "NEWCOMERS_S", 0.3)
     lane = bench.lane()
     robot = bench.robot("robot1")
     keep(lane, 0, 1, 2)
@@ -159,8 +166,8 @@ def test_what_is_kept_no_more_is_skipped(bench: Bench) -> None:
 
 
 def test_much_is_sent_again_in_parts_as_it_arrives(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(worker_keep, "BATCH", 2)
-    monkeypatch.setattr(worker_keep, "NEWCOMERS_S", 0.0)
+    monkeypatch.setattr(worker_lanes, "BATCH", 2)
+    monkeypatch.setattr(worker_lanes, "NEWCOMERS_S", 0.0)
     lane = bench.lane()
     robot = bench.robot("robot1")
     keep(lane, *range(5))
@@ -174,7 +181,7 @@ def test_much_is_sent_again_in_parts_as_it_arrives(bench: Bench, monkeypatch: py
 def test_a_relay_that_restarted_takes_the_place_of_its_former_life(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(worker_keep, "NEWCOMERS_S", 0.0)
+    monkeypatch.setattr(worker_lanes, "NEWCOMERS_S", 0.0)
     lane = bench.lane()
     before, after = bench.robot("robot1", "aa1"), bench.robot("robot1", "aa2")
     keep(lane, 0, 1, 2)
@@ -215,7 +222,8 @@ def test_a_strangers_word_about_a_relay_that_lives_keeps_nothing_from_it(bench: 
 def test_who_cannot_be_reached_is_forgotten_and_what_nobody_acknowledges_too(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(worker_keep, "FORGET_S", 0.4)
+    for module in (worker_lanes, worker_keep):
+        monkeypatch.setattr(module, "FORGET_S", 0.4)
     lane = bench.lane()
     robot = bench.robot("robot1")
     keep(lane, 0, 1)
@@ -226,7 +234,7 @@ def test_who_cannot_be_reached_is_forgotten_and_what_nobody_acknowledges_too(
 
 
 def test_bytes_are_bounded_too(monkeypatch: pytest.MonkeyPatch, bench: Bench) -> None:
-    monkeypatch.setattr(worker_keep, "KEPT_BYTES", 25)
+    monkeypatch.setattr(worker_lanes, "KEPT_BYTES", 25)
     lane = bench.lane()
     keep(lane, 0, 1, 2)
     assert [one.number for one in lane.kept] == [1, 2]
@@ -235,7 +243,7 @@ def test_bytes_are_bounded_too(monkeypatch: pytest.MonkeyPatch, bench: Bench) ->
 def test_strangers_who_acknowledge_are_bounded_and_a_robot_that_was_reached_stays(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(worker_keep, "MAX_RECEIVERS", 4)
+    monkeypatch.setattr(worker_lanes, "MAX_RECEIVERS", 4)
     lane = bench.lane()
     robot = bench.robot("robot1")
     keep(lane, 0, 1, 2)

@@ -17,6 +17,7 @@ from zsched.core.relay_protocol import WorkerTrouble
 from zsched.hop_acks import Acknowledger
 from zsched.keyspace import Keyspace
 from zsched.relay.troubles import Troubles as Heard
+from zsched.worker_debts import Debts
 from zsched.worker_inputs import Dispatcher
 from zsched.worker_samples import Input, Received
 from zsched.worker_troubles import MAX_KINDS, Troubles
@@ -79,7 +80,7 @@ def test_an_error_of_any_length_fits_what_is_carried() -> None:
 def test_the_dispatch_goes_on_behind_a_callback_that_raises() -> None:
     told: list[int] = []
     troubles = Troubles(lambda count, _text: told.append(count))
-    dispatcher = Dispatcher(lambda _epoch: None, cast("Acknowledger", None), troubles)
+    dispatcher = Dispatcher(lambda _epoch: None, cast("Acknowledger", None), troubles, cast("Debts", None))
     dispatcher.start()
 
     def refuse(sample: Received) -> None:

@@ -124,12 +124,15 @@ class Rig:
     def endpoint(self, node: str) -> str:
         return self.endpoints[node]
 
-    def start_worker(self, node: str, *options: str, task: str = TASK) -> subprocess.Popen[bytes]:
+    def start_worker(
+        self, node: str, *options: str, task: str = TASK, operator_json5: str = ""
+    ) -> subprocess.Popen[bytes]:
         self.incarnation += 1
         path = self.folder / f"{task}-{node}.json5"
         # its own relay first, then the robot's, as `zsched.daemon_endpoints` has it: what is dialled is dialled again
         connect = tuple(dict.fromkeys((self.endpoint(node), self.endpoint(ROBOT))))
-        path.write_text(worker_config(connect=connect, timing=self.timing, shared_memory=False))
+        text = worker_config(connect=connect, timing=self.timing, shared_memory=False, operator_json5=operator_json5)
+        path.write_text(text)
         env = os.environ | {
             "ZSCHED_FLEET": FLEET,
             "ZSCHED_NODE": node,

@@ -197,3 +197,46 @@ def test_a_jump_that_something_newer_has_followed_stands(book: Book) -> None:
     assert book.admit(2, 3, 4, 5, in_turn=False) == [False] * 4
     book.acks.processed(NAME, 9, 1)
     assert book.wait(processed=10).reordered == 4
+
+
+def test_what_is_given_up_while_something_is_in_work_is_not_in_flight_for_ever(book: Book) -> None:
+    """An input waits for its answers while the last ones of its stream never come."""
+    assert book.admit(0, 1) == [True, True]
+    book.acks.processed(NAME, 0, 1)
+    book.acks.skip(NAME, 4)
+    ack = book.wait(arrived=4)
+    assert (ack.processed, ack.lost) == (1, 2)
+    book.acks.processed(NAME, 1, 1)
+    assert book.wait(processed=4).lost == 2
+
+
+def test_a_jump_that_is_taken_back_does_not_call_done_what_is_in_work(book: Book) -> None:
+    assert book.admit(0, 1) == [True, True]
+    book.acks.processed(NAME, 0, 1)
+    book.acks.skip(NAME, 1000)  # nobody of ours
+    assert book.admit(2, 3, 4, 5) == [False, False, True, True]
+    ack = book.wait(arrived=6)
+    assert (ack.processed, ack.lost) == (1, 2)
+    book.acks.processed(NAME, 1, 1)
+    assert book.wait(processed=4).lost == 2
+    book.acks.processed(NAME, 5, 1)
+    assert book.wait(processed=6).lost == 2
+
+
+def test_what_came_in_a_jump_that_is_taken_back_is_not_said_to_be_processed(book: Book) -> None:
+    book.acks.skip(NAME, 0)
+    assert book.admit(0) == [True]
+    assert book.admit(1000, in_turn=False) == [True]
+    assert book.admit(1, 2, 3, in_turn=False) == [False, False, True]
+    book.acks.processed(NAME, 1000, 1)
+    book.acks.processed(NAME, 3, 1)
+    assert book.wait(processed=4).arrived == 4
+
+
+def test_who_leaves_says_so_and_nothing_more(book: Book) -> None:
+    assert book.admit(0) == [True]
+    book.acks.processed(NAME, 0, 1)
+    assert not book.wait(arrived=1).has_left
+    book.acks.leave([NAME])
+    assert book.wait(has_left=True).arrived == 1
+    assert book.acks.arrived(NAME) == 0

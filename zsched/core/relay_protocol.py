@@ -184,6 +184,8 @@ class StreamAck:
     """...up to this number, which it has; 0: it has kept nothing newer."""
     is_ended: bool = False
     """The end marker has come."""
+    has_left: bool = False
+    """The receiver wants nothing more of it: nobody need wait until it has the rest."""
 
     def __post_init__(self) -> None:
         for name in ("eid", "first", "arrived", "processed", "lost", "doubled", "reordered", "until"):

@@ -36,7 +36,7 @@ from zsched.lab.fuzz_wire import NAMES
 from zsched.relay.lanes import Lane, Sent, near
 from zsched.relay.tokens import Tokens
 from zsched.relay_pipe import decode_chunk, decode_end, encode_chunk, encode_end
-from zsched.worker_keep import MAX_RECEIVERS, KeptLane
+from zsched.worker_lanes import MAX_RECEIVERS, KeptLane
 from zsched.worker_snapshot import CHUNK, MAX_OFFERS, MAX_SNAPSHOT, Assembly
 
 KEYS = Keyspace("fuzz")

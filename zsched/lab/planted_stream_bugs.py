@@ -9,7 +9,7 @@ from __future__ import annotations
 from zsched.lab.planted_bugs import Bug
 
 ACKS, SERIAL = "zsched.hop_acks", "zsched.core.serial"
-INPUTS = "zsched.worker_inputs"
+INPUTS, WORKER_LANES = "zsched.worker_inputs", "zsched.worker_lanes"
 GREETINGS, LANES, OUTLET = "zsched.relay.greetings", "zsched.relay.lanes", "zsched.relay.outlet"
 
 _GREETINGS = ("tests/parts/test_relay_greetings.py",)
@@ -159,10 +159,45 @@ STREAM_BUGS = (
     ),
     _bug(
         "a relay's next life is sent what the former one has had",
-        "zsched.worker_keep",
+        WORKER_LANES,
         "arrived = max(receiver.waits_for, receiver.had or 0)",
         "arrived = receiver.waits_for",
         ("tests/parts/test_worker_keep.py",),
+    ),
+    _bug(
+        "an input is done before its answers have come",
+        INPUTS,
+        "len(sample.payload), self._owed)",
+        "len(sample.payload), {})",
+        ("tests/integration/test_relay_last_answers.py", "tests/parts/test_worker_done.py"),
+    ),
+    _bug(
+        "an input does not wait for its robot's first word",
+        WORKER_LANES,
+        "low = self.count if is_known or not self._is_expected(relay, now) else 0",
+        "low = self.count",
+        ("tests/unit/test_worker_debts.py",),
+    ),
+    _bug(
+        "a robot that takes long over a large answer has it",
+        WORKER_LANES,
+        "return not self.has_left and (is_own or is_moving)",
+        "return not self.has_left and is_moving",
+        ("tests/unit/test_worker_debts.py",),
+    ),
+    _bug(
+        "a frozen robot stalls the inputs of the others",
+        WORKER_LANES,
+        "return not self.has_left and (is_own or is_moving)",
+        "return not self.has_left",
+        ("tests/unit/test_worker_debts.py",),
+    ),
+    _bug(
+        "a slot that closes does not say so",
+        "zsched.relay.answers",
+        "self._acks.leave(self._names)",
+        "self._acks.flush()",
+        ("tests/parts/test_relay_answers.py",),
     ),
     _bug(
         "what a foreign worker was sent is in no counter",

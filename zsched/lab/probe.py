@@ -33,6 +33,8 @@ def main() -> int:
     parser.add_argument("--put", default="")
     parser.add_argument("--hz", type=float, default=50.0)
     parser.add_argument("--size", type=int, default=0, help="pad messages to so many bytes")
+    parser.add_argument("--burst", type=int, default=1, help="put so many at once, and wait for as many turns")
+    parser.add_argument("--block", action="store_true", help="wait for room, drop nothing")
     parser.add_argument("--watch", action="append", default=[])
     given = parser.parse_args()
     stop = threading.Event()
@@ -79,10 +81,13 @@ def _write(lines: queue.SimpleQueue[str]) -> None:
 
 
 def _send(session: zenoh.Session, given: argparse.Namespace, stop: threading.Event) -> None:
-    publisher = session.declare_publisher(given.put) if given.put else None
+    control = zenoh.CongestionControl.BLOCK if given.block else zenoh.CongestionControl.DROP
+    publisher = session.declare_publisher(given.put, congestion_control=control) if given.put else None
     number = 0
-    while not stop.wait(1.0 / given.hz):
-        if publisher is not None:
+    while not stop.wait(given.burst / given.hz):
+        if publisher is None:
+            continue
+        for _ in range(given.burst):
             message = f"{number:010d} {monotonic_s():.6f}"
             publisher.put(message.ljust(given.size).encode() if given.size else message.encode())
             number += 1

@@ -169,7 +169,7 @@ class Answers:
     def close(self) -> dict[SourceName, int]:
         """The slot is closed: its workers hear once more how far it came; answers the number each comes to next."""
         heard = {name: self._acks.arrived(name) for name in self._names}
-        self._acks.forget(self._names)
+        self._acks.leave(self._names)
         self._names.clear()
         self._early.clear()
         return heard

@@ -32,8 +32,9 @@ FLIP_WAIT_S: Final = 0.3
 """A flip waits at most so long for a worker that is not ready, or has not heard yet that it is the owner."""
 GONE_GRACE_S: Final = 0.05
 """An old owner whose token went has sent its last; what is still in our queues gets so long."""
-SETTLE_S: Final = 1.0
-"""An old owner that has ended has acknowledged all by then, also when one acknowledgement was dropped on the way."""
+SETTLE_S: Final = 1.5
+"""An old owner that has ended has acknowledged all by then, also when one acknowledgement was dropped on the way, or a
+robot has just stalled that gets the same answers (`zsched.worker_lanes.STALLED_S`)."""
 BUSY_S, CARE_S, IDLE_S = 0.01, 0.2, 0.5
 
 _log = logging.getLogger("zsched.relay")
