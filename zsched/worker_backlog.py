@@ -22,6 +22,7 @@ from typing import Final, Generic, NamedTuple, Protocol, TypeVar
 import zenoh
 
 from zsched.hop_acks import SourceName
+from zsched.worker_debts import Held
 
 MAX_WITHHELD: Final = 256
 """Samples per key of an input without ``keep_last`` that a predecessor's state may want again."""
@@ -62,6 +63,8 @@ class Done(NamedTuple, Generic[SourceT]):
     name: SourceName | None = None
     is_whole: bool = False
     """Its publisher is of class ``reliable``."""
+    held: Held | None = None
+    """What waits until it has been answered."""
 
     def is_over(self, *, is_restored: bool, now: float) -> bool:
         """True when it need not be processed again."""
@@ -86,8 +89,8 @@ class Backlog(Generic[SourceT]):
         again = self._again  # replaced whole by other threads
         return bool(again) and again[0].turn < turn
 
-    def keep(self, done: Done[SourceT]) -> list[SourceName]:
-        """Keep a sample; answers whose samples gave way to it unanswered."""
+    def keep(self, done: Done[SourceT]) -> list[Done[SourceT]]:
+        """Keep a sample; answers those that gave way to it unanswered, and are lost."""
         source = done.source
         line = self._kept.setdefault((id(source), str(done.sample.key_expr)), deque())
         line.append(done)
@@ -99,7 +102,7 @@ class Backlog(Generic[SourceT]):
             self._bytes -= len(oldest.sample.payload)
             is_lost = oldest.quiet_at is None and source.wants(is_whole=oldest.is_whole)
             if is_lost and oldest.name is not None:
-                lost.append(oldest.name)
+                lost.append(oldest)
         return lost
 
     def begin(self) -> None:

@@ -8,6 +8,8 @@ machine that holds it. So an input of class ``reliable`` *owes* the answers of c
 put, and counts as processed when everybody has them for whom it waits (`KeptLane.settled`). What is processed is told
 by one number per source, so whatever comes behind such an input waits with it. A callback that puts nothing owes
 nothing, and so does one whose answers another thread puts.
+
+Where an answer was withheld, since the worker was not the owner, its input waits until it has been processed again.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 from zsched.hop_acks import MAX_SOURCES, Acknowledger, SourceName
@@ -26,12 +28,15 @@ MAX_HELD: Final = 4096
 
 
 @dataclass(slots=True, eq=False)
-class _Held:
-    """An input that is done but for its answers' way; ``owed``: {lane: what lies below this number must be there}."""
+class Held:
+    """Inputs of a source that are held; ``owed``: {lane: what lies below this number must be there}."""
 
-    number: int
-    size: int
-    owed: dict[KeptLane, int]
+    number: int = 0
+    """The newest of them."""
+    size: int = 0
+    owed: dict[KeptLane, int] = field(default_factory=dict)
+    unanswered: int = 0
+    """So many of them are to be processed again: what they were answered was withheld."""
 
 
 class Debts:
@@ -41,43 +46,53 @@ class Debts:
         """``acks`` is told what is processed, in the order of each source."""
         self._acks = acks
         self._lock = threading.Lock()
-        self._held: dict[SourceName, deque[_Held]] = {}
+        self._held: dict[SourceName, deque[Held]] = {}
 
     @property
     def is_waiting(self) -> bool:
         """Whether an input is held back."""
         return bool(self._held)
 
-    def processed(self, name: SourceName, number: int, size: int, owed: Mapping[KeptLane, int]) -> None:
-        """A callback has returned (dispatch thread); ``owed`` are the answers that it has put."""
+    def processed(
+        self, name: SourceName, number: int, size: int, owed: Mapping[KeptLane, int], *, is_unanswered: bool = False
+    ) -> Held | None:
+        """A callback has returned (dispatch thread); ``owed`` are the answers that it has put.
+
+        ``is_unanswered``: an answer was withheld; what is given back is for `answered`.
+        """
         with self._lock:
             line = self._held.get(name)
-            is_held = bool(owed) or line is not None
-            if is_held:
-                self._hold(name, line, _Held(number, size, dict(owed)))
-        if not is_held:
-            self._acks.processed(name, number, size)
+            if owed or is_unanswered or line is not None:
+                held = self._place(name, line, is_own=bool(owed) or is_unanswered)
+                held.number, held.size = number, held.size + size
+                held.unanswered += is_unanswered
+                _owe(held, owed)
+                return held
+        self._acks.processed(name, number, size)
+        return None
 
-    def _hold(self, name: SourceName, line: deque[_Held] | None, held: _Held) -> None:
-        for lane in held.owed:
-            if not lane.wake.is_set():
-                lane.wake.set()  # the keeper may have been at rest since the answers were put
+    def answered(self, held: Held, owed: Mapping[KeptLane, int], now: float) -> None:
+        """An input whose answer was withheld has been processed again, or was given up."""
+        with self._lock:
+            held.unanswered -= 1
+            _owe(held, owed)
+        if not owed:
+            self.settle(now)
+
+    def _place(self, name: SourceName, line: deque[Held] | None, *, is_own: bool) -> Held:
+        """A place of its own at the end of a source's line, or the last one."""
         if line is None:
             if len(self._held) >= MAX_SOURCES:
                 self._held.pop(next(iter(self._held)))  # its next sample tells of them
             line = self._held[name] = deque()
-        if line and (not held.owed or len(line) >= MAX_HELD):
-            last = line[-1]
-            last.number, last.size = held.number, last.size + held.size
-            for lane, number in held.owed.items():
-                last.owed[lane] = max(number, last.owed.get(lane, 0))
-        else:
-            line.append(held)
+        if not line or (is_own and len(line) < MAX_HELD):
+            line.append(Held())
+        return line[-1]
 
     def settle(self, now: float) -> None:
-        """Tell of every input whose answers are where they should be (the keeper's thread, after what it has heard)."""
+        """Tell of every input whose answers are where they should be (any thread; the keeper's when it has heard)."""
         lows: dict[tuple[KeptLane, str], int] = {}
-        done: list[tuple[SourceName, _Held]] = []
+        done: list[tuple[SourceName, Held]] = []
         with self._lock:
             for name, line in tuple(self._held.items()):
                 while line and _is_settled(line[0], name[1], lows, now):
@@ -88,7 +103,16 @@ class Debts:
             self._acks.processed(name, held.number, held.size)
 
 
-def _is_settled(held: _Held, relay: str, lows: dict[tuple[KeptLane, str], int], now: float) -> bool:
+def _owe(held: Held, owed: Mapping[KeptLane, int]) -> None:
+    for lane, number in owed.items():
+        held.owed[lane] = max(number, held.owed.get(lane, 0))
+        if not lane.wake.is_set():
+            lane.wake.set()  # the keeper may have been at rest since the answer was put
+
+
+def _is_settled(held: Held, relay: str, lows: dict[tuple[KeptLane, str], int], now: float) -> bool:
+    if held.unanswered:
+        return False
     for lane, number in held.owed.items():
         low = lows.get((lane, relay))
         if low is None:

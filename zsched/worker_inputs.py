@@ -25,7 +25,7 @@ from zsched.core.serial import number_near, serial_of
 from zsched.guard import guarded
 from zsched.hop_acks import GIVE_UP_S, MAX_SOURCES, Acknowledger, SourceName
 from zsched.worker_backlog import Backlog, Done
-from zsched.worker_debts import Debts
+from zsched.worker_debts import Debts, Held
 from zsched.worker_lanes import KeptLane
 from zsched.worker_samples import Input, Marker, OpenSource, Received, Waiting
 from zsched.worker_troubles import Troubles
@@ -274,19 +274,27 @@ class Dispatcher:
         self._in_hand, self._is_whole = epoch, waiting.is_wanted
         self._dispatch(source, sample, replayed=waiting.replayed)
         self._in_hand = None
+        held = None if again is None else again.held
         if waiting.name is not None:
-            self._note(waiting, waiting.name, sample)
+            held = self._note(waiting, waiting.name, sample)
+        if held is not None and not self._has_withheld:
+            self._debts.answered(held, self._owed, monotonic_s())
+            held = None
         if not self._has_withheld and not was_standby:
             return
         quiet_at = None if self._has_withheld else monotonic_s()
         name = waiting.name if again is None else again.name
-        done = Done(source, sample, self._turn_in_hand, epoch, quiet_at, waiting.replayed, name, waiting.is_whole)
+        done = Done(source, sample, self._turn_in_hand, epoch, quiet_at, waiting.replayed, name, waiting.is_whole, held)
         with self._wake:
             if self._begun != begun:  # it became the owner meanwhile
                 self._backlog.put_back(done)
                 return
-            for lost in self._backlog.keep(done):
-                self._acks.shed(lost)
+            given_up = self._backlog.keep(done)
+        for lost in given_up:
+            if lost.name is not None:
+                self._acks.shed(lost.name)
+            if lost.held is not None:
+                self._debts.answered(lost.held, {}, monotonic_s())
 
     def _dispatch(self, source: Input, sample: zenoh.Sample, *, replayed: bool) -> None:
         key = str(sample.key_expr)
@@ -315,17 +323,23 @@ class Dispatcher:
                 state = self._open[name] = OpenSource(epoch=self._epoch, in_turn=in_turn)
             return state.epoch
 
-    def _note(self, waiting: Waiting, name: SourceName, sample: zenoh.Sample) -> None:
-        """A numbered sample is processed; where it must not be lost, when its answers have reached the robots."""
+    def _note(self, waiting: Waiting, name: SourceName, sample: zenoh.Sample) -> Held | None:
+        """A numbered sample is processed; where it must not be lost, when its answers have reached the robots.
+
+        Answers what waits until it has been processed again, where an answer was withheld.
+        """
         number = waiting.number
         with self._wake:
             state = self._open.get(name)
             if state is not None:
                 state.number = max(state.number, number)
         if waiting.is_wanted and sample.congestion_control == zenoh.CongestionControl.BLOCK:
-            self._debts.processed(name, number, len(sample.payload), self._owed)
-        else:
-            self._acks.processed(name, number, len(sample.payload))
+            is_unanswered = self._has_withheld and waiting.is_whole
+            size = len(sample.payload)
+            held = self._debts.processed(name, number, size, self._owed, is_unanswered=is_unanswered)
+            return held if is_unanswered else None
+        self._acks.processed(name, number, len(sample.payload))
+        return None
 
     def _settle(self) -> None:
         """Let every marker take effect whose samples are processed, then tell which epochs are over."""

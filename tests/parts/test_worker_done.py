@@ -138,3 +138,27 @@ def test_a_frozen_robot_does_not_stall_the_inputs_of_another(scene: Scene) -> No
     assert took[0] > 0.8 * STALLED_S
     within(took[0], STALLED_S + 1.0)
     within(sorted(took)[-2], 0.5 * STALLED_S, "for one that comes later")
+
+
+def test_an_input_whose_answer_was_withheld_is_not_done_before_it_is_answered(relay: Relay, tmp_path: Path) -> None:
+    """A worker may take it before it hears that it is the owner; should it die, nobody would answer it."""
+    with Worker.from_env(environment(relay, tmp_path), handles_signals=False) as worker:
+        out = worker.publisher("{prefix}/{epoch}/robot1/out", reliable=True)
+
+        def echo(received: Received) -> None:
+            out.put(received.payload)
+
+        worker.subscribe("{prefix}/*/in", echo)
+        worker.subscribe("{prefix}/*/beside", lambda _: None, keep_last=None)
+        worker.ready()
+        until(lambda: KEYS.worker("edge1", "t", 3) in relay.tokens, "the ready token")
+        relay.greet(is_whole=True)
+        relay.put(b"x")
+        until(lambda: out.withheld == 1, "it is withheld")
+        beside = relay.session.declare_publisher("edge1/t/robot1/beside")
+        beside.put(b"x", source_info=zenoh.SourceInfo(beside.id, 0))
+        until(lambda: any(ack.eid == beside.id.eid and ack.processed for ack in relay.acks), "one that came later")
+        assert [ack.processed for ack in relay.acks if ack.eid == relay.publisher.id.eid][-1] == 0
+        relay.tell(WorkerRole.ACTIVE, 1)
+        until(lambda: relay.outputs == [("edge1/t/1/robot1/out", b"x")], "the answer")
+        until(lambda: relay.acks[-1].processed == 1 and relay.acks[-1].eid == relay.publisher.id.eid, "it is done")

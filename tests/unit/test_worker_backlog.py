@@ -94,6 +94,6 @@ def test_how_much_is_kept_goes_by_the_class_and_what_gives_way_of_a_reliable_sou
     keep_last: KeepLast, is_whole: bool, kept: list[int], lost: int
 ) -> None:
     backlog, source = Backlog[Input](), Input(on_sample=lambda _: None, keep_last=keep_last)
-    gone = [name for turn in (1, 2) for name in backlog.keep(done(turn, source=source)._replace(is_whole=is_whole))]
+    gone = [one.name for turn in (1, 2) for one in backlog.keep(done(turn, source=source)._replace(is_whole=is_whole))]
     backlog.begin()
     assert (turns(backlog), len(gone)) == (kept, lost)

@@ -197,3 +197,31 @@ def test_an_output_that_nobody_looks_after_any_more_holds_nothing_back() -> None
     lane.is_over = True
     told.debts.settle(0.0)
     assert told.numbers == [0]
+
+
+def test_an_input_whose_answer_was_withheld_waits_until_it_has_been_answered() -> None:
+    told, lane = Told(), a_lane(1)
+    ack(lane, OWN, 0)
+    held = told.debts.processed(NAME, 0, 1, {}, is_unanswered=True)
+    assert held is not None
+    told.debts.processed(NAME, 1, 1, {})
+    told.debts.settle(0.0)
+    assert told.numbers == []
+    told.debts.answered(held, {lane: 1}, 0.0)
+    told.debts.settle(0.0)
+    assert told.numbers == []
+    ack(lane, OWN, 1)
+    told.debts.settle(0.0)
+    assert told.numbers == [1]
+
+
+def test_withheld_ones_that_share_a_place_are_all_waited_for() -> None:
+    told, count = Told(), MAX_HELD + 3
+    helds = [told.debts.processed(NAME, number, 1, {}, is_unanswered=True) for number in range(count)]
+    for held in helds[:-1]:
+        assert held is not None
+        told.debts.answered(held, {}, 0.0)
+    assert told.numbers[-1] == MAX_HELD - 2
+    assert helds[-1] is not None
+    told.debts.answered(helds[-1], {}, 0.0)
+    assert told.numbers[-1] == count - 1

@@ -167,9 +167,16 @@ STREAM_BUGS = (
     _bug(
         "an input is done before its answers have come",
         INPUTS,
-        "len(sample.payload), self._owed)",
-        "len(sample.payload), {})",
+        "processed(name, number, size, self._owed, ",
+        "processed(name, number, size, {}, ",
         ("tests/integration/test_relay_last_answers.py", "tests/parts/test_worker_done.py"),
+    ),
+    _bug(
+        "an input whose answer was withheld is done",
+        INPUTS,
+        "is_unanswered = self._has_withheld and waiting.is_whole",
+        "is_unanswered = False",
+        ("tests/parts/test_worker_done.py",),
     ),
     _bug(
         "an input does not wait for its robot's first word",
