@@ -268,6 +268,9 @@ def test_a_slot_that_closes_says_that_nothing_more_is_wanted(bench: Bench) -> No
     assert bench.is_through(0, 1)
     stream.close_slot(1)
     bench.wait_ack(eid=bench.publisher.id.eid, arrived=2, has_left=True)
+    bench.said.clear()
+    stream.open(1, stream.route, bench.acks, is_from_start=True)  # it comes back to the same owner in the same epoch
+    bench.wait_ack(eid=bench.publisher.id.eid, arrived=2, has_left=False)
 
 
 def test_an_answer_in_hand_while_its_slot_closes_starts_no_count_of_its_own(bench: Bench) -> None:

@@ -94,6 +94,7 @@ class Answers:
         self._starts = dict(heard)
         for name, number in heard.items():
             acks.expect(name, number)
+            acks.skip(name, number)  # it says that we are back
 
     def take(self, name: SourceName, serial: int, sample: Sample, *, is_again: bool = False) -> tuple[Sample, ...]:
         """A sample came; answers those that go on now, in order."""
