@@ -276,7 +276,7 @@ class Agreement:
         effects = Effects()
         if not is_fit(self._fleet, event.accept.acceptance.value, register):
             self.counters["accept_unfit"] += 1
-            answer = register.refuse(event.accept.acceptance.ballot, Refusal.BALLOT)
+            answer = register.refuse(event.accept.acceptance.ballot, Refusal.VALUE)
             return Effects(send=[do.AnswerElection(request=event.request, answer=answer)])
         if self.is_elector and not self.witness.may_vote(now):
             answer = register.refuse(event.accept.acceptance.ballot, Refusal.YOUNG)

@@ -8,6 +8,8 @@ Synod on a register that can be rewritten (Rystsov, arXiv 1802.07000): no leader
 * an elector's promise and acceptance are persisted before the answer leaves (`Step.is_dirty`);
 * a ballot carries exactly one value: a proposer that reads an accepted value it has not learnt re-accepts that one, and
   its own change follows under a higher ballot;
+* where too many electors refuse that value for good (its owner is no candidate any more), a move is applied to it at
+  once, as CASPaxos has it: else a value that a minority has accepted would stop its task for ever;
 * among accepted values "newer" means the higher ballot;
 * accepted is not learnt: an elector with an acceptance that it has not learnt runs an *identity round* (it re-accepts
   what it reads), and so does a proposer that does not know how its round ended; it never applies its change twice;
@@ -121,6 +123,8 @@ class _Round:
     value: Allocation | None = None
     sent: Allocation | None = None
     """Our own new value once an accept for it left: from then on the outcome may be unknown."""
+    unfit: Allocation | None = None
+    """A value of somebody else's that no majority will accept, for too many electors do not take it for a true one."""
     attempt: int = 0
 
 
@@ -361,7 +365,9 @@ class Register:
         if is_identity and newest is None:
             self._finish(step, RoundOutcome.COMMITTED if running.sent is None else RoundOutcome.UNKNOWN, now)
             return
-        if read.revision > self.value.revision or running.change is None or running.sent is not None:
+        if (moved := self._moved_on(running, read)) is not None:
+            running.value = running.sent = moved
+        elif read.revision > self.value.revision or running.change is None or running.sent is not None:
             running.value = read
         elif running.change.base_revision != read.revision:
             self._finish(step, RoundOutcome.CONFLICT, now)
@@ -378,6 +384,13 @@ class Register:
             acceptance=Acceptance(ballot=running.ballot, value=running.value),
             electorate=self._electorate,
         )
+
+    def _moved_on(self, running: _Round, read: Allocation) -> Allocation | None:
+        """Our move applied to a value that was read and cannot be settled; ``None``: it is not that, or no move."""
+        if read != running.unfit or running.sent is not None or not isinstance(running.change, MoveOwner):
+            return None
+        moved = running.change.apply(read)
+        return None if moved == read else moved
 
     def _commit(self, running: _Round, step: Step, now: float) -> None:
         """A majority accepted: the value is chosen."""
@@ -399,6 +412,8 @@ class Register:
             self._counter = max(self._counter, answer.promised.counter)
         running.no[answer.elector] = answer.refusal
         if len(self._electors) - len(running.no) < majority(len(self._electors)):
+            if Refusal.VALUE in running.no.values():
+                running.unfit = running.value
             self._again(running, step, now)
 
     def _again(self, running: _Round, step: Step, now: float) -> None:

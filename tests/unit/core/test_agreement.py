@@ -351,6 +351,8 @@ def test_an_absurd_value_is_not_accepted(absurd: Allocation) -> None:
     effects = agreement.on_accept(ev.AcceptAsked(request=1, asker="robot2", accept=asked), 100.0)
     (said,) = of(effects, do.AnswerElection)
     assert isinstance(said.answer, Refused)
+    assert said.answer.refusal is Refusal.VALUE
+    assert agreement.counters["accept_unfit"] == 1
     assert not effects.is_dirty
 
 

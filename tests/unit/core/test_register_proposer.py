@@ -24,9 +24,9 @@ from support.registers import (
     prepare,
     promise_all,
 )
-from zsched.core.messages import Promise, Refused
+from zsched.core.messages import Accepted, Promise, Refusal, Refused
 from zsched.core.model import Acceptance, Allocation
-from zsched.core.register import Register, Retune, RoundOutcome, Step
+from zsched.core.register import MoveOwner, Register, Retune, RoundOutcome, Step
 
 # --- proposer --------------------------------------------------------------------------------------------------------
 
@@ -264,3 +264,62 @@ def test_an_elector_that_nobody_answers_asks_more_and_more_seldom_what_became_of
         now = max(register.next_deadline(), now + 0.001)
     early, late = (sum(start <= at < start + 10.0 for at in asked_at) for start in (0.0, 70.0))
     assert early > 2 * late > 0, (early, late)
+
+
+# --- a value that too many electors refuse for good ------------------------------------------------------------------
+
+
+def stuck(change: MoveOwner | Retune | None) -> tuple[Register, list[Register], Step]:
+    """r1 alone has accepted a value of owner "gone", which the others refuse; (proposer r2, all, its first accept)."""
+    electors = [make(name) for name in ELECTORS]
+    proposer = electors[1]
+    assert electors[0].on_accept(accept(1, GONE, "r0"), 0.0)[0].is_dirty
+    asked = proposer.settle(0.0) if change is None else proposer.propose(change, 0.0)
+    return proposer, electors, promise_all(proposer, asked, electors)
+
+
+def refuse_value(proposer: Register, electors: list[Register], asked: Step) -> Step:
+    """The elector that has it accepts it once more, the other two say that it can be no true one."""
+    assert asked.accept is not None
+    carried = asked.accept.acceptance
+    answers: list[Accepted | Refused] = [electors[0].on_accept(asked.accept, 0.0)[1]]
+    answers += [one.refuse(carried.ballot, Refusal.VALUE) for one in electors[1:]]
+    return last(proposer.on_answer(answer, 0.0) for answer in answers)
+
+
+GONE = allocation(1, "gone")
+SECOND = replace(FIRST, owner="e2")
+
+
+def test_a_move_is_applied_at_once_to_a_value_that_no_majority_takes() -> None:
+    proposer, electors, asked = stuck(SECOND)
+    assert asked.accept is not None
+    assert asked.accept.acceptance.value == GONE, "it may have been chosen: first it is tried"
+    assert refuse_value(proposer, electors, asked) == Step()
+    again = proposer.tick(proposer.next_deadline())
+    step = commit(proposer, again, electors)
+    assert step.finished == (SECOND, RoundOutcome.COMMITTED)
+    assert step.learnt == allocation(2, "e2")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [None, Retune(base_revision=0, tuning=replace(TUNING, bonus=0.3)), replace(FIRST, owner="gone")],
+    ids=["identity round", "retune", "move to it"],
+)
+def test_nothing_but_a_move_away_goes_on_from_it(change: MoveOwner | Retune | None) -> None:
+    proposer, electors, asked = stuck(change)
+    refuse_value(proposer, electors, asked)
+    asked = promise_all(proposer, proposer.tick(proposer.next_deadline()), electors)
+    assert asked.accept is not None
+    assert asked.accept.acceptance.value == GONE
+
+
+def test_a_value_that_is_refused_for_a_higher_ballot_is_tried_again() -> None:
+    proposer, electors, asked = stuck(SECOND)
+    for one in electors:
+        one.on_prepare(prepare(9))
+    assert accept_all(proposer, asked, electors) == Step()
+    asked = promise_all(proposer, proposer.tick(proposer.next_deadline()), electors)
+    assert asked.accept is not None
+    assert asked.accept.acceptance.value == GONE
