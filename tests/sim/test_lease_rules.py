@@ -186,6 +186,23 @@ def test_a_stranger_s_echo_counts_nothing_and_an_elector_s_only_once() -> None:
     assert owner.lease_until() == -math.inf
 
 
+def test_an_elector_that_echoes_what_is_not_sent_yet_counts_nothing_up_to_that() -> None:
+    """Found by the simulator (seed 8004705): beats in the owner's name, of numbers to come, made electors hold less."""
+    owner = holder()
+    owner.on_sent(5, 10.0)
+    for elector in ELECTORS[:2]:
+        owner.on_echo(elector, grant(7))
+    for number, at in ((6, 10.1), (7, 10.2)):
+        owner.on_sent(number, at)
+        for elector in ELECTORS[:2]:
+            owner.on_echo(elector, grant(7))
+    assert owner.lease_until() == -math.inf
+    owner.on_sent(8, 10.3)
+    for elector in ELECTORS[:2]:
+        owner.on_echo(elector, grant(8))
+    assert owner.lease_until() == 10.3 + LEASE_S
+
+
 def test_what_was_given_back_holds_no_lease_any_more() -> None:
     owner = holder()
     owner.on_sent(5, 10.0)

@@ -7,7 +7,8 @@ L is the lease, rho the bound on how far two clocks' rates differ. Nobody compar
 * The owner's beats are numbered. An elector echoes a number, per task, only to the owner and epoch of the value that it
   last *accepted*; the echo is the grant.
 * The owner is active only while a majority has echoed a number that it sent *after learning this epoch*; the lease ends
-  L after the *sending* of the largest number that a majority has echoed or exceeded.
+  L after the *sending* of the largest number that a majority has echoed or exceeded. An elector that echoes what was
+  not sent yet counts from an earlier moment than the owner would: up to that number its echoes count nothing.
 * Only a task that is *leased* for everybody (`Allocation.leased`, `zsched.core.sealing`) is granted.
 * An elector never grants to two owners, or two lives of one, at once: to another only after the hold, or a release.
 * An elector that granted refuses an accept for another owner until L(1+rho)/(1-rho) after its last grant on its own
@@ -204,6 +205,8 @@ class Holder:
     """When a release of nothing that was used last had a beat of its own."""
     _sent: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=SENT_KEPT))
     _echoed: dict[NodeId, int] = field(default_factory=dict)
+    _ahead: dict[NodeId, int] = field(default_factory=dict)
+    """{elector: a number that it echoed before we sent it}: up to that one it counts from somebody else's beats."""
 
     def on_sent(self, number: int, now: float) -> None:
         """A beat leaves."""
@@ -215,7 +218,9 @@ class Holder:
             return
         if (grant.incarnation, grant.epoch) != (self.incarnation, self.epoch):
             return
-        if grant.number >= self.first_number and grant.number > self.released:
+        if not self._sent or grant.number > self._sent[-1][0]:  # somebody else beats in our name
+            self._ahead[elector] = max(self._ahead.get(elector, -1), grant.number)
+        elif grant.number >= self.first_number and grant.number > max(self.released, self._ahead.get(elector, -1)):
             self._echoed[elector] = max(self._echoed.get(elector, -1), grant.number)
 
     def lease_until(self) -> float:
