@@ -127,7 +127,7 @@ class Stage:
         self.calm()
         at = sim.now
         if self.scene.is_memory_false:
-            sim.run(AFTERMATH_S)  # whoever has lost some of its state is told so
+            sim.run(sim.behind_s + AFTERMATH_S)  # a node that has lost some of its state is told so
         if not self.can_agree():
             sim.run(LOST_S)  # nothing may be agreed meanwhile that a majority does not remember
             self._start_generation()

@@ -32,14 +32,15 @@ class Held:
     """A stall: nothing arrives before."""
     every_s: float = 0.0
     """Bursts: what was sent arrives together, so often (0: as it comes)."""
-    _last: float = -math.inf
+    last: float = -math.inf
+    """When the newest message that it has taken arrives."""
 
     def arrival(self, now: float, delay_s: float) -> float:
         """When a message arrives that leaves now and would take ``delay_s``."""
-        at = max(now + delay_s, self.until, self._last)
-        if self.every_s > 0.0 and at > self._last:
+        at = max(now + delay_s, self.until, self.last)
+        if self.every_s > 0.0 and at > self.last:
             at = max(math.ceil(at / self.every_s) * self.every_s, at)
-        self._last = at
+        self.last = at
         return at
 
 
@@ -65,8 +66,13 @@ class Links(Loops):
         for one, other in itertools.permutations(sides, 2):
             self.cuts.update(itertools.product(one, other))
 
+    @property
+    def behind_s(self) -> float:
+        """How long it takes until links that were held have delivered what they had taken by now."""
+        return max([0.0, *(link.last - self.now for link in self.held.values())])
+
     def heal(self) -> None:
-        """Everything passes again, at once."""
+        """Everything passes again, behind what links hold back already."""
         self.cuts.clear()
         self.data_cuts.clear()
         for link in self.held.values():
