@@ -70,6 +70,14 @@ def _bug(name: str, module: str, old: str, new: str, tests: tuple[str, ...] = ()
 REGISTER_BUGS = (
     _bug("quorum off by one", SCORING, "return count // 2 + 1", "return max(count // 2, 1)", _REGISTER),
     _bug(
+        "a value that nobody takes stops its task",
+        REGISTER,
+        "if read != running.unfit or",
+        "if read.revision >= 0 or",
+        _REGISTER,
+        seed=8003417,
+    ),
+    _bug(
         "promise not persisted", REGISTER, "return Step(is_dirty=True), promise", "return Step(), promise", _SCHEDULES
     ),
     _bug(
@@ -229,6 +237,14 @@ REGISTER_BUGS = (
 )
 
 LEASE_BUGS = (
+    _bug(
+        "an echo of what was not sent yet counts later",
+        LEASE,
+        "self._ahead[elector] = max(self._ahead.get(elector, -1), grant.number)",
+        "self._ahead[elector] = -1",
+        _LEASE,
+        seed=8004705,
+    ),
     Bug(
         name="echo to an owner that was not accepted",
         module=LEASE,
@@ -241,8 +257,8 @@ LEASE_BUGS = (
     _bug(
         "echo counts before the epoch was learnt",
         LEASE,
-        "if grant.number >= self.first_number and grant.number > self.released:",
-        "if grant.number > self.released:",
+        "elif grant.number >= self.first_number and grant.number > max(",
+        "elif grant.number > max(",
         _LEASE,
     ),
     _bug(
