@@ -62,6 +62,13 @@ class Aggregate(StrEnum):
     MEDIAN = "median"
 
 
+class ScoreForm(StrEnum):
+    """How a candidate's CPU and memory become a utility (`zsched.core.utility`)."""
+
+    PAPER = "paper"  # Eq. 1, 2 and 4: what is left over, as shares of the machine, and their weighted sum
+    DIMINISHING = "diminishing"  # what there is for the task against what it needs, and their weighted geometric mean
+
+
 # --- what an operator sets -------------------------------------------------------------------------------------------
 
 
@@ -94,6 +101,7 @@ class Tuning:
     time_to_trigger_s: float = 2.0
     cool_down_s: float = 10.0
     aggregate: Aggregate = Aggregate.MEAN
+    score: ScoreForm = ScoreForm.PAPER
 
     def __post_init__(self) -> None:
         check_range("bonus", self.bonus, 0.0, 1.0)

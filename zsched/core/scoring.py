@@ -22,12 +22,13 @@ from zsched.core.model import (
     NodeId,
     PeerState,
     Profile,
+    ScoreForm,
     TaskId,
     Utility,
     UtilityVector,
     WorkerState,
 )
-from zsched.core.utility import cpu_utility, memory_utility, predicted_use, total_utility
+from zsched.core.utility import cpu_utility, memory_utility, predicted_use, room_utility, total_utility
 
 METRICS = ("cpu", "memory", "network")
 
@@ -95,7 +96,7 @@ def score(
     what it has and gets nothing new. What the other tasks of ``bookings`` will use there, and do not show yet, counts
     as in use. ``penalties`` are what this robot remembers; they go along, and `compare` joins them.
     """
-    demand = gateway.demand(spec)
+    demand, form = gateway.demand(spec), allocation.tuning.score
     terms: dict[NodeId, _Terms] = {}
     unreachable: list[NodeId] = []
     refused: list[tuple[NodeId, str]] = []
@@ -127,12 +128,17 @@ def score(
         if link is not None and not link.is_reached:
             unreachable.append(candidate)
             continue
-        terms[candidate] = _measure(spec, profile, demand, unseen, link)
+        terms[candidate] = _measure(spec, profile, demand, unseen, link, form)
     measured = frozenset(name for name in METRICS if any(getattr(t, name) is not None for t in terms.values()))
     utilities = [Utility(candidate=name, value=0.0, reachable=False) for name in unreachable]
     for candidate, term in terms.items():
         value = total_utility(
-            allocation.tuning.weights, cpu=term.cpu, memory=term.memory, network=term.network, measured=measured
+            allocation.tuning.weights,
+            cpu=term.cpu,
+            memory=term.memory,
+            network=term.network,
+            measured=measured,
+            form=form,
         )
         if value is None:
             refused.append((candidate, "a weighted metric is not measured"))
@@ -217,16 +223,29 @@ def _memory_use(profile: Profile, spec: TaskSpec, demand: Demand, unseen: Demand
     return predicted_use(profile.memory_used_mb + unseen.memory_mb, own, demand.memory_mb)
 
 
-def _measure(spec: TaskSpec, profile: Profile, demand: Demand, unseen: Demand, link: PairLink | None) -> _Terms:
+def _measure(
+    spec: TaskSpec, profile: Profile, demand: Demand, unseen: Demand, link: PairLink | None, form: ScoreForm
+) -> _Terms:
     load = profile.worker(spec.name)
+    is_paper = form is ScoreForm.PAPER
     cpu = memory = None
     if profile.cpu_used_cores is not None:
         own = (load.cpu_cores or 0.0) if load is not None else 0.0
-        used_cores = profile.cpu_used_cores + unseen.cpu_cores
-        cpu = cpu_utility(profile.cpu_cores, predicted_use(used_cores, own, demand.cpu_cores))
-    used = _memory_use(profile, spec, demand, unseen)
-    if used is not None:
-        memory = memory_utility(profile.memory_mb, demand.memory_mb, used - demand.memory_mb)
+        used = predicted_use(profile.cpu_used_cores + unseen.cpu_cores, own, demand.cpu_cores)
+        free = profile.cpu_cores - used + demand.cpu_cores
+        cpu = (
+            cpu_utility(profile.cpu_cores, used)
+            if is_paper
+            else room_utility(free, demand.cpu_cores, profile.cpu_cores)
+        )
+    used_mb = _memory_use(profile, spec, demand, unseen)
+    if used_mb is not None:
+        others_mb = used_mb - demand.memory_mb
+        memory = (
+            memory_utility(profile.memory_mb, demand.memory_mb, others_mb)
+            if is_paper
+            else room_utility(profile.memory_mb - others_mb, demand.memory_mb, profile.memory_mb)
+        )
     return _Terms(cpu, memory, None if link is None else link.utility)
 
 

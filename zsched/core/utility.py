@@ -1,14 +1,18 @@
-"""The paper's equations 1 to 4, by the readings of docs/decisions/0001.
+"""The paper's equations 1 to 4, by the readings of docs/decisions/0001, and a form of them without a blind spot.
 
 Knows: arithmetic. Does not know: nodes, tasks, time.
 
 The equations as printed contradict the text in places (Eq. 1 with beta "available" would pick the busiest node); here
 beta and mu are what is *in use*, predicted as if the candidate had the task, and every term is clamped to [0, 1].
+
+That clamp makes all machines alike that have less left than the task needs, idle or starved, and in a sum spare memory
+hides a starved CPU. `ScoreForm.DIMINISHING` compares what is there for the task with what it needs, which is never 0
+before nothing is left, and multiplies. The offline study compares both; a fleet file cannot choose it yet.
 """
 
 from __future__ import annotations
 
-from zsched.core.model import Weights
+from zsched.core.model import ScoreForm, Weights
 
 
 def clamp(value: float) -> float:
@@ -63,6 +67,27 @@ def memory_utility(delta: float, theta: float, mu: float) -> float:
     return clamp((delta - theta - mu) / delta)
 
 
+ROOM_FOR = 2.0
+"""A machine is worth 1/2 when it has so many times what the task needs."""
+LEAST_NEED_RATIO = 0.05
+"""A task counts as needing at least this share of a machine: also of a small one more room is better."""
+
+
+def room_utility(free: float, demand: float, capacity: float) -> float:
+    """``free / (free + 2 demand)``: what there is for the task, against what it needs; diminishing, never clamped.
+
+    Args:
+        free: not in use by others, in cores or MiB; below 0 counts as 0.
+        demand: of the task, in the same unit, >= 0.
+        capacity: of the machine, in the same unit, > 0.
+
+    >>> room_utility(free=4.0, demand=2.0, capacity=4.0), room_utility(free=0.4, demand=4.0, capacity=4.0)
+    (0.5, 0.047619047619047616)
+    """
+    room = max(free, 0.0)
+    return room / (room + ROOM_FOR * max(demand, LEAST_NEED_RATIO * capacity))
+
+
 KNEE_UTILITY = 0.8
 """What a link is worth at its knee."""
 
@@ -92,9 +117,18 @@ def network_utility(signal_dbm: float, nu_dbm: float, rho_dbm: float, knee_dbm: 
 
 
 def total_utility(
-    weights: Weights, *, cpu: float | None, memory: float | None, network: float | None, measured: frozenset[str]
+    weights: Weights,
+    *,
+    cpu: float | None,
+    memory: float | None,
+    network: float | None,
+    measured: frozenset[str],
+    form: ScoreForm = ScoreForm.PAPER,
 ) -> float | None:
     """Eq. 4, the weighted sum; weights of metrics that nobody measured are dropped and the rest renormalised.
+
+    `ScoreForm.DIMINISHING`: the weighted geometric mean instead. A weight says by how many percent the utility falls
+    when that term falls by one percent, whatever the others are.
 
     Args:
         weights: omega, sum 1.
@@ -102,6 +136,7 @@ def total_utility(
         memory: sigma, likewise.
         network: kappa, likewise.
         measured: which of ``cpu``, ``memory``, ``network`` any candidate has.
+        form: sum or geometric mean.
 
     Returns:
         The utility in [0, 1]; ``None`` when a weighted metric that others have is missing here, or nothing is left.
@@ -110,7 +145,8 @@ def total_utility(
     >>> total_utility(w, cpu=0.8, memory=0.4, network=None, measured=frozenset({"cpu", "memory"}))
     0.6666666666666666
     """
-    share = total = 0.0
+    is_sum = form is ScoreForm.PAPER
+    share, total = 0.0, 0.0 if is_sum else 1.0
     for name, weight, term in (
         ("cpu", weights.cpu, cpu),
         ("memory", weights.memory, memory),
@@ -121,5 +157,7 @@ def total_utility(
         if term is None:
             return None
         share += weight
-        total += weight * term
-    return clamp(total / share) if share > 0.0 else None
+        total = total + weight * term if is_sum else total * term**weight
+    if share <= 0.0:
+        return None
+    return clamp(total / share) if is_sum else clamp(total ** (1.0 / share))

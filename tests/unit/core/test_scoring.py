@@ -14,6 +14,7 @@ from zsched.core.model import (
     NodeKind,
     PeerState,
     Profile,
+    ScoreForm,
     Tuning,
     Utility,
     UtilityVector,
@@ -97,6 +98,23 @@ def values(vector: UtilityVector) -> dict[str, float]:
 
 ROBOT = profile("robot1", links=radio(-50.0), state=None)
 EDGES = (profile("edge1", cpu=3.0), profile("edge2", cpu=2.0), profile("edge3", cpu=1.0))
+
+
+# --- the score's form ------------------------------------------------------------------------------------------------
+
+
+def test_machines_that_lack_what_the_task_needs_are_told_apart_by_the_diminishing_form_only() -> None:
+    """One is idle, one is starved, both have less left than a task of a whole machine needs."""
+    spec = replace(SPEC, candidates=("edge1", "edge2"), demand=Demand(cpu_cores=4.0, memory_mb=500.0))
+    edges = (profile("edge1", cpu=3.9), profile("edge2", cpu=0.1))
+    half = Weights(cpu=0.5, memory=0.5, network=0.0)
+    found = {}
+    for form in ScoreForm:
+        agreed = replace(allocation(half, owner=None), tuning=Tuning(weights=half, score=form))
+        found[form] = values(scored(ROBOT, *edges, spec=spec, agreed=agreed))
+
+    assert found[ScoreForm.PAPER]["edge1"] == found[ScoreForm.PAPER]["edge2"]
+    assert found[ScoreForm.DIMINISHING]["edge1"] < found[ScoreForm.DIMINISHING]["edge2"] / 4
 
 
 # --- who is scored -------------------------------------------------------------------------------------------------
