@@ -1,6 +1,6 @@
 """VOTE, what is believed: whether a peer's word is enough for a value to be learnt, or to be accepted.
 
-Knows: candidates, electors, how far a counter can honestly be ahead. Does not know: who asked what, what follows when
+Knows: nodes, electors, how far a counter can honestly be ahead. Does not know: who asked what, what follows when
 it is not enough (`zsched.core.agreement` asks a majority).
 
 Nobody is authenticated here. Whoever can put a frame on the network can say anything once; so what is said unasked only
@@ -23,9 +23,10 @@ MAX_AHEAD = 2**20
 
 
 def is_fit(fleet: Fleet, value: Allocation, register: Register, start: int = 0) -> bool:
-    """Whether a value that is new here could be one: it names a candidate, and is not absurdly far ahead.
+    """Whether a value that is new here could be one: its owner is a node of the fleet, and it is not far ahead.
 
-    ``start`` is the first revision of the generation that it is from.
+    The owner need not be a candidate: it may have been one by the file of before, and a node that could not learn that
+    could not take part in moving the task away from it. ``start`` is the first revision of the value's generation.
     """
     state = register.state
     accepted = None if state.accepted is None else state.accepted.value
@@ -33,8 +34,8 @@ def is_fit(fleet: Fleet, value: Allocation, register: Register, start: int = 0) 
     if value in known:
         return True
     newest = max([register.value.revision, start, *(one.revision for one in known)])
-    is_candidate = value.owner is None or value.owner in fleet.task(value.task).candidates
-    return is_candidate and value.epoch <= value.revision <= newest + MAX_AHEAD
+    is_known = value.owner is None or any(node.name == value.owner for node in fleet.nodes)
+    return is_known and value.epoch <= value.revision <= newest + MAX_AHEAD
 
 
 def is_proven(fleet: Fleet, learnt: Learnt, value: Allocation, register: Register, *, has_generation: bool) -> bool:

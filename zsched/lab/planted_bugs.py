@@ -37,6 +37,7 @@ class Bug:
 SEQUENCE, IDENTITY = "zsched.core.sequence", "zsched.core.identity"
 REGISTER, LEASE, TENURE = "zsched.core.register", "zsched.core.lease", "zsched.core.tenure"
 SEALING, WITNESS = "zsched.core.sealing", "zsched.core.witness"
+BELIEF = "zsched.core.belief"
 AGREEMENT, MEMBERSHIP, NODE = "zsched.core.agreement", "zsched.core.membership", "zsched.core.node"
 ROUNDS, VOTE, VOTING = "zsched.core.rounds", "zsched.core.vote", "zsched.core.voting"
 SCHEDULER, SCORING, EXECUTOR = "zsched.core.scheduler", "zsched.core.scoring", "zsched.core.executor"
@@ -75,7 +76,14 @@ REGISTER_BUGS = (
         "if read != running.unfit or",
         "if read.revision >= 0 or",
         _REGISTER,
-        seed=8003417,
+    ),
+    _bug(
+        "an owner that is no candidate any more cannot be learnt",
+        BELIEF,
+        "any(node.name == value.owner for node in fleet.nodes)",
+        "value.owner in fleet.task(value.task).candidates",
+        _AGREEMENT,
+        seed=8008456,
     ),
     _bug(
         "promise not persisted", REGISTER, "return Step(is_dirty=True), promise", "return Step(), promise", _SCHEDULES

@@ -312,6 +312,24 @@ def test_an_absurd_answer_is_not_learnt_and_a_majority_is_asked_now_and_then(abs
     assert agreement.counters["learnt_unproven"] == 2
 
 
+def test_an_owner_that_is_no_candidate_any_more_can_be_learnt_and_accepted() -> None:
+    """Found by the simulator (seed 8008456): a node that could not learn it had no voice in moving the task away."""
+    before = value(3, "robot3")
+    agreement = make(RegisterState(task="merge", learnt=value(2)))
+    effects = agreement.on_learnt(answer(Learnt(node="robot2", values=(before,))), 200.0)
+    assert [one for one, _ in effects.learnt] == [before]
+    elector = make(RegisterState(task="merge", learnt=value(2)))
+    asked = Accept(
+        task="merge",
+        acceptance=Acceptance(ballot=Ballot(counter=5, node="robot2", incarnation=1), value=before),
+        electorate="e",
+    )
+    elector.on_accept(ev.AcceptAsked(request=1, asker="robot2", accept=asked), 200.0)
+    accepted = elector.registers["merge"].state.accepted
+    assert accepted is not None
+    assert accepted.value == before
+
+
 def test_what_no_single_answer_proves_is_learnt_from_a_majority() -> None:
     """A candidate left the fleet file here and owns the task: the electors' own word is enough."""
     held = Acceptance(ballot=Ballot(counter=5, node="robot2", incarnation=1), value=value(4, "edge9"))
