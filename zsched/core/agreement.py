@@ -564,7 +564,7 @@ def _newest(register: Register) -> Allocation | None:
 def _lost_text(why: str) -> str:
     return (
         f"{why}: it was brought back from a backup, or its disk has lost what it said was written; "
-        "no elector until a new generation (`zsched init --generation G` on every node)"
+        "no elector until a new generation (stop every daemon, then `zsched init --generation G` on every node)"
     )
 
 
