@@ -52,7 +52,9 @@ class Difference:
     theirs: float = 0.0
 
     def text(self) -> str:
-        """For people: ``+12 % [+8, +17]``."""
+        """For people: ``+12 % [+8, +17]``; of one run, which has no interval, ``+12 % (1 run)``."""
+        if not math.isfinite(self.low):
+            return f"{self.value:+.0%} ({self.runs} run)".replace("%", " %")
         return f"{self.value:+.0%} [{self.low:+.0%}, {self.high:+.0%}]".replace("%", " %")
 
 

@@ -62,6 +62,15 @@ def a_run(scheme: str, run: int, level: str = "one", **changed: Any) -> dict[str
     }
 
 
+def test_one_run_has_no_interval_to_tell() -> None:
+    found = difference({1: 1.12}, {1: 1.0})
+    assert found is not None
+    assert found.text() == "+12 % (1 run)"
+    both = difference({1: 1.12, 2: 1.10}, {1: 1.0, 2: 1.0})
+    assert both is not None
+    assert both.text().startswith("+11 % [")
+
+
 def test_the_difference_is_paired_and_its_interval_holds_the_mean() -> None:
     theirs = {0: 1.0, 1: 2.0, 2: 3.0, 3: 4.0, 9: 100.0}
     mine = {run: value * 1.3 for run, value in theirs.items() if run != 9}
