@@ -1,5 +1,7 @@
 """``python -m zsched.lab.decisions``: play thousands of hours to every rule, and say which decided best.
 
+With ``service`` behind it, rules are judged by what the task gets (`zsched.lab.decisions.service.command`).
+
 Knows: the command line. Does not know: what is played (`study`), how it is shown (`report`, `figures`).
 """
 
@@ -11,6 +13,7 @@ import time
 from pathlib import Path
 
 from zsched.lab.decisions import drives, figures, report, study
+from zsched.lab.decisions.service import command
 
 PARTS = ("compare", "sweep", "options", "cool-down", "smoothing")
 SHOWN = ("zsched", "zsched, timer", "the weaker way", "dyna_net", "argmax", "dyna_net_penalty")
@@ -82,6 +85,9 @@ def show(out: Path, folder: Path | None) -> None:
 
 def main() -> None:
     """Play what is missing, then show everything."""
+    if sys.argv[1:2] == ["service"]:
+        command.main(sys.argv[2:])
+        return
     given = parse()
     given.out.mkdir(parents=True, exist_ok=True)
     if given.hours > 0:

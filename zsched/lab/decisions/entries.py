@@ -32,7 +32,7 @@ from zsched.lab.decisions.rules import (
     first_match,
     fixed,
 )
-from zsched.lab.decisions.view import Look, View
+from zsched.lab.decisions.view import Look, Sight
 from zsched.lab.decisions.world import EVEN, RADIO_ONLY, World
 
 RAW: Final = Look(smoothing_s=0.5)
@@ -53,7 +53,7 @@ def core(
     patience: float | None = None,
     pays_off_in_s: float | None = None,
     move_cost_s: float = 0.0,
-) -> Callable[[View], Rule]:
+) -> Callable[[Sight], Rule]:
     """The production's decision; what is ``None`` is what a fleet file gets that does not say it (docs/decisions/0024).
 
     Neither a patience nor a time-to-trigger: the default patience. Signals are `foreseeing`'s affair.
@@ -82,7 +82,7 @@ def ours(world: World) -> tuple[Entry, ...]:
     )
 
 
-def timed(world: World, **settings: Any) -> Callable[[View], Rule]:
+def timed(world: World, **settings: Any) -> Callable[[Sight], Rule]:
     """The production's decision with a time-to-trigger, as it came until docs/decisions/0021; see `core`."""
     return core(world, **{"time_to_trigger_s": TIMER_S, **settings})
 
@@ -107,11 +107,11 @@ def schemes(world: World, seed: int) -> tuple[Entry, ...]:
     )
 
 
-def _pick(cost: float) -> Callable[[View], Rule]:
+def _pick(cost: float) -> Callable[[Sight], Rule]:
     return lambda view: PickRule(view, cost=cost)
 
 
-def _blind(choose: Callable[[tuple[str, ...]], str]) -> Callable[[View], Rule]:
+def _blind(choose: Callable[[tuple[str, ...]], str]) -> Callable[[Sight], Rule]:
     return lambda view: BlindRule(view, choose)
 
 

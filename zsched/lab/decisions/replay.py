@@ -9,10 +9,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from random import Random
 
-from zsched.core.fleet import LinkLimits
+from zsched.core.fleet import Fleet, LinkLimits
 from zsched.core.model import Weights
 from zsched.lab.decisions.rules import Move, Rule
-from zsched.lab.decisions.view import START_S, Feed, Look, View
+from zsched.lab.decisions.view import START_S, Feed, Look, Sight, View
 from zsched.lab.decisions.world import DT_S, World, with_task
 
 TICKS = 2
@@ -24,7 +24,7 @@ class Entry:
     """One rule in a comparison: how it looks at the fleet, and how it is made for a view."""
 
     name: str
-    make: Callable[[View], Rule]
+    make: Callable[[Sight], Rule]
     look: Look = Look()
     weights: Weights | None = None
     """``None``: the task's own."""
@@ -41,24 +41,24 @@ def replay(world: World, entries: tuple[Entry, ...], seed: int = 0) -> Mapping[s
         if key not in views:
             views[key] = View(with_task(world, weights=entry.weights, limits=entry.limits), feeds[entry.look])
         rules[entry.name] = entry.make(views[key])
-    rounds = _rounds(world, seed)
+    due = rounds(world.fleet, world.steps, seed)
     for tick in range(world.steps * TICKS):
         if tick % TICKS == 0:
             for feed in feeds.values():
                 feed.step(tick // TICKS)
         at_s = tick * DT_S / TICKS
-        now, seats = START_S + at_s, rounds[tick]
+        now, seats = START_S + at_s, due[tick]
         for rule in rules.values():
             rule.round(seats, at_s, now)
     return {name: rule.moves for name, rule in rules.items()}
 
 
-def _rounds(world: World, seed: int) -> list[tuple[int, ...]]:
+def rounds(fleet: Fleet, steps: int, seed: int) -> list[tuple[int, ...]]:
     """Which robots have a round at each tick: every ``decide_s``, jittered as `Rounds` does, not synchronised."""
-    rng, period_s = Random(seed), world.fleet.timing.decide_s
-    ticks = world.steps * TICKS
+    rng, period_s = Random(seed), fleet.timing.decide_s
+    ticks = steps * TICKS
     out: list[list[int]] = [[] for _ in range(ticks)]
-    for seat in range(len(world.fleet.voters)):
+    for seat in range(len(fleet.voters)):
         at_s = rng.random() * period_s
         while (tick := round(at_s * TICKS / DT_S)) < ticks:
             out[tick].append(seat)

@@ -22,7 +22,7 @@ from zsched.core.rounds import TIMER_MARGIN_S
 from zsched.core.scheduler import Judge, Judgement, Outcome, escape_reason
 from zsched.core.scoring import Standing, pick
 from zsched.core.vote import VoteOutcome, tally
-from zsched.lab.decisions.view import View
+from zsched.lab.decisions.view import Sight
 
 COMMIT_S = 0.03
 """From the vote to the commit; measured on loopback (`benchmarks.commit`)."""
@@ -52,7 +52,7 @@ class Rule(Protocol):
 class CoreRule:
     """The production's decision under some tuning."""
 
-    view: View
+    view: Sight
     tuning: Tuning
     patience: float | None = None
     pays_off_in_s: float | None = None
@@ -152,7 +152,7 @@ class PickRule:
     ``cost`` above 0 is a bonus for the owner, below 0 the literal penalty, 0 is plain argmax. No memory, no timers.
     """
 
-    view: View
+    view: Sight
     cost: float = 0.0
     period_s: float = 1.0
     moves: list[Move] = field(default_factory=list)
@@ -176,7 +176,7 @@ class PickRule:
 class BlindRule:
     """Fixed, first match, random: a rule that looks at who can have the task, and not at how good it would be."""
 
-    view: View
+    view: Sight
     choose: Callable[[tuple[NodeId, ...]], NodeId]
     period_s: float = math.inf
     moves: list[Move] = field(default_factory=list)

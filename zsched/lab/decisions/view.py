@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Final
+from typing import Final, Protocol
 
-from zsched.core.fleet import Fleet
+from zsched.core.fleet import Fleet, TaskSpec
 from zsched.core.gateway import Gateway
 from zsched.core.model import (
     Allocation,
@@ -39,6 +39,25 @@ class Look:
     """How a rule wants to see: seconds of smoothing at the source."""
 
     smoothing_s: float = WIFI.smoothing_s
+
+
+class Sight(Protocol):
+    """What a rule is given to see with."""
+
+    @property
+    def fleet(self) -> Fleet:
+        """The fleet that it decides in."""
+
+    @property
+    def gateway(self) -> Gateway:
+        """What the robots have heard."""
+
+    @property
+    def spec(self) -> TaskSpec:
+        """The task that it decides about."""
+
+    def standing(self, now: float) -> Standing:
+        """The joint view of a gather now."""
 
 
 class Feed:

@@ -1,0 +1,182 @@
+"""Rules in the closed loop: the core's own scores decide, and the tables and the picture tell what came of it."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from zsched.core import scoring
+from zsched.core.fleet import TaskSpec
+from zsched.core.model import Utility, UtilityVector, Weights
+from zsched.lab.decisions import __main__ as package
+from zsched.lab.decisions import entries
+from zsched.lab.decisions.rules import CoreRule
+from zsched.lab.decisions.service import cast, command, picture, study, tables
+from zsched.lab.decisions.service import replay as closed
+from zsched.lab.decisions.service.history import MEASURED, History, build
+from zsched.lab.decisions.service.replay import Player, Scene, TaskView, replay
+from zsched.lab.decisions.view import START_S
+from zsched.lab.decisions.world import DT_S, loaded_world
+
+HOURS = 0.03
+ZSCHED = cast.players()[0]
+
+
+def scene(history: History, seconds: float, owner: int | None, player: Player = ZSCHED) -> Scene:
+    made = Scene(history, player)
+    if owner is not None:
+        for spec in made.fleet.tasks:
+            made.place(spec.name, spec.candidates[owner])
+    for index in range(round(seconds / DT_S)):
+        made.step(index)
+    return made
+
+
+def test_profiles_show_the_machine_as_it_is_shared_by_then() -> None:
+    calm = replace(MEASURED, cpu=0.0, memory=0.0)
+    history = build(seed=3, hours=HOURS, load_s=0.0, scatter=calm)
+    name = history.fleet.tasks[0].candidates[0]
+    without, beside = (scene(history, 8.0, owner).gateway.fresh(name, START_S + 8.0) for owner in (None, 0))
+    assert without is not None
+    assert beside is not None
+    assert without.cpu_used_cores is not None
+    load = beside.worker("task1")
+    assert load is not None
+    assert load.cpu_cores == pytest.approx(history.on[0][1].cores[0, 0], rel=0.01)
+    together = min(without.cpu_used_cores + history.works[0].demand(history.machines[0]), history.machines[0].cores)
+    assert beside.cpu_used_cores == pytest.approx(together, rel=0.01)
+
+
+def test_the_demand_that_is_learnt_is_that_of_the_owner_s_cores() -> None:
+    history = next(
+        one
+        for one in (build(seed=seed, hours=HOURS, load_s=0.0) for seed in range(1, 60))
+        if one.machines[0].speed < 0.7 and one.works[0].demand(one.machines[0]) < 0.4 * one.machines[0].cores
+    )
+    made = scene(history, 8.0, 0)
+    made.learn(START_S + 8.0)
+    spec = made.fleet.tasks[0]
+    assert made.gateway.demand(spec).cpu_cores == pytest.approx(history.works[0].demand(history.machines[0]), rel=0.02)
+    assert spec.demand.cpu_cores < made.gateway.demand(spec).cpu_cores, "the file says what the fastest one takes"
+
+
+def test_a_view_is_what_the_core_scores_under_the_player_s_tuning() -> None:
+    history = build(seed=3, hours=HOURS, load_s=15.0)
+    seen = []
+    for weights in (Weights(cpu=1.0, memory=0.0, network=0.0), Weights(cpu=0.0, memory=1.0, network=0.0)):
+        made = scene(history, 8.0, None, cast.zsched("one", weights=weights))
+        standing = TaskView(made, made.fleet.tasks[0]).standing(START_S + 8.0)
+        (terms,) = {tuple((one.cpu, one.memory) for one in vector.utilities) for vector in standing.vectors}
+        part = [cpu if weights.cpu else memory for cpu, memory in terms]
+        assert list(standing.aggregates.values()) == pytest.approx(part)
+        assert standing.voters_heard == 3
+        seen.append(part)
+    assert seen[0] != seen[1]
+
+
+def test_another_score_in_the_core_is_another_rule_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The study has no score of its own: a core that prefers the last machine moves everything there."""
+    history = build(seed=3, hours=0.01, load_s=0.0)
+    last = history.fleet.tasks[0].candidates[-1]
+
+    def score(*given: object, **more: object) -> UtilityVector:
+        vector = scoring.score(*given, **more)  # type: ignore[arg-type]
+        made = tuple(Utility(candidate=one.candidate, value=float(one.candidate == last)) for one in vector.utilities)
+        return replace(vector, utilities=made)
+
+    monkeypatch.setattr(closed, "score", score)
+    (after,) = replay(history, ZSCHED, 1)
+    assert [move.owner for move in after] == [last]
+
+
+def test_zsched_here_is_zsched_of_the_other_study() -> None:
+    made = ZSCHED.make(TaskView(scene(build(seed=3, hours=HOURS, load_s=0.0), 1.0, None), spec_of(3)))
+    world = loaded_world(seed=1, hours=HOURS)
+    other = entries.core(world)(made.view) if isinstance(made, CoreRule) else None
+    assert isinstance(made, CoreRule)
+    assert isinstance(other, CoreRule)
+    assert (made.tuning, made.patience, made.pays_off_in_s) == (other.tuning, other.patience, other.pays_off_in_s)
+    assert ZSCHED.look == entries.ours(world)[0].look
+
+
+def spec_of(seed: int) -> TaskSpec:
+    return build(seed=seed, hours=HOURS, load_s=0.0).fleet.tasks[0]
+
+
+def test_a_rule_may_be_described() -> None:
+    player = cast.described("hasty:smoothing_s=0.5,patience=0.3,cool_down_s=1.5,aggregate=median")
+    assert (player.name, player.look.smoothing_s) == ("hasty", 0.5)
+    assert (player.tuning.cool_down_s, player.tuning.aggregate, player.changes["patience"]) == (1.5, "median", 0.3)
+    timer = cast.described("timer:time_to_trigger_s=2")
+    assert (timer.tuning.time_to_trigger_s, timer.tuning.bonus, timer.changes) == (2.0, 0.1, {})
+    for wrong in ("x:speed=3", "x:patience", ":patience=1", "x:bonus=7", "x:demand=1"):
+        with pytest.raises(ValueError, match=r"."):
+            cast.described(wrong)
+
+
+def test_several_tasks_are_placed_apart() -> None:
+    history = build(seed=9, hours=0.01, load_s=60.0, tasks=3)
+    moves = replay(history, ZSCHED, 1)
+    assert len(moves) == 3
+    assert all(mine[0].left is None for mine in moves), "everybody is placed"
+    assert len({mine[0].owner for mine in moves}) > 1, "bookings keep them apart"
+    assert moves == replay(history, ZSCHED, 1), "a seed fixes everything"
+
+
+def test_seeds_for_choosing_and_for_checking_are_different() -> None:
+    assert not set(study.TRAIN) & set(study.TEST)
+
+
+def test_a_resumed_run_plays_what_is_missing_only() -> None:
+    asked = ([5], HOURS, (0.0, 15.0), [1], (0.3,))
+    rules = ("oracle", "dyna_both")
+    known = [row for case in study.cases(*asked, rules, []) for row in study.play(case)]
+    assert len(known) == 4
+    assert study.cases(*asked, rules, known) == []
+    (one, two) = study.cases(*asked, (*rules, "new:patience=0.3"), known)
+    assert one.rules == two.rules == ("new:patience=0.3",)
+
+
+def test_tables_and_picture_say_what_the_rows_say(tmp_path: Path) -> None:
+    rules = (*study.YARDSTICKS, "dyna_both", "new:patience=0.3")
+    made = study.cases([105, 106], HOURS, (0.0, 15.0), [1], (0.3, 1.0), rules, [])
+    rows = [row for case in made for row in study.play(case)]
+    text = tables.report(rows)
+    assert "## one task: 2 seeds (105 to 106), 0.1 h a rule" in text
+    lost = [100 * row["lost"] for row in tables.where(rows, rule="dyna_both", price_s=1.0)]
+    by_load = [sum(lost[index::2]) / 2 for index in (0, 1)]
+    after = text[text.index("1 s a move: lost service") :]
+    line = next(one for one in after.splitlines() if one.startswith("| dyna_both "))
+    assert [cell.partition(" ±")[0].strip() for cell in line.split("|")[2:4]] == [f"{one:.2f}" for one in by_load]
+    names = [one.split("|")[1].strip() for one in after.splitlines()[4:9]]
+    assert names == ["oracle", "new", "dyna_both", "fixed, best", "fixed, mean"]
+    picture.draw(rows, tmp_path / "service.png")
+    assert (tmp_path / "service.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_command_keeps_seeds_and_results_apart(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for wrong in (["--seeds", "90-110"], ["--tasks", "2"], ["--rule", "x:speed=3"]):
+        with pytest.raises(SystemExit) as ended:
+            command.parse(wrong)
+        assert ended.value.code == 2
+    assert "there are 1, 3" in capsys.readouterr().err
+    assert command.parse(["--seeds", "train"]).seeds[0] in study.TRAIN
+    quick = ["--out", str(tmp_path), "--loads", "0", "--tasks", "1", "--prices", "0.3", "--hours", "0.01"]
+    quick += ["--rule", "new:patience=0.3", "--only", "new;fixed, mean"]
+    command.main([*quick, "--seeds", "107"])
+    assert "| new |" in capsys.readouterr().out
+    assert (tmp_path / "service-test.png").exists()
+    with pytest.raises(SystemExit, match="--resume"):
+        command.main([*quick, "--seeds", "107"])
+    other = [one.replace("0.3", "0.2") if one.startswith("new:") else one for one in quick]
+    with pytest.raises(SystemExit, match="another name"):
+        command.main([*other, "--seeds", "107", "--resume"])
+
+
+def test_the_package_s_command_knows_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(sys, "argv", ["decisions", "service", "--hours", "0", "--out", str(tmp_path)])
+    with pytest.raises(SystemExit, match="holds no results"):
+        package.main()

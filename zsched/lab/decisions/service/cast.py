@@ -1,0 +1,110 @@
+"""Who takes part: today's rule, the paper's, plain argmax, and rules that the command line describes.
+
+Knows: every rule's name and settings. Does not know: histories, results.
+"""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Callable, Mapping
+from dataclasses import fields
+from enum import Enum
+from typing import Any, Final, get_args, get_type_hints
+
+from zsched.core.fleet import DEFAULT_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S, TaskSpec
+from zsched.core.model import Tuning, Weights
+from zsched.lab.decisions.entries import PAPER_COST, RAW
+from zsched.lab.decisions.rules import CoreRule, PickRule, Rule
+from zsched.lab.decisions.service.replay import Player, is_of_task
+from zsched.lab.decisions.view import Look, Sight
+from zsched.lab.decisions.world import EVEN, RADIO_ONLY
+
+OWN: Final = ("smoothing_s", "move_cost_s")
+"""Settings of a rule that are neither of `Tuning` nor of `TaskSpec`."""
+
+
+def players() -> tuple[Player, ...]:
+    """The rules that are always compared."""
+    return (
+        zsched("zsched"),
+        _picks("dyna_both", EVEN, PAPER_COST),
+        _picks("dyna_net", RADIO_ONLY, PAPER_COST),
+        _picks("argmax", EVEN, 0.0),
+    )
+
+
+def zsched(name: str, **settings: Any) -> Player:
+    """The production's decision. What ``settings`` do not say is what a fleet file gets that does not say it.
+
+    They are fields of `Tuning` and `TaskSpec`, and those of `OWN`.
+    """
+    given = dict(settings)
+    smoothing_s = given.pop("smoothing_s", Look().smoothing_s)
+    move_cost_s = given.pop("move_cost_s", 0.0)
+    changes = {key: given.pop(key) for key in tuple(given) if is_of_task(key)}
+    if "time_to_trigger_s" not in given:
+        changes.setdefault("patience", DEFAULT_PATIENCE)
+    if changes.get("patience") is not None:
+        given = {"bonus": PATIENT_BONUS, "cool_down_s": PATIENT_COOL_DOWN_S, **given}
+    tuning = Tuning(**{"weights": EVEN, **given})
+    return Player(
+        name=name,
+        make=_core(tuning, changes.get("patience"), changes.get("pays_off_in_s"), move_cost_s),
+        tuning=tuning,
+        look=Look(smoothing_s=smoothing_s),
+        changes=changes,
+    )
+
+
+def _core(
+    tuning: Tuning, patience: float | None, pays_off_in_s: float | None, move_cost_s: float
+) -> Callable[[Sight], Rule]:
+    return lambda view: CoreRule(view, tuning, patience=patience, pays_off_in_s=pays_off_in_s, move_cost_s=move_cost_s)
+
+
+def _picks(name: str, weights: Weights, cost: float) -> Player:
+    """The paper's scheduler: once a second the argmax, with a cost for leaving."""
+    return Player(name=name, make=lambda view: PickRule(view, cost=cost), tuning=Tuning(weights=weights), look=RAW)
+
+
+def described(text: str) -> Player:
+    """A rule by its description, ``NAME:key=value,key=value``. Raises `ValueError` when there is no such setting.
+
+    >>> described("hasty:smoothing_s=0.5,patience=0.3,weights=0.7/0.3/0").tuning.weights
+    Weights(cpu=0.7, memory=0.3, network=0.0)
+    """
+    name, _, rest = text.partition(":")
+    settings: dict[str, Any] = {}
+    for part in filter(None, rest.split(",")):
+        key, sign, value = part.partition("=")
+        if not sign:
+            raise ValueError(f"{part!r} is no key=value")
+        settings[key] = _value(key, value)
+    if not name:
+        raise ValueError("a rule needs a name")
+    return zsched(name, **settings)
+
+
+def _value(key: str, text: str) -> Any:
+    kinds = _kinds()
+    if key not in kinds:
+        raise ValueError(f"no setting {key!r}; there are {', '.join(sorted(kinds))}")
+    kind = kinds[key]
+    if text == "none" and type(None) in get_args(kind):
+        return None
+    if isinstance(kind, types.UnionType):
+        kind = next(one for one in get_args(kind) if one is not type(None))
+    if kind is Weights:
+        cpu, memory, network = (float(one) for one in text.split("/"))
+        return Weights(cpu=cpu, memory=memory, network=network)
+    if kind is bool:
+        return text in ("true", "yes")
+    if isinstance(kind, type) and issubclass(kind, Enum | int | float | str):
+        return kind(text)
+    raise ValueError(f"{key} cannot be given here")
+
+
+def _kinds() -> Mapping[str, Any]:
+    hints = {**get_type_hints(TaskSpec), **get_type_hints(Tuning)}
+    names = {one.name for one in fields(Tuning)} | {name for name in hints if is_of_task(name)}
+    return {**{name: hints[name] for name in names}, **dict.fromkeys(OWN, float)}

@@ -1,0 +1,178 @@
+"""Plays a history to one rule, in a closed loop: where the tasks are decides what the profiles show.
+
+Knows: sampling, smoothing, publication, gathers without loss, bookings. Does not know: what a choice is worth.
+
+On a machine that is short, a task's use is no longer its demand and readings end at the machine's size, so what is
+seen depends on who has the task: every rule gets profilers and a gateway of its own. Every task has a rule of its own;
+the tasks' rounds follow each other, and each sees the bookings of those before (`zsched.core.turns`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Final
+
+from zsched.core.fleet import TaskSpec
+from zsched.core.gateway import Gateway
+from zsched.core.model import (
+    Allocation,
+    DeviceSample,
+    LinkSample,
+    LinkSource,
+    NodeId,
+    PeerState,
+    TaskId,
+    Tuning,
+    WorkerLoad,
+    WorkerState,
+)
+from zsched.core.profile import Profiler
+from zsched.core.scoring import Standing, book, compare, score
+from zsched.lab.decisions.replay import TICKS, rounds
+from zsched.lab.decisions.rules import Move, Rule
+from zsched.lab.decisions.service.history import History, mask_of, rank_of
+from zsched.lab.decisions.view import IDLE, START_S, Look, Sight
+from zsched.lab.decisions.world import DT_S
+
+WIRED: Final = (LinkSample(source=LinkSource.WIRED),)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Player:
+    """One rule in a comparison: how it looks at the fleet, what it scores by, and how it is made for a task."""
+
+    name: str
+    make: Callable[[Sight], Rule]
+    tuning: Tuning
+    """`zsched.core.scoring.score` scores by it."""
+    look: Look = Look()
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    """Fields of `TaskSpec` that it has otherwise."""
+
+
+class Scene:
+    """The fleet under one rule: the readings of its machines, the profiles, and who has which task."""
+
+    def __init__(self, history: History, player: Player) -> None:
+        timing = replace(history.fleet.timing, smoothing_s=max(player.look.smoothing_s, 1e-9))
+        specs = tuple(replace(spec, tuning=player.tuning, **player.changes) for spec in history.fleet.tasks)
+        self.fleet = replace(history.fleet, timing=timing, tasks=specs)
+        self.gateway = Gateway(self.fleet)
+        self.values = {
+            spec.name: Allocation(task=spec.name, revision=0, epoch=0, owner=None, tuning=player.tuning)
+            for spec in specs
+        }
+        self.states = dict.fromkeys((node.name for node in self.fleet.nodes), PeerState.ALIVE)
+        self._history = history
+        self._column = {name: index for index, name in enumerate(specs[0].candidates)}
+        self._placed: tuple[int | None, ...] = (None,) * len(specs)
+        self._profilers = {node.name: Profiler(node.name, 1, timing) for node in self.fleet.nodes}
+        self._ready = dict.fromkeys(self.values, WorkerState.READY)
+        self._stretch = history.stretch.tolist()
+        self._errors = history.cpu_error.tolist(), history.memory_error.tolist()
+        self._shown = [
+            [
+                tuple(getattr(there, name).tolist() for name in ("cores_wanted", "memory_wanted", "cores", "memory"))
+                for there in by_mask
+            ]
+            for by_mask in history.on
+        ]
+        self._robots_every = round(timing.publish_s / DT_S)
+
+    def step(self, index: int) -> None:
+        """Every machine takes its reading of step ``index``; profiles that are due reach every robot."""
+        now = START_S + index * DT_S
+        for name, profiler in self._profilers.items():
+            column = self._column.get(name)
+            if column is None and index % self._robots_every:
+                continue  # nothing ever changes at a robot
+            profiler.absorb(IDLE if column is None else self._device(column, index), WIRED, now)
+            states = {} if column is None else self._ready
+            profile = profiler.publishable(states, is_draining=False, now=now)
+            if profile is not None:
+                self.gateway.absorb(profile, now)
+
+    def _device(self, column: int, index: int) -> DeviceSample:
+        """What the device profiler reads: never more than there is."""
+        machine, stretch = self._history.machines[column], self._stretch[index]
+        cores_wanted, memory_wanted, cores, memory = self._shown[column][mask_of(self._placed, column)]
+        used = cores_wanted[stretch] + self._errors[0][index][column] * machine.cores
+        used_mb = memory_wanted[stretch] + self._errors[1][index][column] * machine.memory_mb
+        workers = []
+        for task, name in enumerate(self.values):
+            is_here = self._placed[task] == column
+            rank = rank_of(self._placed, task) if is_here else 0
+            mine = (cores[stretch][rank], memory[stretch][rank]) if is_here else (0.0, 0.0)
+            workers.append(WorkerLoad(task=name, state=WorkerState.READY, cpu_cores=mine[0], memory_mb=mine[1]))
+        return DeviceSample(
+            cpu_cores=machine.cores,
+            cpu_used_cores=min(max(used, 0.0), machine.cores),
+            memory_mb=machine.memory_mb,
+            memory_used_mb=min(max(used_mb, 0.0), machine.memory_mb),
+            workers=tuple(workers),
+        )
+
+    def learn(self, now: float) -> None:
+        """The robots note what the tasks use where they run."""
+        for name, value in self.values.items():
+            if value.owner is not None:
+                self.gateway.learn_demand(name, value.owner, now)
+
+    def place(self, task: TaskId, owner: NodeId) -> None:
+        """``task`` is at ``owner`` from the next step on."""
+        value = self.values[task]
+        self.values[task] = replace(value, owner=owner, epoch=value.epoch + 1)
+        self._placed = tuple(
+            None if value.owner is None else self._column[value.owner] for value in self.values.values()
+        )
+
+
+class TaskView:
+    """What the robots make of a scene for one task, by the core's scores."""
+
+    def __init__(self, scene: Scene, spec: TaskSpec) -> None:
+        self.fleet, self.gateway, self.spec = scene.fleet, scene.gateway, spec
+        self._scene = scene
+        self._seen: tuple[int, tuple[NodeId | None, ...]] | None = None
+        self._standing: Standing | None = None
+
+    def standing(self, now: float) -> Standing:
+        """The joint view of a gather now; computed anew only when a profile has come or a task has moved."""
+        seen = self.gateway.version, tuple(value.owner for value in self._scene.values.values())
+        if self._standing is None or seen != self._seen:
+            self._seen, self._standing = seen, self._compare(now)
+        return self._standing
+
+    def _compare(self, now: float) -> Standing:
+        allocation = self._scene.values[self.spec.name]
+        bookings = book(self.fleet.tasks, self._scene.values, self.gateway)
+        voters = self.fleet.voters
+        # All robots are on cables: what one of them makes of the profiles is what each of them makes of them.
+        vector = score(self.spec, allocation, voters[0], self.gateway, self._scene.states, now, bookings)
+        return compare(self.spec, allocation, {voter: replace(vector, voter=voter) for voter in voters})
+
+
+def replay(history: History, player: Player, seed: int) -> list[list[Move]]:
+    """The moves of every task under ``player``, in the order of ``history.works``."""
+    scene = Scene(history, player)
+    rules = {spec.name: player.make(TaskView(scene, spec)) for spec in scene.fleet.tasks}
+    due = rounds(history.fleet, history.steps, seed)
+    for tick in range(history.steps * TICKS):
+        if tick % TICKS == 0:
+            scene.step(tick // TICKS)
+        at_s = tick * DT_S / TICKS
+        now = START_S + at_s
+        if due[tick]:
+            scene.learn(now)
+        for name, rule in rules.items():
+            known = len(rule.moves)
+            rule.round(due[tick], at_s, now)
+            if len(rule.moves) > known:
+                scene.place(name, rule.moves[-1].owner)
+    return [rule.moves for rule in rules.values()]
+
+
+def is_of_task(name: str) -> bool:
+    """Whether `TaskSpec` has a field of that name that a player may change."""
+    return name in {one.name for one in fields(TaskSpec)} - {"name", "candidates", "tuning", "rules", "worker"}
