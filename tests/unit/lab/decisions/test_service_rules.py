@@ -117,6 +117,17 @@ def test_a_rule_may_be_described() -> None:
             cast.described(wrong)
 
 
+def test_what_has_just_come_to_a_machine_is_booked_there_before_it_shows() -> None:
+    made = scene(build(seed=9, hours=0.01, load_s=0.0, tasks=3), 8.0, None)
+    first, second = made.fleet.tasks[:2]
+    view, machine = TaskView(made, second), first.candidates[0]
+    before = view.standing(START_S + 8.0).aggregates
+    made.place(first.name, machine)
+    after = view.standing(START_S + 8.0).aggregates
+    assert after[machine] < before[machine]
+    assert {name for name in before if after[name] != before[name]} == {machine}
+
+
 def test_several_tasks_are_placed_apart() -> None:
     history = build(seed=9, hours=0.01, load_s=60.0, tasks=3)
     moves = replay(history, ZSCHED, 1)
@@ -138,6 +149,8 @@ def test_a_resumed_run_plays_what_is_missing_only() -> None:
     assert study.cases(*asked, rules, known) == []
     (one, two) = study.cases(*asked, (*rules, "new:patience=0.3"), known)
     assert one.rules == two.rules == ("new:patience=0.3",)
+    dearer = study.cases([5], HOURS, (15.0,), [1], (0.3, 1.0), rules, known)
+    assert [(case.rules, case.prices_s) for case in dearer] == [(rules, (1.0,))], "no row comes twice"
 
 
 def test_tables_and_picture_say_what_the_rows_say(tmp_path: Path) -> None:

@@ -40,11 +40,6 @@ class Case:
     rules: tuple[str, ...]
     """Names of `players` or of `YARDSTICKS`, or descriptions (`described`)."""
 
-    @property
-    def key(self) -> tuple[object, ...]:
-        """What makes it another history."""
-        return self.tasks, self.load_s, self.seed, self.hours
-
 
 def cases(
     seeds: Sequence[int],
@@ -55,18 +50,19 @@ def cases(
     rules: Sequence[str],
     known: Sequence[Row],
 ) -> list[Case]:
-    """Every history with the rules that ``known`` holds no results of; those without any are left out."""
+    """Every history with the rules and prices that ``known`` holds no results of; those without any are left out."""
     done = {(row["tasks"], row["load_s"], row["seed"], row["asked_hours"], row["price_s"], row["as"]) for row in known}
     made = []
     for seed, count, load_s in itertools.product(seeds, tasks, loads_s):
-        missing = tuple(
-            rule
-            for rule in rules
-            if any((count, load_s, seed, hours, price_s, rule) not in done for price_s in prices_s)
-        )
-        if missing:
-            case = Case(seed=seed, hours=hours, load_s=load_s, tasks=count, prices_s=tuple(prices_s), rules=missing)
-            made.append(case)
+        missing: dict[tuple[float, ...], list[str]] = {}
+        for rule in rules:
+            left = tuple(one for one in prices_s if (count, load_s, seed, hours, one, rule) not in done)
+            missing.setdefault(left, []).append(rule)
+        made += [
+            Case(seed=seed, hours=hours, load_s=load_s, tasks=count, prices_s=left, rules=tuple(names))
+            for left, names in missing.items()
+            if left
+        ]
     return made
 
 
