@@ -112,7 +112,7 @@ def test_a_rule_may_be_described() -> None:
     assert (player.tuning.cool_down_s, player.tuning.aggregate, player.changes["patience"]) == (1.5, "median", 0.3)
     timer = cast.described("timer:time_to_trigger_s=2")
     assert (timer.tuning.time_to_trigger_s, timer.tuning.bonus, timer.changes) == (2.0, 0.1, {})
-    for wrong in ("x:speed=3", "x:patience", ":patience=1", "x:bonus=7", "x:demand=1"):
+    for wrong in ("x:speed=3", "x:patience", ":patience=1", "x:bonus=7", "x:demand=1", "x:exclusive=maybe"):
         with pytest.raises(ValueError, match=r"."):
             cast.described(wrong)
 
@@ -166,6 +166,9 @@ def test_tables_and_picture_say_what_the_rows_say(tmp_path: Path) -> None:
     assert [cell.partition(" ±")[0].strip() for cell in line.split("|")[2:4]] == [f"{one:.2f}" for one in by_load]
     names = [one.split("|")[1].strip() for one in after.splitlines()[4:9]]
     assert names == ["oracle", "new", "dyna_both", "fixed, best", "fixed, mean"]
+    both = [tables.where(rows, rule=rule, price_s=1.0) for rule in ("dyna_both", "new")]
+    more = [sum(row["lost"] for row in mine) / 4 for mine in both]
+    assert tables.beside(*both).startswith(f"{100 * (more[0] - more[1]):+.2f} ± ")
     picture.draw(rows, tmp_path / "service.png")
     assert (tmp_path / "service.png").read_bytes().startswith(b"\x89PNG")
 

@@ -9,7 +9,7 @@ import types
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 from enum import Enum
-from typing import Any, Final, get_args, get_type_hints
+from typing import Any, Final, Literal, get_args, get_origin, get_type_hints
 
 from zsched.core.fleet import DEFAULT_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S, TaskSpec
 from zsched.core.model import Tuning, Weights
@@ -97,8 +97,11 @@ def _value(key: str, text: str) -> Any:
     if kind is Weights:
         cpu, memory, network = (float(one) for one in text.split("/"))
         return Weights(cpu=cpu, memory=memory, network=network)
-    if kind is bool:
-        return text in ("true", "yes")
+    if kind is bool or get_origin(kind) is Literal:
+        found = {str(one).lower(): one for one in ((False, True) if kind is bool else get_args(kind))}
+        if text not in found:
+            raise ValueError(f"{key} is one of {', '.join(found)}, not {text!r}")
+        return found[text]
     if isinstance(kind, type) and issubclass(kind, Enum | int | float | str):
         return kind(text)
     raise ValueError(f"{key} cannot be given here")

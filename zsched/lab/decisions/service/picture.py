@@ -5,14 +5,13 @@ Knows: matplotlib, what `study` writes. Does not know: how rules decide.
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
 import matplotlib as mpl
-import numpy as np
 
-from zsched.lab.decisions.report import mean_and_spread
 from zsched.lab.decisions.service.study import Row
 from zsched.lab.decisions.service.tables import loads_of, names, where
 
@@ -33,7 +32,7 @@ DPI: Final = 110
 
 
 def draw(rows: Sequence[Row], path: Path) -> None:
-    """Means over the seeds with 1.96 standard errors; every rule stands a little beside the others."""
+    """Means over the seeds. Their spread is that of machines and tasks; what differs between rules is in the tables."""
     counts = sorted({int(row["tasks"]) for row in rows})
     prices_s = sorted({float(row["price_s"]) for row in rows})
     figure, axes = plt.subplots(
@@ -46,24 +45,20 @@ def draw(rows: Sequence[Row], path: Path) -> None:
         for axis, price_s in zip(line, prices_s, strict=True):
             mine = where(rows, tasks=tasks, price_s=price_s)
             loads_s = loads_of(mine)
-            for index, name in enumerate(shown):
+            for name in shown:
                 colour, dashes, mark = STYLES.get(name) or (others[name], "-", "P")
                 found = [where(mine, rule=name, load_s=load_s) for load_s in loads_s]
                 if not all(found):
                     continue
-                pairs = [mean_and_spread([100.0 * float(row["lost"]) for row in one]) for one in found]
-                at = np.arange(len(loads_s)) + 0.05 * (index - len(shown) / 2)
-                axis.errorbar(
-                    at, [mean for mean, _ in pairs], yerr=[spread for _, spread in pairs], color=colour,
-                    linestyle=dashes, marker=mark, ms=4, lw=1.3, elinewidth=0.7, capsize=2, label=name,
-                )  # fmt: skip
+                means = [100.0 * statistics.fmean(float(row["lost"]) for row in one) for one in found]
+                axis.plot(range(len(means)), means, color=colour, linestyle=dashes, marker=mark, ms=4, label=name)
             axis.set_xticks(range(len(loads_s)), [f"{load_s:g}" if load_s else "none" for load_s in loads_s])
             axis.set_xlabel("length of the loads, s")
-            axis.set_ylim(bottom=0.0)
             axis.grid(axis="y", lw=0.4)
             what = "one task" if tasks == 1 else f"{tasks} tasks"
             axis.set_title(f"{what}, a move costs {price_s:g} s", fontsize=10)
         line[0].set_ylabel("lost service, %")
-    axes[0][0].legend(fontsize=8)
+        line[0].set_ylim(bottom=0.0)
+    figure.legend(*axes[0][0].get_legend_handles_labels(), loc="outside upper center", ncols=len(shown), fontsize=9)
     figure.savefig(path, dpi=DPI)
     plt.close(figure)

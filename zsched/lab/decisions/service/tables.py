@@ -15,6 +15,7 @@ from zsched.lab.decisions.report import mean_and_spread
 from zsched.lab.decisions.service.cast import players
 from zsched.lab.decisions.service.study import YARDSTICKS, Row
 
+OURS: Final = "zsched"
 ORDER: Final = ("oracle", *(player.name for player in players()), *YARDSTICKS[1:])
 CLASSES: Final = ((0.0, 0.3), (0.3, 0.6), (0.6, 9.0))
 """Sizes of tasks, as shares of the median machine."""
@@ -72,6 +73,19 @@ def lost(rows: Sequence[Row], title: str) -> str:
     return _by_load(rows, f"{title}: lost service, %", lambda mine: percent(mine, "lost") if mine else "-")
 
 
+def beside(mine: Sequence[Row], ours: Sequence[Row]) -> str:
+    """How much more is lost than by another rule on the same seeds, in points, with 1.96 standard errors over seeds."""
+    means = [
+        {seed: statistics.fmean(100.0 * float(row["lost"]) for row in where(rows, seed=seed)) for seed in seeds}
+        for rows, seeds in ((rows, sorted({int(row["seed"]) for row in rows})) for rows in (mine, ours))
+    ]
+    both = sorted(means[0].keys() & means[1].keys())
+    if not both:
+        return "-"
+    mean, spread = mean_and_spread([means[0][seed] - means[1][seed] for seed in both])
+    return f"{mean:+.2f} ± {spread:.2f}"
+
+
 def costs(rows: Sequence[Row], title: str) -> str:
     """Everything that is judged by, over all lengths of load."""
     loaded = [row for row in rows if row["load_s"]]
@@ -86,13 +100,23 @@ def costs(rows: Sequence[Row], title: str) -> str:
                 name,
                 f"{100.0 * share:.2f}",
                 f"{share / floor:.2f}" if floor > 0.0 else "-",
+                "" if name == OURS else beside(mine, where(loaded, rule=OURS)),
                 f"{statistics.fmean(float(row['outputs_hz']) for row in mine):.3f}",
                 f"{100.0 * statistics.fmean(float(row['missed']) for row in mine):.2f}",
                 f"{moves:.1f}",
                 f"{wasted:.1f}",
             )
         )
-    head = ("rule", "lost %", "of the oracle's", "outputs / s", "missed %", "moves / h", "wasted / h")
+    head = (
+        "rule",
+        "lost %",
+        "of the oracle's",
+        f"beside {OURS}, points",
+        "outputs / s",
+        "missed %",
+        "moves / h",
+        "wasted / h",
+    )
     return _table(f"{title}: all loads together", head, lines)
 
 
@@ -132,7 +156,7 @@ def sizes(rows: Sequence[Row], title: str) -> str:
         lines.append((name, *(percent(group, "lost") if group else "-" for group in mine)))
     counts = [len({row["seed"] for row in group}) for group in groups]
     head = ("share of the median machine", *(f"{one} ({count})" for one, count in zip(heads, counts, strict=True)))
-    return _table(f"{title}: lost service by size of task, %", head, lines)
+    return _table(f"{title}: lost service by size of the largest task, %", head, lines)
 
 
 def report(rows: Sequence[Row]) -> str:
