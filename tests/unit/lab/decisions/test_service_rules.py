@@ -10,7 +10,7 @@ import pytest
 
 from zsched.core import scoring
 from zsched.core.fleet import TaskSpec
-from zsched.core.model import Utility, UtilityVector, Weights
+from zsched.core.model import ScoreForm, Utility, UtilityVector, Weights
 from zsched.lab.decisions import __main__ as package
 from zsched.lab.decisions import entries
 from zsched.lab.decisions.rules import CoreRule
@@ -110,6 +110,7 @@ def test_a_rule_may_be_described() -> None:
     player = cast.described("hasty:smoothing_s=0.5,patience=0.3,cool_down_s=1.5,aggregate=median")
     assert (player.name, player.look.smoothing_s) == ("hasty", 0.5)
     assert (player.tuning.cool_down_s, player.tuning.aggregate, player.changes["patience"]) == (1.5, "median", 0.3)
+    assert cast.described("new:score=diminishing").tuning.score is ScoreForm.DIMINISHING
     timer = cast.described("timer:time_to_trigger_s=2")
     assert (timer.tuning.time_to_trigger_s, timer.tuning.bonus, timer.changes) == (2.0, 0.1, {})
     for wrong in ("x:speed=3", "x:patience", ":patience=1", "x:bonus=7", "x:demand=1", "x:exclusive=maybe"):

@@ -12,7 +12,7 @@ from enum import Enum
 from typing import Any, Final, Literal, get_args, get_origin, get_type_hints
 
 from zsched.core.fleet import DEFAULT_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S, TaskSpec
-from zsched.core.model import Tuning, Weights
+from zsched.core.model import ScoreForm, Tuning, Weights
 from zsched.lab.decisions.entries import PAPER_COST, RAW
 from zsched.lab.decisions.rules import CoreRule, PickRule, Rule
 from zsched.lab.decisions.service.replay import Player, is_of_task
@@ -63,8 +63,9 @@ def _core(
 
 
 def _picks(name: str, weights: Weights, cost: float) -> Player:
-    """The paper's scheduler: once a second the argmax, with a cost for leaving."""
-    return Player(name=name, make=lambda view: PickRule(view, cost=cost), tuning=Tuning(weights=weights), look=RAW)
+    """The paper's scheduler by its own equations: once a second the argmax, with a cost for leaving."""
+    tuning = Tuning(weights=weights, score=ScoreForm.PAPER)
+    return Player(name=name, make=lambda view: PickRule(view, cost=cost), tuning=tuning, look=RAW)
 
 
 def described(text: str) -> Player:
