@@ -120,7 +120,7 @@ def _round(rig: Rig, random_: random.Random, hz: float, until_s: float, sums: Su
 def _move(rig: Rig, new: Slot, old: Slot, freeze_s: float) -> None:
     """The executor's table; the new owner's worker stands still from *ready* on."""
     rig.plan(RoutePhase.PREPARE, new, old)
-    until(lambda: rig.find(SlotReady, epoch=new.epoch, is_ready=True), f"epoch {new.epoch} ready", 30.0)
+    until(lambda: rig.find(SlotReady, epoch=new.epoch, is_ready=True), f"epoch {new.epoch} ready", 120.0)
     worker = rig.workers[new.owner]
     if freeze_s:
         worker.send_signal(signal.SIGSTOP)

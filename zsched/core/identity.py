@@ -42,6 +42,8 @@ class Identity:
     incarnation: int
     fleet_file: str
     started_at: float
+    beat_s: float
+    """Between two beats: how long another daemon has stayed is counted by its own beats, too."""
     _twin: tuple[int, int, float] | None = field(default=None)
     """(incarnation, first sequence, since when) of another daemon with our name."""
     _tokens: set[int] = field(default_factory=set)
@@ -81,7 +83,9 @@ class Identity:
         is_younger = (my_sequence, -self.incarnation) < (beat.sequence, -beat.incarnation)
         if is_younger and now - self.started_at < YOUNG_S:
             return Verdict.LEAVE
-        return Verdict.DISPUTE if now - self._twin[2] >= STAYS_S else Verdict.TWIN
+        # Of a node that stood still itself while the other one came and left, only the time between two beats is long.
+        lived_s = (beat.sequence - self._twin[1]) * self.beat_s
+        return Verdict.DISPUTE if min(now - self._twin[2], lived_s) >= STAYS_S else Verdict.TWIN
 
     def file_complaint(self, beat: Beat) -> str | None:
         """How a peer's fleet file differs from ours; ``None`` when it does not, or the peer does not say."""

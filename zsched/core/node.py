@@ -137,7 +137,7 @@ class Node:
         self.unready: dict[TaskId, tuple[int, float]] = {}
         """{task: (epoch, since when)} of the slots whose worker our relay does not see any more."""
         self.fleet_file = fleet_hash(fleet)
-        self._identity = Identity(me, incarnation, self.fleet_file, now)
+        self._identity = Identity(me, incarnation, self.fleet_file, now, fleet.timing.beat_s)
         self._introductions = Introductions()
         self._hangs = HangWatch(fleet)
         self._tenure = Tenure(fleet, me, self.agreement.leases, self.executors)

@@ -54,14 +54,15 @@ def register(learnt: Allocation | None = None, accepted: Allocation | None = Non
     [
         (value(11), True),
         (value(11, None), True),
-        (value(11, "robot1"), False),
+        (value(11, "robot1"), True),
+        (value(11, "robot9"), False),
         (value(11, epoch=11), True),
         (value(11, epoch=12), False),
         (value(10 + MAX_AHEAD), True),
         (value(10 + MAX_AHEAD + 1), False),
     ],
 )
-def test_a_value_names_a_candidate_and_is_not_absurdly_far_ahead(new: Allocation, fits: bool) -> None:
+def test_a_value_names_a_node_of_the_fleet_and_is_not_absurdly_far_ahead(new: Allocation, fits: bool) -> None:
     assert is_fit(FLEET, new, register(learnt=value(10))) is fits
 
 
@@ -75,8 +76,8 @@ def test_ahead_is_counted_from_whatever_is_newest() -> None:
 
 
 def test_what_is_known_here_already_fits_whatever_it_is() -> None:
-    """A fleet file that names other candidates must not make a node refuse what it has agreed to."""
-    old = value(7, "robot1")
+    """A fleet file that names other nodes must not make a node refuse what it has agreed to."""
+    old = value(7, "robot9")
     assert is_fit(FLEET, old, register(learnt=old))
     assert is_fit(FLEET, old, register(learnt=value(8), accepted=old))
     assert not is_fit(FLEET, old, register(learnt=value(8)))

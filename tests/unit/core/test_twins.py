@@ -5,6 +5,10 @@ from __future__ import annotations
 from zsched.core.identity import QUIET_S, STAYS_S, YOUNG_S, Identity, Verdict
 from zsched.core.model import Beat
 
+BEAT_S = 0.5
+STAYS = int(STAYS_S / BEAT_S)
+"""So many beats are as long."""
+
 
 def beat(incarnation: int, sequence: int) -> Beat:
     return Beat(node="robot1", incarnation=incarnation, sequence=sequence, loop_lag_s=0.0)
@@ -12,7 +16,7 @@ def beat(incarnation: int, sequence: int) -> Beat:
 
 def old() -> Identity:
     """A daemon that has run for a long time; two others of its name are there."""
-    identity = Identity(me="robot1", incarnation=7, fleet_file="abc", started_at=0.0)
+    identity = Identity(me="robot1", incarnation=7, fleet_file="abc", started_at=0.0, beat_s=BEAT_S)
     for incarnation in (8, 9):
         identity.on_token(incarnation, is_present=True)
     return identity
@@ -32,7 +36,15 @@ def test_a_twin_that_stays_disputes_the_name_at_the_very_end_of_its_time() -> No
     assert identity.on_own_name(beat(8, 10), 5000, 100.0) is Verdict.TWIN
     assert identity.on_own_name(beat(8, 11), 5000, 100.0 + STAYS_S - 0.01) is Verdict.TWIN
     assert identity.on_own_name(beat(8, 10), 5000, 100.0 + STAYS_S) is Verdict.TWIN, "it has not risen"
-    assert identity.on_own_name(beat(8, 12), 5000, 100.0 + STAYS_S) is Verdict.DISPUTE
+    assert identity.on_own_name(beat(8, 10 + STAYS), 5000, 100.0 + STAYS_S) is Verdict.DISPUTE
+
+
+def test_a_node_that_stood_still_while_a_twin_came_and_left_disputes_nothing() -> None:
+    """It handles the last beat of the twin's few long after the first one, and before the end of its token."""
+    identity = old()
+    assert identity.on_own_name(beat(8, 10), 5000, 100.0) is Verdict.TWIN
+    assert identity.on_own_name(beat(8, 10 + STAYS - 1), 5000, 100.0 + 2 * STAYS_S) is Verdict.TWIN
+    assert identity.on_own_name(beat(8, 10 + STAYS), 5000, 100.0 + 2 * STAYS_S) is Verdict.DISPUTE
 
 
 def test_our_own_beats_say_nothing() -> None:
@@ -42,7 +54,7 @@ def test_our_own_beats_say_nothing() -> None:
 
 
 def test_beats_in_our_name_are_shown_until_they_have_stopped_for_long_enough() -> None:
-    identity = Identity(me="robot1", incarnation=7, fleet_file="abc", started_at=0.0)
+    identity = Identity(me="robot1", incarnation=7, fleet_file="abc", started_at=0.0, beat_s=BEAT_S)
     assert identity.complaint(100.0) is None
     identity.on_own_name(beat(8, 10), 5000, 100.0)
     assert "no daemon of that name is seen" in (identity.complaint(100.0 + QUIET_S - 0.001) or "")
@@ -51,11 +63,11 @@ def test_beats_in_our_name_are_shown_until_they_have_stopped_for_long_enough() -
 
 def test_of_two_that_meet_the_one_that_has_beaten_less_leaves_while_it_is_young() -> None:
     for mine, theirs, verdict in ((5, 11, Verdict.LEAVE), (20, 11, Verdict.TWIN)):
-        identity = Identity(me="robot1", incarnation=7, fleet_file="abc", started_at=100.0)
+        identity = Identity(me="robot1", incarnation=7, fleet_file="abc", started_at=100.0, beat_s=BEAT_S)
         identity.on_token(8, is_present=True)
         assert identity.on_own_name(beat(8, theirs - 1), mine, 100.5) is Verdict.TWIN
         assert identity.on_own_name(beat(8, theirs), mine, 100.0 + YOUNG_S - 0.01) is verdict
-    identity = Identity(me="robot1", incarnation=7, fleet_file="abc", started_at=100.0)
+    identity = Identity(me="robot1", incarnation=7, fleet_file="abc", started_at=100.0, beat_s=BEAT_S)
     identity.on_token(8, is_present=True)
     identity.on_own_name(beat(8, 10), 5, 100.5)
     assert identity.on_own_name(beat(8, 11), 5, 100.0 + YOUNG_S) is Verdict.TWIN, "not young any more"
