@@ -184,7 +184,8 @@ def test_a_worker_that_restarts_in_place_gets_the_last_value_again(rig: Rig) -> 
     worker.wait(60)
     rig.wait(SlotReady, epoch=1, is_ready=False)
     rig.start_worker("edge1", "--latest")
-    until(lambda: app.back == [0, 0], "the value again, from the second incarnation, which asked for its role")
+    until(lambda: len(app.back) > 1, "the value again, from the second incarnation, which asked for its role")
+    assert set(app.back) == {0}
 
 
 def test_output_of_a_stale_epoch_never_passes(rig: Rig) -> None:
