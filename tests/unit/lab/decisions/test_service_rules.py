@@ -170,6 +170,8 @@ def test_tables_and_picture_say_what_the_rows_say(tmp_path: Path) -> None:
     both = [tables.where(rows, rule=rule, price_s=1.0) for rule in ("dyna_both", "new")]
     more = [sum(row["lost"] for row in mine) / 4 for mine in both]
     assert tables.beside(*both).startswith(f"{100 * (more[0] - more[1]):+.2f} ± ")
+    same = [{"seed": seed, "lost": 0.1 * seed, "load_s": load_s} for seed in (1, 3) for load_s in (5.0, 60.0)]
+    assert tables.percent(same, "lost") == "20.00 ± 19.60", "two seeds, however many loads each"
     picture.draw(rows, tmp_path / "service.png")
     assert (tmp_path / "service.png").read_bytes().startswith(b"\x89PNG")
 

@@ -44,9 +44,17 @@ def rate(rows: Sequence[Row], field: str) -> float:
     return sum(float(row[field]) for row in rows) / sum(float(row["hours"]) for row in rows)
 
 
+def by_seed(rows: Sequence[Row], field: str) -> dict[int, float]:
+    """{seed: the mean of its rows}."""
+    values: dict[int, list[float]] = {}
+    for row in rows:
+        values.setdefault(int(row["seed"]), []).append(float(row[field]))
+    return {seed: statistics.fmean(values[seed]) for seed in sorted(values)}
+
+
 def percent(rows: Sequence[Row], field: str) -> str:
-    """Mean and 1.96 standard errors over the rows."""
-    mean, spread = mean_and_spread([100.0 * float(row[field]) for row in rows])
+    """Mean and 1.96 standard errors over the seeds; what one seed gives for several loads is one value."""
+    mean, spread = mean_and_spread([100.0 * value for value in by_seed(rows, field).values()])
     return f"{mean:.2f} ± {spread:.2f}"
 
 
@@ -75,14 +83,11 @@ def lost(rows: Sequence[Row], title: str) -> str:
 
 def beside(mine: Sequence[Row], ours: Sequence[Row]) -> str:
     """How much more is lost than by another rule on the same seeds, in points, with 1.96 standard errors over seeds."""
-    means = [
-        {seed: statistics.fmean(100.0 * float(row["lost"]) for row in where(rows, seed=seed)) for seed in seeds}
-        for rows, seeds in ((rows, sorted({int(row["seed"]) for row in rows})) for rows in (mine, ours))
-    ]
-    both = sorted(means[0].keys() & means[1].keys())
+    theirs, own = by_seed(mine, "lost"), by_seed(ours, "lost")
+    both = [seed for seed in theirs if seed in own]
     if not both:
         return "-"
-    mean, spread = mean_and_spread([means[0][seed] - means[1][seed] for seed in both])
+    mean, spread = mean_and_spread([100.0 * (theirs[seed] - own[seed]) for seed in both])
     return f"{mean:+.2f} ± {spread:.2f}"
 
 
