@@ -30,15 +30,6 @@ from zsched.worker_backlog import MAX_WITHHELD
 from zsched.zenoh_config import data_config, worker_config
 
 
-@pytest.fixture
-def relay() -> Iterator[Relay]:
-    made = Relay()
-    try:
-        yield made
-    finally:
-        made.session.close()
-
-
 class Echo:
     """A worker in this process that answers every input under its epoch."""
 

@@ -67,15 +67,6 @@ class Scene:
 
 
 @pytest.fixture
-def relay() -> Iterator[Relay]:
-    made = Relay()
-    try:
-        yield made
-    finally:
-        made.session.close()
-
-
-@pytest.fixture
 def scene(relay: Relay, tmp_path: Path) -> Iterator[Scene]:
     with Worker.from_env(environment(relay, tmp_path), handles_signals=False) as worker:
         yield Scene(relay, worker)
