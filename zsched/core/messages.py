@@ -83,7 +83,7 @@ class Refusal(StrEnum):
     LEASE = "lease"  # an exclusive task's grant is still running
     RATE = "rate"  # this proposer asks too often
     DISK = "disk"  # it could not persist
-    VALUE = "value"  # it does not take this value for a true one: its fleet file knows no such candidate
+    VALUE = "value"  # it does not take this value for a true one: its fleet file knows no such node
     YOUNG = "young"  # it has just started, and asks the others first what they remember of it
 
 

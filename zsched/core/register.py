@@ -8,7 +8,7 @@ Synod on a register that can be rewritten (Rystsov, arXiv 1802.07000): no leader
 * an elector's promise and acceptance are persisted before the answer leaves (`Step.is_dirty`);
 * a ballot carries exactly one value: a proposer that reads an accepted value it has not learnt re-accepts that one, and
   its own change follows under a higher ballot;
-* where too many electors refuse that value for good (its owner is no candidate any more), a move is applied to it at
+* where too many electors refuse that value for good (their fleet files know no such node), a move is applied to it at
   once, as CASPaxos has it: else a value that a minority has accepted would stop its task for ever;
 * among accepted values "newer" means the higher ballot;
 * accepted is not learnt: an elector with an acceptance that it has not learnt runs an *identity round* (it re-accepts
