@@ -11,6 +11,7 @@ from zsched.core import instructions as do
 from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
 from zsched.core.model import NodeId, NodeKind, Tuning, Weights
 from zsched.core.plan import WorkerRole
+from zsched.lab.sim_parts import Machine
 from zsched.lab.simulator import CORES, Simulator
 
 TASK, LOOK_S = "merge", 0.01
@@ -107,6 +108,26 @@ def test_an_owner_that_is_cut_off_with_the_old_file_is_waited_for(seed: int) -> 
     assert rollout.run(10.0) == 0.0
     assert rollout.at_work() == {rollout.owner()}
     assert rollout.sim.working[TASK][0] == rollout.owner(), "by a lease"
+    assert rollout.problems("robot1") == ""
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_machine_that_has_taken_a_candidate_s_place_answers_for_it(seed: int) -> None:
+    """Who asks cannot tell it from a second machine beside the first: of two with one name nothing can be promised."""
+    rollout = Rollout(seed)
+    owner = rollout.owner() or ""
+    others = rollout.others(owner)
+    rollout.bring(NEW, *others)
+    rollout.sim.cut((owner,), others)
+    assert rollout.run(10.0) == 0.0
+    assert rollout.at_work() == {owner}
+
+    rollout.sim.crash(owner)  # it is broken, and a spare machine is there
+    spare = f"{owner}~"
+    rollout.sim.machines[spare] = Machine(key=spare, name=owner, fleet=NEW)
+    rollout.sim.start(spare)
+    assert rollout.run(5.0) == 0.0
+    assert rollout.sim.working[TASK][0] in rollout.at_work(), "by a lease"
     assert rollout.problems("robot1") == ""
 
 

@@ -50,6 +50,22 @@ def test_plans_have_every_fault_every_size_and_every_kind_of_task() -> None:
     assert any(not one.faults for one in plans), "and some in which nothing goes wrong"
 
 
+@pytest.mark.parametrize("seed", [8021526, 8022150])
+def test_a_task_is_not_made_exclusive_while_two_machines_have_one_name(seed: int) -> None:
+    """Found by the simulator: one of two machines of a name answered that nobody works there, the other one did."""
+    one = plan(seed, kinds=frozenset(LATER))
+    twins = [fault for fault in one.faults if fault.kind == "apart"]
+    result = play(one)
+    assert result.violation == ""
+    assert twins
+    assert result.faults["apart"] == len(twins)
+    assert result.faults["rollout of exclusive"] == 0
+
+    alone = play(replace(one, faults=tuple(fault for fault in one.faults if fault not in twins)))
+    assert alone.violation == ""
+    assert alone.faults["rollout of exclusive"] == 1
+
+
 def test_every_fault_that_is_planned_is_carried_out() -> None:
     done: set[str] = set()
     planned: set[str] = set()

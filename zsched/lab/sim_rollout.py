@@ -17,6 +17,9 @@ from zsched.lab.sim_parts import Machine
 from zsched.lab.sim_scene import Carry, Scene
 from zsched.lab.sim_swarm import Fault
 
+TWINS = ("twin", "apart")
+"""Faults that put a second machine beside a node, under the node's name."""
+
 
 @dataclass(slots=True)
 class Rollouts:
@@ -53,9 +56,13 @@ class Rollouts:
             scene.then(after_s, lambda name=name, file=scene.fleet: scene.restart(scene.sim.machines[name], file))  # type: ignore[misc]
 
     def _may_roll_out(self, name: str) -> bool:
-        """Whether leases are promised all the same (docs/decisions/0026): not to such clocks, nor with both at once."""
+        """Whether leases are promised all the same (docs/decisions/0026).
+
+        They are not to such clocks, not with both at once, and not where two machines have one name: whoever makes the
+        task exclusive asks by names, and one machine's answer counts for the other, which it may not hear.
+        """
         if name == "exclusive":
-            is_promised = not any(_is_wild(fault) for fault in self.scene.plan.faults)
+            is_promised = not any(_is_wild(fault) or fault.kind in TWINS for fault in self.scene.plan.faults)
             return is_promised and not self.scene.done["rollout of candidates"]
         return name != "candidates" or not self.scene.done["rollout of exclusive"]
 
