@@ -32,6 +32,8 @@ from zsched.core.fleet import (
     DEFAULT_PATIENCE,
     PATIENT_BONUS,
     PATIENT_COOL_DOWN_S,
+    SERVICE_COOL_DOWN_S,
+    SERVICE_PATIENCE,
     Demand,
     Fleet,
     LinkLimits,
@@ -47,7 +49,7 @@ from zsched.core.fleet import (
     WorkerLink,
     WorkerSpec,
 )
-from zsched.core.model import RSSI_MAX_DBM, RSSI_MIN_DBM, Aggregate, NodeKind, Tuning
+from zsched.core.model import RSSI_MAX_DBM, RSSI_MIN_DBM, Aggregate, NodeKind, ScoreForm, Tuning
 from zsched.core.plan import HandoverRule, OnCrash, ReadyWhen, ServiceSettings, StreamClass, StreamSettings
 from zsched.core.timing import PROFILES
 
@@ -210,12 +212,21 @@ SCHEDULING: Final = Record(
         "cool_down_s": Field(
             Number(0, 86400, "s"),
             "Least stay after a move.",
-            default=f"`{PATIENT_COOL_DOWN_S:g}`; `10` with `time_to_trigger_s` alone",
+            default=f"`{PATIENT_COOL_DOWN_S:g}` (`{SERVICE_COOL_DOWN_S:g}` with `score: service`); "
+            "`10` with `time_to_trigger_s` alone",
+        ),
+        "score": Field(
+            Choice.of(ScoreForm),
+            "What a machine is worth to the task: `paper`, the free share of it once the task is there (Eq. 1, 2, 4); "
+            "`service`, the share of its work that the task would get done there.",
+            default=f"`{ScoreForm.PAPER}`",
         ),
         "aggregate": Field(Choice.of(Aggregate), "How the robots' utilities become one; `median` resists a liar."),
         "reach": Field(Choice.of(Reach), "Who must reach a candidate.", default=f"`{Reach.MAJORITY}`"),
         "memory_floor_ratio": Field(
-            Number(0, 0.9), "Escape: leave an owner whose free memory is below this share.", default="`0.05`"
+            Number(0, 0.9),
+            "Leave an owner whose free memory is below this share (`score: service`: such memory counts as used).",
+            default="`0.05`",
         ),
         "max_moves_per_minute": Field(
             Whole(1, 100_000), "Hard cap of planned moves; escapes are bounded too, at 60.", default="`6`"
@@ -224,7 +235,8 @@ SCHEDULING: Final = Record(
             Number(0.001, 1000),
             "Move once staying has cost so much, lead times seconds (`time_to_trigger_s` does not count then): "
             "a big lead is followed sooner than a small one.",
-            default=f"`{DEFAULT_PATIENCE:g}`; none with `time_to_trigger_s` alone",
+            default=f"`{DEFAULT_PATIENCE:g}` (`{SERVICE_PATIENCE:g}` with `score: service`); "
+            "none with `time_to_trigger_s` alone",
         ),
         "pays_off_in_s": Field(
             Number(1, 86400, "s"),

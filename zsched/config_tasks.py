@@ -17,6 +17,8 @@ from zsched.core.fleet import (
     DEFAULT_PATIENCE,
     PATIENT_BONUS,
     PATIENT_COOL_DOWN_S,
+    SERVICE_COOL_DOWN_S,
+    SERVICE_PATIENCE,
     Demand,
     LinkLimits,
     OnIsolation,
@@ -24,7 +26,7 @@ from zsched.core.fleet import (
     TaskSpec,
     WorkerSpec,
 )
-from zsched.core.model import NodeKind, Tuning, Weights
+from zsched.core.model import NodeKind, ScoreForm, Tuning, Weights
 from zsched.core.plan import (
     Direction,
     HandoverRule,
@@ -136,7 +138,10 @@ def _tuning(given: Section, out: Collector) -> Tuning | None:
     if weights is None:
         return None
     scheduling: Section | None = given.get("scheduling")
-    patient: dict[str, Any] = {"bonus": PATIENT_BONUS, "cool_down_s": PATIENT_COOL_DOWN_S}
+    patient: dict[str, Any] = {
+        "bonus": PATIENT_BONUS,
+        "cool_down_s": SERVICE_COOL_DOWN_S if _is_service(scheduling) else PATIENT_COOL_DOWN_S,
+    }
     if scheduling is None:
         return Tuning(weights=weights, **patient)
     default = patient if _patience(scheduling) is not None else {}
@@ -146,8 +151,13 @@ def _tuning(given: Section, out: Collector) -> Tuning | None:
 def _patience(scheduling: Section | None) -> float | None:
     """As given; none where only a time-to-trigger is given; else the default."""
     values = {} if scheduling is None else scheduling.values
-    patience: float | None = values.get("patience", None if "time_to_trigger_s" in values else DEFAULT_PATIENCE)
+    default = SERVICE_PATIENCE if _is_service(scheduling) else DEFAULT_PATIENCE
+    patience: float | None = values.get("patience", None if "time_to_trigger_s" in values else default)
     return patience
+
+
+def _is_service(scheduling: Section | None) -> bool:
+    return scheduling is not None and scheduling.values.get("score") is ScoreForm.SERVICE
 
 
 def _limits(given: Section, out: Collector) -> LinkLimits:

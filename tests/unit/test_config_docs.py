@@ -10,6 +10,8 @@ from zsched.core.fleet import (
     DEFAULT_PATIENCE,
     PATIENT_BONUS,
     PATIENT_COOL_DOWN_S,
+    SERVICE_COOL_DOWN_S,
+    SERVICE_PATIENCE,
     LinkSpec,
     TaskSpec,
     Timing,
@@ -48,8 +50,12 @@ def test_defaults_that_hang_on_each_other_are_the_codes() -> None:
     timers = {field.name: field.default for field in fields(Tuning)}
     alone = "with `time_to_trigger_s` alone"
     assert SCHEDULING.default_text("bonus") == f"`{PATIENT_BONUS:g}`; `{timers['bonus']:g}` {alone}"
-    assert SCHEDULING.default_text("cool_down_s") == f"`{PATIENT_COOL_DOWN_S:g}`; `{timers['cool_down_s']:g}` {alone}"
-    assert SCHEDULING.default_text("patience").startswith(f"`{DEFAULT_PATIENCE:g}`; ")
+    served = "with `score: service`"
+    kept = f"`{PATIENT_COOL_DOWN_S:g}` (`{SERVICE_COOL_DOWN_S:g}` {served}); `{timers['cool_down_s']:g}` {alone}"
+    assert SCHEDULING.default_text("cool_down_s") == kept
+    assert SCHEDULING.default_text("score") == f"`{timers['score']}`"
+    patience = f"`{DEFAULT_PATIENCE:g}` (`{SERVICE_PATIENCE:g}` {served}); none {alone}"
+    assert SCHEDULING.default_text("patience") == patience
     assert LINK_LIMITS.default_text("foresee_s") == f"`{DEFAULT_FORESEE_S:g}`"
 
 

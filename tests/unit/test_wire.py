@@ -83,6 +83,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "timeout_s": (0.05, 3600),
     "hold_s": (0, 3600),
     "max_pending": (1, 256),
+    "speed": (0.001, 1000.0),
 }
 
 

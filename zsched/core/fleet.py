@@ -23,6 +23,10 @@ PATIENT_BONUS = 0.05
 """The bonus of a task with a patience, when its fleet file gives none; with a time-to-trigger it is `Tuning`'s."""
 PATIENT_COOL_DOWN_S = 5.0
 """The cool-down of a task with a patience, likewise (docs/decisions/0023)."""
+SERVICE_PATIENCE = 0.1
+"""`DEFAULT_PATIENCE` under `ScoreForm.SERVICE`: a lead is then a share of the task's work (docs/decisions/0030)."""
+SERVICE_COOL_DOWN_S = 2.0
+"""`PATIENT_COOL_DOWN_S` under `ScoreForm.SERVICE`."""
 DEFAULT_FORESEE_S = 3.0
 """How far ahead the signals of a task count when its fleet file does not say."""
 

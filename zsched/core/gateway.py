@@ -8,12 +8,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from zsched.core.demand import Demands
 from zsched.core.fleet import Demand, Fleet, TaskSpec
-from zsched.core.model import NodeId, Profile, TaskId, WorkerState
+from zsched.core.model import NodeId, Profile, TaskId
 from zsched.core.sequence import Order, Track
-
-STARVED_CPU_RATIO = 0.9
-"""On an owner busier than this the task gets less than it wants: its measured use is no demand."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,7 +30,7 @@ class Gateway:
         self._ttl_s = fleet.timing.profile_ttl_s
         self._profiles: dict[NodeId, tuple[Profile, float]] = {}
         self._tracks: dict[NodeId, Track] = {}
-        self._measured: dict[TaskId, Demand] = {}
+        self._demands = Demands()
         self.version = 0
         """Rises with every change; what was computed from an older version may be wrong."""
 
@@ -68,30 +66,11 @@ class Gateway:
         return min(ends, default=math.inf)
 
     def learn_demand(self, task: TaskId, owner: NodeId, now: float) -> None:
-        """Note what the task's worker uses on its owner, unless the owner is starved (then it shows too little).
-
-        A worker that is not ready, or a figure that nobody measured, changes nothing: the task does not cost less
-        because its worker restarts.
-        """
+        """Note what the task's worker wants on its owner (`zsched.core.demand`)."""
         profile = self.fresh(owner, now)
-        load = None if profile is None else profile.worker(task)
-        if profile is None or load is None or profile.cpu_used_cores is None:
-            return
-        if load.state is not WorkerState.READY or profile.cpu_used_cores / profile.cpu_cores >= STARVED_CPU_RATIO:
-            return
-        known = self._measured.get(task, Demand())
-        demand = Demand(
-            cpu_cores=known.cpu_cores if load.cpu_cores is None else load.cpu_cores,
-            memory_mb=known.memory_mb if load.memory_mb is None else load.memory_mb,
-        )
-        if demand != self._measured.get(task):
-            self._measured[task] = demand
+        if profile is not None and self._demands.learn(task, profile, now):
             self.version += 1
 
-    def demand(self, spec: TaskSpec) -> Demand:
-        """What the task will use: the larger of the fleet file's figure and the measurement on the owner."""
-        measured = self._measured.get(spec.name, spec.demand)
-        return Demand(
-            cpu_cores=max(spec.demand.cpu_cores, measured.cpu_cores),
-            memory_mb=max(spec.demand.memory_mb, measured.memory_mb),
-        )
+    def demand(self, spec: TaskSpec, profile: Profile) -> Demand:
+        """What the task will use on the node of ``profile``."""
+        return self._demands.at(spec, profile)

@@ -24,6 +24,7 @@ NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}")
 MAX_COUNTER = 2**53
 """Largest revision, epoch, incarnation or sequence number (exact in every language's float)."""
 MAX_CPU_CORES, MAX_MEMORY_MB, MAX_BITRATE_MBPS = 4096.0, 1e8, 1e6
+MIN_SPEED, MAX_SPEED = 0.001, 1000.0
 MAX_TREND_DB_S = 100.0
 """What no machine or link exceeds: a larger figure is a fault of whoever measured or sent it."""
 MAX_REASON = 200
@@ -66,7 +67,7 @@ class ScoreForm(StrEnum):
     """How a candidate's CPU and memory become a utility (`zsched.core.utility`)."""
 
     PAPER = "paper"  # Eq. 1, 2 and 4: what is left over, as shares of the machine, and their weighted sum
-    DIMINISHING = "diminishing"  # what there is for the task against what it needs, and their weighted geometric mean
+    SERVICE = "service"  # which share of its work the task would get done, and a weighted product
 
 
 # --- what an operator sets -------------------------------------------------------------------------------------------
@@ -167,6 +168,8 @@ class WorkerLoad:
     state: WorkerState
     cpu_cores: float | None = None
     memory_mb: float | None = None
+    wanted_cores: float | None = None
+    """What it would use if it had the machine to itself; ``None``: not measured."""
     reason: str = ""
     """Why it is not ready, or what is wrong with it though it is; at most `MAX_REASON` characters."""
 
@@ -176,6 +179,7 @@ class WorkerLoad:
             raise ValueError(f"worker.reason: {len(self.reason)} characters, at most {MAX_REASON}")
         check_range("worker.cpu_cores", self.cpu_cores, 0.0, MAX_CPU_CORES)
         check_range("worker.memory_mb", self.memory_mb, 0.0, MAX_MEMORY_MB)
+        check_range("worker.wanted_cores", self.wanted_cores, 0.0, MAX_CPU_CORES)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -206,6 +210,8 @@ class DeviceSample:
     memory_mb: float
     memory_used_mb: float | None
     workers: tuple[WorkerLoad, ...] = ()
+    speed: float | None = None
+    """How fast one of its cores is; ``None``: not measured."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -239,6 +245,8 @@ class Profile:
     draining: bool = False
     progress: tuple[TaskProgress, ...] = ()
     """Robots: the watched tasks that answer here, or do not although inputs flow."""
+    speed: float | None = None
+    """How fast one of its cores is, beside the reference (`zsched.adapters.speed`); ``None``: not measured."""
 
     def __post_init__(self) -> None:
         check_name("profile.node", self.node)
@@ -248,6 +256,7 @@ class Profile:
         check_range("profile.cpu_used_cores", self.cpu_used_cores, 0.0, MAX_CPU_CORES)
         check_range("profile.memory_mb", self.memory_mb, 1.0, MAX_MEMORY_MB)
         check_range("profile.memory_used_mb", self.memory_used_mb, 0.0, MAX_MEMORY_MB)
+        check_range("profile.speed", self.speed, MIN_SPEED, MAX_SPEED)
 
     def worker(self, task: TaskId) -> WorkerLoad | None:
         """The load of ``task``'s worker on this node, or ``None`` when the node runs none."""

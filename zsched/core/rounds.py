@@ -123,7 +123,7 @@ class Rounds:
         doubts = {name: self._doubts(task.spec, now) for name, task in self.tasks.items()}
         if version == self._gateway.version and now <= until and seen == (states, values, doubts):
             return answer  # several robots ask within a round, and nothing has changed since
-        bookings = book((task.spec for task in self.tasks.values()), values, self._gateway)
+        bookings = book((task.spec for task in self.tasks.values()), values)
         answer = Utilities(
             voter=self._me,
             vectors=tuple(

@@ -16,7 +16,7 @@ from enum import StrEnum
 
 from zsched.core.damping import ESCAPES_PER_MINUTE, WINDOW_S, Damping
 from zsched.core.fleet import TaskSpec
-from zsched.core.model import Allocation, NodeId, PeerState, Profile, WorkerState
+from zsched.core.model import Allocation, NodeId, PeerState, Profile, ScoreForm, WorkerState
 from zsched.core.scoring import Standing, joined, pick
 
 FORGIVEN_IN_S = 2.0
@@ -212,6 +212,8 @@ def escape_reason(
 ) -> str | None:
     """Why the owner must be left now, without time-to-trigger or cool-down (but never without the quorum).
 
+    Short memory is such a reason under the paper's score, which does not tell it from enough; `ScoreForm.SERVICE` does.
+
     Args:
         spec: the task.
         allocation: the current one, with an owner.
@@ -238,7 +240,7 @@ def escape_reason(
             return f"the worker on {owner} failed{why}"
         if _is_told(spec, profile) and not_ready_for_s > spec.worker.start_deadline_s:
             return f"the worker on {owner} has not been ready for {not_ready_for_s:.1f} s{why}"
-        if profile.memory_used_mb is not None:
+        if allocation.tuning.score is ScoreForm.PAPER and profile.memory_used_mb is not None:
             free_ratio = 1.0 - profile.memory_used_mb / profile.memory_mb
             if free_ratio < spec.memory_floor_ratio:
                 return f"memory of {owner} is {max(free_ratio, 0.0) * 100:.0f} % free"

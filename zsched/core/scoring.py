@@ -28,12 +28,12 @@ from zsched.core.model import (
     UtilityVector,
     WorkerState,
 )
-from zsched.core.utility import cpu_utility, memory_utility, predicted_use, room_utility, total_utility
+from zsched.core.utility import cpu_utility, memory_utility, predicted_use, service_utility, total_utility
 
 METRICS = ("cpu", "memory", "network")
 
-Bookings = Mapping[NodeId, tuple[tuple[TaskId, Demand], ...]]
-"""{owner: its tasks and what each will use there}: of a task that has just come, profiles show nothing yet."""
+Bookings = Mapping[NodeId, tuple[TaskSpec, ...]]
+"""{owner: its tasks}: of a task that has just come, profiles show nothing yet."""
 
 
 def majority(count: int) -> int:
@@ -96,7 +96,7 @@ def score(
     what it has and gets nothing new. What the other tasks of ``bookings`` will use there, and do not show yet, counts
     as in use. ``penalties`` are what this robot remembers; they go along, and `compare` joins them.
     """
-    demand, form = gateway.demand(spec), allocation.tuning.score
+    form = allocation.tuning.score
     terms: dict[NodeId, _Terms] = {}
     unreachable: list[NodeId] = []
     refused: list[tuple[NodeId, str]] = []
@@ -119,7 +119,7 @@ def score(
         if profile is None:
             refused.append((candidate, "no fresh profile"))
             continue
-        unseen = _unseen(spec, profile, bookings)
+        demand, unseen = gateway.demand(spec, profile), _unseen(spec, profile, bookings, gateway)
         reason = _refusal(spec, allocation, profile, demand, unseen)
         if reason:
             refused.append((candidate, reason))
@@ -159,18 +159,18 @@ def score(
 _NOTHING = Demand()
 
 
-def book(specs: Iterable[TaskSpec], values: Mapping[TaskId, Allocation], gateway: Gateway) -> Bookings:
-    """{owner: its tasks and their demand}, as far as this robot has learnt; empty with a single task."""
-    booked: dict[NodeId, tuple[tuple[TaskId, Demand], ...]] = {}
+def book(specs: Iterable[TaskSpec], values: Mapping[TaskId, Allocation]) -> Bookings:
+    """{owner: its tasks}; empty with a single task."""
+    booked: dict[NodeId, tuple[TaskSpec, ...]] = {}
     specs = tuple(specs)
     for spec in specs if len(specs) > 1 else ():
         owner = values[spec.name].owner
         if owner is not None:
-            booked[owner] = (*booked.get(owner, ()), (spec.name, gateway.demand(spec)))
+            booked[owner] = (*booked.get(owner, ()), spec)
     return booked
 
 
-def _unseen(spec: TaskSpec, profile: Profile, bookings: Bookings | None) -> Demand:
+def _unseen(spec: TaskSpec, profile: Profile, bookings: Bookings | None, gateway: Gateway) -> Demand:
     """What other tasks will use on a node beyond what its profile shows of their workers.
 
     A worker that somebody else started never shows what it uses, so it is in the profile already, or nowhere.
@@ -179,9 +179,10 @@ def _unseen(spec: TaskSpec, profile: Profile, bookings: Bookings | None) -> Dema
     if not others:
         return _NOTHING
     cpu = memory = 0.0
-    for task, demand in others:
-        load = profile.worker(task)
-        if task != spec.name and load is not None:
+    for other in others:
+        load = profile.worker(other.name)
+        if other.name != spec.name and load is not None:
+            demand = gateway.demand(other, profile)
             cpu += max(demand.cpu_cores - (load.cpu_cores or 0.0), 0.0)
             memory += max(demand.memory_mb - (load.memory_mb or 0.0), 0.0)
     return Demand(cpu_cores=cpu, memory_mb=memory)
@@ -227,25 +228,22 @@ def _measure(
     spec: TaskSpec, profile: Profile, demand: Demand, unseen: Demand, link: PairLink | None, form: ScoreForm
 ) -> _Terms:
     load = profile.worker(spec.name)
-    is_paper = form is ScoreForm.PAPER
     cpu = memory = None
     if profile.cpu_used_cores is not None:
         own = (load.cpu_cores or 0.0) if load is not None else 0.0
         used = predicted_use(profile.cpu_used_cores + unseen.cpu_cores, own, demand.cpu_cores)
-        free = profile.cpu_cores - used + demand.cpu_cores
-        cpu = (
-            cpu_utility(profile.cpu_cores, used)
-            if is_paper
-            else room_utility(free, demand.cpu_cores, profile.cpu_cores)
-        )
+        if form is ScoreForm.PAPER:
+            cpu = cpu_utility(profile.cpu_cores, used)
+        else:
+            cpu = service_utility(profile.cpu_cores - used + demand.cpu_cores, demand.cpu_cores, profile.cpu_cores)
     used_mb = _memory_use(profile, spec, demand, unseen)
     if used_mb is not None:
         others_mb = used_mb - demand.memory_mb
-        memory = (
-            memory_utility(profile.memory_mb, demand.memory_mb, others_mb)
-            if is_paper
-            else room_utility(profile.memory_mb - others_mb, demand.memory_mb, profile.memory_mb)
-        )
+        if form is ScoreForm.PAPER:
+            memory = memory_utility(profile.memory_mb, demand.memory_mb, others_mb)
+        else:  # what is below the floor is no room: the kernel kills before it is used up
+            room_mb = (1.0 - spec.memory_floor_ratio) * profile.memory_mb - others_mb
+            memory = service_utility(room_mb, demand.memory_mb, profile.memory_mb)
     return _Terms(cpu, memory, None if link is None else link.utility)
 
 

@@ -6,11 +6,13 @@ The equations as printed contradict the text in places (Eq. 1 with beta "availab
 beta and mu are what is *in use*, predicted as if the candidate had the task, and every term is clamped to [0, 1].
 
 That clamp makes all machines alike that have less left than the task needs, idle or starved, and in a sum spare memory
-hides a starved CPU. `ScoreForm.DIMINISHING` compares what is there for the task with what it needs, which is never 0
-before nothing is left, and multiplies. The offline study compares both; a fleet file cannot choose it yet.
+hides a starved CPU. `ScoreForm.SERVICE` (docs/decisions/0030) says which share of its work a task would get done, which
+is never 0 before nothing is left, and multiplies.
 """
 
 from __future__ import annotations
+
+import math
 
 from zsched.core.model import ScoreForm, Weights
 
@@ -67,25 +69,30 @@ def memory_utility(delta: float, theta: float, mu: float) -> float:
     return clamp((delta - theta - mu) / delta)
 
 
-ROOM_FOR = 2.0
-"""A machine is worth 1/2 when it has so many times what the task needs."""
 LEAST_NEED_RATIO = 0.05
 """A task counts as needing at least this share of a machine: also of a small one more room is better."""
+SPARE = 0.04
+"""The part of a term that tells a machine with much to spare from one that just does: too little to be worth a move."""
+SPARE_HALF = 2.0
+"""Half of that part is had where there is room for so many such tasks."""
 
 
-def room_utility(free: float, demand: float, capacity: float) -> float:
-    """``free / (free + 2 demand)``: what there is for the task, against what it needs; diminishing, never clamped.
+def service_utility(free: float, demand: float, capacity: float) -> float:
+    """The share of its work that a task would get done, ``min(free / demand, 1)``, and a little for room to spare.
 
     Args:
-        free: not in use by others, in cores or MiB; below 0 counts as 0.
+        free: not in use by others, in cores or MiB; below 0 counts as 0. Of an owner with nothing to spare it is what
+            the task gets there.
         demand: of the task, in the same unit, >= 0.
         capacity: of the machine, in the same unit, > 0.
 
-    >>> room_utility(free=4.0, demand=2.0, capacity=4.0), room_utility(free=0.4, demand=4.0, capacity=4.0)
-    (0.5, 0.047619047619047616)
+    >>> round(service_utility(free=1.0, demand=2.0, capacity=4.0), 3)
+    0.488
+    >>> round(service_utility(free=4.0, demand=2.0, capacity=4.0), 3)
+    0.98
     """
-    room = max(free, 0.0)
-    return room / (room + ROOM_FOR * max(demand, LEAST_NEED_RATIO * capacity))
+    room = max(free, 0.0) / max(demand, LEAST_NEED_RATIO * capacity)
+    return (1.0 - SPARE) * min(room, 1.0) + SPARE * room / (room + SPARE_HALF)
 
 
 KNEE_UTILITY = 0.8
@@ -127,8 +134,9 @@ def total_utility(
 ) -> float | None:
     """Eq. 4, the weighted sum; weights of metrics that nobody measured are dropped and the rest renormalised.
 
-    `ScoreForm.DIMINISHING`: the weighted geometric mean instead. A weight says by how many percent the utility falls
-    when that term falls by one percent, whatever the others are.
+    `ScoreForm.SERVICE`: a product instead, each term to the power of its weight over the largest one. The metric that
+    weighs most counts as it is, one of half its weight as its square root: a weight says by how many percent of it the
+    utility falls when that term falls by one percent, whatever the others are.
 
     Args:
         weights: omega, sum 1.
@@ -136,7 +144,7 @@ def total_utility(
         memory: sigma, likewise.
         network: kappa, likewise.
         measured: which of ``cpu``, ``memory``, ``network`` any candidate has.
-        form: sum or geometric mean.
+        form: sum or product.
 
     Returns:
         The utility in [0, 1]; ``None`` when a weighted metric that others have is missing here, or nothing is left.
@@ -145,19 +153,17 @@ def total_utility(
     >>> total_utility(w, cpu=0.8, memory=0.4, network=None, measured=frozenset({"cpu", "memory"}))
     0.6666666666666666
     """
-    is_sum = form is ScoreForm.PAPER
-    share, total = 0.0, 0.0 if is_sum else 1.0
-    for name, weight, term in (
-        ("cpu", weights.cpu, cpu),
-        ("memory", weights.memory, memory),
-        ("network", weights.network, network),
-    ):
+    terms = (("cpu", weights.cpu, cpu), ("memory", weights.memory, memory), ("network", weights.network, network))
+    weighed: list[tuple[float, float]] = []
+    for name, weight, term in terms:
         if weight <= 0.0 or name not in measured:
             continue
         if term is None:
             return None
-        share += weight
-        total = total + weight * term if is_sum else total * term**weight
-    if share <= 0.0:
+        weighed.append((weight, term))
+    if not weighed:
         return None
-    return clamp(total / share) if is_sum else clamp(total ** (1.0 / share))
+    if form is ScoreForm.PAPER:
+        return clamp(sum(weight * term for weight, term in weighed) / sum(weight for weight, _ in weighed))
+    most = max(weight for weight, _ in weighed)
+    return clamp(math.prod(term ** (weight / most) for weight, term in weighed))

@@ -32,6 +32,7 @@ TASKS = tuple(
     )
     for name in ("map", "plan", "watch")
 )
+MAP, PLAN, WATCH = TASKS
 FLEET = Fleet(
     name="books",
     timing=Timing(),
@@ -47,9 +48,7 @@ def load(task: str, cpu: float | None = None, memory: float | None = None) -> Wo
     return WorkerLoad(task=task, state=READY, cpu_cores=cpu, memory_mb=memory)
 
 
-def seen(
-    *workers: WorkerLoad, cpu: float = 1.0, memory: float = 1000.0, booked: tuple[tuple[str, Demand], ...] = ()
-) -> Utility:
+def seen(*workers: WorkerLoad, cpu: float = 1.0, memory: float = 1000.0, booked: tuple[TaskSpec, ...] = ()) -> Utility:
     """How robot1 scores edge1 for the task ``map``."""
     gateway = Gateway(FLEET)
     profile = Profile(
@@ -91,20 +90,18 @@ def test_what_the_task_s_own_worker_uses_is_not_counted_twice() -> None:
 def test_what_another_task_will_use_counts_as_far_as_its_worker_does_not_show_it(
     shown: WorkerLoad, cpu: float, memory: float
 ) -> None:
-    booked = (("plan", Demand(cpu_cores=0.5, memory_mb=200.0)),)
-    utility = seen(shown, booked=booked)
+    utility = seen(shown, booked=(PLAN,))
     same = seen(shown, cpu=1.0 + cpu, memory=1000.0 + memory)
     assert (utility.cpu, utility.memory) == pytest.approx((same.cpu, same.memory))
 
 
 def test_several_tasks_add_up_and_our_own_and_a_stranger_s_do_not_count() -> None:
-    each = Demand(cpu_cores=0.5, memory_mb=200.0)
-    both = seen(load("plan"), load("watch"), booked=(("plan", each), ("watch", each)))
+    both = seen(load("plan"), load("watch"), booked=(PLAN, WATCH))
     same = seen(load("plan"), load("watch"), cpu=2.0, memory=1400.0)
     assert (both.cpu, both.memory) == pytest.approx((same.cpu, same.memory))
     plain = seen(load("plan"))
-    assert seen(load("plan"), booked=(("map", each),)) == plain
-    assert seen(load("plan"), booked=(("watch", each),)) == plain, "it runs no worker that zsched would see"
+    assert seen(load("plan"), booked=(MAP,)) == plain
+    assert seen(load("plan"), booked=(WATCH,)) == plain, "it runs no worker that zsched would see"
 
 
 def test_where_somebody_else_starts_the_worker_its_whole_demand_is_added() -> None:

@@ -45,20 +45,33 @@ def test_penalty_grows_with_every_failure_and_is_bounded() -> None:
 
 def test_penalty_halves_its_points_with_the_half_life_and_is_forgotten() -> None:
     damping = Damping()
-    damping.note_move("edge1", has_failed=False, now=1000.0)
-    assert damping.points("edge1", 1000.0) == 1.0
-    assert damping.points("edge1", 1060.0) == pytest.approx(0.5)
+    damping.note_move(None, has_failed=False, now=0.0)
+    damping.note_move("edge1", has_failed=True, now=1000.0)
+    assert damping.points("edge1", 1000.0) == 2.0
+    assert damping.points("edge1", 1060.0) == pytest.approx(1.0)
+    assert damping.penalty("edge1", 1060.0) == pytest.approx(STEP)
     assert damping.penalties(1000.0 + 600.0) == {}
 
 
-def test_being_left_on_probation_costs_more_than_later() -> None:
+def test_to_fail_on_probation_costs_more_than_later() -> None:
     early, late = Damping(), Damping()
     for damping, stay in ((early, PROBATION_S / 2), (late, PROBATION_S * 2)):
         damping.note_move(None, has_failed=False, now=0.0)
-        damping.note_move("edge1", has_failed=False, now=stay)
-    assert early.points("edge1", PROBATION_S / 2) == 2.0
-    assert late.points("edge1", PROBATION_S * 2) == 1.0
-    assert late.penalty("edge1", PROBATION_S * 2) == pytest.approx(STEP)
+        damping.note_move("edge1", has_failed=True, now=stay)
+    assert early.points("edge1", PROBATION_S / 2) == 3.0
+    assert late.points("edge1", PROBATION_S * 2) == 2.0
+
+
+def test_a_node_that_is_left_for_a_better_one_pays_only_when_it_is_left_again_soon() -> None:
+    """To follow a load is what moves are for; to come back and leave again is to and fro."""
+    damping = Damping()
+    for left, at in (("edge1", 100.0), ("edge2", 110.0)):
+        damping.note_move(left, has_failed=False, now=at)
+        assert damping.penalties(at) == {}
+    damping.note_move("edge1", has_failed=False, now=100.0 + PROBATION_S - 1.0)
+    assert damping.points("edge1", 100.0 + PROBATION_S - 1.0) == 1.0
+    damping.note_move("edge2", has_failed=False, now=110.0 + PROBATION_S)
+    assert damping.points("edge2", 110.0 + PROBATION_S) == 0.0
 
 
 @pytest.mark.parametrize("has_failed", [False, True])
@@ -66,9 +79,9 @@ def test_a_node_that_was_told_to_stop_pays_nothing(has_failed: bool) -> None:
     """However soon it is left, and though it may be gone by the time that the others learn of its task's new owner."""
     damping = Damping()
     damping.note_move(None, has_failed=False, now=0.0)
-    damping.note_move("edge1", has_failed=has_failed, was_draining=True, now=PROBATION_S / 2)
-    assert damping.penalties(PROBATION_S / 2) == {}
-    assert damping.moves_within(WINDOW_S, PROBATION_S / 2, escapes=has_failed) == 1, "a move all the same"
+    damping.note_move("edge1", has_failed=has_failed, was_draining=True, now=10.0)
+    assert damping.penalties(10.0) == {}
+    assert damping.moves_within(WINDOW_S, 10.0, escapes=has_failed) == 1, "a move all the same"
 
 
 def test_a_node_that_failed_is_not_chosen_again_at_once() -> None:
@@ -124,7 +137,7 @@ def test_what_any_robot_remembers_counts_and_nothing_counts_for_a_judge_without_
     forgetful = Judge(spec=SPEC).judge(joint, OWNED, **given, damping=Damping())
     assert forgetful.aggregates["edge2"] == pytest.approx(0.3)
     own = Damping()
-    own.note_move("edge2", has_failed=False, now=100.0)
+    own.note_move("edge2", has_failed=True, now=100.0)
     assert Judge(spec=SPEC).judge(joint, OWNED, **given, damping=own).aggregates["edge2"] == pytest.approx(0.3)
     assert Judge(spec=SPEC).judge(joint, OWNED, **given).aggregates["edge2"] == pytest.approx(0.6)
 

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from zsched.core.fleet import Demand, Fleet, NodeSpec, TaskSpec, Timing
-from zsched.core.gateway import STARVED_CPU_RATIO, EdgeData, Gateway
+from zsched.core.gateway import EdgeData, Gateway
 from zsched.core.model import NodeKind, Profile, Tuning, Weights, WorkerLoad, WorkerState
 
 TASK = TaskSpec(
@@ -137,72 +137,7 @@ def test_fresh_up_to_its_time_to_live_and_not_longer() -> None:
     assert gateway.newest("edge1", TTL_S + 0.001) is not None
 
 
-# --- demand --------------------------------------------------------------------------------------------------------
-
-
-def learnt(*profiles: Profile) -> Demand:
-    gateway = Gateway(FLEET)
-    for one in profiles:
-        gateway.absorb(one, 0.0)
-        gateway.learn_demand("merge", one.node, 0.0)
-    return gateway.demand(TASK)
-
-
-def test_before_any_measurement_the_fleet_file_s_figure_counts() -> None:
-    assert learnt() == TASK.demand
-
-
-@pytest.mark.parametrize(
-    ("used", "demand"),
-    [
-        ((0.5, 300.0), (0.5, 300.0)),
-        ((0.1, 100.0), (0.4, 250.0)),
-        ((0.9, 100.0), (0.9, 250.0)),
-        ((None, 300.0), (0.4, 300.0)),
-        ((0.5, None), (0.5, 250.0)),
-    ],
-)
-def test_demand_is_the_larger_of_the_fleet_file_and_the_measurement(
-    used: tuple[float | None, float | None], demand: tuple[float, float]
-) -> None:
-    assert learnt(profile(used=used)) == Demand(cpu_cores=demand[0], memory_mb=demand[1])
-
-
-def test_the_newest_measurement_replaces_the_older_ones() -> None:
-    assert learnt(profile(0, used=(2.0, 900.0)), profile(1, used=(0.5, 300.0))) == Demand(cpu_cores=0.5, memory_mb=300)
-
-
-def test_a_starved_owner_shows_too_little_and_is_not_learnt_from() -> None:
-    wanted = Demand(cpu_cores=1.5, memory_mb=600.0)
-    busy = profile(1, cpu=4.0 * STARVED_CPU_RATIO, used=(0.5, 300.0))
-    nearly = profile(1, cpu=4.0 * STARVED_CPU_RATIO - 0.01, used=(0.5, 300.0))
-
-    assert learnt(profile(0, used=(1.5, 600.0)), busy) == wanted
-    assert learnt(profile(0, used=(1.5, 600.0)), nearly) == Demand(cpu_cores=0.5, memory_mb=300.0)
-    assert learnt(busy) == TASK.demand
-
-
-@pytest.mark.parametrize(("cpu", "is_learnt"), [(2.0, True), (3.5, True), (3.8, False), (4.0, False)])
-def test_a_busy_owner_is_learnt_from_until_next_to_nothing_of_its_processor_is_left(
-    cpu: float, *, is_learnt: bool
-) -> None:
-    """Of 4 cores: one that is half busy gives its worker what it wants."""
-    demand = learnt(profile(cpu=cpu, used=(1.5, 600.0)))
-    assert demand == (Demand(cpu_cores=1.5, memory_mb=600.0) if is_learnt else TASK.demand)
-
-
-@pytest.mark.parametrize("state", [WorkerState.STOPPED, WorkerState.STARTING, WorkerState.FAILED])
-def test_a_task_does_not_cost_less_because_its_worker_restarts(state: WorkerState) -> None:
-    restarting = profile(1, state=state, used=(0.0, 20.0))
-
-    assert learnt(profile(0, used=(1.5, 600.0)), restarting) == Demand(cpu_cores=1.5, memory_mb=600.0)
-
-
-def test_a_figure_that_was_not_measured_leaves_the_known_one() -> None:
-    known, without = profile(0, used=(1.5, 600.0)), profile(1, used=(None, None))
-
-    assert learnt(known, without) == Demand(cpu_cores=1.5, memory_mb=600.0)
-    assert learnt(known, profile(1, cpu=None)) == Demand(cpu_cores=1.5, memory_mb=600.0)
+# --- demand (more of it: test_demand.py) ---------------------------------------------------------------------------
 
 
 def test_an_owner_without_a_fresh_profile_or_worker_is_not_learnt_from() -> None:
@@ -211,12 +146,7 @@ def test_an_owner_without_a_fresh_profile_or_worker_is_not_learnt_from() -> None
     gateway.learn_demand("merge", "edge2", 0.0)
     gateway.learn_demand("other", "edge1", 0.0)
 
-    assert gateway.demand(TASK) == TASK.demand
+    assert gateway.demand(TASK, profile()) == TASK.demand
 
-
-def test_life_with_a_lower_count_is_believed_once_the_higher_one_is_silent() -> None:
-    """The node's state was made anew with a clock that is behind."""
-    gateway = gateway_with(profile(5, incarnation=9))
-    assert gateway.absorb(profile(0, incarnation=2), now=TTL_S) == "doubtful"
-    assert gateway.absorb(profile(1, incarnation=2), now=TTL_S + 0.1) is None
-    assert gateway.fresh("edge1", now=TTL_S + 0.1) == profile(1, incarnation=2)
+    gateway.learn_demand("merge", "edge1", TTL_S)
+    assert gateway.demand(TASK, profile()) == Demand(cpu_cores=1.5, memory_mb=600.0)

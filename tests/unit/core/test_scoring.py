@@ -103,7 +103,7 @@ EDGES = (profile("edge1", cpu=3.0), profile("edge2", cpu=2.0), profile("edge3", 
 # --- the score's form ------------------------------------------------------------------------------------------------
 
 
-def test_machines_that_lack_what_the_task_needs_are_told_apart_by_the_diminishing_form_only() -> None:
+def test_machines_that_lack_what_the_task_needs_are_told_apart_by_the_service_form_only() -> None:
     """One is idle, one is starved, both have less left than a task of a whole machine needs."""
     spec = replace(SPEC, candidates=("edge1", "edge2"), demand=Demand(cpu_cores=4.0, memory_mb=500.0))
     edges = (profile("edge1", cpu=3.9), profile("edge2", cpu=0.1))
@@ -114,7 +114,18 @@ def test_machines_that_lack_what_the_task_needs_are_told_apart_by_the_diminishin
         found[form] = values(scored(ROBOT, *edges, spec=spec, agreed=agreed))
 
     assert found[ScoreForm.PAPER]["edge1"] == found[ScoreForm.PAPER]["edge2"]
-    assert found[ScoreForm.DIMINISHING]["edge1"] < found[ScoreForm.DIMINISHING]["edge2"] / 4
+    assert found[ScoreForm.SERVICE]["edge1"] < found[ScoreForm.SERVICE]["edge2"] / 4
+
+
+def test_memory_below_the_floor_is_no_room_for_a_task_s_service() -> None:
+    half = Weights(cpu=0.5, memory=0.5, network=0.0)
+    spec = replace(SPEC, demand=Demand(cpu_cores=0.4, memory_mb=400.0), memory_floor_ratio=0.05)
+    found = {}
+    for form in ScoreForm:
+        agreed = replace(allocation(half, owner=None), tuning=Tuning(weights=half, score=form))
+        found[form] = scored(ROBOT, profile("edge1", memory=3600.0), spec=spec, agreed=agreed).utilities[0].memory
+    assert found[ScoreForm.PAPER] == 0.0
+    assert found[ScoreForm.SERVICE] == pytest.approx(0.5, abs=0.02)
 
 
 # --- who is scored -------------------------------------------------------------------------------------------------

@@ -83,7 +83,7 @@ def values(owner_of_a: str | None, owner_of_b: str | None = None) -> dict[str, A
 
 
 def scored_b(gateway: Gateway, agreed: dict[str, Allocation]) -> UtilityVector:
-    return score(B, agreed["b"], "robot1", gateway, ALIVE, 0.0, book(FLEET.tasks, agreed, gateway))
+    return score(B, agreed["b"], "robot1", gateway, ALIVE, 0.0, book(FLEET.tasks, agreed))
 
 
 def gateway_with(*workers_on_edge1: WorkerLoad, memory_mb: float = 1000.0) -> Gateway:
@@ -136,4 +136,4 @@ def test_memory_that_is_booked_cannot_be_had_twice() -> None:
 
 
 def test_a_single_task_has_no_bookings() -> None:
-    assert book((A,), values("edge1"), gateway_with()) == {}
+    assert book((A,), values("edge1")) == {}

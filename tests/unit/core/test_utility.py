@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from zsched.core import fleet, scoring, utility
+from zsched.core.fleet import PATIENT_BONUS
 from zsched.core.model import ScoreForm, Weights
 from zsched.core.utility import (
     clamp,
@@ -15,7 +16,7 @@ from zsched.core.utility import (
     memory_utility,
     network_utility,
     predicted_use,
-    room_utility,
+    service_utility,
     total_utility,
 )
 
@@ -141,7 +142,7 @@ def test_results_are_plain_finite_numbers_at_the_edges() -> None:
         assert 0.0 <= value <= 1.0
 
 
-# --- the form without a clamp ----------------------------------------------------------------------------------------
+# --- the share of its work that a task would get done -----------------------------------------------------------------
 
 
 @SEEDED
@@ -149,52 +150,59 @@ def test_results_are_plain_finite_numbers_at_the_edges() -> None:
 def test_room_is_worth_more_the_more_there_is_and_less_the_more_is_needed(
     capacity: float, free: float, more: float, demand: float
 ) -> None:
-    value = room_utility(free, demand, capacity)
+    value = service_utility(free, demand, capacity)
 
-    assert 0.0 <= value < 1.0
-    assert room_utility(free + more, demand, capacity) >= value
-    assert room_utility(free, demand + more, capacity) <= value
+    assert 0.0 <= value <= 1.0
+    assert service_utility(free + more, demand, capacity) >= value - 1e-12
+    assert service_utility(free, demand + more, capacity) <= value + 1e-12
+
+
+def test_below_the_need_a_term_falls_as_the_work_that_is_done_and_above_it_next_to_nothing_counts() -> None:
+    whole = service_utility(2.0, 2.0, 4.0)
+    assert service_utility(1.0, 2.0, 4.0) == pytest.approx(whole / 2, rel=0.02)
+    assert whole < service_utility(4.0, 2.0, 4.0) < whole + PATIENT_BONUS / 2
 
 
 def test_a_starved_machine_is_worth_less_than_an_idle_one_though_neither_has_what_the_task_needs() -> None:
     """Where Eq. 1 says 0 of both: 4 cores, a task that needs 5."""
     assert cpu_utility(4.0, 5.0) == cpu_utility(4.0, 8.6) == 0.0
-    assert room_utility(4.0, 5.0, 4.0) > 5 * room_utility(0.4, 5.0, 4.0) > 0.0
+    assert service_utility(4.0, 5.0, 4.0) > 8 * service_utility(0.4, 5.0, 4.0) > 0.0
 
 
 def test_a_task_that_needs_next_to_nothing_still_prefers_the_machine_with_more_room() -> None:
-    assert room_utility(3.0, 0.0, 4.0) > room_utility(1.0, 0.0, 4.0)
-    assert room_utility(-1.0, 0.0, 4.0) == room_utility(0.0, 1.0, 4.0) == 0.0
+    assert service_utility(3.0, 0.0, 4.0) > service_utility(1.0, 0.0, 4.0)
+    assert service_utility(-1.0, 0.0, 4.0) == service_utility(0.0, 1.0, 4.0) == 0.0
 
 
-DIMINISHING = ScoreForm.DIMINISHING
+SERVICE = ScoreForm.SERVICE
 
 
-def test_in_a_geometric_mean_a_weight_is_how_much_a_percent_of_its_term_counts() -> None:
+def test_in_the_product_the_heaviest_metric_counts_as_it_is_and_the_others_by_their_weight_beside_it() -> None:
     shares = Weights(cpu=0.5, memory=0.25, network=0.25)
-    full = total_utility(shares, cpu=0.8, memory=0.4, network=0.6, measured=ALL, form=DIMINISHING)
-    less = total_utility(shares, cpu=0.8 * 0.99, memory=0.4, network=0.6, measured=ALL, form=DIMINISHING)
+    full = total_utility(shares, cpu=0.8, memory=0.4, network=0.6, measured=ALL, form=SERVICE)
+    cpu = total_utility(shares, cpu=0.8 * 0.99, memory=0.4, network=0.6, measured=ALL, form=SERVICE)
+    memory = total_utility(shares, cpu=0.8, memory=0.4 * 0.99, network=0.6, measured=ALL, form=SERVICE)
     assert full is not None
-    assert less is not None
-    assert less / full == pytest.approx(0.99**0.5)
+    assert full == pytest.approx(0.8 * 0.4**0.5 * 0.6**0.5)
+    assert cpu == pytest.approx(full * 0.99)
+    assert memory == pytest.approx(full * 0.99**0.5)
 
 
-def test_spare_memory_hides_a_starved_cpu_in_a_sum_and_not_in_a_geometric_mean() -> None:
+def test_spare_memory_hides_a_starved_cpu_in_a_sum_and_not_in_a_product() -> None:
     def worth(cpu: float, memory: float, form: ScoreForm) -> float:
         half = Weights(cpu=0.5, memory=0.5, network=0.0)
         return total_utility(half, cpu=cpu, memory=memory, network=None, measured=ALL, form=form) or 0.0
 
     assert worth(0.02, 0.9, ScoreForm.PAPER) > worth(0.4, 0.4, ScoreForm.PAPER)
-    assert worth(0.02, 0.9, DIMINISHING) < worth(0.4, 0.4, DIMINISHING) / 2
+    assert worth(0.02, 0.9, SERVICE) < worth(0.4, 0.4, SERVICE) / 2
 
 
 @SEEDED
-@given(weights(), RATIO, RATIO)
-def test_equal_terms_are_their_own_mean_and_what_is_not_measured_has_no_share(
-    shares: Weights, term: float, memory: float
-) -> None:
-    value = total_utility(shares, cpu=term, memory=term, network=term, measured=ALL, form=DIMINISHING)
-    assert value == pytest.approx(term)
-    kept = Weights(cpu=0.5, memory=0.25, network=0.25)
-    two = total_utility(kept, cpu=term, memory=memory, network=None, measured=ALL - {"network"}, form=DIMINISHING)
-    assert two == pytest.approx(term ** (2 / 3) * memory ** (1 / 3))
+@given(RATIO, RATIO)
+def test_what_nobody_measures_or_nobody_weighs_does_not_count_in_the_product(term: float, memory: float) -> None:
+    shares = Weights(cpu=0.25, memory=0.25, network=0.5)
+    two = total_utility(shares, cpu=term, memory=memory, network=None, measured=ALL - {"network"}, form=SERVICE)
+    assert two == pytest.approx(term * memory)
+    alone = Weights(cpu=1.0, memory=0.0, network=0.0)
+    assert total_utility(alone, cpu=term, memory=memory, network=0.1, measured=ALL, form=SERVICE) == pytest.approx(term)
+    assert total_utility(shares, cpu=None, memory=memory, network=0.1, measured=ALL, form=SERVICE) is None

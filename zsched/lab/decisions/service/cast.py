@@ -11,7 +11,14 @@ from dataclasses import fields
 from enum import Enum
 from typing import Any, Final, Literal, get_args, get_origin, get_type_hints
 
-from zsched.core.fleet import DEFAULT_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S, TaskSpec
+from zsched.core.fleet import (
+    DEFAULT_PATIENCE,
+    PATIENT_BONUS,
+    PATIENT_COOL_DOWN_S,
+    SERVICE_COOL_DOWN_S,
+    SERVICE_PATIENCE,
+    TaskSpec,
+)
 from zsched.core.model import ScoreForm, Tuning, Weights
 from zsched.lab.decisions.entries import PAPER_COST, RAW
 from zsched.lab.decisions.rules import CoreRule, PickRule, Rule
@@ -19,14 +26,15 @@ from zsched.lab.decisions.service.replay import Player, is_of_task
 from zsched.lab.decisions.view import Look, Sight
 from zsched.lab.decisions.world import EVEN, RADIO_ONLY
 
-OWN: Final = ("smoothing_s", "move_cost_s")
-"""Settings of a rule that are neither of `Tuning` nor of `TaskSpec`."""
+OWN: Final = ("smoothing_s", "move_cost_s", "is_told")
+"""Settings of a rule that are neither of `Tuning` nor of `TaskSpec`; ``is_told=0``: no worker says what it wants."""
 
 
 def players() -> tuple[Player, ...]:
     """The rules that are always compared."""
     return (
         zsched("zsched"),
+        zsched("service", score=ScoreForm.SERVICE),
         _picks("dyna_both", EVEN, PAPER_COST),
         _picks("dyna_net", RADIO_ONLY, PAPER_COST),
         _picks("argmax", EVEN, 0.0),
@@ -41,11 +49,14 @@ def zsched(name: str, **settings: Any) -> Player:
     given = dict(settings)
     smoothing_s = given.pop("smoothing_s", Look().smoothing_s)
     move_cost_s = given.pop("move_cost_s", 0.0)
+    is_told = bool(given.pop("is_told", True))
     changes = {key: given.pop(key) for key in tuple(given) if is_of_task(key)}
+    is_service = given.get("score") is ScoreForm.SERVICE
     if "time_to_trigger_s" not in given:
-        changes.setdefault("patience", DEFAULT_PATIENCE)
+        changes.setdefault("patience", SERVICE_PATIENCE if is_service else DEFAULT_PATIENCE)
     if changes.get("patience") is not None:
-        given = {"bonus": PATIENT_BONUS, "cool_down_s": PATIENT_COOL_DOWN_S, **given}
+        cool_down_s = SERVICE_COOL_DOWN_S if is_service else PATIENT_COOL_DOWN_S
+        given = {"bonus": PATIENT_BONUS, "cool_down_s": cool_down_s, **given}
     tuning = Tuning(**{"weights": EVEN, **given})
     return Player(
         name=name,
@@ -53,6 +64,7 @@ def zsched(name: str, **settings: Any) -> Player:
         tuning=tuning,
         look=Look(smoothing_s=smoothing_s),
         changes=changes,
+        is_told=is_told,
     )
 
 

@@ -49,6 +49,8 @@ class Player:
     look: Look = Look()
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Fields of `TaskSpec` that it has otherwise."""
+    is_told: bool = True
+    """Workers say what they would use if they had the machine to themselves."""
 
 
 class Scene:
@@ -64,7 +66,7 @@ class Scene:
             for spec in specs
         }
         self.states = dict.fromkeys((node.name for node in self.fleet.nodes), PeerState.ALIVE)
-        self._history = history
+        self._history, self._is_told = history, player.is_told
         self._column = {name: index for index, name in enumerate(specs[0].candidates)}
         self._placed: tuple[int | None, ...] = (None,) * len(specs)
         self._profilers = {node.name: Profiler(node.name, 1, timing) for node in self.fleet.nodes}
@@ -104,13 +106,19 @@ class Scene:
             is_here = self._placed[task] == column
             rank = rank_of(self._placed, task) if is_here else 0
             mine = (cores[stretch][rank], memory[stretch][rank]) if is_here else (0.0, 0.0)
-            workers.append(WorkerLoad(task=name, state=WorkerState.READY, cpu_cores=mine[0], memory_mb=mine[1]))
+            wanted = self._history.works[task].demand(machine) if is_here and self._is_told else None
+            workers.append(
+                WorkerLoad(
+                    task=name, state=WorkerState.READY, cpu_cores=mine[0], memory_mb=mine[1], wanted_cores=wanted
+                )
+            )
         return DeviceSample(
             cpu_cores=machine.cores,
             cpu_used_cores=min(max(used, 0.0), machine.cores),
             memory_mb=machine.memory_mb,
             memory_used_mb=min(max(used_mb, 0.0), machine.memory_mb),
             workers=tuple(workers),
+            speed=machine.speed,
         )
 
     def learn(self, now: float) -> None:
@@ -146,7 +154,7 @@ class TaskView:
 
     def _compare(self, now: float) -> Standing:
         allocation = self._scene.values[self.spec.name]
-        bookings = book(self.fleet.tasks, self._scene.values, self.gateway)
+        bookings = book(self.fleet.tasks, self._scene.values)
         voters = self.fleet.voters
         # All robots are on cables: what one of them makes of the profiles is what each of them makes of them.
         vector = score(self.spec, allocation, voters[0], self.gateway, self._scene.states, now, bookings)
