@@ -14,10 +14,11 @@ import zenoh
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import between, free_endpoint, until
 from zsched import send_queue
+from zsched.core.books import unaccounted
 from zsched.core.plan import Direction, HandoverRule, Route, StreamClass, StreamSettings
 from zsched.core.relay_protocol import EndMarker
 from zsched.keyspace import END_CHUNK
-from zsched.relay import outlet, outputs, slots
+from zsched.relay import outlet, outputs, receive, slots
 from zsched.relay.inputs import InputStream
 from zsched.relay.outputs import OutputStream
 from zsched.relay_pipe import decode_end, encode_end
@@ -216,6 +217,83 @@ def test_what_this_process_put_does_not_come_back(bench: Bench) -> None:
     publisher = bench.publisher("robot1/in")
     publisher.put(b"x", source_info=zenoh.SourceInfo(publisher.id, 0))
     until(lambda: drops(stream) == {"loop": 1}, "the loop is cut and counted")
+
+
+@dataclass
+class Burst:
+    """Samples that come while their stream stands still: its lock is held."""
+
+    bench: Bench
+    stream: InputStream | OutputStream
+    key: str
+    is_numbered: bool = False
+    count: int = 0
+
+    def put(self, publisher: zenoh.Publisher) -> None:
+        source = zenoh.SourceInfo(publisher.id, self.count) if self.is_numbered else None
+        publisher.put(str(self.count), source_info=source)
+        self.count += 1
+
+    def run(self, count: int) -> None:
+        """Return when all have reached the relay; one is in the hand of the stream's thread."""
+        publisher = self.bench.publisher(self.key, congestion_control=zenoh.CongestionControl.BLOCK)
+        reached: list[zenoh.Sample] = []
+        beside = self.bench.relay.declare_subscriber(self.key, reached.append)
+        self.put(publisher)
+        until(lambda: self.stream.count().messages == 1, "it carries")
+        with self.stream._lock:
+            for _ in range(count):
+                self.put(publisher)
+            until(lambda: len(reached) == self.count, "all have reached the relay")
+        beside.undeclare()
+
+
+@pytest.mark.parametrize("stream_class", list(StreamClass))
+def test_no_sample_of_a_burst_is_lost_without_a_counter(
+    bench: Bench, stream_class: StreamClass, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """More than `depth` come while one waits: what zenoh's ring channel dropped then, nobody counted."""
+    monkeypatch.setattr(receive, "BEHIND_S", 0.0)
+    got: list[str] = []
+    kept = bench.outside.declare_subscriber("edge1/t/in", lambda s: got.append(s.payload.to_string()))
+    route = way_in(stream_class)
+    route = replace(route, settings=replace(route.settings, depth=16))
+    stream = bench.input(route)
+    stream.open(1, route)
+    until(lambda: stream.is_matching(1), "the target subscribes")
+    stream.flip(1)
+    Burst(bench, stream, "robot1/in").run(200)
+    until(lambda: stream.count().messages == 201, f"each in a counter: {stream.count()}")
+    until(lambda: got[-1:] == ["200"], "the newest")
+    assert unaccounted(stream.count()) == 0
+    dropped = drops(stream)
+    until(lambda: len(got) + dropped.get("overflow", 0) == 201, f"{len(got)} came, {dropped}")
+    if stream_class is StreamClass.BEST_EFFORT:
+        assert dropped["overflow"] >= 100, "the oldest give way"
+    if stream_class is StreamClass.RELIABLE:
+        assert not dropped
+    kept.undeclare()
+
+
+@pytest.mark.parametrize("is_numbered", [False, True])
+def test_an_answer_that_gives_way_is_counted_once(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, *, is_numbered: bool
+) -> None:
+    """As overflow; as lost where its number is missed."""
+    monkeypatch.setattr(receive, "BEHIND_S", 0.0)
+    got: list[str] = []
+    kept = bench.outside.declare_subscriber("robot1/out", lambda s: got.append(s.payload.to_string()))
+    route = way_out(1, HandoverRule.LATEST, StreamClass.BEST_EFFORT)
+    route = replace(route, settings=replace(route.settings, depth=16))
+    stream = bench.output(route)
+    stream.open(1, route)
+    stream.flip(1, drops_held=False)
+    Burst(bench, stream, route.from_expr, is_numbered=is_numbered).run(200)
+    until(lambda: got[-1:] == ["200"], "the newest")
+    left = 201 - len(got)
+    assert left >= 100
+    assert (stream.count().lost, drops(stream)) == ((left, {}) if is_numbered else (0, {"overflow": left}))
+    kept.undeclare()
 
 
 def test_a_mirrored_input_feeds_both_owners_until_the_old_slot_closes(bench: Bench) -> None:

@@ -46,6 +46,10 @@ sys.stdin.read()
 """
 
 
+def lost(_sample: zenoh.Sample) -> None:
+    pytest.fail("nothing of class `latest` gives way")
+
+
 class Net:
     """The relay's session and an application's."""
 
@@ -60,7 +64,7 @@ class Net:
 
     def receive(self, key: str = KEY) -> None:
         take = lambda sample: self.got.append(sample.payload.to_string())  # noqa: E731 - named for its use below
-        self.receivers.append(Receiver(self.relay, key, SETTINGS, take, with_history=True))
+        self.receivers.append(Receiver(self.relay, key, SETTINGS, take, with_history=True, give_way=lost))
 
     def advanced(self, key: str = KEY) -> ext.AdvancedPublisher:
         return ext.declare_advanced_publisher(
@@ -163,7 +167,7 @@ def test_all_of_many_publishers_that_appear_at_once_are_asked(net: Net) -> None:
         with zenoh.open(zenoh.Config.from_json5(data_config(listen=(endpoint,), connect=()))) as relay:
             settings = StreamSettings(stream_class=StreamClass.LATEST, keep_last=1, depth=2000)
             take = lambda sample: net.got.append(sample.payload.to_string())  # noqa: E731 - named for its use below
-            receiver = Receiver(relay, "robot1/*/map", settings, take, with_history=True)
+            receiver = Receiver(relay, "robot1/*/map", settings, take, with_history=True, give_way=lost)
             until(lambda: len(set(net.got)) == len(names), "every value", 60.0)
             assert sorted(net.got) == sorted(names), "and each once"
             receiver.close()
@@ -219,7 +223,7 @@ def test_a_publisher_that_dies_with_a_query_open_holds_no_stream(
         thread.start()
         process.send_signal(fault)
         take = lambda sample: arrivals.append(sample.payload.to_string())  # noqa: E731 - used once
-        net.receivers.append(Receiver(net.relay, KEY, SETTINGS, take, with_history=True))
+        net.receivers.append(Receiver(net.relay, KEY, SETTINGS, take, with_history=True, give_way=lost))
         try:
             until(lambda: len(arrivals) > 100, "the live stream", deadline_s=60.0)
         finally:

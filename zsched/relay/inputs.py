@@ -80,7 +80,13 @@ class InputStream:
         side = local or session
         self._loop_ids = own_ids - {str(side.zid())}
         self._receiver = Receiver(
-            side, route.from_expr, route.settings, self._carry, with_history=True, origin=zenoh.Locality.ANY
+            side,
+            route.from_expr,
+            route.settings,
+            self._carry,
+            with_history=True,
+            give_way=self._give_way,
+            origin=zenoh.Locality.ANY,
         )
 
     def open(self, epoch: int, route: Route, acks: Acks | None = None) -> None:
@@ -273,6 +279,12 @@ class InputStream:
                 self._counter.dropped("no_route")
             else:
                 self._counter.unsent += 1
+
+    def _give_way(self, sample: Sample) -> None:
+        """A sample that newer ones overtook before it was carried."""
+        with self._lock:
+            self._counter.seen(len(sample.payload))
+            self._counter.dropped("overflow")
 
     def _send(self, sample: Sample, stamp: Timestamp | None, size: int | None = None) -> None:
         if self._active is not None:

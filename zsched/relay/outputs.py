@@ -122,6 +122,7 @@ class OutputStream:
             route.settings,
             lambda sample: self._carry(feed.slot, sample),
             with_history=has_epoch,
+            give_way=self._give_way,
         )
         if slot.answers is not None:
             feed.again = Receiver(
@@ -130,6 +131,7 @@ class OutputStream:
                 replace(route.settings, stream_class=StreamClass.RELIABLE),
                 lambda sample: self._carry_again(feed.slot, sample),
                 with_history=False,
+                give_way=self._give_way,
             )
 
     def _listen_for_ends(self, epoch: int, from_expr: str) -> None:
@@ -306,6 +308,13 @@ class OutputStream:
                 return
             for (_, zid, eid), ready in slot.answers.take_again(name, sample):
                 self._pass(slot, key, (zid, eid), ready)
+
+    def _give_way(self, sample: Sample) -> None:
+        """An answer that newer ones overtook; one with a number is missed by that, and counted as lost."""
+        if _publisher_of(sample)[1] == UNNUMBERED:
+            with self._lock:
+                self._counter.seen(len(sample.payload))
+                self._counter.dropped("overflow")
 
     def _pass(
         self, slot: OutputSlot, key: KeyState, publisher: _Publisher, sample: Sample, number: int | None = None

@@ -3,23 +3,35 @@
 Knows: zenoh subscribers, ring and fifo handlers. Does not know: what becomes of a sample.
 
 Never callbacks that work: a slow one blocks zenoh's receive pool and with it every other link of the process.
+
+Nothing is lost in here that nobody counts: zenoh's ring channel drops without a word, so no class has one. A full
+queue makes zenoh's thread wait, the publisher's link in the end, until ours takes the next sample. The puts of class
+``best_effort`` are the only ones that may wait in our thread (zenoh gives a full link 1 to 50 ms): behind such a put
+the oldest give way, and the stream hears of each.
 """
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
+from collections import deque
 from collections.abc import Callable
 from typing import Any, Final, Protocol
 
 import zenoh
 from zenoh import Sample, Session
 
+from zsched.clock import awake_s
 from zsched.core.plan import StreamClass, StreamSettings
 from zsched.guard import guarded
 from zsched.relay.history import History
 
 JOIN_S: Final = 0.3
+QUEUE_DEPTH: Final = 256
+"""Samples that zenoh's thread can leave for ours without waiting, at least; also as many as we take in one go."""
+BEHIND_S: Final = 0.01
+"""Class ``best_effort``: who has put so long without looking at what came meanwhile waits for a link."""
 
 _log = logging.getLogger("zsched.relay")
 
@@ -47,10 +59,13 @@ class Receiver:
         carry: Callable[[Sample], None],
         *,
         with_history: bool,
+        give_way: Callable[[Sample], None],
         origin: zenoh.Locality = zenoh.Locality.REMOTE,
     ) -> None:
         """Subscribe and start; by default without what ``session`` itself puts (``origin``).
 
+        ``give_way`` is told of a sample of class ``best_effort`` that is not carried, since newer ones wait (our
+        thread, as ``carry``).
         ``with_history`` asks the publishers of class ``latest`` for what they still hold; wrong where a key outlives
         an owner's epoch (the old epoch's value would come back as the new one's).
 
@@ -63,6 +78,8 @@ class Receiver:
             self._history = History(session, expr, settings.keep_last, carry, origin)
         self._carry = carry if self._history is None else self._history.live
         self._subscriber = _subscribe(session, expr, settings, origin)
+        self._depth = settings.depth
+        self._give_way = give_way if settings.stream_class is StreamClass.BEST_EFFORT else None
         self._handler = self._subscriber.handler  # the thread's own: undeclare() refuses while recv() borrows
         self._thread = guarded(self._run, name=f"from {expr}", kind="from")
         self._thread.start()
@@ -78,19 +95,46 @@ class Receiver:
             self._thread.join(JOIN_S)
 
     def _run(self) -> None:
-        for sample in self._handler:
-            try:
-                self._carry(sample)
-            except Exception:  # noqa: BLE001 - one bad sample must not end its stream
-                _log.exception("%s: a sample could not be carried", sample.key_expr)
+        if self._give_way is None:
+            for sample in self._handler:
+                self._carry_one(sample)
+            return
+        waiting: deque[Sample] = deque()
+        for first in self._handler:
+            waiting.append(first)
+            while waiting:
+                self._take(waiting)
+                if self._is_behind(waiting):
+                    self._take(waiting)
+                    while len(waiting) > self._depth:
+                        self._give_way(waiting.popleft())
+
+    def _is_behind(self, waiting: deque[Sample]) -> bool:
+        """Carry one sample at least, and all that wait unless that takes too long: then newer ones may have come."""
+        until = awake_s() + BEHIND_S
+        self._carry_one(waiting.popleft())
+        while (is_in_time := awake_s() < until) and waiting:
+            self._carry_one(waiting.popleft())
+        return not is_in_time
+
+    def _carry_one(self, sample: Sample) -> None:
+        try:
+            self._carry(sample)
+        except Exception:  # noqa: BLE001 - one bad sample must not end its stream
+            _log.exception("%s: a sample could not be carried", sample.key_expr)
+
+    def _take(self, waiting: deque[Sample]) -> None:
+        """What has come meanwhile: one look at it costs less than one waiting for each."""
+        with contextlib.suppress(zenoh.ZError):  # unsubscribed: the loop over the handler ends, too
+            for _ in range(QUEUE_DEPTH):
+                if (sample := self._handler.try_recv()) is None:
+                    break
+                waiting.append(sample)
 
 
 _Subscriber = zenoh.Subscriber[zenoh.handlers.Handler[Sample]]
 
 
 def _subscribe(session: Session, expr: str, settings: StreamSettings, origin: zenoh.Locality) -> _Subscriber:
-    if settings.stream_class is StreamClass.RELIABLE:
-        fifo: zenoh.handlers.FifoChannel[Sample] = zenoh.handlers.FifoChannel(max(settings.depth, 256))
-        return session.declare_subscriber(expr, fifo, allowed_origin=origin)
-    ring: zenoh.handlers.RingChannel[Sample] = zenoh.handlers.RingChannel(settings.depth)
-    return session.declare_subscriber(expr, ring, allowed_origin=origin)
+    fifo: zenoh.handlers.FifoChannel[Sample] = zenoh.handlers.FifoChannel(max(settings.depth, QUEUE_DEPTH))
+    return session.declare_subscriber(expr, fifo, allowed_origin=origin)

@@ -1,0 +1,80 @@
+"""What a receiver does with samples that come faster than it carries them."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+import zenoh
+
+from support.sessions import hub_and_neighbour, matches
+from support.waiting import until
+from zsched.core.plan import StreamClass, StreamSettings
+from zsched.relay import receive
+from zsched.relay.receive import Receiver
+
+KEY = "robot1/in"
+COUNT = 200
+
+
+@pytest.mark.parametrize("stream_class", list(StreamClass))
+def test_every_sample_that_comes_is_carried_or_gives_way_to_newer_ones(
+    stream_class: StreamClass, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(receive, "BEHIND_S", 0.0)
+    carried: list[int] = []
+    gone: list[int] = []
+    reached: list[zenoh.Sample] = []
+    may_go_on = threading.Event()
+
+    def carry(sample: zenoh.Sample) -> None:
+        carried.append(int(sample.payload.to_bytes()))
+        may_go_on.wait(60.0)
+
+    with hub_and_neighbour() as (relay, outside):
+        receiver = Receiver(
+            relay,
+            KEY,
+            StreamSettings(stream_class=stream_class, depth=16),
+            carry,
+            with_history=False,
+            give_way=lambda sample: gone.append(int(sample.payload.to_bytes())),
+        )
+        beside = relay.declare_subscriber(KEY, reached.append)
+        publisher = outside.declare_publisher(KEY, congestion_control=zenoh.CongestionControl.BLOCK)
+        until(lambda: matches(publisher), "the relay subscribes")
+        publisher.put("0")
+        until(lambda: carried == [0], "the first is in hand")
+        for number in range(1, COUNT):
+            publisher.put(str(number))
+        until(lambda: len(reached) == COUNT, "all have reached the relay")
+        may_go_on.set()
+        until(lambda: carried[-1] == COUNT - 1, "the newest")
+        assert sorted(carried + gone) == list(range(COUNT))
+        assert carried == sorted(carried)
+        if stream_class is StreamClass.BEST_EFFORT:
+            assert len(gone) > COUNT // 2
+            assert gone == list(range(1, len(gone) + 1)), "the oldest behind the one in hand"
+        else:
+            assert not gone, "the newest value of a key may be among the oldest samples"
+        receiver.close()
+        beside.undeclare()
+
+
+def test_a_stream_goes_on_behind_a_sample_that_cannot_be_carried() -> None:
+    carried: list[int] = []
+
+    def carry(sample: zenoh.Sample) -> None:
+        carried.append(int(sample.payload.to_bytes()))
+        if carried == [0]:
+            raise ValueError(sample)
+
+    with hub_and_neighbour() as (relay, outside):
+        settings = StreamSettings(stream_class=StreamClass.BEST_EFFORT, depth=16)
+        receiver = Receiver(relay, KEY, settings, carry, with_history=False, give_way=lambda _: None)
+        publisher = outside.declare_publisher(KEY, congestion_control=zenoh.CongestionControl.BLOCK)
+        until(lambda: matches(publisher), "the relay subscribes")
+        for number in range(2):
+            publisher.put(str(number))
+        until(lambda: carried == [0, 1], "both")
+        receiver.close()
