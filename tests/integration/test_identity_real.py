@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from zsched.lab.loopback import free_endpoint
 from zsched.lab.testbed import DAEMON, Testbed, TestbedError, echo_fleet
 from zsched.lifecycle import init_state
 
@@ -150,3 +151,29 @@ def test_another_fleet_file_is_shown(bed: Testbed) -> None:
         return any("another fleet file" in problem for problem in bed.status("robot1")["problems"])
 
     bed.wait(told, 60, "robot1 to notice")
+
+
+def test_second_machine_that_only_the_others_hear_leaves_again_and_everybody_names_both(tmp_path: Path) -> None:
+    """Its own file gives it another address, so no file has a way from one twin to the other."""
+    tree = echo_fleet(edges=1)
+    with Testbed(tmp_path, tree) as bed:
+        bed.init()
+        bed.start()
+        bed.wait_settled()
+        tree["nodes"]["edge1"]["listen"] = {"control": free_endpoint(), "data": free_endpoint()}
+        file = bed.folder / "twin.yaml"
+        file.write_text(json.dumps(tree))
+        folders = ("--state-dir", str(bed.folder / "twin"), "--runtime-dir", str(bed.folder / "twin-run"))
+        twin = subprocess.run(
+            [*DAEMON, "--config", str(file), "--node", "edge1", *folders],
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+        assert twin.returncode == 75, twin.stderr[-2000:]
+        assert "another daemon calls itself 'edge1': robot" in twin.stderr
+        said = [one for one in bed.status("robot1")["problems"] if "2 daemons call themselves 'edge1'" in one]
+        assert said, bed.status("robot1")["problems"]
+        assert said[0].count("tcp/") == 2, said
+        assert bed.task("robot1")["owner"] == "edge1"

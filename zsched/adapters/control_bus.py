@@ -280,7 +280,7 @@ class ControlBus:
     def ask_utilities(self, gather: int, deadline_s: float) -> None:
         """One query to every robot; answers are posted as they come."""
 
-        def on_answer(owner: NodeId, value: Utilities) -> None:
+        def on_answer(owner: NodeId, value: Utilities, _zid: str) -> None:
             if owner == value.voter:
                 self._post(ev.UtilityReceived(gather=gather, utilities=value))
             else:
@@ -291,7 +291,7 @@ class ControlBus:
     def ask_electors(self, question: Prepare | Accept, deadline_s: float) -> None:
         """One query to every elector, ourselves included; answers are posted as they come."""
 
-        def on_answer(owner: NodeId, value: Promise | Accepted | Refused) -> None:
+        def on_answer(owner: NodeId, value: Promise | Accepted | Refused, _zid: str) -> None:
             if owner == value.elector:
                 self._post(ev.ElectorAnswered(answer=value))
             else:
@@ -303,13 +303,19 @@ class ControlBus:
     def ask_learnt(self, peer: NodeId, deadline_s: float) -> None:
         """Ask one peer for what it has learnt."""
 
-        def on_answer(owner: NodeId, value: Learnt) -> None:
+        def on_answer(owner: NodeId, value: Learnt, zid: str) -> None:
             if owner == value.node == peer:
-                self._post(ev.LearntReceived(learnt=value, is_answer=True))
+                self._post(ev.LearntReceived(learnt=value, is_answer=True, where=self._where(zid)))
             else:
                 self._post(ev.FrameDropped(kind="allocation", reason="foreign"))
 
         self._ask(self._keys.learnt(peer, self._node), None, deadline_s, (Learnt,), on_answer, is_remote=True)
+
+    def _where(self, zid: str) -> str:
+        """The address at the other end of the link to a session; empty: there is none."""
+        session = self._session
+        links = () if session is None else session.info.links()
+        return next((str(link.dst).partition("?")[0] for link in links if str(link.zid) == zid), "")
 
     def _ask(
         self,
@@ -317,7 +323,7 @@ class ControlBus:
         payload: bytes | None,
         deadline_s: float,
         classes: tuple[type[Any], ...],
-        on_answer: Callable[[NodeId, Any], None],
+        on_answer: Callable[[NodeId, Any, str], None],
         *,
         is_remote: bool = False,
     ) -> None:
@@ -332,7 +338,8 @@ class ControlBus:
                 self._post(ev.FrameDropped(kind=key.kind if key is not None else "key", reason=error.reason))
                 return
             if key is not None:
-                on_answer(key.owner, value)
+                replier = reply.replier_id
+                on_answer(key.owner, value, "" if replier is None else str(replier.zid))
 
         if self._session is None:
             return

@@ -35,13 +35,18 @@ def _part_bytes(part: object) -> int:
 def beat_bytes(beat: Beat) -> int:
     """How many bytes a beat's frame takes at most."""
     parts = sum(_part_bytes(part) for kind in _PARTS for part in getattr(beat, kind))
-    return FRAME_BYTES + parts + sum(map(_text, beat.suspects))
+    return FRAME_BYTES + parts + _names_bytes(beat)
+
+
+def _names_bytes(beat: Beat) -> int:
+    return sum(map(_text, beat.suspects)) + sum(map(_text, beat.twins))
 
 
 def most_bytes(fleet: Fleet) -> int:
     """How many bytes a beat of this fleet takes at most in the long run.
 
-    All tasks are learnt, an elector echoes every exclusive one and has given all back itself, and misses everybody.
+    All tasks are learnt, an elector echoes every exclusive one and has given all back itself, and misses everybody (or
+    hears some twice).
     """
     longest = max((len(node.name) for node in fleet.nodes), default=0)
     learnt = sum(1 + _text(task.name) + 2 * _NUMBER for task in fleet.tasks)
@@ -63,7 +68,7 @@ class BeatRoom:
         if beat_bytes(beat) <= MAX_BEAT_BYTES:
             return beat, 0
         parts = [(kind, part) for kind in _PARTS for part in getattr(beat, kind)]
-        room = MAX_BEAT_BYTES - FRAME_BYTES - sum(map(_text, beat.suspects))
+        room = MAX_BEAT_BYTES - FRAME_BYTES - _names_bytes(beat)
         first = self._next % len(parts)
         chosen: list[tuple[str, object]] = []
         for kind, part in (*parts[first:], *parts[:first]):

@@ -120,6 +120,8 @@ class LearntReceived:
 
     learnt: Learnt
     is_answer: bool = False
+    where: str = ""
+    """An answer: the other end of its sender's link, as text for people; empty: not known."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

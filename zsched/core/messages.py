@@ -121,6 +121,10 @@ class Learnt:
     """How many promises and acceptances it has ever given."""
     seen: tuple[tuple[NodeId, int, int], ...] = ()
     """(elector, incarnation, votes): what it remembers of others (`zsched.core.witness`)."""
+    daemon: int = 0
+    """Incarnation of the daemon that answers, whether it has a state or not."""
+    twins: tuple[tuple[NodeId, int, int], ...] = ()
+    """(name, incarnation, newest beat) of the daemons whose name it hears twice (`zsched.core.namesakes`)."""
 
     def __post_init__(self) -> None:
         check_name("learnt.node", self.node)

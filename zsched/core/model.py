@@ -489,6 +489,9 @@ class Beat:
     votes: int = 0
     """How many promises and acceptances this elector has ever given."""
 
+    twins: tuple[NodeId, ...] = ()
+    """Names that this node hears two daemons of; who is one of them asks."""
+
     def __post_init__(self) -> None:
         check_name("beat.node", self.node)
         check_counter("beat.votes", self.votes)

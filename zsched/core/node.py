@@ -41,6 +41,7 @@ from zsched.core.model import (
     Weights,
     WorkerState,
 )
+from zsched.core.namesakes import Namesakes
 from zsched.core.plan import StreamCount
 from zsched.core.probation import Probation
 from zsched.core.profile import Profiler
@@ -138,6 +139,7 @@ class Node:
         """{task: (epoch, since when)} of the slots whose worker our relay does not see any more."""
         self.fleet_file = fleet_hash(fleet)
         self._identity = Identity(me, incarnation, self.fleet_file, now, fleet.timing.beat_s)
+        self.namesakes = Namesakes(fleet.timing.beat_s)
         self._introductions = Introductions()
         self._hangs = HangWatch(fleet)
         self._tenure = Tenure(fleet, me, self.agreement.leases, self.executors)
@@ -281,6 +283,7 @@ class Node:
             lease_terms=self.agreement.leases.terms_told,
             votes=self.agreement.witness.votes,
             has_lost_state=self.me in self.fleet.electors and not self.agreement.is_elector,
+            twins=self.namesakes.names(now),
         )
         self.loop_lag_s = 0.0
         is_in_turn = self._beat_at == self._turn_at  # whoever has news has brought the next beat forward
@@ -309,11 +312,19 @@ class Node:
         if not self.membership.is_known(beat.node):
             self.counters["beat_foreign"] += 1
             return
+        if self.namesakes.on_beat(beat, now):
+            self._beat_at = now  # the two of them may not hear each other
+            text = f"two daemons call themselves {beat.node}"
+            self._batch.add(do.RecordStory(stage="membership", text=text))
+        if self.namesakes.must_ask(beat.node, now):
+            self._ask_peer(beat.node)
         for change in self.membership.absorb_beat(beat, now):
             self._on_transition(change, now)
         if self.membership.is_doubtful(beat.node):
             self.counters["beat_doubtful"] += 1
             return
+        if self.me in beat.twins and self._identity.must_ask(beat.node, now):
+            self._ask_peer(beat.node)
         self._agree(self.agreement.compare(beat, now), now)
         if beat.has_lost_state:
             self.stateless.add(beat.node)
@@ -326,7 +337,13 @@ class Node:
 
     def _on_own_name(self, beat: Beat, now: float) -> None:
         """A beat in our own name that may not be ours."""
-        verdict = self._identity.on_own_name(beat, self._beat_sequence, now)
+        self._heed(self._identity.on_own_name(beat, self._beat_sequence, now), now)
+
+    def _ask_peer(self, peer: NodeId) -> None:
+        self._batch.add(do.AskLearnt(peer=peer, deadline_s=self.fleet.timing.ballot_s))
+
+    def _heed(self, verdict: Verdict, now: float) -> None:
+        """Do what another daemon of our name means for this one."""
         if verdict is Verdict.OURS:
             return
         complaint = self._complain(now)
@@ -371,7 +388,7 @@ class Node:
             if not self.registers[task].is_busy:
                 self._agree(self.agreement.propose(task, change, now), now)
         for peer in self.sealing.to_ask(self.values(), now):
-            self._batch.add(do.AskLearnt(peer=peer, deadline_s=self.fleet.timing.ballot_s))
+            self._ask_peer(peer)
 
     def _on_role_ended(self, event: ev.RoleEnded, now: float) -> None:
         if event.task in self.executors:
@@ -383,6 +400,8 @@ class Node:
         if event.node == self.me:
             self._identity.on_token(event.incarnation, is_present=False)
             self._complain(now)
+        elif self.membership.is_known(event.node):
+            self.namesakes.on_token(event.node, event.incarnation, is_present=False)
         for change in self.membership.absorb_token_lost(event.node, event.incarnation, now):
             self._on_transition(change, now)
 
@@ -391,6 +410,8 @@ class Node:
         if event.node == self.me:
             self._identity.on_token(event.incarnation, is_present=True)
             self._complain(now)
+        elif self.membership.is_known(event.node):
+            self.namesakes.on_token(event.node, event.incarnation, is_present=True)
 
     def _on_transition(self, change: Transition, now: float) -> None:
         text = f"{change.node} {change.before} -> {change.after}: {change.reason}"
@@ -504,9 +525,23 @@ class Node:
         self._agree(self.agreement.on_learnt(event, now), now)
         if event.is_answer and self.membership.is_known(event.learnt.node):
             self.sealing.on_answer(event.learnt)
+            self._on_twins(event, now)
+
+    def _on_twins(self, event: ev.LearntReceived, now: float) -> None:
+        """A peer's answer says where it is, and whether it hears our name twice."""
+        learnt = event.learnt
+        self.namesakes.on_answer(learnt.node, learnt.daemon, event.where)
+        lives = {incarnation: sequence for name, incarnation, sequence in learnt.twins if name == self.me}
+        if lives and learnt.node != self.me:
+            self._heed(self._identity.on_told(learnt.node, lives, self._beat_sequence, now), now)
 
     def _on_learnt_asked(self, event: ev.LearntAsked, now: float) -> None:
-        learnt = replace(self.agreement.answer(), unleased=self.sealing.unleased(now))
+        learnt = replace(
+            self.agreement.answer(),
+            unleased=self.sealing.unleased(now),
+            daemon=self.incarnation,
+            twins=self.namesakes.lives(now),
+        )
         self._batch.add(do.AnswerLearnt(request=event.request, learnt=learnt))
 
     def _on_persist_failed(self, event: ev.PersistFailed, _now: float) -> None:

@@ -17,6 +17,7 @@ from zsched.core.fleet import Fleet, NodeSpec, TaskSpec
 from zsched.core.gateway import Gateway
 from zsched.core.membership import Membership
 from zsched.core.model import Allocation, NodeId, NodeKind, PeerState, TaskId, WorkerLoad, WorkerState
+from zsched.core.namesakes import Namesakes
 from zsched.core.plan import Direction, ReadyWhen, Route, StreamCount
 from zsched.core.register import Register
 from zsched.core.rounds import Rounds, TaskRound
@@ -69,6 +70,7 @@ class NodeView(Protocol):
     registers: dict[TaskId, Register]
     executors: dict[TaskId, Executor]
     sealing: Sealing
+    namesakes: Namesakes
     stream_counts: tuple[StreamCount, ...]
     dropped: dict[str, tuple[int, float]]
     joins_at: tuple[str, ...]
@@ -93,7 +95,7 @@ def build_snapshot(node: NodeView, now: float) -> Snapshot:
         fleet_file=node.fleet_file,
         joins_at=node.joins_at,
         counters=tuple(sorted((node.counters + node.agreement.counters).items())),
-        problems=_problems(node, quorum),
+        problems=(*node.namesakes.problems(now), *_problems(node, quorum)),
     )
 
 

@@ -504,7 +504,7 @@ MEMBERSHIP_BUGS = (
     ),
     _bug("a put teaches an allocation", AGREEMENT, "if not event.is_answer:", "if False:", _AGREEMENT),
     _bug("any answer is believed", AGREEMENT, "elif is_proven(", "elif True or is_proven(", _AGREEMENT),
-    _bug("beats alone dispute a name", IDENTITY, " or beat.incarnation not in self._tokens", "", _NODE),
+    _bug("beats alone dispute a name", IDENTITY, " if beat.incarnation in self._tokens else Verdict.TWIN", "", _NODE),
     _bug(
         "the first node heard after a cut speaks for nobody",
         MEMBERSHIP,

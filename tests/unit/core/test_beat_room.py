@@ -55,6 +55,16 @@ def test_a_beat_takes_no_more_bytes_than_is_reckoned(tasks: int) -> None:
     assert beat_bytes(beat) - taken <= FRAME_BYTES, "and hardly fewer"
 
 
+def test_names_of_twins_take_the_room_that_those_of_the_missing_would() -> None:
+    """Whoever is heard twice is not missed, so a fleet's beats take no more for them."""
+    beat = full(1)
+    told = replace(beat, suspects=(), twins=beat.suspects)
+    assert beat_bytes(told) == beat_bytes(beat) > beat_bytes(replace(beat, suspects=()))
+    sent, _ = BeatRoom().fit(replace(full(200), suspects=(), twins=beat.suspects))
+    assert len(wire.encode(sent)) <= MAX_BEAT_BYTES
+    assert sent.twins == beat.suspects
+
+
 @pytest.mark.parametrize("tasks", [8, 18, 27, 47, 200])
 def test_every_part_of_a_beat_that_is_too_large_is_sent_in_turn_and_suspects_always(tasks: int) -> None:
     room, beat = BeatRoom(), full(tasks)

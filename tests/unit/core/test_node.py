@@ -474,6 +474,54 @@ def test_younger_twin_leaves_and_the_older_one_stays() -> None:
     assert old.agreement.is_elector
 
 
+def test_a_peer_s_beat_about_twins_is_only_a_reason_to_ask_it() -> None:
+    node = started()
+    said = replace(beat("robot2", 2), twins=("robot1",))
+    batch = node.handle(ev.BeatReceived(beat=said), 100.2)
+    assert [one.peer for one in of(batch, do.AskLearnt)] == ["robot2"]
+    assert of(batch, do.StandDown) == []
+    assert node.problems == {}
+    unasked = Learnt(node="robot2", values=(), twins=(("robot1", 7, 2), ("robot1", 6, 500)))
+    for step in range(50):
+        told = replace(unasked, twins=(("robot1", 7, 2), ("robot1", 6, 500 + step)))
+        batch = node.handle(ev.LearntReceived(learnt=told), 100.2 + step * 0.1)
+        assert of(batch, do.StandDown) == []
+    assert node.problems == {}
+
+
+def test_a_young_node_leaves_when_peers_answer_that_they_hear_an_older_one() -> None:
+    node = started()
+    left = []
+    for step in range(20):
+        learnt = Learnt(node="robot2", values=(), twins=(("robot1", 7, 2), ("robot1", 6, 500 + step)))
+        batch = node.handle(ev.LearntReceived(learnt=learnt, is_answer=True), 101.0 + step * 0.1)
+        left += of(batch, do.StandDown)
+    assert left
+    assert "another daemon calls itself 'robot1': robot2 hears it; stop it, or give" in left[0].reason
+
+
+def test_a_node_that_hears_twins_tells_them_and_the_operator() -> None:
+    node = started()
+    for incarnation in (3, 4):
+        node.handle(ev.TokenSeen(node="edge1", incarnation=incarnation), 100.0)
+    batch: tuple[do.Instruction, ...] = ()
+    for step in range(1, 10):
+        for incarnation in (3, 4):
+            heard = beat("edge1", step + 1, incarnation=incarnation)
+            batch += node.handle(ev.BeatReceived(beat=heard), 100.0 + step * 0.2)
+    assert ("edge1",) in [one.beat.twins for one in of(batch, do.PublishBeat)]
+    assert "edge1" in [one.peer for one in of(batch, do.AskLearnt)]
+    assert any(one.text == "two daemons call themselves edge1" for one in of(batch, do.RecordStory))
+    here = Learnt(node="edge1", values=(), daemon=4)
+    node.handle(ev.LearntReceived(learnt=here, is_answer=True, where="tcp/10.0.0.9:7447"), 101.8)
+    answer = of(node.handle(ev.LearntAsked(request=1), 101.8), do.AnswerLearnt)[0].learnt
+    assert (answer.daemon, answer.twins) == (7, (("edge1", 3, 10), ("edge1", 4, 10)))
+    node.handle(ev.BeatReceived(beat=beat("edge1", 11, incarnation=3)), 102.0)
+    problem = build_snapshot(node, 102.0).problems[0]
+    assert "2 daemons call themselves 'edge1'" in problem
+    assert "tcp/10.0.0.9:7447 (incarnation 4)" in problem
+
+
 def test_twin_that_stays_disputes_the_name_on_disk() -> None:
     node = started()
     node.handle(ev.TokenSeen(node="robot1", incarnation=8), 100.0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from zsched.core.identity import QUIET_S, STAYS_S, YOUNG_S, Identity, Verdict
+from zsched.core.identity import ASK_TWINS_S, QUIET_S, STAYS_S, TOLD_FOR_S, TOLD_YOUNG_S, YOUNG_S, Identity, Verdict
 from zsched.core.model import Beat
 
 BEAT_S = 0.5
@@ -71,3 +71,41 @@ def test_of_two_that_meet_the_one_that_has_beaten_less_leaves_while_it_is_young(
     identity.on_token(8, is_present=True)
     identity.on_own_name(beat(8, 10), 5, 100.5)
     assert identity.on_own_name(beat(8, 11), 5, 100.0 + YOUNG_S) is Verdict.TWIN, "not young any more"
+
+
+# --- twins that do not hear each other: a peer's answers -------------------------------------------------------------
+
+
+def test_a_twin_that_is_told_so_for_long_enough_leaves_if_it_came_later() -> None:
+    for mine, verdict in ((20, Verdict.LEAVE), (1000, Verdict.TWIN)):
+        identity = Identity(me="robot1", incarnation=7, fleet_file="abc", started_at=100.0, beat_s=BEAT_S)
+        assert identity.on_told("robot2", {7: mine, 6: 500}, mine, 102.0) is Verdict.TWIN, "one answer is one frame"
+        assert identity.on_told("robot2", {7: mine, 6: 500}, mine, 102.2) is Verdict.TWIN, "it has not risen"
+        assert identity.on_told("robot3", {7: mine, 6: 501}, mine, 102.0 + TOLD_FOR_S - 0.01) is Verdict.TWIN
+        assert identity.on_told("robot2", {7: mine, 6: 500}, mine, 102.0 + TOLD_FOR_S) is Verdict.TWIN, "no rise"
+        assert identity.on_told("robot2", {7: mine, 6: 502}, mine, 102.0 + TOLD_FOR_S) is verdict
+        assert identity.complaint(103.0) == "another daemon calls itself 'robot1': robot2 hears it"
+
+
+def test_who_is_told_late_disputes_the_name_when_the_other_stays() -> None:
+    identity = Identity(me="robot1", incarnation=7, fleet_file="abc", started_at=100.0, beat_s=BEAT_S)
+    assert identity.on_told("robot2", {7: 20, 6: 500}, 20, 100.0 + TOLD_YOUNG_S) is Verdict.TWIN
+    at = 100.0 + TOLD_YOUNG_S
+    assert identity.on_told("robot2", {7: 20, 6: 501}, 21, at + 1.0) is Verdict.TWIN
+    assert identity.on_told("robot2", {7: 20, 6: 500 + STAYS}, 30, at + STAYS_S - 0.01) is Verdict.TWIN
+    assert identity.on_told("robot3", {7: 20, 6: 500 + STAYS}, 30, at + STAYS_S) is Verdict.DISPUTE
+
+
+def test_what_a_peer_knows_of_earlier_lives_is_nothing_to_this_one() -> None:
+    identity = Identity(me="robot1", incarnation=7, fleet_file="abc", started_at=100.0, beat_s=BEAT_S)
+    for lives in ({5: 10, 6: 500}, {7: 20}, {}):
+        assert identity.on_told("robot2", lives, 20, 102.0) is Verdict.OURS
+    assert identity.complaint(102.0) is None
+
+
+def test_a_peer_that_says_so_is_asked_now_and_then() -> None:
+    identity = old()
+    assert identity.must_ask("robot2", 100.0)
+    assert not identity.must_ask("robot2", 100.0 + ASK_TWINS_S - 0.01)
+    assert identity.must_ask("robot3", 100.1)
+    assert identity.must_ask("robot2", 100.0 + ASK_TWINS_S)
