@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -99,7 +100,47 @@ def test_a_new_generation_is_made_node_by_node_where_too_many_states_are_lost(be
     again, voted = bed.folder / "again", f"knows {elector} as an elector that has voted"
     twice = init_that_says(bed, voted, elector, again, "--generation", "1")
     assert twice.returncode == 1, "it has voted in this generation"
-    init_that_says(bed, "the fleet lives in generation 1; join it with `zsched init --generation 1`", elector, again)
+    init_that_says(bed, "`zsched init --generation 2 --force` on every node", elector, again)
+
+
+def test_the_advice_of_init_leads_to_a_fleet_that_agrees(bed: Testbed) -> None:
+    """robot3's state folder is deleted: one refusal names every step, and none of them is refused."""
+    bed.wait(lambda: "robot3" in bed.status("robot1")["quorum"]["voted"], 60, "robot1 to remember robot3's vote")
+    bed.kill("robot3")
+    shutil.rmtree(bed.folder / "robot3")
+    refused = init_that_says(bed, "knows robot3 as an elector that has voted", "robot3", bed.folder / "lost")
+    advice = re.search(r"stop every daemon, run `zsched init (.+)` on every node, and start them", refused.stderr)
+    assert advice is not None, refused.stderr
+    bed.stop()
+    for node in bed.names:
+        done = run_init(bed, node, bed.folder / node, *advice[1].split())
+        assert done.returncode == 0, (node, done.stderr)
+    bed.start()
+    bed.wait_settled()
+    quorums = [bed.status(node)["quorum"] for node in bed.names]
+    assert [(one["alive"], one["stateless"], one["apart"]) for one in quorums] == [(3, [], [])] * len(quorums)
+    assert bed.task("robot1")["epoch"] > 2**32
+
+
+def test_an_elector_of_another_generation_is_not_counted_and_comes_back_by_what_status_says(bed: Testbed) -> None:
+    """The operator has stopped half-way: robot3 alone is of the new generation."""
+    bed.stop("robot3")
+    made = run_init(bed, "robot3", bed.folder / "robot3", "--generation", "1", "--force")
+    assert made.returncode == 0, made.stderr
+    bed.start("robot3")
+    bed.wait(lambda: bed.status("robot1")["quorum"]["apart"] == ["robot3"], 60, "robot1 to leave robot3 out")
+    assert bed.status("robot1")["quorum"]["alive"] == 2
+    assert not bed.wait(lambda: bed.status("robot3"), 60, "robot3")["quorum"]["ok"], "it is alone"
+    (said,) = [one for one in bed.status("robot1")["problems"] if one.startswith("generation/robot3")]
+    advice = re.search(r"stop this daemon, `zsched init (.+)` here, start it", said)
+    assert advice is not None, said
+    for node in ("robot1", "robot2", "edge1"):
+        bed.stop(node)
+        done = partial(run_init, bed, node, bed.folder / node, *advice[1].split())
+        bed.wait(lambda: done().returncode == 0, 60, "a state")  # noqa: B023 - called at once
+        bed.start(node)
+    bed.wait(lambda: bed.status("robot1")["quorum"]["alive"] == 3, 60, "three electors of one generation")
+    bed.wait_settled()
 
 
 def test_init_without_a_reachable_node_goes_on(tmp_path: Path) -> None:

@@ -178,7 +178,7 @@ def test_init_of_a_new_generation_keeps_a_good_state_unless_told(tmp_path: Path)
     refused = run(*arguments, "--generation", 1)
     assert (refused.exit_code, refused.stdout) == (1, "")
     assert "robot2 has a good state of generation 0 here, and no other node answered" in refused.stderr
-    assert "If `zsched status` has said so, add --force" in refused.stderr
+    assert "on another node, has said so, stop every daemon and add --force" in refused.stderr
     assert (state / "state").read_bytes() == before
     done = run(*arguments, "--generation", 2, "--force")
     assert (done.exit_code, done.stderr.count("asked 1 other node: none answered")) == (0, 1), done.stderr

@@ -20,6 +20,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from zsched.core.generations import way_out
 from zsched.core.model import DurableState, NodeId
 from zsched.errors import AdapterError, WireError
 from zsched.wire import decode_state, encode_state
@@ -130,8 +131,7 @@ class StateFile:
             what = f"of generation {standing}" if found.state is not None else f"({found.problem})"
             raise AdapterError(
                 f"{self.path} exists already {what}: this name may have voted. Without this state the node works all "
-                "the same and votes no more. To make it an elector again, stop every daemon, and run "
-                f"`zsched init --generation {standing + 1}` on every node"
+                f"the same and votes no more. To make it an elector again, {way_out(standing + 1)}"
             )
         if found.state is not None:
             state = replace(state, incarnation=max(state.incarnation, found.state.incarnation))

@@ -16,6 +16,7 @@ from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.belief import GENERATION_STEP, MAX_GENERATION, is_fit, is_proven
 from zsched.core.fleet import Fleet
+from zsched.core.generations import way_out
 from zsched.core.lease import Leases
 from zsched.core.messages import CommandOutcome, CommandResult, Learnt, Promise, Refusal, Refused
 from zsched.core.model import NO_BALLOT, Allocation, Ballot, Beat, DurableState, NodeId, RegisterState, TaskId, Weights
@@ -93,6 +94,8 @@ class Agreement:
         """``None``: this node has no state, and has not been told yet which one the fleet is of."""
         self.newest_generation = self.generation or 0
         """That any beat has named: what the operator's next one must exceed."""
+        self.apart: set[NodeId] = set()
+        """Electors whose newest beat says that they are of another generation, or count with other electors."""
         self._has_state, self._electorate = durable is not None, electorate
         self._disputed = "" if durable is None else durable.disputed
         self._lost = "" if durable is None else durable.lost
@@ -109,7 +112,7 @@ class Agreement:
         self.is_elector = durable is not None and me in fleet.electors and not self._disputed and not self._lost
         self.problems: dict[str, str] = {}
         if self._lost:
-            self.problems["state"] = _lost_text(self._lost)
+            self.problems["state"] = _lost_text(self._lost, self.newest_generation)
         if self._disputed:
             self.problems["state"] = f"{self._disputed}; no elector until `zsched init --settle`"
         self.counters: Counter[str] = Counter()
@@ -122,7 +125,7 @@ class Agreement:
                 me=me,
                 incarnation=incarnation,
                 electors=fleet.electors,
-                electorate=self._of_generation(),
+                electorate=self.electorate,
                 is_elector=self.is_elector,
                 initial=task.first_value(start),
                 state=stored.get(task.name, RegisterState(task=task.name)),
@@ -152,7 +155,8 @@ class Agreement:
         self._values: dict[TaskId, Allocation] = {}
         self._accepted: dict[TaskId, tuple[NodeId, int]] = {}
 
-    def _of_generation(self) -> str:
+    @property
+    def electorate(self) -> str:
         """The electorate's hash; generations refuse each other's ballots."""
         return f"{self._electorate}/{self.generation}" if self.generation else self._electorate
 
@@ -382,6 +386,14 @@ class Agreement:
             self._read_at[task] = now
             self._take(task, register.settle(now), effects)
 
+    def _hear_electorate(self, beat: Beat) -> None:
+        """Keep whether an elector refuses our ballots, and we its: it has other electors, or another generation."""
+        is_apart = beat.generation != self.generation or beat.electorate not in ("", self.electorate)
+        if is_apart and not self._is_guest_of(beat.generation) and beat.node in self._fleet.electors:
+            self.apart.add(beat.node)
+        elif self.apart:
+            self.apart.discard(beat.node)
+
     def _is_our_generation(self, node: NodeId, generation: int) -> bool:
         """Whether a node's learnt values mean anything here; the difference is shown."""
         is_ours = generation == self.generation or self._is_guest_of(generation)
@@ -391,7 +403,12 @@ class Agreement:
         if is_ours:
             self.problems.pop(source, None)
             return True
-        self.problems[source] = f"{node} is of generation {generation}, this node of {self.generation}: init them alike"
+        ours = self.generation or 0
+        command = f"`zsched init --generation {max(generation, ours)}`"
+        where = f"there, with that daemon stopped: {command}"
+        if generation > ours:
+            where = f"stop this daemon, {command} here, start it; so on every node that is behind"
+        self.problems[source] = f"{node} is of generation {generation}, this node of {ours}; {where}"
         return False
 
     def _is_guest_of(self, generation: int) -> bool:
@@ -408,7 +425,7 @@ class Agreement:
         self.voted.clear()
         for task in self._fleet.tasks:
             initial = task.first_value(learnt.generation * GENERATION_STEP)
-            self.registers[task.name].follow(self._of_generation(), initial)
+            self.registers[task.name].follow(self.electorate, initial)
 
     def dispute(self, reason: str) -> Effects:
         """Our name is used by somebody else too: no elector any more, on disk, until the operator settles it."""
@@ -424,13 +441,14 @@ class Agreement:
         if not why or self._lost or not self.is_elector:
             return Effects()
         self._lost = why
-        self.problems["state"] = _lost_text(why)
+        self.problems["state"] = _lost_text(why, self.newest_generation)
         self._stop_electing()
         return Effects(is_dirty=True)
 
     def compare(self, beat: Beat, now: float) -> Effects:
         """A peer's beat may show that it has learnt more than we, or has voted: then ask it."""
         self.newest_generation = max(self.newest_generation, min(beat.generation, MAX_GENERATION))
+        self._hear_electorate(beat)
         if not self._is_our_generation(beat.node, beat.generation):
             return NOTHING
         is_news = beat.has_voted and beat.node not in self.voted and beat.node in self._fleet.electors
@@ -561,10 +579,10 @@ def _newest(register: Register) -> Allocation | None:
     return accepted.value if learnt is None or accepted.value.revision > learnt.revision else learnt
 
 
-def _lost_text(why: str) -> str:
+def _lost_text(why: str, newest_generation: int) -> str:
     return (
         f"{why}: it was brought back from a backup, or its disk has lost what it said was written; "
-        "no elector until a new generation (stop every daemon, then `zsched init --generation G` on every node)"
+        f"no elector until a new generation ({way_out(newest_generation + 1)})"
     )
 
 

@@ -36,6 +36,14 @@ def _is_unleased(state: RegisterState) -> bool:
     return newest is not None and not newest.leased and newest.revision > 0
 
 
+def way_out(generation: int) -> str:
+    """The steps that lead from any mix of states to a fleet of one generation, which agrees."""
+    return (
+        f"stop every daemon, run `zsched init --generation {generation} --force` on every node, "
+        "and start them when all have it"
+    )
+
+
 # --- what speaks against a blank state -------------------------------------------------------------------------------
 
 
@@ -66,20 +74,19 @@ def objection(
     """
     newest = max(map(generation_of, answers), default=0)
     current = [answer for answer in answers if generation_of(answer) == newest]
+    knows = next((answer.node for answer in current if node in answer.quorum.voted), None)
+    if newest >= generation and knows is not None:
+        return (
+            f"{knows} knows {node} as an elector that has voted; a blank state would let it vote twice. Without a "
+            f"state it works all the same and votes no more. To make it an elector again, {way_out(newest + 1)}"
+        )
     if newest > generation:
         return (
             f"{current[0].node} says that the fleet lives in generation {newest}; join it with "
             f"`zsched init --generation {newest}`"
         )
-    knows = next((answer.node for answer in current if node in answer.quorum.voted), None)
     if newest == generation:
-        if knows is None:
-            return None
-        return (
-            f"{knows} knows {node} as an elector that has voted; a blank state would let it vote twice. Without a "
-            "state it works all the same and votes no more. To make it an elector again, stop every daemon, and run "
-            f"`zsched init --generation {newest + 1}` on every node"
-        )
+        return None
     if is_forced:
         return None
     agreeing = next((answer for answer in current if answer.quorum.ok), None)
@@ -95,7 +102,8 @@ def objection(
     heard = "nobody who answered says" if answers else "no other node answered, so nobody says"
     return (
         f"{node} has a good state of generation {good.generation} here, and {heard} that the fleet needs a new "
-        "generation. If `zsched status` has said so, add --force"
+        "generation. If `zsched status`, or `zsched init` on another node, has said so, stop every daemon and add "
+        "--force"
     )
 
 

@@ -489,6 +489,8 @@ class Beat:
     votes: int = 0
     """How many promises and acceptances this elector has ever given."""
 
+    electorate: str = ""
+    """Hash of the electors that this elector counts with, and its generation; empty: it answers no proposer."""
     twins: tuple[NodeId, ...] = ()
     """Names that this node hears two daemons of; who is one of them asks."""
 

@@ -283,6 +283,7 @@ class Node:
             lease_terms=self.agreement.leases.terms_told,
             votes=self.agreement.witness.votes,
             has_lost_state=self.me in self.fleet.electors and not self.agreement.is_elector,
+            electorate=self.agreement.electorate if self.agreement.is_elector else "",
             twins=self.namesakes.names(now),
         )
         self.loop_lag_s = 0.0

@@ -110,7 +110,7 @@ class QuorumStatus:
     electors: int
     needed: int
     alive: int
-    """Electors that are alive and have their state."""
+    """Electors that are alive, have their state, and are not apart."""
     ok: bool
     this_node: str
     """``elector``, ``no_elector`` (not in the electorate) or ``lost_state``."""
@@ -118,6 +118,8 @@ class QuorumStatus:
     """Electors that this node knows to have voted (they must not be initialised anew)."""
     stateless: tuple[NodeId, ...] = ()
     """Electors that have lost their state, as they say themselves; also of those that are not alive any more."""
+    apart: tuple[NodeId, ...] = ()
+    """Electors of another generation, or with other electors in their file: they and this node refuse each other."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,6 +15,7 @@ from zsched.core.agreement import Agreement
 from zsched.core.executor import Executor, Phase
 from zsched.core.fleet import Fleet, NodeSpec, TaskSpec
 from zsched.core.gateway import Gateway
+from zsched.core.generations import way_out
 from zsched.core.membership import Membership
 from zsched.core.model import Allocation, NodeId, NodeKind, PeerState, TaskId, WorkerLoad, WorkerState
 from zsched.core.namesakes import Namesakes
@@ -104,6 +105,11 @@ def _problems(node: NodeView, quorum: QuorumStatus) -> tuple[str, ...]:
     if quorum.stateless:
         names = ", ".join(quorum.stateless)
         problems.append(f"electors without their state, {len(quorum.stateless)} of {quorum.electors}: {names}")
+    if quorum.apart:
+        problems.append(
+            "electors of another generation, or with other electors in their fleet file, "
+            f"{len(quorum.apart)} of {quorum.electors}: {', '.join(quorum.apart)}; they and this node refuse each other"
+        )
     if not quorum.ok:
         problems.append(f"no quorum: {quorum.alive} of {quorum.electors} electors can answer, {quorum.needed} needed")
     elif quorum.alive == quorum.needed < quorum.electors:
@@ -114,8 +120,10 @@ def _problems(node: NodeView, quorum: QuorumStatus) -> tuple[str, ...]:
         )
     if quorum.electors - len(quorum.stateless) < quorum.needed:
         number = node.agreement.newest_generation + 1
-        way_out = f"if these are lost, stop every daemon, and `zsched init --generation {number}` on every node"
-        problems.append(f"nothing can be agreed: too many electors without their states (each says why); {way_out}")
+        problems.append(
+            "nothing can be agreed: too many electors without their states (each says why); if these are lost, "
+            + way_out(number)
+        )
     if not node.has_state:
         problems.append("no valid state file: this node is no elector (see `zsched init --help`)")
     return tuple(problems)
@@ -126,7 +134,8 @@ def _has_lost_state(node: NodeView, name: NodeId) -> bool:
 
 
 def _can_answer(node: NodeView, name: NodeId) -> bool:
-    return node.membership.state(name) is PeerState.ALIVE and not _has_lost_state(node, name)
+    is_there = node.membership.state(name) is PeerState.ALIVE and name not in node.agreement.apart
+    return is_there and not _has_lost_state(node, name)
 
 
 def _quorum(node: NodeView) -> QuorumStatus:
@@ -143,6 +152,7 @@ def _quorum(node: NodeView) -> QuorumStatus:
         this_node=role,
         stateless=tuple(sorted(stateless)),
         voted=tuple(sorted(node.agreement.voted)),
+        apart=tuple(sorted(node.agreement.apart)),
     )
 
 

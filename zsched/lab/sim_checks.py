@@ -291,4 +291,11 @@ def _misjudged_electors(running: list[Machine]) -> str:
             told = machine.node.stateless if machine.node is not None and machine is not elector else None
             if told is not None and (elector.name in told) != has_lost:
                 return f"{machine.key} takes {elector.name}'s state for {'there' if has_lost else 'lost'}"
+            if machine.node is None or has_lost or not machine.node.has_state:
+                continue
+            is_apart = elector.node.agreement.electorate != machine.node.agreement.electorate
+            if (elector.name in machine.node.agreement.apart) != is_apart:
+                return (
+                    f"{machine.key} counts {elector.name} {'in' if is_apart else 'out'}; its electorate says otherwise"
+                )
     return ""

@@ -44,6 +44,7 @@ def full(tasks: int, length: int = 63) -> Beat:
         lease_terms=f"{'e' * 16}, clock in doubt",
         has_lost_state=True,
         votes=most,
+        electorate=f"{'e' * 16}/{most}",
     )
 
 

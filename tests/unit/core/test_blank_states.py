@@ -77,6 +77,8 @@ def test_a_first_state_is_refused_where_a_vote_is_remembered_or_the_fleet_is_fur
     remembered = why(0, says(), says("robot2", voted=("robot3",))) or ""
     assert "robot2 knows robot3 as an elector that has voted" in remembered
     ahead = why(0, says(), says("robot2", revision=2 * GENERATION_STEP + 1)) or ""
+    voted = why(0, says("robot2", revision=2 * GENERATION_STEP + 1, voted=("robot3",))) or ""
+    assert "`zsched init --generation 3 --force` on every node" in voted, "no advice that is refused next"
     assert "robot2 says that the fleet lives in generation 2; join it with `zsched init --generation 2`" in ahead
 
 
@@ -84,7 +86,7 @@ def test_a_first_state_is_refused_where_a_vote_is_remembered_or_the_fleet_is_fur
 def test_nothing_lets_a_node_vote_twice_in_a_generation_or_stay_behind_it(forced: bool) -> None:
     new = says(revision=GENERATION_STEP + 1, voted=("robot3",))
     assert "has voted" in (why(1, new, is_forced=forced) or "")
-    assert "--generation 2` on every node" in (why(1, new, is_forced=forced) or "")
+    assert "--generation 2 --force` on every node" in (why(1, new, is_forced=forced) or "")
     assert "join it with" in (why(1, says(revision=2 * GENERATION_STEP), is_forced=forced) or "")
 
 

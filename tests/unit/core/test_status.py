@@ -117,13 +117,50 @@ def test_electors_that_have_lost_their_state_are_named_and_count_for_nothing() -
         "no quorum: 1 of 3 electors can answer, 2 needed",
         (
             "nothing can be agreed: too many electors without their states (each says why); "
-            "if these are lost, stop every daemon, and `zsched init --generation 1` on every node"
+            "if these are lost, stop every daemon, run `zsched init --generation 1 --force` on every node, "
+            "and start them when all have it"
         ),
     )
     again = Beat(node="robot2", incarnation=4, sequence=1, loop_lag_s=0.0)
     node.handle(ev.BeatReceived(beat=again), 100.5)
     quorum = build_snapshot(node, 100.5).quorum
     assert (quorum.alive, quorum.ok, quorum.stateless) == (2, True, ("robot3",))
+
+
+@pytest.mark.parametrize("other", ["generation", "electorate"])
+def test_electors_of_another_generation_or_electorate_count_for_nothing(other: str) -> None:
+    node = make()
+    mine = electorate_hash(FLEET)
+    strange = {"generation": 2, "electorate": f"{mine}/2"} if other == "generation" else {"electorate": "0" * 16}
+    apart = replace(Beat(node="robot2", incarnation=3, sequence=2, loop_lag_s=0.0), **strange)
+    node.handle(ev.BeatReceived(beat=apart), 100.0)
+    snapshot = build_snapshot(node, 100.0)
+    assert (snapshot.quorum.alive, snapshot.quorum.ok, snapshot.quorum.apart) == (2, True, ("robot2",))
+    said = "electors of another generation, or with other electors in their fleet file, 1 of 3: robot2; "
+    assert any(one.startswith(said) for one in snapshot.problems), snapshot.problems
+    assert any("no elector to spare: 2 of 3 can answer, 2 needed; not robot2" in one for one in snapshot.problems)
+    node.handle(ev.BeatReceived(beat=replace(apart, node="robot3")), 100.0)
+    assert not build_snapshot(node, 100.0).quorum.ok
+    for name in ("robot2", "robot3"):
+        again = Beat(node=name, incarnation=3, sequence=3, loop_lag_s=0.0, electorate=mine)
+        node.handle(ev.BeatReceived(beat=again), 100.2)
+    assert build_snapshot(node, 100.2).problems == ()
+
+
+def test_a_node_of_another_generation_is_told_with_the_command_that_mends_it() -> None:
+    node = make()
+    node.handle(
+        ev.BeatReceived(beat=Beat(node="robot2", incarnation=3, sequence=2, loop_lag_s=0.0, generation=2)), 100.0
+    )
+    ahead = "robot2 is of generation 2, this node of 0; stop this daemon, `zsched init --generation 2` here, start it"
+    assert any(ahead in one for one in build_snapshot(node, 100.0).problems)
+
+
+@pytest.mark.parametrize(("me", "has_state"), [("robot1", True), ("robot1", False), ("edge1", False)])
+def test_an_elector_s_beat_says_what_it_counts_with(me: str, *, has_state: bool) -> None:
+    node = make(me, has_state=has_state)
+    sent = [one.beat for one in node.handle(ev.DeadlineReached(), 101.0) if isinstance(one, do.PublishBeat)]
+    assert [beat.electorate for beat in sent] == [electorate_hash(FLEET) if has_state else ""]
 
 
 @pytest.mark.parametrize(("me", "has_state"), [("robot1", True), ("robot1", False), ("edge1", False)])
