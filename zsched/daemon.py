@@ -41,6 +41,7 @@ from zsched.core.workers import runs_worker
 from zsched.daemon_access import StreamAccess, joins_at
 from zsched.daemon_descriptors import take_descriptors
 from zsched.daemon_endpoints import Endpoints, endpoints_for, free_port, is_here
+from zsched.daemon_leaving import Leaving
 from zsched.daemon_memory import shared_memory_objection
 from zsched.daemon_sampler import Sampler
 from zsched.errors import AdapterError, ConfigError, NameTakenError
@@ -51,11 +52,6 @@ from zsched.shell import Desk, Inbox, Shell
 
 EXIT_OK, EXIT_FAILED, EXIT_NAME_TAKEN, EXIT_CONFIG = 0, 1, 75, 78
 NAME_TAKEN_WAIT_S = 5.0
-HAND_OVER_S = 0.8
-"""How long a stopping owner waits for its tasks to be moved away."""
-LEAVE_S = 0.4
-"""...and how long it stays when they are: the next owner's worker asks ours for its state, and what ours has in hand is
-still to come."""
 CLOSE_WORKERS_S = 0.7
 LOOP_MAX_WAIT_S = 1.0
 STDERR = 2
@@ -280,7 +276,7 @@ class Daemon:
         """Take an event, handle it, carry the batch out; wake up in time for the node's next deadline."""
         shell.carry_out(node.start(monotonic_s()))
         watchdog_s = watchdog_interval_s()
-        next_ping, stop_by, is_leaving, alert_until = 0.0, float("inf"), False, 0.0
+        next_ping, leaving, alert_until = 0.0, Leaving(), 0.0
         while True:
             wait = min(node.next_deadline() - monotonic_s(), LOOP_MAX_WAIT_S)
             if monotonic_s() < alert_until:
@@ -294,14 +290,10 @@ class Daemon:
                 raise NameTakenError(f"{node.me}: {shell.stand_down}")
             if isinstance(event, ev.TokenLost):
                 alert_until = now + ALERT_S
-            if isinstance(event, ev.StopRequested) and stop_by == float("inf"):
+            if isinstance(event, ev.StopRequested) and leaving.ask(node.owned(), now):
                 self._notify.stopping()
-                stop_by = now + (HAND_OVER_S if node.owned() else 0.0)
-                is_leaving = stop_by > now
-            if is_leaving and not node.owned():
-                is_leaving, stop_by = False, now + LEAVE_S
-            if now >= stop_by:
-                log.info("stopping node=%s", node.me)
+            if leaving.asked_at is not None and leaving.is_over(node.owned(), node.movable(now), now):
+                self._say_goodbye(node, leaving.last_words(node.owned(), now))
                 return
             if watchdog_s is not None and now >= next_ping:
                 next_ping = now + min(watchdog_s, 1.0)
@@ -309,6 +301,13 @@ class Daemon:
             if now >= self._next_status:
                 self._next_status = now + 1.0
                 self._notify.status(status_line(node))
+
+    def _say_goodbye(self, node: Node, last_words: str) -> None:
+        if last_words:
+            log.warning("stopping node=%s %s", node.me, last_words)
+            self._notify.status(last_words)
+        else:
+            log.info("stopping node=%s", node.me)
 
     def _handle(self, node: Node, shell: Shell, event: ev.Event) -> float:
         """One event, and what must come before any other (a disk that refused); when that was."""

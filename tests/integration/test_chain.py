@@ -127,6 +127,22 @@ def test_stopping_owner_hands_its_task_over_first(bed: Testbed, ping: Callable[[
     assert decision["penalties"].get(owner, 0.0) <= held, "it was told to stop: that is no failure"
 
 
+def test_an_owner_that_nobody_relieves_says_what_it_leaves_behind(bed: Testbed) -> None:
+    """The robots stand still, so nothing moves; the last line of its log names the task."""
+    owner = bed.wait_settled()
+    robots = [name for name in bed.names if name.startswith("robot")]
+    for robot in robots:
+        bed.send(robot, signal.SIGSTOP)
+    ((code, _),) = bed.stop(owner).values()
+    for robot in robots:
+        bed.send(robot, signal.SIGCONT)
+    assert code == 0
+    (said,) = [line for line in bed.log(owner).splitlines() if "zsched.daemon stopping" in line]
+    assert "WARNING" in said
+    assert "leaves 1 task behind after 3." in said
+    assert "(echo): nobody has taken over" in said
+
+
 def _next_decision(bed: Testbed, owner: str | None) -> dict[str, Any]:
     """The newest decision when it is for ``owner``, else an empty one."""
     decision: dict[str, Any] | None = bed.task("robot1")["decision"]

@@ -259,6 +259,17 @@ class Node:
         """The tasks that this node owns, as far as it has learnt."""
         return tuple(name for name, value in self.values().items() if value.owner == self.me)
 
+    def movable(self, now: float) -> tuple[TaskId, ...]:
+        """What of it another candidate could take, as far as is known: one that lives and does not drain itself."""
+        return tuple(name for name in self.owned() if any(map(self._can_take(now), self.fleet.task(name).candidates)))
+
+    def _can_take(self, now: float) -> Callable[[NodeId], bool]:
+        def can(node: NodeId) -> bool:
+            is_there = node != self.me and self.membership.state(node) is PeerState.ALIVE
+            return is_there and not self._was_draining(node, now)
+
+        return can
+
     # --- membership --------------------------------------------------------------------------------------------------
 
     def _beat(self, now: float) -> None:

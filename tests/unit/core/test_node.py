@@ -354,6 +354,16 @@ def test_a_robot_that_drains_what_it_owns_asks_at_once_who_shall_have_it() -> No
         assert bool(of(node.handle(ev.StopRequested(), now), do.AskUtilities)) is asks
 
 
+def test_movable_is_what_a_living_candidate_that_does_not_drain_could_take() -> None:
+    node = started("edge1", learnt=value(1, "edge1"))
+    assert (node.owned(), node.movable(100.0)) == (("merge",), ("merge",))
+    node.handle(profile("edge2", draining=True), 100.0)
+    assert node.movable(100.0) == ()
+    alone = make("edge1", learnt=value(1, "edge1"))
+    alone.start(100.0)
+    assert (alone.owned(), alone.movable(100.0)) == (("merge",), ())
+
+
 def test_a_newer_profile_in_our_name_is_not_ours_either() -> None:
     node = make()
     (published,) = of(node.handle(ev.ProfileSampled(device=SAMPLE), 100.0), do.PublishProfile)

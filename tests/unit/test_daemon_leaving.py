@@ -1,0 +1,60 @@
+"""A daemon's way out: how long it waits, for what, and what it says."""
+
+from __future__ import annotations
+
+from zsched.daemon_leaving import HAND_OVER_S, LEAVE_S, NOBODY_S, TWICE_S, Leaving
+
+OWNED = ("map", "plan")
+
+
+def asked(owned: tuple[str, ...] = OWNED) -> Leaving:
+    leaving = Leaving()
+    assert not leaving.is_over(owned, owned, 99.0), "nobody has asked"
+    assert leaving.ask(owned, 100.0)
+    return leaving
+
+
+def test_who_owns_nothing_leaves_at_once() -> None:
+    assert asked(()).is_over((), (), 100.0)
+
+
+def test_an_owner_waits_until_its_tasks_have_moved_and_a_little_longer() -> None:
+    leaving = asked()
+    assert not leaving.is_over(OWNED, OWNED, 100.5)
+    assert not leaving.is_over((), (), 101.0)
+    assert not leaving.is_over((), (), 101.0 + LEAVE_S - 0.01)
+    assert leaving.is_over((), (), 101.0 + LEAVE_S)
+    assert leaving.last_words((), 101.4) == ""
+
+
+def test_a_task_that_comes_back_meanwhile_is_waited_for_again() -> None:
+    leaving = asked()
+    assert not leaving.is_over((), (), 100.5)
+    assert not leaving.is_over(OWNED, OWNED, 101.0)
+    assert not leaving.is_over((), (), 101.2)
+    assert leaving.is_over((), (), 101.2 + LEAVE_S)
+
+
+def test_tasks_that_another_could_take_are_waited_for_longer_than_those_that_nobody_can() -> None:
+    for movable, wait_s in ((OWNED[:1], HAND_OVER_S), ((), NOBODY_S)):
+        leaving = asked()
+        assert not leaving.is_over(OWNED, movable, 100.0 + wait_s - 0.01)
+        assert leaving.is_over(OWNED, movable, 100.0 + wait_s)
+
+
+def test_what_is_left_behind_is_named() -> None:
+    leaving = asked()
+    assert leaving.last_words(OWNED, 103.0) == (
+        "leaves 2 tasks behind after 3.0 s (map, plan): nobody has taken over; "
+        "the robots move what they can once they miss this node"
+    )
+    assert "leaves 1 task behind" in leaving.last_words(OWNED[:1], 103.0)
+
+
+def test_whoever_asks_twice_does_not_wait() -> None:
+    leaving = asked()
+    assert not leaving.ask(OWNED, 100.0 + TWICE_S - 0.01)
+    assert not leaving.is_over(OWNED, OWNED, 100.0 + TWICE_S - 0.01), "one Ctrl-C that came by two ways"
+    assert not leaving.ask(OWNED, 100.01 + TWICE_S)
+    assert leaving.is_over(OWNED, OWNED, 100.01 + TWICE_S)
+    assert "told to stop twice" in leaving.last_words(OWNED, 100.3)
