@@ -31,6 +31,11 @@ def retry(door: Door, task: str, whose: str | None, *, is_json: bool) -> int:
         raise CliError(EXIT_USAGE, f"fleet {status['fleet']} has no task {task!r}{nearest(task, tasks)}")
     if whose is not None and whose not in states:
         raise CliError(EXIT_USAGE, f"fleet {status['fleet']} has no node {whose!r}{nearest(whose, list(states))}")
+    able = next(list(known["candidates"]) for known in status["tasks"] if known["name"] == task)
+    able += [str(node["name"]) for node in status["nodes"] if task in (one["task"] for one in node["workers"])]
+    if whose is not None and whose not in able:
+        known = ", ".join(dict.fromkeys(able))
+        raise CliError(EXIT_USAGE, f"{whose} is no candidate of {task} and has no worker of it; there are: {known}")
     done: dict[str, str] = {}
     missed: dict[str, str] = {}
     there = [node for node, state in states.items() if state in ("alive", "suspect")]

@@ -27,6 +27,7 @@ from zsched.core.fleet import Fleet, TaskSpec, fleet_hash
 from zsched.core.gateway import Gateway
 from zsched.core.identity import Identity, Verdict
 from zsched.core.introductions import Introductions
+from zsched.core.knocking import Knocking
 from zsched.core.membership import Membership, Transition
 from zsched.core.messages import CommandOutcome, CommandResult
 from zsched.core.model import (
@@ -51,7 +52,7 @@ from zsched.core.scoring import NO_DOUBTS, Doubts
 from zsched.core.sealing import Sealing
 from zsched.core.status import PastValue, build_snapshot
 from zsched.core.tenure import Tenure
-from zsched.core.workers import Workers, failed_workers
+from zsched.core.workers import Workers, failed_workers, runs_worker
 
 HISTORY = 32
 _OFTEN_QUIET = frozenset(
@@ -140,6 +141,7 @@ class Node:
         self.fleet_file = fleet_hash(fleet)
         self._identity = Identity(me, incarnation, self.fleet_file, now, fleet.timing.beat_s)
         self.namesakes = Namesakes(fleet.timing.beat_s)
+        self.knocking = Knocking(self.fleet_file)
         self._introductions = Introductions()
         self._hangs = HangWatch(fleet)
         self._tenure = Tenure(fleet, me, self.agreement.leases, self.executors)
@@ -323,6 +325,7 @@ class Node:
             return
         if not self.membership.is_known(beat.node):
             self.counters["beat_foreign"] += 1
+            self.knocking.on_beat(beat, now)
             return
         if self.namesakes.on_beat(beat, now):
             self._beat_at = now  # the two of them may not hear each other
@@ -658,8 +661,8 @@ class Node:
     def _on_retry(self, event: ev.RetryCommanded, now: float) -> None:
         """Forget failures: of our own worker if it is meant, and what we hold against nodes."""
         task, whose = event.command.task, event.command.node
-        if task not in self.executors or (whose and not self.membership.is_known(whose)):
-            detail = f"no task {task!r}" if task not in self.executors else f"no node {whose!r}"
+        if task not in self.executors or (whose and not self._may_work(task, whose)):
+            detail = f"no task {task!r}" if task not in self.executors else f"{whose!r} is no candidate of {task}"
             result = CommandResult(outcome=CommandOutcome.INVALID, detail=detail)
             self._batch.add(do.AnswerCommand(request=event.request, result=result))
             return
@@ -667,9 +670,18 @@ class Node:
         state = self.worker_states.get(task) if whose in ("", self.me) else None
         if state is not None:
             self._batch.add(do.ResetWorker(task=task))
-        detail = "its penalties are forgotten" if state is None else f"its failures are forgotten, it was {state}"
+        detail = self._forgiven(whose) if state is None else f"its failures are forgotten, it was {state}"
         result = CommandResult(outcome=CommandOutcome.OK, detail=detail)
         self._batch.add(do.AnswerCommand(request=event.request, result=result))
+
+    def _may_work(self, task: TaskId, node: NodeId) -> bool:
+        return self.membership.is_known(node) and runs_worker(self.fleet.task(task), node, self.fleet.node(node).kind)
+
+    def _forgiven(self, whose: NodeId) -> str:
+        """What a node forgets that has no worker that is meant: robots take penalties off candidates."""
+        if not self.rounds.is_voter:
+            return "nothing to forget here"
+        return f"takes no penalty off {whose or 'any candidate'} any more"
 
     def _on_dropped(self, event: ev.FrameDropped, _now: float) -> None:
         self.counters[f"dropped_{event.kind}_{event.reason}"] += 1

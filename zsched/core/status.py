@@ -16,6 +16,7 @@ from zsched.core.executor import Executor, Phase
 from zsched.core.fleet import Fleet, NodeSpec, TaskSpec
 from zsched.core.gateway import Gateway
 from zsched.core.generations import way_out
+from zsched.core.knocking import Knocking
 from zsched.core.membership import Membership
 from zsched.core.model import Allocation, NodeId, NodeKind, PeerState, TaskId, WorkerLoad, WorkerState
 from zsched.core.namesakes import Namesakes
@@ -72,6 +73,7 @@ class NodeView(Protocol):
     executors: dict[TaskId, Executor]
     sealing: Sealing
     namesakes: Namesakes
+    knocking: Knocking
     stream_counts: tuple[StreamCount, ...]
     dropped: dict[str, tuple[int, float]]
     joins_at: tuple[str, ...]
@@ -96,7 +98,7 @@ def build_snapshot(node: NodeView, now: float) -> Snapshot:
         fleet_file=node.fleet_file,
         joins_at=node.joins_at,
         counters=tuple(sorted((node.counters + node.agreement.counters).items())),
-        problems=(*node.namesakes.problems(now), *_problems(node, quorum)),
+        problems=(*node.namesakes.problems(now), *_problems(node, quorum), *node.knocking.problems(now)),
     )
 
 
@@ -117,6 +119,14 @@ def _problems(node: NodeView, quorum: QuorumStatus) -> tuple[str, ...]:
         problems.append(
             f"no elector to spare: {quorum.alive} of {quorum.electors} can answer, {quorum.needed} needed; "
             f"not {missing}. With one more away nothing is decided"
+        )
+    voters = node.fleet.voters
+    silent = [name for name in voters if node.membership.state(name) is not PeerState.ALIVE]
+    needed = majority(len(voters))
+    if quorum.ok and len(voters) - len(silent) < needed:
+        problems.append(
+            f"no planned moves: {len(voters) - len(silent)} of {len(voters)} robots can vote, {needed} needed; "
+            f"not {', '.join(silent)}. An owner that is gone, drains or fails is still replaced"
         )
     if quorum.electors - len(quorum.stateless) < quorum.needed:
         number = node.agreement.newest_generation + 1

@@ -497,7 +497,7 @@ MEMBERSHIP_BUGS = (
     _bug(
         "node without state proposes by generation 0",
         AGREEMENT,
-        "self.registers[task.name].follow(self._of_generation(), initial)",
+        "self.registers[task.name].follow(self.electorate, initial)",
         "self.registers[task.name].follow(self._electorate, initial)",
         _GENERATIONS,
         26,

@@ -13,6 +13,7 @@ from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.fleet import Fleet, NodeSpec, StreamRule, TaskSpec, Timing, WorkerSpec, electorate_hash
 from zsched.core.identity import QUIET_S
+from zsched.core.knocking import KNOCKERS_KEPT
 from zsched.core.messages import (
     Accept,
     CommandOutcome,
@@ -153,7 +154,7 @@ def of(batch: tuple[do.Instruction, ...], kind: type[T]) -> list[T]:
 
 
 def digest(thing: Any, seen: frozenset[int] = frozenset()) -> Any:
-    """Every field of every object that hangs on ``thing``, but the counters and what only refers to code."""
+    """Every field of every object that hangs on ``thing``, but what is only shown and what only refers to code."""
     if isinstance(thing, Random):
         return thing.getstate()
     if isinstance(thing, str | int | float | bool | None):
@@ -167,7 +168,7 @@ def digest(thing: Any, seen: frozenset[int] = frozenset()) -> Any:
         return [digest(item, seen) for item in thing]
     names = [field.name for field in fields(thing)] if is_dataclass(thing) else list(getattr(thing, "__dict__", ()))
     names += [name for name in getattr(type(thing), "__slots__", ()) if hasattr(thing, name)]
-    skipped = {"counters", "_handlers", "fleet", "_fleet"}
+    skipped = {"counters", "knocking", "_handlers", "fleet", "_fleet"}
     return {name: digest(getattr(thing, name), seen) for name in names if name not in skipped}
 
 
@@ -550,6 +551,21 @@ def test_another_fleet_file_is_a_problem_until_it_is_the_same() -> None:
     assert node.problems == {}
 
 
+def test_a_node_that_our_file_does_not_name_is_told_while_it_beats() -> None:
+    node = started()
+    for number in range(9):
+        knock = replace(beat(f"robot{number + 10}"), fleet_file="0123456789abcdef")
+        node.handle(ev.BeatReceived(beat=knock), 100.0)
+    said = [one for one in build_snapshot(node, 100.0 + QUIET_S - 0.01).problems if "beats in this fleet" in one]
+    assert len(said) == KNOCKERS_KEPT
+    assert said[0].startswith(
+        "fleet/robot10: robot10 beats in this fleet, goes by another fleet file (0123456789abcdef, "
+    )
+    assert not any("robot1" in one for one in build_snapshot(node, 100.0 + QUIET_S).problems)
+    node.handle(ev.BeatReceived(beat=beat("robot99")), 100.0 + QUIET_S)
+    assert any("robot99" in one for one in build_snapshot(node, 100.0 + QUIET_S).problems), "the others made room"
+
+
 def test_our_own_token_is_no_problem() -> None:
     node = started()
     node.handle(ev.TokenSeen(node="robot1", incarnation=7), 100.0)
@@ -652,10 +668,18 @@ def test_a_retry_resets_the_worker_that_is_meant_and_forgives_its_node() -> None
         batch = edge.handle(ev.RetryCommanded(request=9, command=RetryTask(task="merge", node=whose)), 100.0)
         assert len(of(batch, do.ResetWorker)) == resets
         detail = of(batch, do.AnswerCommand)[0].result.detail
-        assert detail == ("its failures are forgotten, it was stopped" if resets else "its penalties are forgotten")
+        assert detail == ("its failures are forgotten, it was stopped" if resets else "nothing to forget here")
+    for whose, said in (
+        ("edge1", "takes no penalty off edge1 any more"),
+        ("", "takes no penalty off any candidate any more"),
+    ):
+        batch = node.handle(ev.RetryCommanded(request=9, command=RetryTask(task="merge", node=whose)), 100.0)
+        assert of(batch, do.AnswerCommand)[0].result.detail == said
 
 
-@pytest.mark.parametrize("command", [RetryTask(task="other"), RetryTask(task="merge", node="ghost")])
+@pytest.mark.parametrize(
+    "command", [RetryTask(task="other"), RetryTask(task="merge", node="ghost"), RetryTask(task="merge", node="robot2")]
+)
 def test_a_retry_of_what_there_is_not_is_refused(command: RetryTask) -> None:
     node = make("edge1")
     batch = node.handle(ev.RetryCommanded(request=7, command=command), 100.0)

@@ -200,6 +200,19 @@ def test_a_quorum_without_a_margin_is_a_problem_that_names_who_is_missing() -> N
     assert "not robot1" in problem, "an elector without its state is none"
 
 
+def test_robots_that_cannot_make_a_majority_are_a_problem_while_electors_can() -> None:
+    """The electors agree on an escape then, but no ordinary vote is won."""
+    node = make(alive=())
+    node.fleet = replace(node.fleet, electors=("robot1",))
+    (problem,) = build_snapshot(node, 100.0).problems
+    assert problem == (
+        "no planned moves: 1 of 3 robots can vote, 2 needed; not robot2, robot3. "
+        "An owner that is gone, drains or fails is still replaced"
+    )
+    node.handle(ev.BeatReceived(beat=Beat(node="robot2", incarnation=3, sequence=1, loop_lag_s=0.0)), 100.0)
+    assert build_snapshot(node, 100.0).problems == ()
+
+
 def test_a_worker_that_failed_or_is_missed_is_told_with_its_reason() -> None:
     node = make()
     for name in EDGES:
