@@ -16,6 +16,8 @@ Json = dict[str, Any]
 BUSY, FULL = 0.6, 0.85
 """From here a bar is yellow, from here red."""
 MAX_CANDIDATES, MAX_HISTORY = 12, 3
+TROUBLES = "PROBLEMS"
+"""The title of the last block, which a low window keeps."""
 DROPS_OVER_S = 60.0
 """Drops that have not risen for so long are history."""
 STATE_STYLES = {"alive": "green", "ready": "green"} | dict.fromkeys(
@@ -191,8 +193,8 @@ def _task(page: Page, status: Json, task: Json) -> None:
     owner, state = task["owner"], task["owner_state"]
     parts: list[Cell] = [("no owner yet", "red")]
     if owner is not None:
-        since = "" if task["since_s"] is None else f" since {span(task['since_s'])}"
-        parts = [(f"{owner} owns it{since}", "bold"), (state, STATE_STYLES.get(state, "red"))]
+        known = [] if task["since_s"] is None else [(f"known here for {span(task['since_s'])}", "")]
+        parts = [(f"{owner} owns it", "bold"), *known, (state, STATE_STYLES.get(state, "red"))]
     counts = [(f"epoch {task['epoch']}", ""), (f"revision {task['revision']}", "")]
     page.block(f"TASK {task['name']}", *parts, *counts)
     _scheduler(page, status, task)
@@ -357,4 +359,4 @@ def _troubles(page: Page, status: Json) -> None:
     if dropped:
         page.block("dropped", *((text, "") for text in dropped))
     for number, problem in enumerate(problems):
-        page.block("" if number else "PROBLEMS", (problem, "alarm"))
+        page.block("" if number else TROUBLES, (problem, "alarm"))

@@ -14,7 +14,7 @@ from pathlib import Path
 from zsched.cli_ask import Door, ask_door, find_door
 from zsched.cli_common import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK, CliError, Json, print_json, wants_color
 from zsched.cli_page import harmless
-from zsched.cli_report import degradations, render_status
+from zsched.cli_report import TROUBLES, degradations, render_status
 
 MIN_WIDTH, DEFAULT_WIDTH, MAX_WIDTH = 60, 100, 160
 MAJOR = "1"
@@ -92,16 +92,19 @@ def _print_next(view: StatusView, status: Json | CliError, *, is_screen: bool) -
 def _fitted(text: str) -> str:
     """The text from the top of the screen, fitted to its height; what was there is overwritten, so nothing flickers.
 
-    Of a text that is too high the last block stays, if it is small: that is where problems stand.
+    Of a text that is too high the problems stay, at most in the lower half, with a count of those that have no room.
     """
     height = shutil.get_terminal_size((DEFAULT_WIDTH, 30)).lines
     lines = text.splitlines()
     if len(lines) > height:
-        last = len(lines) - 1 - lines[::-1].index("") if "" in lines else len(lines)
-        tail = lines[last:] if len(lines) - last <= height // 3 else []
+        last = next((at for at, line in enumerate(lines) if TROUBLES in line[:20]), len(lines))
+        last -= last < len(lines) and lines[last - 1] == ""
+        tail, most = lines[last:], height // 2
+        if len(tail) > most:
+            tail = [*tail[: most - 1], f"... {len(tail) - most + 1} more lines of problems: a higher window shows them"]
         room = height - 1 - len(tail)
-        note = f"... {len(lines) - len(tail) - room} more lines: a higher window shows them"
-        lines = [*lines[:room], note, *tail]
+        note = f"... {max(last - room, 0)} more lines: a higher window shows them"
+        lines = [*lines[: min(room, last)], note, *tail]
     return HOME + f"{REST_OF_LINE}\n".join(lines) + REST_OF_LINE + REST_OF_SCREEN
 
 

@@ -26,6 +26,7 @@ from zsched.adapters.operator_socket import OperatorSocket
 from zsched.cli import app
 from zsched.cli_ask import ask_door, find_door
 from zsched.cli_common import CliError, nearest
+from zsched.cli_report import render_status
 from zsched.cli_status import _fitted
 from zsched.cli_weights import parse_weights
 
@@ -289,6 +290,23 @@ def test_screen_that_is_too_low_keeps_the_problems(monkeypatch: pytest.MonkeyPat
     assert shown[7].startswith("... 13 more lines")
 
 
+@pytest.mark.parametrize("height", [20, 24, 30])
+def test_many_problems_of_many_tasks_stay_in_the_lower_half_of_the_screen(
+    monkeypatch: pytest.MonkeyPatch, height: int
+) -> None:
+    monkeypatch.setenv("LINES", str(height))
+    status = json.loads((RECORDED / "healthy.json").read_text())
+    status["tasks"] = [{**status["tasks"][0], "name": f"task{number}"} for number in range(8)]
+    status["problems"] = [f"problem {number}" for number in range(20)]
+    shown = _fitted(render_status(status, 80, color=True))
+    lines = shown.replace("\x1b[K", "").replace("\x1b[H", "").replace("\x1b[J", "").split("\n")
+    assert len(lines) == height
+    assert lines[0].startswith("\x1b[1mfleet")
+    assert "PROBLEMS" in lines[height - height // 2 + 1]
+    assert "problem 0" in lines[height - height // 2 + 1]
+    assert lines[-1] == f"... {22 - height // 2} more lines of problems: a higher window shows them"
+
+
 def test_screen_that_is_high_enough_shows_all(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LINES", "10")
     assert _fitted("\n".join("abcdefghij")).count("\n") == 9
@@ -309,7 +327,14 @@ def test_retry_asks_every_node_that_is_there_and_names_the_others(daemon: Daemon
     assert run("retry", "echo").exit_code == 0
 
 
-@pytest.mark.parametrize(("words", "says"), [(("ehco",), "did you mean echo?"), (("echo", "egde1"), "edge1")])
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("ehco",), "did you mean echo?"),
+        (("echo", "egde1"), "edge1"),
+        (("echo", "robot2"), "robot2 is no candidate of echo and has no worker of it; there are: edge1, edge2"),
+    ],
+)
 def test_retry_of_what_there_is_not_is_a_usage_error(daemon: Daemon, words: tuple[str, ...], says: str) -> None:
     result = run("retry", *words)
     assert result.exit_code == 2
