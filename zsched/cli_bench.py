@@ -45,7 +45,7 @@ def paper(
     runs: Annotated[
         int | None, typer.Option(min=1, max=1000, metavar="N", help="Runs of each scheme. [scenario]")
     ] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="Fixed, dyna_both and zsched once: under 6 minutes.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Fixed, dyna_both and zsched once: 6 quiet minutes.")] = False,
     schemes: Annotated[str, typer.Option(metavar="A,B", help="Only these schemes. [the scenario's]")] = "",
     resume: Annotated[bool, typer.Option("--resume", help="Go on in the folder of --out.")] = False,
     report: Annotated[bool, typer.Option("--report", help="Run nothing; report what is done in --out.")] = False,
