@@ -211,7 +211,8 @@ def _advise_ready(given: Section, worker: WorkerSpec, streams: tuple[Located[Str
     section: Section | None = given.get("worker")
     if worker.ready_when is not ReadyWhen.MATCHING or section is None:
         return
-    if all(stream.value.direction is Direction.OUTPUT for stream in streams):
+    # An input with a fault is no rule, but it is there.
+    if given.is_whole and all(stream.value.direction is Direction.OUTPUT for stream in streams):
         message = "nothing goes to this worker, so nothing tells whether it is there: it always counts as ready"
         out.warn(section.where("ready"), message, "give it an input or a service, or use zsched.worker (ready: token)")
     for stream in streams:

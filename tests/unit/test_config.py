@@ -526,6 +526,16 @@ def test_a_worker_that_shows_itself_by_matching_must_be_given_something() -> Non
     assert [warning for warning in check(without).warnings if told in warning.message]
 
 
+def test_an_input_with_a_fault_is_given_all_the_same() -> None:
+    result = check(
+        swapped(
+            "class: latest, keep_last: 1", "class: lates", swapped("standby: warm", "standby: warm, ready: matching")
+        )
+    )
+    assert "lates" in result.report()
+    assert not [warning for warning in result.warnings if "nothing tells whether it is there" in warning.message]
+
+
 def test_a_worker_that_acknowledges_nothing_cannot_be_reliable() -> None:
     told = "acknowledges nothing"
     text = swapped("class: latest, keep_last: 1", "class: reliable")
