@@ -90,6 +90,7 @@ class Daemon:
         self._notify = Notifier()
         self._next_status = 0.0
         self._is_restart = False
+        self._has_foreign_state = False
         self._door = Door(options.runtime_dir, options.node)
         self._is_ready = False
         self._operator_json5 = daemon_tls.operator_json5(self._fleet)
@@ -118,6 +119,7 @@ class Daemon:
             node.joins_at = joins_at(self._spec, points.worker_connect[:1])
             if problem is not None:
                 node.problems["state"] = problem
+            node.has_foreign_state = self._has_foreign_state
             if self._memory_objection:
                 log.warning("shared_memory off why=%s", self._memory_objection)
                 node.problems["shared_memory"] = f"shared memory is off here: {self._memory_objection}"
@@ -139,9 +141,11 @@ class Daemon:
             return None, loaded.problem
         if loaded.state.electorate != electorate_hash(self._fleet):
             generation = loaded.state.generation + 1
+            self._has_foreign_state = True
             return None, (
-                "the fleet file names another electorate than the state file; this node is no elector. With the new "
-                f"file everywhere stop all, `zsched init --generation {generation}` on each, and start all"
+                "the fleet file names another electorate than the state file, which is whole and stays; this node is "
+                f"no elector. If the file is right, give it to all, stop all, `zsched init --generation {generation} "
+                "--force` on each, and start all"
             )
         # Not just one more: a folder that was brought back from a backup must not live one of its lives again.
         state = replace(loaded.state, incarnation=max(loaded.state.incarnation + 1, wall_tenths()))

@@ -103,6 +103,8 @@ class Node:
         self.incarnation = incarnation
         self.started_at = now
         self.has_state = durable is not None
+        self.has_foreign_state = False
+        """The state file is whole, and of another electorate than the fleet file: it stays on its disk."""
         self.counters: Counter[str] = Counter()
         self.problems: dict[str, str] = {}
         self.is_draining = False

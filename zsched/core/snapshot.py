@@ -113,7 +113,7 @@ class QuorumStatus:
     """Electors that are alive, have their state, and are not apart."""
     ok: bool
     this_node: str
-    """``elector``, ``no_elector`` (not in the electorate) or ``lost_state``."""
+    """``elector``, ``no_elector`` (not in the electorate), ``lost_state`` or ``other_electorate`` (its state is)."""
     voted: tuple[NodeId, ...] = ()
     """Electors that this node knows to have voted (they must not be initialised anew)."""
     stateless: tuple[NodeId, ...] = ()

@@ -60,6 +60,7 @@ class NodeView(Protocol):
     incarnation: int
     started_at: float
     has_state: bool
+    has_foreign_state: bool
     stateless: set[NodeId]
     unready: dict[TaskId, tuple[int, float]]
     agreement: Agreement
@@ -134,7 +135,7 @@ def _problems(node: NodeView, quorum: QuorumStatus) -> tuple[str, ...]:
             "nothing can be agreed: too many electors without their states (each says why); if these are lost, "
             + way_out(number)
         )
-    if not node.has_state:
+    if not node.has_state and not node.has_foreign_state:
         problems.append("no valid state file: this node is no elector (see `zsched init --help`)")
     return tuple(problems)
 
@@ -153,7 +154,8 @@ def _quorum(node: NodeView) -> QuorumStatus:
     stateless = [name for name in electors if _has_lost_state(node, name)]
     alive = [name for name in electors if _can_answer(node, name)]
     needed = majority(len(electors))
-    role = "elector" if node.agreement.is_elector else ("lost_state" if node.me in electors else "no_elector")
+    lost = "other_electorate" if node.has_foreign_state else "lost_state"
+    role = "elector" if node.agreement.is_elector else (lost if node.me in electors else "no_elector")
     return QuorumStatus(
         electors=len(electors),
         needed=needed,

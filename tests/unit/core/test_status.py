@@ -191,6 +191,14 @@ def test_problems_say_what_is_missing_in_words() -> None:
     assert build_snapshot(make(), 100.0).problems == ()
 
 
+def test_a_state_of_another_electorate_is_not_told_as_lost() -> None:
+    node = make(has_state=False)
+    node.has_foreign_state = True
+    snapshot = build_snapshot(node, 100.0)
+    assert snapshot.quorum.this_node == "other_electorate"
+    assert not any("no valid state file" in one for one in snapshot.problems), snapshot.problems
+
+
 def test_a_quorum_without_a_margin_is_a_problem_that_names_who_is_missing() -> None:
     (problem,) = build_snapshot(make(alive=("robot2",)), 100.0).problems
     assert problem == (
