@@ -314,8 +314,11 @@ class ControlBus:
     def _where(self, zid: str) -> str:
         """The address at the other end of the link to a session; empty: there is none."""
         session = self._session
-        links = () if session is None else session.info.links()
-        return next((str(link.dst).partition("?")[0] for link in links if str(link.zid) == zid), "")
+        if session is not None:
+            with contextlib.suppress(zenoh.ZError):  # it is being closed
+                ends = (str(link.dst) for link in session.info.links() if str(link.zid) == zid)
+                return next((end.partition("?")[0] for end in ends), "")
+        return ""
 
     def _ask(
         self,

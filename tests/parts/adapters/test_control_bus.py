@@ -277,7 +277,9 @@ def test_one_peer_is_asked_for_what_it_has_learnt(mesh: tuple[Peer, Peer, Peer])
     a, b, c = mesh
     b.bus.ask_learnt("a", 2.0)
     a.bus.answer(a.next(ev.LearntAsked).request, LEARNT)
-    assert b.next(ev.LearntReceived) == ev.LearntReceived(learnt=LEARNT, is_answer=True)
+    heard = b.next(ev.LearntReceived)
+    assert (heard.learnt, heard.is_answer) == (LEARNT, True)
+    assert heard.where == a.listen, "the other end of the link, for people"
     assert c.events == []
 
 
