@@ -145,6 +145,7 @@ def init(
     `zsched status` names. That is refused while the fleet agrees, and where a good state would be lost.
     """
     from zsched import places  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.adapters import core_speed  # noqa: PLC0415 - likewise
     from zsched.config import load_fleet, require_node  # noqa: PLC0415 - ruamel.yaml is slow to import
     from zsched.lifecycle import check_blank, init_state, settle_dispute, standing_state  # noqa: PLC0415 - imports zenoh
 
@@ -167,6 +168,7 @@ def init(
     heard = check_blank(fleet, name, folder, generation, standing, is_forced=force)
     path = init_state(fleet, name, folder, generation)
     _say(_heard(heard, name, generation, is_elector=name in fleet.electors))
+    typer.echo(f"a core of this machine has speed {core_speed.keep(folder):.2f}")
     typer.echo(f"{path}: blank state of {name} in fleet {fleet.name}, generation {generation}")
 
 

@@ -108,21 +108,23 @@ def _header(page: Page, status: Json) -> None:
 def _nodes(page: Page, status: Json) -> None:
     nodes: list[Json] = status["nodes"]
     name = min(max([page.indent - 1, *(len(node["name"]) + 1 for node in nodes)]), 20)
-    bar = 8 if page.width >= 96 else 4
-    columns = (name, 5, 8, -5, bar, -4, 6, 9, 7, page.width)
+    is_wide = page.width >= 96
+    bar = 8 if is_wide else 4
+    is_timed = is_wide and any(node.get("speed") is not None for node in nodes)
+    columns = (name, 5, 8, -5, bar, -4, 10 if is_timed else 6, 9, 7, page.width)
     titles = ("PROFILE", "kind", "state", "age", "cpu", "", "cores", "memory", "link", "workers")
     styles = ("stage", *["dim"] * (len(titles) - 1))
     page.row(*zip(titles, columns, styles, strict=True))
     room = page.width - sum(abs(width) + 1 for width in columns[:-1])
     for node in nodes:
         workers = _workers(node["workers"], room, is_single=len(status["tasks"]) == 1)
-        texts = [*_node_cells(node, bar, is_me=node["name"] == status["node"]), workers]
+        texts = [*_node_cells(node, bar, is_me=node["name"] == status["node"], is_wide=is_wide), workers]
         if node["state"] in ("gone", "unknown"):  # its last figures are no news
             texts = [(text, style if index == 2 else "dim") for index, (text, style) in enumerate(texts)]
         page.row(*((text, width, style) for (text, style), width in zip(texts, columns, strict=True)))
 
 
-def _node_cells(node: Json, bar: int, *, is_me: bool) -> list[tuple[str, str]]:
+def _node_cells(node: Json, bar: int, *, is_me: bool, is_wide: bool) -> list[tuple[str, str]]:
     state = "draining" if node["draining"] and node["state"] == "alive" else node["state"]
     cpu, cores = node["cpu_ratio"], node["cpu_cores"]
     level = "" if cpu is None else "red" if cpu >= FULL else "yellow" if cpu >= BUSY else "green"
@@ -135,10 +137,21 @@ def _node_cells(node: Json, bar: int, *, is_me: bool) -> list[tuple[str, str]]:
         (span(node["age_s"]), ""),
         ("" if cpu is None else "█" * filled + "░" * (bar - filled), level),
         (_percent(cpu), ""),
-        ("" if cores is None else f"of {cores:.3g}", "dim"),
+        (_cores(cores, node.get("speed") if is_wide else None), "dim"),
         (_memory(node), "red" if is_tight else ""),
         (_link(node["links"]), ""),
     ]
+
+
+def _cores(cores: float | None, speed: float | None) -> str:
+    """How many, and how fast each is where that was measured.
+
+    >>> _cores(4.0, 0.713), _cores(0.5, None)
+    ('of 4 x0.71', 'of 0.5')
+    """
+    if cores is None:
+        return ""
+    return f"of {cores:.3g}" + ("" if speed is None else f" x{speed:.2g}")
 
 
 def _memory(node: Json) -> str:
@@ -170,7 +183,8 @@ def _workers(workers: Sequence[Json], room: int, *, is_single: bool) -> Cell:
     short = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(states))
     if is_single:
         (worker,) = workers[:1]
-        load = [] if worker["cpu_cores"] is None else [f"{worker['cpu_cores']:.2f} cores"]
+        wants = "" if worker.get("wanted_cores") is None else f" of {worker['wanted_cores']:.2f}"
+        load = [] if worker["cpu_cores"] is None else [f"{worker['cpu_cores']:.2f}{wants} cores"]
         load += [] if worker["memory_mb"] is None else [memory(worker["memory_mb"])]
         full, short = " ".join([worker["state"], *load]), worker["state"]
     return (full if len(full) <= room else short), style

@@ -197,7 +197,7 @@ class Daemon:
         relay.start()
         stack.callback(lambda: relay.leave() if self._is_restart else relay.stop(1.0))
         stack.callback(supervisor.close, CLOSE_WORKERS_S)
-        sampler = Sampler(self._spec, fleet.timing.sample_s, shell, self._inbox)
+        sampler = Sampler(self._spec, fleet.timing.sample_s, self._options.state_dir, shell, self._inbox)
         sampler.start()
         stack.callback(sampler.stop)
         return shell

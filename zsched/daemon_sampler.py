@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import logging
 import threading
+from pathlib import Path
 
+from zsched.adapters import core_speed
 from zsched.adapters.device_profiler import DeviceProfiler
 from zsched.adapters.network_profiler import readers_for
 from zsched.clock import ClockWatch
@@ -23,8 +25,9 @@ log = logging.getLogger("zsched.daemon")
 class Sampler:
     """Measures the machine and its links in a thread of its own: a slow driver must not stop the beats."""
 
-    def __init__(self, spec: NodeSpec, period_s: float, shell: Shell, inbox: Inbox) -> None:
+    def __init__(self, spec: NodeSpec, period_s: float, state_dir: Path, shell: Shell, inbox: Inbox) -> None:
         self._readers = readers_for(spec)
+        self._state_dir = state_dir
         self._device, self._clocks = DeviceProfiler(), ClockWatch()
         self._period_s, self._shell, self._inbox = period_s, shell, inbox
         self._stop = threading.Event()
@@ -41,6 +44,7 @@ class Sampler:
         self._thread.join(timeout=0.5)
 
     def _run(self) -> None:
+        self._device.speed = core_speed.kept_or_new(self._state_dir)
         while not self._stop.is_set():
             try:
                 self._compare_clocks()

@@ -190,10 +190,10 @@ def test_free_port_is_any_when_no_other_is_free() -> None:
 # --- the sampler -----------------------------------------------------------------------------------------------------
 
 
-def test_samplers_problem_is_told_once_and_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_samplers_problem_is_told_once_and_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A driver that fails for a while: one problem, one end, and samples again."""
     inbox, shell = Inbox(), SimpleNamespace(crew=SimpleNamespace(supervisor=None))
-    sampler = Sampler(spec("a"), 0.001, shell, inbox)  # type: ignore[arg-type]
+    sampler = Sampler(spec("a"), 0.001, tmp_path, shell, inbox)  # type: ignore[arg-type]
     sample, failures = sampler._device.sample, iter([True] * 3)
 
     def fails_at_first(workers: Any) -> Any:

@@ -11,6 +11,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from zsched import __version__
+from zsched.adapters import core_speed
 from zsched.cli import app
 
 RECORDED = Path(__file__).parent / "recorded_status"
@@ -158,7 +159,9 @@ def test_init_creates_the_state_once(tmp_path: Path) -> None:
     arguments = ("init", "--config", file, "--node", "robot1", "--state-dir", state)
     first, second = run(*arguments), run(*arguments)
     assert first.exit_code == 0
-    assert first.stdout == f"{state}/state: blank state of robot1 in fleet hall, generation 0\n"
+    speed, path = first.stdout.splitlines()
+    assert speed == f"a core of this machine has speed {core_speed.kept(state):.2f}"
+    assert path == f"{state}/state: blank state of robot1 in fleet hall, generation 0"
     said = f"{state}: robot1 has its state in fleet hall, generation 0: nothing to do\n"
     assert (second.exit_code, second.stdout) == (0, said)
     assert run(*arguments, "--generation", 1, "--force").exit_code == 0

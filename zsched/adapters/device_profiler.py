@@ -6,8 +6,9 @@ Under a quota the machine *is* the group that holds the smallest quota: its core
 total - MemAvailable, or under a limit the group's working set, or what the machine has left if that is less.
 
 A worker's load is its whole process tree. CPU: the difference of user and system time, children that were waited for
-included, so short-lived ones count. Memory: the sum of resident sets, which counts shared pages once per process; the
-exact figure (PSS) would cost milliseconds per sample.
+included, so short-lived ones count. A thread that is always running or waiting for a CPU (schedstat's run time and
+run-queue delay) would use a whole one: that is what a worker wants beyond what it gets. Memory: the sum of resident
+sets, which counts shared pages once per process; the exact figure (PSS) would cost milliseconds per sample.
 
 Knows: /proc and /sys/fs/cgroup (proc(5)), below a root that tests can set. Does not know: smoothing, demand, tasks'
 meaning. Nothing here raises: what cannot be read is ``None``.
@@ -15,8 +16,9 @@ meaning. Nothing here raises: what cannot be read is ``None``.
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,6 +28,10 @@ from zsched.core.model import DeviceSample, TaskId, WorkerLoad, WorkerState
 
 LIMITS_EVERY_S = 5.0
 """How often quotas, limits and the set of CPUs are looked up again; they change by an operator's hand only."""
+ALWAYS = 0.95
+"""A thread that runs or waits to run for so much of the time always wants to run."""
+APPETITE_S = 1.5
+"""Time constant of that share: a job that comes once a second and leaves pauses is no such thread."""
 MIN_INTERVAL_S = 0.02
 """Two samples closer than this would divide one tick by nothing: the previous figure stands."""
 TICKS_PER_S = float(os.sysconf("SC_CLK_TCK"))
@@ -91,6 +97,15 @@ def parse_cpu_stat(content: bytes, allowed: frozenset[int] | None) -> CpuTimes |
     return CpuTimes(busy_s=busy / TICKS_PER_S, total_s=total / TICKS_PER_S, cpus=cpus)
 
 
+def parse_schedstat(content: bytes) -> tuple[float, float] | None:
+    """Seconds a thread has run, and has waited to run, of /proc/PID/task/TID/schedstat; ``None`` when malformed."""
+    try:
+        run_ns, wait_ns = (int(field) for field in content.split()[:2])
+    except ValueError:
+        return None
+    return run_ns / 1e9, wait_ns / 1e9
+
+
 def parse_cpu_list(text: str) -> frozenset[int]:
     """A kernel CPU list such as ``0-3,8`` as a set; malformed parts are left out."""
     cpus: set[int] = set()
@@ -106,6 +121,8 @@ class DeviceProfiler:
 
     def __init__(self, root: Path = Path("/"), pid: str = "self") -> None:
         """Read everything below ``root`` ("/" but in tests), as process ``pid`` sees it."""
+        self.speed: float | None = None
+        """How fast a core is, when somebody has measured it."""
         self._root, self._pid = root, pid
         self._proc = str(root / "proc")
         self._trees = _ProcessTrees(self._proc)
@@ -129,6 +146,7 @@ class DeviceProfiler:
             memory_mb=memory_mb,
             memory_used_mb=memory_used_mb,
             workers=self._trees.loads(workers, now),
+            speed=self.speed,
         )
 
     def _look_up_limits(self, now: float) -> None:
@@ -192,6 +210,7 @@ class _ProcessTrees:
         self._proc = proc
         self._has_children_files = os.path.exists(f"{proc}/self/task/{os.getpid()}/children")  # noqa: PTH110 - str paths
         self._seen: dict[TaskId, tuple[float, dict[int, ProcessTimes]]] = {}
+        self._appetites: dict[TaskId, _Appetite] = {}
 
     def loads(self, workers: Mapping[TaskId, tuple[WorkerState, int | None]], now: float) -> tuple[WorkerLoad, ...]:
         """One load per worker, sorted by task."""
@@ -199,6 +218,7 @@ class _ProcessTrees:
         seen = {task: (now, self._tree(pid, children)) for task, (_, pid) in workers.items() if pid is not None}
         loads = tuple(self._load(task, workers[task][0], seen.get(task)) for task in sorted(workers))
         self._seen = seen
+        self._appetites = {task: self._appetites[task] for task in seen if task in self._appetites}
         return loads
 
     def _load(self, task: TaskId, state: WorkerState, seen: tuple[float, dict[int, ProcessTimes]] | None) -> WorkerLoad:
@@ -208,8 +228,23 @@ class _ProcessTrees:
         before = self._seen.get(task)
         cpu_cores = None if before is None else _cores(before[1], tree, now - before[0], now)
         return WorkerLoad(
-            task=task, state=state, cpu_cores=cpu_cores, memory_mb=sum(times.rss_mb for times in tree.values())
+            task=task,
+            state=state,
+            cpu_cores=cpu_cores,
+            memory_mb=sum(times.rss_mb for times in tree.values()),
+            wanted_cores=self._appetites.setdefault(task, _Appetite()).look(self._threads(tree), now),
         )
+
+    def _threads(self, tree: Iterable[int]) -> dict[tuple[int, str], tuple[float, float]]:
+        """{(process, thread): seconds run, seconds waited to run}."""
+        found = {}
+        for pid in tree:
+            folder = f"{self._proc}/{pid}/task"
+            for thread in _names(folder):
+                times = parse_schedstat(_read(f"{folder}/{thread}/schedstat"))
+                if times is not None:
+                    found[pid, thread] = times
+        return found
 
     def _tree(self, pid: int, children: dict[int, list[int]] | None) -> dict[int, ProcessTimes]:
         tree: dict[int, ProcessTimes] = {}
@@ -234,6 +269,39 @@ class _ProcessTrees:
             if name.isdecimal() and (times := parse_process_stat(_read(f"{self._proc}/{name}/stat"))) is not None:
                 children.setdefault(times.parent, []).append(int(name))
         return children
+
+
+class _Appetite:
+    """What the threads of one worker would use if they never had to wait."""
+
+    def __init__(self) -> None:
+        self._at = 0.0
+        self._times: dict[tuple[int, str], tuple[float, float]] = {}
+        self._shares: dict[tuple[int, str], tuple[float, float]] = {}
+        """{thread: share of the time that it ran, and that it ran or waited}, smoothed."""
+
+    def look(self, times: dict[tuple[int, str], tuple[float, float]], now: float) -> float | None:
+        """Cores; ``None`` when no thread always wants to run."""
+        elapsed_s = now - self._at
+        if elapsed_s < MIN_INTERVAL_S:
+            return self._wanted()
+        keep = math.exp(-elapsed_s / APPETITE_S)
+        shares = {}
+        for thread, (run_s, wait_s) in times.items():
+            before = self._times.get(thread)
+            if before is None:
+                continue
+            ran = min(max(run_s - before[0], 0.0) / elapsed_s, 1.0)
+            wanted = min(max(run_s + wait_s - before[0] - before[1], 0.0) / elapsed_s, 1.0)
+            old = self._shares.get(thread, (0.0, 0.0))
+            shares[thread] = (ran + keep * (old[0] - ran), wanted + keep * (old[1] - wanted))
+        self._at, self._times, self._shares = now, times, shares
+        return self._wanted()
+
+    def _wanted(self) -> float | None:
+        if all(wanted < ALWAYS for _, wanted in self._shares.values()):
+            return None
+        return sum(wanted if wanted >= ALWAYS else ran for ran, wanted in self._shares.values())
 
 
 def _cores(

@@ -42,9 +42,10 @@ class Demands:
     def learn(self, task: TaskId, profile: Profile, now: float) -> bool:
         """Note what the task's worker wants on its owner; whether that is news.
 
-        A worker that knows what it would use alone is believed (`WorkerLoad.wanted_cores`). Otherwise what it uses is
-        its need where CPU is left, and the least of it where none is. A worker that is not ready, or a figure that
-        nobody measured, changes nothing: the task does not cost less because its worker restarts.
+        What it uses is its need where CPU is left, and the least of it where none is. Where threads of it always want
+        to run (`WorkerLoad.wanted_cores`), its need is between what it uses and what they would take. A worker that is
+        not ready, or a figure that nobody measured, changes nothing: the task does not cost less because its worker
+        restarts.
         """
         load = profile.worker(task)
         if load is None or load.state is not WorkerState.READY or profile.cpu_used_cores is None:
@@ -54,11 +55,15 @@ class Demands:
         is_new = now - found.since < SETTLE_S
         if load.memory_mb is not None:
             found = replace(found, memory_mb=max(load.memory_mb, (known.memory_mb or 0.0) if is_new else 0.0))
-        use = load.cpu_cores if load.wanted_cores is None else load.wanted_cores
-        if use is not None:
-            is_starved = load.wanted_cores is None and profile.cpu_used_cores / profile.cpu_cores >= STARVED_CPU_RATIO
-            least = known.work if (is_new or is_starved) and known.work is not None else 0.0
-            found = replace(found, work=max(use * speed_of(profile), least))
+        if load.cpu_cores is not None:
+            use, most = load.cpu_cores * speed_of(profile), (load.wanted_cores or 0.0) * speed_of(profile)
+            if most > use:
+                work = max(min(most if known.work is None else known.work, most), use)
+            elif is_new or profile.cpu_used_cores / profile.cpu_cores >= STARVED_CPU_RATIO:
+                work = max(use, known.work or 0.0)
+            else:
+                work = use
+            found = replace(found, work=work)
         self._known[task] = found
         return (found.work, found.memory_mb) != (known.work, known.memory_mb)
 

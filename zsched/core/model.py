@@ -169,7 +169,7 @@ class WorkerLoad:
     cpu_cores: float | None = None
     memory_mb: float | None = None
     wanted_cores: float | None = None
-    """What it would use if it had the machine to itself; ``None``: not measured."""
+    """The most that it would use alone, where threads of it always want to run; ``None``: none does, or unknown."""
     reason: str = ""
     """Why it is not ready, or what is wrong with it though it is; at most `MAX_REASON` characters."""
 

@@ -132,7 +132,6 @@ class Profiler:
         self._signals: dict[NodeId | None, SignalFilter] = {}
         self._worker_cpu: dict[TaskId, Ewma] = {}
         self._worker_memory: dict[TaskId, Ewma] = {}
-        self._worker_wants: dict[TaskId, Ewma] = {}
         self._device: DeviceSample | None = None
         self._sampled_at = -math.inf
         self._is_new = False
@@ -153,7 +152,7 @@ class Profiler:
         _absorb_use(self._cpu, self._worker_cpu, device.cpu_used_cores, worker_cpu, MAX_CPU_CORES, now)
         _absorb_use(self._memory, self._worker_memory, device.memory_used_mb, worker_memory, MAX_MEMORY_MB, now)
         self._links = tuple(self._link(sample, now) for sample in links)
-        self._workers = tuple(self._worker(load, now) for load in device.workers)
+        self._workers = tuple(self._worker(load) for load in device.workers)
 
     def _link(self, sample: LinkSample, now: float) -> Link:
         rssi = trend = None
@@ -170,19 +169,14 @@ class Profiler:
             trend_db_s=trend,
         )
 
-    def _worker(self, load: WorkerLoad, now: float) -> WorkerLoad:
-        wanted = _possible(load.wanted_cores, MAX_CPU_CORES)
-        if wanted is None:
-            self._worker_wants.pop(load.task, None)
-        else:
-            wanted = self._worker_wants.setdefault(load.task, Ewma(self._timing.smoothing_s)).update(wanted, now)
+    def _worker(self, load: WorkerLoad) -> WorkerLoad:
         cpu, memory = self._worker_cpu.get(load.task), self._worker_memory.get(load.task)
         return WorkerLoad(
             task=load.task,
             state=load.state,
             cpu_cores=None if cpu is None else cpu.value,
             memory_mb=None if memory is None else memory.value,
-            wanted_cores=wanted,
+            wanted_cores=_possible(load.wanted_cores, MAX_CPU_CORES),
         )
 
     def publishable(

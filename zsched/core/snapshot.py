@@ -35,6 +35,8 @@ class NodeStatus:
     links: tuple[Link, ...] = ()
     workers: tuple[WorkerLoad, ...] = ()
     draining: bool = False
+    speed: float | None = None
+    """How fast one of its cores is."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

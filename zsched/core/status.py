@@ -191,6 +191,7 @@ def _node_status(node: NodeView, spec: NodeSpec, now: float) -> NodeStatus:
         links=profile.links,
         workers=profile.workers,
         draining=profile.draining,
+        speed=profile.speed,
     )
 
 

@@ -14,7 +14,13 @@ import pytest
 from support.waiting import until
 from zsched.adapters import device_profiler
 from zsched.adapters.cgroup import LimitedGroup
-from zsched.adapters.device_profiler import DeviceProfiler, parse_cpu_list, parse_cpu_stat, parse_process_stat
+from zsched.adapters.device_profiler import (
+    DeviceProfiler,
+    parse_cpu_list,
+    parse_cpu_stat,
+    parse_process_stat,
+    parse_schedstat,
+)
 from zsched.core.model import WorkerState
 
 MEMINFO = "MemTotal:        4096000 kB\nMemFree: 100 kB\nMemAvailable:    3072000 kB\nHugePages_Total: 0\n"
@@ -158,6 +164,78 @@ def test_adopted_old_process_does_not_make_a_spike(tmp_path: Path) -> None:
     load = profiler.sample(workers).workers[0]
     assert load.cpu_cores is not None
     assert load.cpu_cores < 1000.0 / time.clock_gettime(time.CLOCK_BOOTTIME) * 2.0
+
+
+def queued(pid: int, *threads: tuple[float, float]) -> dict[str, str]:
+    """Threads of a process, and for how many seconds each has run and has waited to run."""
+    return {
+        f"proc/{pid}/task/{pid + number}/schedstat": f"{run_s * 1e9:.0f} {wait_s * 1e9:.0f} 5\n"
+        for number, (run_s, wait_s) in enumerate(threads)
+    }
+
+
+def test_a_thread_that_always_wants_to_run_wants_a_core_and_one_that_rests_what_it_uses(
+    tmp_path: Path, clock: Clock
+) -> None:
+    """The first thread gets half a core and waits for the rest; the second has work for 0.2 s a second."""
+    profiler = machine(tmp_path, **process(10, 1, own=0), **queued(10, (0.0, 0.0), (0.0, 0.0)))
+    workers = {"merge": (WorkerState.READY, 10)}
+    seen = []
+    for step in range(60):
+        at_s = 0.2 * step
+        write(tmp_path, queued(10, (0.5 * at_s, 0.5 * at_s), (0.2 * at_s, 0.0)))
+        seen.append(profiler.sample(workers).workers[0].wanted_cores)
+        clock.now += 0.2
+    first = next(number for number, wanted in enumerate(seen) if wanted is not None)
+    assert 3.0 < 0.2 * first < 6.0, "so long it takes to tell a share of 95 % from pauses"
+    assert seen[-1] == pytest.approx(1.2, abs=0.02)
+
+
+def test_a_worker_with_pauses_wants_nothing_beyond_what_it_uses(tmp_path: Path, clock: Clock) -> None:
+    """Jobs of 0.6 s a second, half of it in the queue."""
+    profiler = machine(tmp_path, **process(10, 1, own=0), **queued(10, (0.0, 0.0)))
+    workers = {"merge": (WorkerState.READY, 10)}
+    busy_s = 0.0
+    for step in range(100):
+        busy_s += 0.2 if step % 5 < 3 else 0.0
+        clock.now += 0.2
+        write(tmp_path, queued(10, (busy_s / 2, busy_s / 2)))
+        assert profiler.sample(workers).workers[0].wanted_cores is None
+
+
+def test_without_schedstat_nothing_is_said_and_garbage_is_none(tmp_path: Path, clock: Clock) -> None:
+    profiler = machine(tmp_path, **process(10, 1, own=0), **{"proc/10/task/10/schedstat": "what\n"})
+    for _ in range(3):
+        clock.now += 1.0
+        assert profiler.sample({"merge": (WorkerState.READY, 10)}).workers[0].wanted_cores is None
+    assert parse_schedstat(b"") is parse_schedstat(b"5\n") is parse_schedstat(b"a b c\n") is None
+    assert parse_schedstat(b"1500000000 250000000 7\n") == (1.5, 0.25)
+
+
+SPIN = "import os\nos.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\nprint('up', flush=True)\nwhile True: pass"
+
+
+def test_a_real_process_that_shares_its_cpu_wants_all_of_it() -> None:
+    """Two endless loops on one CPU; the kernel tells that the one which is our worker has to wait."""
+    command = [sys.executable, "-c", SPIN]
+    profiler = DeviceProfiler()
+    with (
+        subprocess.Popen(command, stdout=subprocess.PIPE) as worker,
+        subprocess.Popen(command, stdout=subprocess.DEVNULL) as other,
+    ):
+        try:
+            assert worker.stdout is not None
+            worker.stdout.readline()
+            workers = {"merge": (WorkerState.READY, worker.pid)}
+
+            def wants() -> bool:
+                load = profiler.sample(workers).workers[0]
+                return (load.wanted_cores or 0.0) > 0.9 and load.cpu_cores is not None and load.cpu_cores < 0.8
+
+            until(wants, "it wants a core and gets less")
+        finally:
+            other.kill()
+            worker.kill()
 
 
 def used_s(process: psutil.Process) -> float:

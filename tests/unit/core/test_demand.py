@@ -94,19 +94,20 @@ def test_a_starved_owner_shows_the_least_that_its_task_needs() -> None:
     assert learnt(profile(1.5, 600.0, cpu=4.0)).cpu_cores == 1.5, "it got that much, so it needs that much"
 
 
-def test_a_worker_that_knows_what_it_wants_is_believed_on_a_starved_owner_too() -> None:
-    starved = profile(0.5, 300.0, cpu=4.0, wanted=2.5)
-    assert learnt(starved).cpu_cores == 2.5
-    assert learnt(profile(3.0, cpu=2.0), profile(0.5, cpu=4.0, wanted=1.0)).cpu_cores == 1.0, "less than before as well"
+def test_where_threads_always_want_to_run_the_need_is_between_what_is_used_and_what_they_would_take() -> None:
+    starved = profile(0.5, cpu=4.0, wanted=2.5)
+    assert learnt(starved).cpu_cores == 2.5, "nothing is known: it may need so much"
+    assert learnt(profile(1.5), profile(1.5), starved).cpu_cores == 1.5
+    assert learnt(profile(3.0), profile(3.0), starved).cpu_cores == 2.5
+    assert learnt(profile(0.4), profile(0.4), profile(1.0, cpu=4.0, wanted=2.5)).cpu_cores == 1.0
+    assert learnt(profile(1.0, cpu=2.0, wanted=1.0)).cpu_cores == 1.0, "it has all that it can take"
 
 
-@given(here=st.floats(0.1, 10.0), there=st.floats(0.1, 10.0), cores=st.floats(0.5, 4.0), is_told=st.booleans())
-def test_a_machine_of_twice_the_speed_needs_half_the_cores(
-    here: float, there: float, cores: float, *, is_told: bool
-) -> None:
-    seen = profile(None if is_told else cores, wanted=cores if is_told else None, speed=here)
-    need = learnt(seen, there=profile(node="edge2", speed=there)).cpu_cores
-    assert need == pytest.approx(max(cores * here / there, TASK.demand.cpu_cores))
+@given(here=st.floats(0.1, 10.0), there=st.floats(0.1, 10.0), cores=st.floats(0.5, 4.0))
+def test_a_machine_of_twice_the_speed_needs_half_the_cores(here: float, there: float, cores: float) -> None:
+    for seen in (profile(cores, speed=here), profile(cores / 2, cpu=4.0, wanted=cores, speed=here)):
+        need = learnt(seen, there=profile(node="edge2", speed=there)).cpu_cores
+        assert need == pytest.approx(max(cores * here / there, TASK.demand.cpu_cores))
 
 
 def test_a_machine_that_nobody_has_timed_counts_as_one_of_speed_1() -> None:

@@ -27,7 +27,7 @@ from zsched.lab.decisions.view import Look, Sight
 from zsched.lab.decisions.world import EVEN, RADIO_ONLY
 
 OWN: Final = ("smoothing_s", "move_cost_s", "is_told")
-"""Settings of a rule that are neither of `Tuning` nor of `TaskSpec`; ``is_told=0``: no worker says what it wants."""
+"""Settings of a rule that are neither of `Tuning` nor of `TaskSpec`; ``is_told=0``: run queues are not read."""
 
 
 def players() -> tuple[Player, ...]:

@@ -50,7 +50,7 @@ class Player:
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Fields of `TaskSpec` that it has otherwise."""
     is_told: bool = True
-    """Workers say what they would use if they had the machine to themselves."""
+    """Machines tell when a worker's processes always want to run, as the kernel's run-queue delay does."""
 
 
 class Scene:
@@ -106,7 +106,9 @@ class Scene:
             is_here = self._placed[task] == column
             rank = rank_of(self._placed, task) if is_here else 0
             mine = (cores[stretch][rank], memory[stretch][rank]) if is_here else (0.0, 0.0)
-            wanted = self._history.works[task].demand(machine) if is_here and self._is_told else None
+            work = self._history.works[task]
+            is_short = is_here and self._is_told and mine[0] < 0.99 * min(work.demand(machine), work.processes)
+            wanted = float(work.processes) if is_short else None
             workers.append(
                 WorkerLoad(
                     task=name, state=WorkerState.READY, cpu_cores=mine[0], memory_mb=mine[1], wanted_cores=wanted
