@@ -10,6 +10,10 @@ So is, where a predecessor's state takes the place of its own, every sample proc
 Every sample has a *turn*, its place among all that were ever taken. What is given back goes by turns, and nothing of a
 later turn may be answered before it: neither the sample that is in hand when the worker becomes the owner, nor what was
 given back already when the role comes a second time.
+
+A robot counts what a slot left open as lost when the slot closes, or gives it to the next owner; then nobody shall do
+it later, behind newer work. It says so to the worker that had it; a word that does not arrive (the link was broken, the
+robot's relay died) is replaced by `STALE_S`.
 """
 
 from __future__ import annotations
@@ -30,6 +34,9 @@ MAX_BACKLOG: Final = 4096
 MAX_BACKLOG_BYTES: Final = 32 << 20
 """Of such an input, whose output was withheld, that are kept for the day this worker becomes the owner; older ones are
 lost, and said to be."""
+STALE_S: Final = 2.5
+"""What was withheld so long before a newer epoch than its own begins is given up; until then the robot may still be at
+its slot (as `zsched.worker_epochs.CARRY_S`)."""
 QUIET_S: Final = 10.0
 """What was processed longer ago than this came with another move, or the predecessor had it, too."""
 
@@ -65,10 +72,18 @@ class Done(NamedTuple, Generic[SourceT]):
     """Its publisher is of class ``reliable``."""
     held: Held | None = None
     """What waits until it has been answered."""
+    slot: int = 0
+    """The epoch that it was sent in, 0: its publisher has not said."""
+    at: float = 0.0
+    """When it was first processed."""
 
     def is_over(self, *, is_restored: bool, now: float) -> bool:
         """True when it need not be processed again."""
         return self.quiet_at is not None and not (is_restored and now - self.quiet_at < QUIET_S)
+
+    def is_stale(self, epoch: int, now: float) -> bool:
+        """True when it is too late for it in ``epoch``: it was sent in an older one, long ago."""
+        return 0 < self.slot < epoch and now - self.at > STALE_S
 
 
 class Backlog(Generic[SourceT]):
@@ -104,6 +119,20 @@ class Backlog(Generic[SourceT]):
             if is_lost and oldest.name is not None:
                 lost.append(oldest)
         return lost
+
+    def stale(self, epoch: int, now: float) -> set[SourceName]:
+        """The publishers of what is too old to be done in ``epoch``."""
+        waiting = [*self._again, *(done for line in self._kept.values() for done in line)]
+        return {done.name for done in waiting if done.name is not None and done.is_stale(epoch, now)}
+
+    def forget(self, name: SourceName) -> int:
+        """Let go of everything of one publisher; answers how many samples that was."""
+        before = len(self._again) + sum(len(line) for line in self._kept.values())
+        self._again = deque(done for done in self._again if done.name != name)
+        for key, line in tuple(self._kept.items()):
+            self._kept[key] = left = deque(done for done in line if done.name != name)
+            self._bytes -= sum(len(done.sample.payload) for done in line) - sum(len(one.sample.payload) for one in left)
+        return before - len(self._again) - sum(len(line) for line in self._kept.values())
 
     def begin(self) -> None:
         """This worker is the owner: everything that is kept is to be processed again."""

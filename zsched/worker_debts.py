@@ -79,6 +79,11 @@ class Debts:
         if not owed:
             self.settle(now)
 
+    def forget(self, name: SourceName) -> None:
+        """Nobody waits for this source's inputs any more."""
+        with self._lock:
+            self._held.pop(name, None)
+
     def _place(self, name: SourceName, line: deque[Held] | None, *, is_own: bool) -> Held:
         """A place of its own at the end of a source's line, or the last one."""
         if line is None:

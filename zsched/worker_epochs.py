@@ -5,7 +5,11 @@ told the epoch of the input in hand), where roles come from.
 
 When one epoch follows another on the same owner, its inputs flow on. It goes on stamping what it makes of the older
 epoch's inputs with the older epoch: the robots admit the newer one only from their flip on, and that is when their
-first input of the newer epoch comes. (A -> B -> A is not such a case: A's inputs stopped at the flip to B.)
+first input of the newer epoch comes.
+
+A robot's flip waits only so long for a role, so an input may be of a newer epoch than the role. What is made of it is
+nobody's yet: A -> B -> A looks to a worker that heard of neither move like A still, but the robots have closed the
+epoch that it believes in.
 """
 
 from __future__ import annotations
@@ -50,7 +54,9 @@ class Epochs:
         return True
 
     def stamp(self, role: Role, in_hand: int | None) -> int | None:
-        """The epoch for an output made of an input first heard in epoch ``in_hand``; ``None``: it is closed."""
+        """The epoch for an output made of an input of epoch ``in_hand``; ``None``: it is closed, or not told yet."""
+        if in_hand is not None and in_hand > role.epoch:
+            return None
         if self.is_carried(self._carried) and (in_hand is None or in_hand <= self._carried):
             return self._carried
         return role.epoch if role.epoch > self.ended or self.is_carried(self._carried) else None

@@ -7,7 +7,7 @@ It carries its source and how many samples that source put before it: it takes e
 processed, or, should some have been dropped on the way, a grace time after it came.
 
 What was processed while the worker was not the owner is processed again when it is (`zsched.worker_backlog`), before
-anything newer is answered.
+anything newer is answered; not what its robot has given up meanwhile, by its own word or for its age.
 """
 
 from __future__ import annotations
@@ -59,6 +59,10 @@ class Dispatcher:
         """Numbers of a source below this one went to an earlier owner (zenoh's thread alone touches it)."""
         self._whole: dict[SourceName, None] = {}
         """Sources of class ``reliable``, the oldest first (zenoh's thread alone touches it)."""
+        self._slots: dict[SourceName, int] = {}
+        """The epochs of sources that have named theirs, the oldest first."""
+        self._given_up: dict[SourceName, None] = {}
+        """Sources of which nothing shall be done any more, the oldest first."""
         self._epoch = 0
         self._begun = 0
         self._is_begin_due = False
@@ -93,6 +97,8 @@ class Dispatcher:
         info = sample.source_info
         if info is not None:
             waiting.name = (key, str(info.source_id.zid), info.source_id.eid)
+            if waiting.name in self._given_up:
+                return
             waiting.is_whole = waiting.name in self._whole
             in_turn = waiting.is_wanted and sample.congestion_control == zenoh.CongestionControl.BLOCK
             number = self._acks.admit(waiting.name, info.source_sn, in_turn=in_turn)
@@ -117,8 +123,13 @@ class Dispatcher:
     def put_marker(self, marker: Marker) -> None:
         """Queue an end marker (zenoh's thread)."""
         if marker.end.epoch == 0:  # it ends nothing: what is below its number was given up by the relay
+            if marker.end.is_given_up:
+                self._give_up(marker.name)
+                return
             if marker.end.is_whole:
                 self._note_whole(marker.name)
+            if marker.end.slot:
+                self._note_slot(marker)
             self._acks.skip(marker.name, marker.end.count)
             if marker.end.replayed:
                 self._note_replay(marker)
@@ -131,6 +142,29 @@ class Dispatcher:
         self._whole[name] = None
         if len(self._whole) > MAX_SOURCES:
             self._whole.pop(next(iter(self._whole)))
+
+    def _note_slot(self, marker: Marker) -> None:
+        """A publisher feeds one slot for all its life: its first word stands."""
+        self._slots.setdefault(marker.name, marker.end.slot)
+        if len(self._slots) > MAX_SOURCES:
+            self._slots.pop(next(iter(self._slots)))
+
+    def _give_up(self, name: SourceName) -> None:
+        """Do nothing of a source any more, and acknowledge nothing: its relay counts that, or has counted it."""
+        with self._wake:
+            self._given_up[name] = None
+            if len(self._given_up) > MAX_SOURCES:
+                self._given_up.pop(next(iter(self._given_up)))
+            waiting = [one for one in self._queue if one.name == name and one.sample is not None]
+            for one in waiting:
+                one.source.waiting[name[0]].remove(one)
+                one.sample = None
+            count = len(waiting) + self._backlog.forget(name)
+            self._open.pop(name, None)
+            self._markers = [marker for marker in self._markers if marker.name != name]
+        self._debts.forget(name)
+        if count:
+            _log.info("%s: %d samples are not done any more: their robot has given them up", name[0], count)
 
     def _note_replay(self, marker: Marker) -> None:
         first = self._acks.number(marker.name, serial_of(marker.end.count))
@@ -174,7 +208,14 @@ class Dispatcher:
         self._is_begin_due = is_due
 
     def begin(self, epoch: int) -> None:
-        """This worker is the owner from now on: sources heard first from here on belong to ``epoch``."""
+        """This worker is the owner from now on: sources heard first from here on belong to ``epoch``.
+
+        Those that have not named theirs.
+        """
+        with self._wake:
+            stale = self._backlog.stale(epoch, monotonic_s())
+        for name in stale:
+            self._give_up(name)
         with self._wake:
             self._epoch = epoch
             self._is_begin_due = False
@@ -261,8 +302,10 @@ class Dispatcher:
 
     def _process(self, waiting: Waiting) -> None:
         source, sample = waiting.source, waiting.sample
-        if sample is None:
+        name = waiting.name if waiting.again is None else waiting.again.name
+        if sample is None or name in self._given_up:
             return
+        began_at = monotonic_s()
         self._has_withheld = False
         self._owed.clear()
         begun, was_standby, again = self._begun, self._is_standby(), waiting.again
@@ -274,6 +317,8 @@ class Dispatcher:
         self._in_hand, self._is_whole = epoch, waiting.is_wanted
         self._dispatch(source, sample, replayed=waiting.replayed)
         self._in_hand = None
+        if name in self._given_up:
+            return
         held = None if again is None else again.held
         if waiting.name is not None:
             held = self._note(waiting, waiting.name, sample)
@@ -283,9 +328,22 @@ class Dispatcher:
         if not self._has_withheld and not was_standby:
             return
         quiet_at = None if self._has_withheld else monotonic_s()
-        name = waiting.name if again is None else again.name
-        done = Done(source, sample, self._turn_in_hand, epoch, quiet_at, waiting.replayed, name, waiting.is_whole, held)
+        done = Done(
+            source,
+            sample,
+            self._turn_in_hand,
+            epoch,
+            quiet_at,
+            waiting.replayed,
+            name,
+            waiting.is_whole,
+            held,
+            slot=0 if name is None else self._slots.get(name, 0),
+            at=began_at if again is None else again.at,
+        )
         with self._wake:
+            if name in self._given_up:
+                return
             if self._begun != begun:  # it became the owner meanwhile
                 self._backlog.put_back(done)
                 return
@@ -315,12 +373,14 @@ class Dispatcher:
             self._newest_stamp = self._stamp
 
     def _hear(self, name: SourceName, sample: zenoh.Sample) -> int:
-        """The epoch that a source belongs to: the one in which it is first heard."""
+        """The epoch that a source belongs to: the one that it has named, else the one in which it is first heard."""
         with self._wake:
             state = self._open.get(name)
             if state is None:
                 in_turn = sample.congestion_control == zenoh.CongestionControl.BLOCK
-                state = self._open[name] = OpenSource(epoch=self._epoch, in_turn=in_turn)
+                state = OpenSource(epoch=self._slots.get(name, self._epoch), in_turn=in_turn)
+                if name not in self._given_up:
+                    self._open[name] = state
             return state.epoch
 
     def _note(self, waiting: Waiting, name: SourceName, sample: zenoh.Sample) -> Held | None:

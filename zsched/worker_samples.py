@@ -96,7 +96,10 @@ class Waiting:
 
 @dataclass(slots=True)
 class OpenSource:
-    """A source that has sent something: its newest number, and the epoch it was first heard in (0: standby)."""
+    """A source that has sent something: its newest number, and its epoch.
+
+    That is the one its start marker names, else the one it was first heard in (0: standby).
+    """
 
     epoch: int
     number: int = -1

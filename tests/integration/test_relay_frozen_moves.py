@@ -1,7 +1,8 @@
-"""A planned move to an owner whose worker stands still: nothing is lost, or what is lost is told."""
+"""Moves to an owner that stands still, or whose role is late: nothing is lost, or what is lost is told."""
 
 from __future__ import annotations
 
+import os
 import signal
 import time
 from collections.abc import Iterator
@@ -11,8 +12,9 @@ import pytest
 
 from support.relay_rig import Application, Rig, relay_rig, slot
 from support.waiting import until
-from zsched.core.events import SlotFlipped, SlotReady
+from zsched.core.events import SlotDrained, SlotFlipped, SlotReady
 from zsched.core.plan import RoutePhase, StreamClass, WorkerRole
+from zsched.core.relay_protocol import SlotLost
 
 
 @pytest.fixture
@@ -46,3 +48,72 @@ def test_a_new_owner_that_is_frozen_at_the_move_misses_nothing(rig: Rig, seconds
     app.halt(thread)
     until(lambda: len(app.back) >= app.sent, "every answer")
     assert app.back == list(range(app.sent))
+
+
+@pytest.mark.parametrize("is_told", [True, False], ids=["told in the end", "told the last only"])
+def test_who_is_left_and_chosen_again_while_it_hears_of_neither_misses_nothing(rig: Rig, *, is_told: bool) -> None:
+    """A -> B -> A, planned both times, while A's relay stands still and tells A's worker nothing."""
+    rig.start_worker("edge1")
+    rig.start_worker("edge2")
+    first, second, third = (
+        slot(epoch, owner, StreamClass.RELIABLE, 1) for epoch, owner in ((1, "edge1"), (2, "edge2"), (3, "edge1"))
+    )
+    rig.move(first)
+    app = Application(rig.app)
+    until(app.connected, "the application sees the relay's subscription")
+    thread = app.stream(200)
+    until(lambda: len(app.back) > 50, "the stream through edge1")
+    frozen = rig.relays["edge1"].pid
+    assert frozen is not None
+    os.kill(frozen, signal.SIGSTOP)
+    rig.role("edge2", WorkerRole.ACTIVE, 2)
+    if is_told:
+        rig.role("edge1", WorkerRole.DRAINING, 1)
+        rig.role("edge1", WorkerRole.IDLE)
+    rig.role("edge1", WorkerRole.ACTIVE, 3)
+    for new, old in ((second, first), (third, second)):
+        rig.plan(RoutePhase.PREPARE, new, old)
+        rig.wait(SlotReady, epoch=new.epoch, is_ready=True)
+        rig.plan(RoutePhase.FLIP, new, old)
+        rig.wait(SlotFlipped, epoch=new.epoch)
+    rig.role("edge2", WorkerRole.DRAINING, 2)
+    sent = app.sent
+    until(lambda: app.sent > sent + 50, "samples of an epoch that edge1's worker has not heard of")
+    os.kill(frozen, signal.SIGCONT)
+    rig.wait(SlotDrained, epoch=2)
+    rig.plan(RoutePhase.CLOSE, third)
+    app.halt(thread)
+    until(lambda: len(app.back) >= app.sent, "every answer")
+    assert app.back == list(range(app.sent))
+
+
+def test_work_that_was_counted_as_lost_is_not_done_later(rig: Rig) -> None:
+    """A new owner whose role never comes is left again; it withheld what it was sent, and is chosen once more."""
+    rig.start_worker("edge1")
+    rig.start_worker("edge2")
+    first, second, third, fourth = (
+        slot(epoch, owner, StreamClass.RELIABLE, 1)
+        for epoch, owner in ((1, "edge1"), (2, "edge2"), (3, "edge1"), (4, "edge2"))
+    )
+    rig.move(first)
+    app = Application(rig.app)
+    until(app.connected, "the application sees the relay's subscription")
+    thread = app.stream(200)
+    until(lambda: len(app.back) > 50, "the stream through edge1")
+    rig.plan(RoutePhase.PREPARE, second, first)
+    rig.wait(SlotReady, epoch=2, is_ready=True)
+    rig.plan(RoutePhase.FLIP, second, first)
+    rig.wait(SlotFlipped, epoch=2)
+    sent = app.sent
+    until(lambda: app.sent > sent + 50, "samples to a worker that is not told that it is the owner")
+    rig.role("edge1", WorkerRole.ACTIVE, 3)
+    rig.plan(RoutePhase.PREPARE, third)
+    rig.plan(RoutePhase.CLOSE, third)
+    lost = rig.wait(SlotLost, epoch=2).samples
+    rig.move(fourth, third)
+    until(lambda: app.nodes[-1] == "edge2", "the stream through edge2")
+    app.halt(thread)
+    until(lambda: len(app.back) >= app.sent - lost, "every answer but those")
+    assert app.back == sorted(app.back)
+    assert len(app.back) == app.sent - lost
+    until(lambda: rig.told("echo/in/0").at_most_lost == lost, "their count")

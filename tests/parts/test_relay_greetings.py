@@ -73,8 +73,8 @@ class Bench:
         self._samples: list[zenoh.Sample] = []
         self._subscriber = relay.declare_subscriber("robot1/**", self._samples.append)
 
-    def outlet(self, from_expr: str, to_expr: str, settings: StreamSettings = RELIABLE) -> Outlet:
-        return Outlet(self.relay, from_expr, to_expr, settings, self.acks)
+    def outlet(self, from_expr: str, to_expr: str, settings: StreamSettings = RELIABLE, epoch: int = 0) -> Outlet:
+        return Outlet(self.relay, from_expr, to_expr, settings, self.acks, epoch=epoch)
 
     def sample(self, key: str = "robot1/in") -> zenoh.Sample:
         before = len(self._samples)
@@ -297,3 +297,24 @@ def test_the_sample_that_the_thread_has_just_taken_goes_to_the_next_owner(
     gate.set()
     assert [sample for sample, _ in owed] == [first, second]
     assert (said.waiting, said.in_flight) == (0, 0)
+
+
+@pytest.mark.parametrize("done", [1, 2])
+def test_a_worker_is_told_its_epoch_and_when_it_is_left_with_work_that_this_is_given_up(
+    bench: Bench, done: int
+) -> None:
+    receiver = Receiver(bench.other, bench.relay, "edge1/in")
+    outlet = bench.outlet("robot1/in", "edge1/in", epoch=7)
+    outlet.send(sample := bench.sample())
+    outlet.send(sample)
+    assert receiver.greeted() == EndMarker(epoch=0, count=0, is_whole=True, slot=7)
+    receiver.ack(0)
+    until(lambda: receiver.got == [0, 1], "both")
+    receiver.ack(done)
+    settled(outlet, in_flight=2 - done, acknowledged=done)
+    outlet.undeclare()
+    last = bench.outlet("robot1/in", "edge1/in", epoch=8)
+    until(lambda: cared(last) and receiver.starts[-1].slot == 8, "the next one's start marker")
+    given_up = [start for start in receiver.starts if start.is_given_up]
+    assert given_up == [EndMarker(epoch=0, count=2, slot=7, is_given_up=True)] * (2 - done)
+    last.undeclare()

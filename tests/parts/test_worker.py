@@ -509,3 +509,83 @@ def test_what_a_backlog_has_no_room_for_is_said_to_be_lost(
     relay.tell(WorkerRole.ACTIVE, epoch=4)
     until(lambda: len(relay.outputs) == 10, "the newest")
     heard.undeclare()
+
+
+def test_who_is_chosen_again_before_it_hears_that_it_was_left_answers_in_the_new_epoch(
+    relay: Relay, echo: Echo
+) -> None:
+    """A -> B -> A: its role is late for both moves, and the robots have closed the epoch that it believes in."""
+    relay.tell(WorkerRole.ACTIVE, epoch=1)
+    until(lambda: f"{ROLE_KEY}/1" in relay.tokens, "the worker has begun")
+    relay.open_slot(1)
+    relay.put(b"a")
+    until(lambda: len(relay.outputs) == 1, "the first output")
+    relay.open_slot(3)
+    for name in (b"b", b"c"):
+        relay.put(name)
+    until(lambda: echo.output.withheld == 2, "what belongs to an epoch of which it has not heard")
+    relay.tell(WorkerRole.ACTIVE, epoch=3)
+    until(lambda: f"{ROLE_KEY}/3" in relay.tokens, "the worker has begun with it")
+    relay.put(b"d")
+    until(lambda: len(relay.outputs) >= 4, "all outputs")
+    again = [("edge1/t/3/robot1/out", name) for name in (b"b", b"c", b"d")]
+    assert relay.outputs == [("edge1/t/1/robot1/out", b"a"), *again]
+
+
+def test_what_a_standby_withheld_and_its_robot_gave_up_is_not_done_by_the_owner_it_becomes(
+    relay: Relay, echo: Echo
+) -> None:
+    relay.open_slot(2)
+    for name in (b"a", b"b"):
+        relay.put(name)
+    until(lambda: echo.output.withheld == 2, "the backlog")
+    relay.give_up()
+    until(lambda: echo.worker._dispatcher._given_up, "the robot's word")
+    relay.put(b"c")  # as if the marker had overtaken it
+    relay.open_slot(4)
+    relay.tell(WorkerRole.ACTIVE, epoch=4)
+    until(lambda: f"{ROLE_KEY}/4" in relay.tokens, "the worker has begun")
+    relay.put(b"d")
+    until(lambda: relay.outputs, "an output")
+    assert relay.outputs == [("edge1/t/4/robot1/out", b"d")]
+    assert echo.payloads() == [b"a", b"b", b"d"]
+
+
+def test_what_was_withheld_in_an_older_epoch_is_too_old_for_a_newer_one(
+    relay: Relay, echo: Echo, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No word came that it is given up: the link was broken. It is never acknowledged, so its robot counts it."""
+    relay.open_slot(2)
+    relay.put(b"a")
+    until(lambda: echo.output.withheld == 1, "the backlog")
+    old = relay.publisher.id.eid
+    monkeypatch.setattr(worker_backlog, "STALE_S", 0.0)
+    relay.tell(WorkerRole.ACTIVE, epoch=4)
+    until(lambda: f"{ROLE_KEY}/4" in relay.tokens, "the worker has begun")
+    relay.open_slot(4)
+    relay.put(b"b")
+    until(lambda: relay.outputs, "an output")
+    assert relay.outputs == [("edge1/t/4/robot1/out", b"b")]
+    assert {ack.processed for ack in relay.acks if ack.eid == old} == {0}
+
+
+def test_what_still_waits_when_its_robot_gives_it_up_is_not_done(relay: Relay, tmp_path: Path) -> None:
+    with Worker.from_env(environment(relay, tmp_path), handles_signals=False) as worker:
+        slow = Slow(worker, keep_last=None)
+        until(lambda: KEYS.worker("edge1", "t", 3) in relay.tokens, "the ready token")
+        relay.tell(WorkerRole.ACTIVE, epoch=1)
+        until(lambda: f"{ROLE_KEY}/1" in relay.tokens, "the worker has begun")
+        relay.open_slot(1)
+        slow.gate.clear()
+        for name in (b"a", b"b", b"c"):
+            relay.put(name)
+        until(lambda: slow.taken and len(worker._dispatcher._queue) == 2, "one in hand, two that wait")
+        relay.give_up()
+        until(lambda: worker._dispatcher._given_up, "the robot's word")
+        relay.open_slot(3)
+        relay.tell(WorkerRole.ACTIVE, epoch=3)
+        until(lambda: worker.role.epoch == 3, "the next role")
+        relay.put(b"d")
+        slow.gate.set()
+        until(lambda: slow.payloads()[-1] == b"d", "the next sample")
+        assert slow.payloads() == [b"a", b"d"]

@@ -47,12 +47,29 @@ class Relay:
     def _acknowledged(self, sample: zenoh.Sample) -> None:
         self.acks += wire.decode(sample.payload.to_bytes(), StreamAcks).acks
 
-    def greet(self, *, is_whole: bool) -> None:
+    def greet(self, *, is_whole: bool, slot: int = 0) -> None:
         """The start marker of a stream; a relay sends nothing of class ``reliable`` before its answer."""
         self.publisher = self.session.declare_publisher(INPUT, congestion_control=zenoh.CongestionControl.BLOCK)
-        payload = encode_end(EndMarker(epoch=0, count=self.count, is_whole=is_whole))
-        self.session.put(f"{INPUT}/{END_CHUNK}", payload, source_info=zenoh.SourceInfo(self.publisher.id, self.count))
-        until(lambda: self.acks, "the answer")
+        self.mark(EndMarker(epoch=0, count=self.count, is_whole=is_whole, slot=slot))
+        until(self.told, "the answer")
+
+    def told(self) -> StreamAck | None:
+        """The newest acknowledgement of what the present publisher has put."""
+        return next((ack for ack in reversed(self.acks) if ack.eid == self.publisher.id.eid), None)
+
+    def open_slot(self, epoch: int) -> None:
+        """A publisher of class ``reliable`` for a slot of its own."""
+        self.count = 0
+        self.greet(is_whole=True, slot=epoch)
+
+    def give_up(self) -> None:
+        """The slot is closed: what its publisher has put is not to be done any more."""
+        self.mark(EndMarker(epoch=0, count=self.count, is_given_up=True))
+
+    def mark(self, marker: EndMarker) -> None:
+        """Put an end or start marker of the present publisher."""
+        source = zenoh.SourceInfo(self.publisher.id, marker.count)
+        self.session.put(f"{INPUT}/{END_CHUNK}", encode_end(marker), source_info=source)
 
     def _answer(self, query: zenoh.Query) -> None:
         with query:
@@ -80,9 +97,7 @@ class Relay:
 
     def end(self, epoch: int, count: int | None = None) -> None:
         number = self.count if count is None else count
-        payload = encode_end(EndMarker(epoch=epoch, count=number))
-        source = zenoh.SourceInfo(self.publisher.id, number)
-        self.session.put(f"{INPUT}/{END_CHUNK}", payload, source_info=source)
+        self.mark(EndMarker(epoch=epoch, count=number))
 
 
 def environment(relay: Relay, folder: Path) -> dict[str, str]:

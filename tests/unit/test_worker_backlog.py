@@ -8,7 +8,8 @@ from typing import cast
 import pytest
 import zenoh
 
-from zsched.worker_backlog import QUIET_S, Backlog, Done
+from zsched import worker_backlog
+from zsched.worker_backlog import QUIET_S, STALE_S, Backlog, Done
 from zsched.worker_samples import Input, KeepLast
 
 
@@ -97,3 +98,42 @@ def test_how_much_is_kept_goes_by_the_class_and_what_gives_way_of_a_reliable_sou
     gone = [one.name for turn in (1, 2) for one in backlog.keep(done(turn, source=source)._replace(is_whole=is_whole))]
     backlog.begin()
     assert (turns(backlog), len(gone)) == (kept, lost)
+
+
+def from_slot(turn: int, slot: int, at: float, key: str = "a") -> Done[Input]:
+    return done(turn, key)._replace(slot=slot, at=at)
+
+
+def test_what_an_older_epoch_left_long_ago_is_stale_and_its_publisher_with_it() -> None:
+    backlog = Backlog[Input]()
+    backlog.keep(from_slot(1, slot=2, at=0.0, key="old"))
+    backlog.keep(from_slot(2, slot=2, at=10.0, key="young"))
+    backlog.keep(from_slot(3, slot=4, at=0.0, key="now"))
+    backlog.keep(from_slot(4, slot=0, at=0.0, key="silent"))
+    assert backlog.stale(4, 10.0 + STALE_S) == {("old", "zid", 1)}
+    backlog.begin()
+    backlog.keep(from_slot(5, slot=3, at=0.0, key="kept"))
+    assert backlog.stale(2, 100.0) == set()
+    assert {name for name, _, _ in backlog.stale(4, 10.1 + STALE_S)} == {"old", "young", "kept"}
+
+
+def test_what_a_publisher_gives_up_is_forgotten_wherever_it_waits() -> None:
+    backlog = Backlog[Input]()
+    for turn, key in ((1, "a"), (2, "b")):
+        backlog.keep(done(turn, key))
+    backlog.begin()
+    for turn, key in ((3, "a"), (4, "b")):
+        backlog.keep(done(turn, key))
+    assert backlog.forget(("a", "zid", 1)) == 2
+    assert backlog.forget(("a", "zid", 1)) == 0
+    backlog.begin()
+    assert turns(backlog) == [2, 4]
+
+
+def test_what_is_forgotten_makes_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worker_backlog, "MAX_BACKLOG_BYTES", 2)
+    backlog = Backlog[Input]()
+    for turn in (1, 2):
+        backlog.keep(done(turn, "a"))
+    backlog.forget(("a", "zid", 1))
+    assert [backlog.keep(done(turn, "b")) for turn in (3, 4)] == [[], []]

@@ -225,3 +225,13 @@ def test_withheld_ones_that_share_a_place_are_all_waited_for() -> None:
     assert helds[-1] is not None
     told.debts.answered(helds[-1], {}, 0.0)
     assert told.numbers[-1] == count - 1
+
+
+def test_nobody_waits_for_what_was_given_up() -> None:
+    told = Told()
+    held = told.debts.processed(NAME, 0, 1, {}, is_unanswered=True)
+    assert held is not None
+    told.debts.forget(NAME)
+    told.debts.answered(held, {}, 0.0)
+    assert told.numbers == []
+    assert not told.debts.is_waiting

@@ -95,3 +95,14 @@ def test_what_was_withheld_is_answered_once_a_role_allows_what_the_one_before_di
     before: Role, after: Role, expected: bool
 ) -> None:
     assert lets_out(before, after, now=5.0) is expected
+
+
+def test_an_input_of_a_newer_epoch_than_the_role_is_answered_in_none() -> None:
+    """A -> B -> A: the robots have closed the epoch that a worker believes in which was told of neither move."""
+    epochs = Epochs()
+    third = role(WorkerRole.ACTIVE, 3)
+    epochs.follow(IDLE, FIRST)
+    assert [epochs.stamp(FIRST, in_hand) for in_hand in (1, 3)] == [1, None]
+    assert epochs.stamp(role(WorkerRole.DRAINING, 1), 3) is None
+    epochs.follow(FIRST, third)
+    assert [epochs.stamp(third, in_hand) for in_hand in (1, 3, 4)] == [1, 3, None]

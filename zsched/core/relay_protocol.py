@@ -121,10 +121,16 @@ class EndMarker:
     ``None``: no other life of it is known."""
     age_s: float | None = None
     """Start markers among answers: number 0 was put so long ago."""
+    slot: int = 0
+    """Start markers of inputs: the epoch of the slot that this publisher feeds; 0: it does not say."""
+    is_given_up: bool = False
+    """Start markers of inputs: the slot is closed. What of this publisher has not been acknowledged is counted as lost
+    by now, or goes to another owner, and shall not be done any more."""
 
     def __post_init__(self) -> None:
         check_counter("end.epoch", self.epoch)
         check_counter("end.count", self.count)
+        check_counter("end.slot", self.slot)
         check_counter("end.replayed", self.replayed)
         check_counter("end.had", self.had or 0)
 

@@ -95,7 +95,7 @@ class InputStream:
         Raises:
             ValueError, zenoh.ZError: the route makes no sense (see `Outlet`).
         """
-        outlet = Outlet(self._session, route.from_expr, route.to_expr, route.settings, acks)
+        outlet = Outlet(self._session, route.from_expr, route.to_expr, route.settings, acks, epoch=epoch)
         with self._lock:
             self._is_counted |= acks is not None
             self._has_opened = True

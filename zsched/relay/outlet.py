@@ -72,10 +72,12 @@ class Outlet:
         acks: Acks | None = None,
         *,
         has_crowd: bool = False,
+        epoch: int = 0,
     ) -> None:
         """Declare the publishers. With ``acks`` the receiver is `zsched.worker`, which says what it has processed.
 
-        ``has_crowd``: the receivers are applications, as many as like to.
+        ``has_crowd``: the receivers are applications, as many as like to. ``epoch`` is that of the slot it belongs to,
+        which its worker is told.
 
         Raises:
             ValueError: ``to_expr`` cannot be filled from ``from_expr``.
@@ -90,6 +92,7 @@ class Outlet:
         self._kept_least = 1 if self._is_reliable else settings.keep_last
         self._kept_bytes = KEPT_BYTES if self._is_reliable else KEPT_BYTES_LATEST
         self._to = to_expr
+        self._epoch = epoch
         self._lock = threading.Lock()
         self._lanes: dict[tuple[str, str], Lane] = {}
         self.tally = Tally()
@@ -232,7 +235,7 @@ class Outlet:
         if self._queue is None:
             self._undeclare()
             return self.counted()
-        left = self._queue.close(self._undeclare)
+        left = self._queue.close(self._leave)
         with self._lock:
             said = self._sum()
             in_hand = max(0, said.waiting - left)  # nobody will hear whether it still goes out
@@ -324,10 +327,27 @@ class Outlet:
 
     def _put_marker(self, lane: Lane, epoch: int, count: int) -> None:
         replayed = max(0, lane.replay_end - count)
+        is_start = epoch == SKIP_EPOCH
         marker = EndMarker(
-            epoch=epoch, count=count, replayed=replayed, is_whole=self._is_reliable and epoch == SKIP_EPOCH
+            epoch=epoch,
+            count=count,
+            replayed=replayed,
+            is_whole=self._is_reliable and is_start,
+            slot=self._epoch if is_start else 0,
         )
         put_marker(self._session, lane.key, lane.source_id, lane.publisher.priority, marker)
+
+    def _leave(self) -> None:
+        """The last words to a worker of class ``reliable``: what it still has it shall not do any more."""
+        with self._lock:
+            open_lanes = [lane for lane in self._lanes.values() if self._greetings is not None and lane.in_flight]
+        try:
+            for lane in open_lanes:
+                marker = EndMarker(epoch=SKIP_EPOCH, count=lane.count, slot=self._epoch, is_given_up=True)
+                put_marker(self._session, lane.key, lane.source_id, lane.publisher.priority, marker)
+        except zenoh.ZError:
+            _log.debug("%s: the session closed first", self._to)
+        self._undeclare()
 
     def _undeclare(self) -> None:
         try:
