@@ -127,11 +127,14 @@ def test_electors_that_have_lost_their_state_are_named_and_count_for_nothing() -
     assert (quorum.alive, quorum.ok, quorum.stateless) == (2, True, ("robot3",))
 
 
-@pytest.mark.parametrize("other", ["generation", "electorate"])
-def test_electors_of_another_generation_or_electorate_count_for_nothing(other: str) -> None:
+@pytest.mark.parametrize(
+    "strange",
+    [{"generation": 2}, {"electorate": "0" * 16}, {"generation": 2, "electorate": f"{electorate_hash(FLEET)}/2"}],
+    ids=["generation of a peer that tells no electorate", "electorate", "both"],
+)
+def test_electors_of_another_generation_or_electorate_count_for_nothing(strange: dict[str, Any]) -> None:
     node = make()
     mine = electorate_hash(FLEET)
-    strange = {"generation": 2, "electorate": f"{mine}/2"} if other == "generation" else {"electorate": "0" * 16}
     apart = replace(Beat(node="robot2", incarnation=3, sequence=2, loop_lag_s=0.0), **strange)
     node.handle(ev.BeatReceived(beat=apart), 100.0)
     snapshot = build_snapshot(node, 100.0)
