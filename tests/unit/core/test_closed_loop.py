@@ -6,16 +6,21 @@ A machine's load follows from whether it has the task. Quantities are design sec
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from random import Random
 
 import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 
 from zsched.core.fleet import (
     DEFAULT_PATIENCE,
     PATIENT_BONUS,
     PATIENT_COOL_DOWN_S,
+    SERVICE_COOL_DOWN_S,
+    SERVICE_PATIENCE,
     Demand,
     Fleet,
     NodeSpec,
@@ -32,6 +37,7 @@ from zsched.core.model import (
     NodeKind,
     PeerState,
     Proposal,
+    ScoreForm,
     Tuning,
     Weights,
     WorkerLoad,
@@ -61,6 +67,8 @@ class Machine:
     """Ratio added at a time."""
     noise: float = 0.0
     task_cores: float = 0.0
+    """On a machine of speed 1."""
+    speed: float = 1.0
     task_mb: float = 0.0
     shows_worker: bool = True
 
@@ -69,13 +77,15 @@ class Machine:
         cpu, memory = (self.base + step + rng.uniform(-self.noise, self.noise) for _ in range(2))
         rest = max(cpu, 0.0) * self.cores
         # A full machine gives the task what is left, half a core at least.
-        takes = min(self.task_cores, max(self.cores - rest, 0.5)) if is_owner else 0.0
+        needs = self.task_cores / self.speed if is_owner else 0.0
+        takes = min(needs, max(self.cores - rest, 0.5))
         holds = self.task_mb if is_owner else 0.0
         load = WorkerLoad(
             task="merge",
             state=WorkerState.READY,
             cpu_cores=takes if self.shows_worker else None,
             memory_mb=holds if self.shows_worker else None,
+            wanted_cores=math.ceil(needs) if self.shows_worker and takes < needs else None,
         )
         device = DeviceSample(
             cpu_cores=self.cores,
@@ -83,6 +93,7 @@ class Machine:
             memory_mb=MEMORY_MB,
             memory_used_mb=max(memory, 0.0) * MEMORY_MB + holds,
             workers=(load,),
+            speed=self.speed,
         )
         return device, LinkSample(source=LinkSource.NL80211, rssi_dbm=-60.0 - 40.0 * step)
 
@@ -369,6 +380,88 @@ def test_a_load_that_goes_away_may_bring_the_task_back_once() -> None:
     loop = Loop((loaded, Machine(name="edge2", base=0.4)))
 
     assert [where for _, where in loop.run(200.0)] == ["edge2", "edge1"]
+
+
+# --- scored by service ---------------------------------------------------------------------------------------------
+
+BY_SERVICE = Tuning(weights=BOTH, score=ScoreForm.SERVICE, bonus=PATIENT_BONUS, cool_down_s=SERVICE_COOL_DOWN_S)
+"""With `SERVICE_PATIENCE`: what ``scheduling: {score: service}`` gives (docs/decisions/0030)."""
+CPU_ONLY = Weights(cpu=1.0, memory=0.0, network=0.0)
+
+
+@st.composite
+def constant_machines(draw: st.DrawFn) -> tuple[Machine, ...]:
+    """Two or three machines of whatever size, speed and load, and a task that may be too large for all of them."""
+    task_cores = draw(st.floats(0.1, 8.0))
+    return tuple(
+        Machine(
+            name=f"edge{number}",
+            cores=draw(st.sampled_from((1.0, 2.0, 4.0, 8.0))),
+            speed=draw(st.floats(0.25, 4.0)),
+            base=draw(st.floats(0.0, 0.9)),
+            task_cores=task_cores,
+            task_mb=draw(st.sampled_from((100.0, 800.0))),
+        )
+        for number in range(1, draw(st.integers(2, 3)) + 1)
+    )
+
+
+SLOW_AND_FAST = (
+    Machine(name="edge1", base=0.5, speed=0.5, task_cores=1.1),
+    Machine(name="edge2", base=0.5, speed=2.0, task_cores=1.1),
+)
+
+
+@settings(derandomize=True, database=None, deadline=None, max_examples=60)
+@example(machines=SLOW_AND_FAST, weights=CPU_ONLY)
+@given(
+    machines=constant_machines(),
+    weights=st.sampled_from((CPU_ONLY, BOTH, Weights(cpu=0.2, memory=0.8, network=0.0))),
+)
+def test_where_nothing_changes_a_task_scored_by_service_comes_to_rest(
+    machines: tuple[Machine, ...], weights: Weights
+) -> None:
+    """No limit cycle, whatever the speeds: at most once to each machine to learn what it needs there, then to stay."""
+    loop = Loop(machines, weights=weights, tuning=BY_SERVICE, patience=SERVICE_PATIENCE)
+    moves = loop.run(120.0)
+    assert len(moves) <= len(machines)
+    assert all(at < 30.0 for at, _ in moves)
+
+
+def test_a_task_that_began_on_a_machine_too_slow_for_it_leaves_though_it_was_never_seen_unstarved() -> None:
+    """The slow one is full with it: by what it uses there it would need no more than it gets."""
+    machines = (
+        Machine(name="edge1", base=0.1, speed=0.25, task_cores=2.0),
+        Machine(name="edge2", base=0.1, task_cores=2.0),
+    )
+    (move,) = Loop(machines, tuning=BY_SERVICE, patience=SERVICE_PATIENCE).run(60.0)
+    assert move[1] == "edge2"
+    assert move[0] < 5.0
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.1, 0.33])
+def test_a_step_of_30_percent_that_the_task_feels_is_followed_within_3_seconds(phase: float) -> None:
+    at = 15.0 + phase
+    stepped = Machine(name="edge1", step=lambda now: 0.3 if now >= at else 0.0, task_cores=2.2)
+    robots = ("robot1", "robot2", "robot3")
+    machines = (stepped, Machine(name="edge2", task_cores=2.2))
+    ((moved_at, where),) = Loop(machines, robots=robots, tuning=BY_SERVICE, patience=SERVICE_PATIENCE).run(22.0)
+    assert where == "edge2"
+    assert moved_at - at <= 3.0
+
+
+def test_a_step_that_the_task_does_not_feel_moves_nothing() -> None:
+    stepped = Machine(name="edge1", step=lambda now: 0.3 if now >= 15.0 else 0.0, task_cores=0.4)
+    machines = (stepped, Machine(name="edge2", task_cores=0.4))
+    assert Loop(machines, tuning=BY_SERVICE, patience=SERVICE_PATIENCE).run(60.0) == []
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("task_cores", [0.4, 2.0])
+def test_two_equal_nodes_under_noise_keep_a_task_that_is_scored_by_service(task_cores: float, seed: int) -> None:
+    machines = tuple(Machine(name=name, noise=0.15, task_cores=task_cores) for name in ("edge1", "edge2"))
+    loop = Loop(machines, tuning=BY_SERVICE, patience=SERVICE_PATIENCE, seed=seed)
+    assert len(loop.run(HOUR_S / 4)) <= 1
 
 
 # --- several robots ------------------------------------------------------------------------------------------------
