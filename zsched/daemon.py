@@ -45,6 +45,7 @@ from zsched.daemon_leaving import Leaving
 from zsched.daemon_memory import shared_memory_objection
 from zsched.daemon_sampler import Sampler
 from zsched.errors import AdapterError, ConfigError, NameTakenError
+from zsched.files import write_regular
 from zsched.guard import on_failure
 from zsched.log_limit import limit_handlers
 from zsched.relay_door import Door
@@ -238,17 +239,19 @@ class Daemon:
         paths: dict[TaskId, Path] = {}
         for name, spec in mine.items():
             paths[name] = folder / f"{me}-{name}.zenoh.json5"
-            paths[name].write_text(
-                zenoh_config.worker_config(
-                    connect=points.worker_connect,
-                    listen=points.worker_listen,
-                    timing=fleet.timing,
-                    link=spec.link,
-                    shared_memory=self._memory_objection == "",
-                    operator_json5=operator_json5,
-                    dials_by_gossip=points.worker_by_gossip,
-                )
+            config = zenoh_config.worker_config(
+                connect=points.worker_connect,
+                listen=points.worker_listen,
+                timing=fleet.timing,
+                link=spec.link,
+                shared_memory=self._memory_objection == "",
+                operator_json5=operator_json5,
+                dials_by_gossip=points.worker_by_gossip,
             )
+            try:
+                write_regular(paths[name], config.encode())
+            except OSError as error:
+                raise AdapterError(f"cannot write {paths[name]}: {error.strerror}; check --runtime-dir") from error
             stack.callback(paths[name].unlink, missing_ok=True)
         return WorkerSupervisor(
             specs=mine,

@@ -1,4 +1,4 @@
-"""Reads files that an operator names, and never more of them than they may hold.
+"""Reads files that an operator names, and never more of them than they may hold; writes those that others will read.
 
 Knows: what kinds of files there are, sizes, gzip. Does not know: what is in them.
 
@@ -36,13 +36,39 @@ def read_regular(path: Path, most_bytes: int) -> bytes:
     mode = os.fstat(descriptor).st_mode
     if not stat.S_ISREG(mode):
         os.close(descriptor)
-        kind = next((name for is_kind, name in _KINDS if is_kind(mode)), "something else")
-        raise OSError(errno.EINVAL, f"it is {kind}, not a regular file", str(path))
+        raise OSError(errno.EINVAL, f"it is {_kind(mode)}, not a regular file", str(path))
     with os.fdopen(descriptor, "rb") as file:
         data = file.read(most_bytes + 1)
     if len(data) > most_bytes:
         raise OSError(errno.EFBIG, f"it holds more than {_shown(most_bytes)}", str(path))
     return data
+
+
+def write_regular(path: Path, content: bytes) -> None:
+    """Replace what a regular file holds; nothing stays of one that could not be written whole.
+
+    Raises:
+        OSError: it cannot be written, or there is something that is no regular file; ``strerror`` says which.
+    """
+    flags = os.O_WRONLY | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC
+    try:
+        descriptor = os.open(path, flags, 0o666)
+    except OSError as error:
+        if error.errno == errno.ENXIO:  # nobody reads the pipe
+            raise OSError(errno.EINVAL, "it is a pipe, not a regular file", str(path)) from error
+        raise
+    with os.fdopen(descriptor, "wb", buffering=0) as file:
+        mode = os.fstat(descriptor).st_mode
+        if not stat.S_ISREG(mode):
+            raise OSError(errno.EINVAL, f"it is {_kind(mode)}, not a regular file", str(path))
+        try:
+            file.truncate(0)
+            written = 0
+            while written < len(content):
+                written += file.write(content[written:])
+        except OSError:
+            path.unlink(missing_ok=True)
+            raise
 
 
 def read_packed(path: Path, most_bytes: int) -> bytes:
@@ -80,6 +106,10 @@ def owner_of(path: Path) -> str:
     except OSError:
         return f"user {os.geteuid()} may not look into its folder"
     return f"it belongs to user {found.st_uid} (mode {stat.S_IMODE(found.st_mode):04o}), this is user {os.geteuid()}"
+
+
+def _kind(mode: int) -> str:
+    return next((name for is_kind, name in _KINDS if is_kind(mode)), "something else")
 
 
 def _shown(count: int) -> str:

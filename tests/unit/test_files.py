@@ -5,12 +5,14 @@ from __future__ import annotations
 import errno
 import gzip
 import os
+import resource
+import signal
 import tracemalloc
 from pathlib import Path
 
 import pytest
 
-from zsched.files import owner_of, read_packed, read_regular
+from zsched.files import owner_of, read_packed, read_regular, write_regular
 
 TEXT = b"time_stamp,c_rssi\n" * 100
 
@@ -31,6 +33,28 @@ def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path) -> None:
             read_regular(path, 1024)
     with pytest.raises(FileNotFoundError):
         read_regular(tmp_path / "nothing", 1024)
+
+
+def test_what_is_written_is_whole_or_not_there(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    for content in (TEXT, b"short"):
+        write_regular(path, content)
+        assert path.read_bytes() == content
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))  # as a disk that is full in the middle of it
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            write_regular(path, TEXT)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, ignored)
+    assert not path.exists()
+    os.mkfifo(path)
+    with pytest.raises(OSError, match="it is a pipe, not a regular file"):
+        write_regular(path, TEXT)
+    with pytest.raises(IsADirectoryError):
+        write_regular(tmp_path, TEXT)
 
 
 @pytest.mark.parametrize(

@@ -23,6 +23,7 @@ from typing import Self
 from zsched.core.generations import way_out
 from zsched.core.model import DurableState, NodeId
 from zsched.errors import AdapterError, WireError
+from zsched.files import read_regular
 from zsched.wire import decode_state, encode_state
 
 STATE_NAME, LOCK_NAME, NEW_NAME = "state", "lock", "state.new"
@@ -167,14 +168,13 @@ class StateFile:
 
     def _read(self) -> LoadResult:
         try:
-            with self.path.open("rb") as file:
-                content = file.read(MAX_STATE_BYTES + 1)
+            content = read_regular(self.path, MAX_STATE_BYTES)
         except FileNotFoundError:
             return LoadResult(problem=f"{self.path} does not exist: run `zsched init` if this name has never voted")
         except OSError as error:
             return LoadResult(problem=f"{self.path} cannot be read: {error.strerror}")
         try:
-            return LoadResult(state=decode_state(content[:MAX_STATE_BYTES]))
+            return LoadResult(state=decode_state(content))
         except WireError as error:
             return LoadResult(problem=f"{self.path} is damaged: {error}")
 
@@ -216,7 +216,7 @@ def _parts(hardware: str) -> dict[str, str]:
 
 
 def _write_synced(path: Path, content: bytes) -> None:
-    fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
+    fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NONBLOCK | os.O_CLOEXEC, 0o600)  # waits for no pipe
     try:
         written = 0
         while written < len(content):

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from zsched.adapters.state_file import StateFile, hardware_id, is_same_hardware
+from zsched.adapters.state_file import NEW_NAME, StateFile, hardware_id, is_same_hardware
 from zsched.core.model import Acceptance, Allocation, Ballot, DurableState, RegisterState, Tuning, Weights
 from zsched.errors import AdapterError
 
@@ -98,6 +98,19 @@ def test_unreadable_state_is_a_value(tmp_path: Path) -> None:
         result = file.load()
     assert result.problem is not None
     assert "cannot be read" in result.problem
+
+
+def test_a_pipe_in_place_of_the_state_is_a_value_and_nothing_waits_for_it(tmp_path: Path) -> None:
+    with state_file(tmp_path) as file:
+        os.mkfifo(file.path)
+        os.mkfifo(tmp_path / NEW_NAME)
+        result = file.load()
+        with pytest.raises(AdapterError, match="cannot write"):
+            file.save(STATE)
+        file.save(STATE)
+        assert file.load().state == STATE, "the next save has put a file in the place of either"
+    assert result.problem is not None
+    assert "a pipe" in result.problem
 
 
 def test_file_cut_at_every_length_is_damaged(tmp_path: Path) -> None:
