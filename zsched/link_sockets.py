@@ -1,7 +1,7 @@
 """Finds the sockets beneath a zenoh session's links, and says how far their receivers are.
 
-Knows: this process's descriptors, TCP's own counters, which sessions are workers'. Does not know: streams, who
-subscribes to what, what is done about a slow receiver.
+Knows: this process's descriptors, TCP's own counters. Does not know: streams, who subscribes to what, what is done
+about a slow receiver.
 
 zenoh tells nobody that a receiver takes nothing: a put waits, or drops, in silence. The kernel knows it for every link:
 whether there is room in its send buffer, and how many bytes the other end has taken. The descriptors are zenoh's; they
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import re
+import select
 import socket
 import struct
 from collections.abc import Iterable, Iterator
@@ -26,11 +27,10 @@ from zenoh import Session
 _BYTES_ACKED: Final = struct.Struct("<Q")
 _BYTES_ACKED_AT: Final = 120
 """Where ``tcpi_bytes_acked`` stands in Linux's ``struct tcp_info`` (4.1 and later)."""
+_LAST_DATA_RECV: Final = struct.Struct("<I")
+_LAST_DATA_RECV_AT: Final = 52
+"""Where ``tcpi_last_data_recv`` stands there, in ms."""
 _ADDRESS: Final = re.compile(r"(?:tcp|tls)/\[?([^\]#?]+)\]?:(\d+)")
-MAX_FEEDERS: Final = 1024
-
-_feeders: dict[str, None] = {}
-"""Sessions of workers, in order; of this process."""
 _Ends = tuple[tuple[str, int], tuple[str, int]]
 
 
@@ -52,9 +52,15 @@ class LinkSocket:
 
     def taken(self) -> int:
         """How many bytes the other end has taken so far; 0 when the socket is gone."""
+        return self._tcp_info(_BYTES_ACKED, _BYTES_ACKED_AT)
+
+    def silent_s(self) -> float:
+        """How long nothing has come from the other end; zenoh sends a sign of life four times in a lease."""
+        return self._tcp_info(_LAST_DATA_RECV, _LAST_DATA_RECV_AT) / 1000
+
+    def _tcp_info(self, value: struct.Struct, at: int) -> int:
         with contextlib.suppress(OSError, struct.error), _borrowed(self.fd) as held:
-            info = held.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _BYTES_ACKED_AT + _BYTES_ACKED.size)
-            return int(_BYTES_ACKED.unpack_from(info, _BYTES_ACKED_AT)[0])
+            return int(value.unpack_from(held.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, at + value.size), at)[0])
         return 0
 
     def cut(self) -> bool:
@@ -74,9 +80,9 @@ class LinkSockets:
         self._known: dict[_Ends, int] = {}
 
     def links(self) -> tuple[LinkSocket, ...]:
-        """The links there are now, as far as they are TCP, but to those that feed us."""
+        """The links there are now, as far as they are TCP."""
         found = {(str(link.zid), _ends(link)) for link in self._session.info.links()}
-        links = {ends: zid for zid, ends in found if ends is not None and zid not in _feeders}
+        links = {ends: zid for zid, ends in found if ends is not None}
         self._find(links)
         return tuple(LinkSocket(zid, ends, self._known[ends]) for ends, zid in links.items() if ends in self._known)
 
@@ -93,13 +99,12 @@ class LinkSockets:
                     self._known[ends] = int(path.name)
 
 
-def note_feeder(zid: str) -> None:
-    """A session puts answers to this process: it is a worker's, and none of those that receive outputs."""
-    if zid in _feeders:
-        return
-    if len(_feeders) >= MAX_FEEDERS:
-        _feeders.pop(next(iter(_feeders)))
-    _feeders[zid] = None
+def with_room(links: Iterable[LinkSocket], wait_s: float) -> set[int]:
+    """The descriptors with room (or gone), waiting at most so long for the first one."""
+    poll = select.poll()
+    for link in links:
+        poll.register(link.fd, select.POLLOUT)
+    return {fd for fd, _ in poll.poll(wait_s * 1000)}
 
 
 @contextlib.contextmanager

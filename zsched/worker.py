@@ -41,17 +41,19 @@ from zsched.hop_acks import Acknowledger
 from zsched.keyspace import END_CHUNK, Keyspace
 from zsched.log_limit import limit_library
 from zsched.relay_pipe import decode_end
+from zsched.stalled_links import StalledLinks
 from zsched.worker_debts import Debts
 from zsched.worker_epochs import CARRY_S, Epochs, lets_out
 from zsched.worker_errands import Errands
 from zsched.worker_inputs import Dispatcher
 from zsched.worker_keep import Keeper
+from zsched.worker_lanes import STALLED_S
 from zsched.worker_outputs import OUTPUT_DEPTH, Output
 from zsched.worker_roles import RoleWatch
 from zsched.worker_samples import BY_CLASS, Input, KeepLast, Marker, Received
 from zsched.worker_services import Answer, Handler, Request, Service
 from zsched.worker_snapshot import TIMEOUT_S, Offer, Restorer, StateLink, fetch
-from zsched.worker_start import open_session, relay_endpoint, surroundings
+from zsched.worker_start import lease_s, open_session, relay_endpoint, surroundings
 from zsched.worker_troubles import Troubles
 
 __all__ = ["Answer", "Output", "Received", "Request", "Worker"]
@@ -106,7 +108,8 @@ class Worker:
         self._acks = Acknowledger(self._send_acks)
         self._debts = Debts(self._acks)
         acks_key = self._keyspace.received("*", "*", str(self._session.zid()))
-        self._keeper = Keeper(self._session, acks_key, self._debts)
+        self._stalled = StalledLinks(self._session, lease_s(zenoh_config), STALLED_S)
+        self._keeper = Keeper(self._session, acks_key, self._debts, self._stalled)
         self._troubles = Troubles(self._tell_trouble)
         self._dispatcher = Dispatcher(self._inputs_ended, self._acks, self._troubles, self._debts)
         self._restorer = Restorer(self._fetch_snapshot, node, self._dispatcher)

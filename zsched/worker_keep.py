@@ -27,6 +27,7 @@ from zsched.errors import WireError
 from zsched.guard import guarded
 from zsched.keyspace import AGAIN_CHUNK, END_CHUNK, parse
 from zsched.relay_pipe import encode_end
+from zsched.stalled_links import StalledLinks
 from zsched.worker_debts import Debts
 from zsched.worker_lanes import FORGET_S, Expected, KeptLane, Receiver
 
@@ -43,11 +44,12 @@ _log = logging.getLogger("zsched.worker")
 class Keeper:
     """The answers of one worker, and the thread that takes acknowledgements and sends again."""
 
-    def __init__(self, session: Session, acks_key: str, debts: Debts) -> None:
+    def __init__(self, session: Session, acks_key: str, debts: Debts, stalled: StalledLinks) -> None:
         """``acks_key``: where relays acknowledge, ``.../received/*/*/<our zenoh id>``. Starts with the first lane.
 
-        ``debts`` are settled whenever more may have reached the robots.
+        ``debts`` are settled whenever more may have reached the robots; ``stalled`` watches over every put.
         """
+        self.stalled = stalled
         self._session = session
         self._acks_key = acks_key
         self._debts = debts
@@ -73,6 +75,7 @@ class Keeper:
         self._is_closed = True
         self._wake.set()
         self._came.put(None)
+        self.stalled.close()
 
     # --- the thread --------------------------------------------------------------------------------------------------
 
@@ -86,10 +89,12 @@ class Keeper:
                 sample = None
             try:
                 if sample is not None:
-                    self._take(sample)
+                    with self.stalled:
+                        self._take(sample)
                     self._debts.settle(monotonic_s())
                 if monotonic_s() >= due:
-                    self._look_after()
+                    with self.stalled:
+                        self._look_after()
                     due = monotonic_s() + TICK_S
             except zenoh.ZError as error:  # the session closes
                 _log.debug("answers are not sent again (%s)", error)

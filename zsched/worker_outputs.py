@@ -65,6 +65,7 @@ class Output:
         """Whether the last value is kept for who comes late."""
         self._keep_last = max(1, keep_last)
         self._keeper = keeper if latest or reliable else None
+        self._stalled = keeper.stalled
         self._kept = self._keep_last if latest else depth
         self._congestion = CongestionControl.BLOCK if latest or reliable else CongestionControl.DROP
         self._epoch_now = epoch_now
@@ -120,7 +121,8 @@ class Output:
 
     def _put_end(self, stamped: _Stamped, epoch: int) -> None:
         marker = EndMarker(epoch=epoch, count=stamped.count)
-        put_end(self._session, stamped.key, stamped.publisher.id, marker)
+        with self._stalled:
+            put_end(self._session, stamped.key, stamped.publisher.id, marker)
         if stamped.lane is not None:
             stamped.lane.note_end(marker)
 
@@ -156,11 +158,11 @@ class Output:
             stamped.lane.keep(number, payload, attachment, encoding, timestamp, size)
             if not self.is_latest:
                 self._owe(stamped.lane, number)
+        more = {"attachment": attachment, "encoding": encoding, "timestamp": timestamp}
         if isinstance(publisher, zenoh.Publisher):
-            source = zenoh.SourceInfo(publisher.id, serial_of(number))
-            publisher.put(payload, attachment=attachment, encoding=encoding, timestamp=timestamp, source_info=source)
-        else:
-            publisher.put(payload, attachment=attachment, encoding=encoding, timestamp=timestamp)
+            more["source_info"] = zenoh.SourceInfo(publisher.id, serial_of(number))
+        with self._stalled:
+            publisher.put(payload, **more)
 
 
 def _own(value: Any) -> Any:

@@ -11,6 +11,7 @@ import zenoh
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import until
 from zsched.hop_acks import Acknowledger
+from zsched.stalled_links import StalledLinks
 from zsched.worker_debts import Debts
 from zsched.worker_keep import Keeper
 from zsched.worker_outputs import OUTPUT_DEPTH, Output
@@ -32,7 +33,7 @@ def test_an_answer_that_is_an_input_does_not_hold_the_buffer_in_which_it_came() 
     """Zenoh's is 64 KiB, of which 100 B touch two pages when it is new: kept as they came, these took 12 MB."""
     with hub_and_neighbour() as (application, worker):
         acks = Acknowledger(lambda _relay, _frame: None)
-        keeper = Keeper(worker, "t/acks/*", Debts(acks))
+        keeper = Keeper(worker, "t/acks/*", Debts(acks), StalledLinks(worker, 1.5))
         output = Output(
             worker,
             "edge1/t/{epoch}/out",

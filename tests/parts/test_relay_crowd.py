@@ -10,9 +10,9 @@ import pytest
 import zenoh
 
 from support.waiting import free_endpoint, until
+from zsched.link_sockets import LinkSocket, LinkSockets
 from zsched.relay import crowd
-from zsched.relay.crowd import FITS_BYTES, MAX_REST_S, REST_S, Reader
-from zsched.relay.sockets import LinkSocket, LinkSockets, note_feeder
+from zsched.relay.crowd import FITS_BYTES, MAX_REST_S, REST_S, Reader, note_feeder
 from zsched.zenoh_config import client_config, data_config
 
 NOW = 100.0
@@ -133,7 +133,7 @@ def test_what_still_fits_into_a_full_link_is_not_missed(pair: Pair) -> None:
     assert not reader.misses(10_000)
 
 
-def test_the_sockets_of_all_links_but_the_workers_are_found() -> None:
+def test_the_sockets_of_all_links_are_found_and_workers_receive_no_outputs() -> None:
     endpoint = free_endpoint()
     with contextlib.ExitStack() as stack:
         texts = [data_config(listen=(endpoint,), connect=(), shared_memory=False)]
@@ -141,8 +141,10 @@ def test_the_sockets_of_all_links_but_the_workers_are_found() -> None:
         hub, *apps = [stack.enter_context(zenoh.open(zenoh.Config.from_json5(text))) for text in texts]
         sockets = LinkSockets(hub)
         until(lambda: len(sockets.links()) == 3, "the links")
+        made = crowd.Crowd(hub, "out", lambda: False, is_latest=False)
         note_feeder(str(apps[2].zid()))
-        links = sockets.links()
+        made._look(NOW)
+        links = list(made._readers)
         assert {link.zid for link in links} == {str(apps[0].zid()), str(apps[1].zid())}
         assert all(link.taken() > 0 for link in links)
         assert {link.ends[0][1] for link in links} == {int(endpoint.rsplit(":", 1)[1])}

@@ -15,6 +15,7 @@ from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, Stre
 from zsched.hop_acks import Acknowledger
 from zsched.keyspace import AGAIN_CHUNK, END_CHUNK, Keyspace
 from zsched.relay_pipe import decode_end
+from zsched.stalled_links import StalledLinks
 from zsched.worker_debts import Debts
 from zsched.worker_keep import Keeper
 from zsched.worker_lanes import KeptLane
@@ -66,7 +67,7 @@ class Bench:
         self.told: list[StreamAcks] = []
         self.acks = Acknowledger(lambda _relay, frame: self.told.append(frame))
         self.debts = Debts(self.acks)
-        self.keeper = Keeper(worker, KEYS.received("*", "*", str(worker.zid())), self.debts)
+        self.keeper = Keeper(worker, KEYS.received("*", "*", str(worker.zid())), self.debts, StalledLinks(worker, 1.5))
         self.publisher = worker.declare_publisher(KEY)
         self.eid = self.publisher.id.eid
 

@@ -31,7 +31,7 @@ FLOORS: Final[tuple[tuple[str, int, str], ...]] = (
         "seams",
     ),
     (r"(config|config_\w+)", 2, "seams"),
-    (r"(relay_door|introduction|guard|log_limit|files|opening)", 2, "seams"),
+    (r"(relay_door|introduction|guard|log_limit|files|opening|link_sockets|stalled_links)", 2, "seams"),
     (r"adapters\.(worker_supervisor|worker_process|launch)", 3, "adapters: worker processes"),
     (r"adapters\.(control_bus|open_questions|fleet_poll)", 3, "adapters: control"),
     (r"adapters\.(network_profiler|nl80211)", 3, "adapters: radio"),
@@ -62,7 +62,7 @@ OUTSIDE: Final[dict[str, str]] = {
     # library: who alone may import it, besides lab and tasks
     "zenoh": (
         r"adapters\.(control_bus|open_questions|fleet_poll|stream_tap)|relay\..+|worker|worker_\w+"
-        r"|zenoh_config|introduction"
+        r"|zenoh_config|introduction|link_sockets|stalled_links"
     ),
     "psutil": r"adapters\.\w+",
     "msgpack": r"wire",

@@ -1,7 +1,8 @@
 """Puts a stream's outputs to all its applications, and leaves behind the one that takes too little.
 
-Knows: whose link has room (`zsched.relay.sockets`), when to wait for it and when not. Does not know: zenoh's queues,
-which stream this is, who of those that are linked receives it: whose link fills up receives something.
+Knows: whose link has room (`zsched.link_sockets`), which sessions are workers', when to wait and when not. Does not
+know: zenoh's queues, which stream this is, who of those that are linked receives it: whose link fills up receives
+something.
 
 zenoh hands a sample to one receiver after the other: a put that waits (BLOCK) for a frozen one makes all of them wait,
 for seconds. So, where there are two or more, each put first waits until every link has room. A receiver whose link has
@@ -17,7 +18,6 @@ link's end. `Crowd.look_after` ends the link, when the receiver has taken nothin
 from __future__ import annotations
 
 import logging
-import select
 import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -28,8 +28,8 @@ from zenoh import CongestionControl, Sample, SampleKind, Session, Timestamp
 
 from zsched.clock import monotonic_s
 from zsched.core.serial import serial_of
+from zsched.link_sockets import LinkSocket, LinkSockets, with_room
 from zsched.relay.lanes import Lane
-from zsched.relay.sockets import LinkSocket, LinkSockets
 from zsched.send_queue import PATIENCE_S
 from zsched.zenoh_config import DROP_WAIT_S
 
@@ -46,6 +46,11 @@ FITS_BYTES: Final = 96 << 10
 OVERHEAD_BYTES: Final = 48
 SLOW_PUT_S: Final = 0.005
 MAX_CHARGE_S: Final = 0.5
+
+MAX_FEEDERS: Final = 1024
+
+_feeders: dict[str, None] = {}
+"""Sessions of workers, in order; of this process."""
 
 _log = logging.getLogger("zsched.relay")
 
@@ -180,7 +185,7 @@ class Crowd:
         with self._looking:
             if now - self._looked_at >= period_s:
                 self._looked_at = now
-                links = self._sockets.links()
+                links = [link for link in self._sockets.links() if link.zid not in _feeders]
                 self._readers = {link: self._readers.get(link) or Reader(link, now) for link in links}
             return len(self._readers) < 2
 
@@ -255,9 +260,14 @@ class Crowd:
             )
 
 
+def note_feeder(zid: str) -> None:
+    """A session puts answers to this process: it is a worker's, and none of those that receive outputs."""
+    if zid in _feeders:
+        return
+    if len(_feeders) >= MAX_FEEDERS:
+        _feeders.pop(next(iter(_feeders)))
+    _feeders[zid] = None
+
+
 def _ready(readers: Iterable[Reader], wait_s: float) -> set[int]:
-    """The descriptors with room (or gone), waiting at most so long for the first one."""
-    poll = select.poll()
-    for reader in readers:
-        poll.register(reader.link.fd, select.POLLOUT)
-    return {fd for fd, _ in poll.poll(wait_s * 1000)}
+    return with_room((reader.link for reader in readers), wait_s)

@@ -28,12 +28,12 @@ from zsched.keyspace import AGAIN_CHUNK, END_CHUNK
 from zsched.relay.acks import Acks
 from zsched.relay.answers import Answers
 from zsched.relay.counter import StreamCounter
+from zsched.relay.crowd import note_feeder
 from zsched.relay.fence import Fence
 from zsched.relay.outlet import Outlet
 from zsched.relay.pace import Pace
 from zsched.relay.receive import Receiver, undeclare
 from zsched.relay.slots import Feed, KeyState, OutputSlot
-from zsched.relay.sockets import note_feeder
 from zsched.relay_pipe import decode_end
 
 HOLD_SAMPLES: Final = 10_000
