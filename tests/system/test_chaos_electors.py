@@ -20,6 +20,7 @@ import pytest
 
 from zsched import wire, zenoh_config
 from zsched.adapters.operator_socket import ask
+from zsched.core.identity import TOLD_YOUNG_S
 from zsched.core.model import Beat
 from zsched.keyspace import Keyspace
 from zsched.lab import netns
@@ -221,7 +222,8 @@ def test_twins_that_meet_after_a_cut_both_stop_electing(bed: Bed) -> None:
     init_state(bed.fleet, "robot3", bed.folder / "guest-robot3" / "state", 1)  # an operator who asks nobody
     with guest(bed, "robot3", tree) as (folder, _):
         twin = socket_path(folder, "robot3")
-        bed.wait(lambda: ask(twin, {"verb": "status"})["up_s"] > 3.5, 60, "a twin that is not young any more")
+        old_s = TOLD_YOUNG_S + 0.5
+        bed.wait(lambda: ask(twin, {"verb": "status"})["up_s"] > old_s, 60, "a twin that is not young any more")
         bed.network.heal()
         bed.wait(
             lambda: ask(twin, {"verb": "status"})["quorum"]["this_node"] != "elector", 60, "the twin to stand down"
