@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from zsched.cli_page import Cell, Page, cut, memory, size, span
+from zsched.core.model import WAS_READY, WorkerState, told_of_worker
 
 Json = dict[str, Any]
 
@@ -48,11 +49,12 @@ def _lack_of_worker(status: Json, task: Json) -> str | None:
     owner = task["owner"]
     workers = (worker for node in status["nodes"] if node["name"] == owner for worker in node["workers"])
     state, why = next(((one["state"], one.get("reason")) for one in workers if one["task"] == task["name"]), ("", ""))
-    if state not in ("failed", "stopped"):
+    was_ready = state == "starting" and (why or "").startswith(WAS_READY)
+    if state not in ("failed", "stopped") and not was_ready:
         return None
     because = f": {why}" if why else ""
-    if state == "stopped":
-        return f"the worker on {owner} is stopped{because}"
+    if state != "failed":
+        return f"the worker on {owner} {told_of_worker(WorkerState(state), why or '')}"
     return f"the worker on {owner} failed{because}; mend it, then `zsched retry {task['name']} {owner}`"
 
 

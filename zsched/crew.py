@@ -7,13 +7,15 @@ follows from a state. Called from the supervisor's thread and the relay handle's
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Final
 
 from zsched.adapters.worker_supervisor import WorkerSupervisor
+from zsched.clock import wall_time
 from zsched.core import events as ev
 from zsched.core.fleet import Fleet
-from zsched.core.model import NodeId, TaskId, WorkerState
+from zsched.core.model import WAS_READY, NodeId, TaskId, WorkerState
 from zsched.core.plan import ReadyWhen
 from zsched.core.relay_protocol import WorkerMatched, WorkerSeen, WorkerTrouble
 from zsched.keyspace import Keyspace, counter
@@ -45,6 +47,12 @@ class Crew:
         self._matches: dict[TaskId, WorkerMatched] = {}
         self._strays: dict[TaskId, str] = {}
         """{task: the incarnation of a token here that is not the running process's}."""
+        self._seen: set[TaskId] = set()
+        """Whose worker has been ready: the running process, or somebody else's one at any time."""
+        self._lost: dict[TaskId, str] = {}
+        """{task: since when it is not ready any more, and what to look at}."""
+        self.sessions: Mapping[TaskId, Path] = {}
+        """{task: the file with the session that its worker opens}."""
         self._lock = threading.Lock()  # an end and a token's end come from two threads
 
     def life_of(self, task: TaskId) -> int:
@@ -54,6 +62,8 @@ class Crew:
 
     def why_not_ready(self, task: TaskId) -> str:
         """What its worker lacks, for an operator."""
+        if (lost := self._lost.get(task)) is not None:
+            return lost
         if task not in self._matching:
             return self._no_token(task)
         match = self._matches.get(task)
@@ -71,7 +81,8 @@ class Crew:
         """Say what is missing of the workers that somebody else starts; the relay says it of those seen by matching."""
         for task in sorted(self._foreign - self._matching):
             if self._supervisor_of(task) is not None:
-                reason = self._no_token(task)
+                key = self._keys.worker(self._node, task, "NUMBER")
+                reason = f"no token {key}: {self._start_it(task)}; without zsched.worker say `ready: matching`"
                 self._post(ev.WorkerChanged(task=task, state=WorkerState.STOPPED, reason=reason))
 
     # --- the relay's handle ------------------------------------------------------------------------------------------
@@ -125,8 +136,30 @@ class Crew:
 
     def _tell(self, supervisor: WorkerSupervisor, task: TaskId, life: int, *, is_ready: bool, reason: str) -> None:
         (supervisor.mark_ready if is_ready else supervisor.mark_gone)(task, life)
-        absent = WorkerState.STARTING if task in self._lives else WorkerState.STOPPED
-        self._post(ev.WorkerChanged(task=task, state=WorkerState.READY if is_ready else absent, reason=reason))
+        if is_ready:
+            self._seen.add(task)
+            self._lost.pop(task, None)
+            self._post(ev.WorkerChanged(task=task, state=WorkerState.READY, reason=reason))
+            return
+        is_ours = task in self._lives
+        if task in self._seen and not (is_ours and supervisor.states()[task] is WorkerState.STOPPED):
+            reason = self._lost.setdefault(task, self._not_any_more(task, reason))
+        elif task in self._foreign:
+            reason = f"{reason}: {self._start_it(task)}"
+        state = WorkerState.STARTING if is_ours else WorkerState.STOPPED
+        self._post(ev.WorkerChanged(task=task, state=state, reason=reason))
+
+    def _not_any_more(self, task: TaskId, what: str) -> str:
+        since = f"{WAS_READY}{wall_time()[11:19]} UTC, {what}"
+        if task in self._foreign:
+            return f"{since}: it has ended, hangs or is frozen; {self._start_it(task, 'start it again')}"
+        pid = None if self.supervisor is None else self.supervisor.pids().get(task)
+        return f"{since}: it may hang, be frozen or cut off; see its log{'' if pid is None else f' and process {pid}'}"
+
+    def _start_it(self, task: TaskId, do: str = "start it") -> str:
+        """Of a worker that somebody else starts: that it is the operator who does, and with what."""
+        session = self.sessions.get(task) or f"{self._node}-{task}.zenoh.json5"
+        return f"{do} on {self._node} (the task has no `command`) with the session {session}"
 
     # --- the supervisor ----------------------------------------------------------------------------------------------
 
@@ -134,6 +167,7 @@ class Crew:
         """The supervisor: a worker process runs; it is not ready yet."""
         with self._lock:
             self._lives[task] = incarnation
+            self._forget(task)
             self._post(ev.WorkerChanged(task=task, state=WorkerState.STARTING, reason=f"pid {pid}"))
             match = self._matches.get(task)
             if match is not None and match.is_matched and self.supervisor is not None:
@@ -145,7 +179,12 @@ class Crew:
         with self._lock:
             if self._lives.get(task) == incarnation:
                 self._lives[task] = 0
+                self._forget(task)
                 self._post(ev.WorkerChanged(task=task, state=WorkerState.STOPPED, reason=detail))
+
+    def _forget(self, task: TaskId) -> None:
+        self._seen.discard(task)
+        self._lost.pop(task, None)
 
     def on_failed(self, task: TaskId, reason: str) -> None:
         """The supervisor: the worker is not started again."""

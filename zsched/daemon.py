@@ -253,6 +253,7 @@ class Daemon:
             except OSError as error:
                 raise AdapterError(f"cannot write {paths[name]}: {error.strerror}; check --runtime-dir") from error
             stack.callback(paths[name].unlink, missing_ok=True)
+        shell.crew.sessions = paths
         return WorkerSupervisor(
             specs=mine,
             context=WorkerContext(fleet=fleet.name, node=me, incarnation=incarnation),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import pytest
 
@@ -10,7 +11,7 @@ from support.waiting import until
 from zsched.adapters.worker_supervisor import WorkerContext, WorkerSupervisor
 from zsched.core import events as ev
 from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.model import MAX_REASON, NodeKind, Tuning, Weights, WorkerState
+from zsched.core.model import MAX_REASON, WAS_READY, NodeKind, Tuning, Weights, WorkerState, told_of_worker
 from zsched.core.plan import ReadyWhen
 from zsched.core.relay_protocol import WorkerMatched, WorkerSeen, WorkerTrouble
 from zsched.crew import OTHERS, Crew
@@ -72,7 +73,33 @@ def test_a_process_that_matches_is_ready_and_is_not_ended_at_its_deadline(house:
     assert house.states("node") == [WorkerState.STARTING, WorkerState.READY]
     house.match("node", is_matched=False)
     assert house.states("node")[-1] is WorkerState.STARTING, "its process lives"
+    until(lambda: "not ready again within 0.5 s: was ready until" in str(house.reasons("node")), "the deadline")
+
+
+def test_a_process_that_never_matches_is_told_what_it_lacks(house: House) -> None:
+    house.supervisor.start("node")
+    until(lambda: house.states("node"), "it runs")
+    house.match("node", is_matched=False)
     until(lambda: "not ready within 0.5 s: nobody subscribes to a/key" in str(house.reasons("node")), "the deadline")
+    assert "did it open $ZSCHED_ZENOH_CONFIG?" in str(house.reasons("node"))
+
+
+def test_a_worker_that_was_ready_is_not_told_what_it_has_done_already(house: House) -> None:
+    """It was stopped or hangs: how to get ready is no news to it, and it is not starting."""
+    house.supervisor.start("token")
+    life = until(lambda: house.crew.life_of("token"), "it runs")
+    pid = house.supervisor.pids()["token"]
+    seen = WorkerSeen(node="edge1", task="token", incarnation=str(life), is_present=True)
+    house.crew.on_token(seen)
+    until(lambda: house.supervisor.states()["token"] is WorkerState.READY, "the supervisor knows")
+    house.crew.on_token(replace(seen, is_present=False))
+    lost = house.reasons("token")[-1]
+    assert lost.startswith(WAS_READY)
+    assert lost.endswith(f"its token went: it may hang, be frozen or cut off; see its log and process {pid}")
+    assert told_of_worker(house.states("token")[-1], lost) == lost, "and not that it is starting"
+    until(lambda: f"not ready again within 0.5 s: {lost}" in house.reasons("token"), "the deadline")
+    until(lambda: house.crew.life_of("token") not in (0, life), "the next process runs")
+    assert "no token" in house.crew.why_not_ready("token"), "which has not been ready"
 
 
 def test_what_matches_without_a_process_is_not_the_worker(house: House) -> None:
@@ -91,7 +118,12 @@ def test_somebody_else_s_worker_comes_and_goes_by_matching(house: House) -> None
     house.match("others")
     house.match("others", is_matched=False)
     assert house.states("others") == [WorkerState.STOPPED, WorkerState.READY, WorkerState.STOPPED]
-    assert house.reasons("others")[-1] == "nobody subscribes to a/key"
+    never, _, lost = house.reasons("others")
+    start_it = "on edge1 (the task has no `command`) with the session edge1-others.zenoh.json5"
+    assert never == f"nobody subscribes to a/key: start it {start_it}"
+    assert lost.startswith(WAS_READY)
+    assert lost.endswith(f"nobody subscribes to a/key: it has ended, hangs or is frozen; start it again {start_it}")
+    assert len(lost) <= MAX_REASON
 
 
 def test_a_token_says_nothing_of_a_worker_that_is_known_by_matching(house: House) -> None:
@@ -149,4 +181,5 @@ def test_who_has_to_start_a_worker_with_a_token_is_told_its_key(house: House) ->
     house.crew.begin()
     assert "`ready: matching`" in house.reasons("alone")[0]
     assert "worker/edge1/alone/NUMBER" in house.reasons("alone")[0]
+    assert "start it on edge1 (the task has no `command`) with the session edge1-alone" in house.reasons("alone")[0]
     assert house.reasons("others") == house.reasons("node") == house.reasons("token") == []

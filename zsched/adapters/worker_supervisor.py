@@ -112,6 +112,8 @@ class _Worker:
     incarnation: int = 0
     deadline_s: float | None = None
     failures: deque[float] = field(default_factory=deque)
+    has_been_ready: bool = False
+    """This process has."""
     failure: str = ""
     """While stopping: why, when the stop is not the operator's wish."""
     stop_step: int = 0
@@ -261,7 +263,7 @@ class WorkerSupervisor:
         if not worker.spec.command:
             worker.phase = _Phase.READY
         elif worker.phase is _Phase.STARTING and incarnation == worker.incarnation:
-            worker.phase, worker.deadline_s = _Phase.READY, None
+            worker.phase, worker.deadline_s, worker.has_been_ready = _Phase.READY, None, True
 
     def _on_gone(self, task: TaskId, incarnation: int) -> None:
         worker = self._workers[task]
@@ -306,7 +308,8 @@ class WorkerSupervisor:
             self._spawn(worker, now)
         elif worker.phase is _Phase.STARTING:
             why = self._why_not_ready(worker.task)
-            reason = f"not ready within {worker.spec.start_deadline_s:g} s{': ' if why else ''}{why}"
+            again = "again " if worker.has_been_ready else ""
+            reason = f"not ready {again}within {worker.spec.start_deadline_s:g} s{': ' if why else ''}{why}"
             self._begin_stop(worker, worker.spec.stop_grace_s, failure=reason)
         elif worker.phase is _Phase.STOPPING:
             self._signal_stop(worker, min(worker.stop_step + 1, len(STOP_SIGNALS) - 1), now)
@@ -320,7 +323,7 @@ class WorkerSupervisor:
             self._count_failure(worker, f"cannot start: {error}", None, now)
             return
         self._guard.add(process.pid)
-        worker.process, worker.phase = process, _Phase.STARTING
+        worker.process, worker.phase, worker.has_been_ready = process, _Phase.STARTING, False
         worker.deadline_s = now + worker.spec.start_deadline_s
         self._watch.add(process)
         log.info("worker_started task=%s pid=%d incarnation=%d", worker.task, process.pid, worker.incarnation)

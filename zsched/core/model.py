@@ -160,6 +160,17 @@ class WorkerState(StrEnum):
     FAILED = "failed"  # too many failures in the window, or it said that it cannot: the node is not eligible
 
 
+WAS_READY = "was ready until "
+"""So a reason begins that is one of a worker which is not ready any more: it is starting only for its supervisor."""
+
+
+def told_of_worker(state: WorkerState, reason: str) -> str:
+    """How a worker is, to be said behind its name."""
+    if state is not WorkerState.READY and reason.startswith(WAS_READY):
+        return reason
+    return f"is {state}{': ' if reason else ''}{reason}"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorkerLoad:
     """One task's worker on one node: its state and what its process tree uses now (cores, MiB)."""

@@ -16,7 +16,7 @@ from enum import StrEnum
 
 from zsched.core.damping import ESCAPES_PER_MINUTE, WINDOW_S, Damping
 from zsched.core.fleet import TaskSpec
-from zsched.core.model import Allocation, NodeId, PeerState, Profile, ScoreForm, WorkerState
+from zsched.core.model import Allocation, NodeId, PeerState, Profile, ScoreForm, WorkerState, told_of_worker
 from zsched.core.scoring import Standing, joined, pick
 
 FORGIVEN_IN_S = 2.0
@@ -264,9 +264,8 @@ def escape_ahead(
     if profile is None or is_held or not _is_told(spec, profile):
         return ""
     load = profile.worker(spec.name)
-    state = "not there" if load is None else load.state.value
-    why = "" if load is None or not load.reason else f": {load.reason}"
+    how = "is not there" if load is None else told_of_worker(load.state, load.reason)
     if not has_other:
-        return f"the worker on {allocation.owner} is {state}{why}; nobody else can have the task"
+        return f"the worker on {allocation.owner} {how}; nobody else can have the task"
     left_s = max(spec.worker.start_deadline_s - not_ready_for_s, 0.0)
-    return f"{allocation.owner} will be left in {left_s:.0f} s, for its worker is {state}{why}"
+    return f"{allocation.owner} will be left in {left_s:.0f} s, for its worker {how}"

@@ -18,7 +18,7 @@ from zsched.core.gateway import Gateway
 from zsched.core.generations import way_out
 from zsched.core.knocking import Knocking
 from zsched.core.membership import Membership
-from zsched.core.model import Allocation, NodeId, NodeKind, PeerState, TaskId, WorkerLoad, WorkerState
+from zsched.core.model import Allocation, NodeId, NodeKind, PeerState, TaskId, WorkerLoad, WorkerState, told_of_worker
 from zsched.core.namesakes import Namesakes
 from zsched.core.plan import Direction, ReadyWhen, Route, StreamCount
 from zsched.core.register import Register
@@ -36,6 +36,10 @@ from zsched.core.snapshot import (
     VoteStatus,
 )
 
+STARTED_BEFORE = (
+    "who starts it (the task has no `command`) must start it again if it ran before this robot was in the fleet file "
+    "there: the session {owner}-{task}.zenoh.json5 has this robot's address since"
+)
 UNREADY_SHOWN_S = 2.0
 """A handover takes less; a slot that nobody takes for longer is a problem."""
 
@@ -250,7 +254,7 @@ def _task_problems(node: NodeView, task: TaskSpec, value: Allocation, now: float
         if load.state is WorkerState.FAILED:
             yield f"the worker on {spec.name} failed{why}; mend it, then `zsched retry {task.name} {spec.name}`"
         elif (spec.name == owner and load.state is not WorkerState.READY) or (owner is None and _is_missed(task, load)):
-            yield f"the worker on {spec.name} is {load.state}{why}"
+            yield f"the worker on {spec.name} {told_of_worker(load.state, load.reason)}"
         elif load.state is WorkerState.READY and load.reason:
             yield f"the worker on {spec.name}{why}"
     since = _unready_since(node, executor)
@@ -273,10 +277,11 @@ def _unready_since(node: NodeView, executor: Executor) -> float:
 
 
 def _untaken(task: TaskSpec, executor: Executor) -> str:
+    newer = "" if task.worker.command else f"; {STARTED_BEFORE.format(owner=executor.owner, task=task.name)}"
     if task.worker.ready_when is ReadyWhen.TOKEN:
-        return "our relay does not see its worker's token, or its subscriptions"
+        return f"our relay does not see its worker's token, or its subscriptions{newer}"
     keys = [route.to_expr for route in executor.routes if route.direction is not Direction.OUTPUT]
-    return f"our relay sees nobody take {keys[0] if keys else 'them'}"
+    return f"our relay sees nobody take {keys[0] if keys else 'them'}{newer}"
 
 
 def _with_age(count: StreamCount, dropped: dict[str, tuple[int, float]], now: float) -> StreamCount:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from zsched.core import events as ev
 from zsched.core.fleet import Fleet, OnIsolation, TaskSpec
 from zsched.core.instructions import RecordStory
-from zsched.core.model import MAX_REASON, NodeId, NodeKind, Profile, TaskId, WorkerState
+from zsched.core.model import MAX_REASON, NodeId, NodeKind, Profile, TaskId, WorkerState, told_of_worker
 
 TROUBLE_S = 60.0
 """A callback that has raised is shown for so long behind the last time."""
@@ -56,7 +56,7 @@ class Workers:
         if self.states[event.task] is event.state:
             return None
         self.states[event.task] = event.state
-        text = f"worker {event.state}{': ' if event.reason else ''}{event.reason}"
+        text = f"worker {told_of_worker(event.state, event.reason).removeprefix('is ')}"
         return RecordStory(stage="executor", text=text, task=event.task)
 
     def on_troubled(self, event: ev.WorkerTroubled, now: float) -> None:

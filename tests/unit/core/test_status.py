@@ -8,12 +8,13 @@ from typing import Any
 
 import pytest
 
-from zsched.cli_report import render_status
+from zsched.cli_report import degradations, render_status
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, electorate_hash
 from zsched.core.messages import Learnt
 from zsched.core.model import (
+    WAS_READY,
     Allocation,
     Beat,
     DeviceSample,
@@ -257,6 +258,27 @@ def test_a_task_without_an_owner_says_which_workers_somebody_else_has_to_start()
     assert build_snapshot(node, 100.0).tasks[0].problems == (), "our own standby, which a move starts"
     node.fleet = replace(FLEET, tasks=tuple(replace(task, worker=WorkerSpec()) for task in FLEET.tasks))
     assert build_snapshot(node, 100.0).tasks[0].problems == ("the worker on edge1 is stopped: no token",)
+
+
+def test_an_owner_s_worker_that_was_ready_is_not_said_to_be_starting() -> None:
+    node = make()
+    node.handle(ev.BeatReceived(beat=Beat(node="edge1", incarnation=3, sequence=1, loop_lag_s=0.0)), 100.0)
+    learn(node, 1, "edge1")
+    told_by(node, "edge1", 1, WorkerState.STARTING, f"{WAS_READY}12:00:00 UTC, its token went: it may hang")
+    said = "the worker on edge1 was ready until 12:00:00 UTC, its token went: it may hang"
+    snapshot = build_snapshot(node, 100.0)
+    assert said in snapshot.tasks[0].problems
+    assert any(said in reason for reason in degradations(snapshot_json(snapshot)))
+
+
+def test_a_slot_that_somebody_else_s_worker_does_not_take_is_told_with_what_mends_it() -> None:
+    """It was started on a session that did not know this robot yet."""
+    node = make()
+    node.fleet = replace(FLEET, tasks=tuple(replace(task, worker=WorkerSpec()) for task in FLEET.tasks))
+    learn(node, 1, "edge1")
+    (waits,) = build_snapshot(node, 103.0).tasks[0].problems
+    assert "must start it again" in waits
+    assert "the session edge1-merge.zenoh.json5" in waits
 
 
 def told_by(node: Node, name: str, sequence: int, state: WorkerState, reason: str = "") -> None:
