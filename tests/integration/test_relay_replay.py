@@ -11,6 +11,7 @@ import pytest
 
 from support.relay_rig import Application, Rig, relay_rig, slot
 from support.waiting import until
+from zsched.core.events import SlotFlipped, SlotReady
 from zsched.core.plan import OnCrash, RoutePhase, Slot, StreamClass, WorkerRole
 from zsched.core.relay_protocol import SlotLost
 
@@ -102,3 +103,27 @@ def test_an_owner_that_hangs_until_it_is_left_has_its_work_done_by_the_next(rig:
     until(lambda: app.nodes[-1] == "edge2", "the stream through edge2")
     app.halt(thread)
     is_whole(rig, app)
+
+
+def test_what_an_owner_has_left_undone_comes_before_anything_newer(rig: Rig) -> None:
+    """An exclusive owner stops at once when the task moves, whatever is on its way to it."""
+    rig.start_worker("edge1", "--delay-ms", "5")
+    rig.start_worker("edge2")
+    app = Application(rig.app)
+    first, second = replaying(1, "edge1"), replaying(2, "edge2")
+    rig.move(first)
+    until(app.connected, "the application sees the relay's subscription")
+    thread = app.stream(400)
+    until(lambda: len(app.back) > 50, "the stream through edge1")
+    rig.role("edge1", WorkerRole.IDLE)
+    rig.role("edge2", WorkerRole.ACTIVE, 2)
+    rig.plan(RoutePhase.PREPARE, second, first)
+    until(lambda: rig.reports["robot1"].find(SlotReady, epoch=2, is_ready=True), "the new owner is ready")
+    rig.plan(RoutePhase.FLIP, second, first)
+    until(lambda: rig.reports["robot1"].find(SlotFlipped, epoch=2), "the flip")
+    sent = app.sent
+    until(lambda: app.sent > sent + 5, "newer samples")
+    rig.plan(RoutePhase.CLOSE, second)
+    until(lambda: app.nodes[-1] == "edge2", "the stream through edge2")
+    app.halt(thread)
+    assert is_whole(rig, app), "in order"

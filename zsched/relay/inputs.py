@@ -6,6 +6,8 @@ Everything happens under the stream's lock, the sample that just came included: 
 sends and the first sample behind it there is no gap. A kept value reaches a new owner at least once; it may have
 reached the old one too. With ``on_crash: replay`` the same holds for what an owner that died had not acknowledged,
 unless its answer, known by the sample's timestamp, has passed; and what comes while there is no owner waits for one.
+An owner that is left may stop before it has done all that was on its way to it (an exclusive one does so at once): so
+with ``replay`` what comes behind a flip is held until its slot has ended, and goes out behind what it leaves.
 """
 
 from __future__ import annotations
@@ -31,6 +33,11 @@ from zsched.send_queue import MAX_BYTES
 
 MAX_KEYS: Final = 4096
 """Concrete keys of one wildcard stream whose values are kept; the oldest give way."""
+
+HOLD_S: Final = 1.0
+"""So long an owner that was left may take to end its slot; who hangs is not waited for."""
+MAX_HELD: Final = MAX_OWED // 2
+"""More samples than that are not held either: the next owner's queue has to take them."""
 
 _Kept = tuple[int, Sample, Timestamp | None]
 
@@ -69,6 +76,11 @@ class InputStream:
         self._owed_bytes = 0
         self._owed: list[Owed] = []
         """What waits for the next owner: an owner that died had not acknowledged it, or there was none."""
+        self._next: _InputSlot | None = None
+        """Flipped to, and waits until the slot that carried has ended."""
+        self._held: list[Owed] = []
+        self._held_bytes = 0
+        self._hold_until = 0.0
         self._is_patient = route.settings.stream_class is StreamClass.RELIABLE
         self._number = 0
         self._keep_last = route.settings.keep_last if is_latest else 0
@@ -131,10 +143,16 @@ class InputStream:
         """
         with self._lock:
             slot = self._slots.get(epoch)
-            if slot is None or slot is self._active:
+            if slot is None or slot is self._active or slot is self._next:
                 return 0
+            self._end_hold(is_done)
             if is_old_dead and self._replays:
                 self._abandon(self._active)
+            if self._replays and self._active is not None:
+                said = self._active.outlet.counted()
+                if said.in_flight or said.waiting:
+                    self._hold(self._active, slot)
+                    return 0
             replayed = self._catch_up(slot) + self._replay(slot, is_done)
             if self.route.settings.mirror:
                 self._mirror = self._active
@@ -143,6 +161,16 @@ class InputStream:
                     self._counter.dropped(*slot.outlet.send(sample, stamp))
             self._active = slot
             return replayed
+
+    def end_slot(self, epoch: int, *, is_done: Callable[[Timestamp], bool] = _never) -> None:
+        """The slot that was left has drained, or its worker is gone: what it has not done goes out before the rest."""
+        with self._lock:
+            slot = self._slots.get(epoch)
+            if self._next is None or slot is None or slot is self._next:
+                return
+            del self._slots[epoch]
+            self._settle(slot)
+            self._end_hold(is_done)
 
     def send_end(self, epoch: int) -> None:
         """Put the end marker behind the slot's last sample (it must not be the active one); may block on its link."""
@@ -175,6 +203,9 @@ class InputStream:
                 self._active = None
             if slot is self._mirror:
                 self._mirror = None
+            if slot is self._next:
+                self._next, held, self._held, self._held_bytes = None, self._held, [], 0
+                self._owe(held)
             if self._replays and slot.is_counted:
                 return self._leave(slot, is_done)
             said = slot.outlet.undeclare()
@@ -197,6 +228,7 @@ class InputStream:
     def _leave(self, slot: _InputSlot, is_done: Callable[[Timestamp], bool]) -> int:
         """A slot closes: what its worker has not processed waits for the next owner, or goes to the one there is."""
         left = self._settle(slot)
+        self._end_hold(is_done)
         if self._active is not None:
             self._replay(self._active, is_done)
         return left
@@ -234,9 +266,29 @@ class InputStream:
             self._counter.dropped("overflow", slot.outlet.replay(left))
         return len(left)
 
+    def _hold(self, left: _InputSlot, slot: _InputSlot) -> None:
+        self._active, self._next = None, slot
+        self._hold_until = monotonic_s() + HOLD_S
+        self._held = left.outlet.take_back()
+        self._held_bytes = sum(len(sample.payload) for sample, _ in self._held)
+
+    def _end_hold(self, is_done: Callable[[Timestamp], bool] = _never) -> None:
+        """Feed the slot that waits: first what is owed to it, then what has come since the flip."""
+        slot, self._next = self._next, None
+        if slot is None:
+            return
+        self._active = slot
+        self._replay(slot, is_done)
+        held, self._held, self._held_bytes = self._held, [], 0
+        for sample, stamp in held:
+            self._counter.dropped(*slot.outlet.send(sample, stamp))
+        slot.sent = self._number
+
     def look_after(self) -> None:
         """Have sent (again) what workers have not acknowledged in time, or a rate held back; call it now and then."""
         with self._lock:
+            if self._next is not None and monotonic_s() > self._hold_until:
+                self._end_hold()
             if self._pace is not None and self._keep_last and self._active is not None:
                 for sample, stamp in self._pace.overdue(monotonic_s()):
                     self._counter.repeated += 1  # it has been counted as thinned
@@ -249,7 +301,7 @@ class InputStream:
         with self._lock:
             total = Tally()
             total.add(self._closed)
-            total.waiting += len(self._owed)
+            total.waiting += len(self._owed) + len(self._held)
             for slot in self._slots.values():
                 total.add(slot.outlet.counted())
             return self._counter.value(total if self._has_opened else None, has_acks=self._is_counted)
@@ -273,6 +325,11 @@ class InputStream:
             elif self._active is not None:
                 self._active.sent = self._number
                 self._send(sample, stamp, size)
+            elif self._next is not None:
+                self._held.append((sample, stamp))
+                self._held_bytes += size
+                if len(self._held) >= MAX_HELD or self._held_bytes >= MAX_BYTES // 2:
+                    self._end_hold()
             elif self._replays:
                 self._owe([(sample, stamp)])
             elif not self._keep_last:

@@ -356,6 +356,8 @@ class TaskRelay:
                 sink.close_slot(epoch)
         if all(ended) and (is_gone or (self._services.has_ended(epoch) and self._has_settled(state))):
             state.is_drained = True
+            for source in self._inputs.values():
+                source.end_slot(epoch, is_done=self._is_answered)
             self._report(SlotDrained(task=self._task, epoch=epoch))
 
     def _has_settled(self, state: _OpenSlot) -> bool:
