@@ -157,6 +157,66 @@ def test_what_was_remembered_of_a_generation_says_nothing_of_the_next() -> None:
     assert all(site.sim.node(name).agreement.is_elector for name in ROBOTS)
 
 
+# --- what the simulator calls beyond what is promised -----------------------------------------------------------------
+
+
+def restored(*forgetful: NodeId, cut: tuple[NodeId, ...] = ()) -> Site:
+    """robot1 comes back from a backup, the forgetful ones without a state, and robot1 does not hear those cut off."""
+    site = Site(1)
+    backup = site.saved("robot1")
+    site.move()
+    site.sim.run(1)
+    site.sim.cut(("robot1",), cut)
+    for name in forgetful:
+        site.sim.crash(name)
+        site.sim.machines[name].disk.wipe()
+        site.sim.machines[name].is_durable = False
+        site.sim.start(name)
+    site.bring_back("robot1", backup)
+    site.sim.run(2)
+    return site
+
+
+def test_a_forgotten_vote_that_nobody_has_seen_is_beyond_what_is_promised() -> None:
+    """Found by the simulator (seed 8028426): an elector goes back in time, and all others forget."""
+    site = restored("robot2", "robot3", *EDGES)
+    assert site.sim.node("robot1").agreement.is_elector
+    assert "robot1 began with" in site.sim.memory.beyond
+
+
+def test_a_forgotten_vote_that_only_a_node_beyond_a_cut_has_seen_is_beyond_what_is_promised() -> None:
+    site = restored("robot2", "robot3", "edge2", cut=("edge1",))
+    assert site.sim.node("robot1").agreement.is_elector
+    assert "robot1 began with" in site.sim.memory.beyond
+
+
+def test_a_forgotten_vote_that_somebody_in_reach_has_seen_is_judged() -> None:
+    site = restored("robot2", "robot3", "edge2")
+    assert not site.sim.node("robot1").agreement.is_elector
+    assert site.sim.memory.beyond == ""
+
+
+def test_an_elector_that_votes_though_it_was_told_what_it_forgot_is_judged(monkeypatch: pytest.MonkeyPatch) -> None:
+    backup = Site(1).saved("robot1")
+    monkeypatch.setattr(Witness, "_excess", lambda *_: "")
+    site = restored("robot2", "robot3", "edge2")
+    assert site.saved("robot1").votes > backup.votes, "it has voted again"
+    assert site.sim.memory.beyond == ""
+
+
+def test_an_elector_that_forgets_nothing_is_judged() -> None:
+    site = Site(1)
+    site.move()
+    for name in ("robot2", "robot3", *EDGES):
+        site.sim.crash(name)
+        site.sim.machines[name].disk.wipe()
+        site.sim.start(name)
+    site.bring_back("robot1", site.saved("robot1"))
+    site.sim.run(2)
+    assert site.sim.node("robot1").agreement.is_elector
+    assert site.sim.memory.beyond == ""
+
+
 # --- the rule --------------------------------------------------------------------------------------------------------
 
 

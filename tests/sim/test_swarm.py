@@ -12,7 +12,8 @@ import pytest
 from zsched.core.register import Register
 from zsched.errors import InvariantError
 from zsched.lab import simulate
-from zsched.lab.sim_faults import Stage, play
+from zsched.lab.sim_checks import DisagreementError
+from zsched.lab.sim_faults import BEYOND, Stage, play
 from zsched.lab.sim_files import CHANGES
 from zsched.lab.sim_links import Held
 from zsched.lab.sim_parts import GENERATION_STEP, Clock, Disk
@@ -133,6 +134,29 @@ def test_a_fleet_that_does_not_come_to_rest_is_a_violation(monkeypatch: pytest.M
     monkeypatch.setattr("zsched.lab.simulator.unsettled", lambda *_: "never")
     with pytest.raises(InvariantError, match="not at rest"):
         Stage(Plan(seed=1, fleet=plan(1).fleet, faults=(), seconds=4.0)).play(None, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("beyond", "error", "is_violation"),
+    [
+        ("robot1 began with 3 of 5 votes", DisagreementError, False),
+        ("robot1 began with 3 of 5 votes", InvariantError, True),
+        ("", DisagreementError, True),
+    ],
+)
+def test_only_what_forgotten_votes_do_to_the_agreement_is_no_violation(
+    beyond: str, error: type[InvariantError], is_violation: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Found by seed 8028426: whoever had seen an elector's votes had forgotten them, or was cut off from it."""
+
+    def fail(stage: Stage, *_: object) -> float:
+        stage.sim.memory.beyond = beyond
+        raise error("two values")
+
+    monkeypatch.setattr(Stage, "play", fail)
+    result = play(plan(1))
+    assert bool(result.violation) is is_violation
+    assert result.faults[BEYOND] == (not is_violation)
 
 
 # --- the command -----------------------------------------------------------------------------------------------------

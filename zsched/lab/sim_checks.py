@@ -37,6 +37,10 @@ MAX_WAKES = 50
 """So often in a row a node may want to be woken without time passing."""
 
 
+class DisagreementError(InvariantError):
+    """What a fleet did, whose electors forget nothing unseen, is impossible; each node may have kept its rules."""
+
+
 @dataclass(slots=True)
 class Invariants:
     """Watches one simulated fleet; raises `InvariantError` as soon as something impossible happens."""
@@ -68,7 +72,7 @@ class Invariants:
         """Check one record of the history."""
         found = self.checker.take(record)
         if found:
-            raise InvariantError(found[0])
+            raise DisagreementError(found[0])
 
     # --- lives and disks ---------------------------------------------------------------------------------------------
 

@@ -18,6 +18,7 @@ from zsched import wire
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.fleet import Fleet, electorate_hash
+from zsched.core.messages import Refused
 from zsched.core.model import Allocation, DeviceSample, DurableState, NodeId, PeerState, TaskId
 from zsched.core.node import Node
 from zsched.core.plan import RoutePlan
@@ -25,6 +26,7 @@ from zsched.errors import InvariantError
 from zsched.lab.sim_checks import Invariants, unsettled
 from zsched.lab.sim_links import Links
 from zsched.lab.sim_loops import TICK_S
+from zsched.lab.sim_memory import Memory
 from zsched.lab.sim_network import Message
 from zsched.lab.sim_parts import Machine, blank_state
 from zsched.lab.sim_work import Work
@@ -63,6 +65,7 @@ class Simulator(Links):
     """Nodes that cannot write their state."""
     stories: list[str] = field(default_factory=list)
     invariants: Invariants = field(init=False)
+    memory: Memory = field(init=False)
     work: Work = field(init=False)
     events: int = 0
     most_events: float = math.inf
@@ -77,7 +80,7 @@ class Simulator(Links):
     def __post_init__(self) -> None:
         self.rng = Random(self.seed)
         self.invariants = Invariants(self.fleet)
-        self.work = Work(self)
+        self.memory, self.work = Memory(self), Work(self)
         for spec in self.fleet.nodes:
             machine = self.machines[spec.name] = Machine(key=spec.name, name=spec.name, fleet=self.fleet)
             self.initialise(machine, generation=self.generation)
@@ -200,6 +203,7 @@ class Simulator(Links):
             rng=Random(self.rng.random()),
             now=local,
         )
+        self.memory.on_started(machine, state)
         self._tell_token(machine, ev.TokenSeen(node=machine.name, incarnation=machine.node.incarnation), TOKEN_DELAY_S)
         self._carry_out(machine, machine.node.start(local), 0)
         self.work.greet(machine)
@@ -334,6 +338,8 @@ class Simulator(Links):
             case do.AnswerUtilities(request=request, utilities=value):
                 self._answer(request, value)
             case do.AnswerElection(request=request, answer=vote):
+                if not isinstance(vote, Refused):
+                    self.memory.on_vote(me)
                 self._answer(request, vote)
             case do.AnswerLearnt(request=request, learnt=learnt):
                 self._answer(request, learnt)
