@@ -14,6 +14,8 @@ from zsched.core.fleet import (
     DEFAULT_PATIENCE,
     PATIENT_BONUS,
     PATIENT_COOL_DOWN_S,
+    SERVICE_COOL_DOWN_S,
+    SERVICE_PATIENCE,
     Fleet,
     LinkSpec,
     OnIsolation,
@@ -25,7 +27,7 @@ from zsched.core.fleet import (
     electorate_hash,
     fleet_hash,
 )
-from zsched.core.model import Aggregate, LinkSource, NodeKind
+from zsched.core.model import Aggregate, LinkSource, NodeKind, ScoreForm
 from zsched.core.plan import Direction, HandoverRule, ReadyWhen, StreamClass
 from zsched.errors import ConfigError
 
@@ -168,6 +170,22 @@ def test_patience_is_the_default_and_a_time_to_trigger_alone_takes_its_place(
     assert (task.tuning.bonus, task.tuning.cool_down_s) == (bonus, cool_down_s)
     if trigger_s is not None:
         assert task.tuning.time_to_trigger_s == trigger_s
+
+
+@pytest.mark.parametrize(
+    ("given", "patience", "cool_down_s"),
+    [
+        ("{score: service}", SERVICE_PATIENCE, SERVICE_COOL_DOWN_S),
+        ("{score: service, patience: 0.7, cool_down_s: 9}", 0.7, 9.0),
+        ("{score: service, time_to_trigger_s: 2}", None, 10.0),
+        ("{score: paper}", DEFAULT_PATIENCE, PATIENT_COOL_DOWN_S),
+    ],
+)
+def test_a_task_scored_by_service_has_its_own_defaults(given: str, patience: float | None, cool_down_s: float) -> None:
+    scheduling = "    scheduling: {bonus: 0.10, time_to_trigger_s: 2, cool_down_s: 10}\n"
+    task = fleet_of(swapped(scheduling, f"    scheduling: {given}\n")).tasks[0]
+    assert (task.patience, task.tuning.cool_down_s) == (patience, cool_down_s)
+    assert task.tuning.score is (ScoreForm.SERVICE if "service" in given else ScoreForm.PAPER)
 
 
 @pytest.mark.parametrize(
