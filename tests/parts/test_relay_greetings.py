@@ -18,6 +18,7 @@ from zsched.keyspace import END_CHUNK, Keyspace
 from zsched.relay import greetings
 from zsched.relay.acks import Acks
 from zsched.relay.outlet import Outlet
+from zsched.relay.proofs import LeftOpen
 from zsched.relay_pipe import decode_end
 
 KEYS = Keyspace("t")
@@ -262,7 +263,7 @@ def test_a_replay_behind_newer_samples_skips_none_of_them(bench: Bench) -> None:
     until(lambda: receiver.got == [0, 1, 2], "newer samples")
     receiver.ack(1)
     settled(outlet, acknowledged=1, in_flight=2)
-    assert outlet.replay([(sample, None), (sample, None)]) == 0
+    assert outlet.replay([LeftOpen(sample, None)] * 2) == 0
     until(lambda: receiver.starts[-1].replayed, "the announcement")
     marker = receiver.starts[-1]
     assert marker.count == 1  # it has not said that it has number 1
@@ -295,7 +296,7 @@ def test_the_sample_that_the_thread_has_just_taken_goes_to_the_next_owner(
     outlet.send(second)
     said, owed = outlet.abandon()
     gate.set()
-    assert [sample for sample, _ in owed] == [first, second]
+    assert [one.sample for one in owed] == [first, second]
     assert (said.waiting, said.in_flight) == (0, 0)
 
 

@@ -125,8 +125,9 @@ class Rig:
         return self.endpoints[node]
 
     def start_worker(
-        self, node: str, *options: str, task: str = TASK, operator_json5: str = ""
+        self, node: str, *options: str, task: str = TASK, operator_json5: str = "", script: Path | None = None
     ) -> subprocess.Popen[bytes]:
+        """The echo worker, or the one that a ``script`` is."""
         self.incarnation += 1
         path = self.folder / f"{task}-{node}.json5"
         # its own relay first, then the robot's, as `zsched.daemon_endpoints` has it: what is dialled is dialled again
@@ -140,7 +141,8 @@ class Rig:
             "ZSCHED_INCARNATION": str(self.incarnation),
             "ZSCHED_ZENOH_CONFIG": str(path),
         }
-        command = [sys.executable, "-m", "zsched.tasks.echo", *options]
+        program = ("-m", "zsched.tasks.echo") if script is None else (str(script),)
+        command = [sys.executable, *program, *options]
         worker = subprocess.Popen(command, env=env)
         self.workers.append(worker)
         seen = {"node": node, "task": task, "incarnation": str(self.incarnation), "is_present": True}

@@ -62,7 +62,7 @@ STREAM_BUGS = (
     _bug(
         "a sample that the thread has just taken is not replayed",
         OUTLET,
-        "                owed.append(self._queue.in_hand)",
+        "                owed.append(LeftOpen(*self._queue.in_hand))",
         "                pass",
         _GREETINGS,
     ),
@@ -212,5 +212,33 @@ STREAM_BUGS = (
         "self.tally.unconfirmed += 1",
         "self.tally.unconfirmed += 0",
         (f"{_RELAY_STREAMS}::test_what_a_foreign_worker_was_sent_is_unconfirmed_and_never_dropped",),
+    ),
+    _bug(
+        "an input of an epoch that is not told yet is answered in the old one",
+        "zsched.worker_epochs",
+        "if in_hand is not None and in_hand > role.epoch:",
+        "if in_hand is not None and in_hand < 0:",
+        ("tests/unit/test_worker_epochs.py",),
+    ),
+    _bug(
+        "what is too old for a newer epoch is done all the same",
+        "zsched.worker_backlog",
+        "return 0 < self.slot < epoch and now - self.at > STALE_S",
+        "return False",
+        ("tests/unit/test_worker_backlog.py",),
+    ),
+    _bug(
+        "a slot that leaves work does not give it up",
+        OUTLET,
+        "left = self._queue.close(self._leave)",
+        "left = self._queue.close(self._undeclare)",
+        _GREETINGS,
+    ),
+    _bug(
+        "one answer proves its sample done",
+        "zsched.relay.proofs",
+        "if not is_answered or one.lane not in answered:",
+        "if not is_answered:",
+        ("tests/unit/test_relay_proofs.py",),
     ),
 )

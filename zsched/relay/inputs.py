@@ -5,7 +5,7 @@ Knows: which slots are open and which one the stream feeds. Does not know: why o
 Everything happens under the stream's lock, the sample that just came included: between the kept values that a flip
 sends and the first sample behind it there is no gap. A kept value reaches a new owner at least once; it may have
 reached the old one too. With ``on_crash: replay`` the same holds for what an owner that died had not acknowledged,
-unless its answer, known by the sample's timestamp, has passed; and what comes while there is no owner waits for one.
+unless its answers prove it done (`zsched.relay.proofs`); and what comes while there is no owner waits for one.
 An owner that is left may stop before it has done all that was on its way to it (an exclusive one does so at once): so
 with ``replay`` what comes behind a flip is held until its slot has ended, and goes out behind what it leaves.
 """
@@ -27,6 +27,7 @@ from zsched.relay.acks import Acks
 from zsched.relay.counter import StreamCounter
 from zsched.relay.outlet import MAX_OWED, Outlet, Owed
 from zsched.relay.pace import Pace
+from zsched.relay.proofs import LeftOpen, Stamps, unproven
 from zsched.relay.receive import Receiver
 from zsched.relay.tally import Tally
 from zsched.send_queue import MAX_BYTES
@@ -74,7 +75,7 @@ class InputStream:
         )
         self._replays = route.settings.on_crash is OnCrash.REPLAY
         self._owed_bytes = 0
-        self._owed: list[Owed] = []
+        self._owed: list[LeftOpen] = []
         """What waits for the next owner: an owner that died had not acknowledged it, or there was none."""
         self._next: _InputSlot | None = None
         """Flipped to, and waits until the slot that carried has ended."""
@@ -89,6 +90,7 @@ class InputStream:
         self._is_counted = False
         """Some worker has acknowledged what it has processed, or will."""
         self._has_opened = False
+        self._stamps: Stamps | None = None
         side = local or session
         self._loop_ids = own_ids - {str(side.zid())}
         self._receiver = Receiver(
@@ -101,8 +103,10 @@ class InputStream:
             origin=zenoh.Locality.ANY,
         )
 
-    def open(self, epoch: int, route: Route, acks: Acks | None = None) -> None:
+    def open(self, epoch: int, route: Route, acks: Acks | None = None, stamps: Stamps | None = None) -> None:
         """Declare the publishers of a slot; it carries nothing yet. With ``acks`` its worker counts what it gets.
+
+        ``stamps`` is told every sample's timestamp: an input of the task is of `OnCrash.REPLAY`.
 
         Raises:
             ValueError, zenoh.ZError: the route makes no sense (see `Outlet`).
@@ -110,6 +114,7 @@ class InputStream:
         outlet = Outlet(self._session, route.from_expr, route.to_expr, route.settings, acks, epoch=epoch)
         with self._lock:
             self._is_counted |= acks is not None
+            self._stamps = stamps
             self._has_opened = True
             self._slots[epoch] = _InputSlot(outlet=outlet, is_counted=acks is not None)
 
@@ -135,17 +140,17 @@ class InputStream:
                 number > slot.sent for values in self._kept.values() for number, _, _ in values
             )
 
-    def flip(self, epoch: int, *, is_old_dead: bool = False, is_done: Callable[[Timestamp], bool] = _never) -> int:
+    def flip(self, epoch: int, *, is_old_dead: bool = False, has_answer: Callable[[Timestamp], bool] = _never) -> int:
         """Feed the slot from now on, behind the kept values it has not had; answers how many those were.
 
-        ``is_old_dead``: the worker of the slot that carried is gone. ``is_done`` answers for the timestamp of a sample
-        that such a worker had not acknowledged, whether its answer has passed.
+        ``is_old_dead``: the worker of the slot that carried is gone. ``has_answer`` says of the timestamp of a sample
+        that such a worker had not acknowledged, whether an answer of this sample and no other one has passed.
         """
         with self._lock:
             slot = self._slots.get(epoch)
             if slot is None or slot is self._active or slot is self._next:
                 return 0
-            self._end_hold(is_done)
+            self._end_hold(has_answer)
             if is_old_dead and self._replays:
                 self._abandon(self._active)
             if self._replays and self._active is not None:
@@ -153,7 +158,7 @@ class InputStream:
                 if said.in_flight or said.waiting:
                     self._hold(self._active, slot)
                     return 0
-            replayed = self._catch_up(slot) + self._replay(slot, is_done)
+            replayed = self._catch_up(slot) + self._replay(slot, has_answer)
             if self.route.settings.mirror:
                 self._mirror = self._active
             elif self._active is not None:
@@ -162,7 +167,7 @@ class InputStream:
             self._active = slot
             return replayed
 
-    def end_slot(self, epoch: int, *, is_done: Callable[[Timestamp], bool] = _never) -> None:
+    def end_slot(self, epoch: int, *, has_answer: Callable[[Timestamp], bool] = _never) -> None:
         """The slot that was left has drained, or its worker is gone: what it has not done goes out before the rest."""
         with self._lock:
             slot = self._slots.get(epoch)
@@ -170,7 +175,7 @@ class InputStream:
                 return
             del self._slots[epoch]
             self._settle(slot)
-            self._end_hold(is_done)
+            self._end_hold(has_answer)
 
     def send_end(self, epoch: int) -> None:
         """Put the end marker behind the slot's last sample (it must not be the active one); may block on its link."""
@@ -190,10 +195,10 @@ class InputStream:
             slot = self._slots.get(epoch)
             return slot is None or not slot.is_counted or not slot.outlet.counted().in_flight
 
-    def close_slot(self, epoch: int, *, is_done: Callable[[Timestamp], bool] = _never) -> int:
+    def close_slot(self, epoch: int, *, has_answer: Callable[[Timestamp], bool] = _never) -> int:
         """Forget a slot; answers how many samples its worker had not processed when it was last heard of.
 
-        With `OnCrash.REPLAY` the next owner gets those instead (``is_done`` as in `flip`).
+        With `OnCrash.REPLAY` the next owner gets those instead (``has_answer`` as in `flip`).
         """
         with self._lock:
             slot = self._slots.pop(epoch, None)
@@ -205,9 +210,9 @@ class InputStream:
                 self._mirror = None
             if slot is self._next:
                 self._next, held, self._held, self._held_bytes = None, self._held, [], 0
-                self._owe(held)
+                self._owe([LeftOpen(*one) for one in held])
             if self._replays and slot.is_counted:
-                return self._leave(slot, is_done)
+                return self._leave(slot, has_answer)
             said = slot.outlet.undeclare()
             self._counter.dropped("closed", said.waiting)
             left = said.in_flight if slot.is_counted else 0
@@ -225,12 +230,12 @@ class InputStream:
 
     # --- a crash, with `OnCrash.REPLAY` (under the lock) --------------------------------------------------------------
 
-    def _leave(self, slot: _InputSlot, is_done: Callable[[Timestamp], bool]) -> int:
+    def _leave(self, slot: _InputSlot, has_answer: Callable[[Timestamp], bool]) -> int:
         """A slot closes: what its worker has not processed waits for the next owner, or goes to the one there is."""
         left = self._settle(slot)
-        self._end_hold(is_done)
+        self._end_hold(has_answer)
         if self._active is not None:
-            self._replay(self._active, is_done)
+            self._replay(self._active, has_answer)
         return left
 
     def _abandon(self, slot: _InputSlot | None) -> None:
@@ -248,18 +253,18 @@ class InputStream:
         self._owe(owed)
         return left
 
-    def _owe(self, owed: list[Owed]) -> None:
+    def _owe(self, owed: list[LeftOpen]) -> None:
         for one in owed:
-            size = len(one[0].payload)
+            size = len(one.sample.payload)
             if len(self._owed) < MAX_OWED and self._owed_bytes + size <= MAX_BYTES:
                 self._owed.append(one)
                 self._owed_bytes += size
             else:
                 self._counter.dropped("overflow")
 
-    def _replay(self, slot: _InputSlot, is_done: Callable[[Timestamp], bool]) -> int:
+    def _replay(self, slot: _InputSlot, has_answer: Callable[[Timestamp], bool]) -> int:
         owed, self._owed, self._owed_bytes = self._owed, [], 0
-        left = [one for one in owed if one[1] is None or not is_done(one[1])]
+        left = unproven(owed, has_answer)
         self._closed.acknowledged += len(owed) - len(left)
         if left:
             self._counter.replayed += len(left)
@@ -272,13 +277,13 @@ class InputStream:
         self._held = left.outlet.take_back()
         self._held_bytes = sum(len(sample.payload) for sample, _ in self._held)
 
-    def _end_hold(self, is_done: Callable[[Timestamp], bool] = _never) -> None:
+    def _end_hold(self, has_answer: Callable[[Timestamp], bool] = _never) -> None:
         """Feed the slot that waits: first what is owed to it, then what has come since the flip."""
         slot, self._next = self._next, None
         if slot is None:
             return
         self._active = slot
-        self._replay(slot, is_done)
+        self._replay(slot, has_answer)
         held, self._held, self._held_bytes = self._held, [], 0
         for sample, stamp in held:
             self._counter.dropped(*slot.outlet.send(sample, stamp))
@@ -319,6 +324,8 @@ class InputStream:
                 return
             self._number += 1
             stamp = self._keep(sample) if self._keep_last else self._stamp(sample)
+            if self._stamps is not None and (known := stamp or sample.timestamp) is not None:
+                self._stamps.note(known)
             pace = self._pace
             if pace is not None and not pace.passes(str(sample.key_expr), (sample, stamp), monotonic_s()):
                 self._counter.dropped("thinned")
@@ -331,7 +338,7 @@ class InputStream:
                 if len(self._held) >= MAX_HELD or self._held_bytes >= MAX_BYTES // 2:
                     self._end_hold()
             elif self._replays:
-                self._owe([(sample, stamp)])
+                self._owe([LeftOpen(sample, stamp)])
             elif not self._keep_last:
                 self._counter.dropped("no_route")
             else:
@@ -353,7 +360,7 @@ class InputStream:
             self._counter.dropped(*self._mirror.outlet.send(sample, stamp, size))
 
     def _stamp(self, sample: Sample) -> Timestamp | None:
-        """With `OnCrash.REPLAY` every sample has a timestamp, by which its answer is known."""
+        """With `OnCrash.REPLAY` every sample has a timestamp, by which its answers are known."""
         return sample.timestamp or self._session.new_timestamp() if self._replays else None
 
     def _keep(self, sample: Sample) -> Timestamp | None:

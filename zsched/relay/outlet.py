@@ -32,6 +32,7 @@ from zsched.relay.acks import Acks
 from zsched.relay.crowd import Crowd
 from zsched.relay.greetings import Greetings
 from zsched.relay.lanes import KEPT_BYTES, KEPT_BYTES_LATEST, KEPT_SAMPLES, Lane, Sent, near
+from zsched.relay.proofs import LeftOpen
 from zsched.relay.publishers import declare_publisher, put_marker
 from zsched.relay.receive import undeclare
 from zsched.relay.rewrite import Rewriting
@@ -54,7 +55,7 @@ _log = logging.getLogger("zsched.relay")
 _patient = threading.BoundedSemaphore(MAX_PATIENT)
 
 Owed = tuple[Sample, Timestamp | None]
-"""A sample on its way to an owner, with its timestamp."""
+"""A sample that waits to be sent, with its timestamp."""
 
 _ALL_WENT: Final = ("", 0)
 _DATA: Final = Priority.DATA
@@ -197,14 +198,14 @@ class Outlet:
         else:
             self._queue.then(lambda: self._put_ends(epoch))
 
-    def replay(self, owed: list[Owed]) -> int:
+    def replay(self, owed: list[LeftOpen]) -> int:
         """Send what an owner that died left open, behind a marker that says so; answers how many were dropped."""
         if self._queue is None:
             return len(owed)
-        counts = Counter(id(lane) for sample, _ in owed if (lane := self._lane(sample)) is not None)
+        counts = Counter(id(lane) for one in owed if (lane := self._lane(one.sample)) is not None)
         lanes = [(lane, counts[id(lane)]) for lane in tuple(self._lanes.values()) if counts[id(lane)]]
         self._queue.then(lambda: self._announce(lanes))
-        return sum(self.send(sample, stamp)[1] for sample, stamp in owed)
+        return sum(self.send(one.sample, one.stamp)[1] for one in owed)
 
     def _announce(self, lanes: list[tuple[Lane, int]]) -> None:
         """The marker may be seen before samples that were put before it: what may still come is not skipped by it."""
@@ -213,19 +214,20 @@ class Outlet:
                 lane.replay_end, lowest = lane.count + count, lane.lowest
             self._put_start(lane, lowest)
 
-    def abandon(self) -> tuple[Tally, list[Owed]]:
+    def abandon(self) -> tuple[Tally, list[LeftOpen]]:
         """The receiver died: the last counts, and what it has not processed, in order; nobody else counts that."""
         waiting = self.take_back()
         said = self.undeclare()
         with self._lock:
             kept = sorted(
-                (sent for lane in self._lanes.values() for sent in lane.unprocessed()), key=lambda one: one.at
+                ((sent, lane.eid) for lane in self._lanes.values() for sent in lane.unprocessed()),
+                key=lambda one: one[0].at,
             )
-            owed = [(one.sample, one.stamp) for one in kept]
+            owed = [LeftOpen(sent.sample, sent.stamp, eid) for sent, eid in kept]
             if self._queue is not None and self._handed > self._left:  # its put has not ended, or not begun
-                owed.append(self._queue.in_hand)
+                owed.append(LeftOpen(*self._queue.in_hand))
         said.in_flight -= len(owed)
-        return said, owed + waiting
+        return said, owed + [LeftOpen(*one) for one in waiting]
 
     def undeclare(self) -> Tally:
         """Give the publishers back (a queue's thread its own); answers the last counts: what waits will not go out."""

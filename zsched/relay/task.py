@@ -25,6 +25,7 @@ from zsched.relay.acks import Acks
 from zsched.relay.graph import GraphMirror
 from zsched.relay.inputs import InputStream
 from zsched.relay.outputs import OutputStream
+from zsched.relay.proofs import Stamps
 from zsched.relay.services import Services
 from zsched.relay.tokens import Tokens
 
@@ -85,6 +86,7 @@ class TaskRelay:
         self._inputs: dict[str, InputStream] = {}
         self._outputs: dict[str, OutputStream] = {}
         self._services = Services(session, local)
+        self._stamps = Stamps()
         self._flip_by: float | None = None
         self._is_inherited = False
         """What we carry is the work of a daemon that is gone; the next one may not know of an older slot."""
@@ -224,7 +226,7 @@ class TaskRelay:
                 if source is not None:
                     source.close()
                 source = self._inputs[route.stream] = InputStream(self._session, route, self._own_ids, self._local)
-            source.open(epoch, route, acks)
+            source.open(epoch, route, acks, self._stamps if _replays(slot) else None)
             return
         sink = self._outputs.get(route.stream)
         if sink is None or (sink.route.to_expr, sink.route.settings) != (route.to_expr, route.settings):
@@ -233,13 +235,12 @@ class TaskRelay:
             sink = self._outputs[route.stream] = OutputStream(
                 self._session, route, self._own_ids, self.wake, self._local
             )
-        replays = any(one.settings.on_crash is OnCrash.REPLAY for one in slot.routes)
-        sink.know(route.from_expr, notes_stamps=replays)
+        sink.know(route.from_expr, notes_stamps=_replays(slot))
         sink.open(epoch, route, acks, is_from_start=is_from_start)
 
     def _close(self, epoch: int) -> None:
         state = self._slots.pop(epoch, None)
-        lost = sum(source.close_slot(epoch, is_done=self._is_answered) for source in self._inputs.values())
+        lost = sum(source.close_slot(epoch, has_answer=self._has_answer) for source in self._inputs.values())
         if lost and state is not None:
             self._report(SlotLost(task=self._task, epoch=epoch, owner=state.slot.owner, samples=lost))
         for sink in self._outputs.values():
@@ -321,7 +322,7 @@ class TaskRelay:
         olds = [one for old, one in self._slots.items() if old < epoch]
         is_old_dead = bool(olds) and all(one.gone_at is not None for one in olds)
         replayed = sum(
-            source.flip(epoch, is_old_dead=is_old_dead, is_done=self._is_answered) for source in self._inputs.values()
+            source.flip(epoch, is_old_dead=is_old_dead, has_answer=self._has_answer) for source in self._inputs.values()
         )
         self._services.flip(epoch)
         state.is_flipped = True
@@ -332,9 +333,16 @@ class TaskRelay:
             epochs = [old.slot.epoch for old in olds]
             guarded(self._send_ends, epochs, name="ends", is_lasting=False).start()
 
-    def _is_answered(self, stamp: Timestamp) -> bool:
-        """Whether an answer made of the input with this timestamp has passed."""
-        return any(sink.has_passed(stamp) for sink in self._outputs.values())
+    def _has_answer(self, stamp: Timestamp) -> bool:
+        """Whether the one input with this timestamp has an answer that has passed, on every output that counts.
+
+        Those are the ones of class ``reliable``, as for the worker's acknowledgements; where there are none, all. They
+        are in order key by key only, so what has passed on an output of many keys says nothing of an earlier input.
+        """
+        sinks = tuple(self._outputs.values())
+        counted = [one for one in sinks if one.route.settings.stream_class is StreamClass.RELIABLE] or sinks
+        is_proof = bool(counted) and not any("*" in sink.route.from_expr for sink in counted)
+        return is_proof and self._stamps.is_alone(stamp) and all(sink.has_passed(stamp) for sink in counted)
 
     def _send_ends(self, epochs: list[int]) -> None:
         for epoch in epochs:
@@ -357,7 +365,7 @@ class TaskRelay:
         if all(ended) and (is_gone or (self._services.has_ended(epoch) and self._has_settled(state))):
             state.is_drained = True
             for source in self._inputs.values():
-                source.end_slot(epoch, is_done=self._is_answered)
+                source.end_slot(epoch, has_answer=self._has_answer)
             self._report(SlotDrained(task=self._task, epoch=epoch))
 
     def _has_settled(self, state: _OpenSlot) -> bool:
@@ -390,3 +398,8 @@ class TaskRelay:
         """True when something may have to be sent (again) without a sample coming in."""
         streams: list[InputStream | OutputStream] = [*self._inputs.values(), *self._outputs.values()]
         return any(stream.route.settings.stream_class is not StreamClass.BEST_EFFORT for stream in streams)
+
+
+def _replays(slot: Slot) -> bool:
+    """Whether the next owner gets what this one leaves open of some input."""
+    return any(route.settings.on_crash is OnCrash.REPLAY for route in slot.routes)
