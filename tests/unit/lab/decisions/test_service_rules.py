@@ -168,8 +168,8 @@ def test_tables_and_picture_say_what_the_rows_say(tmp_path: Path) -> None:
     after = text[text.index("1 s a move: lost service") :]
     line = next(one for one in after.splitlines() if one.startswith("| dyna_both "))
     assert [cell.partition(" ±")[0].strip() for cell in line.split("|")[2:4]] == [f"{one:.2f}" for one in by_load]
-    names = [one.split("|")[1].strip() for one in after.splitlines()[4:9]]
-    assert names == ["oracle", "new", "dyna_both", "fixed, best", "fixed, mean"]
+    names = [one.split("|")[1].strip() for one in after.splitlines()[4:10]]
+    assert names == ["oracle", "new", "dyna_both", "present", "fixed, best", "fixed, mean"]
     both = [tables.where(rows, rule=rule, price_s=1.0) for rule in ("dyna_both", "new")]
     more = [sum(row["lost"] for row in mine) / 4 for mine in both]
     assert tables.beside(*both).startswith(f"{100 * (more[0] - more[1]):+.2f} ± ")

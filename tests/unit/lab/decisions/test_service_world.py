@@ -15,6 +15,7 @@ from zsched.lab.decisions.service.history import History, build
 from zsched.lab.decisions.service.judge import SKIP_S, judge, oracle, truth
 from zsched.lab.decisions.service.machines import Machine, Work, share, share_out
 from zsched.lab.decisions.service.oracle import best_path
+from zsched.lab.decisions.service.present import LAG_S, present
 from zsched.lab.decisions.world import DT_S
 
 HOURS = 0.05
@@ -131,6 +132,33 @@ def test_nobody_beats_the_oracle_and_a_dearer_move_is_made_less_often(tasks: int
     assert lost == sorted(lost)
     assert moves == sorted(moves, reverse=True)
     assert moves[0] > moves[-1] == 0
+
+
+@pytest.mark.parametrize("tasks", [1, 3])
+def test_who_knows_the_present_is_between_the_oracle_and_who_stays(tasks: int) -> None:
+    """On histories where staying costs something: at a price it moves once staying has cost half of that."""
+    for seed in (3, 6):
+        history = build(seed=seed, hours=HOURS, load_s=15.0, tasks=tasks)
+        moves = present(history, 0.3)
+        (known,) = judge(history, moves, (0.3,))
+        (best,) = judge(history, oracle(history, 0.3), (0.3,))
+        (stays,) = judge(history, [mine[:1] for mine in moves], (0.3,))
+        assert best.lost <= known.lost <= stays.lost
+        assert len(present(history, 1e9)[0]) == 1
+
+
+def test_who_knows_the_present_leaves_when_staying_has_cost_half_a_move_and_not_before() -> None:
+    history = next(
+        one
+        for one in (build(seed=seed, hours=HOURS, load_s=60.0) for seed in range(1, 60))
+        if judge(one, present(one, 0.3), (0.3,))[0].felt
+    )
+    soon, late = (next(move.at_s for move in present(history, price_s)[0] if move.left) for price_s in (0.0, 2.0))
+    place = history.fleet.tasks[0].candidates.index(present(history, 0.0)[0][0].owner)
+    steps = range(round((soon - LAG_S) / DT_S), round((late - LAG_S) / DT_S) + 1)
+    gives = history.service()[history.stretch[steps], :, 0]
+    cost = ((gives.max(axis=1) - gives[:, place]) * DT_S).cumsum()
+    assert cost[-1] >= 1.0 > cost[-2], "half of 2 s of work"
 
 
 @pytest.mark.parametrize("shape", [(3,), (2, 2), (3, 2)])

@@ -20,14 +20,16 @@ import matplotlib.pyplot as plt
 
 STYLES: Final = {
     "oracle": ("black", "--", ""),
+    "present": ("#555555", ":", ""),
     "zsched": ("#c0392b", "-", "o"),
+    "service": ("#2e8b57", "-", "o"),
     "dyna_both": ("#2c6fbb", "-", "s"),
     "dyna_net": ("#74b3e0", "-", "v"),
     "argmax": ("#e08e0b", "-", "^"),
     "fixed, best": ("#8a8a8a", "-", "D"),
     "fixed, mean": ("#bdbdbd", "-", "D"),
 }
-OTHERS: Final = ("#2e8b57", "#8e44ad", "#c9a227", "#16a085")
+OTHERS: Final = ("#8e44ad", "#c9a227", "#16a085")
 DPI: Final = 110
 
 

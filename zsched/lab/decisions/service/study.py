@@ -15,6 +15,7 @@ from typing import Any, Final
 from zsched.lab.decisions.service.cast import described, players
 from zsched.lab.decisions.service.history import build
 from zsched.lab.decisions.service.judge import Figures, fixed, judge, oracle
+from zsched.lab.decisions.service.present import present
 from zsched.lab.decisions.service.replay import replay
 
 TRAIN: Final = range(1, 100)
@@ -24,7 +25,7 @@ TEST: Final = range(100, 1000)
 LOADS_S: Final = (0.0, 5.0, 10.0, 15.0, 60.0, 300.0)
 PRICES_S: Final = (0.05, 0.3, 1.0)
 """What a move costs, in seconds without the task; real fleets: 0.3 to 0.5 s."""
-YARDSTICKS: Final = ("oracle", "fixed, best", "fixed, mean")
+YARDSTICKS: Final = ("oracle", "present", "fixed, best", "fixed, mean")
 Row = dict[str, Any]
 
 
@@ -72,13 +73,15 @@ def play(case: Case) -> list[Row]:
     common = {"tasks": case.tasks, "load_s": case.load_s, "seed": case.seed, "asked_hours": case.hours}
     found = {one.name: one for one in players()}
     every: dict[float, list[Figures]] = {}
-    if set(YARDSTICKS[1:]) & set(case.rules):
+    if set(YARDSTICKS[2:]) & set(case.rules):
         judged = [judge(history, moves, case.prices_s) for moves in fixed(history)]
         every = {price_s: [one[index] for one in judged] for index, price_s in enumerate(case.prices_s)}
     rows: list[Row] = []
     for rule in case.rules:
         if rule == "oracle":
             made = [judge(history, oracle(history, price_s), (price_s,))[0] for price_s in case.prices_s]
+        elif rule == "present":
+            made = [judge(history, present(history, price_s), (price_s,))[0] for price_s in case.prices_s]
         elif rule == "fixed, best":
             made = [min(every[price_s], key=lambda one: one.lost) for price_s in case.prices_s]
         elif rule == "fixed, mean":
