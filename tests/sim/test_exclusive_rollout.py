@@ -9,7 +9,7 @@ import pytest
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.model import NodeId, NodeKind, Tuning, Weights
+from zsched.core.model import DurableState, NodeId, NodeKind, Tuning, Weights
 from zsched.core.plan import WorkerRole
 from zsched.lab.sim_parts import Machine
 from zsched.lab.simulator import CORES, Simulator
@@ -204,3 +204,58 @@ def test_an_owner_that_needs_a_lease_no_more_waits_for_the_one_of_its_life_befor
     rollout.sim.start()
     rollout.run(8.0)  # the simulator raises when two lives of the owner work at once
     assert rollout.sim.machines[rollout.owner() or ""].roles[TASK].lease_until_s is None
+
+
+def forgetful(rollout: Rollout, fleet: Fleet, state: DurableState | None, *laggards: NodeId) -> float:
+    """An owner with the old file is left, and the task becomes exclusive; then that machine forgets, and hears only
+    the laggards, who have been cut off from before the move on. For how long two were at work since.
+    """
+    left = rollout.owner() or ""
+    machine = rollout.sim.machines[left]
+    others = tuple(name for name in rollout.others(left) if name not in laggards)
+    rollout.sim.cut(laggards, (left, *others))
+    rollout.busy.add(left)
+    rollout.bring(NEW, *others)
+    assert rollout.run(10.0) == 0.0
+    assert rollout.at_work() == {rollout.owner(*others)} == {rollout.sim.working[TASK][0]}
+    assert left not in rollout.at_work()
+
+    rollout.sim.crash(left)
+    machine.disk.wipe()
+    machine.fleet, machine.is_durable = fleet, False
+    if state is not None:
+        machine.disk.write(state)
+        machine.disk.sync()
+    rollout.sim.heal()
+    rollout.sim.cut((left, *laggards), others)
+    rollout.sim.start(left)
+    return rollout.run(10.0)
+
+
+def ends_with_one(rollout: Rollout) -> bool:
+    """Whether the lease's holder alone works once all hear each other."""
+    rollout.sim.heal()
+    rollout.run(5.0)
+    return rollout.at_work() == {rollout.owner()} == {rollout.sim.working[TASK][0]}
+
+
+@pytest.mark.parametrize("fleet", [OLD, NEW], ids=["old file", "new file"])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_candidate_whose_folder_is_brought_back_works_beside_a_lease_by_the_old_file_only(
+    seed: int, fleet: Fleet
+) -> None:
+    """Not covered, and no violation: nothing on that machine can know what was agreed since."""
+    rollout = Rollout(seed)
+    twice_s = forgetful(rollout, fleet, rollout.sim.disk(rollout.owner() or ""))
+    assert (twice_s > 0.0) is (fleet is OLD)
+    assert ends_with_one(rollout)
+
+
+@pytest.mark.parametrize("fleet", [OLD, NEW], ids=["old file", "new file"])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_candidate_without_a_state_works_beside_a_lease_by_the_old_file_only(seed: int, fleet: Fleet) -> None:
+    """Not covered either: an elector that was cut off before the move says that it is the owner."""
+    rollout = Rollout(seed)
+    twice_s = forgetful(rollout, fleet, None, "robot3")
+    assert (twice_s > 0.0) is (fleet is OLD)
+    assert ends_with_one(rollout)

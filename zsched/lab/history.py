@@ -92,6 +92,8 @@ class Worked:
     is_leased: bool = True
     is_late: bool = False
     """By a lease from before its machine stood still, clock and all: nothing there can know that it has ended."""
+    has_forgotten: bool = False
+    """Without a lease, from a state that was lost or brought back: nothing there can know what was agreed since."""
 
 
 Record = Started | Learnt | Stored | Routed | Admitted | Worked
@@ -228,7 +230,7 @@ class Checker:
             if (node, life) != (new.node, new.life)
             and (other.is_leased or new.is_leased)
             and min(other.until, new.until) - max(other.at, new.at) > self.slack_s
-            and not (other.is_late or new.is_late)
+            and not any(work.is_late or work.has_forgotten for work in (other, new))
         ]
         mine[new.node, new.life] = new
         return found

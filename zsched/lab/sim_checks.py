@@ -51,6 +51,8 @@ class Invariants:
     """{task: most moves within a minute, planned or not}."""
     told: dict[tuple[TaskId, int], Allocation] = field(default_factory=dict)
     """{(task, revision): the one value}."""
+    newest: dict[tuple[str, TaskId], int] = field(default_factory=dict)
+    """{(machine, task): the newest revision that it ever learnt}."""
     ballots: dict[tuple[TaskId, Ballot], tuple[str, Allocation | None]] = field(default_factory=dict)
     """{(task, ballot): (whose it is, what it carries)}."""
 
@@ -102,6 +104,8 @@ class Invariants:
         """A node knows a committed value, for good (or, without a state file, for this life)."""
         if value.revision == 0:
             return
+        key = (machine.key, value.task)
+        self.newest[key] = max(self.newest.get(key, 0), value.revision)
         if value.revision % GENERATION_STEP:  # a generation's first value was made by the operator, nobody chose it
             detail = f"{value.tuning} {value.pinned} {value.paused}"
             self.take(
@@ -221,8 +225,14 @@ class Invariants:
             life=machine.life,
             is_leased=lease is not None,
             is_late=lease is not None and lease <= machine.late_until,
+            has_forgotten=lease is None and self._has_forgotten(machine, role.task),
         )
         self.take(work)
+
+    def _has_forgotten(self, machine: Machine, task: TaskId) -> bool:
+        """Whether a machine knew a later revision in an earlier life than it knows now."""
+        assert machine.node is not None
+        return machine.node.registers[task].value.revision < self.newest.get((machine.key, task), 0)
 
     # --- the loop ----------------------------------------------------------------------------------------------------
 
