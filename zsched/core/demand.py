@@ -18,6 +18,8 @@ STARVED_CPU_RATIO = 0.9
 """On an owner busier than this a task may get less than it wants: what it uses is the least that it needs."""
 
 
+UNSURE = 1.5
+"""A worker that always wants to run and never had enough counts as needing so many times what it gets."""
 SETTLE_S = 4.0
 """So long after a task has come to a node what it uses there, smoothed, still rises: it is the least that it needs."""
 
@@ -27,6 +29,8 @@ class _Known:
     """What was learnt of a task; ``None``: nothing yet."""
 
     work: float | None = None
+    is_sure: bool = False
+    """It was measured where the task had all that it needs; otherwise the need may be larger."""
     memory_mb: float | None = None
     owner: NodeId | None = None
     since: float = 0.0
@@ -43,7 +47,8 @@ class Demands:
         """Note what the task's worker wants on its owner; whether that is news.
 
         What it uses is its need where CPU is left, and the least of it where none is. Where threads of it always want
-        to run (`WorkerLoad.wanted_cores`), its need is between what it uses and what they would take. A worker that is
+        to run (`WorkerLoad.wanted_cores`), its need is what was measured when it had enough, if they would take that
+        much; else a guess above what it gets, so that a machine that would give it more is seen to. A worker that is
         not ready, or a figure that nobody measured, changes nothing: the task does not cost less because its worker
         restarts.
         """
@@ -57,13 +62,16 @@ class Demands:
             found = replace(found, memory_mb=max(load.memory_mb, (known.memory_mb or 0.0) if is_new else 0.0))
         if load.cpu_cores is not None:
             use, most = load.cpu_cores * speed_of(profile), (load.wanted_cores or 0.0) * speed_of(profile)
-            if most > use:
-                work = max(min(most if known.work is None else known.work, most), use)
+            least = max(use, known.work or 0.0)
+            is_held = known.is_sure and known.work == least
+            if most > use and not (is_held and least <= most):
+                found = replace(found, work=min(UNSURE * use, most), is_sure=False)
+            elif most > use:
+                found = replace(found, work=least)
             elif is_new or profile.cpu_used_cores / profile.cpu_cores >= STARVED_CPU_RATIO:
-                work = max(use, known.work or 0.0)
+                found = replace(found, work=least, is_sure=is_held)
             else:
-                work = use
-            found = replace(found, work=work)
+                found = replace(found, work=use, is_sure=True)
         self._known[task] = found
         return (found.work, found.memory_mb) != (known.work, known.memory_mb)
 

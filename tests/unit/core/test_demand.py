@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zsched.core.demand import SETTLE_S, STARVED_CPU_RATIO, Demands
+from zsched.core.demand import SETTLE_S, STARVED_CPU_RATIO, UNSURE, Demands
 from zsched.core.fleet import Demand, TaskSpec
 from zsched.core.model import Profile, Tuning, Weights, WorkerLoad, WorkerState
 
@@ -94,18 +94,25 @@ def test_a_starved_owner_shows_the_least_that_its_task_needs() -> None:
     assert learnt(profile(1.5, 600.0, cpu=4.0)).cpu_cores == 1.5, "it got that much, so it needs that much"
 
 
-def test_where_threads_always_want_to_run_the_need_is_between_what_is_used_and_what_they_would_take() -> None:
-    starved = profile(0.5, cpu=4.0, wanted=2.5)
-    assert learnt(starved).cpu_cores == 2.5, "nothing is known: it may need so much"
-    assert learnt(profile(1.5), profile(1.5), starved).cpu_cores == 1.5
-    assert learnt(profile(3.0), profile(3.0), starved).cpu_cores == 2.5
-    assert learnt(profile(0.4), profile(0.4), profile(1.0, cpu=4.0, wanted=2.5)).cpu_cores == 1.0
+def test_where_threads_always_want_to_run_the_need_is_what_it_was_before_or_more_than_is_used() -> None:
+    starved = profile(1.0, cpu=4.0, wanted=2.5)
+    assert learnt(starved).cpu_cores == UNSURE * 1.0, "it never had enough"
+    assert learnt(profile(2.0), profile(2.0), starved, starved).cpu_cores == 2.0
+    assert learnt(profile(3.0), profile(3.0), starved).cpu_cores == UNSURE * 1.0, "so much it does not want any more"
+    assert learnt(profile(0.4), profile(0.4), starved).cpu_cores == UNSURE * 1.0, "it needs more than before"
+    assert learnt(profile(1.0, cpu=4.0, wanted=1.2)).cpu_cores == 1.2, "and not more than its threads would take"
     assert learnt(profile(1.0, cpu=2.0, wanted=1.0)).cpu_cores == 1.0, "it has all that it can take"
+
+
+def test_a_task_that_rises_to_what_a_full_machine_gives_is_not_taken_for_content() -> None:
+    """Its figures rise from nothing while the kernel has not told yet that its threads always want to run."""
+    rising = [profile(cores, cpu=4.0) for cores in (0.5, 1.0, 1.5)]
+    assert learnt(*rising, profile(2.0, cpu=4.0, wanted=4.0), every_s=1.0).cpu_cores == UNSURE * 2.0
 
 
 @given(here=st.floats(0.1, 10.0), there=st.floats(0.1, 10.0), cores=st.floats(0.5, 4.0))
 def test_a_machine_of_twice_the_speed_needs_half_the_cores(here: float, there: float, cores: float) -> None:
-    for seen in (profile(cores, speed=here), profile(cores / 2, cpu=4.0, wanted=cores, speed=here)):
+    for seen in (profile(cores, speed=here), profile(cores / UNSURE, cpu=4.0, wanted=64.0, speed=here)):
         need = learnt(seen, there=profile(node="edge2", speed=there)).cpu_cores
         assert need == pytest.approx(max(cores * here / there, TASK.demand.cpu_cores))
 
