@@ -164,6 +164,7 @@ def total_utility(
     if not weighed:
         return None
     if form is ScoreForm.PAPER:
-        return clamp(sum(weight * term for weight, term in weighed) / sum(weight for weight, _ in weighed))
+        share = sum((weight for weight, _ in weighed), 0.0)
+        return clamp(sum((weight * term for weight, term in weighed), 0.0) / share)
     most = max(weight for weight, _ in weighed)
     return clamp(math.prod(term ** (weight / most) for weight, term in weighed))
