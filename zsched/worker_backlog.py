@@ -81,9 +81,13 @@ class Done(NamedTuple, Generic[SourceT]):
         """True when it need not be processed again."""
         return self.quiet_at is not None and not (is_restored and now - self.quiet_at < QUIET_S)
 
+    def is_open(self, name: SourceName) -> bool:
+        """Whether it is this publisher's, and what it was answered was withheld."""
+        return self.name == name and self.quiet_at is None
+
     def is_stale(self, epoch: int, now: float) -> bool:
-        """True when it is too late for it in ``epoch``: it was sent in an older one, long ago."""
-        return 0 < self.slot < epoch and now - self.at > STALE_S
+        """True when it is too late for it in ``epoch``: it was sent in an older one, long ago, and has no answer."""
+        return self.quiet_at is None and 0 < self.slot < epoch and now - self.at > STALE_S
 
 
 class Backlog(Generic[SourceT]):
@@ -126,11 +130,11 @@ class Backlog(Generic[SourceT]):
         return {done.name for done in waiting if done.name is not None and done.is_stale(epoch, now)}
 
     def forget(self, name: SourceName) -> int:
-        """Let go of everything of one publisher; answers how many samples that was."""
+        """Let go of what one publisher has no answer to; answers how many samples that was."""
         before = len(self._again) + sum(len(line) for line in self._kept.values())
-        self._again = deque(done for done in self._again if done.name != name)
+        self._again = deque(done for done in self._again if not done.is_open(name))
         for key, line in tuple(self._kept.items()):
-            self._kept[key] = left = deque(done for done in line if done.name != name)
+            self._kept[key] = left = deque(done for done in line if not done.is_open(name))
             self._bytes -= sum(len(done.sample.payload) for done in line) - sum(len(one.sample.payload) for one in left)
         return before - len(self._again) - sum(len(line) for line in self._kept.values())
 

@@ -130,6 +130,8 @@ class Dispatcher:
                 self._note_whole(marker.name)
             if marker.end.slot:
                 self._note_slot(marker)
+                if not marker.end.is_whole:
+                    return
             self._acks.skip(marker.name, marker.end.count)
             if marker.end.replayed:
                 self._note_replay(marker)
@@ -165,6 +167,10 @@ class Dispatcher:
         self._debts.forget(name)
         if count:
             _log.info("%s: %d samples are not done any more: their robot has given them up", name[0], count)
+
+    def _is_given_up(self, name: SourceName | None, again: Done[Input] | None) -> bool:
+        """What was acknowledged is not meant: it is processed again for a state that takes the place of ours."""
+        return name in self._given_up and (again is None or again.quiet_at is None)
 
     def _note_replay(self, marker: Marker) -> None:
         first = self._acks.number(marker.name, serial_of(marker.end.count))
@@ -303,7 +309,7 @@ class Dispatcher:
     def _process(self, waiting: Waiting) -> None:
         source, sample = waiting.source, waiting.sample
         name = waiting.name if waiting.again is None else waiting.again.name
-        if sample is None or name in self._given_up:
+        if sample is None or self._is_given_up(name, waiting.again):
             return
         began_at = monotonic_s()
         self._has_withheld = False
@@ -317,7 +323,7 @@ class Dispatcher:
         self._in_hand, self._is_whole = epoch, waiting.is_wanted
         self._dispatch(source, sample, replayed=waiting.replayed)
         self._in_hand = None
-        if name in self._given_up:
+        if self._is_given_up(name, waiting.again):
             return
         held = None if again is None else again.held
         if waiting.name is not None:
@@ -342,7 +348,7 @@ class Dispatcher:
             at=began_at if again is None else again.at,
         )
         with self._wake:
-            if name in self._given_up:
+            if self._is_given_up(name, again):
                 return
             if self._begun != begun:  # it became the owner meanwhile
                 self._backlog.put_back(done)

@@ -87,6 +87,35 @@ def test_who_is_left_and_chosen_again_while_it_hears_of_neither_misses_nothing(r
     assert app.back == list(range(app.sent))
 
 
+def test_the_newest_value_has_its_result_when_who_is_chosen_again_hears_of_it_late(rig: Rig) -> None:
+    """A -> B -> A with class ``latest``: nothing comes behind the last value that would make up for it."""
+    rig.start_worker("edge1", "--latest")
+    rig.start_worker("edge2", "--latest")
+    first, second, third = (
+        slot(epoch, owner, StreamClass.LATEST, 1) for epoch, owner in ((1, "edge1"), (2, "edge2"), (3, "edge1"))
+    )
+    rig.move(first)
+    app = Application(rig.app)
+    until(app.connected, "the application sees the relay's subscription")
+    app.put()
+    until(lambda: app.back == [0], "the first result")
+    frozen = rig.relays["edge1"].pid
+    assert frozen is not None
+    os.kill(frozen, signal.SIGSTOP)
+    rig.role("edge2", WorkerRole.ACTIVE, 2)
+    rig.role("edge1", WorkerRole.ACTIVE, 3)
+    for new, old in ((second, first), (third, second)):
+        rig.plan(RoutePhase.PREPARE, new, old)
+        rig.wait(SlotReady, epoch=new.epoch, is_ready=True)
+        rig.plan(RoutePhase.FLIP, new, old)
+        rig.wait(SlotFlipped, epoch=new.epoch)
+    rig.plan(RoutePhase.CLOSE, third)
+    app.put()
+    until(lambda: rig.told("echo/in/0").messages == 2, "the value at the relay")
+    os.kill(frozen, signal.SIGCONT)
+    until(lambda: app.back[-1] == 1, "its result")
+
+
 def test_work_that_was_counted_as_lost_is_not_done_later(rig: Rig) -> None:
     """A new owner whose role never comes is left again; it withheld what it was sent, and is chosen once more."""
     rig.start_worker("edge1")

@@ -23,6 +23,7 @@ from zsched.relay_pipe import decode_end
 
 KEYS = Keyspace("t")
 RELIABLE = StreamSettings(stream_class=StreamClass.RELIABLE, depth=100)
+LATEST = StreamSettings(stream_class=StreamClass.LATEST)
 REPLAYED = StreamSettings(stream_class=StreamClass.RELIABLE, depth=100, on_crash=OnCrash.REPLAY)
 
 
@@ -319,3 +320,22 @@ def test_a_worker_is_told_its_epoch_and_when_it_is_left_with_work_that_this_is_g
     given_up = [start for start in receiver.starts if start.is_given_up]
     assert given_up == [EndMarker(epoch=0, count=2, slot=7, is_given_up=True)] * (2 - done)
     last.undeclare()
+
+
+def test_a_worker_of_class_latest_is_told_its_epoch_before_any_value(bench: Bench) -> None:
+    """When it has become ready, and of a key that comes later."""
+    receiver = Receiver(bench.other, bench.relay, "edge1/in")
+    outlet = bench.outlet("robot1/in", "edge1/in", LATEST, epoch=7)
+    until(lambda: outlet.is_matching, "the receiver is there")
+    outlet.name_slot()
+    assert receiver.greeted() == EndMarker(epoch=0, count=0, slot=7)
+    outlet.undeclare()
+    late = Receiver(bench.other, bench.relay, "edge2/b")
+    wild = bench.outlet("robot1/*", "edge2/*", LATEST, epoch=8)
+    until(lambda: wild.is_matching, "the receiver is there")
+    sample = bench.sample("robot1/b")
+    wild.send(sample)
+    wild.send(sample)
+    until(lambda: late.got, "a value")
+    assert late.starts == [EndMarker(epoch=0, count=0, slot=8)]
+    wild.undeclare()

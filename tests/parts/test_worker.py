@@ -532,6 +532,27 @@ def test_who_is_chosen_again_before_it_hears_that_it_was_left_answers_in_the_new
     assert relay.outputs == [("edge1/t/1/robot1/out", b"a"), *again]
 
 
+def test_a_value_of_an_epoch_that_is_not_told_yet_waits_for_it_too(relay: Relay, tmp_path: Path) -> None:
+    """Class ``latest``: its marker names the slot, and is no word about numbers."""
+    with Worker.from_env(environment(relay, tmp_path), handles_signals=False) as worker:
+        echo = Echo(worker, keep_last=1)
+        until(lambda: KEYS.worker("edge1", "t", 3) in relay.tokens, "the ready token")
+        relay.tell(WorkerRole.ACTIVE, epoch=1)
+        until(lambda: f"{ROLE_KEY}/1" in relay.tokens, "the worker has begun")
+        relay.publisher = relay.session.declare_publisher(INPUT, congestion_control=zenoh.CongestionControl.BLOCK)
+        relay.mark(EndMarker(epoch=0, count=0, slot=3))
+        until(lambda: worker._dispatcher._slots, "the marker")
+        relay.count = 5
+        relay.put(b"a")
+        until(lambda: echo.output.withheld == 1, "the value")
+        relay.tell(WorkerRole.ACTIVE, epoch=3)
+        until(lambda: relay.outputs == [("edge1/t/3/robot1/out", b"a")], "its result")
+        until(lambda: (told := relay.told()) is not None and told.processed == 6, "the acknowledgement")
+        told = relay.told()
+        assert told is not None
+        assert (told.first, told.lost) == (5, 0)
+
+
 def test_what_a_standby_withheld_and_its_robot_gave_up_is_not_done_by_the_owner_it_becomes(
     relay: Relay, echo: Echo
 ) -> None:

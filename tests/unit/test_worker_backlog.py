@@ -110,6 +110,7 @@ def test_what_an_older_epoch_left_long_ago_is_stale_and_its_publisher_with_it() 
     backlog.keep(from_slot(2, slot=2, at=10.0, key="young"))
     backlog.keep(from_slot(3, slot=4, at=0.0, key="now"))
     backlog.keep(from_slot(4, slot=0, at=0.0, key="silent"))
+    backlog.keep(from_slot(6, slot=2, at=0.0, key="acknowledged")._replace(quiet_at=0.0))
     assert backlog.stale(4, 10.0 + STALE_S) == {("old", "zid", 1)}
     backlog.begin()
     backlog.keep(from_slot(5, slot=3, at=0.0, key="kept"))
@@ -124,10 +125,11 @@ def test_what_a_publisher_gives_up_is_forgotten_wherever_it_waits() -> None:
     backlog.begin()
     for turn, key in ((3, "a"), (4, "b")):
         backlog.keep(done(turn, key))
+    backlog.keep(done(5, "a", quiet_at=0.0))  # has been acknowledged
     assert backlog.forget(("a", "zid", 1)) == 2
     assert backlog.forget(("a", "zid", 1)) == 0
     backlog.begin()
-    assert turns(backlog) == [2, 4]
+    assert turns(backlog) == [2, 4, 5]
 
 
 def test_what_is_forgotten_makes_room(monkeypatch: pytest.MonkeyPatch) -> None:

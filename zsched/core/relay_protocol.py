@@ -122,7 +122,8 @@ class EndMarker:
     age_s: float | None = None
     """Start markers among answers: number 0 was put so long ago."""
     slot: int = 0
-    """Start markers of inputs: the epoch of the slot that this publisher feeds; 0: it does not say."""
+    """Start markers of inputs: the epoch of the slot that this publisher feeds; 0: it does not say. Of class ``latest``
+    that is all such a marker says."""
     is_given_up: bool = False
     """Start markers of inputs: the slot is closed. What of this publisher has not been acknowledged is counted as lost
     by now, or goes to another owner, and shall not be done any more."""

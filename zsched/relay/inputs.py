@@ -130,6 +130,7 @@ class InputStream:
             if slot is None:
                 return 0
             slot.sent = 0  # whatever went there before, this worker has not had it
+            slot.outlet.name_slot()
             return self._catch_up(slot)
 
     def is_behind(self, epoch: int) -> bool:

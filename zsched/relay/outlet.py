@@ -306,7 +306,11 @@ class Outlet:
         lane = self._lanes.get(name)
         if lane is None and len(self._lanes) >= MAX_LANES:
             return None
-        return lane if lane is not None else self._declare(key, priority, is_express=is_express)
+        if lane is None:
+            lane = self._declare(key, priority, is_express=is_express)
+            if self._queue is not None and self._greetings is None and self._acks is not None:
+                self._queue.then(lambda: self._put_names((lane,)))
+        return lane
 
     def _declare(self, key: str, priority: Priority, *, is_express: bool) -> Lane:
         publisher = declare_publisher(self._session, key, self._settings, priority, is_express=is_express)
@@ -335,9 +339,19 @@ class Outlet:
             count=count,
             replayed=replayed,
             is_whole=self._is_reliable and is_start,
-            slot=self._epoch if is_start else 0,
+            slot=self._epoch if is_start and self._is_reliable else 0,
         )
         put_marker(self._session, lane.key, lane.source_id, lane.publisher.priority, marker)
+
+    def name_slot(self) -> None:
+        """Tell a worker of class ``latest`` that has just become ready which slot it is fed from, before any value."""
+        if self._queue is not None and self._greetings is None and self._acks is not None:
+            self._queue.then(lambda: self._put_names(tuple(self._lanes.values())))
+
+    def _put_names(self, lanes: tuple[Lane, ...]) -> None:
+        for lane in lanes:
+            marker = EndMarker(epoch=SKIP_EPOCH, count=0, slot=self._epoch)
+            put_marker(self._session, lane.key, lane.source_id, lane.publisher.priority, marker)
 
     def _leave(self) -> None:
         """The last words to a worker of class ``reliable``: what it still has it shall not do any more."""
