@@ -15,6 +15,8 @@ from zsched.core.executor import Phase
 from zsched.core.fleet import Fleet
 from zsched.core.messages import Accepted, Promise
 from zsched.core.model import (
+    NO_BALLOT,
+    Acceptance,
     Allocation,
     Ballot,
     DurableState,
@@ -55,6 +57,8 @@ class Invariants:
     """{(machine, task): the newest revision that it ever learnt}."""
     ballots: dict[tuple[TaskId, Ballot], tuple[str, Allocation | None]] = field(default_factory=dict)
     """{(task, ballot): (whose it is, what it carries)}."""
+    _floors: dict[str, dict[TaskId, Ballot]] = field(default_factory=dict)
+    """{machine: {task: the highest ballot before the newest write of this batch, and of the answers since}}."""
 
     def __post_init__(self) -> None:
         self.checker = Checker(electors=self.fleet.electors, moves_per_minute=self.limits)
@@ -91,6 +95,7 @@ class Invariants:
             known = old.get(register.task)
             if known is register:
                 continue
+            self._floors.setdefault(machine.key, {})[register.task] = NO_BALLOT if known is None else known.promised
             if known is not None and register.promised < known.promised:
                 raise InvariantError(f"{machine.key} promised {register.promised} after {known.promised}")
             accepted = register.accepted
@@ -123,7 +128,7 @@ class Invariants:
 
     # --- what a batch says -------------------------------------------------------------------------------------------
 
-    def on_leaving(self, machine: Machine, instruction: do.Instruction) -> None:
+    def on_leaving(self, machine: Machine, instruction: do.Instruction, now: float) -> None:
         """What others will see, and what workers and relays do, must stand on this machine's disk."""
         if type(instruction) in _SAYS_NOTHING:
             return
@@ -131,7 +136,7 @@ class Invariants:
             case do.AnswerElection(request=request, answer=Promise() | Accepted() as answer):
                 if request == FORGED:
                     raise InvariantError(f"{machine.key} said yes to a ballot that is not its asker's: {answer}")
-                self._check_answer(machine, answer)
+                self._check_answer(machine, answer, now)
             case do.PublishBeat(beat=beat):
                 for task, revision, _ in beat.learnt:
                     self._check_told(machine, task, revision)
@@ -153,19 +158,36 @@ class Invariants:
     def _register(machine: Machine, task: TaskId) -> RegisterState:
         return machine.disk.registers.get(task) or RegisterState(task=task)
 
-    def _check_answer(self, machine: Machine, answer: Promise | Accepted) -> None:
+    def _check_answer(self, machine: Machine, answer: Promise | Accepted, now: float) -> None:
         if not machine.is_elector:
             raise InvariantError(f"{machine.key} is no elector and answered {answer}")
         held = self._register(machine, answer.task)
         if held.promised < answer.ballot:
             raise InvariantError(f"{machine.key} answered without its promise on disk: {answer}")
-        if isinstance(answer, Accepted) and (held.accepted is None or held.accepted.ballot < answer.ballot):
-            raise InvariantError(f"{machine.key} answered without its acceptance on disk: {answer}")
+        if isinstance(answer, Accepted):
+            if held.accepted is None or held.accepted.ballot < answer.ballot:
+                raise InvariantError(f"{machine.key} answered without its acceptance on disk: {answer}")
+            if held.accepted.ballot > answer.ballot:
+                self._check_overtaken(machine, answer, now)
+        floors = self._floors.get(machine.key, {})
+        if answer.task in floors:
+            floors[answer.task] = max(floors[answer.task], answer.ballot)
         # What it has accepted in the ballot of its promise came after the promise, both in one write.
         is_later = held.accepted is not None and held.accepted.ballot == answer.ballot
         is_last = held.promised == answer.ballot and not is_later
         if isinstance(answer, Promise) and is_last and held.accepted != answer.accepted:
             raise InvariantError(f"{machine.key} promised and told another acceptance than it has: {answer}")
+
+    def _check_overtaken(self, machine: Machine, answer: Accepted, now: float) -> None:
+        """An acceptance that is not on the disk: the same write holds a higher one that came after it."""
+        floor = self._floors.get(machine.key, {}).get(answer.task)
+        if floor is None or answer.ballot < floor:
+            raise InvariantError(f"{machine.key} accepted below what it had promised: {answer}")
+        value = self.ballots.get((answer.task, answer.ballot), ("", None))[1]
+        if value is not None:
+            ballot = str(Acceptance(ballot=answer.ballot, value=value))
+            stored = Stored(at=now, node=machine.key, task=answer.task, revision=value.revision, ballot=ballot)
+            self.take(stored)
 
     def _check_ballot(self, machine: Machine, task: TaskId, ballot: Ballot, value: Allocation | None) -> None:
         """No two lives use one ballot, and it carries one value only."""
@@ -240,6 +262,7 @@ class Invariants:
         """An event was handled: the next deadline lies ahead, and a node without a disk has learnt for this life."""
         node = machine.node
         assert node is not None
+        self._floors.pop(machine.key, None)
         due = node.next_deadline()
         if due < local:
             raise InvariantError(f"{machine.key}: next deadline {due:.6f} in the past of {local:.6f}")

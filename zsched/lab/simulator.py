@@ -284,7 +284,7 @@ class Simulator(Links):
                     return
                 self._sync(machine, instruction.state)
                 continue
-            self.invariants.on_leaving(machine, instruction)
+            self.invariants.on_leaving(machine, instruction, self.now)
             self._one(machine, instruction)
         if end is not None:
             self.crash(machine.key)

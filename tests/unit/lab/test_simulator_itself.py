@@ -9,8 +9,8 @@ import pytest
 
 from zsched.core import instructions as do
 from zsched.core.fleet import Fleet, NodeSpec, StreamRule, TaskSpec, Timing, WorkerSpec
-from zsched.core.messages import Promise
-from zsched.core.model import Allocation, NodeId, NodeKind, PeerState, Tuning, Weights
+from zsched.core.messages import Accepted, Promise
+from zsched.core.model import Acceptance, Allocation, Ballot, NodeId, NodeKind, PeerState, Tuning, Weights
 from zsched.core.plan import Direction, Role, WorkerRole
 from zsched.errors import InvariantError
 from zsched.lab.simulator import RESTART_S, TOKEN_DELAY_S, Simulator
@@ -199,8 +199,40 @@ def test_promise_that_tells_another_acceptance_than_the_disk_holds_is_found() ->
     promise = Promise(elector="robot1", task="merge", ballot=ballot, accepted=before)
 
     machine.disk.registers["merge"] = replace(state, promised=ballot, accepted=later)
-    sim.invariants.on_leaving(machine, do.AnswerElection(request=7, answer=promise))
+    sim.invariants.on_leaving(machine, do.AnswerElection(request=7, answer=promise), sim.now)
 
     machine.disk.registers["merge"] = replace(state, promised=ballot, accepted=None)
     with pytest.raises(InvariantError, match="told another acceptance"):
-        sim.invariants.on_leaving(machine, do.AnswerElection(request=7, answer=promise))
+        sim.invariants.on_leaving(machine, do.AnswerElection(request=7, answer=promise), sim.now)
+
+
+def test_two_acceptances_in_one_write_are_two_and_an_older_one_after_that_is_found() -> None:
+    """Found by seed 400320: one release let an elector accept two values that had waited for it."""
+    sim = settled()
+    machine = sim.machines["robot1"]
+    state, durable = machine.disk.registers["merge"], machine.disk.state
+    assert durable is not None
+    assert state.accepted is not None
+    first = replace(state.promised, counter=state.promised.counter + 1)
+    second = replace(first, counter=first.counter + 1)
+    accepted = Acceptance(ballot=first, value=value("edge2", state.accepted.value.revision + 1, 2))
+    sim.invariants.ballots["merge", first] = ("robot2 life 1", accepted.value)
+
+    def answer(ballot: Ballot) -> None:
+        said = Accepted(elector="robot1", task="merge", ballot=ballot)
+        sim.invariants.on_leaving(machine, do.AnswerElection(request=7, answer=said), sim.now)
+
+    later = replace(state, promised=second, accepted=replace(accepted, ballot=second))
+    durable = replace(durable, registers=(later,))
+    sim.invariants.on_synced(machine, durable, sim.now)
+    machine.disk.write(durable)
+    machine.disk.sync()
+    answer(first)
+    stored = sim.invariants.checker._stored["merge", accepted.value.revision]
+    assert stored[str(accepted)] == {"robot1"}, "it counts for a majority"
+    answer(second)
+    with pytest.raises(InvariantError, match="below what it had promised"):
+        answer(first)
+    sim.invariants.on_handled(machine, sim.now, sim.now)
+    with pytest.raises(InvariantError, match="below what it had promised"):
+        answer(first)
