@@ -13,6 +13,7 @@ anything newer is answered; not what its robot has given up meanwhile, by its ow
 from __future__ import annotations
 
 import logging
+import math
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -61,8 +62,8 @@ class Dispatcher:
         """Sources of class ``reliable``, the oldest first (zenoh's thread alone touches it)."""
         self._slots: dict[SourceName, int] = {}
         """The epochs of sources that have named theirs, the oldest first."""
-        self._given_up: dict[SourceName, None] = {}
-        """Sources of which nothing shall be done any more, the oldest first."""
+        self._given_up: dict[SourceName, tuple[float, int]] = {}
+        """Sources of which nothing shall be done any more, the oldest first: (when we heard, how much that took)."""
         self._epoch = 0
         self._begun = 0
         self._is_begin_due = False
@@ -97,7 +98,7 @@ class Dispatcher:
         info = sample.source_info
         if info is not None:
             waiting.name = (key, str(info.source_id.zid), info.source_id.eid)
-            if waiting.name in self._given_up:
+            if waiting.name in self._given_up and not self._is_taken_back(waiting.name):
                 return
             waiting.is_whole = waiting.name in self._whole
             in_turn = waiting.is_wanted and sample.congestion_control == zenoh.CongestionControl.BLOCK
@@ -124,7 +125,7 @@ class Dispatcher:
         """Queue an end marker (zenoh's thread)."""
         if marker.end.epoch == 0:  # it ends nothing: what is below its number was given up by the relay
             if marker.end.is_given_up:
-                self._give_up(marker.name)
+                self._give_up(marker.name, marker.came_at)
                 return
             if marker.end.is_whole:
                 self._note_whole(marker.name)
@@ -146,15 +147,18 @@ class Dispatcher:
             self._whole.pop(next(iter(self._whole)))
 
     def _note_slot(self, marker: Marker) -> None:
-        """A publisher feeds one slot for all its life: its first word stands."""
-        self._slots.setdefault(marker.name, marker.end.slot)
+        """A publisher feeds one slot for all its life: two words that differ count as none, one is a stranger's."""
+        if self._slots.setdefault(marker.name, marker.end.slot) != marker.end.slot:
+            self._slots[marker.name] = 0
         if len(self._slots) > MAX_SOURCES:
             self._slots.pop(next(iter(self._slots)))
 
-    def _give_up(self, name: SourceName) -> None:
+    def _give_up(self, name: SourceName, at: float) -> None:
         """Do nothing of a source any more, and acknowledge nothing: its relay counts that, or has counted it."""
         with self._wake:
-            self._given_up[name] = None
+            if name in self._given_up:
+                return
+            self._given_up[name] = at, 0
             if len(self._given_up) > MAX_SOURCES:
                 self._given_up.pop(next(iter(self._given_up)))
             waiting = [one for one in self._queue if one.name == name and one.sample is not None]
@@ -162,11 +166,27 @@ class Dispatcher:
                 one.source.waiting[name[0]].remove(one)
                 one.sample = None
             count = len(waiting) + self._backlog.forget(name)
+            self._given_up[name] = at, count
             self._open.pop(name, None)
             self._markers = [marker for marker in self._markers if marker.name != name]
         self._debts.forget(name)
         if count:
             _log.info("%s: %d samples are not done any more: their robot has given them up", name[0], count)
+
+    def _is_taken_back(self, name: SourceName) -> bool:
+        """A sample has come of a source that was given up.
+
+        A relay sends nothing behind that word, which can overtake what was before it by a moment only. Later ones show
+        that it was a stranger's; then what it took is lost.
+        """
+        with self._wake:
+            at, count = self._given_up[name]
+            if monotonic_s() - at <= GIVE_UP_S:
+                return False
+            del self._given_up[name]
+        for _ in range(count):
+            self._acks.shed(name)
+        return True
 
     def _is_given_up(self, name: SourceName | None, again: Done[Input] | None) -> bool:
         """What was acknowledged is not meant: it is processed again for a state that takes the place of ours."""
@@ -221,7 +241,7 @@ class Dispatcher:
         with self._wake:
             stale = self._backlog.stale(epoch, monotonic_s())
         for name in stale:
-            self._give_up(name)
+            self._give_up(name, math.inf)
         with self._wake:
             self._epoch = epoch
             self._is_begin_due = False
@@ -384,7 +404,7 @@ class Dispatcher:
             state = self._open.get(name)
             if state is None:
                 in_turn = sample.congestion_control == zenoh.CongestionControl.BLOCK
-                state = OpenSource(epoch=self._slots.get(name, self._epoch), in_turn=in_turn)
+                state = OpenSource(epoch=self._slots.get(name) or self._epoch, in_turn=in_turn)
                 if name not in self._given_up:
                     self._open[name] = state
             return state.epoch

@@ -18,7 +18,7 @@ import zenoh
 
 from support.hand_relay import INPUT, KEYS, ROLE_KEY, Relay, environment
 from support.waiting import free_endpoint, until, within
-from zsched import wire, worker_backlog
+from zsched import wire, worker_backlog, worker_inputs
 from zsched.clock import monotonic_s
 from zsched.core.plan import Role, WorkerRole
 from zsched.core.relay_protocol import EndMarker, StreamAck, StreamAcks
@@ -551,6 +551,39 @@ def test_a_value_of_an_epoch_that_is_not_told_yet_waits_for_it_too(relay: Relay,
         told = relay.told()
         assert told is not None
         assert (told.first, told.lost) == (5, 0)
+
+
+def test_two_words_about_one_publisher_s_slot_count_as_none(relay: Relay, echo: Echo) -> None:
+    """One is a stranger's, who has guessed its name before it said anything."""
+    relay.tell(WorkerRole.ACTIVE, epoch=1)
+    until(lambda: f"{ROLE_KEY}/1" in relay.tokens, "the worker has begun")
+    relay.greet(is_whole=True, slot=10**6)
+    relay.mark(EndMarker(epoch=0, count=0, is_whole=True, slot=1))
+    until(lambda: 0 in echo.worker._dispatcher._slots.values(), "both words")
+    relay.put(b"a")
+    until(lambda: relay.outputs == [("edge1/t/1/robot1/out", b"a")], "its result")
+
+
+def test_a_stranger_s_word_that_a_publisher_is_given_up_is_taken_back(
+    relay: Relay, echo: Echo, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A relay puts again what is not acknowledged, which it would not do behind such a word of its own."""
+    monkeypatch.setattr(worker_inputs, "GIVE_UP_S", 0.2)
+    relay.open_slot(2)
+    relay.put(b"a")
+    until(lambda: echo.output.withheld == 1, "the backlog")
+    relay.give_up()
+    until(lambda: echo.worker._dispatcher._given_up, "the forgery")
+
+    def is_answered() -> bool:
+        source = zenoh.SourceInfo(relay.publisher.id, 1)
+        relay.publisher.put(b"b", source_info=source)
+        return bool(relay.outputs)
+
+    relay.tell(WorkerRole.ACTIVE, epoch=2)
+    until(is_answered, "a result")
+    assert relay.outputs == [("edge1/t/2/robot1/out", b"b")]
+    until(lambda: (told := relay.told()) is not None and (told.processed, told.lost) == (2, 1), "an account of both")
 
 
 def test_what_a_standby_withheld_and_its_robot_gave_up_is_not_done_by_the_owner_it_becomes(
