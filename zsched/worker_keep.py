@@ -7,6 +7,9 @@ class ``reliable`` is kept, at most ``limit`` of an output and `KEPT_BYTES`, of 
 a gap asks at once; one that makes no progress for `RESEND_S`, longer each time, is sent what it lacks once its link is
 there again. Both go to that relay alone, under `AGAIN_CHUNK`: other robots' radios carry nothing twice. Who cannot be
 reached for `FORGET_S` is forgotten. A plain subscriber never acknowledges; for it nothing is kept longer than that.
+
+Anybody can put under the key of acknowledgements. What is too large to be one, or comes while too many wait, is dropped
+and counted; what is dropped of a relay's is mended by its next one.
 """
 
 from __future__ import annotations
@@ -37,8 +40,24 @@ ASKED_S: Final = 0.1
 LOOK_S: Final = 0.1
 """Nothing was heard of a robot whose input an answer was made of: then it is looked whether it subscribes at all."""
 TICK_S: Final = 0.1
+MAX_FRAME_BYTES: Final = 1 << 17
+"""Of one frame of acknowledgements: ours have at most `zsched.hop_acks.MAX_PER_FRAME`, and take less."""
+MAX_FRAMES: Final = 256
+"""Frames that wait for the thread."""
 
 _log = logging.getLogger("zsched.worker")
+
+
+class _Bell(threading.Event):
+    """Set while something is kept; whoever sets it also wakes a thread that waits for a frame."""
+
+    def __init__(self, frames: queue.SimpleQueue[Sample | None]) -> None:
+        super().__init__()
+        self._frames = frames
+
+    def set(self) -> None:
+        super().set()
+        self._frames.put(None)
 
 
 class Keeper:
@@ -56,7 +75,9 @@ class Keeper:
         self._lock = threading.Lock()
         self._lanes: dict[int, KeptLane] = {}
         self._came: queue.SimpleQueue[Sample | None] = queue.SimpleQueue()
-        self._wake = threading.Event()
+        self._wake = _Bell(self._came)
+        self.dropped = 0
+        """Frames that were too large, or too many."""
         self._is_closed = False
         self._subscriber: zenoh.Subscriber[None] | None = None
 
@@ -66,7 +87,7 @@ class Keeper:
         with self._lock:
             self._lanes[source_id.eid] = lane
             if self._subscriber is None:
-                self._subscriber = self._session.declare_subscriber(self._acks_key, self._came.put)
+                self._subscriber = self._session.declare_subscriber(self._acks_key, self._hear)
                 guarded(self._run, name="zsched keeper").start()
         return lane
 
@@ -74,17 +95,24 @@ class Keeper:
         """End the thread."""
         self._is_closed = True
         self._wake.set()
-        self._came.put(None)
         self.stalled.close()
+
+    def _hear(self, sample: Sample) -> None:
+        """Zenoh's thread: never wait, and let nobody fill our memory."""
+        if len(sample.payload) > MAX_FRAME_BYTES or self._came.qsize() >= MAX_FRAMES:
+            self.dropped += 1
+            _log.warning("a frame of acknowledgements was dropped: too large, or too many")
+            return
+        self._came.put(sample)
 
     # --- the thread --------------------------------------------------------------------------------------------------
 
     def _run(self) -> None:
         due = 0.0
         while not self._is_closed:
-            self._wake.wait()  # nothing is kept: no acknowledgement matters
+            is_idle = not self._wake.is_set()  # nothing is kept: only a frame can come
             try:
-                sample = self._came.get(timeout=max(0.0, due - monotonic_s()))
+                sample = self._came.get(timeout=None if is_idle else max(0.0, due - monotonic_s()))
             except queue.Empty:
                 sample = None
             try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from typing import Any
 
@@ -130,6 +131,35 @@ def test_the_first_answers_of_an_epoch_do_not_stay_for_ever(bench: Bench, monkey
     until(lambda: lane.receivers, "the robot's only word")
     until(lambda: not lane.kept and lane.size == 0, "they are let go of")
     until(lambda: not lane.wake.is_set(), "the keeper is at rest")
+
+
+def test_what_comes_while_nothing_is_kept_stays_in_nobody_s_memory(bench: Bench) -> None:
+    lane = bench.lane()
+    robot = bench.robot("robot1", "aa1")
+    key = KEYS.received("robot1", "aa1", str(bench.worker.zid()))
+    assert not lane.wake.is_set()
+    bench.outside.put(key, bytes(worker_keep.MAX_FRAME_BYTES + 1))
+    until(lambda: bench.keeper.dropped == 1, "what is too large is dropped")
+    for _ in range(3):
+        bench.outside.put(key, b"no frame")
+    robot.ack(bench.eid, 0)
+    until(lambda: "aa1" in lane.receivers, "a word is taken all the same")
+    assert bench.keeper._came.empty()
+    assert not lane.wake.is_set()
+
+
+def test_only_so_many_acknowledgements_wait(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench.lane()
+    go_on = threading.Event()
+    monkeypatch.setattr(bench.keeper, "_take", lambda _: go_on.wait(60))
+    robot = bench.robot("robot1", "aa1")
+    try:
+        for _ in range(worker_keep.MAX_FRAMES + 20):
+            robot.ack(bench.eid, 0)
+        until(lambda: bench.keeper.dropped >= 19, "the rest is dropped")
+        assert bench.keeper._came.qsize() <= worker_keep.MAX_FRAMES
+    finally:
+        go_on.set()
 
 
 def test_a_gap_is_filled_at_once_for_that_robot_alone(bench: Bench) -> None:
