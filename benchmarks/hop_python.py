@@ -91,7 +91,7 @@ def settings_of(stream_class: StreamClass) -> StreamSettings:
 
 def inward(relay: zenoh.Session, stream_class: StreamClass) -> Way:
     """The way of an input to a worker of `zsched.worker`."""
-    acks = Acks(relay, Keyspace("bench"), "robot1")
+    acks = Acks(relay, Keyspace("bench"), "robot1", lambda *_: True).of("edge1", "t")
     route = Route(
         stream="t/in/0",
         direction=Direction.INPUT,
@@ -123,7 +123,7 @@ def _sent(stream: InputStream) -> bool:
 
 def outward(relay: zenoh.Session, stream_class: StreamClass) -> Way:
     """The way of an answer back to the application."""
-    acks = Acks(relay, Keyspace("bench"), "robot1")
+    acks = Acks(relay, Keyspace("bench"), "robot1", lambda *_: True).of("edge1", "t")
     route = Route(
         stream="t/out/0",
         direction=Direction.OUTPUT,

@@ -12,6 +12,7 @@ held is not lost: it is kept until it is acknowledged, and sent again.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 import threading
@@ -34,7 +35,7 @@ REST_S: Final = 2.0
 _log = logging.getLogger("zsched.streams")
 
 
-class StalledLinks:
+class StalledLinks(contextlib.AbstractContextManager[None]):
     """The links of one session. ``with`` it around every put that may wait (any thread, not nested)."""
 
     def __init__(self, session: Session, lease_s: float, patience_s: float = math.inf) -> None:

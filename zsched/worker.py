@@ -53,8 +53,9 @@ from zsched.worker_roles import RoleWatch
 from zsched.worker_samples import BY_CLASS, Input, KeepLast, Marker, Received
 from zsched.worker_services import Answer, Handler, Request, Service
 from zsched.worker_snapshot import TIMEOUT_S, Offer, Restorer, StateLink, fetch
-from zsched.worker_start import lease_s, open_session, relay_endpoint, surroundings
+from zsched.worker_start import open_session, relay_endpoint, surroundings
 from zsched.worker_troubles import Troubles
+from zsched.zenoh_config import lease_s
 
 __all__ = ["Answer", "Output", "Received", "Request", "Worker"]
 

@@ -69,11 +69,6 @@ def relay_endpoint(zenoh_config: str) -> str:
     return first if isinstance(first, str) else ""
 
 
-def lease_s(zenoh_config: str) -> float:
-    """How long a peer of a worker's session may be silent before zenoh ends the link."""
-    return float(json.loads(zenoh.Config.from_json5(zenoh_config).get_json("transport/link/tx/lease"))) / 1000
-
-
 def _read(path: str) -> str:
     try:
         return Path(path).read_text(encoding="utf-8")

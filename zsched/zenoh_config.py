@@ -194,6 +194,13 @@ def introduction_config(session: str) -> str | None:
     return str(config)
 
 
+def lease_s(session: str) -> float:
+    """How long a peer of a session (its configuration) may be silent before zenoh ends the link."""
+    import zenoh  # noqa: PLC0415 - as above
+
+    return float(json.loads(zenoh.Config.from_json5(session).get_json("transport/link/tx/lease"))) / 1000
+
+
 def tls_settings(operator_json5: str) -> frozenset[str]:
     """Which settings of ``transport/link/tls`` the operator's own text makes.
 

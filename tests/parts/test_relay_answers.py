@@ -34,7 +34,7 @@ class Bench:
         received = Keyspace("t").received("robot1", str(relay.zid()), str(worker.zid()))
         self._heard = worker.declare_subscriber(received, self._hear)
         self._app = worker.declare_subscriber("robot1/out", lambda s: self.passed.append(s.payload.to_string()))
-        self.acks = Acks(relay, Keyspace("t"), "robot1")
+        self.acks = Acks(relay, Keyspace("t"), "robot1", lambda *_: True).of("edge1", "t")
 
     def open(self, stream_class: StreamClass = StreamClass.RELIABLE, *, is_from_start: bool = True) -> OutputStream:
         settings = StreamSettings(stream_class=stream_class, depth=500, handover=HandoverRule.ALL)

@@ -49,9 +49,9 @@ class Receiver:
         until(lambda: len(self.starts) >= count, "a start marker")
         return self.starts[-1]
 
-    def ack(self, arrived: int, *, first: int = 0, lost: int = 0, incarnation: str = "1") -> None:
+    def ack(self, arrived: int, *, first: int = 0, lost: int = 0, incarnation: str = "1", task: str = "t") -> None:
         ack = StreamAck(eid=self.eid, first=first, arrived=arrived, processed=arrived, lost=lost)
-        self.session.put(KEYS.ack("edge1", "t", incarnation, self._relay), wire.encode(StreamAcks(acks=(ack,))))
+        self.session.put(KEYS.ack("edge1", task, incarnation, self._relay), wire.encode(StreamAcks(acks=(ack,))))
 
     def leave(self) -> None:
         self._data.undeclare()
@@ -71,7 +71,10 @@ class Bench:
 
     def __init__(self, relay: zenoh.Session, other: zenoh.Session) -> None:
         self.relay, self.other = relay, other
-        self.acks = Acks(relay, KEYS, "robot1")
+        self.tokens: set[str] | None = None
+        """Incarnations that are there; ``None``: all."""
+        acks = Acks(relay, KEYS, "robot1", lambda _node, _task, life: self.tokens is None or life in self.tokens)
+        self.acks = acks.of("edge1", "t")
         self._samples: list[zenoh.Sample] = []
         self._subscriber = relay.declare_subscriber("robot1/**", self._samples.append)
 
@@ -161,6 +164,28 @@ def test_another_life_begins_behind_what_the_former_one_may_have_done(bench: Ben
     receiver.ack(4, first=3, incarnation="2")
     settled(outlet, acknowledged=1, at_most_lost=3, lost=0, in_flight=0)
     outlet.undeclare()
+
+
+def test_only_a_life_with_a_token_is_another_life(bench: Bench) -> None:
+    """One forged acknowledgement while the worker stood still: what it had not got was not sent again."""
+    receiver = Receiver(bench.other, bench.relay, "edge1/in")
+    outlet = bench.outlet("robot1/in", "edge1/in")
+    for _ in range(3):
+        outlet.send(bench.sample())
+    bench.tokens = {"1"}
+    receiver.greeted()
+    receiver.ack(0, incarnation="2")
+    receiver.ack(0, incarnation="1")
+    until(lambda: receiver.got[:3] == [0, 1, 2], "the first life is met by its own word")
+    receiver.ack(0, first=0, incarnation="zz")
+    receiver.ack(3, incarnation="1", task="other")
+    receiver.ack(1)
+    settled(outlet, acknowledged=1, in_flight=2)
+    until(lambda: cared(outlet) and receiver.got.count(2) > 1, "what has not come is sent again")
+    bench.tokens = {"2"}
+    receiver.ack(2)  # the last word of one whose token has gone already
+    receiver.ack(0, incarnation="2")
+    settled(outlet, at_most_lost=1, in_flight=0)
 
 
 def test_nothing_goes_to_a_recorder_while_the_worker_is_gone(bench: Bench) -> None:

@@ -134,10 +134,11 @@ def test_a_frozen_robot_holds_the_answers_of_the_others_up_for_less_than_zenoh_d
             until(lambda: out.put(b"x") and relay.outputs and lines, "both hear")
             other.send_signal(signal.SIGSTOP)
             took: list[float] = []
+            large = bytes(200_000)  # what sockets may hold is several MB by now
             began = monotonic_s()
             while monotonic_s() - began < 4.0:
                 before = monotonic_s()
-                out.put(bytes(60_000))
+                out.put(large)
                 took.append(monotonic_s() - before)
                 time.sleep(0.015)
         finally:

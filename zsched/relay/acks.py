@@ -1,6 +1,9 @@
 """Acknowledgements in both directions: what workers have processed of our samples, what we have of their answers.
 
-Knows: the keys they go on, who waits for which publisher's. Does not know: what is sent again.
+Knows: the keys they go on, who waits for which publisher's, which worker may speak. Does not know: what is sent again.
+
+Anybody can put under these keys. So what a worker says counts for the streams that go to its node and task, and a life
+of it that is new counts once its token has been seen.
 """
 
 from __future__ import annotations
@@ -8,6 +11,8 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
 from weakref import WeakSet
 
 import zenoh
@@ -15,12 +20,16 @@ from zenoh import Sample, Session
 
 from zsched import wire
 from zsched.clock import monotonic_s
-from zsched.core.model import NodeId
+from zsched.core.fleet import Timing
+from zsched.core.model import NodeId, TaskId
 from zsched.core.relay_protocol import StreamAck, StreamAcks
 from zsched.errors import WireError
 from zsched.guard import guarded
 from zsched.hop_acks import Acknowledger
-from zsched.keyspace import Keyspace
+from zsched.keyspace import Keyspace, parse
+from zsched.stalled_links import StalledLinks
+
+DEFAULT_LEASE_S: Final = Timing().zenoh_lease_s
 
 _log = logging.getLogger("zsched.relay")
 
@@ -34,14 +43,25 @@ class Acks:
     What we say goes stream by stream: two outputs may take the answers of one key, and each has its own count.
     """
 
-    def __init__(self, session: Session, keyspace: Keyspace, node: NodeId) -> None:
-        """Subscribe and start."""
+    def __init__(
+        self,
+        session: Session,
+        keyspace: Keyspace,
+        node: NodeId,
+        has_token: Callable[[NodeId, TaskId, str], bool],
+        lease_s: float = DEFAULT_LEASE_S,
+    ) -> None:
+        """Subscribe and start. ``has_token`` (node, task, incarnation) says whether such a worker is there."""
+        self.stalled = StalledLinks(session, lease_s)
+        self._has_token = has_token
         self._session = session
         self._keyspace, self._node, self._own_id = keyspace, node, str(session.zid())
         self._born_at = monotonic_s()
         self._answers: WeakSet[Acknowledger] = WeakSet()
         self._lock = threading.Lock()
-        self._listeners: dict[int, Listener] = {}
+        self._listeners: dict[int, tuple[NodeId, TaskId, Listener]] = {}
+        self.strangers = 0
+        """Acknowledgements of workers that the stream does not go to."""
         key = keyspace.ack("*", "*", "*", str(session.zid()))
         self._subscriber = session.declare_subscriber(key, zenoh.handlers.FifoChannel(1024))
         guarded(self._run, self._subscriber.handler, name="acks").start()
@@ -60,13 +80,21 @@ class Acks:
         for one in made:
             one.flush()
 
-    def expect(self, eid: int, listener: Listener) -> None:
-        """Hand the acknowledgements for our publisher ``eid`` to ``listener``."""
-        self._listeners[eid] = listener
+    def of(self, node: NodeId, task: TaskId) -> WorkerAcks:
+        """What the workers of one node for one task say."""
+        return WorkerAcks(self, node, task)
+
+    def expect(self, eid: int, node: NodeId, task: TaskId, listener: Listener) -> None:
+        """Hand the acknowledgements of a node's worker for our publisher ``eid`` to ``listener``."""
+        self._listeners[eid] = node, task, listener
 
     def forget(self, eid: int) -> None:
         """The publisher is given back."""
         self._listeners.pop(eid, None)
+
+    def has_token(self, node: NodeId, task: TaskId, incarnation: str) -> bool:
+        """Whether this life of a worker is there, as far as tokens say."""
+        return self._has_token(node, task, incarnation)
 
     def _send(self, worker: str, frame: StreamAcks) -> None:
         """Tell a worker how far its answers are; what is dropped here is mended by the next one."""
@@ -84,15 +112,52 @@ class Acks:
             except WireError as error:
                 _log.warning("an unreadable acknowledgement was ignored (%s)", error)
                 continue
-            incarnation = str(sample.key_expr).split("/")[-2]
+            key = parse(str(sample.key_expr))
+            if key is None or len(key.rest) != 3:
+                _log.warning("an acknowledgement under a malformed key was ignored")
+                continue
+            task, incarnation, _ = key.rest
             for ack in acks.acks:
-                self._tell(ack, incarnation)
+                self._tell(key.owner, task, incarnation, ack)
 
-    def _tell(self, ack: StreamAck, incarnation: str) -> None:
-        listener = self._listeners.get(ack.eid)
-        if listener is None:
+    def _tell(self, node: NodeId, task: TaskId, incarnation: str, ack: StreamAck) -> None:
+        found = self._listeners.get(ack.eid)
+        if found is None:
+            return
+        if found[:2] != (node, task):
+            self.strangers += 1
             return
         try:
-            listener(ack, incarnation)
+            found[2](ack, incarnation)
         except Exception:  # noqa: BLE001 - one stream's trouble must not stop the others' acknowledgements
             _log.exception("an acknowledgement failed")
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerAcks:
+    """`Acks` for the streams of one slot: of its owner's worker alone."""
+
+    acks: Acks
+    node: NodeId
+    task: TaskId
+
+    @property
+    def stalled(self) -> StalledLinks:
+        """Watches over the puts to it."""
+        return self.acks.stalled
+
+    def answers(self) -> Acknowledger:
+        """See `Acks.answers`."""
+        return self.acks.answers()
+
+    def expect(self, eid: int, listener: Listener) -> None:
+        """Hand what it acknowledges of our publisher ``eid`` to ``listener``."""
+        self.acks.expect(eid, self.node, self.task, listener)
+
+    def forget(self, eid: int) -> None:
+        """The publisher is given back."""
+        self.acks.forget(eid)
+
+    def has_token(self, incarnation: str) -> bool:
+        """Whether this life of it is there."""
+        return self.acks.has_token(self.node, self.task, incarnation)

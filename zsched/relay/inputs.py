@@ -23,7 +23,7 @@ from zenoh import Sample, Session, Timestamp
 
 from zsched.clock import monotonic_s
 from zsched.core.plan import OnCrash, Route, StreamClass, StreamCount
-from zsched.relay.acks import Acks
+from zsched.relay.acks import WorkerAcks
 from zsched.relay.counter import StreamCounter
 from zsched.relay.outlet import MAX_OWED, Outlet, Owed
 from zsched.relay.pace import Pace
@@ -103,7 +103,7 @@ class InputStream:
             origin=zenoh.Locality.ANY,
         )
 
-    def open(self, epoch: int, route: Route, acks: Acks | None = None, stamps: Stamps | None = None) -> None:
+    def open(self, epoch: int, route: Route, acks: WorkerAcks | None = None, stamps: Stamps | None = None) -> None:
         """Declare the publishers of a slot; it carries nothing yet. With ``acks`` its worker counts what it gets.
 
         ``stamps`` is told every sample's timestamp: an input of the task is of `OnCrash.REPLAY`.

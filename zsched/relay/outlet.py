@@ -16,6 +16,7 @@ already. Class ``reliable`` sends nothing before its receiver has said where it 
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import logging
 import threading
@@ -28,7 +29,7 @@ from zenoh import Priority, Sample, Session, Timestamp
 from zsched.clock import monotonic_s
 from zsched.core.plan import OnCrash, StreamClass, StreamSettings
 from zsched.core.relay_protocol import EndMarker, StreamAck
-from zsched.relay.acks import Acks
+from zsched.relay.acks import WorkerAcks
 from zsched.relay.crowd import Crowd
 from zsched.relay.greetings import Greetings
 from zsched.relay.lanes import KEPT_BYTES, KEPT_BYTES_LATEST, KEPT_SAMPLES, Lane, Sent, near
@@ -70,7 +71,7 @@ class Outlet:
         from_expr: str,
         to_expr: str,
         settings: StreamSettings,
-        acks: Acks | None = None,
+        acks: WorkerAcks | None = None,
         *,
         has_crowd: bool = False,
         epoch: int = 0,
@@ -87,6 +88,7 @@ class Outlet:
         self._session = session
         self._settings = settings
         self._acks = acks
+        self._stalled: contextlib.AbstractContextManager[None] = acks.stalled if acks else contextlib.nullcontext()
         self._rewriting = Rewriting(from_expr, to_expr)
         self._is_reliable = settings.stream_class is StreamClass.RELIABLE
         self._kept_limit = KEPT_SAMPLES if self._is_reliable else max(settings.depth, settings.keep_last)
@@ -341,7 +343,8 @@ class Outlet:
             is_whole=self._is_reliable and is_start,
             slot=self._epoch if is_start and self._is_reliable else 0,
         )
-        put_marker(self._session, lane.key, lane.source_id, lane.publisher.priority, marker)
+        with self._stalled:
+            put_marker(self._session, lane.key, lane.source_id, lane.publisher.priority, marker)
 
     def name_slot(self) -> None:
         """Tell a worker of class ``latest`` that has just become ready which slot it is fed from, before any value."""
@@ -360,7 +363,8 @@ class Outlet:
         try:
             for lane in open_lanes:
                 marker = EndMarker(epoch=SKIP_EPOCH, count=lane.count, slot=self._epoch, is_given_up=True)
-                put_marker(self._session, lane.key, lane.source_id, lane.publisher.priority, marker)
+                with self._stalled:
+                    put_marker(self._session, lane.key, lane.source_id, lane.publisher.priority, marker)
         except zenoh.ZError:
             _log.debug("%s: the session closed first", self._to)
         self._undeclare()
@@ -382,7 +386,8 @@ class Outlet:
             return
         began = monotonic_s()
         try:
-            lane.put(sample, stamp)
+            with self._stalled:
+                lane.put(sample, stamp)
         except zenoh.ZError:
             with self._lock:
                 self.tally.errors += 1
@@ -447,7 +452,8 @@ class Outlet:
         if first > start:  # older ones are kept no more: the receiver must not wait for them
             self._put_marker(lane, SKIP_EPOCH, first)
         for sent in wanted:
-            lane.put_again(self._session, sent)
+            with self._stalled:
+                lane.put_again(self._session, sent)
         with self._lock:
             lane.moved_at = monotonic_s()
             self.tally.resent += len(wanted)
@@ -456,6 +462,9 @@ class Outlet:
 
     def _acknowledged(self, lane: Lane, ack: StreamAck, incarnation: str) -> None:
         now = monotonic_s()
+        is_new = incarnation != lane.incarnation
+        if is_new and (self._acks is None or not self._acks.has_token(incarnation)):
+            return  # a stranger's; or a life that has just begun, which is greeted when its token comes
         with self._lock:
             before, ack = lane.ack, near(ack, lane.count)
             if not lane.acknowledge(ack, incarnation, now):

@@ -25,7 +25,7 @@ from zsched.core.serial import number_near, serial_of
 from zsched.guard import tolerant
 from zsched.hop_acks import Acknowledger, Jump, SourceName
 from zsched.keyspace import AGAIN_CHUNK, END_CHUNK
-from zsched.relay.acks import Acks
+from zsched.relay.acks import WorkerAcks
 from zsched.relay.answers import Answers
 from zsched.relay.counter import StreamCounter
 from zsched.relay.crowd import note_feeder
@@ -88,7 +88,7 @@ class OutputStream:
         max_hz = route.settings.max_hz
         self._pace: Pace[Sample] | None = None if max_hz is None else Pace(max_hz, remembers=self._is_latest)
 
-    def open(self, epoch: int, route: Route, acks: Acks | None = None, *, is_from_start: bool = False) -> None:
+    def open(self, epoch: int, route: Route, acks: WorkerAcks | None = None, *, is_from_start: bool = False) -> None:
         """Subscribe to an owner's output; nothing passes yet.
 
         With ``acks`` its worker keeps its answers until we have acknowledged them; ``is_from_start``: the owner cannot

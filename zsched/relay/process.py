@@ -34,7 +34,7 @@ from zsched.guard import guarded, on_failure
 from zsched.introduction import Introducer
 from zsched.keyspace import Keyspace
 from zsched.opening import why_not_open
-from zsched.relay.acks import Acks
+from zsched.relay.acks import DEFAULT_LEASE_S, Acks
 from zsched.relay.graph import GraphMirror
 from zsched.relay.local_side import LocalSide
 from zsched.relay.matching import Matching
@@ -44,6 +44,7 @@ from zsched.relay.task import TaskRelay
 from zsched.relay.tokens import Tokens
 from zsched.relay.troubles import Troubles
 from zsched.relay_pipe import COMMANDS, read_frame, write_frame
+from zsched.zenoh_config import lease_s
 
 COUNT_S: Final = 1.0
 """Period of the counters."""
@@ -143,7 +144,9 @@ class RelayProcess:
         reporter: Reporter,
         local_config: str = "",
         introducer: Introducer | None = None,
+        link_lease_s: float = DEFAULT_LEASE_S,
     ) -> None:
+        """``link_lease_s``: zenoh's, on the session's links."""
         self._session = session
         self._lock = threading.Lock()  # plans come from the pipe, the local side from a thread of its own
         self._graph: GraphMirror | None = None
@@ -156,7 +159,7 @@ class RelayProcess:
         self._tasks: dict[TaskId, TaskRelay] = {}
         self._own_ids = frozenset({str(session.zid())})
         keyspace = Keyspace(fleet)
-        self._acks = Acks(session, keyspace, node)
+        self._acks = Acks(session, keyspace, node, self._has_worker, link_lease_s)
         self._roles = RoleServer(session, keyspace, node)
         self._matching = Matching(session, reporter.report)
         self._troubles = Troubles(session, keyspace, node, reporter.report)
@@ -257,6 +260,9 @@ class RelayProcess:
             self._tasks[plan.task] = task
         task.apply(plan)
 
+    def _has_worker(self, node: NodeId, task: TaskId, incarnation: str) -> bool:
+        return self._tokens.has_worker(node, task, incarnation)
+
     def _worker_seen(self, seen: WorkerSeen) -> None:
         self._reporter.report(seen)
         if seen.is_present and seen.node == self._node:
@@ -317,7 +323,7 @@ def run(
         reporter.report(ProblemReported(source=SOURCE, problem=problem))
         reporter.flush(CLOSE_S)
         return 1
-    relay = RelayProcess(session, me.fleet, me.node, reporter, local.decode(), Introducer(config))
+    relay = RelayProcess(session, me.fleet, me.node, reporter, local.decode(), Introducer(config), lease_s(config))
     successors = None if door is None else Successors(socket.socket(fileno=door), me)
     try:
         while not relay.obey(commands) and successors is not None:

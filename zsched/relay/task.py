@@ -216,7 +216,8 @@ class TaskRelay:
 
     def _open_route(self, slot: Slot, route: Route, *, is_from_start: bool) -> None:
         epoch = slot.epoch
-        acks = self._acks if slot.ready_when is ReadyWhen.TOKEN else None  # a foreign worker counts nothing
+        is_counted = slot.ready_when is ReadyWhen.TOKEN  # a foreign worker counts nothing
+        acks = self._acks.of(slot.owner, self._task) if is_counted else None
         if route.direction is Direction.SERVICE:
             self._services.open(epoch, route)
             return

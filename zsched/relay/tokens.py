@@ -51,6 +51,10 @@ class Tokens:
         prefix = self._keyspace.worker(node, task, "")
         return frozenset(key for key in self._present if key.startswith(prefix))
 
+    def has_worker(self, node: NodeId, task: TaskId, incarnation: str) -> bool:
+        """Whether this life of a node's worker is there."""
+        return self._keyspace.worker(node, task, incarnation) in self._present
+
     def is_active(self, node: NodeId, task: TaskId, epoch: int) -> bool:
         """True when the node's worker says that it works in that epoch."""
         return f"{self._keyspace.role(node, task)}/{epoch}" in self._present
