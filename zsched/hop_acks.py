@@ -9,7 +9,9 @@ lost and the stream goes on. Who wants only the newest takes any newer one. Numb
 counted either way.
 
 Where everything is wanted a source begins with number 0, or with what its start marker says (`Acknowledger.skip`): what
-came first is no proof that nothing was before it. Only the lowest 32 bits of a number travel (`zsched.core.serial`).
+came first is no proof that nothing was before it. What a start marker says of its stream may be a stranger's: it is
+told in acknowledgements, and the publisher says what is true (`Acknowledger.note_start`). Only the lowest 32 bits of a
+number travel (`zsched.core.serial`).
 """
 
 from __future__ import annotations
@@ -38,7 +40,9 @@ MAX_PER_FRAME: Final = 500
 MAX_AHEAD: Final = 1 << 30
 """No source is so far ahead: at 1 kHz that is a cut of twelve days. Of what is further nobody knows which way it is."""
 RETURN: Final = 3
-"""So many numbers in a row take a jump back that nothing has followed."""
+"""So many numbers in a row take a jump back that nothing has followed; so many start markers what one has said."""
+MAX_REPLAYED: Final = 1 << 13
+"""No start marker speaks of more replays: a relay keeps fewer."""
 
 SourceName = tuple[str, str, int]
 """(key, session id, entity id) of a publisher as zenoh names it."""
@@ -82,6 +86,12 @@ class _Source:
     has_left: bool = False
     jump: Jump | None = None
     """The newest jump, until it is confirmed."""
+    is_whole: bool | None = None
+    """What a start marker has said of its class."""
+    replay_end: int = 0
+    """Numbers below this one went to an earlier owner, by a start marker."""
+    doubts: int = 0
+    """Start markers in a row that say less."""
     gaps: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=MAX_MISSING))
     """Jumps (from, to) that were made while something before them was not processed yet."""
     missing: deque[int] = field(default_factory=lambda: deque(maxlen=MAX_MISSING))
@@ -100,6 +110,8 @@ class _Source:
             until=self.until if self.gap_since is not None else 0,
             is_ended=self.is_ended,
             has_left=self.has_left,
+            is_whole=self.is_whole,
+            replays=max(0, self.replay_end - self.arrived),
         )
 
 
@@ -196,6 +208,37 @@ class Acknowledger:
             if is_first:
                 source.first, source.lost = number, before
             return source.lost - before
+
+    def note_start(self, name: SourceName, number: int, *, is_whole: bool, replayed: int) -> None:
+        """A start marker (behind its `skip`): whether everything is wanted, how many from ``number`` on are replays.
+
+        Anybody can put one. More is believed at once, for it only costs time; less when `RETURN` say so in a row.
+        Either is told in the next acknowledgement, and the publisher corrects what is not so.
+        """
+        with self._wake:
+            source = self._sources.get(name)
+            if source is None:
+                return
+            first = number_near(serial_of(number), source.arrived)
+            end = first + replayed if first <= source.arrived and replayed <= MAX_REPLAYED else 0
+            end, before = (one if one > source.arrived else 0 for one in (end, source.replay_end))
+            is_less = end < before or (source.is_whole is True and not is_whole)
+            source.doubts = source.doubts + 1 if is_less else 0
+            if is_less and source.doubts < RETURN:
+                is_whole, end = is_whole or source.is_whole is True, max(end, before)
+            else:
+                source.doubts = 0
+            source.is_whole, source.replay_end = is_whole, end
+
+    def is_whole(self, name: SourceName) -> bool:
+        """Whether everything of a source is wanted, by its start marker."""
+        source = self._sources.get(name)
+        return source is not None and source.is_whole is True
+
+    def replay_end(self, name: SourceName) -> int:
+        """The numbers of a source below this one may have gone to an earlier owner."""
+        source = self._sources.get(name)
+        return 0 if source is None else source.replay_end
 
     def end(self, name: SourceName) -> None:
         """The source's end marker came."""

@@ -56,10 +56,6 @@ class Dispatcher:
         self._asked: set[int] = set()
         """Epochs whose end is to be told again if they are over."""
         self._open: dict[SourceName, OpenSource] = {}
-        self._replays: dict[SourceName, int] = {}
-        """Numbers of a source below this one went to an earlier owner (zenoh's thread alone touches it)."""
-        self._whole: dict[SourceName, None] = {}
-        """Sources of class ``reliable``, the oldest first (zenoh's thread alone touches it)."""
         self._slots: dict[SourceName, int] = {}
         """The epochs of sources that have named theirs, the oldest first."""
         self._given_up: dict[SourceName, tuple[float, int]] = {}
@@ -100,17 +96,18 @@ class Dispatcher:
             waiting.name = (key, str(info.source_id.zid), info.source_id.eid)
             if waiting.name in self._given_up and not self._is_taken_back(waiting.name):
                 return
-            waiting.is_whole = waiting.name in self._whole
+            waiting.is_whole = self._acks.is_whole(waiting.name)
             in_turn = waiting.is_wanted and sample.congestion_control == zenoh.CongestionControl.BLOCK
             number = self._acks.admit(waiting.name, info.source_sn, in_turn=in_turn)
             if number is None:
                 return
             waiting.number = number
-            waiting.replayed = number < self._replays.get(waiting.name, 0)
+            waiting.replayed = number < self._acks.replay_end(waiting.name)
         with self._wake:
             line = source.waiting.setdefault(key, deque())
             line.append(waiting)
-            if len(line) > (source.newest(is_whole=waiting.is_whole) or source.depth):
+            limit = source.newest(is_whole=waiting.is_whole) or source.depth
+            while len(line) > limit:  # more than one where its class was told wrongly
                 self._shed(source, line.popleft())
             self._queue.append(waiting)
             self._wake.notify()
@@ -127,24 +124,17 @@ class Dispatcher:
             if marker.end.is_given_up:
                 self._give_up(marker.name, marker.came_at)
                 return
-            if marker.end.is_whole:
-                self._note_whole(marker.name)
-            if marker.end.slot:
+            end = marker.end
+            if end.slot:
                 self._note_slot(marker)
-                if not marker.end.is_whole:
+                if not end.is_whole:
                     return
-            self._acks.skip(marker.name, marker.end.count)
-            if marker.end.replayed:
-                self._note_replay(marker)
+            self._acks.skip(marker.name, end.count)
+            self._acks.note_start(marker.name, end.count, is_whole=end.is_whole, replayed=end.replayed)
             return
         with self._wake:
             self._markers.append(marker)
             self._wake.notify()
-
-    def _note_whole(self, name: SourceName) -> None:
-        self._whole[name] = None
-        if len(self._whole) > MAX_SOURCES:
-            self._whole.pop(next(iter(self._whole)))
 
     def _note_slot(self, marker: Marker) -> None:
         """A publisher feeds one slot for all its life: two words that differ count as none, one is a stranger's."""
@@ -191,13 +181,6 @@ class Dispatcher:
     def _is_given_up(self, name: SourceName | None, again: Done[Input] | None) -> bool:
         """What was acknowledged is not meant: it is processed again for a state that takes the place of ours."""
         return name in self._given_up and (again is None or again.quiet_at is None)
-
-    def _note_replay(self, marker: Marker) -> None:
-        first = self._acks.number(marker.name, serial_of(marker.end.count))
-        self._replays.pop(marker.name, None)
-        self._replays[marker.name] = first + marker.end.replayed
-        if len(self._replays) > MAX_SOURCES:
-            self._replays.pop(next(iter(self._replays)))
 
     def epoch_in_hand(self) -> int | None:
         """In the dispatch thread: the epoch in which the source of the input in hand was first heard."""

@@ -49,8 +49,10 @@ class Receiver:
         until(lambda: len(self.starts) >= count, "a start marker")
         return self.starts[-1]
 
-    def ack(self, arrived: int, *, first: int = 0, lost: int = 0, incarnation: str = "1", task: str = "t") -> None:
-        ack = StreamAck(eid=self.eid, first=first, arrived=arrived, processed=arrived, lost=lost)
+    def ack(
+        self, arrived: int, *, first: int = 0, lost: int = 0, incarnation: str = "1", task: str = "t", **more: Any
+    ) -> None:
+        ack = StreamAck(eid=self.eid, first=first, arrived=arrived, processed=arrived, lost=lost, **more)
         self.session.put(KEYS.ack("edge1", task, incarnation, self._relay), wire.encode(StreamAcks(acks=(ack,))))
 
     def leave(self) -> None:
@@ -186,6 +188,32 @@ def test_only_a_life_with_a_token_is_another_life(bench: Bench) -> None:
     receiver.ack(2)  # the last word of one whose token has gone already
     receiver.ack(0, incarnation="2")
     settled(outlet, at_most_lost=1, in_flight=0)
+
+
+@pytest.mark.parametrize("is_whole", [False, True])
+def test_a_worker_that_was_told_a_wrong_class_or_replays_is_told_the_right_ones(bench: Bench, is_whole: bool) -> None:
+    receiver = Receiver(bench.other, bench.relay, "edge1/in")
+    stream_class = StreamClass.RELIABLE if is_whole else StreamClass.LATEST
+    settings = StreamSettings(stream_class=stream_class, depth=10, keep_last=0 if is_whole else 1)
+    outlet = bench.outlet("robot1/in", "edge1/in", settings)
+    main = outlet._main
+    assert main is not None
+    receiver.eid = main.eid
+    outlet.send(bench.sample())
+    if is_whole:
+        receiver.greeted()
+        receiver.ack(0)
+    until(lambda: receiver.got == [0], "the sample")
+    receiver.ack(1, is_whole=is_whole)
+    settled(outlet, acknowledged=1)
+    before = len(receiver.starts)
+    receiver.ack(1, is_whole=not is_whole)
+    until(lambda: len(receiver.starts) > before, "it is told")
+    assert (receiver.starts[-1].is_whole, receiver.starts[-1].count) == (is_whole, 1)
+    before = len(receiver.starts)
+    receiver.ack(1, is_whole=is_whole, replays=7)
+    until(lambda: len(receiver.starts) > before, "it is told")
+    assert receiver.starts[-1].replayed == 0
 
 
 def test_nothing_goes_to_a_recorder_while_the_worker_is_gone(bench: Bench) -> None:

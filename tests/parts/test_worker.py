@@ -289,7 +289,7 @@ def test_what_an_owner_that_died_may_have_done_is_marked(relay: Relay, echo: Ech
     """The start marker says how many samples went to it; what a standby took of them keeps the mark."""
     payload = encode_end(EndMarker(epoch=0, count=0, replayed=2))
     relay.session.put(f"{INPUT}/{END_CHUNK}", payload, source_info=zenoh.SourceInfo(relay.publisher.id, 0))
-    until(lambda: echo.worker._dispatcher._replays, "the start marker: a relay sends nothing before its answer")
+    until(lambda: relay.acks and relay.acks[-1].replays == 2, "the answer: a relay sends nothing before it")
     for name in (b"a", b"b", b"c"):
         relay.put(name)
     until(lambda: len(echo.taken) == 3, "the inputs")
@@ -297,6 +297,31 @@ def test_what_an_owner_that_died_may_have_done_is_marked(relay: Relay, echo: Ech
     until(lambda: len(echo.taken) == 6, "once more, as the owner")
     marks = [(received.payload.to_bytes(), received.replayed) for received in echo.taken]
     assert marks == [(b"a", True), (b"b", True), (b"c", False)] * 2
+
+
+def test_what_one_start_marker_says_is_told_and_three_others_take_it_back(relay: Relay, echo: Echo) -> None:
+    """One forged one made a queue of a `latest` input, or marked all that came later as a replay, for good."""
+
+    def say(marker: EndMarker) -> None:
+        source = zenoh.SourceInfo(relay.publisher.id, marker.count)
+        relay.session.put(f"{INPUT}/{END_CHUNK}", encode_end(marker), source_info=source)
+
+    relay.put(b"a")
+    say(EndMarker(epoch=0, count=1, is_whole=True, replayed=2**40))
+    until(lambda: relay.acks and relay.acks[-1].is_whole, "it is believed, and told")
+    assert relay.acks[-1].replays == 0, "no relay keeps so many"
+    say(EndMarker(epoch=0, count=1, is_whole=True, replayed=5))
+    until(lambda: relay.acks[-1].replays == 5, "this could be")
+    for _ in range(2):
+        before = len(relay.acks)
+        say(EndMarker(epoch=0, count=1))
+        until(lambda before=before: len(relay.acks) > before, "its answer")  # type: ignore[misc]
+    assert (relay.acks[-1].is_whole, relay.acks[-1].replays) == (True, 5)
+    say(EndMarker(epoch=0, count=1))
+    until(lambda: relay.acks[-1].is_whole is False and relay.acks[-1].replays == 0, "three say so")
+    relay.put(b"b")
+    until(lambda: len(echo.taken) == 2, "the inputs")
+    assert [received.replayed for received in echo.taken] == [False, False]
 
 
 def _wait(gate: threading.Event) -> None:

@@ -39,6 +39,7 @@ def test_what_was_broken_from_outside_is_found(monkeypatch: pytest.MonkeyPatch) 
     with monkeypatch.context() as patch:  # one skip marker or number ended a stream
         patch.setattr(hop_acks, "RETURN", 10**9)
         assert "_hop" in found()
+        assert "_start" in found()  # one start marker made a queue of a `latest` input for good
     with monkeypatch.context() as patch:  # one beat made its node's real ones old
         patch.setattr(sequence, "RUN", 10**9)
         assert "_track" in found()

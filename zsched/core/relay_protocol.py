@@ -193,9 +193,13 @@ class StreamAck:
     """The end marker has come."""
     has_left: bool = False
     """The receiver wants nothing more of it: nobody need wait until it has the rest."""
+    is_whole: bool | None = None
+    """A worker's: what a start marker has told it of the stream's class (`EndMarker.is_whole`); ``None``: nothing."""
+    replays: int = 0
+    """A worker's: so many numbers from `arrived` on it takes for replays, by a start marker."""
 
     def __post_init__(self) -> None:
-        for name in ("eid", "first", "arrived", "processed", "lost", "doubled", "reordered", "until"):
+        for name in ("eid", "first", "arrived", "processed", "lost", "doubled", "reordered", "until", "replays"):
             check_counter(f"ack.{name}", getattr(self, name))
 
 

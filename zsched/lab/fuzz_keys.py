@@ -30,7 +30,7 @@ from zsched.core.relay_protocol import EndMarker, SnapshotChunk, StreamAck, Stre
 from zsched.core.ros2 import parse_token
 from zsched.core.sequence import RUN, Order, Track
 from zsched.core.serial import serial_of
-from zsched.hop_acks import RETURN, Acknowledger
+from zsched.hop_acks import MAX_REPLAYED, RETURN, Acknowledger
 from zsched.keyspace import Keyspace, counter, parse
 from zsched.lab.fuzz_wire import NAMES
 from zsched.relay.lanes import Lane, Sent, near
@@ -136,6 +136,7 @@ class KeyFuzz:
             self._lane,
             self._kept,
             self._hop,
+            self._start,
             self._pieces,
             self._track,
         )
@@ -261,6 +262,26 @@ class KeyFuzz:
             acks.flush()
             for frame in tuple(sent):
                 wire.decode(wire.encode(frame), StreamAcks)
+        finally:
+            acks.close()
+
+    def _start(self) -> None:
+        """What start markers say: a few honest ones in a row, and it is so; one never says that less is wanted."""
+        acks = Acknowledger(lambda *_: None)
+        name, is_whole = ("k", "a1", 7), self._rng.random() < 0.5
+        replayed = self._rng.choice((0, 40))
+        try:
+            acks.skip(name, 0)
+            acks.note_start(name, 0, is_whole=is_whole, replayed=replayed)
+            for number in range(4):
+                acks.admit(name, number, in_turn=True)
+            hostile = min(self._number(), MAX_COUNTER)
+            acks.note_start(name, max(hostile, 0), is_whole=self._rng.random() < 0.5, replayed=self._counter())
+            assert acks.is_whole(name) >= is_whole
+            assert replayed <= acks.replay_end(name) <= 4 + MAX_REPLAYED
+            for _ in range(RETURN):
+                acks.note_start(name, 0, is_whole=is_whole, replayed=replayed)
+            assert (acks.is_whole(name), acks.replay_end(name)) == (is_whole, replayed)
         finally:
             acks.close()
 

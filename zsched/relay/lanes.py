@@ -81,6 +81,8 @@ class Lane:
     kept: deque[Sent] = field(default_factory=deque)
     kept_bytes: int = 0
     resend_from: int | None = None
+    is_misheard: bool = False
+    """The receiver believes a start marker that was not ours: ours goes out again."""
     moved_at: float = 0.0
     """When something was last sent or newly acknowledged (monotonic seconds)."""
     pause_s: float = RESEND_S
@@ -176,6 +178,11 @@ class Lane:
         if newest is not None:
             self.pause_s = min(max(2 * (now - newest.at), newest.took_s, RESEND_S), MAX_RESEND_S)
         return True
+
+    def mishears(self, ack: StreamAck, *, is_whole: bool) -> bool:
+        """Whether the receiver believes of this stream what is not so (`near` our count); ``is_whole``: its class."""
+        replays = max(0, self.replay_end - ack.arrived)
+        return ack.is_whole is not None and (ack.is_whole != is_whole or ack.replays != replays)
 
     def meet(self, now: float) -> bool:
         """The receiver has said something: whether it answers a start marker, and is met by that."""

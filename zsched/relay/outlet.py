@@ -354,7 +354,8 @@ class Outlet:
     def _put_names(self, lanes: tuple[Lane, ...]) -> None:
         for lane in lanes:
             marker = EndMarker(epoch=SKIP_EPOCH, count=0, slot=self._epoch)
-            put_marker(self._session, lane.key, lane.source_id, lane.publisher.priority, marker)
+            with self._stalled:
+                put_marker(self._session, lane.key, lane.source_id, lane.publisher.priority, marker)
 
     def _leave(self) -> None:
         """The last words to a worker of class ``reliable``: what it still has it shall not do any more."""
@@ -443,7 +444,10 @@ class Outlet:
                 if not self._may_resend(lane):
                     continue
                 start, lane.resend_from = lane.resend_from, None
+                is_misheard, lane.is_misheard, lowest = lane.is_misheard, False, lane.lowest
                 wanted = tuple(sent for sent in lane.kept if start is not None and sent.number >= start)
+            if is_misheard:
+                self._put_start(lane, lowest)
             if start is not None:
                 self._send_again(lane, start, wanted)
 
@@ -471,6 +475,7 @@ class Outlet:
                 self._begin_life(lane, ack, incarnation, now)
             elif before is None or ack.arrived > before.arrived:
                 lane.moved_at = now
+            lane.is_misheard |= lane.mishears(ack, is_whole=self._is_reliable)
             if self._greetings is not None and not lane.is_met:
                 self._answered(self._greetings, lane, now)
             is_gap = ack.has_gap and now - lane.moved_at > lane.pause_s / 3
