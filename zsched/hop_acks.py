@@ -246,6 +246,14 @@ class Acknowledger:
             (self._sources.get(name) or self._add(name, 0)).is_ended = True
             self._mark(name)
 
+    def reopen(self, name: SourceName) -> None:
+        """It was no end."""
+        with self._wake:
+            source = self._sources.get(name)
+            if source is not None and source.is_ended:
+                source.is_ended = False
+                self._mark(name)
+
     def leave(self, names: Iterable[SourceName]) -> None:
         """Tell how far these are, that nothing more of them is wanted, and then nothing more."""
         with self._wake:

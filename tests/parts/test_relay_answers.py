@@ -291,3 +291,34 @@ def test_an_answer_in_hand_while_its_slot_closes_starts_no_count_of_its_own(benc
     assert bench.is_through(0, 1, 2, 3)
     assert dict(stream.count().drops)["stale_epoch"] == 1
     tap.undeclare()
+
+
+def test_an_end_marker_that_says_less_than_has_come_or_will_come_ends_nothing(bench: Bench) -> None:
+    """One forged long before a move: at the move what the old owner still had in work was lost."""
+    stream = bench.open()
+
+    def end(count: int) -> None:
+        source = zenoh.SourceInfo(bench.publisher.id, count)
+        bench.worker.put(f"{KEY}/{END_CHUNK}", encode_end(EndMarker(epoch=1, count=count)), source_info=source)
+
+    bench.put(0, 1, 2)
+    until(lambda: len(bench.passed) == 3, "the answers")
+    end(1)
+    for count in (0, 1):
+        marker = encode_end(EndMarker(epoch=1, count=count))
+        bench.worker.put(f"{KEY}/{END_CHUNK}", marker)
+        stranger = bench.worker.declare_publisher("somewhere/else")
+        source = zenoh.SourceInfo(stranger.id, count)
+        bench.worker.put(f"{KEY}/{END_CHUNK}", marker, source_info=source)
+    end(4)
+    bench.wait_ack(is_ended=True)
+    assert not stream.has_ended(1)
+    bench.put(3)
+    until(lambda: stream.has_ended(1), "so far it could be true")
+    bench.put(4)
+    until(lambda: not stream.has_ended(1), "something came from behind it")
+    bench.wait_ack(is_ended=False, arrived=5)
+    end(5)
+    until(lambda: stream.has_ended(1), "the real one")
+    bench.wait_ack(is_ended=True)
+    assert bench.passed == ["0", "1", "2", "3", "4"]

@@ -371,7 +371,8 @@ class Handover:
     def end(self, epoch: int, count: int) -> None:
         marker = encode_end(EndMarker(epoch=epoch, count=count))
         before = len(self.wakes)
-        self.bench.outside.put(f"edge{epoch}/t/{epoch}/out/{END_CHUNK}", marker)
+        source = zenoh.SourceInfo((self.old, self.new)[epoch - 1].id, count)
+        self.bench.outside.put(f"edge{epoch}/t/{epoch}/out/{END_CHUNK}", marker, source_info=source)
         until(lambda: len(self.wakes) > before, "the marker")
 
     def is_through(self, *texts: str) -> bool:

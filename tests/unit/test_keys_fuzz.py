@@ -10,7 +10,7 @@ import pytest
 from zsched import hop_acks, keyspace
 from zsched.core import sequence
 from zsched.lab.fuzz_keys import KeyFuzz, main
-from zsched.relay import lanes, tokens
+from zsched.relay import lanes, slots, tokens
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -40,6 +40,9 @@ def test_what_was_broken_from_outside_is_found(monkeypatch: pytest.MonkeyPatch) 
         patch.setattr(hop_acks, "RETURN", 10**9)
         assert "_hop" in found()
         assert "_start" in found()  # one start marker made a queue of a `latest` input for good
+    with monkeypatch.context() as patch:  # one end marker, long before, ended a slot in the move
+        patch.setattr(slots.KeyState, "is_past_end", lambda *_: False)
+        assert "_end" in found()
     with monkeypatch.context() as patch:  # one beat made its node's real ones old
         patch.setattr(sequence, "RUN", 10**9)
         assert "_track" in found()

@@ -34,6 +34,7 @@ from zsched.hop_acks import MAX_REPLAYED, RETURN, Acknowledger
 from zsched.keyspace import Keyspace, counter, parse
 from zsched.lab.fuzz_wire import NAMES
 from zsched.relay.lanes import Lane, Sent, near
+from zsched.relay.slots import KeyState
 from zsched.relay.tokens import Tokens
 from zsched.relay_pipe import decode_chunk, decode_end, encode_chunk, encode_end
 from zsched.worker_lanes import MAX_RECEIVERS, KeptLane
@@ -137,6 +138,7 @@ class KeyFuzz:
             self._kept,
             self._hop,
             self._start,
+            self._end,
             self._pieces,
             self._track,
         )
@@ -284,6 +286,24 @@ class KeyFuzz:
             assert (acks.is_whole(name), acks.replay_end(name)) == (is_whole, replayed)
         finally:
             acks.close()
+
+    def _end(self) -> None:
+        """A slot's end: whatever markers came before, the real one ends it, and nothing before that does."""
+        key, publisher = KeyState(), ("a1", 7)
+        count = self._rng.randrange(1, 40)
+        for number in range(count):
+            if self._rng.random() < 0.2:
+                named = EndMarker(epoch=1, count=self._rng.choice((number, self._counter())))
+                is_taken = key.take_end(named, self._rng.choice((publisher, ("b2", 7))), 1.0)
+                assert not is_taken or key.end_of == publisher or number == 0
+            key.received += 1
+            key.last_number = key.numbers[publisher] = number
+            key.heard_at = 1.0
+            if key.is_past_end(publisher):
+                key.reopen()
+            assert key.end is None or key.end_of != publisher or key.end.count > number
+        assert key.take_end(EndMarker(epoch=1, count=count), publisher, 1.0)
+        assert key.is_ended(1.0, None)
 
     def _pieces(self) -> None:
         """A state's pieces: what is kept is bounded, whatever they say of themselves."""

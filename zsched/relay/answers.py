@@ -146,6 +146,10 @@ class Answers:
         self._names.add(name)
         self._acks.end(name)
 
+    def reopen(self, name: SourceName) -> None:
+        """What came as the source's end was none: the real one is wanted."""
+        self._acks.reopen(name)
+
     def ask_for(self, name: SourceName, until: int) -> bool:
         """Ask for everything below a number; ``False`` when that has been in vain for too long."""
         self._acks.expect(name, 0 if self._is_from_start else until)

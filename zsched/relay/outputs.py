@@ -21,7 +21,7 @@ from zenoh import CongestionControl, Sample, Session, Timestamp
 
 from zsched.clock import monotonic_s
 from zsched.core.plan import HandoverRule, Route, StreamClass, StreamCount
-from zsched.core.serial import number_near, serial_of
+from zsched.core.serial import number_near
 from zsched.guard import tolerant
 from zsched.hop_acks import Acknowledger, Jump, SourceName
 from zsched.keyspace import AGAIN_CHUNK, END_CHUNK
@@ -238,7 +238,7 @@ class OutputStream:
         heirs[0].keys = slot.keys
         heirs[0].answers, slot.answers = slot.answers, heirs[0].answers
         for key in heirs[0].keys.values():
-            key.end = None
+            key.reopen()
         return None
 
     def close(self) -> None:
@@ -324,8 +324,16 @@ class OutputStream:
         size = len(sample.payload)
         self._counter.seen(size)
         key.received += 1
+        key.heard_at = monotonic_s()
         if number == UNNUMBERED or self._is_next(key, publisher, number, in_order=slot.answers is not None):
+            if key.end is not None and key.is_past_end(publisher):
+                self._reopen(slot, key)
             self._gate(slot, sample, size)
+
+    def _reopen(self, slot: OutputSlot, key: KeyState) -> None:
+        if slot.answers is not None and key.ender is not None:
+            slot.answers.reopen(key.ender)
+        key.reopen()
 
     def _is_next(self, key: KeyState, publisher: tuple[str, int], serial: int, *, in_order: bool) -> bool:
         """Count what does not fit the numbers of the hop; an old one is dropped, unless a jump is taken back by it.
@@ -417,12 +425,12 @@ class OutputStream:
             key = None if slot is None else slot.key(name)
             if slot is None or key is None:
                 return
-            if key.end is None:
-                count = number_near(serial_of(marker.count), key.last_number + 1)
-                key.end, key.end_at = replace(marker, count=count), monotonic_s()
             source = sample.source_info
-            if slot.answers is not None and source is not None:
-                key.ender = (name, str(source.source_id.zid), source.source_id.eid)
+            publisher = _NOBODY if source is None else (str(source.source_id.zid), source.source_id.eid)
+            if source is None or not key.take_end(marker, publisher, monotonic_s()):
+                return
+            if slot.answers is not None:
+                key.ender = (name, *publisher)
                 slot.answers.ended(key.ender)
         self._wake()
 
