@@ -139,8 +139,8 @@ STREAM_BUGS = (
     _bug(
         "a worker skips what a reliable input brings",
         INPUTS,
-        "if marker.end.is_whole:",
-        "if marker.end.replayed:",
+        "is_whole=end.is_whole, replayed=end.replayed",
+        "is_whole=bool(end.replayed), replayed=end.replayed",
         (f"{_WORKER}::test_what_a_slow_worker_keeps_follows_the_class_and_what_it_sheds_of_a_reliable_input_is_lost",),
     ),
     _bug(
