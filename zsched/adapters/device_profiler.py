@@ -28,7 +28,7 @@ from zsched.core.model import DeviceSample, TaskId, WorkerLoad, WorkerState
 
 LIMITS_EVERY_S = 5.0
 """How often quotas, limits and the set of CPUs are looked up again; they change by an operator's hand only."""
-ALWAYS = 0.95
+ALWAYS = 0.9
 """A thread that runs or waits to run for so much of the time always wants to run."""
 APPETITE_S = 1.5
 """Time constant of that share: a job that comes once a second and leaves pauses is no such thread."""
@@ -291,8 +291,9 @@ class _Appetite:
             before = self._times.get(thread)
             if before is None:
                 continue
-            ran = min(max(run_s - before[0], 0.0) / elapsed_s, 1.0)
-            wanted = min(max(run_s + wait_s - before[0] - before[1], 0.0) / elapsed_s, 1.0)
+            # A wait is told when it ends, so one sample may show more than its own time: only the mean is bounded.
+            ran = max(run_s - before[0], 0.0) / elapsed_s
+            wanted = max(run_s + wait_s - before[0] - before[1], 0.0) / elapsed_s
             old = self._shares.get(thread, (0.0, 0.0))
             shares[thread] = (ran + keep * (old[0] - ran), wanted + keep * (old[1] - wanted))
         self._at, self._times, self._shares = now, times, shares
@@ -301,7 +302,7 @@ class _Appetite:
     def _wanted(self) -> float | None:
         if all(wanted < ALWAYS for _, wanted in self._shares.values()):
             return None
-        return sum(wanted if wanted >= ALWAYS else ran for ran, wanted in self._shares.values())
+        return sum(min(wanted if wanted >= ALWAYS else ran, 1.0) for ran, wanted in self._shares.values())
 
 
 def _cores(

@@ -187,7 +187,7 @@ def test_a_thread_that_always_wants_to_run_wants_a_core_and_one_that_rests_what_
         seen.append(profiler.sample(workers).workers[0].wanted_cores)
         clock.now += 0.2
     first = next(number for number, wanted in enumerate(seen) if wanted is not None)
-    assert 3.0 < 0.2 * first < 6.0, "so long it takes to tell a share of 95 % from pauses"
+    assert 3.0 < 0.2 * first < 6.0, "so long it takes to tell it from one with pauses"
     assert seen[-1] == pytest.approx(1.2, abs=0.02)
 
 
@@ -201,6 +201,20 @@ def test_a_worker_with_pauses_wants_nothing_beyond_what_it_uses(tmp_path: Path, 
         clock.now += 0.2
         write(tmp_path, queued(10, (busy_s / 2, busy_s / 2)))
         assert profiler.sample(workers).workers[0].wanted_cores is None
+
+
+def test_a_wait_that_is_told_when_it_ends_counts_in_full(tmp_path: Path, clock: Clock) -> None:
+    """0.1 s in the queue, then 0.1 s on the CPU, looked at every 0.05 s."""
+    profiler = machine(tmp_path, **process(10, 1, own=0), **queued(10, (0.0, 0.0)))
+    workers = {"merge": (WorkerState.READY, 10)}
+    seen = []
+    for step in range(1, 400):
+        clock.now += 0.05
+        waits = 0.1 * ((step + 1) // 4)
+        runs = 0.1 * (step // 4) + 0.05 * max(step % 4 - 2, 0)
+        write(tmp_path, queued(10, (runs, waits)))
+        seen.append(profiler.sample(workers).workers[0].wanted_cores)
+    assert all(wanted is not None and wanted > 0.9 for wanted in seen[120:])
 
 
 def test_without_schedstat_nothing_is_said_and_garbage_is_none(tmp_path: Path, clock: Clock) -> None:
@@ -228,9 +242,15 @@ def test_a_real_process_that_shares_its_cpu_wants_all_of_it() -> None:
             worker.stdout.readline()
             workers = {"merge": (WorkerState.READY, worker.pid)}
 
+            looked_at = time.monotonic()
+
             def wants() -> bool:
+                nonlocal looked_at
+                if time.monotonic() - looked_at < 0.2:
+                    return False  # as often as a daemon looks
+                looked_at = time.monotonic()
                 load = profiler.sample(workers).workers[0]
-                return (load.wanted_cores or 0.0) > 0.9 and load.cpu_cores is not None and load.cpu_cores < 0.8
+                return load.wanted_cores is not None and load.cpu_cores is not None and load.cpu_cores < 0.8
 
             until(wants, "it wants a core and gets less")
         finally:
