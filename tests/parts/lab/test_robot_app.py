@@ -77,7 +77,8 @@ def test_it_publishes_its_growing_map_and_counts_the_merged_ones(tmp_path: Path)
             first = decode_grid(bytes(receive(maps).payload))
             second = decode_grid(bytes(receive(maps).payload))
             payload = bytes(receive(maps).payload)
-            wait_for_subscriber(session)
+            for name in ("global_map", "map_merge/status"):  # each is declared by itself
+                wait_for_subscriber(session, f"robot1/{name}")
             session.put("robot1/global_map", b"no map")
             session.put("robot1/global_map", payload)
             session.put("robot1/map_merge/status", json.dumps({"robot1": "attached"}))
@@ -111,8 +112,8 @@ def receive(subscriber: zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]) 
     pytest.fail("no map within 20 s")
 
 
-def wait_for_subscriber(session: zenoh.Session) -> None:
-    with session.declare_publisher("robot1/global_map") as publisher:
+def wait_for_subscriber(session: zenoh.Session, key: str) -> None:
+    with session.declare_publisher(key) as publisher:
         end = time.monotonic() + 60
         while not publisher.matching_status.matching:  # type: ignore[attr-defined]  # the stub says bool, it is none
             assert time.monotonic() < end, "the robot does not listen"
