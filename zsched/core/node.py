@@ -340,8 +340,10 @@ class Node:
         if self.membership.is_doubtful(beat.node):
             self.counters["beat_doubtful"] += 1
             return
-        if self.me in beat.twins and self._identity.must_ask(beat.node, now):
-            self._ask_peer(beat.node)
+        if self.me in beat.twins:
+            self.agreement.witness.on_twin()
+            if self._identity.must_ask(beat.node, now):
+                self._ask_peer(beat.node)
         self._agree(self.agreement.compare(beat, now), now)
         if beat.has_lost_state:
             self.stateless.add(beat.node)
@@ -354,6 +356,7 @@ class Node:
 
     def _on_own_name(self, beat: Beat, now: float) -> None:
         """A beat in our own name that may not be ours."""
+        self.agreement.witness.on_twin()
         self._heed(self._identity.on_own_name(beat, self._beat_sequence, now), now)
 
     def _ask_peer(self, peer: NodeId) -> None:

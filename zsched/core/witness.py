@@ -47,6 +47,7 @@ class Witness:
     started_at: float
     seen: dict[NodeId, tuple[int, int]] = field(default_factory=dict)
     _answered: set[NodeId] = field(default_factory=set)
+    _has_twin: bool = False
     _at_start: int = field(init=False)
 
     def __post_init__(self) -> None:
@@ -64,6 +65,13 @@ class Witness:
             return True
         return beat.node in self.electors and beat.votes > self.seen.get(beat.node, (0, 0))[1]
 
+    def on_twin(self) -> None:
+        """Our name lives twice, or did: a later life that a peer remembers may be the other one's.
+
+        One that has cast no vote beyond those of our state forgets nothing of ours.
+        """
+        self._has_twin = True
+
     def on_answer(self, learnt: Learnt) -> str:
         """A peer answered our question: keep what it says of itself. Why our state was lost; empty: it was not."""
         self._answered.add(learnt.node)
@@ -76,7 +84,8 @@ class Witness:
     def _excess(self, mark: tuple[int, int]) -> str:
         """What a peer remembers of this elector that its state does not know; empty: nothing."""
         incarnation, votes = mark
-        if incarnation > self.incarnation:
+        is_twin = self._has_twin and votes <= self._at_start
+        if incarnation > self.incarnation and not is_twin:
             return f"a later life of this elector ({incarnation}, this is {self.incarnation})"
         known = self.votes if incarnation == self.incarnation else self._at_start
         return f"{votes} votes of this elector, its state knows of {known}" if votes > known else ""

@@ -100,3 +100,16 @@ def test_what_was_seen_is_written_and_read_again() -> None:
     seen = {"robot2": (8, 120), "robot1": (7, 3)}
     assert as_tuple(seen) == (("robot1", 7, 3), ("robot2", 8, 120))
     assert as_seen(as_tuple(seen)) == seen
+
+
+@pytest.mark.parametrize(
+    ("has_twin", "votes", "is_lost"), [(False, 0, True), (True, 0, False), (True, 10, False), (True, 11, True)]
+)
+def test_a_later_life_is_a_twin_s_where_the_name_lives_twice_unless_it_has_voted_more(
+    has_twin: bool, votes: int, is_lost: bool
+) -> None:
+    """A twin that came and left, and was heard by others, is not this elector's own forgotten past."""
+    own = witness(votes=10)
+    if has_twin:
+        own.on_twin()
+    assert bool(own.on_answer(said("robot2", 3, 0, ("robot1", 8, votes)))) is is_lost
