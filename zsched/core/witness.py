@@ -74,12 +74,17 @@ class Witness:
 
     def on_answer(self, learnt: Learnt) -> str:
         """A peer answered our question: keep what it says of itself. Why our state was lost; empty: it was not."""
+        self._has_twin |= learnt.node in self._answered and self._is_later(learnt)  # it began after our own start
         self._answered.add(learnt.node)
         if learnt.node in self.electors:
             incarnation, votes = self.seen.get(learnt.node, (0, 0))
             self.seen[learnt.node] = (max(incarnation, learnt.incarnation), max(votes, learnt.votes))
         mine = [(incarnation, votes) for name, incarnation, votes in learnt.seen if name == self.me]
         return next((f"{learnt.node} remembers {why}" for why in map(self._excess, mine) if why), "")
+
+    def _is_later(self, learnt: Learnt) -> bool:
+        """Whether a peer remembers a life of this elector behind this one."""
+        return any(name == self.me and incarnation > self.incarnation for name, incarnation, _ in learnt.seen)
 
     def _excess(self, mark: tuple[int, int]) -> str:
         """What a peer remembers of this elector that its state does not know; empty: nothing."""

@@ -113,3 +113,11 @@ def test_a_later_life_is_a_twin_s_where_the_name_lives_twice_unless_it_has_voted
     if has_twin:
         own.on_twin()
     assert bool(own.on_answer(said("robot2", 3, 0, ("robot1", 8, votes)))) is is_lost
+
+
+def test_a_later_life_that_a_peer_did_not_know_of_at_our_start_is_a_twin_s() -> None:
+    own = witness(votes=10)
+    assert not own.on_answer(said("robot2"))
+    assert not own.on_answer(said("robot2", 3, 0, ("robot1", 8, 0)))
+    assert own.on_answer(said("robot2", 3, 0, ("robot1", 8, 11)))
+    assert witness(votes=10).on_answer(said("robot3", 3, 0, ("robot1", 8, 0)))
