@@ -89,10 +89,10 @@ class Witness:
     def _excess(self, mark: tuple[int, int]) -> str:
         """What a peer remembers of this elector that its state does not know; empty: nothing."""
         incarnation, votes = mark
-        is_twin = self._has_twin and votes <= self._at_start
-        if incarnation > self.incarnation and not is_twin:
+        if incarnation > self.incarnation and not self._has_twin:
             return f"a later life of this elector ({incarnation}, this is {self.incarnation})"
-        known = self.votes if incarnation == self.incarnation else self._at_start
+        # A peer keeps the highest of both, so a twin's life is told with the votes that this one has cast.
+        known = self.votes if incarnation >= self.incarnation else self._at_start
         return f"{votes} votes of this elector, its state knows of {known}" if votes > known else ""
 
 

@@ -121,3 +121,12 @@ def test_a_later_life_that_a_peer_did_not_know_of_at_our_start_is_a_twin_s() -> 
     assert not own.on_answer(said("robot2", 3, 0, ("robot1", 8, 0)))
     assert own.on_answer(said("robot2", 3, 0, ("robot1", 8, 11)))
     assert witness(votes=10).on_answer(said("robot3", 3, 0, ("robot1", 8, 0)))
+
+
+def test_a_twin_s_life_is_told_with_this_one_s_votes() -> None:
+    """A peer keeps the highest incarnation and the highest count, whichever of the two said it."""
+    own = witness(votes=10)
+    own.on_twin()
+    own.votes = 15
+    assert not own.on_answer(said("robot2", 3, 0, ("robot1", 8, 15)))
+    assert own.on_answer(said("robot2", 3, 0, ("robot1", 8, 16)))
