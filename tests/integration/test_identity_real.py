@@ -151,6 +151,15 @@ def test_init_without_a_reachable_node_goes_on(tmp_path: Path) -> None:
     assert "asked 5 other nodes: none answered" in done.stderr
 
 
+def words_of_twin(bed: Testbed, node: str, file: Path, timeout: float) -> str:
+    """What a second daemon of a name says until it leaves with 75."""
+    folders = ("--state-dir", str(bed.folder / "twin"), "--runtime-dir", str(bed.folder / "twin-run"))
+    command = [*DAEMON, "--config", str(file), "--node", node, *folders]
+    twin = subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)
+    assert twin.returncode == 75, twin.stderr[-2000:]
+    return twin.stderr
+
+
 def test_second_machine_of_a_name_leaves_again_with_75(tmp_path: Path) -> None:
     """A daemon that finds its own name alive elsewhere exits 75; the one that was there stays an elector.
 
@@ -164,16 +173,7 @@ def test_second_machine_of_a_name_leaves_again_with_75(tmp_path: Path) -> None:
         bed.start()
         bed.wait_settled()
         init_state(bed.fleet, "robot2", bed.folder / "twin", 0)  # an operator who does not ask the fleet
-        folders = ("--state-dir", str(bed.folder / "twin"), "--runtime-dir", str(bed.folder / "twin-run"))
-        twin = subprocess.run(
-            [*DAEMON, "--config", str(bed.file), "--node", "robot2", *folders],
-            capture_output=True,
-            text=True,
-            timeout=30,
-            check=False,
-        )
-        assert twin.returncode == 75, twin.stderr[-2000:]
-        assert "another daemon calls itself 'robot2'" in twin.stderr
+        assert "another daemon calls itself 'robot2'" in words_of_twin(bed, "robot2", bed.file, 30)
         with suppress(TestbedError):
             bed.wait(lambda: bed.status("robot2")["quorum"]["this_node"] == "elector", 60, "robot2 as an elector")
         status = bed.status("robot2")
@@ -204,16 +204,7 @@ def test_second_machine_that_only_the_others_hear_leaves_again_and_everybody_nam
         tree["nodes"]["edge1"]["listen"] = {"control": free_endpoint(), "data": free_endpoint()}
         file = bed.folder / "twin.yaml"
         file.write_text(json.dumps(tree))
-        folders = ("--state-dir", str(bed.folder / "twin"), "--runtime-dir", str(bed.folder / "twin-run"))
-        twin = subprocess.run(
-            [*DAEMON, "--config", str(file), "--node", "edge1", *folders],
-            capture_output=True,
-            text=True,
-            timeout=60,
-            check=False,
-        )
-        assert twin.returncode == 75, twin.stderr[-2000:]
-        assert "another daemon calls itself 'edge1': robot" in twin.stderr
+        assert "another daemon calls itself 'edge1': robot" in words_of_twin(bed, "edge1", file, 60)
         said = [one for one in bed.status("robot1")["problems"] if "2 daemons call themselves 'edge1'" in one]
         assert said, bed.status("robot1")["problems"]
         assert said[0].count("tcp/") == 2, said

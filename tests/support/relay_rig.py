@@ -269,6 +269,13 @@ class Application:
         thread.start()
         return thread
 
+    def flow(self, hz: float, answers: int) -> threading.Thread:
+        """Stream as soon as the relay listens; comes back when more than so many answers have."""
+        until(self.connected, "the application sees the relay's subscription")
+        thread = self.stream(hz)
+        until(lambda: len(self.back) > answers, "the stream through the first owner")
+        return thread
+
     def _stream(self, period: float) -> None:
         due = time.monotonic()
         while not self._halt.is_set():
