@@ -168,7 +168,7 @@ def init(
     heard = check_blank(fleet, name, folder, generation, standing, is_forced=force)
     path = init_state(fleet, name, folder, generation)
     _say(_heard(heard, name, generation, is_elector=name in fleet.electors))
-    typer.echo(f"a core of this machine has speed {core_speed.keep(folder):.2f}")
+    typer.echo(f"a core of this machine has speed {core_speed.kept_or_new(folder):.2f}")
     typer.echo(f"{path}: blank state of {name} in fleet {fleet.name}, generation {generation}")
 
 
