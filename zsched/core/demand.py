@@ -16,12 +16,10 @@ from zsched.core.model import NodeId, Profile, TaskId, WorkerState
 
 STARVED_CPU_RATIO = 0.9
 """On an owner busier than this a task may get less than it wants: what it uses is the least that it needs."""
-
-
 UNSURE = 1.5
 """A worker that always wants to run and never had enough counts as needing so many times what it gets."""
 SETTLE_S = 4.0
-"""So long after a task has come to a node what it uses there, smoothed, still rises: it is the least that it needs."""
+"""What a task uses still rises for so long after it has come, for the figures are smoothed: the least that it needs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,9 +64,7 @@ class Demands:
             is_held = known.is_sure and known.work == least
             if most > use and not (is_held and least <= most):
                 found = replace(found, work=min(UNSURE * use, most), is_sure=False)
-            elif most > use:
-                found = replace(found, work=least)
-            elif is_new or profile.cpu_used_cores / profile.cpu_cores >= STARVED_CPU_RATIO:
+            elif most > use or is_new or profile.cpu_used_cores / profile.cpu_cores >= STARVED_CPU_RATIO:
                 found = replace(found, work=least, is_sure=is_held)
             else:
                 found = replace(found, work=use, is_sure=True)
