@@ -6,9 +6,9 @@ Under a quota the machine *is* the group that holds the smallest quota: its core
 total - MemAvailable, or under a limit the group's working set, or what the machine has left if that is less.
 
 A worker's load is its whole process tree. CPU: the difference of user and system time, children that were waited for
-included, so short-lived ones count. A thread that is always running or waiting for a CPU (schedstat's run time and
-run-queue delay) would use a whole one: that is what a worker wants beyond what it gets. Memory: the sum of resident
-sets, which counts shared pages once per process; the exact figure (PSS) would cost milliseconds per sample.
+included, so short-lived ones count. How long its threads have run and waited to run (schedstat) tells what it wants
+beyond that (`zsched.core.appetite`). Memory: the sum of resident sets, which counts shared pages once per process; the
+exact figure (PSS) would cost milliseconds per sample.
 
 Knows: /proc and /sys/fs/cgroup (proc(5)), below a root that tests can set. Does not know: smoothing, demand, tasks'
 meaning. Nothing here raises: what cannot be read is ``None``.
@@ -16,7 +16,6 @@ meaning. Nothing here raises: what cannot be read is ``None``.
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -24,14 +23,11 @@ from pathlib import Path
 
 from zsched.adapters.cgroup import CgroupTree, CpuQuota, MemoryQuota, parse_flat
 from zsched.clock import monotonic_s
+from zsched.core.appetite import Appetite, Thread
 from zsched.core.model import DeviceSample, TaskId, WorkerLoad, WorkerState
 
 LIMITS_EVERY_S = 5.0
 """How often quotas, limits and the set of CPUs are looked up again; they change by an operator's hand only."""
-ALWAYS = 0.9
-"""A thread that runs or waits to run for so much of the time always wants to run."""
-APPETITE_S = 1.5
-"""Time constant of that share: a job that comes once a second and leaves pauses is no such thread."""
 MIN_INTERVAL_S = 0.02
 """Two samples closer than this would divide one tick by nothing: the previous figure stands."""
 TICKS_PER_S = float(os.sysconf("SC_CLK_TCK"))
@@ -210,7 +206,7 @@ class _ProcessTrees:
         self._proc = proc
         self._has_children_files = os.path.exists(f"{proc}/self/task/{os.getpid()}/children")  # noqa: PTH110 - str paths
         self._seen: dict[TaskId, tuple[float, dict[int, ProcessTimes]]] = {}
-        self._appetites: dict[TaskId, _Appetite] = {}
+        self._appetites: dict[TaskId, Appetite] = {}
 
     def loads(self, workers: Mapping[TaskId, tuple[WorkerState, int | None]], now: float) -> tuple[WorkerLoad, ...]:
         """One load per worker, sorted by task."""
@@ -227,16 +223,18 @@ class _ProcessTrees:
         now, tree = seen
         before = self._seen.get(task)
         cpu_cores = None if before is None else _cores(before[1], tree, now - before[0], now)
+        appetite = self._appetites.setdefault(task, Appetite())
+        appetite.look(self._threads(tree), now)
         return WorkerLoad(
             task=task,
             state=state,
             cpu_cores=cpu_cores,
             memory_mb=sum(times.rss_mb for times in tree.values()),
-            wanted_cores=self._appetites.setdefault(task, _Appetite()).look(self._threads(tree), now),
+            wanted_cores=appetite.wanted_cores(),
         )
 
-    def _threads(self, tree: Iterable[int]) -> dict[tuple[int, str], tuple[float, float]]:
-        """{(process, thread): seconds run, seconds waited to run}."""
+    def _threads(self, tree: Iterable[int]) -> dict[Thread, tuple[float, float]]:
+        """Seconds that each has run, and has waited to run."""
         found = {}
         for pid in tree:
             folder = f"{self._proc}/{pid}/task"
@@ -269,40 +267,6 @@ class _ProcessTrees:
             if name.isdecimal() and (times := parse_process_stat(_read(f"{self._proc}/{name}/stat"))) is not None:
                 children.setdefault(times.parent, []).append(int(name))
         return children
-
-
-class _Appetite:
-    """What the threads of one worker would use if they never had to wait."""
-
-    def __init__(self) -> None:
-        self._at = 0.0
-        self._times: dict[tuple[int, str], tuple[float, float]] = {}
-        self._shares: dict[tuple[int, str], tuple[float, float]] = {}
-        """{thread: share of the time that it ran, and that it ran or waited}, smoothed."""
-
-    def look(self, times: dict[tuple[int, str], tuple[float, float]], now: float) -> float | None:
-        """Cores; ``None`` when no thread always wants to run."""
-        elapsed_s = now - self._at
-        if elapsed_s < MIN_INTERVAL_S:
-            return self._wanted()
-        keep = math.exp(-elapsed_s / APPETITE_S)
-        shares = {}
-        for thread, (run_s, wait_s) in times.items():
-            before = self._times.get(thread)
-            if before is None:
-                continue
-            # A wait is told when it ends, so one sample may show more than its own time: only the mean is bounded.
-            ran = max(run_s - before[0], 0.0) / elapsed_s
-            wanted = max(run_s + wait_s - before[0] - before[1], 0.0) / elapsed_s
-            old = self._shares.get(thread, (0.0, 0.0))
-            shares[thread] = (ran + keep * (old[0] - ran), wanted + keep * (old[1] - wanted))
-        self._at, self._times, self._shares = now, times, shares
-        return self._wanted()
-
-    def _wanted(self) -> float | None:
-        if all(wanted < ALWAYS for _, wanted in self._shares.values()):
-            return None
-        return sum(min(wanted if wanted >= ALWAYS else ran, 1.0) for ran, wanted in self._shares.values())
 
 
 def _cores(
