@@ -44,13 +44,15 @@ class Silence:
     def go_on(self, asked_s: float, took_s: float) -> str:
         """Nothing came while we listened for ``took_s`` and wanted to for ``asked_s``; why it is wedged, or ``""``.
 
-        What it took longer, we did not run ourselves.
+        What it took longer, we did not run ourselves. Nor did the relay, maybe, and it needs a moment to say so: then
+        the verdict waits for the next time.
         """
+        has_stood_still = took_s > asked_s + LOOK_S
         self.silent_s += min(took_s, asked_s + LOOK_S)
         had_s = processor_s(self._pid)
         if self._began_at_s is None:
             self._began_at_s = had_s
-        if self.silent_s < self.patience_s:
+        if self.silent_s < self.patience_s or has_stood_still:
             return ""
         if had_s is None or self._began_at_s is None or is_idle(self._pid):
             return f"no sign of life for {self.silent_s:.1f} s"

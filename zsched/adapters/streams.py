@@ -330,7 +330,8 @@ class RelayHandle:
                 if is_there:
                     silence.end()
                     return ""
-                if reason := silence.go_on(asked_s, took_s):
+                reason = silence.go_on(asked_s, took_s)
+                if reason and not poller.poll(0):  # the verdict takes a look of 0.1 s, in which a word may have come
                     return reason
                 if silence.silent_s >= STARVED_S and not is_starved:
                     is_starved = True

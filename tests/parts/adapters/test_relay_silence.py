@@ -73,6 +73,16 @@ def test_what_we_slept_through_is_no_silence(process: Process) -> None:
     assert silence.silent_s == pytest.approx(1.0 + LOOK_S)
 
 
+def test_a_relay_that_stood_still_with_us_is_listened_to_once_more(process: Process) -> None:
+    """It was silent for a second when the machine stopped; awake again, the daemon may be the first to run."""
+    process.is_idle = True
+    silence = Silence(1, PATIENCE_S)
+    silence.go_on(1.0, 1.0)
+    assert silence.go_on(silence.left_s, 12.0) == ""
+    assert silence.left_s == pytest.approx(LOOK_S)
+    assert silence.go_on(LOOK_S, LOOK_S)
+
+
 def test_one_that_is_gone_is_not_waited_for(process: Process) -> None:
     process.had_s = None
     assert Silence(1, PATIENCE_S).go_on(2.0, 2.0)
