@@ -33,6 +33,9 @@ from zsched.worker_troubles import Troubles
 
 END_GRACE_S: Final = 0.1
 JOIN_S: Final = 0.2
+NAME_S: Final = 0.2
+"""So long the first sample of a source waits for the marker that names its slot. That was put before it, but comes in
+another thread of zenoh's."""
 
 _log = logging.getLogger("zsched.worker")
 
@@ -138,10 +141,15 @@ class Dispatcher:
 
     def _note_slot(self, marker: Marker) -> None:
         """A publisher feeds one slot for all its life: two words that differ count as none, one is a stranger's."""
-        if self._slots.setdefault(marker.name, marker.end.slot) != marker.end.slot:
-            self._slots[marker.name] = 0
-        if len(self._slots) > MAX_SOURCES:
-            self._slots.pop(next(iter(self._slots)))
+        with self._wake:
+            if self._slots.setdefault(marker.name, marker.end.slot) != marker.end.slot:
+                self._slots[marker.name] = 0
+            state = self._open.get(marker.name)
+            if state is not None and state.in_turn:  # it was heard before its name was
+                state.epoch = self._slots[marker.name] or state.epoch
+            if len(self._slots) > MAX_SOURCES:
+                self._slots.pop(next(iter(self._slots)))
+            self._wake.notify()
 
     def _give_up(self, name: SourceName, at: float) -> None:
         """Do nothing of a source any more, and acknowledge nothing: its relay counts that, or has counted it."""
@@ -387,6 +395,8 @@ class Dispatcher:
             state = self._open.get(name)
             if state is None:
                 in_turn = sample.congestion_control == zenoh.CongestionControl.BLOCK
+                if in_turn and self._epoch:  # a standby's answers are withheld, whatever the epoch
+                    self._wake.wait_for(lambda: name in self._slots or self._is_closed, NAME_S)
                 state = OpenSource(epoch=self._slots.get(name) or self._epoch, in_turn=in_turn)
                 if name not in self._given_up:
                     self._open[name] = state

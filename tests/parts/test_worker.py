@@ -307,6 +307,7 @@ def test_what_one_start_marker_says_is_told_and_three_others_take_it_back(relay:
         relay.session.put(f"{INPUT}/{END_CHUNK}", encode_end(marker), source_info=source)
 
     relay.put(b"a")
+    until(lambda: echo.taken, "it came: the marker that says it will not comes in another thread")
     say(EndMarker(epoch=0, count=1, is_whole=True, replayed=2**40))
     until(lambda: relay.acks and relay.acks[-1].is_whole, "it is believed, and told")
     assert relay.acks[-1].replays == 0, "no relay keeps so many"
@@ -576,6 +577,34 @@ def test_a_value_of_an_epoch_that_is_not_told_yet_waits_for_it_too(relay: Relay,
         told = relay.told()
         assert told is not None
         assert (told.first, told.lost) == (5, 0)
+
+
+@pytest.mark.parametrize("waits_s", [60.0, 0.0])
+def test_a_name_that_comes_behind_the_first_value_counts_for_it_too(
+    relay: Relay, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, waits_s: float
+) -> None:
+    """Markers and values come in threads of their own. Taken for one of the old epoch, the newest value had no result.
+
+    Where the value has not waited long enough, the ones behind it have their epoch.
+    """
+    monkeypatch.setattr(worker_inputs, "NAME_S", waits_s)
+    with Worker.from_env(environment(relay, tmp_path), handles_signals=False) as worker:
+        echo = Echo(worker, keep_last=1)
+        until(lambda: KEYS.worker("edge1", "t", 3) in relay.tokens, "the ready token")
+        relay.tell(WorkerRole.ACTIVE, epoch=1)
+        until(lambda: f"{ROLE_KEY}/1" in relay.tokens, "the worker has begun")
+        relay.publisher = relay.session.declare_publisher(INPUT, congestion_control=zenoh.CongestionControl.BLOCK)
+        relay.put(b"a")
+        if not waits_s:
+            until(lambda: relay.outputs == [("edge1/t/1/robot1/out", b"a")], "a result that nobody takes any more")
+            relay.outputs.clear()
+        relay.mark(EndMarker(epoch=0, count=0, slot=3))
+        until(lambda: worker._dispatcher._slots, "the marker")
+        if not waits_s:
+            relay.put(b"a")
+        until(lambda: echo.output.withheld == 1, "the value")
+        relay.tell(WorkerRole.ACTIVE, epoch=3)
+        until(lambda: relay.outputs == [("edge1/t/3/robot1/out", b"a")], "its result")
 
 
 def test_two_words_about_one_publisher_s_slot_count_as_none(relay: Relay, echo: Echo) -> None:

@@ -123,6 +123,20 @@ STREAM_BUGS = (
         (f"{_WORKER}::test_what_was_withheld_for_want_of_a_lease_goes_out_before_what_comes_with_it",),
     ),
     _bug(
+        "the name of a slot comes too late for its first value",
+        INPUTS,
+        "if in_turn and self._epoch:  # a standby's",
+        "if False:  # a standby's",
+        (f"{_WORKER}::test_a_name_that_comes_behind_the_first_value_counts_for_it_too",),
+    ),
+    _bug(
+        "the name of a slot is heard once only",
+        INPUTS,
+        "if state is not None and state.in_turn:",
+        "if False:",
+        (f"{_WORKER}::test_a_name_that_comes_behind_the_first_value_counts_for_it_too",),
+    ),
+    _bug(
         "a backlog is answered by keys",
         "zsched.worker_backlog",
         "deque(sorted((*self._again, *kept), key=_turn_of))",
