@@ -19,10 +19,10 @@ from zsched.crew import OTHERS, Crew
 SLEEPER = ("python", "-c", "import time; time.sleep(600)")
 TUNING = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
 SPECS = {
-    "node": WorkerSpec(command=SLEEPER, ready_when=ReadyWhen.MATCHING, start_deadline_s=0.5, stop_grace_s=0.1),
+    "node": WorkerSpec(command=SLEEPER, ready_when=ReadyWhen.MATCHING, start_deadline_s=4.0, stop_grace_s=0.1),
     "others": WorkerSpec(ready_when=ReadyWhen.MATCHING),
     "alone": WorkerSpec(),
-    "token": WorkerSpec(command=SLEEPER, start_deadline_s=0.5, stop_grace_s=0.1),
+    "token": WorkerSpec(command=SLEEPER, start_deadline_s=4.0, stop_grace_s=0.1),
 }
 FLEET = Fleet(
     name="test",
@@ -73,14 +73,14 @@ def test_a_process_that_matches_is_ready_and_is_not_ended_at_its_deadline(house:
     assert house.states("node") == [WorkerState.STARTING, WorkerState.READY]
     house.match("node", is_matched=False)
     assert house.states("node")[-1] is WorkerState.STARTING, "its process lives"
-    until(lambda: "not ready again within 0.5 s: was ready until" in str(house.reasons("node")), "the deadline")
+    until(lambda: "not ready again within 4 s: was ready until" in str(house.reasons("node")), "the deadline")
 
 
 def test_a_process_that_never_matches_is_told_what_it_lacks(house: House) -> None:
     house.supervisor.start("node")
     until(lambda: house.states("node"), "it runs")
     house.match("node", is_matched=False)
-    until(lambda: "not ready within 0.5 s: nobody subscribes to a/key" in str(house.reasons("node")), "the deadline")
+    until(lambda: "not ready within 4 s: nobody subscribes to a/key" in str(house.reasons("node")), "the deadline")
     assert "did it open $ZSCHED_ZENOH_CONFIG?" in str(house.reasons("node"))
 
 
@@ -97,7 +97,7 @@ def test_a_worker_that_was_ready_is_not_told_what_it_has_done_already(house: Hou
     assert lost.startswith(WAS_READY)
     assert lost.endswith(f"its token went: it may hang, be frozen or cut off; see its log and process {pid}")
     assert told_of_worker(house.states("token")[-1], lost) == lost, "and not that it is starting"
-    until(lambda: f"not ready again within 0.5 s: {lost}" in house.reasons("token"), "the deadline")
+    until(lambda: f"not ready again within 4 s: {lost}" in house.reasons("token"), "the deadline")
     until(lambda: house.crew.life_of("token") not in (0, life), "the next process runs")
     assert "no token" in house.crew.why_not_ready("token"), "which has not been ready"
 

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -132,6 +133,8 @@ def test_a_publisher_that_stood_still_while_it_was_asked_is_asked_again(
     monkeypatch.setattr(Questions, "ended", note)
     with publisher(net, tmp_path) as process:
         until(lambda: any(net.relay.liveliness().get(f"{KEY}/@adv/**")), "the publisher's token")
+        ask = partial(net.relay.get, f"{KEY}/@adv/**", accept_replies=zenoh.ReplyKeyExpr.ANY)
+        until(lambda: any(ask()), "its cache: a question for what is not known yet is sent to nobody")
         process.send_signal(signal.SIGSTOP)
         net.receive()
         until(lambda: unanswered and not under_way, "every question so far has ended without an answer")

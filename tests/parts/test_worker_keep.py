@@ -237,7 +237,10 @@ def test_another_life_of_a_relay_is_told_what_the_former_one_has_had_and_is_sent
     assert other.skipped == []
 
 
-def test_a_strangers_word_about_a_relay_that_lives_keeps_nothing_from_it(bench: Bench) -> None:
+def test_a_strangers_word_about_a_relay_that_lives_keeps_nothing_from_it(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(worker_lanes, "NEWCOMERS_S", 60.0)  # later nothing is kept for who is not known
     lane = bench.lane()
     keep(lane, 0, 1, 2)
     robot = bench.robot("robot1")

