@@ -61,6 +61,40 @@ def test_every_sample_that_comes_is_carried_or_gives_way_to_newer_ones(
         beside.undeclare()
 
 
+@pytest.mark.parametrize("stream_class", [StreamClass.LATEST, StreamClass.RELIABLE])
+def test_a_full_queue_makes_the_link_wait_and_drops_nothing(
+    stream_class: StreamClass, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A ring of zenoh's would drop the oldest here, in no counter."""
+    monkeypatch.setattr(receive, "QUEUE_DEPTH", 16)
+    carried: list[int] = []
+    gone: list[zenoh.Sample] = []
+    may_go_on = threading.Event()
+
+    def carry(sample: zenoh.Sample) -> None:
+        carried.append(int(sample.payload.to_bytes()))
+        may_go_on.wait(60.0)
+
+    with hub_and_neighbour() as (relay, outside):
+        settings = StreamSettings(stream_class=stream_class, depth=16)
+        receiver = Receiver(relay, KEY, settings, carry, with_history=False, give_way=gone.append)
+        publisher = outside.declare_publisher(KEY, congestion_control=zenoh.CongestionControl.BLOCK)
+        until(lambda: matches(publisher), "the relay subscribes")
+        publisher.put("0")
+        until(lambda: carried == [0], "the first is in hand")
+        reached: list[zenoh.Sample] = []
+        beside = relay.declare_subscriber(KEY, reached.append)  # declared later, so it is handed each one later
+        for number in range(1, COUNT):
+            publisher.put(str(number))
+        until(lambda: len(reached) >= 16, "the queue is full")
+        may_go_on.set()
+        until(lambda: carried[-1] == COUNT - 1, "the newest")
+        assert carried == list(range(COUNT))
+        assert not gone
+        receiver.close()
+        beside.undeclare()
+
+
 def test_a_stream_goes_on_behind_a_sample_that_cannot_be_carried() -> None:
     carried: list[int] = []
 

@@ -37,6 +37,7 @@ class Bug:
 SEQUENCE, IDENTITY = "zsched.core.sequence", "zsched.core.identity"
 REGISTER, LEASE, TENURE = "zsched.core.register", "zsched.core.lease", "zsched.core.tenure"
 SEALING, WITNESS = "zsched.core.sealing", "zsched.core.witness"
+NAMESAKES = "zsched.core.namesakes"
 BELIEF = "zsched.core.belief"
 AGREEMENT, MEMBERSHIP, NODE = "zsched.core.agreement", "zsched.core.membership", "zsched.core.node"
 ROUNDS, VOTE, VOTING = "zsched.core.rounds", "zsched.core.vote", "zsched.core.voting"
@@ -51,6 +52,8 @@ _SCHEDULES = ("tests/unit/core/test_register_schedules.py",)
 _AGREEMENT = ("tests/unit/core/test_agreement.py",)
 _LEASE = ("tests/sim/test_lease_rules.py", "tests/sim/test_exclusive.py")
 _GENERATIONS = ("tests/sim/test_generations.py",)
+_NAMESAKES = ("tests/unit/core/test_namesakes.py",)
+_WITNESS = ("tests/unit/core/test_witness.py",)
 _RESTORED = ("tests/sim/test_restored_state.py",)
 _ROLLOUT = ("tests/sim/test_exclusive_rollout.py",)
 _MEMBERSHIP = (
@@ -425,6 +428,41 @@ LEASE_BUGS = (
 )
 
 MEMBERSHIP_BUGS = (
+    _bug(
+        "two tokens of one name are twins at their first beats",
+        NAMESAKES,
+        "if life.stays_s() >= self._beside_s > now - life.at",
+        "if self._beside_s > now - life.at",
+        _NAMESAKES,
+    ),
+    _bug(
+        "beats of a life without a token make a twin",
+        NAMESAKES,
+        "        if beat.incarnation not in name.tokens:\n            return False\n",
+        "",
+        _NAMESAKES,
+    ),
+    _bug(
+        "a twin's later life is this elector's forgotten one",
+        WITNESS,
+        "if incarnation > self.incarnation and not self._has_twin:",
+        "if incarnation > self.incarnation:",
+        _WITNESS,
+    ),
+    _bug(
+        "a life that begins after our own start is no twin's",
+        WITNESS,
+        "self._has_twin |= learnt.node in self._answered and self._is_later(learnt)",
+        "self._has_twin |= False",
+        _WITNESS,
+    ),
+    _bug(
+        "a twin's life is not compared with our own votes",
+        WITNESS,
+        "if incarnation >= self.incarnation else self._at_start",
+        "if incarnation == self.incarnation else self._at_start",
+        _WITNESS,
+    ),
     _bug(
         "a slewed clock is believed",
         "zsched.core.clocks",

@@ -13,6 +13,7 @@ INPUTS, WORKER_LANES = "zsched.worker_inputs", "zsched.worker_lanes"
 GREETINGS, LANES, OUTLET = "zsched.relay.greetings", "zsched.relay.lanes", "zsched.relay.outlet"
 
 _GREETINGS = ("tests/parts/test_relay_greetings.py",)
+_RECEIVE = ("tests/parts/test_relay_receive.py",)
 _ACKS = ("tests/unit/test_hop_acks.py",)
 _LANES = ("tests/unit/test_relay_lanes.py",)
 _WORKER = "tests/parts/test_worker.py"
@@ -24,6 +25,20 @@ def _bug(name: str, module: str, old: str, new: str, tests: tuple[str, ...]) -> 
 
 
 STREAM_BUGS = (
+    _bug(
+        "what gives way in front of a stream is in no counter",
+        "zsched.relay.receive",
+        "self._give_way(waiting.popleft())",
+        "waiting.popleft()",
+        _RECEIVE,
+    ),
+    _bug(
+        "zenoh's ring in front of a stream drops what it likes",
+        "zsched.relay.receive",
+        "zenoh.handlers.FifoChannel(max(settings.depth, QUEUE_DEPTH))",
+        "zenoh.handlers.RingChannel(max(settings.depth, QUEUE_DEPTH))",
+        _RECEIVE,
+    ),
     _bug(
         "a new lane does not wait for its greeting's answer",
         OUTLET,

@@ -65,6 +65,16 @@ def test_without_a_second_token_beats_say_nothing() -> None:
     assert namesakes.problems(110.0) == ()
 
 
+def test_beats_of_a_life_that_has_no_token_are_no_twin_beside_a_token_that_lingers() -> None:
+    """After a restart two tokens are there for a while; a stranger puts beats of a third life."""
+    namesakes = two()
+    for step in range(50):
+        now = 100.0 + step * BEAT_S
+        assert not namesakes.on_beat(beat(8, step), now)
+        assert not namesakes.on_beat(beat(9, step), now)
+    assert namesakes.names(110.0) == ()
+
+
 def test_a_token_alone_says_nothing() -> None:
     namesakes = two()
     assert not any(namesakes.on_beat(beat(7, 500 + step), 100.0 + step * BEAT_S) for step in range(50))
