@@ -230,7 +230,7 @@ def _scheduler(page: Page, status: Json, task: Json) -> None:
         (f"bonus {tuning['bonus']:g}", ""),
         (f"trigger {tuning['time_to_trigger_s']:g}s" if patience is None else f"patience {patience:g}", ""),
         (f"cool-down {tuning['cool_down_s']:g}s", ""),
-        *([("by service", "")] if tuning.get("score") == "service" else []),
+        *([("by the paper's score", "")] if tuning.get("score") == "paper" else []),
     )
     if decision is None:
         why = "edges do not decide: ask a robot with --node" if status["kind"] == "edge" else "no round yet"

@@ -30,6 +30,7 @@ from zsched.config_ros2 import ros2_record
 from zsched.core.fleet import (
     DEFAULT_FORESEE_S,
     DEFAULT_PATIENCE,
+    DEFAULT_SCORE,
     PATIENT_BONUS,
     PATIENT_COOL_DOWN_S,
     SERVICE_COOL_DOWN_S,
@@ -212,20 +213,20 @@ SCHEDULING: Final = Record(
         "cool_down_s": Field(
             Number(0, 86400, "s"),
             "Least stay after a move.",
-            default=f"`{PATIENT_COOL_DOWN_S:g}` (`{SERVICE_COOL_DOWN_S:g}` with `score: service`); "
-            "`10` with `time_to_trigger_s` alone",
+            default=f"`{SERVICE_COOL_DOWN_S:g}`; `{PATIENT_COOL_DOWN_S:g}` with a weight for the network or "
+            "`score: paper`; `10` with `time_to_trigger_s` alone",
         ),
         "score": Field(
             Choice.of(ScoreForm),
-            "What a machine is worth to the task: `paper`, the free share of it once the task is there (Eq. 1, 2, 4); "
-            "`service`, the share of its work that the task would get done there.",
-            default=f"`{ScoreForm.PAPER}`",
+            "What a machine is worth to the task: `service`, the share of its work that the task would get done there; "
+            "`paper`, the free share of it once the task is there (Eq. 1, 2, 4).",
+            default=f"`{DEFAULT_SCORE}`",
         ),
         "aggregate": Field(Choice.of(Aggregate), "How the robots' utilities become one; `median` resists a liar."),
         "reach": Field(Choice.of(Reach), "Who must reach a candidate.", default=f"`{Reach.MAJORITY}`"),
         "memory_floor_ratio": Field(
             Number(0, 0.9),
-            "Leave an owner whose free memory is below this share (`score: service`: such memory counts as used).",
+            "Memory below this share counts as used (`score: paper`: an owner that has less is left).",
             default="`0.05`",
         ),
         "max_moves_per_minute": Field(
@@ -235,7 +236,7 @@ SCHEDULING: Final = Record(
             Number(0.001, 1000),
             "Move once staying has cost so much, lead times seconds (`time_to_trigger_s` does not count then): "
             "a big lead is followed sooner than a small one.",
-            default=f"`{DEFAULT_PATIENCE:g}` (`{SERVICE_PATIENCE:g}` with `score: service`); "
+            default=f"`{SERVICE_PATIENCE:g}`; `{DEFAULT_PATIENCE:g}` with a weight for the network or `score: paper`; "
             "none with `time_to_trigger_s` alone",
         ),
         "pays_off_in_s": Field(

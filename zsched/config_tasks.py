@@ -15,6 +15,7 @@ from zsched.config_ros2 import ros2_rules
 from zsched.core.fleet import (
     DEFAULT_FORESEE_S,
     DEFAULT_PATIENCE,
+    DEFAULT_SCORE,
     PATIENT_BONUS,
     PATIENT_COOL_DOWN_S,
     SERVICE_COOL_DOWN_S,
@@ -100,7 +101,7 @@ def _task(
         limits=limits,
         worker=worker,
         rules=tuple(stream.value for stream in streams),
-        patience=_patience(scheduling),
+        patience=_patience(scheduling, (tuning or _ANY_TUNING).weights),
         **_of(given, "on_isolation", "exclusive", "drain_s"),
         **more,
     )
@@ -138,26 +139,37 @@ def _tuning(given: Section, out: Collector) -> Tuning | None:
     if weights is None:
         return None
     scheduling: Section | None = given.get("scheduling")
+    score = _score(scheduling)
+    is_quick = _is_quick(score, weighs_network=weights.network > 0)
     patient: dict[str, Any] = {
         "bonus": PATIENT_BONUS,
-        "cool_down_s": SERVICE_COOL_DOWN_S if _is_service(scheduling) else PATIENT_COOL_DOWN_S,
+        "cool_down_s": SERVICE_COOL_DOWN_S if is_quick else PATIENT_COOL_DOWN_S,
     }
     if scheduling is None:
-        return Tuning(weights=weights, **patient)
-    default = patient if _patience(scheduling) is not None else {}
-    return scheduling.build(Tuning, out, weights=weights, **{**default, **_of(scheduling, *patient)})
+        return Tuning(weights=weights, score=score, **patient)
+    default = patient if _patience(scheduling, weights) is not None else {}
+    more = {"score": score, **default, **_of(scheduling, *patient)}
+    return scheduling.build(Tuning, out, weights=weights, **more)
 
 
-def _patience(scheduling: Section | None) -> float | None:
+def _patience(scheduling: Section | None, weights: Weights) -> float | None:
     """As given; none where only a time-to-trigger is given; else the default."""
     values = {} if scheduling is None else scheduling.values
-    default = SERVICE_PATIENCE if _is_service(scheduling) else DEFAULT_PATIENCE
+    is_quick = _is_quick(_score(scheduling), weighs_network=weights.network > 0)
+    default = SERVICE_PATIENCE if is_quick else DEFAULT_PATIENCE
     patience: float | None = values.get("patience", None if "time_to_trigger_s" in values else default)
     return patience
 
 
-def _is_service(scheduling: Section | None) -> bool:
-    return scheduling is not None and scheduling.values.get("score") is ScoreForm.SERVICE
+def _score(scheduling: Section | None) -> ScoreForm:
+    values = {} if scheduling is None else scheduling.values
+    score: ScoreForm = values.get("score", DEFAULT_SCORE)
+    return score
+
+
+def _is_quick(score: ScoreForm, *, weighs_network: bool) -> bool:
+    """Whether the shorter patience is the default: not where a radio counts, which comes and goes (0031)."""
+    return score is ScoreForm.SERVICE and not weighs_network
 
 
 def _limits(given: Section, out: Collector) -> LinkLimits:

@@ -145,19 +145,19 @@ def test_links_of_every_source() -> None:
 @pytest.mark.parametrize(
     ("scheduling", "patience", "bonus", "cool_down_s", "trigger_s"),
     [
-        ("", DEFAULT_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S, None),
-        ("{}", DEFAULT_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S, None),
-        ("{cool_down_s: 7}", DEFAULT_PATIENCE, PATIENT_BONUS, 7.0, None),
-        ("{cool_down_s: 0}", DEFAULT_PATIENCE, PATIENT_BONUS, 0.0, None),
-        ("{bonus: 0.2}", DEFAULT_PATIENCE, 0.2, PATIENT_COOL_DOWN_S, None),
-        ("{bonus: 0}", DEFAULT_PATIENCE, 0.0, PATIENT_COOL_DOWN_S, None),
-        ("{patience: 0.3}", 0.3, PATIENT_BONUS, PATIENT_COOL_DOWN_S, None),
-        ("{patience: 0.3, bonus: 0.2}", 0.3, 0.2, PATIENT_COOL_DOWN_S, None),
+        ("", SERVICE_PATIENCE, PATIENT_BONUS, SERVICE_COOL_DOWN_S, None),
+        ("{}", SERVICE_PATIENCE, PATIENT_BONUS, SERVICE_COOL_DOWN_S, None),
+        ("{cool_down_s: 7}", SERVICE_PATIENCE, PATIENT_BONUS, 7.0, None),
+        ("{cool_down_s: 0}", SERVICE_PATIENCE, PATIENT_BONUS, 0.0, None),
+        ("{bonus: 0.2}", SERVICE_PATIENCE, 0.2, SERVICE_COOL_DOWN_S, None),
+        ("{bonus: 0}", SERVICE_PATIENCE, 0.0, SERVICE_COOL_DOWN_S, None),
+        ("{patience: 0.3}", 0.3, PATIENT_BONUS, SERVICE_COOL_DOWN_S, None),
+        ("{patience: 0.3, bonus: 0.2}", 0.3, 0.2, SERVICE_COOL_DOWN_S, None),
         ("{time_to_trigger_s: 2}", None, 0.1, 10.0, 2.0),
         ("{time_to_trigger_s: 0}", None, 0.1, 10.0, 0.0),
         ("{time_to_trigger_s: 3, bonus: 0.05, cool_down_s: 4}", None, 0.05, 4.0, 3.0),
-        ("{time_to_trigger_s: 3, patience: 0.3}", 0.3, PATIENT_BONUS, PATIENT_COOL_DOWN_S, 3.0),
-        ("{time_to_trigger_s: 3, patience: 0.3, bonus: 0.2}", 0.3, 0.2, PATIENT_COOL_DOWN_S, 3.0),
+        ("{time_to_trigger_s: 3, patience: 0.3}", 0.3, PATIENT_BONUS, SERVICE_COOL_DOWN_S, 3.0),
+        ("{time_to_trigger_s: 3, patience: 0.3, bonus: 0.2}", 0.3, 0.2, SERVICE_COOL_DOWN_S, 3.0),
     ],
 )
 def test_patience_is_the_default_and_a_time_to_trigger_alone_takes_its_place(
@@ -175,6 +175,7 @@ def test_patience_is_the_default_and_a_time_to_trigger_alone_takes_its_place(
 @pytest.mark.parametrize(
     ("given", "patience", "cool_down_s"),
     [
+        ("{bonus: 0.05}", SERVICE_PATIENCE, SERVICE_COOL_DOWN_S),
         ("{score: service}", SERVICE_PATIENCE, SERVICE_COOL_DOWN_S),
         ("{score: service, patience: 0.7, cool_down_s: 9}", 0.7, 9.0),
         ("{score: service, time_to_trigger_s: 2}", None, 10.0),
@@ -185,7 +186,18 @@ def test_a_task_scored_by_service_has_its_own_defaults(given: str, patience: flo
     scheduling = "    scheduling: {bonus: 0.10, time_to_trigger_s: 2, cool_down_s: 10}\n"
     task = fleet_of(swapped(scheduling, f"    scheduling: {given}\n")).tasks[0]
     assert (task.patience, task.tuning.cool_down_s) == (patience, cool_down_s)
-    assert task.tuning.score is (ScoreForm.SERVICE if "service" in given else ScoreForm.PAPER)
+    assert task.tuning.score is (ScoreForm.PAPER if "paper" in given else ScoreForm.SERVICE)
+
+
+@pytest.mark.parametrize("given", ["", "    scheduling: {score: service}\n"])
+def test_a_task_that_weighs_the_network_is_as_patient_as_before(given: str) -> None:
+    """A radio comes and goes: four times as many moves otherwise (docs/decisions/0031)."""
+    scheduling = "    scheduling: {bonus: 0.10, time_to_trigger_s: 2, cool_down_s: 10}\n"
+    text = swapped(scheduling, given).replace("network: 0.0", "network: 0.2").replace("cpu: 0.5", "cpu: 0.3")
+    task = fleet_of(text).tasks[0]
+    assert task.tuning.weights.network > 0
+    assert (task.patience, task.tuning.cool_down_s) == (DEFAULT_PATIENCE, PATIENT_COOL_DOWN_S)
+    assert task.tuning.score is ScoreForm.SERVICE
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from zsched.config_schema import LINK_LIMITS, RULE, SCHEDULING, TRACE, WORKER, r
 from zsched.core.fleet import (
     DEFAULT_FORESEE_S,
     DEFAULT_PATIENCE,
+    DEFAULT_SCORE,
     PATIENT_BONUS,
     PATIENT_COOL_DOWN_S,
     SERVICE_COOL_DOWN_S,
@@ -50,11 +51,11 @@ def test_defaults_that_hang_on_each_other_are_the_codes() -> None:
     timers = {field.name: field.default for field in fields(Tuning)}
     alone = "with `time_to_trigger_s` alone"
     assert SCHEDULING.default_text("bonus") == f"`{PATIENT_BONUS:g}`; `{timers['bonus']:g}` {alone}"
-    served = "with `score: service`"
-    kept = f"`{PATIENT_COOL_DOWN_S:g}` (`{SERVICE_COOL_DOWN_S:g}` {served}); `{timers['cool_down_s']:g}` {alone}"
+    patient = "with a weight for the network or `score: paper`"
+    kept = f"`{SERVICE_COOL_DOWN_S:g}`; `{PATIENT_COOL_DOWN_S:g}` {patient}; `{timers['cool_down_s']:g}` {alone}"
     assert SCHEDULING.default_text("cool_down_s") == kept
-    assert SCHEDULING.default_text("score") == f"`{timers['score']}`"
-    patience = f"`{DEFAULT_PATIENCE:g}` (`{SERVICE_PATIENCE:g}` {served}); none {alone}"
+    assert SCHEDULING.default_text("score") == f"`{DEFAULT_SCORE}`"
+    patience = f"`{SERVICE_PATIENCE:g}`; `{DEFAULT_PATIENCE:g}` {patient}; none {alone}"
     assert SCHEDULING.default_text("patience") == patience
     assert LINK_LIMITS.default_text("foresee_s") == f"`{DEFAULT_FORESEE_S:g}`"
 

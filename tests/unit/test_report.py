@@ -346,10 +346,10 @@ def test_speed_of_the_cores_what_a_starved_worker_wants_and_the_score_are_shown_
     status = recorded("healthy")
     (node, *_), (task, *_) = status["nodes"], status["tasks"]
     node["speed"], node["workers"][0]["cpu_cores"], node["workers"][0]["wanted_cores"] = 0.713, 0.48, 1.0
-    task["tuning"]["score"] = "service"
+    task["tuning"]["score"] = "paper"
     wide, narrow = (render_status(status, width, color=False) for width in (120, 80))
     assert "of 2 x0.71 " in wide
     assert "0.48 of 1.00 cores" in wide
-    assert "· by service" in wide
+    assert "· by the paper's score" in wide
     assert "x0.71" not in narrow
-    assert "by service" not in render_status(recorded("healthy"), 120, color=False)
+    assert "paper's score" not in render_status(recorded("healthy"), 120, color=False)

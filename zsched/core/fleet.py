@@ -14,9 +14,11 @@ from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
 from functools import lru_cache
 
-from zsched.core.model import Allocation, LinkSource, NodeId, NodeKind, TaskId, Tuning, check_range
+from zsched.core.model import Allocation, LinkSource, NodeId, NodeKind, ScoreForm, TaskId, Tuning, check_range
 from zsched.core.plan import Direction, ReadyWhen, ServiceSettings, StreamSettings
 
+DEFAULT_SCORE = ScoreForm.SERVICE
+"""What a machine is worth to a task whose fleet file does not say how to score (docs/decisions/0031)."""
 DEFAULT_PATIENCE = 0.4
 """Utility seconds; for a task whose fleet file gives neither a patience nor a time-to-trigger (docs/decisions/0024)."""
 PATIENT_BONUS = 0.05
@@ -24,9 +26,10 @@ PATIENT_BONUS = 0.05
 PATIENT_COOL_DOWN_S = 5.0
 """The cool-down of a task with a patience, likewise (docs/decisions/0023)."""
 SERVICE_PATIENCE = 0.1
-"""`DEFAULT_PATIENCE` under `ScoreForm.SERVICE`: a lead is then a share of the task's work (docs/decisions/0030)."""
+"""`DEFAULT_PATIENCE` under `ScoreForm.SERVICE` of a task that does not weigh the network: a lead is then a share of the
+task's work (docs/decisions/0030, 0031)."""
 SERVICE_COOL_DOWN_S = 2.0
-"""`PATIENT_COOL_DOWN_S` under `ScoreForm.SERVICE`."""
+"""`PATIENT_COOL_DOWN_S`, likewise."""
 DEFAULT_FORESEE_S = 3.0
 """How far ahead the signals of a task count when its fleet file does not say."""
 

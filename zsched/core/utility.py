@@ -71,14 +71,12 @@ def memory_utility(delta: float, theta: float, mu: float) -> float:
 
 LEAST_NEED_RATIO = 0.05
 """A task counts as needing at least this share of a machine: also of a small one more room is better."""
-SPARE = 0.04
-"""The part of a term that tells a machine with much to spare from one that just does: too little to be worth a move."""
-SPARE_HALF = 2.0
-"""Half of that part is had where there is room for so many such tasks."""
+SPARE = 0.05
+"""The part of a term that is the machine's free share: enough to place tasks apart, too little to be worth a move."""
 
 
 def service_utility(free: float, demand: float, capacity: float) -> float:
-    """The share of its work that a task would get done, ``min(free / demand, 1)``, and a little for room to spare.
+    """The share of its work that a task would get done, ``min(free / demand, 1)``, and a little for what is left free.
 
     Args:
         free: not in use by others, in cores or MiB; below 0 counts as 0. Of an owner with nothing to spare it is what
@@ -86,13 +84,13 @@ def service_utility(free: float, demand: float, capacity: float) -> float:
         demand: of the task, in the same unit, >= 0.
         capacity: of the machine, in the same unit, > 0.
 
-    >>> round(service_utility(free=1.0, demand=2.0, capacity=4.0), 3)
-    0.488
-    >>> round(service_utility(free=4.0, demand=2.0, capacity=4.0), 3)
-    0.98
+    >>> round(service_utility(free=1.0, demand=2.0, capacity=4.0), 4)
+    0.4875
+    >>> round(service_utility(free=4.0, demand=2.0, capacity=4.0), 4)
+    1.0
     """
     room = max(free, 0.0) / max(demand, LEAST_NEED_RATIO * capacity)
-    return (1.0 - SPARE) * min(room, 1.0) + SPARE * room / (room + SPARE_HALF)
+    return (1.0 - SPARE) * min(room, 1.0) + SPARE * clamp(free / capacity)
 
 
 KNEE_UTILITY = 0.8

@@ -125,7 +125,7 @@ def test_memory_below_the_floor_is_no_room_for_a_task_s_service() -> None:
         agreed = replace(allocation(half, owner=None), tuning=Tuning(weights=half, score=form))
         found[form] = scored(ROBOT, profile("edge1", memory=3600.0), spec=spec, agreed=agreed).utilities[0].memory
     assert found[ScoreForm.PAPER] == 0.0
-    assert found[ScoreForm.SERVICE] == pytest.approx(0.5, abs=0.02)
+    assert found[ScoreForm.SERVICE] == pytest.approx(0.5, abs=0.03)
 
 
 # --- who is scored -------------------------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from zsched.core import fleet, scoring, utility
 from zsched.core.fleet import PATIENT_BONUS
 from zsched.core.model import ScoreForm, Weights
+from zsched.core.scoring import rounded
 from zsched.core.utility import (
     clamp,
     cpu_utility,
@@ -160,7 +161,14 @@ def test_room_is_worth_more_the_more_there_is_and_less_the_more_is_needed(
 def test_below_the_need_a_term_falls_as_the_work_that_is_done_and_above_it_next_to_nothing_counts() -> None:
     whole = service_utility(2.0, 2.0, 4.0)
     assert service_utility(1.0, 2.0, 4.0) == pytest.approx(whole / 2, rel=0.02)
-    assert whole < service_utility(4.0, 2.0, 4.0) < whole + PATIENT_BONUS / 2
+    assert whole < service_utility(4.0, 2.0, 4.0) < whole + PATIENT_BONUS
+    assert service_utility(4.0, 0.2, 4.0) <= service_utility(0.2, 0.2, 4.0) + PATIENT_BONUS, "idle beside just enough"
+
+
+def test_a_tenth_of_a_machine_places_tasks_apart_however_much_room_there_is() -> None:
+    """Else three small tasks that come together all go to the first machine by name."""
+    without, beside = (service_utility(free, 0.4, 4.0) for free in (3.6, 3.2))
+    assert rounded(without) > rounded(beside)
 
 
 def test_a_starved_machine_is_worth_less_than_an_idle_one_though_neither_has_what_the_task_needs() -> None:

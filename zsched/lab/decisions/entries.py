@@ -54,8 +54,9 @@ def core(
     pays_off_in_s: float | None = None,
     move_cost_s: float = 0.0,
 ) -> Callable[[Sight], Rule]:
-    """The production's decision; what is ``None`` is what a fleet file gets that does not say it (docs/decisions/0024).
+    """The production's decision; what is ``None`` is what a fleet file with ``score: paper`` gets that leaves it out.
 
+    These histories are judged by the paper's utility, so the product decides by that, too (docs/decisions/0024).
     Neither a patience nor a time-to-trigger: the default patience. Signals are `foreseeing`'s affair.
     """
     if patience is None and time_to_trigger_s is None:
@@ -75,7 +76,7 @@ def foreseeing(world: World, lead_s: float = DEFAULT_FORESEE_S, **more: Any) -> 
 
 
 def ours(world: World) -> tuple[Entry, ...]:
-    """The product as it comes, and with a time-to-trigger in place of patience and foresight."""
+    """The product as `score: paper` has it, and with a time-to-trigger in place of patience and foresight."""
     return (
         Entry(name="zsched", limits=foreseeing(world), make=core(world)),
         Entry(name="zsched, timer", make=timed(world)),

@@ -52,14 +52,14 @@ class Scheme:
     weights: tuple[float, float, float] | None = None
     only: int | None = None
     labels: Mapping[str, str] = field(default_factory=dict)
-    scheduling: Mapping[str, float] = field(default_factory=dict)
+    scheduling: Mapping[str, float | str] = field(default_factory=dict)
     link: Mapping[str, float] = field(default_factory=dict)
     timing: Mapping[str, float] = field(default_factory=dict)
     rule: RuleName | None = None
 
 
 CPU, MEMORY, BOTH, NETWORK = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.5, 0.5, 0.0), (0.0, 0.0, 1.0)
-_FREE = {"bonus": 0.0, "time_to_trigger_s": 0.0, "cool_down_s": 0.0}
+_FREE: Mapping[str, float | str] = {"score": "paper", "bonus": 0.0, "time_to_trigger_s": 0.0, "cool_down_s": 0.0}
 _AS_MEASURED = {"foresee_s": 0.0}
 _TIMING = {"smoothing_s": PAPER_SMOOTHING_S, "decide_s": PAPER_PERIOD_S}
 

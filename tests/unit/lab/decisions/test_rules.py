@@ -30,8 +30,9 @@ tasks:
   plain:
     candidates: {kind: edge}
     weights: {cpu: 0.5, memory: 0.5}
+    scheduling: {score: paper}
 """
-"""A fleet file that leaves everything to zsched."""
+"""A fleet file that leaves everything else to zsched."""
 
 
 def only(world: World, entry: Entry, seed: int = 0) -> list[Move]:
@@ -103,7 +104,7 @@ def test_patience_keeps_equal_nodes_apart_as_well_and_follows_a_step_sooner() ->
     assert move.at_s < by_timer.at_s
 
 
-def test_zsched_in_the_comparison_is_what_a_fleet_file_without_settings_gets() -> None:
+def test_zsched_in_the_comparison_is_what_a_fleet_file_gets_that_names_the_paper_s_score_only() -> None:
     """Rule "zsched" plays the product's defaults, whatever they are."""
     result = check_bytes(PLAIN.encode(), "plain.yaml")
     assert result.fleet is not None, result.faults

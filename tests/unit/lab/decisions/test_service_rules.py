@@ -95,8 +95,10 @@ def test_another_score_in_the_core_is_another_rule_here(monkeypatch: pytest.Monk
     assert [move.owner for move in after] == [last]
 
 
-def test_zsched_here_is_zsched_of_the_other_study() -> None:
-    made = ZSCHED.make(TaskView(scene(build(seed=3, hours=HOURS, load_s=0.0), 1.0, None), spec_of(3)))
+def test_the_paper_s_score_here_is_zsched_of_the_other_study() -> None:
+    made = cast.zsched("paper", score=ScoreForm.PAPER).make(
+        TaskView(scene(build(seed=3, hours=HOURS, load_s=0.0), 1.0, None), spec_of(3))
+    )
     world = loaded_world(seed=1, hours=HOURS)
     other = entries.core(world)(made.view) if isinstance(made, CoreRule) else None
     assert isinstance(made, CoreRule)

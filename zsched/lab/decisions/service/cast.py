@@ -1,4 +1,4 @@
-"""Who takes part: today's rule, the paper's, plain argmax, and rules that the command line describes.
+"""Who takes part: today's rule, the same with ``score: paper``, the paper's, plain argmax, and described ones.
 
 Knows: every rule's name and settings. Does not know: histories, results.
 """
@@ -13,6 +13,7 @@ from typing import Any, Final, Literal, get_args, get_origin, get_type_hints
 
 from zsched.core.fleet import (
     DEFAULT_PATIENCE,
+    DEFAULT_SCORE,
     PATIENT_BONUS,
     PATIENT_COOL_DOWN_S,
     SERVICE_COOL_DOWN_S,
@@ -33,8 +34,8 @@ OWN: Final = ("smoothing_s", "move_cost_s", "is_told")
 def players() -> tuple[Player, ...]:
     """The rules that are always compared."""
     return (
-        zsched("zsched"),
-        zsched("service", score=ScoreForm.SERVICE),
+        zsched("service"),
+        zsched("paper", score=ScoreForm.PAPER),
         _picks("dyna_both", EVEN, PAPER_COST),
         _picks("dyna_net", RADIO_ONLY, PAPER_COST),
         _picks("argmax", EVEN, 0.0),
@@ -51,7 +52,7 @@ def zsched(name: str, **settings: Any) -> Player:
     move_cost_s = given.pop("move_cost_s", 0.0)
     is_told = bool(given.pop("is_told", True))
     changes = {key: given.pop(key) for key in tuple(given) if is_of_task(key)}
-    is_service = given.get("score") is ScoreForm.SERVICE
+    is_service = given.setdefault("score", DEFAULT_SCORE) is ScoreForm.SERVICE  # no task here weighs the network
     if "time_to_trigger_s" not in given:
         changes.setdefault("patience", SERVICE_PATIENCE if is_service else DEFAULT_PATIENCE)
     if changes.get("patience") is not None:

@@ -21,7 +21,7 @@ import matplotlib.pyplot as plt
 STYLES: Final = {
     "oracle": ("black", "--", ""),
     "present": ("#555555", ":", ""),
-    "zsched": ("#c0392b", "-", "o"),
+    "paper": ("#c0392b", "-", "o"),
     "service": ("#2e8b57", "-", "o"),
     "dyna_both": ("#2c6fbb", "-", "s"),
     "dyna_net": ("#74b3e0", "-", "v"),

@@ -15,7 +15,7 @@ from zsched.lab.decisions.report import mean_and_spread
 from zsched.lab.decisions.service.cast import players
 from zsched.lab.decisions.service.study import YARDSTICKS, Row
 
-OURS: Final = "zsched"
+OURS: Final = "service"
 ORDER: Final = ("oracle", *(player.name for player in players()), *YARDSTICKS[1:])
 CLASSES: Final = ((0.0, 0.3), (0.3, 0.6), (0.6, 9.0))
 """Sizes of tasks, as shares of the median machine."""
