@@ -11,6 +11,7 @@ from typing import Any
 import psutil
 import pytest
 
+from zsched.core.utility import SPARE
 from zsched.lab.testbed import Testbed, echo_fleet
 
 TASKS = ("task1", "task2", "task3")
@@ -61,7 +62,7 @@ def looked_again(log: str) -> dict[str, bool]:
         elif (seen := LEARNT.search(line)) and seen[1] in votes:
             at, utilities = votes[seen[1]]
             best = max(utilities.values())
-            found[seen[1]] = all(then < at and utilities[node] < best - SHARE / 2 for then, node in placed)
+            found[seen[1]] = all(then < at and utilities[node] < best - SPARE * SHARE / 2 for then, node in placed)
         if seen := LEARNT.search(line):
             placed.append((number, seen[2]))
     return found
