@@ -21,7 +21,8 @@ SHARE = 0.1
 
 def three_tasks() -> dict[str, Any]:
     """Three robots that are all candidates of three equal tasks; they share one machine, so their figures are equal."""
-    tree = echo_fleet(edges=0, weights={"cpu": 0.0, "memory": 1.0, "network": 0.0})
+    weights = {"cpu": 0.0, "memory": 1.0, "network": 0.0}
+    tree = echo_fleet(edges=0, weights=weights, scheduling={"score": "service"})
     body = {
         **tree["tasks"].popitem()[1],
         "demand": {"memory_mb": round(SHARE * psutil.virtual_memory().total / 2**20)},
