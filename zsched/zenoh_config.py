@@ -228,19 +228,14 @@ def pool_threads(nodes: int, tasks: int = 0) -> int:
 
 
 def runtime_pools(nodes: int, tasks: int = 0) -> str:
-    """The value of ``ZENOH_RUNTIME`` for a process with links to so many nodes (zenoh reads it once)."""
-    return pools(pool_threads(nodes, tasks))
+    """The value of ``ZENOH_RUNTIME`` for a process with links to so many nodes (zenoh reads it once).
 
-
-def pools(threads: int, tx: int = TX_THREADS) -> str:
-    """The same for so many links that may fall silent at once.
-
-    ``tx``: how many of them a put may wait for. ``net`` closes links and dials, ``acc`` shakes hands with who dials us;
-    both have one thread by default. Closing a link that is dead one way holds a thread for zenoh's SO_LINGER, 10 s, in
-    which no other link came or went.
+    ``net`` closes links and dials, ``acc`` shakes hands with who dials us; both have one thread by default. Closing a
+    link that is dead one way holds a thread for zenoh's SO_LINGER, 10 s, in which no other link came or went.
     """
-    counts = {"rx": threads, "tx": tx, "net": threads, "acc": threads}
-    return f"({', '.join(f'{name}: (worker_threads: {count})' for name, count in counts.items())})"
+    threads = pool_threads(nodes, tasks)
+    pools = {"rx": threads, "tx": TX_THREADS, "net": threads, "acc": threads}
+    return f"({', '.join(f'{name}: (worker_threads: {count})' for name, count in pools.items())})"
 
 
 # --- parts -----------------------------------------------------------------------------------------------------------

@@ -5,9 +5,7 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
-from collections import Counter
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -73,20 +71,6 @@ def test_it_says_that_it_started_and_counts_every_second(process: subprocess.Pop
     assert isinstance(started, RelayStarted)
     assert started.pid == process.pid
     assert isinstance(next_report(reports), StreamsCounted)
-
-
-def test_one_link_that_closes_slowly_leaves_threads_to_close_and_accept_others() -> None:
-    """These pools have one thread by default; closing a link that is dead one way takes it for 10 s."""
-    command = [sys.executable, "-m", "zsched.relay", "--fleet", "test", "--node", "robot1", "--threads", "5"]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0) as child:
-        try:
-            _, reports = begin(child)
-            assert isinstance(next_report(reports), RelayStarted)
-            threads = [path.read_text().strip() for path in Path(f"/proc/{child.pid}/task").glob("*/comm")]
-            counts = Counter(name.rpartition("-")[0] for name in threads)
-            assert (counts["net"], counts["acc"]) == (5, 5)
-        finally:
-            child.kill()
 
 
 def test_it_gives_a_sign_of_life_between_its_counts(process: subprocess.Popen[bytes]) -> None:

@@ -20,7 +20,6 @@ import sys
 
 from zsched.core.relay_life import RelayHello
 from zsched.log_limit import limit_handlers
-from zsched.zenoh_config import pools
 
 PR_SET_PDEATHSIG = 1
 M_ARENA_MAX = -8
@@ -42,9 +41,10 @@ def main() -> None:
     signal.signal(signal.SIGTERM, _stop_soon)
     faulthandler.enable()
     faulthandler.register(signal.SIGUSR1)  # where every thread stands, for whoever has to ask
-    # One stalled target holds one thread of each kind: there must be more than targets may stall. Read once, when
-    # zenoh's runtime starts; what the daemon's environment says is for its own process.
-    os.environ["ZENOH_RUNTIME"] = pools(arguments.threads, tx=arguments.threads)
+    # One stalled target holds one transmit thread: there must be more threads than targets may stall. Read once, when
+    # zenoh's runtime starts. Links are closed and accepted one after the other here (docs/decisions/0016).
+    pools = f"(tx: (worker_threads: {arguments.threads}), rx: (worker_threads: {arguments.threads}))"
+    os.environ["ZENOH_RUNTIME"] = pools
     code = 1
     try:
         from zsched.relay.process import run  # noqa: PLC0415 - imports zenoh, which must find ZENOH_RUNTIME set
