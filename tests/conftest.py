@@ -3,21 +3,15 @@
 A job in the background of a script has SIGINT and SIGQUIT ignored, one under nohup SIGHUP; Python and every process
 that a test starts would inherit that, and tests of Ctrl-C would wait for ever.
 
-This process has many sessions at a time, and some of their peers are frozen by a test: closing such a link holds one of
-zenoh's threads, so it has as many as a daemon has.
-
 A test that finds a measured time too long is run up to three times: a machine is busy once, a fault is slow each time.
 Only tests of modules that measure times are marked for that: it costs a marked test 40 ms beside other processes.
 """
 
 from __future__ import annotations
 
-import os
 import signal
 
 import pytest
-
-from zsched.zenoh_config import runtime_pools
 
 MEASURES = ("TooSlowError", "between", "within")
 """Names of `support.waiting` that a module imports whose tests measure times."""
@@ -25,7 +19,6 @@ MEASURES = ("TooSlowError", "between", "within")
 
 def pytest_configure() -> None:
     """In each process that runs tests, before any does."""
-    os.environ.setdefault("ZENOH_RUNTIME", runtime_pools(6))
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     for number in (signal.SIGQUIT, signal.SIGHUP):
