@@ -140,10 +140,9 @@ def _tuning(given: Section, out: Collector) -> Tuning | None:
         return None
     scheduling: Section | None = given.get("scheduling")
     score = _score(scheduling)
-    is_quick = _is_quick(score, weighs_network=weights.network > 0)
     patient: dict[str, Any] = {
         "bonus": PATIENT_BONUS,
-        "cool_down_s": SERVICE_COOL_DOWN_S if is_quick else PATIENT_COOL_DOWN_S,
+        "cool_down_s": SERVICE_COOL_DOWN_S if _is_quick(score, weights) else PATIENT_COOL_DOWN_S,
     }
     if scheduling is None:
         return Tuning(weights=weights, score=score, **patient)
@@ -155,8 +154,7 @@ def _tuning(given: Section, out: Collector) -> Tuning | None:
 def _patience(scheduling: Section | None, weights: Weights) -> float | None:
     """As given; none where only a time-to-trigger is given; else the default."""
     values = {} if scheduling is None else scheduling.values
-    is_quick = _is_quick(_score(scheduling), weighs_network=weights.network > 0)
-    default = SERVICE_PATIENCE if is_quick else DEFAULT_PATIENCE
+    default = SERVICE_PATIENCE if _is_quick(_score(scheduling), weights) else DEFAULT_PATIENCE
     patience: float | None = values.get("patience", None if "time_to_trigger_s" in values else default)
     return patience
 
@@ -167,9 +165,9 @@ def _score(scheduling: Section | None) -> ScoreForm:
     return score
 
 
-def _is_quick(score: ScoreForm, *, weighs_network: bool) -> bool:
+def _is_quick(score: ScoreForm, weights: Weights) -> bool:
     """Whether the shorter patience is the default: not where a radio counts, which comes and goes (0031)."""
-    return score is ScoreForm.SERVICE and not weighs_network
+    return score is ScoreForm.SERVICE and not weights.network
 
 
 def _limits(given: Section, out: Collector) -> LinkLimits:

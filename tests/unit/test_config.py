@@ -191,7 +191,7 @@ def test_a_task_scored_by_service_has_its_own_defaults(given: str, patience: flo
 
 @pytest.mark.parametrize("given", ["", "    scheduling: {score: service}\n"])
 def test_a_task_that_weighs_the_network_is_as_patient_as_before(given: str) -> None:
-    """A radio comes and goes: four times as many moves otherwise (docs/decisions/0031)."""
+    """A radio comes and goes: twice as many moves otherwise (docs/decisions/0031)."""
     scheduling = "    scheduling: {bonus: 0.10, time_to_trigger_s: 2, cool_down_s: 10}\n"
     text = swapped(scheduling, given).replace("network: 0.0", "network: 0.2").replace("cpu: 0.5", "cpu: 0.3")
     task = fleet_of(text).tasks[0]

@@ -2,8 +2,8 @@
 
 Knows: what an operator may say, with the defaults (they live here only). Does not know: YAML, files, positions.
 
-A class's defaults are the plain rule: a time-to-trigger, signals as they are. The three constants below are what a task
-of a fleet file gets that says nothing else.
+A class's defaults are the plain rule: a time-to-trigger, signals as they are. The constants below are what a task of a
+fleet file gets that says nothing else.
 """
 
 from __future__ import annotations
