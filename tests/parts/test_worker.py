@@ -558,53 +558,53 @@ def test_who_is_chosen_again_before_it_hears_that_it_was_left_answers_in_the_new
     assert relay.outputs == [("edge1/t/1/robot1/out", b"a"), *again]
 
 
-def test_a_value_of_an_epoch_that_is_not_told_yet_waits_for_it_too(relay: Relay, tmp_path: Path) -> None:
-    """Class ``latest``: its marker names the slot, and is no word about numbers."""
+@pytest.fixture
+def newest(relay: Relay, tmp_path: Path) -> Iterator[Echo]:
+    """The owner of epoch 1 that keeps the newest value only; the relay has a new publisher, as for another slot."""
     with Worker.from_env(environment(relay, tmp_path), handles_signals=False) as worker:
-        echo = Echo(worker, keep_last=1)
+        made = Echo(worker, keep_last=1)
         until(lambda: KEYS.worker("edge1", "t", 3) in relay.tokens, "the ready token")
         relay.tell(WorkerRole.ACTIVE, epoch=1)
         until(lambda: f"{ROLE_KEY}/1" in relay.tokens, "the worker has begun")
         relay.publisher = relay.session.declare_publisher(INPUT, congestion_control=zenoh.CongestionControl.BLOCK)
-        relay.mark(EndMarker(epoch=0, count=0, slot=3))
-        until(lambda: worker._dispatcher._slots, "the marker")
-        relay.count = 5
-        relay.put(b"a")
-        until(lambda: echo.output.withheld == 1, "the value")
-        relay.tell(WorkerRole.ACTIVE, epoch=3)
-        until(lambda: relay.outputs == [("edge1/t/3/robot1/out", b"a")], "its result")
-        until(lambda: (told := relay.told()) is not None and told.processed == 6, "the acknowledgement")
-        told = relay.told()
-        assert told is not None
-        assert (told.first, told.lost) == (5, 0)
+        yield made
+
+
+def test_a_value_of_an_epoch_that_is_not_told_yet_waits_for_it_too(relay: Relay, newest: Echo) -> None:
+    """Class ``latest``: its marker names the slot, and is no word about numbers."""
+    relay.mark(EndMarker(epoch=0, count=0, slot=3))
+    until(lambda: newest.worker._dispatcher._slots, "the marker")
+    relay.count = 5
+    relay.put(b"a")
+    until(lambda: newest.output.withheld == 1, "the value")
+    relay.tell(WorkerRole.ACTIVE, epoch=3)
+    until(lambda: relay.outputs == [("edge1/t/3/robot1/out", b"a")], "its result")
+    until(lambda: (told := relay.told()) is not None and told.processed == 6, "the acknowledgement")
+    told = relay.told()
+    assert told is not None
+    assert (told.first, told.lost) == (5, 0)
 
 
 @pytest.mark.parametrize("waits_s", [60.0, 0.0])
 def test_a_name_that_comes_behind_the_first_value_counts_for_it_too(
-    relay: Relay, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, waits_s: float
+    relay: Relay, newest: Echo, monkeypatch: pytest.MonkeyPatch, waits_s: float
 ) -> None:
     """Markers and values come in threads of their own. Taken for one of the old epoch, the newest value had no result.
 
     Where the value has not waited long enough, the ones behind it have their epoch.
     """
     monkeypatch.setattr(worker_inputs, "NAME_S", waits_s)
-    with Worker.from_env(environment(relay, tmp_path), handles_signals=False) as worker:
-        echo = Echo(worker, keep_last=1)
-        until(lambda: KEYS.worker("edge1", "t", 3) in relay.tokens, "the ready token")
-        relay.tell(WorkerRole.ACTIVE, epoch=1)
-        until(lambda: f"{ROLE_KEY}/1" in relay.tokens, "the worker has begun")
-        relay.publisher = relay.session.declare_publisher(INPUT, congestion_control=zenoh.CongestionControl.BLOCK)
+    relay.put(b"a")
+    if not waits_s:
+        until(lambda: relay.outputs == [("edge1/t/1/robot1/out", b"a")], "a result that nobody takes any more")
+        relay.outputs.clear()
+    relay.mark(EndMarker(epoch=0, count=0, slot=3))
+    until(lambda: newest.worker._dispatcher._slots, "the marker")
+    if not waits_s:
         relay.put(b"a")
-        if not waits_s:
-            until(lambda: relay.outputs == [("edge1/t/1/robot1/out", b"a")], "a result that nobody takes any more")
-            relay.outputs.clear()
-        relay.mark(EndMarker(epoch=0, count=0, slot=3))
-        until(lambda: worker._dispatcher._slots, "the marker")
-        if not waits_s:
-            relay.put(b"a")
-        until(lambda: echo.output.withheld == 1, "the value")
-        relay.tell(WorkerRole.ACTIVE, epoch=3)
-        until(lambda: relay.outputs == [("edge1/t/3/robot1/out", b"a")], "its result")
+    until(lambda: newest.output.withheld == 1, "the value")
+    relay.tell(WorkerRole.ACTIVE, epoch=3)
+    until(lambda: relay.outputs == [("edge1/t/3/robot1/out", b"a")], "its result")
 
 
 def test_two_words_about_one_publisher_s_slot_count_as_none(relay: Relay, echo: Echo) -> None:
