@@ -6,7 +6,8 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import Any
 import pytest
 import zenoh
 
+from support.beside import COUPLED, Beside
 from support.relay_rig import BESIDE, ROBOT, Application, Rig, relay_rig, slot
 from support.sessions import matches
 from support.waiting import until, within
@@ -122,42 +124,20 @@ def test_a_worker_that_restarts_in_place_is_not_sent_what_its_former_life_may_ha
     until(lambda: told(rig).at_most_lost >= app.sent - len(app.back), "what may be lost")
 
 
-class Beside:
-    """A second task's stream through the same relay, from a session of its own, to a plain zenoh program."""
-
-    def __init__(self, rig: Rig) -> None:
-        self.arrivals: list[float] = []
-        config = zenoh.Config.from_json5
-        self._far = zenoh.open(config(worker_config(connect=(rig.endpoint("edge2"),))))
-        self._near = zenoh.open(config(worker_config(connect=(rig.endpoint(ROBOT),))))
-        self._halt = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        way = replace(slot(1, "edge2", StreamClass.RELIABLE, 0, ReadyWhen.MATCHING), routes=(BESIDE,))
-        self._far.declare_subscriber(BESIDE.to_expr, lambda _: self.arrivals.append(time.monotonic()))
+@contextmanager
+def stream_beside(rig: Rig) -> Iterator[Beside]:
+    """A second task's stream through the same relay, of another process, to a plain zenoh program."""
+    way = replace(slot(1, "edge2", StreamClass.RELIABLE, 0, ReadyWhen.MATCHING), routes=(BESIDE,))
+    beside = Beside(
+        near=rig.endpoint(ROBOT), far=rig.endpoint("edge2"), from_expr=BESIDE.from_expr, to_expr=BESIDE.to_expr
+    )
+    try:
         for phase in (RoutePhase.PREPARE, RoutePhase.FLIP):
             rig.relays[ROBOT].apply(RoutePlan(task="beside", phase=phase, current=way))
-        self._source = self._near.declare_publisher(BESIDE.from_expr)
-        until(lambda: self._source.put(b"x") or self.arrivals, "the live stream flows")
-        self._thread.start()
-
-    def _run(self) -> None:
-        while not self._halt.wait(0.005):
-            self._source.put(b"x")
-
-    def listen(self, take: Callable[[bytes], Any]) -> None:
-        """Hear every payload at the far end."""
-        self._far.declare_subscriber(BESIDE.to_expr, lambda sample: take(sample.payload.to_bytes()))
-
-    def longest_gap(self) -> float:
-        """From the tenth sample on."""
-        assert len(self.arrivals) > 200
-        return max(later - earlier for earlier, later in pairwise(self.arrivals[10:]))
-
-    def close(self) -> None:
-        self._halt.set()
-        self._thread.join(60)
-        for session in (self._far, self._near):
-            session.close()
+        until(lambda: beside.arrivals, "the live stream flows")
+        yield beside
+    finally:
+        beside.close()
 
 
 def test_a_stalled_workers_full_queue_delays_no_other_stream(rig: Rig) -> None:
@@ -165,8 +145,7 @@ def test_a_stalled_workers_full_queue_delays_no_other_stream(rig: Rig) -> None:
     frozen = rig.start_worker("edge1")
     app, _ = through(rig)
     app.padding = bytes(500_000)
-    beside = Beside(rig)
-    try:
+    with stream_beside(rig) as beside:
         thread = app.stream(100)
         until(lambda: len(app.back) > 20, "the stream through edge1")
         frozen.send_signal(signal.SIGSTOP)
@@ -175,8 +154,6 @@ def test_a_stalled_workers_full_queue_delays_no_other_stream(rig: Rig) -> None:
         until(lambda: len(beside.arrivals) > before + 100, "the stream beside goes on, and the application too")
         app.halt(thread)
         within(beside.longest_gap(), 0.9, "without a sample")
-    finally:
-        beside.close()
 
 
 def test_a_slow_workers_full_queue_slows_its_own_application_and_no_other(rig: Rig) -> None:
@@ -188,23 +165,20 @@ def test_a_slow_workers_full_queue_slows_its_own_application_and_no_other(rig: R
     app = Application(rig.app)
     until(app.connected, "the application sees the relay's subscription")
     app.padding = bytes(10_000)
-    beside = Beside(rig)
     coupled: list[int] = []
-    try:
-        beside.listen(lambda sample: coupled.append(len(app.back)) if sample == b"coupled" else None)
+    with stream_beside(rig) as beside:
+        beside.on_coupled(lambda: coupled.append(len(app.back)))
         also = rig.app.declare_publisher(BESIDE.from_expr, congestion_control=zenoh.CongestionControl.BLOCK)
         until(lambda: matches(also), "the relay takes the application's other stream, too")
         for _ in range(MORE_THAN_FITS):
             app.put()
-        also.put(b"coupled")  # behind all of them on the same link
+        also.put(COUPLED.encode())  # behind all of them on the same link
         until(lambda: coupled, "the application's other stream", deadline_s=60.0)
         dropped = rig.drops()["overflow"]  # on a busy machine the worker may have looked stalled
         assert coupled[0] + dropped > MORE_THAN_FITS - WHAT_FITS
         until(lambda: len(app.back) + rig.drops()["overflow"] >= app.sent, "every answer", deadline_s=60.0)
         assert app.back == sorted(set(app.back))
         within(beside.longest_gap(), 0.9, "without a sample")
-    finally:
-        beside.close()
 
 
 @pytest.mark.parametrize("stream_class", [StreamClass.RELIABLE, StreamClass.LATEST])
