@@ -81,10 +81,11 @@ def main(near: str, far: str, from_expr: str, to_expr: str) -> None:
         what = COUPLED if sample.payload.to_bytes() == COUPLED.encode() else "-"
         print(f"{time.monotonic()} {what}", flush=True)
 
-    config = zenoh.Config.from_json5
+    config = zenoh.Config.from_json5(worker_config(connect=(far,)))
+    config.insert_json5("id", '"1"')  # the lowest of all: the others dial it, and so does the relay
     with (
-        zenoh.open(config(worker_config(connect=(far,)))) as there,
-        zenoh.open(config(worker_config(connect=(near,)))) as here,
+        zenoh.open(config) as there,
+        zenoh.open(zenoh.Config.from_json5(worker_config(connect=(near,)))) as here,
     ):
         there.declare_subscriber(to_expr, take)
         source = here.declare_publisher(from_expr)

@@ -41,9 +41,9 @@ def main() -> None:
     signal.signal(signal.SIGTERM, _stop_soon)
     faulthandler.enable()
     faulthandler.register(signal.SIGUSR1)  # where every thread stands, for whoever has to ask
-    # One stalled target holds one transmit thread: there must be more threads than targets may stall. Read once, when
-    # zenoh's runtime starts. Links are closed and accepted one after the other here (docs/decisions/0016).
-    pools = f"(tx: (worker_threads: {arguments.threads}), rx: (worker_threads: {arguments.threads}))"
+    # One stalled target holds one thread that transmits, and later the one that closes its link: there must be more of
+    # each than targets may stall. Read once, when zenoh's runtime starts (docs/decisions/0016).
+    pools = f"({', '.join(f'{pool}: (worker_threads: {arguments.threads})' for pool in ('tx', 'rx', 'net'))})"
     os.environ["ZENOH_RUNTIME"] = pools
     code = 1
     try:
@@ -67,7 +67,8 @@ def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m zsched.relay", description="zsched's data plane")
     parser.add_argument("--fleet", required=True)
     parser.add_argument("--node", required=True)
-    parser.add_argument("--threads", type=int, default=DEFAULT_THREADS, help="transmit and receive threads, each")
+    threads = "threads that transmit, receive, and close links, each"
+    parser.add_argument("--threads", type=int, default=DEFAULT_THREADS, help=threads)
     parser.add_argument("--parent", type=int, default=0, help="process id that must be our parent")
     parser.add_argument("--local", action="store_true", help="a second frame holds the session of the host's own side")
     parser.add_argument("--door", type=int, help="listening socket (inherited) for the daemon's successors")
