@@ -208,6 +208,9 @@ class StreamCount:
     """Inputs of class ``latest``: values that came while there was no owner; the newest are kept for the next one."""
     unconfirmed: int = 0
     """Inputs: sent to a worker that acknowledges nothing (a foreign one): nobody knows what came of them."""
+    answer_s: float | None = None
+    """Outputs: mean seconds from inputs to their answers since the count before, network included. An answer without
+    its input's timestamp counts since the newest input before it, so it took at least so long."""
     from_expr: str = ""
     """Filled in by the status: the keys of the newest slot, empty while the task has no owner."""
     to_expr: str = ""

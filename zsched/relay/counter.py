@@ -25,12 +25,20 @@ class StreamCounter:
         self.replayed = 0
         self.repeated = 0
         self.unsent = 0
+        self._answers = 0
+        self._answers_s = 0.0
 
     def seen(self, size: int) -> None:
         """A sample of ``size`` bytes came in."""
         self._messages += 1
         self._bytes += size
         self._last_seen = monotonic_s()
+
+    def answered(self, took_s: float | None) -> None:
+        """An answer has come, ``took_s`` after its input."""
+        if took_s is not None:
+            self._answers += 1
+            self._answers_s += took_s
 
     def dropped(self, reason: str, count: int = 1) -> None:
         """``count`` samples did not go on, because of ``reason``."""
@@ -48,6 +56,8 @@ class StreamCounter:
             more = {"error": drops.get("error", 0) + said.errors, "uncounted": said.uncounted}
             drops = {**drops, **{reason: count for reason, count in more.items() if count}}
         age = None if self._last_seen is None else round(max(0.0, monotonic_s() - self._last_seen), 3)
+        answer_s = round(self._answers_s / self._answers, 4) if self._answers else None
+        self._answers, self._answers_s = 0, 0.0
         return StreamCount(
             stream=self.stream,
             messages=self._messages,
@@ -64,4 +74,5 @@ class StreamCounter:
             repeated=self.repeated,
             unsent=self.unsent,
             unconfirmed=said.unconfirmed,
+            answer_s=answer_s,
         )

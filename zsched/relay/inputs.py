@@ -24,6 +24,7 @@ from zenoh import Sample, Session, Timestamp
 from zsched.clock import monotonic_s
 from zsched.core.plan import OnCrash, Route, StreamClass, StreamCount
 from zsched.relay.acks import WorkerAcks
+from zsched.relay.answer_times import AnswerTimes
 from zsched.relay.counter import StreamCounter
 from zsched.relay.outlet import MAX_OWED, Outlet, Owed
 from zsched.relay.pace import Pace
@@ -59,9 +60,17 @@ class _InputSlot:
 class InputStream:
     """One input rule on this node; slots are named by their epoch."""
 
-    def __init__(self, session: Session, route: Route, own_ids: frozenset[str], local: Session | None = None) -> None:
+    def __init__(
+        self,
+        session: Session,
+        route: Route,
+        own_ids: frozenset[str],
+        local: Session | None = None,
+        times: AnswerTimes | None = None,
+    ) -> None:
         """Subscribe on ``local``, the host's own side, if there is one; ``session`` is the fleet's."""
         self.route = route
+        self._times = times
         self._session = session
         self._lock = threading.Lock()
         self._counter = StreamCounter(route.stream)
@@ -353,6 +362,8 @@ class InputStream:
 
     def _send(self, sample: Sample, stamp: Timestamp | None, size: int | None = None) -> None:
         if self._active is not None:
+            if self._times is not None:
+                self._times.sent(stamp or sample.timestamp)
             reason, dropped = self._active.outlet.send(sample, stamp, size)
             if dropped:
                 self._counter.dropped(reason, dropped)

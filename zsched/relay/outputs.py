@@ -26,6 +26,7 @@ from zsched.guard import tolerant
 from zsched.hop_acks import Acknowledger, Jump, SourceName
 from zsched.keyspace import AGAIN_CHUNK, END_CHUNK
 from zsched.relay.acks import WorkerAcks
+from zsched.relay.answer_times import AnswerTimes
 from zsched.relay.answers import Answers
 from zsched.relay.counter import StreamCounter
 from zsched.relay.crowd import note_feeder
@@ -60,6 +61,7 @@ class OutputStream:
         own_ids: frozenset[str],
         wake: Callable[[], None],
         local: Session | None = None,
+        times: AnswerTimes | None = None,
     ) -> None:
         """Declare the publisher, on ``local``, the host's own side, if there is one; ``session`` is the fleet's.
 
@@ -69,6 +71,7 @@ class OutputStream:
             ValueError, zenoh.ZError: the route makes no sense (see `Outlet`).
         """
         self.route = route
+        self._times = times
         self._session = session
         self._own_ids = own_ids
         self._wake = wake
@@ -398,6 +401,8 @@ class OutputStream:
         slot.held_bytes = 0
 
     def _forward(self, sample: Sample, size: int | None = None) -> None:
+        if self._times is not None:
+            self._counter.answered(self._times.answered(sample.timestamp))
         if self._is_latest:
             stamp = sample.timestamp
             if stamp is not None and not self._fence.passes(self._outlet.key_of(sample), stamp):

@@ -22,6 +22,7 @@ from zsched.core.plan import Direction, OnCrash, ReadyWhen, Route, RoutePhase, R
 from zsched.core.relay_protocol import RelayReport, SlotLost
 from zsched.guard import guarded
 from zsched.relay.acks import Acks
+from zsched.relay.answer_times import AnswerTimes
 from zsched.relay.graph import GraphMirror
 from zsched.relay.inputs import InputStream
 from zsched.relay.outputs import OutputStream
@@ -87,6 +88,7 @@ class TaskRelay:
         self._outputs: dict[str, OutputStream] = {}
         self._services = Services(session, local)
         self._stamps = Stamps()
+        self._times = AnswerTimes()
         self._flip_by: float | None = None
         self._is_inherited = False
         """What we carry is the work of a daemon that is gone; the next one may not know of an older slot."""
@@ -226,7 +228,9 @@ class TaskRelay:
             if source is None or (source.route.from_expr, source.route.settings) != (route.from_expr, route.settings):
                 if source is not None:
                     source.close()
-                source = self._inputs[route.stream] = InputStream(self._session, route, self._own_ids, self._local)
+                source = self._inputs[route.stream] = InputStream(
+                    self._session, route, self._own_ids, self._local, self._times
+                )
             source.open(epoch, route, acks, self._stamps if _replays(slot) else None)
             return
         sink = self._outputs.get(route.stream)
@@ -234,7 +238,7 @@ class TaskRelay:
             if sink is not None:
                 sink.close()
             sink = self._outputs[route.stream] = OutputStream(
-                self._session, route, self._own_ids, self.wake, self._local
+                self._session, route, self._own_ids, self.wake, self._local, self._times
             )
         sink.know(route.from_expr, notes_stamps=_replays(slot))
         sink.open(epoch, route, acks, is_from_start=is_from_start)

@@ -1,0 +1,65 @@
+"""How far outputs come behind their inputs, at a robot's relay."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import zenoh
+
+from support.sessions import hub_and_neighbour
+from zsched.relay import answer_times
+from zsched.relay.answer_times import MAX_SENT, AnswerTimes
+from zsched.relay.counter import StreamCounter
+
+
+@pytest.fixture
+def at(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
+    """Sets the clock."""
+
+    def set_to(now: float) -> None:
+        monkeypatch.setattr(answer_times, "monotonic_s", lambda: now)
+
+    return set_to
+
+
+def stamps(count: int) -> list[zenoh.Timestamp]:
+    with hub_and_neighbour() as (hub, _):
+        return [hub.new_timestamp() for _ in range(count)]
+
+
+def test_an_answer_with_its_input_s_timestamp_is_told_exactly(at: Callable[[float], None]) -> None:
+    one, two, stranger = stamps(3)
+    times = AnswerTimes()
+    at(10.0)
+    assert times.answered(one) is None, "nothing was sent"
+    times.sent(one)
+    at(10.3)
+    times.sent(two)
+    at(10.5)
+    assert times.answered(one) == pytest.approx(0.5)
+    assert times.answered(two) == pytest.approx(0.2)
+    assert times.answered(two) == pytest.approx(0.2), "an input may have several answers"
+    assert times.answered(stranger) == pytest.approx(0.2), "at least as old as the newest input"
+    assert times.answered(None) == pytest.approx(0.2)
+
+
+def test_inputs_without_timestamps_and_very_many_of_them_cost_no_memory(at: Callable[[float], None]) -> None:
+    first, *others = stamps(MAX_SENT + 1)
+    times = AnswerTimes()
+    for number, stamp in enumerate((first, *others)):
+        at(float(number))
+        times.sent(stamp)
+    times.sent(None)
+    assert len(times._sent) == MAX_SENT
+    at(MAX_SENT + 1.0)
+    assert times.answered(first) == pytest.approx(1.0), "it was forgotten: the newest one counts"
+
+
+def test_a_count_tells_the_mean_since_the_one_before() -> None:
+    counter = StreamCounter("merge/out/0")
+    assert counter.value().answer_s is None
+    for took_s in (0.1, None, 0.3):
+        counter.answered(took_s)
+    assert counter.value().answer_s == pytest.approx(0.2)
+    assert counter.value().answer_s is None

@@ -1,0 +1,46 @@
+"""How long a task's answers take at this robot: from an input as it left to an output as it came.
+
+Knows: timestamps, times. Does not know: who answered, what follows.
+
+An answer that has its input's timestamp (the library's do, and a foreign worker's that copies it) is told exactly, the
+network included. Any other one is at least as old as the newest input before it.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from typing import Final
+
+from zenoh import Timestamp
+
+from zsched.clock import monotonic_s
+
+MAX_SENT: Final = 256
+"""So many inputs may wait for their answer; who is slower is told by the newest one."""
+
+
+class AnswerTimes:
+    """Of one task's streams. Any thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._sent: OrderedDict[Timestamp, float] = OrderedDict()
+        self._newest_at: float | None = None
+
+    def sent(self, stamp: Timestamp | None) -> None:
+        """An input leaves for the owner."""
+        now = monotonic_s()
+        with self._lock:
+            self._newest_at = now
+            if stamp is not None:
+                self._sent[stamp] = now
+                if len(self._sent) > MAX_SENT:
+                    self._sent.popitem(last=False)
+
+    def answered(self, stamp: Timestamp | None) -> float | None:
+        """An output has come: seconds since its input; ``None`` when there was none."""
+        now = monotonic_s()
+        with self._lock:
+            at = self._newest_at if stamp is None else self._sent.get(stamp, self._newest_at)
+        return None if at is None else now - at
