@@ -125,6 +125,12 @@ class Crew:
                 told = ev.WorkerTroubled(task=trouble.task, count=trouble.count, text=trouble.text)
                 self._post(told)
 
+    def is_ours(self, jobs: ev.WorkerJobs) -> bool:
+        """Whether that is the word of a worker that runs here, or of one that somebody else started."""
+        with self._lock:
+            current = self._lives.get(jobs.task)
+            return current is None or str(current) == jobs.incarnation
+
     def _supervisor_of(self, task: TaskId) -> WorkerSupervisor | None:
         supervisor = self.supervisor
         return supervisor if supervisor is not None and task in supervisor.states() else None

@@ -124,7 +124,7 @@ class Keyspace:
         return self._key("role", node, task)
 
     def trouble(self, node: NodeId, task: TaskId, incarnation: int | str) -> str:
-        """Put of a worker, to its own node's relay: its callbacks raise."""
+        """Put of a worker, to its own node's relay: its callbacks raise, or what jobs it has done."""
         return self._key("trouble", node, task, str(incarnation))
 
     def ack(self, node: NodeId, task: TaskId, incarnation: int | str, relay: str) -> str:

@@ -32,6 +32,8 @@ _REGISTERED: Final[tuple[tuple[str, type, int], ...]] = (
     ("worker_watch", relay_protocol.WorkerWatch, wire.LARGE),
     ("worker_matched", relay_protocol.WorkerMatched, _SMALL),
     ("worker_trouble", relay_protocol.WorkerTrouble, _SMALL),
+    ("worker_jobs", events.WorkerJobs, 1024),
+    ("frame_dropped", events.FrameDropped, _SMALL),
     ("end_marker", relay_protocol.EndMarker, 256),
     ("snapshot_chunk", relay_protocol.SnapshotChunk, 256),
     ("stream_acks", relay_protocol.StreamAcks, wire.LARGE),
@@ -58,6 +60,8 @@ REPORTS: Final[tuple[type[Any], ...]] = (
     relay_protocol.WorkerSeen,
     relay_protocol.WorkerMatched,
     relay_protocol.WorkerTrouble,
+    events.WorkerJobs,
+    events.FrameDropped,
     relay_protocol.SlotLost,
     events.SlotReady,
     events.SlotFlipped,
@@ -110,12 +114,15 @@ def decode_end(payload: bytes) -> relay_protocol.EndMarker | None:
         return None
 
 
-def decode_trouble(payload: bytes) -> relay_protocol.WorkerTrouble | None:
-    """A worker's word about itself in a payload, or ``None`` when it is none."""
-    try:
-        return wire.decode(payload, relay_protocol.WorkerTrouble)
-    except WireError:
-        return None
+def decode_word(payload: bytes) -> relay_protocol.WorkerTrouble | events.WorkerJobs:
+    """A worker's word about itself in a payload.
+
+    Raises:
+        WireError: it is none.
+    """
+    word: relay_protocol.WorkerTrouble | events.WorkerJobs
+    word = wire.decode(payload, relay_protocol.WorkerTrouble, events.WorkerJobs)  # type: ignore[assignment] # one of both
+    return word
 
 
 def encode_chunk(chunk: relay_protocol.SnapshotChunk) -> bytes:

@@ -314,6 +314,10 @@ class Shell:
         if isinstance(report, WorkerTrouble):
             self.crew.on_trouble(report)
             return
+        if isinstance(report, ev.WorkerJobs):
+            if self.crew.is_ours(report):
+                self._inbox.post_quietly(report)
+            return
         if not isinstance(report, WorkerSeen):
             self._inbox.post(report)
             return

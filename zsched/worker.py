@@ -34,6 +34,7 @@ import zenoh
 
 from zsched import wire
 from zsched.clock import monotonic_s
+from zsched.core.events import WorkerJobs
 from zsched.core.plan import Role, WorkerRole
 from zsched.core.relay_protocol import StreamAcks, WorkerTrouble
 from zsched.guard import guarded, tolerant
@@ -46,6 +47,7 @@ from zsched.worker_debts import Debts
 from zsched.worker_epochs import CARRY_S, Epochs, lets_out
 from zsched.worker_errands import Errands
 from zsched.worker_inputs import Dispatcher
+from zsched.worker_jobs import Job, JobBook
 from zsched.worker_keep import Keeper
 from zsched.worker_lanes import STALLED_S
 from zsched.worker_outputs import OUTPUT_DEPTH, Output
@@ -80,6 +82,7 @@ class Worker:
         zenoh_config: str,
         is_standalone: bool = False,
         drains_itself: bool = False,
+        deadline_s: float | None = None,
     ) -> None:
         """Open the session (``zenoh_config``: JSON5 text). See `from_env` for the other arguments.
 
@@ -112,7 +115,8 @@ class Worker:
         self._stalled = StalledLinks(self._session, lease_s(zenoh_config), STALLED_S)
         self._keeper = Keeper(self._session, acks_key, self._debts, self._stalled)
         self._troubles = Troubles(self._tell_trouble)
-        self._dispatcher = Dispatcher(self._inputs_ended, self._acks, self._troubles, self._debts)
+        self._jobs = JobBook(task, incarnation, self._tell_jobs, deadline_s)
+        self._dispatcher = Dispatcher(self._inputs_ended, self._acks, self._troubles, self._debts, self._jobs)
         self._restorer = Restorer(self._fetch_snapshot, node, self._dispatcher)
         self._dispatcher.start()
         self._watch: RoleWatch | None = None
@@ -150,6 +154,7 @@ class Worker:
             zenoh_config=around.zenoh_config,
             is_standalone=around.is_standalone,
             drains_itself=drains_itself and not around.is_standalone,
+            deadline_s=around.deadline_s,
         )
         if handles_signals and threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, worker._on_signal)
@@ -235,6 +240,7 @@ class Worker:
             is_owner=self._is_owner,
             later=self._errands.put,
             troubles=self._troubles,
+            jobs=self._jobs,
             depth=depth,
         )
         self._declared.append(service)
@@ -271,6 +277,15 @@ class Worker:
         """Sleep at most so long; ``False`` as soon as the worker shall end."""
         return not self._stop.wait(timeout_s)
 
+    def job(self, *, skipped: int = 0, came_s: float | None = None) -> Job:
+        """A piece of work that is not done in a callback: ``with worker.job(): ...``, in whatever thread does it.
+
+        The daemon is told how long jobs take, how much CPU, and how many are left undone (docs/worker.md); from the
+        first one on, callbacks are no jobs any more. ``skipped``: so many were left undone for this one. ``came_s``:
+        when what it works on came, by ``time.monotonic``.
+        """
+        return self._jobs.job(skipped, came_s)
+
     def drained(self) -> None:
         """Say that everything taken so far is published (only with ``drains_itself``): ends may go out now."""
         role = self._role
@@ -292,6 +307,7 @@ class Worker:
             signal.setitimer(signal.ITIMER_REAL, ALARM_S)
         self._dispatcher.close()
         self._troubles.close()
+        self._jobs.close()
         self._debts.settle(monotonic_s())
         self._acks.close()
         self._keeper.close()
@@ -419,8 +435,16 @@ class Worker:
 
     def _tell_trouble(self, count: int, text: str) -> None:
         trouble = WorkerTrouble(task=self._task, incarnation=self._incarnation, count=count, text=text)
+        self._tell(trouble)
+
+    def _tell_jobs(self, jobs: WorkerJobs) -> None:
+        if not self._is_standalone:
+            self._tell(jobs)
+
+    def _tell(self, word: WorkerTrouble | WorkerJobs) -> None:
+        """Say something of this worker to its node; what is dropped here is said by the next word."""
         key = self._keyspace.trouble(self._node, self._task, self._incarnation)
-        self._session.put(key, wire.encode(trouble), congestion_control=zenoh.CongestionControl.DROP)
+        self._session.put(key, wire.encode(word), congestion_control=zenoh.CongestionControl.DROP)
 
     # --- ends --------------------------------------------------------------------------------------------------------
 

@@ -17,16 +17,19 @@ import math
 import threading
 from collections import deque
 from collections.abc import Callable
+from time import monotonic
 from typing import Final
 
 import zenoh
 
 from zsched.clock import monotonic_s
+from zsched.core.events import WorkerJobs
 from zsched.core.serial import number_near, serial_of
 from zsched.guard import guarded
 from zsched.hop_acks import GIVE_UP_S, MAX_SOURCES, Acknowledger, SourceName
 from zsched.worker_backlog import Backlog, Done
 from zsched.worker_debts import Debts, Held
+from zsched.worker_jobs import JobBook
 from zsched.worker_lanes import KeptLane
 from zsched.worker_samples import Input, Marker, OpenSource, Received, Waiting
 from zsched.worker_troubles import Troubles
@@ -43,8 +46,18 @@ _log = logging.getLogger("zsched.worker")
 class Dispatcher:
     """The worker's own thread. ``on_ended(epoch)`` is called in it when every input seen in the epoch has ended."""
 
-    def __init__(self, on_ended: Callable[[int], None], acks: Acknowledger, troubles: Troubles, debts: Debts) -> None:
+    def __init__(
+        self,
+        on_ended: Callable[[int], None],
+        acks: Acknowledger,
+        troubles: Troubles,
+        debts: Debts,
+        jobs: JobBook | None = None,
+    ) -> None:
         self._on_ended = on_ended
+        self._jobs = jobs or JobBook("unnamed", "", _untold)
+        self._timer = self._jobs.timer()
+        """Its counts of what waits are guarded by `_wake`."""
         self._troubles = troubles
         self._acks = acks
         self._debts = debts
@@ -93,7 +106,7 @@ class Dispatcher:
     def put(self, source: Input, sample: zenoh.Sample) -> None:
         """Queue a sample (zenoh's thread)."""
         key = str(sample.key_expr)
-        waiting = Waiting(source, sample)
+        waiting = Waiting(source, sample, came_s=monotonic())
         info = sample.source_info
         if info is not None:
             waiting.name = (key, str(info.source_id.zid), info.source_id.eid)
@@ -107,6 +120,7 @@ class Dispatcher:
             waiting.number = number
             waiting.replayed = number < self._acks.replay_end(waiting.name)
         with self._wake:
+            self._timer.waiting += 1
             line = source.waiting.setdefault(key, deque())
             line.append(waiting)
             limit = source.newest(is_whole=waiting.is_whole) or source.depth
@@ -114,10 +128,13 @@ class Dispatcher:
                 self._shed(source, line.popleft())
             self._queue.append(waiting)
             self._wake.notify()
+        self._jobs.wake()
 
     def _shed(self, source: Input, oldest: Waiting) -> None:
         oldest.sample = None
         source.shed += 1
+        self._timer.skipped += 1
+        self._timer.waiting -= 1
         if oldest.is_wanted and oldest.name is not None:
             self._acks.shed(oldest.name)
 
@@ -163,6 +180,7 @@ class Dispatcher:
             for one in waiting:
                 one.source.waiting[name[0]].remove(one)
                 one.sample = None
+            self._timer.waiting -= len(waiting)
             count = len(waiting) + self._backlog.forget(name)
             self._given_up[name] = at, count
             self._open.pop(name, None)
@@ -315,6 +333,8 @@ class Dispatcher:
         if waiting is None or waiting.sample is None:
             return None
         waiting.source.waiting[str(waiting.sample.key_expr)].remove(waiting)
+        self._timer.waiting -= 1
+        self._timer.least = min(self._timer.least, self._timer.waiting)
         return waiting
 
     def _process(self, waiting: Waiting) -> None:
@@ -332,7 +352,7 @@ class Dispatcher:
         else:
             self._turn_in_hand, epoch = again.turn, again.epoch
         self._in_hand, self._is_whole = epoch, waiting.is_wanted
-        self._dispatch(source, sample, replayed=waiting.replayed)
+        self._dispatch(source, sample, waiting.came_s if again is None else None, replayed=waiting.replayed)
         self._in_hand = None
         if self._is_given_up(name, waiting.again):
             return
@@ -371,7 +391,7 @@ class Dispatcher:
             if lost.held is not None:
                 self._debts.answered(lost.held, {}, monotonic_s())
 
-    def _dispatch(self, source: Input, sample: zenoh.Sample, *, replayed: bool) -> None:
+    def _dispatch(self, source: Input, sample: zenoh.Sample, came_s: float | None, *, replayed: bool) -> None:
         key = str(sample.key_expr)
         received = Received(
             key=key,
@@ -381,10 +401,12 @@ class Dispatcher:
             replayed=replayed,
         )
         self._stamp = sample.timestamp
+        self._timer.begin()
         try:
             source.on_sample(received)
         except Exception as error:  # noqa: BLE001 - the worker's own bug must not end its dispatch
             self._troubles.note(key, error)
+        self._timer.end(came_s)
         newest = self._newest_stamp
         if self._stamp is not None and (newest is None or newest < self._stamp):  # type: ignore[operator] # zenoh's stubs
             self._newest_stamp = self._stamp
@@ -451,3 +473,7 @@ class Dispatcher:
 
 def _never() -> bool:
     return False
+
+
+def _untold(_jobs: WorkerJobs) -> None:
+    """Nobody wants to know."""

@@ -85,6 +85,8 @@ class Waiting:
     replayed: bool = False
     is_whole: bool = False
     """Its source is of class ``reliable``: given up, it is lost."""
+    came_s: float = 0.0
+    """When it came, by ``time.monotonic``."""
     again: Done[Input] | None = None
     """It is processed again: this is what it was the first time."""
 

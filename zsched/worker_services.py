@@ -14,6 +14,7 @@ import queue
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
+from time import monotonic
 from typing import Final
 
 import zenoh
@@ -22,6 +23,7 @@ from zsched.clock import monotonic_s
 from zsched.core.keyexpr import is_wild
 from zsched.core.relay_protocol import ERROR_ENCODING, REFUSED_ENCODING
 from zsched.guard import guarded, tolerant
+from zsched.worker_jobs import JobBook
 from zsched.worker_troubles import Troubles
 
 ROLE_WAIT_S: Final = 0.3
@@ -67,6 +69,7 @@ class Service:
         is_owner: Callable[[], bool],
         later: Callable[[Callable[[], None]], None],
         troubles: Troubles,
+        jobs: JobBook,
         depth: int,
     ) -> None:
         """Declare the queryable; ``later`` runs a call in another thread (zenoh's own must only enqueue).
@@ -79,7 +82,8 @@ class Service:
         self._is_owner = is_owner
         self._later = later
         self._troubles = troubles
-        self._requests: queue.Queue[zenoh.Query | None] = queue.Queue(depth)
+        self._jobs, self._timer = jobs, jobs.timer()
+        self._requests: queue.Queue[tuple[zenoh.Query, float] | None] = queue.Queue(depth)
         self._is_closed = False
         guarded(self._run, name=f"zsched serve {key_expr}", kind="zsched serve").start()
         self._queryable = session.declare_queryable(key_expr, tolerant(self._take, "request"), complete=True)
@@ -93,23 +97,27 @@ class Service:
 
     def _take(self, query: zenoh.Query) -> None:
         try:
-            self._requests.put_nowait(query)
+            self._requests.put_nowait((query, monotonic()))
+            self._jobs.wake()
         except queue.Full:
+            self._timer.skipped += 1
             self._later(lambda: _refuse(query, f"busy: {self._requests.maxsize} requests wait", ERROR_ENCODING))
 
     def _run(self) -> None:
         while True:
-            query = self._requests.get()
-            if query is None:
+            taken = self._requests.get()
+            if taken is None:
                 return
+            self._timer.waiting = self._requests.qsize()
+            self._timer.least = min(self._timer.least, self._timer.waiting)
             try:
-                self._answer(query)
+                self._answer(*taken)
             except zenoh.ZError as error:
                 _log.info("an answer could not be given (%s)", error)
             if self._is_closed and self._requests.empty():
                 return
 
-    def _answer(self, query: zenoh.Query) -> None:
+    def _answer(self, query: zenoh.Query, came_s: float) -> None:
         if self._is_closed or not self._may_work():
             _refuse(query, "not owner: nothing was done", REFUSED_ENCODING)
             return
@@ -121,12 +129,15 @@ class Service:
                 attachment=query.attachment,
                 encoding=str(query.encoding or ""),
             )
+            self._timer.begin()
             try:
                 given = self._handler(request)
             except Exception as error:  # noqa: BLE001 - the asker must hear of it, whatever it is
                 self._troubles.note(request.key, error)
                 query.reply_err(f"failed: {type(error).__name__}: {error}"[:400], encoding=ERROR_ENCODING)
                 return
+            finally:
+                self._timer.end(came_s)
             answer = given if isinstance(given, Answer) else Answer(payload=given)
             key = self._key_expr if is_wild(request.key) else request.key
             query.reply(key, answer.payload, attachment=answer.attachment, encoding=answer.encoding)

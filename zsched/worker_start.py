@@ -18,6 +18,9 @@ from zsched.errors import ConfigError
 _ENVIRONMENT: Final = ("ZSCHED_FLEET", "ZSCHED_NODE", "ZSCHED_TASK", "ZSCHED_INCARNATION", "ZSCHED_ZENOH_CONFIG")
 
 
+DEADLINE: Final = "ZSCHED_DEADLINE_MS"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Surroundings:
     """Who a worker is, and its session's configuration (JSON5 text)."""
@@ -28,6 +31,8 @@ class Surroundings:
     incarnation: str
     zenoh_config: str
     is_standalone: bool = False
+    deadline_s: float | None = None
+    """The task's (`objective: latency`); ``None``: it has none, or whoever started the worker has not told."""
 
 
 def surroundings(env: Mapping[str, str], standalone: str) -> Surroundings:
@@ -47,7 +52,14 @@ def surroundings(env: Mapping[str, str], standalone: str) -> Surroundings:
             fleet="standalone", node="local", task=standalone, incarnation="1", zenoh_config="{}", is_standalone=True
         )
     fleet, node, task, incarnation, path = (env[name] for name in _ENVIRONMENT)
-    return Surroundings(fleet=fleet, node=node, task=task, incarnation=incarnation, zenoh_config=_read(path))
+    return Surroundings(
+        fleet=fleet,
+        node=node,
+        task=task,
+        incarnation=incarnation,
+        zenoh_config=_read(path),
+        deadline_s=_deadline_s(env.get(DEADLINE, "")),
+    )
 
 
 def open_session(zenoh_config: str) -> zenoh.Session:
@@ -67,6 +79,13 @@ def relay_endpoint(zenoh_config: str) -> str:
     endpoints = json.loads(zenoh.Config.from_json5(zenoh_config).get_json("connect/endpoints"))
     first = endpoints[0] if isinstance(endpoints, list) and endpoints else ""
     return first if isinstance(first, str) else ""
+
+
+def _deadline_s(text: str) -> float | None:
+    try:
+        return float(text) / 1e3 if text else None
+    except ValueError as error:
+        raise ConfigError(f"{DEADLINE}: {text!r} is no number of milliseconds") from error
 
 
 def _read(path: str) -> str:

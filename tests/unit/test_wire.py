@@ -84,6 +84,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "hold_s": (0, 3600),
     "max_pending": (1, 256),
     "speed": (0.001, 1000.0),
+    "deadline_ms": (1.0, 3.6e6),
 }
 
 

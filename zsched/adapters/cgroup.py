@@ -57,6 +57,10 @@ class CpuQuota:
         used_us = parse_flat(_text(self.folder / "cpu.stat")).get("usage_usec")
         return None if used_us is None else used_us / 1e6
 
+    def pressure_file(self) -> str | None:
+        """Where the kernel tells how long the group's processes lacked a CPU (version 2 only)."""
+        return str(self.folder / "cpu.pressure") if self.is_v2 else None
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MemoryQuota:

@@ -102,6 +102,16 @@ def parse_schedstat(content: bytes) -> tuple[float, float] | None:
     return run_ns / 1e9, wait_ns / 1e9
 
 
+def parse_pressure(content: bytes) -> float | None:
+    """Seconds in which some process was stalled, of a PSI file (``some ... total=MICROSECONDS``); ``None`` without."""
+    for line in content.split(b"\n"):
+        kind, _, rest = line.partition(b" ")
+        if kind == b"some":
+            _, _, total = rest.partition(b"total=")
+            return int(total) / 1e6 if total.isdigit() else None
+    return None
+
+
 def parse_cpu_list(text: str) -> frozenset[int]:
     """A kernel CPU list such as ``0-3,8`` as a set; malformed parts are left out."""
     cpus: set[int] = set()
@@ -127,6 +137,8 @@ class DeviceProfiler:
         self._cpu_quota: CpuQuota | None = None
         self._memory_quota: MemoryQuota | None = None
         self._usage: tuple[float, float] | None = None
+        self._stalled: tuple[float, float] | None = None
+        self._pressure: float | None = None
         self._used_cores: float | None = None
 
     def sample(self, workers: Mapping[TaskId, tuple[WorkerState, int | None]]) -> DeviceSample:
@@ -143,7 +155,24 @@ class DeviceProfiler:
             memory_used_mb=memory_used_mb,
             workers=self._trees.loads(workers, now),
             speed=self.speed,
+            cpu_pressure=self._cpu_pressure(now),
         )
+
+    def _cpu_pressure(self, now: float) -> float | None:
+        """Share of the last seconds in which some process of this machine, or of the group that it is, lacked a CPU.
+
+        ``None`` on the first sample, and where the kernel has no pressure stall information.
+        """
+        path = f"{self._proc}/pressure/cpu" if self._cpu_quota is None else self._cpu_quota.pressure_file()
+        stalled_s = None if path is None else parse_pressure(_read(path))
+        before, self._stalled = self._stalled, None if stalled_s is None else (now, stalled_s)
+        if stalled_s is None or before is None:
+            self._pressure = None
+        elif now - before[0] < MIN_INTERVAL_S:
+            self._stalled = before
+        else:
+            self._pressure = min(max(stalled_s - before[1], 0.0) / (now - before[0]), 1.0)
+        return self._pressure
 
     def _look_up_limits(self, now: float) -> None:
         self._limits_at_s = now
@@ -156,7 +185,7 @@ class DeviceProfiler:
         if quota is not None and times is not None and quota.cores >= times.cpus:
             quota = None  # wider than the machine: no limit
         if quota != self._cpu_quota:
-            self._usage = None  # another account: its difference to the old one means nothing
+            self._usage = self._stalled = None  # another account: its difference to the old one means nothing
         self._cpu_quota = quota
 
     def _capacity(self, times: CpuTimes | None) -> float:

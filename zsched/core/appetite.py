@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from zsched.core.profile import Ewma
+from zsched.core.means import Ewma
 
 ALWAYS = 0.9
 """A thread that runs or waits to run for so much of the time always wants to run."""

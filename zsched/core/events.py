@@ -21,7 +21,20 @@ from zsched.core.messages import (
     SetWeights,
     Utilities,
 )
-from zsched.core.model import Beat, DeviceSample, LinkSample, NodeId, Profile, Proposal, TaskId, WorkerState
+from zsched.core.model import (
+    MAX_COUNTER,
+    Beat,
+    DeviceSample,
+    LinkSample,
+    NodeId,
+    Profile,
+    Proposal,
+    TaskId,
+    WorkerState,
+    check_counter,
+    check_name,
+    check_range,
+)
 from zsched.core.plan import StreamCount
 
 
@@ -186,6 +199,43 @@ class WorkerTroubled:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class WorkerJobs:
+    """A worker of this node says what it has done in this life: to the relay, which hands it on.
+
+    Counts and sums only rise, so a word that is lost costs nothing; means and rates are made of the differences
+    (`zsched.core.jobs`).
+    """
+
+    task: TaskId
+    incarnation: str
+    at_s: float
+    """When this was so: seconds since this life of the worker began, by its own clock."""
+    done: int
+    skipped: int = 0
+    """Gave way to something newer, undone."""
+    waiting: int = 0
+    """The fewest that have waited for their turn since the word before."""
+    time_s: float = 0.0
+    """Of all that are done: from beginning to end..."""
+    cpu_s: float = 0.0
+    """...CPU time..."""
+    wait_s: float | None = None
+    """...waiting for a CPU; ``None``: not known..."""
+    age_s: float | None = None
+    """...and from arrival to end; ``None``: not known."""
+    late: int | None = None
+    """So many took longer from arrival to end than the task's deadline; ``None``: it has none."""
+
+    def __post_init__(self) -> None:
+        check_name("jobs.task", self.task)
+        for name in ("done", "skipped", "waiting"):
+            check_counter(f"jobs.{name}", getattr(self, name))
+        check_counter("jobs.late", self.late or 0)
+        for name in ("at_s", "time_s", "cpu_s", "wait_s", "age_s"):
+            check_range(f"jobs.{name}", getattr(self, name), 0.0, MAX_COUNTER)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class WorkerShown:
     """The relay saw the token of another node's worker come over a living link, or go."""
 
@@ -314,6 +364,7 @@ Event = (
     | TokenLost
     | WorkerChanged
     | WorkerTroubled
+    | WorkerJobs
     | WorkerShown
     | SlotReady
     | SlotFlipped

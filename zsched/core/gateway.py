@@ -30,7 +30,9 @@ class Gateway:
         self._ttl_s = fleet.timing.profile_ttl_s
         self._profiles: dict[NodeId, tuple[Profile, float]] = {}
         self._tracks: dict[NodeId, Track] = {}
-        self._demands = Demands()
+        self.demands = Demands()
+        """What tasks need, as this node has learnt it."""
+        self._candidates = {task.name: task.candidates for task in fleet.tasks}
         self.version = 0
         """Rises with every change; what was computed from an older version may be wrong."""
 
@@ -68,9 +70,15 @@ class Gateway:
     def learn_demand(self, task: TaskId, owner: NodeId, now: float) -> None:
         """Note what the task's worker wants on its owner (`zsched.core.demand`)."""
         profile = self.fresh(owner, now)
-        if profile is not None and self._demands.learn(task, profile, now):
+        if profile is None:
+            return
+        speeds = [
+            known[0].speed for name in self._candidates.get(task, ()) if (known := self._profiles.get(name)) is not None
+        ]
+        fastest = max((speed for speed in speeds if speed is not None), default=None)
+        if self.demands.learn(task, profile, now, fastest):
             self.version += 1
 
     def demand(self, spec: TaskSpec, profile: Profile) -> Demand:
         """What the task will use on the node of ``profile``."""
-        return self._demands.at(spec, profile)
+        return self.demands.at(spec, profile)

@@ -26,6 +26,7 @@ MAX_COUNTER = 2**53
 MAX_CPU_CORES, MAX_MEMORY_MB, MAX_BITRATE_MBPS = 4096.0, 1e8, 1e6
 MIN_SPEED, MAX_SPEED = 0.001, 1000.0
 MAX_TREND_DB_S = 100.0
+MAX_JOBS_HZ, MAX_JOB_S = 1e6, 1e6
 """What no machine or link exceeds: a larger figure is a fault of whoever measured or sent it."""
 MAX_REASON = 200
 """Characters of a worker's reason: it travels with every profile."""
@@ -70,6 +71,13 @@ class ScoreForm(StrEnum):
     SERVICE = "service"  # which share of its work the task would get done, and a weighted product
 
 
+class Objective(StrEnum):
+    """What a task wants of its machine (`ScoreForm.SERVICE`)."""
+
+    SERVICE = "service"  # as many of its jobs done as possible
+    LATENCY = "latency"  # as many of them as possible done within a deadline
+
+
 # --- what an operator sets -------------------------------------------------------------------------------------------
 
 
@@ -89,6 +97,9 @@ class Weights:
             raise ValueError(f"weights: the sum is {total:g}, not 1")
 
 
+MIN_DEADLINE_MS, MAX_DEADLINE_MS = 1.0, 3.6e6
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tuning:
     """What may be changed on the running fleet: agreed through the register like an allocation.
@@ -103,8 +114,17 @@ class Tuning:
     cool_down_s: float = 10.0
     aggregate: Aggregate = Aggregate.MEAN
     score: ScoreForm = ScoreForm.PAPER
+    deadline_ms: float | None = None
+    """`Objective.LATENCY`: a job that takes longer from input to output, network included, comes too late. ``None``:
+    `Objective.SERVICE`. `ScoreForm.PAPER` knows no deadlines."""
+
+    @property
+    def objective(self) -> Objective:
+        """What a machine is judged by."""
+        return Objective.SERVICE if self.deadline_ms is None else Objective.LATENCY
 
     def __post_init__(self) -> None:
+        check_range("deadline_ms", self.deadline_ms, MIN_DEADLINE_MS, MAX_DEADLINE_MS)
         check_range("bonus", self.bonus, 0.0, 1.0)
         check_range("time_to_trigger_s", self.time_to_trigger_s, 0.0, 3600.0)
         check_range("cool_down_s", self.cool_down_s, 0.0, 86400.0)
@@ -172,6 +192,43 @@ def told_of_worker(state: WorkerState, reason: str) -> str:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Jobs:
+    """What a worker says of its own jobs, smoothed (`zsched.core.jobs`); a job is one input sample, and its callback.
+
+    Times are seconds per job, means over the jobs that were done; rates are jobs per second.
+    """
+
+    time_s: float
+    """From the beginning of a job to its end."""
+    cpu_s: float
+    """CPU time of a job, in all threads that work on it."""
+    wait_s: float | None = None
+    """Of ``time_s``, what its thread waited for a CPU; ``None``: the kernel does not tell, or several threads work."""
+    age_s: float | None = None
+    """From a job's arrival to its end, the wait for its turn included; ``None``: not told."""
+    done_hz: float = 0.0
+    wanted_hz: float = 0.0
+    """Done, and left undone: skipped for something newer, or added to those that wait."""
+    backlog: int = 0
+    """So many wait for their turn."""
+    late_ratio: float | None = None
+    """Share of the done ones that took longer than the task's deadline from arrival to end; ``None``: it has none."""
+
+    def __post_init__(self) -> None:
+        for name in ("time_s", "cpu_s", "wait_s", "age_s"):
+            check_range(f"jobs.{name}", getattr(self, name), 0.0, MAX_JOB_S)
+        for name in ("done_hz", "wanted_hz"):
+            check_range(f"jobs.{name}", getattr(self, name), 0.0, MAX_JOBS_HZ)
+        check_counter("jobs.backlog", self.backlog)
+        check_range("jobs.late_ratio", self.late_ratio, 0.0, 1.0)
+
+    @property
+    def done_ratio(self) -> float | None:
+        """Share of the wanted jobs that are done, in [0, 1]; ``None`` while none is wanted."""
+        return min(self.done_hz / self.wanted_hz, 1.0) if self.wanted_hz > 0.0 else None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class WorkerLoad:
     """One task's worker on one node: its state and what its process tree uses now (cores, MiB)."""
 
@@ -183,6 +240,8 @@ class WorkerLoad:
     """The most that it would use alone, where threads of it always want to run; ``None``: none does, or unknown."""
     reason: str = ""
     """Why it is not ready, or what is wrong with it though it is; at most `MAX_REASON` characters."""
+    jobs: Jobs | None = None
+    """What it says of its jobs; ``None``: nothing, or it has none."""
 
     def __post_init__(self) -> None:
         check_name("worker.task", self.task)
@@ -223,6 +282,8 @@ class DeviceSample:
     workers: tuple[WorkerLoad, ...] = ()
     speed: float | None = None
     """How fast one of its cores is; ``None``: not measured."""
+    cpu_pressure: float | None = None
+    """Share of the time since the last sample in which some process wanted a CPU and had none; ``None``: not known."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -234,6 +295,25 @@ class LinkSample:
     rssi_dbm: float | None = None
     bitrate_mbps: float | None = None
     retry_ratio: float | None = None
+
+
+MAX_HELD_S = 3600.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Echo:
+    """The newest profile that the sender has of another node, and how long it has held it."""
+
+    node: NodeId
+    incarnation: int
+    sequence: int
+    held_s: float
+
+    def __post_init__(self) -> None:
+        check_name("echo.node", self.node)
+        check_counter("echo.incarnation", self.incarnation)
+        check_counter("echo.sequence", self.sequence)
+        check_range("echo.held_s", self.held_s, 0.0, MAX_HELD_S)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -258,6 +338,10 @@ class Profile:
     """Robots: the watched tasks that answer here, or do not although inputs flow."""
     speed: float | None = None
     """How fast one of its cores is, beside the reference (`zsched.adapters.speed`); ``None``: not measured."""
+    cpu_pressure: float | None = None
+    """Share of the time in which some process wanted a CPU and had none (PSI "some"); ``None``: not measured."""
+    echoes: tuple[Echo, ...] = ()
+    """Which profiles of others the node has, where a task has a deadline (`zsched.core.round_trips`)."""
 
     def __post_init__(self) -> None:
         check_name("profile.node", self.node)
@@ -268,6 +352,7 @@ class Profile:
         check_range("profile.memory_mb", self.memory_mb, 1.0, MAX_MEMORY_MB)
         check_range("profile.memory_used_mb", self.memory_used_mb, 0.0, MAX_MEMORY_MB)
         check_range("profile.speed", self.speed, MIN_SPEED, MAX_SPEED)
+        check_range("profile.cpu_pressure", self.cpu_pressure, 0.0, 1.0)
 
     def worker(self, task: TaskId) -> WorkerLoad | None:
         """The load of ``task``'s worker on this node, or ``None`` when the node runs none."""

@@ -47,6 +47,7 @@ from zsched.core.plan import StreamCount
 from zsched.core.probation import Probation
 from zsched.core.profile import Profiler
 from zsched.core.progress import HangWatch
+from zsched.core.round_trips import RoundTrips
 from zsched.core.rounds import Rounds
 from zsched.core.scoring import NO_DOUBTS, Doubts
 from zsched.core.sealing import Sealing
@@ -65,6 +66,7 @@ _OFTEN_QUIET = frozenset(
         ev.TokenSeen,
         ev.StreamsCounted,
         ev.WorkerTroubled,
+        ev.WorkerJobs,
         ev.FrameDropped,
         ev.ClockCompared,
     }
@@ -121,8 +123,10 @@ class Node:
         self.membership = Membership(me, names, fleet.timing)
         self.profiler = Profiler(me, incarnation, fleet.timing)
         self.gateway = Gateway(fleet)
+        self.round_trips = RoundTrips(me)
+        self._has_deadlines = any(task.tuning.deadline_ms is not None for task in fleet.tasks)
         self._probation = Probation(fleet)
-        self.rounds = Rounds(fleet, me, self.gateway, rng, now, self._doubts)
+        self.rounds = Rounds(fleet, me, self.gateway, rng, now, self._doubts, self.round_trips)
         self.agreement = Agreement(
             fleet=fleet,
             me=me,
@@ -453,6 +457,10 @@ class Node:
     def _on_sampled(self, event: ev.ProfileSampled, now: float) -> None:
         self.profiler.absorb(event.device, event.links, now)
 
+    def _on_jobs(self, event: ev.WorkerJobs, now: float) -> None:
+        if event.task not in self.worker_states or not self.profiler.note_jobs(event, now):
+            self.counters["jobs_refused"] += 1
+
     def _publish_profile(self, now: float) -> None:
         progress = self._hangs.reports(now)
         profile = self.profiler.publishable(
@@ -461,8 +469,11 @@ class Node:
             now=now,
             progress=progress,
             reasons=self._workers.told(now),
+            echoes=self.round_trips.echoes(now) if self._has_deadlines else (),
         )
         if profile is not None:
+            if self._has_deadlines:
+                self.round_trips.note_sent(profile, now)
             self.gateway.absorb(profile, now)
             self._batch.add(do.PublishProfile(profile=profile, is_news=self.profiler.has_news))
             self._batch.add(*self._hangs.look(self.owned(), self.executors, self.gateway, now))
@@ -475,6 +486,8 @@ class Node:
         if reason is not None:
             self.counters[f"profile_{reason}"] += 1
             return
+        if self._has_deadlines:
+            self.round_trips.note_heard(profile, self.incarnation, now)
         if profile.progress:
             self._batch.add(*self._hangs.look(self.owned(), self.executors, self.gateway, now))
         failed = failed_workers(profile)
@@ -726,6 +739,7 @@ class Node:
             ev.TokenLost: self._on_token_lost,
             ev.WorkerChanged: self._on_worker,
             ev.WorkerTroubled: self._workers.on_troubled,
+            ev.WorkerJobs: self._on_jobs,
             ev.WorkerShown: self._on_worker_shown,
             ev.SlotReady: self._on_slot_ready,
             ev.SlotFlipped: self._on_slot_flipped,

@@ -15,13 +15,17 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
 
+from zsched.core.events import WorkerJobs
 from zsched.core.fleet import Timing
+from zsched.core.jobs import JobMeter
+from zsched.core.means import STALE_S, Ewma
 from zsched.core.model import (
     MAX_BITRATE_MBPS,
     MAX_CPU_CORES,
     MAX_MEMORY_MB,
     MAX_TREND_DB_S,
     DeviceSample,
+    Echo,
     Link,
     LinkSample,
     LinkSource,
@@ -35,6 +39,8 @@ from zsched.core.model import (
 
 RATIO_CHANGE = 0.02
 """A CPU or memory ratio that moved by this much is worth a profile before its time."""
+JOB_CHANGE = 0.2
+"""So is a worker's share of done jobs that moved by this much, or its time per job by this part."""
 RSSI_CHANGE_DB = 1.0
 RSSI_IMPOSSIBLE_ABOVE_DBM = -10.0
 RSSI_IMPOSSIBLE_BELOW_DBM = -100.0
@@ -42,39 +48,6 @@ RSSI_OUTLIER_DB = 25.0
 RSSI_WINDOW = 5
 """A reading further than 25 dB from the median of the last 5 is dropped (measured on real drives)."""
 NO_REASONS: Mapping[TaskId, str] = {}
-STALE_S = 5.0
-"""What gave no valid reading for so long (a radio, or the whole sampler) counts as not measured."""
-
-
-class Ewma:
-    """Exponentially weighted mean with a time constant, for samples at uneven times.
-
-    ``alpha = 1 - exp(-dt / tau)``; the first value is taken as it is. ``tau_s`` of 0 means no smoothing.
-    """
-
-    __slots__ = ("_at", "tau_s", "value")
-
-    def __init__(self, tau_s: float) -> None:
-        self.tau_s = tau_s
-        self.value: float | None = None
-        self._at = 0.0
-
-    def update(self, sample: float, now: float) -> float:
-        """Take a sample in and return the new mean."""
-        if self.value is None or self.tau_s <= 0.0:
-            self.value = sample
-        else:
-            alpha = 1.0 - math.exp(-max(now - self._at, 0.0) / self.tau_s)
-            self.value += alpha * (sample - self.value)
-        self._at = now
-        return self.value
-
-    def share(self) -> Ewma:
-        """The mean of a part of what this one smooths, which was nothing so far."""
-        part = Ewma(self.tau_s)
-        if self.value is not None:
-            part.update(0.0, self._at)
-        return part
 
 
 class SignalFilter:
@@ -129,9 +102,11 @@ class Profiler:
         self._timing = timing
         self._cpu = Ewma(timing.smoothing_s)
         self._memory = Ewma(timing.smoothing_s)
+        self._pressure = Ewma(timing.smoothing_s)
         self._signals: dict[NodeId | None, SignalFilter] = {}
         self._worker_cpu: dict[TaskId, Ewma] = {}
         self._worker_memory: dict[TaskId, Ewma] = {}
+        self._jobs: dict[TaskId, JobMeter] = {}
         self._device: DeviceSample | None = None
         self._sampled_at = -math.inf
         self._is_new = False
@@ -151,8 +126,20 @@ class Profiler:
         worker_memory = {load.task: load.memory_mb for load in device.workers}
         _absorb_use(self._cpu, self._worker_cpu, device.cpu_used_cores, worker_cpu, MAX_CPU_CORES, now)
         _absorb_use(self._memory, self._worker_memory, device.memory_used_mb, worker_memory, MAX_MEMORY_MB, now)
+        pressure = _possible(device.cpu_pressure, 1.0)
+        if pressure is None:
+            self._pressure.value = None
+        else:
+            self._pressure.update(pressure, now)
         self._links = tuple(self._link(sample, now) for sample in links)
+        for meter in self._jobs.values():
+            meter.look(now)
         self._workers = tuple(self._worker(load) for load in device.workers)
+
+    def note_jobs(self, report: WorkerJobs, now: float) -> bool:
+        """Take in what a worker of this node says of its jobs; whether it can be true."""
+        meter = self._jobs.setdefault(report.task, JobMeter(self._timing.smoothing_s))
+        return meter.absorb(report, now)
 
     def _link(self, sample: LinkSample, now: float) -> Link:
         rssi = trend = None
@@ -177,6 +164,7 @@ class Profiler:
             cpu_cores=None if cpu is None else cpu.value,
             memory_mb=None if memory is None else memory.value,
             wanted_cores=_possible(load.wanted_cores, MAX_CPU_CORES),
+            jobs=self._jobs[load.task].value if load.task in self._jobs else None,
         )
 
     def publishable(
@@ -187,6 +175,7 @@ class Profiler:
         now: float,
         progress: tuple[TaskProgress, ...] = (),
         reasons: Mapping[TaskId, str] = NO_REASONS,
+        echoes: tuple[Echo, ...] = (),
     ) -> Profile | None:
         """The profile to send now, or ``None`` when nothing is due.
 
@@ -196,6 +185,7 @@ class Profiler:
             now: monotonic seconds.
             progress: which watched tasks answer this robot.
             reasons: why workers are not ready.
+            echoes: which profiles this node has of others; they are no reason to send one.
         """
         is_due = now - self._sent_at >= self._timing.publish_s
         flags = (is_draining, *states.values(), *reasons.values(), progress)
@@ -209,6 +199,8 @@ class Profiler:
             profile = replace(profile, progress=progress)
         if not is_due and self._sent is not None and not _differs(profile, self._sent):
             return None
+        if echoes:
+            profile = replace(profile, echoes=echoes)
         self._sequence += 1
         self.has_news = self._sent is None or _kinds(profile) != _kinds(self._sent)
         self._sent, self._sent_at = profile, now
@@ -229,6 +221,7 @@ class Profiler:
                 memory_mb=loads[task].memory_mb if task in loads else None,
                 wanted_cores=loads[task].wanted_cores if task in loads else None,
                 reason=reasons.get(task, ""),
+                jobs=loads[task].jobs if task in loads else None,
             )
             for task in sorted(states)
         )
@@ -244,6 +237,7 @@ class Profiler:
             workers=workers,
             draining=is_draining,
             speed=self._device.speed,
+            cpu_pressure=self._pressure.value if is_measured else None,
         )
 
 
@@ -286,8 +280,19 @@ def _differs(new: Profile, old: Profile) -> bool:
         return True
     if _moved(new.memory_used_mb, old.memory_used_mb, RATIO_CHANGE * new.memory_mb):
         return True
+    if any(_lost_or_won(new.worker(load.task), load) for load in old.workers):
+        return True
     before = {link.peer: link.rssi_dbm for link in old.links}
     return any(_moved(link.rssi_dbm, before.get(link.peer), RSSI_CHANGE_DB) for link in new.links)
+
+
+def _lost_or_won(new: WorkerLoad | None, old: WorkerLoad) -> bool:
+    """Whether a worker's jobs take another time, or another share of them is done."""
+    if new is None or new.jobs is None or old.jobs is None:
+        return (None if new is None else new.jobs) is not old.jobs
+    if _moved(new.jobs.done_ratio, old.jobs.done_ratio, JOB_CHANGE):
+        return True
+    return abs(new.jobs.time_s - old.jobs.time_s) >= JOB_CHANGE * max(new.jobs.time_s, old.jobs.time_s)
 
 
 def _kinds(profile: Profile) -> tuple[object, ...]:

@@ -4,9 +4,9 @@ Knows: what the daemon and its relay tell each other beside plans, roles and the
 end marker says. Does not know: pipes, frames, zenoh.
 
 Commands (daemon to relay): `RoutePlan`, `Role`, `WorkerWatch`, `RelayStop`. Reports (relay to daemon): `RelayStarted`,
-`WorkerSeen`, `WorkerMatched`, `WorkerTrouble`, `SlotLost` and the events `SlotReady`, `SlotFlipped`, `SlotDrained`,
-`RoleEnded`, `StreamsCounted`, `ProblemReported`. The handle adds `RelayChanged`. Between workers and relays:
-`WorkerTrouble`, `EndMarker`, `StreamAcks`.
+`WorkerSeen`, `WorkerMatched`, `WorkerTrouble`, `WorkerJobs`, `SlotLost` and the events `SlotReady`, `SlotFlipped`,
+`SlotDrained`, `RoleEnded`, `StreamsCounted`, `ProblemReported`, `FrameDropped`. The handle adds `RelayChanged`. Between
+workers and relays: `WorkerTrouble`, `WorkerJobs`, `EndMarker`, `StreamAcks`.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from enum import StrEnum
 from typing import Final
 
 from zsched.core.events import (
+    FrameDropped,
     ProblemReported,
     RelayChanged,
     RoleEnded,
@@ -23,6 +24,7 @@ from zsched.core.events import (
     SlotFlipped,
     SlotReady,
     StreamsCounted,
+    WorkerJobs,
 )
 from zsched.core.model import MAX_REASON, NodeId, TaskId, check_counter, check_name
 from zsched.core.plan import Role, Route, RoutePlan
@@ -226,6 +228,8 @@ RelayReport = (
     | WorkerSeen
     | WorkerMatched
     | WorkerTrouble
+    | WorkerJobs
+    | FrameDropped
     | SlotReady
     | SlotFlipped
     | SlotDrained

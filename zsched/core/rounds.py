@@ -25,6 +25,7 @@ from zsched.core.messages import Utilities
 from zsched.core.model import Allocation, NodeId, PeerState, Proposal, TaskId, UtilityVector, WorkerState
 from zsched.core.plan import StreamCount
 from zsched.core.register import MoveOwner
+from zsched.core.round_trips import RoundTrips
 from zsched.core.scheduler import Judge, Judgement, Outcome, escape_ahead, escape_reason
 from zsched.core.scoring import NO_DOUBTS, Doubts, Standing, book, compare, is_out, majority, score
 from zsched.core.turns import in_turn, who_moves_first
@@ -76,9 +77,11 @@ class Rounds:
         rng: Random,
         now: float,
         doubts: Callable[[TaskSpec, float], Doubts] = lambda _spec, _now: NO_DOUBTS,
+        round_trips: RoundTrips | None = None,
     ) -> None:
         self._fleet, self._me, self._gateway, self._rng = fleet, me, gateway, rng
         self._doubts = doubts
+        self._round_trips = round_trips or RoundTrips(me)
         self.is_voter = me in fleet.voters
         self.tasks = {
             spec.name: TaskRound(
@@ -137,6 +140,7 @@ class Rounds:
                     bookings,
                     doubts[name],
                     task.damping.penalties(now),
+                    self._round_trips.seconds(),
                 )
                 for name, task in self.tasks.items()
             ),

@@ -13,9 +13,10 @@ from collections.abc import Iterable, Mapping
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 
+from zsched.core.demand import Demands, speed_of
 from zsched.core.fleet import Demand, Reach, Standby, TaskSpec
 from zsched.core.gateway import Gateway
-from zsched.core.links import PairLink, pair_link
+from zsched.core.links import pair_link
 from zsched.core.model import (
     Aggregate,
     Allocation,
@@ -24,11 +25,19 @@ from zsched.core.model import (
     Profile,
     ScoreForm,
     TaskId,
+    Tuning,
     Utility,
     UtilityVector,
     WorkerState,
 )
-from zsched.core.utility import cpu_utility, memory_utility, predicted_use, service_utility, total_utility
+from zsched.core.utility import (
+    cpu_utility,
+    memory_utility,
+    on_time,
+    predicted_use,
+    service_utility,
+    total_utility,
+)
 
 METRICS = ("cpu", "memory", "network")
 
@@ -88,13 +97,15 @@ def score(
     bookings: Bookings | None = None,
     doubts: Doubts = NO_DOUBTS,
     penalties: Mapping[NodeId, float] = NOTHING_HELD,
+    round_trips: Mapping[NodeId, float] = NOTHING_HELD,
 ) -> UtilityVector:
     """This robot's utilities of a task's candidates, by the tuning of ``allocation``.
 
     A candidate that this robot cannot reach gets 0 (not: is left out, which would raise its mean); one that may not
     have the task is refused with the reason. Where there are ``doubts`` about a node, it keeps
     what it has and gets nothing new. What the other tasks of ``bookings`` will use there, and do not show yet, counts
-    as in use. ``penalties`` are what this robot remembers; they go along, and `compare` joins them.
+    as in use. ``penalties`` are what this robot remembers; they go along, and `compare` joins them. ``round_trips`` are
+    seconds to each candidate and back, where measured (`zsched.core.round_trips`).
     """
     form = allocation.tuning.score
     terms: dict[NodeId, _Terms] = {}
@@ -128,7 +139,10 @@ def score(
         if link is not None and not link.is_reached:
             unreachable.append(candidate)
             continue
-        terms[candidate] = _measure(spec, profile, demand, unseen, link, form)
+        network_s = round_trips.get(candidate, 0.0)
+        cpu = _cpu(spec, profile, demand, unseen, allocation.tuning, gateway.demands, network_s)
+        memory = _memory(spec, profile, demand, unseen, form)
+        terms[candidate] = _Terms(cpu, memory, None if link is None else link.utility)
     measured = frozenset(name for name in METRICS if any(getattr(t, name) is not None for t in terms.values()))
     utilities = [Utility(candidate=name, value=0.0, reachable=False) for name in unreachable]
     for candidate, term in terms.items():
@@ -224,27 +238,43 @@ def _memory_use(profile: Profile, spec: TaskSpec, demand: Demand, unseen: Demand
     return predicted_use(profile.memory_used_mb + unseen.memory_mb, own, demand.memory_mb)
 
 
-def _measure(
-    spec: TaskSpec, profile: Profile, demand: Demand, unseen: Demand, link: PairLink | None, form: ScoreForm
-) -> _Terms:
+def _cpu(
+    spec: TaskSpec,
+    profile: Profile,
+    demand: Demand,
+    unseen: Demand,
+    tuning: Tuning,
+    demands: Demands,
+    network_s: float,
+) -> float | None:
+    """Eq. 1, or the share of its jobs that the task would get done, in time where it has a deadline."""
+    if profile.cpu_used_cores is None:
+        return None
     load = profile.worker(spec.name)
-    cpu = memory = None
-    if profile.cpu_used_cores is not None:
-        own = (load.cpu_cores or 0.0) if load is not None else 0.0
-        used = predicted_use(profile.cpu_used_cores + unseen.cpu_cores, own, demand.cpu_cores)
-        if form is ScoreForm.PAPER:
-            cpu = cpu_utility(profile.cpu_cores, used)
-        else:
-            cpu = service_utility(profile.cpu_cores - used + demand.cpu_cores, demand.cpu_cores, profile.cpu_cores)
+    own = (load.cpu_cores or 0.0) if load is not None else 0.0
+    used = predicted_use(profile.cpu_used_cores + unseen.cpu_cores, own, demand.cpu_cores)
+    if tuning.score is ScoreForm.PAPER:
+        return cpu_utility(profile.cpu_cores, used)
+    free, job = profile.cpu_cores - used + demand.cpu_cores, demands.job(spec.name)
+    share, stretch = demands.experience(spec.name, profile)
+    if job is None:
+        return service_utility(free, demand.cpu_cores, profile.cpu_cores, share=share)
+    speed = speed_of(profile)
+    if tuning.deadline_ms is not None:
+        share *= on_time(stretch * job.age_s(speed, free) + network_s, tuning.deadline_ms / 1e3)
+    return service_utility(free, demand.cpu_cores, profile.cpu_cores, most=job.most_cores(speed), share=share)
+
+
+def _memory(spec: TaskSpec, profile: Profile, demand: Demand, unseen: Demand, form: ScoreForm) -> float | None:
     used_mb = _memory_use(profile, spec, demand, unseen)
-    if used_mb is not None:
-        others_mb = used_mb - demand.memory_mb
-        if form is ScoreForm.PAPER:
-            memory = memory_utility(profile.memory_mb, demand.memory_mb, others_mb)
-        else:  # what is below the floor is no room: the kernel kills before it is used up
-            room_mb = (1.0 - spec.memory_floor_ratio) * profile.memory_mb - others_mb
-            memory = service_utility(room_mb, demand.memory_mb, profile.memory_mb)
-    return _Terms(cpu, memory, None if link is None else link.utility)
+    if used_mb is None:
+        return None
+    others_mb = used_mb - demand.memory_mb
+    if form is ScoreForm.PAPER:
+        return memory_utility(profile.memory_mb, demand.memory_mb, others_mb)
+    # what is below the floor is no room: the kernel kills before it is used up
+    room_mb = (1.0 - spec.memory_floor_ratio) * profile.memory_mb - others_mb
+    return service_utility(room_mb, demand.memory_mb, profile.memory_mb)
 
 
 # --- compare: all robots' views (Compare_Utility) --------------------------------------------------------------------

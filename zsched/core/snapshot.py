@@ -37,6 +37,8 @@ class NodeStatus:
     draining: bool = False
     speed: float | None = None
     """How fast one of its cores is."""
+    cpu_pressure: float | None = None
+    """Share of the time in which some process lacked a CPU (PSI)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -103,6 +105,8 @@ class TaskStatus:
     problems: tuple[str, ...] = ()
     patience: float | None = None
     """Utility seconds that staying may cost; ``None``: the tuning's time-to-trigger counts."""
+    round_trips: tuple[tuple[NodeId, float], ...] = ()
+    """(node, seconds from the answering node to it and back), of a task with a deadline."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

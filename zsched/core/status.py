@@ -22,6 +22,7 @@ from zsched.core.model import Allocation, NodeId, NodeKind, PeerState, TaskId, W
 from zsched.core.namesakes import Namesakes
 from zsched.core.plan import Direction, ReadyWhen, Route, StreamCount
 from zsched.core.register import Register
+from zsched.core.round_trips import RoundTrips
 from zsched.core.rounds import Rounds, TaskRound
 from zsched.core.scoring import joined, majority
 from zsched.core.sealing import Sealing
@@ -74,6 +75,7 @@ class NodeView(Protocol):
     membership: Membership
     gateway: Gateway
     rounds: Rounds
+    round_trips: RoundTrips
     registers: dict[TaskId, Register]
     executors: dict[TaskId, Executor]
     sealing: Sealing
@@ -196,6 +198,7 @@ def _node_status(node: NodeView, spec: NodeSpec, now: float) -> NodeStatus:
         workers=profile.workers,
         draining=profile.draining,
         speed=profile.speed,
+        cpu_pressure=profile.cpu_pressure,
     )
 
 
@@ -216,6 +219,7 @@ def _task_status(node: NodeView, spec: TaskSpec, now: float) -> TaskStatus:
         tuning=value.tuning,
         candidates=spec.candidates,
         patience=spec.patience,
+        round_trips=_round_trips(node, spec) if value.tuning.deadline_ms is not None else (),
         decision=_decision(standing, now),
         vote=_vote(standing, now),
         problems=tuple(_task_problems(node, spec, value, now)),
@@ -234,6 +238,12 @@ def _task_status(node: NodeView, spec: TaskSpec, now: float) -> TaskStatus:
             )
             for past in node.history[spec.name]
         ),
+    )
+
+
+def _round_trips(node: NodeView, spec: TaskSpec) -> tuple[tuple[NodeId, float], ...]:
+    return tuple(
+        (name, round_trip_s) for name, round_trip_s in node.round_trips.seconds().items() if name in spec.candidates
     )
 
 

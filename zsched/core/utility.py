@@ -75,7 +75,9 @@ SPARE = 0.05
 """The part of a term that is the machine's free share: enough to place tasks apart, too little to be worth a move."""
 
 
-def service_utility(free: float, demand: float, capacity: float) -> float:
+def service_utility(
+    free: float, demand: float, capacity: float, *, most: float | None = None, share: float = 1.0
+) -> float:
     """The share of its work that a task would get done, ``min(free / demand, 1)``, and a little for what is left free.
 
     Args:
@@ -83,14 +85,39 @@ def service_utility(free: float, demand: float, capacity: float) -> float:
             the task gets there.
         demand: of the task, in the same unit, >= 0.
         capacity: of the machine, in the same unit, > 0.
+        most: what the task can use there at a time, however much is free; ``None``: any amount.
+        share: what counts of that share of its work, in [0, 1]: less where it got less than was foreseen, or gets it
+            too late (`on_time`).
 
     >>> round(service_utility(free=1.0, demand=2.0, capacity=4.0), 4)
     0.4875
     >>> round(service_utility(free=4.0, demand=2.0, capacity=4.0), 4)
     1.0
+    >>> round(service_utility(free=4.0, demand=2.0, capacity=4.0, most=1.0), 4)
+    0.525
     """
     room = max(free, 0.0) / max(demand, LEAST_NEED_RATIO * capacity)
-    return (1.0 - SPARE) * min(room, 1.0) + SPARE * clamp(free / capacity)
+    if most is not None and most < demand:
+        room = min(room, most / demand)
+    return (1.0 - SPARE) * share * min(room, 1.0) + SPARE * clamp(free / capacity)
+
+
+STEEPNESS = 4.0
+"""Of the share of jobs within the deadline over their median time: how little the times of one task's jobs spread."""
+
+
+def on_time(job_s: float, deadline_s: float) -> float:
+    """The share of jobs expected within the deadline, where they take ``job_s`` (0 or more) in the middle.
+
+    Times of jobs are skewed to the right; they are taken for log-logistic (Fisk 1961), ``1 / (1 + (t / d)^4)``: the
+    middle half lies within a factor of 1.7. So there is no edge at which a machine is worth nothing, or no better than
+    another one, and what is judged is what counts: deadlines missed, not milliseconds.
+
+    >>> [round(on_time(job_s, 0.1), 3) for job_s in (0.0, 0.05, 0.1, 0.2)]
+    [1.0, 0.941, 0.5, 0.059]
+    """
+    ratio = min(job_s / deadline_s, 1e6)
+    return 1.0 / (1.0 + math.pow(ratio, STEEPNESS))
 
 
 KNEE_UTILITY = 0.8

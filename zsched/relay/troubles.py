@@ -1,4 +1,4 @@
-"""Hears from this node's workers that their callbacks raise, and lets the daemon know.
+"""Hears what this node's workers say of themselves (jobs done, callbacks that raise) and lets the daemon know.
 
 Knows: the keys it comes on, how much of it is handed on. Does not know: what a callback does, what follows.
 """
@@ -11,31 +11,50 @@ from typing import Final
 from zenoh import Sample, Session
 
 from zsched.clock import monotonic_s
+from zsched.core.events import FrameDropped, WorkerJobs
 from zsched.core.model import NodeId
 from zsched.core.relay_protocol import WorkerTrouble
+from zsched.errors import WireError
 from zsched.guard import tolerant
 from zsched.keyspace import Keyspace, parse
-from zsched.relay_pipe import decode_trouble
+from zsched.relay_pipe import decode_word
 
 PAUSE_S: Final = 0.1
-"""A worker says something once a second; more than this is no worker of ours, and is left out."""
+"""A worker says something five times a second; more than this is no worker of ours, and is left out."""
+MAX_SPEAKERS: Final = 256
+"""Tasks, times the kinds of words: more of them are no workers of ours either."""
+_GARBAGE: Final = ""
+
+Word = WorkerTrouble | WorkerJobs | FrameDropped
 
 
 class Troubles:
     """One subscription. ``report`` is called in zenoh's thread and must only enqueue."""
 
-    def __init__(
-        self, session: Session, keyspace: Keyspace, node: NodeId, report: Callable[[WorkerTrouble], None]
-    ) -> None:
+    def __init__(self, session: Session, keyspace: Keyspace, node: NodeId, report: Callable[[Word], None]) -> None:
         self._report = report
-        self._reported_at = -PAUSE_S
+        self._reported_at: dict[tuple[str, type[Word]], float] = {}
         self._subscriber = session.declare_subscriber(keyspace.trouble(node, "*", "*"), tolerant(self._hear, "trouble"))
 
     def _hear(self, sample: Sample) -> None:
-        now, parsed = monotonic_s(), parse(str(sample.key_expr))
-        if parsed is None or now - self._reported_at < PAUSE_S:
+        parsed = parse(str(sample.key_expr))
+        if parsed is None:
             return
-        trouble = decode_trouble(sample.payload.to_bytes())
-        if trouble is not None and parsed.rest == (trouble.task, trouble.incarnation):
-            self._reported_at = now
-            self._report(trouble)
+        try:
+            word = decode_word(sample.payload.to_bytes())
+        except WireError as error:
+            self._hand_on(_GARBAGE, FrameDropped(kind="trouble", reason=error.reason))
+            return
+        if parsed.rest == (word.task, word.incarnation):
+            self._hand_on(word.task, word)
+        else:
+            self._hand_on(_GARBAGE, FrameDropped(kind="trouble", reason="foreign"))
+
+    def _hand_on(self, task: str, word: Word) -> None:
+        now, speaker = monotonic_s(), (task, type(word))
+        if now - self._reported_at.get(speaker, -PAUSE_S) < PAUSE_S:
+            return
+        if speaker not in self._reported_at and len(self._reported_at) >= MAX_SPEAKERS:
+            return
+        self._reported_at[speaker] = now
+        self._report(word)

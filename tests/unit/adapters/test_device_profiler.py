@@ -18,6 +18,7 @@ from zsched.adapters.device_profiler import (
     DeviceProfiler,
     parse_cpu_list,
     parse_cpu_stat,
+    parse_pressure,
     parse_process_stat,
     parse_schedstat,
 )
@@ -256,6 +257,28 @@ def test_a_real_process_that_shares_its_cpu_wants_all_of_it() -> None:
         finally:
             other.kill()
             worker.kill()
+
+
+PRESSURE = "some avg10=1.00 avg60=1.00 avg300=1.00 total={}\nfull avg10=0.00 avg60=0.00 avg300=0.00 total=9\n"
+
+
+def test_pressure_is_the_share_of_the_time_in_which_somebody_lacked_a_cpu(tmp_path: Path, clock: Clock) -> None:
+    profiler = machine(tmp_path, **{"proc/pressure/cpu": PRESSURE.format(5_000_000)})
+    assert profiler.sample({}).cpu_pressure is None, "nothing to compare with"
+    for passed_s, total_us, share in ((0.2, 5_100_000, 0.5), (0.2, 5_100_000, 0.0), (1.0, 9_000_000, 1.0)):
+        clock.now += passed_s
+        write(tmp_path, {"proc/pressure/cpu": PRESSURE.format(total_us)})
+        assert profiler.sample({}).cpu_pressure == pytest.approx(share)
+    clock.now += 0.001
+    assert profiler.sample({}).cpu_pressure == pytest.approx(1.0), "too soon: the figure stands"
+    (tmp_path / "proc/pressure/cpu").unlink()
+    clock.now += 1.0
+    assert profiler.sample({}).cpu_pressure is None
+
+
+@pytest.mark.parametrize("text", [b"", b"full total=7\n", b"some avg10=1.00\n", b"some total=x\n", b"\xff\x00"])
+def test_what_is_no_pressure_is_not_measured(text: bytes) -> None:
+    assert parse_pressure(text) is None
 
 
 def used_s(process: psutil.Process) -> float:

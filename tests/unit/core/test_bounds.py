@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from zsched.core import model
-from zsched.core.events import RetryCommanded, WeightsCommanded, commanded
+from zsched.core.events import RetryCommanded, WeightsCommanded, WorkerJobs, commanded
 from zsched.core.fleet import Demand
 from zsched.core.messages import Accept, Accepted, Learnt, Prepare, Promise, Refusal, Refused, RetryTask, SetWeights
 from zsched.core.model import (
@@ -17,11 +17,14 @@ from zsched.core.model import (
     Allocation,
     Ballot,
     Beat,
+    Echo,
     Grant,
+    Jobs,
     Link,
     LinkSource,
     Profile,
     Proposal,
+    ScoreForm,
     TaskProgress,
     Tuning,
     Utility,
@@ -33,7 +36,7 @@ from zsched.core.model import (
 from zsched.core.plan import ServiceSettings, StreamSettings
 from zsched.core.relay_protocol import EndMarker, SnapshotChunk, StreamAck, WorkerTrouble
 
-TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
+TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0), score=ScoreForm.SERVICE)
 BALLOT = Ballot(counter=1, node="r1", incarnation=1)
 VALUE = Allocation(task="merge", revision=1, epoch=1, owner="e1", tuning=TUNING)
 ACCEPT = Accept(task="merge", acceptance=Acceptance(ballot=BALLOT, value=VALUE), electorate="x")
@@ -52,6 +55,9 @@ PROMISE = Promise(elector="r1", task="merge", ballot=BALLOT)
 ACCEPTED = Accepted(elector="r1", task="merge", ballot=BALLOT)
 REFUSED = Refused(elector="r1", task="merge", ballot=BALLOT, refusal=Refusal.BALLOT, promised=BALLOT)
 TROUBLE = WorkerTrouble(task="merge", incarnation="1", count=1, text="")
+WORD = WorkerJobs(task="merge", incarnation="1", at_s=1.0, done=1)
+JOBS = Jobs(time_s=0.1, cpu_s=0.1)
+ECHO = Echo(node="r1", incarnation=1, sequence=1, held_s=0.1)
 END = EndMarker(epoch=1, count=1)
 PIECE = SnapshotChunk(index=0, count=1, size=1, checksum="")
 
@@ -74,6 +80,10 @@ COUNTERS = [
     (BEAT, "generation", "beat"),
     (Learnt(node="e1", values=()), "generation", "learnt"),
     (TROUBLE, "count", "trouble"),
+    *((WORD, name, "jobs") for name in ("done", "skipped", "waiting", "late")),
+    (JOBS, "backlog", "jobs"),
+    (ECHO, "incarnation", "echo"),
+    (ECHO, "sequence", "echo"),
     (END, "epoch", "end"),
     (END, "count", "end"),
     (END, "replayed", "end"),
@@ -110,6 +120,8 @@ NAMES = [
     (Learnt(node="e1", values=()), "node", "learnt"),
     (SetWeights(task="merge", cpu=1.0, memory=0.0, network=0.0), "task", "weights"),
     (TROUBLE, "task", "trouble"),
+    (WORD, "task", "jobs"),
+    (ECHO, "node", "echo"),
     (RetryTask(task="merge"), "task", "retry"),
     (RetryTask(task="merge"), "node", "retry"),
 ]
@@ -128,6 +140,14 @@ RANGES = [
     (PROFILE, "cpu_used_cores", "profile.cpu_used_cores", (0.0, model.MAX_CPU_CORES)),
     (PROFILE, "memory_mb", "profile.memory_mb", (1.0, model.MAX_MEMORY_MB)),
     (PROFILE, "memory_used_mb", "profile.memory_used_mb", (0.0, model.MAX_MEMORY_MB)),
+    (PROFILE, "cpu_pressure", "profile.cpu_pressure", RATIO),
+    (LOAD, "wanted_cores", "worker.wanted_cores", (0.0, model.MAX_CPU_CORES)),
+    (TUNING, "deadline_ms", "deadline_ms", (model.MIN_DEADLINE_MS, model.MAX_DEADLINE_MS)),
+    *((JOBS, name, f"jobs.{name}", (0.0, model.MAX_JOB_S)) for name in ("time_s", "cpu_s", "wait_s", "age_s")),
+    *((JOBS, name, f"jobs.{name}", (0.0, model.MAX_JOBS_HZ)) for name in ("done_hz", "wanted_hz")),
+    (JOBS, "late_ratio", "jobs.late_ratio", RATIO),
+    *((WORD, name, f"jobs.{name}", (0.0, MAX_COUNTER)) for name in ("at_s", "time_s", "cpu_s", "wait_s", "age_s")),
+    (ECHO, "held_s", "echo.held_s", (0.0, model.MAX_HELD_S)),
     (UTILITY, "value", "utility.value", RATIO),
     (UTILITY, "cpu", "utility.cpu", RATIO),
     (UTILITY, "memory", "utility.memory", RATIO),
@@ -167,7 +187,7 @@ def test_figures_keep_within_both_ends(value: Any, field: str, told: str, ends: 
     low, high = ends
     for good in ends:
         assert getattr(replace(value, **{field: good}), field) == good
-    for bad in (low - 0.0001, high + 0.01, float("nan"), float("inf")):
+    for bad in (low - 0.0001, high * 1.01 + 0.01, float("nan"), float("inf")):
         with pytest.raises(ValueError, match=told):
             replace(value, **{field: bad})
 

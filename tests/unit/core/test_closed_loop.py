@@ -15,6 +15,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from zsched.core.events import WorkerJobs
 from zsched.core.fleet import (
     DEFAULT_PATIENCE,
     PATIENT_BONUS,
@@ -71,6 +72,12 @@ class Machine:
     speed: float = 1.0
     task_mb: float = 0.0
     shows_worker: bool = True
+    job_s: float | None = None
+    """Its worker tells of its jobs, of so many CPU seconds at speed 1; ``None``: it does not."""
+    rub: float = 1.0
+    """A job takes so many times the CPU time when the machine is full."""
+    most_cores: float = math.inf
+    """The task gets no more there, though the machine's figures say that more is free."""
 
     def sample(self, now: float, rng: Random, *, is_owner: bool) -> tuple[DeviceSample, LinkSample]:
         step = self.step(now)
@@ -78,7 +85,7 @@ class Machine:
         rest = max(cpu, 0.0) * self.cores
         # A full machine gives the task what is left, half a core at least.
         needs = self.task_cores / self.speed if is_owner else 0.0
-        takes = min(needs, max(self.cores - rest, 0.5))
+        takes = min(needs, max(self.cores - rest, 0.5), self.most_cores)
         holds = self.task_mb if is_owner else 0.0
         load = WorkerLoad(
             task="merge",
@@ -87,6 +94,7 @@ class Machine:
             memory_mb=holds if self.shows_worker else None,
             wanted_cores=math.ceil(needs) if self.shows_worker and takes < needs else None,
         )
+        self._work(now, needs, takes)
         device = DeviceSample(
             cpu_cores=self.cores,
             cpu_used_cores=min(rest + takes, self.cores),
@@ -96,6 +104,36 @@ class Machine:
             speed=self.speed,
         )
         return device, LinkSample(source=LinkSource.NL80211, rssi_dbm=-60.0 - 40.0 * step)
+
+    def __post_init__(self) -> None:
+        self.told: WorkerJobs | None = None
+        self._done = self._undone = self._now = 0.0
+
+    def _work(self, now: float, needs: float, takes: float) -> None:
+        """One worker of one thread, which skips what it cannot do; jobs are a fluid here, and told in whole ones."""
+        elapsed_s, self._now = max(now - self._now, 0.0), now
+        if now == 0.0:
+            self.told = None
+        if self.job_s is None or needs <= 0.0:
+            self.told = None
+            return
+        word = self.told or WorkerJobs(task="merge", incarnation=str(now), at_s=now, done=0, wait_s=0.0, age_s=0.0)
+        cpu_s = self.job_s / self.speed * (self.rub if takes < needs else 1.0)
+        wanted_hz = needs / (self.job_s / self.speed)
+        done_hz = takes / cpu_s
+        before, self._done = int(self._done), self._done + elapsed_s * done_hz
+        self._undone += elapsed_s * max(wanted_hz - done_hz, 0.0)
+        jobs, time_s = int(self._done) - before, max(1.0 / done_hz, cpu_s) if takes < needs else cpu_s
+        self.told = replace(
+            word,
+            at_s=now,
+            done=word.done + jobs,
+            skipped=int(self._undone),
+            time_s=word.time_s + jobs * time_s,
+            cpu_s=word.cpu_s + jobs * cpu_s,
+            wait_s=(word.wait_s or 0.0) + jobs * (time_s - cpu_s),
+            age_s=(word.age_s or 0.0) + jobs * time_s,
+        )
 
 
 @dataclass
@@ -150,6 +188,8 @@ class Loop:
         for machine in self.machines:
             is_owner = machine.name == self.allocation.owner
             device, link = machine.sample(now, self.rng, is_owner=is_owner)
+            if machine.told is not None:
+                self.profilers[machine.name].note_jobs(machine.told, now)
             self.profilers[machine.name].absorb(device, (link,) if self.weights.network > 0.0 else (), now)
         if self.weights.network > 0.0:
             device = DeviceSample(cpu_cores=4.0, cpu_used_cores=1.0, memory_mb=MEMORY_MB, memory_used_mb=1000.0)
@@ -427,6 +467,65 @@ def test_where_nothing_changes_a_task_scored_by_service_comes_to_rest(
     """
     loop = Loop(machines, weights=weights, tuning=BY_SERVICE, patience=SERVICE_PATIENCE)
     assert len(loop.run(300.0)) <= len(machines)
+
+
+BY_LATENCY = replace(BY_SERVICE, deadline_ms=150.0)
+
+
+@settings(derandomize=True, database=None, deadline=None, max_examples=40)
+@example(machines=SLOW_AND_FAST, tuning=BY_LATENCY, job_s=0.2, rub=1.0, most_cores=math.inf)
+@given(
+    machines=constant_machines(),
+    tuning=st.sampled_from((BY_SERVICE, BY_LATENCY, replace(BY_LATENCY, deadline_ms=1000.0))),
+    job_s=st.floats(0.02, 1.0),
+    rub=st.sampled_from((1.0, 1.3)),
+    most_cores=st.sampled_from((math.inf, 0.2)),
+)
+def test_where_nothing_changes_a_task_whose_worker_tells_of_its_jobs_comes_to_rest(
+    machines: tuple[Machine, ...], tuning: Tuning, job_s: float, rub: float, most_cores: float
+) -> None:
+    """Neither does a deadline make it go round, nor jobs that cost more on a full machine, nor a loss unexplained.
+
+    The first owner may be left before it was seen what the task gets there, and be tried once more.
+    """
+    for machine in machines:
+        machine.job_s, machine.rub, machine.most_cores = job_s, rub, most_cores
+        machine.task_cores = min(machine.task_cores, 1.0)
+    loop = Loop(machines, weights=CPU_ONLY, tuning=tuning, patience=SERVICE_PATIENCE)
+    assert len(loop.run(300.0)) <= len(machines) + 1
+
+
+@pytest.mark.parametrize("deadline_ms", [60.0, 100.0])
+def test_a_task_with_a_deadline_goes_where_its_jobs_are_quicker_though_it_loses_none(deadline_ms: float) -> None:
+    """Both machines do all of its jobs, in 100 ms and in 50: by service there is nothing to gain."""
+    machines = (
+        Machine(name="edge1", base=0.1, speed=1.0, task_cores=0.3, job_s=0.1),
+        Machine(name="edge2", base=0.1, speed=2.0, task_cores=0.3, job_s=0.1),
+    )
+    by_latency = replace(BY_SERVICE, deadline_ms=deadline_ms)
+    assert Loop(machines, weights=CPU_ONLY, tuning=BY_SERVICE, patience=SERVICE_PATIENCE).run(60.0) == []
+    ((_, where),) = Loop(machines, weights=CPU_ONLY, tuning=by_latency, patience=SERVICE_PATIENCE).run(60.0)
+    assert where == "edge2"
+
+
+def test_a_deadline_that_both_machines_keep_moves_nothing() -> None:
+    machines = (
+        Machine(name="edge1", base=0.1, speed=1.0, task_cores=0.3, job_s=0.1),
+        Machine(name="edge2", base=0.1, speed=2.0, task_cores=0.3, job_s=0.1),
+    )
+    lenient = replace(BY_SERVICE, deadline_ms=300.0)
+    assert Loop(machines, weights=CPU_ONLY, tuning=lenient, patience=SERVICE_PATIENCE).run(120.0) == []
+
+
+def test_an_owner_that_is_measured_to_lose_service_is_left_though_its_figures_are_fine() -> None:
+    """It gives the task half a core beside two idle ones; the other machine would give it all."""
+    machines = (
+        Machine(name="edge1", base=0.2, task_cores=0.9, job_s=0.1, most_cores=0.45),
+        Machine(name="edge2", base=0.3, task_cores=0.9, job_s=0.1),
+    )
+    ((at, where),) = Loop(machines, weights=CPU_ONLY, tuning=BY_SERVICE, patience=SERVICE_PATIENCE).run(120.0)
+    assert where == "edge2"
+    assert at < 15.0
 
 
 def test_a_task_that_began_on_a_machine_too_slow_for_it_leaves_though_it_was_never_seen_unstarved() -> None:

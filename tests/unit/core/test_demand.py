@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zsched.core.demand import SETTLE_S, STARVED_CPU_RATIO, UNSURE, Demands
+from zsched.core.demand import QUEUE_RATIO, SETTLE_S, STARVED_CPU_RATIO, UNSURE, Demands
 from zsched.core.fleet import Demand, TaskSpec
-from zsched.core.model import Profile, Tuning, Weights, WorkerLoad, WorkerState
+from zsched.core.model import Jobs, Profile, Tuning, Weights, WorkerLoad, WorkerState
 
 TASK = TaskSpec(
     name="merge",
@@ -30,6 +30,7 @@ def profile(
     state: WorkerState = WorkerState.READY,
     wanted: float | None = None,
     speed: float | None = None,
+    jobs: Jobs | None = None,
 ) -> Profile:
     return Profile(
         node=node,
@@ -39,7 +40,7 @@ def profile(
         cpu_used_cores=cpu,
         memory_mb=4000.0,
         memory_used_mb=1000.0,
-        workers=(WorkerLoad(task="merge", state=state, cpu_cores=cores, memory_mb=mb, wanted_cores=wanted),),
+        workers=(WorkerLoad(task="merge", state=state, cpu_cores=cores, memory_mb=mb, wanted_cores=wanted, jobs=jobs),),
         speed=speed,
     )
 
@@ -139,3 +140,129 @@ def test_only_another_figure_is_news() -> None:
     assert not demands.learn("merge", profile(1.5), 1.0)
     assert not demands.learn("merge", profile(1.5, node="edge2"), 2.0)
     assert demands.learn("merge", profile(1.6, node="edge2"), 3.0)
+
+
+# --- by the worker's own word --------------------------------------------------------------------------------------
+
+
+def told(
+    wanted_hz: float,
+    *,
+    cpu_s: float = 0.1,
+    got: float = 1.0,
+    other_s: float = 0.0,
+    speed: float | None = None,
+    used: float = 4.0,
+) -> Profile:
+    """A serial worker that gets ``got`` of a core when it runs, and skips what it cannot do."""
+    time_s = other_s + cpu_s / got
+    done_hz = min(wanted_hz, 1.0 / time_s)
+    jobs = Jobs(
+        time_s=time_s, cpu_s=cpu_s, wait_s=time_s - cpu_s - other_s, age_s=time_s, done_hz=done_hz, wanted_hz=wanted_hz
+    )
+    return profile(done_hz * cpu_s, cpu=used, speed=speed, jobs=jobs, wanted=1.0 if got < 1.0 else None)
+
+
+@given(got=st.floats(0.02, 1.0), wanted_hz=st.floats(4.1, 10.0), speed=st.floats(0.25, 4.0))
+def test_a_starved_worker_s_need_is_what_it_is_without_the_load(got: float, wanted_hz: float, speed: float) -> None:
+    """Known at once and exactly: nothing was ever seen of the task where it had enough."""
+    need = learnt(told(wanted_hz, got=got, speed=speed), there=profile(speed=speed)).cpu_cores
+    assert need == pytest.approx(wanted_hz * 0.1)
+
+
+def test_cpu_time_that_rises_by_a_tenth_under_contention_raises_the_need_by_no_more() -> None:
+    calm, beside = learnt(told(8.0)).cpu_cores, learnt(told(8.0, cpu_s=0.11, got=0.5)).cpu_cores
+    assert calm < beside <= 1.11 * calm
+
+
+def test_a_need_that_was_told_falls_again_on_a_full_machine() -> None:
+    """What is only used there would be the least of it."""
+    assert learnt(told(9.0, got=0.5), told(5.0, got=0.5)).cpu_cores == pytest.approx(0.5)
+
+
+def test_samples_that_no_core_could_do_are_not_needed() -> None:
+    """A camera's 30 pictures a second, of which one core does ten: class latest skips the rest, wherever it runs."""
+    assert learnt(told(30.0, got=0.5)).cpu_cores == pytest.approx(1.0)
+    assert learnt(told(30.0)).cpu_cores == pytest.approx(1.0)
+    demands = Demands()
+    demands.learn("merge", told(30.0, speed=1.0), 0.0, fastest=2.0)
+    assert demands.at(TASK, profile(speed=1.0)).cpu_cores == pytest.approx(2.0), "a faster candidate does twice as many"
+
+
+def test_jobs_that_wait_for_a_disk_need_no_other_machine() -> None:
+    """Half of the jobs are skipped, and none of their time was spent waiting for a CPU."""
+    at_disk = told(10.0, cpu_s=0.05, other_s=0.15)
+    assert learnt(at_disk).cpu_cores == pytest.approx(max(5.0 * 0.05, TASK.demand.cpu_cores))
+    both = told(10.0, cpu_s=0.1, other_s=0.1, got=0.25)
+    assert learnt(both).cpu_cores == pytest.approx(5.0 * 0.1), "alone it would do five a second"
+
+
+def test_what_several_threads_leave_undone_counts_where_they_always_want_to_run() -> None:
+    jobs = Jobs(time_s=0.5, cpu_s=1.0, done_hz=2.0, wanted_hz=4.0)
+    assert learnt(profile(2.0, cpu=4.0, wanted=8.0, jobs=jobs)).cpu_cores == pytest.approx(4.0)
+    assert learnt(profile(2.0, cpu=4.0, wanted=3.0, jobs=jobs)).cpu_cores == pytest.approx(3.0)
+    assert learnt(profile(2.0, cpu=2.0, jobs=jobs)).cpu_cores == pytest.approx(2.0), "they wait for something else"
+
+
+def test_a_worker_that_catches_up_needs_less_than_it_uses() -> None:
+    jobs = Jobs(time_s=0.1, cpu_s=0.1, wait_s=0.0, done_hz=9.0, wanted_hz=6.0)
+    assert learnt(profile(0.9, cpu=2.0, jobs=jobs)).cpu_cores == pytest.approx(0.6)
+
+
+def test_what_was_told_is_the_least_where_the_task_has_just_come() -> None:
+    rising = Jobs(time_s=0.1, cpu_s=0.1, wait_s=0.0, done_hz=1.0, wanted_hz=1.0)
+    demand = learnt(told(9.0), profile(0.1, node="edge2", jobs=rising), every_s=1.0)
+    assert demand.cpu_cores == pytest.approx(0.9)
+
+
+def test_how_long_a_job_takes_elsewhere_is_its_cpu_by_speed_and_what_is_free_and_the_rest_as_it_was() -> None:
+    demands = Demands()
+    assert demands.job("merge") is None
+    demands.learn("merge", told(2.0, cpu_s=0.1, other_s=0.05, got=0.5, speed=2.0), 0.0)
+    job = demands.job("merge")
+    assert job is not None
+    assert job.age_s(speed=2.0, free_cores=1.0) == pytest.approx(0.15)
+    assert job.age_s(speed=1.0, free_cores=4.0) == pytest.approx(0.25)
+    assert job.age_s(speed=1.0, free_cores=0.5) == pytest.approx(0.45)
+    assert job.age_s(speed=1.0, free_cores=-1.0) < 5.0, "no machine makes it endless"
+    assert job.most_cores(2.0) == pytest.approx(2 / 3)
+
+
+def test_the_wait_for_a_turn_is_what_it_is_where_nothing_is_short() -> None:
+    def queued(age_s: float, wait_s: float) -> Profile:
+        jobs = Jobs(time_s=0.1 + wait_s, cpu_s=0.1, wait_s=wait_s, age_s=age_s, done_hz=3.0, wanted_hz=3.0)
+        return profile(0.3, cpu=2.0, jobs=jobs)
+
+    demands = Demands()
+    demands.learn("merge", queued(2.0, 0.4), 0.0)
+    assert demands.job("merge") is not None
+    assert getattr(demands.job("merge"), "queue_ratio", 0.0) == QUEUE_RATIO
+    demands.learn("merge", queued(0.3, 0.0), EVERY_S)
+    assert getattr(demands.job("merge"), "queue_ratio", 0.0) == pytest.approx(3.0)
+    demands.learn("merge", queued(5.0, 0.4), 2 * EVERY_S)
+    assert getattr(demands.job("merge"), "queue_ratio", 0.0) == pytest.approx(3.0)
+
+
+def test_a_task_that_gets_less_than_its_machine_s_figures_say_is_remembered_there() -> None:
+    """Half of its jobs are left undone beside two idle cores (it is pinned, or has a quota of its own)."""
+    demands, pinned = Demands(), told(9.0, got=0.5, used=2.0)
+    demands.learn("merge", pinned, 0.0)
+    assert demands.experience("merge", pinned) == (1.0, 1.0), "it has just come"
+    demands.learn("merge", pinned, EVERY_S)
+    share, stretch = demands.experience("merge", pinned)
+    assert share == pytest.approx(5 / 9)
+    assert stretch == pytest.approx(2.0)
+    left = profile(0.0, cpu=1.5)
+    assert demands.experience("merge", left) == (share, stretch), "it does not look better once the task has left"
+    assert demands.experience("merge", profile(0.0, cpu=1.0)) == (1.0, 1.0), "another load may be another story"
+    assert demands.experience("merge", profile(0.0, cpu=1.5, node="edge2")) == (1.0, 1.0)
+    demands.learn("merge", told(9.0, used=2.0), 2 * EVERY_S)
+    assert demands.experience("merge", pinned) == (1.0, 1.0), "it gets all again"
+
+
+def test_a_loss_that_the_machine_s_figures_explain_is_not_counted_twice() -> None:
+    demands, starved = Demands(), told(9.0, got=0.5, used=4.0)
+    for now in (0.0, EVERY_S):
+        demands.learn("merge", starved, now)
+    share, _ = demands.experience("merge", starved)
+    assert share == pytest.approx(1.0)

@@ -278,6 +278,19 @@ class Storm:
     def worker(self) -> ev.Event:
         if self.rng.random() < 0.2:
             return ev.WorkerTroubled(task=self.task(), count=self.number(), text="x" * self.rng.choice((0, 3, 400)))
+        if self.rng.random() < 0.3:
+            at_s, time_s, cpu_s, wait_s = (self.rng.choice((0.0, 0.5, 3.0, 1e6)) for _ in range(4))
+            return ev.WorkerJobs(
+                task=self.task(),
+                incarnation=self.rng.choice("12"),
+                at_s=at_s,
+                done=self.number(),
+                skipped=self.number(),
+                waiting=self.number(),
+                time_s=time_s,
+                cpu_s=cpu_s,
+                wait_s=wait_s,
+            )
         reason = self.rng.choice(("", "its token", "x" * 400))
         return ev.WorkerChanged(task=self.task(), state=self.rng.choice(tuple(WorkerState)), reason=reason)
 

@@ -6,13 +6,12 @@ from dataclasses import replace
 import pytest
 
 from zsched.core.fleet import Timing
+from zsched.core.means import STALE_S, Ewma
 from zsched.core.model import DeviceSample, LinkSample, LinkSource, Profile, WorkerLoad, WorkerState
 from zsched.core.profile import (
     RATIO_CHANGE,
     RSSI_CHANGE_DB,
     RSSI_OUTLIER_DB,
-    STALE_S,
-    Ewma,
     Profiler,
     SignalFilter,
 )

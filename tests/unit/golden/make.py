@@ -172,6 +172,20 @@ SAMPLES: dict[str, object] = {
     "worker_trouble": relay_protocol.WorkerTrouble(
         task="map_merge", incarnation="12300001", count=2088, text="ValueError: no such map"
     ),
+    "worker_jobs": events.WorkerJobs(
+        task="map_merge",
+        incarnation="12300001",
+        at_s=61.4,
+        done=2088,
+        skipped=12,
+        waiting=2,
+        time_s=73.08,
+        cpu_s=70.9,
+        wait_s=1.5,
+        age_s=80.25,
+        late=7,
+    ),
+    "frame_dropped": events.FrameDropped(kind="trouble", reason="garbage"),
     "end_marker": relay_protocol.EndMarker(epoch=4, count=1000),
     "snapshot_chunk": relay_protocol.SnapshotChunk(
         index=1, count=3, size=600_000, checksum="00112233445566778899aabbccddeeff"

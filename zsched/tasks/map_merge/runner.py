@@ -55,7 +55,13 @@ def run(options: argparse.Namespace) -> None:
                 return ros[output].put(payload)
             return outputs[output].put(payload, attachment=attachment)
 
-        service = MapMergeService(settings, publish, clock=monotonic_s, rate_hz=options.rate)
+        service = MapMergeService(
+            settings,
+            publish,
+            clock=monotonic_s,
+            rate_hz=options.rate,
+            job=lambda skipped: worker.job(skipped=skipped),
+        )
 
         def on_map(received: Received) -> None:
             robot = received.key.removeprefix(f"{worker.prefix}/").removesuffix("/map")

@@ -10,11 +10,13 @@ counter. A search runs in a thread of its own, one at a time, so that merged map
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import queue
 import threading
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Protocol
@@ -64,6 +66,10 @@ def _outcome(job: SearchJob) -> Estimate | None:
         return None
 
 
+def _untold(_skipped: int) -> AbstractContextManager[object]:
+    return contextlib.nullcontext()
+
+
 class Publish(Protocol):
     """Sends one message of an output; whether it went out (an idle worker's does not)."""
 
@@ -82,7 +88,10 @@ class _Input:
 
 
 class MapMergeService:
-    """The task without its transport. ``rate_hz`` bounds merges; ``clock`` gives monotonic seconds."""
+    """The task without its transport. ``rate_hz`` bounds merges; ``clock`` gives monotonic seconds.
+
+    Every merge is a ``job``, told how many could have been made since it was due.
+    """
 
     def __init__(
         self,
@@ -91,12 +100,14 @@ class MapMergeService:
         *,
         clock: Callable[[], float],
         rate_hz: float = 4.0,
+        job: Callable[[int], AbstractContextManager[object]] = _untold,
         spawn: Callable[[Callable[[], None]], None] = _in_thread,
     ) -> None:
         self._settings = settings
         self._publish = publish
         self._clock = clock
         self._period_s = 1.0 / rate_hz
+        self._job = job
         self._spawn = spawn
         self._merger = Merger(settings, searches_itself=False)
         self._found: queue.SimpleQueue[tuple[SearchJob, Estimate | None]] = queue.SimpleQueue()
@@ -115,6 +126,8 @@ class MapMergeService:
         self._merges = 0
         self._merge_ms: float | None = None
         self._next_merge_s = float("-inf")
+        self._due_s = float("-inf")
+        """Since when something waits to be merged."""
         self._next_status_s = float("-inf")
 
     # --- any thread ---------------------------------------------------------------------------------------------------
@@ -156,15 +169,19 @@ class MapMergeService:
     def merge_now(self) -> bytes:
         """Merge as soon as may be, whether anything has changed or not; answers with the status as of now."""
         with self._lock:
-            self._is_due = True
+            self._make_due()
             self._next_merge_s = float("-inf")
         return json.dumps(self.status()).encode()
+
+    def _make_due(self) -> None:
+        if not self._is_due:
+            self._is_due, self._due_s = True, self._clock()
 
     def _keep(self, robot: str, grid: Grid | None) -> None:
         with self._lock:
             self._pending[robot] = grid
             self._stale.discard(robot)
-            self._is_due = True
+            self._make_due()
 
     # --- one thread ---------------------------------------------------------------------------------------------------
 
@@ -184,7 +201,7 @@ class MapMergeService:
         """
         now = self._clock()
         if is_active and not self._was_active:
-            self._is_due = True
+            self._make_due()
             self._active_s = now
             self._next_merge_s = self._next_status_s = float("-inf")
         elif self._was_active and not is_active:
@@ -196,8 +213,10 @@ class MapMergeService:
         self._take_found()
         awaits = self._awaits_reference(now) or self._awaits_fresh_maps(now)
         if self._is_due and now >= self._next_merge_s and not awaits:
+            skipped = int(max(now - max(self._next_merge_s, self._due_s, self._active_s), 0.0) / self._period_s)
             self._next_merge_s = now + self._period_s
-            self._merge()
+            with self._job(skipped):
+                self._merge()
             return True
         if now >= self._next_status_s:
             self._publish_status()
@@ -244,7 +263,8 @@ class MapMergeService:
                 self._merger.remove(robot)
                 self._inputs[robot].bad += 1
                 self._inputs[robot].last_error = "a merge failed with its map (see the worker's log)"
-            self._is_due = bool(pending)
+            if pending:
+                self._make_due()
 
     def _search(self) -> None:
         """Start the search that is due, unless one runs: a search takes up to a second, and maps go on meanwhile."""
@@ -259,7 +279,7 @@ class MapMergeService:
             self._merger.finish_search(*self._found.get())
             self._is_searching = False
             with self._lock:
-                self._is_due = True
+                self._make_due()
 
     def _publish_result(self, result: MergeResult) -> None:
         attachment = json.dumps({"merge": self._merges, "inputs": dict(result.inputs)}).encode()

@@ -1,0 +1,199 @@
+"""A worker's own clock: what it counts of its jobs, how often it tells, and what its node believes."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+from functools import partial
+from typing import Any, cast
+
+import pytest
+
+from support.sessions import hub_and_neighbour, matches
+from support.waiting import until
+from zsched import wire
+from zsched.core.events import FrameDropped, WorkerJobs
+from zsched.core.relay_protocol import WorkerTrouble
+from zsched.hop_acks import Acknowledger
+from zsched.keyspace import Keyspace
+from zsched.relay.troubles import PAUSE_S, Troubles, Word
+from zsched.worker_debts import Debts
+from zsched.worker_inputs import Dispatcher
+from zsched.worker_jobs import TELL_S, JobBook, JobTimer
+from zsched.worker_samples import Input, Received
+
+KEYS = Keyspace("test")
+WORD = WorkerJobs(task="t", incarnation="7", at_s=3.0, done=4)
+
+
+def burn(cpu_s: float) -> None:
+    end = time.thread_time() + cpu_s
+    while time.thread_time() < end:
+        pass
+
+
+def test_a_job_s_time_holds_its_cpu_time_and_what_it_slept() -> None:
+    timer = JobTimer(deadline_s=0.05)
+    for pause_s in (0.0, 0.04):
+        timer.begin()
+        burn(0.02)
+        time.sleep(pause_s)
+        timer.end(came_s=time.monotonic() - 0.01 - 2 * pause_s)
+    assert timer.done == 2
+    assert 0.04 <= timer.cpu_s < 0.06
+    assert timer.time_s >= timer.cpu_s + 0.039
+    assert timer.late >= 1
+    assert not timer.is_in_hand
+
+
+def test_the_kernel_tells_how_long_a_job_waited_for_a_cpu() -> None:
+    """Two threads of two processes cannot be made to share a CPU here; but what is told only rises, and is less."""
+    timer = JobTimer()
+    assert timer.waited_s() == 0.0
+    timer.begin()
+    burn(0.05)
+    timer.end()
+    waited_s = timer.waited_s()
+    assert waited_s is None or 0.0 <= waited_s <= timer.time_s - timer.cpu_s + 0.02
+
+
+def test_helpers_in_other_threads_are_part_of_a_job() -> None:
+    """hashlib lets go of Python's lock: three threads compute at the same time."""
+    import hashlib
+
+    data, timer = bytes(8 << 20), JobTimer()
+
+    def job() -> None:
+        helpers = [threading.Thread(target=lambda: hashlib.sha256(data).digest()) for _ in range(3)]
+        for helper in helpers:
+            helper.start()
+        for helper in helpers:
+            helper.join()
+        burn(0.002)
+
+    for _ in range(3):
+        timer.begin()
+        job()
+        timer.end()
+        timer.look_for_helpers()
+    assert timer.is_parallel
+    alone = timer.cpu_s
+    timer.begin()
+    job()
+    timer.end()
+    assert timer.cpu_s - alone > 0.008, "the helpers' time counts"
+
+
+def test_the_node_is_told_while_there_is_work_and_once_behind_it() -> None:
+    told: list[tuple[float, WorkerJobs]] = []
+    book = JobBook("t", "7", lambda word: told.append((time.monotonic(), word)))
+    with book.job(skipped=2, came_s=None):
+        until(lambda: len(told) >= 3, "a job that takes long is told of")
+        assert {word.done for _, word in told} == {0}
+    until(lambda: told[-1][1].done == 1, "its end")
+    assert told[-1][1].skipped == 2
+    count = len(told)
+    time.sleep(4 * TELL_S)
+    assert len(told) == count, "nothing is said of nothing"
+    with book.job(skipped=0, came_s=None):
+        pass
+    until(lambda: told[-1][1].done == 2, "it wakes up again")
+    assert min(later - earlier for (earlier, _), (later, _) in itertools.pairwise(told)) > TELL_S / 2
+    book.close()
+
+
+def test_from_the_author_s_first_job_on_callbacks_are_none_and_sums_only_rise() -> None:
+    told: list[WorkerJobs] = []
+    book = JobBook("t", "7", told.append)
+    callback = book.timer()
+    callback.begin()
+    callback.end()
+    book.wake()
+    until(lambda: told and told[-1].done == 1, "the callback")
+    for _ in range(3):
+        with book.job(skipped=0, came_s=None):
+            callback.begin()
+            callback.end()
+    until(lambda: told[-1].done == 4, "one and three")
+    book.close()
+
+
+def test_the_dispatcher_times_its_callbacks_and_counts_what_waits_and_gives_way() -> None:
+    told: list[WorkerJobs] = []
+    book = JobBook("t", "7", told.append, deadline_s=0.05)
+    dispatcher = Dispatcher(
+        lambda _epoch: None, cast("Acknowledger", None), cast("Any", None), cast("Debts", None), book
+    )
+    dispatcher.start()
+    gate, begun = threading.Event(), threading.Event()
+
+    def hold(_sample: Received) -> None:
+        begun.set()
+        gate.wait(20.0)
+        burn(0.005)
+
+    every, newest = Input(on_sample=hold, keep_last=None), Input(on_sample=hold, keep_last=1)
+    with hub_and_neighbour() as (hub, neighbour):
+        kept = [
+            hub.declare_subscriber("every", partial(dispatcher.put, every)),
+            hub.declare_subscriber("newest", partial(dispatcher.put, newest)),
+        ]
+        publishers = {key: neighbour.declare_publisher(key) for key in ("every", "newest")}
+        for publisher in publishers.values():
+            until(partial(matches, publisher), "they match")
+        publishers["every"].put("x")
+        until(begun.is_set, "one is in hand")
+        for _ in range(4):
+            publishers["every"].put("x")
+            publishers["newest"].put("x")
+        until(lambda: newest.shed == 3, "of the newest one waits")
+        until(lambda: told and told[-1].waiting == 5, "four, and one")
+        assert (told[-1].done, told[-1].skipped) == (0, 3)
+        gate.set()
+        until(lambda: told[-1].done == 6, "all are done")
+        until(lambda: told[-1].waiting == 0, "and nothing waits")
+        kept.clear()
+    last = told[-1]
+    assert 0.03 <= last.cpu_s < 0.2
+    assert last.age_s is not None
+    assert last.age_s > last.time_s, "who waited is older than its job took"
+    assert last.late is not None
+    assert last.late >= 5
+    dispatcher.close()
+    book.close()
+
+
+def test_the_relay_hands_on_every_worker_s_word_and_counts_garbage() -> None:
+    heard: list[Word] = []
+    with hub_and_neighbour() as (hub, neighbour):
+        kept = [Troubles(hub, KEYS, "edge1", heard.append)]
+        until(partial(matches, neighbour.declare_publisher(KEYS.trouble("edge1", "t", "7"))), "the relay listens")
+        say = neighbour.put
+        say(KEYS.trouble("edge1", "t", "7"), wire.encode(WORD))
+        say(KEYS.trouble("edge1", "u", "9"), wire.encode(WorkerJobs(task="u", incarnation="9", at_s=1.0, done=1)))
+        say(KEYS.trouble("edge1", "t", "7"), wire.encode(WorkerTrouble(task="t", incarnation="7", count=1, text="x")))
+        until(lambda: len(heard) == 3, "two workers, and two words of one, within a moment")
+        say(KEYS.trouble("edge1", "t", "7"), b"\x00 garbage")
+        until(lambda: FrameDropped(kind="trouble", reason="garbage") in heard, "garbage is counted")
+        time.sleep(PAUSE_S)
+        say(KEYS.trouble("edge1", "t", "8"), wire.encode(WORD))
+        until(lambda: FrameDropped(kind="trouble", reason="foreign") in heard, "and one worker's word at another's key")
+        time.sleep(PAUSE_S)
+        before = len(heard)
+        for _ in range(500):
+            say(KEYS.trouble("edge1", "t", "7"), wire.encode(WORD))
+            say(KEYS.trouble("edge1", "t", "7"), b"garbage")
+        time.sleep(0.5)
+        assert 1 <= len(heard) - before < 50, "a flood is no work for the daemon"
+        kept.clear()
+
+
+@pytest.mark.parametrize("incarnation", ["7", "8"])
+def test_only_the_running_worker_s_word_is_believed(incarnation: str) -> None:
+    from zsched.crew import Crew
+
+    crew = Crew(lambda _event: None)
+    crew.on_started("t", 4711, 7)
+    assert crew.is_ours(WorkerJobs(task="t", incarnation=incarnation, at_s=1.0, done=1)) == (incarnation == "7")
+    assert crew.is_ours(WorkerJobs(task="somebody_elses", incarnation="1", at_s=1.0, done=1))

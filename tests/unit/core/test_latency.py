@@ -1,0 +1,116 @@
+"""A task with a deadline: what a machine is worth to it, by its jobs' time there and the way."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from zsched.core.fleet import Demand, Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.gateway import Gateway
+from zsched.core.model import (
+    Allocation,
+    Jobs,
+    NodeKind,
+    PeerState,
+    Profile,
+    ScoreForm,
+    Tuning,
+    Weights,
+    WorkerLoad,
+    WorkerState,
+)
+from zsched.core.scoring import score
+from zsched.core.utility import on_time, service_utility
+
+TUNING = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0), score=ScoreForm.SERVICE, deadline_ms=100.0)
+EDGES = ("edge1", "edge2")
+JOBS = Jobs(time_s=0.08, cpu_s=0.08, wait_s=0.0, age_s=0.08, done_hz=2.0, wanted_hz=2.0)
+
+
+def worth(
+    tuning: Tuning = TUNING,
+    *,
+    jobs: Jobs | None = JOBS,
+    speeds: tuple[float, float] = (1.0, 1.0),
+    used: tuple[float, float] = (1.0, 1.0),
+    away_s: tuple[float, float] = (0.0, 0.0),
+) -> tuple[float, float]:
+    """What the owner edge1 and the candidate edge2 are worth, behind the owner's settling."""
+    spec = TaskSpec(name="merge", candidates=EDGES, tuning=tuning, worker=WorkerSpec(command=("x",)), demand=Demand())
+    nodes = tuple(NodeSpec(name=name, kind=NodeKind.EDGE) for name in EDGES)
+    nodes += (NodeSpec(name="robot1", kind=NodeKind.ROBOT),)
+    gateway = Gateway(Fleet(name="f", timing=Timing(), nodes=nodes, tasks=(spec,), electors=("robot1",)))
+    for sequence, now in ((1, 0.0), (2, 10.0)):
+        for name, speed, cores in zip(EDGES, speeds, used, strict=True):
+            own = JOBS.done_hz * JOBS.cpu_s if name == "edge1" else 0.0
+            load = WorkerLoad(
+                task="merge",
+                state=WorkerState.READY,
+                cpu_cores=own,
+                memory_mb=1.0,
+                jobs=jobs if name == "edge1" else None,
+            )
+            profile = Profile(
+                node=name,
+                incarnation=1,
+                sequence=sequence,
+                cpu_cores=4.0,
+                cpu_used_cores=cores,
+                memory_mb=1000.0,
+                memory_used_mb=100.0,
+                workers=(load,),
+                speed=speed,
+            )
+            assert gateway.absorb(profile, now) is None
+        gateway.learn_demand("merge", "edge1", now)
+    allocation = Allocation(task="merge", revision=1, epoch=1, owner="edge1", tuning=tuning)
+    states = dict.fromkeys((*EDGES, "robot1"), PeerState.ALIVE)
+    trips = dict(zip(EDGES, away_s, strict=True))
+    vector = score(spec, allocation, "robot1", gateway, states, 10.0, round_trips=trips)
+    found = {one.candidate: one.value for one in vector.utilities}
+    return found["edge1"], found["edge2"]
+
+
+def test_by_service_both_machines_that_do_all_jobs_are_worth_the_same_but_for_what_is_free() -> None:
+    owner, other = worth(replace(TUNING, deadline_ms=None), speeds=(1.0, 4.0))
+    assert owner == pytest.approx(other, abs=0.02)
+
+
+def test_with_a_deadline_the_machine_is_worth_more_whose_jobs_are_in_time() -> None:
+    owner, other = worth(speeds=(1.0, 4.0))
+    assert owner == pytest.approx(service_utility(3.16, 0.16, 4.0, share=on_time(0.08, 0.1)), abs=0.01)
+    assert other > owner + 0.2
+
+
+def test_the_way_counts_as_a_job_s_own_time_does() -> None:
+    near, far = worth(away_s=(0.0, 0.3))
+    assert far < 0.1 < near
+    assert worth(away_s=(0.05, 0.05))[0] < near
+
+
+def test_a_candidate_with_nothing_free_stretches_the_job() -> None:
+    owner, full = worth(used=(1.0, 3.8))
+    assert full < 0.1 < owner
+
+
+def test_a_job_that_waits_for_a_disk_is_as_late_on_a_faster_machine() -> None:
+    at_disk = replace(JOBS, time_s=0.3, cpu_s=0.01, age_s=0.3, wait_s=0.0)
+    owner, other = worth(jobs=at_disk, speeds=(1.0, 4.0))
+    assert other == pytest.approx(owner, abs=0.02)
+
+
+def test_a_task_whose_worker_tells_nothing_is_judged_by_service() -> None:
+    assert worth(jobs=None) == worth(replace(TUNING, deadline_ms=None), jobs=None)
+
+
+def test_the_paper_s_score_knows_no_deadline() -> None:
+    paper = replace(TUNING, score=ScoreForm.PAPER)
+    assert worth(paper, speeds=(1.0, 4.0)) == worth(replace(paper, deadline_ms=None), speeds=(1.0, 4.0))
+
+
+@given(one_s=st.floats(0.0, 1e6), more_s=st.floats(0.0, 1e6), deadline_s=st.floats(0.001, 3600.0))
+def test_longer_jobs_are_never_more_in_time(one_s: float, more_s: float, deadline_s: float) -> None:
+    assert 0.0 <= on_time(one_s + more_s, deadline_s) <= on_time(one_s, deadline_s) <= 1.0

@@ -1,0 +1,64 @@
+"""How far away another node is, by which of our profiles it echoes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from zsched.core.model import Echo, Profile
+from zsched.core.round_trips import ECHO_S, KEPT, SENT, RoundTrips
+
+MINE = Profile(
+    node="robot1", incarnation=7, sequence=0, cpu_cores=4.0, cpu_used_cores=1.0, memory_mb=100.0, memory_used_mb=1.0
+)
+EDGE = replace(MINE, node="edge1", incarnation=3)
+
+
+def exchange(mine: RoundTrips, there_s: float, held_s: float, back_s: float, sequence: int, at: float = 100.0) -> None:
+    """One profile of ours goes there, is kept, and comes back in the edge's next one."""
+    edge = RoundTrips("edge1")
+    mine.note_sent(replace(MINE, sequence=sequence), at)
+    edge.note_heard(replace(MINE, sequence=sequence), 3, 5000.0)
+    echoes = edge.echoes(5000.0 + held_s)
+    mine.note_heard(replace(EDGE, sequence=sequence, echoes=echoes), 7, at + there_s + held_s + back_s)
+
+
+def test_what_is_left_of_the_time_since_we_sent_is_the_way_whatever_the_other_clock_says() -> None:
+    mine = RoundTrips("robot1")
+    assert mine.seconds() == {}
+    exchange(mine, 0.01, 0.6, 0.03, 1)
+    assert round(mine.seconds()["edge1"], 6) == 0.04
+
+
+def test_the_least_of_the_last_ones_counts() -> None:
+    mine = RoundTrips("robot1")
+    for sequence, slow_s in enumerate((0.5, 0.0, 0.9)):
+        exchange(mine, 0.01, 0.2, 0.01 + slow_s, sequence)
+    assert round(mine.seconds()["edge1"], 6) == 0.02
+    for sequence in range(10, 10 + KEPT):
+        exchange(mine, 0.05, 0.2, 0.05, sequence)
+    assert round(mine.seconds()["edge1"], 6) == 0.1, "and it can rise"
+
+
+def test_echoes_that_mean_nothing_change_nothing() -> None:
+    mine = RoundTrips("robot1")
+    mine.note_sent(replace(MINE, sequence=1), 100.0)
+    good = Echo(node="robot1", incarnation=7, sequence=1, held_s=0.1)
+    for bad in (
+        replace(good, node="robot2"),
+        replace(good, incarnation=6),
+        replace(good, sequence=2),
+        replace(good, held_s=5.0),
+    ):
+        mine.note_heard(replace(EDGE, echoes=(bad,)), 7, 101.0)
+    assert mine.seconds() == {}
+    for sequence in range(2, 2 + SENT):
+        mine.note_sent(replace(MINE, sequence=sequence), 100.0)
+    mine.note_heard(replace(EDGE, echoes=(good,)), 7, 101.0)
+    assert mine.seconds() == {}, "so old a one is forgotten"
+
+
+def test_a_profile_is_echoed_for_as_long_as_it_may_mean_something() -> None:
+    edge = RoundTrips("edge1")
+    edge.note_heard(MINE, 3, 50.0)
+    assert [echo.held_s for echo in edge.echoes(50.0 + ECHO_S)] == [ECHO_S]
+    assert edge.echoes(50.1 + ECHO_S) == ()

@@ -1,0 +1,42 @@
+"""PROFILE, means over time, for samples at uneven times.
+
+Knows: arithmetic. Does not know: what is smoothed.
+"""
+
+from __future__ import annotations
+
+import math
+
+STALE_S = 5.0
+"""What gave no valid reading for so long (a radio, a worker, the whole sampler) counts as not measured."""
+
+
+class Ewma:
+    """Exponentially weighted mean with a time constant, for samples at uneven times.
+
+    ``alpha = 1 - exp(-dt / tau)``; the first value is taken as it is. ``tau_s`` of 0 means no smoothing.
+    """
+
+    __slots__ = ("_at", "tau_s", "value")
+
+    def __init__(self, tau_s: float) -> None:
+        self.tau_s = tau_s
+        self.value: float | None = None
+        self._at = 0.0
+
+    def update(self, sample: float, now: float) -> float:
+        """Take a sample in and return the new mean."""
+        if self.value is None or self.tau_s <= 0.0:
+            self.value = sample
+        else:
+            alpha = 1.0 - math.exp(-max(now - self._at, 0.0) / self.tau_s)
+            self.value += alpha * (sample - self.value)
+        self._at = now
+        return self.value
+
+    def share(self) -> Ewma:
+        """The mean of a part of what this one smooths, which was nothing so far."""
+        part = Ewma(self.tau_s)
+        if self.value is not None:
+            part.update(0.0, self._at)
+        return part

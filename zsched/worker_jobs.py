@@ -1,0 +1,283 @@
+"""Times a worker's jobs, counts what waits and what is skipped, and lets its node know while there is work.
+
+Knows: clocks, how often a word is worth sending. Does not know: zenoh, keys, what a job computes, what is made of it.
+
+A job is one input sample and its callback, one request and its handler, or what the worker's author calls one (`Job`).
+Two readings of the thread's CPU clock are most of what that costs; nothing is locked, for every figure has one thread
+that writes it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from time import monotonic, process_time, thread_time
+from types import TracebackType
+from typing import Final, Self
+
+from zsched.core.events import WorkerJobs
+from zsched.guard import guarded
+
+TELL_S: Final = 0.2
+"""The node is told no more often: as often as it measures itself."""
+LONG_S: Final = 1e-3
+"""Behind a job that took so long, the process's CPU clock is read as well: it costs more, by the number of threads."""
+PARALLEL, ALONE = 1.5, 1.3
+"""From so many times a thread's own CPU time on, the process's time during its jobs is the jobs'; up to so many it is
+somebody else's in the process."""
+
+
+class JobTimer:
+    """The jobs of one thread. `begin` and `end` are called in it."""
+
+    __slots__ = (
+        "_began_s",
+        "_cpu_s",
+        "_deadline_s",
+        "_is_long",
+        "_process_s",
+        "_thread_id",
+        "_waited_s",
+        "age_s",
+        "cpu_s",
+        "done",
+        "is_in_hand",
+        "is_parallel",
+        "late",
+        "least",
+        "long_process_s",
+        "long_thread_s",
+        "skipped",
+        "time_s",
+        "waiting",
+    )
+
+    def __init__(self, deadline_s: float | None = None) -> None:
+        """``deadline_s``: a job that takes longer from arrival to end is `late`."""
+        self._deadline_s = deadline_s
+        self._began_s = self._cpu_s = self._process_s = self._waited_s = 0.0
+        self._thread_id = 0
+        self._is_long = False
+        self.is_in_hand = False
+        self.is_parallel = False
+        """Its jobs have helpers in other threads of the process."""
+        self.done = self.late = self.skipped = 0
+        self.waiting = self.least = 0
+        """How many wait for their turn: now, and at least since the node was told."""
+        self.time_s = self.cpu_s = self.age_s = 0.0
+        self.long_thread_s = self.long_process_s = 0.0
+
+    def begin(self) -> None:
+        """A job begins."""
+        if not self._thread_id:
+            self._thread_id = threading.get_native_id()
+            self._waited_s = _waited_s(self._thread_id) or 0.0
+        self.is_in_hand = True
+        if self._is_long:
+            self._process_s = process_time()
+        self._began_s = monotonic()
+        self._cpu_s = thread_time()
+
+    def end(self, came_s: float | None = None) -> None:
+        """It ends; ``came_s``: when it came, by ``time.monotonic``."""
+        cpu_s = thread_time() - self._cpu_s
+        now = monotonic()
+        took_s = now - self._began_s
+        if self._is_long:
+            process_s = process_time() - self._process_s
+            self.long_thread_s += cpu_s
+            self.long_process_s += process_s
+            if self.is_parallel:
+                cpu_s = max(cpu_s, process_s)
+        self._is_long = took_s >= LONG_S
+        age_s = took_s if came_s is None else now - came_s
+        self.time_s += took_s
+        self.cpu_s += cpu_s
+        self.age_s += age_s
+        if self._deadline_s is not None and age_s > self._deadline_s:
+            self.late += 1
+        self.is_in_hand = False
+        self.done += 1
+
+    def look_for_helpers(self) -> None:
+        """Judge by the long jobs since the last look whether other threads of the process work on them (any thread)."""
+        thread_s, process_s = self.long_thread_s, self.long_process_s
+        if thread_s >= LONG_S:
+            self.is_parallel = process_s > (ALONE if self.is_parallel else PARALLEL) * thread_s
+            self.long_thread_s, self.long_process_s = thread_s / 2, process_s / 2
+
+    def waited_s(self) -> float | None:
+        """How long its thread has waited for a CPU since its first job; ``None``: the kernel does not tell."""
+        if not self._thread_id:
+            return 0.0
+        waited_s = _waited_s(self._thread_id)
+        return None if waited_s is None else max(waited_s - self._waited_s, 0.0)
+
+
+def _waited_s(thread_id: int) -> float | None:
+    """The run-queue delay of a thread of this process (/proc/PID/task/TID/schedstat, second figure)."""
+    try:
+        fd = os.open(f"/proc/self/task/{thread_id}/schedstat", os.O_RDONLY | os.O_CLOEXEC)
+    except OSError:
+        return None
+    try:
+        return int(os.read(fd, 128).split()[1]) / 1e9
+    except (OSError, ValueError, IndexError):
+        return None
+    finally:
+        os.close(fd)
+
+
+class Job:
+    """A job that is not a callback's (`zsched.worker.Worker.job`): a context manager, for one thread."""
+
+    def __init__(self, timer: JobTimer, wake: Callable[[], None], came_s: float | None) -> None:
+        self._timer, self._wake, self._came_s = timer, wake, came_s
+
+    def __enter__(self) -> Self:
+        self._timer.begin()
+        self._wake()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._timer.end(self._came_s)
+
+
+class JobBook:
+    """All jobs of one worker. ``tell`` runs in a thread of its own while there is work."""
+
+    def __init__(
+        self, task: str, incarnation: str, tell: Callable[[WorkerJobs], None], deadline_s: float | None = None
+    ) -> None:
+        self._task, self._incarnation, self._tell, self._deadline_s = task, incarnation, tell, deadline_s
+        self._since_s = monotonic()
+        self._lock = threading.Lock()
+        self._timers: list[JobTimer] = []
+        self._own: dict[int, JobTimer] = {}
+        """{thread: what its author calls jobs}; once there is one, callbacks are none any more."""
+        self._is_asleep = False
+        self._wake = threading.Event()
+        self._closed = threading.Event()
+        self._told = (0, 0)
+        self._before: _Sums | None = None
+        self._has_thread = False
+
+    def timer(self) -> JobTimer:
+        """For a thread that is about to serve callbacks."""
+        timer = JobTimer(self._deadline_s)
+        with self._lock:
+            self._timers.append(timer)
+        return timer
+
+    def job(self, skipped: int, came_s: float | None) -> Job:
+        """One job of the calling thread; ``skipped``: so many before it were left undone for it."""
+        thread = threading.get_ident()
+        with self._lock:
+            timer = self._own.get(thread)
+            if timer is None:
+                if not self._own:  # sums only rise: what callbacks have done until now stays in them
+                    self._before = _Sums()
+                    for one in self._timers:
+                        self._before.add(one)
+                timer = self._own[thread] = JobTimer(self._deadline_s)
+        timer.skipped += skipped
+        return Job(timer, self.wake, came_s)
+
+    def wake(self) -> None:
+        """There is work (any thread)."""
+        if self._is_asleep or not self._has_thread:
+            self._rouse()
+
+    def close(self) -> None:
+        """Tell nothing any more."""
+        self._closed.set()
+        self._wake.set()
+
+    def _rouse(self) -> None:
+        with self._lock:
+            is_first, self._has_thread = not self._has_thread, True
+        self._is_asleep = False
+        self._wake.set()
+        if is_first and not self._closed.is_set():
+            guarded(self._run, name="zsched jobs").start()
+
+    def _run(self) -> None:
+        """Tell, every `TELL_S` while there is work, and once behind it; then sleep until there is some."""
+        while not self._closed.wait(TELL_S):
+            report = self.report()
+            if self._is_busy() or self._counts() != self._told:
+                self._told = self._counts()
+                with contextlib.suppress(Exception):  # the session closes
+                    self._tell(report)
+                continue
+            self._wake.clear()
+            self._is_asleep = True
+            if not self._is_busy() and self._counts() == self._told:  # or it came just now
+                self._wake.wait()
+            self._is_asleep = False
+
+    def _counts(self) -> tuple[int, int]:
+        timers = self._at_work()
+        return sum(timer.done for timer in timers), sum(timer.skipped for timer in timers)
+
+    def _at_work(self) -> tuple[JobTimer, ...]:
+        """Whose jobs count."""
+        with self._lock:
+            return tuple(self._own.values()) or tuple(self._timers)
+
+    def _is_busy(self) -> bool:
+        return any(timer.is_in_hand or timer.waiting for timer in self._at_work())
+
+    def report(self) -> WorkerJobs:
+        """What has been done so far; every waiting figure begins again."""
+        sums = _Sums() if self._before is None else self._before.copy()
+        waiting = 0
+        for timer in self._at_work():
+            timer.look_for_helpers()
+            sums.add(timer)
+            waiting += timer.least
+            timer.least = timer.waiting
+        return WorkerJobs(
+            task=self._task,
+            incarnation=self._incarnation,
+            at_s=round(monotonic() - self._since_s, 4),
+            done=sums.done,
+            skipped=sums.skipped,
+            waiting=waiting,
+            time_s=round(sums.time_s, 6),
+            cpu_s=round(sums.cpu_s, 6),
+            wait_s=None if sums.wait_s is None else round(sums.wait_s, 6),
+            age_s=round(sums.age_s, 6),
+            late=None if self._deadline_s is None else sums.late,
+        )
+
+
+@dataclass(slots=True)
+class _Sums:
+    """Over timers."""
+
+    done: int = 0
+    skipped: int = 0
+    late: int = 0
+    time_s: float = 0.0
+    cpu_s: float = 0.0
+    wait_s: float | None = 0.0
+    age_s: float = 0.0
+
+    def add(self, timer: JobTimer) -> None:
+        self.done += timer.done
+        self.skipped += timer.skipped
+        self.late += timer.late
+        self.time_s += timer.time_s
+        self.cpu_s += timer.cpu_s
+        self.age_s += timer.age_s
+        waited_s = None if timer.is_parallel else timer.waited_s()
+        self.wait_s = None if self.wait_s is None or waited_s is None else self.wait_s + waited_s
+
+    def copy(self) -> _Sums:
+        return replace(self)
