@@ -97,6 +97,13 @@ JsonOption = Annotated[bool, typer.Option("--json", help="JSON with its schema's
 # --- the daemon ------------------------------------------------------------------------------------------------------
 
 
+LATENCY = (
+    "{task}: objective latency: a machine is worth the share of jobs that it is expected to do within {deadline} ms, "
+    "by its worker's word of them (CPU per job over the machine's speed and what is free there, and what a job waits "
+    "for otherwise) and the measured way there and back"
+)
+
+
 @app.command(cls=Verb)
 def up(
     config: ConfigOption = None,
@@ -285,6 +292,9 @@ def check(
         raise typer.Exit(EXIT_CONFIG)
     if not json_:
         typer.echo("ok: " + ", ".join(_count(number, noun) for noun, number in counts.items()))
+        for task in fleet.tasks if fleet is not None else ():
+            if task.tuning.deadline_ms is not None:
+                typer.echo(LATENCY.format(task=task.name, deadline=f"{task.tuning.deadline_ms:g}"))
 
 
 # --- everything else -------------------------------------------------------------------------------------------------

@@ -50,7 +50,17 @@ from zsched.core.fleet import (
     WorkerLink,
     WorkerSpec,
 )
-from zsched.core.model import RSSI_MAX_DBM, RSSI_MIN_DBM, Aggregate, NodeKind, ScoreForm, Tuning
+from zsched.core.model import (
+    MAX_DEADLINE_MS,
+    MIN_DEADLINE_MS,
+    RSSI_MAX_DBM,
+    RSSI_MIN_DBM,
+    Aggregate,
+    NodeKind,
+    Objective,
+    ScoreForm,
+    Tuning,
+)
 from zsched.core.plan import HandoverRule, OnCrash, ReadyWhen, ServiceSettings, StreamClass, StreamSettings
 from zsched.core.timing import PROFILES
 
@@ -221,6 +231,18 @@ SCHEDULING: Final = Record(
             "What a machine is worth to the task: `service`, the share of its work that the task would get done there; "
             "`paper`, the free share of it once the task is there (Eq. 1, 2, 4).",
             default=f"`{DEFAULT_SCORE}`",
+        ),
+        "objective": Field(
+            Choice.of(Objective),
+            "What the task wants: `service`, as many of its jobs done as possible; `latency`, as many as possible "
+            "done within `deadline_ms`. With `score: service` only.",
+            default=f"`{Objective.SERVICE}`",
+        ),
+        "deadline_ms": Field(
+            Number(MIN_DEADLINE_MS, MAX_DEADLINE_MS, "ms"),
+            "For `objective: latency`: a job that takes longer, from input to output and the network included, "
+            "comes too late.",
+            default="none",
         ),
         "aggregate": Field(Choice.of(Aggregate), "How the robots' utilities become one; `median` resists a liar."),
         "reach": Field(Choice.of(Reach), "Who must reach a candidate.", default=f"`{Reach.MAJORITY}`"),

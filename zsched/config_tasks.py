@@ -27,7 +27,7 @@ from zsched.core.fleet import (
     TaskSpec,
     WorkerSpec,
 )
-from zsched.core.model import NodeKind, ScoreForm, Tuning, Weights
+from zsched.core.model import NodeKind, Objective, ScoreForm, Tuning, Weights
 from zsched.core.plan import (
     Direction,
     HandoverRule,
@@ -71,6 +71,7 @@ def read_tasks(section: Section, cast: Cast, out: Collector) -> tuple[TaskSpec, 
         if task is not None:
             tasks.append(task)
             _advise_network(task.tuning, entry.value, cast, out)
+            _advise_deadline(task.tuning, task.worker, entry.value, out)
     split = frozenset(node.name for node in cast.nodes if node.local is not None)
     for conflict in rule_conflicts(tasks, cast.of_kind(NodeKind.ROBOT), split):
         _report(conflict, places, out)
@@ -140,6 +141,7 @@ def _tuning(given: Section, out: Collector) -> Tuning | None:
         return None
     scheduling: Section | None = given.get("scheduling")
     score = _score(scheduling)
+    deadline = {} if scheduling is None else _deadline(scheduling, score, out)
     patient: dict[str, Any] = {
         "bonus": PATIENT_BONUS,
         "cool_down_s": SERVICE_COOL_DOWN_S if _is_quick(score, weights) else PATIENT_COOL_DOWN_S,
@@ -147,8 +149,26 @@ def _tuning(given: Section, out: Collector) -> Tuning | None:
     if scheduling is None:
         return Tuning(weights=weights, score=score, **patient)
     default = patient if _patience(scheduling, weights) is not None else {}
-    more = {"score": score, **default, **_of(scheduling, *patient)}
+    more = {"score": score, **default, **_of(scheduling, *patient), **deadline}
     return scheduling.build(Tuning, out, weights=weights, **more)
+
+
+def _deadline(scheduling: Section, score: ScoreForm, out: Collector) -> dict[str, float | None]:
+    """``deadline_ms`` as the tuning has it, which is the objective at the same time."""
+    objective = scheduling.values.get("objective", Objective.SERVICE)
+    deadline_ms: float | None = scheduling.values.get("deadline_ms")
+    if objective is Objective.LATENCY and deadline_ms is None and scheduling.is_whole:
+        message = "objective latency needs a deadline: when is a job too late?"
+        out.error(scheduling.where("objective"), message, "deadline_ms: 100 (milliseconds from input to output)")
+    elif objective is Objective.SERVICE and deadline_ms is not None:
+        message = "deadline_ms counts for objective latency only, and this task has objective service"
+        out.error(scheduling.where("deadline_ms"), message, "add objective: latency, or delete it")
+    elif objective is Objective.LATENCY and score is ScoreForm.PAPER:
+        message = "the paper's score knows no deadlines: objective latency goes with score service"
+        out.error(scheduling.where("objective"), message, "score: service, or objective: service without deadline_ms")
+    else:
+        return {"deadline_ms": deadline_ms}
+    return {"deadline_ms": None}
 
 
 def _patience(scheduling: Section | None, weights: Weights) -> float | None:
@@ -234,6 +254,14 @@ def _advise_ready(given: Section, worker: WorkerSpec, streams: tuple[Located[Str
             message = "class reliable, but this worker (ready: matching) acknowledges nothing: what is lost on its link"
             message += " is not sent again, and what it is sent counts as unconfirmed"
             out.warn(stream.place, message, "use zsched.worker (ready: token), or class: latest or best_effort")
+
+
+def _advise_deadline(tuning: Tuning, worker: WorkerSpec, given: Section, out: Collector) -> None:
+    if tuning.deadline_ms is not None and worker.ready_when is ReadyWhen.MATCHING:
+        message = "only a worker that uses zsched.worker tells how long its jobs take; this one (ready: matching) does "
+        message += "not, so its machines are judged by service, whatever the deadline"
+        scheduling: Section = given.get("scheduling")
+        out.warn(scheduling.where("objective"), message, "use zsched.worker (ready: token), or objective: service")
 
 
 def _advise_network(tuning: Tuning, given: Section, cast: Cast, out: Collector) -> None:

@@ -235,6 +235,12 @@ class Daemon:
     ) -> WorkerSupervisor:
         fleet, me = self._fleet, self._spec.name
         mine = {task.name: task.worker for task in fleet.tasks if runs_worker(task, me, self._spec.kind)}
+        tunings = {task.name: task.tuning for task in fleet.tasks}
+        deadlines = {
+            name: {"ZSCHED_DEADLINE_MS": f"{tuning.deadline_ms:g}"}
+            for name, tuning in tunings.items()
+            if tuning.deadline_ms is not None
+        }
         folder = self._options.runtime_dir
         paths: dict[TaskId, Path] = {}
         for name, spec in mine.items():
@@ -262,6 +268,7 @@ class Daemon:
                 "PYTHONFAULTHANDLER": "1",
                 "ZSCHED_ZENOH_CONFIG": str(paths[task]),
                 "ZENOH_SESSION_CONFIG_URI": str(paths[task]),  # a ROS node (rmw_zenoh) joins the data network by this
+                **deadlines.get(task, {}),
             },
             rng=random.Random(f"{me}/{incarnation}/workers"),
             why_not_ready=shell.crew.why_not_ready,

@@ -53,6 +53,16 @@ def test_check_of_a_good_file_counts_what_is_in_it(tmp_path: Path) -> None:
     assert body["fleet"] == {"name": "hall", "nodes": 3, "tasks": 1, "electors": 3}
 
 
+def test_check_says_in_words_what_a_deadline_means(tmp_path: Path) -> None:
+    file = tmp_path / "fleet.yaml"
+    file.write_text(
+        FLEET.replace("    weights:", "    scheduling: {objective: latency, deadline_ms: 80}\n    weights:")
+    )
+    result = run("check", file)
+    assert result.exit_code == 0
+    assert "the share of jobs that it is expected to do within 80 ms" in result.stdout
+
+
 def test_check_of_a_bad_file_reports_every_fault_with_its_place_and_exits_with_78(tmp_path: Path) -> None:
     file = tmp_path / "fleet.yaml"
     file.write_text(FLEET.replace("kind: robot}\n  robot3", "kind: rowboat}\n  robot3").replace("cpu: 0.5", "cpu: 5"))

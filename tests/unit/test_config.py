@@ -27,7 +27,7 @@ from zsched.core.fleet import (
     electorate_hash,
     fleet_hash,
 )
-from zsched.core.model import Aggregate, LinkSource, NodeKind, ScoreForm
+from zsched.core.model import Aggregate, LinkSource, NodeKind, Objective, ScoreForm
 from zsched.core.plan import Direction, HandoverRule, ReadyWhen, StreamClass
 from zsched.errors import ConfigError
 
@@ -187,6 +187,51 @@ def test_a_task_scored_by_service_has_its_own_defaults(given: str, patience: flo
     task = fleet_of(swapped(scheduling, f"    scheduling: {given}\n")).tasks[0]
     assert (task.patience, task.tuning.cool_down_s) == (patience, cool_down_s)
     assert task.tuning.score is (ScoreForm.PAPER if "paper" in given else ScoreForm.SERVICE)
+
+
+SCHEDULED = "    scheduling: {bonus: 0.10, time_to_trigger_s: 2, cool_down_s: 10}\n"
+
+
+@pytest.mark.parametrize(
+    ("given", "objective", "deadline_ms"),
+    [
+        ("{objective: service}", Objective.SERVICE, None),
+        ("{objective: latency, deadline_ms: 80}", Objective.LATENCY, 80.0),
+        ("{deadline_ms: 80, objective: latency, score: service}", Objective.LATENCY, 80.0),
+    ],
+)
+def test_a_task_s_objective_is_part_of_what_is_agreed(
+    given: str, objective: Objective, deadline_ms: float | None
+) -> None:
+    tuning = fleet_of(swapped(SCHEDULED, f"    scheduling: {given}\n")).tasks[0].tuning
+    assert (tuning.objective, tuning.deadline_ms) == (objective, deadline_ms)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("{objective: latency}", ("objective latency needs a deadline", "deadline_ms: 100")),
+        ("{deadline_ms: 80}", ("deadline_ms counts for objective latency only", "add objective: latency")),
+        ("{objective: service, deadline_ms: 80}", ("deadline_ms counts for objective latency only",)),
+        ("{objective: latency, deadline_ms: 80, score: paper}", ("the paper's score knows no deadlines",)),
+        ("{objective: latency, deadline_ms: 0}", ("0 is not in the allowed range 1..3600000 ms",)),
+        ("{objective: speed}", ("objective", "speed")),
+    ],
+)
+def test_half_an_objective_is_a_fault_that_says_what_is_missing(given: str, words: tuple[str, ...]) -> None:
+    result = check_bytes(swapped(SCHEDULED, f"    scheduling: {given}\n").encode())
+    assert result.fleet is None
+    assert len(result.faults) == 1, result.report()
+    for word in words:
+        assert word in result.report()
+
+
+def test_a_deadline_of_a_worker_that_tells_nothing_is_worth_a_word() -> None:
+    text = swapped(SCHEDULED, "    scheduling: {objective: latency, deadline_ms: 80}\n")
+    assert "judged by service" not in check_bytes(text.encode()).report()
+    foreign = text.replace("    worker: {", "    worker: {ready: matching, ")
+    assert foreign != text
+    assert "judged by service, whatever the deadline" in check_bytes(foreign.encode()).report()
 
 
 @pytest.mark.parametrize("given", ["", "    scheduling: {score: service}\n"])
