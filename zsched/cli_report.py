@@ -19,6 +19,8 @@ BUSY, FULL = 0.6, 0.85
 MAX_CANDIDATES, MAX_HISTORY = 12, 3
 TROUBLES = "PROBLEMS"
 """The title of the last block, which a low window keeps."""
+MOST, LITTLE = 0.98, 0.8
+"""From here on nearly all jobs are done; below that, many are not."""
 DROPS_OVER_S = 60.0
 """Drops that have not risen for so long are history."""
 STATE_STYLES = {"alive": "green", "ready": "green"} | dict.fromkeys(
@@ -213,11 +215,50 @@ def _task(page: Page, status: Json, task: Json) -> None:
         parts = [(f"{owner} owns it", "bold"), *known, (state, STATE_STYLES.get(state, "red"))]
     counts = [(f"epoch {task['epoch']}", ""), (f"revision {task['revision']}", "")]
     page.block(f"TASK {task['name']}", *parts, *counts)
+    _work(page, status, task)
     _scheduler(page, status, task)
     _vote(page, task)
     is_quiet = task["phase"] in ("idle", "settled")
     page.block("EXECUTOR", (str(task["phase"]), "" if is_quiet else "yellow"))
     _route(page, status, task)
+
+
+def _work(page: Page, status: Json, task: Json) -> None:
+    """What workers say of their jobs, the owner's first; nothing where none does."""
+    nodes = sorted(status["nodes"], key=lambda node: (node["name"] != task["owner"], node["name"]))
+    told = [
+        (node, worker["jobs"])
+        for node in nodes
+        for worker in node["workers"]
+        if worker["task"] == task["name"] and worker.get("jobs")  # a later field of the schema's major version
+    ]
+    deadline_ms = task["tuning"].get("deadline_ms")
+    for number, (node, jobs) in enumerate(told):
+        wanted, done = jobs["wanted_hz"], jobs["done_hz"]
+        share = min(done / wanted, 1.0) if wanted > 0 else None
+        parts: list[Cell] = [
+            (node["name"], "bold" if node["name"] == task["owner"] else ""),
+            (f"{millis(jobs['time_s'])} a job, {millis(jobs['cpu_s'])} of CPU", ""),
+            (f"{done:.3g} of {wanted:.3g} a second", ""),
+        ]
+        if share is not None:
+            parts.append((f"{share:.0%} done", "red" if share < LITTLE else "yellow" if share < MOST else "green"))
+        parts += [(f"{jobs['backlog']} wait", "yellow")] if jobs["backlog"] else []
+        if deadline_ms is not None:
+            late = jobs.get("late_ratio")
+            told_late = "" if late is None else f", {late:.0%} late"
+            age = "" if jobs.get("age_s") is None else f"{millis(jobs['age_s'])} from input to end, "
+            parts.append((f"{age}deadline {deadline_ms:g} ms{told_late}", "yellow" if late and late > 1 - MOST else ""))
+        page.block("" if number else "JOBS", *parts)
+
+
+def millis(seconds: float) -> str:
+    """A job's time.
+
+    >>> millis(0.0352), millis(0.00006), millis(12.3)
+    ('35 ms', '0.06 ms', '12 s')
+    """
+    return f"{seconds:.2g} s" if seconds >= 10.0 else f"{seconds * 1e3:.{2 if seconds < 1e-3 else 0}f} ms"
 
 
 def _scheduler(page: Page, status: Json, task: Json) -> None:
@@ -230,6 +271,7 @@ def _scheduler(page: Page, status: Json, task: Json) -> None:
         (f"bonus {tuning['bonus']:g}", ""),
         (f"trigger {tuning['time_to_trigger_s']:g}s" if patience is None else f"patience {patience:g}", ""),
         (f"cool-down {tuning['cool_down_s']:g}s", ""),
+        *([(f"deadline {tuning['deadline_ms']:g} ms", "")] if tuning.get("deadline_ms") is not None else []),
         *([("by the paper's score", "")] if tuning.get("score") == "paper" else []),
     )
     if decision is None:
@@ -346,6 +388,8 @@ def _route(page: Page, status: Json, task: Json) -> None:
             "at most lost": stream.get("at_most_lost"),
             "unconfirmed": stream.get("unconfirmed"),
         }
+        answer_s = stream.get("answer_s")  # a later field of the schema's major version
+        text += "" if answer_s is None else f", {millis(answer_s)} behind its input"
         text += "".join(f", {count} {what}" for what, count in told.items() if count)
         is_over = (stream.get("dropped_s") or 0.0) > DROPS_OVER_S
         if drops:

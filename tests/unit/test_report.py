@@ -353,3 +353,22 @@ def test_speed_of_the_cores_what_a_starved_worker_wants_and_the_score_are_shown_
     assert "· by the paper's score" in wide
     assert "x0.71" not in narrow
     assert "paper's score" not in render_status(recorded("healthy"), 120, color=False)
+
+
+def test_what_a_worker_says_of_its_jobs_is_shown_with_the_deadline_and_what_misses_it() -> None:
+    status = recorded("healthy")
+    (task, *_) = status["tasks"]
+    assert "JOBS" not in render_status(status, 120, color=False)
+    owner = next(node for node in status["nodes"] if node["name"] == task["owner"])
+    jobs = {"time_s": 0.22, "cpu_s": 0.034, "wait_s": 0.18, "age_s": 0.41, "done_hz": 4.0, "wanted_hz": 6.0}
+    owner["workers"][0]["jobs"] = {**jobs, "backlog": 3, "late_ratio": None}
+    text = render_status(status, 120, color=False)
+    assert f"JOBS       {task['owner']} · 220 ms a job, 34 ms of CPU · 4 of 6 a second · 67% done · 3 wait" in text
+    assert "deadline" not in text
+    task["tuning"]["deadline_ms"] = 100.0
+    owner["workers"][0]["jobs"]["late_ratio"] = 0.95
+    text = render_status(status, 160, color=False)
+    assert "410 ms from input to end, deadline 100 ms, 95% late" in text
+    assert "· deadline 100 ms" in text
+    owner["workers"][0]["jobs"] = None
+    assert "JOBS" not in render_status(status, 120, color=False), "nothing is told"
