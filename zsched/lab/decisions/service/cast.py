@@ -27,8 +27,9 @@ from zsched.lab.decisions.service.replay import Player, is_of_task
 from zsched.lab.decisions.view import Look, Sight
 from zsched.lab.decisions.world import EVEN, RADIO_ONLY
 
-OWN: Final = ("smoothing_s", "move_cost_s", "is_told")
-"""Settings of a rule that are neither of `Tuning` nor of `TaskSpec`; ``is_told=0``: run queues are not read."""
+OWN: Final = ("smoothing_s", "move_cost_s", "is_told", "tells_jobs")
+"""Settings of a rule that are neither of `Tuning` nor of `TaskSpec`; ``is_told=0``: run queues are not read;
+``tells_jobs=0``: the worker says nothing of its jobs."""
 
 
 def players() -> tuple[Player, ...]:
@@ -50,7 +51,7 @@ def zsched(name: str, **settings: Any) -> Player:
     given = dict(settings)
     smoothing_s = given.pop("smoothing_s", Look().smoothing_s)
     move_cost_s = given.pop("move_cost_s", 0.0)
-    is_told = bool(given.pop("is_told", True))
+    is_told, tells_jobs = bool(given.pop("is_told", True)), bool(given.pop("tells_jobs", True))
     changes = {key: given.pop(key) for key in tuple(given) if is_of_task(key)}
     is_service = given.setdefault("score", DEFAULT_SCORE) is ScoreForm.SERVICE  # no task here weighs the network
     if "time_to_trigger_s" not in given:
@@ -66,6 +67,7 @@ def zsched(name: str, **settings: Any) -> Player:
         look=Look(smoothing_s=smoothing_s),
         changes=changes,
         is_told=is_told,
+        tells_jobs=tells_jobs,
     )
 
 

@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Final
 
+from zsched.core.events import WorkerJobs
 from zsched.core.fleet import TaskSpec
 from zsched.core.gateway import Gateway
 from zsched.core.model import (
@@ -32,6 +33,7 @@ from zsched.core.scoring import Standing, book, compare, score
 from zsched.lab.decisions.replay import TICKS, rounds
 from zsched.lab.decisions.rules import Move, Rule
 from zsched.lab.decisions.service.history import History, mask_of, rank_of
+from zsched.lab.decisions.service.machines import Machine, Work
 from zsched.lab.decisions.view import IDLE, START_S, Look, Sight
 from zsched.lab.decisions.world import DT_S
 
@@ -51,6 +53,8 @@ class Player:
     """Fields of `TaskSpec` that it has otherwise."""
     is_told: bool = True
     """Machines tell when a worker's processes always want to run, as the kernel's run-queue delay does."""
+    tells_jobs: bool = True
+    """Workers tell of their jobs, as those do that use the library."""
 
 
 class Scene:
@@ -67,6 +71,7 @@ class Scene:
         }
         self.states = dict.fromkeys((node.name for node in self.fleet.nodes), PeerState.ALIVE)
         self._history, self._is_told = history, player.is_told
+        self._books = [_Book() for _ in specs] if player.tells_jobs else []
         self._column = {name: index for index, name in enumerate(specs[0].candidates)}
         self._placed: tuple[int | None, ...] = (None,) * len(specs)
         self._profilers = {node.name: Profiler(node.name, 1, timing) for node in self.fleet.nodes}
@@ -75,7 +80,10 @@ class Scene:
         self._errors = history.cpu_error.tolist(), history.memory_error.tolist()
         self._shown = [
             [
-                tuple(getattr(there, name).tolist() for name in ("cores_wanted", "memory_wanted", "cores", "memory"))
+                tuple(
+                    getattr(there, name).tolist()
+                    for name in ("cores_wanted", "memory_wanted", "cores", "memory", "service")
+                )
                 for there in by_mask
             ]
             for by_mask in history.on
@@ -89,6 +97,8 @@ class Scene:
             column = self._column.get(name)
             if column is None and index % self._robots_every:
                 continue  # nothing ever changes at a robot
+            if column is not None and self._books:
+                self._tell_jobs(profiler, column, index, now)
             profiler.absorb(IDLE if column is None else self._device(column, index), WIRED, now)
             states = {} if column is None else self._ready
             profile = profiler.publishable(states, is_draining=False, now=now)
@@ -98,7 +108,7 @@ class Scene:
     def _device(self, column: int, index: int) -> DeviceSample:
         """What the device profiler reads: never more than there is."""
         machine, stretch = self._history.machines[column], self._stretch[index]
-        cores_wanted, memory_wanted, cores, memory = self._shown[column][mask_of(self._placed, column)]
+        cores_wanted, memory_wanted, cores, memory, _ = self._shown[column][mask_of(self._placed, column)]
         used = cores_wanted[stretch] + self._errors[0][index][column] * machine.cores
         used_mb = memory_wanted[stretch] + self._errors[1][index][column] * machine.memory_mb
         workers = []
@@ -123,6 +133,16 @@ class Scene:
             speed=machine.speed,
         )
 
+    def _tell_jobs(self, profiler: Profiler, column: int, index: int, now: float) -> None:
+        """What the workers here say of their jobs, as `zsched.worker` does."""
+        machine, stretch = self._history.machines[column], self._stretch[index]
+        _, _, cores, _, service = self._shown[column][mask_of(self._placed, column)]
+        for task, (name, kept) in enumerate(zip(self.values, self._books, strict=True)):
+            if self._placed[task] == column:
+                rank, work = rank_of(self._placed, task), self._history.works[task]
+                kept.work(work, machine, cores[stretch][rank], service[stretch][rank])
+                profiler.note_jobs(kept.report(name, self.values[name].epoch, now), now)
+
     def learn(self, now: float) -> None:
         """The robots note what the tasks use where they run."""
         for name, value in self.values.items():
@@ -135,6 +155,43 @@ class Scene:
         self.values[task] = replace(value, owner=owner, epoch=value.epoch + 1)
         self._placed = tuple(
             None if value.owner is None else self._column[value.owner] for value in self.values.values()
+        )
+
+
+class _Book:
+    """What a worker counts of its jobs: whole ones."""
+
+    def __init__(self) -> None:
+        self._done = self._undone = self._time_s = self._cpu_s = self._wait_s = 0.0
+        self._is_serial = False
+
+    def work(self, work: Work, machine: Machine, cores: float, service: float) -> None:
+        """One step with so many cores, in which that share of the jobs is done."""
+        cpu_s, served = work.cpu_s / machine.speed, min(service, 1.0)
+        before = int(self._done)
+        self._done += served * work.rate_hz * DT_S
+        self._undone += (1.0 - served) * work.rate_hz * DT_S
+        # Whoever does not do all of them is always at work.
+        is_behind = served < 0.999
+        time_s = 1.0 / max(served * work.rate_hz, 1e-3) if is_behind else cpu_s / work.processes
+        is_starved = cores < 0.99 * min(work.demand(machine), work.processes)
+        self._is_serial = work.processes == 1
+        done = int(self._done) - before
+        self._time_s += done * time_s
+        self._cpu_s += done * cpu_s
+        self._wait_s += done * (max(time_s - cpu_s, 0.0) if is_starved else 0.0)
+
+    def report(self, task: TaskId, life: int, now: float) -> WorkerJobs:
+        """Of several processes nobody tells what they wait for."""
+        return WorkerJobs(
+            task=task,
+            incarnation=str(life),
+            at_s=now,
+            done=int(self._done),
+            skipped=int(self._undone),
+            time_s=self._time_s,
+            cpu_s=self._cpu_s,
+            wait_s=self._wait_s if self._is_serial else None,
         )
 
 
