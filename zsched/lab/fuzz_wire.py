@@ -29,7 +29,19 @@ from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, electorate_hash
 from zsched.core.messages import Accept, Accepted, Learnt, Prepare, Promise, Refused, SetWeights, Utilities
-from zsched.core.model import Beat, DurableState, NodeKind, Profile, Proposal, Tuning, Weights
+from zsched.core.model import (
+    Beat,
+    DeviceSample,
+    DurableState,
+    NodeKind,
+    Profile,
+    Proposal,
+    ScoreForm,
+    Tuning,
+    Weights,
+    WorkerLoad,
+    WorkerState,
+)
 from zsched.core.node import Node
 from zsched.core.status import build_snapshot
 from zsched.errors import WireError
@@ -156,9 +168,9 @@ def _fleet() -> Fleet:
         NodeSpec(name=name, kind=NodeKind.ROBOT if name.startswith("robot") else NodeKind.EDGE)
         for name in sorted(NAMES[:-1])
     )
-    tuning = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
+    tuning = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0), score=ScoreForm.SERVICE, deadline_ms=100.0)
     worker = WorkerSpec(command=("work",))
-    task = TaskSpec(name="merge", candidates=("edge1", "edge2"), tuning=tuning, worker=worker, exclusive=True)
+    task = TaskSpec(name="merge", candidates=NAMES[:4:3], tuning=tuning, worker=worker, exclusive=True)
     return Fleet(name="fuzz", timing=Timing(), nodes=nodes, tasks=(task,), electors=NAMES[:3])
 
 
@@ -180,7 +192,15 @@ _EVENTS: dict[type[Any], Callable[[Any], ev.Event]] = {
     Accepted: lambda v: ev.ElectorAnswered(answer=v),
     Refused: lambda v: ev.ElectorAnswered(answer=v),
     SetWeights: lambda v: ev.WeightsCommanded(request=1, command=v),
+    ev.WorkerJobs: lambda v: v,  # of this node's own worker, by way of its relay
 }
+_SAMPLE = DeviceSample(
+    cpu_cores=4.0,
+    cpu_used_cores=3.9,
+    memory_mb=4000.0,
+    memory_used_mb=1000.0,
+    workers=(WorkerLoad(task="merge", state=WorkerState.READY, cpu_cores=0.5, memory_mb=100.0),),
+)
 
 
 @dataclass(slots=True)
@@ -244,6 +264,8 @@ class Fuzz:
         event = _event(value) if value is not None else None
         if event is not None:
             self._handle(event)
+            if isinstance(event, ev.WorkerJobs):  # its figures become a profile, and that a score
+                self._handle(ev.ProfileSampled(device=_SAMPLE))
             return
         self._handle(ev.DeadlineReached())
         for _ in range(DUE_AT_MOST):  # what is due by now is no work of the frame
