@@ -12,6 +12,7 @@ from zsched.core.demand import Demands
 from zsched.core.fleet import Demand, Fleet, TaskSpec
 from zsched.core.model import NodeId, Profile, TaskId
 from zsched.core.sequence import Order, Track
+from zsched.core.sharing import Shares
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,6 +32,7 @@ class Gateway:
         self._profiles: dict[NodeId, tuple[Profile, float]] = {}
         self._tracks: dict[NodeId, Track] = {}
         self._demands = Demands()
+        self._shares = Shares()
         self.version = 0
         """Rises with every change; what was computed from an older version may be wrong."""
 
@@ -66,11 +68,17 @@ class Gateway:
         return min(ends, default=math.inf)
 
     def learn_demand(self, task: TaskId, owner: NodeId, now: float) -> None:
-        """Note what the task's worker wants on its owner (`zsched.core.demand`)."""
+        """Note what the task's worker wants on its owner, and gets (`zsched.core.demand`, `zsched.core.sharing`)."""
         profile = self.fresh(owner, now)
-        if profile is not None and self._demands.learn(task, profile, now):
-            self.version += 1
+        if profile is None:
+            return
+        news = self._demands.learn(task, profile, now), self._shares.learn(task, profile)
+        self.version += any(news)
 
     def demand(self, spec: TaskSpec, profile: Profile) -> Demand:
         """What the task will use on the node of ``profile``."""
         return self._demands.at(spec, profile)
+
+    def share(self, spec: TaskSpec, profile: Profile, need_cores: float, coming_cores: float) -> float:
+        """Cores that the task would get on the node of ``profile``, were it full (`zsched.core.sharing`)."""
+        return self._shares.at(spec.name, profile, need_cores, coming_cores)

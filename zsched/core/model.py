@@ -25,6 +25,7 @@ MAX_COUNTER = 2**53
 """Largest revision, epoch, incarnation or sequence number (exact in every language's float)."""
 MAX_CPU_CORES, MAX_MEMORY_MB, MAX_BITRATE_MBPS = 4096.0, 1e8, 1e6
 MIN_SPEED, MAX_SPEED = 0.001, 1000.0
+MAX_RUNNABLE = 1e6
 MAX_TREND_DB_S = 100.0
 """What no machine or link exceeds: a larger figure is a fault of whoever measured or sent it."""
 MAX_REASON = 200
@@ -223,6 +224,8 @@ class DeviceSample:
     workers: tuple[WorkerLoad, ...] = ()
     speed: float | None = None
     """How fast one of its cores is; ``None``: not measured."""
+    runnable: float | None = None
+    """Threads that run or wait to run just now, the profiler's own left out; ``None``: not to be told."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -258,6 +261,8 @@ class Profile:
     """Robots: the watched tasks that answer here, or do not although inputs flow."""
     speed: float | None = None
     """How fast one of its cores is, beside the reference (`zsched.adapters.speed`); ``None``: not measured."""
+    runnable: float | None = None
+    """Threads that run or wait to run, on the mean: what a task would share a full machine with; ``None``: unknown."""
 
     def __post_init__(self) -> None:
         check_name("profile.node", self.node)
@@ -268,6 +273,7 @@ class Profile:
         check_range("profile.memory_mb", self.memory_mb, 1.0, MAX_MEMORY_MB)
         check_range("profile.memory_used_mb", self.memory_used_mb, 0.0, MAX_MEMORY_MB)
         check_range("profile.speed", self.speed, MIN_SPEED, MAX_SPEED)
+        check_range("profile.runnable", self.runnable, 0.0, MAX_RUNNABLE)
 
     def worker(self, task: TaskId) -> WorkerLoad | None:
         """The load of ``task``'s worker on this node, or ``None`` when the node runs none."""

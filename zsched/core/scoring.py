@@ -28,7 +28,14 @@ from zsched.core.model import (
     UtilityVector,
     WorkerState,
 )
-from zsched.core.utility import cpu_utility, memory_utility, predicted_use, service_utility, total_utility
+from zsched.core.utility import (
+    cpu_utility,
+    memory_service,
+    memory_utility,
+    predicted_use,
+    service_utility,
+    total_utility,
+)
 
 METRICS = ("cpu", "memory", "network")
 
@@ -128,7 +135,10 @@ def score(
         if link is not None and not link.is_reached:
             unreachable.append(candidate)
             continue
-        terms[candidate] = _measure(spec, profile, demand, unseen, link, form)
+        # what an owner that is short gets is measured
+        is_owner = candidate == allocation.owner
+        share = 0.0 if is_owner else gateway.share(spec, profile, demand.cpu_cores, unseen.cpu_cores)
+        terms[candidate] = _measure(spec, profile, demand, unseen, link, form, share)
     measured = frozenset(name for name in METRICS if any(getattr(t, name) is not None for t in terms.values()))
     utilities = [Utility(candidate=name, value=0.0, reachable=False) for name in unreachable]
     for candidate, term in terms.items():
@@ -225,8 +235,15 @@ def _memory_use(profile: Profile, spec: TaskSpec, demand: Demand, unseen: Demand
 
 
 def _measure(
-    spec: TaskSpec, profile: Profile, demand: Demand, unseen: Demand, link: PairLink | None, form: ScoreForm
+    spec: TaskSpec,
+    profile: Profile,
+    demand: Demand,
+    unseen: Demand,
+    link: PairLink | None,
+    form: ScoreForm,
+    share: float,
 ) -> _Terms:
+    """Eq. 1-3 by ``form``; ``share``: cores that the task gets at least, however full the machine is."""
     load = profile.worker(spec.name)
     cpu = memory = None
     if profile.cpu_used_cores is not None:
@@ -235,15 +252,16 @@ def _measure(
         if form is ScoreForm.PAPER:
             cpu = cpu_utility(profile.cpu_cores, used)
         else:
-            cpu = service_utility(profile.cpu_cores - used + demand.cpu_cores, demand.cpu_cores, profile.cpu_cores)
+            free = max(profile.cpu_cores - used + demand.cpu_cores, share)
+            cpu = service_utility(free, demand.cpu_cores, profile.cpu_cores)
     used_mb = _memory_use(profile, spec, demand, unseen)
     if used_mb is not None:
         others_mb = used_mb - demand.memory_mb
         if form is ScoreForm.PAPER:
             memory = memory_utility(profile.memory_mb, demand.memory_mb, others_mb)
-        else:  # what is below the floor is no room: the kernel kills before it is used up
-            room_mb = (1.0 - spec.memory_floor_ratio) * profile.memory_mb - others_mb
-            memory = service_utility(room_mb, demand.memory_mb, profile.memory_mb)
+        else:
+            free_mb = profile.memory_mb - others_mb
+            memory = memory_service(free_mb, demand.memory_mb, profile.memory_mb, spec.memory_floor_ratio)
     return _Terms(cpu, memory, None if link is None else link.utility)
 
 
