@@ -29,12 +29,11 @@ from zsched.config_blocks import (
 from zsched.config_ros2 import ros2_record
 from zsched.core.fleet import (
     DEFAULT_FORESEE_S,
-    DEFAULT_PATIENCE,
     DEFAULT_SCORE,
+    PAPER_PATIENCE,
     PATIENT_BONUS,
     PATIENT_COOL_DOWN_S,
-    SERVICE_COOL_DOWN_S,
-    SERVICE_PATIENCE,
+    RADIO_PATIENCE,
     Demand,
     Fleet,
     LinkLimits,
@@ -51,6 +50,7 @@ from zsched.core.fleet import (
     WorkerSpec,
 )
 from zsched.core.model import RSSI_MAX_DBM, RSSI_MIN_DBM, Aggregate, NodeKind, ScoreForm, Tuning
+from zsched.core.patience import CHOICES
 from zsched.core.plan import HandoverRule, OnCrash, ReadyWhen, ServiceSettings, StreamClass, StreamSettings
 from zsched.core.timing import PROFILES
 
@@ -213,8 +213,7 @@ SCHEDULING: Final = Record(
         "cool_down_s": Field(
             Number(0, 86400, "s"),
             "Least stay after a move.",
-            default=f"`{SERVICE_COOL_DOWN_S:g}`; `{PATIENT_COOL_DOWN_S:g}` with a weight for the network or "
-            "`score: paper`; `10` with `time_to_trigger_s` alone",
+            default=f"`{PATIENT_COOL_DOWN_S:g}`; `10` with `time_to_trigger_s` alone",
         ),
         "score": Field(
             Choice.of(ScoreForm),
@@ -226,7 +225,8 @@ SCHEDULING: Final = Record(
         "reach": Field(Choice.of(Reach), "Who must reach a candidate.", default=f"`{Reach.MAJORITY}`"),
         "memory_floor_ratio": Field(
             Number(0, 0.9),
-            "Memory below this share counts as used (`score: paper`: an owner that has less is left).",
+            "Where a task leaves less memory free than this share, its memory counts up to 15 % less "
+            "(`score: paper`: an owner that has less is left).",
             default="`0.05`",
         ),
         "max_moves_per_minute": Field(
@@ -236,8 +236,8 @@ SCHEDULING: Final = Record(
             Number(0.001, 1000),
             "Move once staying has cost so much, lead times seconds (`time_to_trigger_s` does not count then): "
             "a big lead is followed sooner than a small one.",
-            default=f"`{SERVICE_PATIENCE:g}`; `{DEFAULT_PATIENCE:g}` with a weight for the network or `score: paper`; "
-            "none with `time_to_trigger_s` alone",
+            default=f"learnt, {CHOICES[0]:g} to {CHOICES[-1]:g}; `{RADIO_PATIENCE:g}` with a weight for the network; "
+            f"`{PAPER_PATIENCE:g}` with `score: paper`; none with `time_to_trigger_s` alone",
         ),
         "pays_off_in_s": Field(
             Number(1, 86400, "s"),

@@ -215,7 +215,7 @@ def _task_status(node: NodeView, spec: TaskSpec, now: float) -> TaskStatus:
         phase=executor.phase.value,
         tuning=value.tuning,
         candidates=spec.candidates,
-        patience=spec.patience,
+        patience=standing.judge.patience,
         decision=_decision(standing, now),
         vote=_vote(standing, now),
         problems=tuple(_task_problems(node, spec, value, now)),

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from zsched.config import check_bytes
-from zsched.core.fleet import DEFAULT_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S
+from zsched.core.fleet import PAPER_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S
 from zsched.core.model import Tuning
 from zsched.lab.decisions import entries
 from zsched.lab.decisions.replay import Entry, replay
@@ -148,13 +148,13 @@ def test_the_grid_holds_the_default() -> None:
     world = loaded_world(seed=1, hours=0.05)
     tuning = Tuning(weights=EVEN)
     smoothing = f"s{world.fleet.timing.smoothing_s:g}"
-    default = f"{smoothing} b{PATIENT_BONUS:g} p{DEFAULT_PATIENCE:g} c{PATIENT_COOL_DOWN_S:g}"
+    default = f"{smoothing} b{PATIENT_BONUS:g} p{PAPER_PATIENCE:g} c{PATIENT_COOL_DOWN_S:g}"
     timer = f"{smoothing} b{tuning.bonus:g} t{tuning.time_to_trigger_s:g} c{tuning.cool_down_s:g}"
     assert list(STARS.values()) == [default, timer]
     cast = {entry.name: entry for entry in entries.grid(world)}
     for name, entry in zip((default, timer), entries.ours(world), strict=True):
         assert only(world, cast[name]) == only(world, entry)
         assert cast[name].look == Look(smoothing_s=world.fleet.timing.smoothing_s)
-    name = f"{smoothing} p{DEFAULT_PATIENCE:g}"
+    name = f"{smoothing} p{PAPER_PATIENCE:g}"
     smoothed = {entry.name: entry for entry in entries.smoothings(world)}
     assert only(world, smoothed[name]) == only(world, entries.ours(world)[0])
