@@ -366,7 +366,7 @@ TIMING: Final = Record(
         "confirm_s": Field(_SECONDS, "How long a suspect may refute before it is gone."),
         "zenoh_lease_s": Field(_SECONDS, "zenoh's own lease."),
         "sample_s": Field(_SECONDS, "Period of the profilers."),
-        "smoothing_s": Field(_SECONDS, "Time constant of CPU, memory and dBm."),
+        "smoothing_s": Field(_SECONDS, "Time constant of CPU and memory, and of dBm where it is over 0.5 s."),
         "publish_s": Field(_SECONDS, "A profile at least so often."),
         "profile_ttl_s": Field(_SECONDS, "An older profile does not count."),
         "decide_s": Field(_SECONDS, "A robot's own round at least so often."),

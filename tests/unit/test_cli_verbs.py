@@ -59,7 +59,7 @@ def test_check_of_a_good_file_counts_what_is_in_it(tmp_path: Path) -> None:
         ("{}", ["share of its work", "more than 0.05 (bonus)", "learns (0.05 to 1.5 s of its work)", "stays 2 s"]),
         ("{patience: 0.7}", ["staying has cost 0.7 s of its work (patience)"]),
         ("{time_to_trigger_s: 4}", ["more than 0.1 (bonus)", "has lasted 4 s (time_to_trigger_s)", "stays 10 s"]),
-        ("{score: paper}", ["Eq. 1 and 2", "0.5 utility seconds", "less than 5 % of its memory free is left at once"]),
+        ("{score: paper}", ["Eq. 1 and 2", "0.55 utility seconds", "less than 5 % of its memory free is left at once"]),
         ("{max_moves_per_minute: 9, reach: all, aggregate: median}", ["9 times", "all robots reach", "median decides"]),
         ("{pays_off_in_s: 60, memory_floor_ratio: 0.2}", ["within 60 s (pays_off_in_s)", "less than 20 %"]),
     ],

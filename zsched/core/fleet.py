@@ -19,7 +19,7 @@ from zsched.core.plan import Direction, ReadyWhen, ServiceSettings, StreamSettin
 
 DEFAULT_SCORE = ScoreForm.SERVICE
 """What a machine is worth to a task whose fleet file does not say how to score (docs/decisions/0031)."""
-PAPER_PATIENCE = 0.5
+PAPER_PATIENCE = 0.55
 """Utility seconds, of a task with `ScoreForm.PAPER` whose fleet file gives neither a patience nor a time-to-trigger."""
 RADIO_PATIENCE = 0.3
 """Likewise, of a task scored by service that weighs the network. All others learn theirs (docs/decisions/0033)."""

@@ -138,7 +138,7 @@ def grid(world: World) -> tuple[Entry, ...]:
             make=core(world, bonus=bonus, cool_down_s=cool_s, patience=patience),
         )
         for smoothing_s, bonus, patience, cool_s in itertools.product(
-            (0.3, 1.0, 3.0), (0.03, 0.05, 0.07), (0.1, 0.2, 0.5, 0.7), (2.0,)
+            (0.3, 1.0, 3.0), (0.03, 0.05, 0.07), (0.1, 0.2, 0.4, 0.55), (2.0,)
         )
     )
     return by_timer + patient
@@ -162,7 +162,7 @@ def smoothings(world: World) -> tuple[Entry, ...]:
             make=core(world, patience=patience),
         )
         for smoothing_s, patience in itertools.product(
-            (0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0), (0.1, 0.2, 0.3, 0.35, 0.4, 0.5)
+            (0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0), (0.1, 0.2, 0.3, 0.4, 0.5, 0.55)
         )
     )
 

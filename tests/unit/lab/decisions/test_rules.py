@@ -88,11 +88,11 @@ def spiky() -> World:
     return replace(world, cpu=use, memory=use, cpu_read=use, memory_read=use)
 
 
-def test_short_spikes_move_nothing_by_default_nor_with_the_timer_and_a_small_bonus_needs_patience() -> None:
-    """Why the timer's bonus is not that of patience (docs/decisions/0017)."""
+def test_short_spikes_move_nothing_by_default_nor_with_the_timer_and_half_the_patience_would_follow() -> None:
+    """Why the patience of the paper's score is not less (docs/decisions/0033)."""
     world = spiky()
     assert [only(world, entry) for entry in entries.ours(world)] == [[], []]
-    assert len(only(world, Entry(name="small bonus", make=entries.timed(world, bonus=0.05)))) >= 1
+    assert len(only(world, Entry(name="half", make=entries.core(world, patience=PAPER_PATIENCE / 2)))) >= 1
 
 
 def test_patience_keeps_equal_nodes_apart_as_well_and_follows_a_step_sooner() -> None:
