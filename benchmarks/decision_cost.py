@@ -51,7 +51,13 @@ class Round:
         """A fleet of so many edges and robots, all of them just heard."""
         edges = tuple(f"edge{index:03d}" for index in range(candidates))
         names = tuple(f"robot{index:03d}" for index in range(robots))
-        task = TaskSpec(name="task", candidates=edges, tuning=TUNING, demand=Demand(cpu_cores=0.4, memory_mb=250.0))
+        task = TaskSpec(
+            name="task",
+            candidates=edges,
+            tuning=TUNING,
+            demand=Demand(cpu_cores=0.4, memory_mb=250.0),
+            learns_patience=True,
+        )
         nodes = [NodeSpec(name=name, kind=NodeKind.EDGE) for name in edges]
         nodes += [NodeSpec(name=name, kind=NodeKind.ROBOT) for name in names]
         fleet = Fleet(name="cost", timing=Timing(), nodes=tuple(nodes), tasks=(task,), electors=names)

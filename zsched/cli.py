@@ -97,13 +97,6 @@ JsonOption = Annotated[bool, typer.Option("--json", help="JSON with its schema's
 # --- the daemon ------------------------------------------------------------------------------------------------------
 
 
-LATENCY = (
-    "{task}: objective latency: a machine is worth the share of jobs that it is expected to do within {deadline} ms, "
-    "by its worker's word of them (CPU per job over the machine's speed and what is free there, and what a job waits "
-    "for otherwise) and the measured way there and back"
-)
-
-
 @app.command(cls=Verb)
 def up(
     config: ConfigOption = None,
@@ -271,8 +264,12 @@ def check(
     config: ConfigOption = None,
     json_: JsonOption = False,
 ) -> None:
-    """Check a fleet file: every fault at once, each with file:line:col; exits with 78 when there is one."""
+    """Check a fleet file: every fault at once, each with file:line:col; exits with 78 when there is one.
+
+    Of a file without fault it says in words when each task moves, setting by setting.
+    """
     from zsched import places  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.cli_rules import told  # noqa: PLC0415 - as above
     from zsched.config import check_file  # noqa: PLC0415 - ruamel.yaml is slow to import
 
     result = check_file(places.config_path(file or config, os.environ))
@@ -292,9 +289,9 @@ def check(
         raise typer.Exit(EXIT_CONFIG)
     if not json_:
         typer.echo("ok: " + ", ".join(_count(number, noun) for noun, number in counts.items()))
-        for task in fleet.tasks if fleet is not None else ():
-            if task.tuning.deadline_ms is not None:
-                typer.echo(LATENCY.format(task=task.name, deadline=f"{task.tuning.deadline_ms:g}"))
+    for spec in fleet.tasks if fleet is not None and not json_ else ():
+        first, *more = told(spec)
+        typer.echo("\n".join((first, *(f"  {line}" for line in more))))
 
 
 # --- everything else -------------------------------------------------------------------------------------------------

@@ -29,12 +29,11 @@ from zsched.config_blocks import (
 from zsched.config_ros2 import ros2_record
 from zsched.core.fleet import (
     DEFAULT_FORESEE_S,
-    DEFAULT_PATIENCE,
     DEFAULT_SCORE,
+    PAPER_PATIENCE,
     PATIENT_BONUS,
     PATIENT_COOL_DOWN_S,
-    SERVICE_COOL_DOWN_S,
-    SERVICE_PATIENCE,
+    RADIO_PATIENCE,
     Demand,
     Fleet,
     LinkLimits,
@@ -61,6 +60,7 @@ from zsched.core.model import (
     ScoreForm,
     Tuning,
 )
+from zsched.core.patience import CHOICES
 from zsched.core.plan import HandoverRule, OnCrash, ReadyWhen, ServiceSettings, StreamClass, StreamSettings
 from zsched.core.timing import PROFILES
 
@@ -223,8 +223,7 @@ SCHEDULING: Final = Record(
         "cool_down_s": Field(
             Number(0, 86400, "s"),
             "Least stay after a move.",
-            default=f"`{SERVICE_COOL_DOWN_S:g}`; `{PATIENT_COOL_DOWN_S:g}` with a weight for the network or "
-            "`score: paper`; `10` with `time_to_trigger_s` alone",
+            default=f"`{PATIENT_COOL_DOWN_S:g}`; `10` with `time_to_trigger_s` alone",
         ),
         "score": Field(
             Choice.of(ScoreForm),
@@ -248,7 +247,8 @@ SCHEDULING: Final = Record(
         "reach": Field(Choice.of(Reach), "Who must reach a candidate.", default=f"`{Reach.MAJORITY}`"),
         "memory_floor_ratio": Field(
             Number(0, 0.9),
-            "Memory below this share counts as used (`score: paper`: an owner that has less is left).",
+            "Where a task leaves less memory free than this share, its memory counts up to 15 % less "
+            "(`score: paper`: an owner that has less is left).",
             default="`0.05`",
         ),
         "max_moves_per_minute": Field(
@@ -258,8 +258,8 @@ SCHEDULING: Final = Record(
             Number(0.001, 1000),
             "Move once staying has cost so much, lead times seconds (`time_to_trigger_s` does not count then): "
             "a big lead is followed sooner than a small one.",
-            default=f"`{SERVICE_PATIENCE:g}`; `{DEFAULT_PATIENCE:g}` with a weight for the network or `score: paper`; "
-            "none with `time_to_trigger_s` alone",
+            default=f"learnt, {CHOICES[0]:g} to {CHOICES[-1]:g}; `{RADIO_PATIENCE:g}` with a weight for the network; "
+            f"`{PAPER_PATIENCE:g}` with `score: paper`; none with `time_to_trigger_s` alone",
         ),
         "pays_off_in_s": Field(
             Number(1, 86400, "s"),
@@ -388,7 +388,7 @@ TIMING: Final = Record(
         "confirm_s": Field(_SECONDS, "How long a suspect may refute before it is gone."),
         "zenoh_lease_s": Field(_SECONDS, "zenoh's own lease."),
         "sample_s": Field(_SECONDS, "Period of the profilers."),
-        "smoothing_s": Field(_SECONDS, "Time constant of CPU, memory and dBm."),
+        "smoothing_s": Field(_SECONDS, "Time constant of CPU and memory, and of dBm where it is over 0.5 s."),
         "publish_s": Field(_SECONDS, "A profile at least so often."),
         "profile_ttl_s": Field(_SECONDS, "An older profile does not count."),
         "decide_s": Field(_SECONDS, "A robot's own round at least so often."),

@@ -5,7 +5,7 @@ Knows: how the values of one task, and the rules of all tasks, relate. Does not 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 from zsched.config_blocks import Located, Section
@@ -14,12 +14,11 @@ from zsched.config_reader import Collector, Place, nearest
 from zsched.config_ros2 import ros2_rules
 from zsched.core.fleet import (
     DEFAULT_FORESEE_S,
-    DEFAULT_PATIENCE,
     DEFAULT_SCORE,
+    PAPER_PATIENCE,
     PATIENT_BONUS,
     PATIENT_COOL_DOWN_S,
-    SERVICE_COOL_DOWN_S,
-    SERVICE_PATIENCE,
+    RADIO_PATIENCE,
     Demand,
     LinkLimits,
     OnIsolation,
@@ -28,6 +27,7 @@ from zsched.core.fleet import (
     WorkerSpec,
 )
 from zsched.core.model import NodeKind, Objective, ScoreForm, Tuning, Weights
+from zsched.core.patience import FIRST_PATIENCE
 from zsched.core.plan import (
     Direction,
     HandoverRule,
@@ -103,6 +103,7 @@ def _task(
         worker=worker,
         rules=tuple(stream.value for stream in streams),
         patience=_patience(scheduling, (tuning or _ANY_TUNING).weights),
+        learns_patience=_learns(scheduling, (tuning or _ANY_TUNING).weights),
         **_of(given, "on_isolation", "exclusive", "drain_s"),
         **more,
     )
@@ -142,10 +143,7 @@ def _tuning(given: Section, out: Collector) -> Tuning | None:
     scheduling: Section | None = given.get("scheduling")
     score = _score(scheduling)
     deadline = {} if scheduling is None else _deadline(scheduling, score, out)
-    patient: dict[str, Any] = {
-        "bonus": PATIENT_BONUS,
-        "cool_down_s": SERVICE_COOL_DOWN_S if _is_quick(score, weights) else PATIENT_COOL_DOWN_S,
-    }
+    patient: dict[str, Any] = {"bonus": PATIENT_BONUS, "cool_down_s": PATIENT_COOL_DOWN_S}
     if scheduling is None:
         return Tuning(weights=weights, score=score, **patient)
     default = patient if _patience(scheduling, weights) is not None else {}
@@ -174,20 +172,29 @@ def _deadline(scheduling: Section, score: ScoreForm, out: Collector) -> dict[str
 def _patience(scheduling: Section | None, weights: Weights) -> float | None:
     """As given; none where only a time-to-trigger is given; else the default."""
     values = {} if scheduling is None else scheduling.values
-    default = SERVICE_PATIENCE if _is_quick(_score(scheduling), weights) else DEFAULT_PATIENCE
-    patience: float | None = values.get("patience", None if "time_to_trigger_s" in values else default)
+    patience: float | None = values.get(
+        "patience", None if "time_to_trigger_s" in values else _default(values, weights)
+    )
     return patience
+
+
+def _default(values: Mapping[str, Any], weights: Weights) -> float:
+    if values.get("score", DEFAULT_SCORE) is ScoreForm.PAPER:
+        return PAPER_PATIENCE
+    return RADIO_PATIENCE if weights.network else FIRST_PATIENCE
+
+
+def _learns(scheduling: Section | None, weights: Weights) -> bool:
+    """Whether the task learns its patience: not where a radio counts, whose noise costs as much as it (0033)."""
+    values = {} if scheduling is None else scheduling.values
+    is_given = "patience" in values or "time_to_trigger_s" in values
+    return not is_given and _score(scheduling) is ScoreForm.SERVICE and not weights.network
 
 
 def _score(scheduling: Section | None) -> ScoreForm:
     values = {} if scheduling is None else scheduling.values
     score: ScoreForm = values.get("score", DEFAULT_SCORE)
     return score
-
-
-def _is_quick(score: ScoreForm, weights: Weights) -> bool:
-    """Whether the shorter patience is the default: not where a radio counts, which comes and goes (0031)."""
-    return score is ScoreForm.SERVICE and not weights.network
 
 
 def _limits(given: Section, out: Collector) -> LinkLimits:

@@ -11,23 +11,24 @@ import pytest
 from zsched.config import CheckResult, check_bytes, check_file, load_fleet
 from zsched.core.fleet import (
     DEFAULT_FORESEE_S,
-    DEFAULT_PATIENCE,
+    PAPER_PATIENCE,
     PATIENT_BONUS,
     PATIENT_COOL_DOWN_S,
-    SERVICE_COOL_DOWN_S,
-    SERVICE_PATIENCE,
+    RADIO_PATIENCE,
     Fleet,
     LinkSpec,
     OnIsolation,
     PairReading,
     Reach,
     Standby,
+    Timing,
     WorkerLink,
     dial_endpoint,
     electorate_hash,
     fleet_hash,
 )
 from zsched.core.model import Aggregate, LinkSource, NodeKind, Objective, ScoreForm
+from zsched.core.patience import FIRST_PATIENCE
 from zsched.core.plan import Direction, HandoverRule, ReadyWhen, StreamClass
 from zsched.errors import ConfigError
 
@@ -145,19 +146,19 @@ def test_links_of_every_source() -> None:
 @pytest.mark.parametrize(
     ("scheduling", "patience", "bonus", "cool_down_s", "trigger_s"),
     [
-        ("", SERVICE_PATIENCE, PATIENT_BONUS, SERVICE_COOL_DOWN_S, None),
-        ("{}", SERVICE_PATIENCE, PATIENT_BONUS, SERVICE_COOL_DOWN_S, None),
-        ("{cool_down_s: 7}", SERVICE_PATIENCE, PATIENT_BONUS, 7.0, None),
-        ("{cool_down_s: 0}", SERVICE_PATIENCE, PATIENT_BONUS, 0.0, None),
-        ("{bonus: 0.2}", SERVICE_PATIENCE, 0.2, SERVICE_COOL_DOWN_S, None),
-        ("{bonus: 0}", SERVICE_PATIENCE, 0.0, SERVICE_COOL_DOWN_S, None),
-        ("{patience: 0.3}", 0.3, PATIENT_BONUS, SERVICE_COOL_DOWN_S, None),
-        ("{patience: 0.3, bonus: 0.2}", 0.3, 0.2, SERVICE_COOL_DOWN_S, None),
+        ("", FIRST_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S, None),
+        ("{}", FIRST_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S, None),
+        ("{cool_down_s: 7}", FIRST_PATIENCE, PATIENT_BONUS, 7.0, None),
+        ("{cool_down_s: 0}", FIRST_PATIENCE, PATIENT_BONUS, 0.0, None),
+        ("{bonus: 0.2}", FIRST_PATIENCE, 0.2, PATIENT_COOL_DOWN_S, None),
+        ("{bonus: 0}", FIRST_PATIENCE, 0.0, PATIENT_COOL_DOWN_S, None),
+        ("{patience: 0.3}", 0.3, PATIENT_BONUS, PATIENT_COOL_DOWN_S, None),
+        ("{patience: 0.3, bonus: 0.2}", 0.3, 0.2, PATIENT_COOL_DOWN_S, None),
         ("{time_to_trigger_s: 2}", None, 0.1, 10.0, 2.0),
         ("{time_to_trigger_s: 0}", None, 0.1, 10.0, 0.0),
         ("{time_to_trigger_s: 3, bonus: 0.05, cool_down_s: 4}", None, 0.05, 4.0, 3.0),
-        ("{time_to_trigger_s: 3, patience: 0.3}", 0.3, PATIENT_BONUS, SERVICE_COOL_DOWN_S, 3.0),
-        ("{time_to_trigger_s: 3, patience: 0.3, bonus: 0.2}", 0.3, 0.2, SERVICE_COOL_DOWN_S, 3.0),
+        ("{time_to_trigger_s: 3, patience: 0.3}", 0.3, PATIENT_BONUS, PATIENT_COOL_DOWN_S, 3.0),
+        ("{time_to_trigger_s: 3, patience: 0.3, bonus: 0.2}", 0.3, 0.2, PATIENT_COOL_DOWN_S, 3.0),
     ],
 )
 def test_patience_is_the_default_and_a_time_to_trigger_alone_takes_its_place(
@@ -175,11 +176,11 @@ def test_patience_is_the_default_and_a_time_to_trigger_alone_takes_its_place(
 @pytest.mark.parametrize(
     ("given", "patience", "cool_down_s"),
     [
-        ("{bonus: 0.05}", SERVICE_PATIENCE, SERVICE_COOL_DOWN_S),
-        ("{score: service}", SERVICE_PATIENCE, SERVICE_COOL_DOWN_S),
+        ("{bonus: 0.05}", FIRST_PATIENCE, PATIENT_COOL_DOWN_S),
+        ("{score: service}", FIRST_PATIENCE, PATIENT_COOL_DOWN_S),
         ("{score: service, patience: 0.7, cool_down_s: 9}", 0.7, 9.0),
         ("{score: service, time_to_trigger_s: 2}", None, 10.0),
-        ("{score: paper}", DEFAULT_PATIENCE, PATIENT_COOL_DOWN_S),
+        ("{score: paper}", PAPER_PATIENCE, PATIENT_COOL_DOWN_S),
     ],
 )
 def test_a_task_scored_by_service_has_its_own_defaults(given: str, patience: float | None, cool_down_s: float) -> None:
@@ -235,13 +236,14 @@ def test_a_deadline_of_a_worker_that_tells_nothing_is_worth_a_word() -> None:
 
 
 @pytest.mark.parametrize("given", ["", "    scheduling: {score: service}\n"])
-def test_a_task_that_weighs_the_network_is_as_patient_as_before(given: str) -> None:
-    """A radio comes and goes: twice as many moves otherwise (docs/decisions/0031)."""
+def test_a_task_that_weighs_the_network_has_a_patience_that_is_not_learnt(given: str) -> None:
+    """A radio comes and goes: twice as many moves otherwise (docs/decisions/0033)."""
     scheduling = "    scheduling: {bonus: 0.10, time_to_trigger_s: 2, cool_down_s: 10}\n"
     text = swapped(scheduling, given).replace("network: 0.0", "network: 0.2").replace("cpu: 0.5", "cpu: 0.3")
     task = fleet_of(text).tasks[0]
     assert task.tuning.weights.network > 0
-    assert (task.patience, task.tuning.cool_down_s) == (DEFAULT_PATIENCE, PATIENT_COOL_DOWN_S)
+    assert (task.patience, task.tuning.cool_down_s) == (RADIO_PATIENCE, PATIENT_COOL_DOWN_S)
+    assert not task.learns_patience
     assert task.tuning.score is ScoreForm.SERVICE
 
 
@@ -257,8 +259,24 @@ def test_signals_are_foreseen_unless_the_file_says_otherwise(link: str, foresee_
     assert limits.nu_dbm == (-75.0 if "nu_dbm" in link else -80.0)
 
 
-def test_the_defaults_of_a_fleet_file_are_those_of_decisions_0021_0023_and_0024() -> None:
-    assert (DEFAULT_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S, DEFAULT_FORESEE_S) == (0.4, 0.05, 5.0, 3.0)
+def test_the_defaults_of_a_fleet_file_are_those_of_decisions_0021_and_0033() -> None:
+    assert (PAPER_PATIENCE, RADIO_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S) == (0.55, 0.3, 0.05, 2.0)
+    assert (DEFAULT_FORESEE_S, Timing().smoothing_s) == (3.0, 0.3)
+
+
+@pytest.mark.parametrize(
+    ("given", "learns"),
+    [
+        ("{}", True),
+        ("{score: service, bonus: 0.1}", True),
+        ("{patience: 0.3}", False),
+        ("{time_to_trigger_s: 2}", False),
+        ("{score: paper}", False),
+    ],
+)
+def test_a_patience_is_learnt_where_the_file_gives_neither_one_nor_a_time_to_trigger(given: str, learns: bool) -> None:
+    scheduling = "    scheduling: {bonus: 0.10, time_to_trigger_s: 2, cool_down_s: 10}\n"
+    assert fleet_of(swapped(scheduling, f"    scheduling: {given}\n")).tasks[0].learns_patience is learns
 
 
 def test_every_setting_of_a_task_arrives() -> None:

@@ -7,12 +7,11 @@ from zsched.config import check_bytes
 from zsched.config_schema import LINK_LIMITS, RULE, SCHEDULING, TRACE, WORKER, reference
 from zsched.core.fleet import (
     DEFAULT_FORESEE_S,
-    DEFAULT_PATIENCE,
     DEFAULT_SCORE,
+    PAPER_PATIENCE,
     PATIENT_BONUS,
     PATIENT_COOL_DOWN_S,
-    SERVICE_COOL_DOWN_S,
-    SERVICE_PATIENCE,
+    RADIO_PATIENCE,
     LinkSpec,
     TaskSpec,
     Timing,
@@ -51,12 +50,11 @@ def test_defaults_that_hang_on_each_other_are_the_codes() -> None:
     timers = {field.name: field.default for field in fields(Tuning)}
     alone = "with `time_to_trigger_s` alone"
     assert SCHEDULING.default_text("bonus") == f"`{PATIENT_BONUS:g}`; `{timers['bonus']:g}` {alone}"
-    patient = "with a weight for the network or `score: paper`"
-    kept = f"`{SERVICE_COOL_DOWN_S:g}`; `{PATIENT_COOL_DOWN_S:g}` {patient}; `{timers['cool_down_s']:g}` {alone}"
+    kept = f"`{PATIENT_COOL_DOWN_S:g}`; `{timers['cool_down_s']:g}` {alone}"
     assert SCHEDULING.default_text("cool_down_s") == kept
     assert SCHEDULING.default_text("score") == f"`{DEFAULT_SCORE}`"
-    patience = f"`{SERVICE_PATIENCE:g}`; `{DEFAULT_PATIENCE:g}` {patient}; none {alone}"
-    assert SCHEDULING.default_text("patience") == patience
+    radio, paper = f"`{RADIO_PATIENCE:g}` with a weight for the network", f"`{PAPER_PATIENCE:g}` with `score: paper`"
+    assert SCHEDULING.default_text("patience") == f"learnt, 0.05 to 1.5; {radio}; {paper}; none {alone}"
     assert LINK_LIMITS.default_text("foresee_s") == f"`{DEFAULT_FORESEE_S:g}`"
 
 

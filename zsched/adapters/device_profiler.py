@@ -8,7 +8,8 @@ total - MemAvailable, or under a limit the group's working set, or what the mach
 A worker's load is its whole process tree. CPU: the difference of user and system time, children that were waited for
 included, so short-lived ones count. How long its threads have run and waited to run (schedstat) tells what it wants
 beyond that (`zsched.core.appetite`). Memory: the sum of resident sets, which counts shared pages once per process; the
-exact figure (PSS) would cost milliseconds per sample.
+exact figure (PSS) would cost milliseconds per sample. How many threads want to run is what /proc/stat counts at the
+moment of the sample.
 
 Knows: /proc and /sys/fs/cgroup (proc(5)), below a root that tests can set. Does not know: smoothing, demand, tasks'
 meaning. Nothing here raises: what cannot be read is ``None``.
@@ -93,6 +94,13 @@ def parse_cpu_stat(content: bytes, allowed: frozenset[int] | None) -> CpuTimes |
     return CpuTimes(busy_s=busy / TICKS_PER_S, total_s=total / TICKS_PER_S, cpus=cpus)
 
 
+def parse_running(content: bytes) -> int | None:
+    """Threads that run or wait to run on the whole machine, of /proc/stat; ``None`` when it does not tell."""
+    _, found, rest = content.partition(b"\nprocs_running ")
+    count = rest.partition(b"\n")[0].strip()
+    return int(count) if found and count.isdigit() else None
+
+
 def parse_schedstat(content: bytes) -> tuple[float, float] | None:
     """Seconds a thread has run, and has waited to run, of /proc/PID/task/TID/schedstat; ``None`` when malformed."""
     try:
@@ -146,7 +154,8 @@ class DeviceProfiler:
         now = monotonic_s()
         if self._limits_at_s is None or now - self._limits_at_s >= LIMITS_EVERY_S:
             self._look_up_limits(now)
-        times = parse_cpu_stat(_read(f"{self._proc}/stat"), self._allowed)
+        stat = _read(f"{self._proc}/stat")
+        times = parse_cpu_stat(stat, self._allowed)
         memory_mb, memory_used_mb = self._memory()
         return DeviceSample(
             cpu_cores=self._capacity(times),
@@ -156,6 +165,7 @@ class DeviceProfiler:
             workers=self._trees.loads(workers, now),
             speed=self.speed,
             cpu_pressure=self._cpu_pressure(now),
+            runnable=self._runnable(stat, times),
         )
 
     def _cpu_pressure(self, now: float) -> float | None:
@@ -173,6 +183,13 @@ class DeviceProfiler:
         else:
             self._pressure = min(max(stalled_s - before[1], 0.0) / (now - before[0]), 1.0)
         return self._pressure
+
+    def _runnable(self, stat: bytes, times: CpuTimes | None) -> float | None:
+        """Of the whole machine only: under a quota, or on some of its CPUs, nobody counts who else wants them."""
+        every, running = parse_cpu_stat(stat, None), parse_running(stat)
+        if self._cpu_quota is not None or times is None or every is None or running is None:
+            return None
+        return max(running - 1.0, 0.0) if times.cpus == every.cpus else None  # one of them is this thread
 
     def _look_up_limits(self, now: float) -> None:
         self._limits_at_s = now

@@ -19,17 +19,14 @@ from zsched.core.plan import Direction, ReadyWhen, ServiceSettings, StreamSettin
 
 DEFAULT_SCORE = ScoreForm.SERVICE
 """What a machine is worth to a task whose fleet file does not say how to score (docs/decisions/0031)."""
-DEFAULT_PATIENCE = 0.4
-"""Utility seconds; for a task whose fleet file gives neither a patience nor a time-to-trigger (docs/decisions/0024)."""
+PAPER_PATIENCE = 0.55
+"""Utility seconds, of a task with `ScoreForm.PAPER` whose fleet file gives neither a patience nor a time-to-trigger."""
+RADIO_PATIENCE = 0.3
+"""Likewise, of a task scored by service that weighs the network. All others learn theirs (docs/decisions/0033)."""
 PATIENT_BONUS = 0.05
 """The bonus of a task with a patience, when its fleet file gives none; with a time-to-trigger it is `Tuning`'s."""
-PATIENT_COOL_DOWN_S = 5.0
-"""The cool-down of a task with a patience, likewise (docs/decisions/0023)."""
-SERVICE_PATIENCE = 0.1
-"""`DEFAULT_PATIENCE` under `ScoreForm.SERVICE` of a task that does not weigh the network: a lead is then a share of the
-task's work (docs/decisions/0030, 0031)."""
-SERVICE_COOL_DOWN_S = 2.0
-"""`PATIENT_COOL_DOWN_S`, likewise."""
+PATIENT_COOL_DOWN_S = 2.0
+"""The cool-down of a task with a patience, likewise (docs/decisions/0033)."""
 DEFAULT_FORESEE_S = 3.0
 """How far ahead the signals of a task count when its fleet file does not say."""
 
@@ -196,6 +193,8 @@ class TaskSpec:
     """Hard cap of planned moves; escapes have their own (`zsched.core.damping`)."""
     patience: float | None = None
     """Utility seconds that staying may cost before the task moves, in place of the time-to-trigger; ``None``: that."""
+    learns_patience: bool = False
+    """Its patience is learnt (`zsched.core.patience`); ``patience`` is what it begins with."""
     pays_off_in_s: float | None = None
     """A move must earn what moves have cost (measured) within so many seconds; ``None``: the bonus alone counts."""
     on_isolation: OnIsolation = OnIsolation.HOLD
@@ -222,7 +221,7 @@ class Timing:
     """How long a suspect may refute, or a second observer confirm, before it is gone."""
     zenoh_lease_s: float = 1.5
     sample_s: float = 0.2
-    smoothing_s: float = 1.0
+    smoothing_s: float = 0.3
     """EWMA time constant of CPU, memory and dBm."""
     publish_s: float = 1.0
     """Profiles at least so often (sooner on change)."""

@@ -12,6 +12,7 @@ from zsched.core.demand import Demands
 from zsched.core.fleet import Demand, Fleet, TaskSpec
 from zsched.core.model import NodeId, Profile, TaskId
 from zsched.core.sequence import Order, Track
+from zsched.core.sharing import Shares
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,6 +33,7 @@ class Gateway:
         self._tracks: dict[NodeId, Track] = {}
         self.demands = Demands()
         """What tasks need, as this node has learnt it."""
+        self._shares = Shares()
         self._candidates = {task.name: task.candidates for task in fleet.tasks}
         self.version = 0
         """Rises with every change; what was computed from an older version may be wrong."""
@@ -68,7 +70,7 @@ class Gateway:
         return min(ends, default=math.inf)
 
     def learn_demand(self, task: TaskId, owner: NodeId, now: float) -> None:
-        """Note what the task's worker wants on its owner (`zsched.core.demand`)."""
+        """Note what the task's worker wants on its owner, and gets (`zsched.core.demand`, `zsched.core.sharing`)."""
         profile = self.fresh(owner, now)
         if profile is None:
             return
@@ -76,9 +78,13 @@ class Gateway:
             known[0].speed for name in self._candidates.get(task, ()) if (known := self._profiles.get(name)) is not None
         ]
         fastest = max((speed for speed in speeds if speed is not None), default=None)
-        if self.demands.learn(task, profile, now, fastest):
-            self.version += 1
+        news = self.demands.learn(task, profile, now, fastest), self._shares.learn(task, profile)
+        self.version += any(news)
 
     def demand(self, spec: TaskSpec, profile: Profile) -> Demand:
         """What the task will use on the node of ``profile``."""
         return self.demands.at(spec, profile)
+
+    def share(self, spec: TaskSpec, profile: Profile, need_cores: float, coming_cores: float) -> float:
+        """Cores that the task would get on the node of ``profile``, were it full (`zsched.core.sharing`)."""
+        return self._shares.at(spec.name, profile, need_cores, coming_cores)

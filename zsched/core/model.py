@@ -25,6 +25,7 @@ MAX_COUNTER = 2**53
 """Largest revision, epoch, incarnation or sequence number (exact in every language's float)."""
 MAX_CPU_CORES, MAX_MEMORY_MB, MAX_BITRATE_MBPS = 4096.0, 1e8, 1e6
 MIN_SPEED, MAX_SPEED = 0.001, 1000.0
+MAX_RUNNABLE = 1e6
 MAX_TREND_DB_S = 100.0
 MAX_JOBS_HZ, MAX_JOB_S = 1e6, 1e6
 """What no machine or link exceeds: a larger figure is a fault of whoever measured or sent it."""
@@ -284,6 +285,8 @@ class DeviceSample:
     """How fast one of its cores is; ``None``: not measured."""
     cpu_pressure: float | None = None
     """Share of the time since the last sample in which some process wanted a CPU and had none; ``None``: not known."""
+    runnable: float | None = None
+    """Threads that run or wait to run just now, the profiler's own left out; ``None``: not to be told."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -342,6 +345,8 @@ class Profile:
     """Share of the time in which some process wanted a CPU and had none (PSI "some"); ``None``: not measured."""
     echoes: tuple[Echo, ...] = ()
     """Which profiles of others the node has, where a task has a deadline (`zsched.core.round_trips`)."""
+    runnable: float | None = None
+    """Threads that run or wait to run, on the mean: what a task would share a full machine with; ``None``: unknown."""
 
     def __post_init__(self) -> None:
         check_name("profile.node", self.node)
@@ -353,6 +358,7 @@ class Profile:
         check_range("profile.memory_used_mb", self.memory_used_mb, 0.0, MAX_MEMORY_MB)
         check_range("profile.speed", self.speed, MIN_SPEED, MAX_SPEED)
         check_range("profile.cpu_pressure", self.cpu_pressure, 0.0, 1.0)
+        check_range("profile.runnable", self.runnable, 0.0, MAX_RUNNABLE)
 
     def worker(self, task: TaskId) -> WorkerLoad | None:
         """The load of ``task``'s worker on this node, or ``None`` when the node runs none."""

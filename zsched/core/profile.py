@@ -23,6 +23,7 @@ from zsched.core.model import (
     MAX_BITRATE_MBPS,
     MAX_CPU_CORES,
     MAX_MEMORY_MB,
+    MAX_RUNNABLE,
     MAX_TREND_DB_S,
     DeviceSample,
     Echo,
@@ -45,6 +46,8 @@ RSSI_CHANGE_DB = 1.0
 RSSI_IMPOSSIBLE_ABOVE_DBM = -10.0
 RSSI_IMPOSSIBLE_BELOW_DBM = -100.0
 RSSI_OUTLIER_DB = 25.0
+SIGNAL_SMOOTHING_S = 0.5
+"""A radio is smoothed over this at least: its readings scatter by 2.5 to 2.9 dB, and trends are seen in them."""
 RSSI_WINDOW = 5
 """A reading further than 25 dB from the median of the last 5 is dropped (measured on real drives)."""
 NO_REASONS: Mapping[TaskId, str] = {}
@@ -103,6 +106,7 @@ class Profiler:
         self._cpu = Ewma(timing.smoothing_s)
         self._memory = Ewma(timing.smoothing_s)
         self._pressure = Ewma(timing.smoothing_s)
+        self._runnable = Ewma(timing.smoothing_s)
         self._signals: dict[NodeId | None, SignalFilter] = {}
         self._worker_cpu: dict[TaskId, Ewma] = {}
         self._worker_memory: dict[TaskId, Ewma] = {}
@@ -131,6 +135,11 @@ class Profiler:
             self._pressure.value = None
         else:
             self._pressure.update(pressure, now)
+        runnable = _possible(device.runnable, MAX_RUNNABLE)
+        if runnable is None:
+            self._runnable.value = None
+        else:
+            self._runnable.update(runnable, now)
         self._links = tuple(self._link(sample, now) for sample in links)
         for meter in self._jobs.values():
             meter.look(now)
@@ -144,7 +153,7 @@ class Profiler:
     def _link(self, sample: LinkSample, now: float) -> Link:
         rssi = trend = None
         if sample.source is not LinkSource.WIRED:
-            signal = self._signals.setdefault(sample.peer, SignalFilter(self._timing.smoothing_s))
+            signal = self._signals.setdefault(sample.peer, SignalFilter(_signal_tau_s(self._timing)))
             rssi = signal.update(sample.rssi_dbm, now)
             trend = signal.trend_db_s
         return Link(
@@ -238,7 +247,14 @@ class Profiler:
             draining=is_draining,
             speed=self._device.speed,
             cpu_pressure=self._pressure.value if is_measured else None,
+            runnable=self._runnable.value if is_measured else None,
         )
+
+
+def _signal_tau_s(timing: Timing) -> float:
+    """Less than the period of samples is no smoothing, neither of signals (no fleet file can say that)."""
+    is_smoothed = timing.smoothing_s >= timing.sample_s
+    return max(timing.smoothing_s, SIGNAL_SMOOTHING_S) if is_smoothed else timing.smoothing_s
 
 
 def _absorb_use(

@@ -17,11 +17,9 @@ from enum import StrEnum
 from zsched.core.damping import ESCAPES_PER_MINUTE, WINDOW_S, Damping
 from zsched.core.fleet import TaskSpec
 from zsched.core.model import Allocation, NodeId, PeerState, Profile, ScoreForm, WorkerState, told_of_worker
+from zsched.core.patience import LONGEST_GAP_S, LearntPatience, spend
 from zsched.core.scoring import Standing, joined, pick
 
-FORGIVEN_IN_S = 2.0
-LONGEST_GAP_S = 2.0
-"""Nothing is charged for longer than this between two judgements: nobody looked."""
 MOST_FOR_COST = 0.3
 """The bonus rises by no more than this, whatever moves cost: a task must be able to leave a node that is full."""
 INITIAL_SETTLE_S = 3.0
@@ -61,6 +59,8 @@ class Judge:
     spent: float = 0.0
     """What staying has cost so far, in utility seconds (tasks with a ``patience``)."""
     spent_at: float | None = None
+    learnt: LearntPatience = field(default_factory=LearntPatience)
+    """Of a task that learns its patience."""
     move_cost_s: float = 0.0
     """What the last moves have cost, in seconds of the task's work (`zsched.core.costs`; tasks with a horizon)."""
     seen_first_at: float | None = None
@@ -68,6 +68,11 @@ class Judge:
 
     out: AbstractSet[NodeId] = frozenset()
     """The candidates that a first placement does not wait for: they cannot have the task."""
+
+    @property
+    def patience(self) -> float | None:
+        """What staying may cost now, in utility seconds; ``None``: the time-to-trigger counts."""
+        return self.learnt.value if self.spec.learns_patience else self.spec.patience
 
     def reset(self, *, is_new_owner: bool = False) -> None:
         """A vote was lost or the value changed: wait the whole time-to-trigger again."""
@@ -99,6 +104,9 @@ class Judge:
                 ``standing``, count as well); ``None``: neither.
         """
         owner = allocation.owner
+        if self.spec.learns_patience:
+            tuning = allocation.tuning
+            self.learnt.watch(standing.aggregates, tuning.bonus, tuning.cool_down_s, now)
         bonus = self._bonus(allocation) if escape is None else 0.0
         penalties = {} if damping is None else joined((damping.penalties(now), standing.penalties))
         scored = {
@@ -133,19 +141,14 @@ class Judge:
         return allocation.tuning.bonus + min(self.move_cost_s / horizon_s, MOST_FOR_COST)
 
     def _spend(self, scored: Mapping[NodeId, float], owner: NodeId | None, now: float) -> None:
-        """Add up the lead over the owner with its bonus, over time (Page's CUSUM, Biometrika 41, 1954).
-
-        The bonus is its drift and the patience its threshold. `FORGIVEN_IN_S` without a lead clear the account.
-        """
-        patience = self.spec.patience
+        """Add up the lead over the owner with its bonus, over time (`zsched.core.patience.spend`)."""
+        patience = self.patience
         if patience is None or owner is None or owner not in scored:
             self.spent, self.spent_at = 0.0, None
             return
         elapsed_s = 0.0 if self.spent_at is None else min(now - self.spent_at, LONGEST_GAP_S)
-        lead = max(scored.values()) - scored[owner]
-        rate = lead if lead > 0.0 else -patience / FORGIVEN_IN_S
-        # No more than is asked for: what a lead within the cool-down leaves behind is forgiven as soon as anything.
-        self.spent, self.spent_at = min(max(self.spent + elapsed_s * rate, 0.0), patience), now
+        self.spent = spend(self.spent, max(scored.values()) - scored[owner], patience, elapsed_s)
+        self.spent_at = now
 
     def _cap(self, damping: Damping, *, is_escape: bool, now: float) -> str | None:
         """Why no further move is allowed in this minute, or ``None``."""
@@ -183,7 +186,7 @@ class Judge:
             return Outcome.PROPOSE, f"vote called; {why}"
         if settled_for_s < tuning.cool_down_s:
             return Outcome.WAIT, f"{why}; cool-down {settled_for_s:.1f} of {tuning.cool_down_s:g} s"
-        patience = self.spec.patience
+        patience = self.patience
         if patience is not None and self.spent < patience:
             return Outcome.WAIT, f"{why}; staying has cost {self.spent:.3f} of {patience:g}"
         if patience is None and led_for < tuning.time_to_trigger_s:

@@ -32,6 +32,7 @@ from zsched.core.model import (
 )
 from zsched.core.utility import (
     cpu_utility,
+    memory_service,
     memory_utility,
     on_time,
     predicted_use,
@@ -140,7 +141,10 @@ def score(
             unreachable.append(candidate)
             continue
         network_s = round_trips.get(candidate, 0.0)
-        cpu = _cpu(spec, profile, demand, unseen, allocation.tuning, gateway.demands, network_s)
+        # what an owner that is short gets is measured
+        is_owner = candidate == allocation.owner
+        least = 0.0 if is_owner else gateway.share(spec, profile, demand.cpu_cores, unseen.cpu_cores)
+        cpu = _cpu(spec, profile, demand, unseen, allocation.tuning, gateway.demands, network_s, least)
         memory = _memory(spec, profile, demand, unseen, form)
         terms[candidate] = _Terms(cpu, memory, None if link is None else link.utility)
     measured = frozenset(name for name in METRICS if any(getattr(t, name) is not None for t in terms.values()))
@@ -246,8 +250,12 @@ def _cpu(
     tuning: Tuning,
     demands: Demands,
     network_s: float,
+    least_cores: float,
 ) -> float | None:
-    """Eq. 1, or the share of its jobs that the task would get done, in time where it has a deadline."""
+    """Eq. 1, or the share of its jobs that the task would get done, in time where it has a deadline.
+
+    ``least_cores``: so much it gets, however full the machine is.
+    """
     if profile.cpu_used_cores is None:
         return None
     load = profile.worker(spec.name)
@@ -255,7 +263,7 @@ def _cpu(
     used = predicted_use(profile.cpu_used_cores + unseen.cpu_cores, own, demand.cpu_cores)
     if tuning.score is ScoreForm.PAPER:
         return cpu_utility(profile.cpu_cores, used)
-    free, job = profile.cpu_cores - used + demand.cpu_cores, demands.job(spec.name)
+    free, job = max(profile.cpu_cores - used + demand.cpu_cores, least_cores), demands.job(spec.name)
     share, stretch = demands.experience(spec.name, profile)
     if job is None:
         return service_utility(free, demand.cpu_cores, profile.cpu_cores, share=share)
@@ -272,9 +280,8 @@ def _memory(spec: TaskSpec, profile: Profile, demand: Demand, unseen: Demand, fo
     others_mb = used_mb - demand.memory_mb
     if form is ScoreForm.PAPER:
         return memory_utility(profile.memory_mb, demand.memory_mb, others_mb)
-    # what is below the floor is no room: the kernel kills before it is used up
-    room_mb = (1.0 - spec.memory_floor_ratio) * profile.memory_mb - others_mb
-    return service_utility(room_mb, demand.memory_mb, profile.memory_mb)
+    free_mb = profile.memory_mb - others_mb
+    return memory_service(free_mb, demand.memory_mb, profile.memory_mb, spec.memory_floor_ratio)
 
 
 # --- compare: all robots' views (Compare_Utility) --------------------------------------------------------------------

@@ -218,7 +218,7 @@ def _task_status(node: NodeView, spec: TaskSpec, now: float) -> TaskStatus:
         phase=executor.phase.value,
         tuning=value.tuning,
         candidates=spec.candidates,
-        patience=spec.patience,
+        patience=standing.judge.patience,
         round_trips=_round_trips(node, spec) if value.tuning.deadline_ms is not None else (),
         decision=_decision(standing, now),
         vote=_vote(standing, now),

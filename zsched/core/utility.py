@@ -120,6 +120,43 @@ def on_time(job_s: float, deadline_s: float) -> float:
     return 1.0 / (1.0 + math.pow(ratio, STEEPNESS))
 
 
+NEARLY_FULL = 0.15
+"""So much of the memory's term goes where nothing is left beside the task: enough to leave for, in some seconds."""
+
+
+def memory_service(free: float, demand: float, capacity: float, floor_ratio: float) -> float:
+    """`service_utility` of memory, and up to `NEARLY_FULL` of it less where the task leaves less than the floor free.
+
+    A task that has its memory works as well on a full machine as on an empty one, until the kernel kills somebody.
+
+    Args:
+        free: not in use by others, MiB.
+        demand: of the task, MiB, >= 0.
+        capacity: of the machine, MiB, > 0.
+        floor_ratio: of the machine, in [0, 1).
+
+    >>> round(memory_service(free=400.0, demand=300.0, capacity=4000.0, floor_ratio=0.05), 3)
+    0.883
+    """
+    floor = floor_ratio * capacity
+    depth = clamp(1.0 - (free - demand) / floor) if floor > 0.0 else 0.0
+    return service_utility(free, demand, capacity) * (1.0 - NEARLY_FULL * depth)
+
+
+def fair_share(capacity: float, threads: float, others: float) -> float:
+    """Cores that a fair scheduler gives ``threads`` beside ``others`` that all want to run; never more than there are.
+
+    Args:
+        capacity: cores of the machine, > 0.
+        threads: of the task, >= 1.
+        others: that run or wait to run there without it, >= 0, on the mean.
+
+    >>> fair_share(capacity=4.0, threads=3.0, others=5.0)
+    1.5
+    """
+    return min(capacity * threads / max(threads + others, capacity), capacity)
+
+
 KNEE_UTILITY = 0.8
 """What a link is worth at its knee."""
 

@@ -20,6 +20,7 @@ from zsched.adapters.device_profiler import (
     parse_cpu_stat,
     parse_pressure,
     parse_process_stat,
+    parse_running,
     parse_schedstat,
 )
 from zsched.core.model import WorkerState
@@ -104,6 +105,40 @@ def test_machine_with_less_memory_left_than_the_group_may_use_tells_so(tmp_path:
     }
     sample = machine(tmp_path, **files).sample({})
     assert (sample.memory_mb, sample.memory_used_mb) == (3500.0, 500.0)
+
+
+RUNNING = "ctxt 9\nprocesses 7\nprocs_running 6\nprocs_blocked 1\n"
+
+
+def test_who_wants_to_run_is_counted_without_the_profiler(tmp_path: Path) -> None:
+    profiler = machine(tmp_path)
+    assert profiler.sample({}).runnable is None, "this kernel does not tell"
+    text = (tmp_path / "proc/stat").read_text()
+    write(tmp_path, {"proc/stat": text + RUNNING})
+    assert profiler.sample({}).runnable == 5.0
+    write(tmp_path, {"proc/stat": text + RUNNING.replace("6", "0")})
+    assert profiler.sample({}).runnable == 0.0
+
+
+def test_on_some_of_the_cpus_or_under_a_quota_nobody_counts_who_else_wants_them(tmp_path: Path) -> None:
+    some = {"proc/self/status": "Name:\tx\nCpus_allowed_list:\t1\n"}
+    quota = {
+        "proc/self/mountinfo": V2,
+        "proc/self/cgroup": "0::/a\n",
+        "sys/fs/cgroup/a/cpu.max": "50000 100000\n",
+        "sys/fs/cgroup/a/cpu.stat": "usage_usec 1000000\n",
+    }
+    for number, files in enumerate((some, quota)):
+        root = tmp_path / str(number)
+        profiler = machine(root, **files)
+        write(root, {"proc/stat": (root / "proc/stat").read_text() + RUNNING})
+        assert profiler.sample({}).runnable is None
+
+
+def test_a_broken_count_of_who_runs_is_none() -> None:
+    assert parse_running(b"cpu 1\nprocs_running many\n") is None
+    assert parse_running(b"cpu 1\nprocs_running ") is None
+    assert parse_running(b"") is None
 
 
 def test_quota_wider_than_the_machine_is_no_limit(tmp_path: Path) -> None:

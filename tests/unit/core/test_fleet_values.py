@@ -48,7 +48,7 @@ def test_defaults_are_the_design_s_first_ones() -> None:
     assert TUNING.aggregate is Aggregate.MEAN
     assert LinkLimits() == LinkLimits(nu_dbm=-80.0, rho_dbm=-40.0)
     timing = Timing()
-    assert (timing.sample_s, timing.smoothing_s) == (0.2, 1.0)
+    assert (timing.sample_s, timing.smoothing_s) == (0.2, 0.3)
     assert (timing.beat_s, timing.suspect_s) == (0.2, 1.2)
     assert WorkerSpec().command == ()
 

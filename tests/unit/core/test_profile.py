@@ -12,6 +12,7 @@ from zsched.core.profile import (
     RATIO_CHANGE,
     RSSI_CHANGE_DB,
     RSSI_OUTLIER_DB,
+    SIGNAL_SMOOTHING_S,
     Profiler,
     SignalFilter,
 )
@@ -138,9 +139,9 @@ def test_a_radio_that_gives_nothing_is_soon_not_measured_any_more() -> None:
 def test_signals_are_smoothed_in_dbm_and_each_link_for_itself() -> None:
     profiler = make_profiler()
     profiler.absorb(device(), (radio(-60.0), radio(-40.0, "robot2")), now=0.0)
-    profiler.absorb(device(), (radio(-70.0), radio(-40.0, "robot2")), now=TIMING.smoothing_s)
+    profiler.absorb(device(), (radio(-70.0), radio(-40.0, "robot2")), now=SIGNAL_SMOOTHING_S)
 
-    way, direct = taken(profiler, TIMING.smoothing_s).links
+    way, direct = taken(profiler, SIGNAL_SMOOTHING_S).links
     assert way.rssi_dbm == pytest.approx(-60.0 - 10.0 * (1 - math.exp(-1.0)))
     assert direct.peer == "robot2"
     assert direct.rssi_dbm == pytest.approx(-40.0)
@@ -390,3 +391,23 @@ def test_a_profile_carries_the_trend_of_a_radio_and_none_of_a_cable() -> None:
     assert links[0].trend_db_s is not None
     assert -2.0 < links[0].trend_db_s < -1.0
     assert links[1].trend_db_s is None
+
+
+def test_who_wants_to_run_is_smoothed_and_unknown_at_once_where_nobody_counts() -> None:
+    profiler = make_profiler()
+    for at_s, runnable in ((0.0, 2.0), (TIMING.smoothing_s, 10.0)):
+        profiler.absorb(replace(device(), runnable=runnable), (), now=at_s)
+    assert taken(profiler, 1.0).runnable == pytest.approx(2.0 + 8.0 * (1 - math.exp(-1.0)))
+    profiler.absorb(device(), (), now=2.0)
+    assert taken(profiler, 2.0).runnable is None
+    profiler.absorb(replace(device(), runnable=math.nan), (), now=3.0)
+    assert taken(profiler, 3.0).runnable is None
+
+
+@pytest.mark.parametrize(("smoothing_s", "signal_s"), [(0.2, SIGNAL_SMOOTHING_S), (2.0, 2.0), (0.05, 0.05)])
+def test_a_radio_is_smoothed_over_half_a_second_at_least(smoothing_s: float, signal_s: float) -> None:
+    profiler = make_profiler(replace(TIMING, smoothing_s=smoothing_s))
+    for at_s, rssi in ((0.0, -60.0), (0.2, -70.0)):
+        profiler.absorb(device(), (radio(rssi),), now=at_s)
+    (link,) = taken(profiler, 0.2).links
+    assert link.rssi_dbm == pytest.approx(-60.0 - 10.0 * (1 - math.exp(-0.2 / signal_s)))

@@ -18,8 +18,8 @@ from zsched.core.model import (
     WorkerLoad,
     WorkerState,
 )
+from zsched.core.patience import FORGIVEN_IN_S
 from zsched.core.scheduler import (
-    FORGIVEN_IN_S,
     INITIAL_SETTLE_S,
     Judge,
     Judgement,

@@ -5,7 +5,18 @@ from dataclasses import replace
 
 import pytest
 
-from zsched.core.fleet import Demand, Fleet, LinkLimits, NodeSpec, PairReading, Standby, TaskSpec, Timing, WorkerSpec
+from zsched.core.fleet import (
+    PATIENT_BONUS,
+    Demand,
+    Fleet,
+    LinkLimits,
+    NodeSpec,
+    PairReading,
+    Standby,
+    TaskSpec,
+    Timing,
+    WorkerSpec,
+)
 from zsched.core.gateway import Gateway
 from zsched.core.model import (
     Allocation,
@@ -23,6 +34,7 @@ from zsched.core.model import (
     WorkerState,
 )
 from zsched.core.scoring import NO_DOUBTS, Doubts, compare, score
+from zsched.core.utility import NEARLY_FULL, service_utility
 
 CPU = Weights(cpu=1.0, memory=0.0, network=0.0)
 HALVES = Weights(cpu=0.5, memory=0.0, network=0.5)
@@ -117,15 +129,39 @@ def test_machines_that_lack_what_the_task_needs_are_told_apart_by_the_service_fo
     assert found[ScoreForm.SERVICE]["edge1"] < found[ScoreForm.SERVICE]["edge2"] / 4
 
 
-def test_memory_below_the_floor_is_no_room_for_a_task_s_service() -> None:
+def test_a_full_machine_is_worth_the_fair_share_of_it_to_all_but_its_owner() -> None:
+    """Four threads wait beside the task's two; what the owner gets is measured, and was not much."""
+    spec = replace(SPEC, candidates=("edge1", "edge2"), demand=Demand(cpu_cores=2.0))
+    agreed = Allocation(
+        task="merge", revision=7, epoch=3, owner="edge1", tuning=Tuning(weights=CPU, score=ScoreForm.SERVICE)
+    )
+    full = [
+        replace(profile(name, cpu=4.0, own=(0.2 if name == "edge1" else 0.0, 0.0)), runnable=runnable)
+        for name, runnable in (("edge1", 4.0), ("edge2", 4.0))
+    ]
+    told = values(scored(ROBOT, *full, spec=spec, agreed=agreed))
+    untold = values(scored(ROBOT, *(replace(one, runnable=None) for one in full), spec=spec, agreed=agreed))
+    assert told["edge2"] == pytest.approx(service_utility(4.0 * 2 / 6, 2.0, 4.0))
+    assert untold["edge2"] == pytest.approx(0.0)
+    assert told["edge1"] == untold["edge1"] == pytest.approx(service_utility(0.2, 2.0, 4.0))
+
+
+def test_a_task_that_has_its_memory_counts_a_full_machine_less_and_not_for_nothing() -> None:
     half = Weights(cpu=0.5, memory=0.5, network=0.0)
     spec = replace(SPEC, demand=Demand(cpu_cores=0.4, memory_mb=400.0), memory_floor_ratio=0.05)
-    found = {}
-    for form in ScoreForm:
+
+    def term(used_mb: float, form: ScoreForm = ScoreForm.SERVICE) -> float:
         agreed = replace(allocation(half, owner=None), tuning=Tuning(weights=half, score=form))
-        found[form] = scored(ROBOT, profile("edge1", memory=3600.0), spec=spec, agreed=agreed).utilities[0].memory
-    assert found[ScoreForm.PAPER] == 0.0
-    assert found[ScoreForm.SERVICE] == pytest.approx(0.5, abs=0.03)
+        found = scored(ROBOT, profile("edge1", memory=used_mb), spec=spec, agreed=agreed).utilities[0].memory
+        assert found is not None
+        return found
+
+    enough, half_way, nothing = term(3400.0), term(3500.0), term(3600.0)
+    assert term(3600.0, ScoreForm.PAPER) == 0.0
+    assert enough - PATIENT_BONUS > half_way - PATIENT_BONUS > nothing, (
+        "a full one is worth a move, a half full one late"
+    )
+    assert nothing == pytest.approx(enough * (1.0 - NEARLY_FULL), abs=0.01)
 
 
 # --- who is scored -------------------------------------------------------------------------------------------------

@@ -30,6 +30,7 @@ from zsched.core.model import (
     WorkerState,
 )
 from zsched.core.node import Node
+from zsched.core.patience import FIRST_PATIENCE
 from zsched.core.plan import StreamCount
 from zsched.core.snapshot import SCHEMA, Snapshot
 from zsched.core.status import build_snapshot, status_line
@@ -174,10 +175,12 @@ def test_a_beat_says_whether_an_elector_has_lost_its_state(me: str, *, has_state
     assert [beat.has_lost_state for beat in sent] == [me in ROBOTS and not has_state]
 
 
-@pytest.mark.parametrize("patience", [None, 0.2])
-def test_a_task_says_whether_it_is_moved_by_patience(patience: float | None) -> None:
+@pytest.mark.parametrize(("patience", "learns"), [(None, False), (0.2, False), (FIRST_PATIENCE, True)])
+def test_a_task_says_whether_it_is_moved_by_patience(patience: float | None, *, learns: bool) -> None:
     node = make()
-    node.fleet = replace(node.fleet, tasks=tuple(replace(task, patience=patience) for task in node.fleet.tasks))
+    given = None if learns else patience
+    for task in node.rounds.tasks.values():
+        task.judge.spec = replace(task.judge.spec, patience=given, learns_patience=learns)
     snapshot = build_snapshot(node, 100.0)
     assert [task.patience for task in snapshot.tasks] == [patience] * 2
     assert [task["patience"] for task in snapshot_json(snapshot)["tasks"]] == [patience] * 2

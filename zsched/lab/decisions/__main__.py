@@ -16,7 +16,7 @@ from zsched.lab.decisions import drives, figures, report, study
 from zsched.lab.decisions.service import command
 
 PARTS = ("compare", "sweep", "options", "cool-down", "smoothing")
-SHOWN = ("zsched", "zsched, timer", "the weaker way", "dyna_net", "argmax", "dyna_net_penalty")
+SHOWN = ("zsched by service", "zsched", "zsched, timer", "the weaker way", "dyna_net", "argmax", "dyna_net_penalty")
 
 
 def parse() -> argparse.Namespace:
@@ -68,6 +68,8 @@ def show(out: Path, folder: Path | None) -> None:
         for name, title in (("drives", "every candidate follows a recorded drive"), ("robots", "robot to robot")):
             tables[title], moves, world = drives.compare(recorded, are_robots=name == "robots")
             figures.drives(world, moves, SHOWN, f"Recorded drives: {title}", out / f"{name}.png")
+        for title, fleet in drives.apart(folder).items():
+            tables[title] = drives.compare(fleet, are_robots=True)[0]
     report.write(rows, tables, out / "report.md")
     cases = {str(row["case"]) for row in rows}
     if "long" in cases:

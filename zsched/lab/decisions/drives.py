@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from zsched.core.fleet import LinkLimits, PairReading
+from zsched.core.fleet import RADIO_PATIENCE, LinkLimits, PairReading
 from zsched.lab.decisions import entries
 from zsched.lab.decisions.radio import Drive, read_drive
 from zsched.lab.decisions.replay import Entry, replay
@@ -24,6 +24,8 @@ from zsched.lab.decisions.view import Look
 from zsched.lab.decisions.world import World, drives_world
 
 FILES: Final = ("router-5G-trial1.csv.gz", "router-2G-trial1.csv.gz")
+APART: Final = ("router-2G-trial2.csv.gz", "router-2G-trial3.csv.gz", "router-5G-trial2.csv.gz")
+"""Drives that nothing was chosen by: where the folder has them, they are only looked at."""
 SHIFT_S: Final = 120.0
 """The third robot drives as the first one did, two minutes later."""
 WEAK_DBM: Final = -70.0
@@ -50,10 +52,23 @@ def load(folder: Path) -> tuple[Drive, ...]:
     return first, second, first.shifted(SHIFT_S)
 
 
+def apart(folder: Path) -> dict[str, tuple[Drive, ...]]:
+    """{title: three robots' drives} of what ``folder`` has of `APART`: all together, and each by itself, shifted."""
+    found = {name: read_drive(folder / name) for name in APART if (folder / name).exists()}
+    fleets = {drive.name: (drive, drive.shifted(SHIFT_S / 2), drive.shifted(SHIFT_S)) for drive in found.values()}
+    together = {"all three": tuple(found.values())} if len(found) == len(APART) else {}
+    return {f"robot to robot, kept apart: {name}": fleet for name, fleet in (together | fleets).items()}
+
+
 def cast(world: World) -> tuple[Entry, ...]:
     """Who drives: zsched, what it could be, and the yardsticks."""
     return (
         *entries.ours(world),
+        Entry(
+            name="zsched by service",
+            limits=entries.foreseeing(world),
+            make=entries.core(world, patience=RADIO_PATIENCE),
+        ),
         *(
             Entry(name=f"timer, bonus {bonus:g}", make=entries.timed(world, bonus=bonus))
             for bonus in (0.03, 0.05, 0.07)

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from zsched.core.fleet import (
     DEFAULT_FORESEE_S,
-    DEFAULT_PATIENCE,
+    PAPER_PATIENCE,
     PATIENT_BONUS,
     PATIENT_COOL_DOWN_S,
     LinkLimits,
@@ -60,7 +60,7 @@ def core(
     Neither a patience nor a time-to-trigger: the default patience. Signals are `foreseeing`'s affair.
     """
     if patience is None and time_to_trigger_s is None:
-        patience = DEFAULT_PATIENCE
+        patience = PAPER_PATIENCE
     if patience is not None:
         bonus = PATIENT_BONUS if bonus is None else bonus
         cool_down_s = PATIENT_COOL_DOWN_S if cool_down_s is None else cool_down_s
@@ -128,7 +128,7 @@ def grid(world: World) -> tuple[Entry, ...]:
             make=core(world, bonus=bonus, time_to_trigger_s=trigger_s, cool_down_s=cool_s),
         )
         for smoothing_s, bonus, trigger_s, cool_s in itertools.product(
-            (1.0, 3.0), (0.03, 0.05, 0.10, 0.15), (1.0, 2.0, 4.0), (10.0,)
+            (0.3, 1.0, 3.0), (0.03, 0.05, 0.10, 0.15), (1.0, 2.0, 4.0), (10.0,)
         )
     )
     patient = tuple(
@@ -138,7 +138,7 @@ def grid(world: World) -> tuple[Entry, ...]:
             make=core(world, bonus=bonus, cool_down_s=cool_s, patience=patience),
         )
         for smoothing_s, bonus, patience, cool_s in itertools.product(
-            (1.0, 1.5, 3.0), (0.03, 0.05, 0.07), (0.1, 0.2, 0.4, 0.6), (5.0,)
+            (0.3, 1.0, 3.0), (0.03, 0.05, 0.07), (0.1, 0.2, 0.4, 0.55), (2.0,)
         )
     )
     return by_timer + patient
@@ -161,7 +161,9 @@ def smoothings(world: World) -> tuple[Entry, ...]:
             limits=foreseeing(world),
             make=core(world, patience=patience),
         )
-        for smoothing_s, patience in itertools.product((0.5, 0.75, 1.0, 1.5, 2.0, 3.0), (0.1, 0.2, 0.3, 0.35, 0.4, 0.5))
+        for smoothing_s, patience in itertools.product(
+            (0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0), (0.1, 0.2, 0.3, 0.4, 0.5, 0.55)
+        )
     )
 
 
@@ -208,7 +210,7 @@ def costly(world: World, move_cost_s: float) -> tuple[Entry, ...]:
             )
             for horizon_s in (60.0, 120.0)
         ),
-        Entry(name="patience of the cost", make=core(world, patience=max(DEFAULT_PATIENCE, 0.5 * move_cost_s))),
+        Entry(name="patience of the cost", make=core(world, patience=max(PAPER_PATIENCE, 0.5 * move_cost_s))),
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from zsched.config import check_bytes
-from zsched.core.fleet import DEFAULT_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S
+from zsched.core.fleet import PAPER_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S
 from zsched.core.model import Tuning
 from zsched.lab.decisions import entries
 from zsched.lab.decisions.replay import Entry, replay
@@ -88,11 +88,11 @@ def spiky() -> World:
     return replace(world, cpu=use, memory=use, cpu_read=use, memory_read=use)
 
 
-def test_short_spikes_move_nothing_by_default_nor_with_the_timer_and_a_small_bonus_needs_patience() -> None:
-    """Why the timer's bonus is not that of patience (docs/decisions/0017)."""
+def test_short_spikes_move_nothing_by_default_nor_with_the_timer_and_half_the_patience_would_follow() -> None:
+    """Why the patience of the paper's score is not less (docs/decisions/0033)."""
     world = spiky()
     assert [only(world, entry) for entry in entries.ours(world)] == [[], []]
-    assert len(only(world, Entry(name="small bonus", make=entries.timed(world, bonus=0.05)))) >= 1
+    assert len(only(world, Entry(name="half", make=entries.core(world, patience=PAPER_PATIENCE / 2)))) >= 1
 
 
 def test_patience_keeps_equal_nodes_apart_as_well_and_follows_a_step_sooner() -> None:
@@ -148,13 +148,13 @@ def test_the_grid_holds_the_default() -> None:
     world = loaded_world(seed=1, hours=0.05)
     tuning = Tuning(weights=EVEN)
     smoothing = f"s{world.fleet.timing.smoothing_s:g}"
-    default = f"{smoothing} b{PATIENT_BONUS:g} p{DEFAULT_PATIENCE:g} c{PATIENT_COOL_DOWN_S:g}"
+    default = f"{smoothing} b{PATIENT_BONUS:g} p{PAPER_PATIENCE:g} c{PATIENT_COOL_DOWN_S:g}"
     timer = f"{smoothing} b{tuning.bonus:g} t{tuning.time_to_trigger_s:g} c{tuning.cool_down_s:g}"
     assert list(STARS.values()) == [default, timer]
     cast = {entry.name: entry for entry in entries.grid(world)}
     for name, entry in zip((default, timer), entries.ours(world), strict=True):
         assert only(world, cast[name]) == only(world, entry)
         assert cast[name].look == Look(smoothing_s=world.fleet.timing.smoothing_s)
-    name = f"{smoothing} p{DEFAULT_PATIENCE:g}"
+    name = f"{smoothing} p{PAPER_PATIENCE:g}"
     smoothed = {entry.name: entry for entry in entries.smoothings(world)}
     assert only(world, smoothed[name]) == only(world, entries.ours(world)[0])

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from zsched.core.fleet import DEFAULT_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S, Timing
+from zsched.core.fleet import PAPER_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S, Timing
 from zsched.core.model import Tuning
 from zsched.lab.decisions.loads import Array
 from zsched.lab.decisions.replay import Entry, replay
@@ -78,7 +78,7 @@ def _at(table: Array, step: int, column: int) -> float:
     return float(table[step, column])
 
 
-@pytest.mark.parametrize(("tuning", "patience"), [(TIMER, None), (PATIENT, DEFAULT_PATIENCE)])
+@pytest.mark.parametrize(("tuning", "patience"), [(TIMER, None), (PATIENT, PAPER_PATIENCE)])
 @pytest.mark.parametrize(("seed", "scatter"), [(1, 0.0), (2, 0.03)])
 def test_the_replay_makes_the_moves_that_full_nodes_make(
     seed: int, scatter: float, tuning: Tuning, patience: float | None

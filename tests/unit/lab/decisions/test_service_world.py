@@ -25,7 +25,13 @@ NO_MEMORY = np.zeros((1, 0))
 
 def work(*, cores: float, rate_hz: float = 1.0, processes: int = 4, memory_mb: float = 100.0) -> Work:
     return Work(
-        name="a", cpu_s=cores / rate_hz, rate_hz=rate_hz, memory_mb=memory_mb, processes=processes, deadline_s=1.5
+        name="a",
+        cpu_s=cores / rate_hz,
+        rate_hz=rate_hz,
+        memory_mb=memory_mb,
+        processes=processes,
+        deadline_s=1.5,
+        slow_s=1.0,
     )
 
 
@@ -62,14 +68,16 @@ def test_a_slow_machine_takes_more_of_its_cores_for_the_same_jobs() -> None:
 
 def test_a_job_that_takes_longer_than_its_deadline_is_missed() -> None:
     """Four processes beside n others: the job's 2 CPU seconds run on max(4 - n, 16 / (4 + n)) cores."""
-    missed = []
+    missed, slow = [], []
     for busy in (0.0, 1.0, 4.0, 6.0, 16.0):
         others = np.array([[[busy, busy]]])
         given = share(machine(), (work(cores=2.0),), others, NO_MEMORY)
         missed.append((float(given.service[0, 0]), float(given.missed[0, 0])))
+        slow.append(float(given.slow[0, 0]))
     assert missed[:3] == [(1.0, 0.0)] * 3
     assert missed[3] == pytest.approx((0.8, 0.2)), "1.25 s a job: those that are done are in time"
     assert missed[4] == pytest.approx((0.4, 1.0)), "2.5 s a job: all of them are late"
+    assert slow == [0.0, 0.0, 0.0, 1.0, 1.0], "1 s a job beside four others is just not slow, 1.25 s is"
 
 
 def test_memory_has_a_floor_and_the_scarcer_one_decides() -> None:

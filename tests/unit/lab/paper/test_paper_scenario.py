@@ -7,7 +7,7 @@ import pytest
 
 from zsched.adapters.network_profiler import parse_trace
 from zsched.config import load_fleet
-from zsched.core.fleet import DEFAULT_FORESEE_S, PATIENT_BONUS, SERVICE_COOL_DOWN_S, SERVICE_PATIENCE
+from zsched.core.fleet import DEFAULT_FORESEE_S, PATIENT_BONUS, PATIENT_COOL_DOWN_S
 from zsched.core.model import ScoreForm
 from zsched.errors import ConfigError
 from zsched.lab.fleet_runner import read_tree, write_fleet
@@ -149,8 +149,8 @@ def test_every_scheme_makes_a_valid_fleet_file(tmp_path: Path, scenario: Scenari
     assert spec.candidates
     family = SCHEMES[name].family
     if family is Family.OURS:
-        tuned = (spec.patience, spec.tuning.bonus, spec.tuning.cool_down_s, spec.limits.foresee_s)
-        as_it_comes = (SERVICE_PATIENCE, PATIENT_BONUS, SERVICE_COOL_DOWN_S, DEFAULT_FORESEE_S)
+        tuned = (spec.learns_patience, spec.tuning.bonus, spec.tuning.cool_down_s, spec.limits.foresee_s)
+        as_it_comes = (True, PATIENT_BONUS, PATIENT_COOL_DOWN_S, DEFAULT_FORESEE_S)
         assert tuned == as_it_comes, "the product as it comes"
         assert spec.tuning.score is ScoreForm.SERVICE
     elif family is not Family.FIXED:

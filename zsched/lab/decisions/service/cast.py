@@ -12,15 +12,14 @@ from enum import Enum
 from typing import Any, Final, Literal, get_args, get_origin, get_type_hints
 
 from zsched.core.fleet import (
-    DEFAULT_PATIENCE,
     DEFAULT_SCORE,
+    PAPER_PATIENCE,
     PATIENT_BONUS,
     PATIENT_COOL_DOWN_S,
-    SERVICE_COOL_DOWN_S,
-    SERVICE_PATIENCE,
     TaskSpec,
 )
 from zsched.core.model import ScoreForm, Tuning, Weights
+from zsched.core.patience import FIRST_PATIENCE
 from zsched.lab.decisions.entries import PAPER_COST, RAW
 from zsched.lab.decisions.rules import CoreRule, PickRule, Rule
 from zsched.lab.decisions.service.replay import Player, is_of_task
@@ -54,15 +53,15 @@ def zsched(name: str, **settings: Any) -> Player:
     is_told, tells_jobs = bool(given.pop("is_told", True)), bool(given.pop("tells_jobs", True))
     changes = {key: given.pop(key) for key in tuple(given) if is_of_task(key)}
     is_service = given.setdefault("score", DEFAULT_SCORE) is ScoreForm.SERVICE  # no task here weighs the network
-    if "time_to_trigger_s" not in given:
-        changes.setdefault("patience", SERVICE_PATIENCE if is_service else DEFAULT_PATIENCE)
+    if "time_to_trigger_s" not in given and "patience" not in changes:
+        changes.setdefault("learns_patience", is_service)
+        changes["patience"] = FIRST_PATIENCE if is_service else PAPER_PATIENCE
     if changes.get("patience") is not None:
-        cool_down_s = SERVICE_COOL_DOWN_S if is_service else PATIENT_COOL_DOWN_S
-        given = {"bonus": PATIENT_BONUS, "cool_down_s": cool_down_s, **given}
+        given = {"bonus": PATIENT_BONUS, "cool_down_s": PATIENT_COOL_DOWN_S, **given}
     tuning = Tuning(**{"weights": EVEN, **given})
     return Player(
         name=name,
-        make=_core(tuning, changes.get("patience"), changes.get("pays_off_in_s"), move_cost_s),
+        make=_core(tuning, changes, move_cost_s),
         tuning=tuning,
         look=Look(smoothing_s=smoothing_s),
         changes=changes,
@@ -71,10 +70,9 @@ def zsched(name: str, **settings: Any) -> Player:
     )
 
 
-def _core(
-    tuning: Tuning, patience: float | None, pays_off_in_s: float | None, move_cost_s: float
-) -> Callable[[Sight], Rule]:
-    return lambda view: CoreRule(view, tuning, patience=patience, pays_off_in_s=pays_off_in_s, move_cost_s=move_cost_s)
+def _core(tuning: Tuning, changes: Mapping[str, Any], move_cost_s: float) -> Callable[[Sight], Rule]:
+    own = {name: changes[name] for name in ("patience", "learns_patience", "pays_off_in_s") if name in changes}
+    return lambda view: CoreRule(view, tuning, move_cost_s=move_cost_s, **own)
 
 
 def _picks(name: str, weights: Weights, cost: float) -> Player:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from zsched.core.fleet import Demand, Fleet, TaskSpec, Timing
 from zsched.core.model import Tuning
 from zsched.lab.decisions.loads import LONG, Array, Scatter, correlated
-from zsched.lab.decisions.service.machines import Machine, Shared, Work, share
+from zsched.lab.decisions.service.machines import Machine, Shared, Work, alone_s, share
 from zsched.lab.decisions.world import DT_S, EVEN, MEMORY_MB, build_fleet
 
 ROBOTS: Final = 3
@@ -29,6 +29,8 @@ EDGES: Final = {1: 3, 3: 4}
 """{number of tasks: number of machines}."""
 RATES_HZ: Final = (0.5, 5.0)
 MEMORY_SHARES: Final = (0.05, 0.3)
+SLOW_TIMES: Final = 2.0
+"""A job is slow when it takes so many times as long as on the median machine while that is idle."""
 DEADLINE_PERIODS: Final = 1.5
 """A job is late when it takes longer than so many periods of its task."""
 LEAST_PAUSE_S: Final = (10.0, 20.0)
@@ -64,6 +66,8 @@ class History:
     cpu_error: Array
     """[T, C]: what a reading adds to the cores in use, as a share of the machine."""
     memory_error: Array
+    running_error: Array
+    """[T, C]: what a count of the threads that want to run adds to the cores that are wanted."""
     size: float
     """The largest task, as a share of the median machine."""
 
@@ -156,8 +160,17 @@ def build(*, seed: int, hours: float, load_s: float, tasks: int = 1, scatter: Sc
         begins=begins,
         cpu_error=np.stack(errors[0], axis=1),
         memory_error=np.stack(errors[1], axis=1),
+        running_error=np.stack(
+            [_counted(steps, idle[index][0] * machine.cores, rng) for index, machine in enumerate(machines)], axis=1
+        ),
         size=max(sizes),
     )
+
+
+def _counted(steps: int, background: float, rng: np.random.Generator) -> Array:
+    """[steps]: at the moment of a count each thread of the background runs or does not; less their mean."""
+    threads = math.ceil(background)
+    return rng.binomial(threads, background / threads, steps).astype(np.float64) - background
 
 
 def _between(span: tuple[float, float], rng: np.random.Generator) -> float:
@@ -168,13 +181,15 @@ def _between(span: tuple[float, float], rng: np.random.Generator) -> float:
 def _work(name: str, cores: float, machines: tuple[Machine, ...], rng: np.random.Generator) -> Work:
     """A task that takes ``cores`` of speed 1, with enough processes for the slowest machine."""
     rate_hz = _between(RATES_HZ, rng)
+    cpu_s, processes = cores / rate_hz, math.ceil(cores / min(machine.speed for machine in machines))
     return Work(
         name=name,
-        cpu_s=cores / rate_hz,
+        cpu_s=cpu_s,
         rate_hz=rate_hz,
         memory_mb=float(rng.uniform(*MEMORY_SHARES)) * MEMORY_MB,
-        processes=math.ceil(cores / min(machine.speed for machine in machines)),
+        processes=processes,
         deadline_s=DEADLINE_PERIODS / rate_hz,
+        slow_s=SLOW_TIMES * float(np.median([alone_s(cpu_s, processes, machine) for machine in machines])),
     )
 
 

@@ -37,6 +37,8 @@ class Figures:
     """Jobs done per second and task."""
     missed: float
     """Share of the jobs that were not done, or later than the deadline."""
+    slow: float
+    """Share of the jobs that were not done, or took twice as long as on the idle median machine."""
     moves: int
     wasted: int
     """Moves that lost more than they gained until the task's next one."""
@@ -66,7 +68,7 @@ class _Past:
 
 def truth(history: History, placed: Where, begin: int, end: int, name: str = "service") -> Array:
     """[end - begin, K] of one field of `Shared` under ``placed``; a task without a machine does nothing."""
-    out = np.full((end - begin, len(placed)), 1.0 if name == "missed" else 0.0)
+    out = np.full((end - begin, len(placed)), 1.0 if name in {"missed", "slow"} else 0.0)
     stretch = history.stretch[begin:end]
     for task, machine in enumerate(placed):
         if machine is not None:
@@ -79,10 +81,11 @@ def judge(history: History, moves: Sequence[Sequence[Move]], prices_s: Sequence[
     """What one rule's moves (one list per task) were worth on one history, at every price."""
     runs, past = _course(history, moves)
     rates = np.array([work.rate_hz for work in history.works])
-    served, missed = np.zeros(len(rates)), np.zeros(len(rates))
+    served, missed, slow = (np.zeros(len(rates)) for _ in range(3))
     for run in runs:
         served += truth(history, run.placed, run.begin, run.end).sum(axis=0) * DT_S
         missed += truth(history, run.placed, run.begin, run.end, "missed").sum(axis=0) * DT_S
+        slow += truth(history, run.placed, run.begin, run.end, "slow").sum(axis=0) * DT_S
     total_s = (history.steps - round(SKIP_S / DT_S)) * DT_S
     moved = np.array([sum(one.task == task for one in past) for task in range(len(rates))])
     gains = [_gain(history, runs, past, index) for index in range(len(past))]
@@ -94,6 +97,7 @@ def judge(history: History, moves: Sequence[Sequence[Move]], prices_s: Sequence[
             lost=float(1.0 - (served - moved * price_s).sum() / (total_s * len(rates))),
             outputs_hz=float((rates * (served - moved * price_s)).sum() / (total_s * len(rates))),
             missed=float((rates * (missed + moved * price_s)).sum() / (rates.sum() * total_s)),
+            slow=float((rates * (slow + moved * price_s)).sum() / (rates.sum() * total_s)),
             moves=len(past),
             wasted=sum(gain < price_s for gain in gains),
             felt=felt,

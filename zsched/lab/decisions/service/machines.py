@@ -35,12 +35,14 @@ class Work:
     processes: int
     deadline_s: float
     """A job that takes longer comes too late."""
+    slow_s: float
+    """A job that takes longer is slow, in time or not."""
 
     def demand(self, machine: Machine) -> float:
-        """Cores of ``machine`` that it takes to do every job in time.
+        """Cores of ``machine`` that it takes to do every job.
 
         >>> slow = Machine(cores=4.0, speed=0.5, memory_mb=4000.0)
-        >>> Work(name="a", cpu_s=0.4, rate_hz=2.0, memory_mb=10.0, processes=2, deadline_s=1.0).demand(slow)
+        >>> Work(name="a", cpu_s=0.4, rate_hz=2.0, memory_mb=10.0, processes=2, deadline_s=1.0, slow_s=1.0).demand(slow)
         1.6
         """
         return self.cpu_s * self.rate_hz / machine.speed
@@ -73,6 +75,15 @@ def share_out(capacity: float, wanted: Array, heads: Array) -> Array:
     return got
 
 
+def alone_s(cpu_s: float, processes: int, machine: Machine) -> float:
+    """How long a job of ``cpu_s`` takes by so many processes on a machine that is idle.
+
+    >>> alone_s(0.4, 3, Machine(cores=2.0, speed=0.5, memory_mb=4000.0))
+    0.4
+    """
+    return cpu_s / machine.speed / min(processes, machine.cores)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shared:
     """What a machine shows and gives in S situations while some tasks (M of them) are on it."""
@@ -87,6 +98,8 @@ class Shared:
     """[S, M]: the share of its jobs that each of the tasks does."""
     missed: Array
     """[S, M]: the share of its jobs that are not done, or too late."""
+    slow: Array
+    """[S, M]: the share of its jobs that are not done, or slow."""
 
 
 def share(machine: Machine, works: tuple[Work, ...], others: Array, others_mb: Array) -> Shared:
@@ -112,14 +125,15 @@ def share(machine: Machine, works: tuple[Work, ...], others: Array, others_mb: A
     memory = share_out(machine.memory_mb, wanted_mb, (wanted_mb > 0).astype(float))[:, others_mb.shape[1] :]
     paged = memory / needed_mb if works else memory
     service = np.minimum(cores / np.array([work.demand(machine) for work in works]), paged) if works else cores
-    missed = np.ones_like(service)
+    missed, slow = np.ones_like(service), np.ones_like(service)
     for index, work in enumerate(works):
         # While a job runs, all of its processes do: it wants more cores than on the mean.
         at_work = wanted.copy()
         at_work[:, others.shape[1] + index] = processes[index]
         runs_on = share_out(machine.cores, at_work, heads)[:, others.shape[1] + index] * paged[:, index]
-        is_late = work.cpu_s / machine.speed > work.deadline_s * runs_on
-        missed[:, index] = np.where(is_late, 1.0, 1.0 - service[:, index])
+        for out, within_s in ((missed, work.deadline_s), (slow, work.slow_s)):
+            is_over = work.cpu_s / machine.speed > within_s * runs_on
+            out[:, index] = np.where(is_over, 1.0, 1.0 - service[:, index])
     return Shared(
         cores_wanted=wanted.sum(axis=1),
         memory_wanted=wanted_mb.sum(axis=1),
@@ -127,4 +141,5 @@ def share(machine: Machine, works: tuple[Work, ...], others: Array, others_mb: A
         memory=memory,
         service=service,
         missed=missed,
+        slow=slow,
     )

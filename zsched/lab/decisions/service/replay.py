@@ -77,7 +77,9 @@ class Scene:
         self._profilers = {node.name: Profiler(node.name, 1, timing) for node in self.fleet.nodes}
         self._ready = dict.fromkeys(self.values, WorkerState.READY)
         self._stretch = history.stretch.tolist()
-        self._errors = history.cpu_error.tolist(), history.memory_error.tolist()
+        self._errors = tuple(
+            error.tolist() for error in (history.cpu_error, history.memory_error, history.running_error)
+        )
         self._shown = [
             [
                 tuple(
@@ -131,6 +133,7 @@ class Scene:
             memory_used_mb=min(max(used_mb, 0.0), machine.memory_mb),
             workers=tuple(workers),
             speed=machine.speed,
+            runnable=max(cores_wanted[stretch] + self._errors[2][index][column], 0.0) if self._is_told else None,
         )
 
     def _tell_jobs(self, profiler: Profiler, column: int, index: int, now: float) -> None:

@@ -102,6 +102,7 @@ def _mean(every: list[Figures]) -> Figures:
         lost=fmean(one.lost for one in every),
         outputs_hz=fmean(one.outputs_hz for one in every),
         missed=fmean(one.missed for one in every),
+        slow=fmean(one.slow for one in every),
         moves=0,
         wasted=0,
         felt=0,

@@ -108,6 +108,7 @@ def costs(rows: Sequence[Row], title: str) -> str:
                 "" if name == OURS else beside(mine, where(loaded, rule=OURS)),
                 f"{statistics.fmean(float(row['outputs_hz']) for row in mine):.3f}",
                 f"{100.0 * statistics.fmean(float(row['missed']) for row in mine):.2f}",
+                f"{100.0 * statistics.fmean(float(row['slow']) for row in mine):.2f}",
                 f"{moves:.1f}",
                 f"{wasted:.1f}",
             )
@@ -119,6 +120,7 @@ def costs(rows: Sequence[Row], title: str) -> str:
         f"beside {OURS}, points",
         "outputs / s",
         "missed %",
+        "slow %",
         "moves / h",
         "wasted / h",
     )

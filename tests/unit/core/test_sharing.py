@@ -1,0 +1,69 @@
+"""What a task would get of a machine that is full: fair shares, and what it was seen to get there."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from zsched.core.model import Profile, WorkerLoad, WorkerState
+from zsched.core.sharing import Shares
+from zsched.core.utility import fair_share
+
+
+def profile(
+    *, runnable: float | None = 8.0, got: float | None = 1.0, wanted: float | None = None, node: str = "edge1"
+) -> Profile:
+    return Profile(
+        node=node,
+        incarnation=1,
+        sequence=1,
+        cpu_cores=4.0,
+        cpu_used_cores=4.0,
+        memory_mb=4000.0,
+        memory_used_mb=1000.0,
+        workers=(WorkerLoad(task="merge", state=WorkerState.READY, cpu_cores=got, wanted_cores=wanted),),
+        runnable=runnable,
+    )
+
+
+def test_by_its_need_until_it_was_seen_to_lack_cpu_then_by_its_threads() -> None:
+    shares = Shares()
+    assert shares.at("merge", profile(), 2.0) == pytest.approx(4.0 * 2 / 10)
+    assert shares.at("merge", profile(), 0.3) == pytest.approx(4.0 / 9), "one thread at least"
+    assert not shares.learn("merge", profile(got=0.7)), "it has what it wants"
+    assert shares.learn("merge", profile(got=2.0, wanted=4.0))
+    assert shares.at("merge", profile(node="edge2"), 0.3) == pytest.approx(4.0 * 4 / 12)
+
+
+def test_what_comes_shares_as_well_and_nobody_counted_is_nothing() -> None:
+    assert Shares().at("merge", profile(), 2.0, coming_cores=6.0) == pytest.approx(4.0 * 2 / 16)
+    assert Shares().at("merge", profile(runnable=None), 2.0) == 0.0
+    assert not Shares().learn("merge", profile(runnable=None, wanted=3.0))
+
+
+def test_where_it_got_less_than_its_share_that_is_believed_of_this_machine_only() -> None:
+    """Groups with weights of their own: 4 threads of 8 got a quarter of what is fair."""
+    shares = Shares()
+    shares.learn("merge", profile(got=0.5, wanted=4.0))
+    fair = 4.0 * 4 / 12
+    assert shares.at("merge", profile(), 4.0) == pytest.approx(fair / 4)
+    assert shares.at("merge", profile(node="edge2"), 4.0) == pytest.approx(fair)
+    shares.learn("merge", profile(got=9.0, wanted=4.0))
+    assert shares.at("merge", profile(), 4.0) == pytest.approx(fair), "the newest counts, and no more than is fair"
+
+
+def test_the_same_again_is_no_news() -> None:
+    shares = Shares()
+    assert shares.learn("merge", profile(got=0.5, wanted=4.0))
+    assert not shares.learn("merge", profile(got=0.5, wanted=4.0))
+
+
+@given(st.floats(0.1, 4096.0), st.floats(1.0, 1e4), st.floats(0.0, 1e6), st.floats(0.0, 1e3))
+def test_a_share_is_no_more_than_there_is_or_than_the_threads_can_use_and_falls_with_the_others(
+    capacity: float, threads: float, others: float, more: float
+) -> None:
+    share = fair_share(capacity, threads, others)
+    assert 0.0 < share <= min(capacity, threads) * (1 + 1e-9)
+    assert fair_share(capacity, threads, others + more) <= share
+    assert fair_share(capacity, threads + more, others) >= share * (1 - 1e-9)
