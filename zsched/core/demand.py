@@ -10,6 +10,7 @@ the same but for a common factor, so a constant fleet has no limit cycle.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 from zsched.core.fleet import Demand, TaskSpec
@@ -83,6 +84,8 @@ class _Known:
     owner: NodeId | None = None
     since: float = 0.0
     """When it was first looked at there."""
+    at: float = 0.0
+    """When it was looked at last."""
 
 
 class Demands:
@@ -117,11 +120,14 @@ class Demands:
             told = _told(load, speed, max(fastest or speed, speed))
             least = max(use, known.work or 0.0)
             is_held = known.is_sure and known.work == least
+            is_starved = profile.cpu_used_cores / profile.cpu_cores >= STARVED_CPU_RATIO
             if told is not None:
-                found = replace(found, work=max(told, known.work or 0.0) if is_new else told, is_sure=True)
+                # what a task uses falls at once when a load comes; what it leaves undone is counted in whole jobs
+                kept = 1.0 if is_new else math.exp(-max(now - found.at, 0.0) / SETTLE_S) if is_starved else 0.0
+                found = replace(found, work=max(told, kept * (known.work or 0.0)), is_sure=True)
             elif most > use and not (is_held and least <= most):
                 found = replace(found, work=min(UNSURE * use, most), is_sure=False)
-            elif most > use or is_new or profile.cpu_used_cores / profile.cpu_cores >= STARVED_CPU_RATIO:
+            elif most > use or is_new or is_starved:
                 found = replace(found, work=least, is_sure=is_held)
             else:
                 found = replace(found, work=use, is_sure=True)
@@ -129,7 +135,7 @@ class Demands:
             found = replace(found, job=_job(load.jobs, speed_of(profile), known.job))
             if not is_new:
                 self._note_shortfall(task, profile, load, found)
-        self._known[task] = found
+        self._known[task] = found = replace(found, at=now)
         return load.jobs is not None or (found.work, found.memory_mb) != (known.work, known.memory_mb)
 
     def _note_shortfall(self, task: TaskId, profile: Profile, load: WorkerLoad, found: _Known) -> None:

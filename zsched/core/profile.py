@@ -40,6 +40,8 @@ from zsched.core.model import (
 
 RATIO_CHANGE = 0.02
 """A CPU or memory ratio that moved by this much is worth a profile before its time."""
+JOB_SMOOTHING_S = 1.0
+"""Least time constant of what workers say of their jobs: a job or two in a sample is no rate."""
 JOB_CHANGE = 0.2
 """So is a worker's share of done jobs that moved by this much, or its time per job by this part."""
 RSSI_CHANGE_DB = 1.0
@@ -147,7 +149,7 @@ class Profiler:
 
     def note_jobs(self, report: WorkerJobs, now: float) -> bool:
         """Take in what a worker of this node says of its jobs; whether it can be true."""
-        meter = self._jobs.setdefault(report.task, JobMeter(self._timing.smoothing_s))
+        meter = self._jobs.setdefault(report.task, JobMeter(max(self._timing.smoothing_s, JOB_SMOOTHING_S)))
         return meter.absorb(report, now)
 
     def _link(self, sample: LinkSample, now: float) -> Link:
