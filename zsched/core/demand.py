@@ -10,6 +10,7 @@ the same but for a common factor, so a constant fleet has no limit cycle.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 from zsched.core.fleet import Demand, TaskSpec
@@ -23,6 +24,8 @@ SETTLE_S = 4.0
 """What a task uses still rises for so long after it has come, for the figures are smoothed: the least that it needs."""
 
 
+NEED_S = 3.0
+"""Time constant of a need that a worker's own word says."""
 CALM_WAIT_RATIO = 0.1
 """Jobs that wait for a CPU for no more of their time show how long they wait for their turn where nothing is short."""
 QUEUE_RATIO = 2.0
@@ -78,6 +81,8 @@ class _Known:
     work: float | None = None
     is_sure: bool = False
     """It was measured where the task had all that it needs; otherwise the need may be larger."""
+    told_at: float | None = None
+    """When the worker's own word last said it."""
     memory_mb: float | None = None
     job: JobNeed | None = None
     owner: NodeId | None = None
@@ -118,7 +123,10 @@ class Demands:
             least = max(use, known.work or 0.0)
             is_held = known.is_sure and known.work == least
             if told is not None:
-                found = replace(found, work=max(told, known.work or 0.0) if is_new else told, is_sure=True)
+                if known.told_at is not None and known.work is not None:  # whole jobs come and go: a few of them count
+                    told = known.work + (told - known.work) * -math.expm1(-max(now - known.told_at, 0.0) / NEED_S)
+                work = max(told, known.work or 0.0) if is_new else told
+                found = replace(found, work=work, is_sure=True, told_at=now)
             elif most > use and not (is_held and least <= most):
                 found = replace(found, work=min(UNSURE * use, most), is_sure=False)
             elif most > use or is_new or profile.cpu_used_cores / profile.cpu_cores >= STARVED_CPU_RATIO:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zsched.core.demand import QUEUE_RATIO, SETTLE_S, STARVED_CPU_RATIO, UNSURE, Demands
+from zsched.core.demand import NEED_S, QUEUE_RATIO, SETTLE_S, STARVED_CPU_RATIO, UNSURE, Demands
 from zsched.core.fleet import Demand, TaskSpec
 from zsched.core.model import Jobs, Profile, Tuning, Weights, WorkerLoad, WorkerState
 
@@ -177,7 +178,16 @@ def test_cpu_time_that_rises_by_a_tenth_under_contention_raises_the_need_by_no_m
 
 def test_a_need_that_was_told_falls_again_on_a_full_machine() -> None:
     """What is only used there would be the least of it."""
-    assert learnt(told(9.0, got=0.5), told(5.0, got=0.5)).cpu_cores == pytest.approx(0.5)
+    before, after = told(9.0, got=0.5), told(5.0, got=0.5)
+    assert learnt(before, *[after] * 4).cpu_cores == pytest.approx(0.5, abs=0.01)
+
+
+def test_a_need_that_was_told_follows_a_few_jobs_and_not_one() -> None:
+    """A worker of long jobs has done one more, or one less, whenever one looks: one look is not the need."""
+    steady, one_more = told(5.0), told(9.0)
+    assert learnt(*[steady] * 6, one_more, every_s=1.0).cpu_cores == pytest.approx(
+        0.5 + 0.4 * (1 - math.exp(-1 / NEED_S))
+    )
 
 
 def test_samples_that_no_core_could_do_are_not_needed() -> None:
