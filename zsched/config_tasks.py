@@ -142,7 +142,7 @@ def _tuning(given: Section, out: Collector) -> Tuning | None:
         return None
     scheduling: Section | None = given.get("scheduling")
     score = _score(scheduling)
-    deadline = {} if scheduling is None else _deadline(scheduling, score, out)
+    deadline = {} if scheduling is None else _deadline(scheduling, score, weights, out)
     patient: dict[str, Any] = {"bonus": PATIENT_BONUS, "cool_down_s": PATIENT_COOL_DOWN_S}
     if scheduling is None:
         return Tuning(weights=weights, score=score, **patient)
@@ -151,7 +151,7 @@ def _tuning(given: Section, out: Collector) -> Tuning | None:
     return scheduling.build(Tuning, out, weights=weights, **more)
 
 
-def _deadline(scheduling: Section, score: ScoreForm, out: Collector) -> dict[str, float | None]:
+def _deadline(scheduling: Section, score: ScoreForm, weights: Weights, out: Collector) -> dict[str, float | None]:
     """``deadline_ms`` as the tuning has it, which is the objective at the same time."""
     objective = scheduling.values.get("objective", Objective.SERVICE)
     deadline_ms: float | None = scheduling.values.get("deadline_ms")
@@ -164,6 +164,9 @@ def _deadline(scheduling: Section, score: ScoreForm, out: Collector) -> dict[str
     elif objective is Objective.LATENCY and score is ScoreForm.PAPER:
         message = "the paper's score knows no deadlines: objective latency goes with score service"
         out.error(scheduling.where("objective"), message, "score: service, or objective: service without deadline_ms")
+    elif objective is Objective.LATENCY and not weights.cpu:
+        message = "jobs are in time or late by the CPU of a machine, and this task gives the CPU no weight"
+        out.error(scheduling.where("objective"), message, "a weight for cpu, or objective: service")
     else:
         return {"deadline_ms": deadline_ms}
     return {"deadline_ms": None}

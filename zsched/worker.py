@@ -307,7 +307,6 @@ class Worker:
             signal.setitimer(signal.ITIMER_REAL, ALARM_S)
         self._dispatcher.close()
         self._troubles.close()
-        self._jobs.close()
         self._debts.settle(monotonic_s())
         self._acks.close()
         self._keeper.close()

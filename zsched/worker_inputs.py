@@ -100,6 +100,7 @@ class Dispatcher:
         with self._wake:
             self._is_closed = True
             self._wake.notify()
+        self._jobs.close()
         if self._thread is not threading.current_thread():
             self._thread.join(JOIN_S)
 

@@ -227,6 +227,12 @@ def test_half_an_objective_is_a_fault_that_says_what_is_missing(given: str, word
         assert word in result.report()
 
 
+def test_a_deadline_counts_with_the_cpu() -> None:
+    text = swapped(SCHEDULED, "    scheduling: {objective: latency, deadline_ms: 80}\n")
+    without = re.sub(r"weights: {.*}", "weights: {cpu: 0, memory: 1, network: 0}", text)
+    assert "this task gives the CPU no weight" in check_bytes(without.encode()).report()
+
+
 def test_a_deadline_of_a_worker_that_tells_nothing_is_worth_a_word() -> None:
     text = swapped(SCHEDULED, "    scheduling: {objective: latency, deadline_ms: 80}\n")
     assert "judged by service" not in check_bytes(text.encode()).report()

@@ -469,7 +469,7 @@ class Node:
             now=now,
             progress=progress,
             reasons=self._workers.told(now),
-            echoes=self.round_trips.echoes(now) if self._has_deadlines else (),
+            echoes=self.round_trips.echoes(now),
         )
         if profile is not None:
             if self._has_deadlines:

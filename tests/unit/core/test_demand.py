@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -177,7 +178,15 @@ def test_cpu_time_that_rises_by_a_tenth_under_contention_raises_the_need_by_no_m
 
 def test_a_need_that_was_told_falls_again_on_a_full_machine() -> None:
     """What is only used there would be the least of it."""
-    assert learnt(told(9.0, got=0.5), told(5.0, got=0.5)).cpu_cores == pytest.approx(0.5)
+    before, after = told(9.0, got=0.5), told(5.0, got=0.5)
+    assert learnt(before, *[after] * 4).cpu_cores == pytest.approx(0.5, abs=0.01)
+
+
+@pytest.mark.parametrize(("used", "need"), [(4.0, 0.8 * math.exp(-1.0 / SETTLE_S)), (2.0, 0.5)])
+def test_a_full_machine_holds_a_need_that_was_told_for_a_while(used: float, need: float) -> None:
+    """When a load comes, what is used falls at once, and what is left undone is seen after some jobs."""
+    before, after = told(8.0, used=used), told(5.0, used=used)
+    assert learnt(*[before] * 6, after, every_s=1.0).cpu_cores == pytest.approx(need)
 
 
 def test_samples_that_no_core_could_do_are_not_needed() -> None:

@@ -32,6 +32,7 @@ from zsched.core.model import (
     Beat,
     DeviceSample,
     DurableState,
+    Echo,
     NodeKind,
     PeerState,
     Profile,
@@ -40,6 +41,7 @@ from zsched.core.model import (
     Tuning,
     UtilityVector,
     Weights,
+    WorkerLoad,
     WorkerState,
 )
 from zsched.core.node import Node
@@ -416,7 +418,7 @@ def test_a_relay_that_has_gone_leaves_every_slot_to_be_taken_again() -> None:
     node = started(learnt=value(1, "edge1"))
     for event in (ev.SlotReady(task="merge", epoch=1), ev.SlotFlipped(task="merge", epoch=1)):
         node.handle(event, 101.0)
-    assert build_snapshot(node, 110.0).tasks[0].problems == ()
+    assert build_snapshot(node, 111.0).tasks[0].problems == ()
     node.handle(ev.RelayChanged(is_running=False, reason="exited"), 110.0)
     node.handle(ev.RelayChanged(is_running=True), 110.5)
     (problem,) = build_snapshot(node, 115.0).tasks[0].problems
@@ -731,3 +733,63 @@ def test_a_profile_that_comes_late_hurries_no_decision_by_what_it_says() -> None
         late = replace(new, sequence=sequence, draining=True)
         assert not of(node.handle(ev.ProfileReceived(profile=late), now + 0.001), do.AskUtilities)
         assert node.rounds.next_deadline() == due
+
+
+# --- the workers' word of their jobs -------------------------------------------------------------------------------
+
+
+def word(done: int, **more: Any) -> ev.WorkerJobs:
+    figures = {"time_s": 0.1 * done, "cpu_s": 0.05 * done, "wait_s": 0.0}
+    return ev.WorkerJobs(task="merge", incarnation="7", at_s=float(done), done=done, **{**figures, **more})
+
+
+def test_what_a_worker_here_says_of_its_jobs_is_in_the_next_profile_and_in_the_status() -> None:
+    node = started("edge1")
+    node.handle(ev.WorkerChanged(task="merge", state=WorkerState.READY), 100.0)
+    sample = replace(SAMPLE, workers=(WorkerLoad(task="merge", state=WorkerState.READY, cpu_cores=0.5, memory_mb=9.0),))
+    published: list[do.PublishProfile] = []
+    for number in range(1, 11):
+        now = 100.0 + number
+        for event in (word(5 * number), ev.ProfileSampled(device=sample)):
+            published += of(node.handle(event, now), do.PublishProfile)
+    jobs = published[-1].profile.workers[0].jobs
+    assert jobs is not None
+    assert jobs.time_s == pytest.approx(0.1)
+    assert jobs.cpu_s == pytest.approx(0.05)
+    assert node.counters["jobs_refused"] == 0
+    (shown,) = (one for one in build_snapshot(node, 110.0).nodes if one.name == "edge1")
+    assert shown.workers[0].jobs is not None
+
+
+def test_a_worker_s_word_that_cannot_be_true_or_is_of_no_worker_here_only_counts() -> None:
+    node = started("edge1")
+    node.handle(word(50), 100.0)
+    for number, lie in enumerate((word(10), word(60, cpu_s=1e9), replace(word(60), task="other")), 1):
+        node.handle(lie, 101.0)
+        assert node.counters["jobs_refused"] == number
+
+
+def test_profiles_are_echoed_in_a_fleet_with_a_deadline_and_only_there() -> None:
+    late = replace(FLEET.tasks[0], tuning=replace(TUNING, deadline_ms=100.0))
+    for fleet, is_echoed in ((FLEET, False), (replace(FLEET, tasks=(late,)), True)):
+        node = Node(
+            fleet=fleet,
+            me="robot1",
+            durable=durable("robot1"),
+            incarnation=7,
+            electorate=ELECTORATE,
+            rng=Random(1),
+            now=100.0,
+        )
+        node.start(100.0)
+        node.handle(ev.BeatReceived(beat=beat("edge1")), 100.0)
+        (own,) = of(node.handle(ev.ProfileSampled(device=SAMPLE), 100.0), do.PublishProfile)
+        echo = Echo(node="robot1", incarnation=7, sequence=own.profile.sequence, held_s=0.5)
+        heard = profile("edge1").profile
+        node.handle(ev.ProfileReceived(profile=replace(heard, echoes=(echo,))), 100.52)
+        (own,) = of(node.handle(ev.ProfileSampled(device=SAMPLE), 101.02), do.PublishProfile)
+        found = [(one.node, one.sequence, round(one.held_s, 3)) for one in own.profile.echoes]
+        assert found == ([("edge1", heard.sequence, 0.5)] if is_echoed else [])
+        assert {name: round(far_s, 3) for name, far_s in node.round_trips.seconds().items()} == (
+            {"edge1": 0.02} if is_echoed else {}
+        )

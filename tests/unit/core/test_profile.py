@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 
+from zsched.core.events import WorkerJobs
 from zsched.core.fleet import Timing
 from zsched.core.means import STALE_S, Ewma
 from zsched.core.model import DeviceSample, LinkSample, LinkSource, Profile, WorkerLoad, WorkerState
@@ -411,3 +412,30 @@ def test_a_radio_is_smoothed_over_half_a_second_at_least(smoothing_s: float, sig
         profiler.absorb(device(), (radio(rssi),), now=at_s)
     (link,) = taken(profiler, 0.2).links
     assert link.rssi_dbm == pytest.approx(-60.0 - 10.0 * (1 - math.exp(-0.2 / signal_s)))
+
+
+# --- the workers' word ---------------------------------------------------------------------------------------------
+
+
+def test_a_job_that_takes_another_time_is_worth_a_profile_before_its_time() -> None:
+    """Nothing else has changed: the task waits in a queue for the CPU, and the machine is as full as it was."""
+    profiler = make_profiler(replace(TIMING, publish_s=60.0))
+    now, done, time_s = 0.0, 0, 0.0
+
+    def goes_on(job_s: float, count: int) -> list[Profile]:
+        nonlocal now, done, time_s
+        sent = []
+        for _ in range(count):
+            now, done, time_s = now + 0.2, done + 2, time_s + 2 * job_s
+            word = WorkerJobs(task="merge", incarnation="1", at_s=now, done=done, time_s=time_s, cpu_s=0.03 * done)
+            assert profiler.note_jobs(word, now)
+            profiler.absorb(device(4.0, 1000.0, load(0.3, 100.0)), (), now)
+            sent.append(profiler.publishable(READY, is_draining=False, now=now))
+        return [one for one in sent if one is not None]
+
+    goes_on(0.035, 40)
+    assert goes_on(0.035, 40) == []
+    sent = goes_on(0.22, 2)
+    assert sent, "within 0.4 s"
+    assert sent[0].workers[0].jobs is not None
+    assert sent[0].workers[0].jobs.time_s > 0.042

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -164,6 +165,25 @@ def test_rate_bounds_merges_and_no_input_no_merge(view: View) -> None:
     assert service.step(is_active=True)
     wire.now_s += 0.26
     assert not service.step(is_active=True)
+
+
+def test_every_merge_is_a_job_told_how_many_could_have_been_made_since_it_was_due(view: View) -> None:
+    """Four a second: a merger that comes back after a second has left three out, and none that nobody wanted."""
+    wire, skipped = _Wire(), list[int]()
+
+    def job(count: int) -> AbstractContextManager[object]:
+        skipped.append(count)
+        return nullcontext()
+
+    settings = MergerSettings(mode=Mode.KNOWN, poses=_POSES)
+    service = MapMergeService(settings, wire.publish, clock=wire.clock, rate_hz=4.0, job=job, spawn=lambda work: work())
+    for number, (waits_s, late_s) in enumerate(((0.0, 0.0), (0.25, 0.0), (0.25, 0.8), (60.0, 0.0), (60.0, 0.3))):
+        wire.now_s += waits_s
+        _feed(service, view, "robot1")
+        wire.now_s += late_s
+        assert service.step(is_active=True)
+        assert len(skipped) == number + 1
+    assert skipped == [0, 0, 3, 0, 1]
 
 
 def test_status_goes_on_while_nothing_comes_in(view: View) -> None:
