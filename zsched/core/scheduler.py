@@ -186,7 +186,8 @@ class Judge:
             return Outcome.PROPOSE, f"vote called; {why}"
         if settled_for_s < tuning.cool_down_s:
             return Outcome.WAIT, f"{why}; cool-down {settled_for_s:.1f} of {tuning.cool_down_s:g} s"
-        patience = self.patience
+        # What an owner that may not be scored is worth, nobody knows: it is left by the time alone.
+        patience = self.patience if owner in scored else None
         if patience is not None and self.spent < patience:
             return Outcome.WAIT, f"{why}; staying has cost {self.spent:.3f} of {patience:g}"
         if patience is None and led_for < tuning.time_to_trigger_s:

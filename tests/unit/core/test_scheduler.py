@@ -400,6 +400,13 @@ def test_with_patience_a_task_moves_once_staying_has_cost_it(challenger: float, 
     assert moved_after({"edge1": 0.5, "edge2": challenger + 1e-6}) == after_s
 
 
+def test_a_patient_task_leaves_an_owner_that_may_not_be_scored_by_the_time_to_trigger() -> None:
+    """Nobody knows what staying costs there: for an account that never fills it would stay for ever."""
+    judge = Judge(spec=PATIENT)
+    found = [judged(judge, {"edge2": 0.1}, 100.0 + tick / 2).outcome for tick in range(5)]
+    assert found == [*[Outcome.WAIT] * 4, Outcome.PROPOSE]
+
+
 def test_patience_is_given_back_while_nobody_leads() -> None:
     judge, lead = Judge(spec=PATIENT), {"edge1": 0.5, "edge2": 0.7}
     for tick in range(40):

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from zsched.lab.decisions import radio
+from zsched.lab.decisions import drives, radio
 
 
 def test_path_loss_falls_by_28_db_for_every_ten_times_the_distance() -> None:
@@ -77,3 +77,19 @@ def test_a_shifted_drive_begins_later_and_wraps(drive_file: Path) -> None:
     shifted = drive.shifted(1.0)
     assert shifted.rssi_dbm[0] == drive.rssi_dbm[5]
     assert shifted.rssi_dbm[-1] == drive.rssi_dbm[4]
+
+
+def test_drives_that_nothing_was_chosen_by_are_played_where_the_folder_has_them(
+    drive_file: Path, tmp_path: Path
+) -> None:
+    assert drives.apart(tmp_path) == {}
+    (tmp_path / drives.APART[0]).write_bytes(drive_file.read_bytes())
+    ((title, fleet),) = drives.apart(tmp_path).items()
+    assert title == "robot to robot, kept apart: router-2G-trial2"
+    assert [drive.name.partition("+")[2] for drive in fleet] == ["", "60s", "120s"]
+    for name in drives.APART[1:]:
+        (tmp_path / name).write_bytes(drive_file.read_bytes())
+    every = drives.apart(tmp_path)
+    assert len(every) == len(drives.APART) + 1
+    assert {len(fleet) for fleet in every.values()} == {3}
+    assert not set(drives.APART) & set(drives.FILES)

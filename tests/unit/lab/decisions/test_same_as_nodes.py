@@ -9,6 +9,7 @@ import pytest
 
 from zsched.core.fleet import PAPER_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S, Timing
 from zsched.core.model import Tuning
+from zsched.core.patience import FIRST_PATIENCE
 from zsched.lab.decisions.loads import Array
 from zsched.lab.decisions.replay import Entry, replay
 from zsched.lab.decisions.rules import CoreRule
@@ -48,7 +49,7 @@ def history(seed: int, scatter: float) -> World:
     )
 
 
-def by_nodes(world: World, tuning: Tuning, patience: float | None) -> list[tuple[float, str]]:
+def by_nodes(world: World, tuning: Tuning, patience: float | None, *, learns: bool = False) -> list[tuple[float, str]]:
     """(time, owner) of every allocation that a fleet of full nodes learns."""
     column = {name: index for index, name in enumerate(world.candidates)}
     cpu, memory = world.cpu_read, world.memory_read
@@ -59,7 +60,7 @@ def by_nodes(world: World, tuning: Tuning, patience: float | None) -> list[tuple
             return 1.0, 1000.0
         return _at(cpu, step, column[name]) * CORES, _at(memory, step, column[name]) * MEMORY_MB
 
-    task = replace(world.spec, tuning=tuning, patience=patience)
+    task = replace(world.spec, tuning=tuning, patience=patience, learns_patience=learns)
     sim = Simulator(fleet=replace(world.fleet, tasks=(task,)), seed=1, load=load)
     sim.start()
     learnt: list[tuple[float, str]] = []
@@ -78,15 +79,18 @@ def _at(table: Array, step: int, column: int) -> float:
     return float(table[step, column])
 
 
-@pytest.mark.parametrize(("tuning", "patience"), [(TIMER, None), (PATIENT, PAPER_PATIENCE)])
+@pytest.mark.parametrize(
+    ("tuning", "patience", "learns"),
+    [(TIMER, None, False), (PATIENT, PAPER_PATIENCE, False), (PATIENT, FIRST_PATIENCE, True)],
+)
 @pytest.mark.parametrize(("seed", "scatter"), [(1, 0.0), (2, 0.03)])
 def test_the_replay_makes_the_moves_that_full_nodes_make(
-    seed: int, scatter: float, tuning: Tuning, patience: float | None
+    seed: int, scatter: float, tuning: Tuning, patience: float | None, *, learns: bool
 ) -> None:
     world = history(seed, scatter)
-    rule = Entry(name="zsched", make=lambda view: CoreRule(view, tuning, patience=patience))
+    rule = Entry(name="zsched", make=lambda view: CoreRule(view, tuning, patience=patience, learns_patience=learns))
     moves = replay(world, (rule,))["zsched"]
-    nodes = by_nodes(world, tuning, patience)
+    nodes = by_nodes(world, tuning, patience, learns=learns)
 
     assert [move.owner for move in moves] == [owner for _, owner in nodes]
     assert len(moves) >= 4, "a history without moves shows nothing"

@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 
 from zsched.core import scoring
-from zsched.core.fleet import TaskSpec
+from zsched.core.fleet import PATIENT_BONUS, PATIENT_COOL_DOWN_S, TaskSpec
 from zsched.core.model import ScoreForm, Utility, UtilityVector, Weights
+from zsched.core.patience import FIRST_PATIENCE
 from zsched.lab.decisions import __main__ as package
 from zsched.lab.decisions import entries
 from zsched.lab.decisions.rules import CoreRule
@@ -105,6 +106,14 @@ def test_the_paper_s_score_here_is_zsched_of_the_other_study() -> None:
     assert isinstance(other, CoreRule)
     assert (made.tuning, made.patience, made.pays_off_in_s) == (other.tuning, other.patience, other.pays_off_in_s)
     assert ZSCHED.look == entries.ours(world)[0].look
+
+
+def test_the_service_rule_is_what_a_fleet_file_gets_that_says_nothing() -> None:
+    assert ZSCHED.changes == {"patience": FIRST_PATIENCE, "learns_patience": True}
+    assert (ZSCHED.tuning.bonus, ZSCHED.tuning.cool_down_s) == (PATIENT_BONUS, PATIENT_COOL_DOWN_S)
+    made = ZSCHED.make(TaskView(scene(build(seed=3, hours=HOURS, load_s=0.0), 1.0, None), spec_of(3)))
+    assert isinstance(made, CoreRule)
+    assert [judge.spec.learns_patience for judge in made._judges] == [True] * 3
 
 
 def spec_of(seed: int) -> TaskSpec:
