@@ -117,7 +117,9 @@ class ScanMatcher:
         closest = np.array([CLOSEST_M, CLOSEST_M, CLOSEST_RAD])
         best_fit = float(fits.of(best[None, :])[0])
         weights, total, rounds = np.zeros(3), 0.0, 0
-        while rounds < LEAST_ROUNDS or self._spent_s() < until_s:
+        before_s = after_s = self._spent_s()
+        while rounds < LEAST_ROUNDS or after_s + (after_s - before_s) / 2 < until_s:  # no half a round too many
+            before_s = after_s
             drawn = best + self._random.standard_normal((ROUND, 3)) * spread
             fit = fits.of(drawn)
             top = int(fit.argmax())
@@ -129,6 +131,7 @@ class ScanMatcher:
             weights, total = weights + weight @ drawn, total + float(weight.sum())
             spread = np.maximum(spread * 0.8, closest)
             rounds += 1
+            after_s = self._spent_s()
         x, y, yaw = (weights / total).tolist() if total > 0.0 else best.tolist()
         pose = Pose2(x=x, y=y, yaw=wrap_angle(yaw))
         return Match(pose=pose, fit=float(fits.plain(np.array([[x, y, yaw]]))[0]), hypotheses=looked + rounds * ROUND)

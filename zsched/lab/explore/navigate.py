@@ -7,13 +7,15 @@ Knows: the robot's keys, this node's data endpoint. Does not know: zsched, the w
     in   <robot>/pose               where SLAM found the robot (`zsched.lab.explore.slam --match`)
          <robot>/bump               it has met a wall
          <robot>/global_map         the merged map
+         <robot>/map                its own map, on which it plans until the merger has placed it
          <robot>/map_merge/tf       where the merger has placed the robot's map frame
          explore/*/claim            where the others go
     out  <robot>/way                the corners ahead, in the robot's map frame
          explore/<robot>/claim      where it goes, 2 Hz
 
 It plans on every new map and at every goal, and besides as often as ``--cores`` of CPU allow: a planner that has the
-time looks again. The robot is started with ``--led``.
+time looks again. A robot whose map the merger has not placed yet goes on by its own map, and claims nothing: its map
+must grow to be placed. The robot is started with ``--led``.
 """
 
 from __future__ import annotations
@@ -63,14 +65,15 @@ class Budget:
 class Navigator:
     """One robot's navigation on one session."""
 
-    def __init__(self, robot: str, session: zenoh.Session, cores: float) -> None:
+    def __init__(self, robot: str, session: zenoh.Session, cores: float, limits: Limits) -> None:
         """Declare everything."""
         self._robot = robot
-        self._explorer = Explorer(robot, Limits())
+        self._explorer = Explorer(robot, limits)
         self._budget = Budget(cores)
         ring = zenoh.handlers.RingChannel
         self._poses = session.declare_subscriber(f"{robot}/pose", ring(1))
         self._bumps = session.declare_subscriber(f"{robot}/bump", ring(1))
+        self._own_maps = session.declare_subscriber(f"{robot}/map", ring(1))
         self._maps = session.declare_subscriber(f"{robot}/global_map", ring(1))
         self._transforms = session.declare_subscriber(f"{robot}/map_merge/tf", ring(1))
         self._claims = session.declare_subscriber("explore/*/claim", ring(16))
@@ -78,6 +81,7 @@ class Navigator:
         self._claim = session.declare_publisher(f"explore/{robot}/claim")
         self._correction: Correction | None = None
         self._merged_t_map: Pose2 | None = None
+        """``None``: it is not placed yet."""
         self._is_blocked = False
         self._told: tuple[tuple[float, float], ...] | None = None
         self._next_way_s = self._next_claim_s = float("-inf")
@@ -85,7 +89,7 @@ class Navigator:
     def turn(self, now: float) -> None:
         """Do what is due at ``now``."""
         is_new = self._listen(now)
-        if self._correction is None or self._merged_t_map is None:
+        if self._correction is None:
             return
         if self._budget.allows(now, time.process_time()):
             self._explorer.look_again()
@@ -93,7 +97,7 @@ class Navigator:
         if is_new:
             self._explorer.step(self._correction.pose, now, is_blocked=self._is_blocked)
             self._is_blocked = False
-        self._tell(now, self._correction.stamp_ns, self._merged_t_map)
+        self._tell(now, self._correction.stamp_ns, self._merged_t_map or Pose2())
 
     def _tell(self, now: float, stamp_ns: int, merged_t_map: Pose2) -> None:
         way = self._explorer.way
@@ -101,7 +105,7 @@ class Navigator:
             self._told, self._next_way_s = way, now + AGAIN_S
             map_t_merged = merged_t_map.inverse()
             self._way.put(encode_way(stamp_ns, [map_t_merged.apply_point(x, y) for x, y in way]))
-        if now >= self._next_claim_s:
+        if now >= self._next_claim_s and self._merged_t_map is not None:
             self._next_claim_s = now + CLAIM_PERIOD_S
             self._claim.put(encode_claim(self._robot, self._explorer.claim))
 
@@ -111,7 +115,9 @@ class Navigator:
         while (sample := self._transforms.try_recv()) is not None:
             self._take_transforms(bytes(sample.payload))
         while (sample := self._maps.try_recv()) is not None:
-            self._take_map(bytes(sample.payload))
+            self._take_map(bytes(sample.payload), is_own=False)
+        while (sample := self._own_maps.try_recv()) is not None:
+            self._take_map(bytes(sample.payload), is_own=True)
         while (sample := self._claims.try_recv()) is not None:
             self._take_claim(bytes(sample.payload), now)
         while self._bumps.try_recv() is not None:
@@ -127,11 +133,15 @@ class Navigator:
             return False
         return True
 
-    def _take_map(self, payload: bytes) -> None:
+    def _take_map(self, payload: bytes, *, is_own: bool) -> None:
+        if is_own == (self._merged_t_map is not None):
+            return
         try:
             self._explorer.take_map(decode_grid(payload))
         except CdrError:
             return
+        if is_own:
+            self._explorer.take_transform(Pose2())
 
     def _take_transforms(self, payload: bytes) -> None:
         try:
@@ -148,7 +158,7 @@ class Navigator:
             robot, claim = decode_claim(payload)
         except WireError:
             return
-        if claim is None:
+        if claim is None or self._merged_t_map is None:
             self._explorer.drop_claim(robot)
         else:
             self._explorer.take_claims((claim,), now)
@@ -161,12 +171,13 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--robot", "--name", required=True, help="the robot that is led")
     parser.add_argument("--endpoint", required=True, help="this node's data endpoint, e.g. tcp/127.0.0.1:7460")
     parser.add_argument("--cores", type=float, default=0.0, help="plan again as often as this CPU allows (0: do not)")
+    parser.add_argument("--speed", type=float, default=Limits().speed, help="m/s at most of the robot (0.5)")
     given = parser.parse_args(arguments)
-    if not 0.0 <= given.cores <= 64.0:
-        parser.error("--cores must be in [0, 64]")
+    if not (0.0 <= given.cores <= 64.0 and 0.0 < given.speed <= 5.0):
+        parser.error("--cores must be in [0, 64] and --speed in (0, 5]")
 
     def work(session: zenoh.Session, stop: StopFlag) -> None:
-        navigator = Navigator(given.robot, session, given.cores)
+        navigator = Navigator(given.robot, session, given.cores, Limits(speed=given.speed))
         while not stop.is_set:
             navigator.turn(monotonic_s())
             time.sleep(POLL_S)

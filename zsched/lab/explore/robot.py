@@ -263,7 +263,7 @@ class Applications:
                 "bytes_received": self._received_bytes,
                 "claims_heard": self._claims_heard,
                 "coverage": self._coverage,
-                "state": self._agent.explorer.state.value,
+                "state": "led" if self._is_led else self._agent.explorer.state.value,
                 "goals": self._agent.explorer.goals,
                 "way_m": round(self._agent.body.way_m, 2),
                 "cpu_s": round(time.process_time(), 3),

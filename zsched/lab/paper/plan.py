@@ -36,7 +36,12 @@ def leave_out(scenario: Scenario, skipped: Mapping[str, str]) -> Scenario:
 
 def cell_s(scenario: Scenario, cell: Cell) -> float:
     """How long a cell lasts at most, in seconds, unless it is repeated."""
-    return scenario.duration_s + AROUND_S + (0.0 if bandwidth_of(scenario, cell) is None else NARROW_S)
+    return (
+        scenario.duration_s
+        + scenario.warm_up_s
+        + AROUND_S
+        + (0.0 if bandwidth_of(scenario, cell) is None else NARROW_S)
+    )
 
 
 def plan_text(
@@ -54,7 +59,7 @@ def plan_text(
     rows += [f"{name:<15} {0:>4}  {'-':>7}  left out: {why}" for name, why in skipped.items()]
     left = sum(cell_s(scenario, cell) for cell in todo) + radio_s
     done = "" if len(todo) == len(cells) else f", {len(cells) - len(todo)} of them done already"
-    cores = sum(share.cpu_cores for share in scenario.nodes.values())
+    cores = sum(share.quota_cores for share in scenario.nodes.values())
     rows.append(f"{len(cells)} runs{done}; at most {clock(left)} on two cores, without repeats")
     rows.append(f"quotas {cores:g} cores in all; a run over pressure {scenario.pressure_limit:g} is repeated")
     return "\n".join(rows)

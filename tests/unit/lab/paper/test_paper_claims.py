@@ -65,7 +65,7 @@ def a_run(scheme: str, run: int, level: str = "one", **changed: Any) -> dict[str
 def test_one_run_has_no_interval_to_tell() -> None:
     found = difference({1: 1.12}, {1: 1.0})
     assert found is not None
-    assert found.text() == "+12 % (1 run)"
+    assert found.text() == "+12 % (n = 1)"
     both = difference({1: 1.12, 2: 1.10}, {1: 1.0, 2: 1.0})
     assert both is not None
     assert both.text().startswith("+11 % [")
