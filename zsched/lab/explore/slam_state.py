@@ -70,10 +70,10 @@ class Slam:
             predicted = self._last[1].compose(self._last[0].inverse().compose(odometry))
             match = self._matcher.match(self._mapper, scan, predicted, self._spent_until_s)
             pose, fit = match.pose, match.fit
+        self._spent_until_s = self._spent_s()  # what comes from here on, mapping included, is of the next scan's share
         self._mapper.add(pose, scan)
         self._last, self._stamp_ns = (odometry, pose), scan.stamp_ns
         self.scans += 1
-        self._spent_until_s = self._spent_s()
         return Correction(stamp_ns=scan.stamp_ns, pose=pose, fit=fit)
 
     def due_map(self, now: float) -> Grid | None:

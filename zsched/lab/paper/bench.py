@@ -25,6 +25,7 @@ from zsched.lab.paper.coverage_report import save_coverage
 from zsched.lab.paper.figures import save_all, save_gains, save_panels
 from zsched.lab.paper.matrix import Matrix, collect, undone
 from zsched.lab.paper.metrics import Truth, brief, measure
+from zsched.lab.paper.places import scenario_path
 from zsched.lab.paper.plan import AROUND_S, leave_out, plan_text, without
 from zsched.lab.paper.radio_bench import RADIO_SCHEMES, radio_results, run_radio
 from zsched.lab.paper.report import groups_of, in_block, is_whole, main_level, report, snippet
@@ -212,6 +213,8 @@ def planned(options: BenchOptions) -> tuple[Scenario, tuple[Cell, ...], dict[str
     if options.duration_s is not None:
         scenario = replace(scenario, duration_s=options.duration_s)
     skipped = without(scenario, is_exploring=options.is_exploring, why_not=why_not)
+    if scenario.main in skipped:
+        raise ConfigError(f"{options.scenario}: block {scenario.main}: {skipped[scenario.main]}")
     return scenario, cells_of(leave_out(scenario, skipped), options.schemes, options.runs), skipped
 
 
@@ -300,7 +303,7 @@ def block_pictures(results: Mapping[str, Any], out: Path) -> list[str]:
     curves = [
         found
         for name in results["scenario"]["blocks"]
-        if (found := save_coverage(out / f"{name}-coverage.png", in_block(results["runs"], name), f"{title}, {name}"))
+        if (found := save_coverage(out / f"{name}-coverage.png", in_block(results["runs"], name), title))
     ]
     return [*curves, *([gains] if gains else []), *panels]
 
@@ -308,6 +311,8 @@ def block_pictures(results: Mapping[str, Any], out: Path) -> list[str]:
 def command_of(options: BenchOptions) -> str:
     """The command that makes these results, without the places of this machine."""
     words = ["zsched bench paper"]
+    if options.scenario != scenario_path():
+        words += [f"--scenario {options.scenario.name.removesuffix('.scenario.yml')}"]
     words += ["--quick"] if options.is_quick else []
     words += [f"--input {'explore' if options.is_exploring else 'log'}"]
     words += [f"--runs {options.runs}"] if options.runs is not None else []

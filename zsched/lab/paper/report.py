@@ -199,7 +199,7 @@ def moves_text(results: Json) -> str:
     lines = ["| where | moves of zsched | silence, mean s | longest s | lost per move |", "| --- " * 5 + "|"]
     for title, runs in groups_of(results).items():
         own = [figures for figures in runs if figures["scheme"] == "zsched"]
-        moves = sum(int(figures["moves"]) for figures in own)
+        moves = sum(int(figures.get("moves") or 0) for figures in own)
         gaps = [float(figures["move_gap_max_s"]) for figures in own if figures.get("move_gap_max_s") is not None]
         if moves and gaps:
             cells = [

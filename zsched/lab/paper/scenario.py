@@ -264,9 +264,6 @@ class Scenario:
         doubled = sorted(({*self.levels, MATRIX}) & self.blocks.keys())
         if doubled:
             raise ValueError(f"blocks: {', '.join(doubled)} is taken; choose another name")
-        for key in ("main", "quick"):
-            if getattr(self, key) not in (MATRIX, *self.blocks):
-                raise ValueError(f"{key}: {getattr(self, key)!r} is none of {', '.join((MATRIX, *self.blocks))}")
         for name, block in self.blocks.items():
             if block.level not in (None, *self.levels):
                 raise ValueError(f"blocks: {name}: level {block.level!r} is none of {', '.join(self.levels)}")
@@ -312,6 +309,9 @@ def _scenario(path: Path, tree: dict[str, Any]) -> Scenario:
     merge = MergeTask(**dict(tree.pop("merge", None) or {}))
     known = {str(name): value for name, value in _tuples(tree).items()}
     blocks: dict[str, Any] = {"levels": levels, "nodes": nodes, "links": links, "link_view": view, "blocks": rows}
+    for key in ("main", "quick"):
+        if known.get(key, MATRIX) not in (MATRIX, *rows):
+            raise ValueError(f"{key}: {known[key]!r} is none of {', '.join((MATRIX, *rows))}")
     return Scenario(fleet=fleet, load=load, sweep=sweep, explore=explore, merge=merge, **blocks, **known)
 
 
