@@ -20,7 +20,7 @@ from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid
 
 ODOMETRY = Drift(yaw=0.02, way=0.02)
-"""Of robots whose SLAM corrects it: after 60 m half a metre to two, and up to 11 degrees (300 s in four offices)."""
+"""Of robots whose SLAM corrects it: half a metre to two after 30 to 60 m, and up to 11 degrees (three offices)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
