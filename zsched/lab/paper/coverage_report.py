@@ -20,6 +20,8 @@ from zsched.lab.paper.schemes import SCHEMES
 from zsched.lab.plots import COLOURS, DPI
 
 Json = Mapping[str, Any]
+OURS = {"zsched": "#111111", "zsched_slam": "#8a1c1c"}
+"""Colours that stand out among the others' lines and bands."""
 Curve = tuple[list[float], list[float], list[float | None]]
 """(t_s, mean share, half of its 95 % interval or ``None`` of one run)."""
 MARKS = 5
@@ -131,10 +133,11 @@ def save_coverage(path: Path, runs: Sequence[Json], title: str) -> str | None:
     for index, name in enumerate(schemes):
         own = [figures for figures in known if figures["scheme"] == name]
         times, means, halves = mean_curve(own)
-        colour, is_ours = COLOURS[index % len(COLOURS)], name.startswith("zsched")
+        is_ours = name.startswith("zsched")
+        colour = OURS[name] if name in OURS else COLOURS[index % len(COLOURS)]
         low = [max(mean - (half or 0.0), 0.0) for mean, half in zip(means, halves, strict=True)]
         high = [min(mean + (half or 0.0), 1.0) for mean, half in zip(means, halves, strict=True)]
-        axes.fill_between(times, low, high, color=colour, alpha=0.12, linewidth=0)
+        axes.fill_between(times, low, high, color=colour, alpha=0.1, linewidth=0)
         style = "--" if name.startswith("fixed") else "-"
         label = f"{name} (n = {len(own)})"
         axes.plot(times, means, style, color=colour, linewidth=2.4 if is_ours else 1.4, label=label)

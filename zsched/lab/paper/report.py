@@ -80,8 +80,9 @@ COLUMNS = (
 
 
 FLOORS = {MATRIX: -0.10, "heavy": -0.17, "heavy_again": -0.17}
-"""{block: the task latency of a merger that costs nothing, against fixed placement}: `zsched.lab.paper.floor` of
-docs/evaluation/results.json. No scheduler can gain more there."""
+"""{block: the task latency of a merger that costs nothing, against fixed placement}, no scheduler can gain more there.
+
+`zsched.lab.paper.latency_floor` printed them of docs/evaluation/results.json."""
 
 
 # --- the text --------------------------------------------------------------------------------------------------------

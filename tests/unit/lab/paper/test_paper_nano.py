@@ -18,7 +18,7 @@ from zsched.lab.paper.bench import BenchOptions, InputsOf, planned
 from zsched.lab.paper.cells import Cell, cells_of
 from zsched.lab.paper.claims import GAINS, best_fixed, over_best_fixed, over_fixed
 from zsched.lab.paper.coverage_report import coverage_parts, coverage_table, roles_table, save_coverage
-from zsched.lab.paper.floor import floor_of
+from zsched.lab.paper.latency_floor import floor_of
 from zsched.lab.paper.matrix import invalid_reason
 from zsched.lab.paper.metrics import Arrival, Streams, coverage_figures, led_of, merge_cpu_s, pose_errors
 from zsched.lab.paper.places import robots_scenario_path, scenario_path, shipped_names, shipped_scenario

@@ -2,7 +2,7 @@
 
 Knows: a bench's results, exploration in virtual time. Does not know: processes, schedules.
 
-    python -m zsched.lab.paper.floor docs/evaluation/results.json
+    python -m zsched.lab.paper.latency_floor docs/evaluation/results.json
 
 No placing can be quicker than merged maps that come at once. So the robots of every run of a block explore its office
 once more in virtual time (`zsched.lab.explore.virtual`): same world, seed, speed and target, each merged map there as
@@ -61,7 +61,8 @@ def floor_of(scenario: Json, runs: Sequence[Json]) -> tuple[float, float, str] |
 def main(arguments: list[str] | None = None) -> int:
     """Print the floor of every block of a bench's results."""
     cv2.setNumThreads(1)
-    parser = argparse.ArgumentParser(prog="python -m zsched.lab.paper.floor", description=__doc__.split("\n")[0])
+    prog = "python -m zsched.lab.paper.latency_floor"
+    parser = argparse.ArgumentParser(prog=prog, description=__doc__.split("\n")[0])
     parser.add_argument("results", type=Path, help="results.json of `zsched bench paper`")
     parser.add_argument("--block", action="append", default=[], help="only this one (repeatable)")
     given = parser.parse_args(arguments)
