@@ -28,11 +28,12 @@ from zsched.lab.paper.metrics import Truth, brief, measure
 from zsched.lab.paper.places import scenario_path
 from zsched.lab.paper.plan import AROUND_S, leave_out, plan_text, without
 from zsched.lab.paper.radio_bench import RADIO_SCHEMES, radio_results, run_radio
-from zsched.lab.paper.report import groups_of, in_block, is_whole, main_level, report, snippet
+from zsched.lab.paper.report import groups_of, in_block, is_whole, main_level, report
 from zsched.lab.paper.robots import ExploreRobots, LogRobots, Robots, slam_task
 from zsched.lab.paper.run import CellRun, Inputs, write_json
 from zsched.lab.paper.scenario import MATRIX, Scenario, load_scenario
 from zsched.lab.paper.schemes import QUICK_SCHEMES
+from zsched.lab.paper.snippet import snippet
 from zsched.lab.signals import Interrupted, interruptible
 
 RESULTS_SCHEMA = "zsched.paper/1"

@@ -1,6 +1,6 @@
 """Writes report.md: every claim beside our figure, all schemes, the sweep over load, the blocks, what was run and how.
 
-Knows: Markdown, which figure stands where, what the README shows of it. Does not know: how a figure or a verdict comes
+Knows: Markdown, which figure stands where. Does not know: how a figure or a verdict comes
 about.
 """
 
@@ -39,8 +39,6 @@ GAINS_SAY = (
     "Against the mean of the three fixed schemes, same runs, 95 %. The oracle knows the load beforehand and is at the "
     "best node by Eq. 1 and 2 at every moment.\n"
 )
-RANKED = ("zsched", "dyna_both", "oracle")
-"""Whose gains the README shows."""
 EXHAUSTED = 0.95
 """Of a node's memory: beyond, the kernel reclaims what is in use."""
 FOLLOWS_DB = 1.5
@@ -193,21 +191,6 @@ def gains_text(results: Json, schemes: Sequence[str]) -> str:
         for scheme in sorted(found, key=lambda name: -found[name]["map_hz"].value if "map_hz" in found[name] else 0.0):
             rows[title, scheme] = found[scheme]
     return gains_table(("where", "scheme"), rows)
-
-
-def moves_text(results: Json) -> str:
-    """What moves cost zsched in every block that had any: the silence around them, and what was lost; else empty."""
-    lines = ["| where | moves of zsched | silence, mean s | longest s | lost per move |", "| --- " * 5 + "|"]
-    for title, runs in groups_of(results).items():
-        own = [figures for figures in runs if figures["scheme"] == "zsched"]
-        moves = sum(int(figures.get("moves") or 0) for figures in own)
-        gaps = [float(figures["move_gap_max_s"]) for figures in own if figures.get("move_gap_max_s") is not None]
-        if moves and gaps:
-            cells = [
-                mean_text([figures.get(name) for figures in own], 2) for name in ("move_gap_mean_s", "lost_per_move")
-            ]
-            lines.append(f"| {title} | {moves} in {len(own)} runs | {cells[0]} | {max(gaps):.2f} | {cells[1]} |")
-    return "\n".join(lines) + "\n" if len(lines) > 2 else ""
 
 
 def groups_of(results: Json) -> dict[str, list[Json]]:
@@ -416,34 +399,6 @@ def conditions_text(results: Json) -> str:
     lines += [f"* No valid run of {len(missing)} cells: {', '.join(missing)}."] if missing else []
     lines += [f"* Repeated: {one['cell']}: {one['reason'].splitlines()[0]}" for one in results["invalid"]]
     return "\n".join(lines) + "\n"
-
-
-def snippet(results: Json, pictures: Sequence[str]) -> str:
-    """What the README shows: what moves cost, where placing pays, the claims with verdicts, and a picture."""
-    scenario, main = results["scenario"], main_runs(results)
-    where = "the matrix" if main_block(results) == MATRIX else f"`{main_block(results)}`"
-    outcomes = [outcome for _, _, outcome in judged(main)]
-    judgeable = [outcome for outcome in outcomes if outcome not in (Verdict.NOT_MEASURED, Verdict.TOO_FEW)]
-    kept = sum(outcome is not Verdict.NOT_REPRODUCED for outcome in judgeable)
-    lines = [
-        (
-            f"`{results['command']}` (seed {scenario['seed']}, {len(results['runs'])} runs): "
-            f"{kept} of {len(judgeable)} claims hold, {len(outcomes) - len(judgeable)} could not be judged."
-        ),
-        "",
-        *([moved] if (moved := moves_text(results)) else []),
-        *([table] if (table := gains_text(results, RANKED)) else []),
-        f"| claim, in {where} | found, 95 % interval | verdict |",
-        "| --- | --- | --- |",
-    ]
-    for claim, found, outcome in judged(main):
-        says = claim.says + floor_text(claim, main)
-        lines.append(f"| {claim.source}: {says} | {'-' if found is None else found.text()} | {outcome} |")
-    lines.append("")
-    if "gains.png" in pictures:
-        lines += ["![What placing gains over fixed placement](docs/evaluation/gains.png)", ""]
-    lines.append("All figures: [docs/evaluation/report.md](docs/evaluation/report.md).\n")
-    return "\n".join(lines)
 
 
 def radio_text(radio: Json) -> str:

@@ -30,9 +30,9 @@ from zsched.lab.paper.report import (
     over_fixed_text,
     radio_text,
     report,
-    snippet,
 )
 from zsched.lab.paper.schemes import FIXED_SCHEMES, PAPER_SCHEMES, SCHEMES
+from zsched.lab.paper.snippet import snippet
 
 HIGHER = Claim(source="paper", says="x", metric="map_hz", mine=("a",), theirs=("b",), target=0.2)
 LOWER = Claim(source="paper", says="x", metric="task_latency_s", mine=("a",), theirs=("b",), target=-0.28)

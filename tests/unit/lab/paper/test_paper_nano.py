@@ -14,13 +14,15 @@ from zsched.lab.explore.navigate import main as navigate
 from zsched.lab.explore.robot import parse as parse_explorer
 from zsched.lab.explore.slam import main as slam
 from zsched.lab.explore.slam_worker import main as slam_worker
+from zsched.lab.paper.arrivals import Arrival, Streams
 from zsched.lab.paper.bench import BenchOptions, InputsOf, planned
 from zsched.lab.paper.cells import Cell, cells_of
 from zsched.lab.paper.claims import GAINS, best_fixed, over_best_fixed, over_fixed
 from zsched.lab.paper.coverage_report import coverage_parts, coverage_table, roles_table, save_coverage
-from zsched.lab.paper.latency_floor import floor_of
+from zsched.lab.paper.latency_floor import ceiling_of, floor_of, tell_ceiling
+from zsched.lab.paper.latency_floor import main as latency_floor
+from zsched.lab.paper.led_metrics import coverage_figures, led_of, merge_cpu_s, pose_errors
 from zsched.lab.paper.matrix import invalid_reason
-from zsched.lab.paper.metrics import Arrival, Streams, coverage_figures, led_of, merge_cpu_s, pose_errors
 from zsched.lab.paper.places import robots_scenario_path, scenario_path, shipped_names, shipped_scenario
 from zsched.lab.paper.plan import AROUND_S, cell_s, plan_text
 from zsched.lab.paper.report import (
@@ -28,7 +30,6 @@ from zsched.lab.paper.report import (
     claims_text,
     gains_text,
     main_runs,
-    moves_text,
     over_fixed_text,
     report,
 )
@@ -37,6 +38,7 @@ from zsched.lab.paper.roles import REST, RoleMeter, mean_shares, role_figures
 from zsched.lab.paper.run import CellRun, Inputs
 from zsched.lab.paper.scenario import MATRIX, NodeShare, Scenario, load_scenario
 from zsched.lab.paper.schemes import FIXED_SCHEMES, SCHEMES
+from zsched.lab.paper.snippet import moves_text
 
 AUTHORS = {"slam": 0.352, "model": 0.60, "merge": 0.096, "navigation": 0.027}
 """Shares of a Jetson Nano's CPU: config/task_req.yaml of herolab-uga/ros-edge-orchestration, rounded."""
@@ -471,6 +473,31 @@ def test_the_floor_stands_beside_every_goal_for_the_latency(block: str, told: st
     rows = [line for line in claims_text(runs).splitlines() if "task_latency_s" in line]
     assert len(rows) == 5
     assert all((f"a merger that costs nothing gains {told}" in row) == bool(told) for row in rows)
+
+
+def test_the_ceiling_of_coverage_is_told_before_and_after_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    loop = {"world": "turtlebot3", "speed": 0.5, "duration_s": 6.0, "map_period_s": 2.0}
+    merge = {"rate_hz": 0.5, "min_agreeing": 150}
+    scenario = {"seed": 1, "warm_up_s": 1.0, "explore": loop, "merge": merge, "blocks": {}}
+    runs = [{"scheme": name, "run": 0, "coverage_mean": 0.1} for name in FIXED_SCHEMES]
+
+    found = ceiling_of(scenario, runs)
+
+    assert found is not None
+    assert found[0] == pytest.approx(0.1)
+    assert 0.1 < found[1] < 1.0
+    assert found[2].endswith("(n = 1)")
+    short = replace(shipped("nano"), duration_s=5.0, warm_up_s=0.0)
+    short = replace(
+        short,
+        explore=replace(short.explore, duration_s=5.0, world="turtlebot3"),
+        blocks={"nano": replace(short.blocks["nano"], runs=1)},
+    )
+    assert tell_ceiling(short) == 0
+    assert capsys.readouterr().out.startswith("seed 41000: covered on the way 0.")
+    for wrong in ([], ["--scenario", "paper"], ["--scenario", "nono"], ["x.json", "--scenario", "nano"]):
+        with pytest.raises(SystemExit):
+            latency_floor(wrong)
 
 
 def test_the_floor_is_what_robots_do_with_maps_that_come_at_once() -> None:
