@@ -29,7 +29,9 @@ PLAN_PERIOD_S = 0.5
 """Plans at most so often, and only for a reason: a new map, a reached goal, a wall."""
 REACHED_M = 0.4
 AVOID_S = 8.0
-"""A frontier that the robot has been at, or could not get to, does not count for so long."""
+"""A frontier that the robot has been at, or could not get to, does not count for so long, ..."""
+AVOID_M = 8.0
+"""... or for as long as a slow robot needs for this way: else it is back before it has got anywhere."""
 CLAIM_LIFE_S = 3.0
 
 
@@ -39,6 +41,15 @@ class State(StrEnum):
     WAITING = "waiting"
     DRIVING = "driving"
     IDLE = "idle"
+
+
+def avoid_s(limits: Limits) -> float:
+    """How long a robot of these limits is to avoid a frontier, in s.
+
+    >>> avoid_s(Limits(speed=1.0)), round(avoid_s(Limits(speed=0.22)), 1)
+    (8.0, 36.4)
+    """
+    return max(AVOID_S, AVOID_M / limits.speed)
 
 
 @dataclass(slots=True)
@@ -51,8 +62,10 @@ class _Goal:
 class Explorer:
     """One robot's explorer; all points are in the merged frame, but poses that are handed in by `step`."""
 
-    def __init__(self, robot: str, limits: Limits) -> None:
+    def __init__(self, robot: str, limits: Limits, avoid_s: float = AVOID_S) -> None:
+        """``avoid_s``: for how long a frontier does not count that the robot has been at, or could not get to."""
         self._robot = robot
+        self._avoid_s = avoid_s
         self._limits = limits
         self._map: Grid | None = None
         self._plan: PlanMap | None = None
@@ -131,7 +144,7 @@ class Explorer:
             self._back_until_s = now + BACK_S
         end = self._goal.way[-1]
         if is_blocked or math.dist((here.x, here.y), end) < REACHED_M:
-            self._avoided.append((now + AVOID_S, self._goal.frontier.point))
+            self._avoided.append((now + self._avoid_s, self._goal.frontier.point))
             self._goal, self._is_due = None, True
 
     def _decide(self, here: Pose2) -> None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 from zsched.lab.explore.agent import CLAIM_PERIOD_S, Agent, RobotSettings
 from zsched.lab.explore.body import Drift, Limits
-from zsched.lab.explore.explorer import Explorer
+from zsched.lab.explore.explorer import Explorer, avoid_s
 from zsched.lab.explore.laser import LaserScan
 from zsched.lab.explore.referee import Referee
 from zsched.lab.explore.slam_state import Slam, SlamSettings
@@ -122,7 +122,7 @@ def _robots(plan: LedRun) -> dict[str, _Robot]:
         found[name] = _Robot(
             agent=Agent(settings, plan.world, phase=index / plan.robots),
             slam=Slam(SlamSettings(robot=name, map_period_s=plan.map_period_s)),
-            navigation=Explorer(name, plan.limits),
+            navigation=Explorer(name, plan.limits, avoid_s(plan.limits)),
         )
     return found
 

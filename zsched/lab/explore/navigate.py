@@ -31,7 +31,7 @@ from zsched.errors import WireError
 from zsched.lab import application
 from zsched.lab.explore.agent import CLAIM_PERIOD_S
 from zsched.lab.explore.body import Limits
-from zsched.lab.explore.explorer import Explorer
+from zsched.lab.explore.explorer import Explorer, avoid_s
 from zsched.lab.explore.messages import Correction, decode_claim, decode_correction, encode_claim, encode_way
 from zsched.lab.signals import StopFlag
 from zsched.tasks.map_merge.cdr import CdrError, decode_grid, decode_transforms
@@ -68,7 +68,7 @@ class Navigator:
     def __init__(self, robot: str, session: zenoh.Session, cores: float, limits: Limits) -> None:
         """Declare everything."""
         self._robot = robot
-        self._explorer = Explorer(robot, limits)
+        self._explorer = Explorer(robot, limits, avoid_s(limits))
         self._budget = Budget(cores)
         ring = zenoh.handlers.RingChannel
         self._poses = session.declare_subscriber(f"{robot}/pose", ring(1))
