@@ -45,16 +45,20 @@ def paper(
     runs: Annotated[
         int | None, typer.Option(min=1, max=1000, metavar="N", help="Runs of each scheme. [scenario]")
     ] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="Fixed, dyna_both and zsched once: 6 quiet minutes.")] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="The README's block `heavy`, five schemes once: 6 quiet minutes.")
+    ] = False,
     schemes: Annotated[str, typer.Option(metavar="A,B", help="Only these schemes. [the scenario's]")] = "",
     resume: Annotated[bool, typer.Option("--resume", help="Go on in the folder of --out.")] = False,
     report: Annotated[bool, typer.Option("--report", help="Run nothing; report what is done in --out.")] = False,
     plan: Annotated[bool, typer.Option("--plan", help="Only say what would be run, and for how long.")] = False,
     kind: Annotated[
-        RobotsSee | None, typer.Option("--input", help="What the robots see. [explore; log with --quick or --log]")
+        RobotsSee | None, typer.Option("--input", help="What the robots see. [explore; log with --log]")
     ] = None,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the results.")] = Path("zsched-paper"),
-    scenario: Annotated[Path | None, typer.Option(metavar="FILE", help="Scenario. [the paper's]")] = None,
+    scenario: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="A file, or nano, nano-moves, heavy-again. [paper]")
+    ] = None,
     log: Annotated[Path | None, typer.Option(metavar="FILE", help="CARMEN laser log. [Malaga, shipped]")] = None,
     drives: Annotated[Path | None, typer.Option(metavar="DIR", help="Recorded radio drives. [simulated]")] = None,
     duration: Annotated[
@@ -70,18 +74,18 @@ def paper(
         raise CliError(
             EXIT_FAILED, f"the lab needs {', '.join(missing)}, not installed here; run `pip install 'zsched[lab]'`"
         )
-    is_replay = kind is RobotsSee.LOG or (kind is None and (quick or log is not None))
+    is_replay = kind is RobotsSee.LOG or (kind is None and log is not None)
     if log is not None and not is_replay:
         raise CliError(EXIT_USAGE, "--log goes with --input log; leave one of them out")
     names = tuple(name.strip() for name in schemes.split(",") if name.strip())
     if schemes and not names:
         raise CliError(EXIT_USAGE, f"--schemes {schemes!r}: give names, e.g. --schemes dyna_both,zsched")
     from zsched.lab.paper.bench import BenchOptions, run_bench  # noqa: PLC0415 - the lab is an extra
-    from zsched.lab.paper.places import robots_scenario_path, scenario_path  # noqa: PLC0415 - as above
+    from zsched.lab.paper.places import robots_scenario_path, scenario_path, shipped_scenario  # noqa: PLC0415 - as above
 
     options = BenchOptions(
         out=out,
-        scenario=scenario or scenario_path(),
+        scenario=scenario_path() if scenario is None else shipped_scenario(str(scenario)) or scenario,
         robots_scenario=robots_scenario_path(),
         runs=runs,
         schemes=names,

@@ -12,9 +12,10 @@ from mcap.reader import make_reader
 from zsched.adapters.cgroup import LimitedGroup
 from zsched.lab.laser_log import malaga_path
 from zsched.lab.netns import why_not
+from zsched.lab.paper.bench import BenchOptions, InputsOf
 from zsched.lab.paper.cells import Cell, bandwidth_of, world_of
 from zsched.lab.paper.metrics import Truth, measure
-from zsched.lab.paper.places import scenario_path
+from zsched.lab.paper.places import robots_scenario_path, scenario_path, shipped_scenario
 from zsched.lab.paper.robots import ExploreRobots, LogRobots
 from zsched.lab.paper.run import CellRun, Inputs
 from zsched.lab.paper.scenario import LoadPlan, load_scenario
@@ -55,6 +56,33 @@ def test_a_cell_is_run_and_measured_and_leaves_nothing(tmp_path: Path) -> None:
     decisions = read_records(folder / "records" / "decisions.ndjson")
     assert {record["node"] for record in decisions} == set(run["robots"])
     assert any(record["decision"] and record["decision"]["utilities"] for record in decisions)
+    assert one.left_behind == []
+
+
+@pytest.mark.root
+@pytest.mark.skipif(WHY_NOT is not None, reason=f"no control groups: {WHY_NOT}")
+def test_a_cell_whose_slam_are_tasks_leads_its_robots_from_the_edges(tmp_path: Path) -> None:
+    path = shipped_scenario("nano-moves")
+    assert path is not None
+    load = LoadPlan(lanes=1, busy_s=(20.0, 20.0), idle_s=(0.0, 0.0), first_s=1.0)
+    scenario = replace(load_scenario(path), duration_s=12.0, warm_up_s=3.0, load=load)
+    options = BenchOptions(out=tmp_path, scenario=path, robots_scenario=robots_scenario_path(), is_exploring=True)
+    cell = Cell(scheme=SCHEMES["zsched_slam"], level="one", run=0, block="nano_moves")
+    inputs, folder = InputsOf(options, scenario).of(cell), tmp_path / "cell"
+
+    one = CellRun(scenario, cell, inputs, folder)
+    run = one.run()
+    figures = measure(folder, scenario, Truth(inputs.robots.truth()))
+
+    assert sorted(run["others"]) == ["slam_robot1", "slam_robot2", "slam_robot3"]
+    assert all(moves[0]["node"] in scenario.nodes for moves in run["others"].values())
+    assert figures["corrections_hz"] > 1.0
+    assert figures["pose_error_m"] < 0.5
+    assert figures["coverage_mean"] > 0.0
+    assert figures["merge_cpu_s"] is not None
+    roles = {role for states in figures["roles"].values() for row in states.values() for role in row}
+    assert {"slam", "navigation", "merge", "model"} <= roles
+    assert run["warm_up_s"] == 3.0
     assert one.left_behind == []
 
 

@@ -31,7 +31,7 @@ def short_scenario(folder: Path) -> Path:
     fleet = scenario_path().parent / tree["fleet"]
     (folder / fleet.name).write_text(fleet.read_text())
     tree |= {"duration_s": 5, "runs": 1, "pressure_limit": 1.0, "schemes": ["zsched"]}
-    tree |= {"sweep": {}, "blocks": {}}
+    tree |= {"sweep": {}, "blocks": {}, "quick": "matrix"}
     path = folder / "short.scenario.yml"
     with path.open("w") as file:
         YAML().dump(tree, file)

@@ -38,8 +38,11 @@ class LabFleet:
 
     path: Path
     task: TaskId
+    """The one that is watched."""
     kinds: Mapping[NodeId, str]
     data_endpoints: Mapping[NodeId, str]
+    others: tuple[TaskId, ...] = ()
+    """What runs beside it."""
 
     @property
     def robots(self) -> tuple[NodeId, ...]:
@@ -67,10 +70,16 @@ def read_tree(path: Path) -> Tree:
     return tree
 
 
-def write_fleet(template: Path, path: Path, replaced: Mapping[str, tuple[str, ...]]) -> LabFleet:
+def write_fleet(
+    template: Path,
+    path: Path,
+    replaced: Mapping[str, tuple[str, ...]],
+    others: Mapping[str, tuple[str, ...]] | None = None,
+) -> LabFleet:
     """Write the effective fleet file: the template on loopback endpoints of our own, its worker with other options.
 
-    ``replaced`` is {option: values}: every ``option value`` in the worker's command gives way to these.
+    ``replaced`` is {option: values}: every ``option value`` in the worker's command gives way to these. The first task
+    is the one that is watched; with ``others``, which is the same for the rest of them, there may be more.
 
     Raises:
         ConfigError: the template is no fleet file, or has not exactly one task.
@@ -83,15 +92,17 @@ def write_fleet(template: Path, path: Path, replaced: Mapping[str, tuple[str, ..
         node["host"] = own_address()
         node["listen"] = {"control": control, "data": data}
         endpoints[name] = data
-    if len(tree["tasks"]) != 1:
+    task, *rest = tree["tasks"] or ("",)
+    if not task or (rest and others is None):
         raise ConfigError(f"{template}: the lab runs one task, there are {len(tree['tasks'])}")
-    ((task, spec),) = tree["tasks"].items()
-    spec["worker"]["command"] = with_options(spec["worker"]["command"], replaced)
+    for name, spec in tree["tasks"].items():
+        given = replaced if name == task else others or {}
+        spec["worker"]["command"] = with_options(spec["worker"]["command"], given)
     with path.open("w", encoding="utf-8") as file:
         file.write(f"# Effective fleet file of one run, made from {template.name}.\n")
         YAML().dump(tree, file)
     kinds = {name: str(node["kind"]) for name, node in nodes.items()}
-    return LabFleet(path=path, task=task, kinds=kinds, data_endpoints=endpoints)
+    return LabFleet(path=path, task=task, kinds=kinds, data_endpoints=endpoints, others=tuple(rest))
 
 
 def with_options(command: list[str], replaced: Mapping[str, tuple[str, ...]]) -> list[str]:

@@ -60,6 +60,11 @@ class NodeLimits:
         except OSError as error:
             raise AdapterError(f"cannot bind process {pid} to CPU {cpu}: {error}") from error
 
+    def pids(self, node: NodeId) -> tuple[int, ...]:
+        """Every process in the node's group; none where it has no group."""
+        group = self._groups.get(node)
+        return () if group is None else group.pids()
+
     def remove(self) -> None:
         """Remove the groups; what is still inside one stays (in the lab the janitor comes after us)."""
         for group in self._groups.values():

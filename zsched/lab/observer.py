@@ -26,13 +26,13 @@ FORGET_S = 3.0
 class Observer:
     """Asks every daemon for its status twice a second; read from any thread. A context: leaving it ends the thread."""
 
-    def __init__(self, sockets: Mapping[NodeId, Path], task: TaskId, ask: Ask) -> None:
+    def __init__(self, sockets: Mapping[NodeId, Path], task: TaskId, ask: Ask, others: tuple[TaskId, ...] = ()) -> None:
         self._sockets = dict(sockets)
         self._task = task
         self._ask = ask
         self._lock = threading.Lock()
         self._statuses: dict[NodeId, tuple[float, Status]] = {}
-        self._moves: dict[int, Move] = {}
+        self._moves: dict[TaskId, dict[int, Move]] = {name: {} for name in (task, *others)}
         self._stop = threading.Event()
         self._thread = guarded(self._run, name="observer")
 
@@ -55,10 +55,11 @@ class Observer:
         with self._lock:
             return {node: at_s for node, (at_s, _) in self._statuses.items()}
 
-    def moves(self) -> list[Move]:
-        """Every allocation told so far, by epoch; times on the daemon's clock."""
+    def moves(self, task: TaskId | None = None) -> list[Move]:
+        """Every allocation of a task (``None``: the first) told so far, by epoch; times on the daemon's clock."""
         with self._lock:
-            return [self._moves[epoch] for epoch in sorted(self._moves)]
+            found = self._moves[task or self._task]
+            return [found[epoch] for epoch in sorted(found)]
 
     def _run(self) -> None:
         while not self._stop.is_set():
@@ -77,7 +78,7 @@ class Observer:
         if "error" in status:
             return
         now = monotonic_s()
-        told = past_allocations(status, self._task, now)
+        told = {task: past_allocations(status, task, now) for task in self._moves}
         with self._lock:
             self._statuses[node] = (now, status)
-            self._moves = merge_moves(self._moves, told)
+            self._moves = {task: merge_moves(known, told[task]) for task, known in self._moves.items()}

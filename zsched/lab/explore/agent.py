@@ -9,10 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from zsched.lab.explore.body import Body, Drift, Limits
+from zsched.lab.explore.body import Body, Drift, Limits, Twist
 from zsched.lab.explore.explorer import Explorer
+from zsched.lab.explore.follower import Follower
 from zsched.lab.explore.frontier import Claim
 from zsched.lab.explore.laser import SCAN_PERIOD_S, Laser, LaserScan
+from zsched.lab.explore.localizer import Localizer
 from zsched.lab.explore.mapper import ScanMapper
 from zsched.lab.explore.world import World
 from zsched.lab.mapping import RESOLUTION_M
@@ -39,6 +41,10 @@ class RobotSettings:
     """Of its own map."""
     has_slam: bool = True
     """Whether it maps itself; else it only hands out scans, for an edge to map."""
+    is_led: bool = False
+    """Whether SLAM on an edge gives it its pose, and navigation there its way: without fresh poses it stands."""
+    hold_until_s: float | None = None
+    """It stands, and looks, until then (the clock of `Agent.step`); ``None``: it drives at once."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -64,6 +70,10 @@ class Agent:
         self.settings = settings
         self.body = Body(world, settings.start, settings.limits, settings.drift, body_random)
         self.explorer = Explorer(settings.robot, settings.limits)
+        self.localizer = Localizer()
+        self.follower = Follower(settings.limits)
+        self.stopped_s = 0.0
+        """How long it has stood since it might drive, because its last correction was too old."""
         self._laser = Laser(world, laser_random)
         self._mapper = ScanMapper(resolution=settings.resolution_m, frame_id=f"{settings.robot}/map")
         self._phase = phase
@@ -79,8 +89,7 @@ class Agent:
             self._next_claim_s = now
             self._next_map_s = now + self._phase * MAP_PERIOD_S
             self._next_scan_s = now if self.settings.has_slam else self._next_map_s
-        twist = self.explorer.step(self.body.belief, now, is_blocked=self.body.is_blocked)
-        self.body.move(twist, now - self._last_s)
+        self.body.move(self._twist(now, stamp_ns, now - self._last_s), now - self._last_s)
         self._last_s = now
         scan = self._look(now, stamp_ns)
         is_map_due = self.settings.has_slam and now >= self._next_map_s
@@ -93,8 +102,25 @@ class Agent:
             grid=self._mapper.grid(stamp_ns) if is_map_due else None,
             scan=scan,
             claim=self.explorer.claim if is_claim_due else None,
-            is_claim_due=is_claim_due,
+            is_claim_due=is_claim_due and not self.settings.is_led,
         )
+
+    @property
+    def belief(self) -> Pose2:
+        """Where it believes to be, in its map frame."""
+        return self.localizer.belief(self.body.belief) if self.settings.is_led else self.body.belief
+
+    def _twist(self, now: float, stamp_ns: int, seconds: float) -> Twist:
+        """The velocity of this moment, for the next ``seconds``."""
+        hold_until_s = self.settings.hold_until_s
+        if hold_until_s is not None and now < hold_until_s:
+            return Twist()
+        if not self.settings.is_led:
+            return self.explorer.step(self.body.belief, now, is_blocked=self.body.is_blocked)
+        if self.localizer.is_lost(stamp_ns):
+            self.stopped_s += seconds
+            return Twist()
+        return self.follower.step(self.belief, now, is_blocked=self.body.is_blocked)
 
     def _look(self, now: float, stamp_ns: int) -> LaserScan | None:
         """Take the scan that is due and map it, if it can tell something new."""
@@ -102,7 +128,7 @@ class Agent:
             return None
         self._next_scan_s = max(self._next_scan_s + SCAN_PERIOD_S, now)
         belief = self.body.belief
-        if self._mapped is not None:
+        if self._mapped is not None and not self.settings.is_led:  # SLAM is kept at work at the laser's own rate
             way, turn = difference(belief, self._mapped[0])
             if way < MOVED_M and turn < TURNED_RAD and now - self._mapped[1] < STILL_PERIOD_S:
                 return None
@@ -111,4 +137,6 @@ class Agent:
         scan = self._laser.scan(self.body.pose, stamp_ns)
         if self.settings.has_slam:
             self._mapper.add(belief, scan)
+        if self.settings.is_led:
+            self.localizer.note(stamp_ns, belief)
         return scan

@@ -19,21 +19,20 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from zsched.lab.explore.body import Limits, Twist
+from zsched.lab.explore.follower import BACK_S, BACK_SPEED, next_corner, towards
 from zsched.lab.explore.frontier import Claim, Frontier, choose, find_frontiers
 from zsched.lab.explore.planner import PlanMap, Point, distances, plan_map, way_to
-from zsched.tasks.map_merge.geometry import Pose2, wrap_angle
+from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid
 
 PLAN_PERIOD_S = 0.5
 """Plans at most so often, and only for a reason: a new map, a reached goal, a wall."""
 REACHED_M = 0.4
 AVOID_S = 8.0
-"""A frontier that the robot has been at, or could not get to, does not count for so long."""
+"""A frontier that the robot has been at, or could not get to, does not count for so long, ..."""
+AVOID_M = 8.0
+"""... or for as long as a slow robot needs for this way: else it is back before it has got anywhere."""
 CLAIM_LIFE_S = 3.0
-CORNER_M = 0.15
-TURN_FIRST_RAD = 0.9
-BACK_S = 0.6
-"""After a bump it backs off for so long."""
 
 
 class State(StrEnum):
@@ -42,6 +41,15 @@ class State(StrEnum):
     WAITING = "waiting"
     DRIVING = "driving"
     IDLE = "idle"
+
+
+def avoid_s(limits: Limits) -> float:
+    """How long a robot of these limits is to avoid a frontier, in s.
+
+    >>> avoid_s(Limits(speed=1.0)), round(avoid_s(Limits(speed=0.22)), 1)
+    (8.0, 36.4)
+    """
+    return max(AVOID_S, AVOID_M / limits.speed)
 
 
 @dataclass(slots=True)
@@ -54,8 +62,10 @@ class _Goal:
 class Explorer:
     """One robot's explorer; all points are in the merged frame, but poses that are handed in by `step`."""
 
-    def __init__(self, robot: str, limits: Limits) -> None:
+    def __init__(self, robot: str, limits: Limits, avoid_s: float = AVOID_S) -> None:
+        """``avoid_s``: for how long a frontier does not count that the robot has been at, or could not get to."""
         self._robot = robot
+        self._avoid_s = avoid_s
         self._limits = limits
         self._map: Grid | None = None
         self._plan: PlanMap | None = None
@@ -83,9 +93,18 @@ class Explorer:
         x, y = self._goal.frontier.point
         return Claim(robot=self._robot, x=x, y=y, way_m=round(self._goal.frontier.way_m, 2))
 
+    @property
+    def way(self) -> tuple[Point, ...]:
+        """The corners of the way that are still ahead; none: it goes nowhere."""
+        return () if self._goal is None else self._goal.way[self._goal.next :]
+
     def take_map(self, grid: Grid) -> None:
         """The newest merged map."""
         self._map, self._is_due = grid, True
+
+    def look_again(self) -> None:
+        """Plan anew on the map that it has."""
+        self._is_due = self._map is not None
 
     def take_transform(self, merged_t_map: Pose2) -> None:
         """Where the merger has placed this robot's map frame."""
@@ -112,7 +131,7 @@ class Explorer:
             self._is_due = False
             self._decide(here)
         if now < self._back_until_s:
-            return Twist(speed=-0.3 * self._limits.speed)
+            return Twist(speed=BACK_SPEED * self._limits.speed)
         return Twist() if self._goal is None else self._follow(self._goal, here)
 
     def _notice(self, here: Pose2, now: float, *, is_blocked: bool) -> None:
@@ -125,7 +144,7 @@ class Explorer:
             self._back_until_s = now + BACK_S
         end = self._goal.way[-1]
         if is_blocked or math.dist((here.x, here.y), end) < REACHED_M:
-            self._avoided.append((now + AVOID_S, self._goal.frontier.point))
+            self._avoided.append((now + self._avoid_s, self._goal.frontier.point))
             self._goal, self._is_due = None, True
 
     def _decide(self, here: Pose2) -> None:
@@ -150,13 +169,6 @@ class Explorer:
         self._goal, self.state = _Goal(frontier=chosen, way=way), State.DRIVING
 
     def _follow(self, goal: _Goal, here: Pose2) -> Twist:
-        """Towards the next corner of the way; first turn, then drive."""
-        last = len(goal.way) - 1
-        while goal.next < last and math.dist((here.x, here.y), goal.way[goal.next]) < CORNER_M:
-            goal.next += 1
-        x, y = goal.way[goal.next]
-        error = wrap_angle(math.atan2(y - here.y, x - here.x) - here.yaw)
-        turn = max(-self._limits.turn, min(self._limits.turn, 2.5 * error))
-        if abs(error) > TURN_FIRST_RAD:
-            return Twist(turn=turn)
-        return Twist(speed=self._limits.speed * max(0.2, math.cos(error)), turn=turn)
+        """Towards the next corner of the way."""
+        goal.next = next_corner(goal.way, goal.next, here)
+        return towards(goal.way[goal.next], here, self._limits)

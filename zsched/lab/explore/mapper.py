@@ -11,6 +11,8 @@ values it shares; the poses are given (`zsched.lab.explore.body`: truth plus the
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,12 +20,15 @@ import numpy.typing as npt
 from zsched.lab.explore.laser import RANGE_M, LaserScan
 from zsched.lab.mapping import CLIP, FREE_BELOW, HIT, MISS, OCCUPIED_ABOVE, RESOLUTION_M
 from zsched.tasks.map_merge.geometry import Pose2
-from zsched.tasks.map_merge.grid import FREE, OCCUPIED, UNKNOWN, Grid
+from zsched.tasks.map_merge.grid import FREE, OCCUPIED, UNKNOWN, Grid, Mask
 
 _GROWTH_CELLS = 128
 ONE_WALL_M = 0.25
 """Echoes of two neighbouring beams that lie so near each other are of one wall: at a grazing angle beams skip cells."""
 _BETWEEN = np.array([0.2, 0.4, 0.6, 0.8])
+
+STEP = 0.05
+"""`HIT`, `MISS` and `CLIP` are multiples of it: in steps of it a log-odds fits into a byte."""
 
 _Box = tuple[int, int, int, int]
 """Cells of the map frame: low x, low y (inclusive), high x, high y (exclusive)."""
@@ -58,6 +63,23 @@ class ScanMapper:
         np.add(part, np.float32(MISS), out=part, where=missed)
         np.clip(part, -CLIP, CLIP, out=part)
 
+    @property
+    def resolution(self) -> float:
+        """Metres per cell."""
+        return self._resolution
+
+    def walls(self, near: Pose2, reach_m: float) -> tuple[Mask, int, int]:
+        """The wall cells in a square of ``reach_m`` each way round ``near``, and the square's lowest cell (x, y)."""
+        reach = math.ceil(reach_m / self._resolution)
+        low_x, low_y = (math.floor(value / self._resolution) - reach for value in (near.x, near.y))
+        found: Mask = np.zeros((2 * reach + 1, 2 * reach + 1), dtype=np.bool_)
+        left, low = max(low_x, self._box[0]), max(low_y, self._box[1])
+        right, high = min(low_x + 2 * reach + 1, self._box[2]), min(low_y + 2 * reach + 1, self._box[3])
+        if left < right and low < high:
+            known = self._part((left, low, right, high)) > OCCUPIED_ABOVE
+            found[low - low_y : high - low_y, left - low_x : right - low_x] = known
+        return found, low_x, low_y
+
     def grid(self, stamp_ns: int = 0) -> Grid:
         """The grid so far, cut to what scans could reach (1 x 1 unknown before the first scan)."""
         low_x, low_y, high_x, high_y = self._touched or (0, 0, 1, 1)
@@ -68,6 +90,24 @@ class ScanMapper:
             cells[part > OCCUPIED_ABOVE] = OCCUPIED
         origin = Pose2(x=low_x * self._resolution, y=low_y * self._resolution)
         return Grid(data=cells, resolution=self._resolution, origin=origin, stamp_ns=stamp_ns, frame_id=self._frame_id)
+
+    def state(self) -> tuple[npt.NDArray[np.int8], dict[str, object]]:
+        """The log-odds in steps of `STEP` (rows, columns), and where they lie: for `restore`."""
+        cells = np.rint(self._log_odds / STEP).astype(np.int8)
+        return cells, {"shape": cells.shape, "box": self._box, "touched": self._touched}
+
+    def restore(self, cells: npt.NDArray[np.int8], where: Mapping[str, Any]) -> None:
+        """Go on from another mapper's `state`.
+
+        Raises:
+            ValueError, TypeError, KeyError: it does not fit together; nothing has changed.
+        """
+        box = _box(where["box"])
+        touched = None if where["touched"] is None else _box(where["touched"])
+        if cells.shape != (box[3] - box[1], box[2] - box[0]) or (touched and _union(box, touched) != box):
+            raise ValueError(f"{cells.shape} cells in {box}, touched {touched}")
+        self._box, self._touched = box, touched
+        self._log_odds = cells.astype(np.float32) * np.float32(STEP)
 
     def _missed(self, pose: Pose2, scan: LaserScan, window: _Box) -> npt.NDArray[np.bool_]:
         """Which cells of ``window`` a beam passes through."""
@@ -116,6 +156,11 @@ def _walls(pose: Pose2, scan: LaserScan) -> tuple[npt.NDArray[np.float64], npt.N
     between_x = (x[is_one_wall] + shares * to_x[is_one_wall]).ravel()
     between_y = (y[is_one_wall] + shares * to_y[is_one_wall]).ravel()
     return np.concatenate((x[scan.echo], between_x)), np.concatenate((y[scan.echo], between_y))
+
+
+def _box(raw: Any) -> _Box:
+    low_x, low_y, high_x, high_y = (int(value) for value in raw)
+    return low_x, low_y, high_x, high_y
 
 
 def _union(a: _Box, b: _Box) -> _Box:

@@ -1,4 +1,4 @@
-"""The explorers' own messages as bytes: claims, and scans for mapping elsewhere.
+"""The explorers' own messages as bytes: claims, scans for mapping elsewhere, and what comes back: poses and ways.
 
 Knows: the two layouts. Does not know: zenoh, who sends what when. Maps and transforms are ROS messages
 (`zsched.tasks.map_merge.cdr`).
@@ -6,7 +6,9 @@ Knows: the two layouts. Does not know: zenoh, who sends what when. Maps and tran
 A claim is JSON: ``{"robot", "x", "y", "way_m"}`` in the merged frame, without ``x`` when the robot goes nowhere. A scan
 is, little endian: ``ZSC1``, the stamp in ns (int64), the robot's pose in its map frame x, y, yaw (float64), the number
 of beams (uint16), and one float32 per beam from straight ahead counter-clockwise, infinite without an echo (as in
-sensor_msgs/msg/LaserScan).
+sensor_msgs/msg/LaserScan). A correction is, little endian: ``ZCR1``, the stamp of its scan in ns (int64), the robot's
+pose then in its map frame x, y, yaw (float64), and how well the scan fits (float64, 0 to 1). A way is JSON:
+``{"stamp_ns", "points": [[x, y], ...]}`` in the robot's map frame, without points when the robot is to stand.
 """
 
 from __future__ import annotations
@@ -14,6 +16,8 @@ from __future__ import annotations
 import json
 import math
 import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -25,6 +29,62 @@ from zsched.tasks.map_merge.geometry import Pose2
 _HEAD = struct.Struct("<4sqdddH")
 _MAGIC = b"ZSC1"
 MAX_BEAMS = 4096
+_CORRECTION = struct.Struct("<4sqdddd")
+_CORRECTION_MAGIC = b"ZCR1"
+MAX_POINTS = 4096
+Point = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Correction:
+    """Where SLAM has found the robot: its pose in its map frame when the scan of ``stamp_ns`` was taken."""
+
+    stamp_ns: int
+    pose: Pose2
+    fit: float = 0.0
+    """The mean likelihood of the scan's echoes, 0 to 1."""
+
+
+def encode_correction(correction: Correction) -> bytes:
+    """A correction."""
+    pose = correction.pose
+    return _CORRECTION.pack(_CORRECTION_MAGIC, correction.stamp_ns, pose.x, pose.y, pose.yaw, correction.fit)
+
+
+def decode_correction(payload: bytes) -> Correction:
+    """The correction.
+
+    Raises:
+        WireError: the bytes are none.
+    """
+    if len(payload) != _CORRECTION.size:
+        raise WireError("correction", f"{len(payload)} bytes, not {_CORRECTION.size}")
+    magic, stamp_ns, x, y, yaw, fit = _CORRECTION.unpack(payload)
+    pose = Pose2(x=x, y=y, yaw=yaw)
+    if magic != _CORRECTION_MAGIC or not pose.is_finite or not 0.0 <= fit <= 1.0:
+        raise WireError("correction", f"{pose} with fit {fit} is none")
+    return Correction(stamp_ns=stamp_ns, pose=pose, fit=fit)
+
+
+def encode_way(stamp_ns: int, points: Sequence[Point]) -> bytes:
+    """A way in the robot's map frame, as of ``stamp_ns``."""
+    return json.dumps({"stamp_ns": stamp_ns, "points": [[round(x, 3), round(y, 3)] for x, y in points]}).encode()
+
+
+def decode_way(payload: bytes) -> tuple[Point, ...]:
+    """The points of a way; none: stand.
+
+    Raises:
+        WireError: the bytes are none.
+    """
+    try:
+        told = json.loads(payload)["points"]
+        points = tuple((float(x), float(y)) for x, y in told[: MAX_POINTS + 1])
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        raise WireError("way", repr(error)) from error
+    if len(points) > MAX_POINTS or not all(map(math.isfinite, (value for point in points for value in point))):
+        raise WireError("way", "too many points, or one that is no finite number")
+    return points
 
 
 def encode_claim(robot: str, claim: Claim | None) -> bytes:

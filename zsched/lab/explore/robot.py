@@ -6,13 +6,20 @@ late map costs it.
     python -m zsched.lab.explore.robot --robot robot1 --world office:1 --index 0 --robots 3 --seed 1
         --endpoint tcp/127.0.0.1:7458 --records DIR [--start x,y,yaw] [--target 0.9] [--speed 0.5] [--slam-on edge1]
 
+With ``--led`` SLAM and navigation on a node lead it (`zsched.lab.explore.slam --match`, `zsched.lab.explore.navigate`).
+
     out  <robot>/map                nav_msgs/msg/OccupancyGrid, CDR, 2 Hz (not with --slam-on)
          <robot>/scan               with --slam-on: its scans, 5 Hz (`zsched.lab.explore.slam` maps them)
-         explore/<robot>/claim      where it goes, 2 Hz
+         explore/<robot>/claim      where it goes, 2 Hz (not with --led)
+         <robot>/bump               with --led: it has met a wall
     in   <robot>/global_map         the merged map: the only one it plans on
          <robot>/map_merge/tf       where the merger has placed its map frame: without it the robot stands
          <robot>/map_merge/status   recorded
          explore/*/claim            the others' claims
+         <robot>/pose, <robot>/way  with --led: corrections of its pose, and where to drive
+         <robot>/TASK/pose, /map    with --slam-task TASK: both from a task; it hands them on
+
+With ``--slam-task`` its scans go to ``<robot>/TASK/scan``.
 
 The merger's ``--pose <robot>=x,y,yaw`` is the robot's start: ``load_world(world).starts(robots)[index]``.
 
@@ -25,6 +32,7 @@ end it writes ``<robot>-global_map.cdr`` and ``<robot>-map.cdr``. ``t_s`` is the
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import sys
 import time
@@ -39,7 +47,7 @@ from zsched.errors import ConfigError, WireError
 from zsched.lab import application
 from zsched.lab.explore.agent import Agent, Outputs, RobotSettings
 from zsched.lab.explore.body import Drift, Limits
-from zsched.lab.explore.messages import decode_claim, encode_claim, encode_scan
+from zsched.lab.explore.messages import decode_claim, decode_correction, decode_way, encode_claim, encode_scan
 from zsched.lab.explore.referee import Referee
 from zsched.lab.explore.world import World
 from zsched.lab.explore.worlds import load_world
@@ -68,6 +76,8 @@ class Options:
     target: float
     begin_s: float | None = None
     """When it begins, on the machine's monotonic clock; ``None``: at once."""
+    slam_task: str = ""
+    """The task that its SLAM is; empty: a program that runs on one node."""
 
 
 class Applications:
@@ -83,7 +93,16 @@ class Applications:
         # BLOCK_FIRST: a map is many fragments, which DROP loses on a slow link; one map waits, none piles up behind it.
         latest = zenoh.CongestionControl.BLOCK_FIRST
         self._map = session.declare_publisher(f"{robot}/map", congestion_control=latest)
-        self._scan = session.declare_publisher(f"{robot}/scan", congestion_control=zenoh.CongestionControl.DROP)
+        slam = f"{robot}/{options.slam_task}" if options.slam_task else robot
+        self._scan = session.declare_publisher(f"{slam}/scan", congestion_control=zenoh.CongestionControl.DROP)
+        self._is_led = options.settings.is_led
+        if self._is_led:
+            self._bump = session.declare_publisher(f"{robot}/bump")
+            self._poses = session.declare_subscriber(f"{slam}/pose", zenoh.handlers.RingChannel(4))
+            self._ways = session.declare_subscriber(f"{robot}/way", zenoh.handlers.RingChannel(1))
+        if options.slam_task:
+            self._own_maps = session.declare_subscriber(f"{slam}/map", zenoh.handlers.RingChannel(1))
+            self._pose = session.declare_publisher(f"{robot}/pose")
         self._claim = session.declare_publisher(f"explore/{robot}/claim")
         self._maps = session.declare_subscriber(f"{robot}/global_map", zenoh.handlers.RingChannel(4))
         self._transforms = session.declare_subscriber(f"{robot}/map_merge/tf", zenoh.handlers.RingChannel(4))
@@ -91,6 +110,9 @@ class Applications:
         self._claims = session.declare_subscriber("explore/*/claim", zenoh.handlers.RingChannel(64))
         self._sent = self._sent_bytes = self._received = self._received_bytes = self._claims_heard = 0
         self._last_sent = self._last_map = self._last_state = b""
+        self._corrections = 0
+        self._latest_s = 0.0
+        """The oldest that a correction was when the next one came, since the last record of progress."""
         self._last_map_s: float | None = None
         self._merged_t_map: Pose2 | None = None
         self._coverage = 0.0
@@ -124,9 +146,9 @@ class Applications:
 
     def _send(self, outputs: Outputs) -> None:
         if outputs.grid is not None:
-            self._last_sent = encode_grid(outputs.grid)
-            self._map.put(self._last_sent)
-            self._sent, self._sent_bytes = self._sent + 1, self._sent_bytes + len(self._last_sent)
+            self._send_map(encode_grid(outputs.grid))
+        if self._is_led and self._agent.body.is_blocked:
+            self._bump.put(b"")
         if outputs.scan is not None and not self._options.settings.has_slam:
             payload = encode_scan(outputs.scan, self._agent.body.belief)
             self._scan.put(payload)
@@ -135,6 +157,11 @@ class Applications:
             self._claim.put(encode_claim(self._options.settings.robot, outputs.claim))
 
     def _listen(self, now: float) -> None:
+        if self._is_led:
+            self._be_led()
+        if self._options.slam_task:
+            while (sample := self._own_maps.try_recv()) is not None:
+                self._send_map(bytes(sample.payload))
         while (sample := self._transforms.try_recv()) is not None:
             self._take_transforms(bytes(sample.payload))
         while (sample := self._maps.try_recv()) is not None:
@@ -143,6 +170,26 @@ class Applications:
             self._take_state(bytes(sample.payload), now)
         while (sample := self._claims.try_recv()) is not None:
             self._take_claim(bytes(sample.payload), now)
+
+    def _be_led(self) -> None:
+        """Take what SLAM and navigation say; what is no such message counts for nothing."""
+        localizer, now_ns = self._agent.localizer, time.time_ns()
+        while (sample := self._poses.try_recv()) is not None:
+            payload = bytes(sample.payload)
+            if self._options.slam_task:
+                self._pose.put(payload)
+            with contextlib.suppress(WireError):
+                correction = decode_correction(payload)
+                self._corrections += localizer.take(correction.stamp_ns, correction.pose)
+        self._latest_s = max(self._latest_s, localizer.age_s(now_ns) or 0.0)
+        while (sample := self._ways.try_recv()) is not None:
+            with contextlib.suppress(WireError):
+                self._agent.follower.take_way(decode_way(bytes(sample.payload)))
+
+    def _send_map(self, payload: bytes) -> None:
+        self._last_sent = payload
+        self._map.put(payload)
+        self._sent, self._sent_bytes = self._sent + 1, self._sent_bytes + len(payload)
 
     def _take_transforms(self, payload: bytes) -> None:
         try:
@@ -163,7 +210,8 @@ class Applications:
         gap = None if self._last_map_s is None else now - self._last_map_s
         self._received, self._received_bytes = self._received + 1, self._received_bytes + len(payload)
         self._last_map, self._last_map_s = payload, now
-        self._agent.explorer.take_map(grid)
+        if not self._is_led:
+            self._agent.explorer.take_map(grid)
         record: Record = {"kind": "map", "t_s": now, "gap_s": gap, "bytes": len(payload)}
         record["known_m2"] = round(grid.known_area_m2, 1)
         if self._merged_t_map is not None:
@@ -197,7 +245,7 @@ class Applications:
             self._agent.explorer.take_claims((claim,), now)
 
     def _record_path(self, now: float) -> None:
-        true, belief = self._agent.body.pose, self._agent.body.belief
+        true, belief = self._agent.body.pose, self._agent.belief
         record: Record = {"kind": "path", "t_s": now}
         record |= {name: round(getattr(true, name), 3) for name in ("x", "y", "yaw")}
         record |= {f"belief_{name}": round(getattr(belief, name), 3) for name in ("x", "y", "yaw")}
@@ -215,12 +263,16 @@ class Applications:
                 "bytes_received": self._received_bytes,
                 "claims_heard": self._claims_heard,
                 "coverage": self._coverage,
-                "state": self._agent.explorer.state.value,
+                "state": "led" if self._is_led else self._agent.explorer.state.value,
                 "goals": self._agent.explorer.goals,
                 "way_m": round(self._agent.body.way_m, 2),
                 "cpu_s": round(time.process_time(), 3),
+                "stopped_s": round(self._agent.stopped_s, 2),
+                "corrections": self._corrections,
+                "correction_age_s": round(self._latest_s, 3),
             }
         )
+        self._latest_s = 0.0
 
     def _write(self, record: Record) -> None:
         self._recorder.write(self._options.settings.robot, record)
@@ -247,11 +299,16 @@ def parse(arguments: list[str]) -> Options:
     add("--drift-yaw", type=float, default=Drift().yaw, help="rad per square root of a metre (0.001)")
     add("--drift-way", type=float, default=Drift().way, help="m per square root of a metre (0.003)")
     add("--resolution", type=metres_per_cell, default=RESOLUTION_M, help="of its own map, metres per cell (0.05)")
-    add("--slam-on", default="", metavar="NODE", help="map on this node (zsched.lab.explore.slam) and only send scans")
+    add("--slam-on", default="", metavar="NODE", help="map on this node (zsched.lab.explore.slam), send scans")
+    add("--led", action="store_true", help="let SLAM and navigation on a node lead it; only with --slam-on")
+    add("--slam-task", default="", metavar="TASK", help="the task that its SLAM is; only with --led")
+    add("--hold-until-s", type=float, help="stand until then, on the machine's monotonic clock (do not)")
     add("--begin-s", type=float, help="when to begin, on the machine's monotonic clock (at once)")
     given = parser.parse_args(arguments)
     if not 0 <= given.index < given.robots or not 0.0 < given.speed <= 5.0:
         parser.error("--index must be in [0, robots) and --speed in (0, 5]")
+    if (given.led and not given.slam_on) or (given.slam_task and not given.led):
+        parser.error("--led goes with --slam-on, and --slam-task with --led")
     world = load_world(given.world)
     settings = RobotSettings(
         robot=given.robot,
@@ -261,6 +318,8 @@ def parse(arguments: list[str]) -> Options:
         drift=Drift(yaw=given.drift_yaw, way=given.drift_way),
         resolution_m=given.resolution,
         has_slam=not given.slam_on,
+        is_led=given.led,
+        hold_until_s=given.hold_until_s,
     )
     phase = given.index / given.robots
     return Options(
@@ -271,6 +330,7 @@ def parse(arguments: list[str]) -> Options:
         records=given.records,
         target=given.target,
         begin_s=given.begin_s,
+        slam_task=given.slam_task,
     )
 
 

@@ -17,19 +17,23 @@ from typing import Any
 from zsched import __version__
 from zsched.errors import ConfigError, ZschedError
 from zsched.lab.demo import EXIT_CONFIG, EXIT_FAILED, EXIT_SIGNAL, EXIT_USAGE
+from zsched.lab.fleet_runner import read_tree
 from zsched.lab.laser_log import malaga_path
 from zsched.lab.netns import why_not
 from zsched.lab.paper.cells import Cell, cells_of, merge_of, world_of
+from zsched.lab.paper.coverage_report import save_coverage
 from zsched.lab.paper.figures import save_all, save_gains, save_panels
 from zsched.lab.paper.matrix import Matrix, collect, undone
 from zsched.lab.paper.metrics import Truth, brief, measure
+from zsched.lab.paper.places import scenario_path
 from zsched.lab.paper.plan import AROUND_S, leave_out, plan_text, without
 from zsched.lab.paper.radio_bench import RADIO_SCHEMES, radio_results, run_radio
-from zsched.lab.paper.report import groups_of, in_block, is_whole, report, snippet
-from zsched.lab.paper.robots import ExploreRobots, LogRobots, Robots
+from zsched.lab.paper.report import groups_of, in_block, is_whole, main_level, report
+from zsched.lab.paper.robots import ExploreRobots, LogRobots, Robots, slam_task
 from zsched.lab.paper.run import CellRun, Inputs, write_json
 from zsched.lab.paper.scenario import MATRIX, Scenario, load_scenario
 from zsched.lab.paper.schemes import QUICK_SCHEMES
+from zsched.lab.paper.snippet import snippet
 from zsched.lab.signals import Interrupted, interruptible
 
 RESULTS_SCHEMA = "zsched.paper/1"
@@ -81,7 +85,8 @@ def _run(options: BenchOptions) -> int:
     scenario, cells, skipped = planned(options)
     inputs = InputsOf(options, scenario)
     body = plan_body(scenario, inputs, cells)
-    radio = load_scenario(options.robots_scenario) if not options.is_quick and not options.schemes else None
+    has_radio = scenario.main == MATRIX and not options.is_quick and not options.schemes
+    radio = load_scenario(options.robots_scenario) if has_radio else None
     wrong = None if options.is_plan else claim_folder(options, body)
     if wrong:
         say(wrong)
@@ -124,6 +129,8 @@ class InputsOf:
 
     def __init__(self, options: BenchOptions, scenario: Scenario) -> None:
         self._options, self._scenario = options, scenario
+        tasks = read_tree(scenario.fleet)["tasks"]
+        self._has_slam_tasks = any(slam_task(robot) in tasks for robot in scenario.explore.slam_on)
 
     @property
     def name(self) -> str:
@@ -158,8 +165,18 @@ class InputsOf:
         if not self._options.is_exploring:
             return LogRobots(log=log_path(self._options))
         loop = self._scenario.explore
-        world, resolution_m = world_of(self._scenario, cell), merge_of(self._scenario, cell).resolution_m
-        return ExploreRobots(world=world, speed=loop.speed, slam_on=loop.slam_on, resolution_m=resolution_m)
+        full = self._scenario.full_cores
+        return ExploreRobots(
+            world=world_of(self._scenario, cell),
+            speed=loop.speed,
+            slam_on=loop.slam_on,
+            resolution_m=merge_of(self._scenario, cell).resolution_m,
+            slam_cores=None if loop.slam_share is None else loop.slam_share * full,
+            navigate_cores=loop.navigate_share * full,
+            map_period_s=loop.map_period_s,
+            ends_at_target=loop.ends_at_target,
+            is_slam_task=self._has_slam_tasks,
+        )
 
 
 def told_plan(
@@ -191,14 +208,27 @@ def planned(options: BenchOptions) -> tuple[Scenario, tuple[Cell, ...], dict[str
         loop = scenario.explore
         scenario = replace(scenario, duration_s=loop.duration_s, target_coverage=loop.target_coverage)
     if options.is_quick:
-        names = options.schemes or QUICK_SCHEMES
-        scenario = replace(scenario, schemes=names, runs=1, sweep=replace(scenario.sweep, schemes=()), blocks={})
+        scenario = quick_of(scenario, options)
     if options.is_quick and not options.is_exploring:
         scenario = replace(scenario, duration_s=QUICK_S)
     if options.duration_s is not None:
         scenario = replace(scenario, duration_s=options.duration_s)
     skipped = without(scenario, is_exploring=options.is_exploring, why_not=why_not)
+    if scenario.main in skipped:
+        raise ConfigError(f"{options.scenario}: block {scenario.main}: {skipped[scenario.main]}")
     return scenario, cells_of(leave_out(scenario, skipped), options.schemes, options.runs), skipped
+
+
+def quick_of(scenario: Scenario, options: BenchOptions) -> Scenario:
+    """What ``--quick`` leaves: one run of a few schemes, in the block that the scenario names for it.
+
+    That block is for robots that explore; a replayed log goes through the matrix.
+    """
+    names = options.schemes or QUICK_SCHEMES
+    main = scenario.quick if options.is_exploring else MATRIX
+    kept = {main: replace(scenario.blocks[main], schemes=names, runs=1)} if main != MATRIX else {}
+    sweep = replace(scenario.sweep, schemes=())
+    return replace(scenario, schemes=names, runs=1, sweep=sweep, blocks=kept, main=main, quick=main)
 
 
 def plan_body(scenario: Scenario, inputs: InputsOf, cells: Sequence[Cell]) -> dict[str, Any]:
@@ -248,8 +278,10 @@ def conclude(options: BenchOptions, scenario: Scenario, inputs: InputsOf, cells:
         "radio": rest.radio,
     }
     write_json(options.out / "results.json", results)
-    title = f"{scenario.name}, load {scenario.level}, seed {scenario.seed}, {inputs.name}"
-    drawn = save_all(in_block(runs, MATRIX), scenario.level, tuple(scenario.levels), options.out, title)
+    title = f"{scenario.name}, load {main_level(results)}, seed {scenario.seed}, {inputs.name}"
+    main = in_block(runs, scenario.main)
+    level = main_level(results)
+    drawn = save_all(main, level, tuple(scenario.levels), options.out, title)
     drawn += block_pictures(results, options.out)
     (options.out / "report.md").write_text(report(results, drawn), encoding="utf-8")
     (options.out / "readme.md").write_text(snippet(results, drawn), encoding="utf-8")
@@ -269,12 +301,19 @@ def block_pictures(results: Mapping[str, Any], out: Path) -> list[str]:
         for name in results["scenario"]["blocks"]
         if is_whole(own := in_block(results["runs"], name))
     ]
-    return [*([gains] if gains else []), *panels]
+    curves = [
+        found
+        for name in results["scenario"]["blocks"]
+        if (found := save_coverage(out / f"{name}-coverage.png", in_block(results["runs"], name), title))
+    ]
+    return [*curves, *([gains] if gains else []), *panels]
 
 
 def command_of(options: BenchOptions) -> str:
     """The command that makes these results, without the places of this machine."""
     words = ["zsched bench paper"]
+    if options.scenario != scenario_path():
+        words += [f"--scenario {options.scenario.name.removesuffix('.scenario.yml')}"]
     words += ["--quick"] if options.is_quick else []
     words += [f"--input {'explore' if options.is_exploring else 'log'}"]
     words += [f"--runs {options.runs}"] if options.runs is not None else []

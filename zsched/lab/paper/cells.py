@@ -38,15 +38,17 @@ def cells_of(scenario: Scenario, names: tuple[str, ...], runs: int | None = None
         ConfigError: an unknown scheme.
     """
     most = scenario.runs if runs is None else runs
-    cells = list(_by_run(scenario, find_schemes(names or scenario.schemes), most))
-    if swept := _kept(scenario.sweep.schemes, names):
+    has_matrix = scenario.main == MATRIX
+    cells = list(_by_run(scenario, find_schemes(names or scenario.schemes), most)) if has_matrix else []
+    if has_matrix and (swept := _kept(scenario.sweep.schemes, names)):
         others = [level for level in scenario.levels if level != scenario.level]
         for run in range(min(scenario.sweep.runs, most)):
             cells += [Cell(scheme=s, level=level, run=run) for level in others for s in swept]
     for name, block in scenario.blocks.items():
         kept = _kept(block.schemes, names)
         for run in range(min(block.runs, most)):
-            cells += [Cell(scheme=s, level=block.level or scenario.level, run=run, block=name) for s in kept]
+            order = kept[::-1] if block.alternates and run % 2 else kept
+            cells += [Cell(scheme=s, level=block.level or scenario.level, run=run, block=name) for s in order]
     return tuple(cells)
 
 

@@ -30,7 +30,7 @@ IDLE_FLOOR = 0.05
 GIVE_UP = 3
 """So many cells in a row that stay invalid: the machine or the fleet is at fault, and the rest would fail as well."""
 METRICS = "metrics.json"
-DEFINITIONS = 3
+DEFINITIONS = 4
 """Raise it when a figure's definition changes: figures of finished runs are then made again."""
 Say = Callable[[str], None]
 Json = dict[str, Any]
@@ -43,12 +43,11 @@ Measure = Callable[[Cell, Path], tuple[Json, str]]
 def invalid_reason(scenario: Scenario, host: Mapping[str, float | None]) -> str | None:
     """Why a run does not count: the host itself was short of CPU; ``None``: it counts."""
     pressure, idle = host.get("pressure"), host.get("idle_ratio")
-    if pressure is not None:
-        if pressure > scenario.pressure_limit:
-            return f"pressure {pressure:.2f} outside the quotas, at most {scenario.pressure_limit:g}"
-        return None
-    if idle is not None and idle < IDLE_FLOOR:
-        return f"the host was idle for {idle:.2f} of the time, at least {IDLE_FLOOR:g}"
+    if pressure is not None and pressure > scenario.pressure_limit:
+        return f"pressure {pressure:.2f} outside the quotas, at most {scenario.pressure_limit:g}"
+    floor = scenario.idle_floor if pressure is not None else max(scenario.idle_floor, IDLE_FLOOR)
+    if idle is not None and idle < floor:
+        return f"the host was idle for {idle:.2f} of the time, at least {floor:g}"
     return None
 
 

@@ -13,7 +13,8 @@ import itertools
 import json
 import statistics
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,11 @@ from mcap.reader import make_reader
 from zsched.core.model import NodeId
 from zsched.lab.fleet_view import Load
 from zsched.lab.map_metrics import score_map
+from zsched.lab.paper.arrivals import Arrival, Streams
+from zsched.lab.paper.led_metrics import coverage_figures, led_figures, merge_cpu_s
 from zsched.lab.paper.load import Window, loaded_at
 from zsched.lab.paper.oracle import changes, utilities
+from zsched.lab.paper.roles import role_figures
 from zsched.lab.paper.scenario import Scenario
 from zsched.lab.recorder import read_records
 from zsched.tasks.map_merge.cdr import CdrError, decode_grid
@@ -36,29 +40,6 @@ HELD_EVERY_S = 5.0
 Json = dict[str, Any]
 
 
-@dataclass(frozen=True, slots=True)
-class Arrival:
-    """One merged map at one robot: when, how old its newest input was, how large."""
-
-    t_s: float
-    latency_s: float
-    size: int
-    known: float
-    """Share of the truth's known cells that it knows."""
-
-
-@dataclass(slots=True)
-class Streams:
-    """What the recorder heard of one run."""
-
-    maps: dict[NodeId, list[Arrival]] = field(default_factory=dict)
-    sent: dict[NodeId, list[tuple[float, int]]] = field(default_factory=dict)
-    """(when, bytes) of each robot's own maps."""
-    held: dict[float, list[int]] = field(default_factory=dict)
-    """{instant: keys of the maps that the robots held then}."""
-    payloads: dict[int, bytes] = field(default_factory=dict)
-
-
 class Truth:
     """The grid of the whole log, and how much of it a map knows."""
 
@@ -67,6 +48,8 @@ class Truth:
         rows, columns = np.nonzero(grid.known)
         self._x = grid.origin.x + (columns + 0.5) * grid.resolution
         self._y = grid.origin.y + (rows + 0.5) * grid.resolution
+        self.area_m2 = self._x.size * grid.resolution**2
+        """What can be known."""
 
     def coverage(self, payload: bytes) -> float:
         """Share of the known cells that the map in ``payload`` knows; 0 for what is no map.
@@ -114,6 +97,13 @@ def measure(folder: Path, scenario: Scenario, truth: Truth) -> Json:
         "is_done": is_done,
         "duration_s": duration_s,
         **map_figures(streams, truth, len(run["robots"])),
+        **coverage_figures(streams, duration_s, truth.area_m2),
+        **led_figures(folder, run),
+        "merge_cpu_s": merge_cpu_s(nodes, len(streams.stamps)),
+        "roles": role_figures(nodes, run["shares"], partial(owner_at, owners)),
+        "other_moves": sum(
+            len(owners_within(own, duration_s)) - 1 for own in (run.get("others") or {}).values() if own
+        ),
         **move_figures(run, streams, owners),
         "regret": regret(scenario, run, owners),
     }
@@ -153,6 +143,8 @@ def read_streams(folder: Path, run: Mapping[str, Any], truth: Truth) -> Streams:
         if key not in known:
             known[key] = truth.coverage(data)
         newest[robot] = key
+        if 0.0 <= t_s <= float(run["duration_s"]):
+            found.stamps.add(key)
         found.payloads[key] = data
         found.maps[robot].append(Arrival(t_s, (log_ns - sent_ns) / 1e9, len(data), known[key]))
         drop_unheld(found, newest)

@@ -31,8 +31,8 @@ def node_limits(prefix: str, scenario: Scenario, fleet: LabFleet) -> NodeLimits:
             if node not in fleet.kinds:
                 continue
             name = f"{prefix}-{node}"
-            groups[node] = LimitedGroup.create(name, cpu_cores=share.cpu_cores, memory_mb=share.memory_mb)
-            says.append(f"{node} {share.cpu_cores:g} cores, {share.memory_mb:.0f} MiB")
+            groups[node] = LimitedGroup.create(name, cpu_cores=share.quota_cores, memory_mb=share.memory_mb)
+            says.append(f"{node} {share.quota_cores:g} cores, {share.memory_mb:.0f} MiB")
     except AdapterError:
         for group in groups.values():
             group.remove()
@@ -66,6 +66,11 @@ def own_links(status: Status, node: NodeId) -> object:
     """The signals (dBm) of the node's own way to the access point, by its own snapshot."""
     own: Status = next((part for part in status.get("nodes") or () if part.get("name") == node), {})
     return [link.get("rssi_dbm") for link in own.get("links") or () if link.get("peer") is None]
+
+
+def owners_of(status: Status, tasks: tuple[str, ...]) -> set[str | None]:
+    """The owners of ``tasks`` by one snapshot; ``None`` among them: one has none yet."""
+    return {(find_task(status, task) or {}).get("owner") for task in tasks}
 
 
 def task_streams(status: Status, task: str) -> object:

@@ -15,6 +15,18 @@ def scenario_path() -> Path:
     return DATA / "paper.scenario.yml"
 
 
+def shipped_scenario(name: str) -> Path | None:
+    """A shipped scenario by its name (``nano``); ``None``: there is none of that name."""
+    path = DATA / f"{name}.scenario.yml"
+    return path if name.isascii() and name.replace("-", "").isalnum() and path.is_file() else None
+
+
+def shipped_names() -> tuple[str, ...]:
+    """The names of all shipped scenarios with edges."""
+    names = sorted(path.name.removesuffix(".scenario.yml") for path in DATA.glob("*.scenario.yml"))
+    return tuple(name for name in names if name != robots_scenario_path().name.removesuffix(".scenario.yml"))
+
+
 def robots_scenario_path() -> Path:
     """The paper's real-world demonstration: three robots, no edges."""
     return DATA / "paper-robots.scenario.yml"

@@ -22,7 +22,7 @@ def without(scenario: Scenario, *, is_exploring: bool, why_not: Callable[[], str
     """{block: why it cannot be run}; ``why_not`` says why there can be no namespaces and is only asked when needed."""
     skipped = {}
     for name, block in scenario.blocks.items():
-        if block.world is not None and not is_exploring:
+        if (block.world is not None or name == scenario.main) and not is_exploring:
             skipped[name] = NO_WORLD
         elif block.links.bandwidth_mbit is not None and (why := why_not()) is not None:
             skipped[name] = f"no network namespaces: {why}"
@@ -36,7 +36,12 @@ def leave_out(scenario: Scenario, skipped: Mapping[str, str]) -> Scenario:
 
 def cell_s(scenario: Scenario, cell: Cell) -> float:
     """How long a cell lasts at most, in seconds, unless it is repeated."""
-    return scenario.duration_s + AROUND_S + (0.0 if bandwidth_of(scenario, cell) is None else NARROW_S)
+    return (
+        scenario.duration_s
+        + scenario.warm_up_s
+        + AROUND_S
+        + (0.0 if bandwidth_of(scenario, cell) is None else NARROW_S)
+    )
 
 
 def plan_text(
@@ -54,9 +59,10 @@ def plan_text(
     rows += [f"{name:<15} {0:>4}  {'-':>7}  left out: {why}" for name, why in skipped.items()]
     left = sum(cell_s(scenario, cell) for cell in todo) + radio_s
     done = "" if len(todo) == len(cells) else f", {len(cells) - len(todo)} of them done already"
-    cores = sum(share.cpu_cores for share in scenario.nodes.values())
+    cores = sum(share.quota_cores for share in scenario.nodes.values())
     rows.append(f"{len(cells)} runs{done}; at most {clock(left)} on two cores, without repeats")
-    rows.append(f"quotas {cores:g} cores in all; a run over pressure {scenario.pressure_limit:g} is repeated")
+    warm = f"{clock(scenario.warm_up_s)} of warm-up in every run; " if scenario.warm_up_s > 0.0 else ""
+    rows.append(f"{warm}quotas {cores:g} cores in all; a run over pressure {scenario.pressure_limit:g} is repeated")
     return "\n".join(rows)
 
 
@@ -73,7 +79,7 @@ def _rows(scenario: Scenario, cells: Sequence[Cell], log: str | None) -> list[st
         rate = bandwidth_of(scenario, own[0])
         what += "" if rate is None else f", links of {rate:g} Mbit/s"
         merge = merge_of(scenario, own[0])
-        what += "" if merge == scenario.merge else f", {merge_text(merge)}"
+        what += "" if merge == scenario.merge and scenario.main == MATRIX else f", {merge_text(merge)}"
         title = f"matrix ({name})" if name == scenario.level else name
         rows.append(f"{title:<15} {len(own):>4}  {clock(sum(cell_s(scenario, c) for c in own)):>7}  {what}")
     return rows

@@ -12,11 +12,15 @@ from pathlib import Path
 from typing import Protocol
 
 from zsched.core.model import NodeId
+from zsched.lab.explore.body import Drift
 from zsched.lab.explore.worlds import load_world
 from zsched.lab.laser_log import load_log
 from zsched.lab.mapping import RESOLUTION_M, displacements, truth_grid
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid
+
+ODOMETRY = Drift(yaw=0.02, way=0.02)
+"""Of robots whose SLAM corrects it: half a metre to two after 30 to 60 m, and up to 11 degrees (three offices)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,6 +37,8 @@ class Place:
     target_coverage: float
     begin_s: float
     """When all robots begin, on the machine's monotonic clock."""
+    drive_s: float | None = None
+    """When they may drive, on the same clock; ``None``: from their begin on."""
 
     @property
     def begin(self) -> tuple[str, str]:
@@ -112,6 +118,13 @@ class ExploreRobots:
     """{robot: node that maps for it}; a robot that is not in it maps on board."""
     resolution_m: float = RESOLUTION_M
     """Of the robots' maps."""
+    slam_cores: float | None = None
+    """For scan matching, which then leads the robots together with navigation; ``None``: poses are given."""
+    navigate_cores: float = 0.0
+    map_period_s: float = 2.0
+    ends_at_target: bool = True
+    is_slam_task: bool = False
+    """Whether SLAM is a task of the fleet (`slam_task`), so that nothing of it is to be started beside."""
 
     @property
     def name(self) -> str:
@@ -121,7 +134,7 @@ class ExploreRobots:
     @property
     def ends_when_covered(self) -> bool:
         """A late map costs time."""
-        return True
+        return self.ends_at_target
 
     def truth(self) -> Grid:
         """What can be seen of the world."""
@@ -138,10 +151,36 @@ class ExploreRobots:
         command += ["--index", str(place.index), "--robots", str(place.robots), "--seed", str(place.seed)]
         command += ["--endpoint", place.endpoint, "--records", str(place.records), "--speed", f"{self.speed:g}"]
         command += ["--target", f"{place.target_coverage:g}", "--resolution", f"{self.resolution_m:g}", *place.begin]
-        node = self.slam_on.get(place.robot)
-        return command if node is None else [*command, "--slam-on", node]
+        command += [] if place.drive_s is None else ["--hold-until-s", f"{place.drive_s:.3f}"]
+        if (node := self.slam_on.get(place.robot)) is None:
+            return command
+        command += ["--slam-on", node]
+        if self.slam_cores is None:
+            return command
+        drift = ["--drift-yaw", f"{ODOMETRY.yaw:g}", "--drift-way", f"{ODOMETRY.way:g}"]
+        task = ["--slam-task", slam_task(place.robot)] if self.is_slam_task else []
+        return [*command, "--led", *drift, *task]
 
     def helpers(self, endpoints: Mapping[NodeId, str]) -> Sequence[tuple[NodeId, list[str]]]:
         """The robots' mapping, where it is placed on other nodes."""
-        module = [sys.executable, "-m", "zsched.lab.explore.slam", "--resolution", f"{self.resolution_m:g}"]
-        return [(n, [*module, "--robot", robot, "--endpoint", endpoints[n]]) for robot, n in self.slam_on.items()]
+        slam = [sys.executable, "-m", "zsched.lab.explore.slam", "--resolution", f"{self.resolution_m:g}"]
+        navigate = [sys.executable, "-m", "zsched.lab.explore.navigate", "--cores", f"{self.navigate_cores:g}"]
+        navigate += ["--speed", f"{self.speed:g}"]
+        if self.slam_cores is not None:
+            slam += ["--match", f"{self.slam_cores:g}", "--map-period", f"{self.map_period_s:g}"]
+        modules = [] if self.is_slam_task else [slam]
+        modules += [] if self.slam_cores is None else [navigate]
+        return [
+            (node, [*module, "--robot", robot, "--endpoint", endpoints[node]])
+            for module in modules
+            for robot, node in self.slam_on.items()
+        ]
+
+
+def slam_task(robot: NodeId) -> str:
+    """The name of the task that is a robot's SLAM.
+
+    >>> slam_task("robot1")
+    'slam_robot1'
+    """
+    return f"slam_{robot}"

@@ -14,6 +14,7 @@ import tempfile
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,11 +32,12 @@ from zsched.lab.netns import Network
 from zsched.lab.observer import Observer
 from zsched.lab.paper.cells import Cell, bandwidth_of, merge_of
 from zsched.lab.paper.load import Loads, Window, schedule
-from zsched.lab.paper.node_state import is_calm, node_limits, own_links, ready_workers, task_streams
+from zsched.lab.paper.node_state import is_calm, node_limits, own_links, owners_of, ready_workers, task_streams
 from zsched.lab.paper.oracle import best_nodes
 from zsched.lab.paper.radio import drive_file
 from zsched.lab.paper.record import HostGauge, NodeMeter
 from zsched.lab.paper.robots import Place, Robots
+from zsched.lab.paper.roles import RoleMeter
 from zsched.lab.paper.rules import RulePlan
 from zsched.lab.paper.scenario import LinkView, Scenario
 from zsched.lab.paper.schemes import scheme_tree
@@ -107,6 +109,7 @@ class CellRun:
         """What could not be removed when the run had ended."""
         self._windows: tuple[Window, ...] = ()
         self._meters: dict[NodeId, NodeMeter] = {}
+        self._roles: dict[NodeId, RoleMeter] = {}
         self._decided: dict[NodeId, object] = {}
         self._next_sample_s = 0.0
         self._zero_s, self._zero_wall_ns = 0.0, 0
@@ -143,6 +146,7 @@ class CellRun:
         self._windows = schedule(self._scenario.load, candidates, self._scenario.duration_s, self._seed)
         level = self._scenario.levels[self._cell.level]
         full = self._scenario.full_cores
+        self._roles = {node: RoleMeter(partial(limits.pids, node)) for node in shares}
         loads = Loads(self._windows, level, full, children, limits, self._records, self._tell)
         runner = FleetRunner(fleet, children, runtime, limits, self._cli())
         return _Parts(
@@ -150,7 +154,7 @@ class CellRun:
             runner=runner,
             limits=limits,
             loads=loads,
-            observer=Observer(runner.sockets(), fleet.task, ask),
+            observer=Observer(runner.sockets(), fleet.task, ask, fleet.others),
             gauge=HostGauge.create(f"zsched-{children.token}-host"),
         )
 
@@ -179,7 +183,12 @@ class CellRun:
             "--resolution": (f"{merge.resolution_m:g}",),
             "--min-agreeing": (f"{merge.min_agreeing}",),
         }
-        return write_fleet(template, self._folder / "fleet.yaml", options)
+        loop = self._scenario.explore
+        slam = {
+            "--match": (f"{(loop.slam_share or 0.0) * self._scenario.full_cores:g}",),
+            "--map-period": (f"{loop.map_period_s:g}",),
+        }
+        return write_fleet(template, self._folder / "fleet.yaml", options, slam)
 
     def _lay_links(self, nodes: Tree) -> None:
         traces = {}
@@ -236,19 +245,19 @@ class CellRun:
 
     def _wait_owned(self, children: Children, parts: _Parts) -> None:
         """Until the task has an owner and every candidate's worker is ready: nobody starts with a handicap."""
-        candidates = set(read_tree(self._folder / "template.yaml")["tasks"][parts.fleet.task]["candidates"])
+        tasks = (parts.fleet.task, *parts.fleet.others)
+        given = read_tree(self._folder / "template.yaml")["tasks"]
+        wanted = {(task, node) for task in tasks for node in given[task]["candidates"]}
         end = time.monotonic() + OWNED_S
         while True:
             children.check()
             views = parts.observer.statuses()
-            ready = {node for status in views.values() for node in ready_workers(status, parts.fleet.task)}
-            owners = {
-                (find_task(views[r], parts.fleet.task) or {}).get("owner") for r in parts.fleet.robots if r in views
-            }
-            if candidates <= ready and owners and None not in owners:
+            ready = {(task, node) for task in tasks for view in views.values() for node in ready_workers(view, task)}
+            owners = {owner for r in parts.fleet.robots if r in views for owner in owners_of(views[r], tasks)}
+            if wanted <= ready and owners and None not in owners:
                 break
             if time.monotonic() > end:
-                late = ", ".join(sorted(candidates - ready)) or "an owner"
+                late = ", ".join(f"{task} on {node}" for task, node in sorted(wanted - ready)) or "an owner"
                 raise ChildError(f"no {late} within {OWNED_S:.0f} s; see {self._folder / 'logs'}")
             time.sleep(TICK_S)
 
@@ -276,7 +285,9 @@ class CellRun:
         many merged maps there are was mostly a matter of which program was up first.)
         """
         robots = parts.fleet.robots
-        self._zero_s, self._zero_wall_ns = monotonic_s() + LEAD_S, time.time_ns() + round(LEAD_S * 1e9)
+        warm_s = self._scenario.warm_up_s
+        lead_s = LEAD_S + warm_s
+        self._zero_s, self._zero_wall_ns = monotonic_s() + lead_s, time.time_ns() + round(lead_s * 1e9)
         for index, robot in enumerate(robots):
             place = Place(
                 robot=robot,
@@ -287,7 +298,8 @@ class CellRun:
                 records=self._records,
                 duration_s=self._scenario.duration_s,
                 target_coverage=self._scenario.target_coverage,
-                begin_s=self._zero_s,
+                begin_s=self._zero_s - warm_s,
+                drive_s=self._zero_s if warm_s > 0.0 else None,
             )
             child = children.start(f"app-{robot}", self._inputs.robots.command(place))
             parts.gauge.add(child.process.pid)
@@ -305,7 +317,9 @@ class CellRun:
             return
         self._next_sample_s = now + SAMPLE_S
         nodes = {node: meter.read(monotonic_s()) for node, meter in self._meters.items()}
-        self._recorder.write("nodes", {"kind": "nodes", "t_s": now, "loaded": sorted(parts.loads.loaded), **nodes})
+        roles = {node: meter.read() for node, meter in self._roles.items()}
+        record = {"kind": "nodes", "t_s": now, "loaded": sorted(parts.loads.loaded), "roles": roles, **nodes}
+        self._recorder.write("nodes", record)
         for node, status in parts.observer.statuses().items():
             task = find_task(status, parts.fleet.task) or {}
             said = {"owner": task.get("owner"), "epoch": task.get("epoch"), "decision": task.get("decision")}
@@ -317,7 +331,8 @@ class CellRun:
     def _finish(self, children: Children, parts: _Parts, drove_s: float) -> dict[str, Any]:
         host = parts.gauge.result()
         parts.loads.stop(monotonic_s() - self._zero_s)
-        allocations = [asdict(move) | {"t_s": move.t_s - self._zero_s} for move in parts.observer.moves()]
+        told = {task: parts.observer.moves(task) for task in (parts.fleet.task, *parts.fleet.others)}
+        since = {task: [asdict(move) | {"t_s": move.t_s - self._zero_s} for move in own] for task, own in told.items()}
         streams = {node: task_streams(status, parts.fleet.task) for node, status in parts.observer.statuses().items()}
         apps = [*children.running("app-"), *children.running("record"), *children.running("helper-")]
         children.stop(*apps, grace_s=RECORDER_S)
@@ -339,11 +354,13 @@ class CellRun:
             "zero_s": self._zero_s,
             "zero_wall_ns": self._zero_wall_ns,
             "duration_s": drove_s,
+            "warm_up_s": self._scenario.warm_up_s,
             "robots": parts.fleet.robots,
             "shares": {node: asdict(share) for node, share in self._scenario.nodes.items()},
             "windows": [asdict(window) for window in self._windows],
             "loads": [asdict(load) for load in parts.loads.past],
-            "allocations": allocations,
+            "allocations": since.pop(parts.fleet.task),
+            "others": since,
             "streams": streams,
             "host": host,
         }

@@ -28,16 +28,27 @@ MAX_CORES = 1.5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NodeShare:
-    """What one node may use: ``cpu_cores`` (quota), ``memory_mb`` (limit); ``ballast_mb`` is taken from the start."""
+    """What one node may use: ``cpu_cores`` (quota), ``memory_mb`` (limit); ``ballast_mb`` is taken from the start.
+
+    ``overhead_cores`` come on top of the quota: what zsched's own processes take there while nothing happens, where
+    ``cpu_cores`` is to be there for the tasks alone.
+    """
 
     cpu_cores: float
     memory_mb: float
     ballast_mb: float = 0.0
+    overhead_cores: float = 0.0
 
     def __post_init__(self) -> None:
         check_range("cpu_cores", self.cpu_cores, 0.05, MAX_CORES)
         check_range("memory_mb", self.memory_mb, 128.0, 1e6)
         check_range("ballast_mb", self.ballast_mb, 0.0, self.memory_mb)
+        check_range("overhead_cores", self.overhead_cores, 0.0, MAX_CORES)
+
+    @property
+    def quota_cores(self) -> float:
+        """What the node's group may use in all."""
+        return self.cpu_cores + self.overhead_cores
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -115,11 +126,25 @@ class Exploration:
     target_coverage: float = 0.8
     slam_on: Mapping[NodeId, NodeId] = field(default_factory=dict)
     """{robot: the node that maps for it, inside its share}, as the paper places SLAM on the edges."""
+    slam_share: float | None = None
+    """Of a whole edge's CPU, for scan matching that gives the robot its pose; ``None``: poses are given."""
+    navigate_share: float = 0.0
+    """Of a whole edge's CPU, for the planning beside such a SLAM: it plans again as often as that allows."""
+    map_period_s: float = 2.0
+    """From one map of such a SLAM to the next."""
+    ends_at_target: bool = True
+    """Whether a run is over when every robot holds the target; else it takes its whole time."""
 
     def __post_init__(self) -> None:
         check_range("explore.speed", self.speed, 0.01, 5.0)
         check_range("explore.duration_s", self.duration_s, 5.0, 600.0)
         check_range("explore.target_coverage", self.target_coverage, 0.01, 1.0)
+        check_range("explore.navigate_share", self.navigate_share, 0.0, 1.0)
+        check_range("explore.map_period_s", self.map_period_s, 0.1, 60.0)
+        if self.slam_share is not None:
+            check_range("explore.slam_share", self.slam_share, 0.0, 1.0)
+            if not self.slam_on:
+                raise ValueError("explore.slam_share: say which node maps for which robot (explore.slam_on)")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -166,6 +191,8 @@ class Block:
     links: LinkLimits = LinkLimits()
     merge: Mapping[str, Any] = field(default_factory=dict)
     """What is different in `Scenario.merge`."""
+    alternates: bool = False
+    """Whether every second run takes the schemes in reverse, so that a machine that drifts favours none of them."""
 
     def __post_init__(self) -> None:
         check_range("runs", self.runs, 1, 1000)
@@ -188,7 +215,8 @@ class Scenario:
 
     ``duration_s`` counts from the robots' start; ``target_coverage`` ends the task (share of the truth's known cells,
     at every robot); ``pressure_limit`` is the share of time in which processes outside the nodes' quotas may have
-    waited for a CPU: above it the run is invalid.
+    waited for a CPU: above it the run is invalid. For ``warm_up_s`` before the drive the robots stand and map, so that
+    the task runs and is measured; nothing of that counts.
     """
 
     name: str
@@ -212,6 +240,13 @@ class Scenario:
     merge: MergeTask = MergeTask()
     target_coverage: float = 0.9
     pressure_limit: float = 0.2
+    idle_floor: float = 0.0
+    """A run is invalid, too, when the machine idled for less of the time than this: it could not keep its quotas."""
+    warm_up_s: float = 0.0
+    main: str = MATRIX
+    """What is judged: the matrix, or a block; with a block there is no matrix and no sweep."""
+    quick: str = MATRIX
+    """What ``--quick`` runs when the robots explore."""
 
     def __post_init__(self) -> None:
         check_range("duration_s", self.duration_s, 5.0, 600.0)
@@ -219,7 +254,9 @@ class Scenario:
         check_range("yardstick_runs", self.yardstick_runs, 1, 1000)
         check_range("target_coverage", self.target_coverage, 0.01, 1.0)
         check_range("pressure_limit", self.pressure_limit, 0.0, 1.0)
-        total = sum(share.cpu_cores for share in self.nodes.values())
+        check_range("idle_floor", self.idle_floor, 0.0, 1.0)
+        check_range("warm_up_s", self.warm_up_s, 0.0, 600.0)
+        total = sum(share.quota_cores for share in self.nodes.values())
         if total > MAX_CORES:
             raise ValueError(f"nodes: quotas of {total:g} cores in all, at most {MAX_CORES:g}")
         if self.level not in self.levels:
@@ -272,6 +309,9 @@ def _scenario(path: Path, tree: dict[str, Any]) -> Scenario:
     merge = MergeTask(**dict(tree.pop("merge", None) or {}))
     known = {str(name): value for name, value in _tuples(tree).items()}
     blocks: dict[str, Any] = {"levels": levels, "nodes": nodes, "links": links, "link_view": view, "blocks": rows}
+    for key in ("main", "quick"):
+        if known.get(key, MATRIX) not in (MATRIX, *rows):
+            raise ValueError(f"{key}: {known[key]!r} is none of {', '.join((MATRIX, *rows))}")
     return Scenario(fleet=fleet, load=load, sweep=sweep, explore=explore, merge=merge, **blocks, **known)
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any
 
@@ -56,6 +56,8 @@ class Scheme:
     link: Mapping[str, float] = field(default_factory=dict)
     timing: Mapping[str, float] = field(default_factory=dict)
     rule: RuleName | None = None
+    moves_slam: bool = False
+    """Whether the tasks beside the first, the robots' SLAM, may go to every edge; else each stays where it is."""
 
 
 CPU, MEMORY, BOTH, NETWORK = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.5, 0.5, 0.0), (0.0, 0.0, 1.0)
@@ -118,6 +120,17 @@ SCHEMES: Mapping[str, Scheme] = {
         _yardstick("first_match", RuleName.FIRST, "the first candidate with the label size=large", {"size": "large"}),
         _yardstick("every_25s", RuleName.EVERY, "the highest utility, once in 25 s"),
         _yardstick("oracle", RuleName.ORACLE, "knows the schedule of the injected load"),
+        replace(
+            _dyna("dyna_both_slam", BOTH, "as dyna_both, and the robots' SLAM moves, too"),
+            family=Family.YARDSTICK,
+            moves_slam=True,
+        ),
+        Scheme(
+            name="zsched_slam",
+            family=Family.OURS,
+            says="as zsched, and the robots' SLAM moves, too",
+            moves_slam=True,
+        ),
     )
 }
 PAPER_SCHEMES = ("dyna_cpu", "dyna_mem", "dyna_both")
@@ -126,7 +139,7 @@ QUICK_SCHEMES = (*FIXED_SCHEMES, "dyna_both", "zsched")
 
 
 def find_schemes(names: tuple[str, ...]) -> tuple[Scheme, ...]:
-    """The schemes of these names, all for none.
+    """The schemes of these names; for none all but those that move SLAM, which is no task in the paper's fleet.
 
     Raises:
         ConfigError: one is unknown.
@@ -134,34 +147,39 @@ def find_schemes(names: tuple[str, ...]) -> tuple[Scheme, ...]:
     unknown = [name for name in names if name not in SCHEMES]
     if unknown:
         raise ConfigError(f"no scheme {', '.join(unknown)}; there are {', '.join(SCHEMES)}")
-    return tuple(SCHEMES[name] for name in names or tuple(SCHEMES))
+    return tuple(SCHEMES[name] for name in names or [name for name, one in SCHEMES.items() if not one.moves_slam])
 
 
 def scheme_tree(tree: Tree, scheme: Scheme) -> Tree:
     """A copy of a fleet file's tree as ``scheme`` wants it."""
     tree = copy.deepcopy(tree)
-    ((_, task),) = tree["tasks"].items()
-    if scheme.weights is not None:
-        task["weights"] = dict(zip(("cpu", "memory", "network"), scheme.weights, strict=True))
-    if scheme.scheduling:
-        task["scheduling"] = {**task.get("scheduling", {}), **scheme.scheduling}
-    if scheme.link:
-        task["link"] = {**task.get("link", {}), **scheme.link}
-    task["candidates"] = candidates_of(tree, scheme)
+    candidates, (first, *others) = candidates_of(tree, scheme), tree["tasks"].values()
+    for task in (first, *(others if scheme.moves_slam else ())):
+        _lay(task, scheme)
+        task["candidates"] = list(candidates)
     if scheme.timing:
         timing = tree.get("timing", "wifi")
         tree["timing"] = {**({"profile": timing} if isinstance(timing, str) else timing), **scheme.timing}
     return tree
 
 
+def _lay(task: Tree, scheme: Scheme) -> None:
+    """The scheme's settings over one task's."""
+    if scheme.weights is not None:
+        task["weights"] = dict(zip(("cpu", "memory", "network"), scheme.weights, strict=True))
+    if scheme.scheduling:
+        task["scheduling"] = {**task.get("scheduling", {}), **scheme.scheduling}
+    if scheme.link:
+        task["link"] = {**task.get("link", {}), **scheme.link}
+
+
 def candidates_of(tree: Tree, scheme: Scheme) -> list[NodeId]:
-    """The task's candidates under ``scheme``, by name.
+    """The first task's candidates under ``scheme``, by name.
 
     Raises:
         ConfigError: there is no such candidate.
     """
-    ((_, task),) = tree["tasks"].items()
-    wanted = task["candidates"]
+    wanted = next(iter(tree["tasks"].values()))["candidates"]
     nodes: Tree = tree["nodes"]
     names = sorted(nodes) if isinstance(wanted, dict) else sorted(wanted)
     if isinstance(wanted, dict) and "kind" in wanted:

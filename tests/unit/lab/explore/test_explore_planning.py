@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from zsched.lab.explore.body import Limits
-from zsched.lab.explore.explorer import AVOID_S, CLAIM_LIFE_S, Explorer, State
+from zsched.lab.explore.explorer import AVOID_M, AVOID_S, CLAIM_LIFE_S, Explorer, State, avoid_s
 from zsched.lab.explore.frontier import Claim, Frontier, choose, find_frontiers, utility
 from zsched.lab.explore.planner import INFLATION_M, distances, plan_map, way_to
 from zsched.tasks.map_merge.geometry import Pose2
@@ -235,6 +235,29 @@ def test_on_a_map_that_does_not_change_it_stands_where_it_has_been_and_tries_aga
         now += 0.1
         one.step(Pose2(x=3.8, y=2.0), now)
         assert now < 3 * AVOID_S, "it never tried again"
+
+
+@pytest.mark.parametrize("speed", [1.0, 0.22])
+def test_a_slow_robot_avoids_for_as_long_as_it_needs_to_get_away(speed: float) -> None:
+    slow_s = avoid_s(Limits(speed=speed))
+    one = Explorer("robot1", Limits(speed=speed), slow_s)
+    one.take_transform(Pose2())
+    one.take_map(grid_of(open_to_the_right()))
+    one.step(Pose2(x=1.0, y=2.0), 0.0)
+    one.step(Pose2(x=1.0, y=2.0), 1.0, is_blocked=True)
+    idle_until, now = 0.0, 1.0
+    while now < 60.0:
+        now += 0.5
+        one.look_again()
+        one.step(Pose2(x=3.8, y=one.goal[1] if one.goal else 2.0), now)
+        if one.state is State.IDLE:
+            idle_until = now
+            if now > slow_s + 2.0:
+                break
+        elif idle_until:
+            break
+    assert idle_until == pytest.approx(1.0 + slow_s, abs=3.0)
+    assert slow_s * speed >= AVOID_M
 
 
 def test_it_backs_off_a_wall_and_takes_another_goal() -> None:

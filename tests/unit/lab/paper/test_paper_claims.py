@@ -30,9 +30,9 @@ from zsched.lab.paper.report import (
     over_fixed_text,
     radio_text,
     report,
-    snippet,
 )
 from zsched.lab.paper.schemes import FIXED_SCHEMES, PAPER_SCHEMES, SCHEMES
+from zsched.lab.paper.snippet import snippet
 
 HIGHER = Claim(source="paper", says="x", metric="map_hz", mine=("a",), theirs=("b",), target=0.2)
 LOWER = Claim(source="paper", says="x", metric="task_latency_s", mine=("a",), theirs=("b",), target=-0.28)
@@ -65,7 +65,7 @@ def a_run(scheme: str, run: int, level: str = "one", **changed: Any) -> dict[str
 def test_one_run_has_no_interval_to_tell() -> None:
     found = difference({1: 1.12}, {1: 1.0})
     assert found is not None
-    assert found.text() == "+12 % (1 run)"
+    assert found.text() == "+12 % (n = 1)"
     both = difference({1: 1.12, 2: 1.10}, {1: 1.0, 2: 1.0})
     assert both is not None
     assert both.text().startswith("+11 % [")

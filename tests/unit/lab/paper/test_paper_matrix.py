@@ -41,7 +41,7 @@ def test_the_matrix_is_every_scheme_by_run_then_the_sweep(scenario: Scenario) ->
     main = [cell for cell in cells if cell.level == scenario.level and cell.block == MATRIX]
 
     assert len({cell.name for cell in cells}) == len(cells)
-    assert {cell.scheme.name for cell in main} == set(SCHEMES)
+    assert {cell.scheme.name for cell in main} == {name for name, one in SCHEMES.items() if not one.moves_slam}
     assert sum(cell.scheme.name == "zsched" for cell in main) == 5
     assert sum(cell.scheme.name == "oracle" for cell in main) == 3
     assert [cell.run for cell in main] == sorted(cell.run for cell in main)

@@ -1,0 +1,166 @@
+"""Robots that are led from elsewhere, as real processes on real zenoh: SLAM gives the pose, navigation the way.
+
+And SLAM as a task of a real fleet: it moves with its map.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zenoh
+
+from zsched.lab.explore.laser import Laser
+from zsched.lab.explore.localizer import LOST_S
+from zsched.lab.explore.messages import decode_correction, encode_scan
+from zsched.lab.explore.worlds import load_world
+from zsched.lab.loopback import free_endpoints
+from zsched.lab.recorder import Record, read_records
+from zsched.lab.testbed import Testbed, echo_fleet
+from zsched.tasks.map_merge.cdr import decode_grid
+from zsched.tasks.map_merge.geometry import Pose2
+
+WORLD = "office:3"
+DEADLINE_S = 45.0
+SLIP_M = 0.02
+"""What the wheels of a robot that stands tell too much at every scan."""
+SLAM_WORKER = ("python", "-m", "zsched.lab.explore.slam_worker", "--robot", "robot1")
+
+
+def until(condition: Callable[[], bool], what: str) -> None:
+    end = time.monotonic() + DEADLINE_S
+    while not condition():
+        assert time.monotonic() < end, what
+        time.sleep(0.05)
+
+
+@contextlib.contextmanager
+def running(*commands: list[str]) -> Iterator[list[subprocess.Popen[bytes]]]:
+    processes = [subprocess.Popen([sys.executable, "-m", *command]) for command in commands]
+    try:
+        yield processes
+        for process in processes:
+            process.terminate()
+        assert [process.wait(timeout=15.0) for process in processes] == [0] * len(processes)
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+
+
+@pytest.fixture
+def endpoint() -> Iterator[str]:
+    """A peer that all of the robot's programs are clients of."""
+    (one,) = free_endpoints(1)
+    config = {
+        "mode": "peer",
+        "listen": {"endpoints": [one]},
+        "scouting": {"multicast": {"enabled": False}},
+        "transport": {"shared_memory": {"enabled": False}},
+    }
+    with zenoh.open(zenoh.Config.from_json5(json.dumps(config))):
+        yield one
+
+
+def test_a_robot_drives_by_its_slam_and_stands_while_that_is_silent(endpoint: str, tmp_path: Path) -> None:
+    """It is not placed in any merged map here, so navigation plans on its own one."""
+    robot = ["zsched.lab.explore.robot", "--robot", "robot1", "--world", WORLD, "--endpoint", endpoint]
+    robot += ["--records", str(tmp_path), "--slam-on", "edge1", "--led", "--drift-yaw", "0.02", "--drift-way", "0.02"]
+    slam = ["zsched.lab.explore.slam", "--robot", "robot1", "--endpoint", endpoint, "--match", "0.02"]
+    navigate = ["zsched.lab.explore.navigate", "--robot", "robot1", "--endpoint", endpoint, "--cores", "0.01"]
+
+    def newest() -> Record:
+        found = [record for record in read_records(tmp_path / "robot1.ndjson") if record["kind"] == "progress"]
+        return found[-1] if found else {"way_m": 0.0, "stopped_s": 0.0, "corrections": 0}
+
+    with running(robot, slam, navigate) as (_, matcher, _):
+        until(lambda: newest()["way_m"] > 2.0, "SLAM and navigation do not lead the robot")
+        matcher.send_signal(signal.SIGSTOP)
+        time.sleep(LOST_S + 2.0)
+        standing = newest()
+        time.sleep(2.0)
+        still = newest()
+        matcher.send_signal(signal.SIGCONT)
+        until(lambda: newest()["way_m"] > still["way_m"] + 0.5, "the robot does not drive on")
+
+    assert still["way_m"] == standing["way_m"]
+    assert still["corrections"] == standing["corrections"] > 10
+    assert still["stopped_s"] > standing["stopped_s"] + 1.0
+    path = [record for record in read_records(tmp_path / "robot1.ndjson") if record["kind"] == "path"]
+    start = load_world(WORLD).starts(3)[0]
+    for record in path:
+        believed = start.compose(Pose2(x=record["belief_x"], y=record["belief_y"]))
+        assert math.dist((believed.x, believed.y), (record["x"], record["y"])) < 0.4
+
+
+class StandingRobot(threading.Thread):
+    """A robot that stands and looks, ten times a second, while its wheels slip: odometry creeps, the truth does not."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        super().__init__(daemon=True)
+        world = load_world(WORLD)
+        self._start, self._laser = world.starts(1)[0], Laser(world, np.random.default_rng(1))
+        self._scan = session.declare_publisher("robot1/in")
+        self.slipped_m = 0.0
+        self.is_over = threading.Event()
+
+    def run(self) -> None:
+        while not self.is_over.wait(0.1):
+            scan = self._laser.scan(self._start, time.time_ns())
+            self._scan.put(encode_scan(scan, Pose2(x=self.slipped_m)))
+            self.slipped_m += SLIP_M
+
+
+def test_a_slam_that_moves_takes_its_map_along(tmp_path: Path) -> None:
+    """A new owner without it would believe the wheels: more than half a metre off by then."""
+    rules = {
+        "inputs": [{"from": "{robot}/in", "to": "{target}/echo/{robot}/scan", "class": "latest"}],
+        "outputs": [
+            {"from": "{target}/echo/{epoch}/{robot}/pose", "to": "{robot}/pose", "class": "latest"},
+            {"from": "{target}/echo/{epoch}/{robot}/map", "to": "{robot}/map", "class": "latest"},
+        ],
+    }
+    with Testbed(tmp_path, echo_fleet(robots=1, edges=2, worker=SLAM_WORKER, task=rules)) as bed:
+        bed.init()
+        bed.start()
+        owner = bed.wait_settled()
+        session = bed.app("robot1")
+        poses: list[tuple[int, Pose2]] = []
+        maps: list[bytes] = []
+
+        def on_pose(sample: zenoh.Sample) -> None:
+            correction = decode_correction(sample.payload.to_bytes())
+            poses.append((correction.stamp_ns, correction.pose))
+
+        kept = [
+            session.declare_subscriber("robot1/pose", on_pose),
+            session.declare_subscriber("robot1/map", lambda sample: maps.append(sample.payload.to_bytes())),
+        ]
+        robot = StandingRobot(session)
+        robot.start()
+        until(lambda: robot.slipped_m > 0.6 and bool(maps), "no poses or no map")
+        before = len(poses)
+        stopped_ns = time.time_ns()
+
+        bed.stop(owner)
+        until(lambda: bool(poses) and poses[-1][0] > stopped_ns + 2_000_000_000, "no poses from the next owner")
+        robot.is_over.set()
+        robot.join()
+        seen = len(maps)
+
+        assert bed.wait_settled() != owner
+        assert before > 10
+        assert all(math.hypot(pose.x, pose.y) < 0.15 for _, pose in poses)
+        assert decode_grid(maps[-1]).known_area_m2 >= 0.95 * decode_grid(maps[0]).known_area_m2
+        assert seen > 1
+        del kept

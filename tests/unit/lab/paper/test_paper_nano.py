@@ -1,0 +1,521 @@
+"""The blocks that were declared before their runs (`nano`, `nano_moves`, `heavy_again`), and what is said of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from zsched.config import load_fleet
+from zsched.errors import ConfigError
+from zsched.lab.explore.navigate import main as navigate
+from zsched.lab.explore.robot import parse as parse_explorer
+from zsched.lab.explore.slam import main as slam
+from zsched.lab.explore.slam_worker import main as slam_worker
+from zsched.lab.paper.arrivals import Arrival, Streams
+from zsched.lab.paper.bench import BenchOptions, InputsOf, planned
+from zsched.lab.paper.cells import Cell, cells_of
+from zsched.lab.paper.claims import GAINS, best_fixed, over_best_fixed, over_fixed
+from zsched.lab.paper.coverage_report import coverage_parts, coverage_table, roles_table, save_coverage
+from zsched.lab.paper.latency_floor import ceiling_of, floor_of, tell_ceiling
+from zsched.lab.paper.latency_floor import main as latency_floor
+from zsched.lab.paper.led_metrics import coverage_figures, led_of, merge_cpu_s, pose_errors
+from zsched.lab.paper.matrix import invalid_reason
+from zsched.lab.paper.places import robots_scenario_path, scenario_path, shipped_names, shipped_scenario
+from zsched.lab.paper.plan import AROUND_S, cell_s, plan_text
+from zsched.lab.paper.report import (
+    blocks_parts,
+    claims_text,
+    gains_text,
+    main_runs,
+    over_fixed_text,
+    report,
+)
+from zsched.lab.paper.robots import ODOMETRY, ExploreRobots, Place, slam_task
+from zsched.lab.paper.roles import REST, RoleMeter, mean_shares, role_figures
+from zsched.lab.paper.run import CellRun, Inputs
+from zsched.lab.paper.scenario import MATRIX, NodeShare, Scenario, load_scenario
+from zsched.lab.paper.schemes import FIXED_SCHEMES, SCHEMES
+from zsched.lab.paper.snippet import moves_text
+
+AUTHORS = {"slam": 0.352, "model": 0.60, "merge": 0.096, "navigation": 0.027}
+"""Shares of a Jetson Nano's CPU: config/task_req.yaml of herolab-uga/ros-edge-orchestration, rounded."""
+
+
+def shipped(name: str) -> Scenario:
+    path = shipped_scenario(name)
+    assert path is not None
+    return load_scenario(path)
+
+
+def options(tmp_path: Path, name: str, **given: Any) -> BenchOptions:
+    path = shipped_scenario(name)
+    assert path is not None
+    exploring = {"is_exploring": True} | given
+    return BenchOptions(out=tmp_path, scenario=path, robots_scenario=robots_scenario_path(), **exploring)
+
+
+# --- what is declared ------------------------------------------------------------------------------------------------
+
+
+def test_the_shipped_scenarios_are_found_by_name_and_nothing_else_is() -> None:
+    assert shipped_names() == ("heavy-again", "nano", "nano-moves", "paper")
+    assert shipped_scenario("paper") == scenario_path()
+    assert shipped_scenario("nono") is None
+    assert shipped_scenario("../paper") is None
+
+
+def test_nano_has_the_authors_demands_in_their_proportions() -> None:
+    scenario = shipped("nano")
+    loop, level = scenario.explore, scenario.levels[scenario.level]
+
+    assert loop.slam_share == AUTHORS["slam"]
+    assert loop.navigate_share == AUTHORS["navigation"]
+    assert level.streams * level.share == pytest.approx(AUTHORS["model"])
+    assert sum(AUTHORS.values()) > 1.07  # the tipping point: all of them are more than an edge
+    assert sum(AUTHORS.values()) - AUTHORS["merge"] < 1.0  # and without the merger they are not
+    assert len({(share.cpu_cores, share.overhead_cores, share.memory_mb) for share in scenario.nodes.values()}) == 1
+    assert (scenario.merge.mode, scenario.merge.rate_hz, loop.speed) == ("estimate", 0.5, 0.22)
+    assert (scenario.duration_s, loop.duration_s) == (300, 300)
+    assert not loop.ends_at_target
+    assert list(scenario.load.busy_s) == [30, 90]
+    assert sorted(loop.slam_on.values()) == sorted(scenario.nodes)
+
+
+def test_each_declared_block_is_all_that_its_scenario_runs() -> None:
+    wanted = {
+        "nano": (("fixed_e1", "fixed_e2", "fixed_e3", "dyna_cpu", "dyna_mem", "dyna_both", "zsched"), 5),
+        "nano-moves": (("dyna_both", "dyna_both_slam", "zsched", "zsched_slam"), 5),
+        "heavy-again": (("fixed_e1", "fixed_e2", "fixed_e3", "dyna_both", "zsched"), 8),
+    }
+    limits, seeds = set(), set(range(20260, 20260 + 100))
+    for name, (schemes, runs) in wanted.items():
+        scenario = shipped(name)
+        cells = cells_of(scenario, ())
+        assert {cell.block for cell in cells} == {scenario.main} == {name.replace("-", "_")}
+        assert sorted(cell.scheme.name for cell in cells) == sorted(schemes * runs)
+        own = {scenario.run_seed(run) for run in range(runs)}
+        assert not own & seeds, "seeds of its own"
+        seeds |= own
+        limits.add(scenario.pressure_limit)
+        assert scenario.warm_up_s == 60
+        assert cell_s(scenario, cells[0]) == scenario.duration_s + 60 + AROUND_S
+    assert limits == {load_scenario(scenario_path()).pressure_limit}, "one limit"
+
+
+def test_every_second_run_takes_the_schemes_in_reverse() -> None:
+    scenario = shipped("heavy-again")
+    order = [[cell.scheme.name for cell in cells_of(scenario, ()) if cell.run == run] for run in range(3)]
+    assert order[0] == order[2] == order[1][::-1]
+    assert abs(order[0].index("zsched") - order[0].index("dyna_both")) == 1
+
+
+def test_heavy_again_is_heavy() -> None:
+    paper, again = load_scenario(scenario_path()), shipped("heavy-again")
+    heavy = paper.blocks["heavy"]
+    assert again.merge == replace(paper.merge, **heavy.merge)
+    assert again.explore == replace(paper.explore, world=heavy.world or "")
+    assert (again.nodes, again.load, again.links) == (paper.nodes, paper.load, paper.links)
+    assert again.levels[again.level] == paper.levels[heavy.level or ""]
+
+
+def test_quick_runs_the_first_block_of_the_readme(tmp_path: Path) -> None:
+    scenario, cells, _ = planned(options(tmp_path, "paper", is_quick=True))
+    assert [cell.name for cell in cells] == [f"heavy-{name}-1" for name in (*FIXED_SCHEMES, "dyna_both", "zsched")]
+    assert sum(cell_s(scenario, cell) for cell in cells) < 6 * 60
+    _, replayed, _ = planned(options(tmp_path, "paper", is_quick=True, is_exploring=False))
+    assert {cell.block for cell in replayed} == {MATRIX}, "a log cannot be explored"
+
+
+def test_the_plan_tells_the_warm_up_and_the_task() -> None:
+    scenario = shipped("nano")
+    cells = cells_of(scenario, ())
+    text = plan_text(scenario, cells, cells, 0.0, {}, None)
+    assert "1 min of warm-up in every run; quotas 0.945 cores" in text
+    assert "mode estimate, at most 0.5 maps/s" in text
+
+
+def test_a_block_for_robots_that_explore_does_not_replay_a_log(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="nano"):
+        planned(options(tmp_path, "nano", is_exploring=False))
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ("main: nono", "main"),
+        ("quick: nono", "quick"),
+        ("explore: {slam_share: 2}", "slam_share"),
+        ("explore: {slam_share: 0.3}", "slam_on"),
+        ("warm_up_s: -1", "warm_up_s"),
+        ("idle_floor: 2", "idle_floor"),
+        ("nodes: {e: {cpu_cores: 1.0, overhead_cores: 0.6, memory_mb: 512}}", "1.6 cores"),
+    ],
+)
+def test_a_wrong_key_is_told(tmp_path: Path, line: str, told: str) -> None:
+    path = tmp_path / "x.scenario.yml"
+    path.write_text(
+        f"name: x\nfleet: f.yaml\nduration_s: 10\nseed: 1\nruns: 1\nlevel: one\nlevels: {{one: {{}}}}\n{line}\n"
+    )
+    with pytest.raises(ConfigError, match=told):
+        load_scenario(path)
+
+
+def test_a_machine_that_did_not_idle_could_not_keep_its_quotas() -> None:
+    scenario = replace(shipped("nano"), idle_floor=0.15)
+    assert invalid_reason(scenario, {"pressure": 0.1, "idle_ratio": 0.2}) is None
+    assert "idle for 0.10" in (invalid_reason(scenario, {"pressure": 0.1, "idle_ratio": 0.1}) or "")
+    assert "pressure" in (invalid_reason(scenario, {"pressure": 0.2, "idle_ratio": 0.9}) or "")
+    assert invalid_reason(replace(scenario, idle_floor=0.0), {"pressure": 0.1, "idle_ratio": 0.0}) is None
+
+
+def test_zsched_s_own_cpu_comes_on_top_of_an_edge() -> None:
+    share = NodeShare(cpu_cores=0.28, overhead_cores=0.035, memory_mb=1024)
+    assert share.quota_cores == pytest.approx(0.315)
+    assert shipped("nano").full_cores == 0.28, "shares are of the edge, not of its quota"
+
+
+# --- what is started -------------------------------------------------------------------------------------------------
+
+
+def a_place(records: Path) -> Place:
+    return Place(
+        robot="robot2",
+        index=1,
+        robots=3,
+        seed=5,
+        endpoint="tcp/127.0.0.1:1",
+        records=records,
+        duration_s=30.0,
+        target_coverage=0.7,
+        begin_s=10.0,
+        drive_s=70.0,
+    )
+
+
+def the_robots(name: str, tmp_path: Path) -> ExploreRobots:
+    given = options(tmp_path, name)
+    scenario, cells, _ = planned(given)
+    robots = InputsOf(given, scenario).of(cells[0]).robots
+    assert isinstance(robots, ExploreRobots)
+    return robots
+
+
+def test_nano_s_robots_are_led_by_slam_and_navigation_on_their_edges(tmp_path: Path) -> None:
+    robots = the_robots("nano", tmp_path)
+    endpoints = {f"edge{number}": f"tcp/127.0.0.1:{number}" for number in (1, 2, 3)}
+
+    started = robots.helpers(endpoints)
+    given = parse_explorer(robots.command(a_place(tmp_path))[3:])
+
+    assert sorted((node, command[2].rpartition(".")[2]) for node, command in started) == [
+        (f"edge{number}", what) for number in (1, 2, 3) for what in ("navigate", "slam")
+    ]
+    first = started[0][1]
+    assert first[first.index("--match") + 1] == f"{0.352 * 0.28:g}"
+    last = started[-1][1]
+    assert last[last.index("--cores") + 1] == f"{0.027 * 0.28:g}"
+    assert (given.settings.is_led, given.settings.has_slam, given.slam_task) == (True, False, "")
+    assert (given.begin_s, given.settings.hold_until_s, given.settings.drift) == (10.0, 70.0, ODOMETRY)
+    assert not robots.ends_when_covered
+
+
+def test_slam_that_is_a_task_is_not_started_beside(tmp_path: Path) -> None:
+    robots = the_robots("nano-moves", tmp_path)
+    endpoints = {f"edge{number}": f"tcp/127.0.0.1:{number}" for number in (1, 2, 3)}
+    assert {command[2] for _, command in robots.helpers(endpoints)} == {"zsched.lab.explore.navigate"}
+    assert parse_explorer(robots.command(a_place(tmp_path))[3:]).slam_task == "slam_robot2"
+
+
+@pytest.mark.parametrize(
+    ("scheme", "wanted"),
+    [
+        ("zsched", {"slam_robot1": ("edge1",), "slam_robot3": ("edge3",)}),
+        ("zsched_slam", {"slam_robot1": ("edge1", "edge2", "edge3"), "slam_robot3": ("edge1", "edge2", "edge3")}),
+        ("dyna_both_slam", {"slam_robot2": ("edge1", "edge2", "edge3")}),
+    ],
+)
+def test_a_scheme_moves_slam_only_where_it_says_so(
+    tmp_path: Path, scheme: str, wanted: dict[str, tuple[str, ...]]
+) -> None:
+    given = options(tmp_path, "nano-moves")
+    scenario, _, _ = planned(given)
+    cell = Cell(scheme=SCHEMES[scheme], level="one", run=0, block="nano_moves")
+    lab = CellRun(scenario, cell, Inputs(robots=the_robots("nano-moves", tmp_path)), tmp_path).write_fleet()
+
+    tasks = {task.name: task for task in load_fleet(lab.path).tasks}
+
+    assert (lab.task, sorted(lab.others)) == ("map_merge", [slam_task(f"robot{number}") for number in (1, 2, 3)])
+    assert set(tasks["map_merge"].candidates) == {"edge1", "edge2", "edge3"}
+    assert {name: tuple(sorted(tasks[name].candidates)) for name in wanted} == wanted
+    command = list(tasks["slam_robot1"].worker.command)
+    assert command[command.index("--match") + 1] == f"{0.352 * 0.28:g}"
+    assert "0.5" in tasks["map_merge"].worker.command
+    is_papers = scheme.startswith("dyna")
+    assert (tasks["slam_robot1"].tuning.score.value == "paper") == is_papers
+
+
+def test_the_matrix_s_schemes_leave_slam_alone() -> None:
+    scenario = load_scenario(scenario_path())
+    assert not any(cell.scheme.moves_slam for cell in cells_of(scenario, ()))
+
+
+@pytest.mark.parametrize(
+    ("main", "arguments"),
+    [
+        (navigate, ["--robot", "r", "--endpoint", "tcp/127.0.0.1:1", "--cores", "-1"]),
+        (slam, ["--robot", "r", "--endpoint", "tcp/127.0.0.1:1", "--match", "99"]),
+        (slam_worker, ["--robot", "r", "--map-period", "0"]),
+    ],
+)
+def test_wrong_options_of_the_programs_are_usage(main: Any, arguments: list[str]) -> None:
+    with pytest.raises(SystemExit) as told:
+        main(arguments)
+    assert told.value.code == 2
+
+
+def test_a_robot_is_led_only_by_a_node(tmp_path: Path) -> None:
+    robots = ["--robot", "robot1", "--world", "turtlebot3", "--endpoint", "x", "--records", str(tmp_path)]
+    for wrong in (["--led"], ["--slam-on", "edge1", "--slam-task", "slam_robot1"]):
+        with pytest.raises(SystemExit):
+            parse_explorer([*robots, *wrong])
+
+
+# --- whose CPU it was ------------------------------------------------------------------------------------------------
+
+
+def a_process(proc: Path, pid: int, command: str, ticks: int) -> None:
+    folder = proc / str(pid)
+    folder.mkdir(exist_ok=True)
+    (folder / "cmdline").write_bytes(command.replace(" ", "\0").encode())
+    (folder / "stat").write_text(f"{pid} (a) b) S 1 1 1 0 -1 0 0 0 0 0 {ticks} {ticks} 0 0 20 0 4 0 9 9 9\n")
+
+
+def test_processes_are_told_apart_by_their_programs_and_the_dead_are_remembered(tmp_path: Path) -> None:
+    pids = [1, 2, 3, 4, 5, 6]
+    meter = RoleMeter(lambda: pids, tmp_path)
+    names = ("explore.slam --robot r", "explore.navigate", "paper.cameras", "explore.slam_worker")
+    for pid, name in enumerate(names, start=1):
+        a_process(tmp_path, pid, f"python -m zsched.lab.{name}", 100)
+    a_process(tmp_path, 5, "python -m zsched.tasks.map_merge --mode estimate", 50)
+    a_process(tmp_path, 6, "python -I -S launch.py", 1)
+
+    first = meter.read()
+    pids.remove(3)
+    a_process(tmp_path, 6, "zsched up", 300)
+    a_process(tmp_path, 1, "python -m zsched.lab.explore.slam --robot r", 150)
+    second = meter.read()
+    pids.append(77)  # gone before it was looked at
+
+    assert first == {"merge": 1.0, "model": 2.0, "navigation": 2.0, "slam": 4.0, REST: 0.02}
+    assert second == {"merge": 1.0, "model": 2.0, "navigation": 2.0, "slam": 5.0, REST: 6.0}
+    assert meter.read() == second
+
+
+def test_shares_of_an_edge_are_told_by_what_was_on_it() -> None:
+    records = [
+        {"t_s": 0.0, "loaded": [], "roles": {"edge1": {"slam": 0.0}}},
+        {"t_s": 10.0, "loaded": ["edge1"], "roles": {"edge1": {"slam": 1.0}}},
+        {"t_s": 20.0, "loaded": ["edge1"], "roles": {"edge1": {"slam": 1.5, "model": 1.0}}},
+        {"t_s": 30.0, "loaded": ["edge1"], "roles": {"edge1": {"slam": 2.5, "model": 3.0, "merge": 0.2}}},
+        {"t_s": 40.0, "loaded": []},
+    ]
+    found = role_figures(records, {"edge1": {"cpu_cores": 0.5}}, lambda t_s: "edge1" if t_s >= 20.0 else None)
+
+    assert found == {
+        "edge1": {
+            "idle": {"s": 10.0, "slam": 0.2},
+            "model": {"s": 10.0, "model": 0.2, "slam": 0.1},
+            "both": {"s": 10.0, "merge": 0.04, "model": 0.4, "slam": 0.2},
+        }
+    }
+    both = mean_shares([found, {"edge2": {"both": {"s": 30.0, "slam": 0.6}}}], "both")
+    assert both["slam"] == pytest.approx((0.2 * 10 + 0.6 * 30) / 40)
+    assert mean_shares([found], "merge") == {}
+    assert merge_cpu_s(records, 2) == pytest.approx(0.1)
+    assert merge_cpu_s(records[:1], 2) is None
+    assert merge_cpu_s(records, 0) is None
+
+
+# --- coverage over time ----------------------------------------------------------------------------------------------
+
+
+def test_coverage_over_time_is_the_mean_of_what_the_robots_hold() -> None:
+    maps = {
+        "robot1": [Arrival(-3.0, 0.1, 1, 0.1), Arrival(6.0, 0.1, 1, 0.5)],
+        "robot2": [Arrival(10.0, 0.1, 1, 0.4), Arrival(11.0, 0.1, 1, 0.9)],
+    }
+    found = coverage_figures(Streams(maps=maps), 11.0, area_m2=200.0)
+
+    assert found["coverage_curve"] == [[0.0, 0.05], [5.0, 0.05], [10.0, 0.45], [11.0, 0.7]]
+    first, second = (0.1 * 6 + 0.5 * 5) / 11, 0.4 * 1 / 11
+    assert found["coverage_mean"] == pytest.approx((first + second) / 2)
+    assert found["explored_m2"] == pytest.approx(140.0)
+
+
+def test_how_a_robot_was_led_is_told_of_its_drive_only() -> None:
+    run = {"zero_s": 100.0, "duration_s": 10.0}
+    progress = [
+        {"kind": "progress", "t_s": t, "stopped_s": s, "corrections": c, "correction_age_s": a}
+        for t, s, c, a in ((90.0, 0.0, 1, 9.0), (100.0, 0.0, 50, 0.3), (105.0, 2.0, 70, 1.8), (110.0, 2.5, 95, 0.4))
+    ]
+    start = {"kind": "start", "t_s": 90.0, "x": 1.0, "y": 2.0, "yaw": 0.0}
+    path = [
+        {"kind": "path", "t_s": 101.0 + n, "x": 1.0, "y": 2.0, "belief_x": 0.1 * n, "belief_y": 0.0} for n in range(3)
+    ]
+
+    found = led_of([start, *progress, *path], run)
+
+    assert found == {
+        "stopped_ratio": 0.25,
+        "corrections_hz": 4.5,
+        "correction_age_max_s": 1.8,
+        "pose_error_m": pytest.approx(0.1),
+    }
+    assert led_of([start, {**progress[1], "corrections": 0}, {**progress[2], "corrections": 0}], run) is None
+    assert pose_errors([]) == [0.0]
+
+
+def a_run(scheme: str, run: int, covered: float, **changed: Any) -> dict[str, Any]:
+    curve = [[5.0 * n, round(covered * n / 12, 4)] for n in range(13)]
+    figures = {"scheme": scheme, "block": "nano", "level": "one", "run": run, "coverage_curve": curve}
+    figures |= {"coverage_mean": covered / 2, "explored_m2": 500 * covered, "stopped_ratio": 0.1, "moves": 2}
+    figures |= {"move_gap_mean_s": 0.2, "move_gap_max_s": 0.3, "lost_per_move": 0.0, "map_hz": covered}
+    figures |= {"roles": {"edge1": {"both": {"s": 30.0, "slam": 0.31, "model": 0.58, "zsched": 0.09}}}}
+    figures |= {"nodes": {}, "host": {"pressure": 0.1}, "links": "simulated"}
+    return figures | changed
+
+
+def the_runs(count: int = 3) -> list[dict[str, Any]]:
+    base = {"fixed_e1": 0.5, "fixed_e2": 0.6, "fixed_e3": 0.4, "dyna_both": 0.7, "zsched": 0.65}
+    return [a_run(name, run, value + 0.01 * run) for name, value in base.items() for run in range(count)]
+
+
+def test_the_best_fixed_scheme_stands_beside_the_mean_of_all() -> None:
+    runs = the_runs()
+    mean, best = over_fixed(runs, "zsched")["coverage_mean"], over_best_fixed(runs, "zsched")["coverage_mean"]
+
+    assert best_fixed(runs, "coverage_mean") == "fixed_e2"
+    assert mean.value == pytest.approx(0.66 / 0.51 - 1)
+    assert best.value == pytest.approx(0.66 / 0.61 - 1)
+    assert best_fixed([{**one, "stopped_ratio": one["coverage_mean"]} for one in runs], "stopped_ratio") == "fixed_e3"
+    assert best_fixed([one for one in runs if one["scheme"] != "fixed_e1"], "coverage_mean") is None
+    text = over_fixed_text(runs)
+    assert "Against the best fixed scheme, chosen in hindsight by covered on the way: fixed_e2" in text
+    assert GAINS[0] == "coverage_mean"
+    assert {"received_mb_s", "throughput_mb_s"} <= set(GAINS)
+
+
+def test_coverage_is_told_with_intervals_and_without_one_of_one_run() -> None:
+    told = coverage_table(the_runs())
+    row = next(line for line in told.splitlines() if line.startswith("| zsched"))
+    assert "0.330 ±0.012" in row  # 0.325, 0.330, 0.335: t(2) * 0.005 / sqrt(3)
+    one = coverage_table(the_runs(1))
+    assert "(n = 1)" in one
+    assert "inf" not in one + told
+    assert coverage_parts([{**figures, "stopped_ratio": None} for figures in the_runs()]) == []
+    assert "| and both: the tipping point | 31.0 % | 0.0 % | 0.0 % | 58.0 % | 89.0 % | 9.0 % |" in roles_table(
+        the_runs()
+    )
+
+
+def test_the_curves_are_drawn_where_there_are_any(tmp_path: Path) -> None:
+    assert save_coverage(tmp_path / "c.png", the_runs(), "title") == "c.png"
+    assert (tmp_path / "c.png").stat().st_size > 5000
+    assert save_coverage(tmp_path / "d.png", [{**one, "stopped_ratio": None} for one in the_runs()], "x") is None
+
+
+def results_of(runs: list[dict[str, Any]], main: str = "nano") -> dict[str, Any]:
+    scenario = {
+        "name": "nano",
+        "seed": 1,
+        "level": "one",
+        "levels": {"one": {"streams": 4, "share": 0.15, "side": 320}},
+    }
+    scenario |= {"main": main, "blocks": {"nano": {"schemes": [], "level": None}}, "merge": {}, "nodes": {}}
+    scenario |= {"target_coverage": 0.6, "pressure_limit": 0.15, "warm_up_s": 60.0}
+    return {
+        "scenario": scenario,
+        "runs": runs,
+        "invalid": [],
+        "command": "x",
+        "input": "x",
+        "version": "0",
+        "machine": "x",
+    }
+
+
+def test_a_report_is_of_the_main_block() -> None:
+    results = results_of(the_runs())
+    text = report(results, ["nano-coverage.png"])
+    assert len(main_runs(results)) == 15
+    assert "### Coverage over time" in text
+    assert "Warm-up before the drive: 60 s" in text
+    assert "![nano-coverage.png](nano-coverage.png)" in text
+    assert blocks_parts(results) == []
+    assert text.count("| zsched | 3 |") >= 2
+
+
+def test_schemes_stand_where_they_stand_behind_what_moves_cost() -> None:
+    results = results_of(the_runs())
+    table = gains_text(results, ("zsched", "dyna_both", "oracle"))
+    rows = [line.split(" | ")[1] for line in table.splitlines()[2:]]
+    assert rows == ["dyna_both", "zsched"]
+    assert "| nano | 6 in 3 runs | 0.20 | 0.30 | 0.00 |" in moves_text(results)
+    assert moves_text(results_of([{**one, "moves": 0} for one in the_runs()])) == ""
+
+
+@pytest.mark.parametrize(("block", "told"), [("matrix", "10 %"), ("heavy", "17 %"), ("nano", "")])
+def test_the_floor_stands_beside_every_goal_for_the_latency(block: str, told: str) -> None:
+    runs = [{**one, "block": block, "task_latency_s": 30.0} for one in the_runs()]
+    rows = [line for line in claims_text(runs).splitlines() if "task_latency_s" in line]
+    assert len(rows) == 5
+    assert all((f"a merger that costs nothing gains {told}" in row) == bool(told) for row in rows)
+
+
+def test_the_ceiling_of_coverage_is_told_before_and_after_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    loop = {"world": "turtlebot3", "speed": 0.5, "duration_s": 6.0, "map_period_s": 2.0}
+    merge = {"rate_hz": 0.5, "min_agreeing": 150}
+    scenario = {"seed": 1, "warm_up_s": 1.0, "explore": loop, "merge": merge, "blocks": {}}
+    runs = [{"scheme": name, "run": 0, "coverage_mean": 0.1} for name in FIXED_SCHEMES]
+
+    found = ceiling_of(scenario, runs)
+
+    assert found is not None
+    assert found[0] == pytest.approx(0.1)
+    assert 0.1 < found[1] < 1.0
+    assert found[2].endswith("(n = 1)")
+    short = replace(shipped("nano"), duration_s=5.0, warm_up_s=0.0)
+    short = replace(
+        short,
+        explore=replace(short.explore, duration_s=5.0, world="turtlebot3"),
+        blocks={"nano": replace(short.blocks["nano"], runs=1)},
+    )
+    assert tell_ceiling(short) == 0
+    assert capsys.readouterr().out.startswith("seed 41000: covered on the way 0.")
+    for wrong in ([], ["--scenario", "paper"], ["--scenario", "nono"], ["x.json", "--scenario", "nano"]):
+        with pytest.raises(SystemExit):
+            latency_floor(wrong)
+
+
+def test_the_floor_is_what_robots_do_with_maps_that_come_at_once() -> None:
+    runs = [
+        {"scheme": name, "block": MATRIX, "run": run, "task_latency_s": 22.0 + run}
+        for name in FIXED_SCHEMES
+        for run in range(2)
+    ]
+    loop = {"world": "turtlebot3", "speed": 1.0, "duration_s": 20.0, "target_coverage": 0.5}
+    scenario = {"seed": 1, "blocks": {}, "explore": loop}
+
+    found = floor_of(scenario, runs)
+
+    assert found is not None
+    assert found[0] == 22.5
+    assert 0.0 < found[1] < 20.0
+    assert found[2].startswith("-")
+    never = floor_of({**scenario, "explore": {**loop, "target_coverage": 1.0, "duration_s": 5.0}}, runs)
+    assert never is not None
+    assert never[1] == 5.0
+    assert floor_of(scenario, runs[:1]) is None
