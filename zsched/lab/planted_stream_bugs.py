@@ -270,4 +270,32 @@ STREAM_BUGS = (
         "if not is_answered:",
         ("tests/unit/test_relay_proofs.py",),
     ),
+    _bug(
+        "a relay leaves a put to a frozen worker to zenoh",
+        OUTLET,
+        "= acks.stalled if acks else contextlib.nullcontext()",
+        "= contextlib.nullcontext()",
+        ("tests/parts/test_stalled_links.py::test_a_relay_ends_the_link_of_a_frozen_worker_behind_its_put",),
+    ),
+    _bug(
+        "a relay closes links, and reads those it has dialled, with a single thread",
+        "zsched.zenoh_config",
+        "return _pools(rx=threads, tx=threads, net=threads)",
+        "return _pools(rx=threads, tx=threads)",
+        ("tests/unit/test_zenoh_config.py", "tests/integration/test_zenoh_pools.py"),
+    ),
+    _bug(
+        "a node's processes have as many threads as zenoh likes",
+        "zsched.daemon",
+        'os.environ.setdefault(\n            "ZENOH_RUNTIME",',
+        'os.environ.setdefault(\n            "ZENOH_RUNTIME_UNREAD",',
+        ("tests/integration/test_zenoh_pools.py",),
+    ),
+    _bug(
+        "a relay has the threads that its daemon has",
+        "zsched.relay.__main__",
+        'os.environ["ZENOH_RUNTIME"] = relay_pools(arguments.threads)',
+        "relay_pools(arguments.threads)",
+        ("tests/integration/test_zenoh_pools.py",),
+    ),
 )
