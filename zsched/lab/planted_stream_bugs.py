@@ -298,4 +298,11 @@ STREAM_BUGS = (
         "relay_pools(arguments.threads)",
         ("tests/integration/test_zenoh_pools.py",),
     ),
+    _bug(
+        "a relay does not tell a role again whose token goes",
+        "zsched.relay.process",
+        "self._roles.remind(ended.task, ended.epoch)",
+        "pass",
+        ("tests/integration/test_relay_process.py::test_a_role_whose_token_goes_is_told_again_by_the_relay",),
+    ),
 )
