@@ -16,7 +16,6 @@ from zsched.core.events import SlotDrained, SlotFlipped, SlotReady
 from zsched.core.plan import RoutePhase, StreamClass, WorkerRole
 from zsched.core.relay_protocol import SlotLost
 
-
 FROZEN_S = 4.0
 """Longer than the lease: its link ends, and whatever is on its way goes with it."""
 MORE_THAN_IS_KEPT = 2048 + 1000

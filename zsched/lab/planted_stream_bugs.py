@@ -17,6 +17,8 @@ _RECEIVE = ("tests/parts/test_relay_receive.py",)
 _ACKS = ("tests/unit/test_hop_acks.py",)
 _LANES = ("tests/unit/test_relay_lanes.py",)
 _WORKER = "tests/parts/test_worker.py"
+_FROZEN = "tests/integration/test_relay_frozen_moves.py"
+_CHAOS = "tests/system/test_chaos_streams.py"
 _RELAY_STREAMS = "tests/integration/test_relay_streams.py"
 
 
@@ -304,5 +306,26 @@ STREAM_BUGS = (
         "self._roles.remind(ended.task, ended.epoch)",
         "pass",
         ("tests/integration/test_relay_process.py::test_a_role_whose_token_goes_is_told_again_by_the_relay",),
+    ),
+    _bug(
+        "a reliable lane sends to whoever subscribes",
+        OUTLET,
+        "is_open=self._is_open if is_reliable and self._acks is not None else None,",
+        "is_open=None,",
+        (f"{_FROZEN}::test_an_owner_that_is_frozen_before_it_is_greeted_misses_nothing",),
+    ),
+    _bug(
+        "a lane waits for an answer to a greeting that was not put",
+        GREETINGS,
+        "                self._put_start(lane, lowest)\n",
+        "",
+        (f"{_FROZEN}::test_an_owner_that_is_frozen_before_it_is_greeted_misses_nothing",),
+    ),
+    _bug(
+        "what an input's rule says of a crash is not read",
+        "zsched.config_tasks",
+        '"graph", "on_crash")',
+        '"graph")',
+        (f"{_CHAOS}::test_a_power_cut_loses_nothing_where_the_rule_says_replay",),
     ),
 )
