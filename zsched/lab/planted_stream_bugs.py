@@ -328,4 +328,11 @@ STREAM_BUGS = (
         '"graph")',
         (f"{_CHAOS}::test_a_power_cut_loses_nothing_where_the_rule_says_replay",),
     ),
+    _bug(
+        "a cold standby without a command is let through",
+        "zsched.config_tasks",
+        'is Standby.COLD and not section.get("command"):',
+        'is Standby.COLD and section.get("command") == ():',
+        ("tests/unit/test_config.py::test_one_fault_is_reported_once_at_its_place",),
+    ),
 )
