@@ -335,4 +335,21 @@ STREAM_BUGS = (
         'is Standby.COLD and section.get("command") == ():',
         ("tests/unit/test_config.py::test_one_fault_is_reported_once_at_its_place",),
     ),
+    _bug(
+        "one forged acknowledgement lets go of what is kept",
+        LANES,
+        "        self._take_back(limit)\n",
+        "",
+        (
+            "tests/unit/test_relay_lanes.py::test_what_an_acknowledgement_says_is_taken_back_by_one_that_says_less",
+            "tests/integration/test_relay_reliable.py",
+        ),
+    ),
+    _bug(
+        "a start marker skips what one forged acknowledgement has let go of",
+        LANES,
+        "first = self.spare[0] if self.spare else self.kept[0] if self.kept else None",
+        "first = self.kept[0] if self.kept else None",
+        (*_LANES, *_GREETINGS),
+    ),
 )
