@@ -301,7 +301,9 @@ WORKER: Final = Record(
             "Program and arguments, no shell. A first word `python` is the daemon's own interpreter. "
             "Absent: the worker is started by somebody else.",
         ),
-        "standby": Field(Choice.of(Standby), "`warm`: runs on every candidate; `cold`: started on the move."),
+        "standby": Field(
+            Choice.of(Standby), "`warm`: runs on every candidate; `cold`: started on the move, by its `command`."
+        ),
         "ready": Field(
             Choice.of(ReadyWhen),
             "`token`: zsched.worker says so; `matching`: any zenoh program, while it takes every input and service.",

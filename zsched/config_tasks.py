@@ -22,6 +22,7 @@ from zsched.core.fleet import (
     Demand,
     LinkLimits,
     OnIsolation,
+    Standby,
     StreamRule,
     TaskSpec,
     WorkerSpec,
@@ -225,6 +226,10 @@ def _worker(given: Section, out: Collector) -> WorkerSpec:
     for key, held in env.items():
         if key.startswith("ZSCHED_"):
             out.error(held.place, f"{key} is set by zsched itself", "choose another name")
+    if section.is_whole and section.get("standby") is Standby.COLD and not section.get("command"):
+        message = "a cold standby is started on the move, and this worker has no `command` to start it with"
+        hint = "give its `command`, or delete `standby`: a worker that somebody else starts counts wherever it runs"
+        out.error(section.where("standby"), message, hint)
     return section.build(WorkerSpec, out, env=pairs, **ready) or WorkerSpec()
 
 

@@ -126,6 +126,8 @@ class Acknowledger:
         self._sources: dict[SourceName, _Source] = {}
         self._dirty: set[SourceName] = set()
         self._wake = threading.Condition()
+        self._sending = threading.Lock()
+        """Frames leave in the order in which they were made: one that says less than the one before is a stranger's."""
         self._samples = 0
         self._bytes = 0
         self._is_closed = False
@@ -287,9 +289,10 @@ class Acknowledger:
 
     def flush(self) -> None:
         """Send what changed at once (the caller's thread)."""
-        with self._wake:
-            frames = self._frames()
-        self._send_all(frames)
+        with self._sending:
+            with self._wake:
+                frames = self._frames()
+            self._send_all(frames)
 
     # --- numbers -----------------------------------------------------------------------------------------------------
 
@@ -391,8 +394,7 @@ class Acknowledger:
                 if rest > 0 and not self._is_closed and not self._is_urgent():
                     self._wake.wait(rest)
                 is_last = self._is_closed
-                frames = self._frames()
-            self._send_all(frames)
+            self.flush()
             if is_last:
                 return
             due = monotonic_s() + ACK_S

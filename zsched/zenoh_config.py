@@ -234,8 +234,21 @@ def runtime_pools(nodes: int, tasks: int = 0) -> str:
     link that is dead one way holds a thread for zenoh's SO_LINGER, 10 s, in which no other link came or went.
     """
     threads = pool_threads(nodes, tasks)
-    pools = {"rx": threads, "tx": TX_THREADS, "net": threads, "acc": threads}
-    return f"({', '.join(f'{name}: (worker_threads: {count})' for name, count in pools.items())})"
+    return _pools(rx=threads, tx=TX_THREADS, net=threads, acc=threads)
+
+
+def relay_pools(threads: int) -> str:
+    """The value of ``ZENOH_RUNTIME`` for a relay: ``threads`` that receive, transmit, and close links, each.
+
+    One stalled target holds one thread that transmits, and later the one that closes its link. ``net`` has as many as
+    ``rx``, because a socket is read by the pool that opened it: ``net`` also receives on every link that this process
+    has dialled (docs/decisions/0016).
+    """
+    return _pools(rx=threads, tx=threads, net=threads)
+
+
+def _pools(**threads: int) -> str:
+    return f"({', '.join(f'{name}: (worker_threads: {count})' for name, count in threads.items())})"
 
 
 # --- parts -----------------------------------------------------------------------------------------------------------

@@ -16,6 +16,13 @@ from zsched.core.events import SlotDrained, SlotFlipped, SlotReady
 from zsched.core.plan import RoutePhase, StreamClass, WorkerRole
 from zsched.core.relay_protocol import SlotLost
 
+FROZEN_S = 4.0
+"""Longer than the lease: its link ends, and whatever is on its way goes with it."""
+MORE_THAN_IS_KEPT = 2048 + 1000
+"""...and less than a slot's queue holds."""
+PADDING = 2000
+"""So that no socket holds what a relay does not keep."""
+
 
 @pytest.fixture
 def rig(tmp_path: Path) -> Iterator[Rig]:
@@ -46,6 +53,39 @@ def test_a_new_owner_that_is_frozen_at_the_move_misses_nothing(rig: Rig, seconds
     app.halt(thread)
     until(lambda: len(app.back) >= app.sent, "every answer")
     assert app.back == list(range(app.sent))
+
+
+def test_an_owner_that_is_frozen_before_it_is_greeted_misses_nothing(rig: Rig) -> None:
+    """It hears neither of the slot nor of its role, and more is on its way to it than a relay keeps to send again.
+
+    Before it has answered nothing may go out: what it does not take would be lost, or would have to be given up.
+    """
+    rig.start_worker("edge1")
+    frozen = rig.start_worker("edge2")
+    first, second = slot(1, "edge1", StreamClass.RELIABLE, 1), slot(2, "edge2", StreamClass.RELIABLE, 1)
+    rig.move(first)
+    app = Application(rig.app)
+    app.halt(app.flow(200, 20))
+    until(lambda: len(app.back) == app.sent, "every answer of the first owner")
+    app.padding = bytes(PADDING)
+    frozen.send_signal(signal.SIGSTOP)
+    frozen_at = time.monotonic()
+    rig.role("edge2", WorkerRole.ACTIVE, 2)
+    rig.role("edge1", WorkerRole.DRAINING, 1)
+    rig.plan(RoutePhase.PREPARE, second, first)
+    rig.plan(RoutePhase.FLIP, second, first)
+    rig.wait(SlotFlipped, epoch=2)
+    for _ in range(MORE_THAN_IS_KEPT):
+        app.put()
+    time.sleep(max(0.0, frozen_at + FROZEN_S - time.monotonic()))
+    frozen.send_signal(signal.SIGCONT)
+    rig.wait(SlotDrained, epoch=1)
+    rig.plan(RoutePhase.CLOSE, second)
+    until(lambda: len(app.back) >= app.sent, "every answer")
+    assert app.back == list(range(app.sent))
+    until(lambda: rig.told("echo/in/0").acknowledged == app.sent, "every acknowledgement")
+    told = rig.told("echo/in/0")
+    assert (told.lost, told.at_most_lost, told.drops) == (0, 0, ())
 
 
 @pytest.mark.parametrize("is_told", [True, False], ids=["told in the end", "told the last only"])

@@ -6,23 +6,29 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from support.relay_rig import FLEET, TASK, relay_rig
+from support.waiting import until
 from zsched import wire
 from zsched.core.events import ProblemReported, StreamsCounted
 from zsched.core.plan import (
     Direction,
     ReadyWhen,
+    Role,
     Route,
     RoutePhase,
     RoutePlan,
     Slot,
     StreamSettings,
+    WorkerRole,
 )
 from zsched.core.relay_life import RelayPulse
 from zsched.core.relay_protocol import RelayStarted, RelayStop
+from zsched.keyspace import Keyspace
 from zsched.relay_pipe import REPORTS, read_frame, write_frame
 from zsched.zenoh_config import data_config
 
@@ -147,3 +153,31 @@ def test_garbage_and_bad_plans_are_reported_and_survived(process: subprocess.Pop
     problems = [str(report.problem) for report in said if isinstance(report, ProblemReported)]
     assert any("unreadable command" in problem for problem in problems)
     assert any("more wildcards" in problem for problem in problems)
+
+
+def test_a_role_whose_token_goes_is_told_again_by_the_relay(tmp_path: Path) -> None:
+    """The worker has been told something else, or has lost its link for a while: its daemon's word still holds."""
+    key = Keyspace(FLEET).role("edge1", TASK)
+    told: list[Role] = []
+    with relay_rig(tmp_path) as rig:
+        watch = rig.app.declare_subscriber(
+            key, lambda sample: told.append(wire.decode(sample.payload.to_bytes(), Role))
+        )
+        worker = rig.start_worker("edge1")
+
+        def is_heard() -> bool:
+            rig.role("edge1", WorkerRole.ACTIVE, 1)
+            return bool(told)
+
+        def works() -> bool:
+            return any(reply.ok is not None for reply in rig.app.liveliness().get(f"{key}/2"))
+
+        until(is_heard, "a put under the role's key")
+        rig.role("edge1", WorkerRole.ACTIVE, 2)
+        until(works, "the token of the role")
+        until(lambda: told[-1].epoch == 2, "the role, behind all that was put before")
+        told.clear()
+        worker.kill()
+        until(lambda: told, "the role again")
+        assert told == [Role(task=TASK, role=WorkerRole.ACTIVE, epoch=2)]
+        watch.undeclare()

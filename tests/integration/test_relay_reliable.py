@@ -17,11 +17,13 @@ import pytest
 import zenoh
 
 from support.beside import COUPLED, Beside
-from support.relay_rig import BESIDE, ROBOT, Application, Rig, relay_rig, slot
+from support.relay_rig import BESIDE, FLEET, ROBOT, TASK, Application, Rig, relay_rig, slot
 from support.sessions import matches
 from support.waiting import until, within
+from zsched import wire
 from zsched.core.plan import ReadyWhen, RoutePhase, RoutePlan, StreamClass, StreamCount
-from zsched.core.relay_protocol import SlotLost, WorkerSeen
+from zsched.core.relay_protocol import SlotLost, StreamAck, StreamAcks, WorkerSeen
+from zsched.keyspace import Keyspace
 from zsched.zenoh_config import worker_config
 
 WHAT_FITS = 5500
@@ -72,6 +74,35 @@ def test_what_a_frozen_worker_missed_reaches_it_when_it_wakes_up(rig: Rig) -> No
     until(lambda: told(rig, "echo/out/0").messages >= app.sent, "the counters of the answers")
     answers = told(rig, "echo/out/0")
     assert (answers.lost, answers.doubled, answers.reordered) == (0, 0, 0)
+
+
+def test_an_acknowledgement_from_another_session_takes_nothing_from_what_is_kept(rig: Rig) -> None:
+    """In the worker's name, of all that is on its way to it, while it stands still: it is sent that all the same."""
+    worker = rig.start_worker("edge1")
+    app, _ = through(rig)
+    put: list[zenoh.Sample] = []
+    recorder = rig.app.declare_subscriber(f"edge1/{TASK}/{ROBOT}/in", put.append)
+    until(lambda: app.put() or (put and app.back), "the stream through edge1, seen by a stranger")
+    until(lambda: told(rig).acknowledged == app.sent, "every acknowledgement so far")
+    before, app.padding = app.sent, bytes(5000)  # more than sockets hold: something is lost with the link
+    worker.send_signal(signal.SIGSTOP)
+    for _ in range(300):
+        app.put()
+    rig.wait(WorkerSeen, is_present=False)
+    info = put[-1].source_info
+    assert info is not None
+    count = info.source_sn + 1
+    assert count > before
+    forged = StreamAck(eid=info.source_id.eid, first=0, arrived=count, processed=count)
+    key = Keyspace(FLEET).ack("edge1", TASK, rig.incarnation, str(info.source_id.zid))
+    rig.app.put(key, wire.encode(StreamAcks(acks=(forged,))))
+    until(lambda: told(rig).acknowledged == count, "the forged word is taken for the worker's")
+    recorder.undeclare()
+    worker.send_signal(signal.SIGCONT)
+    until(lambda: len(app.back) == app.sent, "every answer")
+    assert app.back == list(range(app.sent))
+    until(lambda: told(rig).acknowledged == app.sent, "every acknowledgement")
+    assert (told(rig).lost, told(rig).at_most_lost, told(rig).drops) == (0, 0, ())
 
 
 def test_the_newest_answer_of_a_frozen_worker_reaches_its_robot(rig: Rig) -> None:

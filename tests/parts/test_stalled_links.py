@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import socket
 import subprocess
@@ -15,11 +16,15 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
+import zenoh
 
-from support.hand_relay import KEYS, Relay, environment
-from support.waiting import until, within
+from support.hand_relay import INPUT, KEYS, Relay, environment
+from support.sessions import hub_and_neighbour
+from support.waiting import free_endpoint, until, within
 from zsched.clock import monotonic_s
-from zsched.core.plan import WorkerRole
+from zsched.core.plan import StreamClass, StreamSettings, WorkerRole
+from zsched.relay.acks import Acks
+from zsched.relay.outlet import Outlet
 from zsched.stalled_links import StalledLinks
 from zsched.worker import Worker
 from zsched.zenoh_config import worker_config
@@ -146,3 +151,47 @@ def test_a_frozen_robot_holds_the_answers_of_the_others_up_for_less_than_zenoh_d
         reader.join()
     assert max(took) > 0.2, "the put has waited for the frozen one"
     within(max(took), 2.0)
+
+
+def test_a_relay_ends_the_link_of_a_frozen_worker_behind_its_put(tmp_path: Path) -> None:
+    """Whatever else the relay puts to that worker's machine waits behind that put: by zenoh alone for 5 s and more."""
+    endpoint, path = free_endpoint(), tmp_path / "worker.json5"
+    path.write_text(worker_config(connect=(endpoint,), shared_memory=False))
+    variables = {"FLEET": "test", "NODE": "edge1", "TASK": "t", "INCARNATION": "3", "ZENOH_CONFIG": str(path)}
+    env = os.environ | {f"ZSCHED_{name}": value for name, value in variables.items()}
+    samples: list[zenoh.Sample] = []
+    with (
+        hub_and_neighbour(endpoint) as (relay, _),
+        subprocess.Popen([sys.executable, "-m", "zsched.tasks.echo"], env=env) as worker,
+    ):
+        try:
+            acks = Acks(relay, KEYS, "robot1", lambda _node, _task, _life: True)
+            settings = StreamSettings(stream_class=StreamClass.RELIABLE, depth=100)
+            outlet = Outlet(relay, "robot1/in", INPUT, settings, acks.of("edge1", "t"))
+            lane = outlet._main
+            assert lane is not None
+            taken = relay.declare_subscriber("robot1/in", samples.append)
+            relay.put("robot1/in", bytes(200_000))  # what the sockets may hold is several MB
+            until(lambda: samples, "a sample")
+            outlet.send(samples[0])
+
+            def has_come() -> bool:
+                outlet.look_after()
+                return lane.ack is not None and lane.ack.arrived == 1
+
+            until(has_come, "the worker has it")
+            worker.send_signal(signal.SIGSTOP)
+            for _ in range(70):
+                outlet.send(samples[0])
+            until(lambda: acks.stalled.ended, "its link is ended")
+
+            def longest_s() -> float:
+                with outlet._lock:
+                    return max(sent.took_s for sent in lane.kept)
+
+            until(lambda: longest_s() > 0.2, "the end of the put that has waited")
+            within(longest_s(), 2.0, "in a put")
+            taken.undeclare()
+        finally:
+            worker.kill()
+        outlet.undeclare()

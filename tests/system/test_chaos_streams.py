@@ -7,8 +7,11 @@ from __future__ import annotations
 
 import os
 import signal
+from collections import Counter
 from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import pairwise
+from pathlib import Path
 from typing import Final
 
 import pytest
@@ -17,14 +20,20 @@ from support.waiting import within
 from zsched.clock import monotonic_s
 from zsched.core.fleet import Timing
 from zsched.core.model import NodeId
+from zsched.core.plan import StreamCount
 from zsched.lab import netns
 from zsched.lab.chaos import ChaosBed
-from zsched.lab.netbed import Probe
+from zsched.lab.netbed import Netbed, Probe, descendants_running
+from zsched.lab.testbed import TASK, echo_fleet
 
 CUTS: Final = int(os.environ.get("ZSCHED_CUTS", "3"))
 LONGEST_S: Final = 4.0
 """The longest time that a robot may go without answers after a one-way cut."""
 GIVE_UP_S: Final = 30.0
+FROZEN_S: Final = 4.0
+"""Longer than the lease of the links."""
+BUSY_HZ: Final = 800.0
+"""In that time more than a relay keeps to send again (2048), and less than the queue of a slot holds."""
 
 pytestmark = [pytest.mark.timeout(120 + 60 * CUTS), pytest.mark.root]
 
@@ -95,3 +104,86 @@ def test_a_frozen_application_holds_up_no_other_of_its_robot(bed: ChaosBed) -> N
 def test_what_was_seen_breaks_no_rule(bed: ChaosBed) -> None:
     bed.calm()
     assert bed.violations() == []
+
+
+@contextmanager
+def reliable_bed(folder: Path, on_crash: str, hz: float) -> Iterator[tuple[Netbed, Probe]]:
+    """A robot, two edges, one ``reliable`` stream through them that flows; its books balance at the end."""
+    reason = netns.why_not()
+    if reason is not None:
+        pytest.skip(f"no network namespaces here: {reason}")
+    tree = echo_fleet(robots=1, edges=2, timing="wired", stream_class="reliable")
+    tree["tasks"][TASK]["inputs"][0] |= {"on_crash": on_crash, "depth": 8000}
+    tree["tasks"][TASK]["outputs"][0]["handover"] = "all"
+    with Netbed(folder, tree) as bed:
+        bed.init()
+        bed.start()
+        bed.wait_settled()
+        burst = max(1, round(hz / 100))
+        probe = bed.probe("robot1", put="robot1/in", watch=["robot1/out"], hz=hz, burst=burst, blocks=True)
+        bed.wait(probe.is_flowing, 60, "answers")
+        yield bed, probe
+
+
+def counted(bed: Netbed) -> StreamCount:
+    """What robot1's relay has counted of its input."""
+    return next(one for one in bed.counts("robot1") if one.stream == f"{TASK}/in/0")
+
+
+def lost_and_told(bed: Netbed, probe: Probe) -> tuple[int, int]:
+    """Of all numbers up to the newest that came back: how many did not, and how many the robot's counters tell of."""
+    back = {one.number for one in tuple(probe.received)}
+    counts = [count for count in bed.counts("robot1") if count.stream in {f"{TASK}/in/0", f"{TASK}/out/0"}]
+    told = sum(one.lost + one.at_most_lost + sum(number for _, number in one.drops) for one in counts)
+    return max(back) + 1 - len(back), told
+
+
+def test_a_new_owner_frozen_at_the_move_loses_nothing_silently(tmp_path: Path) -> None:
+    """Its worker stands still from just before it is chosen until long after its link has ended."""
+    with reliable_bed(tmp_path, "report", BUSY_HZ) as (bed, probe):
+        owner = bed.wait_settled()
+        other = "edge2" if owner == "edge1" else "edge1"
+        (worker,) = descendants_running(bed.pid(other), "zsched.tasks.echo")
+        os.kill(worker, signal.SIGSTOP)
+        frozen = monotonic_s()
+        try:
+            bed.send(owner, signal.SIGTERM)  # it drains: a planned move
+            bed.wait(lambda: bed.task("robot1")["owner"] == other, GIVE_UP_S, "the move")
+            assert monotonic_s() < frozen + FROZEN_S
+            assert probe.first_after(frozen, but_of=owner) is None, "it stands still"
+            bed.wait(lambda: monotonic_s() > frozen + FROZEN_S, 60, "the time that it stands still for")
+        finally:
+            os.kill(worker, signal.SIGCONT)
+        awake = monotonic_s()
+        bed.wait(lambda: bed.has_ended(owner), 60, "the end of the old owner's daemon")
+        bed.wait(lambda: probe.first_after(awake, but_of=owner), 60, "an answer to what was sent since it is awake")
+        bed.wait(lambda: lost_and_told(bed, probe)[0] <= lost_and_told(bed, probe)[1], 20, "a word of every loss")
+        lost, told = lost_and_told(bed, probe)
+        print(f"frozen at the move: lost {lost}, told of {told}", flush=True)
+        assert lost < BUSY_HZ / 2, "what came while it stood still has waited for it"
+        numbers = [one.number for one in tuple(probe.received)]
+        assert numbers == sorted(set(numbers))
+
+
+def test_a_power_cut_loses_nothing_where_the_rule_says_replay(tmp_path: Path) -> None:
+    """From the fleet file by way of the daemon to the relay: what the dead owner had not done is done by the next."""
+    with reliable_bed(tmp_path, "replay", 100.0) as (bed, probe):
+        owner = bed.wait_settled()
+        bed.wait(lambda: len(probe.received) > 50, 60, "some answers")
+        bed.power_off(owner)
+        cut = monotonic_s()
+        bed.wait(lambda: probe.first_after(cut, but_of=owner), 60, "an answer of the next owner")
+        settled = monotonic_s()
+        bed.wait(lambda: is_back(probe, settled), 60, "answers to what was sent since")
+        newest = probe.received[-1].number
+        bed.wait(lambda: counted(bed).messages > newest, 20, "the counts of all that")
+        lost, told = lost_and_told(bed, probe)
+        times = Counter(one.number for one in tuple(probe.received))
+        doubled = sum(count > 1 for count in times.values())
+        replayed = counted(bed).replayed
+        print(f"power cut: lost {lost}, told of {told}, replayed {replayed}, done twice {doubled}", flush=True)
+        assert (lost, told) == (0, 0)
+        assert replayed > 0, "the dead owner has left something, or this shows nothing"
+        assert max(times.values()) <= 2, "by the dead owner, and once more by the next"
+        first_ones = list(dict.fromkeys(one.number for one in tuple(probe.received)))
+        assert first_ones == sorted(first_ones), "in order"

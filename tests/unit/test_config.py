@@ -541,6 +541,7 @@ ONE_FAULT = [
     ("[python, -m, zsched.tasks.map_merge]", "python -m x", "expected a list", "python -m x"),
     ("[python, -m, zsched.tasks.map_merge]", "[]", "expected a list", "[]"),
     ("standby: warm", "env: {ZSCHED_NODE: x}", "is set by zsched itself", "ZSCHED_NODE"),
+    ("command: [python, -m, zsched.tasks.map_merge], standby: warm", "standby: cold", "no `command`", "cold"),
     ("    outputs:  ", "    link: {knee_dbm: -40}\n    outputs:  ", "must lie between nu_dbm (-80)", "-40}"),
     ("keep_last: 1", "keep_last: 1001", "not in the allowed range 0..1000", "1001"),
     ("keep_last: 1", "keep_last: 1.5", "expected a whole number", "1.5"),

@@ -120,7 +120,36 @@ def test_a_lane_is_met_by_the_answer_to_its_greeting_alone() -> None:
     books.greeted_at = 12.0
     books.acknowledge(ack(0, 1), "1", 12.1)
     assert books.meet(12.1)
-    assert (books.resend_from, books.lowest) == (1, 1)
+    assert (books.resend_from, books.lowest) == (1, 0), "what was let go of last may be taken back"
+
+
+@pytest.mark.parametrize("keeps_work", [False, True])
+def test_what_an_acknowledgement_says_is_taken_back_by_one_that_says_less(*, keeps_work: bool) -> None:
+    """A stranger's said that all had come; the worker's own, behind it, tells what has."""
+    books = lane()
+    books.keeps_work = keeps_work
+    for _ in range(8):
+        sent(books, at=10.0)
+    books.acknowledge(ack(0, 3), "1", 10.1)
+    books.acknowledge(ack(0, 8), "1", 10.2)
+    assert (books.acknowledged, books.in_flight, len(books.kept)) == (8, 0, 0)
+    assert books.lowest == 3, "a start marker must not tell the worker to skip what it has not got"
+    books.acknowledge(ack(0, 4), "1", 10.3)
+    assert (books.acknowledged, books.in_flight, books.lowest) == (4, 4, 3)
+    assert [one.number for one in books.kept] == [4, 5, 6, 7]
+    assert books.kept_bytes == sum(one.size for one in books.kept)
+    books.acknowledge(ack(0, 8), "1", 10.4)
+    assert (books.acknowledged, books.in_flight, books.kept_bytes, len(books.kept)) == (8, 0, 0, 0)
+
+
+def test_one_acknowledgement_further_on_lets_go_for_good() -> None:
+    books = lane()
+    for _ in range(3):
+        sent(books, at=10.0)
+        acknowledged(books, books.count, 10.1)
+    assert [one.number for one in books.spare] == [2]
+    books.begin_life("2", 3)
+    assert not books.spare
 
 
 @pytest.mark.parametrize("start", [0, SPAN - 2, SPAN, 5 * SPAN - 1])

@@ -81,9 +81,13 @@ class _Planter(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         self._path = found.origin
         return importlib.util.spec_from_loader(fullname, self, origin=found.origin)
 
-    def exec_module(self, module: types.ModuleType) -> None:
+    def get_code(self, _name: str) -> types.CodeType:
+        """The module's code with the bug; ``python -m`` asks for it, too."""
         source = changed(self._bug, Path(self._path).read_text(encoding="utf-8"))
-        exec(compile(source, self._path, "exec"), module.__dict__)  # noqa: S102 - our own source, a few words changed
+        return compile(source, self._path, "exec")
+
+    def exec_module(self, module: types.ModuleType) -> None:
+        exec(self.get_code(module.__name__), module.__dict__)  # noqa: S102 - our own source, a few words changed
 
 
 def plant(bug: Bug) -> None:

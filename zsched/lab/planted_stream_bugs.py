@@ -17,6 +17,8 @@ _RECEIVE = ("tests/parts/test_relay_receive.py",)
 _ACKS = ("tests/unit/test_hop_acks.py",)
 _LANES = ("tests/unit/test_relay_lanes.py",)
 _WORKER = "tests/parts/test_worker.py"
+_FROZEN = "tests/integration/test_relay_frozen_moves.py"
+_CHAOS = "tests/system/test_chaos_streams.py"
 _RELAY_STREAMS = "tests/integration/test_relay_streams.py"
 
 
@@ -269,5 +271,85 @@ STREAM_BUGS = (
         "if not is_answered or one.lane not in answered:",
         "if not is_answered:",
         ("tests/unit/test_relay_proofs.py",),
+    ),
+    _bug(
+        "a relay leaves a put to a frozen worker to zenoh",
+        OUTLET,
+        "= acks.stalled if acks else contextlib.nullcontext()",
+        "= contextlib.nullcontext()",
+        ("tests/parts/test_stalled_links.py::test_a_relay_ends_the_link_of_a_frozen_worker_behind_its_put",),
+    ),
+    _bug(
+        "a relay closes links, and reads those it has dialled, with a single thread",
+        "zsched.zenoh_config",
+        "return _pools(rx=threads, tx=threads, net=threads)",
+        "return _pools(rx=threads, tx=threads)",
+        ("tests/unit/test_zenoh_config.py", "tests/integration/test_zenoh_pools.py"),
+    ),
+    _bug(
+        "a node's processes have as many threads as zenoh likes",
+        "zsched.daemon",
+        'os.environ.setdefault(\n            "ZENOH_RUNTIME",',
+        'os.environ.setdefault(\n            "ZENOH_RUNTIME_UNREAD",',
+        ("tests/integration/test_zenoh_pools.py",),
+    ),
+    _bug(
+        "a relay has the threads that its daemon has",
+        "zsched.relay.__main__",
+        'os.environ["ZENOH_RUNTIME"] = relay_pools(arguments.threads)',
+        "relay_pools(arguments.threads)",
+        ("tests/integration/test_zenoh_pools.py",),
+    ),
+    _bug(
+        "a relay does not tell a role again whose token goes",
+        "zsched.relay.process",
+        "self._roles.remind(ended.task, ended.epoch)",
+        "pass",
+        ("tests/integration/test_relay_process.py::test_a_role_whose_token_goes_is_told_again_by_the_relay",),
+    ),
+    _bug(
+        "a reliable lane sends to whoever subscribes",
+        OUTLET,
+        "is_open=self._is_open if is_reliable and self._acks is not None else None,",
+        "is_open=None,",
+        (f"{_FROZEN}::test_an_owner_that_is_frozen_before_it_is_greeted_misses_nothing",),
+    ),
+    _bug(
+        "a lane waits for an answer to a greeting that was not put",
+        GREETINGS,
+        "                self._put_start(lane, lowest)\n",
+        "",
+        (f"{_FROZEN}::test_an_owner_that_is_frozen_before_it_is_greeted_misses_nothing",),
+    ),
+    _bug(
+        "what an input's rule says of a crash is not read",
+        "zsched.config_tasks",
+        '"graph", "on_crash")',
+        '"graph")',
+        (f"{_CHAOS}::test_a_power_cut_loses_nothing_where_the_rule_says_replay",),
+    ),
+    _bug(
+        "a cold standby without a command is let through",
+        "zsched.config_tasks",
+        'is Standby.COLD and not section.get("command"):',
+        'is Standby.COLD and section.get("command") == ():',
+        ("tests/unit/test_config.py::test_one_fault_is_reported_once_at_its_place",),
+    ),
+    _bug(
+        "one forged acknowledgement lets go of what is kept",
+        LANES,
+        "        self._take_back(limit)\n",
+        "",
+        (
+            "tests/unit/test_relay_lanes.py::test_what_an_acknowledgement_says_is_taken_back_by_one_that_says_less",
+            "tests/integration/test_relay_reliable.py",
+        ),
+    ),
+    _bug(
+        "a start marker skips what one forged acknowledgement has let go of",
+        LANES,
+        "first = self.spare[0] if self.spare else self.kept[0] if self.kept else None",
+        "first = self.kept[0] if self.kept else None",
+        (*_LANES, *_GREETINGS),
     ),
 )

@@ -20,6 +20,7 @@ import sys
 
 from zsched.core.relay_life import RelayHello
 from zsched.log_limit import limit_handlers
+from zsched.zenoh_config import relay_pools
 
 PR_SET_PDEATHSIG = 1
 M_ARENA_MAX = -8
@@ -41,10 +42,7 @@ def main() -> None:
     signal.signal(signal.SIGTERM, _stop_soon)
     faulthandler.enable()
     faulthandler.register(signal.SIGUSR1)  # where every thread stands, for whoever has to ask
-    # One stalled target holds one thread that transmits, and later the one that closes its link: there must be more of
-    # each than targets may stall. Read once, when zenoh's runtime starts (docs/decisions/0016).
-    pools = f"({', '.join(f'{pool}: (worker_threads: {arguments.threads})' for pool in ('tx', 'rx', 'net'))})"
-    os.environ["ZENOH_RUNTIME"] = pools
+    os.environ["ZENOH_RUNTIME"] = relay_pools(arguments.threads)  # read once, when zenoh's runtime starts
     code = 1
     try:
         from zsched.relay.process import run  # noqa: PLC0415 - imports zenoh, which must find ZENOH_RUNTIME set

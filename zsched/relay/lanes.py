@@ -80,6 +80,8 @@ class Lane:
     incarnation: str = ""
     kept: deque[Sent] = field(default_factory=deque)
     kept_bytes: int = 0
+    spare: list[Sent] = field(default_factory=list)
+    """What the newest acknowledgement has let go of: until one that goes further, it may be taken back."""
     resend_from: int | None = None
     is_misheard: bool = False
     """The receiver believes a start marker that was not ours: ours goes out again."""
@@ -168,16 +170,27 @@ class Lane:
         if not ack.processed <= ack.arrived <= self.count + 1:
             return True  # of what was never sent (one may be on its way and not counted yet): nobody of ours says so
         self.incarnation, self.is_foreign = incarnation, False
-        if self.ack is None or ack.processed >= self.ack.processed:
-            self.ack = ack
-        newest: Sent | None = None
         limit = ack.processed if self.keeps_work else ack.arrived
+        self.ack = ack
+        self._take_back(limit)
+        gone: list[Sent] = []
         while self.kept and self.kept[0].number < limit:
-            newest = self.kept.popleft()
-            self.kept_bytes -= newest.size
-        if newest is not None:
+            gone.append(self.kept.popleft())
+        if gone:
+            newest, self.spare = gone[-1], gone
+            self.kept_bytes -= sum(sent.size for sent in gone)
             self.pause_s = min(max(2 * (now - newest.at), newest.took_s, RESEND_S), MAX_RESEND_S)
         return True
+
+    def _take_back(self, limit: int) -> None:
+        """An acknowledgement that says less than the one before: the worker's own never does, so that was a stranger's.
+
+        Anybody can put one under the worker's key. What it let go of is kept again.
+        """
+        while self.spare and self.spare[-1].number >= limit:
+            sent = self.spare.pop()
+            self.kept.appendleft(sent)
+            self.kept_bytes += sent.size
 
     def mishears(self, ack: StreamAck, *, is_whole: bool) -> bool:
         """Whether the receiver believes of this stream what is not so (`near` our count); ``is_whole``: its class."""
@@ -209,13 +222,15 @@ class Lane:
         self.was_foreign, self.forgiven = is_foreign, None
         self.replay_end = self.count if self.keeps_work else 0
         self.ack, self.resend_from = None, None
+        self.spare.clear()
         while self.kept and self.kept[0].number < start:
             self.kept_bytes -= self.kept.popleft().size
 
     @property
     def lowest(self) -> int:
         """The lowest number that may still be sent: what a start marker says."""
-        return max(self.base, self.kept[0].number) if self.kept else self.count
+        first = self.spare[0] if self.spare else self.kept[0] if self.kept else None
+        return self.count if first is None else max(self.base, first.number)
 
     def unprocessed(self) -> list[Sent]:
         """What is kept of the samples that the receiver has not acknowledged as processed."""
