@@ -38,9 +38,14 @@ def test_same_seed_same_schedule_to_the_letter() -> None:
 def test_plans_have_every_fault_every_size_and_every_kind_of_task() -> None:
     plans = [plan(seed, kinds=frozenset(LATER)) for seed in range(400)]
     kinds = {fault.kind for one in plans for fault in one.faults}
-    assert kinds == (set(MAKERS) - {"clock"}) | {"absence", "clock_rate", "clock_jump", "load", "slew"} | set(LATER) - {
-        "fsync"
-    }
+    assert kinds == (set(MAKERS) - {"clock"}) | {
+        "absence",
+        "clock_rate",
+        "clock_jump",
+        "load",
+        "slew",
+        "suspend",
+    } | set(LATER) - {"fsync"}
     assert {one.generation for one in plans} == {0, 1, 2}
     assert any(not set(one.fleet.electors) & set(one.fleet.voters) for one in plans), "edges alone"
     assert {fault.size for one in plans for fault in one.faults if fault.kind == "rollout"} == set(range(len(CHANGES)))

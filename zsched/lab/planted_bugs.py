@@ -471,6 +471,13 @@ MEMBERSHIP_BUGS = (
         ("tests/sim/test_clock_doubt.py",),
     ),
     _bug(
+        "a jump of the clock is believed",
+        "zsched.core.clocks",
+        " or abs(event.jump_s) > JUMP_S + RHO * event.since_s",
+        "",
+        ("tests/sim/test_clock_doubt.py",),
+    ),
+    _bug(
         "token resurrects a peer",
         NODE,
         '        self.counters["tokens_seen"] += 1\n',

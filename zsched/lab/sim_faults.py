@@ -239,6 +239,10 @@ class Stage:
         """The whole machine stands still, its clock and its workers too (a VM that is not scheduled)."""
         self.sim.freeze(self.scene.machine(fault), fault.seconds)
 
+    def _suspend(self, fault: Fault) -> None:
+        """The machine sleeps: loop and workers stand still, the clock goes on, and its watch sees a jump."""
+        self.sim.suspend(self.scene.machine(fault), fault.seconds, fault.size)
+
     def _kill(self, fault: Fault) -> None:
         self.sim.crash(fault.nodes[0], is_power_lost=fault.kind == "power")
         self.scene.start_later(fault)
@@ -376,6 +380,7 @@ class Stage:
             "slew": self._slew,
             **dict.fromkeys(("twin", "apart"), self._twin),
             "freeze": self._freeze,
+            "suspend": self._suspend,
             "worker": self._worker,
             "absence": self._absence,
             "retune": self._retune,

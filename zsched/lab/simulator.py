@@ -24,6 +24,7 @@ from zsched.core.node import Node
 from zsched.core.plan import RoutePlan
 from zsched.errors import InvariantError
 from zsched.lab.sim_checks import Invariants, unsettled
+from zsched.lab.sim_clocks import LOOK_S, awake
 from zsched.lab.sim_links import Links
 from zsched.lab.sim_loops import TICK_S
 from zsched.lab.sim_memory import Memory
@@ -234,6 +235,20 @@ class Simulator(Links):
     def thawed(self, machine: Machine) -> None:
         """Its workers go on by a clock that stood still."""
         self.work.thaw(machine, self.fleet.timing.lease_s)
+
+    def woken_up(self, machine: Machine, slept_s: float) -> None:
+        """Its workers go on; its watch looks at the clocks a little later, as often as the daemon's does."""
+        life = machine.life
+        self.work.thaw(machine, max(-machine.sleep_error_s, 0.0))
+
+        def tell(event: ev.Event) -> None:
+            if machine.life == life:
+                self.deliver(machine, event)
+
+        def is_believed() -> bool:
+            return machine.life != life or machine.node is None or "clock" not in machine.node.problems
+
+        self.later(LOOK_S, lambda: awake(slept_s, tell=tell, later=self.later, is_believed=is_believed))
 
     # --- events ------------------------------------------------------------------------------------------------------
 
