@@ -19,6 +19,7 @@ from zsched.core.timing import WAN, WIFI, WIRED
 from zsched.lab.sim_clocks import clock_faults, suspensions
 from zsched.lab.sim_files import CHANGES
 from zsched.lab.sim_foreign import absences, with_foreign_workers
+from zsched.lab.sim_many import with_many_tasks
 
 SECONDS = 30.0
 """Virtual seconds of one schedule: faults in the first half, then quiet."""
@@ -73,6 +74,7 @@ def plan(seed: int, *, nodes: int | None = None, seconds: float = SECONDS, kinds
     is_leased = seed % LEASE_EVERY == LEASE_OFFSET
     if is_leased:
         fleet = _leased(rng, fleet)
+    fleet = with_many_tasks(Random(f"many {seed}"), fleet)
     kinds = frozenset(LATER) - PENDING if kinds is None else kinds
     faults = (_lease_faults if is_leased else _faults)(rng, fleet, until)
     fleet, generation = _varied(later, fleet)

@@ -22,7 +22,7 @@ from zsched.core.messages import Refused
 from zsched.core.model import Allocation, DeviceSample, DurableState, NodeId, PeerState, TaskId
 from zsched.core.node import Node
 from zsched.core.plan import RoutePlan
-from zsched.errors import InvariantError
+from zsched.errors import InvariantError, WireError
 from zsched.lab.sim_checks import Invariants, unsettled
 from zsched.lab.sim_clocks import LOOK_S, awake
 from zsched.lab.sim_links import Links
@@ -379,7 +379,10 @@ class Simulator(Links):
         key = (me.key, type(value))
         known = self._frames.get(key)
         if known is None or known[0] is not value:
-            frame = wire.encode(value)
+            try:
+                frame = wire.encode(value)
+            except WireError as error:
+                raise InvariantError(f"{me.key} cannot send what it says: {error}") from error
             known = self._frames[key] = (value, frame, wire.decode(frame, type(value)))
         return known[1], known[2]
 
