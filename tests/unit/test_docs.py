@@ -336,7 +336,8 @@ def test_decisions_that_the_code_cites_exist() -> None:
 def faults_of_bug_table(text: str, bugs: Sequence[Bug]) -> list[str]:
     """What docs/planted-bugs.md says otherwise than the code: how many there are, which, where, in which order."""
     found = [] if f"each of these {len(bugs)} bugs" in text else [f"there are {len(bugs)}"]
-    rows = [tuple(map(str.strip, line.split("|")[1:3])) for line in text.splitlines() if line.startswith("| ")][2:]
+    cells = [line.split("|") for line in text.splitlines() if line.startswith("| ")][2:]
+    rows = [(row[1].strip(), row[2].strip()) for row in cells]
     expected = [(bug.name, places(bug)) for bug in bugs]
     found += [f"no row of {name}" for name, _ in expected if name not in dict(rows)]
     found += [f"no such bug: {name}" for name, _ in rows if name not in dict(expected)]
