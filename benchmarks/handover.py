@@ -5,6 +5,7 @@
 that a move takes what it takes. ``--recorder``: a foreign subscriber to ``**``. ``--stalled``: a third edge whose
 worker is frozen takes the same streams meanwhile. ``--crash``: the owner's worker is killed before every move.
 ``--all`` makes each of these runs, and a plain one of both classes, in turn. ``--out FILE`` keeps what was printed.
+After every move the counters must account for every sample (`zsched.core.books`); the exit code is 1 when they do not.
 """
 
 from __future__ import annotations
@@ -33,22 +34,24 @@ ALL_RUNS: tuple[dict[str, object], ...] = (
 )
 
 
-def main() -> None:
-    """Print what was lost, doubled, reordered, and the gaps."""
+def main() -> int:
+    """Print what was lost, doubled, reordered, and the gaps; 1 when counters did not account for every sample."""
     options = _options()
     if options.out is not None:
         sys.stdout = _Both(options.out.open("a", encoding="utf-8"))
     print(machine())
-    for changes in ALL_RUNS if options.all else ({},):
-        _one(argparse.Namespace(**(vars(options) | changes)))
+    runs = ALL_RUNS if options.all else ({},)
+    broken = sum(_one(argparse.Namespace(**(vars(options) | changes))) for changes in runs)
+    print(f"\nlooks at which a stream's counters did not account for every sample: {broken}")
+    return 1 if broken else 0
 
 
-def _one(options: argparse.Namespace) -> None:
+def _one(options: argparse.Namespace) -> int:
     extras = [name for name in ("recorder", "stalled", "mirror", "crash") if getattr(options, name)]
     print(f"\n{options.moves} moves, class {options.stream_class}{''.join(f', {name}' for name in extras)}", flush=True)
     edges = ("edge1", "edge2", "edge3") if options.stalled else ("edge1", "edge2")
     with tempfile.TemporaryDirectory() as folder, Rig(Path(folder), edges) as rig:
-        _run(rig, options)
+        return _run(rig, options)
 
 
 class _Both:
@@ -82,7 +85,8 @@ def _options() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def _run(rig: Rig, options: argparse.Namespace) -> None:
+def _run(rig: Rig, options: argparse.Namespace) -> int:
+    """One run; at how many looks the books of a stream were not balanced."""
     stream_class = StreamClass(options.stream_class)
     arguments = ("--latest",) if stream_class is StreamClass.LATEST else ()
     loads = tuple(
@@ -106,7 +110,7 @@ def _run(rig: Rig, options: argparse.Namespace) -> None:
     for traffic in traffics:
         traffic.start()
     until(lambda: all(len(traffic.back) > 5 for traffic in traffics), "echoes", 60.0)
-    moments, flips = [], []
+    moments, flips, broken = [], [], 0
     for number in range(options.moves):
         time.sleep(0.15)
         owner = "edge2" if now.owner == "edge1" else "edge1"
@@ -119,6 +123,7 @@ def _run(rig: Rig, options: argparse.Namespace) -> None:
         if options.crash:
             rig.start_worker(now.owner, *arguments)
         now = new
+        broken += _is_broken(rig, number)
         if number % 50 == 49:
             print(f"  {number + 1}/{options.moves}", flush=True)
     time.sleep(0.3)
@@ -128,6 +133,13 @@ def _run(rig: Rig, options: argparse.Namespace) -> None:
     _report(rig, traffics, moments, flips)
     if options.recorder:
         print(f"  the recorder took {recorded[0]} samples")
+    return broken + _is_broken(rig, options.moves)
+
+
+def _is_broken(rig: Rig, move: int) -> bool:
+    missing = rig.unaccounted()
+    print("".join(f"  BROKEN after move {move}: {one}\n" for one in missing), end="", flush=True)
+    return bool(missing)
 
 
 def _stall(rig: Rig, loads: tuple[Load, ...], stream_class: StreamClass) -> None:
@@ -169,4 +181,4 @@ def _report(rig: Rig, traffics: list[Traffic], moments: list[float], flips: list
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -23,6 +23,7 @@ import psutil
 import zenoh
 
 from zsched.adapters.streams import RelayHandle
+from zsched.core.books import unaccounted
 from zsched.core.events import RelayChanged, SlotDrained, SlotFlipped, SlotReady, StreamsCounted
 from zsched.core.plan import (
     Direction,
@@ -210,6 +211,12 @@ class Rig:
         report = self.find(StreamsCounted)
         assert isinstance(report, StreamsCounted)
         return {count.stream: count for count in report.counts}
+
+    def unaccounted(self) -> list[str]:
+        """Streams whose newest counters do not account for every sample (`zsched.core.books`); none, at any time."""
+        return [
+            f"{missing} unaccounted: {count}" for count in self.counts().values() if (missing := unaccounted(count))
+        ]
 
     def left_behind(self) -> list[int]:
         """What closed slots reported as "at most so many lost"."""

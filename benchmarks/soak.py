@@ -4,7 +4,7 @@
 200 Hz and 100 B to 20 kB, a move to a random other edge every 1 to 5 s, now and then a killed worker or a killed relay
 (of an edge). A second application receives all answers and freezes for seconds at a time; what it may have missed is
 counted, and the first one misses nothing by it. Every minute: private memory, descriptors and threads of the robot's
-relay and of the workers.
+relay and of the workers, and whether its counters account for every sample (`zsched.core.books`): exit code 1 if not.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import argparse
 import os
 import random
 import signal
+import sys
 import tempfile
 import time
 from pathlib import Path
@@ -25,8 +26,8 @@ from zsched.core.plan import StreamClass
 EDGES = ("edge1", "edge2", "edge3")
 
 
-def main() -> None:
-    """Print one line a minute and the sums."""
+def main() -> int:
+    """Print one line a minute and the sums; 1 when the counters of a stream did not account for every sample."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=30.0)
     parser.add_argument("--seed", type=int, default=1)
@@ -36,13 +37,16 @@ def main() -> None:
     random_ = random.Random(options.seed)
     with tempfile.TemporaryDirectory() as folder, Rig(Path(folder), EDGES) as rig:
         with Bystander(rig.endpoint(ROBOT), f"{ROBOT}/*/out", options.seed) as bystander:
-            _run(rig, random_, options.minutes * 60, has_faults=not options.no_faults)
+            broken = _run(rig, random_, options.minutes * 60, has_faults=not options.no_faults)
             drops = [dict(count.drops) for name, count in rig.counts().items() if "/out/" in name]
         missed, overflow = (sum(one.get(reason, 0) for one in drops) for reason in ("slow_reader", "overflow"))
         print(f"a second application froze {bystander.freezes} times and may have missed {missed}; overflow {overflow}")
+    print(f"looks at which a stream's counters did not account for every sample: {broken}")
+    return 1 if broken else 0
 
 
-def _run(rig: Rig, random_: random.Random, seconds: float, *, has_faults: bool) -> None:
+def _run(rig: Rig, random_: random.Random, seconds: float, *, has_faults: bool) -> int:
+    """Move for so long; at how many looks the books of a stream were not balanced."""
     loads = tuple(
         Load(name=f"s{n}", hz=random_.choice([20, 50, 100, 200]), size=random_.choice([100, 1000, 20_000]))
         for n in range(10)
@@ -57,10 +61,10 @@ def _run(rig: Rig, random_: random.Random, seconds: float, *, has_faults: bool) 
     for traffic in traffics:
         traffic.start()
     end, next_line = time.monotonic() + seconds, 0.0
-    moves = crashes = 0
+    moves = crashes = broken = 0
     while time.monotonic() < end:
         if time.monotonic() >= next_line:
-            _line(rig, traffics, moves, crashes)
+            broken += _line(rig, traffics, moves, crashes)
             next_line = time.monotonic() + 60
         time.sleep(random_.uniform(1, 5))
         is_crash = has_faults and random_.random() < 0.05
@@ -79,18 +83,23 @@ def _run(rig: Rig, random_: random.Random, seconds: float, *, has_faults: bool) 
     for traffic in traffics:
         traffic.stop()
     time.sleep(2)
-    _line(rig, traffics, moves, crashes)
+    broken += _line(rig, traffics, moves, crashes)
     print(f"reported 'at most N lost': {sum(rig.left_behind())} samples in {len(rig.left_behind())} slots")
+    return broken
 
 
-def _line(rig: Rig, traffics: list[Traffic], moves: int, crashes: int) -> None:
+def _line(rig: Rig, traffics: list[Traffic], moves: int, crashes: int) -> bool:
+    """Print how things are; whether the books of a stream are not balanced."""
     lost, doubled, reordered = (sum(part) for part in zip(*(traffic.result() for traffic in traffics), strict=True))
     parts = [f"{name} {mb:.1f} MB {fds} fd {threads} thr" for name, (mb, fds, threads) in rig.memory().items()]
     sent = sum(len(traffic.sent) for traffic in traffics)
     clock = time.strftime("%H:%M:%S")
     print(f"{clock} moves {moves} crashes {crashes} sent {sent} open {lost} doubled {doubled} reordered {reordered}")
     print("         " + " | ".join(parts), flush=True)
+    missing = rig.unaccounted()
+    print("".join(f"{clock} BROKEN {one}\n" for one in missing), end="", flush=True)
+    return bool(missing)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

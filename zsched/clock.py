@@ -21,6 +21,8 @@ NAP_S = 1e-3
 WINDOW_S = 1.0
 LEAST_WINDOW_S = 0.15
 """In a shorter time the clocks' rates cannot be told apart from the readings' own time."""
+JUMP_RATIO = 0.2
+"""Clocks that move apart faster have jumped: Linux slews by at most a tenth."""
 
 
 def _apart(one: int, other: int) -> float:
@@ -57,7 +59,7 @@ class Drift(NamedTuple):
     """How CLOCK_BOOTTIME ran against CLOCK_MONOTONIC_RAW."""
 
     error_ratio: float
-    """Over the last `WINDOW_S` or less: 0.083 is 8.3 % faster."""
+    """Over the last `WINDOW_S` or less: 0.083 is 8.3 % faster; what was before a jump is left out, and the jump."""
     jump_s: float
     """How far it got ahead since the reading before."""
     since_s: float
@@ -78,6 +80,9 @@ class ClockWatch:
     def judge(self, raw_s: float, ahead_s: float) -> Drift | None:
         """Take one reading in: ``ahead_s`` is how far the slewed clock is ahead at ``raw_s``."""
         last_raw_s, last_ahead_s = self._readings[-1] if self._readings else (raw_s, ahead_s)
+        if abs(ahead_s - last_ahead_s) > JUMP_RATIO * max(raw_s - last_raw_s, LEAST_WINDOW_S):
+            self._readings = deque([(raw_s, ahead_s)])
+            return Drift(0.0, ahead_s - last_ahead_s, raw_s - last_raw_s)
         self._readings.append((raw_s, ahead_s))
         while len(self._readings) > 2 and raw_s - self._readings[1][0] >= WINDOW_S:
             self._readings.popleft()

@@ -120,7 +120,7 @@ class Desk:
                 command = _COMMANDS[verb](request)
             except KeyError as error:
                 return {"error": f"{verb}: {error} is missing"}
-            except (TypeError, ValueError) as error:
+            except (TypeError, ValueError, OverflowError) as error:
                 return {"error": f"{verb}: {error}"}
             return self._ask(node, command)
         if verb == "access" and self._access is not None:

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 import zenoh
 
+from support.books import assert_nothing_is_unaccounted
 from support.sessions import opened
 from support.waiting import free_endpoint, until
 from zsched.adapters.streams import RelayHandle
@@ -135,6 +136,9 @@ def rig() -> Iterator[tuple[Edge, dict[str, Robot]]]:
         for robot in robots.values():
             stack.callback(robot.stop)
         yield edge, robots
+        for robot in robots.values():
+            if robot.relay is not None:
+                assert_nothing_is_unaccounted(lambda robot=robot: tuple(robot.reports))  # type: ignore[misc] # at once
 
 
 def test_three_robots_publish_map_and_each_hears_its_own_result(rig: tuple[Edge, dict[str, Robot]]) -> None:

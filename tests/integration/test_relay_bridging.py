@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from support.books import assert_nothing_is_unaccounted
 from support.sessions import matches
 from support.waiting import free_endpoint, until
 from zsched.adapters.streams import Bequest, RelayHandle
@@ -97,6 +98,7 @@ def node(tmp_path: Path) -> Iterator[Node]:
     made.daemon()
     try:
         yield made
+        assert_nothing_is_unaccounted(lambda: tuple(made.reports))
     finally:
         made.handles[-1].stop(2.0)
         # its child is reaped, whoever stopped it (a relay leaves its door a moment before it has ended)

@@ -15,6 +15,7 @@ import pytest
 import zenoh
 from zenoh import ext
 
+from support.books import assert_nothing_is_unaccounted
 from support.waiting import free_endpoint, until
 from zsched.adapters.streams import RelayHandle
 from zsched.config import load_fleet
@@ -101,6 +102,8 @@ def hosts(tmp_path: Path) -> Iterator[dict[str, Host]]:
                 host.relay.apply(plan_for(task, phase, slot_for(task, host.name, "edge1", 1), None))
                 host.wait(kind)
         yield made
+        for host in made.values():
+            assert_nothing_is_unaccounted(lambda host=host: tuple(host.reports))  # type: ignore[misc] # at once
 
 
 def _start_worker(folder: Path, edge: str) -> subprocess.Popen[bytes]:

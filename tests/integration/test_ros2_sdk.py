@@ -104,7 +104,9 @@ class Rig(RosHost):
 @pytest.fixture
 def rig() -> Iterator[Rig]:
     with contextlib.ExitStack() as stack:
-        yield Rig(stack)
+        made = Rig(stack)
+        yield made
+        made.assert_nothing_is_unaccounted()
 
 
 def test_a_foreign_node_talks_listens_asks_and_looks_through_a_move(rig: Rig) -> None:

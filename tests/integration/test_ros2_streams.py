@@ -133,7 +133,9 @@ class Rig(RosHost):
 @pytest.fixture
 def rig() -> Iterator[Rig]:
     with contextlib.ExitStack() as stack:
-        yield Rig(stack)
+        made = Rig(stack)
+        yield made
+        made.assert_nothing_is_unaccounted()
 
 
 def of(node: RosNode) -> list[tuple[bytes, bytes]]:

@@ -9,6 +9,8 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -16,21 +18,28 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import zenoh
 
+from support.sessions import matches
 from support.waiting import until
 from zsched import daemon
 from zsched.adapters.operator_socket import ask
 from zsched.adapters.state_file import StateFile
+from zsched.clock import ClockWatch, Drift
 from zsched.core import events as ev
+from zsched.core.clocks import is_bad
 from zsched.core.fleet import Fleet, NodeSpec, Timing
 from zsched.core.model import NodeKind
 from zsched.daemon import EXIT_CONFIG, EXIT_FAILED, EXIT_OK
 from zsched.daemon_endpoints import MAX_PORT, MIN_PORT, PORT_RANGE, Endpoints, endpoints_for, free_port, is_here
 from zsched.daemon_sampler import Sampler
 from zsched.errors import AdapterError
+from zsched.keyspace import Keyspace
 from zsched.lab.testbed import echo_fleet
+from zsched.log_limit import BURST, RATE_HZ
 from zsched.places import socket_path
 from zsched.shell import Inbox
+from zsched.zenoh_config import worker_config
 
 Json = dict[str, Any]
 
@@ -218,6 +227,36 @@ def test_samplers_problem_is_told_once_and_ends(tmp_path: Path, monkeypatch: pyt
     assert inbox.take(0.0) is None, "and told once"
 
 
+def test_the_sampler_tells_the_node_of_a_slew_and_a_jump(tmp_path: Path) -> None:
+    """What is wrong wakes the loop, what is well does not; the readings are ours, the watch and its judgement real."""
+    inbox, shell = Inbox(), SimpleNamespace(crew=SimpleNamespace(supervisor=None))
+    sampler = Sampler(spec("a"), 0.001, tmp_path, shell, inbox)  # type: ignore[arg-type]
+    rest = [(10.0 + 0.2 * n, 5.0) for n in range(4)]
+    slew = [(10.8 + 0.2 * n, 5.0 + 0.083 * 0.2 * (n + 1)) for n in range(3)]
+    jump = [(12.0 + 0.2 * n, 65.0) for n in range(2)]
+    readings = iter((*rest, *slew, *jump))
+    compared, is_over = ClockWatch(), threading.Event()
+
+    def look() -> Drift | None:
+        reading = next(readings, None)
+        if reading is None:
+            is_over.set()
+            return None
+        return compared.judge(*reading)
+
+    sampler._clocks.look = look  # type: ignore[method-assign]
+    sampler.start()
+    assert is_over.wait(60.0)
+    sampler.stop()
+    aloud = [event for event in iter(lambda: inbox.take(0.0), None) if isinstance(event, ev.ClockCompared)]
+    quiet = [event for event in inbox.waiting() if isinstance(event, ev.ClockCompared)]
+    assert all(is_bad(event) for event in aloud), aloud
+    assert not any(is_bad(event) for event in quiet), quiet
+    assert [round(event.error_ratio, 3) for event in aloud] == [0.021, 0.033, 0.05, 0.0], "a slew, and one jump"
+    assert [round(event.jump_s, 2) for event in aloud[-1:]] == [59.95]
+    assert len(quiet) == 4, "three before, one after"
+
+
 # --- the process -----------------------------------------------------------------------------------------------------
 
 
@@ -340,6 +379,37 @@ def test_journal_stamps_its_own_times_and_an_early_stop_is_an_orderly_one(place:
     assert process.returncode == EXIT_OK, error
     assert not socket_path(place.folder, "edge1").exists()
     assert {line.split()[0] for line in error.splitlines()} <= {"DEBUG", "INFO", "WARNING"}, error
+
+
+def test_daemon_and_relay_limit_what_they_log(place: Place) -> None:
+    """1000 lines that a library prints in it, 1000 bad acknowledgements: a burst, and how many were left out."""
+    process = place.start(env={"RUST_LOG": ""})
+    until(lambda: place.status() is not None, "its status")
+    endpoint = json.loads(place.file.read_text())["nodes"]["edge1"]["listen"]["data"]
+    config = worker_config(connect=(endpoint,), shared_memory=False)
+    printed = Path(f"/proc/{process.pid}/fd/1")
+    began = time.monotonic()
+    with zenoh.open(zenoh.Config.from_json5(config)) as stranger, printed.open("w") as standard_output:
+        relay = until(lambda: next(iter(stranger.info.peers_zid()), None), "the relay")
+        bad = stranger.declare_publisher(
+            Keyspace("testbed").ack("edge1", "echo", 1, str(relay)), congestion_control=zenoh.CongestionControl.BLOCK
+        )
+        until(lambda: matches(bad), "the relay to listen for acknowledgements")
+        for number, count in enumerate((1000, 1, 1, 1, 1)):
+            for _ in range(count):
+                bad.put(b"no frame")
+            standard_output.write("printed by a library\n" * count)
+            standard_output.flush()
+            room_at = began + number + 1.0
+            until(lambda: time.monotonic() > room_at, "room for another line")  # noqa: B023 - called at once
+        until(lambda: place.status() is not None, "an answer behind it all")
+        took_s = time.monotonic() - began + 1.0
+    process.send_signal(signal.SIGTERM)
+    _, error = process.communicate(timeout=60)
+    for text in ("zsched.relay WARNING an unreadable acknowledgement", "zsched.zenoh printed by a library"):
+        lines = [line for line in error.splitlines() if text in line]
+        assert BURST <= len(lines) <= BURST + RATE_HZ * took_s, (text, len(lines))
+        assert any("more from here were left out" in line for line in lines), text
 
 
 def test_options_are_found_in_arguments_and_environment(

@@ -337,6 +337,7 @@ def test_desk_refuses_what_is_no_request(house: House) -> None:
         ({**weights, "task": "No Name"}, "weights: weights.task: 'No Name' is not a name"),
         ({**weights, "cpu": "much"}, "weights: could not convert"),
         ({**weights, "cpu": float("nan")}, "weights: expected finite numbers"),
+        ({**weights, "cpu": 10**400}, "weights: int too large to convert to float"),
         ({**weights, "cpu": [1]}, "weights: float() argument"),
         ({**weights, "base_revision": "3"}, "weights: base_revision: expected a whole number, not '3'"),
         ({**weights, "base_revision": True}, "weights: base_revision: expected a whole number, not True"),

@@ -197,6 +197,34 @@ def test_an_owner_s_worker_stops_at_once_and_the_task_goes_to_a_node_whose_clock
     assert sim.unsettled() == ""
 
 
+@pytest.mark.parametrize(("slept_s", "error_s"), [(0.5, 0.0), (3.0, 0.0), (3.0, 0.9), (3.0, -0.9), (60.0, 0.0)])
+def test_an_owner_that_wakes_from_sleep_stops_and_begins_again_like_one_that_has_just_started(
+    slept_s: float, error_s: float
+) -> None:
+    """Its clock may be wrong by what it misjudges its sleep: the watch sees that there was one."""
+    sim, owner = started("edge1", "edge2")
+    sim.suspend(sim.machines[owner], slept_s, error_s)
+    sim.run(slept_s + 1.5 * LOOK_S)
+    assert f"jumped by {slept_s:+.3f} s" in sim.node(owner).problems["clock"]
+    assert sim.machines[owner].roles["guard"].role is WorkerRole.IDLE
+    assert working(sim) != owner
+    sim.run(DOUBT_S - LOOK_S)
+    assert "jumped" in sim.node(owner).problems["clock"], "and it is no slew to anybody who looks a little later"
+    sim.run(10.0)
+    assert "clock" not in sim.node(owner).problems
+    assert working(sim) != "", "somebody works"
+
+
+def test_an_elector_that_wakes_from_sleep_grants_nothing_for_a_while() -> None:
+    sim, owner = started("edge1", "edge2")
+    sim.suspend(sim.machines[ROBOTS[0]], 3.0, 0.5)
+    sim.run(3.0 + 1.5 * LOOK_S)
+    assert sim.node(ROBOTS[0]).problems["clock"]
+    for _ in range(60):
+        sim.run(0.1)
+        assert working(sim) == owner, "the others' grants are enough"
+
+
 def test_the_only_candidate_works_again_once_its_clock_is_right() -> None:
     sim, owner = started("edge1")
     slewed(sim, owner, 3.0)

@@ -21,10 +21,10 @@ from typing import Any, TypeVar
 
 import zenoh
 
+from support.books import newest_counts, wait_for_balance
 from support.waiting import free_endpoint, until
 from zsched.adapters.streams import RelayHandle
-from zsched.core.books import unaccounted
-from zsched.core.events import RelayChanged, SlotDrained, SlotFlipped, SlotReady, StreamsCounted
+from zsched.core.events import RelayChanged, SlotDrained, SlotFlipped, SlotReady
 from zsched.core.fleet import Timing
 from zsched.core.plan import (
     Direction,
@@ -86,6 +86,9 @@ class Reports:
 
     def add(self, report: HandleReport) -> None:
         self.items.append((time.monotonic(), report))
+
+    def told(self) -> tuple[HandleReport, ...]:
+        return tuple(report for _, report in tuple(self.items))
 
     def find(self, kind: type[Kind], **fields: Any) -> Kind | None:
         for _, report in tuple(self.items):
@@ -177,8 +180,7 @@ class Rig:
 
     def counts(self) -> tuple[StreamCount, ...]:
         """The newest counters of the robot's relay."""
-        reports = [report for _, report in tuple(self.reports[ROBOT].items) if isinstance(report, StreamsCounted)]
-        return reports[-1].counts if reports else ()
+        return newest_counts(self.reports[ROBOT].told())
 
     def told(self, stream: str) -> StreamCount:
         """The newest counters of one stream."""
@@ -186,15 +188,7 @@ class Rig:
 
     def assert_nothing_is_unaccounted(self) -> None:
         """Every sample that came in is somewhere in the counters, of every stream (`zsched.core.books`)."""
-        found: dict[str, tuple[int, StreamCount]] = {}
-
-        def is_balanced() -> bool:
-            books = {count.stream: (unaccounted(count) or 0, count) for count in self.counts()}
-            found.clear()
-            found.update({name: book for name, book in books.items() if book[0]})
-            return not found
-
-        until(is_balanced, f"an account of every sample, missing {found}")
+        wait_for_balance(self.counts)
 
     def drops(self) -> Counter[str]:
         """The newest drops, summed over all streams."""

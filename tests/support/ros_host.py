@@ -10,6 +10,7 @@ from functools import partial
 
 import zenoh
 
+from support.books import assert_nothing_is_unaccounted
 from support.relay_rig import Reports
 from support.waiting import free_endpoint, until
 from zsched.adapters.streams import RelayHandle
@@ -55,6 +56,10 @@ class RosHost:
         self._relay.start()
         stack.callback(self._relay.stop, 2.0)
         until(lambda: self.reports.find(RelayChanged, is_running=True), "the relay runs")
+
+    def assert_nothing_is_unaccounted(self) -> None:
+        """Every sample that came in is somewhere in the counters, of every stream (`zsched.core.books`)."""
+        assert_nothing_is_unaccounted(self.reports.told)
 
     def move(self, owner: str) -> None:
         """To a new owner, whose predecessor is closed at the end."""

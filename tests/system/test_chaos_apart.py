@@ -24,6 +24,7 @@ from zsched.adapters.state_file import StateFile
 from zsched.clock import monotonic_s
 from zsched.core.model import NodeId
 from zsched.lab import netns
+from zsched.lab.chaos import TWO_CLASSES
 from zsched.lab.netbed import Netbed, Probe, Received
 from zsched.lab.testbed import TASK, Json, echo_fleet
 from zsched.places import socket_path
@@ -31,17 +32,7 @@ from zsched.places import socket_path
 pytestmark = pytest.mark.root
 
 HIDDEN = ("edge1", "edge2", "robot3")
-ROBOTS_TASK: Json = {
-    "on_isolation": "local",
-    "inputs": [
-        {"from": "{robot}/in", "to": "{target}/echo/{robot}/in", "class": "latest"},
-        {"from": "{robot}/order", "to": "{target}/echo/{robot}-orders/in", "class": "reliable"},
-    ],
-    "outputs": [
-        {"from": "{target}/echo/{epoch}/{robot}/out", "to": "{robot}/out", "class": "latest"},
-        {"from": "{target}/echo/{epoch}/{robot}-orders/out", "to": "{robot}/done", "class": "reliable"},
-    ],
-}
+ROBOTS_TASK: Json = {"on_isolation": "local", **TWO_CLASSES}
 
 
 class Bed(Netbed):
@@ -86,10 +77,11 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bed]:
 
 
 @pytest.fixture
-def bed(fleet: Bed) -> Bed:
+def bed(fleet: Bed) -> Iterator[Bed]:
     fleet.network.heal()
     fleet.wait(fleet.is_whole, 60, "everybody alive to everybody")
-    return fleet
+    yield fleet
+    assert fleet.unaccounted() == []
 
 
 def test_two_nodes_without_addresses_find_each_other_again_after_short_cuts(bed: Bed) -> None:

@@ -89,6 +89,13 @@ def bed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bed]:
         yield found
 
 
+@pytest.fixture(autouse=True)
+def books(bed: Bed) -> Iterator[None]:
+    """After every test each sample is in one counter of a robot's relay."""
+    yield
+    assert bed.unaccounted() == []
+
+
 @contextlib.contextmanager
 def guest(bed: Bed, node: str, tree: Json) -> Iterator[tuple[Path, subprocess.Popen[bytes]]]:
     """A daemon in the guest's namespace with a fleet file, state and runtime folder of its own."""

@@ -49,6 +49,13 @@ def bed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ChaosBed]:
         yield made
 
 
+@pytest.fixture(autouse=True)
+def books(bed: ChaosBed) -> Iterator[None]:
+    """After every test each sample is in one counter of a robot's relay."""
+    yield
+    assert bed.unaccounted() == []
+
+
 def is_back(probe: Probe, moment: float) -> bool:
     """Whether something came back that was sent after ``moment``."""
     return probe.first_after(moment) is not None

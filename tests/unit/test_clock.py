@@ -72,6 +72,7 @@ def test_a_suspend_is_a_jump_as_long_as_it_took_at_once() -> None:
     seen = watch((10.0, 5.0), (10.2, 5.0), (10.4, 65.0), (10.6, 65.0))
     assert [None if drift is None else round(drift.jump_s, 6) for drift in seen] == [None, 0.0, 60.0, 0.0]
     assert [None if drift is None else round(drift.since_s, 6) for drift in seen] == [None, 0.2, 0.2, 0.2]
+    assert [None if drift is None else drift.error_ratio for drift in seen] == [None, 0.0, 0.0, 0.0], "and no slew"
 
 
 def test_two_readings_at_once_tell_nothing_and_a_long_gap_is_compared_all_the_same() -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import inspect
 import re
 import types
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
 from pathlib import Path
@@ -21,6 +21,8 @@ from zsched import relay_pipe, wire  # the pipe's kinds are registered with the 
 from zsched.cli import app
 from zsched.core.timing import PROFILES
 from zsched.keyspace import Keyspace
+from zsched.lab.planted import BUGS, places
+from zsched.lab.planted_bugs import Bug
 
 ROOT: Final = Path(__file__).parents[2]
 DOCS: Final = sorted(
@@ -326,6 +328,33 @@ def test_decisions_that_the_code_cites_exist() -> None:
         for number in re.findall(r"decisions/(\d{4})", path.read_text(encoding="utf-8"))
     }
     assert cited <= {Path(name).name[:4] for name in DECISIONS}
+
+
+# --- planted bugs ----------------------------------------------------------------------------------------------------
+
+
+def faults_of_bug_table(text: str, bugs: Sequence[Bug]) -> list[str]:
+    """What docs/planted-bugs.md says otherwise than the code: how many there are, which, where, in which order."""
+    found = [] if f"each of these {len(bugs)} bugs" in text else [f"there are {len(bugs)}"]
+    cells = [line.split("|") for line in text.splitlines() if line.startswith("| ")][2:]
+    rows = [(row[1].strip(), row[2].strip()) for row in cells]
+    expected = [(bug.name, places(bug)) for bug in bugs]
+    found += [f"no row of {name}" for name, _ in expected if name not in dict(rows)]
+    found += [f"no such bug: {name}" for name, _ in rows if name not in dict(expected)]
+    return found if found or rows == expected else ["rows in another order, of other modules, or twice"]
+
+
+def test_every_planted_bug_has_a_row() -> None:
+    assert faults_of_bug_table(text_of("docs/planted-bugs.md"), BUGS) == []
+
+
+def test_planted_faults_of_the_bug_table_are_found() -> None:
+    text = text_of("docs/planted-bugs.md")
+    row = next(line for line in text.splitlines() if line.startswith(f"| {BUGS[0].name} |"))
+    assert faults_of_bug_table(text.replace(row + "\n", ""), BUGS) == [f"no row of {BUGS[0].name}"]
+    assert faults_of_bug_table(text, BUGS[1:]) == [f"there are {len(BUGS) - 1}", f"no such bug: {BUGS[0].name}"]
+    assert faults_of_bug_table(text.replace(row, f"{row}\n{row}"), BUGS) != []
+    assert faults_of_bug_table(text.replace(row, row.replace(".py", ".pyc", 1)), BUGS) != []
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ Knows: folders, locks, fsync, what identifies this machine. Does not know: the b
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import hashlib
 import os
@@ -66,9 +67,9 @@ class StateFile:
             self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             fd = os.open(self.folder / LOCK_NAME, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         except OSError as error:
-            raise AdapterError(
-                f"cannot use the state folder {self.folder}: {error.strerror}; check its owner"
-            ) from error
+            is_file = error.errno in (errno.EEXIST, errno.ENOTDIR)
+            advice = "a file is where a folder should be: see --state-dir" if is_file else "check its owner"
+            raise AdapterError(f"cannot use the state folder {self.folder}: {error.strerror}; {advice}") from error
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:

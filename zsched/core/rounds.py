@@ -259,7 +259,7 @@ class Rounds:
             return out
         if judgement.outcome is Outcome.PROPOSE or is_called:
             if not judgement.is_escape:
-                task.voting.called_at = now
+                task.voting.call(now)
             out += self._propose(task, judgement, allocation, states, now)
         return out
 

@@ -34,7 +34,7 @@ class Turn(Protocol):
 
     @property
     def called_at(self) -> float:
-        """When this robot last proposed a planned move of it."""
+        """When this robot last proposed a planned move of it, first tries in vain left out."""
 
 
 def who_moves_first(tasks: Mapping[TaskId, Turn], mine: TaskId, *, is_called: bool, now: float) -> TaskId | None:
@@ -57,5 +57,8 @@ def who_moves_first(tasks: Mapping[TaskId, Turn], mine: TaskId, *, is_called: bo
 
 
 def in_turn(tasks: Mapping[TaskId, Turn]) -> list[TaskId]:
-    """The order in which a round judges: who has proposed longest ago first, so that nobody waits for ever."""
+    """The order in which a round judges: who has proposed longest ago first, so that nobody waits for ever.
+
+    A first try counts only once it has succeeded, so that the second one follows it (`zsched.core.voting.Voting.call`).
+    """
     return sorted(tasks, key=lambda name: (tasks[name].called_at, name))

@@ -35,7 +35,9 @@ class Voting:
         self.proposals: dict[NodeId, tuple[Proposal, float]] = {}
         """Each robot's newest proposal and when it came."""
         self.called_at = -math.inf
-        """When this robot last proposed a planned move."""
+        """When this robot last proposed a planned move, first tries in vain left out."""
+        self._first_call_at: float | None = None
+        """When it proposed one on today's value for the first time; ``None``: not yet, or twice already."""
         self.opened_at: float | None = None
         """Since when a vote on a move is open."""
         self.tally: Tally | None = None
@@ -50,6 +52,17 @@ class Voting:
     def next_deadline(self) -> float:
         """When a commit is due or the open vote ends; infinity when neither."""
         return self.commit_at if self.opened_at is None else min(self.commit_at, self.opened_at + self._vote_s)
+
+    def call(self, now: float) -> None:
+        """This robot proposes a planned move.
+
+        The first try on a value keeps the task's turn: an owner that is asked to leave and slow to stop leaves by the
+        next vote, if that comes before its lease is granted again.
+        """
+        if self._first_call_at is None:
+            self._first_call_at = now
+        else:
+            self.called_at, self._first_call_at = now, None
 
     # --- proposals -----------------------------------------------------------------------------------------------
 
@@ -131,5 +144,7 @@ class Voting:
         """A newer revision is known: proposals on older bases are worthless, and so is a commit not yet handed out."""
         self.proposals.clear()
         self.opened_at, self.awaited_until = None, -math.inf
+        if self._first_call_at is not None:
+            self.called_at, self._first_call_at = self._first_call_at, None
         if self.commit is not None and self.commit_at < math.inf:
             self.end_commit()

@@ -21,10 +21,25 @@ GUARD = "guard"
 TICK_GAP_S = 0.05
 """Ticks further apart are two intervals of work."""
 
+TWO_CLASSES: Json = {
+    "inputs": [
+        {"from": "{robot}/in", "to": "{target}/echo/{robot}/in", "class": "latest"},
+        {"from": "{robot}/order", "to": "{target}/echo/{robot}-orders/in", "class": "reliable"},
+    ],
+    "outputs": [
+        {"from": "{target}/echo/{epoch}/{robot}/out", "to": "{robot}/out", "class": "latest"},
+        {"from": "{target}/echo/{epoch}/{robot}-orders/out", "to": "{robot}/done", "class": "reliable"},
+    ],
+}
+"""Rules of the echo task for a stream of each class that must keep something."""
+
 
 def chaos_fleet(ticks: Path, *, timing: str = "wired", edges: int = 3) -> Json:
-    """Three robots, some edges; ``echo`` on every edge, and ``guard``, exclusive, whose workers write to ``ticks``."""
-    tree = echo_fleet(robots=3, edges=edges, timing=timing)
+    """Three robots, some edges; ``echo`` on every edge, and ``guard``, exclusive, whose workers write to ``ticks``.
+
+    ``echo`` has a stream of class ``latest`` (``in``, ``out``) and one of class ``reliable`` (``order``, ``done``).
+    """
+    tree = echo_fleet(robots=3, edges=edges, timing=timing, task=TWO_CLASSES)
     tree["electorate"] = ["robot1", "robot2", "robot3", "edge1"]
     tree["tasks"][GUARD] = {
         **{key: tree["tasks"][TASK][key] for key in ("candidates", "weights", "scheduling")},
@@ -36,7 +51,7 @@ def chaos_fleet(ticks: Path, *, timing: str = "wired", edges: int = 3) -> Json:
 
 
 class ChaosBed(Netbed):
-    """A `chaos_fleet` that runs, with an application on ``robot1`` and one on ``robot2``."""
+    """A `chaos_fleet` that runs, with an application on ``robot1`` and one on ``robot2``, and one for orders."""
 
     __test__ = False
 
@@ -53,6 +68,7 @@ class ChaosBed(Netbed):
             robot: self.probe(robot, put=f"{robot}/in", watch=[f"{robot}/out", f"{robot}/tick"])
             for robot in ("robot1", "robot2")
         }
+        self.orders = self.probe("robot1", put="robot1/order", watch=["robot1/done"])
         self.calm()
 
     # --- looking -----------------------------------------------------------------------------------------------------
@@ -82,7 +98,7 @@ class ChaosBed(Netbed):
             if any(entry["state"] != "alive" for entry in self.status(node)["nodes"]):
                 return False
         owners = (self.owner_of(TASK), self.owner_of(GUARD))
-        return None not in owners and all(probe.is_flowing() for probe in self.probes.values())
+        return None not in owners and all(probe.is_flowing() for probe in (*self.probes.values(), self.orders))
 
     # --- mending -----------------------------------------------------------------------------------------------------
 

@@ -188,10 +188,13 @@ def _found(bug: Bug, how: str, budget_s: float) -> str:
 def table(verdicts: Sequence[Verdict]) -> str:
     """The verdicts as Markdown, as docs/planted-bugs.md keeps them."""
     rows = ["| bug | in | found by | s |", "| --- | --- | --- | ---: |"]
-    for one in verdicts:
-        modules = ", ".join(f"`{part.module.removeprefix('zsched.').replace('.', '/')}.py`" for part in one.bug.parts)
-        rows.append(f"| {one.bug.name} | {modules} | {_short(one.found_by)} | {one.seconds:.1f} |")
+    rows += [f"| {one.bug.name} | {places(one.bug)} | {_short(one.found_by)} | {one.seconds:.1f} |" for one in verdicts]
     return "\n".join(rows)
+
+
+def places(bug: Bug) -> str:
+    """The modules that a bug is in, as the table names them."""
+    return ", ".join(f"`{part.module.removeprefix('zsched.').replace('.', '/')}.py`" for part in bug.parts)
 
 
 def _short(found_by: str) -> str:

@@ -52,6 +52,7 @@ _SCHEDULES = ("tests/unit/core/test_register_schedules.py",)
 _AGREEMENT = ("tests/unit/core/test_agreement.py",)
 _LEASE = ("tests/sim/test_lease_rules.py", "tests/sim/test_exclusive.py")
 _GENERATIONS = ("tests/sim/test_generations.py",)
+_BEAT_ROOM = ("tests/unit/core/test_beat_room.py",)
 _NAMESAKES = ("tests/unit/core/test_namesakes.py",)
 _WITNESS = ("tests/unit/core/test_witness.py",)
 _RESTORED = ("tests/sim/test_restored_state.py",)
@@ -469,6 +470,36 @@ MEMBERSHIP_BUGS = (
         "abs(event.error_ratio) > RHO or",
         "abs(event.error_ratio) > 1.0 or",
         ("tests/sim/test_clock_doubt.py",),
+    ),
+    _bug(
+        "a jump of the clock is believed",
+        "zsched.core.clocks",
+        " or abs(event.jump_s) > JUMP_S + RHO * event.since_s",
+        "",
+        ("tests/sim/test_clock_doubt.py",),
+    ),
+    _bug(
+        "a beat that is too large is sent whole",
+        "zsched.core.beat_room",
+        "if beat_bytes(beat) <= MAX_BEAT_BYTES:",
+        "if beat.node:",
+        _BEAT_ROOM,
+        seed=242,
+    ),
+    _bug(
+        "what had no room in a beat has none in the next",
+        "zsched.core.beat_room",
+        "first = self._next % len(parts)",
+        "first = 0",
+        _BEAT_ROOM,
+    ),
+    _bug(
+        "a vote in vain loses its task's turn",
+        VOTING,
+        "            self._first_call_at = now\n",
+        "            self.called_at = now\n",
+        ("tests/unit/core/test_turns.py",),
+        seed=598,
     ),
     _bug(
         "token resurrects a peer",

@@ -3,6 +3,7 @@
 Knows: what the watch reports meanwhile and afterwards. Does not know: what a node makes of it (`zsched.core.clocks`).
 
 Decisions go by a clock that nothing slews (`zsched.clock`), so a slew changes no time here: it is only reported.
+A machine that has slept knows how long, some to a second only: then its clock is wrong from there on.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from random import Random
 
+from zsched.clock import WINDOW_S, ClockWatch
 from zsched.core import events as ev
 from zsched.core.clocks import DOUBT_S
 from zsched.core.fleet import Fleet
@@ -19,6 +21,8 @@ LOOK_S = 0.2
 """The watch compares the clocks so often."""
 SLEWS = (-0.083, -0.002, 0.0011, 0.083)
 SHARE = 0.2
+SUSPENDED = 0.1
+ERRORS_S = (-0.9, -0.1, 0.0, 0.1, 0.9)
 
 
 def clock_faults(rng: Random, fleet: Fleet, until: float) -> list[tuple[float, NodeId, float, float]]:
@@ -28,6 +32,20 @@ def clock_faults(rng: Random, fleet: Fleet, until: float) -> list[tuple[float, N
         return []
     return [
         (rng.uniform(0.0, until), rng.choice(names), rng.uniform(0.1, 5.0), rng.choice(SLEWS))
+        for _ in range(rng.randint(1, 2))
+    ]
+
+
+def suspensions(rng: Random, fleet: Fleet, until: float) -> list[tuple[float, NodeId, float, float]]:
+    """(at, node, seconds, error of the length in seconds) of one or two suspends, in every tenth schedule.
+
+    Of machines that know its length to a second only, too.
+    """
+    names = [node.name for node in fleet.nodes]
+    if rng.random() > SUSPENDED:
+        return []
+    return [
+        (rng.uniform(0.0, until), rng.choice(names), 10 ** rng.uniform(-1.0, 0.8), rng.choice(ERRORS_S))
         for _ in range(rng.randint(1, 2))
     ]
 
@@ -54,3 +72,28 @@ def slew(
             later(LOOK_S, lambda: look(elapsed_s + LOOK_S, 0.0 if is_bad else well_s + LOOK_S))
 
     look(0.0, 0.0)
+
+
+def awake(
+    slept_s: float,
+    *,
+    tell: Callable[[ev.Event], None],
+    later: Callable[[float, Callable[[], None]], None],
+    is_believed: Callable[[], bool],
+) -> None:
+    """Report what the watch finds after the machine has slept, until its clock is believed again.
+
+    The sleep is in CLOCK_BOOTTIME only: `ClockWatch` is given the readings from before and after it.
+    """
+    watch, before = ClockWatch(), round(WINDOW_S / LOOK_S)
+    for step in range(before):
+        watch.judge(step * LOOK_S, 0.0)
+
+    def look(step: int) -> None:
+        drift = watch.judge(step * LOOK_S, slept_s)
+        assert drift is not None
+        tell(ev.ClockCompared(error_ratio=drift.error_ratio, jump_s=drift.jump_s, since_s=drift.since_s))
+        if (step - before) * LOOK_S < DOUBT_S + 2 * LOOK_S or not is_believed():
+            later(LOOK_S, lambda: look(step + 1))
+
+    look(before)

@@ -41,6 +41,9 @@ AFTERMATH_S = 1.0
 """What was under way when the faults ended has arrived."""
 STOP_S = 0.8
 """What a daemon that was told to stop waits for its tasks to move."""
+FEW_TASKS = 3
+TURN_S = 1.0
+"""Planned moves take turns: so much more each task beyond `FEW_TASKS` may take until the fleet is at rest."""
 STOP_WORK_S = (0.002, 0.02, 0.1, 0.4)
 """Exclusive workers stop at once, or are slower than a commit's stagger, or slower than a whole ballot."""
 
@@ -57,7 +60,7 @@ class Result:
     """How often each fault was carried out."""
     stories: tuple[str, ...]
     settled_s: float | None
-    """How long it took to come to rest; ``None``: it did not."""
+    """How long it took to come to rest; ``None``: it did not, or more than `FEW_TASKS` tasks took turns."""
 
 
 def play(plan: Plan, keep: frozenset[int] | None = None, calm_at: float | None = None) -> Result:
@@ -88,7 +91,7 @@ def play(plan: Plan, keep: frozenset[int] | None = None, calm_at: float | None =
         revisions=len(sim.learnt),
         faults=stage.scene.done + sim.weather.counts,
         stories=tuple(sim.stories),
-        settled_s=settled_s,
+        settled_s=settled_s if len(sim.fleet.tasks) <= FEW_TASKS else None,
     )
 
 
@@ -141,7 +144,7 @@ class Stage:
             sim.run(LOST_S)  # nothing may be agreed meanwhile that a majority does not remember
             self._start_generation()
             at = sim.now
-        most_s = AT_MOST_S[sim.fleet.timing.name]
+        most_s = AT_MOST_S[sim.fleet.timing.name] + TURN_S * max(len(sim.fleet.tasks) - FEW_TASKS, 0)
         if not sim.run_until(_every(50, lambda: not sim.unsettled()), most_s) and sim.unsettled():
             raise DisagreementError(f"not at rest {most_s:g} s after the faults: {sim.unsettled()}")
         settled_s = sim.now - at
@@ -238,6 +241,10 @@ class Stage:
     def _freeze(self, fault: Fault) -> None:
         """The whole machine stands still, its clock and its workers too (a VM that is not scheduled)."""
         self.sim.freeze(self.scene.machine(fault), fault.seconds)
+
+    def _suspend(self, fault: Fault) -> None:
+        """The machine sleeps: loop and workers stand still, the clock goes on, and its watch sees a jump."""
+        self.sim.suspend(self.scene.machine(fault), fault.seconds, fault.size)
 
     def _kill(self, fault: Fault) -> None:
         self.sim.crash(fault.nodes[0], is_power_lost=fault.kind == "power")
@@ -376,6 +383,7 @@ class Stage:
             "slew": self._slew,
             **dict.fromkeys(("twin", "apart"), self._twin),
             "freeze": self._freeze,
+            "suspend": self._suspend,
             "worker": self._worker,
             "absence": self._absence,
             "retune": self._retune,

@@ -121,6 +121,11 @@ class Loops:
             machine.frozen_at = None
             self.thawed(machine)
             self.rearm(machine)
+        if machine.asleep_since is not None:
+            slept_s, machine.asleep_since = self.now - machine.asleep_since, None
+            machine.clock.change(self.now, jump_s=max(machine.sleep_error_s, -slept_s))
+            self.woken_up(machine, slept_s)
+            self.rearm(machine)
         self.pump_later(machine)
 
     def freeze(self, machine: Machine, seconds: float) -> None:
@@ -129,6 +134,16 @@ class Loops:
             machine.frozen_at = self.now
             self.frozen(machine)
             self.pause(machine, seconds)
+
+    def suspend(self, machine: Machine, seconds: float, error_s: float = 0.0) -> None:
+        """The machine sleeps: loop and workers stand still; its clock goes on, wrong by ``error_s`` when it wakes."""
+        if machine.node is not None and not machine.is_paused:
+            machine.asleep_since, machine.sleep_error_s = self.now, error_s
+            self.frozen(machine)
+            self.pause(machine, seconds)
+
+    def woken_up(self, machine: Machine, slept_s: float) -> None:
+        """A machine goes on after it has slept."""
 
     def frozen(self, machine: Machine) -> None:
         """A machine has begun to stand still."""

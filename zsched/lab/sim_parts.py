@@ -172,6 +172,10 @@ class Machine:
     is_paused: bool = False
     frozen_at: float | None = None
     """Since when the whole machine stands still, its clock too; ``None``: it does not."""
+    asleep_since: float | None = None
+    """Since when the machine sleeps, its clock going on; ``None``: it does not."""
+    sleep_error_s: float = 0.0
+    """By how much it then misjudges how long that was."""
     late_until: float = -math.inf
     """By its own clock: leases until then were begun before it last stood still."""
     is_pumping: bool = False
@@ -193,7 +197,7 @@ class Machine:
         self.roles.clear()
         self.inbox.clear()
         self.busy_until, self.is_paused, self.wake_at = -math.inf, False, math.inf
-        self.frozen_at = None
+        self.frozen_at = self.asleep_since = None
 
 
 def blank_state(machine: Machine, incarnation: int, generation: int) -> DurableState:

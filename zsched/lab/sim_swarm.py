@@ -16,9 +16,10 @@ from random import Random
 from zsched.core.fleet import Fleet, NodeSpec, OnIsolation, Standby, TaskSpec, WorkerSpec
 from zsched.core.model import Aggregate, NodeId, NodeKind, Tuning, Weights
 from zsched.core.timing import WAN, WIFI, WIRED
-from zsched.lab.sim_clocks import clock_faults
+from zsched.lab.sim_clocks import clock_faults, suspensions
 from zsched.lab.sim_files import CHANGES
 from zsched.lab.sim_foreign import absences, with_foreign_workers
+from zsched.lab.sim_many import with_many_tasks
 
 SECONDS = 30.0
 """Virtual seconds of one schedule: faults in the first half, then quiet."""
@@ -73,12 +74,15 @@ def plan(seed: int, *, nodes: int | None = None, seconds: float = SECONDS, kinds
     is_leased = seed % LEASE_EVERY == LEASE_OFFSET
     if is_leased:
         fleet = _leased(rng, fleet)
+    fleet = with_many_tasks(Random(f"many {seed}"), fleet)
     kinds = frozenset(LATER) - PENDING if kinds is None else kinds
     faults = (_lease_faults if is_leased else _faults)(rng, fleet, until)
     fleet, generation = _varied(later, fleet)
     faults += _later_faults(later, fleet, until, kinds, fleet.tasks[0].candidates if is_leased else ())
     for at, name, slewed_s, size in clock_faults(Random(f"clocks {seed}"), fleet, until):
         faults += (Fault(at=at, kind="slew", nodes=(name,), seconds=slewed_s, size=size),)
+    for at, name, slept_s, size in suspensions(Random(f"suspended {seed}"), fleet, until):
+        faults += (Fault(at=at, kind="suspend", nodes=(name,), seconds=slept_s, size=size),)
     if is_leased and "rollout" in kinds and later.random() < 0.25:
         fleet, rollout = _made_exclusive(later, fleet)
         faults += (rollout,)

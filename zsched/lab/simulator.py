@@ -22,8 +22,9 @@ from zsched.core.messages import Refused
 from zsched.core.model import Allocation, DeviceSample, DurableState, NodeId, PeerState, TaskId
 from zsched.core.node import Node
 from zsched.core.plan import RoutePlan
-from zsched.errors import InvariantError
+from zsched.errors import InvariantError, WireError
 from zsched.lab.sim_checks import Invariants, unsettled
+from zsched.lab.sim_clocks import LOOK_S, awake
 from zsched.lab.sim_links import Links
 from zsched.lab.sim_loops import TICK_S
 from zsched.lab.sim_memory import Memory
@@ -235,6 +236,20 @@ class Simulator(Links):
         """Its workers go on by a clock that stood still."""
         self.work.thaw(machine, self.fleet.timing.lease_s)
 
+    def woken_up(self, machine: Machine, slept_s: float) -> None:
+        """Its workers go on; its watch looks at the clocks a little later, as often as the daemon's does."""
+        life = machine.life
+        self.work.thaw(machine, max(-machine.sleep_error_s, 0.0))
+
+        def tell(event: ev.Event) -> None:
+            if machine.life == life:
+                self.deliver(machine, event)
+
+        def is_believed() -> bool:
+            return machine.life != life or machine.node is None or "clock" not in machine.node.problems
+
+        self.later(LOOK_S, lambda: awake(slept_s, tell=tell, later=self.later, is_believed=is_believed))
+
     # --- events ------------------------------------------------------------------------------------------------------
 
     def woken(self, machine: Machine) -> None:
@@ -364,7 +379,10 @@ class Simulator(Links):
         key = (me.key, type(value))
         known = self._frames.get(key)
         if known is None or known[0] is not value:
-            frame = wire.encode(value)
+            try:
+                frame = wire.encode(value)
+            except WireError as error:
+                raise InvariantError(f"{me.key} cannot send what it says: {error}") from error
             known = self._frames[key] = (value, frame, wire.decode(frame, type(value)))
         return known[1], known[2]
 

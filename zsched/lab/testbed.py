@@ -48,6 +48,8 @@ SCHEDULING: Mapping[str, float | str] = {
 """All nodes share one machine, and the echo needs next to nothing. By service its CPU is worth the same everywhere, and
 next to nothing while the machine is busy; what is left over still tells the nodes apart."""
 POLL_S = 0.01
+COUNTS_S = 30.0
+"""So long a daemon that runs may take to tell its counters."""
 
 Json = dict[str, Any]
 T = TypeVar("T")
@@ -219,15 +221,38 @@ class Testbed:
         return tuple(StreamCount(**{**stream, "drops": tuple(sorted(stream["drops"].items()))}) for stream in streams)
 
     def unaccounted(self) -> list[str]:
-        """Input streams whose counters do not account for every sample (`zsched.core.books`); none, at any time."""
-        counts = [(node, count) for node in self.running() for count in self._counts_if_there(node)]
-        return [f"{node}: {missing} unaccounted: {one}" for node, one in counts if (missing := unaccounted(one))]
+        """Input streams whose counters do not account for every sample (`zsched.core.books`); none, at any time.
 
-    def _counts_if_there(self, node: NodeId) -> tuple[StreamCount, ...]:
-        try:
-            return self.counts(node)
-        except AdapterError:  # it is down, or stands still
-            return ()
+        Also daemons that tell no counters, although they neither have ended nor stand still.
+        """
+        found: list[str] = []
+        for node in self.running():
+            try:
+                counts = self._counts_if_awake(node)
+            except AdapterError as error:
+                found.append(f"{node}: no counters: {error}")
+            else:
+                found += [f"{node}: {missing} unaccounted: {one}" for one in counts if (missing := unaccounted(one))]
+        return found
+
+    def _counts_if_awake(self, node: NodeId) -> tuple[StreamCount, ...]:
+        """Its counters, once it answers; none of a daemon that has ended or stands still."""
+        deadline = time.monotonic() + COUNTS_S
+        while self._is_awake(node):
+            try:
+                return self.counts(node)
+            except AdapterError:  # it may have just started, or be busy
+                if time.monotonic() > deadline:
+                    raise
+            time.sleep(POLL_S)
+        return ()
+
+    def _is_awake(self, node: NodeId) -> bool:
+        if self._processes[node].poll() is not None:
+            return False
+        with contextlib.suppress(OSError):
+            return Path(f"/proc/{self.pid(node)}/stat").read_text().rpartition(")")[2].split()[0] not in "TtZ"
+        return False
 
     def owner(self, *nodes: NodeId) -> NodeId | None:
         """The owner that ``nodes`` (default: all running) agree on, settled on every robot; else ``None``."""

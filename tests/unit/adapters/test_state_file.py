@@ -34,6 +34,13 @@ def state_file(folder: Path, node: str = "robot1", fleet: str = "hall", hardware
     return StateFile(folder, fleet=fleet, node=node, hardware=hardware)
 
 
+@pytest.mark.parametrize("place", ["taken", "taken/below"])
+def test_a_file_where_the_folder_should_be_is_told_as_that(tmp_path: Path, place: str) -> None:
+    (tmp_path / "taken").write_text("")
+    with pytest.raises(AdapterError, match=r"a file is where a folder should be: see --state-dir"):
+        state_file(tmp_path / place).acquire()
+
+
 def test_saved_state_is_loaded_and_the_folder_is_private(tmp_path: Path) -> None:
     folder = tmp_path / "deep" / "zsched"
     with state_file(folder) as file:

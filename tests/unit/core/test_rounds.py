@@ -467,6 +467,8 @@ def test_only_a_planned_move_costs_a_task_its_turn() -> None:
         robot.states["edge1"] = PeerState.ALIVE if is_planned else PeerState.GONE
         robot.round(edge1=0.5, edge2=0.9)
         assert robot.outcome() is Outcome.PROPOSE
+        assert robot.task.voting.called_at == -math.inf, "not before it has moved, or has been tried again"
+        robot.task.voting.on_learnt()
         assert (robot.task.voting.called_at > -math.inf) is is_planned
 
 

@@ -22,6 +22,7 @@ from zsched.core.model import (
 )
 from zsched.core.scoring import book, score
 from zsched.core.turns import in_turn, who_moves_first
+from zsched.core.voting import Voting
 
 
 @dataclass
@@ -60,6 +61,21 @@ def test_who_has_proposed_longest_ago_is_judged_first() -> None:
     tasks = {"a": Task(called_at=9.0), "b": Task(called_at=3.0), "c": Task()}
     assert in_turn(tasks) == ["c", "b", "a"]
     assert in_turn({"b": Task(), "a": Task()}) == ["a", "b"]
+
+
+def test_a_move_keeps_its_turn_for_a_second_try_and_loses_it_then_or_when_it_has_succeeded() -> None:
+    """An owner that is slow to stop leaves by the next vote, if that comes before its lease is granted again."""
+    voting = Voting(FLEET, "robot1")
+    voting.call(3.0)
+    assert voting.called_at == -math.inf, "it is first again"
+    voting.call(5.0)
+    assert voting.called_at == 5.0, "and lets others pass"
+    voting.call(7.0)
+    assert voting.called_at == 5.0
+    voting.on_learnt()
+    assert voting.called_at == 7.0, "it has moved"
+    voting.on_learnt()
+    assert voting.called_at == 7.0, "somebody else's change is no try of ours"
 
 
 # --- bookings --------------------------------------------------------------------------------------------------------
