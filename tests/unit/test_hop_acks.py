@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator
 
@@ -240,3 +241,30 @@ def test_who_leaves_says_so_and_nothing_more(book: Book) -> None:
     book.acks.leave([NAME])
     assert book.wait(has_left=True).arrived == 1
     assert book.acks.arrived(NAME) == 0
+
+
+def test_frames_leave_in_the_order_in_which_they_were_made() -> None:
+    """One that says less than the one before it is taken for a stranger's."""
+    told: list[int] = []
+    is_sending, may_go_on = threading.Event(), threading.Event()
+
+    def send(_session: str, frame: StreamAcks) -> None:
+        if not is_sending.is_set():
+            is_sending.set()
+            may_go_on.wait(20)
+        told.append(frame.acks[0].arrived)
+
+    acks = Acknowledger(send)
+    name = ("key", "session", 1)
+    acks.expect(name, 0)
+    assert acks.take(name, 0, 1)
+    assert is_sending.wait(20), "the thread sends the first"
+    assert acks.take(name, 1, 1)
+    other = threading.Thread(target=acks.flush)
+    other.start()
+    other.join(0.2)
+    assert told == [], "the second one waits for it"
+    may_go_on.set()
+    other.join(20)
+    assert told == [1, 2]
+    acks.close()
