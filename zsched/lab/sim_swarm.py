@@ -81,7 +81,8 @@ def plan(seed: int, *, nodes: int | None = None, seconds: float = SECONDS, kinds
     faults += _later_faults(later, fleet, until, kinds, fleet.tasks[0].candidates if is_leased else ())
     for at, name, slewed_s, size in clock_faults(Random(f"clocks {seed}"), fleet, until):
         faults += (Fault(at=at, kind="slew", nodes=(name,), seconds=slewed_s, size=size),)
-    for at, name, slept_s, size in suspensions(Random(f"suspended {seed}"), fleet, until):
+    suspends = suspensions(Random(f"suspended {seed}"), fleet, until) if "suspend" in kinds else ()
+    for at, name, slept_s, size in suspends:
         faults += (Fault(at=at, kind="suspend", nodes=(name,), seconds=slept_s, size=size),)
     if is_leased and "rollout" in kinds and later.random() < 0.25:
         fleet, rollout = _made_exclusive(later, fleet)
@@ -367,5 +368,5 @@ LATER: dict[str, Maker] = {
     "generation": _one_node("generation", 1, 8.0),
 }
 """Faults that came later, drawn apart from `MAKERS`."""
-PENDING: frozenset[str] = frozenset()
+PENDING: frozenset[str] = frozenset({"suspend"})
 """Faults whose mend has not landed: only ``--with`` plays them."""

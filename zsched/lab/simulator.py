@@ -246,7 +246,8 @@ class Simulator(Links):
                 self.deliver(machine, event)
 
         def is_believed() -> bool:
-            return machine.life != life or machine.node is None or "clock" not in machine.node.problems
+            node, is_behind = machine.node, machine.is_paused or bool(machine.inbox)  # it has not heard of it yet
+            return machine.life != life or node is None or not (is_behind or "clock" in node.problems)
 
         self.later(LOOK_S, lambda: awake(slept_s, tell=tell, later=self.later, is_believed=is_believed))
 
