@@ -14,7 +14,7 @@ from zsched.adapters.state_file import StateFile, hardware_id
 from zsched.clock import wall_tenths
 from zsched.core.belief import MAX_GENERATION
 from zsched.core.fleet import Fleet, dial_endpoint, electorate_hash
-from zsched.core.generations import first_registers, objection
+from zsched.core.generations import blank_state, objection
 from zsched.core.model import DurableState, NodeId
 from zsched.core.snapshot import Snapshot
 from zsched.daemon_tls import operator_json5, protocol_of
@@ -40,16 +40,7 @@ def init_state(fleet: Fleet, node: NodeId, folder: Path, generation: int) -> Pat
     """
     _check_range(generation)
     before = StateFile(folder, fleet=fleet.name, node=node).load().state
-    registers = first_registers(fleet, generation, () if before is None else before.registers)
-    state = DurableState(
-        fleet=fleet.name,
-        node=node,
-        incarnation=wall_tenths(),
-        generation=generation,
-        hardware=hardware_id(),
-        electorate=electorate_hash(fleet),
-        registers=registers,
-    )
+    state = blank_state(fleet, node, generation, before, incarnation=wall_tenths(), hardware=hardware_id())
     with StateFile(folder, fleet=fleet.name, node=node) as file:
         file.create(state)
         return file.path

@@ -90,6 +90,17 @@ def test_new_generation_counts_as_accepted_or_its_first_round_would_find_a_forgo
         assert register.accepted.value == register.learnt
 
 
+def test_a_new_generation_keeps_how_long_the_leases_were_that_were_granted(fleet: Fleet, tmp_path: Path) -> None:
+    """Who has one may work by it until it is over, and by a fleet file that says another length."""
+    init_state(fleet, "robot1", tmp_path, 0)
+    with StateFile(tmp_path, fleet=fleet.name, node="robot1") as file:
+        state = file.load().state
+        assert state is not None
+        file.save(replace(state, lease_s=12.5))
+    init_state(fleet, "robot1", tmp_path, 1)
+    assert load(fleet, tmp_path).lease_s == 12.5
+
+
 def test_generation_that_is_not_newer_is_refused(fleet: Fleet, tmp_path: Path) -> None:
     init_state(fleet, "robot1", tmp_path, 3)
     for generation in (0, 2, 3):

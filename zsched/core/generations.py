@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from zsched.core.belief import GENERATION_STEP
-from zsched.core.fleet import Fleet
+from zsched.core.fleet import Fleet, electorate_hash
 from zsched.core.model import NO_BALLOT, Acceptance, Allocation, DurableState, NodeId, RegisterState
 from zsched.core.snapshot import Snapshot
 
@@ -34,6 +34,26 @@ def _is_unleased(state: RegisterState) -> bool:
     values += [] if state.accepted is None else [state.accepted.value]
     newest = max(values, key=lambda value: value.revision, default=None)
     return newest is not None and not newest.leased and newest.revision > 0
+
+
+def blank_state(
+    fleet: Fleet, node: NodeId, generation: int, before: DurableState | None, *, incarnation: int, hardware: str
+) -> DurableState:
+    """What `zsched init` writes: this name has never voted, in ``generation``.
+
+    How long the leases were that the state ``before`` granted is kept: who was granted one may still work by it, and by
+    a file that says another length.
+    """
+    return DurableState(
+        fleet=fleet.name,
+        node=node,
+        incarnation=incarnation,
+        generation=generation,
+        hardware=hardware,
+        electorate=electorate_hash(fleet),
+        registers=first_registers(fleet, generation, () if before is None else before.registers),
+        lease_s=0.0 if before is None else before.lease_s,
+    )
 
 
 def way_out(generation: int) -> str:

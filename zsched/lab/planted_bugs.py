@@ -361,6 +361,14 @@ LEASE_BUGS = (
         42,
     ),
     _bug(
+        "a new generation forgets a longer lease",
+        "zsched.core.generations",
+        "lease_s=0.0 if before is None else before.lease_s",
+        "lease_s=0.0",
+        ("tests/unit/test_lifecycle.py",),
+        seed=2140,
+    ),
+    _bug(
         "restart forgets a longer lease",
         LEASE,
         "hold_s(max(self.fleet.timing.lease_s, self.granted_s))",

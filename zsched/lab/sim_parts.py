@@ -12,8 +12,7 @@ from random import Random
 
 from zsched import wire
 from zsched.core import events as ev
-from zsched.core.fleet import Fleet, electorate_hash
-from zsched.core.generations import first_registers
+from zsched.core.fleet import Fleet
 from zsched.core.model import Allocation, DurableState, NodeId, RegisterState, TaskId
 from zsched.core.node import Node
 from zsched.core.plan import Role
@@ -198,17 +197,3 @@ class Machine:
         self.inbox.clear()
         self.busy_until, self.is_paused, self.wake_at = -math.inf, False, math.inf
         self.frozen_at = self.asleep_since = None
-
-
-def blank_state(machine: Machine, incarnation: int, generation: int) -> DurableState:
-    """What `zsched init` writes: this name has never voted (``generation`` above 0: the fleet starts anew)."""
-    registers = first_registers(machine.fleet, generation, machine.disk.registers.values())
-    return DurableState(
-        fleet=machine.fleet.name,
-        node=machine.name,
-        incarnation=incarnation,
-        generation=generation,
-        hardware="",
-        electorate=electorate_hash(machine.fleet),
-        registers=registers,
-    )

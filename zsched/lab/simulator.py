@@ -18,6 +18,7 @@ from zsched import wire
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.fleet import Fleet, electorate_hash
+from zsched.core.generations import blank_state
 from zsched.core.messages import Refused
 from zsched.core.model import Allocation, DeviceSample, DurableState, NodeId, PeerState, TaskId
 from zsched.core.node import Node
@@ -29,7 +30,7 @@ from zsched.lab.sim_links import Links
 from zsched.lab.sim_loops import TICK_S
 from zsched.lab.sim_memory import Memory
 from zsched.lab.sim_network import Message
-from zsched.lab.sim_parts import Machine, blank_state
+from zsched.lab.sim_parts import Machine
 from zsched.lab.sim_work import Work
 
 Load = Callable[[NodeId, float], tuple[float, float]]
@@ -88,7 +89,8 @@ class Simulator(Links):
 
     def initialise(self, machine: Machine, *, incarnation: int = 0, generation: int = 0) -> None:
         """`zsched init`: a blank durable state, which says that this name has never voted."""
-        blank = blank_state(machine, incarnation, generation)
+        before = machine.disk.state
+        blank = blank_state(machine.fleet, machine.name, generation, before, incarnation=incarnation, hardware="")
         machine.disk.wipe()
         self.invariants.expect(generation, machine.fleet.electors)
         machine.disk.write(blank)
