@@ -209,7 +209,7 @@ def test_too_many_lost_states_move_nothing_until_a_new_generation(bed: Bed) -> N
     bed.wait(lambda: bed.revision() is not None, 60, "all know what was agreed")
     epoch = bed.task("robot1")["epoch"]
     refused = bed.weigh("robot1", 0.55)
-    assert refused["outcome"] == "no_quorum", refused
+    assert refused.get("outcome") == "no_quorum", refused
     assert "no valid state file" in bed.problems("robot3")
     bed.wait(bed.app_on_robot1.is_flowing, 60, "echoes, for what was allocated stays")
     bed.stop()

@@ -10,7 +10,6 @@ the same but for a common factor, so a constant fleet has no limit cycle.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 from zsched.core.fleet import Demand, TaskSpec
@@ -84,8 +83,6 @@ class _Known:
     owner: NodeId | None = None
     since: float = 0.0
     """When it was first looked at there."""
-    at: float = 0.0
-    """When it was looked at last."""
 
 
 class Demands:
@@ -101,8 +98,9 @@ class Demands:
         What it uses is its need where CPU is left, and the least of it where none is. Where threads of it always want
         to run (`WorkerLoad.wanted_cores`), its need is what was measured when it had enough, if they would take that
         much; else a guess above what it gets, so that a machine that would give it more is seen to. Where the worker
-        tells what it left undone (`WorkerLoad.jobs`), nothing is guessed. A worker that is not ready, or a figure that
-        nobody measured, changes nothing: the task does not cost less because its worker restarts.
+        tells what it left undone (`WorkerLoad.jobs`), nothing is guessed: that is less exact than what was measured,
+        for jobs are whole, but known at once. A worker that is not ready, or a figure that nobody measured, changes
+        nothing: the task does not cost less because its worker restarts.
 
         ``fastest``: the highest speed among the candidates (``None``: the owner's).
         """
@@ -121,10 +119,8 @@ class Demands:
             least = max(use, known.work or 0.0)
             is_held = known.is_sure and known.work == least
             is_starved = profile.cpu_used_cores / profile.cpu_cores >= STARVED_CPU_RATIO
-            if told is not None:
-                # what a task uses falls at once when a load comes; what it leaves undone is counted in whole jobs
-                kept = 1.0 if is_new else math.exp(-max(now - found.at, 0.0) / SETTLE_S) if is_starved else 0.0
-                found = replace(found, work=max(told, kept * (known.work or 0.0)), is_sure=True)
+            if told is not None and not known.is_sure and (most > use or is_new or is_starved):
+                found = replace(found, work=max(told, known.work or 0.0) if is_new else told)
             elif most > use and not (is_held and least <= most):
                 found = replace(found, work=min(UNSURE * use, most), is_sure=False)
             elif most > use or is_new or is_starved:
@@ -135,7 +131,7 @@ class Demands:
             found = replace(found, job=_job(load.jobs, speed_of(profile), known.job))
             if not is_new:
                 self._note_shortfall(task, profile, load, found)
-        self._known[task] = found = replace(found, at=now)
+        self._known[task] = found
         return load.jobs is not None or (found.work, found.memory_mb) != (known.work, known.memory_mb)
 
     def _note_shortfall(self, task: TaskId, profile: Profile, load: WorkerLoad, found: _Known) -> None:

@@ -11,6 +11,7 @@ import sys
 import psutil
 import pytest
 
+from support.waiting import until
 from zsched.adapters.worker_process import LAUNCHER, LINES_BURST, LineLog, WorkerGuard
 from zsched.log_limit import LogLimit
 
@@ -60,6 +61,11 @@ def test_a_worker_s_output_has_one_limit_and_not_that_of_the_daemon_s_own_lines_
     assert len(caplog.messages) == 50
 
 
+def guarding() -> psutil.Process | None:
+    """The guard's process."""
+    return next((child for child in psutil.Process().children() if "zsched-guard" in words_of(child)), None)
+
+
 def test_guard_that_was_killed_is_replaced_and_knows_all_groups() -> None:
     with (
         subprocess.Popen(["sleep", "60"], start_new_session=True) as first,
@@ -69,7 +75,7 @@ def test_guard_that_was_killed_is_replaced_and_knows_all_groups() -> None:
         try:
             guard = WorkerGuard()
             guard.add(first.pid)
-            (shell,) = (child for child in psutil.Process().children() if "zsched-guard" in words_of(child))
+            shell = until(guarding, "the guard's process, which is not yet what it will be when it has just been made")
             shell.kill()
             shell.wait(timeout=60)
             guard.add(forgotten.pid)

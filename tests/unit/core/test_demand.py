@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import pytest
@@ -182,11 +181,11 @@ def test_a_need_that_was_told_falls_again_on_a_full_machine() -> None:
     assert learnt(before, *[after] * 4).cpu_cores == pytest.approx(0.5, abs=0.01)
 
 
-@pytest.mark.parametrize(("used", "need"), [(4.0, 0.8 * math.exp(-1.0 / SETTLE_S)), (2.0, 0.5)])
-def test_a_full_machine_holds_a_need_that_was_told_for_a_while(used: float, need: float) -> None:
-    """When a load comes, what is used falls at once, and what is left undone is seen after some jobs."""
-    before, after = told(8.0, used=used), told(5.0, used=used)
-    assert learnt(*[before] * 6, after, every_s=1.0).cpu_cores == pytest.approx(need)
+def test_what_was_measured_where_the_task_had_enough_counts_more_than_its_worker_s_word() -> None:
+    """Jobs are whole, so what a second of them tells is less exact."""
+    had_enough, starved = profile(0.8, cpu=2.0), told(5.0, got=0.5)
+    assert learnt(had_enough, had_enough, starved).cpu_cores == 0.8
+    assert learnt(starved).cpu_cores == pytest.approx(0.5)
 
 
 def test_samples_that_no_core_could_do_are_not_needed() -> None:
