@@ -146,7 +146,12 @@ class Stage:
             self._start_generation()
             at = sim.now
         most_s = AT_MOST_S[sim.fleet.timing.name] + TURN_S * max(len(sim.fleet.tasks) - FEW_TASKS, 0)
-        if not sim.run_until(_every(50, lambda: not sim.unsettled()), most_s) and sim.unsettled():
+        is_at_rest = _every(50, lambda: not sim.unsettled())
+        if not sim.run_until(is_at_rest, most_s) and not self.can_agree():  # a name was disputed once all were heard
+            self._start_generation()
+            at = sim.now
+            sim.run_until(is_at_rest, most_s)
+        if sim.unsettled():
             raise DisagreementError(f"not at rest {most_s:g} s after the faults: {sim.unsettled()}")
         settled_s = sim.now - at
         sim.run(max(self.plan.seconds / 2 - settled_s, 0.0))
