@@ -5,7 +5,6 @@ The merger is the task's own, in this process: it answers with a merged map and 
 
 from __future__ import annotations
 
-import contextlib
 import json
 import subprocess
 import sys
@@ -16,6 +15,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from support.programs import running
 from zsched.lab.explore.worlds import load_world
 from zsched.lab.loopback import free_endpoints
 from zsched.lab.map_metrics import score_map
@@ -83,21 +83,6 @@ class Hub:
     def close(self) -> None:
         for session in self._sessions.values():
             session.close()
-
-
-@contextlib.contextmanager
-def running(*commands: list[str]) -> Iterator[list[subprocess.Popen[bytes]]]:
-    """The processes; at the end they are asked to stop, must do so with 0, and are reaped."""
-    processes = [subprocess.Popen([sys.executable, "-m", *command]) for command in commands]
-    try:
-        yield processes
-        for process in processes:
-            process.terminate()
-        assert [process.wait(timeout=15.0) for process in processes] == [0] * len(processes)
-    finally:
-        for process in processes:
-            process.kill()
-            process.wait()
 
 
 @pytest.fixture

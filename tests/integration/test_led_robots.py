@@ -5,12 +5,9 @@ And SLAM as a task of a real fleet: it moves with its map.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -20,6 +17,7 @@ import numpy as np
 import pytest
 import zenoh
 
+from support.programs import running
 from zsched.lab.explore.laser import Laser
 from zsched.lab.explore.localizer import LOST_S
 from zsched.lab.explore.messages import decode_correction, encode_scan
@@ -42,20 +40,6 @@ def until(condition: Callable[[], bool], what: str) -> None:
     while not condition():
         assert time.monotonic() < end, what
         time.sleep(0.05)
-
-
-@contextlib.contextmanager
-def running(*commands: list[str]) -> Iterator[list[subprocess.Popen[bytes]]]:
-    processes = [subprocess.Popen([sys.executable, "-m", *command]) for command in commands]
-    try:
-        yield processes
-        for process in processes:
-            process.terminate()
-        assert [process.wait(timeout=15.0) for process in processes] == [0] * len(processes)
-    finally:
-        for process in processes:
-            process.kill()
-            process.wait()
 
 
 @pytest.fixture
