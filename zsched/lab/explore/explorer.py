@@ -14,7 +14,6 @@ have long seen, and stands when it has been at all of them: that is what a slow 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -110,15 +109,12 @@ class Explorer:
         """Where the merger has placed this robot's map frame."""
         self._merged_t_map = merged_t_map
 
-    def take_claims(self, claims: Iterable[Claim], now: float) -> None:
-        """What other robots claim, newest word each."""
-        for claim in claims:
-            if claim.robot != self._robot:
-                self._claims[claim.robot] = (now, claim)
-
-    def drop_claim(self, robot: str) -> None:
-        """A robot goes nowhere any more."""
-        self._claims.pop(robot, None)
+    def hear_claim(self, robot: str, claim: Claim | None, now: float) -> None:
+        """A robot's newest word: what it claims; ``None``: it goes nowhere."""
+        if claim is None:
+            self._claims.pop(robot, None)
+        elif robot != self._robot:
+            self._claims[robot] = (now, claim)
 
     def step(self, pose: Pose2, now: float, *, is_blocked: bool = False) -> Twist:
         """The velocity for this moment; ``pose`` is what the robot believes, in its own map frame."""

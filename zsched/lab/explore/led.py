@@ -158,9 +158,5 @@ def _claim(robots: dict[str, _Robot], now: float) -> None:
     """Robots that are placed tell each other where they go."""
     placed = {name: robot for name, robot in robots.items() if robot.placed is not None}
     for name, robot in placed.items():
-        claim = robot.navigation.claim
         for other in placed.values():
-            if claim is None:
-                other.navigation.drop_claim(name)
-            else:
-                other.navigation.take_claims((claim,), now)
+            other.navigation.hear_claim(name, robot.navigation.claim, now)

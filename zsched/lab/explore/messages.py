@@ -1,7 +1,7 @@
 """The explorers' own messages as bytes: claims, scans for mapping elsewhere, and what comes back: poses and ways.
 
-Knows: the two layouts. Does not know: zenoh, who sends what when. Maps and transforms are ROS messages
-(`zsched.tasks.map_merge.cdr`).
+Knows: these layouts, and where a robot's map stands among the merger's transforms. Does not know: zenoh, who sends what
+when. Maps and transforms are ROS messages (`zsched.tasks.map_merge.cdr`).
 
 A claim is JSON: ``{"robot", "x", "y", "way_m"}`` in the merged frame, without ``x`` when the robot goes nowhere. A scan
 is, little endian: ``ZSC1``, the stamp in ns (int64), the robot's pose in its map frame x, y, yaw (float64), the number
@@ -24,6 +24,7 @@ import numpy as np
 from zsched.errors import WireError
 from zsched.lab.explore.frontier import Claim
 from zsched.lab.explore.laser import RANGE_M, LaserScan
+from zsched.tasks.map_merge.cdr import CdrError, decode_transforms
 from zsched.tasks.map_merge.geometry import Pose2
 
 _HEAD = struct.Struct("<4sqdddH")
@@ -135,3 +136,13 @@ def decode_scan(payload: bytes) -> tuple[LaserScan, Pose2]:
     echo = np.isfinite(told) & (told >= 0.0) & (told <= RANGE_M)
     ranges = np.where(echo, told, np.float32(RANGE_M)).astype(np.float32)
     return LaserScan(ranges=ranges, echo=echo, stamp_ns=stamp_ns), pose
+
+
+def pose_of_map(payload: bytes, robot: str) -> Pose2 | None:
+    """Where the merger has placed a robot's map frame; ``None``: it has not, or the bytes are no transforms."""
+    try:
+        transforms = decode_transforms(payload)
+    except CdrError:
+        return None
+    placed = [transform.pose for transform in transforms if transform.child == f"{robot}/map"]
+    return placed[-1] if placed else None

@@ -32,9 +32,16 @@ from zsched.lab import application
 from zsched.lab.explore.agent import CLAIM_PERIOD_S
 from zsched.lab.explore.body import Limits
 from zsched.lab.explore.explorer import Explorer, avoid_s
-from zsched.lab.explore.messages import Correction, decode_claim, decode_correction, encode_claim, encode_way
+from zsched.lab.explore.messages import (
+    Correction,
+    decode_claim,
+    decode_correction,
+    encode_claim,
+    encode_way,
+    pose_of_map,
+)
 from zsched.lab.signals import StopFlag
-from zsched.tasks.map_merge.cdr import CdrError, decode_grid, decode_transforms
+from zsched.tasks.map_merge.cdr import CdrError, decode_grid
 from zsched.tasks.map_merge.geometry import Pose2
 
 POLL_S = 0.05
@@ -144,24 +151,17 @@ class Navigator:
             self._explorer.take_transform(Pose2())
 
     def _take_transforms(self, payload: bytes) -> None:
-        try:
-            transforms = decode_transforms(payload)
-        except CdrError:
-            return
-        for transform in transforms:
-            if transform.child == f"{self._robot}/map":
-                self._merged_t_map = transform.pose
-                self._explorer.take_transform(transform.pose)
+        pose = pose_of_map(payload, self._robot)
+        if pose is not None:
+            self._merged_t_map = pose
+            self._explorer.take_transform(pose)
 
     def _take_claim(self, payload: bytes, now: float) -> None:
         try:
             robot, claim = decode_claim(payload)
         except WireError:
             return
-        if claim is None or self._merged_t_map is None:
-            self._explorer.drop_claim(robot)
-        else:
-            self._explorer.take_claims((claim,), now)
+        self._explorer.hear_claim(robot, None if self._merged_t_map is None else claim, now)
 
 
 def main(arguments: list[str] | None = None) -> int:

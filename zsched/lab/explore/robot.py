@@ -47,7 +47,14 @@ from zsched.errors import ConfigError, WireError
 from zsched.lab import application
 from zsched.lab.explore.agent import Agent, Outputs, RobotSettings
 from zsched.lab.explore.body import Drift, Limits
-from zsched.lab.explore.messages import decode_claim, decode_correction, decode_way, encode_claim, encode_scan
+from zsched.lab.explore.messages import (
+    decode_claim,
+    decode_correction,
+    decode_way,
+    encode_claim,
+    encode_scan,
+    pose_of_map,
+)
 from zsched.lab.explore.referee import Referee
 from zsched.lab.explore.world import World
 from zsched.lab.explore.worlds import load_world
@@ -55,7 +62,7 @@ from zsched.lab.mapping import RESOLUTION_M
 from zsched.lab.recorder import Record, Recorder
 from zsched.lab.signals import StopFlag
 from zsched.tasks.map_merge.__main__ import metres_per_cell
-from zsched.tasks.map_merge.cdr import CdrError, decode_grid, decode_transforms, encode_grid
+from zsched.tasks.map_merge.cdr import CdrError, decode_grid, encode_grid
 from zsched.tasks.map_merge.geometry import Pose2
 
 TICK_S = 0.1
@@ -192,14 +199,10 @@ class Applications:
         self._sent, self._sent_bytes = self._sent + 1, self._sent_bytes + len(payload)
 
     def _take_transforms(self, payload: bytes) -> None:
-        try:
-            transforms = decode_transforms(payload)
-        except CdrError:
-            return
-        for transform in transforms:
-            if transform.child == f"{self._options.settings.robot}/map":
-                self._merged_t_map = transform.pose
-                self._agent.explorer.take_transform(transform.pose)
+        pose = pose_of_map(payload, self._options.settings.robot)
+        if pose is not None:
+            self._merged_t_map = pose
+            self._agent.explorer.take_transform(pose)
 
     def _take_map(self, payload: bytes, now: float) -> None:
         try:
@@ -239,10 +242,7 @@ class Applications:
         except WireError:
             return
         self._claims_heard += robot != self._options.settings.robot
-        if claim is None:
-            self._agent.explorer.drop_claim(robot)
-        else:
-            self._agent.explorer.take_claims((claim,), now)
+        self._agent.explorer.hear_claim(robot, claim, now)
 
     def _record_path(self, now: float) -> None:
         true, belief = self._agent.body.pose, self._agent.belief

@@ -113,7 +113,4 @@ def step_robots(agents: Sequence[Agent], merger: Merger, now: float) -> None:
         if not outputs.is_claim_due:
             continue
         for other in agents:
-            if outputs.claim is None:
-                other.explorer.drop_claim(agent.settings.robot)
-            else:
-                other.explorer.take_claims((outputs.claim,), now)
+            other.explorer.hear_claim(agent.settings.robot, outputs.claim, now)

@@ -286,7 +286,8 @@ def test_two_that_plan_in_step_do_not_swap_goals_for_ever(gap_m: float) -> None:
             one.step(poses[name], now)
         claims = [one.claim for one in robots.values() if one.claim is not None]
         for one in robots.values():
-            one.take_claims(claims, now)
+            for claim in claims:
+                one.hear_claim(claim.robot, claim, now)
 
     assert max(one.goals for one in robots.values()) <= 2
     left, right = sorted(one.goal for one in robots.values() if one.goal is not None)
@@ -301,19 +302,21 @@ def test_anothers_claim_sends_it_to_the_other_side_and_expires() -> None:
     assert alone.goal[0] < 6.0
     together = explorer(open_on_both_sides())
     claims = [Claim(robot=f"robot{2 + i}", x=3.05, y=y, way_m=0.5) for i, y in enumerate((0.7, 2.0, 3.3))]
-    together.take_claims(claims, 0.0)
+    for claim in claims:
+        together.hear_claim(claim.robot, claim, 0.0)
     together.step(at, 0.0)
     assert together.goal is not None
     assert together.goal[0] > 6.0
     late = explorer(open_on_both_sides())
-    late.take_claims(claims, 0.0)
+    for claim in claims:
+        late.hear_claim(claim.robot, claim, 0.0)
     late.step(at, CLAIM_LIFE_S + 0.1)
     assert late.goal is not None
     assert late.goal[0] < 6.0
     dropped = explorer(open_on_both_sides())
-    dropped.take_claims(claims, 0.0)
     for claim in claims:
-        dropped.drop_claim(claim.robot)
+        dropped.hear_claim(claim.robot, claim, 0.0)
+        dropped.hear_claim(claim.robot, None, 0.0)
     dropped.step(at, 0.1)
     assert dropped.goal is not None
     assert dropped.goal[0] < 6.0
