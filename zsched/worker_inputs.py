@@ -23,7 +23,6 @@ from typing import Final
 import zenoh
 
 from zsched.clock import monotonic_s
-from zsched.core.events import WorkerJobs
 from zsched.core.serial import number_near, serial_of
 from zsched.guard import guarded
 from zsched.hop_acks import GIVE_UP_S, MAX_SOURCES, Acknowledger, SourceName
@@ -52,10 +51,10 @@ class Dispatcher:
         acks: Acknowledger,
         troubles: Troubles,
         debts: Debts,
-        jobs: JobBook | None = None,
+        jobs: JobBook,
     ) -> None:
         self._on_ended = on_ended
-        self._jobs = jobs or JobBook("unnamed", "", _untold)
+        self._jobs = jobs
         self._timer = self._jobs.timer()
         """Its counts of what waits are guarded by `_wake`."""
         self._troubles = troubles
@@ -474,7 +473,3 @@ class Dispatcher:
 
 def _never() -> bool:
     return False
-
-
-def _untold(_jobs: WorkerJobs) -> None:
-    """Nobody wants to know."""

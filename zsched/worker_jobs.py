@@ -209,15 +209,15 @@ class JobBook:
     def _run(self) -> None:
         """Tell, every `TELL_S` while there is work, and once behind it; then sleep until there is some."""
         while not self._closed.wait(TELL_S):
-            report = self.report()
-            if self._is_busy() or self._counts() != self._told:
-                self._told = self._counts()
+            report, counts = self.report(), self._counts()
+            if self._is_busy() or counts != self._told:
+                self._told = counts
                 with contextlib.suppress(Exception):  # the session closes
                     self._tell(report)
                 continue
             self._wake.clear()
             self._is_asleep = True
-            if not self._is_busy() and self._counts() == self._told:  # or it came just now
+            if not self._is_busy() and self._counts() == counts:  # or it came just now
                 self._wake.wait()
             self._is_asleep = False
 
@@ -235,7 +235,7 @@ class JobBook:
 
     def report(self) -> WorkerJobs:
         """What has been done so far; every waiting figure begins again."""
-        sums = _Sums() if self._before is None else self._before.copy()
+        sums = _Sums() if self._before is None else replace(self._before)
         waiting = 0
         for timer in self._at_work():
             timer.look_for_helpers()
@@ -278,6 +278,3 @@ class _Sums:
         self.age_s += timer.age_s
         waited_s = None if timer.is_parallel else timer.waited_s()
         self.wait_s = None if self.wait_s is None or waited_s is None else self.wait_s + waited_s
-
-    def copy(self) -> _Sums:
-        return replace(self)

@@ -21,6 +21,7 @@ from zsched.relay.troubles import Troubles as Heard
 from zsched.relay.troubles import Word
 from zsched.worker_debts import Debts
 from zsched.worker_inputs import Dispatcher
+from zsched.worker_jobs import JobBook
 from zsched.worker_samples import Input, Received
 from zsched.worker_troubles import MAX_KINDS, Troubles
 
@@ -82,7 +83,8 @@ def test_an_error_of_any_length_fits_what_is_carried() -> None:
 def test_the_dispatch_goes_on_behind_a_callback_that_raises() -> None:
     told: list[int] = []
     troubles = Troubles(lambda count, _text: told.append(count))
-    dispatcher = Dispatcher(lambda _epoch: None, cast("Acknowledger", None), troubles, cast("Debts", None))
+    jobs = JobBook("t", "1", lambda _jobs: None)
+    dispatcher = Dispatcher(lambda _epoch: None, cast("Acknowledger", None), troubles, cast("Debts", None), jobs)
     dispatcher.start()
 
     def refuse(sample: Received) -> None:
