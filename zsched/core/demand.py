@@ -129,27 +129,27 @@ class Demands:
                 found = replace(found, work=use, is_sure=True)
         if load.jobs is not None:
             found = replace(found, job=_job(load.jobs, speed_of(profile), known.job))
-            if not is_new:
-                self._note_shortfall(task, profile, load, found)
         self._known[task] = found
-        return load.jobs is not None or (found.work, found.memory_mb) != (known.work, known.memory_mb)
+        is_seen = load.jobs is not None and not is_new and self._note_shortfall(task, profile, load, found)
+        return is_seen or (found.work, found.memory_mb, found.job) != (known.work, known.memory_mb, known.job)
 
-    def _note_shortfall(self, task: TaskId, profile: Profile, load: WorkerLoad, found: _Known) -> None:
-        """Remember of a machine that the task gets less there than its figures say, if it does."""
+    def _note_shortfall(self, task: TaskId, profile: Profile, load: WorkerLoad, found: _Known) -> bool:
+        """Remember of a machine that the task gets less there than its figures say, if it does; is that news?"""
         jobs, job, used = load.jobs, found.job, profile.cpu_used_cores
         if jobs is None or job is None or used is None or load.cpu_cores is None or not found.work:
-            return
-        speed, others = speed_of(profile), max(used - load.cpu_cores, 0.0)
+            return False
+        speed, others = speed_of(profile), _others_cores(task, profile, used)
         need, free = found.work / speed, profile.cpu_cores - others
         most = job.most_cores(speed)
         foreseen = min(free / need, 1.0 if most is None else most / need, 1.0)
-        share = 1.0 if foreseen <= 0.0 or not is_told(load) else min(load.cpu_cores / need / foreseen, 1.0)
+        share = 1.0 if foreseen <= 0.0 or not _is_told(load) else min(load.cpu_cores / need / foreseen, 1.0)
         age_s = jobs.time_s if jobs.age_s is None else jobs.age_s
         stretch = max(age_s / max(job.age_s(speed, free), 1e-9), 1.0)
-        if share < SHORT_RATIO or stretch > 1.0 / SHORT_RATIO:
-            self._shortfalls[task, profile.node] = _Shortfall(share, stretch, others)
-        else:
-            self._shortfalls.pop((task, profile.node), None)
+        before = self._shortfalls.pop((task, profile.node), None)
+        if share >= SHORT_RATIO and stretch <= 1.0 / SHORT_RATIO:
+            return before is not None
+        self._shortfalls[task, profile.node] = _Shortfall(share, stretch, others)
+        return before != self._shortfalls[task, profile.node]
 
     def job(self, task: TaskId) -> JobNeed | None:
         """What one of its jobs takes; ``None``: its worker has never told."""
@@ -164,9 +164,7 @@ class Demands:
         seen, used = self._shortfalls.get((task, profile.node)), profile.cpu_used_cores
         if seen is None or used is None:
             return 1.0, 1.0
-        load = profile.worker(task)
-        others = max(used - ((load.cpu_cores or 0.0) if load is not None else 0.0), 0.0)
-        is_same = abs(others - seen.others_cores) <= SAME_RATIO * profile.cpu_cores
+        is_same = abs(_others_cores(task, profile, used) - seen.others_cores) <= SAME_RATIO * profile.cpu_cores
         return (seen.share, seen.stretch) if is_same else (1.0, 1.0)
 
     def at(self, spec: TaskSpec, profile: Profile) -> Demand:
@@ -178,7 +176,11 @@ class Demands:
         )
 
 
-def is_told(load: WorkerLoad) -> bool:
+def _others_cores(task: TaskId, profile: Profile, used_cores: float) -> float:
+    return max(used_cores - profile.cores_of(task), 0.0)
+
+
+def _is_told(load: WorkerLoad) -> bool:
     """Whether the worker's own word says what it lacks of a CPU, and not only what it leaves undone."""
     jobs = load.jobs
     return jobs is not None and (jobs.wait_s is not None or load.wanted_cores is not None)
@@ -192,7 +194,7 @@ def _told(load: WorkerLoad, speed: float, fastest: float) -> float | None:
     long jobs have waited for a CPU, that bound is known; else only threads that always want to run show a lack.
     """
     jobs, use = load.jobs, load.cpu_cores
-    if jobs is None or use is None or not is_told(load):
+    if jobs is None or use is None or not _is_told(load):
         return None
     undone_hz = jobs.wanted_hz - jobs.done_hz
     if jobs.wait_s is None:

@@ -367,6 +367,11 @@ class Profile:
                 return load
         return None
 
+    def cores_of(self, task: TaskId) -> float:
+        """What ``task``'s worker uses on this node; 0 where the node runs none, or has not measured it."""
+        load = self.worker(task)
+        return 0.0 if load is None else load.cpu_cores or 0.0
+
 
 # --- SCHEDULER -------------------------------------------------------------------------------------------------------
 

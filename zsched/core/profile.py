@@ -132,16 +132,8 @@ class Profiler:
         worker_memory = {load.task: load.memory_mb for load in device.workers}
         _absorb_use(self._cpu, self._worker_cpu, device.cpu_used_cores, worker_cpu, MAX_CPU_CORES, now)
         _absorb_use(self._memory, self._worker_memory, device.memory_used_mb, worker_memory, MAX_MEMORY_MB, now)
-        pressure = _possible(device.cpu_pressure, 1.0)
-        if pressure is None:
-            self._pressure.value = None
-        else:
-            self._pressure.update(pressure, now)
-        runnable = _possible(device.runnable, MAX_RUNNABLE)
-        if runnable is None:
-            self._runnable.value = None
-        else:
-            self._runnable.update(runnable, now)
+        _absorb_known(self._pressure, device.cpu_pressure, 1.0, now)
+        _absorb_known(self._runnable, device.runnable, MAX_RUNNABLE, now)
         self._links = tuple(self._link(sample, now) for sample in links)
         for meter in self._jobs.values():
             meter.look(now)
@@ -283,6 +275,15 @@ def _absorb_use(
         if task in shares:
             shares[task].update(part or 0.0, now)
     whole.update(used, now)
+
+
+def _absorb_known(mean: Ewma, figure: float | None, high: float, now: float) -> None:
+    """Smooth a figure; where it is not measured, there is no mean either."""
+    known = _possible(figure, high)
+    if known is None:
+        mean.value = None
+    else:
+        mean.update(known, now)
 
 
 def _possible(value: float | None, high: float) -> float | None:

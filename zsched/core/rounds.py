@@ -127,6 +127,7 @@ class Rounds:
         if version == self._gateway.version and now <= until and seen == (states, values, doubts):
             return answer  # several robots ask within a round, and nothing has changed since
         bookings = book((task.spec for task in self.tasks.values()), values)
+        round_trips = self._round_trips.seconds()
         answer = Utilities(
             voter=self._me,
             vectors=tuple(
@@ -140,7 +141,7 @@ class Rounds:
                     bookings,
                     doubts[name],
                     task.damping.penalties(now),
-                    self._round_trips.seconds(),
+                    round_trips,
                 )
                 for name, task in self.tasks.items()
             ),

@@ -258,9 +258,8 @@ def _cpu(
     """
     if profile.cpu_used_cores is None:
         return None
-    load = profile.worker(spec.name)
-    own = (load.cpu_cores or 0.0) if load is not None else 0.0
-    used = predicted_use(profile.cpu_used_cores + unseen.cpu_cores, own, demand.cpu_cores)
+    used_cores = profile.cpu_used_cores + unseen.cpu_cores
+    used = predicted_use(used_cores, profile.cores_of(spec.name), demand.cpu_cores)
     if tuning.score is ScoreForm.PAPER:
         return cpu_utility(profile.cpu_cores, used)
     free, job = max(profile.cpu_cores - used + demand.cpu_cores, least_cores), demands.job(spec.name)

@@ -274,3 +274,11 @@ def test_a_loss_that_the_machine_s_figures_explain_is_not_counted_twice() -> Non
         demands.learn("merge", starved, now)
     share, _ = demands.experience("merge", starved)
     assert share == pytest.approx(1.0)
+
+
+def test_the_same_word_again_is_no_news() -> None:
+    """Nothing is scored anew for it: a worker speaks five times a second."""
+    demands = Demands()
+    news = [demands.learn("merge", word, 10.0 * at) for at, word in enumerate([told(9.0)] * 3)]
+    assert news == [True, False, False]
+    assert demands.learn("merge", told(9.0, cpu_s=0.3), 30.0)
