@@ -142,6 +142,7 @@ class DeviceProfiler:
         self._trees = _ProcessTrees(self._proc)
         self._limits_at_s: float | None = None
         self._allowed: frozenset[int] | None = None
+        self._has_all_cpus = False
         self._cpu_quota: CpuQuota | None = None
         self._memory_quota: MemoryQuota | None = None
         self._usage: tuple[float, float] | None = None
@@ -165,7 +166,7 @@ class DeviceProfiler:
             workers=self._trees.loads(workers, now),
             speed=self.speed,
             cpu_pressure=self._cpu_pressure(now),
-            runnable=self._runnable(stat, times),
+            runnable=self._runnable(stat),
         )
 
     def _cpu_pressure(self, now: float) -> float | None:
@@ -184,12 +185,10 @@ class DeviceProfiler:
             self._pressure = min(max(stalled_s - before[1], 0.0) / (now - before[0]), 1.0)
         return self._pressure
 
-    def _runnable(self, stat: bytes, times: CpuTimes | None) -> float | None:
+    def _runnable(self, stat: bytes) -> float | None:
         """Of the whole machine only: under a quota, or on some of its CPUs, nobody counts who else wants them."""
-        every, running = parse_cpu_stat(stat, None), parse_running(stat)
-        if self._cpu_quota is not None or times is None or every is None or running is None:
-            return None
-        return max(running - 1.0, 0.0) if times.cpus == every.cpus else None  # one of them is this thread
+        running = parse_running(stat) if self._cpu_quota is None and self._has_all_cpus else None
+        return None if running is None else max(running - 1.0, 0.0)  # one of them is this thread
 
     def _look_up_limits(self, now: float) -> None:
         self._limits_at_s = now
@@ -198,7 +197,9 @@ class DeviceProfiler:
         quota, status = tree.cpu_quota(), _read(f"{self._proc}/{self._pid}/status").decode(errors="replace")
         _, _, allowed = status.partition("Cpus_allowed_list:")
         self._allowed = parse_cpu_list(allowed.partition("\n")[0]) or None
-        times = parse_cpu_stat(_read(f"{self._proc}/stat"), self._allowed)
+        stat = _read(f"{self._proc}/stat")
+        times, every = parse_cpu_stat(stat, self._allowed), parse_cpu_stat(stat, None)
+        self._has_all_cpus = times is not None and every is not None and times.cpus == every.cpus
         if quota is not None and times is not None and quota.cores >= times.cpus:
             quota = None  # wider than the machine: no limit
         if quota != self._cpu_quota:
