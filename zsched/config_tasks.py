@@ -5,7 +5,7 @@ Knows: how the values of one task, and the rules of all tasks, relate. Does not 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any, Final
 
 from zsched.config_blocks import Located, Section
@@ -175,17 +175,12 @@ def _deadline(scheduling: Section, score: ScoreForm, weights: Weights, out: Coll
 
 def _patience(scheduling: Section | None, weights: Weights) -> float | None:
     """As given; none where only a time-to-trigger is given; else the default."""
+    if _learns(scheduling, weights):
+        return FIRST_PATIENCE
     values = {} if scheduling is None else scheduling.values
-    patience: float | None = values.get(
-        "patience", None if "time_to_trigger_s" in values else _default(values, weights)
-    )
+    default = PAPER_PATIENCE if _score(scheduling) is ScoreForm.PAPER else RADIO_PATIENCE
+    patience: float | None = values.get("patience", None if "time_to_trigger_s" in values else default)
     return patience
-
-
-def _default(values: Mapping[str, Any], weights: Weights) -> float:
-    if values.get("score", DEFAULT_SCORE) is ScoreForm.PAPER:
-        return PAPER_PATIENCE
-    return RADIO_PATIENCE if weights.network else FIRST_PATIENCE
 
 
 def _learns(scheduling: Section | None, weights: Weights) -> bool:

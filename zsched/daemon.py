@@ -235,11 +235,10 @@ class Daemon:
     ) -> WorkerSupervisor:
         fleet, me = self._fleet, self._spec.name
         mine = {task.name: task.worker for task in fleet.tasks if runs_worker(task, me, self._spec.kind)}
-        tunings = {task.name: task.tuning for task in fleet.tasks}
         deadlines = {
-            name: {"ZSCHED_DEADLINE_MS": f"{tuning.deadline_ms:g}"}
-            for name, tuning in tunings.items()
-            if tuning.deadline_ms is not None
+            task.name: {"ZSCHED_DEADLINE_MS": f"{task.tuning.deadline_ms:g}"}
+            for task in fleet.tasks
+            if task.tuning.deadline_ms is not None
         }
         folder = self._options.runtime_dir
         paths: dict[TaskId, Path] = {}
