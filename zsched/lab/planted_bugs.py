@@ -510,6 +510,20 @@ MEMBERSHIP_BUGS = (
         seed=598,
     ),
     _bug(
+        "a lease that forbids an accept ends its ballot",
+        REGISTER,
+        "return running.phase is _Phase.ACCEPT and set(running.no.values()) == {Refusal.LEASE}",
+        "return False",
+        ("tests/unit/core/test_register_proposer.py",),
+    ),
+    _bug(
+        "who is overtaken ends the accept that waits",
+        REGISTER,
+        "now < (until := min(self._lease_over_at, running.give_up_at))",
+        "now < (until := -math.inf)",
+        ("tests/unit/core/test_register_proposer.py", "tests/sim/test_exclusive.py"),
+    ),
+    _bug(
         "token resurrects a peer",
         NODE,
         '        self.counters["tokens_seen"] += 1\n',
