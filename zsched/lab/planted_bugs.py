@@ -403,7 +403,7 @@ LEASE_BUGS = (
         AGREEMENT,
         "if step.is_dirty and (known is None or accept.acceptance.value.revision > known.revision):",
         "if step.is_dirty:",
-        _LEASE,
+        (*_LEASE, "tests/unit/core/test_parked_accepts.py"),
     ),
     _bug(
         "echoes prolong the wait for a stopped worker",

@@ -196,3 +196,17 @@ def test_who_is_overtaken_while_an_elector_asks_this_owner_to_leave_waits_for_a_
     if waits:
         assert agreement.registers["guard"].next_deadline() == pytest.approx(101.0 + HOLD_S)
         assert agreement.tick(101.0 + HOLD_S).send != []
+
+
+def test_an_identity_round_does_not_end_the_silence_towards_an_owner_that_is_asked_to_leave() -> None:
+    """It is no newer revision, and the next owner may still wait: the present one must not work again before it."""
+    agreement, now = elector(), 100.0 + 2 * HOLD_S
+    beat = Beat(node="robot2", incarnation=1, sequence=9, loop_lag_s=0.0, learnt=(("guard", 3, 3),))
+    assert agreement.leases.on_beat(beat, {"guard": ("robot2", 3)}, now)
+    asks(agreement, 1, 5, now)
+    acceptance = Acceptance(ballot=Ballot(counter=6, node="robot2", incarnation=1), value=value(3, "robot2"))
+    identity = Accept(task="guard", acceptance=acceptance, electorate="e")
+    effects = agreement.on_accept(ev.AcceptAsked(request=2, asker="robot2", accept=identity), now)
+    assert answers(effects) == [(2, "accepted")]
+    said = agreement.leases.on_sent(1, now + 0.1)
+    assert (said.asked_to_leave, said.echoes) == ((("guard", "robot2", 3),), ())
