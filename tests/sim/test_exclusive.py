@@ -129,6 +129,22 @@ def test_planned_move_costs_less_than_two_round_trips_more_than_an_idempotent_on
 
 @pytest.mark.parametrize("stop_s", [0.05, 0.1, 0.4])
 @pytest.mark.parametrize("seed", range(5))
+def test_a_planned_move_takes_one_vote_and_as_long_as_its_worker_takes_to_stop(seed: int, stop_s: float) -> None:
+    """Proposers overtake each other meanwhile: the one that was overtaken must not end the accept that waits."""
+    busy: set[NodeId] = set()
+    sim = Simulator(fleet=fleet(), seed=seed, load=lambda n, _: (CORES * (0.9 if n in busy else 0.2), 1000.0))
+    sim.work.stop_s = (stop_s,)
+    sim.start()
+    assert sim.run_until(lambda: is_working(sim), 20)
+    sim.run(3)
+    owner = sim.agreed(TASK) or ""
+    busy.add(owner)
+    assert sim.run_until(lambda: any("the worker stops" in story for story in sim.stories[-3:]), 20)
+    assert sim.run_until(lambda: sim.agreed(TASK) not in (None, owner), stop_s + 0.05), "\n".join(sim.stories[-30:])
+
+
+@pytest.mark.parametrize("stop_s", [0.05, 0.1, 0.4])
+@pytest.mark.parametrize("seed", range(5))
 def test_owner_whose_worker_is_slow_to_stop_is_left_by_the_next_vote(seed: int, stop_s: float) -> None:
     """Proposers that take turns refuse each other meanwhile; what they settle on is no reason to let it work again.
 

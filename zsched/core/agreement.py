@@ -17,7 +17,7 @@ from zsched.core import instructions as do
 from zsched.core.belief import GENERATION_STEP, MAX_GENERATION, is_fit, is_proven
 from zsched.core.fleet import Fleet
 from zsched.core.generations import way_out
-from zsched.core.lease import Leases
+from zsched.core.lease import Leases, hold_s
 from zsched.core.messages import CommandOutcome, CommandResult, Learnt, Promise, Refusal, Refused
 from zsched.core.model import NO_BALLOT, Allocation, Ballot, Beat, DurableState, NodeId, RegisterState, TaskId, Weights
 from zsched.core.register import Change, MoveOwner, Register, Retune, RoundOutcome, Step
@@ -344,6 +344,15 @@ class Agreement:
 
     def _is_its_own(self, ballot: Ballot, asker: NodeId) -> bool:
         return ballot.node == asker and asker in self._nodes
+
+    def note_asked(self, beat: Beat, now: float) -> None:
+        """An elector (maybe this one) asks owners to leave: somebody's accept waits for that."""
+        if beat.node not in self._fleet.electors:
+            return
+        for task, _, epoch in beat.asked_to_leave:
+            register = self.registers.get(task)
+            if register is not None and epoch == register.value.epoch:
+                register.expect_release(now, now + hold_s(self._fleet.timing.lease_s))
 
     # --- learners ----------------------------------------------------------------------------------------------------
 

@@ -387,6 +387,7 @@ class Node:
             return  # thirty beats a second come by here
         if self._tenure.hear(beat, self.agreement.accepted(), now):
             self._beat_at = now  # a first grant: the new owner waits for its echo
+        self.agreement.note_asked(beat, now)
         if beat.released:
             self._agree(self.agreement.retry_parked(now), now)
 

@@ -156,6 +156,8 @@ class Register:
         self._queue: list[Change] = []
         self._settle_at = math.inf
         self._settle_tries = 0
+        self._lease_over_at = -math.inf
+        """The owner is asked to leave, for somebody's accept: when its lease must be over."""
 
     @property
     def value(self) -> Allocation:
@@ -263,6 +265,7 @@ class Register:
                 step.problem = f"two values for revision {value.revision}: {current.owner} and {value.owner}"
             return
         self._set_state(learnt=value)
+        self._lease_over_at = -math.inf
         step.is_dirty, step.learnt = True, value
         if not self._is_unlearnt():
             self._settle_at = math.inf
@@ -282,6 +285,11 @@ class Register:
         return RoundOutcome.UNKNOWN if value.revision > running.sent.revision else None  # ours may lie under it
 
     # --- proposer ----------------------------------------------------------------------------------------------
+
+    def expect_release(self, now: float, at_most: float) -> None:
+        """An exclusive task's owner is asked to leave, for an accept that waits; its lease is over ``at_most`` then."""
+        if now >= self._lease_over_at:
+            self._lease_over_at = at_most
 
     def propose(self, change: Change, now: float) -> Step:
         """Try to commit a change; its end comes as `Step.finished` of this or a later call."""
@@ -378,12 +386,7 @@ class Register:
         else:
             running.value = running.sent = changed
         assert running.ballot is not None
-        running.phase, running.deadline, running.no = _Phase.ACCEPT, now + self._ballot_s, {}
-        step.accept = Accept(
-            task=self.state.task,
-            acceptance=Acceptance(ballot=running.ballot, value=running.value),
-            electorate=self._electorate,
-        )
+        self._accept(running, running.ballot, running.value, step, now)
 
     def _moved_on(self, running: _Round, read: Allocation) -> Allocation | None:
         """Our move applied to a value that was read and cannot be settled; ``None``: it is not that, or no move."""
@@ -412,9 +415,30 @@ class Register:
             self._counter = max(self._counter, answer.promised.counter)
         running.no[answer.elector] = answer.refusal
         if len(self._electors) - len(running.no) < majority(len(self._electors)):
+            if self._waits_for_leases(running):
+                return  # the same accept is sent once more at its deadline
             if Refusal.VALUE in running.no.values():
                 running.unfit = running.value
             self._again(running, step, now)
+
+    @staticmethod
+    def _waits_for_leases(running: _Round) -> bool:
+        """Whether nothing but an exclusive task's lease stands against our accept: it will end, the ballot is good."""
+        return running.phase is _Phase.ACCEPT and set(running.no.values()) == {Refusal.LEASE}
+
+    def _ask_again(self, running: _Round, step: Step, now: float) -> None:
+        """Send the same accept once more: a new ballot could only find out what became of it, without a move."""
+        if now >= running.give_up_at:
+            self._give_up(running, step, now)
+            return
+        assert running.ballot is not None
+        assert running.value is not None
+        self._accept(running, running.ballot, running.value, step, now)
+
+    def _accept(self, running: _Round, ballot: Ballot, value: Allocation, step: Step, now: float) -> None:
+        running.phase, running.deadline, running.no = _Phase.ACCEPT, now + self._ballot_s, {}
+        acceptance = Acceptance(ballot=ballot, value=value)
+        step.accept = Accept(task=self.state.task, acceptance=acceptance, electorate=self._electorate)
 
     def _again(self, running: _Round, step: Step, now: float) -> None:
         """This ballot cannot win: wait a little and try a higher one (only to find out, once ours was sent), or end."""
@@ -445,8 +469,12 @@ class Register:
         step = Step()
         running = self._round
         if running is not None and now >= running.deadline:
-            if running.phase is _Phase.WAIT:
+            if running.phase is _Phase.WAIT and now < (until := min(self._lease_over_at, running.give_up_at)):
+                running.deadline = until  # our next ballot would end the accept that waits
+            elif running.phase is _Phase.WAIT:
                 self._begin(step, now)
+            elif self._waits_for_leases(running):
+                self._ask_again(running, step, now)
             else:
                 self._again(running, step, now)
         elif running is None and now >= self._settle_at:

@@ -403,7 +403,7 @@ LEASE_BUGS = (
         AGREEMENT,
         "if step.is_dirty and (known is None or accept.acceptance.value.revision > known.revision):",
         "if step.is_dirty:",
-        _LEASE,
+        (*_LEASE, "tests/unit/core/test_parked_accepts.py"),
     ),
     _bug(
         "echoes prolong the wait for a stopped worker",
@@ -508,6 +508,20 @@ MEMBERSHIP_BUGS = (
         "            self.called_at = now\n",
         ("tests/unit/core/test_turns.py",),
         seed=598,
+    ),
+    _bug(
+        "a lease that forbids an accept ends its ballot",
+        REGISTER,
+        "return running.phase is _Phase.ACCEPT and set(running.no.values()) == {Refusal.LEASE}",
+        "return False",
+        ("tests/unit/core/test_register_proposer.py",),
+    ),
+    _bug(
+        "who is overtaken ends the accept that waits",
+        REGISTER,
+        "now < (until := min(self._lease_over_at, running.give_up_at))",
+        "now < (until := -math.inf)",
+        ("tests/unit/core/test_register_proposer.py", "tests/sim/test_exclusive.py"),
     ),
     _bug(
         "token resurrects a peer",

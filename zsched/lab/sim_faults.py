@@ -120,8 +120,7 @@ class Stage:
             delay_s=SMALL_DELAY_S,
             weather=Weather(),
         )
-        # Open: of many tasks in turn, workers slower than a ballot may keep a busy owner for ever (seed 400778).
-        self.sim.work.stop_s = STOP_WORK_S if len(plan.fleet.tasks) <= FEW_TASKS else STOP_WORK_S[:2]
+        self.sim.work.stop_s = STOP_WORK_S
         self.sim.most_events = EVENTS_PER_S * len(plan.fleet.nodes) * plan.seconds
         self._rng = Random(f"stage {plan.seed}")
         self.scene = Scene(plan=plan, sim=self.sim, rng=self._rng, fleet=plan.fleet, generation=plan.generation)

@@ -12,8 +12,19 @@ from zsched.core.agreement import PARK_SHARE, Agreement, Effects
 from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing
 from zsched.core.lease import hold_s
 from zsched.core.messages import Accept, Accepted, Learnt, Refusal, Refused
-from zsched.core.model import Acceptance, Allocation, Ballot, DurableState, NodeKind, RegisterState, Tuning, Weights
+from zsched.core.model import (
+    Acceptance,
+    Allocation,
+    Ballot,
+    Beat,
+    DurableState,
+    NodeKind,
+    RegisterState,
+    Tuning,
+    Weights,
+)
 from zsched.core.node import Node
+from zsched.core.register import MoveOwner
 
 ROBOTS = ("robot1", "robot2", "robot3")
 TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
@@ -153,3 +164,49 @@ def test_a_question_that_waits_is_answered_though_no_task_is_exclusive_any_more(
     told = [one for one in node.handle(ev.DeadlineReached(), now) if isinstance(one, do.AnswerElection)]
     assert [one.request for one in told] == [1]
     assert node.next_deadline() > now
+
+
+@pytest.mark.parametrize(
+    ("node", "epoch", "waits"),
+    [("robot2", 3, True), ("robot1", 3, True), ("robot2", 2, False), ("edge1", 3, False)],
+)
+def test_who_is_overtaken_while_an_elector_asks_this_owner_to_leave_waits_for_a_hold(
+    node: str, epoch: int, waits: bool
+) -> None:
+    """The overtaker's accept waits there, and a ballot of ours would end it."""
+    agreement = elector()
+    change = MoveOwner(base_revision=3, owner="robot3", reason="test")
+    (sent,) = agreement.propose("guard", change, 101.0).send
+    assert isinstance(sent, do.SendPrepare)
+    for name in ROBOTS[1:]:
+        no = Refused(
+            elector=name,
+            task="guard",
+            ballot=sent.prepare.ballot,
+            refusal=Refusal.BALLOT,
+            promised=Ballot(counter=9, node="robot3", incarnation=1),
+        )
+        agreement.on_answer(ev.ElectorAnswered(answer=no), 101.0)
+    asks_to_leave = (("guard", "robot2", epoch), ("stranger", "robot2", 3))
+    agreement.note_asked(
+        Beat(node=node, incarnation=1, sequence=9, loop_lag_s=0.0, asked_to_leave=asks_to_leave), 101.0
+    )
+    at = agreement.registers["guard"].next_deadline()
+    assert (agreement.tick(at).send == []) is waits
+    if waits:
+        assert agreement.registers["guard"].next_deadline() == pytest.approx(101.0 + HOLD_S)
+        assert agreement.tick(101.0 + HOLD_S).send != []
+
+
+def test_an_identity_round_does_not_end_the_silence_towards_an_owner_that_is_asked_to_leave() -> None:
+    """It is no newer revision, and the next owner may still wait: the present one must not work again before it."""
+    agreement, now = elector(), 100.0 + 2 * HOLD_S
+    beat = Beat(node="robot2", incarnation=1, sequence=9, loop_lag_s=0.0, learnt=(("guard", 3, 3),))
+    assert agreement.leases.on_beat(beat, {"guard": ("robot2", 3)}, now)
+    asks(agreement, 1, 5, now)
+    acceptance = Acceptance(ballot=Ballot(counter=6, node="robot2", incarnation=1), value=value(3, "robot2"))
+    identity = Accept(task="guard", acceptance=acceptance, electorate="e")
+    effects = agreement.on_accept(ev.AcceptAsked(request=2, asker="robot2", accept=identity), now)
+    assert answers(effects) == [(2, "accepted")]
+    said = agreement.leases.on_sent(1, now + 0.1)
+    assert (said.asked_to_leave, said.echoes) == ((("guard", "robot2", 3),), ())

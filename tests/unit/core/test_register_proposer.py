@@ -323,3 +323,105 @@ def test_a_value_that_is_refused_for_a_higher_ballot_is_tried_again() -> None:
     asked = promise_all(proposer, proposer.tick(proposer.next_deadline()), electors)
     assert asked.accept is not None
     assert asked.accept.acceptance.value == GONE
+
+
+# --- an exclusive task's lease ---------------------------------------------------------------------------------------
+
+
+def asked(others: tuple[Register, ...]) -> tuple[Register, Acceptance]:
+    """A proposer whose accept is on its way to r2 and r3."""
+    proposer = make("r1", is_elector=False)
+    carried = promise_all(proposer, proposer.propose(FIRST, 0.0), others).accept
+    assert carried is not None
+    return proposer, carried.acceptance
+
+
+def refused(proposer: Register, others: tuple[Register, ...], held: Acceptance, *whys: Refusal) -> Step:
+    answers = [one.refuse(held.ballot, why) for one, why in zip(others, whys, strict=False)]
+    return last(proposer.on_answer(answer, 0.25) for answer in answers)
+
+
+def test_an_accept_that_only_leases_forbid_is_sent_once_more_under_its_ballot() -> None:
+    """A higher ballot would only find out that nobody has accepted ours, and end the move for whose sake one leaves."""
+    others = (make("r2"), make("r3"))
+    proposer, held = asked(others)
+    assert refused(proposer, others, held, Refusal.LEASE, Refusal.LEASE) == Step()
+    assert proposer.tick(BALLOT_S - 0.001) == Step()
+    again = proposer.tick(BALLOT_S)
+    assert (again.accept and again.accept.acceptance, again.prepare) == (held, None)
+    assert accept_all(proposer, again, others, BALLOT_S).finished == (FIRST, RoundOutcome.COMMITTED)
+
+
+def test_who_has_accepted_before_the_others_were_free_counts() -> None:
+    others = (make("r2"), make("r3"))
+    proposer, held = asked(others)
+    yes = Accepted(elector="r2", task="merge", ballot=held.ballot)
+    assert proposer.on_answer(yes, 0.1) == Step()
+    proposer.on_answer(others[1].refuse(held.ballot, Refusal.LEASE), 0.25)
+    again = proposer.tick(BALLOT_S)
+    assert accept_all(proposer, again, others[1:], BALLOT_S).finished == (FIRST, RoundOutcome.COMMITTED)
+
+
+def test_a_lease_that_does_not_end_is_waited_for_as_long_as_any_other_answer() -> None:
+    others = (make("r2"), make("r3"))
+    proposer, held = asked(others)
+    for _ in range(100):
+        refused(proposer, others, held, Refusal.LEASE, Refusal.LEASE)
+        at = proposer.next_deadline()
+        step = proposer.tick(at)
+        if step.finished is not None:
+            break
+    assert (step.finished, step.accept) == ((FIRST, RoundOutcome.UNKNOWN), None)
+    assert at == pytest.approx(6 * BALLOT_S)
+
+
+@pytest.mark.parametrize("why", [Refusal.BALLOT, Refusal.YOUNG, Refusal.NOT_ELECTOR])
+def test_a_no_for_any_other_reason_than_a_lease_takes_a_higher_ballot(why: Refusal) -> None:
+    others = (make("r2"), make("r3"))
+    proposer, held = asked(others)
+    for other in others:
+        other.on_prepare(prepare(9))
+    assert refused(proposer, others, held, Refusal.LEASE, why) == Step()
+    again = proposer.tick(proposer.next_deadline())
+    assert (again.accept, again.prepare is None) == (None, False)
+
+
+def overtaken() -> tuple[Register, float]:
+    """A proposer that a higher ballot has overtaken, and when it would try again."""
+    others = (make("r2"), make("r3"))
+    proposer, held = asked(others)
+    for other in others:
+        other.on_prepare(prepare(9))
+    refused(proposer, others, held, Refusal.BALLOT, Refusal.BALLOT)
+    at = proposer.next_deadline()
+    assert at < 0.25 + BALLOT_S
+    return proposer, at
+
+
+def test_who_is_overtaken_lets_the_accept_end_that_waits_for_the_owner_to_leave() -> None:
+    proposer, at = overtaken()
+    proposer.expect_release(0.2, 1.2)
+    proposer.expect_release(0.26, 1.26)
+    assert (proposer.tick(at), proposer.next_deadline()) == (Step(), 1.2)
+    proposer.expect_release(1.0, 2.0)
+    assert proposer.tick(1.2).prepare is not None, "no later than the first question said"
+
+
+def test_who_is_overtaken_waits_no_longer_than_its_change_may_take_and_for_nobody_s_owner_but_this_one() -> None:
+    proposer, at = overtaken()
+    proposer.expect_release(0.2, 99.0)
+    assert (proposer.tick(at), proposer.next_deadline()) == (Step(), 6 * BALLOT_S)
+    assert proposer.tick(6 * BALLOT_S).prepare is not None
+
+    proposer, at = overtaken()
+    assert proposer.tick(at).prepare is not None, "nobody was asked to leave"
+
+    proposer = make("r1", is_elector=False)
+    proposer.expect_release(0.0, 99.0)
+    proposer.learn(allocation(1), 0.0)
+    others = (make("r2"), make("r3"))
+    proposer.propose(MoveOwner(base_revision=1, owner="e2", reason="test"), 0.0)
+    for other in others:
+        other.on_prepare(prepare(9))
+    proposer.tick(BALLOT_S)
+    assert proposer.tick(proposer.next_deadline()).prepare is not None, "who was asked to leave has left"
