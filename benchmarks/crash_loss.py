@@ -8,7 +8,7 @@ fails: nobody sees a socket close. Per death: how many numbers have no answer at
 robot's status says of it.
 
 ``--one-stamp``: all messages of a burst have the same timestamp, as the parts of one scan; no answer tells which of
-them it is of.
+them it is of. It tells most together with ``--mbit``: then the owner dies within a burst.
 
 ``--mbit``: what leaves the edges goes over links of so many Mbit/s, which the answers to a burst fill: they wait there,
 acknowledgements do not. The owner dies while answers come.
