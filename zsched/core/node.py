@@ -743,6 +743,7 @@ class Node:
             ev.TokenLost: self._on_token_lost,
             ev.WorkerChanged: self._on_worker,
             ev.WorkerTroubled: self._workers.on_troubled,
+            ev.WorkerOutdated: self._workers.on_outdated,
             ev.WorkerJobs: self._on_jobs,
             ev.WorkerShown: self._on_worker_shown,
             ev.SlotReady: self._on_slot_ready,
