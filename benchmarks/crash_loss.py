@@ -1,10 +1,14 @@
 """What an owner's death costs a ``reliable`` stream, with `on_crash: report` and with `replay`.
 
 ``python -m benchmarks.crash_loss [--n 20] [--hz 100] [--only kill|cut] [--rule report|replay]
-[--mbit 12 --size 10000 --burst 50]``. Real daemons in network namespaces (root). The application on robot1 publishes
-numbers, the echo worker answers each. *kill*: the owner's daemon, relay and worker are killed (SIGKILL): their sockets
-close at once. *cut*: the owner's link goes and then everything on it, as when its power fails: nobody sees a socket
-close. Per death: how many numbers have no answer at all, how many have two, and what the robot's status says of it.
+[--burst 20 --one-stamp] [--mbit 12 --size 10000 --burst 50]``. Real daemons in network namespaces (root). The
+application on robot1 publishes numbers, the echo worker answers each. *kill*: the owner's daemon, relay and worker are
+killed (SIGKILL): their sockets close at once. *cut*: the owner's link goes and then everything on it, as when its power
+fails: nobody sees a socket close. Per death: how many numbers have no answer at all, how many have two, and what the
+robot's status says of it.
+
+``--one-stamp``: all messages of a burst have the same timestamp, as the parts of one scan; no answer tells which of
+them it is of. It tells most together with ``--mbit``: then the owner dies within a burst.
 
 ``--mbit``: what leaves the edges goes over links of so many Mbit/s, which the answers to a burst fill: they wait there,
 acknowledgements do not. The owner dies while answers come.
@@ -45,6 +49,9 @@ def main() -> int:
     parser.add_argument("--hz", type=float, default=100.0)
     parser.add_argument("--size", type=int, default=0)
     parser.add_argument("--burst", type=int, default=1, help="messages that are put at once")
+    parser.add_argument(
+        "--one-stamp", action="store_true", help="a burst's messages have one timestamp, as a scan's parts"
+    )
     parser.add_argument("--mbit", type=float)
     parser.add_argument("--timing", default="wifi", choices=["wifi", "wired"])
     parser.add_argument("--only", choices=["kill", "cut"])
@@ -84,6 +91,7 @@ def _case(options: argparse.Namespace, rule: str, death: str) -> int:
             hz=options.hz,
             size=options.size,
             burst=options.burst,
+            has_one_stamp=options.one_stamp,
             watch=[f"{ROBOT}/out"],
             blocks=is_full,
         )

@@ -6,18 +6,21 @@ follows from a state. Called from the supervisor's thread and the relay handle's
 
 from __future__ import annotations
 
+import logging
+import math
 import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final
 
 from zsched.adapters.worker_supervisor import WorkerSupervisor
-from zsched.clock import wall_time
+from zsched.clock import monotonic_s, wall_time
 from zsched.core import events as ev
 from zsched.core.fleet import Fleet
 from zsched.core.model import WAS_READY, NodeId, TaskId, WorkerState
 from zsched.core.plan import ReadyWhen
 from zsched.core.relay_protocol import WorkerMatched, WorkerSeen, WorkerTrouble
+from zsched.daemon_sessions import SessionsRead
 from zsched.keyspace import Keyspace, counter
 
 OTHERS: Final = (
@@ -28,6 +31,10 @@ NO_TOKEN: Final = (
     "no token: without zsched.worker say `ready: matching`; with it, Worker.ready() on $ZSCHED_ZENOH_CONFIG declares"
 )
 OTHER_NETWORK: Final = "did it open $ZSCHED_ZENOH_CONFIG?"
+REJOIN_S: Final = 4.0
+"""A worker that runs already is seen so soon after its relay's start: it dials at least once a second."""
+
+_log = logging.getLogger("zsched.crew")
 
 
 class Crew:
@@ -53,6 +60,9 @@ class Crew:
         """{task: since when it is not ready any more, and what to look at}."""
         self.sessions: Mapping[TaskId, Path] = {}
         """{task: the file with the session that its worker opens}."""
+        self.sessions_read: SessionsRead | None = None
+        self._outdated: set[TaskId] = set()
+        self._relay_at = -math.inf
         self._lock = threading.Lock()  # an end and a token's end come from two threads
 
     def life_of(self, task: TaskId) -> int:
@@ -86,6 +96,10 @@ class Crew:
                 self._post(ev.WorkerChanged(task=task, state=WorkerState.STOPPED, reason=reason))
 
     # --- the relay's handle ------------------------------------------------------------------------------------------
+
+    def on_relay_started(self) -> None:
+        """A relay runs: who joins it in the next moments may have been there before it."""
+        self._relay_at = monotonic_s()
 
     def on_token(self, seen: WorkerSeen) -> None:
         """A token of a worker here; one of a process that has ended says nothing (its end was reported)."""
@@ -143,6 +157,8 @@ class Crew:
     def _tell(self, supervisor: WorkerSupervisor, task: TaskId, life: int, *, is_ready: bool, reason: str) -> None:
         (supervisor.mark_ready if is_ready else supervisor.mark_gone)(task, life)
         if is_ready:
+            if task in self._foreign:
+                self._look_what_it_has_read(task, life)
             self._seen.add(task)
             self._lost.pop(task, None)
             self._post(ev.WorkerChanged(task=task, state=WorkerState.READY, reason=reason))
@@ -154,6 +170,32 @@ class Crew:
             reason = f"{reason}: {self._start_it(task)}"
         state = WorkerState.STARTING if is_ours else WorkerState.STOPPED
         self._post(ev.WorkerChanged(task=task, state=state, reason=reason))
+
+    def _look_what_it_has_read(self, task: TaskId, life: int) -> None:
+        """Whether somebody else's worker, which is there, goes on with a session of before; say so, or take it back."""
+        if self.sessions_read is None:
+            return
+        lack = self.sessions_read.seen(task, life, is_new=self._has_started_since(task, life, self.sessions_read))
+        if not lack and task not in self._outdated:
+            return
+        reason = ""
+        if lack:
+            what = "seems to run since before its session changed"
+            reason = f"{what}: {self._start_it(task, 'start it again')}; it lacks {lack}"
+            _log.warning("task=%s the worker %s", task, reason)
+        (self._outdated.add if lack else self._outdated.discard)(task)
+        self._post(ev.WorkerOutdated(task=task, reason=reason))
+
+    def _has_started_since(self, task: TaskId, life: int, read: SessionsRead) -> bool:
+        """Whether somebody else's worker has started since this daemon did.
+
+        By the number of its life, or because it was not there although it would have joined the relay long ago.
+        """
+        before = read.life(task)
+        if life and before and life != before:
+            return True
+        was_away = task in self._lost or (task not in self._seen and not (life and before))
+        return was_away and monotonic_s() - self._relay_at >= REJOIN_S
 
     def _not_any_more(self, task: TaskId, what: str) -> str:
         since = f"{WAS_READY}{wall_time()[11:19]} UTC, {what}"

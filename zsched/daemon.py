@@ -44,6 +44,7 @@ from zsched.daemon_endpoints import Endpoints, endpoints_for, free_port, is_here
 from zsched.daemon_leaving import Leaving
 from zsched.daemon_memory import shared_memory_objection
 from zsched.daemon_sampler import Sampler
+from zsched.daemon_sessions import SessionsRead
 from zsched.errors import AdapterError, ConfigError, NameTakenError
 from zsched.files import write_regular
 from zsched.guard import on_failure
@@ -242,6 +243,7 @@ class Daemon:
         }
         folder = self._options.runtime_dir
         paths: dict[TaskId, Path] = {}
+        sessions_read = SessionsRead(self._options.state_dir)
         for name, spec in mine.items():
             paths[name] = folder / f"{me}-{name}.zenoh.json5"
             config = zenoh_config.worker_config(
@@ -258,7 +260,11 @@ class Daemon:
             except OSError as error:
                 raise AdapterError(f"cannot write {paths[name]}: {error.strerror}; check --runtime-dir") from error
             stack.callback(paths[name].unlink, missing_ok=True)
-        shell.crew.sessions = paths
+            if not spec.command:
+                sessions_read.begin(name, config)
+        if any(not spec.command for spec in mine.values()):
+            sessions_read.save()
+        shell.crew.sessions, shell.crew.sessions_read = paths, sessions_read
         return WorkerSupervisor(
             specs=mine,
             context=WorkerContext(fleet=fleet.name, node=me, incarnation=incarnation),

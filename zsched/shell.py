@@ -303,6 +303,7 @@ class Shell:
     def on_report(self, report: HandleReport) -> None:
         """The relay's handle: most reports are events; what is seen of our own workers goes by the crew."""
         if isinstance(report, RelayStarted):
+            self.crew.on_relay_started()
             return
         if isinstance(report, SlotLost):
             text = f"{report.owner} left {report.samples} samples unacknowledged: at most so many had no result"

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from support.waiting import until
+from zsched import crew as crew_module
 from zsched.adapters.worker_supervisor import WorkerContext, WorkerSupervisor
 from zsched.core import events as ev
 from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
@@ -15,6 +17,8 @@ from zsched.core.model import MAX_REASON, WAS_READY, NodeKind, Tuning, Weights, 
 from zsched.core.plan import ReadyWhen
 from zsched.core.relay_protocol import WorkerMatched, WorkerSeen, WorkerTrouble
 from zsched.crew import OTHERS, Crew
+from zsched.daemon_sessions import SessionsRead
+from zsched.zenoh_config import worker_config
 
 SLEEPER = ("python", "-c", "import time; time.sleep(600)")
 TUNING = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
@@ -137,6 +141,66 @@ def test_who_listens_to_everything_is_told_where_no_process_would_show_the_end(h
     house.match("node", is_certain=False)
     problems = [one.problem for one in house.events if isinstance(one, ev.ProblemReported)]
     assert problems == [OTHERS, None, None]
+
+
+def outdated(house: House) -> list[str]:
+    return [one.reason for one in house.events if isinstance(one, ev.WorkerOutdated)]
+
+
+def reads(house: House, folder: Path, *tasks: str) -> None:
+    """The daemon of before has written another session."""
+    for connect in (("tcp/10.0.0.1:7458",), ("tcp/10.0.0.1:7458", "tcp/10.0.0.2:7458")):
+        read = SessionsRead(folder)
+        for task in tasks:
+            read.begin(task, worker_config(connect=connect))
+        read.save()
+    house.crew.sessions_read = read
+
+
+def test_a_stranger_that_is_there_with_the_relay_runs_since_before(
+    house: House, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reads(house, tmp_path, "others")
+    house.crew.on_relay_started()
+    house.match("others", is_matched=False)  # it dials the new relay only now
+    house.match("others")
+    (told,) = outdated(house)
+    assert told.startswith("seems to run since before its session changed: start it again on edge1 (the task has no")
+    assert told.endswith("it lacks tcp/10.0.0.2:7458")
+    house.match("others", is_matched=False)
+    house.match("others")
+    assert set(outdated(house)) == {told}, "the relay is as young"
+    monkeypatch.setattr(crew_module, "REJOIN_S", 0.0)
+    house.match("others", is_matched=False)
+    house.match("others")
+    assert outdated(house)[-1] == ""
+
+
+def test_a_stranger_that_comes_long_after_the_relay_has_read_the_newest(
+    house: House, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(crew_module, "REJOIN_S", 0.0)
+    reads(house, tmp_path, "others")
+    house.crew.on_relay_started()
+    house.match("others")
+    assert outdated(house) == []
+
+
+def test_the_number_of_its_life_tells_more_than_the_time(
+    house: House, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reads(house, tmp_path, "alone")
+    assert house.crew.sessions_read is not None
+    house.crew.sessions_read.seen("alone", 5, is_new=False)
+    monkeypatch.setattr(crew_module, "REJOIN_S", 0.0)
+    house.crew.on_relay_started()
+    seen = WorkerSeen(node="edge1", task="alone", incarnation="5", is_present=True)
+    house.crew.on_token(seen)
+    (told,) = outdated(house)
+    assert "it lacks tcp/10.0.0.2:7458" in told
+    monkeypatch.setattr(crew_module, "REJOIN_S", 1e9)
+    house.crew.on_token(replace(seen, incarnation="6"))
+    assert outdated(house) == [told, ""]
 
 
 def test_only_the_running_process_complains(house: House) -> None:

@@ -199,6 +199,14 @@ class WorkerTroubled:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class WorkerOutdated:
+    """A worker of this node that somebody else started should be started again, and why; empty: no more."""
+
+    task: TaskId
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class WorkerJobs:
     """A worker of this node says what it has done in this life: to the relay, which hands it on.
 
@@ -364,6 +372,7 @@ Event = (
     | TokenLost
     | WorkerChanged
     | WorkerTroubled
+    | WorkerOutdated
     | WorkerJobs
     | WorkerShown
     | SlotReady

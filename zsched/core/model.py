@@ -347,6 +347,8 @@ class Profile:
     """Which profiles of others the node has, where a task has a deadline (`zsched.core.round_trips`)."""
     runnable: float | None = None
     """Threads that run or wait to run, on the mean: what a task would share a full machine with; ``None``: unknown."""
+    relay: str = ""
+    """What is wrong with its relay (`zsched.core.relay_ends`); at most `MAX_REASON` characters, empty: nothing."""
 
     def __post_init__(self) -> None:
         check_name("profile.node", self.node)
@@ -359,6 +361,8 @@ class Profile:
         check_range("profile.speed", self.speed, MIN_SPEED, MAX_SPEED)
         check_range("profile.cpu_pressure", self.cpu_pressure, 0.0, 1.0)
         check_range("profile.runnable", self.runnable, 0.0, MAX_RUNNABLE)
+        if len(self.relay) > MAX_REASON:
+            raise ValueError(f"profile.relay: {len(self.relay)} characters, at most {MAX_REASON}")
 
     def worker(self, task: TaskId) -> WorkerLoad | None:
         """The load of ``task``'s worker on this node, or ``None`` when the node runs none."""

@@ -47,6 +47,7 @@ from zsched.core.plan import StreamCount
 from zsched.core.probation import Probation
 from zsched.core.profile import Profiler
 from zsched.core.progress import HangWatch
+from zsched.core.relay_ends import RelayEnds
 from zsched.core.round_trips import RoundTrips
 from zsched.core.rounds import Rounds
 from zsched.core.scoring import NO_DOUBTS, Doubts
@@ -115,6 +116,7 @@ class Node:
         self.stream_counts: tuple[StreamCount, ...] = ()
         self.dropped: dict[str, tuple[int, float]] = {}
         """{stream: (how many samples it has dropped, when that last rose)}."""
+        self.relay_ends = RelayEnds()
         self.joins_at: tuple[str, ...] = ()
         """Where applications on this machine join its streams, for the status."""
         self.history: dict[TaskId, deque[PastValue]] = {task.name: deque(maxlen=HISTORY) for task in fleet.tasks}
@@ -471,6 +473,7 @@ class Node:
             progress=progress,
             reasons=self._workers.told(now),
             echoes=self.round_trips.echoes(now),
+            relay=self.relay_ends.told(now),
         )
         if profile is not None:
             if self._has_deadlines:
@@ -666,6 +669,7 @@ class Node:
         self.rounds.absorb_counts(event.counts, now)
 
     def _on_relay(self, event: ev.RelayChanged, now: float) -> None:
+        self.relay_ends.on_changed(event, now)
         self._set_problem("relay", None if event.is_running else f"the relay is down: {event.reason}")
         if not event.is_running:
             self._probation.forget_tokens()
@@ -740,6 +744,7 @@ class Node:
             ev.TokenLost: self._on_token_lost,
             ev.WorkerChanged: self._on_worker,
             ev.WorkerTroubled: self._workers.on_troubled,
+            ev.WorkerOutdated: self._workers.on_outdated,
             ev.WorkerJobs: self._on_jobs,
             ev.WorkerShown: self._on_worker_shown,
             ev.SlotReady: self._on_slot_ready,

@@ -179,6 +179,7 @@ class Profiler:
         progress: tuple[TaskProgress, ...] = (),
         reasons: Mapping[TaskId, str] = NO_REASONS,
         echoes: tuple[Echo, ...] = (),
+        relay: str = "",
     ) -> Profile | None:
         """The profile to send now, or ``None`` when nothing is due.
 
@@ -189,17 +190,18 @@ class Profiler:
             progress: which watched tasks answer this robot.
             reasons: why workers are not ready.
             echoes: which profiles this node has of others; they are no reason to send one.
+            relay: what is wrong with this node's relay.
         """
         is_due = now - self._sent_at >= self._timing.publish_s
-        flags = (is_draining, *states.values(), *reasons.values(), progress)
+        flags = (is_draining, *states.values(), *reasons.values(), progress, bool(relay))
         if not is_due and not self._is_new and flags == self._flags:
             return None  # nothing was measured since the last look
         self._is_new, self._flags = False, flags
         profile = self._current(states, reasons, is_draining=is_draining, now=now)
         if profile is None:
             return None
-        if progress:
-            profile = replace(profile, progress=progress)
+        if progress or relay:
+            profile = replace(profile, progress=progress, relay=relay)
         if not is_due and self._sent is not None and not _differs(profile, self._sent):
             return None
         if echoes:
@@ -321,7 +323,13 @@ def _kinds(profile: Profile) -> tuple[object, ...]:
         (load.task, load.state, bool(load.reason) if load.state is WorkerState.READY else load.reason)
         for load in profile.workers
     ]
-    return profile.draining, workers, profile.progress, [(link.peer, link.source) for link in profile.links]
+    return (
+        profile.draining,
+        workers,
+        profile.progress,
+        bool(profile.relay),
+        [(link.peer, link.source) for link in profile.links],
+    )
 
 
 def _moved(new: float | None, old: float | None, threshold: float) -> bool:

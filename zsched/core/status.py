@@ -22,6 +22,7 @@ from zsched.core.model import Allocation, NodeId, NodeKind, PeerState, TaskId, W
 from zsched.core.namesakes import Namesakes
 from zsched.core.plan import Direction, ReadyWhen, Route, StreamCount
 from zsched.core.register import Register
+from zsched.core.relay_ends import RelayEnds
 from zsched.core.round_trips import RoundTrips
 from zsched.core.rounds import Rounds, TaskRound
 from zsched.core.scoring import joined, majority
@@ -83,6 +84,7 @@ class NodeView(Protocol):
     knocking: Knocking
     stream_counts: tuple[StreamCount, ...]
     dropped: dict[str, tuple[int, float]]
+    relay_ends: RelayEnds
     joins_at: tuple[str, ...]
     history: dict[TaskId, deque[PastValue]]
 
@@ -105,7 +107,12 @@ def build_snapshot(node: NodeView, now: float) -> Snapshot:
         fleet_file=node.fleet_file,
         joins_at=node.joins_at,
         counters=tuple(sorted((node.counters + node.agreement.counters).items())),
-        problems=(*node.namesakes.problems(now), *_problems(node, quorum), *node.knocking.problems(now)),
+        problems=(
+            *node.namesakes.problems(now),
+            *_problems(node, quorum),
+            *_relay_problems(node, now),
+            *node.knocking.problems(now),
+        ),
     )
 
 
@@ -144,6 +151,21 @@ def _problems(node: NodeView, quorum: QuorumStatus) -> tuple[str, ...]:
     if not node.has_state and not node.has_foreign_state:
         problems.append("no valid state file: this node is no elector (see `zsched init --help`)")
     return tuple(problems)
+
+
+def _relay_problems(node: NodeView, now: float) -> Iterator[str]:
+    """Relays that do not stay: their robots' streams pause each time, whatever the tasks look like from here."""
+    for name in node.membership.states():
+        told = _relay_told(node, name, now)
+        if told and not (name == node.me and "relay" in node.problems):
+            yield f"the relay of {name} {told}; its streams rest meanwhile: look at the log of zsched on {name}"
+
+
+def _relay_told(node: NodeView, name: NodeId, now: float) -> str:
+    if name == node.me:
+        return node.relay_ends.told(now)
+    data = node.gateway.newest(name, now)
+    return "" if data is None or node.membership.state(name) is not PeerState.ALIVE else data.profile.relay
 
 
 def _has_lost_state(node: NodeView, name: NodeId) -> bool:

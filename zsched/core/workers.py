@@ -36,6 +36,8 @@ class Workers:
     reasons: dict[TaskId, str] = field(default_factory=dict)
     _troubles: dict[TaskId, tuple[str, float]] = field(default_factory=dict)
     """{task: (what a worker that is ready complains of, since when it has not again)}."""
+    _outdated: dict[TaskId, str] = field(default_factory=dict)
+    """{task: why a worker that is ready should be started again}."""
 
     @classmethod
     def of(cls, fleet: Fleet, me: NodeId) -> Workers:
@@ -65,9 +67,17 @@ class Workers:
             times = "once" if event.count == 1 else f"{event.count} times"
             self._troubles[event.task] = (f"callback raised {times}: {event.text}"[:MAX_REASON], now)
 
+    def on_outdated(self, event: ev.WorkerOutdated, _now: float) -> None:
+        """A worker that somebody else started should be started again, or has been."""
+        if event.reason and event.task in self.states:
+            self._outdated[event.task] = event.reason[:MAX_REASON]
+        else:
+            self._outdated.pop(event.task, None)
+
     def told(self, now: float) -> Mapping[TaskId, str]:
         """{task: why its worker is not ready, or what is wrong with it though it is}."""
-        if not self._troubles:
+        if not self._troubles and not self._outdated:
             return self.reasons
         self._troubles = {task: one for task, one in self._troubles.items() if now - one[1] <= TROUBLE_S}
-        return {**{task: text for task, (text, _) in self._troubles.items()}, **self.reasons}
+        outdated = {task: text for task, text in self._outdated.items() if self.states[task] is WorkerState.READY}
+        return {**outdated, **{task: text for task, (text, _) in self._troubles.items()}, **self.reasons}

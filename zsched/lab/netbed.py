@@ -223,20 +223,22 @@ class Netbed(Testbed):
         hz: float = 50.0,
         size: int = 0,
         burst: int = 1,
+        has_one_stamp: bool = False,
         blocks: bool = False,
         watch: Sequence[str] = (),
         timing: Timing | None = None,
     ) -> Probe:
         """An application on ``node``: a client of its data endpoint; ended with the bed.
 
-        It puts ``hz`` messages a second, ``burst`` of them at once. ``blocks``: it waits where there is no room, and
-        drops nothing.
+        It puts ``hz`` messages a second, ``burst`` of them at once, and ``has_one_stamp``: those under one timestamp.
+        ``blocks``: it waits where there is no room, and drops nothing.
         """
         endpoints = (self._data_endpoint(node),)
         config = zenoh_config.client_config(connect=endpoints, timing=timing or self.fleet.timing)
         watched = [word for key in watch for word in ("--watch", key)]
         command = [*PROBE, config, "--put", put, "--hz", str(hz), "--size", str(size), *watched]
         command += ["--burst", str(burst), *(["--block"] if blocks else [])]
+        command += ["--one-stamp"] if has_one_stamp else []
         with (self.folder / f"probe-{node}.log").open("ab") as log:
             probe = Probe(self.network.wrap(node, command), log)
         self._probes.append(probe)

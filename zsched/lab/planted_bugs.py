@@ -54,6 +54,7 @@ _LEASE = ("tests/sim/test_lease_rules.py", "tests/sim/test_exclusive.py")
 _GENERATIONS = ("tests/sim/test_generations.py",)
 _BEAT_ROOM = ("tests/unit/core/test_beat_room.py",)
 _NAMESAKES = ("tests/unit/core/test_namesakes.py",)
+_TWINS = ("tests/unit/core/test_twins.py",)
 _WITNESS = ("tests/unit/core/test_witness.py",)
 _RESTORED = ("tests/sim/test_restored_state.py",)
 _ROLLOUT = ("tests/sim/test_exclusive_rollout.py",)
@@ -596,6 +597,34 @@ MEMBERSHIP_BUGS = (
     _bug("a put teaches an allocation", AGREEMENT, "if not event.is_answer:", "if False:", _AGREEMENT),
     _bug("any answer is believed", AGREEMENT, "elif is_proven(", "elif True or is_proven(", _AGREEMENT),
     _bug("beats alone dispute a name", IDENTITY, " if beat.incarnation in self._tokens else Verdict.TWIN", "", _NODE),
+    _bug(
+        "of twins the older one leaves",
+        IDENTITY,
+        "(my_sequence, -self.incarnation) < (sequence, -incarnation)",
+        "(my_sequence, -self.incarnation) > (sequence, -incarnation)",
+        _TWINS,
+    ),
+    _bug(
+        "an echo that does not rise is a twin",
+        IDENTITY,
+        "if sequence <= self._twin[1]:",
+        "if sequence < self._twin[1]:",
+        _TWINS,
+    ),
+    _bug(
+        "one answer of a peer proves a twin",
+        IDENTITY,
+        "return verdict if is_lasting else Verdict.TWIN",
+        "return verdict",
+        _TWINS,
+    ),
+    _bug(
+        "a twin that has left disputes the name of who stood still meanwhile",
+        IDENTITY,
+        "min(now - self._twin[2], lived_s) >= STAYS_S",
+        "now - self._twin[2] >= STAYS_S",
+        _TWINS,
+    ),
     _bug(
         "the first node heard after a cut speaks for nobody",
         MEMBERSHIP,

@@ -18,6 +18,7 @@ _ACKS = ("tests/unit/test_hop_acks.py",)
 _LANES = ("tests/unit/test_relay_lanes.py",)
 _WORKER = "tests/parts/test_worker.py"
 _FROZEN = "tests/integration/test_relay_frozen_moves.py"
+_REPLAY = "tests/integration/test_relay_replay.py"
 _CHAOS = "tests/system/test_chaos_streams.py"
 _RELAY_STREAMS = "tests/integration/test_relay_streams.py"
 
@@ -351,5 +352,40 @@ STREAM_BUGS = (
         "first = self.spare[0] if self.spare else self.kept[0] if self.kept else None",
         "first = self.kept[0] if self.kept else None",
         (*_LANES, *_GREETINGS),
+    ),
+    _bug(
+        "a timestamp that several samples have proves one of them done",
+        "zsched.relay.proofs",
+        "return self._alone.get(stamp, False)",
+        "return stamp in self._alone",
+        ("tests/unit/test_relay_proofs.py",),
+    ),
+    _bug(
+        "a timestamp that was forgotten is alone when it comes again",
+        "zsched.relay.proofs",
+        "if self._floor is not None and not self._floor < stamp:",
+        "if self._floor is not None and False:",
+        ("tests/unit/test_relay_proofs.py",),
+    ),
+    _bug(
+        "nobody asks whether a timestamp is one sample's",
+        "zsched.relay.task",
+        "is_proof and self._stamps.is_alone(stamp) and",
+        "is_proof and",
+        (f"{_REPLAY}::test_a_timestamp_that_several_samples_have_proves_none_of_them_done",),
+    ),
+    _bug(
+        "beats in turn wait for a loop that does not come",
+        "zsched.adapters.control_bus",
+        "zenoh.handlers.RingChannel(RING)",
+        "zenoh.handlers.FifoChannel(RING)",
+        ("tests/parts/adapters/test_control_bus.py",),
+    ),
+    _bug(
+        "a relay that does not stay is its own node's secret",
+        "zsched.core.profile",
+        "profile = replace(profile, progress=progress, relay=relay)",
+        "profile = replace(profile, progress=progress)",
+        ("tests/unit/core/test_node.py",),
     ),
 )

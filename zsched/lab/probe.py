@@ -34,6 +34,7 @@ def main() -> int:
     parser.add_argument("--hz", type=float, default=50.0)
     parser.add_argument("--size", type=int, default=0, help="pad messages to so many bytes")
     parser.add_argument("--burst", type=int, default=1, help="put so many at once, and wait for as many turns")
+    parser.add_argument("--one-stamp", action="store_true", help="give what is put at once one zenoh timestamp")
     parser.add_argument("--block", action="store_true", help="wait for room, drop nothing")
     parser.add_argument("--watch", action="append", default=[])
     given = parser.parse_args()
@@ -87,9 +88,10 @@ def _send(session: zenoh.Session, given: argparse.Namespace, stop: threading.Eve
     while not stop.wait(given.burst / given.hz):
         if publisher is None:
             continue
+        stamp = session.new_timestamp() if given.one_stamp else None
         for _ in range(given.burst):
             message = f"{number:010d} {monotonic_s():.6f}"
-            publisher.put(message.ljust(given.size).encode() if given.size else message.encode())
+            publisher.put(message.ljust(given.size).encode(), timestamp=stamp)
             number += 1
 
 

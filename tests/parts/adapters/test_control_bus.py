@@ -14,7 +14,7 @@ import zenoh
 from support.waiting import free_endpoint, until
 from zsched import wire
 from zsched.adapters import control_bus, open_questions
-from zsched.adapters.control_bus import ControlBus
+from zsched.adapters.control_bus import RING, ControlBus
 from zsched.adapters.open_questions import Questions
 from zsched.core import events as ev
 from zsched.core.fleet import Timing
@@ -182,6 +182,34 @@ def test_what_comes_in_turn_waits_until_the_loop_asks_and_news_do_not() -> None:
         a.bus.close()
         b.bus.close()
     assert list(b.bus.waiting()) == []
+
+
+def test_a_loop_that_does_not_come_costs_the_oldest_in_turn_and_holds_no_news_up() -> None:
+    """More than the ring holds come; zenoh's thread waits for nobody."""
+    hub = free_endpoint()
+    a, b = Peer("a", hub, None), Peer("b", free_endpoint(), hub, hears_all_beats_at_once=False)
+    try:
+        a.bus.open()
+        b.bus.open()
+        until(lambda: a.sees("b") and b.sees("a"), "each other's tokens")
+        newest = RING + 300
+        for number in range(newest + 1):
+            a.bus.publish("beat_in_turn", replace(BEAT, sequence=number))
+            if number % 50 == 0:
+                time.sleep(0.02)  # the sender drops what has no room at its link
+        a.bus.publish("beat", replace(BEAT, sequence=10_000))
+        assert b.next(ev.BeatReceived).beat.sequence == 10_000
+        kept: list[int] = []
+
+        def has_newest() -> bool:
+            kept.extend(event.beat.sequence for event in b.bus.waiting() if isinstance(event, ev.BeatReceived))
+            return newest in kept
+
+        until(has_newest, "the newest beat in turn")
+        assert kept == sorted(kept)
+    finally:
+        a.bus.close()
+        b.bus.close()
 
 
 def test_edges_are_not_asked_for_utilities_and_answer_everything_else() -> None:

@@ -414,6 +414,42 @@ def test_relay_that_is_down_is_a_problem_until_it_is_up() -> None:
     assert node.counters["relay_exits"] == 1
 
 
+def test_a_relay_that_keeps_ending_is_a_problem_on_every_node() -> None:
+    robot1, robot2 = started("robot1"), started("robot2")
+
+    def told(at: float) -> set[str]:
+        """What is heard of robot2 in time, and then shown by both."""
+        for published in of(robot2.handle(ev.DeadlineReached(), at), do.PublishProfile):
+            robot1.handle(ev.ProfileReceived(profile=published.profile), at)
+        robot2.handle(ev.BeatReceived(beat=beat("robot1", round(at))), at)
+        robot1.handle(ev.BeatReceived(beat=beat("robot2", round(at))), at)
+        shown = {tuple(one for one in build_snapshot(node, at).problems if "relay" in one) for node in (robot1, robot2)}
+        assert len(shown) == 1
+        return set(shown.pop())
+
+    for at in (101.0, 102.0, 103.0):
+        assert told(at) == set()
+        robot2.handle(ev.RelayChanged(is_running=False, reason="exit code -9"), at)
+        robot2.handle(ev.RelayChanged(is_running=True), at + 0.1)
+    why = (
+        "has ended 3 times in 60 s, last: exit code -9; its streams rest meanwhile: look at the log of zsched on robot2"
+    )
+    assert told(104.0) == {f"the relay of robot2 {why}"}
+    assert told(162.0) == set()
+
+
+def test_a_problem_of_a_relay_is_sent_at_once_and_not_said_of_a_node_that_is_not_there() -> None:
+    robot1, robot2 = started("robot1"), started("robot2")
+    down = ev.RelayChanged(is_running=False, reason="exit code -9")
+    assert not of((*robot2.handle(down, 100.1), *robot2.handle(down, 100.1)), do.PublishProfile)
+    (published,) = of(robot2.handle(down, 100.1), do.PublishProfile)
+    assert published.is_news
+    robot1.handle(ev.ProfileReceived(profile=published.profile), 100.1)
+    assert len(build_snapshot(robot1, 100.1).problems) == 1
+    robot1.handle(ev.DeadlineReached(), 120.0)
+    assert not [one for one in build_snapshot(robot1, 120.0).problems if "relay" in one]
+
+
 def test_a_relay_that_has_gone_leaves_every_slot_to_be_taken_again() -> None:
     node = started(learnt=value(1, "edge1"))
     for event in (ev.SlotReady(task="merge", epoch=1), ev.SlotFlipped(task="merge", epoch=1)):

@@ -278,6 +278,8 @@ class Storm:
     def worker(self) -> ev.Event:
         if self.rng.random() < 0.2:
             return ev.WorkerTroubled(task=self.task(), count=self.number(), text="x" * self.rng.choice((0, 3, 400)))
+        if self.rng.random() < 0.1:
+            return ev.WorkerOutdated(task=self.task(), reason=self.rng.choice(("", "it lacks x", "x" * 400)))
         if self.rng.random() < 0.3:
             at_s, time_s, cpu_s, wait_s = (self.rng.choice((0.0, 0.5, 3.0, 1e6)) for _ in range(4))
             return ev.WorkerJobs(

@@ -39,3 +39,18 @@ def test_an_unknown_task_is_nobody_s_worker() -> None:
     assert workers.on_changed(changed(WorkerState.READY)) is None
     workers.on_troubled(ev.WorkerTroubled(task="merge", count=1, text="x"), 0.0)
     assert (workers.states, workers.told(0.0)) == ({}, {})
+
+
+def test_a_worker_that_should_be_started_again_is_told_of_while_it_is_ready() -> None:
+    workers = Workers(states={"merge": WorkerState.READY})
+    workers.on_outdated(ev.WorkerOutdated(task="merge", reason="x" * 300), 0.0)
+    workers.on_outdated(ev.WorkerOutdated(task="other", reason="not ours"), 0.0)
+    assert workers.told(0.0) == {"merge": "x" * MAX_REASON}
+    workers.on_troubled(ev.WorkerTroubled(task="merge", count=1, text="ValueError"), 0.0)
+    assert workers.told(0.0) == {"merge": "callback raised once: ValueError"}, "which is the worse"
+    assert workers.told(TROUBLE_S + 0.1) == {"merge": "x" * MAX_REASON}
+    workers.on_changed(ev.WorkerChanged(task="merge", state=WorkerState.STOPPED, reason="gone"))
+    assert workers.told(100.0) == {"merge": "gone"}
+    workers.on_changed(ev.WorkerChanged(task="merge", state=WorkerState.READY))
+    workers.on_outdated(ev.WorkerOutdated(task="merge", reason=""), 100.0)
+    assert workers.told(100.0) == {}
