@@ -142,7 +142,11 @@ class Demands:
         need, free = found.work / speed, profile.cpu_cores - others
         most = job.most_cores(speed)
         foreseen = min(free / need, 1.0 if most is None else most / need, 1.0)
-        share = 1.0 if foreseen <= 0.0 or not _is_told(load) else min(load.cpu_cores / need / foreseen, 1.0)
+        share = (
+            1.0
+            if foreseen <= 0.0 or not (_is_told(load) and is_short(load))
+            else min(load.cpu_cores / need / foreseen, 1.0)
+        )
         age_s = jobs.time_s if jobs.age_s is None else jobs.age_s
         stretch = max(age_s / max(job.age_s(speed, free), 1e-9), 1.0)
         before = self._shortfalls.pop((task, profile.node), None)
@@ -178,6 +182,16 @@ class Demands:
 
 def _others_cores(task: TaskId, profile: Profile, used_cores: float) -> float:
     return max(used_cores - profile.cores_of(task), 0.0)
+
+
+def is_short(load: WorkerLoad) -> bool:
+    """Whether the worker is seen to want more than it gets; one that has nothing to do uses little and lacks nothing.
+
+    Its threads always want to run and run for less, or it leaves work undone.
+    """
+    jobs, use = load.jobs, load.cpu_cores or 0.0
+    is_hungry = load.wanted_cores is not None and use < SHORT_RATIO * load.wanted_cores
+    return is_hungry or (jobs is not None and jobs.done_hz < SHORT_RATIO * jobs.wanted_hz)
 
 
 def _is_told(load: WorkerLoad) -> bool:

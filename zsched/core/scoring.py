@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 
-from zsched.core.demand import Demands, speed_of
+from zsched.core.demand import Demands, is_short, speed_of
 from zsched.core.fleet import Demand, Reach, Standby, TaskSpec
 from zsched.core.gateway import Gateway
 from zsched.core.links import pair_link
@@ -141,9 +141,11 @@ def score(
             unreachable.append(candidate)
             continue
         network_s = round_trips.get(candidate, 0.0)
+        load = profile.worker(spec.name)
         # what an owner that is short gets is measured
-        is_owner = candidate == allocation.owner
-        least = 0.0 if is_owner else gateway.share(spec, profile, demand.cpu_cores, unseen.cpu_cores)
+        is_measured = candidate == allocation.owner and load is not None and is_short(load)
+        share = 0.0 if is_measured else gateway.share(spec, profile, demand.cpu_cores, unseen.cpu_cores)
+        least = min(share, demand.cpu_cores)
         cpu = _cpu(spec, profile, demand, unseen, allocation.tuning, gateway.demands, network_s, least)
         memory = _memory(spec, profile, demand, unseen, form)
         terms[candidate] = _Terms(cpu, memory, None if link is None else link.utility)

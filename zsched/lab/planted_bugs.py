@@ -755,6 +755,13 @@ VOTE_BUGS = (
         (*_SCHEDULER, "tests/sim/test_vote_rules.py"),
     ),
     _bug(
+        "an owner without work gives the task nothing",
+        SCORING,
+        "load is not None and is_short(load)",
+        "load is not None",
+        ("tests/unit/core/test_closed_loop.py",),
+    ),
+    _bug(
         "median and mean swapped",
         SCORING,
         "if allocation.tuning.aggregate is Aggregate.MEAN",

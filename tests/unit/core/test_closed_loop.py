@@ -79,13 +79,15 @@ class Machine:
     """The task gets no more there, though the machine's figures say that more is free."""
     threads: float | None = None
     """Of others, that want to run; ``None``: nobody counts."""
+    works_until: float = math.inf
+    """From then on its worker has nothing to do."""
 
     def sample(self, now: float, rng: Random, *, is_owner: bool) -> tuple[DeviceSample, LinkSample]:
         step = self.step(now)
         cpu, memory = (self.base + step + rng.uniform(-self.noise, self.noise) for _ in range(2))
         rest = max(cpu, 0.0) * self.cores
         # A full machine gives the task what is left, half a core at least.
-        needs = self.task_cores / self.speed if is_owner else 0.0
+        needs = self.task_cores / self.speed if is_owner and now < self.works_until else 0.0
         takes = min(needs, max(self.cores - rest, 0.5), self.most_cores)
         holds = self.task_mb if is_owner else 0.0
         load = WorkerLoad(
@@ -437,13 +439,13 @@ CPU_ONLY = Weights(cpu=1.0, memory=0.0, network=0.0)
 @st.composite
 def constant_machines(draw: st.DrawFn) -> tuple[Machine, ...]:
     """Two or three machines of whatever size, speed and load, and a task that may be too large for all of them."""
-    task_cores = draw(st.floats(0.1, 8.0))
+    task_cores = draw(st.one_of(st.floats(0.001, 0.1), st.floats(0.1, 8.0)))
     return tuple(
         Machine(
             name=f"edge{number}",
             cores=draw(st.sampled_from((1.0, 2.0, 4.0, 8.0))),
             speed=draw(st.floats(0.25, 4.0)),
-            base=draw(st.floats(0.0, 0.9)),
+            base=draw(st.floats(0.0, 1.1)),
             task_cores=task_cores,
             task_mb=draw(st.sampled_from((100.0, 800.0))),
             threads=draw(st.one_of(st.none(), st.floats(0.0, 20.0))),
@@ -473,6 +475,33 @@ def test_where_nothing_changes_a_task_scored_by_service_comes_to_rest(
     """
     loop = Loop(machines, weights=weights, tuning=BY_SERVICE, learns=True)
     assert len(loop.run(300.0)) <= len(machines)
+
+
+FULL = tuple(Machine(name=name, cores=2.0, base=1.0, threads=4.0, task_cores=0.3) for name in ("edge1", "edge2"))
+
+
+@settings(derandomize=True, database=None, deadline=None, max_examples=20)
+@example(machines=FULL, job_s=None)
+@given(machines=constant_machines(), job_s=st.one_of(st.none(), st.floats(0.001, 0.2)))
+def test_a_task_that_has_nothing_to_do_any_more_comes_to_rest(
+    machines: tuple[Machine, ...], job_s: float | None
+) -> None:
+    """What it used when it had is still its need; that it uses nothing now is no lack."""
+    for machine in machines:
+        machine.works_until, machine.job_s = 30.0, job_s
+    loop = Loop(machines, weights=CPU_ONLY, tuning=BY_SERVICE, learns=True)
+    assert len([at for at, _ in loop.run(240.0) if at > 30.0]) <= len(machines)
+
+
+@pytest.mark.parametrize("works_until", [20.0, math.inf])
+@pytest.mark.parametrize("task_cores", [0.005, 0.3])
+@pytest.mark.parametrize("job_s", [None, 0.001])
+def test_a_task_that_lacks_nothing_stays_where_all_machines_are_full(
+    works_until: float, task_cores: float, job_s: float | None
+) -> None:
+    """Each of them would give it a fair share of much; so does its owner, which shows only what it uses."""
+    machines = tuple(replace(one, task_cores=task_cores, works_until=works_until, job_s=job_s) for one in FULL)
+    assert Loop(machines, weights=CPU_ONLY, tuning=BY_SERVICE, learns=True).run(90.0) == []
 
 
 BY_LATENCY = replace(BY_SERVICE, deadline_ms=150.0)
