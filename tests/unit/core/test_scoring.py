@@ -129,8 +129,8 @@ def test_machines_that_lack_what_the_task_needs_are_told_apart_by_the_service_fo
     assert found[ScoreForm.SERVICE]["edge1"] < found[ScoreForm.SERVICE]["edge2"] / 4
 
 
-def test_a_full_machine_is_worth_the_fair_share_of_it_to_all_but_its_owner() -> None:
-    """Four threads wait beside the task's two; what the owner gets is measured, and was not much."""
+def test_a_full_machine_is_worth_the_fair_share_of_it_to_all_but_an_owner_that_lacks_cpu() -> None:
+    """Four threads wait beside the task's two; what such an owner gives is measured, and was not much."""
     spec = replace(SPEC, candidates=("edge1", "edge2"), demand=Demand(cpu_cores=2.0))
     agreed = Allocation(
         task="merge", revision=7, epoch=3, owner="edge1", tuning=Tuning(weights=CPU, score=ScoreForm.SERVICE)
@@ -143,7 +143,10 @@ def test_a_full_machine_is_worth_the_fair_share_of_it_to_all_but_its_owner() -> 
     untold = values(scored(ROBOT, *(replace(one, runnable=None) for one in full), spec=spec, agreed=agreed))
     assert told["edge2"] == pytest.approx(service_utility(4.0 * 2 / 6, 2.0, 4.0))
     assert untold["edge2"] == pytest.approx(0.0)
-    assert told["edge1"] == untold["edge1"] == pytest.approx(service_utility(0.2, 2.0, 4.0))
+    assert told["edge1"] == told["edge2"], "it uses little, and nobody says that it wants more"
+    hungry = tuple(replace(load, wanted_cores=2.0) for load in full[0].workers)
+    short = values(scored(ROBOT, replace(full[0], workers=hungry), full[1], spec=spec, agreed=agreed))
+    assert short["edge1"] == untold["edge1"] == pytest.approx(service_utility(0.2, 2.0, 4.0))
 
 
 def test_a_task_that_has_its_memory_counts_a_full_machine_less_and_not_for_nothing() -> None:
