@@ -59,6 +59,19 @@ def test_the_same_again_is_no_news() -> None:
     assert not shares.learn("merge", profile(got=0.5, wanted=4.0))
 
 
+def test_what_it_got_counts_as_a_part_of_what_as_many_threads_would_get_by_fairness() -> None:
+    shares = Shares()
+    shares.learn("merge", profile(got=0.25, wanted=0.95))
+    assert shares.at("merge", profile(node="edge2"), 0.25) == pytest.approx(4.0 / 9), "one thread, never less"
+    assert shares.at("merge", profile(), 0.25) == pytest.approx(4.0 / 9 / 2), "beside seven others half a core is fair"
+    shares.learn("merge", profile(runnable=2.0, got=2.0, wanted=4.0))
+    assert shares.at("merge", profile(runnable=0.0), 0.25) == pytest.approx(2.0), "the machine is the task's alone"
+
+
+def test_nothing_is_learnt_of_a_worker_whose_use_nobody_measured() -> None:
+    assert not Shares().learn("merge", profile(got=None, wanted=3.0))
+
+
 @given(st.floats(0.1, 4096.0), st.floats(1.0, 1e4), st.floats(0.0, 1e6), st.floats(0.0, 1e3))
 def test_a_share_is_no_more_than_there_is_or_than_the_threads_can_use_and_falls_with_the_others(
     capacity: float, threads: float, others: float, more: float
