@@ -17,7 +17,7 @@ import pytest
 
 from zsched.cli_page import Page, cut, memory, size, span
 from zsched.cli_report import degradations, printable, render_status
-from zsched.core.model import Link, LinkSource, Tuning, Utility, Weights, WorkerLoad, WorkerState
+from zsched.core.model import WAS_READY, Link, LinkSource, Tuning, Utility, Weights, WorkerLoad, WorkerState
 from zsched.core.plan import StreamCount
 from zsched.core.snapshot import (
     DecisionStatus,
@@ -207,6 +207,27 @@ def test_bonus_and_penalty_stand_beside_the_candidate_they_change() -> None:
     lines = {line.split()[0]: line for line in render_status(status, 100, color=False).splitlines()[12:] if line}
     assert lines["edge1"].endswith("owner +0.1")
     assert lines["edge2"].endswith("penalty -0.05")
+
+
+@pytest.mark.parametrize(
+    ("reason", "said"),
+    [
+        ("pid 7", "starting"),
+        (f"{WAS_READY}12:00:00 UTC, its token went: it may hang", "was ready"),
+        ("restarting (failure 1 of 3): killed by signal 9 (Killed); now it is pid 8", "restarting"),
+    ],
+)
+def test_a_worker_that_was_ready_is_starting_in_no_row(reason: str, said: str) -> None:
+    status = recorded("healthy")
+    status["nodes"][0]["workers"][0].update(state="starting", reason=reason)
+    name = status["nodes"][0]["name"]
+    for width in (80, 120):
+        rows = [line for line in render_status(status, width, color=False).splitlines() if line.startswith(name)]
+        assert said in rows[0]
+        assert ("starting" in rows[0].split()) is (said == "starting")
+    status["nodes"][0]["workers"].append({**status["nodes"][0]["workers"][0], "task": "slam"})
+    status["tasks"].append({**copy.deepcopy(status["tasks"][0]), "name": "slam", "streams": []})
+    assert f"echo {said}, slam {said}" in render_status(status, 140, color=False)
 
 
 def test_several_tasks_and_workers_are_told_apart() -> None:
