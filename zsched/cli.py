@@ -243,6 +243,7 @@ def retry(
         str | None, typer.Argument(metavar="[NODE]", help="Whose failures are forgotten; without it everybody's.")
     ] = None,
     json_: JsonOption = False,
+    node: AskedOption = None,
     runtime_dir: RuntimeOption = None,
 ) -> None:
     """Forget a task's failures: a failed worker is started again, and nodes pay no penalty any more.
@@ -252,7 +253,7 @@ def retry(
     from zsched.cli_ask import find_door  # noqa: PLC0415 - each verb imports what it needs
     from zsched.cli_retry import retry as ask_all  # noqa: PLC0415 - as above
 
-    raise typer.Exit(ask_all(find_door(runtime_dir, None), task, whose, is_json=json_))
+    raise typer.Exit(ask_all(find_door(runtime_dir, node), task, whose, is_json=json_))
 
 
 # --- the fleet file --------------------------------------------------------------------------------------------------
