@@ -21,6 +21,8 @@ TROUBLES = "PROBLEMS"
 """The title of the last block, which a low window keeps."""
 MOST, LITTLE = 0.98, 0.8
 """From here on nearly all jobs are done; below that, many are not."""
+JOBS_OVER_S = 10.0
+"""What a profile says of jobs that is so old is history, too."""
 DROPS_OVER_S = 60.0
 """Drops that have not risen for so long are history."""
 STATE_STYLES = {"alive": "green", "ready": "green"} | dict.fromkeys(
@@ -235,12 +237,13 @@ def _task(page: Page, status: Json, task: Json) -> None:
 
 
 def _work(page: Page, status: Json, task: Json) -> None:
-    """What workers say of their jobs, the owner's first; nothing where none does."""
+    """What workers say of their jobs, the owner's first; nothing where none does, or the one that did does not now."""
     nodes = sorted(status["nodes"], key=lambda node: (node["name"] != task["owner"], node["name"]))
     told = [
         (node, worker["jobs"])
         for node in nodes
         for worker in node["workers"]
+        if node["state"] == "alive" and (node["age_s"] or 0.0) <= JOBS_OVER_S and worker["state"] == "ready"
         if worker["task"] == task["name"] and worker.get("jobs")  # a later field of the schema's major version
     ]
     deadline_ms = task["tuning"].get("deadline_ms")

@@ -376,6 +376,28 @@ def test_speed_of_the_cores_what_a_starved_worker_wants_and_the_score_are_shown_
     assert "paper's score" not in render_status(recorded("healthy"), 120, color=False)
 
 
+@pytest.mark.parametrize(
+    ("of_node", "of_worker", "is_shown"),
+    [
+        ({}, {}, True),
+        ({"state": "gone", "age_s": 15.0}, {}, False),
+        ({"state": "suspect"}, {}, False),
+        ({"age_s": 15.0}, {}, False),
+        ({}, {"state": "starting", "reason": f"{WAS_READY}12:00:00 UTC, its token went"}, False),
+        ({}, {"state": "stopped", "reason": "killed by signal 9 (Killed)"}, False),
+    ],
+)
+def test_jobs_of_who_does_none_any_more_are_not_shown(
+    of_node: dict[str, Any], of_worker: dict[str, Any], *, is_shown: bool
+) -> None:
+    status = recorded("healthy")
+    node = status["nodes"][0]
+    node.update(of_node)
+    jobs = {"time_s": 0.02, "cpu_s": 0.01, "done_hz": 47.5, "wanted_hz": 47.5, "backlog": 0}
+    node["workers"][0].update(jobs=jobs, **of_worker)
+    assert ("47.5 of 47.5 a second" in render_status(status, 120, color=False)) is is_shown
+
+
 def test_what_a_worker_says_of_its_jobs_is_shown_with_the_deadline_and_what_misses_it() -> None:
     status = recorded("healthy")
     (task, *_) = status["tasks"]
