@@ -243,6 +243,7 @@ def retry(
         str | None, typer.Argument(metavar="[NODE]", help="Whose failures are forgotten; without it everybody's.")
     ] = None,
     json_: JsonOption = False,
+    node: AskedOption = None,
     runtime_dir: RuntimeOption = None,
 ) -> None:
     """Forget a task's failures: a failed worker is started again, and nodes pay no penalty any more.
@@ -252,7 +253,7 @@ def retry(
     from zsched.cli_ask import find_door  # noqa: PLC0415 - each verb imports what it needs
     from zsched.cli_retry import retry as ask_all  # noqa: PLC0415 - as above
 
-    raise typer.Exit(ask_all(find_door(runtime_dir, None), task, whose, is_json=json_))
+    raise typer.Exit(ask_all(find_door(runtime_dir, node), task, whose, is_json=json_))
 
 
 # --- the fleet file --------------------------------------------------------------------------------------------------
@@ -271,10 +272,12 @@ def check(
     from zsched import places  # noqa: PLC0415 - each verb imports what it needs
     from zsched.cli_rules import told  # noqa: PLC0415 - as above
     from zsched.config import check_file  # noqa: PLC0415 - ruamel.yaml is slow to import
+    from zsched.core.fleet import fleet_hash  # noqa: PLC0415 - as above
 
     result = check_file(places.config_path(file or config, os.environ))
     fleet = result.fleet
     counts: Json | None = None
+    digest = None if fleet is None else fleet_hash(fleet)
     if fleet is not None:
         counts = {"nodes": len(fleet.nodes), "tasks": len(fleet.tasks), "electors": len(fleet.electors)}
     if json_:
@@ -282,13 +285,15 @@ def check(
         keys = ("line", "col", "message", "hint", "source_line")
         found = {name: [{key: getattr(fault, key) for key in keys} for fault in items] for name, items in lists.items()}
         named = None if fleet is None else {"name": fleet.name, **(counts or {})}
-        print_json({"schema": "zsched.check/1", "file": result.file, "ok": fleet is not None, "fleet": named, **found})
+        body = {"schema": "zsched.check/1", "file": result.file, "ok": fleet is not None, "hash": digest}
+        print_json({**body, "fleet": named, **found})
     elif report := result.report():
         _say(report)
     if counts is None:
         raise typer.Exit(EXIT_CONFIG)
     if not json_:
         typer.echo("ok: " + ", ".join(_count(number, noun) for noun, number in counts.items()))
+        typer.echo(f"hash: {digest} (nodes whose files have another one say so in `zsched status`)")
     for spec in fleet.tasks if fleet is not None and not json_ else ():
         first, *more = told(spec)
         typer.echo("\n".join((first, *(f"  {line}" for line in more))))

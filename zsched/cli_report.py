@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from zsched.cli_page import Cell, Page, cut, memory, size, span
-from zsched.core.model import WAS_READY, WorkerState, told_of_worker
+from zsched.core.model import RESTARTING, WAS_READY, WorkerState, told_of_worker
 
 Json = dict[str, Any]
 
@@ -21,10 +21,12 @@ TROUBLES = "PROBLEMS"
 """The title of the last block, which a low window keeps."""
 MOST, LITTLE = 0.98, 0.8
 """From here on nearly all jobs are done; below that, many are not."""
+JOBS_OVER_S = 10.0
+"""What a profile says of jobs that is so old is history, too."""
 DROPS_OVER_S = 60.0
 """Drops that have not risen for so long are history."""
 STATE_STYLES = {"alive": "green", "ready": "green"} | dict.fromkeys(
-    ("draining", "starting", "stopped", "suspect", "unknown"), "yellow"
+    ("draining", "starting", RESTARTING, "stopped", "suspect", "unknown"), "yellow"
 )
 """All others are red."""
 
@@ -180,18 +182,29 @@ def _workers(workers: Sequence[Json], room: int, *, is_single: bool) -> Cell:
     """The workers' states, with as much beside as there is room for."""
     if not workers:
         return "-", "dim"
-    states = [worker["state"] for worker in workers]
+    states = [_worker_state(worker) for worker in workers]
     styles = [STATE_STYLES.get(state, "red") for state in states]
     style = next((style for style in ("red", "yellow") if style in styles), "green")
-    full = ", ".join(f"{worker['task']} {worker['state']}" for worker in workers)
+    full = ", ".join(f"{worker['task']} {state}" for worker, state in zip(workers, states, strict=True))
     short = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(states))
     if is_single:
         (worker,) = workers[:1]
         wants = "" if worker.get("wanted_cores") is None else f" of {worker['wanted_cores']:.2f}"
         load = [] if worker["cpu_cores"] is None else [f"{worker['cpu_cores']:.2f}{wants} cores"]
         load += [] if worker["memory_mb"] is None else [memory(worker["memory_mb"])]
-        full, short = " ".join([worker["state"], *load]), worker["state"]
+        full, short = " ".join([states[0], *load]), states[0]
     return (full if len(full) <= room else short), style
+
+
+def _worker_state(worker: Json) -> str:
+    """In a word what the daemon's problems say at length (`told_of_worker`).
+
+    >>> _worker_state({"state": "starting", "reason": "was ready until 12:00:00 UTC, its token went"})
+    'was ready'
+    """
+    state, why = str(worker["state"]), worker.get("reason") or ""  # a later field of the schema's major version
+    begins = (word for word in (WAS_READY.removesuffix(" until "), RESTARTING) if why.startswith(word))
+    return state if state == "ready" else next(begins, state)
 
 
 def _gateway(page: Page, nodes: Sequence[Json]) -> None:
@@ -224,12 +237,13 @@ def _task(page: Page, status: Json, task: Json) -> None:
 
 
 def _work(page: Page, status: Json, task: Json) -> None:
-    """What workers say of their jobs, the owner's first; nothing where none does."""
+    """What workers say of their jobs, the owner's first; nothing where none does, or the one that did does not now."""
     nodes = sorted(status["nodes"], key=lambda node: (node["name"] != task["owner"], node["name"]))
     told = [
         (node, worker["jobs"])
         for node in nodes
         for worker in node["workers"]
+        if node["state"] == "alive" and (node["age_s"] or 0.0) <= JOBS_OVER_S and worker["state"] == "ready"
         if worker["task"] == task["name"] and worker.get("jobs")  # a later field of the schema's major version
     ]
     deadline_ms = task["tuning"].get("deadline_ms")

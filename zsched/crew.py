@@ -17,7 +17,7 @@ from zsched.adapters.worker_supervisor import WorkerSupervisor
 from zsched.clock import monotonic_s, wall_time
 from zsched.core import events as ev
 from zsched.core.fleet import Fleet
-from zsched.core.model import WAS_READY, NodeId, TaskId, WorkerState
+from zsched.core.model import MAX_REASON, WAS_READY, NodeId, TaskId, WorkerState
 from zsched.core.plan import ReadyWhen
 from zsched.core.relay_protocol import WorkerMatched, WorkerSeen, WorkerTrouble
 from zsched.daemon_sessions import SessionsRead
@@ -216,19 +216,25 @@ class Crew:
         with self._lock:
             self._lives[task] = incarnation
             self._forget(task)
-            self._post(ev.WorkerChanged(task=task, state=WorkerState.STARTING, reason=f"pid {pid}"))
+            again = self._why_again(task)
+            longer = f"{again}; now it is pid {pid}" if again else f"pid {pid}"
+            reason = longer if len(longer) <= MAX_REASON else again
+            self._post(ev.WorkerChanged(task=task, state=WorkerState.STARTING, reason=reason))
             match = self._matches.get(task)
             if match is not None and match.is_matched and self.supervisor is not None:
                 self._tell(self.supervisor, task, incarnation, is_ready=True, reason="it matches already")
 
     def on_exited(self, task: TaskId, incarnation: int, returncode: int, reason: str) -> None:
         """The supervisor: a worker process has ended."""
-        detail = reason or f"exit code {returncode}"
+        detail = self._why_again(task) or reason or f"exit code {returncode}"
         with self._lock:
             if self._lives.get(task) == incarnation:
                 self._lives[task] = 0
                 self._forget(task)
                 self._post(ev.WorkerChanged(task=task, state=WorkerState.STOPPED, reason=detail))
+
+    def _why_again(self, task: TaskId) -> str:
+        return "" if self.supervisor is None else self.supervisor.why_again(task)
 
     def _forget(self, task: TaskId) -> None:
         self._seen.discard(task)

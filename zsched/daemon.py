@@ -122,6 +122,7 @@ class Daemon:
             if problem is not None:
                 node.problems["state"] = problem
             node.has_foreign_state = self._has_foreign_state
+            node.fleet_path = str(self._options.config.absolute())
             if self._memory_objection:
                 log.warning("shared_memory off why=%s", self._memory_objection)
                 node.problems["shared_memory"] = f"shared memory is off here: {self._memory_objection}"

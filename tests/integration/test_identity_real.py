@@ -189,7 +189,8 @@ def test_another_fleet_file_is_shown(bed: Testbed) -> None:
     bed.start("edge1")
 
     def told() -> bool:
-        return any("another fleet file" in problem for problem in bed.status("robot1")["problems"])
+        problems = bed.status("robot1")["problems"]
+        return any("another fleet file" in one and f" of {bed.file.absolute()})" in one for one in problems)
 
     bed.wait(told, 60, "robot1 to notice")
 

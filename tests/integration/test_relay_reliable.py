@@ -153,6 +153,9 @@ def test_a_worker_that_restarts_in_place_is_not_sent_what_its_former_life_may_ha
     until(lambda: app.back[-1] == app.sent - 1, "the newest sample")
     assert app.back == sorted(set(app.back))
     until(lambda: told(rig).at_most_lost >= app.sent - len(app.back), "what may be lost")
+    left = rig.wait(SlotLost, epoch=1).samples
+    until(lambda: told(rig).at_most_lost == left > 0, "the log's line says as much as the counters")
+    assert rig.reports[ROBOT].count(SlotLost) == 1, "once for each death"
 
 
 @contextmanager

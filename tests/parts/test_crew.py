@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -101,9 +103,30 @@ def test_a_worker_that_was_ready_is_not_told_what_it_has_done_already(house: Hou
     assert lost.startswith(WAS_READY)
     assert lost.endswith(f"its token went: it may hang, be frozen or cut off; see its log and process {pid}")
     assert told_of_worker(house.states("token")[-1], lost) == lost, "and not that it is starting"
-    until(lambda: f"not ready again within 4 s: {lost}" in house.reasons("token"), "the deadline")
+    until(lambda: f"not ready again within 4 s: {lost}" in str(house.reasons("token")), "the deadline")
     until(lambda: house.crew.life_of("token") not in (0, life), "the next process runs")
     assert "no token" in house.crew.why_not_ready("token"), "which has not been ready"
+
+
+def test_a_worker_that_was_killed_is_restarting_and_not_just_starting(house: House) -> None:
+    house.supervisor.start("token")
+    life = until(lambda: house.crew.life_of("token"), "it runs")
+    first = house.supervisor.pids()["token"]
+    assert house.reasons("token") == [f"pid {first}"]
+    os.kill(first, signal.SIGKILL)
+    again = until(lambda: (now := house.crew.life_of("token")) not in (0, life) and now, "the next process runs")
+    second = house.supervisor.pids()["token"]
+    said = "restarting (failure 1 of 3): killed by signal 9 (Killed)"
+    assert house.reasons("token")[1:] == [said, f"{said}; now it is pid {second}"]
+    told = [told_of_worker(*one) for one in zip(house.states("token"), house.reasons("token"), strict=True)]
+    assert told == [f"is starting: pid {first}", f"is {said}", f"is {said}; now it is pid {second}"]
+    house.crew.on_token(WorkerSeen(node="edge1", task="token", incarnation=str(again), is_present=True))
+    until(lambda: house.supervisor.states()["token"] is WorkerState.READY, "the supervisor knows")
+    house.supervisor.stop("token")
+    until(lambda: house.crew.life_of("token") == 0, "it is stopped")
+    house.supervisor.start("token")
+    until(lambda: house.crew.life_of("token"), "it runs again")
+    assert house.reasons("token")[-1].startswith("pid "), "an operator's stop is no failure"
 
 
 def test_what_matches_without_a_process_is_not_the_worker(house: House) -> None:

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, Self
 
 import pytest
+import typer
 from typer.testing import CliRunner, Result
 
 from support.waiting import within
@@ -164,6 +165,34 @@ def test_status_of_several_daemons_needs_a_name(daemon: Daemon, folder: Path, mo
         assert len(other.asked) == 1
         assert run("status", "--node", "robot1").exit_code == 0
         assert daemon.asked == [{"verb": "status"}]
+
+
+def test_every_verb_that_asks_a_daemon_takes_the_node_that_several_daemons_make_it_name(
+    daemon: Daemon, folder: Path
+) -> None:
+    def verbs(group: typer.core.TyperGroup, *before: str) -> Iterator[tuple[tuple[str, ...], set[str]]]:
+        for name, command in group.commands.items():
+            if isinstance(command, typer.core.TyperGroup):
+                yield from verbs(command, *before, name)
+            else:
+                yield (*before, name), {option for one in command.params for option in one.opts}
+
+    main = typer.main.get_command(app)
+    assert isinstance(main, typer.core.TyperGroup)
+    asking = [words for words, options in verbs(main) if "--runtime-dir" in options]
+    arguments = {"weights": ["echo"], "retry": ["echo"], "bw": ["in/0"], "hz": ["in/0"], "tail": ["in/0"]}
+    assert set(asking) >= {("status",), ("weights",), ("retry",), ("stream", "list"), ("stream", "tail")}
+    del asking[asking.index(("up",))]  # it starts the daemon
+    with Daemon(folder, "robot2") as other:
+        for words in asking:
+            command = [*words, *arguments.get(words[-1], [])]
+            refused = run(*command)
+            assert (refused.exit_code, "say which one with --node" in refused.stderr) == (2, True), words
+            daemon.asked.clear()
+            other.asked.clear()
+            result = run(*command, "--node", "robot2")
+            assert "No such option" not in result.stderr, words
+            assert (bool(other.asked), daemon.asked) == (True, []), words
 
 
 @pytest.mark.parametrize("others", [("robot2",), ("robot2", "edge1")], ids=["one other", "two others"])

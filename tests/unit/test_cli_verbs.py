@@ -13,6 +13,8 @@ from typer.testing import CliRunner, Result
 from zsched import __version__
 from zsched.adapters import core_speed
 from zsched.cli import app
+from zsched.config import load_fleet
+from zsched.core.fleet import fleet_hash
 
 RECORDED = Path(__file__).parent / "recorded_status"
 
@@ -51,6 +53,18 @@ def test_check_of_a_good_file_counts_what_is_in_it(tmp_path: Path) -> None:
     body = json.loads(run("check", file, "--json").stdout)
     assert (body["schema"], body["ok"], body["faults"]) == ("zsched.check/1", True, [])
     assert body["fleet"] == {"name": "hall", "nodes": 3, "tasks": 1, "electors": 3}
+
+
+def test_check_tells_the_hash_by_which_a_daemon_names_the_file(tmp_path: Path) -> None:
+    file, other = tmp_path / "fleet.yaml", tmp_path / "other.yaml"
+    file.write_text(FLEET)
+    other.write_text(FLEET.replace("cpu: 0.5, memory: 0.5", "cpu: 0.6, memory: 0.4"))
+    digest = fleet_hash(load_fleet(file))
+    assert run("check", file).stdout.splitlines()[1].startswith(f"hash: {digest} ")
+    assert json.loads(run("check", file, "--json").stdout)["hash"] == digest
+    assert json.loads(run("check", other, "--json").stdout)["hash"] not in (None, digest)
+    other.write_text("fleet: hall")
+    assert json.loads(run("check", other, "--json").stdout)["hash"] is None
 
 
 @pytest.mark.parametrize(

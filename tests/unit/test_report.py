@@ -17,7 +17,7 @@ import pytest
 
 from zsched.cli_page import Page, cut, memory, size, span
 from zsched.cli_report import degradations, printable, render_status
-from zsched.core.model import Link, LinkSource, Tuning, Utility, Weights, WorkerLoad, WorkerState
+from zsched.core.model import WAS_READY, Link, LinkSource, Tuning, Utility, Weights, WorkerLoad, WorkerState
 from zsched.core.plan import StreamCount
 from zsched.core.snapshot import (
     DecisionStatus,
@@ -209,6 +209,27 @@ def test_bonus_and_penalty_stand_beside_the_candidate_they_change() -> None:
     assert lines["edge2"].endswith("penalty -0.05")
 
 
+@pytest.mark.parametrize(
+    ("reason", "said"),
+    [
+        ("pid 7", "starting"),
+        (f"{WAS_READY}12:00:00 UTC, its token went: it may hang", "was ready"),
+        ("restarting (failure 1 of 3): killed by signal 9 (Killed); now it is pid 8", "restarting"),
+    ],
+)
+def test_a_worker_that_was_ready_is_starting_in_no_row(reason: str, said: str) -> None:
+    status = recorded("healthy")
+    status["nodes"][0]["workers"][0].update(state="starting", reason=reason)
+    name = status["nodes"][0]["name"]
+    for width in (80, 120):
+        rows = [line for line in render_status(status, width, color=False).splitlines() if line.startswith(name)]
+        assert said in rows[0]
+        assert ("starting" in rows[0].split()) is (said == "starting")
+    status["nodes"][0]["workers"].append({**status["nodes"][0]["workers"][0], "task": "slam"})
+    status["tasks"].append({**copy.deepcopy(status["tasks"][0]), "name": "slam", "streams": []})
+    assert f"echo {said}, slam {said}" in render_status(status, 140, color=False)
+
+
 def test_several_tasks_and_workers_are_told_apart() -> None:
     status = recorded("healthy")
     status["tasks"].append({**copy.deepcopy(status["tasks"][0]), "name": "slam", "streams": []})
@@ -353,6 +374,28 @@ def test_speed_of_the_cores_what_a_starved_worker_wants_and_the_score_are_shown_
     assert "· by the paper's score" in wide
     assert "x0.71" not in narrow
     assert "paper's score" not in render_status(recorded("healthy"), 120, color=False)
+
+
+@pytest.mark.parametrize(
+    ("of_node", "of_worker", "is_shown"),
+    [
+        ({}, {}, True),
+        ({"state": "gone", "age_s": 15.0}, {}, False),
+        ({"state": "suspect"}, {}, False),
+        ({"age_s": 15.0}, {}, False),
+        ({}, {"state": "starting", "reason": f"{WAS_READY}12:00:00 UTC, its token went"}, False),
+        ({}, {"state": "stopped", "reason": "killed by signal 9 (Killed)"}, False),
+    ],
+)
+def test_jobs_of_who_does_none_any_more_are_not_shown(
+    of_node: dict[str, Any], of_worker: dict[str, Any], *, is_shown: bool
+) -> None:
+    status = recorded("healthy")
+    node = status["nodes"][0]
+    node.update(of_node)
+    jobs = {"time_s": 0.02, "cpu_s": 0.01, "done_hz": 47.5, "wanted_hz": 47.5, "backlog": 0}
+    node["workers"][0].update(jobs=jobs, **of_worker)
+    assert ("47.5 of 47.5 a second" in render_status(status, 120, color=False)) is is_shown
 
 
 def test_what_a_worker_says_of_its_jobs_is_shown_with_the_deadline_and_what_misses_it() -> None:

@@ -300,7 +300,7 @@ def _parent(tree: CgroupTree, controller: str, wanted: tuple[str, ...]) -> Path:
             _delegate(folder, controller)
             return folder
     raise AdapterError(
-        f"no control group above this process may have children with {sorted(needed)}; "
+        f"no control group above this process may have children with {' and '.join(sorted(needed))}; "
         "run as root on the host, or with `systemd-run --user --scope -p Delegate=yes`"
     )
 

@@ -33,7 +33,8 @@ from zsched.adapters.launch import EXIT_CANNOT
 from zsched.adapters.worker_process import ProcessWatch, WorkerGuard, WorkerProcess
 from zsched.clock import awake_s
 from zsched.core.fleet import WorkerSpec
-from zsched.core.model import NodeId, TaskId, WorkerState
+from zsched.core.model import MAX_REASON as MAX_TOLD
+from zsched.core.model import RESTARTING, NodeId, TaskId, WorkerState
 from zsched.guard import guarded
 
 log = logging.getLogger("zsched.worker")
@@ -116,6 +117,8 @@ class _Worker:
     """This process has."""
     failure: str = ""
     """While stopping: why, when the stop is not the operator's wish."""
+    why_again: str = ""
+    """Since its last failure, until it is ready: which one that was, and that it is started again."""
     stop_step: int = 0
     stop_grace_s: float = 0.0
 
@@ -199,6 +202,10 @@ class WorkerSupervisor:
         """Every task's worker as of the supervisor's last step."""
         return self._snapshot[1]
 
+    def why_again(self, task: TaskId) -> str:
+        """Which failure ``task``'s worker is started again after; empty once it is ready, or nobody starts it again."""
+        return self._workers[task].why_again
+
     def close(self, within_s: float = 1.5) -> None:
         """Stop every worker within ``within_s`` seconds (SIGTERM after half, SIGKILL after 80 %) and end the thread."""
         self._command(self._on_close, within_s)
@@ -252,7 +259,7 @@ class WorkerSupervisor:
 
     def _on_stop(self, task: TaskId) -> None:
         worker = self._workers[task]
-        worker.is_wanted = False
+        worker.is_wanted, worker.why_again = False, ""
         if worker.phase in {_Phase.STARTING, _Phase.READY} and worker.process is not None:
             self._begin_stop(worker, worker.spec.stop_grace_s)
         elif worker.phase is _Phase.BACKOFF:
@@ -264,6 +271,7 @@ class WorkerSupervisor:
             worker.phase = _Phase.READY
         elif worker.phase is _Phase.STARTING and incarnation == worker.incarnation:
             worker.phase, worker.deadline_s, worker.has_been_ready = _Phase.READY, None, True
+            worker.why_again = ""
 
     def _on_gone(self, task: TaskId, incarnation: int) -> None:
         worker = self._workers[task]
@@ -281,6 +289,7 @@ class WorkerSupervisor:
     def _on_reset(self, task: TaskId) -> None:
         worker = self._workers[task]
         worker.failures.clear()
+        worker.why_again = ""
         if worker.phase in {_Phase.FAILED, _Phase.BACKOFF}:
             worker.phase, worker.deadline_s = _Phase.IDLE, None
             self._tell(self._events.on_reset, task)
@@ -320,7 +329,8 @@ class WorkerSupervisor:
         try:
             process = WorkerProcess(worker.spec.command, self._environment_of(worker), worker.logger)
         except Exception as error:  # noqa: BLE001 - whatever stops a start is that worker's failure, never the daemon's
-            self._count_failure(worker, f"cannot start: {error}", None, now)
+            reason = f"cannot start: {error}"
+            self._after_failure(worker, reason, now, is_last=self._count_failure(worker, reason, None, now))
             return
         self._guard.add(process.pid)
         worker.process, worker.phase, worker.has_been_ready = process, _Phase.STARTING, False
@@ -376,16 +386,25 @@ class WorkerSupervisor:
             self._tell(self._events.on_exited, worker.task, worker.incarnation, returncode, reason)
             return
         reason = worker.failure or _describe_exit(returncode, process.last_line)
+        is_last = self._count_failure(worker, reason, returncode, now)  # who is told of the end asks what follows
         self._tell(self._events.on_exited, worker.task, worker.incarnation, returncode, reason)
-        self._count_failure(worker, reason, returncode, now)
+        self._after_failure(worker, reason, now, is_last=is_last)
 
-    def _count_failure(self, worker: _Worker, reason: str, returncode: int | None, now: float) -> None:
+    def _count_failure(self, worker: _Worker, reason: str, returncode: int | None, now: float) -> bool:
+        """Whether that was one too many."""
         worker.failure = ""
         worker.failures.append(now)
         while worker.failures[0] < now - worker.spec.failure_window_s:
             worker.failures.popleft()
+        count, most = len(worker.failures), worker.spec.max_failures
+        is_last = returncode == EXIT_CANNOT or count >= most
+        is_again = worker.is_wanted and not is_last
+        worker.why_again = _told_again(reason, count, most) if is_again else ""
+        return is_last
+
+    def _after_failure(self, worker: _Worker, reason: str, now: float, *, is_last: bool) -> None:
         count = len(worker.failures)
-        if returncode == EXIT_CANNOT or count >= worker.spec.max_failures:
+        if is_last:
             worker.phase, worker.deadline_s = _Phase.FAILED, None
             log.error("worker_failed task=%s failures=%d reason=%r", worker.task, count, reason)
             self._tell(self._events.on_failed, worker.task, reason)
@@ -402,6 +421,12 @@ class WorkerSupervisor:
             call(*arguments)
         except Exception:
             log.exception("event_handler_failed handler=%s", getattr(call, "__name__", call))
+
+
+def _told_again(reason: str, count: int, most: int) -> str:
+    """Which failure is followed by a start; without the count where that would cost the reason its end."""
+    told = f"{RESTARTING} (failure {count} of {most}): {reason}"
+    return told if len(told) <= MAX_TOLD else f"{RESTARTING}: {reason}"
 
 
 def _describe_exit(returncode: int, last_line: str) -> str:

@@ -95,7 +95,8 @@ class Agreement:
         self.newest_generation = self.generation or 0
         """That any beat has named: what the operator's next one must exceed."""
         self.apart: set[NodeId] = set()
-        """Electors whose newest beat says that they are of another generation, or count with other electors."""
+        """Electors whose newest beat says that they are of another generation, or count with other electors (who may
+        leave them out: then they are none by their own file)."""
         self._has_state, self._electorate = durable is not None, electorate
         self._disputed = "" if durable is None else durable.disputed
         self._lost = "" if durable is None else durable.lost
@@ -398,10 +399,20 @@ class Agreement:
     def _hear_electorate(self, beat: Beat) -> None:
         """Keep whether an elector refuses our ballots, and we its: it has other electors, or another generation."""
         is_apart = beat.generation != self.generation or beat.electorate not in ("", self.electorate)
+        is_apart |= self._is_no_elector_there(beat)
         if is_apart and not self._is_guest_of(beat.generation) and beat.node in self._fleet.electors:
             self.apart.add(beat.node)
         elif self.apart:
             self.apart.discard(beat.node)
+
+    def _is_no_elector_there(self, beat: Beat) -> bool:
+        """Whether a node that this file has as an elector counts with others, and does not have itself among them.
+
+        It tells no electorate then, and no lost state either: who has lost one is an elector by its own file. The terms
+        tell such a node from one that is too old to tell its electorate.
+        """
+        terms = beat.lease_terms.partition(",")[0]  # behind it a clock is in doubt
+        return not beat.electorate and not beat.has_lost_state and terms not in ("", self.leases.terms)
 
     def _is_our_generation(self, node: NodeId, generation: int) -> bool:
         """Whether a node's learnt values mean anything here; the difference is shown."""

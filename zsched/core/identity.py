@@ -35,6 +35,15 @@ QUIET_S = 10.0
 """Beats in our name that were heard so long ago are no complaint any more."""
 
 
+def here(fleet_file: str, path: str) -> str:
+    """Our own fleet file, to be found and compared: its hash, and its path where that is known."""
+    return f"here {fleet_file}{' of ' if path else ''}{path}"
+
+
+ONE_FILE = "compare them (`zsched check` tells a file's hash), give all nodes the same one, restart who had another"
+"""What to do about two fleet files."""
+
+
 class Verdict(StrEnum):
     """What a beat in our own name means."""
 
@@ -134,8 +143,9 @@ class Identity:
         lived_s = (sequence - self._twin[1]) * self.beat_s
         return Verdict.DISPUTE if min(now - self._twin[2], lived_s) >= STAYS_S else Verdict.TWIN
 
-    def file_complaint(self, beat: Beat) -> str | None:
-        """How a peer's fleet file differs from ours; ``None`` when it does not, or the peer does not say."""
+    def file_complaint(self, beat: Beat, path: str = "") -> str | None:
+        """How a peer's fleet file differs from ours, at ``path``; ``None``: it does not, or the peer does not say."""
         if beat.fleet_file in ("", self.fleet_file):
             return None
-        return f"{beat.node} goes by another fleet file ({beat.fleet_file}, here {self.fleet_file})"
+        ours = here(self.fleet_file, path)
+        return f"{beat.node} goes by another fleet file ({beat.fleet_file}, {ours}): {ONE_FILE}"

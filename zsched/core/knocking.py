@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from zsched.core.identity import QUIET_S
+from zsched.core.identity import ONE_FILE, QUIET_S, here
 from zsched.core.model import Beat, NodeId
 
 KNOCKERS_KEPT = 4
@@ -31,11 +31,12 @@ class Knocking:
         if beat.node in self._heard or len(self._heard) < KNOCKERS_KEPT:
             self._heard[beat.node] = (beat, now)
 
-    def problems(self, now: float) -> tuple[str, ...]:
-        """What status says of those that were heard lately."""
+    def problems(self, now: float, path: str = "") -> tuple[str, ...]:
+        """What status says of those that were heard lately; our own fleet file is at ``path``."""
+        ours = here(self.fleet_file, path)
         return tuple(
             f"fleet/{name}: {name} beats in this fleet, goes by another fleet file ({beat.fleet_file or 'not told'}, "
-            f"here {self.fleet_file}), and is in no line of this one: give all nodes the same file"
+            f"{ours}), and is in no line of this one: {ONE_FILE}"
             for name, (beat, at) in sorted(self._heard.items())
             if now < at + QUIET_S
         )

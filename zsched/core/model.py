@@ -184,11 +184,16 @@ class WorkerState(StrEnum):
 WAS_READY = "was ready until "
 """So a reason begins that is one of a worker which is not ready any more: it is starting only for its supervisor."""
 
+RESTARTING = "restarting"
+"""So a reason begins that is one of a worker which has failed, and is or will be started again."""
+
 
 def told_of_worker(state: WorkerState, reason: str) -> str:
     """How a worker is, to be said behind its name."""
     if state is not WorkerState.READY and reason.startswith(WAS_READY):
         return reason
+    if state is not WorkerState.READY and reason.startswith(RESTARTING):
+        return f"is {reason}"
     return f"is {state}{': ' if reason else ''}{reason}"
 
 

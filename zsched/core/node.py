@@ -147,6 +147,8 @@ class Node:
         self.unready: dict[TaskId, tuple[int, float]] = {}
         """{task: (epoch, since when)} of the slots whose worker our relay does not see any more."""
         self.fleet_file = fleet_hash(fleet)
+        self.fleet_path = ""
+        """Where that file lies, for the status."""
         self._identity = Identity(me, incarnation, self.fleet_file, now, fleet.timing.beat_s)
         self.namesakes = Namesakes(fleet.timing.beat_s)
         self.knocking = Knocking(self.fleet_file)
@@ -357,7 +359,7 @@ class Node:
             self.stateless.discard(beat.node)
         self.sealing.hear(beat)
         if beat.fleet_file != self.fleet_file or self.problems:
-            self._set_problem(f"fleet/{beat.node}", self._identity.file_complaint(beat))
+            self._set_problem(f"fleet/{beat.node}", self._identity.file_complaint(beat, self.fleet_path))
         self._hear_leases(beat, now)
 
     def _on_own_name(self, beat: Beat, now: float) -> None:

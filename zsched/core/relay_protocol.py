@@ -214,7 +214,7 @@ class StreamAcks:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SlotLost:
-    """A slot closed with samples that its worker had not acknowledged: at most so many had no result."""
+    """A slot closed, or its worker restarted, with samples not acknowledged: at most so many had no result."""
 
     task: TaskId
     epoch: int

@@ -62,6 +62,7 @@ class NodeView(Protocol):
     me: NodeId
     version: str
     fleet_file: str
+    fleet_path: str
     kind: NodeKind
     incarnation: int
     started_at: float
@@ -111,7 +112,7 @@ def build_snapshot(node: NodeView, now: float) -> Snapshot:
             *node.namesakes.problems(now),
             *_problems(node, quorum),
             *_relay_problems(node, now),
-            *node.knocking.problems(now),
+            *node.knocking.problems(now, node.fleet_path),
         ),
     )
 

@@ -127,7 +127,8 @@ def _carmen_scan(line: str) -> Scan | None:
     if not word or word.startswith("#") or word in _CARMEN_SKIPPED:
         return None
     if word != "FLASER":
-        raise ValueError(f"unknown CARMEN message {word[:20]!r}; known are FLASER and {sorted(_CARMEN_SKIPPED)}")
+        skipped = ", ".join(sorted(_CARMEN_SKIPPED))
+        raise ValueError(f"unknown CARMEN message {word[:20]!r}; known are FLASER, and as skipped {skipped}")
     fields = rest.split()
     if not fields or not fields[0].isdecimal():
         raise ValueError("FLASER without a number of beams")

@@ -205,6 +205,11 @@ class InputStream:
             slot = self._slots.get(epoch)
             return slot is None or not slot.is_counted or not slot.outlet.counted().in_flight
 
+    def take_left(self, epoch: int) -> int:
+        """How many samples the slot's worker left open when it died and restarted in place, since the last time."""
+        slot = self._slots.get(epoch)
+        return slot.outlet.take_left() if slot is not None and slot.is_counted else 0
+
     def close_slot(self, epoch: int, *, has_answer: Callable[[Timestamp], bool] = _never) -> int:
         """Forget a slot; answers how many samples its worker had not processed when it was last heard of.
 

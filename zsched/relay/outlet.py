@@ -103,6 +103,8 @@ class Outlet:
         """Samples taken and not dropped (the stream's lock guards it)..."""
         self._left = 0
         """...and those of them that have left the queue, or could not (our lock)."""
+        self._left_told = 0
+        """How much of the tally's `at_most_lost` has been taken."""
         self._replays = settings.on_crash is OnCrash.REPLAY and acks is not None
         holds = self._is_reliable and acks is not None
         self._greetings = Greetings(self._lock, self._put_start) if holds else None
@@ -281,6 +283,11 @@ class Outlet:
     def take_missed(self) -> int:
         """How many samples single slow receivers may have missed since the last time."""
         return 0 if self._crowd is None else self._crowd.take_missed()
+
+    def take_left(self) -> int:
+        """How many samples workers left open that another life has followed, since the last time (by one thread)."""
+        before, self._left_told = self._left_told, self.tally.at_most_lost
+        return self._left_told - before
 
     def counted(self) -> Tally:
         """What this outlet has taken and sent, and what is known of it (under the stream's lock)."""

@@ -37,6 +37,8 @@ GONE_GRACE_S: Final = 0.05
 SETTLE_S: Final = 1.5
 """An old owner that has ended has acknowledged all by then, also when one acknowledgement was dropped on the way, or a
 robot has just stalled that gets the same answers (`zsched.worker_lanes.STALLED_S`)."""
+GATHER_S: Final = 0.5
+"""What a worker left that restarted in place is told of once, when each of its streams has met the new life."""
 BUSY_S, CARE_S, IDLE_S = 0.01, 0.2, 0.5
 
 _log = logging.getLogger("zsched.relay")
@@ -52,6 +54,10 @@ class _OpenSlot:
     is_drained: bool = False
     gone_at: float | None = None
     ended_at: float | None = None
+    left: int = 0
+    """Samples that a worker left open which another life has followed, not reported yet..."""
+    left_at: float | None = None
+    """...and since when that is known."""
 
 
 class _Orphaned:
@@ -148,6 +154,7 @@ class TaskRelay:
     def _step(self) -> None:
         for state in tuple(self._slots.values()):
             self._refresh(state)
+            self._tell_left(state)
         self._flip_when_due()
         self._drain()
         for source in self._inputs.values():
@@ -245,12 +252,27 @@ class TaskRelay:
 
     def _close(self, epoch: int) -> None:
         state = self._slots.pop(epoch, None)
-        lost = sum(source.close_slot(epoch, has_answer=self._has_answer) for source in self._inputs.values())
+        lost = (0 if state is None else state.left) + sum(
+            source.take_left(epoch) + source.close_slot(epoch, has_answer=self._has_answer)
+            for source in self._inputs.values()
+        )
         if lost and state is not None:
             self._report(SlotLost(task=self._task, epoch=epoch, owner=state.slot.owner, samples=lost))
         for sink in self._outputs.values():
             sink.close_slot(epoch)
         self._services.close_slot(epoch)
+
+    def _tell_left(self, state: _OpenSlot) -> None:
+        """Report, once for each death, what a worker has left open that restarted in place."""
+        now = monotonic_s()
+        left = sum(source.take_left(state.slot.epoch) for source in self._inputs.values())
+        if left:
+            state.left, state.left_at = state.left + left, state.left_at or now
+        if state.left_at is None or now - state.left_at < GATHER_S:
+            return
+        slot, lost = state.slot, state.left
+        state.left, state.left_at = 0, None
+        self._report(SlotLost(task=self._task, epoch=slot.epoch, owner=slot.owner, samples=lost))
 
     def _forget_streams(self) -> None:
         """Close streams that no slot names any more; without any slot they stay, and with them the kept values."""

@@ -584,8 +584,13 @@ def test_another_fleet_file_is_a_problem_until_it_is_the_same() -> None:
     node = started()
     strange = replace(beat("robot2", 1), fleet_file="0123456789abcdef")
     node.handle(ev.BeatReceived(beat=strange), 100.0)
-    assert "another fleet file" in node.problems["fleet/robot2"]
-    node.handle(ev.BeatReceived(beat=replace(beat("robot2", 2), fleet_file=node.fleet_file)), 100.2)
+    told = f"robot2 goes by another fleet file (0123456789abcdef, here {node.fleet_file}): compare them ("
+    assert node.problems["fleet/robot2"].startswith(told)
+    assert node.problems["fleet/robot2"].endswith("give all nodes the same one, restart who had another")
+    node.fleet_path = "/etc/zsched/fleet.yaml"
+    node.handle(ev.BeatReceived(beat=replace(strange, sequence=2)), 100.1)
+    assert f"here {node.fleet_file} of /etc/zsched/fleet.yaml)" in node.problems["fleet/robot2"]
+    node.handle(ev.BeatReceived(beat=replace(beat("robot2", 3), fleet_file=node.fleet_file)), 100.2)
     assert node.problems == {}
 
 
@@ -599,6 +604,7 @@ def test_a_node_that_our_file_does_not_name_is_told_while_it_beats() -> None:
     assert said[0].startswith(
         "fleet/robot10: robot10 beats in this fleet, goes by another fleet file (0123456789abcdef, "
     )
+    assert "and is in no line of this one: compare them (`zsched check` tells a file's hash)" in said[0]
     assert not any("robot1" in one for one in build_snapshot(node, 100.0 + QUIET_S).problems)
     node.handle(ev.BeatReceived(beat=beat("robot99")), 100.0 + QUIET_S)
     assert any("robot99" in one for one in build_snapshot(node, 100.0 + QUIET_S).problems), "the others made room"

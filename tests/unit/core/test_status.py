@@ -11,7 +11,7 @@ import pytest
 from zsched.cli_report import degradations, render_status
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, electorate_hash
+from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, electorate_hash, lease_terms
 from zsched.core.messages import Learnt
 from zsched.core.model import (
     WAS_READY,
@@ -150,6 +150,48 @@ def test_electors_of_another_generation_or_electorate_count_for_nothing(strange:
         again = Beat(node=name, incarnation=3, sequence=3, loop_lag_s=0.0, electorate=mine)
         node.handle(ev.BeatReceived(beat=again), 100.2)
     assert build_snapshot(node, 100.2).problems == ()
+
+
+def test_an_elector_that_is_none_by_its_own_file_counts_for_nothing() -> None:
+    """Its beat names no electorate at all, and no lost state: it answers every proposer that it is no elector."""
+    node = make()
+    others = replace(FLEET, electors=("robot1", "robot3"))
+    told = Node(
+        fleet=others,
+        me="robot2",
+        durable=None,
+        incarnation=3,
+        electorate=electorate_hash(others),
+        rng=Random(1),
+        now=100.0,
+    )
+    (sent,) = (one.beat for one in told.handle(ev.DeadlineReached(), 101.0) if isinstance(one, do.PublishBeat))
+    assert (sent.electorate, sent.has_lost_state) == ("", False)
+    node.handle(ev.BeatReceived(beat=replace(sent, sequence=2)), 100.0)
+    snapshot = build_snapshot(node, 100.0)
+    assert (snapshot.quorum.alive, snapshot.quorum.ok, snapshot.quorum.apart) == (2, True, ("robot2",))
+    assert any("1 of 3: robot2; they and this node refuse each other" in one for one in snapshot.problems)
+    assert any("no elector to spare: 2 of 3 can answer, 2 needed; not robot2" in one for one in snapshot.problems)
+    alone = make(alive=())
+    alone.handle(ev.BeatReceived(beat=sent), 100.0)
+    assert not build_snapshot(alone, 100.0).quorum.ok
+    assert any("no quorum: 1 of 3" in one for one in degradations(snapshot_json(build_snapshot(alone, 100.0))))
+
+
+@pytest.mark.parametrize(
+    "compatible",
+    [
+        {"fleet_file": "0" * 16},
+        {"fleet_file": "0" * 16, "lease_terms": f"{lease_terms(FLEET)}, clock in doubt"},
+        {"electorate": electorate_hash(FLEET), "lease_terms": "0" * 16},
+    ],
+    ids=["another file, from a peer that tells no terms", "a clock in doubt", "leases of another length"],
+)
+def test_an_elector_with_another_file_and_the_same_electors_counts(compatible: dict[str, Any]) -> None:
+    node = make()
+    beat = replace(Beat(node="robot2", incarnation=3, sequence=2, loop_lag_s=0.0), **compatible)
+    node.handle(ev.BeatReceived(beat=beat), 100.0)
+    assert (build_snapshot(node, 100.0).quorum.alive, build_snapshot(node, 100.0).quorum.apart) == (3, ())
 
 
 def test_a_node_of_another_generation_is_told_with_the_command_that_mends_it() -> None:

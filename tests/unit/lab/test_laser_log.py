@@ -89,7 +89,7 @@ def test_gzip_is_read_and_names_are_short(tmp_path: Path) -> None:
         ("FLASER 3 1 2 3 0 0 0", "fields"),
         (_flaser(4).replace("2.0", "two", 1), "not a number"),
         (_flaser(4).replace("2.0", "nan", 1), "finite"),
-        ("WHAT 1 2", "unknown CARMEN message"),
+        ("WHAT 1 2", "unknown CARMEN message 'WHAT'; known are FLASER, and as skipped MARKER, NEFF, ODOM, PARAM"),
     ],
 )
 def test_malformed_line_is_named(tmp_path: Path, line: str, why: str) -> None:
