@@ -398,9 +398,12 @@ def _route(page: Page, status: Json, task: Json) -> None:
         parts.append((text, "yellow" if drops and not is_over else ""))
     unheard = [one for one in task["streams"] if one["last_seen_s"] is None and f"{prefix}in/" in one["stream"]]
     first = next((one["name"] for one in status["tasks"] if one["streams"]), None)
+    if first is None and status["kind"] == "robot":  # no counts yet: an application may join all the same
+        first = status["tasks"][0]["name"]
     if (unheard or task["name"] == first) and status.get("joins_at"):  # a later field of the schema's major version
         parts.append((f"applications here join at {', '.join(status['joins_at'])} (mode client)", "dim"))
-    page.block("ROUTE", *(parts or [("no streams here", "dim")]))
+    has_streams = bool(task["streams"])
+    page.block("ROUTE", *([] if has_streams else [("no streams here", "dim")]), *parts)
 
 
 # --- problems --------------------------------------------------------------------------------------------------------

@@ -255,6 +255,17 @@ def test_where_applications_join_stays_once_messages_flow() -> None:
     assert render_status(status, 100, color=False).count("applications here join at tcp/127.0.0.1:7458") == 1
 
 
+def test_where_applications_join_is_told_before_anything_is_counted() -> None:
+    status = recorded("healthy")
+    status["joins_at"] = ["tcp/127.0.0.1:7458"]
+    status["tasks"][0]["streams"] = []
+    told = render_status(status, 100, color=False)
+    assert "no streams here" in told
+    assert told.count("applications here join at tcp/127.0.0.1:7458") == 1
+    status["kind"] = "edge"
+    assert "applications here join" not in render_status(status, 100, color=False)
+
+
 # --- degraded --------------------------------------------------------------------------------------------------------
 
 

@@ -58,6 +58,13 @@ class _Orphaned:
     """In the queue of plans: those behind it are another daemon's."""
 
 
+@dataclass(frozen=True, slots=True)
+class _Unowned:
+    """In the queue of plans: inputs that are taken whether or not there is an owner."""
+
+    routes: tuple[Route, ...]
+
+
 class TaskRelay:
     """One task's streams on this node. Every method may be called from any thread; none blocks."""
 
@@ -81,7 +88,7 @@ class TaskRelay:
         self._acks = acks
         self._own_ids = own_ids
         self._report = report
-        self._queue: queue.SimpleQueue[RoutePlan | _Orphaned | None] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[RoutePlan | _Orphaned | _Unowned | None] = queue.SimpleQueue()
         self._plan: RoutePlan | None = None
         self._slots: dict[int, _OpenSlot] = {}
         self._inputs: dict[str, InputStream] = {}
@@ -97,6 +104,10 @@ class TaskRelay:
     def apply(self, plan: RoutePlan) -> None:
         """Take the newest plan."""
         self._queue.put(plan)
+
+    def listen(self, routes: tuple[Route, ...]) -> None:
+        """Take these inputs from now on, so that what comes before the first owner is counted, or kept for it."""
+        self._queue.put(_Unowned(routes))
 
     def wake(self) -> None:
         """Something that readiness or draining hangs on has changed."""
@@ -129,6 +140,8 @@ class TaskRelay:
             try:
                 if isinstance(plan, _Orphaned):
                     self._pause()
+                elif isinstance(plan, _Unowned):
+                    self._listen(plan.routes)
                 elif plan is not None:
                     self._take(plan)
                 self._step()
@@ -166,6 +179,18 @@ class TaskRelay:
         if self._plan is not None and self._plan.exclusive:
             for sink in self._outputs.values():
                 sink.pause()
+
+    def _listen(self, routes: tuple[Route, ...]) -> None:
+        for route in routes:
+            if route.stream in self._inputs:
+                continue
+            try:
+                self._inputs[route.stream] = self._take_input(route)
+            except (ValueError, zenoh.ZError) as error:
+                self._problem(f"{route.stream}: {route.from_expr}: {error}")
+
+    def _take_input(self, route: Route) -> InputStream:
+        return InputStream(self._session, route, self._own_ids, self._local, self._times)
 
     def _take(self, plan: RoutePlan) -> None:
         self._plan = plan
@@ -228,9 +253,7 @@ class TaskRelay:
             if source is None or (source.route.from_expr, source.route.settings) != (route.from_expr, route.settings):
                 if source is not None:
                     source.close()
-                source = self._inputs[route.stream] = InputStream(
-                    self._session, route, self._own_ids, self._local, self._times
-                )
+                source = self._inputs[route.stream] = self._take_input(route)
             source.open(epoch, route, acks, self._stamps if _replays(slot) else None)
             return
         sink = self._outputs.get(route.stream)
