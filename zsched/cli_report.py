@@ -21,6 +21,8 @@ TROUBLES = "PROBLEMS"
 """The title of the last block, which a low window keeps."""
 MOST, LITTLE = 0.98, 0.8
 """From here on nearly all jobs are done; below that, many are not."""
+NO_ANSWER_TO = 100
+"""After so many inputs without one output, ever, the key of the output is doubted."""
 DROPS_OVER_S = 60.0
 """Drops that have not risen for so long are history."""
 STATE_STYLES = {"alive": "green", "ready": "green"} | dict.fromkeys(
@@ -396,6 +398,7 @@ def _route(page: Page, status: Json, task: Json) -> None:
             text += ", dropped " + " ".join(f"{count} {reason}" for reason, count in drops.items())
             text += f" (none for {span(stream['dropped_s'])})" if is_over else ""
         parts.append((text, "yellow" if drops and not is_over else ""))
+    parts += [(hint, "yellow") for hint in _unanswered(task)]
     unheard = [one for one in task["streams"] if one["last_seen_s"] is None and f"{prefix}in/" in one["stream"]]
     first = next((one["name"] for one in status["tasks"] if one["streams"]), None)
     if first is None and status["kind"] == "robot":  # no counts yet: an application may join all the same
@@ -404,6 +407,18 @@ def _route(page: Page, status: Json, task: Json) -> None:
         parts.append((f"applications here join at {', '.join(status['joins_at'])} (mode client)", "dim"))
     has_streams = bool(task["streams"])
     page.block("ROUTE", *([] if has_streams else [("no streams here", "dim")]), *parts)
+
+
+def _unanswered(task: Json) -> list[str]:
+    """A hint that the worker may put its outputs under other keys than the rule's; no problem: it may answer rarely."""
+    streams = {way: [one for one in task["streams"] if f"/{way}/" in one["stream"]] for way in ("in", "out")}
+    done = sum(one.get("acknowledged") or 0 for one in streams["in"])
+    keys = [key for one in streams["out"] if (key := one.get("from_expr"))]
+    is_silent = task["phase"] == "settled" and not any(one["messages"] for one in streams["out"])
+    if not keys or not is_silent or done < NO_ANSWER_TO:
+        return []
+    what = f"{task['owner']} has done {done} inputs and nothing has ever come on {', '.join(keys)}"
+    return [f"{what}: does its worker put its outputs under that key?"]
 
 
 # --- problems --------------------------------------------------------------------------------------------------------

@@ -336,3 +336,17 @@ def test_what_comes_before_the_first_owner_is_counted(rig: Rig, stream_class: St
     until(lambda: app.back, "the first owner answers")
     until(lambda: rig.told(f"{TASK}/in/0").messages == 161, "the same stream goes on")
     rig.assert_nothing_is_unaccounted()
+
+
+def test_a_key_that_the_worker_does_not_take_is_told(rig: Rig) -> None:
+    """Its token is there, so what is missing has to be named."""
+    now = slot(1, "edge1", StreamClass.RELIABLE, 1)
+    wrong = replace(now, routes=(replace(now.routes[0], to_expr="edge1/wrongkey/robot1/in"), *now.routes[1:]))
+    rig.plan(RoutePhase.PREPARE, wrong)
+    rig.wait(SlotReady, epoch=1, is_ready=False, has_token=False, untaken=("edge1/wrongkey/robot1/in",))
+    rig.start_worker("edge1")
+    rig.wait(SlotReady, epoch=1, is_ready=False, has_token=True, untaken=("edge1/wrongkey/robot1/in",))
+    session = rig.app
+    taken = session.declare_subscriber("edge1/wrongkey/robot1/in", lambda _sample: None)
+    rig.wait(SlotReady, epoch=1, is_ready=True)
+    taken.undeclare()

@@ -266,6 +266,27 @@ def test_where_applications_join_is_told_before_anything_is_counted() -> None:
     assert "applications here join" not in render_status(status, 100, color=False)
 
 
+@pytest.mark.parametrize(
+    ("done", "answers", "phase", "is_told"),
+    [(100, 0, "settled", True), (99, 0, "settled", False), (100, 1, "settled", False), (100, 0, "preparing", False)],
+)
+def test_a_worker_that_does_all_and_answers_nothing_may_put_it_under_another_key(
+    done: int, answers: int, phase: str, is_told: bool
+) -> None:
+    status = recorded("healthy")
+    (task,) = status["tasks"]
+    task["phase"] = phase
+    for stream in task["streams"]:
+        if "/in/" in stream["stream"]:
+            stream["acknowledged"] = done
+        else:
+            stream.update(messages=answers, from_expr="edge1/echo/1/anser")
+    told = " ".join(render_status(status, 160, color=False).split())
+    assert (f"done {done} inputs and nothing has ever come on edge1/echo/1/anser" in told) is is_told
+    assert degradations(status) == (), "it may answer rarely"
+    assert "PROBLEMS" not in told
+
+
 # --- degraded --------------------------------------------------------------------------------------------------------
 
 

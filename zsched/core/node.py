@@ -145,6 +145,7 @@ class Node:
         self.stateless: set[NodeId] = set()
         """Electors whose newest beat says that they answer no proposer."""
         self.unready: dict[TaskId, tuple[int, float]] = {}
+        self.lacks: dict[TaskId, ev.SlotReady] = {}
         """{task: (epoch, since when)} of the slots whose worker our relay does not see any more."""
         self.fleet_file = fleet_hash(fleet)
         self._identity = Identity(me, incarnation, self.fleet_file, now, fleet.timing.beat_s)
@@ -646,9 +647,12 @@ class Node:
         if event.task not in self.executors:
             return
         if not event.is_ready:
-            self.unready[event.task] = (event.epoch, now)
+            known, since = self.unready.get(event.task, (-1, now))
+            self.unready[event.task] = (event.epoch, since if known == event.epoch else now)
+            self.lacks[event.task] = event
             return
         self.unready.pop(event.task, None)
+        self.lacks.pop(event.task, None)
         self._batch.add(*self.executors[event.task].on_ready(event.epoch))
 
     def _on_slot_flipped(self, event: ev.SlotFlipped, now: float) -> None:

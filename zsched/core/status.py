@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 from zsched.core.agreement import Agreement
+from zsched.core.events import SlotReady
 from zsched.core.executor import Executor, Phase
 from zsched.core.fleet import Fleet, NodeSpec, TaskSpec
 from zsched.core.gateway import Gateway
@@ -69,6 +70,7 @@ class NodeView(Protocol):
     has_foreign_state: bool
     stateless: set[NodeId]
     unready: dict[TaskId, tuple[int, float]]
+    lacks: dict[TaskId, SlotReady]
     agreement: Agreement
     loop_lag_s: float
     counters: Counter[str]
@@ -292,7 +294,7 @@ def _task_problems(node: NodeView, task: TaskSpec, value: Allocation, now: float
     since = _unready_since(node, executor)
     if is_owner_ready and now - since >= UNREADY_SHOWN_S:
         waited = f"this robot's streams have waited for {executor.owner} for {now - since:.0f} s"
-        yield f"{waited}: {_untaken(task, executor)}"
+        yield f"{waited}: {_untaken(task, executor, node.lacks.get(task.name))}"
 
 
 def _is_missed(task: TaskSpec, load: WorkerLoad) -> bool:
@@ -308,12 +310,24 @@ def _unready_since(node: NodeView, executor: Executor) -> float:
     return since if epoch == executor.epoch else math.inf
 
 
-def _untaken(task: TaskSpec, executor: Executor) -> str:
+def _untaken(task: TaskSpec, executor: Executor, lack: SlotReady | None) -> str:
+    """What our relay misses, as far as it has said."""
     newer = "" if task.worker.command else f"; {STARTED_BEFORE.format(owner=executor.owner, task=task.name)}"
+    told = lack if lack is not None and lack.epoch == executor.epoch else None
+    untaken = () if told is None else told.untaken
     if task.worker.ready_when is ReadyWhen.TOKEN:
-        return f"our relay does not see its worker's token, or its subscriptions{newer}"
-    keys = [route.to_expr for route in executor.routes if route.direction is not Direction.OUTPUT]
-    return f"our relay sees nobody take {keys[0] if keys else 'them'}{newer}"
+        if told is None or told.has_token is None:
+            return f"our relay does not see its worker's token, or its subscriptions{newer}"
+        if not told.has_token:
+            return f"our relay does not see its worker's token{newer}"
+        if not untaken:
+            return f"our relay has just seen its worker's subscriptions{newer}"
+        return (
+            f"its worker is there, and nobody subscribes to {', '.join(untaken)}: it has to take each such key with "
+            f"`Worker.subscribe` before `ready` (`zsched stream list` shows the keys){newer}"
+        )
+    keys = untaken or [route.to_expr for route in executor.routes if route.direction is not Direction.OUTPUT][:1]
+    return f"our relay sees nobody take {', '.join(keys) or 'them'}{newer}"
 
 
 def _with_age(count: StreamCount, dropped: dict[str, tuple[int, float]], now: float) -> StreamCount:

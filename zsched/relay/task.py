@@ -37,6 +37,10 @@ GONE_GRACE_S: Final = 0.05
 SETTLE_S: Final = 1.5
 """An old owner that has ended has acknowledged all by then, also when one acknowledgement was dropped on the way, or a
 robot has just stalled that gets the same answers (`zsched.worker_lanes.STALLED_S`)."""
+MAX_UNTAKEN: Final = 4
+"""More keys than that are not told of."""
+LACK_S: Final = 1.0
+"""What a worker lacks that has just come is on its way; after so long it is told."""
 BUSY_S, CARE_S, IDLE_S = 0.01, 0.2, 0.5
 
 _log = logging.getLogger("zsched.relay")
@@ -48,6 +52,9 @@ class _OpenSlot:
     tokens: frozenset[str] = frozenset()
     seen: frozenset[str] = frozenset()
     is_ready: bool = False
+    lacks_since: float | None = None
+    lack: SlotReady | None = None
+    """What it lacks, as it was told last."""
     is_flipped: bool = False
     is_drained: bool = False
     gone_at: float | None = None
@@ -215,6 +222,8 @@ class TaskRelay:
             self._flip_by = monotonic_s() + FLIP_WAIT_S
         if current is not None and plan.phase is RoutePhase.PREPARE and current.is_ready:
             self._report(SlotReady(task=self._task, epoch=current.slot.epoch))  # asked again: say it again
+        if current is not None:
+            current.lack = None  # the same
         if current is not None and plan.phase is RoutePhase.FLIP and current.is_flipped:
             self._report(SlotFlipped(task=self._task, epoch=current.slot.epoch, replayed=0))  # for another daemon
         for sink in self._outputs.values():
@@ -312,12 +321,36 @@ class TaskRelay:
             self._warm_up(slot.epoch)
         if has_changed and is_current:
             self._report(SlotReady(task=self._task, epoch=slot.epoch, is_ready=is_ready))
+        if is_ready:
+            state.lacks_since = state.lack = None
+        elif is_current:
+            self._tell_lack(state, has_token=bool(tokens) if needs_token else None)
+
+    def _tell_lack(self, state: _OpenSlot, *, has_token: bool | None) -> None:
+        """Say what a worker lacks that is not ready for a while, whenever that changes."""
+        now = monotonic_s()
+        state.lacks_since = state.lacks_since or now
+        if now - state.lacks_since < LACK_S:
+            return
+        untaken = self._untaken(state.slot)
+        lack = SlotReady(
+            task=self._task, epoch=state.slot.epoch, is_ready=False, has_token=has_token, untaken=untaken[:MAX_UNTAKEN]
+        )
+        if lack != state.lack:
+            state.lack = lack
+            self._report(lack)
 
     def _is_matching(self, slot: Slot) -> bool:
-        return all(
-            self._inputs[route.stream].is_matching(slot.epoch)
+        return not self._untaken(slot)
+
+    def _untaken(self, slot: Slot) -> tuple[str, ...]:
+        """The inputs' keys that nobody subscribes to."""
+        return tuple(
+            route.to_expr
             for route in slot.routes
-            if route.direction is Direction.INPUT and route.stream in self._inputs
+            if route.direction is Direction.INPUT
+            and route.stream in self._inputs
+            and not self._inputs[route.stream].is_matching(slot.epoch)
         )
 
     def _warm_up(self, epoch: int) -> None:

@@ -334,6 +334,43 @@ def test_a_slot_whose_worker_is_not_seen_is_a_problem_until_it_is() -> None:
     assert build_snapshot(node, 120.0).tasks[0].problems == ()
 
 
+def lack_of(node: Node, lack: ev.SlotReady) -> str:
+    """The words that follow "have waited for edge1 for 3 s"."""
+    node.handle(lack, 101.0)
+    (told,) = build_snapshot(node, 103.0).tasks[0].problems
+    start = "this robot's streams have waited for edge1 for 3 s: "
+    assert told.startswith(start)
+    return told.removeprefix(start)
+
+
+def test_a_key_that_nobody_subscribes_to_is_named_with_what_to_do() -> None:
+    node = make()
+    learn(node, 1, "edge1")
+    keys = ("edge1/wrongkey/robot1/question", "edge1/t/robot1/map")
+    told = lack_of(node, ev.SlotReady(task="merge", epoch=1, is_ready=False, has_token=True, untaken=keys))
+    assert "nobody subscribes to edge1/wrongkey/robot1/question, edge1/t/robot1/map" in told
+    assert "`Worker.subscribe`" in told
+    assert "token" not in told, "it is there"
+    told = lack_of(node, ev.SlotReady(task="merge", epoch=1, is_ready=False, has_token=False, untaken=keys))
+    assert told == "our relay does not see its worker's token"
+    told = lack_of(node, ev.SlotReady(task="merge", epoch=0, is_ready=False, has_token=True, untaken=keys))
+    assert told == "our relay does not see its worker's token, or its subscriptions", "that was another slot"
+    node.handle(ev.SlotReady(task="merge", epoch=1), 104.0)
+    assert build_snapshot(node, 110.0).tasks[0].problems == ()
+
+
+def test_how_long_streams_wait_does_not_begin_again_when_the_relay_says_why() -> None:
+    node = make()
+    learn(node, 1, "edge1")
+    node.handle(ev.SlotReady(task="merge", epoch=1), 100.0)
+    node.handle(ev.SlotFlipped(task="merge", epoch=1), 100.0)
+    node.handle(ev.SlotReady(task="merge", epoch=1, is_ready=False), 110.0)
+    node.handle(ev.SlotReady(task="merge", epoch=1, is_ready=False, has_token=False), 111.0)
+    assert build_snapshot(node, 114.0).tasks[0].problems == (
+        "this robot's streams have waited for edge1 for 4 s: our relay does not see its worker's token",
+    )
+
+
 def test_drops_have_an_age_and_an_input_its_way_in() -> None:
     node = make()
     node.joins_at = ("tcp/127.0.0.1:7458",)
