@@ -287,6 +287,23 @@ def test_a_worker_that_does_all_and_answers_nothing_may_put_it_under_another_key
     assert "PROBLEMS" not in told
 
 
+@pytest.mark.parametrize(
+    ("base", "has_quorum", "told"),
+    [
+        (0, True, "won edge1 · "),
+        (1, True, "won edge1, not agreed on yet"),
+        (1, False, "won edge1, no quorum to agree on it"),
+    ],
+)
+def test_a_vote_that_is_won_and_not_agreed_on_is_shown_as_such(base: int, has_quorum: bool, told: str) -> None:
+    status = recorded("healthy")
+    (task,) = status["tasks"]
+    assert task["revision"] == 1
+    task["vote"]["base_revision"] = base
+    status["quorum"]["ok"] = has_quorum
+    assert told in " ".join(render_status(status, 160, color=False).split())
+
+
 # --- degraded --------------------------------------------------------------------------------------------------------
 
 

@@ -107,6 +107,7 @@ class Node:
         self.started_at = now
         self.has_state = durable is not None
         self.has_foreign_state = False
+        self.lacks_state_file = False
         """The state file is whole, and of another electorate than the fleet file: it stays on its disk."""
         self.counters: Counter[str] = Counter()
         self.problems: dict[str, str] = {}

@@ -19,7 +19,17 @@ from zsched.core.gateway import Gateway
 from zsched.core.generations import way_out
 from zsched.core.knocking import Knocking
 from zsched.core.membership import Membership
-from zsched.core.model import Allocation, NodeId, NodeKind, PeerState, TaskId, WorkerLoad, WorkerState, told_of_worker
+from zsched.core.model import (
+    NEVER_INITIALISED,
+    Allocation,
+    NodeId,
+    NodeKind,
+    PeerState,
+    TaskId,
+    WorkerLoad,
+    WorkerState,
+    told_of_worker,
+)
 from zsched.core.namesakes import Namesakes
 from zsched.core.plan import Direction, ReadyWhen, Route, StreamCount
 from zsched.core.register import Register
@@ -68,6 +78,8 @@ class NodeView(Protocol):
     started_at: float
     has_state: bool
     has_foreign_state: bool
+    lacks_state_file: bool
+    """There is none at all, rather than one that cannot be used."""
     stateless: set[NodeId]
     unready: dict[TaskId, tuple[int, float]]
     lacks: dict[TaskId, SlotReady]
@@ -119,6 +131,14 @@ def build_snapshot(node: NodeView, now: float) -> Snapshot:
 
 
 def _problems(node: NodeView, quorum: QuorumStatus) -> tuple[str, ...]:
+    if _is_never_initialised(node, quorum):
+        others = {source: text for source, text in node.problems.items() if source != "state"}
+        names = ", ".join(quorum.stateless)
+        first = (
+            f"{NEVER_INITIALISED}: no elector heard has a state ({names}), and nobody knows of one. "
+            "Stop every daemon, run `zsched init` on every node, and start them again"
+        )
+        return (first, *(f"{source}: {text}" for source, text in sorted(others.items())))
     problems = [f"{source}: {text}" for source, text in sorted({**node.problems, **node.agreement.problems}.items())]
     if quorum.stateless:
         names = ", ".join(quorum.stateless)
@@ -153,6 +173,17 @@ def _problems(node: NodeView, quorum: QuorumStatus) -> tuple[str, ...]:
     if not node.has_state and not node.has_foreign_state:
         problems.append("no valid state file: this node is no elector (see `zsched init --help`)")
     return tuple(problems)
+
+
+def _is_never_initialised(node: NodeView, quorum: QuorumStatus) -> bool:
+    """Whether too many electors have no state, none is known to have one, and nobody remembers that one ever had."""
+    agreement, electors = node.agreement, node.fleet.electors
+    if node.me in electors and not node.lacks_state_file:
+        return False
+    is_remembered = agreement.newest_generation or agreement.voted or agreement.problems or quorum.apart
+    if is_remembered or any(register.value.revision for register in node.registers.values()):
+        return False
+    return quorum.alive == 0 and quorum.electors - len(quorum.stateless) < quorum.needed
 
 
 def _relay_problems(node: NodeView, now: float) -> Iterator[str]:

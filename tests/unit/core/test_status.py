@@ -129,6 +129,53 @@ def test_electors_that_have_lost_their_state_are_named_and_count_for_nothing() -
     assert (quorum.alive, quorum.ok, quorum.stateless) == (2, True, ("robot3",))
 
 
+def forgotten(me: str = "robot1", *, lacks_file: bool = True, stateless: tuple[str, ...] = ROBOTS) -> Node:
+    """A node of a fleet whose electors say that they have no state."""
+    node = make(me, has_state=me not in stateless)
+    node.lacks_state_file = lacks_file
+    node.problems["state"] = "/x/state does not exist"
+    for name in stateless:
+        if name != me:
+            beat = Beat(node=name, incarnation=3, sequence=2, loop_lag_s=0.0, has_lost_state=True)
+            node.handle(ev.BeatReceived(beat=beat), 100.0)
+    return node
+
+
+@pytest.mark.parametrize("me", ["robot1", "edge1"])
+def test_a_fleet_that_was_never_initialised_is_told_one_order_and_told_it_first(me: str) -> None:
+    snapshot = build_snapshot(forgotten(me), 100.0)
+    (told,) = snapshot.problems
+    assert told.startswith("never initialised: ")
+    assert "Stop every daemon, run `zsched init` on every node, and start them again" in told
+    assert "--generation" not in told
+    shown = " ".join(render_status(snapshot_json(snapshot), 160, color=False).split())
+    assert "PROBLEMS never initialised: " in shown, "before all that follows from it"
+    assert "lost state" not in shown
+
+
+def test_a_fleet_of_which_somebody_remembers_a_state_was_initialised() -> None:
+    """A blank state in place of a lost one may vote twice: only a new generation helps."""
+    learnt = forgotten()
+    learn(learnt, 1, "edge1")
+    voted = forgotten()
+    voted.agreement.voted.add("robot2")
+    newer = forgotten()
+    newer.agreement.newest_generation = 1
+    for node in (learnt, voted, newer, forgotten(lacks_file=False)):
+        problems = build_snapshot(node, 100.0).problems
+        assert not any(one.startswith("never initialised") for one in problems), problems
+        assert any("--generation" in one and one.startswith("nothing can be agreed") for one in problems), problems
+        shown = " ".join(render_status(snapshot_json(build_snapshot(node, 100.0)), 160, color=False).split())
+        assert "PROBLEMS nothing can be agreed" in shown
+
+
+def test_one_node_without_a_state_is_not_the_fleet() -> None:
+    node = forgotten(stateless=("robot1",))
+    problems = build_snapshot(node, 100.0).problems
+    assert "state: /x/state does not exist" in problems
+    assert not any(one.startswith("never initialised") for one in problems)
+
+
 @pytest.mark.parametrize(
     "strange",
     [{"generation": 2}, {"electorate": "0" * 16}, {"generation": 2, "electorate": f"{electorate_hash(FLEET)}/2"}],
