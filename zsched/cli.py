@@ -265,12 +265,12 @@ def check(
     config: ConfigOption = None,
     json_: JsonOption = False,
 ) -> None:
-    """Check a fleet file: every fault at once, each with file:line:col; exits with 78 when there is one.
+    """Check a fleet file: all faults that can be judged at once, each with file:line:col; exits with 78 on any.
 
-    Of a file without fault it says in words when each task moves, setting by setting.
+    Of a file without fault it says in words when each task moves, setting by setting, once for tasks alike.
     """
     from zsched import places  # noqa: PLC0415 - each verb imports what it needs
-    from zsched.cli_rules import told  # noqa: PLC0415 - as above
+    from zsched.cli_rules import told_once  # noqa: PLC0415 - as above
     from zsched.config import check_file  # noqa: PLC0415 - ruamel.yaml is slow to import
     from zsched.core.fleet import fleet_hash  # noqa: PLC0415 - as above
 
@@ -294,8 +294,7 @@ def check(
     if not json_:
         typer.echo("ok: " + ", ".join(_count(number, noun) for noun, number in counts.items()))
         typer.echo(f"hash: {digest} (nodes whose files have another one say so in `zsched status`)")
-    for spec in fleet.tasks if fleet is not None and not json_ else ():
-        first, *more = told(spec)
+    for first, *more in told_once(fleet.tasks) if fleet is not None and not json_ else ():
         typer.echo("\n".join((first, *(f"  {line}" for line in more))))
 
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from zsched.cli_page import Cell, Page, cut, memory, size, span
-from zsched.core.model import RESTARTING, WAS_READY, WorkerState, told_of_worker
+from zsched.core.model import NEVER_INITIALISED, RESTARTING, WAS_READY, WorkerState, told_of_worker
 
 Json = dict[str, Any]
 
@@ -23,6 +23,10 @@ MOST, LITTLE = 0.98, 0.8
 """From here on nearly all jobs are done; below that, many are not."""
 JOBS_OVER_S = 10.0
 """What a profile says of jobs that is so old is history, too."""
+CAUSES = (NEVER_INITIALISED, "nothing can be agreed")
+"""How the problems begin from which others follow: they come first."""
+NO_ANSWER_TO = 100
+"""After so many inputs without one output, ever, the key of the output is doubted."""
 DROPS_OVER_S = 60.0
 """Drops that have not risen for so long are history."""
 STATE_STYLES = {"alive": "green", "ready": "green"} | dict.fromkeys(
@@ -98,7 +102,8 @@ def _header(page: Page, status: Json) -> None:
         health, style = f"ok, {away} node{'s'[: away != 1]} away", "yellow"
     if degradations(status):
         health, style = "DEGRADED", "alarm"
-    role = "" if quorum["this_node"] == "no_elector" else ", " + quorum["this_node"].replace("_", " ")
+    roles = {"no_elector": "", "lost_state": ", no valid state"}  # it may never have had one
+    role = roles.get(quorum["this_node"], ", " + quorum["this_node"].replace("_", " "))
     parts = [f"fleet {status['fleet']}", f"{status['node']} ({status['kind']}{role})"]
     parts.append(f"quorum {quorum['alive']} of {quorum['electors']}, needs {quorum['needed']}")
     room = page.width - len(health) - 1
@@ -230,7 +235,7 @@ def _task(page: Page, status: Json, task: Json) -> None:
     page.block(f"TASK {task['name']}", *parts, *counts)
     _work(page, status, task)
     _scheduler(page, status, task)
-    _vote(page, task)
+    _vote(page, task, has_quorum=status["quorum"]["ok"])
     is_quiet = task["phase"] in ("idle", "settled")
     page.block("EXECUTOR", (str(task["phase"]), "" if is_quiet else "yellow"))
     _route(page, status, task)
@@ -367,7 +372,7 @@ def _number(value: float | None, digits: int) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 
-def _vote(page: Page, task: Json) -> None:
+def _vote(page: Page, task: Json, *, has_quorum: bool) -> None:
     vote = task["vote"]
     if vote is None:
         page.block("VOTE", ("none seen by this node", "dim"))
@@ -376,9 +381,12 @@ def _vote(page: Page, task: Json) -> None:
         for voter, choice in vote["votes"].items():
             camps.setdefault(choice, []).append(voter)
         winner = f" {vote['winner']}" if vote["winner"] else ""
+        is_won, is_agreed = vote["outcome"] == "won", vote["base_revision"] < task["revision"]
+        lack = ", not agreed on yet" if has_quorum else ", no quorum to agree on it"
+        so_far = lack if is_won and not is_agreed else ""
         page.block(
             "VOTE",
-            (f"{vote['outcome'].replace('_', ' ')}{winner}", "green" if vote["outcome"] == "won" else "yellow"),
+            (f"{vote['outcome'].replace('_', ' ')}{winner}{so_far}", "green" if is_won and is_agreed else "yellow"),
             *((f"{choice}: {', '.join(voters)}", "") for choice, voters in camps.items()),
             (f"on revision {vote['base_revision']}", "dim"),
             (f"{span(vote['age_s'])} ago", "dim"),
@@ -410,18 +418,35 @@ def _route(page: Page, status: Json, task: Json) -> None:
             text += ", dropped " + " ".join(f"{count} {reason}" for reason, count in drops.items())
             text += f" (none for {span(stream['dropped_s'])})" if is_over else ""
         parts.append((text, "yellow" if drops and not is_over else ""))
+    parts += [(hint, "yellow") for hint in _unanswered(task)]
     unheard = [one for one in task["streams"] if one["last_seen_s"] is None and f"{prefix}in/" in one["stream"]]
     first = next((one["name"] for one in status["tasks"] if one["streams"]), None)
+    if first is None and status["kind"] == "robot":  # no counts yet: an application may join all the same
+        first = status["tasks"][0]["name"]
     if (unheard or task["name"] == first) and status.get("joins_at"):  # a later field of the schema's major version
         parts.append((f"applications here join at {', '.join(status['joins_at'])} (mode client)", "dim"))
-    page.block("ROUTE", *(parts or [("no streams here", "dim")]))
+    has_streams = bool(task["streams"])
+    page.block("ROUTE", *([] if has_streams else [("no streams here", "dim")]), *parts)
+
+
+def _unanswered(task: Json) -> list[str]:
+    """A hint that the worker may put its outputs under other keys than the rule's; no problem: it may answer rarely."""
+    streams = {way: [one for one in task["streams"] if f"/{way}/" in one["stream"]] for way in ("in", "out")}
+    done = sum(one.get("acknowledged") or 0 for one in streams["in"])
+    keys = [key for one in streams["out"] if (key := one.get("from_expr"))]
+    is_silent = task["phase"] == "settled" and not any(one["messages"] for one in streams["out"])
+    if not keys or not is_silent or done < NO_ANSWER_TO:
+        return []
+    what = f"{task['owner']} has done {done} inputs and nothing has ever come on {', '.join(keys)}"
+    return [f"{what}: does its worker put its outputs under that key?"]
 
 
 # --- problems --------------------------------------------------------------------------------------------------------
 
 
 def _problems(status: Json) -> list[str]:
-    found = [*degradations(status), *status["problems"]]
+    causes = [problem for problem in status["problems"] if problem.startswith(CAUSES)]
+    found = [*causes, *degradations(status), *status["problems"]]
     found += [f"{task['name']}: {problem}" for task in status["tasks"] for problem in task["problems"]]
     return list(dict.fromkeys(found))
 

@@ -5,21 +5,35 @@ Knows: a task's settings. Does not know: the fleet file, nodes, how anything is 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from zsched.core.fleet import TaskSpec
 from zsched.core.model import ScoreForm
 from zsched.core.patience import CHOICES
 from zsched.core.utility import NEARLY_FULL
 
 
+def told_once(specs: Iterable[TaskSpec]) -> list[list[str]]:
+    """What is told of every task, the names first, and once for all tasks of which the same is told."""
+    alike: dict[tuple[str, ...], list[str]] = {}
+    for spec in specs:
+        alike.setdefault(tuple(told(spec)), []).append(spec.name)
+    return [[f"{_named(names)}: {first}", *more] for (first, *more), names in alike.items()]
+
+
+def _named(names: list[str]) -> str:
+    return names[0] if len(names) == 1 else f"tasks {', '.join(names)}"
+
+
 def told(spec: TaskSpec) -> list[str]:
-    """One sentence per setting, the task's name first."""
+    """One sentence per setting."""
     tuning, weights = spec.tuning, spec.tuning.weights
     is_service = tuning.score is ScoreForm.SERVICE
     shares = ", ".join(f"{name} {getattr(weights, name):g}" for name in ("cpu", "memory", "network"))
     worth = "the share of its work that it gets done there" if is_service else "what is left free there (Eq. 1 and 2)"
     floor = f"{100 * spec.memory_floor_ratio:g} %"
     seconds = "s of its work" if is_service else "utility seconds"
-    lines = [f"{spec.name}: a machine is worth {worth}; weights: {shares}"]
+    lines = [f"a machine is worth {worth}; weights: {shares}"]
     if spec.learns_patience:
         when = f"staying has cost its patience, which it learns ({CHOICES[0]:g} to {CHOICES[-1]:g} {seconds})"
     elif spec.patience is not None:

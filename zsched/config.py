@@ -25,6 +25,7 @@ from zsched.files import owner_of, read_regular
 
 __all__ = ["CheckResult", "Fault", "check_bytes", "check_file", "load_fleet", "require_node"]
 
+MORE = "note: more may follow once these are mended: what hangs on a faulty part cannot be judged"
 _SEEDS = 2
 """How many nodes are seeds when the file names none: one may be down."""
 
@@ -41,7 +42,8 @@ class CheckResult:
     def report(self) -> str:
         """Faults, then warnings, as a compiler shows them; empty when there are none."""
         parts = (render_all(self.file, self.faults), render_all(self.file, self.warnings, "warning"))
-        return "\n".join(part for part in parts if part)
+        note = f"{self.file}: {MORE}" if any(fault.line for fault in self.faults) else ""
+        return "\n".join(part for part in (*parts, note) if part)
 
 
 def load_fleet(path: str | Path) -> Fleet:
@@ -207,7 +209,8 @@ def _electors(section: Section, cast: Cast, out: Collector) -> tuple[NodeId, ...
 
 def _advise_electors(electors: tuple[NodeId, ...], cast: Cast, place: Place, out: Collector) -> None:
     spare = [name for name in cast.names if name not in electors]
-    hint = f"electorate: [{', '.join(sorted((*electors, *spare[: 3 - len(electors)])))}]" if spare else ""
+    three = (*electors, *spare[: 3 - len(electors)])
+    hint = f"electorate: [{', '.join(sorted(three))}]" if len(three) == 3 else ""  # two would be no better than one
     if len(electors) == 1:
         out.warn(place, f"{electors[0]!r} is the only elector: while it is away no task can move", hint)
     elif len(electors) == 2:

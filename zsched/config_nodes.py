@@ -78,7 +78,7 @@ def read_nodes(section: Section, folder: Path, out: Collector) -> Cast:
     if not entries and "nodes" in section.values:
         out.error(place, "the fleet has no nodes")
     is_whole = out.count == before and len(nodes) == len(entries) > 0
-    _check_endpoints(nodes, entries, out)
+    _check_endpoints(entries, out)
     sound = frozenset(name for name, entry in entries.items() if entry.value is not None and entry.value.is_whole)
     return Cast(place=place, names=tuple(entries), nodes=tuple(nodes), sound=sound, is_whole=is_whole)
 
@@ -134,21 +134,22 @@ def _port(endpoint: str) -> str:
 # --- endpoints -------------------------------------------------------------------------------------------------------
 
 
-def _check_endpoints(nodes: list[NodeSpec], entries: dict[str, Located[Section | None]], out: Collector) -> None:
-    """No two sessions of the fleet may have one address."""
+def _check_endpoints(entries: dict[str, Located[Section | None]], out: Collector) -> None:
+    """No two sessions of the fleet may have one address, whatever else is wrong with their nodes."""
     taken: dict[str, str] = {}
-    for node in nodes:
-        section = entries[node.name].value
+    for name, entry in entries.items():
+        section = entry.value
         listen: Section | None = section.get("listen") if section is not None else None
-        if listen is None:
+        if section is None or listen is None:
             continue
-        for kind, endpoint in (("control", node.listen_control), ("data", node.listen_data)):
+        for kind in ("control", "data"):
             # a node without a host listens "everywhere", but on its own machine
-            address = dial_endpoint(endpoint, node.host or node.name).partition("?")[0].partition("#")[0]
+            endpoint = listen.get(kind, "")
+            address = dial_endpoint(endpoint, section.get("host", "") or name).partition("?")[0].partition("#")[0]
             if not address:
                 continue
-            owner = taken.setdefault(address, f"{node.name}'s {kind} session")
-            if owner != f"{node.name}'s {kind} session":
+            owner = taken.setdefault(address, f"{name}'s {kind} session")
+            if owner != f"{name}'s {kind} session":
                 out.error(listen.where(kind), f"{endpoint} is already {owner}", "give each session a port of its own")
 
 

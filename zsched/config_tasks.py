@@ -39,6 +39,7 @@ from zsched.core.plan import (
     StreamClass,
     StreamSettings,
 )
+from zsched.core.route import NOBODY
 from zsched.core.rulecheck import RuleConflict, rule_conflicts
 from zsched.core.templates import (
     PLACEHOLDERS,
@@ -52,6 +53,8 @@ from zsched.core.templates import (
 
 _ANY_TUNING: Final = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
 """Stands in for a faulty one, so that the task's rules are checked in the same pass; such a file gives no fleet."""
+_ANY_CANDIDATES: Final = (NOBODY,)
+"""The same for candidates: of a task without any the file has a fault."""
 _OF_THE_TASK: Final = ("reach", "memory_floor_ratio", "max_moves_per_minute", "pays_off_in_s")
 """Keys of `scheduling:` that are not part of the tuning: they cannot be changed at run time (nor can `patience`)."""
 _Places = dict[str, Place]
@@ -90,14 +93,12 @@ def _task(
     _check_exclusive(given, worker, streams, out)
     _advise_ready(given, worker, streams, out)
     _check_mirrors(given, streams, out)
-    if not candidates:
-        return None
     scheduling: Section | None = given.get("scheduling")
     more = {} if scheduling is None else _of(scheduling, *_OF_THE_TASK)
     demand: Section | None = given.get("demand")
     task = TaskSpec(
         name=name,
-        candidates=candidates,
+        candidates=candidates or _ANY_CANDIDATES,
         tuning=tuning or _ANY_TUNING,
         demand=(demand.build(Demand, out) if demand is not None else None) or Demand(),
         limits=limits,
@@ -318,9 +319,9 @@ def _check_mirrors(given: Section, streams: tuple[Located[StreamRule], ...], out
 def _check_keys(rule: StreamRule, section: Section, cast: Cast, out: Collector) -> None:
     """What depends on the robots' local sides, and what is worth a word."""
     robots = [node for node in cast.nodes if node.kind is NodeKind.ROBOT]
-    without = [node.name for node in robots if node.local is None]
+    without = [node.name for node in robots if node.local is None and node.name in cast.sound]
     problem = shared_key_fault(rule)
-    if problem is not None and without and cast.is_whole:
+    if problem is not None and without:
         held: Located[str] = section.get("to" if rule.direction is Direction.OUTPUT else "from")
         hint = f"add {{robot}}, or give every robot a `local:` side ({', '.join(without[:4])} has none)"
         out.error(held.place, f"{held.value!r}: {problem}", hint)
@@ -330,14 +331,16 @@ def _check_keys(rule: StreamRule, section: Section, cast: Cast, out: Collector) 
 
 
 def _rule(section: Section, direction: Direction, out: Collector) -> StreamRule | None:
-    before = out.count
+    """The rule, of which only the keys need be right: what else is wrong says nothing of how it goes with others."""
+    has_keys = True
     for side in ("from", "to"):
         held: Located[str] | None = section.get(side)
         problem = template_fault(held.value, direction, side) if held is not None else None
+        has_keys &= held is not None and problem is None
         if held is not None and problem is not None:
             out.error(held.place, f"{held.value!r}: {problem}", _placeholder_hint(held.value))
     _check_settings(section, direction, out)
-    if not section.is_whole or out.count > before:
+    if not has_keys:
         return None
     rule = StreamRule(
         direction=direction,

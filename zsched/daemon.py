@@ -93,6 +93,7 @@ class Daemon:
         self._next_status = 0.0
         self._is_restart = False
         self._has_foreign_state = False
+        self._lacks_state_file = False
         self._door = Door(options.runtime_dir, options.node)
         self._is_ready = False
         self._operator_json5 = daemon_tls.operator_json5(self._fleet)
@@ -123,6 +124,7 @@ class Daemon:
                 node.problems["state"] = problem
             node.has_foreign_state = self._has_foreign_state
             node.fleet_path = str(self._options.config.absolute())
+            node.lacks_state_file = self._lacks_state_file
             if self._memory_objection:
                 log.warning("shared_memory off why=%s", self._memory_objection)
                 node.problems["shared_memory"] = f"shared memory is off here: {self._memory_objection}"
@@ -137,6 +139,7 @@ class Daemon:
     def _restore(self, state_file: StateFile) -> tuple[DurableState | None, str | None]:
         """The durable state with this start's incarnation on disk, or why there is none."""
         loaded = state_file.load()
+        self._lacks_state_file = loaded.is_missing
         if loaded.state is None:
             here = self._options
             command = f"zsched init --config {here.config} --node {here.node} --state-dir {here.state_dir}"

@@ -212,6 +212,7 @@ def test_up_without_state_starts_and_says_how_to_make_it_an_elector(tmp_path: Pa
     assert shown.returncode == 4
     assert "DEGRADED" in shown.stdout
     assert "no quorum" in shown.stdout
+    assert "never initialised" in shown.stdout
     assert f"zsched init --config {only.file} --node robot1" in only.log()
 
 

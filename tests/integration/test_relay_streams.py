@@ -23,6 +23,7 @@ from zsched.core.plan import (
     StreamClass,
     WorkerRole,
 )
+from zsched.core.relay_protocol import WorkerWatch
 from zsched.zenoh_config import DEFAULT_TIMING, worker_config
 
 WAITS_S = 5.0
@@ -311,3 +312,41 @@ def test_what_a_foreign_worker_was_sent_is_unconfirmed_and_never_dropped(rig: Ri
         assert (told.drops, told.lost, told.at_most_lost, told.acknowledged) == ((), 0, 0, None)
     finally:
         foreign.close()
+
+
+@pytest.mark.parametrize("stream_class", StreamClass)
+def test_what_comes_before_the_first_owner_is_counted(rig: Rig, stream_class: StreamClass) -> None:
+    """A task whose worker never gets ready has no owner, no plan and no slot: its robot's inputs count all the same."""
+    now = slot(1, "edge1", stream_class, 1)
+    rig.relays[ROBOT].watch(WorkerWatch(task=TASK, unowned=now.routes[:1]))
+    app = Application(rig.app)
+    until(app.connected, "the application sees the relay's subscription")
+    for _ in range(160):
+        app.put()
+    until(lambda: rig.told(f"{TASK}/in/0").messages == 160, "the relay counts")
+    told = rig.told(f"{TASK}/in/0")
+    if stream_class is StreamClass.LATEST:
+        assert (told.drops, told.unsent) == ((), 160)
+    else:
+        assert told.drops == (("no_route", 160),)
+    rig.assert_nothing_is_unaccounted()
+    rig.start_worker("edge1")
+    rig.move(now)
+    app.put()
+    until(lambda: app.back, "the first owner answers")
+    until(lambda: rig.told(f"{TASK}/in/0").messages == 161, "the same stream goes on")
+    rig.assert_nothing_is_unaccounted()
+
+
+def test_a_key_that_the_worker_does_not_take_is_told(rig: Rig) -> None:
+    """Its token is there, so what is missing has to be named."""
+    now = slot(1, "edge1", StreamClass.RELIABLE, 1)
+    wrong = replace(now, routes=(replace(now.routes[0], to_expr="edge1/wrongkey/robot1/in"), *now.routes[1:]))
+    rig.plan(RoutePhase.PREPARE, wrong)
+    rig.wait(SlotReady, epoch=1, is_ready=False, has_token=False, untaken=("edge1/wrongkey/robot1/in",))
+    rig.start_worker("edge1")
+    rig.wait(SlotReady, epoch=1, is_ready=False, has_token=True, untaken=("edge1/wrongkey/robot1/in",))
+    session = rig.app
+    taken = session.declare_subscriber("edge1/wrongkey/robot1/in", lambda _sample: None)
+    rig.wait(SlotReady, epoch=1, is_ready=True)
+    taken.undeclare()

@@ -87,6 +87,23 @@ def test_check_says_in_words_when_a_task_moves(tmp_path: Path, scheduling: str, 
     assert [word for word in words if word not in text] == [], text
 
 
+def test_check_says_once_what_holds_for_several_tasks(tmp_path: Path) -> None:
+    file = tmp_path / "fleet.yaml"
+    head, task = FLEET.split("tasks:\n")
+    names = ("alike", "also", "other")
+    (name,) = (line.strip(" :") for line in task.splitlines() if line.startswith("  ") and line[2] != " ")
+    tasks = {one: task.replace(name, one) for one in names}
+    weights = next(line for line in tasks["other"].splitlines() if "weights:" in line)
+    tasks["other"] = tasks["other"].replace(weights, f"{weights}\n    scheduling: {{patience: 0.7}}")
+    file.write_text(f"{head}tasks:\n" + "".join(text.rstrip() + "\n" for text in tasks.values()))
+    lines = run("check", file).stdout.splitlines()
+    assert [line.split(": a machine")[0] for line in lines if "a machine is worth" in line] == [
+        "tasks alike, also",
+        "other",
+    ], lines
+    assert len([line for line in lines if "after a move it stays" in line]) == 2
+
+
 def test_check_of_a_bad_file_reports_every_fault_with_its_place_and_exits_with_78(tmp_path: Path) -> None:
     file = tmp_path / "fleet.yaml"
     file.write_text(FLEET.replace("kind: robot}\n  robot3", "kind: rowboat}\n  robot3").replace("cpu: 0.5", "cpu: 5"))
@@ -112,6 +129,7 @@ def test_check_warns_on_stderr_and_still_exits_with_0(tmp_path: Path) -> None:
 
 def test_check_of_a_missing_file_exits_with_78(tmp_path: Path) -> None:
     result = run("check", tmp_path / "none.yaml")
+    assert "more may follow" not in result.stderr
     assert result.exit_code == 78
     assert "cannot be read" in result.stderr
 

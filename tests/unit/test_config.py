@@ -376,6 +376,60 @@ def test_few_electors_are_advised_by_warning_only() -> None:
     assert "survive the loss of 1, as 3 would" in four.report()
 
 
+def test_the_hint_for_few_electors_is_no_worse_than_one() -> None:
+    """Two electors need both, so they are no better than one."""
+    pair = """\
+fleet: pair
+nodes:
+  robot1: {kind: robot, host: 192.0.2.1, listen: {control: tcp/0.0.0.0:7457, data: tcp/0.0.0.0:7458}}
+  edge1: {kind: edge, host: 192.0.2.2, listen: {control: tcp/0.0.0.0:7457, data: tcp/0.0.0.0:7458}}
+tasks: {}
+"""
+    (only,) = (one for one in check(pair).warnings if "only elector" in one.message)
+    assert only.hint == ""
+    (only,) = (one for one in check(pair.replace("tasks:", "  edge2: {kind: edge}\ntasks:")).warnings if one.hint)
+    assert only.hint == "electorate: [edge1, edge2, robot1]"
+
+
+MANY_FAULTS = """\
+fleet: hall
+nodes:
+  robot1: {kind: robot, host: 127.0.0.1, listen: {control: tcp/127.0.0.1:21480, data: tcp/127.0.0.1:21481}}
+  edge1: {kind: edgy, host: 127.0.0.1, listen: {control: tcp/127.0.0.1:21480, data: tcp/127.0.0.1:21482}}
+  edge2: {kind: edge}
+tasks:
+  adder:
+    candidates: [edge9]
+    weights: {cpu: 1, memory: 0, network: 0}
+    inputs:  [{from: "{robot}/number", to: "{target}/adder/{robot}/number", class: relible}]
+    outputs: [{from: "{target}/adder/{robot}/number", to: "{robot}/number"}]
+  summer:
+    candidates: [edge2]
+    weights: {cpu: 1, memory: 0, network: 0}
+    inputs:  [{from: "{robot}/part", to: "{target}/summer/{robot}/part"}]
+    outputs: [{from: "{target}/summer/total", to: total, handover: sometimes}]
+"""
+
+
+def test_a_fault_hides_no_other_that_can_be_judged_beside_it() -> None:
+    """What a stranger mended only to be told of three more."""
+    result = check(MANY_FAULTS)
+    told = [(fault.line, fault.message) for fault in result.faults]
+    for line, said in (
+        (4, "edgy"),
+        (4, "tcp/127.0.0.1:21480 is already robot1's control session"),
+        (8, "there is no node 'edge9'"),
+        (10, "relible"),
+        (11, "loop, relays feed each other"),
+        (16, "'total': it lacks {robot}"),
+        (16, "sometimes"),
+    ):
+        assert any(at == line and said in message for at, message in told), (line, said, told)
+    assert len(told) == 7, told
+    assert result.report().endswith("what hangs on a faulty part cannot be judged")
+    assert "more may follow" not in check(GOOD).report(), "there are warnings only"
+
+
 def test_files_that_are_elsewhere_are_warnings() -> None:
     warnings = [fault.message for fault in check(GOOD).warnings]
     assert [text.rsplit("/", 1)[1] for text in warnings] == [

@@ -276,6 +276,55 @@ def test_where_applications_join_stays_once_messages_flow() -> None:
     assert render_status(status, 100, color=False).count("applications here join at tcp/127.0.0.1:7458") == 1
 
 
+def test_where_applications_join_is_told_before_anything_is_counted() -> None:
+    status = recorded("healthy")
+    status["joins_at"] = ["tcp/127.0.0.1:7458"]
+    status["tasks"][0]["streams"] = []
+    told = render_status(status, 100, color=False)
+    assert "no streams here" in told
+    assert told.count("applications here join at tcp/127.0.0.1:7458") == 1
+    status["kind"] = "edge"
+    assert "applications here join" not in render_status(status, 100, color=False)
+
+
+@pytest.mark.parametrize(
+    ("done", "answers", "phase", "is_told"),
+    [(100, 0, "settled", True), (99, 0, "settled", False), (100, 1, "settled", False), (100, 0, "preparing", False)],
+)
+def test_a_worker_that_does_all_and_answers_nothing_may_put_it_under_another_key(
+    done: int, answers: int, phase: str, is_told: bool
+) -> None:
+    status = recorded("healthy")
+    (task,) = status["tasks"]
+    task["phase"] = phase
+    for stream in task["streams"]:
+        if "/in/" in stream["stream"]:
+            stream["acknowledged"] = done
+        else:
+            stream.update(messages=answers, from_expr="edge1/echo/1/anser")
+    told = " ".join(render_status(status, 160, color=False).split())
+    assert (f"done {done} inputs and nothing has ever come on edge1/echo/1/anser" in told) is is_told
+    assert degradations(status) == (), "it may answer rarely"
+    assert "PROBLEMS" not in told
+
+
+@pytest.mark.parametrize(
+    ("base", "has_quorum", "told"),
+    [
+        (0, True, "won edge1 · "),
+        (1, True, "won edge1, not agreed on yet"),
+        (1, False, "won edge1, no quorum to agree on it"),
+    ],
+)
+def test_a_vote_that_is_won_and_not_agreed_on_is_shown_as_such(base: int, has_quorum: bool, told: str) -> None:
+    status = recorded("healthy")
+    (task,) = status["tasks"]
+    assert task["revision"] == 1
+    task["vote"]["base_revision"] = base
+    status["quorum"]["ok"] = has_quorum
+    assert told in " ".join(render_status(status, 160, color=False).split())
+
+
 # --- degraded --------------------------------------------------------------------------------------------------------
 
 

@@ -43,6 +43,8 @@ class LoadResult:
 
     state: DurableState | None = None
     problem: str | None = None
+    is_missing: bool = False
+    """There is no such file: this node was never initialised, or its folder is gone."""
 
 
 class StateFile:
@@ -171,7 +173,8 @@ class StateFile:
         try:
             content = read_regular(self.path, MAX_STATE_BYTES)
         except FileNotFoundError:
-            return LoadResult(problem=f"{self.path} does not exist: run `zsched init` if this name has never voted")
+            advice = "if this name has never voted, stop the daemon, run `zsched init`, and start it again"
+            return LoadResult(problem=f"{self.path} does not exist: {advice}", is_missing=True)
         except OSError as error:
             return LoadResult(problem=f"{self.path} cannot be read: {error.strerror}")
         try:

@@ -19,7 +19,7 @@ from zsched.core.plan import StreamCount
 
 
 def unaccounted(count: StreamCount) -> int | None:
-    """Samples that the counters say nothing of (below 0: counted twice); ``None``: no input, or never had an owner.
+    """Samples that the counters say nothing of (below 0: counted twice); ``None``: no input.
 
     Counters are read while samples move; one that is in a thread's hand is accounted for, so 0 holds at any time.
     """

@@ -260,6 +260,10 @@ class SlotReady:
     task: TaskId
     epoch: int
     is_ready: bool = True
+    has_token: bool | None = None
+    """Not ready: whether the relay sees the worker's token all the same; ``None``: it does not say."""
+    untaken: tuple[str, ...] = ()
+    """Not ready: the inputs' keys at the owner that nobody subscribes to."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

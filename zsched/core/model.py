@@ -181,6 +181,8 @@ class WorkerState(StrEnum):
     FAILED = "failed"  # too many failures in the window, or it said that it cannot: the node is not eligible
 
 
+NEVER_INITIALISED = "never initialised"
+"""How the problem begins of a fleet in which no elector has a state, and nobody remembers one."""
 WAS_READY = "was ready until "
 """So a reason begins that is one of a worker which is not ready any more: it is starting only for its supervisor."""
 

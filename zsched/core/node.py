@@ -108,6 +108,7 @@ class Node:
         self.has_state = durable is not None
         self.has_foreign_state = False
         """The state file is whole, and of another electorate than the fleet file: it stays on its disk."""
+        self.lacks_state_file = False
         self.counters: Counter[str] = Counter()
         self.problems: dict[str, str] = {}
         self.is_draining = False
@@ -146,6 +147,8 @@ class Node:
         """Electors whose newest beat says that they answer no proposer."""
         self.unready: dict[TaskId, tuple[int, float]] = {}
         """{task: (epoch, since when)} of the slots whose worker our relay does not see any more."""
+        self.lacks: dict[TaskId, ev.SlotReady] = {}
+        """{task: what our relay misses of such a worker}."""
         self.fleet_file = fleet_hash(fleet)
         self.fleet_path = ""
         """Where that file lies, for the status."""
@@ -648,9 +651,12 @@ class Node:
         if event.task not in self.executors:
             return
         if not event.is_ready:
-            self.unready[event.task] = (event.epoch, now)
+            known, since = self.unready.get(event.task, (-1, now))
+            self.unready[event.task] = (event.epoch, since if known == event.epoch else now)
+            self.lacks[event.task] = event
             return
         self.unready.pop(event.task, None)
+        self.lacks.pop(event.task, None)
         self._batch.add(*self.executors[event.task].on_ready(event.epoch))
 
     def _on_slot_flipped(self, event: ev.SlotFlipped, now: float) -> None:

@@ -73,6 +73,8 @@ class WorkerWatch:
     """What the worker here is asked: per rule the key of every robot."""
     standbys: tuple[Route, ...] = ()
     """Robots: the inputs towards every candidate, to be announced in the ROS graph for warm workers to find."""
+    unowned: tuple[Route, ...] = ()
+    """Robots: the inputs towards nobody, taken from the start: what comes while there is no owner is counted."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -50,9 +50,17 @@ def watch_for(fleet: Fleet, spec: TaskSpec, me: NodeId) -> WorkerWatch | None:
         strangers = tuple(key for key in strangers if key not in inputs)
         services = _served(spec, me, fleet.voters)
     standbys = _standbys(spec, me) if kind is NodeKind.ROBOT else ()
-    if not is_watched and not standbys:
+    unowned = _unowned(spec, me) if kind is NodeKind.ROBOT else ()
+    if not is_watched and not unowned:
         return None
-    return WorkerWatch(task=spec.name, inputs=inputs, strangers=strangers, services=services, standbys=standbys)
+    return WorkerWatch(
+        task=spec.name,
+        inputs=inputs,
+        strangers=strangers,
+        services=services,
+        standbys=standbys,
+        unowned=unowned,
+    )
 
 
 def _taken(spec: TaskSpec, target: NodeId) -> tuple[str, ...]:
@@ -71,6 +79,11 @@ def _served(spec: TaskSpec, target: NodeId, robots: tuple[NodeId, ...]) -> tuple
         keys = tuple(dict.fromkeys(key for key in filled if not keyexpr.is_wild(key)))
         result += [keys] if keys else []
     return tuple(result)
+
+
+def _unowned(spec: TaskSpec, me: NodeId) -> tuple[Route, ...]:
+    """This robot's inputs while the task has no owner yet."""
+    return tuple(route for route in routes_for(spec, me, NOBODY, 0) if route.direction is Direction.INPUT)
 
 
 def _standbys(spec: TaskSpec, me: NodeId) -> tuple[Route, ...]:

@@ -12,13 +12,24 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 from zsched.core.agreement import Agreement
+from zsched.core.events import SlotReady
 from zsched.core.executor import Executor, Phase
 from zsched.core.fleet import Fleet, NodeSpec, TaskSpec
 from zsched.core.gateway import Gateway
 from zsched.core.generations import way_out
 from zsched.core.knocking import Knocking
 from zsched.core.membership import Membership
-from zsched.core.model import Allocation, NodeId, NodeKind, PeerState, TaskId, WorkerLoad, WorkerState, told_of_worker
+from zsched.core.model import (
+    NEVER_INITIALISED,
+    Allocation,
+    NodeId,
+    NodeKind,
+    PeerState,
+    TaskId,
+    WorkerLoad,
+    WorkerState,
+    told_of_worker,
+)
 from zsched.core.namesakes import Namesakes
 from zsched.core.plan import Direction, ReadyWhen, Route, StreamCount
 from zsched.core.register import Register
@@ -68,8 +79,11 @@ class NodeView(Protocol):
     started_at: float
     has_state: bool
     has_foreign_state: bool
+    lacks_state_file: bool
+    """There is none at all, rather than one that cannot be used."""
     stateless: set[NodeId]
     unready: dict[TaskId, tuple[int, float]]
+    lacks: dict[TaskId, SlotReady]
     agreement: Agreement
     loop_lag_s: float
     counters: Counter[str]
@@ -118,6 +132,14 @@ def build_snapshot(node: NodeView, now: float) -> Snapshot:
 
 
 def _problems(node: NodeView, quorum: QuorumStatus) -> tuple[str, ...]:
+    if _is_never_initialised(node, quorum):
+        others = {source: text for source, text in node.problems.items() if source != "state"}
+        names = ", ".join(quorum.stateless)
+        first = (
+            f"{NEVER_INITIALISED}: no elector heard has a state ({names}), and nobody knows of one. "
+            "Stop every daemon, run `zsched init` on every node, and start them again"
+        )
+        return (first, *(f"{source}: {text}" for source, text in sorted(others.items())))
     problems = [f"{source}: {text}" for source, text in sorted({**node.problems, **node.agreement.problems}.items())]
     if quorum.stateless:
         names = ", ".join(quorum.stateless)
@@ -152,6 +174,17 @@ def _problems(node: NodeView, quorum: QuorumStatus) -> tuple[str, ...]:
     if not node.has_state and not node.has_foreign_state:
         problems.append("no valid state file: this node is no elector (see `zsched init --help`)")
     return tuple(problems)
+
+
+def _is_never_initialised(node: NodeView, quorum: QuorumStatus) -> bool:
+    """Whether too many electors have no state, none is known to have one, and nobody remembers that one ever had."""
+    agreement, electors = node.agreement, node.fleet.electors
+    if node.me in electors and not node.lacks_state_file:
+        return False
+    is_remembered = agreement.newest_generation or agreement.voted or agreement.problems or quorum.apart
+    if is_remembered or any(register.value.revision for register in node.registers.values()):
+        return False
+    return quorum.alive == 0 and quorum.electors - len(quorum.stateless) < quorum.needed
 
 
 def _relay_problems(node: NodeView, now: float) -> Iterator[str]:
@@ -293,7 +326,7 @@ def _task_problems(node: NodeView, task: TaskSpec, value: Allocation, now: float
     since = _unready_since(node, executor)
     if is_owner_ready and now - since >= UNREADY_SHOWN_S:
         waited = f"this robot's streams have waited for {executor.owner} for {now - since:.0f} s"
-        yield f"{waited}: {_untaken(task, executor)}"
+        yield f"{waited}: {_untaken(task, executor, node.lacks.get(task.name))}"
 
 
 def _is_missed(task: TaskSpec, load: WorkerLoad) -> bool:
@@ -309,12 +342,24 @@ def _unready_since(node: NodeView, executor: Executor) -> float:
     return since if epoch == executor.epoch else math.inf
 
 
-def _untaken(task: TaskSpec, executor: Executor) -> str:
+def _untaken(task: TaskSpec, executor: Executor, lack: SlotReady | None) -> str:
+    """What our relay misses, as far as it has said."""
     newer = "" if task.worker.command else f"; {STARTED_BEFORE.format(owner=executor.owner, task=task.name)}"
+    told = lack if lack is not None and lack.epoch == executor.epoch else None
+    untaken = () if told is None else told.untaken
     if task.worker.ready_when is ReadyWhen.TOKEN:
-        return f"our relay does not see its worker's token, or its subscriptions{newer}"
-    keys = [route.to_expr for route in executor.routes if route.direction is not Direction.OUTPUT]
-    return f"our relay sees nobody take {keys[0] if keys else 'them'}{newer}"
+        if told is None or told.has_token is None:
+            return f"our relay does not see its worker's token, or its subscriptions{newer}"
+        if not told.has_token:
+            return f"our relay does not see its worker's token{newer}"
+        if not untaken:
+            return f"our relay has just seen its worker's subscriptions{newer}"
+        return (
+            f"its worker is there, and nobody subscribes to {', '.join(untaken)}: it has to take each such key with "
+            f"`Worker.subscribe` before `ready` (`zsched stream list` shows the keys){newer}"
+        )
+    keys = untaken or [route.to_expr for route in executor.routes if route.direction is not Direction.OUTPUT][:1]
+    return f"our relay sees nobody take {', '.join(keys) or 'them'}{newer}"
 
 
 def _with_age(count: StreamCount, dropped: dict[str, tuple[int, float]], now: float) -> StreamCount:

@@ -98,7 +98,6 @@ class InputStream:
         self._closed = Tally()  # what slots that are closed have counted
         self._is_counted = False
         """Some worker has acknowledged what it has processed, or will."""
-        self._has_opened = False
         self._stamps: Stamps | None = None
         side = local or session
         self._loop_ids = own_ids - {str(side.zid())}
@@ -124,7 +123,6 @@ class InputStream:
         with self._lock:
             self._is_counted |= acks is not None
             self._stamps = stamps
-            self._has_opened = True
             self._slots[epoch] = _InputSlot(outlet=outlet, is_counted=acks is not None)
 
     def is_matching(self, epoch: int) -> bool:
@@ -324,7 +322,7 @@ class InputStream:
             total.waiting += len(self._owed) + len(self._held)
             for slot in self._slots.values():
                 total.add(slot.outlet.counted())
-            return self._counter.value(total if self._has_opened else None, has_acks=self._is_counted)
+            return self._counter.value(total, has_acks=self._is_counted)
 
     # --- one sample --------------------------------------------------------------------------------------------------
 

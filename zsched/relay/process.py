@@ -153,6 +153,7 @@ class RelayProcess:
         self._local: zenoh.Session | None = None
         self._waiting: dict[TaskId, RoutePlan] = {}
         self._standbys: dict[TaskId, tuple[Route, ...]] = {}
+        self._unowned: dict[TaskId, tuple[Route, ...]] = {}
         self._node = node
         self._reporter = reporter
         self._introducer = introducer
@@ -189,6 +190,8 @@ class RelayProcess:
             for plan in self._waiting.values():
                 self._apply(plan, self._graph)
             self._waiting.clear()
+            for task, routes in self._unowned.items():
+                self._listen(task, routes, self._graph)
             for task, routes in self._standbys.items():
                 self._graph.set_routes(_standbys_of(task), routes)
 
@@ -237,19 +240,28 @@ class RelayProcess:
                 self._apply(command, self._graph)
 
     def _watch(self, watch: WorkerWatch) -> None:
-        if watch.inputs or watch.services or not watch.standbys:
+        if watch.inputs or watch.services or not (watch.standbys or watch.unowned):
             self._matching.watch(watch)
         with self._lock:
             self._standbys[watch.task] = watch.standbys
+            self._unowned[watch.task] = watch.unowned
             if self._graph is not None:
                 self._graph.set_routes(_standbys_of(watch.task), watch.standbys)
+                self._listen(watch.task, watch.unowned, self._graph)
+
+    def _listen(self, task: TaskId, routes: tuple[Route, ...], graph: GraphMirror) -> None:
+        if routes:
+            self._task(task, graph).listen(routes)
 
     def _apply(self, plan: RoutePlan, graph: GraphMirror) -> None:
-        task = self._tasks.get(plan.task)
+        self._task(plan.task, graph).apply(plan)
+
+    def _task(self, name: TaskId, graph: GraphMirror) -> TaskRelay:
+        task = self._tasks.get(name)
         if task is None:
             task = TaskRelay(
                 self._session,
-                plan.task,
+                name,
                 self._tokens,
                 self._acks,
                 self._own_ids,
@@ -257,8 +269,8 @@ class RelayProcess:
                 graph,
                 self._local,
             )
-            self._tasks[plan.task] = task
-        task.apply(plan)
+            self._tasks[name] = task
+        return task
 
     def _has_worker(self, node: NodeId, task: TaskId, incarnation: str) -> bool:
         return self._tokens.has_worker(node, task, incarnation)

@@ -39,6 +39,10 @@ SETTLE_S: Final = 1.5
 robot has just stalled that gets the same answers (`zsched.worker_lanes.STALLED_S`)."""
 GATHER_S: Final = 0.5
 """What a worker left that restarted in place is told of once, when each of its streams has met the new life."""
+MAX_UNTAKEN: Final = 4
+"""More keys than that are not told of."""
+LACK_S: Final = 1.0
+"""What a worker lacks that has just come is on its way; after so long it is told."""
 BUSY_S, CARE_S, IDLE_S = 0.01, 0.2, 0.5
 
 _log = logging.getLogger("zsched.relay")
@@ -50,6 +54,9 @@ class _OpenSlot:
     tokens: frozenset[str] = frozenset()
     seen: frozenset[str] = frozenset()
     is_ready: bool = False
+    lacks_since: float | None = None
+    lack: SlotReady | None = None
+    """What it lacks, as it was told last."""
     is_flipped: bool = False
     is_drained: bool = False
     gone_at: float | None = None
@@ -62,6 +69,13 @@ class _OpenSlot:
 
 class _Orphaned:
     """In the queue of plans: those behind it are another daemon's."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Unowned:
+    """In the queue of plans: inputs that are taken whether or not there is an owner."""
+
+    routes: tuple[Route, ...]
 
 
 class TaskRelay:
@@ -87,7 +101,7 @@ class TaskRelay:
         self._acks = acks
         self._own_ids = own_ids
         self._report = report
-        self._queue: queue.SimpleQueue[RoutePlan | _Orphaned | None] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[RoutePlan | _Orphaned | _Unowned | None] = queue.SimpleQueue()
         self._plan: RoutePlan | None = None
         self._slots: dict[int, _OpenSlot] = {}
         self._inputs: dict[str, InputStream] = {}
@@ -103,6 +117,10 @@ class TaskRelay:
     def apply(self, plan: RoutePlan) -> None:
         """Take the newest plan."""
         self._queue.put(plan)
+
+    def listen(self, routes: tuple[Route, ...]) -> None:
+        """Take these inputs from now on, so that what comes before the first owner is counted, or kept for it."""
+        self._queue.put(_Unowned(routes))
 
     def wake(self) -> None:
         """Something that readiness or draining hangs on has changed."""
@@ -135,6 +153,8 @@ class TaskRelay:
             try:
                 if isinstance(plan, _Orphaned):
                     self._pause()
+                elif isinstance(plan, _Unowned):
+                    self._listen(plan.routes)
                 elif plan is not None:
                     self._take(plan)
                 self._step()
@@ -174,6 +194,18 @@ class TaskRelay:
             for sink in self._outputs.values():
                 sink.pause()
 
+    def _listen(self, routes: tuple[Route, ...]) -> None:
+        for route in routes:
+            if route.stream in self._inputs:
+                continue
+            try:
+                self._inputs[route.stream] = self._take_input(route)
+            except (ValueError, zenoh.ZError) as error:
+                self._problem(f"{route.stream}: {route.from_expr}: {error}")
+
+    def _take_input(self, route: Route) -> InputStream:
+        return InputStream(self._session, route, self._own_ids, self._local, self._times)
+
     def _take(self, plan: RoutePlan) -> None:
         self._plan = plan
         self._flip_by = None
@@ -197,6 +229,8 @@ class TaskRelay:
             self._flip_by = monotonic_s() + FLIP_WAIT_S
         if current is not None and plan.phase is RoutePhase.PREPARE and current.is_ready:
             self._report(SlotReady(task=self._task, epoch=current.slot.epoch))  # asked again: say it again
+        if current is not None:
+            current.lack = None  # the same
         if current is not None and plan.phase is RoutePhase.FLIP and current.is_flipped:
             self._report(SlotFlipped(task=self._task, epoch=current.slot.epoch, replayed=0))  # for another daemon
         for sink in self._outputs.values():
@@ -235,9 +269,7 @@ class TaskRelay:
             if source is None or (source.route.from_expr, source.route.settings) != (route.from_expr, route.settings):
                 if source is not None:
                     source.close()
-                source = self._inputs[route.stream] = InputStream(
-                    self._session, route, self._own_ids, self._local, self._times
-                )
+                source = self._inputs[route.stream] = self._take_input(route)
             source.open(epoch, route, acks, self._stamps if _replays(slot) else None)
             return
         sink = self._outputs.get(route.stream)
@@ -311,12 +343,36 @@ class TaskRelay:
             self._warm_up(slot.epoch)
         if has_changed and is_current:
             self._report(SlotReady(task=self._task, epoch=slot.epoch, is_ready=is_ready))
+        if is_ready:
+            state.lacks_since = state.lack = None
+        elif is_current:
+            self._tell_lack(state, has_token=bool(tokens) if needs_token else None)
+
+    def _tell_lack(self, state: _OpenSlot, *, has_token: bool | None) -> None:
+        """Say what a worker lacks that is not ready for a while, whenever that changes."""
+        now = monotonic_s()
+        state.lacks_since = state.lacks_since or now
+        if now - state.lacks_since < LACK_S:
+            return
+        untaken = self._untaken(state.slot)
+        lack = SlotReady(
+            task=self._task, epoch=state.slot.epoch, is_ready=False, has_token=has_token, untaken=untaken[:MAX_UNTAKEN]
+        )
+        if lack != state.lack:
+            state.lack = lack
+            self._report(lack)
 
     def _is_matching(self, slot: Slot) -> bool:
-        return all(
-            self._inputs[route.stream].is_matching(slot.epoch)
+        return not self._untaken(slot)
+
+    def _untaken(self, slot: Slot) -> tuple[str, ...]:
+        """The inputs' keys that nobody subscribes to."""
+        return tuple(
+            route.to_expr
             for route in slot.routes
-            if route.direction is Direction.INPUT and route.stream in self._inputs
+            if route.direction is Direction.INPUT
+            and route.stream in self._inputs
+            and not self._inputs[route.stream].is_matching(slot.epoch)
         )
 
     def _warm_up(self, epoch: int) -> None:

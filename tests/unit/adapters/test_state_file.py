@@ -59,7 +59,8 @@ def test_missing_state_is_a_value_with_advice(tmp_path: Path) -> None:
         result = file.load()
     assert result.state is None
     assert result.problem is not None
-    assert "zsched init" in result.problem
+    assert "stop the daemon, run `zsched init`" in result.problem
+    assert result.is_missing
 
 
 def test_create_refuses_an_existing_state_unless_the_generation_rises(tmp_path: Path) -> None:
@@ -97,6 +98,7 @@ def test_state_of_somebody_else_is_lost_state(tmp_path: Path, fleet: str, node: 
     assert result.state is None
     assert result.problem is not None
     assert word in result.problem
+    assert not result.is_missing, "it is lost"
 
 
 def test_unreadable_state_is_a_value(tmp_path: Path) -> None:

@@ -81,12 +81,35 @@ def test_a_worker_without_a_token_is_watched_where_it_may_run_over_all_robots() 
         strangers=("Nobody/merge/*/map",),
         services=(("edge2/merge/robot1/now", "edge2/merge/robot2/now"),),
     )
-    assert watch_for(fleet_of(spec), spec, "robot1") is None, "no candidate"
+    robot = watch_for(fleet_of(spec), spec, "robot1")
+    assert robot is not None
+    assert (robot.inputs, robot.services) == ((), ()), "no candidate"
 
 
 def test_a_worker_with_a_token_is_not_watched() -> None:
     spec = replace(SPEC, worker=WorkerSpec())
-    assert all(watch_for(fleet_of(spec), spec, name) is None for name in ("edge1", "robot1"))
+    assert watch_for(fleet_of(spec), spec, "edge1") is None
+    robot = watch_for(fleet_of(spec), spec, "robot1")
+    assert robot is not None
+    assert (robot.inputs, robot.services) == ((), ())
+
+
+@pytest.mark.parametrize("ready", ReadyWhen)
+def test_a_robot_takes_its_own_inputs_before_there_is_an_owner(ready: ReadyWhen) -> None:
+    """What nobody subscribes to is lost without a count."""
+    spec = replace(SPEC, worker=WorkerSpec(ready_when=ready))
+    taken = {}
+    for node in ("robot1", "robot2", "edge1"):
+        watch = watch_for(fleet_of(spec), spec, node)
+        taken[node] = () if watch is None else watch.unowned
+    of_a_slot = slot_for(spec, "robot1", "edge1", 1).routes[0]
+    assert [(one.stream, one.from_expr) for one in taken["robot1"]] == [(of_a_slot.stream, "robot1/map")]
+    assert taken["robot1"][0].settings == of_a_slot.settings
+    assert [one.from_expr for one in taken["robot2"]] == ["robot2/map"]
+    assert taken["edge1"] == ()
+    without = replace(spec, rules=spec.rules[1:])
+    robot = watch_for(fleet_of(without), without, "robot1")
+    assert robot is None or robot.unowned == ()
 
 
 @pytest.mark.parametrize("standby", Standby)

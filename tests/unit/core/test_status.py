@@ -129,6 +129,53 @@ def test_electors_that_have_lost_their_state_are_named_and_count_for_nothing() -
     assert (quorum.alive, quorum.ok, quorum.stateless) == (2, True, ("robot3",))
 
 
+def forgotten(me: str = "robot1", *, lacks_file: bool = True, stateless: tuple[str, ...] = ROBOTS) -> Node:
+    """A node of a fleet whose electors say that they have no state."""
+    node = make(me, has_state=me not in stateless)
+    node.lacks_state_file = lacks_file
+    node.problems["state"] = "/x/state does not exist"
+    for name in stateless:
+        if name != me:
+            beat = Beat(node=name, incarnation=3, sequence=2, loop_lag_s=0.0, has_lost_state=True)
+            node.handle(ev.BeatReceived(beat=beat), 100.0)
+    return node
+
+
+@pytest.mark.parametrize("me", ["robot1", "edge1"])
+def test_a_fleet_that_was_never_initialised_is_told_one_order_and_told_it_first(me: str) -> None:
+    snapshot = build_snapshot(forgotten(me), 100.0)
+    (told,) = snapshot.problems
+    assert told.startswith("never initialised: ")
+    assert "Stop every daemon, run `zsched init` on every node, and start them again" in told
+    assert "--generation" not in told
+    shown = " ".join(render_status(snapshot_json(snapshot), 160, color=False).split())
+    assert "PROBLEMS never initialised: " in shown, "before all that follows from it"
+    assert "lost state" not in shown
+
+
+def test_a_fleet_of_which_somebody_remembers_a_state_was_initialised() -> None:
+    """A blank state in place of a lost one may vote twice: only a new generation helps."""
+    learnt = forgotten()
+    learn(learnt, 1, "edge1")
+    voted = forgotten()
+    voted.agreement.voted.add("robot2")
+    newer = forgotten()
+    newer.agreement.newest_generation = 1
+    for node in (learnt, voted, newer, forgotten(lacks_file=False)):
+        problems = build_snapshot(node, 100.0).problems
+        assert not any(one.startswith("never initialised") for one in problems), problems
+        assert any("--generation" in one and one.startswith("nothing can be agreed") for one in problems), problems
+        shown = " ".join(render_status(snapshot_json(build_snapshot(node, 100.0)), 160, color=False).split())
+        assert "PROBLEMS nothing can be agreed" in shown
+
+
+def test_one_node_without_a_state_is_not_the_fleet() -> None:
+    node = forgotten(stateless=("robot1",))
+    problems = build_snapshot(node, 100.0).problems
+    assert "state: /x/state does not exist" in problems
+    assert not any(one.startswith("never initialised") for one in problems)
+
+
 @pytest.mark.parametrize(
     "strange",
     [{"generation": 2}, {"electorate": "0" * 16}, {"generation": 2, "electorate": f"{electorate_hash(FLEET)}/2"}],
@@ -374,6 +421,43 @@ def test_a_slot_whose_worker_is_not_seen_is_a_problem_until_it_is() -> None:
     )
     node.handle(ev.SlotReady(task="merge", epoch=1), 114.0)
     assert build_snapshot(node, 120.0).tasks[0].problems == ()
+
+
+def lack_of(node: Node, lack: ev.SlotReady) -> str:
+    """The words that follow "have waited for edge1 for 3 s"."""
+    node.handle(lack, 101.0)
+    (told,) = build_snapshot(node, 103.0).tasks[0].problems
+    start = "this robot's streams have waited for edge1 for 3 s: "
+    assert told.startswith(start)
+    return told.removeprefix(start)
+
+
+def test_a_key_that_nobody_subscribes_to_is_named_with_what_to_do() -> None:
+    node = make()
+    learn(node, 1, "edge1")
+    keys = ("edge1/wrongkey/robot1/question", "edge1/t/robot1/map")
+    told = lack_of(node, ev.SlotReady(task="merge", epoch=1, is_ready=False, has_token=True, untaken=keys))
+    assert "nobody subscribes to edge1/wrongkey/robot1/question, edge1/t/robot1/map" in told
+    assert "`Worker.subscribe`" in told
+    assert "token" not in told, "it is there"
+    told = lack_of(node, ev.SlotReady(task="merge", epoch=1, is_ready=False, has_token=False, untaken=keys))
+    assert told == "our relay does not see its worker's token"
+    told = lack_of(node, ev.SlotReady(task="merge", epoch=0, is_ready=False, has_token=True, untaken=keys))
+    assert told == "our relay does not see its worker's token, or its subscriptions", "that was another slot"
+    node.handle(ev.SlotReady(task="merge", epoch=1), 104.0)
+    assert build_snapshot(node, 110.0).tasks[0].problems == ()
+
+
+def test_how_long_streams_wait_does_not_begin_again_when_the_relay_says_why() -> None:
+    node = make()
+    learn(node, 1, "edge1")
+    node.handle(ev.SlotReady(task="merge", epoch=1), 100.0)
+    node.handle(ev.SlotFlipped(task="merge", epoch=1), 100.0)
+    node.handle(ev.SlotReady(task="merge", epoch=1, is_ready=False), 110.0)
+    node.handle(ev.SlotReady(task="merge", epoch=1, is_ready=False, has_token=False), 111.0)
+    assert build_snapshot(node, 114.0).tasks[0].problems == (
+        "this robot's streams have waited for edge1 for 4 s: our relay does not see its worker's token",
+    )
 
 
 def test_drops_have_an_age_and_an_input_its_way_in() -> None:
