@@ -40,7 +40,7 @@ def test_a_test_that_fails_again_fails_the_run(tmp_path: Path) -> None:
 
 
 def test_many_failures_are_not_repeated(tmp_path: Path) -> None:
-    wrong = "".join(f"def test_{number}():\n    assert False\n\n" for number in range(5))
+    wrong = "".join(f"def test_{number}():\n    assert False\n\n" for number in range(13))
     code, told = run(tmp_path, wrong)
     assert code == 1
     assert "repeat" not in told
