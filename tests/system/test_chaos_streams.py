@@ -9,7 +9,7 @@ import os
 import signal
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import Final
@@ -156,11 +156,12 @@ def test_a_new_owner_frozen_at_the_move_loses_nothing_silently(tmp_path: Path) -
         try:
             bed.send(owner, signal.SIGTERM)  # it drains: a planned move
             bed.wait(lambda: bed.task("robot1")["owner"] == other, GIVE_UP_S, "the move")
-            assert monotonic_s() < frozen + FROZEN_S
+            within(monotonic_s() - frozen, FROZEN_S)
             assert probe.first_after(frozen, but_of=owner) is None, "it stands still"
             bed.wait(lambda: monotonic_s() > frozen + FROZEN_S, 60, "the time that it stands still for")
         finally:
-            os.kill(worker, signal.SIGCONT)
+            with suppress(ProcessLookupError):  # ended at its start-up deadline: too slow
+                os.kill(worker, signal.SIGCONT)
         awake = monotonic_s()
         bed.wait(lambda: bed.has_ended(owner), 60, "the end of the old owner's daemon")
         bed.wait(lambda: probe.first_after(awake, but_of=owner), 60, "an answer to what was sent since it is awake")

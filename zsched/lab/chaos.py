@@ -75,9 +75,10 @@ class ChaosBed(Netbed):
 
     def owner_of(self, task: str, *nodes: NodeId) -> NodeId | None:
         """The owner of a task that ``nodes`` (default: all running) agree on, streams settled; else ``None``."""
-        blocks = [
-            block for node in nodes or self.running() for block in self.status(node)["tasks"] if block["name"] == task
-        ]
+        told = [self.status(node).get("tasks") for node in nodes or self.running()]
+        if None in told:
+            return None  # a daemon that was too busy to answer
+        blocks = [block for blocks in told for block in blocks or () if block["name"] == task]
         owners = {(block["owner"], block["epoch"]) for block in blocks}
         is_settled = all(block["phase"] in {"settled", "idle"} for block in blocks)
         return owners.pop()[0] if len(owners) == 1 and is_settled else None
