@@ -16,7 +16,7 @@ FEW = 12
 """A fleet that a whole module shares fails with all of its tests."""
 TESTS_FAILED = 1
 """pytest's exit code when tests were run and some failed."""
-LIMIT_S = 2400
+LIMIT_S = 3600
 FAILED = Path(".pytest_cache/v/cache/lastfailed")
 
 
