@@ -142,11 +142,8 @@ class Demands:
         need, free = found.work / speed, profile.cpu_cores - others
         most = job.most_cores(speed)
         foreseen = min(free / need, 1.0 if most is None else most / need, 1.0)
-        share = (
-            1.0
-            if foreseen <= 0.0 or not (_is_told(load) and is_short(load))
-            else min(load.cpu_cores / need / foreseen, 1.0)
-        )
+        is_lacking = foreseen > 0.0 and _is_told(load) and is_short(load)
+        share = min(load.cpu_cores / need / foreseen, 1.0) if is_lacking else 1.0
         age_s = jobs.time_s if jobs.age_s is None else jobs.age_s
         stretch = max(age_s / max(job.age_s(speed, free), 1e-9), 1.0)
         before = self._shortfalls.pop((task, profile.node), None)

@@ -158,5 +158,6 @@ def _claim(robots: dict[str, _Robot], now: float) -> None:
     """Robots that are placed tell each other where they go."""
     placed = {name: robot for name, robot in robots.items() if robot.placed is not None}
     for name, robot in placed.items():
+        claim = robot.navigation.claim
         for other in placed.values():
-            other.navigation.hear_claim(name, robot.navigation.claim, now)
+            other.navigation.hear_claim(name, claim, now)
