@@ -35,6 +35,8 @@ BEYOND = "beyond what is promised"
 """How a schedule is counted in which nobody agrees any more because of votes that nobody can remember."""
 EVENTS_PER_S = 500.0
 """A node handles about 50 a second; ten times that, on average over a whole schedule, is a storm."""
+EVENTS_PER_TASK_S = 25.0
+"""And so many more for each task: one that all nodes vote on anew after each fault costs a node about 10 a second."""
 LOST_S = 3.0
 """So long a fleet that cannot agree is watched before the operator starts it anew."""
 AFTERMATH_S = 1.0
@@ -121,7 +123,8 @@ class Stage:
             weather=Weather(),
         )
         self.sim.work.stop_s = STOP_WORK_S
-        self.sim.most_events = EVENTS_PER_S * len(plan.fleet.nodes) * plan.seconds
+        each_s = EVENTS_PER_S + EVENTS_PER_TASK_S * len(plan.fleet.tasks)
+        self.sim.most_events = each_s * len(plan.fleet.nodes) * plan.seconds
         self._rng = Random(f"stage {plan.seed}")
         self.scene = Scene(plan=plan, sim=self.sim, rng=self._rng, fleet=plan.fleet, generation=plan.generation)
         self._links, self._rollouts = LinkFaults(self.scene), Rollouts(self.scene)
