@@ -19,7 +19,7 @@ from zsched.lab.sim_files import CHANGES
 from zsched.lab.sim_links import Held
 from zsched.lab.sim_parts import GENERATION_STEP, Clock, Disk
 from zsched.lab.sim_rest import AT_MOST_S
-from zsched.lab.sim_swarm import LATER, MAKERS, MAX_NODES, MIN_NODES, PENDING, Fault, Plan, plan
+from zsched.lab.sim_swarm import KINDS, LATER, MAKERS, MAX_NODES, MIN_NODES, PENDING, Fault, Plan, plan
 from zsched.lab.simulate import Job, main, shrink
 from zsched.lab.simulator import Simulator
 
@@ -37,7 +37,7 @@ def test_same_seed_same_schedule_to_the_letter() -> None:
 
 
 def test_plans_have_every_fault_every_size_and_every_kind_of_task() -> None:
-    plans = [plan(seed, kinds=frozenset(LATER) | PENDING) for seed in range(400)]
+    plans = [plan(seed, kinds=KINDS) for seed in range(400)]
     kinds = {fault.kind for one in plans for fault in one.faults}
     assert kinds == (set(MAKERS) - {"clock"}) | {
         "absence",
@@ -291,7 +291,10 @@ def test_every_change_of_a_fleet_file_makes_another_fleet_file(name: str) -> Non
 
 
 def test_pending_faults_are_played_only_when_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
-    assert {*LATER, "suspend"} >= PENDING
+    assert KINDS >= PENDING
+    played = {fault.kind for seed in range(200) for fault in Job(seed=seed).plan.faults}
+    assert {"suspend", "stall", "apart"} - PENDING <= played
+    assert not played & PENDING
     assert main(["--seed", "5", "--runs", "3", "--seconds", "2", "--with", "amnesia"]) in (0, 1)
     again = Job(seed=5, pending=frozenset({"amnesia", "lie"})).command
     assert again.endswith("--with amnesia,lie")

@@ -67,7 +67,7 @@ def plan(seed: int, *, nodes: int | None = None, seconds: float = SECONDS, kinds
         seed: any whole number.
         nodes: the fleet's size, 3 to 7 (``None``: by seed).
         seconds: virtual seconds; faults begin in the first half only.
-        kinds: which of `LATER` there may be (``None``: all but `PENDING`).
+        kinds: which of `KINDS` there may be (``None``: all but `PENDING`).
     """
     rng, later, until = Random(f"schedule {seed}"), Random(f"later {seed}"), seconds / 2
     fleet = _fleet(rng, nodes or rng.randint(MIN_NODES, MAX_NODES))
@@ -75,7 +75,7 @@ def plan(seed: int, *, nodes: int | None = None, seconds: float = SECONDS, kinds
     if is_leased:
         fleet = _leased(rng, fleet)
     fleet = with_many_tasks(Random(f"many {seed}"), fleet)
-    kinds = frozenset(LATER) - PENDING if kinds is None else kinds
+    kinds = KINDS - PENDING if kinds is None else kinds
     faults = (_lease_faults if is_leased else _faults)(rng, fleet, until)
     fleet, generation = _varied(later, fleet)
     faults += _later_faults(later, fleet, until, kinds, fleet.tasks[0].candidates if is_leased else ())
@@ -368,5 +368,7 @@ LATER: dict[str, Maker] = {
     "generation": _one_node("generation", 1, 8.0),
 }
 """Faults that came later, drawn apart from `MAKERS`."""
-PENDING: frozenset[str] = frozenset({"suspend"})
+KINDS: frozenset[str] = frozenset(LATER) | {"suspend"}
+"""Faults that may be left out: each is drawn by dice of its own, or by those of `LATER`."""
+PENDING: frozenset[str] = frozenset()
 """Faults whose mend has not landed: only ``--with`` plays them."""

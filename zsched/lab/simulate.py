@@ -24,7 +24,7 @@ from pathlib import Path
 
 from zsched.lab.sim_faults import Result, play
 from zsched.lab.sim_rest import spread, too_slow
-from zsched.lab.sim_swarm import LATER, MAX_NODES, MIN_NODES, PENDING, SECONDS, Plan, plan
+from zsched.lab.sim_swarm import KINDS, MAX_NODES, MIN_NODES, PENDING, SECONDS, Plan, plan
 
 CHUNK = 10
 STORIES_SHOWN = 40
@@ -50,7 +50,7 @@ class Job:
     @property
     def plan(self) -> Plan:
         """Its schedule."""
-        kinds = frozenset(LATER) - PENDING | self.pending
+        kinds = KINDS - PENDING | self.pending
         return plan(self.seed, nodes=self.nodes, seconds=self.seconds, kinds=kinds)
 
     @property
