@@ -1,19 +1,16 @@
 """The unit on a real, booted systemd: a small Debian in systemd-nspawn, driven from inside by `boot_drive.py`.
 
-Needs root, debootstrap and systemd-nspawn, and once the network (about 45 s and 300 MB, kept in a cache folder:
-ZSCHED_TEST_CACHE, else ~/.cache/zsched). Skipped with the reason otherwise. Each test has a machine of its own on an
-overlay over the cached one; they run side by side (about 12 s, most of it waiting).
+Needs root, debootstrap and systemd-nspawn, and once the network (`support.debian`). Skipped with the reason otherwise.
+Each test has a machine of its own on an overlay over the cached one; they run side by side (about 12 s, most of it
+waiting).
 """
 
 from __future__ import annotations
 
-import fcntl
 import importlib.util
 import json
 import os
-import shutil
 import subprocess
-import sys
 import sysconfig
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -23,12 +20,10 @@ from typing import Any
 
 import pytest
 
+from support.debian import NoDebianError, debian_root
 from zsched.lab.loopback import free_endpoints
 
 HERE, REPO = Path(__file__).parent, Path(__file__).parents[2]
-SUITE = "bookworm"
-PYTHON_IN_SUITE = (3, 11)
-PACKAGES = "systemd,systemd-sysv,dbus,python3,python3-venv"
 BOOT_TIMEOUT_S = 150.0
 pytestmark = [pytest.mark.root, pytest.mark.timeout(420)]
 
@@ -67,42 +62,13 @@ REAL_WORKS = "echo@edge1 epoch 1"
 """What the status line says, after the watchdog's restart, too: the state was on the disk."""
 
 
-def cache_folder() -> Path:
-    return Path(os.environ.get("ZSCHED_TEST_CACHE") or Path.home() / ".cache" / "zsched")
-
-
-def why_not() -> str | None:
-    """Why a machine cannot be booted here."""
-    if os.geteuid() != 0:
-        return "booting a machine needs root"
-    missing = [tool for tool in ("debootstrap", "systemd-nspawn", "mount") if shutil.which(tool) is None]
-    if missing:
-        return f"not installed: {', '.join(missing)} (Debian: debootstrap, systemd-container)"
-    if sys.version_info[:2] != PYTHON_IN_SUITE:
-        return f"the booted Debian has Python {PYTHON_IN_SUITE}, this is {sys.version_info[:2]}: no common packages"
-    return None
-
-
 @pytest.fixture(scope="module")
 def debian() -> Path:
     """The cached root of a minimal Debian; made when there is none."""
-    if (reason := why_not()) is not None:
-        pytest.skip(reason)
-    cache = cache_folder()
-    cache.mkdir(parents=True, exist_ok=True)
-    root, part = cache / SUITE, cache / f"{SUITE}.part"
-    with (cache / "lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if root.exists():
-            return root
-        shutil.rmtree(part, ignore_errors=True)
-        command = ["debootstrap", "--variant=minbase", f"--include={PACKAGES}", SUITE, str(part)]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=400, check=False)
-        if done.returncode != 0:
-            shutil.rmtree(part, ignore_errors=True)
-            pytest.skip(f"debootstrap failed (no network?): {(done.stdout + done.stderr).strip()[-300:]}")
-        part.rename(root)
-    return root
+    try:
+        return debian_root()
+    except NoDebianError as error:
+        pytest.skip(str(error))
 
 
 @contextmanager
