@@ -118,8 +118,9 @@ class Totals:
 
 def collect_seldom() -> None:
     """What a schedule leaves behind is collected now and then: looking for it all the time takes 2 % of the time."""
-    gc.freeze()
-    gc.set_threshold(*GARBAGE)
+    if sys.implementation.name == "cpython":  # PyPy's collector has neither
+        gc.freeze()
+        gc.set_threshold(*GARBAGE)
 
 
 def _play(job: Job) -> tuple[Job, Result]:
