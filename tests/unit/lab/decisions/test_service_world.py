@@ -11,7 +11,7 @@ import pytest
 from zsched.lab.decisions.rules import Move
 from zsched.lab.decisions.service import history as histories
 from zsched.lab.decisions.service import machines
-from zsched.lab.decisions.service.history import History, build
+from zsched.lab.decisions.service.history import BURSTS_S, IDLE_SHARE, Activity, History, build
 from zsched.lab.decisions.service.judge import SKIP_S, judge, oracle, truth
 from zsched.lab.decisions.service.machines import Machine, Work, share, share_out
 from zsched.lab.decisions.service.oracle import best_path
@@ -106,6 +106,54 @@ def test_histories_hold_what_they_promise() -> None:
     assert lengths == {round(15.0 / DT_S)}
     assert made[0].machines == build(seed=1, hours=HOURS, load_s=60.0).machines, "one bed for all lengths"
     assert np.any(made[0].service() < 1.0)
+
+
+@pytest.mark.parametrize("activity", list(Activity))
+def test_machines_and_loads_are_the_same_whenever_jobs_come(activity: Activity) -> None:
+    steady, other = (build(seed=3, hours=HOURS, load_s=15.0, activity=one) for one in (Activity.STEADY, activity))
+    assert (other.machines, other.works, other.begins) == (steady.machines, steady.works, steady.begins)
+    assert np.array_equal(other.cpu_error, steady.cpu_error)
+
+
+def test_a_task_to_which_no_job_comes_wants_nothing_and_lacks_nothing() -> None:
+    busy = np.array([[[8.0, 8.0]]] * 2)
+    given = share(machine(), (work(cores=3.0), work(cores=3.0)), busy, NO_MEMORY[[0, 0]], np.array([[0.0, 1], [1, 1]]))
+    assert (given.cores[0, 0], given.service[0, 0], given.missed[0, 0], given.slow[0, 0]) == (0.0, 1.0, 0.0, 0.0)
+    assert given.cores[0, 1] == pytest.approx(4.0 * 4 / 12), "only the load is beside it"
+    assert given.cores[1].tolist() == pytest.approx([4.0 * 4 / 16] * 2)
+
+
+def test_an_idle_task_gets_all_that_it_wants_beside_a_full_load() -> None:
+    full = np.array([[[8.0, 8.0]]])
+    given = share(machine(), (work(cores=3.0),), full, NO_MEMORY, np.array([[IDLE_SHARE]]))
+    assert given.service[0, 0] == 1.0
+    assert given.cores[0, 0] == pytest.approx(IDLE_SHARE * 3.0)
+    assert given.slow[0, 0] == 1.0, "but each of its jobs takes longer"
+
+
+def test_bursts_and_pauses_are_as_long_as_is_said_and_each_task_has_its_own() -> None:
+    history = build(seed=4, hours=0.5, load_s=0.0, tasks=3, activity=Activity.BURSTY)
+    comes = history.activity[history.stretch]
+    assert set(comes.ravel()) == {0.0, 1.0}
+    for task in range(3):
+        changes = np.flatnonzero(np.diff(comes[:, task]))
+        lengths_s = np.diff(changes) * DT_S
+        assert BURSTS_S[0][0] <= lengths_s.min()
+        assert lengths_s.max() <= BURSTS_S[0][1]
+        assert 0.25 < comes[:, task].mean() < 0.75
+    assert not np.array_equal(comes[:, 0], comes[:, 1])
+
+
+def test_only_jobs_that_come_are_missed() -> None:
+    """Whoever has the task on a machine that does none of it in time misses all jobs, however few come."""
+    for activity in Activity:
+        history = build(seed=5, hours=HOURS, load_s=15.0, activity=activity)
+        names = history.fleet.tasks[0].candidates
+        nowhere = judge(history, [[]], (0.3,))[0]
+        assert (nowhere.missed, nowhere.slow) == (pytest.approx(1.0), pytest.approx(1.0)), activity
+        stayed = judge(history, [[Move(at_s=0.0, owner=names[0], left=None)]], (0.3,))[0]
+        assert 0.0 <= stayed.missed <= stayed.slow <= 1.0
+        assert stayed.outputs_hz <= history.works[0].rate_hz * float(history.activity[history.stretch].mean()) * 1.2
 
 
 def tries(history: History, price_s: float, rng: np.random.Generator) -> float:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from zsched.lab.decisions import study as before
 from zsched.lab.decisions.service import cast, picture, study, tables
-from zsched.lab.decisions.service.history import SIZES
+from zsched.lab.decisions.service.history import SIZES, Activity
 
 
 def _seeds(text: str) -> range:
@@ -52,6 +52,8 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--jobs", type=int, default=1, help="histories at a time (default 1)")
     parser.add_argument("--loads", type=_numbers, default=study.LOADS_S, help="lengths of load, s; 0: no loads")
     parser.add_argument("--tasks", type=_numbers, default=(1.0, 3.0), help="numbers of tasks (default 1,3)")
+    when = "when the tasks' jobs come; each has results of its own (default steady)"
+    parser.add_argument("--activity", type=Activity, choices=list(Activity), default=Activity.STEADY, help=when)
     parser.add_argument("--prices", type=_numbers, default=study.PRICES_S, help="of a move, s (default 0.05,0.3,1)")
     also = "one more rule: zsched's under other settings (of Tuning, of TaskSpec, smoothing_s)"
     parser.add_argument("--rule", type=_described, action="append", default=[], metavar="NAME:KEY=VALUE,...", help=also)
@@ -80,7 +82,7 @@ def play(given: argparse.Namespace, results: Path) -> None:
     if any(row["asked_hours"] != given.hours for row in known):
         sys.exit(f"{results} holds histories of another length: give the same --hours, or another --out")
     tasks = [int(count) for count in given.tasks]
-    made = study.cases(given.seeds, given.hours, given.loads, tasks, given.prices, rules, known)
+    made = study.cases(given.seeds, given.hours, given.loads, tasks, given.prices, rules, known, given.activity)
     began_at = time.monotonic()
     for index, (case, rows) in enumerate(study.play_all(made, given.jobs), 1):
         with results.open("a", encoding="utf-8") as file:
@@ -98,14 +100,15 @@ def main(argv: Sequence[str]) -> None:
     given = parse(argv)
     given.out.mkdir(parents=True, exist_ok=True)
     kind = "train" if given.seeds[0] in study.TRAIN else "test"
-    results = given.out / f"service-{kind}.ndjson"
+    name = f"service-{kind}" if given.activity is Activity.STEADY else f"service-{kind}-{given.activity}"
+    results = given.out / f"{name}.ndjson"
     if given.hours > 0:
         play(given, results)
     rows = before.read(results)
     if not rows:
         sys.exit(f"{results} holds no results")
-    text = f"# Judged by service, {kind}ing seeds\n\n{tables.report(rows)}"
+    text = f"# Judged by service, {kind}ing seeds, {given.activity} tasks\n\n{tables.report(rows)}"
     print(text)
-    (given.out / f"service-{kind}.md").write_text(text, encoding="utf-8")
-    picture.draw(rows, given.out / f"service-{kind}.png")
-    print(f"written: service-{kind}.md and service-{kind}.png in {given.out}")
+    (given.out / f"{name}.md").write_text(text, encoding="utf-8")
+    picture.draw(rows, given.out / f"{name}.png")
+    print(f"written: {name}.md and {name}.png in {given.out}")

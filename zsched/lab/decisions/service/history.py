@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from typing import Final
 
 import numpy as np
@@ -35,10 +36,22 @@ DEADLINE_PERIODS: Final = 1.5
 """A job is late when it takes longer than so many periods of its task."""
 LEAST_PAUSE_S: Final = (10.0, 20.0)
 """Between two loads of a machine: the least pause and the mean of what is added, each the load's length at least."""
+IDLE_SHARE: Final = 0.02
+"""An idle task still gets so much of its jobs."""
+BURSTS_S: Final = ((5.0, 60.0), (5.0, 60.0))
+"""How long a bursty task has all of its jobs, and then none; drawn so that halves and doubles are as likely."""
 MEASURED: Final = Scatter(spike_hz=0.0)
 """As `zsched.lab.decisions.scatter` measured it; nobody has recorded spikes of readings."""
 Placement = tuple[int, ...]
 """The machine of every task."""
+
+
+class Activity(StrEnum):
+    """When the jobs of the tasks come: always, hardly ever, or in bursts of each task's own."""
+
+    STEADY = "steady"
+    IDLE = "idle"
+    BURSTY = "bursty"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,6 +75,8 @@ class History:
     """[T]: which stretch a step belongs to."""
     on: tuple[tuple[Shared, ...], ...]
     """[C][2^K]: what a machine gives when the tasks of that bit mask are on it."""
+    activity: Array
+    """[S, K]: the share of its jobs that comes to each task."""
     begins: tuple[Begin, ...]
     cpu_error: Array
     """[T, C]: what a reading adds to the cores in use, as a share of the machine."""
@@ -117,8 +132,16 @@ def rank_of(placed: tuple[int | None, ...], task: int) -> int:
     return sum(where == placed[task] for where in placed[:task])
 
 
-def build(*, seed: int, hours: float, load_s: float, tasks: int = 1, scatter: Scatter = MEASURED) -> History:
-    """A history; machines and tasks are the same for every length of load.
+def build(
+    *,
+    seed: int,
+    hours: float,
+    load_s: float,
+    tasks: int = 1,
+    scatter: Scatter = MEASURED,
+    activity: Activity = Activity.STEADY,
+) -> History:
+    """A history; machines and tasks are the same for every length of load, and machines and loads for every activity.
 
     Args:
         seed: of everything.
@@ -126,6 +149,7 @@ def build(*, seed: int, hours: float, load_s: float, tasks: int = 1, scatter: Sc
         load_s: how long every injected load lasts; 0: there are none.
         tasks: how many tasks, 1 or 3.
         scatter: of the readings.
+        activity: when the tasks' jobs come.
     """
     rng = np.random.default_rng((seed, tasks))
     machines = tuple(
@@ -139,7 +163,8 @@ def build(*, seed: int, hours: float, load_s: float, tasks: int = 1, scatter: Sc
     rng = np.random.default_rng((seed, tasks, round(load_s * 10)))
     steps = round(hours * 3600 / DT_S)
     busy, held, begins = _loads(steps, load_s, machines, rng)
-    changed = np.any(np.diff(busy, axis=0) != 0, axis=1) | np.any(np.diff(held, axis=0) != 0, axis=1)
+    comes = _comes(steps, tasks, activity, np.random.default_rng((seed, tasks, *activity.encode())))
+    changed = np.any([np.any(np.diff(one, axis=0) != 0, axis=1) for one in (busy, held, comes)], axis=0)
     first = np.concatenate([[0], np.flatnonzero(changed) + 1])
     stretch = np.zeros(steps, dtype=np.intp)
     stretch[first[1:]] = 1
@@ -154,9 +179,10 @@ def build(*, seed: int, hours: float, load_s: float, tasks: int = 1, scatter: Sc
         fleet=_fleet(machines, works),
         stretch=np.cumsum(stretch),
         on=tuple(
-            _shares(machine, works, idle[index], busy[first, index], held[first, index])
+            _shares(machine, works, idle[index], busy[first, index], held[first, index], comes[first])
             for index, machine in enumerate(machines)
         ),
+        activity=comes[first],
         begins=begins,
         cpu_error=np.stack(errors[0], axis=1),
         memory_error=np.stack(errors[1], axis=1),
@@ -171,6 +197,20 @@ def _counted(steps: int, background: float, rng: np.random.Generator) -> Array:
     """[steps]: at the moment of a count each thread of the background runs or does not; less their mean."""
     threads = math.ceil(background)
     return rng.binomial(threads, background / threads, steps).astype(np.float64) - background
+
+
+def _comes(steps: int, tasks: int, activity: Activity, rng: np.random.Generator) -> Array:
+    """[steps, tasks]: the share of its jobs that comes to each task."""
+    if activity is not Activity.BURSTY:
+        return np.full((steps, tasks), IDLE_SHARE if activity is Activity.IDLE else 1.0)
+    comes = np.zeros((steps, tasks))
+    for task in range(tasks):
+        step, pause = 0, int(rng.integers(2))
+        while step < steps:
+            length = max(round(_between(BURSTS_S[pause], rng) / DT_S), 1)
+            comes[step : step + length, task] = 1.0 - pause
+            step, pause = step + length, 1 - pause
+    return comes
 
 
 def _between(span: tuple[float, float], rng: np.random.Generator) -> float:
@@ -228,13 +268,13 @@ def _loads(
 
 
 def _shares(
-    machine: Machine, works: tuple[Work, ...], idle: tuple[float, float], busy: Array, held: Array
+    machine: Machine, works: tuple[Work, ...], idle: tuple[float, float], busy: Array, held: Array, comes: Array
 ) -> tuple[Shared, ...]:
     """[2^K]: what the machine gives to every set of tasks, beside its background and the load."""
     background = np.full(len(busy), idle[0] * machine.cores)
     others = np.stack([np.stack([background, np.ceil(background)], axis=1), np.stack([busy, busy], axis=1)], axis=1)
     others_mb = np.stack([np.full(len(held), idle[1] * machine.memory_mb), held], axis=1)
+    sets = [[task for task in range(len(works)) if mask >> task & 1] for mask in range(1 << len(works))]
     return tuple(
-        share(machine, tuple(work for task, work in enumerate(works) if mask >> task & 1), others, others_mb)
-        for mask in range(1 << len(works))
+        share(machine, tuple(works[task] for task in here), others, others_mb, comes[:, here]) for here in sets
     )

@@ -81,12 +81,17 @@ def judge(history: History, moves: Sequence[Sequence[Move]], prices_s: Sequence[
     """What one rule's moves (one list per task) were worth on one history, at every price."""
     runs, past = _course(history, moves)
     rates = np.array([work.rate_hz for work in history.works])
-    served, missed, slow = (np.zeros(len(rates)) for _ in range(3))
+    served, done, missed, slow, jobs = (np.zeros(len(rates)) for _ in range(5))
     for run in runs:
-        served += truth(history, run.placed, run.begin, run.end).sum(axis=0) * DT_S
-        missed += truth(history, run.placed, run.begin, run.end, "missed").sum(axis=0) * DT_S
-        slow += truth(history, run.placed, run.begin, run.end, "slow").sum(axis=0) * DT_S
+        come = rates * history.activity[history.stretch[run.begin : run.end]] * DT_S
+        got = truth(history, run.placed, run.begin, run.end)
+        served += got.sum(axis=0) * DT_S
+        done += (come * got).sum(axis=0)
+        missed += (come * truth(history, run.placed, run.begin, run.end, "missed")).sum(axis=0)
+        slow += (come * truth(history, run.placed, run.begin, run.end, "slow")).sum(axis=0)
+        jobs += come.sum(axis=0)
     total_s = (history.steps - round(SKIP_S / DT_S)) * DT_S
+    mean_hz = jobs / total_s
     moved = np.array([sum(one.task == task for one in past) for task in range(len(rates))])
     gains = [_gain(history, runs, past, index) for index in range(len(past))]
     felt, reactions = _reactions(history, runs, past)
@@ -95,9 +100,9 @@ def judge(history: History, moves: Sequence[Sequence[Move]], prices_s: Sequence[
             price_s=price_s,
             hours=total_s / 3600,
             lost=float(1.0 - (served - moved * price_s).sum() / (total_s * len(rates))),
-            outputs_hz=float((rates * (served - moved * price_s)).sum() / (total_s * len(rates))),
-            missed=float((rates * (missed + moved * price_s)).sum() / (rates.sum() * total_s)),
-            slow=float((rates * (slow + moved * price_s)).sum() / (rates.sum() * total_s)),
+            outputs_hz=float((done - mean_hz * moved * price_s).sum() / (total_s * len(rates))),
+            missed=float((missed + mean_hz * moved * price_s).sum() / jobs.sum()),
+            slow=float((slow + mean_hz * moved * price_s).sum() / jobs.sum()),
             moves=len(past),
             wasted=sum(gain < price_s for gain in gains),
             felt=felt,

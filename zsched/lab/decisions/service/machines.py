@@ -102,7 +102,9 @@ class Shared:
     """[S, M]: the share of its jobs that are not done, or slow."""
 
 
-def share(machine: Machine, works: tuple[Work, ...], others: Array, others_mb: Array) -> Shared:
+def share(
+    machine: Machine, works: tuple[Work, ...], others: Array, others_mb: Array, activity: Array | None = None
+) -> Shared:
     """What ``works`` get on ``machine`` beside ``others``.
 
     Args:
@@ -110,21 +112,26 @@ def share(machine: Machine, works: tuple[Work, ...], others: Array, others_mb: A
         works: the tasks that run on it.
         others: [S, N, 2]: cores that others want, and by how many processes.
         others_mb: [S, N]: memory of others.
+        activity: [S, M]: the share of its jobs that comes to each task; a task to which none comes lacks nothing
+            (``None``: all jobs, always).
 
     A task that lacks memory pages, and does its jobs by the share of memory that it gets: the scarcer of CPU and
     memory decides.
     """
     count = len(others)
-    demands = np.array([min(work.demand(machine), work.processes) for work in works])
+    comes = np.ones((count, len(works))) if activity is None else activity
+    is_active = comes > 0.0
+    needed = comes * np.array([work.demand(machine) for work in works])
     processes = np.array([float(work.processes) for work in works])
-    wanted = np.concatenate([others[:, :, 0], np.tile(demands, (count, 1))], axis=1)
-    heads = np.concatenate([others[:, :, 1], np.tile(processes, (count, 1))], axis=1)
+    wanted = np.concatenate([others[:, :, 0], np.minimum(needed, processes)], axis=1)
+    heads = np.concatenate([others[:, :, 1], np.where(is_active, processes, 0.0)], axis=1)
     cores = share_out(machine.cores, wanted, heads)[:, others.shape[1] :]
     needed_mb = np.array([work.memory_mb for work in works])
     wanted_mb = np.concatenate([others_mb, np.tile(needed_mb, (count, 1))], axis=1)
     memory = share_out(machine.memory_mb, wanted_mb, (wanted_mb > 0).astype(float))[:, others_mb.shape[1] :]
     paged = memory / needed_mb if works else memory
-    service = np.minimum(cores / np.array([work.demand(machine) for work in works]), paged) if works else cores
+    served = np.divide(cores, needed, out=np.ones_like(cores), where=is_active)
+    service = np.where(is_active, np.minimum(served, paged), 1.0) if works else cores
     missed, slow = np.ones_like(service), np.ones_like(service)
     for index, work in enumerate(works):
         # While a job runs, all of its processes do: it wants more cores than on the mean.
@@ -133,7 +140,7 @@ def share(machine: Machine, works: tuple[Work, ...], others: Array, others_mb: A
         runs_on = share_out(machine.cores, at_work, heads)[:, others.shape[1] + index] * paged[:, index]
         for out, within_s in ((missed, work.deadline_s), (slow, work.slow_s)):
             is_over = work.cpu_s / machine.speed > within_s * runs_on
-            out[:, index] = np.where(is_over, 1.0, 1.0 - service[:, index])
+            out[:, index] = np.where(is_over & is_active[:, index], 1.0, 1.0 - service[:, index])
     return Shared(
         cores_wanted=wanted.sum(axis=1),
         memory_wanted=wanted_mb.sum(axis=1),

@@ -119,7 +119,8 @@ class Scene:
             rank = rank_of(self._placed, task) if is_here else 0
             mine = (cores[stretch][rank], memory[stretch][rank]) if is_here else (0.0, 0.0)
             work = self._history.works[task]
-            is_short = is_here and self._is_told and mine[0] < 0.99 * min(work.demand(machine), work.processes)
+            needed = work.demand(machine) * self._history.activity[stretch, task]
+            is_short = is_here and self._is_told and mine[0] < 0.99 * min(needed, work.processes)
             wanted = float(work.processes) if is_short else None
             workers.append(
                 WorkerLoad(
@@ -143,7 +144,8 @@ class Scene:
         for task, (name, kept) in enumerate(zip(self.values, self._books, strict=True)):
             if self._placed[task] == column:
                 rank, work = rank_of(self._placed, task), self._history.works[task]
-                kept.work(work, machine, cores[stretch][rank], service[stretch][rank])
+                comes = float(self._history.activity[stretch, task])
+                kept.work(work, machine, cores[stretch][rank], service[stretch][rank], comes)
                 profiler.note_jobs(kept.report(name, self.values[name].epoch, now), now)
 
     def learn(self, now: float) -> None:
@@ -168,16 +170,17 @@ class _Book:
         self._done = self._undone = self._time_s = self._cpu_s = self._wait_s = 0.0
         self._is_serial = False
 
-    def work(self, work: Work, machine: Machine, cores: float, service: float) -> None:
-        """One step with so many cores, in which that share of the jobs is done."""
+    def work(self, work: Work, machine: Machine, cores: float, service: float, comes: float) -> None:
+        """One step with so many cores, in which that share of the jobs that come is done, and so many of all come."""
         cpu_s, served = work.cpu_s / machine.speed, min(service, 1.0)
         before = int(self._done)
-        self._done += served * work.rate_hz * DT_S
-        self._undone += (1.0 - served) * work.rate_hz * DT_S
+        rate_hz = comes * work.rate_hz
+        self._done += served * rate_hz * DT_S
+        self._undone += (1.0 - served) * rate_hz * DT_S
         # Whoever does not do all of them is always at work.
         is_behind = served < 0.999
-        time_s = 1.0 / max(served * work.rate_hz, 1e-3) if is_behind else cpu_s / work.processes
-        is_starved = cores < 0.99 * min(work.demand(machine), work.processes)
+        time_s = 1.0 / max(served * rate_hz, 1e-3) if is_behind else cpu_s / work.processes
+        is_starved = cores < 0.99 * min(comes * work.demand(machine), work.processes)
         self._is_serial = work.processes == 1
         done = int(self._done) - before
         self._time_s += done * time_s

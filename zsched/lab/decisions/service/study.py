@@ -13,7 +13,7 @@ from statistics import fmean
 from typing import Any, Final
 
 from zsched.lab.decisions.service.cast import described, players
-from zsched.lab.decisions.service.history import build
+from zsched.lab.decisions.service.history import Activity, build
 from zsched.lab.decisions.service.judge import Figures, fixed, judge, oracle
 from zsched.lab.decisions.service.present import present
 from zsched.lab.decisions.service.replay import replay
@@ -38,6 +38,7 @@ class Case:
     load_s: float
     tasks: int
     prices_s: tuple[float, ...]
+    activity: Activity = Activity.STEADY
     rules: tuple[str, ...]
     """Names of `players` or of `YARDSTICKS`, or descriptions (`described`)."""
 
@@ -50,6 +51,7 @@ def cases(
     prices_s: Sequence[float],
     rules: Sequence[str],
     known: Sequence[Row],
+    activity: Activity = Activity.STEADY,
 ) -> list[Case]:
     """Every history with the rules and prices that ``known`` holds no results of; those without any are left out."""
     done = {(row["tasks"], row["load_s"], row["seed"], row["asked_hours"], row["price_s"], row["as"]) for row in known}
@@ -60,7 +62,15 @@ def cases(
             left = tuple(one for one in prices_s if (count, load_s, seed, hours, one, rule) not in done)
             missing.setdefault(left, []).append(rule)
         made += [
-            Case(seed=seed, hours=hours, load_s=load_s, tasks=count, prices_s=left, rules=tuple(names))
+            Case(
+                seed=seed,
+                hours=hours,
+                load_s=load_s,
+                tasks=count,
+                prices_s=left,
+                rules=tuple(names),
+                activity=activity,
+            )
             for left, names in missing.items()
             if left
         ]
@@ -69,7 +79,7 @@ def cases(
 
 def play(case: Case) -> list[Row]:
     """One row per rule and price."""
-    history = build(seed=case.seed, hours=case.hours, load_s=case.load_s, tasks=case.tasks)
+    history = build(seed=case.seed, hours=case.hours, load_s=case.load_s, tasks=case.tasks, activity=case.activity)
     common = {"tasks": case.tasks, "load_s": case.load_s, "seed": case.seed, "asked_hours": case.hours}
     found = {one.name: one for one in players()}
     every: dict[float, list[Figures]] = {}
