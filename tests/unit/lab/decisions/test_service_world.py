@@ -150,7 +150,7 @@ def test_only_jobs_that_come_are_missed() -> None:
         history = build(seed=5, hours=HOURS, load_s=15.0, activity=activity)
         names = history.fleet.tasks[0].candidates
         nowhere = judge(history, [[]], (0.3,))[0]
-        assert (nowhere.missed, nowhere.slow) == (pytest.approx(1.0), pytest.approx(1.0)), activity
+        assert [nowhere.missed, nowhere.slow] == pytest.approx([1.0, 1.0]), activity
         stayed = judge(history, [[Move(at_s=0.0, owner=names[0], left=None)]], (0.3,))[0]
         assert 0.0 <= stayed.missed <= stayed.slow <= 1.0
         assert stayed.outputs_hz <= history.works[0].rate_hz * float(history.activity[history.stretch].mean()) * 1.2
@@ -221,18 +221,35 @@ def test_who_knows_the_present_leaves_when_staying_has_cost_half_a_move_and_not_
 def test_the_oracle_is_what_trying_everything_finds(shape: tuple[int, ...]) -> None:
     rng = np.random.default_rng(5)
     places = list(itertools.product(*map(range, shape)))
-    for price in (0.0, 0.2, 0.6):
+    for highest in (0.0, 0.2, 0.6):
         worth = rng.uniform(0.0, 1.0, (4, len(places)))
+        price = rng.uniform(0.0, 1.0, (4, len(shape))).round() * highest
 
-        def paid(path: tuple[int, ...], worth: np.ndarray = worth, price: float = price) -> float:
-            pairs = itertools.pairwise(path)
-            moved = sum(x != y for a, b in pairs for x, y in zip(places[a], places[b], strict=True))
-            return float(worth[np.arange(4), list(path)].sum()) - price * moved
+        def paid(path: tuple[int, ...], worth: np.ndarray = worth, price: np.ndarray = price) -> float:
+            moved = 0.0
+            for stretch, (a, b) in enumerate(itertools.pairwise(path), 1):
+                changed = [x != y for x, y in zip(places[a], places[b], strict=True)]
+                moved += float(price[stretch][changed].sum())
+            return float(worth[np.arange(4), list(path)].sum()) - moved
 
         best = max(map(paid, itertools.product(range(len(places)), repeat=4)))
         total, path = best_path(worth, price, shape)
         assert total == pytest.approx(best)
         assert paid(tuple(path)) == pytest.approx(best)
+
+
+def test_a_move_in_a_pause_costs_nothing_and_one_in_a_burst_its_price() -> None:
+    history = build(seed=4, hours=HOURS, load_s=0.0, activity=Activity.BURSTY)
+    comes = history.activity[history.stretch, 0]
+    first, second = history.fleet.tasks[0].candidates[:2]
+    later = np.arange(history.steps) * DT_S > SKIP_S + 1.0
+    for is_burst in (False, True):
+        step = int(np.flatnonzero(later & (comes == float(is_burst)))[3])
+        moves = [Move(at_s=0.0, owner=first, left=None), Move(at_s=step * DT_S, owner=second, left=first)]
+        free, paid = judge(history, [moves], (0.0, 2.0))
+        total_s = paid.hours * 3600
+        assert (paid.lost - free.lost) * total_s == pytest.approx(2.0 * is_burst)
+        assert (free.outputs_hz - paid.outputs_hz) * total_s == pytest.approx(2.0 * is_burst * history.works[0].rate_hz)
 
 
 def test_figures_of_a_move_by_hand() -> None:

@@ -27,7 +27,10 @@ Where = tuple[int | None, ...]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Figures:
-    """One rule on one history, every move at ``price_s`` seconds without the task."""
+    """One rule on one history, every move at ``price_s`` seconds without the task.
+
+    A move while no job comes costs nothing: nobody misses the task then.
+    """
 
     price_s: float
     hours: float
@@ -91,8 +94,11 @@ def judge(history: History, moves: Sequence[Sequence[Move]], prices_s: Sequence[
         slow += (come * truth(history, run.placed, run.begin, run.end, "slow")).sum(axis=0)
         jobs += come.sum(axis=0)
     total_s = (history.steps - round(SKIP_S / DT_S)) * DT_S
-    mean_hz = jobs / total_s
-    moved = np.array([sum(one.task == task for one in past) for task in range(len(rates))])
+    comes = np.array([history.activity[history.stretch[one.step], one.task] for one in past])
+    paid = comes > 0.0
+    tasks = np.array([one.task for one in past], dtype=int)
+    moved = np.bincount(tasks, weights=paid, minlength=len(rates))
+    held_hz = np.bincount(tasks, weights=comes, minlength=len(rates)) * rates
     gains = [_gain(history, runs, past, index) for index in range(len(past))]
     felt, reactions = _reactions(history, runs, past)
     return [
@@ -100,11 +106,11 @@ def judge(history: History, moves: Sequence[Sequence[Move]], prices_s: Sequence[
             price_s=price_s,
             hours=total_s / 3600,
             lost=float(1.0 - (served - moved * price_s).sum() / (total_s * len(rates))),
-            outputs_hz=float((done - mean_hz * moved * price_s).sum() / (total_s * len(rates))),
-            missed=float((missed + mean_hz * moved * price_s).sum() / jobs.sum()),
-            slow=float((slow + mean_hz * moved * price_s).sum() / jobs.sum()),
+            outputs_hz=float((done - held_hz * price_s).sum() / (total_s * len(rates))),
+            missed=float((missed + held_hz * price_s).sum() / jobs.sum()),
+            slow=float((slow + held_hz * price_s).sum() / jobs.sum()),
             moves=len(past),
-            wasted=sum(gain < price_s for gain in gains),
+            wasted=sum(gain < (price_s if pays else 0.0) for gain, pays in zip(gains, paid, strict=True)),
             felt=felt,
             reactions_s=tuple(reactions),
         )
@@ -186,7 +192,8 @@ def oracle(history: History, price_s: float) -> list[list[Move]]:
     stretches, first, steps = np.unique(history.stretch[skip:], return_index=True, return_counts=True)
     worth = history.service()[stretches].sum(axis=2) * steps[:, None] * DT_S
     shape = (len(history.machines),) * len(history.works)
-    _, path = best_path(worth, price_s, shape)
+    prices = np.where(history.activity[stretches] > 0.0, price_s, 0.0)
+    _, path = best_path(worth, prices, shape)
     placements = history.placements
     return [
         _changes(history, [placements[place][task] for place in path], (first + skip).tolist())
