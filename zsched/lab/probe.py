@@ -23,7 +23,8 @@ import zenoh
 from zsched.clock import monotonic_s
 from zsched.guard import guarded
 
-OPEN_S = 20.0
+OPEN_S = 120.0
+"""A relay takes 20 s to start on a machine where a dozen processes start beside it; a hang takes longer."""
 
 
 def main() -> int:
