@@ -168,10 +168,9 @@ def test_a_new_owner_frozen_at_the_move_loses_nothing_silently(tmp_path: Path) -
         bed.wait(lambda: lost_and_told(bed, probe)[0] <= lost_and_told(bed, probe)[1], 20, "a word of every loss")
         lost, told = lost_and_told(bed, probe)
         print(f"frozen at the move: lost {lost}, told of {told}", flush=True)
+        assert lost < BUSY_HZ / 2, "what came while it stood still has waited for it"
         numbers = [one.number for one in tuple(probe.received)]
         assert numbers == sorted(set(numbers))
-        # What came while it stood still has waited for it; overload may lose, and has told so above.
-        within(lost / BUSY_HZ, 0.5, "of what was sent is lost")
 
 
 def test_a_power_cut_loses_nothing_where_the_rule_says_replay(tmp_path: Path) -> None:
