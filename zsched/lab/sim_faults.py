@@ -36,7 +36,7 @@ BEYOND = "beyond what is promised"
 EVENTS_PER_S = 500.0
 """A node handles about 50 a second; ten times that, on average over a whole schedule, is a storm."""
 EVENTS_PER_TASK_S = 25.0
-"""And so many more for each task: one that all nodes vote on anew after each fault costs a node about 10 a second."""
+"""Each task adds so many. A node handles about 10 a second for a task that all nodes vote on again after each fault."""
 LOST_S = 3.0
 """So long a fleet that cannot agree is watched before the operator starts it anew."""
 AFTERMATH_S = 1.0

@@ -369,6 +369,6 @@ LATER: dict[str, Maker] = {
 }
 """Faults that came later, drawn apart from `MAKERS`."""
 KINDS: frozenset[str] = frozenset(LATER) | {"suspend"}
-"""Faults that may be left out: each is drawn by dice of its own, or by those of `LATER`."""
+"""Faults that a plan may leave out; no other fault of the plan changes by that."""
 PENDING: frozenset[str] = frozenset()
 """Faults whose mend has not landed: only ``--with`` plays them."""

@@ -145,7 +145,7 @@ def test_bursts_and_pauses_are_as_long_as_is_said_and_each_task_has_its_own() ->
 
 
 def test_only_jobs_that_come_are_missed() -> None:
-    """Whoever has the task on a machine that does none of it in time misses all jobs, however few come."""
+    """A task without a machine misses all of its jobs, however few of them come."""
     for activity in Activity:
         history = build(seed=5, hours=HOURS, load_s=15.0, activity=activity)
         names = history.fleet.tasks[0].candidates

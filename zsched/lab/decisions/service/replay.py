@@ -171,7 +171,7 @@ class _Book:
         self._is_serial = False
 
     def work(self, work: Work, machine: Machine, cores: float, service: float, comes: float) -> None:
-        """One step with so many cores, in which that share of the jobs that come is done, and so many of all come."""
+        """One step with so many cores: of all jobs the share ``comes`` comes, and ``service`` of that is done."""
         cpu_s, served = work.cpu_s / machine.speed, min(service, 1.0)
         before = int(self._done)
         rate_hz = comes * work.rate_hz
