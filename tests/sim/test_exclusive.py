@@ -9,9 +9,10 @@ from random import Random
 
 import pytest
 
+from zsched.core.events import BeatReceived
 from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
 from zsched.core.lease import hold_s
-from zsched.core.model import NodeId, NodeKind, Tuning, Weights
+from zsched.core.model import Beat, NodeId, NodeKind, Tuning, Weights
 from zsched.core.plan import WorkerRole
 from zsched.lab.simulator import CORES, Simulator
 
@@ -98,6 +99,26 @@ def test_one_way_cuts_never_make_two_owners(seed: int, towards_owner: bool) -> N
     sim.run(10)
     sim.heal()
     assert sim.run_until(lambda: is_working(sim), 10), "\n".join(sim.stories[-40:])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_one_forged_number_costs_no_elector_s_grants(seed: int) -> None:
+    """After a cut of a second a beat may be 60 numbers ahead, and the first one that comes may be anybody's."""
+    sim = started(seed)
+    owner = sim.agreed(TASK) or ""
+    sim.cut((owner,), ("robot2",))
+    sim.run(1.1)
+    sim.heal()
+    holder = sim.node(owner)
+    learnt = tuple((name, value.revision, value.epoch) for name, value in holder.values().items())
+    forged = Beat(node=owner, incarnation=holder.incarnation, sequence=75, loop_lag_s=0.0, learnt=learnt)
+    sim.deliver(sim.machines["robot2"], BeatReceived(beat=forged))
+    assert sim.node("robot2").membership.is_newest(owner), "it looks like the owner's"
+    sim.run(1.0)
+    sim.crash("robot3")
+    sim.run(3)
+    assert is_working(sim), "two electors of three are there"
+    assert sim.agreed(TASK) == owner
 
 
 def _planned_move_s(*, exclusive: bool, seed: int) -> tuple[float, float]:

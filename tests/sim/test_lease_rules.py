@@ -10,7 +10,7 @@ import pytest
 from zsched.core.executor import Executor
 from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, lease_terms
 from zsched.core.instructions import SetRole
-from zsched.core.lease import RHO, Granter, Holder, Leases, hold_s
+from zsched.core.lease import RHO, SENT_KEPT, Granter, Holder, Leases, hold_s
 from zsched.core.model import Allocation, Beat, Grant, NodeKind, Tuning, Weights
 from zsched.core.plan import WorkerRole
 from zsched.core.tenure import Tenure
@@ -142,8 +142,21 @@ def test_the_owner_s_next_life_is_granted_only_when_its_former_one_cannot_work_a
 def test_an_old_beat_prolongs_nothing() -> None:
     elector = granter()
     elector.on_beat(beat(number=5), ("e1", 3), 10.0)
-    elector.on_beat(beat(number=4), ("e1", 3), 10.9)
+    elector.on_beat(beat(number=4), ("e1", 3), 10.9, is_newest=False)
     assert elector.may_accept("e2", 10.0 + HOLD_S)
+
+
+def test_true_numbers_behind_a_forged_one_are_granted_again() -> None:
+    """Found by the simulator (seed 9003597): a beat of 2^52 in the owner's name, and an elector granted no more."""
+    elector = granter()
+    elector.on_beat(beat(number=2**52), ("e1", 3), 10.0)
+    elector.on_beat(beat(number=9), ("e1", 3), 10.1, is_newest=False)
+    assert elector.echo(10.1) == grant(2**52), "of what is not believed, nothing follows"
+    elector.on_beat(beat(number=10), ("e1", 3), 10.2)
+    assert elector.echo(10.2) == grant(10)
+    assert not elector.may_accept("e2", 10.1 + HOLD_S), "it is held for as long as after any grant"
+    elector.on_beat(beat(number=11, released=(grant(11),)), ("e1", 3), 10.3)
+    assert elector.may_accept("e2", 10.3), "what the owner gives back is all of it"
 
 
 # --- owners ----------------------------------------------------------------------------------------------------------
@@ -186,21 +199,35 @@ def test_a_stranger_s_echo_counts_nothing_and_an_elector_s_only_once() -> None:
     assert owner.lease_until() == -math.inf
 
 
-def test_an_elector_that_echoes_what_is_not_sent_yet_counts_nothing_up_to_that() -> None:
+def test_an_echo_of_what_was_not_sent_yet_never_counts() -> None:
     """Found by the simulator (seed 8004705): beats in the owner's name, of numbers to come, made electors hold less."""
     owner = holder()
     owner.on_sent(5, 10.0)
-    for elector in ELECTORS[:2]:
-        owner.on_echo(elector, grant(7))
-    for number, at in ((6, 10.1), (7, 10.2)):
-        owner.on_sent(number, at)
+    for number in (9, 7):
         for elector in ELECTORS[:2]:
-            owner.on_echo(elector, grant(7))
+            owner.on_echo(elector, grant(number))
+    for number in range(6, 10):
+        owner.on_sent(number, 10.0 + 0.1 * (number - 5))
+        for elector in ELECTORS[:2]:
+            for echoed in (9, 7):
+                owner.on_echo(elector, grant(echoed))
     assert owner.lease_until() == -math.inf
-    owner.on_sent(8, 10.3)
     for elector in ELECTORS[:2]:
         owner.on_echo(elector, grant(8))
-    assert owner.lease_until() == 10.3 + LEASE_S
+    assert owner.lease_until() == pytest.approx(10.3 + LEASE_S), "that one it has from us"
+
+
+def test_however_many_numbers_somebody_makes_an_elector_echo_the_next_ones_are_known() -> None:
+    owner = holder()
+    owner.on_sent(5, 10.0)
+    for number in range(5 + 2 * SENT_KEPT, 5, -1):
+        owner.on_echo("r1", grant(number))
+        owner.on_echo("r2", grant(number))
+    for number in range(6, 6 + SENT_KEPT):
+        owner.on_sent(number, 10.1)
+        owner.on_echo("r1", grant(number))
+        owner.on_echo("r2", grant(number))
+        assert owner.lease_until() == -math.inf
 
 
 def test_what_was_given_back_holds_no_lease_any_more() -> None:

@@ -8,7 +8,9 @@ L is the lease, rho the bound on how far two clocks' rates differ. Nobody compar
   last *accepted*; the echo is the grant.
 * The owner is active only while a majority has echoed a number that it sent *after learning this epoch*; the lease ends
   L after the *sending* of the largest number that a majority has echoed or exceeded. An elector that echoes what was
-  not sent yet counts from an earlier moment than the owner would: up to that number its echoes count nothing.
+  not sent yet, for somebody else beats in the owner's name, counts from an earlier moment than the owner would: its
+  echo of that number never counts. It grants the real, lower numbers again once they are believed
+  (`zsched.core.sequence`).
 * Only a task that is *leased* for everybody (`Allocation.leased`, `zsched.core.sealing`) is granted.
 * An elector never grants to two owners, or two lives of one, at once: to another only after the hold, or a release.
 * An elector that granted refuses an accept for another owner until L(1+rho)/(1-rho) after its last grant on its own
@@ -41,6 +43,7 @@ from zsched.core.scoring import majority
 RHO = 1e-3
 """Bound on the relative difference of two clocks' rates (a crystal is within 1e-4)."""
 SENT_KEPT = 128
+"""An owner knows when it sent so many of its newest numbers; of older ones there is no lease."""
 HURRY_S = 0.05
 """A release of nothing that was used is worth a beat of its own at most so often."""
 
@@ -77,13 +80,14 @@ class Granter:
     """(owner, epoch) that is not echoed any more because another one waits."""
     _silent_until: float = -math.inf
 
-    def on_beat(self, beat: Beat, accepted: tuple[NodeId, int] | None, now: float) -> bool:
+    def on_beat(self, beat: Beat, accepted: tuple[NodeId, int] | None, now: float, *, is_newest: bool = True) -> bool:
         """Take a beat in: grant it if its sender is the accepted owner. Whether this begins a new grant.
 
         Args:
             beat: of any node.
             accepted: (owner, epoch) of the value that this elector last accepted.
             now: monotonic seconds.
+            is_newest: it is no repeat and no late one. A lower number than the last is then the sender's true one.
         """
         for grant in beat.released:
             if grant.task == self.task and grant.owner == beat.node:
@@ -102,7 +106,7 @@ class Granter:
             beat.incarnation,
             epoch,
         )
-        if not is_new and self._last is not None and beat.sequence <= self._last.number:
+        if not is_new and not is_newest and self._last is not None and beat.sequence <= self._last.number:
             return False
         self._last = Grant(
             task=self.task, owner=beat.node, incarnation=beat.incarnation, epoch=epoch, number=beat.sequence
@@ -205,8 +209,8 @@ class Holder:
     """When a release of nothing that was used last had a beat of its own."""
     _sent: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=SENT_KEPT))
     _echoed: dict[NodeId, int] = field(default_factory=dict)
-    _ahead: dict[NodeId, int] = field(default_factory=dict)
-    """{elector: a number that it echoed before we sent it}: up to that one it counts from somebody else's beats."""
+    _ahead: dict[NodeId, list[int]] = field(default_factory=dict)
+    """{elector: the numbers that it echoed before we sent them, the lowest first}: of somebody else's beats."""
 
     def on_sent(self, number: int, now: float) -> None:
         """A beat leaves."""
@@ -219,9 +223,17 @@ class Holder:
         if (grant.incarnation, grant.epoch) != (self.incarnation, self.epoch):
             return
         if not self._sent or grant.number > self._sent[-1][0]:  # somebody else beats in our name
-            self._ahead[elector] = max(self._ahead.get(elector, -1), grant.number)
-        elif grant.number >= self.first_number and grant.number > max(self.released, self._ahead.get(elector, -1)):
+            self._note_ahead(elector, grant.number)
+        elif grant.number < self.first_number or grant.number <= self.released:
+            return
+        elif grant.number not in self._ahead.get(elector, ()):
             self._echoed[elector] = max(self._echoed.get(elector, -1), grant.number)
+
+    def _note_ahead(self, elector: NodeId, number: int) -> None:
+        """Keep the lowest: what is `SENT_KEPT` numbers behind those was echoed long before we could send it."""
+        known = {*self._ahead.get(elector, ()), number}
+        echoed = self._echoed.get(elector, -1)
+        self._ahead[elector] = sorted(one for one in known if one > echoed)[:SENT_KEPT]
 
     def lease_until(self) -> float:
         """When the lease ends (monotonic seconds on this machine); minus infinity when there is none."""
@@ -454,11 +466,13 @@ class Leases:
             asked_to_leave=tuple(ask for ask in asked if ask is not None),
         )
 
-    def on_beat(self, beat: Beat, accepted: Mapping[TaskId, tuple[NodeId, int]], now: float) -> bool:
+    def on_beat(
+        self, beat: Beat, accepted: Mapping[TaskId, tuple[NodeId, int]], now: float, *, is_newest: bool = True
+    ) -> bool:
         """A beat came, or our own left: grant, count echoes, hear who must leave. Whether to beat at once."""
         is_new = False
         for task, granter in self._granters.items():
-            is_new |= granter.on_beat(beat, accepted.get(task), now)
+            is_new |= granter.on_beat(beat, accepted.get(task), now, is_newest=is_newest)
         if beat.lease_terms == self.terms:
             self._others.pop(beat.node, None)
         else:

@@ -106,6 +106,10 @@ class Membership:
         """Whether the beat that came last in this peer's name is not to be believed, whatever it says."""
         return self._peers[node].order is Order.DOUBTFUL
 
+    def is_newest(self, node: NodeId) -> bool:
+        """Whether the beat that came last in this peer's name is no repeat and no late one, and is believed."""
+        return self._peers[node].order is Order.NEW
+
     def alive(self) -> tuple[NodeId, ...]:
         """The living peers, sorted, without this node."""
         return tuple(name for name, peer in self._peers.items() if peer.state is PeerState.ALIVE)

@@ -317,7 +317,7 @@ class Node:
         self._beat_at = self._turn_at = now + self.fleet.timing.beat_s
         self._batch.add(do.PublishBeat(beat=self._fitting(beat), is_news=not is_in_turn))
         self._seal(now)
-        self._hear_leases(beat, now)
+        self._hear_leases(beat, now, is_newest=True)
         if self._introductions.is_due(now, is_missing=self.membership.misses_anybody):
             self._batch.add(do.IntroducePeers())
 
@@ -363,7 +363,7 @@ class Node:
         self.sealing.hear(beat)
         if beat.fleet_file != self.fleet_file or self.problems:
             self._set_problem(f"fleet/{beat.node}", self._identity.file_complaint(beat, self.fleet_path))
-        self._hear_leases(beat, now)
+        self._hear_leases(beat, now, is_newest=self.membership.is_newest(beat.node))
 
     def _on_own_name(self, beat: Beat, now: float) -> None:
         """A beat in our own name that may not be ours."""
@@ -389,10 +389,10 @@ class Node:
         self._set_problem("membership", complaint)
         return complaint or ""
 
-    def _hear_leases(self, beat: Beat, now: float) -> None:
+    def _hear_leases(self, beat: Beat, now: float, *, is_newest: bool) -> None:
         if not self._tenure.exclusive:
             return  # thirty beats a second come by here
-        if self._tenure.hear(beat, self.agreement.accepted(), now):
+        if self._tenure.hear(beat, self.agreement.accepted(), now, is_newest=is_newest):
             self._beat_at = now  # a first grant: the new owner waits for its echo
         self.agreement.note_asked(beat, now)
         if beat.released:

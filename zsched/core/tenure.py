@@ -67,9 +67,9 @@ class Tenure:
         else:
             self.leases.end(value.task, next_number - 1)
 
-    def hear(self, beat: Beat, accepted: Mapping[TaskId, tuple[NodeId, int]], now: float) -> bool:
+    def hear(self, beat: Beat, accepted: Mapping[TaskId, tuple[NodeId, int]], now: float, *, is_newest: bool) -> bool:
         """A beat (our own too) may grant, echo, release, or ask us to leave. Whether to beat at once."""
-        return self.leases.on_beat(beat, accepted, now)
+        return self.leases.on_beat(beat, accepted, now, is_newest=is_newest)
 
     def on_clock(
         self, event: ClockCompared, standing: Mapping[TaskId, Allocation | None], number: int, now: float

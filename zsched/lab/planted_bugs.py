@@ -253,10 +253,26 @@ LEASE_BUGS = (
     _bug(
         "an echo of what was not sent yet counts later",
         LEASE,
-        "self._ahead[elector] = max(self._ahead.get(elector, -1), grant.number)",
-        "self._ahead[elector] = -1",
+        "elif grant.number not in self._ahead.get(elector, ()):",
+        "else:",
         _LEASE,
         seed=8004705,
+    ),
+    _bug(
+        "an elector holds on to a forged number",
+        LEASE,
+        "if not is_new and not is_newest and self._last is not None and",
+        "if not is_new and self._last is not None and",
+        _LEASE,
+        seed=9003597,
+    ),
+    _bug(
+        "an elector that has echoed a forged number counts no more",
+        LEASE,
+        "elif grant.number not in self._ahead.get(elector, ()):",
+        "elif grant.number > max(self._ahead.get(elector, [-1])):",
+        _LEASE,
+        seed=9003597,
     ),
     Bug(
         name="echo to an owner that was not accepted",

@@ -135,7 +135,7 @@ def test_nobody_gives_back_another_one_s_grant_or_another_task_s(by: str, given_
 
 def test_a_beat_that_is_repeated_or_of_a_silenced_owner_prolongs_no_hold() -> None:
     one = granter()
-    assert not one.on_beat(beat(), ("r2", 3), 10.5)
+    assert not one.on_beat(beat(), ("r2", 3), 10.5, is_newest=False)
     assert one.echo(10.0 + L) is None
     assert not one.may_accept("r3", 10.6)
     assert not one.on_beat(beat(number=6), ("r2", 3), 10.7)
