@@ -1,10 +1,12 @@
 """Decides when a relay that says nothing is wedged, and not merely short of a processor.
 
-Knows: threads' states and processor time from /proc. Does not know: what a relay says, how it is replaced.
+Knows: what /proc says of a process: its threads' states, the processor time it had, how long it waited for one. Does
+not know: what a relay says, how it is replaced.
 
-Only time in which the daemon itself was there to listen counts: not a suspended machine's, nor a stopped daemon's. A
-relay that wants a processor and gets none is never wedged, however long that takes: another one would have to begin
-from the start, and make the machine busier still. One that gets its processor time and says nothing all the same is.
+Only time in which the daemon itself was there to listen counts: not a suspended machine's, nor a stopped daemon's. Of
+that, only what the relay slept through uses up the patience. A relay that wants a processor and gets none is never
+wedged, however long that takes: another one would have to begin from the start, and make the machine busier still. One
+that works for `WORK_S` and says nothing all the same is.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import os
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -29,17 +32,25 @@ class Silence:
         self.patience_s = patience_s
         self.silent_s = 0.0
         self._pid = pid
-        self._began_at_s: float | None = None
-        """Its processor time when the silence began."""
+        self._awake_s = 0.0
+        """How much of the silence it ran or waited for a processor; at most all of it, however many its threads are."""
+        self._seen: _Use | None = use_of(pid)
+        self._work_s = 0.0
 
     @property
     def left_s(self) -> float:
-        """How long to listen before the next verdict."""
-        return max(LOOK_S, self.patience_s - self.silent_s)
+        """How long to listen before the next call of `go_on`.
+
+        A relay that speaks in time is not looked at, which would cost more than its words. So the first half of a
+        silence is not measured, but for a new relay's.
+        """
+        patience_s = self.patience_s / 2 if self._seen is None else self.patience_s
+        return max(LOOK_S, patience_s - (self.silent_s - self._awake_s))
 
     def end(self) -> None:
         """It has said something."""
-        self.silent_s, self._began_at_s = 0.0, None
+        self.silent_s = self._awake_s = self._work_s = 0.0
+        self._seen = None
 
     def go_on(self, asked_s: float, took_s: float) -> str:
         """Nothing came while we listened for ``took_s`` and wanted to for ``asked_s``; why it is wedged, or ``""``.
@@ -49,16 +60,48 @@ class Silence:
         """
         has_stood_still = took_s > asked_s + LOOK_S
         self.silent_s += min(took_s, asked_s + LOOK_S)
-        had_s = processor_s(self._pid)
-        if self._began_at_s is None:
-            self._began_at_s = had_s
-        if self.silent_s < self.patience_s or has_stood_still:
+        use, seen = use_of(self._pid), self._seen
+        self._seen = use
+        if use is None:
+            return self._verdict() if self.silent_s >= self.patience_s and not has_stood_still else ""
+        if seen is not None:
+            self._work_s += use.processor_s - seen.processor_s
+            lately_s = use.processor_s - seen.processor_s + max(0.0, use.waited_s - seen.waited_s)
+            self._awake_s = min(self.silent_s, self._awake_s + lately_s)
+        if has_stood_still or self.silent_s < self.patience_s:
             return ""
-        if had_s is None or self._began_at_s is None or is_idle(self._pid):
-            return f"no sign of life for {self.silent_s:.1f} s"
-        if had_s - self._began_at_s < WORK_S:
-            return ""
-        return f"no sign of life for {self.silent_s:.1f} s, {had_s - self._began_at_s:.1f} s of them on a processor"
+        if self._work_s >= WORK_S:
+            return f"{self._verdict()}, {self._work_s:.1f} s of them on a processor"
+        has_slept = self.silent_s - self._awake_s >= self.patience_s
+        return self._verdict() if has_slept and is_idle(self._pid) else ""
+
+    def _verdict(self) -> str:
+        return f"no sign of life for {self.silent_s:.1f} s"
+
+
+@dataclass(frozen=True, slots=True)
+class _Use:
+    """What all threads of a process have had and lacked so far."""
+
+    processor_s: float
+    waited_s: float
+    """In a run queue, also while its cgroup is throttled. A wait counts when it ends; 0 where the kernel tells none."""
+
+
+def use_of(pid: int) -> _Use | None:
+    """What a process has had of the processor so far; ``None`` when there is no such process."""
+    had_s = processor_s(pid)
+    return None if had_s is None else _Use(had_s, waited_s(pid))
+
+
+def waited_s(pid: int) -> float:
+    """How long the threads that a process has now have waited for a processor (Documentation/scheduler/sched-stats)."""
+    waited_ns = 0
+    with contextlib.suppress(OSError):
+        for thread in Path(f"/proc/{pid}/task").iterdir():
+            with contextlib.suppress(OSError, IndexError, ValueError):
+                waited_ns += int((thread / "schedstat").read_text().split()[1])
+    return waited_ns / 1e9
 
 
 def processor_s(pid: int) -> float | None:
