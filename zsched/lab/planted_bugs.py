@@ -256,7 +256,6 @@ LEASE_BUGS = (
         "elif grant.number not in self._ahead.get(elector, ()):",
         "else:",
         _LEASE,
-        seed=8004705,
     ),
     _bug(
         "an elector holds on to a forged number",
@@ -286,8 +285,8 @@ LEASE_BUGS = (
     _bug(
         "echo counts before the epoch was learnt",
         LEASE,
-        "elif grant.number >= self.first_number and grant.number > max(",
-        "elif grant.number > max(",
+        "elif grant.number < self.first_number or grant.number <= self.released:",
+        "elif grant.number <= self.released:",
         _LEASE,
     ),
     _bug(
