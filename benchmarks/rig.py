@@ -123,7 +123,10 @@ class Rig:
             heard: list[tuple[float, HandleReport]] = []
             self.heard[node] = heard
             connect = () if node == ROBOT else (self.endpoint(ROBOT),)
-            text = data_config(listen=(self.endpoint(node),), connect=connect, shared_memory=False)
+            # one side dials every link, as `zsched.daemon_endpoints` has it
+            text = data_config(
+                listen=(self.endpoint(node),), connect=connect, shared_memory=False, dials_by_gossip=False
+            )
             on_report = _listener(heard)
             self.relays[node] = RelayHandle(fleet=FLEET, node=node, zenoh_config=text, on_report=on_report)
             self.relays[node].start()
@@ -164,7 +167,7 @@ class Rig:
         self.incarnation += 1
         path = self.folder / f"{node}.json5"
         connect = tuple(dict.fromkeys((self.endpoint(node), self.endpoint(ROBOT))))  # as `zsched.daemon_endpoints`
-        path.write_text(worker_config(connect=connect, shared_memory=False))
+        path.write_text(worker_config(connect=connect, shared_memory=False, dials_by_gossip=False))
         env = os.environ | {
             "ZSCHED_FLEET": FLEET,
             "ZSCHED_NODE": node,

@@ -252,7 +252,6 @@ class Daemon:
             paths[name] = folder / f"{me}-{name}.zenoh.json5"
             config = zenoh_config.worker_config(
                 connect=points.worker_connect,
-                listen=points.worker_listen,
                 timing=fleet.timing,
                 link=spec.link,
                 shared_memory=self._memory_objection == "",

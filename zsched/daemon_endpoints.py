@@ -33,7 +33,6 @@ class Endpoints:
     data_listen: tuple[str, ...]
     data_connect: tuple[str, ...]
     worker_connect: tuple[str, ...]
-    worker_listen: tuple[str, ...]
     control_by_gossip: bool
     """Whether the control session dials whom it hears of by gossip; the same for the relay's and the workers'."""
     data_by_gossip: bool
@@ -51,9 +50,10 @@ def endpoints_for(
 
     What the fleet file does not say listens with ``protocol`` (`zsched.daemon_tls`).
 
-    A link is dialled by one side only: two that redial each other while a cut heals can end with a link that zenoh
-    keeps alive and delivers nothing on. Who gives no address dials everybody who does; only two that give none meet by
-    gossip, and then zenoh's ids decide who dials. Workers dial their own relay first, then the robots'.
+    A link is dialled by one side only: of two that redial each other one may take the other's new link for a part of
+    its old session, and tells it nothing again (eclipse-zenoh/zenoh#2806). Who gives no address dials everybody who
+    does; only two that give none meet by gossip, and then zenoh's ids decide who dials. Workers dial their own relay
+    first, then the robots', and listen nowhere, so nobody dials them.
     Our own address on another machine (``is_here``) is dialled too: there a twin of ours may be, and must be heard.
     """
     robots = [node for node in fleet.nodes if node.kind is NodeKind.ROBOT and node.name != me.name]
@@ -61,14 +61,12 @@ def endpoints_for(
     if not dial_endpoint(data_listen, "127.0.0.1"):  # any port will do, but workers must know which
         address, _, rest = data_listen.rpartition(":")
         data_listen = f"{address}:{free_port()}{rest.removeprefix('0')}"
-    is_loopback = "/127." in data_listen or "/[::1]" in data_listen
     return Endpoints(
         control_listen=(me.listen_control or f"{protocol}/0.0.0.0:0",),
         control_connect=_dialled(_targets(fleet, me, _control, is_here), _control),
         data_listen=(data_listen,),
         data_connect=_dialled(_targets(fleet, me, _data), _data),
         worker_connect=(dial_endpoint(data_listen, "127.0.0.1"), *_dialled(robots, _data)),
-        worker_listen=(f"{protocol}/127.0.0.1:0" if is_loopback else f"{protocol}/0.0.0.0:0",),
         control_by_gossip=not _dialled([me], _control) and len(_hidden(list(fleet.nodes), _control)) > 1,
         data_by_gossip=not _dialled([me], _data),  # also for the workers of others, if this is a robot
         worker_by_gossip=bool(_hidden(robots, _data)),

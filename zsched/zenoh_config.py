@@ -106,7 +106,7 @@ def data_config(
 def worker_config(
     *,
     connect: tuple[str, ...],
-    listen: tuple[str, ...] = (LOOPBACK_LISTEN,),
+    listen: tuple[str, ...] = (),
     timing: Timing = DEFAULT_TIMING,
     link: WorkerLink = WorkerLink.PEER,
     shared_memory: bool = True,
@@ -115,8 +115,8 @@ def worker_config(
 ) -> str:
     """A worker's session: joined to its own node's relay (the first of ``connect``), by the rest or gossip to others.
 
-    ``listen`` must be reachable for the robots' relays when they are other machines (``tcp/0.0.0.0:0``). With
-    ``link: client`` everything goes through the node's relay (robots that cannot reach the worker's port).
+    A worker listens nowhere: it dials, and nobody dials it (`zsched.daemon_endpoints` says why). Other programs may
+    ``listen``. With ``link: client`` everything goes through the node's relay (robots that the worker cannot dial).
 
     Raises:
         ValueError: the operator's JSON5 is not a zenoh configuration.
@@ -131,7 +131,7 @@ def worker_config(
         )
     settings = _peer(_small_buffers(listen), _small_buffers(connect), timing)
     _set_shared_memory(settings, is_on=shared_memory)
-    _set_gossip(settings, dials=dials_by_gossip)
+    _set_gossip(settings, dials=dials_by_gossip, is_dialled=bool(listen))
     return _render(settings, operator_json5)
 
 
@@ -277,12 +277,14 @@ def _peer(listen: tuple[str, ...], connect: tuple[str, ...], timing: Timing) -> 
     return settings
 
 
-def _set_gossip(settings: Settings, *, dials: bool) -> None:
+def _set_gossip(settings: Settings, *, dials: bool, is_dialled: bool = True) -> None:
+    """``is_dialled``: others can dial this session, too."""
     if not dials:
         settings["scouting/gossip/autoconnect"] = {"router": [], "peer": []}
         return
     # Of two that hear of each other one dials: where both redial after a cut, a link may come back dead.
-    settings["scouting/gossip/autoconnect_strategy"] = {"peer": {"to_router": "always", "to_peer": "greater-zid"}}
+    to_peer = "greater-zid" if is_dialled else "always"
+    settings["scouting/gossip/autoconnect_strategy"] = {"peer": {"to_router": "always", "to_peer": to_peer}}
 
 
 def _set_shared_memory(settings: Settings, *, is_on: bool) -> None:

@@ -67,7 +67,6 @@ def test_node_listens_where_the_file_says_and_its_workers_dial_it_on_this_machin
         data_listen=("tcp/0.0.0.0:7458",),
         data_connect=(),
         worker_connect=("tcp/127.0.0.1:7458",),
-        worker_listen=("tcp/0.0.0.0:0",),
         control_by_gossip=False,
         data_by_gossip=False,
         worker_by_gossip=False,
@@ -82,25 +81,24 @@ def test_node_without_endpoints_takes_free_ports_and_knows_the_one_that_its_work
 
 
 @pytest.mark.parametrize(
-    ("data", "connect", "listen"),
+    ("data", "connect"),
     [
-        ("tcp/127.0.0.1:7458", "tcp/127.0.0.1:7458", "tcp/127.0.0.1:0"),
-        ("tcp/127.0.0.2:7458", "tcp/127.0.0.2:7458", "tcp/127.0.0.1:0"),
-        ("tcp/[::1]:7458", "tcp/[::1]:7458", "tcp/127.0.0.1:0"),
-        ("tcp/192.0.2.1:7458", "tcp/192.0.2.1:7458", "tcp/0.0.0.0:0"),
-        ("tcp/[::]:7458", "tcp/127.0.0.1:7458", "tcp/0.0.0.0:0"),
-        ("tls/0.0.0.0:7458", "tls/127.0.0.1:7458", "tcp/0.0.0.0:0"),
+        ("tcp/127.0.0.1:7458", "tcp/127.0.0.1:7458"),
+        ("tcp/127.0.0.2:7458", "tcp/127.0.0.2:7458"),
+        ("tcp/[::1]:7458", "tcp/[::1]:7458"),
+        ("tcp/192.0.2.1:7458", "tcp/192.0.2.1:7458"),
+        ("tcp/[::]:7458", "tcp/127.0.0.1:7458"),
+        ("tls/0.0.0.0:7458", "tls/127.0.0.1:7458"),
     ],
 )
-def test_workers_listen_on_loopback_only_when_the_fleet_does(data: str, connect: str, listen: str) -> None:
-    found = endpoints(spec("a", data=data))
-    assert (found.worker_connect, found.worker_listen) == ((connect,), (listen,))
+def test_workers_dial_their_own_relay_where_it_listens(data: str, connect: str) -> None:
+    assert endpoints(spec("a", data=data)).worker_connect == (connect,)
 
 
 def test_what_the_file_does_not_say_listens_with_tls_where_there_is_tls() -> None:
     found = endpoints_for(fleet(spec("a")), spec("a"), lambda: 50000, protocol="tls")
     assert (found.control_listen, found.data_listen) == (("tls/0.0.0.0:0",), ("tls/0.0.0.0:50000",))
-    assert (found.worker_connect, found.worker_listen) == (("tls/127.0.0.1:50000",), ("tls/0.0.0.0:0",))
+    assert found.worker_connect == ("tls/127.0.0.1:50000",)
 
 
 def test_port_zero_is_replaced_by_a_port_that_workers_can_dial() -> None:

@@ -69,6 +69,15 @@ def test_peers_gossip_and_wait_for_nobody(name: str) -> None:
     assert read(ALL[name], "connect/exit_on_failure") is False
 
 
+def test_nobody_dials_a_worker_so_it_dials_whom_it_hears_of() -> None:
+    """Of two that dial each other one may tell the other nothing again (eclipse-zenoh/zenoh#2806)."""
+    strategy = "scouting/gossip/autoconnect_strategy"
+    assert read(ALL["worker"], "listen/endpoints") == []
+    assert read(ALL["worker"], strategy)["peer"]["to_peer"] == "always"
+    assert read(ALL["data"], strategy)["peer"]["to_peer"] == "greater-zid"
+    assert read(ALL["control"], strategy)["peer"]["to_peer"] == "greater-zid"
+
+
 def test_a_put_waits_longer_for_room_where_applications_receive() -> None:
     wait = "transport/link/tx/queue/congestion_control/drop/wait_before_drop"
     assert (read(ALL["data"], wait), read(ALL["worker"], wait)) == (50_000, 1000)
