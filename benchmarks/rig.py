@@ -167,7 +167,7 @@ class Rig:
         self.incarnation += 1
         path = self.folder / f"{node}.json5"
         connect = tuple(dict.fromkeys((self.endpoint(node), self.endpoint(ROBOT))))  # as `zsched.daemon_endpoints`
-        path.write_text(worker_config(connect=connect, shared_memory=False, dials_by_gossip=False))
+        path.write_text(worker_config(connect=connect, listen=(), shared_memory=False, dials_by_gossip=False))
         env = os.environ | {
             "ZSCHED_FLEET": FLEET,
             "ZSCHED_NODE": node,

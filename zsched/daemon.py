@@ -252,6 +252,7 @@ class Daemon:
             paths[name] = folder / f"{me}-{name}.zenoh.json5"
             config = zenoh_config.worker_config(
                 connect=points.worker_connect,
+                listen=(),
                 timing=fleet.timing,
                 link=spec.link,
                 shared_memory=self._memory_objection == "",

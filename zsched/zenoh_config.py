@@ -106,7 +106,7 @@ def data_config(
 def worker_config(
     *,
     connect: tuple[str, ...],
-    listen: tuple[str, ...] = (),
+    listen: tuple[str, ...] = (LOOPBACK_LISTEN,),
     timing: Timing = DEFAULT_TIMING,
     link: WorkerLink = WorkerLink.PEER,
     shared_memory: bool = True,
@@ -115,8 +115,8 @@ def worker_config(
 ) -> str:
     """A worker's session: joined to its own node's relay (the first of ``connect``), by the rest or gossip to others.
 
-    A worker listens nowhere: it dials, and nobody dials it (`zsched.daemon_endpoints` says why). Other programs may
-    ``listen``. With ``link: client`` everything goes through the node's relay (robots that the worker cannot dial).
+    A daemon's workers ``listen`` nowhere: they dial, and nobody dials them (`zsched.daemon_endpoints` says why). With
+    ``link: client`` everything goes through the node's relay (robots that the worker cannot dial).
 
     Raises:
         ValueError: the operator's JSON5 is not a zenoh configuration.

@@ -55,4 +55,4 @@ def test_a_daemon_gives_itself_its_relay_and_its_workers_a_thread_for_every_link
     assert workers
     for worker in workers:
         assert environment(worker)["ZENOH_RUNTIME"] == runtime_pools(NODES, TASKS)
-        assert has_threads(worker, rx=count, net=count, acc=count)
+        assert has_threads(worker, rx=count, net=count)  # nobody dials it: no `acc`

@@ -118,13 +118,7 @@ class Rig:
             self.reports[node] = Reports()
             connect = () if node == ROBOT else (seed,)
             # no shared memory: a stalled target must fill its socket
-            text = data_config(
-                listen=(self.endpoint(node),),
-                connect=connect,
-                timing=self.timing,
-                shared_memory=False,
-                dials_by_gossip=False,
-            )
+            text = data_config(listen=(self.endpoint(node),), connect=connect, timing=self.timing, shared_memory=False)
             self.relays[node] = RelayHandle(fleet=FLEET, node=node, zenoh_config=text, on_report=self.reports[node].add)
             self.relays[node].start()
         until(lambda: all(r.find(RelayChanged, is_running=True) for r in self.reports.values()), "the relays run")

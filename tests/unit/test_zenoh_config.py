@@ -72,8 +72,9 @@ def test_peers_gossip_and_wait_for_nobody(name: str) -> None:
 def test_nobody_dials_a_worker_so_it_dials_whom_it_hears_of() -> None:
     """Of two that dial each other one may tell the other nothing again (eclipse-zenoh/zenoh#2806)."""
     strategy = "scouting/gossip/autoconnect_strategy"
-    assert read(ALL["worker"], "listen/endpoints") == []
-    assert read(ALL["worker"], strategy)["peer"]["to_peer"] == "always"
+    worker = worker_config(connect=(THERE,), listen=(), timing=TIMING)
+    assert read(worker, "listen/endpoints") == []
+    assert read(worker, strategy)["peer"]["to_peer"] == "always"
     assert read(ALL["data"], strategy)["peer"]["to_peer"] == "greater-zid"
     assert read(ALL["control"], strategy)["peer"]["to_peer"] == "greater-zid"
 
