@@ -68,7 +68,7 @@ def endpoints_for(
         data_connect=_dialled(_targets(fleet, me, _data), _data),
         worker_connect=(dial_endpoint(data_listen, "127.0.0.1"), *_dialled(robots, _data)),
         control_by_gossip=not _dialled([me], _control) and len(_hidden(list(fleet.nodes), _control)) > 1,
-        data_by_gossip=not _dialled([me], _data),  # also for the workers of others, if this is a robot
+        data_by_gossip=not _dialled([me], _data),
         worker_by_gossip=bool(_hidden(robots, _data)),
     )
 

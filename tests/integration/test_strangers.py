@@ -67,7 +67,7 @@ class Application:
 def bed(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Testbed]:
     """One edge, so that nothing moves by itself; the streams' class may be the parameter.
 
-    A robot without an address on the data network: workers dial it by gossip, and so whoever else is there and listens.
+    One robot has no address on the data network. So workers dial by gossip, and they dial any session that listens.
     """
     tree = echo_fleet(edges=1, stream_class=getattr(request, "param", "latest"))
     del tree["nodes"]["robot3"]["listen"]["data"]

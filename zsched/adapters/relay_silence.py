@@ -14,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import os
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -62,21 +63,19 @@ class Silence:
         self.silent_s += min(took_s, asked_s + LOOK_S)
         use, seen = use_of(self._pid), self._seen
         self._seen = use
-        if use is None:
-            return self._verdict() if self.silent_s >= self.patience_s and not has_stood_still else ""
-        if seen is not None:
-            self._work_s += use.processor_s - seen.processor_s
-            lately_s = use.processor_s - seen.processor_s + max(0.0, use.waited_s - seen.waited_s)
-            self._awake_s = min(self.silent_s, self._awake_s + lately_s)
+        if use is not None and seen is not None:
+            worked_s = use.processor_s - seen.processor_s
+            self._work_s += worked_s
+            self._awake_s = min(self.silent_s, self._awake_s + worked_s + max(0.0, use.waited_s - seen.waited_s))
         if has_stood_still or self.silent_s < self.patience_s:
             return ""
+        verdict = f"no sign of life for {self.silent_s:.1f} s"
+        if use is None:
+            return verdict
         if self._work_s >= WORK_S:
-            return f"{self._verdict()}, {self._work_s:.1f} s of them on a processor"
+            return f"{verdict}, {self._work_s:.1f} s of them on a processor"
         has_slept = self.silent_s - self._awake_s >= self.patience_s
-        return self._verdict() if has_slept and is_idle(self._pid) else ""
-
-    def _verdict(self) -> str:
-        return f"no sign of life for {self.silent_s:.1f} s"
+        return verdict if has_slept and is_idle(self._pid) else ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,10 +96,9 @@ def use_of(pid: int) -> _Use | None:
 def waited_s(pid: int) -> float:
     """How long the threads that a process has now have waited for a processor (Documentation/scheduler/sched-stats)."""
     waited_ns = 0
-    with contextlib.suppress(OSError):
-        for thread in Path(f"/proc/{pid}/task").iterdir():
-            with contextlib.suppress(OSError, IndexError, ValueError):
-                waited_ns += int((thread / "schedstat").read_text().split()[1])
+    for text in _of_threads(pid, "schedstat"):
+        with contextlib.suppress(IndexError, ValueError):
+            waited_ns += int(text.split()[1])
     return waited_ns / 1e9
 
 
@@ -131,8 +129,15 @@ def is_idle(pid: int) -> bool:
 
 def _thread_states(pid: int) -> set[str]:
     states = set()
+    for text in _of_threads(pid, "stat"):
+        with contextlib.suppress(IndexError):
+            states.add(text.rsplit(")", 1)[1].split()[0])
+    return states
+
+
+def _of_threads(pid: int, file: str) -> Iterator[str]:
+    """What /proc says under that name of each thread there is; one that ends meanwhile is left out."""
     with contextlib.suppress(OSError):
         for thread in Path(f"/proc/{pid}/task").iterdir():
-            with contextlib.suppress(OSError, IndexError):
-                states.add((thread / "stat").read_text().rsplit(")", 1)[1].split()[0])
-    return states
+            with contextlib.suppress(OSError):
+                yield (thread / file).read_text()
