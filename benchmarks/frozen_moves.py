@@ -32,7 +32,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from benchmarks.common import machine
-from benchmarks.rig import ROBOT, TASK, Load, Rig, Traffic, routes, until
+from benchmarks.rig import ROBOT, TASK, Load, Rig, Traffic, routes, told_of, until
 from zsched.core.books import unaccounted
 from zsched.core.events import SlotDrained, SlotFlipped, SlotReady, StreamsCounted
 from zsched.core.plan import RoutePhase, Slot, StreamClass, StreamCount, WorkerRole
@@ -186,8 +186,7 @@ def _judge(rig: Rig, traffic: Traffic, sums: Sums, *, is_overload: bool, has_bac
         counts = rig.counts()
         inward, outward = counts[f"{TASK}/in/0"], counts[f"{TASK}/out/0"]
         lost, doubled, reordered = traffic.result()
-        told = inward.lost + inward.at_most_lost + sum(n for _, n in inward.drops)
-        told += outward.lost + sum(n for _, n in outward.drops)
+        told = told_of(counts, 0)
         if not inward.in_flight and inward.messages == len(traffic.sent) and lost <= told:
             break
     told -= inward.at_most_lost if has_back and not lost else 0

@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 from bisect import bisect_left
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -221,6 +221,23 @@ class Rig:
             f"{missing} unaccounted: {count}" for count in self.counts().values() if (missing := unaccounted(count))
         ]
 
+    def silent_losses(self, traffics: Sequence[Traffic], deadline_s: float = 20.0) -> list[str]:
+        """Loads of which more samples have not come back than the robot's counters tell of, once that is final.
+
+        The loads are those of the slot, in its order, and have stopped; what is on its way has ``deadline_s`` to come.
+        """
+        end = time.monotonic() + deadline_s
+        while True:
+            counts = self.counts()
+            pairs = [(traffic.result()[0], told_of(counts, index)) for index, traffic in enumerate(traffics)]
+            if all(lost <= told for lost, told in pairs) or time.monotonic() > end:
+                break
+        return [
+            f"{traffic.load.name}: {lost} lost, {told} told of"
+            for traffic, (lost, told) in zip(traffics, pairs, strict=True)
+            if lost > told
+        ]
+
     def left_behind(self) -> list[int]:
         """What closed slots reported as "at most so many lost"."""
         return [report.samples for _, report in self.heard[ROBOT] if isinstance(report, SlotLost)]
@@ -229,6 +246,12 @@ class Rig:
         """{process: (private MB, descriptors, threads)} of the robot's relay and the workers."""
         pids = {ROBOT: self.relays[ROBOT].pid or 0} | {node: worker.pid for node, worker in self.workers.items()}
         return {name: _footprint(pid) for name, pid in pids.items() if psutil.pid_exists(pid)}
+
+
+def told_of(counts: Mapping[str, StreamCount], index: int) -> int:
+    """How many samples of a slot's load the counters of the robot's relay give up: on the way there and back."""
+    both = (counts[f"{TASK}/in/{index}"], counts[f"{TASK}/out/{index}"])
+    return sum(one.lost + one.at_most_lost + sum(number for _, number in one.drops) for one in both)
 
 
 def _listener(heard: list[tuple[float, HandleReport]]) -> Callable[[HandleReport], None]:
