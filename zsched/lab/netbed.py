@@ -74,13 +74,19 @@ class PeerChange:
 class Probe:
     """`zsched.lab.probe` as a child: what an application in a node's namespace sends and sees."""
 
-    def __init__(self, command: Sequence[str | Path], log: IO[bytes]) -> None:
-        """Start it; `Netbed.probe` knows the command."""
+    def __init__(self, command: Sequence[str | Path], log: IO[bytes], name: str = "") -> None:
+        """Start it; `Netbed.probe` knows the command, and the name of its log."""
+        self.name = name
         self.received: list[Received] = []
         self.is_open = False
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log)
         self._thread = guarded(self._read, name="netbed", is_lasting=False)
         self._thread.start()
+        self._is_closed = False
+
+    def ended(self) -> int | None:
+        """Its exit code if it has ended by itself."""
+        return None if self._is_closed else self._process.poll()
 
     def _read(self) -> None:
         assert self._process.stdout is not None
@@ -110,6 +116,7 @@ class Probe:
 
     def close(self) -> None:
         """End it."""
+        self._is_closed = True
         assert self._process.stdin is not None
         with contextlib.suppress(OSError):
             self._process.stdin.close()
@@ -239,10 +246,16 @@ class Netbed(Testbed):
         command = [*PROBE, config, "--put", put, "--hz", str(hz), "--size", str(size), *watched]
         command += ["--burst", str(burst), *(["--block"] if blocks else [])]
         command += ["--one-stamp"] if has_one_stamp else []
-        with (self.folder / f"probe-{node}.log").open("ab") as log:
-            probe = Probe(self.network.wrap(node, command), log)
+        name = f"probe-{node}"
+        with (self.folder / f"{name}.log").open("ab") as log:
+            probe = Probe(self.network.wrap(node, command), log, name)
         self._probes.append(probe)
         return probe
+
+    def _ended(self) -> dict[str, int]:
+        """Applications, too: nobody waits for answers at one that is no more."""
+        codes = {probe.name: code for probe in self._probes if (code := probe.ended()) is not None}
+        return super()._ended() | codes
 
     def _data_endpoint(self, node: NodeId) -> str:
         if self.fleet.node(node).listen_data:

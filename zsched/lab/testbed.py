@@ -265,7 +265,7 @@ class Testbed:
         """Poll until ``condition`` is truthy and return it.
 
         Raises:
-            TestbedError: not within ``timeout_s``, or a daemon that nobody asked to end has ended meanwhile; the
+            TestbedError: not within ``timeout_s``, or a process that nobody asked to end has ended meanwhile; the
                 message ends with the last lines of its log, or of every log.
         """
         deadline = time.monotonic() + timeout_s
@@ -278,13 +278,13 @@ class Testbed:
                 pass  # not up yet: as good as false
             if ended:
                 codes = ", ".join(f"{node} with {code}" for node, code in ended.items())
-                raise TestbedError(f"waited for {what}, but daemons have ended: {codes}\n{self._tails(ended)}")
+                raise TestbedError(f"waited for {what}, but processes have ended: {codes}\n{self._tails(ended)}")
             if time.monotonic() > deadline:
                 raise TestbedError(f"waited {timeout_s:g} s for {what}\n{self._tails(self._processes)}")
             time.sleep(POLL_S)
 
-    def _ended(self) -> dict[NodeId, int]:
-        """Daemons that have ended by themselves, with their exit codes."""
+    def _ended(self) -> dict[str, int]:
+        """Daemons that have ended by themselves, with their exit codes; the names are those of their logs."""
         codes = {node: process.poll() for node, process in self._processes.items() if node not in self._may_end}
         return {node: code for node, code in codes.items() if code is not None}
 
