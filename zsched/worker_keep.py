@@ -27,7 +27,7 @@ from zsched.clock import monotonic_s
 from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks
 from zsched.core.serial import number_near, serial_of
 from zsched.errors import WireError
-from zsched.guard import guarded
+from zsched.guard import guarded, tolerant
 from zsched.keyspace import AGAIN_CHUNK, END_CHUNK, parse
 from zsched.relay_pipe import encode_end
 from zsched.stalled_links import StalledLinks
@@ -87,7 +87,9 @@ class Keeper:
         with self._lock:
             self._lanes[source_id.eid] = lane
             if self._subscriber is None:
-                self._subscriber = self._session.declare_subscriber(self._acks_key, self._hear)
+                self._subscriber = self._session.declare_subscriber(
+                    self._acks_key, tolerant(self._hear, "acknowledgements")
+                )
                 guarded(self._run, name="zsched keeper").start()
         return lane
 

@@ -15,7 +15,7 @@ import zenoh
 from zsched import wire
 from zsched.core.plan import Role
 from zsched.errors import WireError
-from zsched.guard import guarded
+from zsched.guard import guarded, tolerant
 
 ROLE_RETRY_S: Final = 0.5
 RETRY_S: Final = 0.02
@@ -51,7 +51,7 @@ class RoleWatch:
 
     def start(self) -> None:
         """Subscribe, and ask until the first answer: our relay may start later than we do."""
-        self._watch = self._session.declare_subscriber(self._key, lambda _: self._told.set())
+        self._watch = self._session.declare_subscriber(self._key, tolerant(lambda _: self._told.set(), "role"))
         guarded(self._run, name="zsched roles").start()
 
     @property

@@ -24,7 +24,7 @@ from zsched.clock import monotonic_s
 from zsched.core.model import NodeId
 from zsched.core.plan import Role, WorkerRole
 from zsched.core.relay_protocol import ERROR_ENCODING, SnapshotChunk
-from zsched.guard import guarded
+from zsched.guard import guarded, tolerant
 from zsched.relay_pipe import decode_chunk, encode_chunk
 
 CHUNK: Final = 256 * 1024
@@ -185,7 +185,7 @@ def fetch(session: zenoh.Session, key: str, timeout_s: float) -> bytes | str:
     try:
         session.get(
             key,
-            zenoh.handlers.Callback(replies.put, lambda: replies.put(None), indirect=False),
+            zenoh.handlers.Callback(tolerant(replies.put, "snapshot"), lambda: replies.put(None), indirect=False),
             target=zenoh.QueryTarget.ALL,  # a stranger's offer may call itself complete, and must not be the only one
             timeout=timeout_s + 1.0,
             consolidation=zenoh.ConsolidationMode.NONE,

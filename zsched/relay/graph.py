@@ -22,7 +22,7 @@ from zsched.core.model import NodeId, TaskId
 from zsched.core.plan import RosGraph, Route
 from zsched.core.ros2 import Endpoint, endpoint_token, node_token, parse_token, ros_node_name, token_selector
 from zsched.core.ros_mirror import Sides, mirrored
-from zsched.guard import guarded
+from zsched.guard import guarded, tolerant
 from zsched.relay.receive import undeclare
 
 MAX_TOKENS: Final = 20_000
@@ -128,7 +128,7 @@ class GraphMirror:
             if graph in side.watches:
                 continue
             side.watches[graph] = side.session.liveliness().declare_subscriber(
-                token_selector(graph), partial(self._enqueue, side), history=True
+                token_selector(graph), tolerant(partial(self._enqueue, side), "graph"), history=True
             )
 
     def _enqueue(self, side: _Side, sample: Sample) -> None:

@@ -24,7 +24,7 @@ from zenoh import Locality, Session
 from zsched.clock import monotonic_s
 from zsched.core.model import TaskId
 from zsched.core.relay_protocol import WorkerMatched, WorkerWatch
-from zsched.guard import guarded
+from zsched.guard import guarded, tolerant
 from zsched.relay.receive import Declared, undeclare
 
 SETTLE_S: Final = 1.5
@@ -123,12 +123,12 @@ class Matching:
 
     def _probe(self, key: str) -> zenoh.Publisher:
         probe = self._session.declare_publisher(key, allowed_destination=Locality.REMOTE)
-        probe.declare_matching_listener(self._wake)
+        probe.declare_matching_listener(tolerant(self._wake, "matching"))
         return probe
 
     def _asker(self, key: str) -> zenoh.Querier:
         asker = self._session.declare_querier(key, allowed_destination=Locality.REMOTE)
-        asker.declare_matching_listener(self._wake)
+        asker.declare_matching_listener(tolerant(self._wake, "matching"))
         return asker
 
     def _look(self) -> None:

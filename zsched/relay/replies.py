@@ -16,6 +16,7 @@ import zenoh
 from zenoh import Reply, Session
 
 from zsched.clock import monotonic_s
+from zsched.guard import tolerant
 
 MAX_WAITING: Final = 1024
 """Replies that may wait for a slow asker; further ones are dropped, and `Replies.has_overflowed` says so."""
@@ -43,7 +44,7 @@ class Replies:
         left_s = max(0.0, self._until - monotonic_s())
         session.get(
             selector,
-            zenoh.handlers.Callback(self._take, lambda: self._waiting.put(None), indirect=False),
+            zenoh.handlers.Callback(tolerant(self._take, "answer"), lambda: self._waiting.put(None), indirect=False),
             timeout=left_s + 1.0,  # ours comes first, and needs no telling from an owner's own "Timeout"
             consolidation=zenoh.ConsolidationMode.NONE,
             allowed_destination=zenoh.Locality.REMOTE,
