@@ -9,8 +9,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from random import Random
 
-from zsched.core.fleet import Fleet, OnIsolation, TaskSpec
-from zsched.core.model import Weights
+from zsched.core.fleet import Fleet, OnIsolation, Standby, StreamRule, TaskSpec
+from zsched.core.model import ScoreForm, Weights
+from zsched.core.plan import Direction
 from zsched.core.timing import PROFILES
 
 Change = Callable[[Random, Fleet], Fleet]
@@ -63,6 +64,51 @@ def _other_tasks(_rng: Random, fleet: Fleet) -> Fleet:
     return replace(fleet, tasks=(replace(fleet.tasks[0], name="extra"), *fleet.tasks))
 
 
+def _other_isolation(_rng: Random, fleet: Fleet) -> Fleet:
+    """Robots may work alone, or may not any more; `zsched check` refuses the first for an exclusive task."""
+    task = fleet.tasks[0]
+    may_work = task.on_isolation is OnIsolation.HOLD and not task.exclusive
+    return _with_task(
+        fleet, lambda task: replace(task, on_isolation=OnIsolation.LOCAL if may_work else OnIsolation.HOLD)
+    )
+
+
+def _other_worker(rng: Random, fleet: Fleet) -> Fleet:
+    """Warm or cold, more or less time to start, fewer failures until it is given up, watched for its output."""
+    standby = Standby.COLD if fleet.tasks[0].worker.standby is Standby.WARM else Standby.WARM
+    deadline_s, failures, silence_s = rng.choice((2.0, 3.0, 5.0)), rng.choice((1, 3)), rng.choice((None, 3.0))
+    worker = replace(
+        fleet.tasks[0].worker,
+        standby=standby,
+        start_deadline_s=deadline_s,
+        max_failures=failures,
+        output_deadline_s=silence_s,
+    )
+    return _with_task(fleet, lambda task: replace(task, worker=worker))
+
+
+def _other_score(rng: Random, fleet: Fleet) -> Fleet:
+    """Another form, with or without a deadline; learnt patience or the timer."""
+    score, deadline_ms = rng.choice(((ScoreForm.PAPER, None), (ScoreForm.SERVICE, None), (ScoreForm.SERVICE, 500.0)))
+    patience = rng.choice((None, 0.3))
+
+    def changed(task: TaskSpec) -> TaskSpec:
+        tuning = replace(task.tuning, score=score, deadline_ms=deadline_ms)
+        return replace(task, tuning=tuning, patience=patience, learns_patience=patience is not None)
+
+    return _with_task(fleet, changed)
+
+
+def _other_streams(rng: Random, fleet: Fleet) -> Fleet:
+    """A stream more, or another place for it, or none."""
+    kept = rng.choice(((), ("in",), ("{task}/in",)))
+    rules = tuple(
+        StreamRule(direction=Direction.INPUT, from_template="{robot}/in", to_template=f"{{target}}/{place}/{{robot}}")
+        for place in kept
+    )
+    return _with_task(fleet, lambda task: replace(task, rules=rules))
+
+
 CHANGES: dict[str, Change] = {
     "exclusive": _other_exclusive,
     "timing": _other_timing,
@@ -71,5 +117,9 @@ CHANGES: dict[str, Change] = {
     "electors": other_electors,
     "limits": _other_limits,
     "tasks": _other_tasks,
+    "isolation": _other_isolation,
+    "worker": _other_worker,
+    "score": _other_score,
+    "streams": _other_streams,
 }
 """In the order of a fault's size."""

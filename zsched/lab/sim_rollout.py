@@ -58,12 +58,13 @@ class Rollouts:
     def _may_roll_out(self, name: str) -> bool:
         """Whether leases are promised all the same (docs/decisions/0026).
 
-        They are not to such clocks, not with both at once, and not where two machines have one name: whoever makes the
-        task exclusive asks by names, and one machine's answer counts for the other, which it may not hear.
+        They are not to such clocks, not with both at once, not where a robot may still work alone by the old file, and
+        not where two machines have one name: whoever makes the task exclusive asks by names, and one machine's answer
+        counts for the other, which it may not hear.
         """
         if name == "exclusive":
             is_promised = not any(_is_wild(fault) or fault.kind in TWINS for fault in self.scene.plan.faults)
-            return is_promised and not self.scene.done["rollout of candidates"]
+            return is_promised and not any(self.scene.done[f"rollout of {one}"] for one in ("candidates", "isolation"))
         return name != "candidates" or not self.scene.done["rollout of exclusive"]
 
     def _generation(self, fault: Fault) -> None:
