@@ -454,6 +454,14 @@ LEASE_BUGS = (
 
 MEMBERSHIP_BUGS = (
     _bug(
+        "a beat does not tell that its elector has lost its state",
+        NODE,
+        "        if beat.has_lost_state:\n",
+        "        if beat.twins:\n",
+        ("tests/sim/test_status_words.py", "tests/sim/test_restored_state.py"),
+        seed=9000013,
+    ),
+    _bug(
         "two tokens of one name are twins at their first beats",
         NAMESAKES,
         "if life.stays_s() >= self._beside_s > now - life.at",

@@ -28,6 +28,7 @@ from zsched.lab.sim_parts import Machine
 from zsched.lab.sim_rest import AT_MOST_S
 from zsched.lab.sim_rollout import Rollouts
 from zsched.lab.sim_scene import Carry, Scene
+from zsched.lab.sim_status import TOLD_S, untrue
 from zsched.lab.sim_swarm import Fault, Plan
 from zsched.lab.simulator import CORES, Simulator
 
@@ -158,6 +159,7 @@ class Stage:
         settled_s = sim.now - at
         sim.run(max(self.plan.seconds / 2 - settled_s, 0.0))
         self._check_answers()
+        self._check_words()
         return settled_s
 
     def calm(self) -> None:
@@ -220,6 +222,11 @@ class Stage:
         for machine in self.sim.machines.values():
             self.scene.bring(machine, self.scene.generation)
         self.sim.start(*running)
+
+    def _check_words(self) -> None:
+        """Every node's status says what is so."""
+        if not self.sim.run_until(_every(50, lambda: not untrue(self.sim)), TOLD_S) and (found := untrue(self.sim)):
+            raise DisagreementError(f"status is wrong {TOLD_S:g} s after the fleet has come to rest: {found[:4]}")
 
     def _check_answers(self) -> None:
         """An operator who was told "committed" finds the weights in that revision."""
