@@ -254,6 +254,7 @@ class JobBook:
             wait_s=None if sums.wait_s is None else round(sums.wait_s, 6),
             age_s=round(sums.age_s, 6),
             late=None if self._deadline_s is None else sums.late,
+            is_idle=not self._is_busy(),
         )
 
 

@@ -233,6 +233,8 @@ class WorkerJobs:
     """...and from arrival to end; ``None``: not known."""
     late: int | None = None
     """So many took longer from arrival to end than the task's deadline; ``None``: it has none."""
+    is_idle: bool = False
+    """It has nothing to do just now: nothing in hand, and nothing that waits."""
 
     def __post_init__(self) -> None:
         check_name("jobs.task", self.task)

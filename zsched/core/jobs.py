@@ -5,6 +5,10 @@ Knows: sums that only rise, smoothing. Does not know: how a job is timed (`zsche
 Rates are smoothed as the CPU in use is, and a mean per job is the quotient of two such rates: so ``done_hz`` times
 ``cpu_s`` is what the jobs use, in step with what the worker's processes are seen to use.
 
+A worker that has nothing to do, and has left nothing undone since it was last looked at, lacks nothing from then on:
+what it left undone before does not fade as means do. Its use of the CPU is gone in a moment, and beside a lack that
+fades slowly that would look like a worker that is given nothing.
+
 A job that waits for its turn is not lost. It is *left undone* when it gives way to a newer one, or by as much as more
 and more wait: the fewest in `QUEUE_S`, so that three maps which come at once, and are merged one by one, are no loss.
 """
@@ -100,6 +104,8 @@ class JobMeter:
                 self._means[name] = Ewma(self._tau_s)
                 self._means[name].update(0.0, since)
             self._means[name].update(rise / (now - since), now)
+        if newest.is_idle and undone <= 0:
+            self._means["undone"].value = 0.0
 
     def _evaluate(self, newest: WorkerJobs) -> None:
         done_hz = self._rate("done")

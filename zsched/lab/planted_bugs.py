@@ -778,6 +778,13 @@ VOTE_BUGS = (
         (*_SCHEDULER, "tests/sim/test_vote_rules.py"),
     ),
     _bug(
+        "a worker that has nothing more to do lacks what it lacked before",
+        "zsched.core.jobs",
+        "if newest.is_idle and undone <= 0:",
+        "if newest.is_idle and undone < 0:",
+        ("tests/unit/core/test_jobs.py", "tests/unit/core/test_closed_loop.py"),
+    ),
+    _bug(
         "an owner without work gives the task nothing",
         SCORING,
         "load is not None and is_short(load)",

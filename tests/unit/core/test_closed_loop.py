@@ -115,11 +115,13 @@ class Machine:
 
     def _work(self, now: float, needs: float, takes: float) -> None:
         """One worker of one thread, which skips what it cannot do; jobs are a fluid here, and told in whole ones."""
-        elapsed_s, self._now = max(now - self._now, 0.0), now
+        before_s, self._now = self._now, now
+        elapsed_s = max(now - before_s, 0.0)
         if now == 0.0:
             self.told = None
         if self.job_s is None or needs <= 0.0:
-            self.told = None
+            has_ended = self.told is not None and self.told.at_s == before_s and now >= self.works_until
+            self.told = replace(self.told, at_s=now, is_idle=True) if has_ended and self.told is not None else None
             return
         word = self.told or WorkerJobs(task="merge", incarnation=str(now), at_s=now, done=0, wait_s=0.0, age_s=0.0)
         cpu_s = self.job_s / self.speed * (self.rub if takes < needs else 1.0)
@@ -502,6 +504,18 @@ def test_a_task_that_lacks_nothing_stays_where_all_machines_are_full(
     """Each of them would give it a fair share of much; so does its owner, which shows only what it uses."""
     machines = tuple(replace(one, task_cores=task_cores, works_until=works_until, job_s=job_s) for one in FULL)
     assert Loop(machines, weights=CPU_ONLY, tuning=BY_SERVICE, learns=True).run(90.0) == []
+
+
+@pytest.mark.parametrize("works_until", [60.0, 60.1, 60.3])
+@pytest.mark.parametrize("task_cores", [0.8, 2.5])
+@pytest.mark.parametrize("job_s", [0.02, 0.3, 1.0])
+def test_a_task_whose_input_stops_stays_where_all_machines_are_full(
+    works_until: float, task_cores: float, job_s: float
+) -> None:
+    """What it left undone until then fades slowly and its use at once: that is no worker which is given nothing."""
+    machines = tuple(replace(one, task_cores=task_cores, works_until=works_until, job_s=job_s) for one in FULL)
+    moves = Loop(machines, weights=CPU_ONLY, tuning=BY_SERVICE, learns=True).run(90.0)
+    assert [move for move in moves if move[0] > works_until] == []
 
 
 BY_LATENCY = replace(BY_SERVICE, deadline_ms=150.0)

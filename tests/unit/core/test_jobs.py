@@ -158,6 +158,31 @@ def test_a_worker_that_has_nothing_to_do_says_nothing_and_is_not_measured() -> N
     assert teller.meter.value is None
 
 
+def test_a_worker_that_has_nothing_more_to_do_lacks_nothing_at_once() -> None:
+    meter = JobMeter(1.0)
+    teller = Teller(meter)
+    busy = teller.works(10.0, done_hz=3.0, skipped_hz=7.0)
+    assert busy is not None
+    assert busy.wanted_hz == pytest.approx(10.0, rel=0.1)
+    teller.now += LOOK_S
+    meter.absorb(replace(teller.word, at_s=teller.word.at_s + LOOK_S, is_idle=True), teller.now)
+    meter.look(teller.now)
+    assert meter.value is not None
+    assert meter.value.wanted_hz == meter.value.done_hz > 1.0
+
+
+def test_a_moment_without_work_is_no_end_while_samples_are_skipped() -> None:
+    meter = JobMeter(1.0)
+    teller = Teller(meter)
+    teller.works(10.0, done_hz=3.0, skipped_hz=7.0)
+    teller.now += LOOK_S
+    word = replace(teller.word, at_s=teller.word.at_s + LOOK_S, skipped=teller.word.skipped + 1, is_idle=True)
+    meter.absorb(word, teller.now)
+    meter.look(teller.now)
+    assert meter.value is not None
+    assert meter.value.wanted_hz > 2 * meter.value.done_hz
+
+
 def test_another_life_of_the_worker_begins_anew() -> None:
     teller = told()
     teller.works(10.0, done_hz=5.0)
