@@ -319,7 +319,9 @@ WORKER: Final = Record(
             _SECONDS, "No output for so long while inputs flow counts as hung.", default="not watched"
         ),
         "max_failures": Field(Whole(1, 100), "So many failures in the window make the node ineligible."),
-        "failure_window_s": Field(Number(1, 86400, "s"), "The window."),
+        "failure_window_s": Field(
+            Number(1, 86400, "s"), "The window; failures since it was last ready count however old."
+        ),
     },
     WorkerSpec,
 )

@@ -19,6 +19,7 @@ Knows: phases, deadlines, the order of signals. Does not know: why a task starts
 from __future__ import annotations
 
 import logging
+import math
 import os
 import random
 import signal
@@ -115,6 +116,8 @@ class _Worker:
     failures: deque[float] = field(default_factory=deque)
     has_been_ready: bool = False
     """This process has."""
+    ready_at: float = -math.inf
+    """When one of its processes was last ready: only failures before that are ever forgotten."""
     failure: str = ""
     """While stopping: why, when the stop is not the operator's wish."""
     why_again: str = ""
@@ -271,7 +274,7 @@ class WorkerSupervisor:
             worker.phase = _Phase.READY
         elif worker.phase is _Phase.STARTING and incarnation == worker.incarnation:
             worker.phase, worker.deadline_s, worker.has_been_ready = _Phase.READY, None, True
-            worker.why_again = ""
+            worker.why_again, worker.ready_at = "", awake_s()
 
     def _on_gone(self, task: TaskId, incarnation: int) -> None:
         worker = self._workers[task]
@@ -394,7 +397,8 @@ class WorkerSupervisor:
         """Whether that was one too many."""
         worker.failure = ""
         worker.failures.append(now)
-        while worker.failures[0] < now - worker.spec.failure_window_s:
+        oldest = now - worker.spec.failure_window_s
+        while worker.failures[0] < min(oldest, worker.ready_at):
             worker.failures.popleft()
         count, most = len(worker.failures), worker.spec.max_failures
         is_last = returncode == EXIT_CANNOT or count >= most

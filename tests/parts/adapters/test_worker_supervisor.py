@@ -226,6 +226,29 @@ def test_worker_that_is_never_ready_is_ended_and_counted() -> None:
         assert [call[0] for call in recorder.calls] == ["started", "exited"] * 2 + ["failed"]
 
 
+def test_worker_that_is_never_ready_fails_however_long_that_takes() -> None:
+    """Three starts of 40 s each do not fit into a window of a minute."""
+    spec = python(SLEEP, start_deadline_s=0.1, max_failures=3, failure_window_s=0.01)
+    with supervised(spec) as (supervisor, recorder):
+        supervisor.start("merge")
+        recorder.wait("failed")
+        assert [call[0] for call in recorder.calls] == ["started", "exited"] * 3 + ["failed"]
+
+
+def test_failures_before_a_worker_was_ready_are_forgotten_behind_the_window() -> None:
+    with supervised(python(SLEEP, max_failures=2, failure_window_s=0.01)) as (supervisor, recorder):
+        supervisor.start("merge")
+        for count in range(1, 5):
+            _, _, pid, incarnation = recorder.wait("started", count)
+            assert isinstance(pid, int)
+            assert isinstance(incarnation, int)
+            supervisor.mark_ready("merge", incarnation)
+            wait_until(lambda: supervisor.states()["merge"] is WorkerState.READY)
+            os.kill(pid, signal.SIGKILL)
+            recorder.wait("exited", count)
+        recorder.wait("started", 5)
+
+
 def test_hung_worker_is_killed_and_started_again() -> None:
     with supervised(python(SLEEP, stop_grace_s=30)) as (supervisor, recorder):
         supervisor.start("merge")
