@@ -164,6 +164,8 @@ class Crew:
             self._post(ev.WorkerChanged(task=task, state=WorkerState.READY, reason=reason))
             return
         is_ours = task in self._lives
+        if is_ours and (again := self._why_again(task)):
+            reason = again if reason in again else f"{again}; now {reason}"
         if task in self._seen and not (is_ours and supervisor.states()[task] is WorkerState.STOPPED):
             reason = self._lost.setdefault(task, self._not_any_more(task, reason))
         elif task in self._foreign:

@@ -36,7 +36,7 @@ Writer = Callable[[Any], Any]
 
 KINDS: dict[str, tuple[type, int]] = {
     "beat": (model.Beat, MAX_BEAT_BYTES),
-    "profile": (model.Profile, 4 * SMALL),
+    "profile": (model.Profile, 8 * SMALL),
     "proposal": (model.Proposal, SMALL),
     "utilities": (messages.Utilities, LARGE),
     "prepare": (messages.Prepare, SMALL),

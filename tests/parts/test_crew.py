@@ -129,6 +129,18 @@ def test_a_worker_that_was_killed_is_restarting_and_not_just_starting(house: Hou
     assert house.reasons("token")[-1].startswith("pid "), "an operator's stop is no failure"
 
 
+def test_a_process_that_is_started_again_and_matches_nobody_is_restarting(house: House) -> None:
+    """What it lacks is said of every one that does not get ready; that there was one before must not be lost by it."""
+    house.supervisor.start("node")
+    until(lambda: house.states("node"), "it runs")
+    house.match("node", is_matched=False)
+    until(lambda: len(house.states("node")) > 3, "the next process runs")
+    house.match("node", is_matched=False)
+    said = house.reasons("node")[-1]
+    assert said.startswith("restarting (failure 1 of 3): not ready within 4 s")
+    assert said.count("nobody subscribes to a/key") == 1
+
+
 def test_what_matches_without_a_process_is_not_the_worker(house: House) -> None:
     house.match("node")
     assert house.states("node") == []

@@ -29,8 +29,13 @@ MAX_RUNNABLE = 1e6
 MAX_TREND_DB_S = 100.0
 MAX_JOBS_HZ, MAX_JOB_S = 1e6, 1e6
 """What no machine or link exceeds: a larger figure is a fault of whoever measured or sent it."""
-MAX_REASON = 200
+MAX_REASON = 400
 """Characters of a worker's reason: it travels with every profile."""
+
+
+def as_reason(text: str) -> str:
+    """``text``, cut to `MAX_REASON` characters where it is longer, visibly."""
+    return text if len(text) <= MAX_REASON else f"{text[: MAX_REASON - 1]}…"
 
 
 def check_name(field: str, value: str) -> None:

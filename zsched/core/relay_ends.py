@@ -13,7 +13,7 @@ from collections import deque
 from dataclasses import dataclass, field
 
 from zsched.core.events import RelayChanged
-from zsched.core.model import MAX_REASON
+from zsched.core.model import as_reason
 
 WINDOW_S = 60.0
 OFTEN = 3
@@ -43,7 +43,7 @@ class RelayEnds:
         while self._ended_at and now - self._ended_at[0] > WINDOW_S:
             self._ended_at.popleft()
         if len(self._ended_at) >= OFTEN:
-            return f"has ended {len(self._ended_at)} times in {WINDOW_S:.0f} s, last: {self._reason}"[:MAX_REASON]
+            return as_reason(f"has ended {len(self._ended_at)} times in {WINDOW_S:.0f} s, last: {self._reason}")
         if now - self._down_since >= DOWN_TOLD_S:
-            return f"is down: {self._reason}"[:MAX_REASON]
+            return as_reason(f"is down: {self._reason}")
         return ""

@@ -21,6 +21,7 @@ from zsched.core.knocking import Knocking
 from zsched.core.membership import Membership
 from zsched.core.model import (
     NEVER_INITIALISED,
+    RESTARTING,
     Allocation,
     NodeId,
     NodeKind,
@@ -319,7 +320,9 @@ def _task_problems(node: NodeView, task: TaskSpec, value: Allocation, now: float
         why = f": {load.reason}" if load.reason else ""
         if load.state is WorkerState.FAILED:
             yield f"the worker on {spec.name} failed{why}; mend it, then `zsched retry {task.name} {spec.name}`"
-        elif (spec.name == owner and load.state is not WorkerState.READY) or (owner is None and _is_missed(task, load)):
+        elif (spec.name == owner and load.state is not WorkerState.READY) or (
+            owner is None and _is_in_the_way(task, load)
+        ):
             yield f"the worker on {spec.name} {told_of_worker(load.state, load.reason)}"
         elif load.state is WorkerState.READY and load.reason:
             yield f"the worker on {spec.name}{why}"
@@ -329,9 +332,10 @@ def _task_problems(node: NodeView, task: TaskSpec, value: Allocation, now: float
         yield f"{waited}: {_untaken(task, executor, node.lacks.get(task.name))}"
 
 
-def _is_missed(task: TaskSpec, load: WorkerLoad) -> bool:
-    """Whether somebody else has to start a node's worker, and it is not seen."""
-    return not task.worker.command and load.state is WorkerState.STOPPED and bool(load.reason)
+def _is_in_the_way(task: TaskSpec, load: WorkerLoad) -> bool:
+    """Whether a task may be without an owner for its sake: somebody else has to start it, or it has failed before."""
+    is_missed = not task.worker.command and load.state is WorkerState.STOPPED and bool(load.reason)
+    return is_missed or (load.state is not WorkerState.READY and load.reason.startswith(RESTARTING))
 
 
 def _unready_since(node: NodeView, executor: Executor) -> float:

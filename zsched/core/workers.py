@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from zsched.core import events as ev
 from zsched.core.fleet import Fleet, OnIsolation, TaskSpec
 from zsched.core.instructions import RecordStory
-from zsched.core.model import MAX_REASON, NodeId, NodeKind, Profile, TaskId, WorkerState, told_of_worker
+from zsched.core.model import NodeId, NodeKind, Profile, TaskId, WorkerState, as_reason, told_of_worker
 
 TROUBLE_S = 60.0
 """A callback that has raised is shown for so long behind the last time."""
@@ -54,7 +54,7 @@ class Workers:
         if event.state is WorkerState.READY:
             self.reasons.pop(event.task, None)
         elif event.reason:
-            self.reasons[event.task] = event.reason[:MAX_REASON]
+            self.reasons[event.task] = as_reason(event.reason)
         if self.states[event.task] is event.state:
             return None
         self.states[event.task] = event.state
@@ -65,12 +65,12 @@ class Workers:
         """A worker that is ready says that its callbacks raise."""
         if self.states.get(event.task) is WorkerState.READY:
             times = "once" if event.count == 1 else f"{event.count} times"
-            self._troubles[event.task] = (f"callback raised {times}: {event.text}"[:MAX_REASON], now)
+            self._troubles[event.task] = (as_reason(f"callback raised {times}: {event.text}"), now)
 
     def on_outdated(self, event: ev.WorkerOutdated, _now: float) -> None:
         """A worker that somebody else started should be started again, or has been."""
         if event.reason and event.task in self.states:
-            self._outdated[event.task] = event.reason[:MAX_REASON]
+            self._outdated[event.task] = as_reason(event.reason)
         else:
             self._outdated.pop(event.task, None)
 

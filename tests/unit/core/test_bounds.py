@@ -200,11 +200,11 @@ def test_a_penalty_is_a_ratio() -> None:
 
 
 def test_what_a_worker_says_of_itself_has_a_length() -> None:
-    assert len(replace(LOAD, reason="x" * 200).reason) == len(replace(TROUBLE, text="x" * 200).text) == 200
-    with pytest.raises(ValueError, match=r"worker\.reason: 201 characters, at most 200"):
-        replace(LOAD, reason="x" * 201)
-    with pytest.raises(ValueError, match=r"trouble\.text: 201 characters, at most 200"):
-        replace(TROUBLE, text="x" * 201)
+    assert len(replace(LOAD, reason="x" * 400).reason) == len(replace(TROUBLE, text="x" * 400).text) == 400
+    with pytest.raises(ValueError, match=r"worker\.reason: 401 characters, at most 400"):
+        replace(LOAD, reason="x" * 401)
+    with pytest.raises(ValueError, match=r"trouble\.text: 401 characters, at most 400"):
+        replace(TROUBLE, text="x" * 401)
 
 
 def test_each_command_is_its_own_event() -> None:

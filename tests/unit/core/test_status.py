@@ -14,6 +14,7 @@ from zsched.core import instructions as do
 from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, electorate_hash, lease_terms
 from zsched.core.messages import Learnt
 from zsched.core.model import (
+    RESTARTING,
     WAS_READY,
     Allocation,
     Beat,
@@ -350,6 +351,16 @@ def test_a_task_without_an_owner_says_which_workers_somebody_else_has_to_start()
     assert build_snapshot(node, 100.0).tasks[0].problems == (), "our own standby, which a move starts"
     node.fleet = replace(FLEET, tasks=tuple(replace(task, worker=WorkerSpec()) for task in FLEET.tasks))
     assert build_snapshot(node, 100.0).tasks[0].problems == ("the worker on edge1 is stopped: no token",)
+
+
+def test_a_task_without_an_owner_says_which_workers_have_failed_before() -> None:
+    node = make()
+    node.handle(ev.BeatReceived(beat=Beat(node="edge1", incarnation=3, sequence=1, loop_lag_s=0.0)), 100.0)
+    told_by(node, "edge1", 1, WorkerState.STARTING, "pid 7")
+    assert build_snapshot(node, 100.0).tasks[0].problems == (), "it starts"
+    told_by(node, "edge1", 2, WorkerState.STARTING, f"{RESTARTING} (failure 1 of 3): not ready within 20 s")
+    said = ("the worker on edge1 is restarting (failure 1 of 3): not ready within 20 s",)
+    assert build_snapshot(node, 100.0).tasks[0].problems == said
 
 
 def test_an_owner_s_worker_that_was_ready_is_not_said_to_be_starting() -> None:

@@ -6,6 +6,8 @@ from zsched.core import events as ev
 from zsched.core.model import MAX_REASON, WorkerState
 from zsched.core.workers import TROUBLE_S, Workers
 
+CUT = "x" * (MAX_REASON - 1) + "…"
+
 
 def changed(state: WorkerState, reason: str = "") -> ev.WorkerChanged:
     return ev.WorkerChanged(task="merge", state=state, reason=reason)
@@ -14,7 +16,7 @@ def changed(state: WorkerState, reason: str = "") -> ev.WorkerChanged:
 def test_a_reason_stays_until_the_worker_is_ready_and_is_no_longer_than_can_be_carried() -> None:
     workers = Workers({"merge": WorkerState.STARTING})
     workers.on_changed(changed(WorkerState.STOPPED, "x" * 10_000))
-    assert workers.told(0.0) == {"merge": "x" * MAX_REASON}
+    assert workers.told(0.0) == {"merge": CUT}
     assert workers.on_changed(changed(WorkerState.STOPPED, "another")) is None, "no news for the journal"
     assert workers.told(0.0) == {"merge": "another"}
     workers.on_changed(changed(WorkerState.READY, "its token"))
@@ -43,12 +45,12 @@ def test_an_unknown_task_is_nobody_s_worker() -> None:
 
 def test_a_worker_that_should_be_started_again_is_told_of_while_it_is_ready() -> None:
     workers = Workers(states={"merge": WorkerState.READY})
-    workers.on_outdated(ev.WorkerOutdated(task="merge", reason="x" * 300), 0.0)
+    workers.on_outdated(ev.WorkerOutdated(task="merge", reason="x" * 500), 0.0)
     workers.on_outdated(ev.WorkerOutdated(task="other", reason="not ours"), 0.0)
-    assert workers.told(0.0) == {"merge": "x" * MAX_REASON}
+    assert workers.told(0.0) == {"merge": CUT}
     workers.on_troubled(ev.WorkerTroubled(task="merge", count=1, text="ValueError"), 0.0)
     assert workers.told(0.0) == {"merge": "callback raised once: ValueError"}, "which is the worse"
-    assert workers.told(TROUBLE_S + 0.1) == {"merge": "x" * MAX_REASON}
+    assert workers.told(TROUBLE_S + 0.1) == {"merge": CUT}
     workers.on_changed(ev.WorkerChanged(task="merge", state=WorkerState.STOPPED, reason="gone"))
     assert workers.told(100.0) == {"merge": "gone"}
     workers.on_changed(ev.WorkerChanged(task="merge", state=WorkerState.READY))
