@@ -36,7 +36,7 @@ def show(view: StatusView) -> int:
     """Print one status; returns the exit code."""
     status = _ask(find_door(view.runtime_dir, view.node))
     if view.is_json:
-        print_json(status)
+        print_json(_with_reasons(status))
     else:
         sys.stdout.write(render_status(status, _width(), wants_color(view.is_plain)))
     return _code(status)
@@ -81,7 +81,7 @@ def _print_next(view: StatusView, status: Json | CliError, *, is_screen: bool) -
             return
         text += "asking again until Ctrl-C\n"
     elif view.is_json:
-        print_json(status, is_line=True)
+        print_json(_with_reasons(status), is_line=True)
         return
     else:
         text = render_status(status, _width(), wants_color(view.is_plain))
@@ -115,6 +115,11 @@ def _ask(door: Door) -> Json:
         text = f"the daemon's status is {found!r}, this zsched reads zsched.status/{MAJOR}; update the older of the two"
         raise CliError(EXIT_FAILED, text)
     return status
+
+
+def _with_reasons(status: Json) -> Json:
+    """The daemon's answer, and why the exit code says that the fleet is degraded."""
+    return {**status, "degraded": list(degradations(status))}
 
 
 def _code(status: Json) -> int:

@@ -95,9 +95,9 @@ def test_status_shows_the_only_daemon_without_colour_off_a_terminal(daemon: Daem
     assert daemon.asked == [{"verb": "status"}]
 
 
-def test_status_as_json_is_the_answer_itself(daemon: Daemon) -> None:
+def test_status_as_json_is_the_answer_itself_and_why_the_fleet_is_degraded(daemon: Daemon) -> None:
     result = run("status", "--json")
-    assert json.loads(result.stdout) == daemon.status
+    assert json.loads(result.stdout) == {**daemon.status, "degraded": []}
     assert daemon.status["schema"] == "zsched.status/1"
 
 
@@ -279,6 +279,7 @@ def test_watch_with_json_gives_a_line_each_until_interrupted(folder: Path) -> No
         process.send_signal(signal.SIGINT)
         _, error = process.communicate(timeout=60)
     assert {line["schema"] for line in lines} == {"zsched.status/1"}
+    assert all(line["degraded"] for line in lines), "why it is 4"
     assert (process.returncode, error) == (4, "")
 
 
