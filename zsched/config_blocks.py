@@ -221,7 +221,8 @@ class ListOf(Generic[T]):
             _refuse(node, out, self.says(), hint)
             return None
         if len(node.items) < self.least:
-            _refuse(node, out, self.says(), f"at least {self.least}")
+            found = len(node.items) or "none"
+            out.error(node.place, f"expected {self.says()}, at least {self.least} of them, found {found}")
             return None
         values = (self.item.read(item, out) for item in node.items)
         return tuple(value for value in values if value is not None)

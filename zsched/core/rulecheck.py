@@ -29,6 +29,7 @@ from zsched.core.fleet import StreamRule, TaskSpec
 from zsched.core.keytree import KeyTree
 from zsched.core.model import NodeId, TaskId
 from zsched.core.plan import Direction
+from zsched.core.route import NOBODY
 from zsched.core.templates import named_rules, widened
 
 MAX_COMPARED: Final = 200_000
@@ -100,8 +101,9 @@ class _Robots:
 
 
 def _shown(expr: str) -> str:
-    """As the file's reader knows it: without the room."""
-    return expr.split("/", 2)[2] if expr.startswith(f"{_LOCAL}/") else expr
+    """As the file's reader knows it: without the room, and with the owner's place where no candidate is known."""
+    known = expr.split("/", 2)[2] if expr.startswith(f"{_LOCAL}/") else expr
+    return "/".join("{target}" if chunk == NOBODY else chunk for chunk in known.split("/"))
 
 
 _Graph = Mapping[str, Iterable[str]]
