@@ -168,7 +168,9 @@ def test_a_new_owner_frozen_at_the_move_loses_nothing_silently(tmp_path: Path) -
         bed.wait(lambda: lost_and_told(bed, probe)[0] <= lost_and_told(bed, probe)[1], 20, "a word of every loss")
         lost, told = lost_and_told(bed, probe)
         print(f"frozen at the move: lost {lost}, told of {told}", flush=True)
-        assert lost < BUSY_HZ / 2, "what came while it stood still has waited for it"
+        # What came while it stood still has waited for it. On a busy machine the old owner's worker still has work in
+        # hand when its daemon's time to stop (2 s) is over: that is lost, and told (0 to 125 seen beside two loops).
+        assert lost < BUSY_HZ / 2
         numbers = [one.number for one in tuple(probe.received)]
         assert numbers == sorted(set(numbers))
 
