@@ -189,8 +189,10 @@ class Simulator(Links):
         state = machine.disk.read()
         if state is not None and (state.electorate != electorate or self._is_refused(machine)):
             state = None
+        # No two machines' clocks agree to the millisecond, not even where power comes back to all of them at once.
+        wall_count = self.wall_count + (machine.key != machine.name)
         if state is not None:
-            state = replace(state, incarnation=max(state.incarnation + 1, self.wall_count))
+            state = replace(state, incarnation=max(state.incarnation + 1, wall_count))
             machine.disk.write(state)
             machine.disk.sync()
         machine.life += 1
@@ -201,7 +203,7 @@ class Simulator(Links):
             fleet=machine.fleet,
             me=machine.name,
             durable=state,
-            incarnation=state.incarnation if state is not None else self.wall_count,
+            incarnation=state.incarnation if state is not None else wall_count,
             electorate=electorate,
             rng=Random(self.rng.random()),
             now=local,
