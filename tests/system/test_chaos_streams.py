@@ -24,7 +24,7 @@ from zsched.core.plan import StreamCount
 from zsched.lab import netns
 from zsched.lab.chaos import ChaosBed
 from zsched.lab.netbed import Netbed, Probe, descendants_running
-from zsched.lab.testbed import TASK, echo_fleet
+from zsched.lab.testbed import TASK, TestbedError, echo_fleet
 
 CUTS: Final = int(os.environ.get("ZSCHED_CUTS", "3"))
 LONGEST_S: Final = 4.0
@@ -106,6 +106,16 @@ def test_a_frozen_application_holds_up_no_other_of_its_robot(bed: ChaosBed) -> N
     bed.wait(lambda: is_back(frozen, began + 6), 60, "answers at the one that woke up")
     for probe in others:
         probe.close()
+
+
+def test_a_wait_ends_at_once_when_an_application_has_ended(bed: ChaosBed) -> None:
+    probe = bed.probe("robot1", watch=["robot1/out"])
+    bed.wait(lambda: probe.received, 60, "an answer")
+    probe.send(signal.SIGKILL)
+    with pytest.raises(TestbedError, match=r"waited for godot, but processes have ended: probe-robot1 with"):
+        bed.wait(lambda: False, 60, "godot")
+    probe.close()
+    assert bed.wait(lambda: True, 60, "what nobody is missed for any more")
 
 
 def test_what_was_seen_breaks_no_rule(bed: ChaosBed) -> None:
