@@ -281,13 +281,19 @@ def test_a_backup_and_a_lying_disk_give_back_an_older_file() -> None:
     assert {disk.state.incarnation for disk in disks if disk.state is not None} == set(range(6))
 
 
+MAY_STAY = ("limits", "weights", "candidates", "exclusive", "isolation", "score", "streams")
+
+
 @pytest.mark.parametrize("name", CHANGES)
 def test_every_change_of_a_fleet_file_makes_another_fleet_file(name: str) -> None:
+    differing = 0
     for seed in range(20):
         fleet = plan(seed).fleet
         changed = CHANGES[name](Random(seed), fleet)
-        assert changed != fleet or name in ("limits", "weights", "candidates", "exclusive"), name
+        differing += changed != fleet
         assert [task.name for task in changed.tasks] == sorted(task.name for task in changed.tasks)
+    # What is drawn may be what was there, and an exclusive task is never given to robots that work alone.
+    assert differing == 20 or (name in MAY_STAY and differing > 5), differing
 
 
 def test_pending_faults_are_played_only_when_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
