@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 DEMO_ARGS ?=
-# Test modules at a time; the real fleets of the second half mostly wait.
+# Test modules at a time; integration tests mostly wait.
 TEST_JOBS ?= 2
 REAL_JOBS ?= 3
 # How the tests with real processes are run; `.ci/run` gives failed ones a second chance, alone.
@@ -31,10 +31,11 @@ $(VENV)/.dev: pyproject.toml $(VENV)/.python
 demo: $(VENV)/.lab  ## Watch six machines merge laser maps (DEMO_ARGS="--headless --out DIR" to choose)
 	$(BIN)/zsched demo $(DEMO_ARGS)
 
-# The second half in its order, for the longest come first.
+# Real fleets of the system tests keep real time and fill a machine: they have it to themselves.
 test: $(VENV)/.dev  ## All tests: unit, paper, simulator, parts, integration and system (real daemons on localhost)
 	$(BIN)/python -m pytest -q -n $(TEST_JOBS) --dist loadfile tests/unit tests/paper tests/sim tests/planted
-	$(BIN)/python $(PYTEST_REAL) -q -n $(REAL_JOBS) --dist loadfile --no-loadscope-reorder --durations=15 tests/system tests/integration tests/parts
+	$(BIN)/python $(PYTEST_REAL) -q --durations=10 tests/system
+	$(BIN)/python $(PYTEST_REAL) -q -n $(REAL_JOBS) --dist loadfile --durations=10 tests/integration tests/parts
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile tests/bench
 
 test-quick: $(VENV)/.dev  ## Unit and paper tests only
