@@ -28,7 +28,7 @@ from pathlib import Path
 
 from benchmarks.common import machine
 from zsched.clock import monotonic_s
-from zsched.core.books import unaccounted
+from zsched.core.books import given_up, unaccounted
 from zsched.core.plan import StreamCount
 from zsched.lab.netbed import Netbed, Probe
 from zsched.lab.testbed import TASK, Json, echo_fleet
@@ -168,9 +168,7 @@ def _count(bed: Netbed, stream: str = f"{TASK}/in/0") -> StreamCount:
 
 def _told(bed: Netbed) -> int:
     """What the robot says may be lost of its input, and of the answers."""
-    count, answers = _count(bed), _count(bed, f"{TASK}/out/0")
-    dropped = sum(number for one in (count, answers) for _, number in one.drops)
-    return count.lost + count.at_most_lost + dropped + answers.lost
+    return given_up(_count(bed)) + given_up(_count(bed, f"{TASK}/out/0"))
 
 
 if __name__ == "__main__":

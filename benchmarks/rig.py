@@ -23,7 +23,7 @@ import psutil
 import zenoh
 
 from zsched.adapters.streams import RelayHandle
-from zsched.core.books import unaccounted
+from zsched.core.books import given_up, unaccounted
 from zsched.core.events import RelayChanged, SlotDrained, SlotFlipped, SlotReady, StreamsCounted
 from zsched.core.plan import (
     Direction,
@@ -250,8 +250,7 @@ class Rig:
 
 def told_of(counts: Mapping[str, StreamCount], index: int) -> int:
     """How many samples of a slot's load the counters of the robot's relay give up: on the way there and back."""
-    both = (counts[f"{TASK}/in/{index}"], counts[f"{TASK}/out/{index}"])
-    return sum(one.lost + one.at_most_lost + sum(number for _, number in one.drops) for one in both)
+    return given_up(counts[f"{TASK}/in/{index}"]) + given_up(counts[f"{TASK}/out/{index}"])
 
 
 def _listener(heard: list[tuple[float, HandleReport]]) -> Callable[[HandleReport], None]:

@@ -47,7 +47,7 @@ def main() -> int:
 
 
 def _run(rig: Rig, random_: random.Random, seconds: float, *, has_faults: bool) -> int:
-    """Move for so long; at how many looks the books of a stream were not balanced, and how many lost silently."""
+    """Move the streams for ``seconds``; returns the looks at unbalanced books plus the streams that lost silently."""
     loads = tuple(
         Load(name=f"s{n}", hz=random_.choice([20, 50, 100, 200]), size=random_.choice([100, 1000, 20_000]))
         for n in range(10)

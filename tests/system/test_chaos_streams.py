@@ -18,6 +18,7 @@ import pytest
 
 from support.waiting import within
 from zsched.clock import monotonic_s
+from zsched.core.books import given_up
 from zsched.core.fleet import Timing
 from zsched.core.model import NodeId
 from zsched.core.plan import StreamCount
@@ -151,7 +152,7 @@ def lost_and_told(bed: Netbed, probe: Probe) -> tuple[int, int]:
     """Of all numbers up to the newest that came back: how many did not, and how many the robot's counters tell of."""
     back = {one.number for one in tuple(probe.received)}
     counts = [count for count in bed.counts("robot1") if count.stream in {f"{TASK}/in/0", f"{TASK}/out/0"}]
-    told = sum(one.lost + one.at_most_lost + sum(number for _, number in one.drops) for one in counts)
+    told = sum(map(given_up, counts))
     return max(back) + 1 - len(back), told
 
 

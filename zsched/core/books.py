@@ -25,5 +25,10 @@ def unaccounted(count: StreamCount) -> int | None:
     """
     if count.in_flight is None:
         return None
-    known = (count.acknowledged or 0) + count.lost + sum(number for _, number in count.drops) + count.unconfirmed
-    return count.messages + count.repeated - known - count.in_flight - count.at_most_lost - count.unsent
+    known = (count.acknowledged or 0) + given_up(count) + count.unconfirmed
+    return count.messages + count.repeated - known - count.in_flight - count.unsent
+
+
+def given_up(count: StreamCount) -> int:
+    """Samples that the counters of an input or an output call lost, perhaps lost, or dropped."""
+    return count.lost + count.at_most_lost + sum(number for _, number in count.drops)

@@ -207,10 +207,7 @@ class Stage:
 
     def can_agree(self) -> bool:
         """Whether a majority of the electors has kept its state."""
-        sim = self.sim
-        running = sim.running()
-        fit = [name for name in sim.fleet.electors if name in running and sim.node(name).agreement.is_elector]
-        return len(fit) >= majority(len(sim.fleet.electors))
+        return len(self.sim.fit_electors()) >= majority(len(self.sim.fleet.electors))
 
     def _start_generation(self) -> None:
         """Too many states are lost: the operator stops every daemon and starts a new generation everywhere."""

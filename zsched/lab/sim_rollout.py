@@ -58,9 +58,9 @@ class Rollouts:
     def _may_roll_out(self, name: str) -> bool:
         """Whether leases are promised all the same (docs/decisions/0026).
 
-        They are not to such clocks, not with both at once, not where a robot may still work alone by the old file, and
-        not where two machines have one name: whoever makes the task exclusive asks by names, and one machine's answer
-        counts for the other, which it may not hear.
+        They are not promised to clocks beyond the bound, nor with other candidates at the same time, nor where a robot
+        may still work alone by the old file, nor where two machines have one name: the owner that makes the task
+        exclusive asks by names, and the answer of one machine counts for the other one, which the owner may not hear.
         """
         if name == "exclusive":
             is_promised = not any(_is_wild(fault) or fault.kind in TWINS for fault in self.scene.plan.faults)

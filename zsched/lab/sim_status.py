@@ -16,7 +16,7 @@ from zsched.core.status import build_snapshot
 from zsched.lab.simulator import Simulator
 
 TOLD_S = 3.0
-"""So long after it is at rest a fleet may take until every node says so: the longest silence that tells a peer gone."""
+"""At most this long after the fleet has come to rest, every status is right: no peer takes longer to be found gone."""
 
 
 def untrue(sim: Simulator) -> list[str]:
@@ -33,7 +33,7 @@ def _untrue(sim: Simulator, running: tuple[NodeId, ...], said: Snapshot) -> Iter
     for node in said.nodes:
         if (node.state == PeerState.ALIVE.value) is not (node.name in running):
             yield f"that {node.name} is {node.state}"
-    fit = [name for name in sim.fleet.electors if name in running and sim.node(name).agreement.is_elector]
+    fit = sim.fit_electors()
     lost = [name for name in sim.fleet.electors if name in running and name not in fit]
     quorum = said.quorum
     if [name for name in quorum.stateless if name in running] != sorted(lost):

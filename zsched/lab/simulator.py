@@ -162,6 +162,11 @@ class Simulator(Links):
         """The nodes that are up, sorted."""
         return tuple(key for key, machine in sorted(self.machines.items()) if machine.node is not None)
 
+    def fit_electors(self) -> tuple[NodeId, ...]:
+        """The electors that are up and have their state."""
+        running = self.running()
+        return tuple(name for name in self.fleet.electors if name in running and self.node(name).agreement.is_elector)
+
     def agreed(self, task: TaskId, *names: NodeId) -> NodeId | None:
         """The owner that ``names`` (default: all running) have learnt, when it is one and the same; else ``None``."""
         values = {self.node(name).registers[task].value for name in names or self.running()}
