@@ -203,9 +203,10 @@ class Rig:
             self.role(old.owner, WorkerRole.IDLE)
         return took
 
-    def plan(self, phase: RoutePhase, current: Slot, predecessor: Slot | None = None) -> None:
+    def plan(self, phase: RoutePhase, current: Slot, *predecessors: Slot | None) -> None:
         """Give the robot's relay a plan."""
-        self.relays[ROBOT].apply(RoutePlan(task=TASK, phase=phase, current=current, predecessor=predecessor))
+        olds = tuple(slot for slot in predecessors if slot is not None)
+        self.relays[ROBOT].apply(RoutePlan(task=TASK, phase=phase, current=current, predecessors=olds))
 
     def counts(self) -> dict[str, StreamCount]:
         """The newest counters of the robot's streams, at most a second old."""

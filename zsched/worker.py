@@ -44,7 +44,7 @@ from zsched.log_limit import limit_library
 from zsched.relay_pipe import decode_end
 from zsched.stalled_links import StalledLinks
 from zsched.worker_debts import Debts
-from zsched.worker_epochs import CARRY_S, Epochs, lets_out
+from zsched.worker_epochs import CARRY_LOOK_S, CARRY_S, Epochs, lets_out
 from zsched.worker_errands import Errands
 from zsched.worker_inputs import Dispatcher
 from zsched.worker_jobs import Job, JobBook
@@ -379,8 +379,13 @@ class Worker:
             self._begin(role)  # also what was withheld for want of a lease
 
     def _end_later(self, epoch: int) -> None:
-        if not self._stop.wait(CARRY_S):
-            self._send_ends(epoch)
+        """End an epoch that is carried, also when the end of its inputs never comes."""
+        if self._stop.wait(CARRY_S):
+            return
+        while self._epochs.is_carried(epoch) and self._dispatcher.has_waiting(epoch):
+            if self._stop.wait(CARRY_LOOK_S):
+                return
+        self._send_ends(epoch)
 
     def _begin(self, role: Role) -> None:
         """Work in the role's epoch from now on, behind the predecessor's snapshot if there is one to be had."""

@@ -103,6 +103,10 @@ class Backlog(Generic[SourceT]):
         """True while something is to be processed again."""
         return bool(self._again)
 
+    def owes(self, epoch: int) -> bool:
+        """Whether a sample of the epoch, or an older one, is still to be answered."""
+        return any(done.epoch <= epoch and done.quiet_at is None for done in self._again)
+
     def is_before(self, turn: int) -> bool:
         """Whether a sample of an earlier turn is still to be processed again (the dispatch thread needs no lock)."""
         again = self._again  # replaced whole by other threads

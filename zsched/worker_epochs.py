@@ -3,9 +3,9 @@
 Knows: the role's epoch, the one before it that has not ended here, which ones have. Does not know: zenoh, inputs (it is
 told the epoch of the input in hand), where roles come from.
 
-When one epoch follows another on the same owner, its inputs flow on. It goes on stamping what it makes of the older
-epoch's inputs with the older epoch: the robots admit the newer one only from their flip on, and that is when their
-first input of the newer epoch comes.
+When one epoch follows another on the same owner, or the owner that drains is the owner again, its inputs flow on. It
+goes on stamping what it makes of the older epoch's inputs with the older epoch: the robots admit the newer one only
+from their flip on, and that is when their first input of the newer epoch comes.
 
 A robot's flip waits only so long for a role, so an input may be of a newer epoch than the role. What is made of it is
 nobody's yet: A -> B -> A looks to a worker that heard of neither move like A still, but the robots have closed the
@@ -19,7 +19,9 @@ from typing import Final
 from zsched.core.plan import Role, WorkerRole
 
 CARRY_S: Final = 2.5
-"""The older epoch's inputs that have not ended by then never will."""
+"""The older epoch's inputs that have not come by then never will..."""
+CARRY_LOOK_S: Final = 0.2
+"""...and those that have come are processed; so often is looked for them."""
 
 
 class Epochs:
@@ -32,8 +34,8 @@ class Epochs:
 
     def follow(self, before: Role, role: Role) -> None:
         """A new role: from now on an older epoch may be carried beside it."""
-        both_active = before.role is WorkerRole.ACTIVE and role.role is WorkerRole.ACTIVE
-        is_owner_again = both_active and self.ended < before.epoch < role.epoch
+        has_worked = before.role is not WorkerRole.IDLE and role.role is WorkerRole.ACTIVE
+        is_owner_again = has_worked and self.ended < before.epoch < role.epoch
         if is_owner_again and before.epoch and not self.is_carried(self._carried):
             self._carried = before.epoch
 

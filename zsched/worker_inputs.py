@@ -240,7 +240,9 @@ class Dispatcher:
 
     def expect_begin(self, *, is_due: bool) -> None:
         """A role comes that `begin` follows, and until then outputs are withheld; or one that takes that back."""
-        self._is_begin_due = is_due
+        with self._wake:
+            self._is_begin_due = is_due
+            self._wake.notify()
 
     def begin(self, epoch: int) -> None:
         """This worker is the owner from now on: sources heard first from here on belong to ``epoch``.
@@ -285,6 +287,13 @@ class Dispatcher:
         with self._wake:
             return self._is_over(epoch)
 
+    def has_waiting(self, epoch: int) -> bool:
+        """Whether an input of the epoch, or an older one, has come and is not processed."""
+        with self._wake:
+            heard = {name for name, state in self._open.items() if state.epoch <= epoch}
+            is_queued = any(waiting.sample is not None and waiting.name in heard for waiting in self._queue)
+            return is_queued or (self._in_hand is not None and self._in_hand <= epoch) or self._backlog.owes(epoch)
+
     def has_begun(self, epoch: int) -> bool:
         """Whether `begin` has come for the epoch, or a newer one."""
         return self._epoch >= epoch
@@ -317,13 +326,17 @@ class Dispatcher:
                     self._settle_state(is_restored=is_restored)
             if claimed is not None:
                 self._process(claimed)
-            if (self._markers or self._asked) and not self._backlog.is_due:  # that is answered before any end
+            if (self._markers or self._asked) and not self._owes_withheld():
                 self._settle()
 
+    def _owes_withheld(self) -> bool:
+        """Whether something withheld is answered before any end: when `begin` comes, or now that it has come."""
+        return self._is_begin_due or self._backlog.is_due
+
     def _has_work(self) -> bool:
-        is_due = self._backlog.is_due
-        is_asked = bool(self._asked) and not is_due
-        return self._first is not None or is_asked or (not self._is_held and (bool(self._queue) or is_due))
+        is_asked = bool(self._asked) and not self._owes_withheld()
+        is_to_do = bool(self._queue) or self._backlog.is_due
+        return self._first is not None or is_asked or (not self._is_held and is_to_do)
 
     def _claim(self) -> Waiting | None:
         """Take the next sample out of its key's line (under the lock): from here on nothing sheds it."""

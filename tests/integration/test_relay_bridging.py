@@ -78,7 +78,11 @@ class Node:
         )
 
     def plan(self, phase: RoutePhase, new: Slot, old: Slot | None = None, *, exclusive: bool = False) -> None:
-        self.handles[-1].apply(RoutePlan(task="t", phase=phase, current=new, predecessor=old, exclusive=exclusive))
+        self.handles[-1].apply(
+            RoutePlan(
+                task="t", phase=phase, current=new, predecessors=() if old is None else (old,), exclusive=exclusive
+            )
+        )
 
     def settle(self, new: Slot, *, exclusive: bool = False) -> None:
         """What an executor says about a slot when it knows of no other."""

@@ -149,7 +149,11 @@ class Rig:
         return path.read_text().splitlines() if path.exists() else []
 
     def plan(self, phase: RoutePhase, current: Slot | None, predecessor: Slot | None = None) -> None:
-        self.relays[ROBOT].apply(RoutePlan(task=TASK, phase=phase, current=current, predecessor=predecessor))
+        self.relays[ROBOT].apply(
+            RoutePlan(
+                task=TASK, phase=phase, current=current, predecessors=() if predecessor is None else (predecessor,)
+            )
+        )
 
     def wait(self, kind: type, **fields: Any) -> None:
         until(lambda: self.find(kind, **fields), f"{kind.__name__} {fields}")

@@ -81,7 +81,9 @@ class Fleet:
         self.app = Application(session)
 
     def plan(self, phase: RoutePhase, new: Slot, old: Slot | None = None) -> None:
-        self.relays[ROBOT]._do(RoutePlan(task=TASK, phase=phase, current=new, predecessor=old))
+        self.relays[ROBOT]._do(
+            RoutePlan(task=TASK, phase=phase, current=new, predecessors=() if old is None else (old,))
+        )
 
     def move(self, new: Slot, old: Slot | None = None) -> None:
         heard = self.heard[ROBOT]

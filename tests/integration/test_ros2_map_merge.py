@@ -99,7 +99,7 @@ def hosts(tmp_path: Path) -> Iterator[dict[str, Host]]:
         for host in made.values():
             host.wait(RelayChanged)
             for phase, kind in ((RoutePhase.PREPARE, SlotReady), (RoutePhase.FLIP, SlotFlipped)):
-                host.relay.apply(plan_for(task, phase, slot_for(task, host.name, "edge1", 1), None))
+                host.relay.apply(plan_for(task, phase, slot_for(task, host.name, "edge1", 1), ()))
                 host.wait(kind)
         yield made
         for host in made.values():

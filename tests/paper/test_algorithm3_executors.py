@@ -187,14 +187,13 @@ def test_the_old_edge_carries_the_streams_until_the_new_one_is_ready() -> None:
     executor.on_flipped(1, 0, 0.1)
     (prepare,) = plans(executor.execute(allocation("edge2", 2), 1.0))
     assert prepare.phase is RoutePhase.PREPARE
-    assert prepare.predecessor is not None
-    assert prepare.predecessor.owner == "edge1"
+    assert [slot.owner for slot in prepare.predecessors] == ["edge1"]
 
     (flip,) = plans(executor.on_ready(2))
     assert flip.phase is RoutePhase.FLIP
     executor.on_flipped(2, 1, 1.1)
     (close,) = plans(executor.on_drained(1))
-    assert (close.phase, close.predecessor, executor.phase) == (RoutePhase.CLOSE, None, Phase.SETTLED)
+    assert (close.phase, close.predecessors, executor.phase) == (RoutePhase.CLOSE, (), Phase.SETTLED)
 
 
 def test_a_move_does_not_initialise_the_task_anew() -> None:

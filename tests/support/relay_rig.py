@@ -155,8 +155,9 @@ class Rig:
     def role(self, node: str, role: WorkerRole, epoch: int = 0, task: str = TASK) -> None:
         self.relays[node].set_role(Role(task=task, role=role, epoch=epoch))
 
-    def plan(self, phase: RoutePhase, current: Slot | None, predecessor: Slot | None = None, task: str = TASK) -> None:
-        self.relays[ROBOT].apply(RoutePlan(task=task, phase=phase, current=current, predecessor=predecessor))
+    def plan(self, phase: RoutePhase, current: Slot | None, *predecessors: Slot | None, task: str = TASK) -> None:
+        olds = tuple(slot for slot in predecessors if slot is not None)
+        self.relays[ROBOT].apply(RoutePlan(task=task, phase=phase, current=current, predecessors=olds))
 
     def wait(self, kind: type[Kind], **fields: Any) -> Kind:
         report: Kind = until(lambda: self.reports[ROBOT].find(kind, **fields), f"{kind.__name__} {fields}")
@@ -167,10 +168,10 @@ class Rig:
         self.role(new.owner, WorkerRole.ACTIVE, new.epoch, task)
         if old is not None:
             self.role(old.owner, WorkerRole.DRAINING, old.epoch, task)
-        self.plan(RoutePhase.PREPARE, new, old, task)
+        self.plan(RoutePhase.PREPARE, new, old, task=task)
         self.wait(SlotReady, task=task, epoch=new.epoch, is_ready=True)
         started = time.monotonic()
-        self.plan(RoutePhase.FLIP, new, old, task)
+        self.plan(RoutePhase.FLIP, new, old, task=task)
         self.wait(SlotFlipped, task=task, epoch=new.epoch)
         took = time.monotonic() - started
         if old is not None and drains:

@@ -66,6 +66,6 @@ class RosHost:
         old = self._now
         new = self._now = slot_for(self._task, ROBOT, owner, 1 if old is None else old.epoch + 1)
         for phase, kind in ((RoutePhase.PREPARE, SlotReady), (RoutePhase.FLIP, SlotFlipped)):
-            self._relay.apply(plan_for(self._task, phase, new, old))
+            self._relay.apply(plan_for(self._task, phase, new, () if old is None else (old,)))
             until(partial(self.reports.find, kind, epoch=new.epoch), f"{phase} {owner}")
-        self._relay.apply(plan_for(self._task, RoutePhase.CLOSE, new, old))
+        self._relay.apply(plan_for(self._task, RoutePhase.CLOSE, new, ()))

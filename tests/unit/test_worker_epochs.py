@@ -35,13 +35,16 @@ def test_the_older_epochs_inputs_are_stamped_with_it_until_it_ends() -> None:
     assert not epochs.close(1)
 
 
-def test_who_was_draining_starts_afresh() -> None:
+def test_who_was_draining_carries_the_older_epoch_to_its_end() -> None:
+    """There and back: the robots keep the slot that is left until it has drained."""
     epochs = Epochs()
     draining, third = role(WorkerRole.DRAINING, 1), role(WorkerRole.ACTIVE, 3)
     epochs.follow(IDLE, FIRST)
     epochs.follow(FIRST, draining)
     assert not epochs.is_carried(1)
     epochs.follow(draining, third)
+    assert [epochs.stamp(third, in_hand) for in_hand in (None, 1, 3)] == [1, 1, 3]
+    epochs.close(1)
     assert [epochs.stamp(third, in_hand) for in_hand in (None, 1, 3)] == [3, 3, 3]
 
 

@@ -283,7 +283,7 @@ class SlotDrained:
 
     task: TaskId
     epoch: int
-    """Epoch of the slot that is drained (the predecessor's)."""
+    """Epoch of the slot that is drained, a predecessor."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

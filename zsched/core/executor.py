@@ -11,10 +11,13 @@ in           when                                     do                        
 any          a newer epoch is learnt                  plan PREPARE: the new slot opens, the old     PREPARING
                                                       one still carries
 PREPARING    the new owner's worker is ready          plan FLIP: kept values, switch, end markers   FLIPPING
-FLIPPING     the relay flipped, an old slot is left   (the old slot drains)                         DRAINING
+FLIPPING     the relay flipped, an old slot is left   (the old slots drain)                         DRAINING
 FLIPPING     the relay flipped, none is left          plan CLOSE                                    SETTLED
-DRAINING     drained, or the drain time is over       plan CLOSE: the old slot is dropped           SETTLED
-any          the predecessor is gone                  the same plan without the predecessor         as before
+DRAINING     the last old slot drained, or its drain  plan CLOSE: every old slot is dropped         SETTLED
+             time is over
+any          an old slot drained                      (the next plan does not name it)              as before
+any          an old slot's drain time is over, or     the same plan without that slot               as before
+             its owner is gone
 any          isolated (`on_isolation: local`)         the worker here is active; plan PREPARE of    PREPARING
                                                       a slot to this robot itself, the other
                                                       one is closed
@@ -23,24 +26,27 @@ PREPARING..  the owner is back (`rejoin`)             the worker here is idle; p
 ===========  =======================================  ============================================  ===========
 
 An abort is never local: while the new owner does not get ready the old slot stays open, and giving up on it is a new
-proposal. "Predecessor" is always the last slot that was flipped to.
+proposal. The old slots are called predecessors. When the task moves again before a slot has drained, there are several:
+the newest carries until the next flip, and the others go on to drain, each within its own drain time.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 from zsched.core.fleet import OnIsolation, Standby, TaskSpec
 from zsched.core.instructions import ApplyRoutes, Instruction, RecordStory, SetRole, StartWorker, StopWorker
 from zsched.core.model import Allocation, NodeId, NodeKind
-from zsched.core.plan import Role, Route, RoutePhase, Slot, WorkerRole
+from zsched.core.plan import Role, Route, RoutePhase, RoutePlan, Slot, WorkerRole
 from zsched.core.route import plan_for, slot_for
 from zsched.core.workers import runs_worker
 
 ROLE_DRAIN_MARGIN_S = 1.0
 """The old owner's worker goes idle this much after the robots' drain time (a cold standby's start comes on top)."""
+MAX_OLD = 3
+"""So many predecessors are kept; a plan has to fit a frame (`zsched.wire`)."""
 LEAVES_S = 1.0
 """A worker whose draining is over hears so within this time (it says nothing more)."""
 
@@ -53,6 +59,20 @@ class Phase(StrEnum):
     FLIPPING = "flipping"
     DRAINING = "draining"
     SETTLED = "settled"
+
+
+@dataclass(frozen=True, slots=True)
+class _Old:
+    """A slot that another one follows, or will: a predecessor."""
+
+    slot: Slot
+    until: float = math.inf
+    """When its drain time is over; infinity while it carries."""
+
+    @property
+    def is_left(self) -> bool:
+        """Whether the relay has flipped to another slot."""
+        return self.until < math.inf
 
 
 @dataclass(slots=True)
@@ -78,8 +98,8 @@ class Executor:
     _is_owner_gone: bool = False
     """The owner went during its epoch: its worker's state is not asked for."""
     _current: Slot | None = None
-    _predecessor: Slot | None = None
-    _drain_deadline: float = math.inf
+    _old: tuple[_Old, ...] = ()
+    """The predecessors, the oldest first."""
     _role_deadline: float = math.inf
     started_at: float = 0.0
 
@@ -93,9 +113,9 @@ class Executor:
         return runs_worker(self.spec, self.me, NodeKind.ROBOT if self.has_streams else NodeKind.EDGE)
 
     @property
-    def predecessor(self) -> NodeId | None:
-        """The owner of the old slot while a handover runs."""
-        return None if self._predecessor is None else self._predecessor.owner
+    def predecessors(self) -> tuple[NodeId, ...]:
+        """The owners of the old slots while a handover runs, the oldest first."""
+        return tuple(dict.fromkeys(old.slot.owner for old in self._old))
 
     @property
     def routes(self) -> tuple[Route, ...]:
@@ -111,13 +131,12 @@ class Executor:
                 result += (StopWorker(task=self.spec.name),)
         if self._current is not None:
             phases = {Phase.PREPARING: RoutePhase.PREPARE, Phase.SETTLED: RoutePhase.CLOSE}
-            plan = phases.get(self.phase, RoutePhase.FLIP)
-            result += (ApplyRoutes(plan=plan_for(self.spec, plan, self._current, self._predecessor)),)
+            result += (ApplyRoutes(plan=self._plan(self._current, phases.get(self.phase, RoutePhase.FLIP))),)
         return result
 
     def next_deadline(self) -> float:
         """When `tick` may have something to do; infinity when never."""
-        return min(self._drain_deadline, self._role_deadline)
+        return min(self._role_deadline, *(old.until for old in self._old), math.inf)
 
     def start(self) -> tuple[Instruction, ...]:
         """The node starts: warm candidates start their worker."""
@@ -205,8 +224,7 @@ class Executor:
         can = self.has_streams and may_work and self.epoch > 0
         if self.is_local or not can or self.owner == self.me:
             return ()
-        self.is_local, self._predecessor = True, None
-        self._drain_deadline = self._role_deadline = math.inf
+        self.is_local, self._old, self._role_deadline = True, (), math.inf
         role = self._become(Role(task=self.spec.name, role=WorkerRole.ACTIVE, epoch=self.epoch))
         self._current = slot_for(self.spec, self.me, self.me, self.epoch)
         plan = self._go(Phase.PREPARING, RoutePhase.PREPARE, f"cut off from {self.owner}: works alone (degraded)")
@@ -257,10 +275,9 @@ class Executor:
     def _prepare(self, owner: NodeId) -> tuple[Instruction, ...]:
         if not self.has_streams:
             return ()
-        if self.phase in (Phase.FLIPPING, Phase.DRAINING, Phase.SETTLED):
-            self._predecessor = self._current
+        if self._current is not None and self.phase in (Phase.FLIPPING, Phase.DRAINING, Phase.SETTLED):
+            self._old = (*self._old, _Old(self._current))[-MAX_OLD:]
         self._current = slot_for(self.spec, self.me, owner, self.epoch)
-        self._drain_deadline = math.inf
         return self._go(Phase.PREPARING, RoutePhase.PREPARE, f"prepares {owner}")
 
     def _go(self, phase: Phase, plan: RoutePhase | None, text: str) -> tuple[Instruction, ...]:
@@ -268,7 +285,10 @@ class Executor:
         story = RecordStory(stage="executor", text=text, task=self.spec.name, epoch=self.epoch)
         if plan is None or self._current is None:
             return (story,)
-        return (ApplyRoutes(plan=plan_for(self.spec, plan, self._current, self._predecessor)), story)
+        return (ApplyRoutes(plan=self._plan(self._current, plan)), story)
+
+    def _plan(self, current: Slot, phase: RoutePhase) -> RoutePlan:
+        return plan_for(self.spec, phase, current, tuple(old.slot for old in self._old))
 
     def on_ready(self, epoch: int) -> tuple[Instruction, ...]:
         """The relay sees the new owner's worker ready for the slot of ``epoch``."""
@@ -281,38 +301,47 @@ class Executor:
         if epoch != self.epoch or self.phase is not Phase.FLIPPING:
             return ()
         done = f"flipped to {self.owner} in {(now - self.started_at) * 1000:.0f} ms, {replayed} kept values replayed"
-        if self._predecessor is None:
+        if not self._old:
             return self._go(Phase.SETTLED, RoutePhase.CLOSE, done)
-        self._drain_deadline = now + self.spec.drain_s
-        return self._go(Phase.DRAINING, None, f"{done}; {self._predecessor.owner} drains")
+        drained_by = now + self.spec.drain_s
+        self._old = tuple(old if old.is_left else replace(old, until=drained_by) for old in self._old)
+        return self._go(Phase.DRAINING, None, f"{done}; {', '.join(self.predecessors)} drains")
 
     def on_drained(self, epoch: int) -> tuple[Instruction, ...]:
-        """The predecessor's slot of ``epoch`` has given back all it had."""
-        if self._predecessor is None or epoch != self._predecessor.epoch or self.phase is not Phase.DRAINING:
+        """The old slot of ``epoch`` has given back all it had."""
+        drained = tuple(old for old in self._old if old.slot.epoch == epoch and old.is_left)
+        if not drained:
             return ()
-        return self._close(f"{self._predecessor.owner} drained")
+        self._old = tuple(old for old in self._old if old not in drained)
+        text = f"{drained[0].slot.owner} drained"
+        return self._close(text) if self._is_over() else self._go(self.phase, None, text)
 
     def on_gone(self, node: NodeId) -> tuple[Instruction, ...]:
-        """A peer is gone: nothing will come from its slot any more."""
+        """A peer is gone: nothing will come from its slots any more."""
         self._is_owner_gone = self._is_owner_gone or node == self.owner
-        if self._predecessor is None or self._predecessor.owner != node:
+        return self._drop(tuple(old for old in self._old if old.slot.owner == node), f"{node} is gone")
+
+    def _drop(self, dropped: tuple[_Old, ...], why: str) -> tuple[Instruction, ...]:
+        if not dropped:
             return ()
-        if self.phase is Phase.DRAINING:
-            return self._close(f"{node} is gone")
-        self._predecessor = None
+        self._old = tuple(old for old in self._old if old not in dropped)
+        if self._is_over():
+            return self._close(why)
         plan = RoutePhase.PREPARE if self.phase is Phase.PREPARING else RoutePhase.FLIP
-        return self._go(self.phase, plan, f"drops the slot of {node}, which is gone")
+        epochs = ", ".join(str(old.slot.epoch) for old in dropped)
+        return self._go(self.phase, plan, f"drops the slot of epoch {epochs}: {why}")
+
+    def _is_over(self) -> bool:
+        """Whether the handover has nothing to wait for any more."""
+        return self.phase is Phase.DRAINING and not self._old
 
     def _close(self, text: str) -> tuple[Instruction, ...]:
-        self._predecessor = None
-        self._drain_deadline = math.inf
         return self._go(Phase.SETTLED, RoutePhase.CLOSE, f"settled on {self.owner}: {text}")
 
     def tick(self, now: float) -> tuple[Instruction, ...]:
         """Time has passed."""
-        result: tuple[Instruction, ...] = ()
-        if now >= self._drain_deadline:
-            result += self._close(f"drain time of {self.spec.drain_s:g} s over")
+        late = tuple(old for old in self._old if now >= old.until)
+        result = self._drop(late, f"drain time of {self.spec.drain_s:g} s over")
         if now >= self._role_deadline:
             self._role_deadline = math.inf
             if self.role.role is WorkerRole.DRAINING:

@@ -608,9 +608,9 @@ class Node:
         self._batch.add(do.RecordStory(stage="vote", text=text, task=task, epoch=value.epoch))
         self._batch.add(*executor.execute(value, now))
         self._tenure.hold(value, self._beat_sequence + 1)
-        old = executor.predecessor
-        if old is not None and self.membership.state(old) is PeerState.GONE:
-            self._batch.add(*executor.on_gone(old))
+        for old in executor.predecessors:
+            if self.membership.state(old) is PeerState.GONE:
+                self._batch.add(*executor.on_gone(old))
         self._beat_at = now
 
     def _was_draining(self, node: NodeId | None, now: float) -> bool:

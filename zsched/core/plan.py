@@ -133,17 +133,21 @@ class RoutePhase(StrEnum):
 
     PREPARE = "prepare"  # open the new slot, watch for readiness; the old slot still carries the streams
     FLIP = "flip"  # warm up and switch; the old slot drains
-    CLOSE = "close"  # drop the old slot
+    CLOSE = "close"  # drop every old slot
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RoutePlan:
-    """What this node's relay shall do for one task; the newest plan of a task replaces the previous one whole."""
+    """What this node's relay shall do for one task; the newest plan of a task replaces the previous one whole.
+
+    ``predecessors`` are the slots that were left and have not drained, the oldest first, and last the one that carries
+    until the flip. The relay closes every slot that the plan does not name.
+    """
 
     task: TaskId
     phase: RoutePhase
     current: Slot | None
-    predecessor: Slot | None = None
+    predecessors: tuple[Slot, ...] = ()
     exclusive: bool = False
     """What the owner puts out must not pass while nobody here would hear of another owner."""
 

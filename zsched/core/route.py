@@ -27,13 +27,13 @@ def slot_for(spec: TaskSpec, robot: NodeId, owner: NodeId, epoch: int) -> Slot:
     )
 
 
-def plan_for(spec: TaskSpec, phase: RoutePhase, current: Slot, predecessor: Slot | None) -> RoutePlan:
-    """The plan in one phase; in `CLOSE` there is no predecessor any more."""
+def plan_for(spec: TaskSpec, phase: RoutePhase, current: Slot, predecessors: tuple[Slot, ...]) -> RoutePlan:
+    """The plan in one phase; in `CLOSE` there are no predecessors any more."""
     return RoutePlan(
         task=spec.name,
         phase=phase,
         current=current,
-        predecessor=None if phase is RoutePhase.CLOSE else predecessor,
+        predecessors=() if phase is RoutePhase.CLOSE else predecessors,
         exclusive=spec.exclusive,
     )
 

@@ -811,8 +811,15 @@ HANDOVER_BUGS = (
     _bug(
         "drain ends the gate too early",
         EXECUTOR,
-        "        if self._predecessor is None:\n            return self._go(Phase.SETTLED, RoutePhase.CLOSE, done)",
+        "        if not self._old:\n            return self._go(Phase.SETTLED, RoutePhase.CLOSE, done)",
         "        if True:\n            return self._go(Phase.SETTLED, RoutePhase.CLOSE, done)",
+        _EXECUTOR,
+    ),
+    _bug(
+        "closes a slot that drains when the task moves again",
+        EXECUTOR,
+        "            self._old = (*self._old, _Old(self._current))[-MAX_OLD:]",
+        "            self._old = (_Old(self._current),)",
         _EXECUTOR,
     ),
     _bug(

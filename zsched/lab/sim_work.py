@@ -260,8 +260,7 @@ class Work:
         if machine.life != life or plan.current is None:
             return
         self._sim.deliver(machine, ev.SlotFlipped(task=plan.task, epoch=plan.current.epoch))
-        if plan.predecessor is None:
-            return
-        predecessor = self._sim.machines.get(plan.predecessor.owner)
-        if predecessor is not None and predecessor.node is not None:
-            self._sim.deliver(machine, ev.SlotDrained(task=plan.task, epoch=plan.predecessor.epoch))
+        for slot in plan.predecessors:
+            owner = self._sim.machines.get(slot.owner)
+            if owner is not None and owner.node is not None:
+                self._sim.deliver(machine, ev.SlotDrained(task=plan.task, epoch=slot.epoch))

@@ -87,7 +87,9 @@ class InputStream:
         self._owed: list[LeftOpen] = []
         """What waits for the next owner: an owner that died had not acknowledged it, or there was none."""
         self._next: _InputSlot | None = None
-        """Flipped to, and waits until the slot that carried has ended."""
+        """Flipped to, and waits until..."""
+        self._waits_for: _InputSlot | None = None
+        """...this slot, which carried, has ended."""
         self._held: list[Owed] = []
         self._held_bytes = 0
         self._hold_until = 0.0
@@ -183,7 +185,7 @@ class InputStream:
                 return
             del self._slots[epoch]
             self._settle(slot)
-            self._end_hold(has_answer)
+            self._end_hold_behind(slot, has_answer)
 
     def send_end(self, epoch: int) -> None:
         """Put the end marker behind the slot's last sample (it must not be the active one); may block on its link."""
@@ -222,7 +224,8 @@ class InputStream:
             if slot is self._mirror:
                 self._mirror = None
             if slot is self._next:
-                self._next, held, self._held, self._held_bytes = None, self._held, [], 0
+                held, self._held, self._held_bytes = self._held, [], 0
+                self._next = self._waits_for = None
                 self._owe([LeftOpen(*one) for one in held])
             if self._replays and slot.is_counted:
                 return self._leave(slot, has_answer)
@@ -246,7 +249,7 @@ class InputStream:
     def _leave(self, slot: _InputSlot, has_answer: Callable[[Timestamp], bool]) -> int:
         """A slot closes: what its worker has not processed waits for the next owner, or goes to the one there is."""
         left = self._settle(slot)
-        self._end_hold(has_answer)
+        self._end_hold_behind(slot, has_answer)
         if self._active is not None:
             self._replay(self._active, has_answer)
         return left
@@ -285,14 +288,19 @@ class InputStream:
         return len(left)
 
     def _hold(self, left: _InputSlot, slot: _InputSlot) -> None:
-        self._active, self._next = None, slot
+        self._active, self._next, self._waits_for = None, slot, left
         self._hold_until = monotonic_s() + HOLD_S
         self._held = left.outlet.take_back()
         self._held_bytes = sum(len(sample.payload) for sample, _ in self._held)
 
+    def _end_hold_behind(self, slot: _InputSlot, has_answer: Callable[[Timestamp], bool]) -> None:
+        """End the wait if it is for this slot's end, and not for a later one's."""
+        if slot is self._waits_for:
+            self._end_hold(has_answer)
+
     def _end_hold(self, has_answer: Callable[[Timestamp], bool] = _never) -> None:
         """Feed the slot that waits: first what is owed to it, then what has come since the flip."""
-        slot, self._next = self._next, None
+        slot, self._next, self._waits_for = self._next, None, None
         if slot is None:
             return
         self._active = slot

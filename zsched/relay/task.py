@@ -210,18 +210,19 @@ class TaskRelay:
         self._plan = plan
         self._flip_by = None
         keeps_old = plan.phase is not RoutePhase.CLOSE
-        old = (plan.predecessor or self._inherited(plan)) if keeps_old else None
+        olds = (plan.predecessors or self._inherited(plan)) if keeps_old else ()
         self._is_inherited &= keeps_old
-        wanted = {slot.epoch: slot for slot in (old, plan.current) if slot is not None}
+        wanted = {slot.epoch: slot for slot in (*olds, plan.current) if slot is not None}
         if plan.phase is RoutePhase.CLOSE and plan.current is not None:
             self._open(plan.current)
             self._flip(self._slots[plan.current.epoch])
-        for epoch, state in tuple(self._slots.items()):
+        for epoch, state in sorted(self._slots.items()):
             if wanted.get(epoch) != state.slot:
                 self._close(epoch)
-        if old is not None and old.epoch not in self._slots:  # we were not there when it opened: it carries
-            self._open(old)
-            self._flip(self._slots[old.epoch], is_reported=False)
+        for old in olds:
+            if old.epoch not in self._slots:  # we were not there when it opened: it carries, or did
+                self._open(old)
+                self._flip(self._slots[old.epoch], is_reported=False)
         if plan.current is not None:
             self._open(plan.current, is_from_start=plan.phase is RoutePhase.PREPARE)
         current = self._current()
@@ -240,12 +241,12 @@ class TaskRelay:
             self._task, tuple(route for state in self._slots.values() for route in state.slot.routes)
         )
 
-    def _inherited(self, plan: RoutePlan) -> Slot | None:
-        """The slot that carries since another daemon's time, while the new owner is not ready."""
+    def _inherited(self, plan: RoutePlan) -> tuple[Slot, ...]:
+        """The slot that carries since another daemon's time, while the new owner is not ready, and what drains."""
         if not self._is_inherited or plan.current is None:
-            return None
-        olds = [state.slot for epoch, state in self._slots.items() if state.is_flipped and epoch < plan.current.epoch]
-        return max(olds, key=lambda slot: slot.epoch, default=None)
+            return ()
+        olds = [self._slots[epoch] for epoch in sorted(self._slots) if epoch < plan.current.epoch]
+        return tuple(state.slot for state in olds if state.is_flipped and not state.is_drained)
 
     def _open(self, slot: Slot, *, is_from_start: bool = False) -> None:
         if slot.epoch in self._slots:
@@ -339,7 +340,7 @@ class TaskRelay:
         if is_ready:
             state.tokens = tokens
         is_current = state is self._current()
-        if is_new and (is_current or not self._is_flipped()):
+        if is_new and (is_current or state is self._carrier()):
             self._warm_up(slot.epoch)
         if has_changed and is_current:
             self._report(SlotReady(task=self._task, epoch=slot.epoch, is_ready=is_ready))
@@ -402,8 +403,9 @@ class TaskRelay:
         is_behind = any(source.is_behind(epoch) for source in self._inputs.values())
         for sink in self._outputs.values():
             sink.flip(epoch, drops_held=is_behind)
-        olds = [one for old, one in self._slots.items() if old < epoch]
-        is_old_dead = bool(olds) and all(one.gone_at is not None for one in olds)
+        olds = [self._slots[old] for old in sorted(self._slots) if old < epoch]
+        carrier = self._carrier()
+        is_old_dead = carrier is not None and carrier.gone_at is not None
         replayed = sum(
             source.flip(epoch, is_old_dead=is_old_dead, has_answer=self._has_answer) for source in self._inputs.values()
         )
@@ -459,12 +461,10 @@ class TaskRelay:
         return is_over or all(source.has_settled(state.slot.epoch) for source in self._inputs.values())
 
     def _draining(self) -> _OpenSlot | None:
-        """The predecessor, while the current slot carries and it has not drained yet."""
-        current = self._current()
-        if current is None or not current.is_flipped:
-            return None
-        olds = [state for epoch, state in self._slots.items() if epoch < current.slot.epoch and not state.is_drained]
-        return olds[0] if olds else None
+        """The oldest slot that is left and has not drained: with `HandoverRule.ALL` the later ones wait for it."""
+        carrier = self._carrier()
+        olds = [] if carrier is None else [epoch for epoch in sorted(self._slots) if epoch < carrier.slot.epoch]
+        return next((self._slots[epoch] for epoch in olds if not self._slots[epoch].is_drained), None)
 
     # --- small questions ---------------------------------------------------------------------------------------------
 
@@ -473,9 +473,10 @@ class TaskRelay:
             return None
         return self._slots.get(self._plan.current.epoch)
 
-    def _is_flipped(self) -> bool:
-        current = self._current()
-        return current is not None and current.is_flipped
+    def _carrier(self) -> _OpenSlot | None:
+        """The slot that the inputs go to: the newest that was flipped to."""
+        epochs = [epoch for epoch in sorted(self._slots) if self._slots[epoch].is_flipped]
+        return self._slots[epochs[-1]] if epochs else None
 
     def _is_counted(self) -> bool:
         """True when something may have to be sent (again) without a sample coming in."""

@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import pytest
 
-from zsched.core.executor import LEAVES_S, ROLE_DRAIN_MARGIN_S, Executor, Phase
+from zsched.core.executor import LEAVES_S, MAX_OLD, ROLE_DRAIN_MARGIN_S, Executor, Phase
 from zsched.core.fleet import Standby, StreamRule, TaskSpec, WorkerSpec
 from zsched.core.instructions import ApplyRoutes, Instruction, RecordStory, SetRole, StartWorker, StopWorker
 from zsched.core.model import Allocation, Tuning, Weights
@@ -43,16 +43,17 @@ def edge(name: str = "edge1", spec: TaskSpec = SPEC) -> Executor:
     return Executor(spec=spec, me=name, has_streams=False)
 
 
-def plan(out: tuple[Instruction, ...]) -> tuple[str, int, int | None] | None:
-    """(phase, epoch, the predecessor's epoch) of the one plan in a batch, or ``None``."""
+def plan(out: tuple[Instruction, ...]) -> tuple[str | int | None, ...] | None:
+    """(phase, epoch, the predecessors' epochs or ``None``) of the one plan in a batch, or ``None``."""
     plans = [one.plan for one in out if isinstance(one, ApplyRoutes)]
     assert len(plans) <= 1
     return short(plans[0]) if plans else None
 
 
-def short(plan: RoutePlan) -> tuple[str, int, int | None]:
+def short(plan: RoutePlan) -> tuple[str | int | None, ...]:
     assert plan.current is not None
-    return plan.phase.value, plan.current.epoch, None if plan.predecessor is None else plan.predecessor.epoch
+    epochs: list[int | None] = [slot.epoch for slot in plan.predecessors] or [None]
+    return plan.phase.value, plan.current.epoch, *epochs
 
 
 def roles(out: tuple[Instruction, ...]) -> list[tuple[WorkerRole, int]]:
@@ -100,9 +101,9 @@ def test_move_goes_through_every_phase_and_keeps_the_old_slot_until_it_is_draine
     assert plan(one.execute(allocation("edge2", 2), 1.0)) == ("prepare", 2, 1)
     assert plan(one.on_ready(2)) == ("flip", 2, 1)
     assert plan(one.on_flipped(2, 1, 1.1)) is None, "the flip's plan stands while the old slot drains"
-    assert (one.phase, one.predecessor) == (Phase.DRAINING, "edge1")
+    assert (one.phase, one.predecessors) == (Phase.DRAINING, ("edge1",))
     assert plan(one.on_drained(1)) == ("close", 2, None)
-    assert (one.phase, one.predecessor) == (Phase.SETTLED, None)
+    assert (one.phase, one.predecessors) == (Phase.SETTLED, ())
 
 
 def test_drain_time_closes_the_old_slot() -> None:
@@ -123,11 +124,11 @@ def test_drain_time_closes_the_old_slot() -> None:
     ],
 )
 def test_gone_predecessor_leaves_the_plan_in_every_phase(
-    phase: Phase, expected: tuple[str, int, int | None] | None, after: Phase
+    phase: Phase, expected: tuple[str | int | None, ...] | None, after: Phase
 ) -> None:
     one = at(phase)
     assert plan(one.on_gone("edge1")) == expected
-    assert (one.phase, one.predecessor) == (after, None)
+    assert (one.phase, one.predecessors) == (after, ())
 
 
 @pytest.mark.parametrize("phase", [Phase.PREPARING, Phase.FLIPPING, Phase.DRAINING, Phase.SETTLED])
@@ -139,28 +140,86 @@ def test_other_nodes_that_go_change_nothing(phase: Phase) -> None:
 
 
 @pytest.mark.parametrize(
-    ("phase", "expected"),
+    ("phase", "expected", "deadline"),
     [
-        (Phase.PREPARING, ("prepare", 3, 1)),  # edge2 was never flipped to
-        (Phase.FLIPPING, ("prepare", 3, 2)),
-        (Phase.DRAINING, ("prepare", 3, 2)),
-        (Phase.SETTLED, ("prepare", 3, 1)),
+        (Phase.PREPARING, ("prepare", 3, 1), math.inf),  # edge2 was never flipped to
+        (Phase.FLIPPING, ("prepare", 3, 1, 2), math.inf),
+        (Phase.DRAINING, ("prepare", 3, 1, 2), 12.0),
+        (Phase.SETTLED, ("prepare", 3, 1), math.inf),
     ],
 )
-def test_newer_epoch_in_any_phase_prepares_and_keeps_the_last_slot_flipped_to(
-    phase: Phase, expected: tuple[str, int, int | None]
+def test_newer_epoch_in_any_phase_prepares_and_keeps_the_slots_that_carry_or_drain(
+    phase: Phase, expected: tuple[str, int, int], deadline: float
 ) -> None:
     one = at(phase)
     assert plan(one.execute(allocation("edge3", 3), 11.0)) == expected
     assert one.phase is Phase.PREPARING
-    assert one.next_deadline() == math.inf, "the old drain time is no longer waited for"
+    assert one.next_deadline() == deadline
+
+
+def moved_twice() -> Executor:
+    """Epoch 1 (edge1) drains since 10 s, epoch 2 (edge2) carries, epoch 3 (edge1) is prepared at 11 s."""
+    one = at(Phase.DRAINING)
+    one.execute(allocation("edge1", 3), 11.0)
+    return one
+
+
+def test_a_slot_that_drains_goes_on_to_when_the_task_moves_again() -> None:
+    one = moved_twice()
+    assert plan(one.on_ready(3)) == ("flip", 3, 1, 2)
+    assert plan(one.on_flipped(3, 0, 11.5)) is None
+    assert plan(one.on_drained(1)) is None, "the other one still drains"
+    assert one.phase is Phase.DRAINING
+    assert one.predecessors == ("edge2",)
+    assert one.next_deadline() == 13.5
+    assert plan(one.on_drained(2)) == ("close", 3, None)
+
+
+def test_a_slot_that_has_drained_is_not_in_the_next_plan() -> None:
+    one = moved_twice()
+    assert plan(one.on_drained(1)) is None
+    assert one.on_drained(2) == (), "it still carries"
+    assert plan(one.on_ready(3)) == ("flip", 3, 2)
+
+
+@pytest.mark.parametrize("steps", [0, 1, 2], ids=["preparing", "flipping", "draining"])
+def test_each_slot_has_its_own_drain_time(steps: int) -> None:
+    one = moved_twice()
+    if steps:
+        one.on_ready(3)
+    if steps == 2:
+        one.on_flipped(3, 0, 11.5)
+    assert plan(one.tick(11.99)) is None
+    assert plan(one.tick(12.0)) == ("flip" if steps else "prepare", 3, 2)
+    assert plan(one.tick(13.5)) == (("close", 3, None) if steps == 2 else None), "what carries has none"
+
+
+def test_every_slot_of_an_owner_that_is_gone_is_dropped() -> None:
+    one = moved_twice()
+    assert plan(one.on_gone("edge1")) == ("prepare", 3, 2)
+    two = moved_twice()
+    assert plan(two.on_gone("edge2")) == ("prepare", 3, 1)
+    assert plan(two.on_ready(3)) == ("flip", 3, 1)
+    two.on_flipped(3, 0, 11.5)
+    assert two.next_deadline() == 12.0, "the older one's time goes on"
+    assert plan(two.on_gone("edge1")) == ("close", 3, None)
+
+
+def test_only_so_many_slots_drain_at_once() -> None:
+    one = at(Phase.SETTLED)
+    for epoch in range(2, 9):
+        one.execute(allocation(f"edge{1 + epoch % 2}", epoch), 0.0)
+        one.on_ready(epoch)
+        out = one.on_flipped(epoch, 0, 0.0)
+    assert plan(out) is None
+    assert plan(one.again()) == ("flip", 8, *range(8 - MAX_OLD, 8))
 
 
 def test_there_and_back_ends_on_the_first_owner_with_its_own_old_slot_to_drain() -> None:
     """A -> B -> A before B was ready: the old slot of A stays open beside A's new one."""
     one = at(Phase.PREPARING)
     assert plan(one.execute(allocation("edge1", 3), 11.0)) == ("prepare", 3, 1)
-    assert one.predecessor == one.owner == "edge1"
+    assert (one.predecessors, one.owner) == (("edge1",), "edge1")
     assert plan(one.on_ready(3)) == ("flip", 3, 1)
     one.on_flipped(3, 0, 11.1)
     assert plan(one.on_drained(1)) == ("close", 3, None)

@@ -301,8 +301,8 @@ class Storm:
         current = self.rng.choice(self.plans).plan if self.plans else None
         name = self.task() if current is None else current.task
         epoch = self.number() if current is None or current.current is None else current.current.epoch
-        if current is not None and current.predecessor is not None and self.rng.random() < 0.3:
-            return ev.SlotDrained(task=name, epoch=current.predecessor.epoch)
+        if current is not None and current.predecessors and self.rng.random() < 0.3:
+            return ev.SlotDrained(task=name, epoch=self.rng.choice(current.predecessors).epoch)
         kind = self.rng.choice((ev.SlotReady, ev.SlotFlipped, ev.RoleEnded))
         return kind(task=name, epoch=epoch)
 

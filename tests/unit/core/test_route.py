@@ -53,11 +53,11 @@ def test_stream_names_outlive_owners_and_epochs() -> None:
 
 
 @pytest.mark.parametrize("phase", RoutePhase)
-def test_only_a_closing_plan_drops_the_predecessor(phase: RoutePhase) -> None:
+def test_only_a_closing_plan_drops_the_predecessors(phase: RoutePhase) -> None:
     old, new = slot_for(SPEC, "robot1", "edge1", 1), slot_for(SPEC, "robot1", "edge2", 2)
-    plan = plan_for(SPEC, phase, new, old)
+    plan = plan_for(SPEC, phase, new, (old,))
     assert (plan.task, plan.phase, plan.current) == ("merge", phase, new)
-    assert plan.predecessor == (None if phase is RoutePhase.CLOSE else old)
+    assert plan.predecessors == (() if phase is RoutePhase.CLOSE else (old,))
 
 
 # --- what the relay looks after, whoever owns the task ---------------------------------------------------------------

@@ -151,7 +151,9 @@ SAMPLES: dict[str, object] = {
         problems=("robot2 is silent",),
     ),
     "role": plan.Role(task="map_merge", role=plan.WorkerRole.DRAINING, epoch=4),
-    "route_plan": plan.RoutePlan(task="map_merge", phase=plan.RoutePhase.FLIP, current=_SLOT, predecessor=_SLOT),
+    "route_plan": plan.RoutePlan(
+        task="map_merge", phase=plan.RoutePhase.FLIP, current=_SLOT, predecessors=(_SLOT, _SLOT)
+    ),
     "relay_stop": relay_protocol.RelayStop(),
     "relay_pulse": relay_life.RelayPulse(counted_s=0.5),
     "relay_hello": relay_life.RelayHello(fleet="warehouse", node="robot1", incarnation=3, digest="0123456789abcdef"),

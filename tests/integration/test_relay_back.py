@@ -1,0 +1,119 @@
+"""A task that moves again before the slot that it left has drained: each slot drains, one after the other."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from support.relay_rig import ROBOT, TASK, Application, Rig, relay_rig, slot
+from support.waiting import until
+from zsched.clock import monotonic_s
+from zsched.core.events import SlotDrained, SlotFlipped, SlotReady
+from zsched.core.plan import OnCrash, RoutePhase, Slot, StreamClass, WorkerRole
+
+BEFORE, BACKLOG, BEHIND = 5, 200, 10
+DRAIN_S = 2.0
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    with relay_rig(tmp_path) as made:
+        yield made
+
+
+def flip(rig: Rig, new: Slot, *olds: Slot) -> None:
+    rig.plan(RoutePhase.PREPARE, new, *olds)
+    rig.wait(SlotReady, epoch=new.epoch, is_ready=True)
+    rig.plan(RoutePhase.FLIP, new, *olds)
+    rig.wait(SlotFlipped, epoch=new.epoch)
+
+
+def there_and_back(rig: Rig, app: Application, on_crash: OnCrash) -> None:
+    """edge1 has `BACKLOG` samples that it has not answered when edge2 gets `BEHIND` more, and edge1 so many again."""
+    first, second, third = (
+        slot(epoch, owner, StreamClass.RELIABLE, 0, on_crash=on_crash)
+        for epoch, owner in ((1, "edge1"), (2, "edge2"), (3, "edge1"))
+    )
+    rig.role("edge2", WorkerRole.ACTIVE, 2)
+    rig.role("edge1", WorkerRole.DRAINING, 1)
+    flip(rig, second, first)
+    for _ in range(BEHIND):
+        app.put()
+    rig.role("edge1", WorkerRole.ACTIVE, 3)
+    rig.role("edge2", WorkerRole.DRAINING, 2)
+    flip(rig, third, first, second)
+    for _ in range(BEHIND):
+        app.put()
+
+
+def first_owner(rig: Rig, app: Application, on_crash: OnCrash) -> None:
+    rig.start_worker("edge2")
+    rig.move(slot(1, "edge1", StreamClass.RELIABLE, 0, on_crash=on_crash))
+    until(app.connected, "the application sees the relay's subscription")
+    for _ in range(BEFORE):  # a lane that nobody has acknowledged holds what it is given, for any owner
+        app.put()
+    until(lambda: len(app.back) == BEFORE, "the first owner answers")
+
+
+def all_is_back(rig: Rig, app: Application, on_crash: OnCrash) -> None:
+    """The executor's table; a slot that was never given anything has its drain time to say that it has ended."""
+    rig.wait(SlotDrained, epoch=1)
+    left_at = monotonic_s()
+    until(lambda: rig.reports[ROBOT].find(SlotDrained, epoch=2) or monotonic_s() > left_at + DRAIN_S, "epoch 2")
+    rig.plan(RoutePhase.CLOSE, slot(3, "edge1", StreamClass.RELIABLE, 0, on_crash=on_crash))
+    until(lambda: len(app.back) >= app.sent, f"{app.sent} samples back")
+    assert app.back == list(range(app.sent))
+    assert [rig.told(f"{TASK}/in/0").at_most_lost, rig.told(f"{TASK}/out/0").lost] == [0, 0]
+
+
+@pytest.mark.parametrize("on_crash", OnCrash)
+def test_a_slow_owner_gives_back_what_it_had_before_it_was_left_and_came_back(rig: Rig, on_crash: OnCrash) -> None:
+    rig.start_worker("edge1", "--delay-ms", "20")
+    app = Application(rig.app)
+    first_owner(rig, app, on_crash)
+    for _ in range(BACKLOG):
+        app.put()
+    there_and_back(rig, app, on_crash)
+    assert len(app.back) < BEFORE + BACKLOG, "the first owner is busy all the while"
+    all_is_back(rig, app, on_crash)
+
+
+@pytest.mark.parametrize("on_crash", OnCrash)
+def test_a_frozen_owner_gives_back_what_it_had_before_it_was_left_and_came_back(rig: Rig, on_crash: OnCrash) -> None:
+    worker = rig.start_worker("edge1")
+    app = Application(rig.app)
+    first_owner(rig, app, on_crash)
+    worker.send_signal(signal.SIGSTOP)
+    for _ in range(BACKLOG):
+        app.put()
+    there_and_back(rig, app, on_crash)
+    worker.send_signal(signal.SIGCONT)
+    all_is_back(rig, app, on_crash)
+
+
+def test_a_slot_that_is_closed_before_it_has_drained_lets_the_next_one_have_its_turn(rig: Rig) -> None:
+    """Its drain time is over: what it had is told, and the answers behind it come in their order."""
+    worker = rig.start_worker("edge1")
+    app = Application(rig.app)
+    first_owner(rig, app, OnCrash.REPORT)
+    worker.send_signal(signal.SIGSTOP)
+    for _ in range(BACKLOG):
+        app.put()
+    second = slot(2, "edge2", StreamClass.RELIABLE, 0)
+    rig.role("edge2", WorkerRole.ACTIVE, 2)
+    rig.role("edge1", WorkerRole.DRAINING, 1)
+    flip(rig, second, slot(1, "edge1", StreamClass.RELIABLE, 0))
+    for _ in range(BEHIND):
+        app.put()
+    third = slot(3, "edge1", StreamClass.RELIABLE, 0)
+    rig.plan(RoutePhase.PREPARE, third, second)
+    until(lambda: app.back[-1] == app.sent - 1, f"what {ROBOT} sent to edge2 comes back")
+    missing = app.sent - len(app.back)
+    assert app.back == [*range(BEFORE), *range(BEFORE + missing, app.sent)], (
+        "what was not sent to edge1 yet edge2 has got"
+    )
+    told = until(lambda: rig.told(f"{TASK}/in/0").at_most_lost, "what the first slot had is told")
+    assert 0 < missing <= told <= BEFORE + missing, "an answer may be back before its acknowledgement"
