@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zsched.core.demand import QUEUE_RATIO, SETTLE_S, STARVED_CPU_RATIO, UNSURE, Demands
+from zsched.core.demand import QUEUE_RATIO, SETTLE_S, SHORT_RATIO, STARVED_CPU_RATIO, UNSURE, Demands, is_short
 from zsched.core.fleet import Demand, TaskSpec
 from zsched.core.model import Jobs, Profile, Tuning, Weights, WorkerLoad, WorkerState
 
@@ -282,3 +282,44 @@ def test_the_same_word_again_is_no_news() -> None:
     news = [demands.learn("merge", word, 10.0 * at) for at, word in enumerate([told(9.0)] * 3)]
     assert news == [True, False, False]
     assert demands.learn("merge", told(9.0, cpu_s=0.3), 30.0)
+
+
+def test_who_gets_less_than_its_threads_want_is_short() -> None:
+    def load(cores: float | None, wanted: float | None) -> WorkerLoad:
+        return WorkerLoad(task="merge", state=WorkerState.READY, cpu_cores=cores, wanted_cores=wanted)
+
+    assert is_short(load(1.0, 4.0))
+    assert is_short(load(0.8 * SHORT_RATIO, 0.9)), "whatever it wants"
+    assert not is_short(load(3.99, 4.0))
+    assert not is_short(load(1.0, None))
+    assert is_short(load(None, 1.0))
+
+
+def test_a_worker_that_does_not_tell_its_jobs_ages_is_judged_by_how_long_they_take() -> None:
+    """Class latest: what waits gives way, so that a job is as old as it takes."""
+    demands, pinned = Demands(), told(9.0, got=0.5, used=2.0)
+    load = pinned.workers[0]
+    assert load.jobs is not None
+    young = replace(pinned, workers=(replace(load, jobs=replace(load.jobs, age_s=None)),))
+    old = replace(pinned, workers=(replace(load, jobs=replace(load.jobs, age_s=3.0 * load.jobs.time_s)),))
+    for word, stretch in ((young, 2.0), (old, 6.0)):
+        demands = Demands()
+        demands.learn("merge", told(9.0), 0.0)
+        demands.learn("merge", word, EVERY_S)
+        demands.learn("merge", word, 2 * EVERY_S)
+        assert demands.experience("merge", pinned)[1] == pytest.approx(stretch)
+
+
+def test_a_job_is_at_least_as_old_as_it_takes() -> None:
+    """A clock that disagrees makes nobody's queue shorter than none."""
+    demands = Demands()
+    jobs = Jobs(time_s=0.1, cpu_s=0.1, wait_s=0.0, age_s=0.05, done_hz=3.0, wanted_hz=3.0)
+    demands.learn("merge", profile(0.3, cpu=2.0, jobs=jobs), 0.0)
+    assert getattr(demands.job("merge"), "queue_ratio", 0.0) == 1.0
+
+
+def test_a_job_of_several_threads_takes_elsewhere_what_it_takes_here() -> None:
+    """How its threads share the work is not told, so all of its time is taken for work."""
+    demands = Demands()
+    demands.learn("merge", profile(2.0, jobs=Jobs(time_s=0.5, cpu_s=1.5, done_hz=2.0, wanted_hz=2.0)), 0.0)
+    assert getattr(demands.job("merge"), "work_s", 0.0) == 0.5

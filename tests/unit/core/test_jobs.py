@@ -264,3 +264,27 @@ def test_whatever_comes_is_refused_or_becomes_figures_in_their_ranges(
         )
         meter.absorb(word, now)
         meter.look(now)  # `Jobs` checks its own ranges
+
+
+def test_a_rate_rises_from_nothing_as_what_the_processes_use_does() -> None:
+    """The first words of a worker that comes are no whole second."""
+    jobs = told().works(2 * LOOK_S, done_hz=5.0)
+    assert jobs is not None
+    assert 0.0 < jobs.done_hz < 2.5, "of five a second, with a time constant of 1 s"
+
+
+def test_more_late_jobs_than_jobs_are_all_of_them() -> None:
+    teller = told()
+    for _ in range(25):
+        teller.works(LOOK_S, done_hz=5.0, time_s=0.3)
+        late = teller.word.late
+        assert late is not None
+        teller.word = replace(teller.word, late=late + 1)
+    assert teller.meter.value is not None
+    assert teller.meter.value.late_ratio == 1.0
+
+
+def test_a_word_says_nothing_of_what_it_leaves_out() -> None:
+    word = WorkerJobs(task="merge", incarnation="1", at_s=0.0, done=0)
+    assert (word.time_s, word.cpu_s, word.skipped, word.waiting) == (0.0, 0.0, 0, 0)
+    assert (word.wait_s, word.age_s, word.late) == (None, None, None)

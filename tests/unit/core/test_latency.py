@@ -36,7 +36,7 @@ def worth(
     jobs: Jobs | None = JOBS,
     speeds: tuple[float, float] = (1.0, 1.0),
     used: tuple[float, float] = (1.0, 1.0),
-    away_s: tuple[float, float] = (0.0, 0.0),
+    away_s: tuple[float | None, float | None] = (0.0, 0.0),
 ) -> tuple[float, float]:
     """What the owner edge1 and the candidate edge2 are worth, behind the owner's settling."""
     spec = TaskSpec(name="merge", candidates=EDGES, tuning=tuning, worker=WorkerSpec(command=("x",)), demand=Demand())
@@ -68,7 +68,7 @@ def worth(
         gateway.learn_demand("merge", "edge1", now)
     allocation = Allocation(task="merge", revision=1, epoch=1, owner="edge1", tuning=tuning)
     states = dict.fromkeys((*EDGES, "robot1"), PeerState.ALIVE)
-    trips = dict(zip(EDGES, away_s, strict=True))
+    trips = {name: trip_s for name, trip_s in zip(EDGES, away_s, strict=True) if trip_s is not None}
     vector = score(spec, allocation, "robot1", gateway, states, 10.0, round_trips=trips)
     found = {one.candidate: one.value for one in vector.utilities}
     return found["edge1"], found["edge2"]
@@ -89,6 +89,10 @@ def test_the_way_counts_as_a_job_s_own_time_does() -> None:
     near, far = worth(away_s=(0.0, 0.3))
     assert far < 0.1 < near
     assert worth(away_s=(0.05, 0.05))[0] < near
+
+
+def test_a_way_that_nobody_has_measured_counts_nothing() -> None:
+    assert worth(away_s=(0.0, None)) == worth(away_s=(0.0, 0.0))
 
 
 def test_a_candidate_with_nothing_free_stretches_the_job() -> None:

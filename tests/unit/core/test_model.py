@@ -10,6 +10,7 @@ import pytest
 from zsched.core import model
 from zsched.core.model import (
     MAX_COUNTER,
+    MAX_REASON,
     NO_BALLOT,
     Allocation,
     Ballot,
@@ -24,6 +25,7 @@ from zsched.core.model import (
     Weights,
     WorkerLoad,
     WorkerState,
+    as_reason,
     check_name,
     check_range,
 )
@@ -176,3 +178,10 @@ def test_values_are_frozen_slotted_and_keyword_only() -> None:
     profile = make_profile()
     with pytest.raises(FrozenInstanceError):
         profile.sequence = 2  # type: ignore[misc]  # that is the point
+
+
+@pytest.mark.parametrize(("length", "is_cut"), [(MAX_REASON, False), (MAX_REASON + 1, True)])
+def test_a_reason_is_cut_where_it_is_too_long(length: int, *, is_cut: bool) -> None:
+    reason = as_reason("x" * length)
+    assert len(reason) == MAX_REASON
+    assert reason.endswith("…") is is_cut

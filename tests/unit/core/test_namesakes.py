@@ -132,8 +132,8 @@ def test_both_are_asked_where_they_are_until_it_is_known() -> None:
     assert namesakes.must_ask("edge2", 102.0)
     assert not namesakes.must_ask("edge2", 102.0 + WHERE_EVERY_S - 0.01)
     namesakes.on_answer("edge2", 7, "tcp/10.0.0.7:7447")
-    both(namesakes, 102.2, 2.0)
-    assert namesakes.must_ask("edge2", 104.2)
+    both(namesakes, 102.2, WHERE_EVERY_S - 0.2)
+    assert namesakes.must_ask("edge2", 102.0 + WHERE_EVERY_S)
     namesakes.on_answer("edge2", 8, "tcp/10.0.0.9:7447")
     both(namesakes, 104.4, 2.0)
     assert not namesakes.must_ask("edge2", 110.0)
@@ -151,3 +151,20 @@ def test_a_stranger_s_tokens_and_names_are_bounded() -> None:
             namesakes.on_token(f"n{number}", incarnation, is_present=True)
         both(namesakes, 200.0, 2.0, f"n{number}")
     assert namesakes.names(202.0) == tuple(f"n{number}" for number in range(TWINS_TOLD))
+
+
+def test_a_name_with_two_tokens_of_which_one_beats_is_told_to_nobody() -> None:
+    namesakes = two()
+    for step in range(40):
+        namesakes.on_beat(beat(7, step + 1), 100.0 + step * BEAT_S)
+    assert namesakes.names(100.0 + 40 * BEAT_S) == ()
+
+
+def test_tokens_over_the_bound_are_not_there_when_the_others_go() -> None:
+    namesakes = two(tokens=tuple(range(20, 20 + LIVES_KEPT - 1)))
+    for incarnation in (7, 8):  # the last that is kept, and one more
+        namesakes.on_token("edge2", incarnation, is_present=True)
+    for incarnation in range(20, 20 + LIVES_KEPT - 1):
+        namesakes.on_token("edge2", incarnation, is_present=False)
+    both(namesakes, 100.0, 2.0)
+    assert namesakes.names(102.0) == (), "7 alone is known"

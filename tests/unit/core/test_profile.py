@@ -439,3 +439,10 @@ def test_a_job_that_takes_another_time_is_worth_a_profile_before_its_time() -> N
     assert sent, "within 0.4 s"
     assert sent[0].workers[0].jobs is not None
     assert sent[0].workers[0].jobs.time_s > 0.042
+
+
+@pytest.mark.parametrize("pressure", [0.0, 0.7, 1.0])
+def test_every_share_of_time_is_a_pressure(pressure: float) -> None:
+    profiler = make_profiler()
+    profiler.absorb(replace(device(), cpu_pressure=pressure), (), now=0.0)
+    assert taken(profiler, 0.0).cpu_pressure == pressure

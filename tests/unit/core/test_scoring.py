@@ -290,6 +290,11 @@ def test_memory_that_the_task_would_not_get_is_a_hard_constraint() -> None:
     assert vector.refused[0] == ("edge2", "needs 500 MiB, has 400 free")
 
 
+def test_memory_that_is_not_measured_refuses_nobody() -> None:
+    spec = replace(SPEC, demand=Demand(memory_mb=500.0))
+    assert "edge1" not in dict(scored(ROBOT, profile("edge1", memory=None), spec=spec).refused)
+
+
 def test_memory_that_its_own_worker_holds_counts_as_free_for_the_task() -> None:
     spec = replace(SPEC, demand=Demand(memory_mb=500.0))
     vector = scored(ROBOT, profile("edge1", memory=3900.0, own=(0.0, 500.0)), spec=spec)

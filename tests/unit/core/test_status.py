@@ -20,11 +20,13 @@ from zsched.core.model import (
     Beat,
     DeviceSample,
     DurableState,
+    Echo,
     LinkSample,
     LinkSource,
     NodeKind,
     Profile,
     Proposal,
+    ScoreForm,
     Tuning,
     Weights,
     WorkerLoad,
@@ -274,6 +276,29 @@ def test_a_task_says_whether_it_is_moved_by_patience(patience: float | None, *, 
     snapshot = build_snapshot(node, 100.0)
     assert [task.patience for task in snapshot.tasks] == [patience] * 2
     assert [task["patience"] for task in snapshot_json(snapshot)["tasks"]] == [patience] * 2
+
+
+@pytest.mark.parametrize("deadline_ms", [None, 100.0])
+def test_the_way_there_and_back_is_told_of_a_task_with_a_deadline(deadline_ms: float | None) -> None:
+    node = make()
+    tuning = replace(TUNING, deadline_ms=deadline_ms, score=ScoreForm.SERVICE)
+    value = Allocation(task="merge", revision=1, epoch=1, owner="edge1", tuning=tuning)
+    node.handle(ev.LearntReceived(learnt=Learnt(node="robot2", values=(value,)), is_answer=True), 100.0)
+    ours = Profile(
+        node="robot1",
+        incarnation=7,
+        sequence=1,
+        cpu_cores=4.0,
+        cpu_used_cores=1.0,
+        memory_mb=100.0,
+        memory_used_mb=1.0,
+    )
+    node.round_trips.note_sent(ours, 100.0)
+    echo = Echo(node="robot1", incarnation=7, sequence=1, held_s=0.5)
+    for name in ("edge1", "robot2"):
+        node.round_trips.note_heard(replace(ours, node=name, echoes=(echo,)), 7, 101.0)
+    told = {task.name: task.round_trips for task in build_snapshot(node, 101.0).tasks}
+    assert told == {"merge": () if deadline_ms is None else (("edge1", 0.5),), "merge2": ()}
 
 
 def test_problems_say_what_is_missing_in_words() -> None:

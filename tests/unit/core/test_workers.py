@@ -56,3 +56,11 @@ def test_a_worker_that_should_be_started_again_is_told_of_while_it_is_ready() ->
     workers.on_changed(ev.WorkerChanged(task="merge", state=WorkerState.READY))
     workers.on_outdated(ev.WorkerOutdated(task="merge", reason=""), 100.0)
     assert workers.told(100.0) == {}
+
+
+def test_a_worker_that_should_be_started_again_and_starts_is_not_told_of() -> None:
+    workers = Workers(states={"merge": WorkerState.READY})
+    workers.on_outdated(ev.WorkerOutdated(task="merge", reason="its file has changed"), 0.0)
+    assert workers.told(0.0) == {"merge": "its file has changed"}
+    workers.on_changed(ev.WorkerChanged(task="merge", state=WorkerState.STARTING))
+    assert workers.told(0.0) == {}
