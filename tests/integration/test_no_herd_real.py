@@ -23,8 +23,11 @@ def three_tasks() -> dict[str, Any]:
     """Three robots that are all candidates of three equal tasks; they share one machine, so their figures are equal."""
     weights = {"cpu": 0.0, "memory": 1.0, "network": 0.0}
     tree = echo_fleet(edges=0, weights=weights, scheduling={"score": "service"})
+    echo = tree["tasks"].popitem()[1]
     body = {
-        **tree["tasks"].popitem()[1],
+        **echo,
+        # else the machines whose workers are up first get all, and nine of them start at once
+        "worker": {**echo["worker"], "standby": "cold"},
         "demand": {"memory_mb": round(SHARE * psutil.virtual_memory().total / 2**20)},
         "inputs": [{"from": "{robot}/{task}/in", "to": "{target}/{task}/{robot}/in"}],
         "outputs": [{"from": "{target}/{task}/{epoch}/{robot}/out", "to": "{robot}/{task}/out"}],
