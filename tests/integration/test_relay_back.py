@@ -117,3 +117,28 @@ def test_a_slot_that_is_closed_before_it_has_drained_lets_the_next_one_have_its_
     )
     told = until(lambda: rig.told(f"{TASK}/in/0").at_most_lost, "what the first slot had is told")
     assert 0 < missing <= told <= BEFORE + missing, "an answer may be back before its acknowledgement"
+
+
+def test_the_first_slot_carries_on_when_the_task_moves_again_before_the_flip(rig: Rig) -> None:
+    """The flip waits for an owner that has not heard of its role yet; by then it is no longer meant."""
+    rig.start_worker("edge1")
+    app = Application(rig.app)
+    first_owner(rig, app, OnCrash.REPORT)
+    first, second, third = (slot(epoch, f"edge{2 - epoch % 2}", StreamClass.RELIABLE, 0) for epoch in (1, 2, 3))
+    rig.plan(RoutePhase.PREPARE, second, first)
+    rig.wait(SlotReady, epoch=2, is_ready=True)
+    rig.plan(RoutePhase.FLIP, second, first)
+    rig.plan(RoutePhase.PREPARE, third, first, second)
+    rig.wait(SlotReady, epoch=3, is_ready=True)
+    for _ in range(BEHIND):
+        app.put()
+    until(lambda: len(app.back) == BEFORE + BEHIND, "the first owner answers")
+    rig.role("edge1", WorkerRole.ACTIVE, 3)
+    rig.plan(RoutePhase.FLIP, third, first, second)
+    rig.wait(SlotFlipped, epoch=3)
+    for _ in range(BEHIND):
+        app.put()
+    until(lambda: len(app.back) == app.sent, "nothing is lost")
+    assert app.back == list(range(app.sent))
+    assert app.nodes == ["edge1"] * app.sent
+    rig.plan(RoutePhase.CLOSE, third)

@@ -34,14 +34,13 @@ from zsched.adapters.launch import EXIT_CANNOT
 from zsched.adapters.worker_process import ProcessWatch, WorkerGuard, WorkerProcess
 from zsched.clock import awake_s
 from zsched.core.fleet import WorkerSpec
-from zsched.core.model import MAX_REASON as MAX_TOLD
-from zsched.core.model import RESTARTING, NodeId, TaskId, WorkerState
+from zsched.core.model import MAX_REASON, RESTARTING, NodeId, TaskId, WorkerState, as_reason
 from zsched.guard import guarded
 
 log = logging.getLogger("zsched.worker")
 
 INCARNATIONS_PER_DAEMON = 100_000
-MAX_REASON = 200
+MAX_LINE = 200
 """Characters of a worker's last line that go into the reason of its exit."""
 KILL = signal.SIGKILL
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, KILL)
@@ -430,11 +429,11 @@ class WorkerSupervisor:
 def _told_again(reason: str, count: int, most: int) -> str:
     """Which failure is followed by a start; without the count where that would cost the reason its end."""
     told = f"{RESTARTING} (failure {count} of {most}): {reason}"
-    return told if len(told) <= MAX_TOLD else f"{RESTARTING}: {reason}"
+    return told if len(told) <= MAX_REASON else f"{RESTARTING}: {reason}"
 
 
 def _describe_exit(returncode: int, last_line: str) -> str:
     if returncode < 0:
         return f"killed by signal {-returncode} ({signal.strsignal(-returncode)})"
-    said = f": {last_line[:MAX_REASON]}" if last_line else ""
+    said = f": {as_reason(last_line, MAX_LINE)}" if last_line else ""
     return f"exited with status {returncode}{said}"

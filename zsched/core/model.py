@@ -33,9 +33,9 @@ MAX_REASON = 400
 """Characters of a worker's reason: it travels with every profile."""
 
 
-def as_reason(text: str) -> str:
-    """``text``, cut to `MAX_REASON` characters where it is longer, visibly."""
-    return text if len(text) <= MAX_REASON else f"{text[: MAX_REASON - 1]}…"
+def as_reason(text: str, longest: int = MAX_REASON) -> str:
+    """``text``, cut to ``longest`` characters where it has more, visibly."""
+    return text if len(text) <= longest else f"{text[: longest - 1]}…"
 
 
 def check_name(field: str, value: str) -> None:
