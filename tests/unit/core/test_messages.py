@@ -10,6 +10,7 @@ import pytest
 from zsched.core import messages
 from zsched.core.messages import Accept, Accepted, Learnt, Prepare, Promise, Refusal, Refused, SetWeights, Utilities
 from zsched.core.model import NO_BALLOT, Acceptance, Allocation, Ballot, Tuning, Weights
+from zsched.core.relay_protocol import EndMarker
 
 TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
 BALLOT = Ballot(counter=1, node="r1", incarnation=1)
@@ -69,3 +70,9 @@ def test_every_message_is_frozen_and_keyword_only() -> None:
     for cls in ours:
         assert cls.__dataclass_params__.frozen, cls  # type: ignore[attr-defined] # typeshed does not name it
         assert all(field.kw_only for field in fields(cls)), cls
+
+
+def test_a_marker_says_nothing_of_what_it_leaves_out() -> None:
+    marker = EndMarker(epoch=3, count=7)
+    assert (marker.replayed, marker.slot, marker.had, marker.age_s) == (0, 0, None, None)
+    assert (marker.is_whole, marker.is_given_up) == (False, False)

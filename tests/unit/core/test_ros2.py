@@ -220,7 +220,7 @@ def test_the_attachment_is_33_bytes_in_the_right_order() -> None:
     value = Attachment(sequence=42, stamp_ns=0x17C35833A5D83300, gid=bytes(range(16)))
     assert encode_attachment(value) == RECORDED
     assert decode_attachment(RECORDED) == value
-    odd = Attachment(sequence=-2, stamp_ns=0x17C35833A5D833FF, gid=bytes(range(16)))
+    odd = Attachment(sequence=-2, stamp_ns=0x17C35833A5D8337F, gid=bytes(range(16)))
     assert decode_attachment(encode_attachment(odd)) == odd, "no byte is another's"
 
 
