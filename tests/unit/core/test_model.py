@@ -185,3 +185,16 @@ def test_a_reason_is_cut_where_it_is_too_long(length: int, *, is_cut: bool) -> N
     reason = as_reason("x" * length)
     assert len(reason) == MAX_REASON
     assert reason.endswith("…") is is_cut
+
+
+@pytest.mark.parametrize("field", ["value", "cpu", "memory", "network"])
+def test_no_utility_is_above_1(field: str) -> None:
+    whole = {"candidate": "edge1", "value": 1.0, "cpu": 1.0, "memory": 1.0, "network": 1.0}
+    Utility(**whole)  # type: ignore[arg-type] # by name
+    with pytest.raises(ValueError, match=f"utility.{field}"):
+        Utility(**{**whole, field: 1.5})  # type: ignore[arg-type] # by name
+
+
+def test_a_worker_may_use_next_to_nothing() -> None:
+    load = WorkerLoad(task="merge", state=WorkerState.READY, cpu_cores=0.0, memory_mb=0.0, wanted_cores=0.0)
+    assert (load.cpu_cores, load.memory_mb, load.wanted_cores) == (0.0, 0.0, 0.0)

@@ -153,11 +153,12 @@ def test_a_stranger_s_tokens_and_names_are_bounded() -> None:
     assert namesakes.names(202.0) == tuple(f"n{number}" for number in range(TWINS_TOLD))
 
 
-def test_a_name_with_two_tokens_of_which_one_beats_is_told_to_nobody() -> None:
+def test_one_that_beats_on_when_its_twin_has_stopped_is_no_twin() -> None:
     namesakes = two()
-    for step in range(40):
-        namesakes.on_beat(beat(7, step + 1), 100.0 + step * BEAT_S)
-    assert namesakes.names(100.0 + 40 * BEAT_S) == ()
+    both(namesakes, 100.0, 2.0)
+    for step in range(round(BESIDE_S / BEAT_S) + 1):
+        namesakes.on_beat(beat(7, 600 + step), 102.0 + step * BEAT_S)
+    assert namesakes.names(102.0 + BESIDE_S) == ()
 
 
 def test_tokens_over_the_bound_are_not_there_when_the_others_go() -> None:

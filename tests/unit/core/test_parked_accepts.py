@@ -175,18 +175,7 @@ def test_who_is_overtaken_while_an_elector_asks_this_owner_to_leave_waits_for_a_
 ) -> None:
     """The overtaker's accept waits there, and a ballot of ours would end it."""
     agreement = elector()
-    change = MoveOwner(base_revision=3, owner="robot3", reason="test")
-    (sent,) = agreement.propose("guard", change, 101.0).send
-    assert isinstance(sent, do.SendPrepare)
-    for name in ROBOTS[1:]:
-        no = Refused(
-            elector=name,
-            task="guard",
-            ballot=sent.prepare.ballot,
-            refusal=Refusal.BALLOT,
-            promised=Ballot(counter=9, node="robot3", incarnation=1),
-        )
-        agreement.on_answer(ev.ElectorAnswered(answer=no), 101.0)
+    overtaken(agreement)
     asks_to_leave = (("guard", "robot2", epoch), ("stranger", "robot2", 3))
     agreement.note_asked(
         Beat(node=node, incarnation=1, sequence=9, loop_lag_s=0.0, asked_to_leave=asks_to_leave), 101.0
@@ -210,3 +199,47 @@ def test_an_identity_round_does_not_end_the_silence_towards_an_owner_that_is_ask
     assert answers(effects) == [(2, "accepted")]
     said = agreement.leases.on_sent(1, now + 0.1)
     assert (said.asked_to_leave, said.echoes) == ((("guard", "robot2", 3),), ())
+
+
+def overtaken(agreement: Agreement) -> None:
+    """A round of this elector's own in which a higher ballot has been promised by the others."""
+    change = MoveOwner(base_revision=3, owner="robot3", reason="test")
+    (sent,) = agreement.propose("guard", change, 101.0).send
+    assert isinstance(sent, do.SendPrepare)
+    for name in ROBOTS[1:]:
+        no = Refused(
+            elector=name,
+            task="guard",
+            ballot=sent.prepare.ballot,
+            refusal=Refusal.BALLOT,
+            promised=Ballot(counter=9, node="robot3", incarnation=1),
+        )
+        agreement.on_answer(ev.ElectorAnswered(answer=no), 101.0)
+
+
+ASKS_TO_LEAVE = Beat(node="robot2", incarnation=1, sequence=9, loop_lag_s=0.0, asked_to_leave=(("guard", "robot2", 3),))
+
+
+def test_a_node_heeds_a_beat_by_which_an_owner_is_asked_to_leave() -> None:
+    node = Node(
+        fleet=FLEET, me="robot1", durable=disk(), incarnation=7, electorate="e", rng=Random(1), now=100.0, version="t"
+    )
+    node.start(100.0)
+    for name in ROBOTS[1:]:
+        node.agreement.witness.on_answer(Learnt(node=name, values=()))
+    overtaken(node.agreement)
+    node.handle(ev.BeatReceived(beat=ASKS_TO_LEAVE), 101.0)
+    register = node.agreement.registers["guard"]
+    assert node.agreement.tick(register.next_deadline()).send == []
+    assert register.next_deadline() == pytest.approx(101.0 + HOLD_S)
+
+
+def test_a_round_that_nobody_answers_waits_for_no_owner_s_leaving() -> None:
+    """Only a ballot that would end another one's accept does."""
+    agreement = elector()
+    agreement.propose("guard", MoveOwner(base_revision=3, owner="robot3", reason="test"), 101.0)
+    agreement.note_asked(ASKS_TO_LEAVE, 101.0)
+    register = agreement.registers["guard"]
+    at = register.next_deadline()
+    agreement.tick(at)
+    assert at < register.next_deadline() < 101.0 + HOLD_S

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from random import Random
 
 import pytest
 
 from zsched.core.fleet import Fleet, NodeSpec, Standby, TaskSpec, Timing, WorkerSpec
-from zsched.core.model import NodeKind, Tuning, Weights
+from zsched.core.membership import Transition
+from zsched.core.model import NodeKind, PeerState, Tuning, Weights
+from zsched.core.node import Node
 from zsched.core.plan import ReadyWhen
 from zsched.core.probation import LEASE_MARGIN_S, LIMIT_S, Probation
 
@@ -115,3 +118,17 @@ def test_a_new_relay_tells_its_tokens_anew() -> None:
     assert doubted(known, STOOD_S)
     known.on_token("edge1", "merge", "1", is_present=True, now=BACK_AT + 3.0)
     assert not doubted(known, 3.0)
+
+
+def test_a_node_doubts_a_peer_that_was_gone_and_is_back() -> None:
+    node = Node(
+        fleet=FLEET, me="edge2", durable=None, incarnation=7, electorate="e", rng=Random(1), now=100.0, version="t"
+    )
+    node._on_transition(
+        Transition(node="edge1", before=PeerState.SUSPECT, after=PeerState.GONE, reason="silent"), 100.0
+    )
+    assert node._probation.doubts(TASK, 101.0) == {}, "it is not there at all"
+    node._on_transition(
+        Transition(node="edge1", before=PeerState.GONE, after=PeerState.ALIVE, reason="it beats"), 101.0
+    )
+    assert list(node._probation.doubts(TASK, 101.1)) == ["edge1"]
