@@ -262,6 +262,7 @@ def test_values_of_several_tasks_are_learnt_from_one_message() -> None:
     assert [one.task for one, _ in effects.learnt] == ["merge", "plan"]
     assert {reason for _, reason in effects.learnt} == {"learnt from a peer"}
     assert agreement.counters == {"learnt_foreign": 1}
+    assert agreement.on_learnt(answer(replace(both, node="robot1")), 100.0) == Effects(), "our own"
     assert agreement.on_learnt(answer(replace(both, node="stranger")), 100.0) == Effects()
     assert agreement.counters == {"learnt_foreign": 2}
     assert agreement.on_learnt(answer(both), 100.0) == Effects(), "the same again changes nothing"
