@@ -34,7 +34,7 @@ from pathlib import Path
 from benchmarks.common import machine
 from benchmarks.rig import ROBOT, TASK, Load, Rig, Traffic, routes, told_of, until
 from zsched.core.books import unaccounted
-from zsched.core.events import SlotDrained, SlotFlipped, SlotReady, StreamsCounted
+from zsched.core.events import SlotFlipped, SlotReady, StreamsCounted
 from zsched.core.plan import RoutePhase, Slot, StreamClass, StreamCount, WorkerRole
 from zsched.core.relay_protocol import RelayStarted
 
@@ -142,9 +142,7 @@ def _move(rig: Rig, new: Slot, old: Slot, freeze_s: float) -> None:
     rig.role(old.owner, WorkerRole.DRAINING, old.epoch)
     rig.plan(RoutePhase.FLIP, new, old)
     until(lambda: rig.find(SlotFlipped, epoch=new.epoch), f"epoch {new.epoch} flipped", 30.0)
-    end = time.monotonic() + max(DRAIN_S, freeze_s)
-    while not rig.find(SlotDrained, epoch=old.epoch) and time.monotonic() < end:
-        time.sleep(0.01)
+    rig.wait_drained(max(DRAIN_S, freeze_s), old)
     time.sleep(freeze_s)  # at most; it is awake before the next move
     rig.plan(RoutePhase.CLOSE, new)
     rig.role(old.owner, WorkerRole.IDLE)
@@ -172,10 +170,7 @@ def _there_and_back(rig: Rig, new: Slot, old: Slot, again: Slot) -> Slot:
     finally:
         with contextlib.suppress(ProcessLookupError):
             os.kill(relay, signal.SIGCONT)
-    end = time.monotonic() + DRAIN_S
-    for slot in (old, new):
-        while not rig.find(SlotDrained, epoch=slot.epoch) and time.monotonic() < end:
-            time.sleep(0.01)
+    rig.wait_drained(DRAIN_S, old, new)
     rig.plan(RoutePhase.CLOSE, again)
     rig.role(new.owner, WorkerRole.IDLE)
     return again

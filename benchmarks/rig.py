@@ -195,13 +195,17 @@ class Rig:
         until(lambda: self.find(SlotFlipped, epoch=new.epoch), f"epoch {new.epoch} flipped")
         took = time.monotonic() - began
         if old is not None and not is_crash:
-            end = time.monotonic() + drain_s
-            while not self.find(SlotDrained, epoch=old.epoch) and time.monotonic() < end:
-                time.sleep(0.002)
+            self.wait_drained(drain_s, old)
         self.plan(RoutePhase.CLOSE, new)
         if old is not None and not is_crash and old.owner != new.owner:
             self.role(old.owner, WorkerRole.IDLE)
         return took
+
+    def wait_drained(self, drain_s: float, *olds: Slot) -> None:
+        """Wait until the robot's relay has said that these slots are drained, or their drain time is over."""
+        end = time.monotonic() + drain_s
+        while time.monotonic() < end and not all(self.find(SlotDrained, epoch=old.epoch) for old in olds):
+            time.sleep(0.002)
 
     def plan(self, phase: RoutePhase, current: Slot, *predecessors: Slot | None) -> None:
         """Give the robot's relay a plan."""

@@ -31,17 +31,30 @@ def flip(rig: Rig, new: Slot, *olds: Slot) -> None:
     rig.wait(SlotFlipped, epoch=new.epoch)
 
 
-def there_and_back(rig: Rig, app: Application, on_crash: OnCrash) -> None:
-    """edge1 has `BACKLOG` samples that it has not answered when edge2 gets `BEHIND` more, and edge1 so many again."""
+def slots(on_crash: OnCrash = OnCrash.REPORT) -> tuple[Slot, Slot, Slot]:
+    """edge1's, edge2's and edge1's again."""
     first, second, third = (
         slot(epoch, owner, StreamClass.RELIABLE, 0, on_crash=on_crash)
         for epoch, owner in ((1, "edge1"), (2, "edge2"), (3, "edge1"))
     )
+    return first, second, third
+
+
+def away(rig: Rig, app: Application, first: Slot, second: Slot) -> None:
+    """edge1 has `BACKLOG` samples that it has not answered when edge2 gets `BEHIND` more."""
+    for _ in range(BACKLOG):
+        app.put()
     rig.role("edge2", WorkerRole.ACTIVE, 2)
     rig.role("edge1", WorkerRole.DRAINING, 1)
     flip(rig, second, first)
     for _ in range(BEHIND):
         app.put()
+
+
+def there_and_back(rig: Rig, app: Application, on_crash: OnCrash) -> None:
+    """Away from edge1, and back to it, which gets as many again as edge2 did."""
+    first, second, third = slots(on_crash)
+    away(rig, app, first, second)
     rig.role("edge1", WorkerRole.ACTIVE, 3)
     rig.role("edge2", WorkerRole.DRAINING, 2)
     flip(rig, third, first, second)
@@ -51,7 +64,7 @@ def there_and_back(rig: Rig, app: Application, on_crash: OnCrash) -> None:
 
 def first_owner(rig: Rig, app: Application, on_crash: OnCrash) -> None:
     rig.start_worker("edge2")
-    rig.move(slot(1, "edge1", StreamClass.RELIABLE, 0, on_crash=on_crash))
+    rig.move(slots(on_crash)[0])
     until(app.connected, "the application sees the relay's subscription")
     for _ in range(BEFORE):  # a lane that nobody has acknowledged holds what it is given, for any owner
         app.put()
@@ -63,7 +76,7 @@ def all_is_back(rig: Rig, app: Application, on_crash: OnCrash) -> None:
     rig.wait(SlotDrained, epoch=1)
     left_at = monotonic_s()
     until(lambda: rig.reports[ROBOT].find(SlotDrained, epoch=2) or monotonic_s() > left_at + DRAIN_S, "epoch 2")
-    rig.plan(RoutePhase.CLOSE, slot(3, "edge1", StreamClass.RELIABLE, 0, on_crash=on_crash))
+    rig.plan(RoutePhase.CLOSE, slots(on_crash)[2])
     until(lambda: len(app.back) >= app.sent, f"{app.sent} samples back")
     assert app.back == list(range(app.sent))
     assert [rig.told(f"{TASK}/in/0").at_most_lost, rig.told(f"{TASK}/out/0").lost] == [0, 0]
@@ -74,8 +87,6 @@ def test_a_slow_owner_gives_back_what_it_had_before_it_was_left_and_came_back(ri
     rig.start_worker("edge1", "--delay-ms", "20")
     app = Application(rig.app)
     first_owner(rig, app, on_crash)
-    for _ in range(BACKLOG):
-        app.put()
     there_and_back(rig, app, on_crash)
     assert len(app.back) < BEFORE + BACKLOG, "the first owner is busy all the while"
     all_is_back(rig, app, on_crash)
@@ -87,28 +98,19 @@ def test_a_frozen_owner_gives_back_what_it_had_before_it_was_left_and_came_back(
     app = Application(rig.app)
     first_owner(rig, app, on_crash)
     worker.send_signal(signal.SIGSTOP)
-    for _ in range(BACKLOG):
-        app.put()
     there_and_back(rig, app, on_crash)
     worker.send_signal(signal.SIGCONT)
     all_is_back(rig, app, on_crash)
 
 
 def test_a_slot_that_is_closed_before_it_has_drained_lets_the_next_one_have_its_turn(rig: Rig) -> None:
-    """Its drain time is over: what it had is told, and the answers behind it come in their order."""
+    """The first slot's drain time is over: its samples are told as perhaps lost, and the next owner's answers come."""
     worker = rig.start_worker("edge1")
     app = Application(rig.app)
     first_owner(rig, app, OnCrash.REPORT)
     worker.send_signal(signal.SIGSTOP)
-    for _ in range(BACKLOG):
-        app.put()
-    second = slot(2, "edge2", StreamClass.RELIABLE, 0)
-    rig.role("edge2", WorkerRole.ACTIVE, 2)
-    rig.role("edge1", WorkerRole.DRAINING, 1)
-    flip(rig, second, slot(1, "edge1", StreamClass.RELIABLE, 0))
-    for _ in range(BEHIND):
-        app.put()
-    third = slot(3, "edge1", StreamClass.RELIABLE, 0)
+    first, second, third = slots()
+    away(rig, app, first, second)
     rig.plan(RoutePhase.PREPARE, third, second)
     until(lambda: app.back[-1] == app.sent - 1, f"what {ROBOT} sent to edge2 comes back")
     missing = app.sent - len(app.back)
@@ -124,7 +126,7 @@ def test_the_first_slot_carries_on_when_the_task_moves_again_before_the_flip(rig
     rig.start_worker("edge1")
     app = Application(rig.app)
     first_owner(rig, app, OnCrash.REPORT)
-    first, second, third = (slot(epoch, f"edge{2 - epoch % 2}", StreamClass.RELIABLE, 0) for epoch in (1, 2, 3))
+    first, second, third = slots()
     rig.plan(RoutePhase.PREPARE, second, first)
     rig.wait(SlotReady, epoch=2, is_ready=True)
     rig.plan(RoutePhase.FLIP, second, first)

@@ -136,7 +136,7 @@ class Executor:
 
     def next_deadline(self) -> float:
         """When `tick` may have something to do; infinity when never."""
-        return min(self._role_deadline, *(old.until for old in self._old), math.inf)
+        return min((self._role_deadline, *(old.until for old in self._old)))
 
     def start(self) -> tuple[Instruction, ...]:
         """The node starts: warm candidates start their worker."""
@@ -312,9 +312,8 @@ class Executor:
         drained = tuple(old for old in self._old if old.slot.epoch == epoch and old.is_left)
         if not drained:
             return ()
-        self._old = tuple(old for old in self._old if old not in drained)
         text = f"{drained[0].slot.owner} drained"
-        return self._close(text) if self._is_over() else self._go(self.phase, None, text)
+        return self._close(text) if self._forget(drained) else self._go(self.phase, None, text)
 
     def on_gone(self, node: NodeId) -> tuple[Instruction, ...]:
         """A peer is gone: nothing will come from its slots any more."""
@@ -324,15 +323,15 @@ class Executor:
     def _drop(self, dropped: tuple[_Old, ...], why: str) -> tuple[Instruction, ...]:
         if not dropped:
             return ()
-        self._old = tuple(old for old in self._old if old not in dropped)
-        if self._is_over():
+        if self._forget(dropped):
             return self._close(why)
         plan = RoutePhase.PREPARE if self.phase is Phase.PREPARING else RoutePhase.FLIP
         epochs = ", ".join(str(old.slot.epoch) for old in dropped)
         return self._go(self.phase, plan, f"drops the slot of epoch {epochs}: {why}")
 
-    def _is_over(self) -> bool:
-        """Whether the handover has nothing to wait for any more."""
+    def _forget(self, gone: tuple[_Old, ...]) -> bool:
+        """Let go of predecessors; answers whether the handover has nothing to wait for any more."""
+        self._old = tuple(old for old in self._old if old not in gone)
         return self.phase is Phase.DRAINING and not self._old
 
     def _close(self, text: str) -> tuple[Instruction, ...]:

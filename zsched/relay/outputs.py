@@ -207,8 +207,8 @@ class OutputStream:
             if slot is None or (self._carrier is not None and self._carrier.epoch > epoch):
                 return True
             now = monotonic_s()
-            same = [other for other in self._slots.values() if other.expr == slot.expr and other.feed is None]
-            if any(other.is_flipped for other in same):
+            heirs = [other for other in self._slots.values() if other.expr == slot.expr and other.feed is None]
+            if any(heir.is_flipped for heir in heirs):
                 return True  # the same owner goes on under the same key
             return bool(slot.keys) and all(key.is_ended(now, slot.answers) for key in slot.keys.values())
 
@@ -387,9 +387,10 @@ class OutputStream:
             self._counter.dropped("overflow")
 
     def _promote(self) -> None:
-        flipped = [self._slots[epoch] for epoch in sorted(self._slots) if self._slots[epoch].is_flipped]
-        if flipped:  # with `ALL` each has its turn
-            self._take_over(flipped[0 if self.route.settings.handover is HandoverRule.ALL else -1])
+        flipped = [slot for slot in self._slots.values() if slot.is_flipped]
+        choose = min if self.route.settings.handover is HandoverRule.ALL else max  # with `ALL` each has its turn
+        if flipped:
+            self._take_over(choose(flipped, key=lambda slot: slot.epoch))
 
     def _take_over(self, slot: OutputSlot) -> None:
         self._fence.begin(is_first=self._carrier is None)

@@ -245,8 +245,8 @@ class TaskRelay:
         """The slot that carries since another daemon's time, while the new owner is not ready, and what drains."""
         if not self._is_inherited or plan.current is None:
             return ()
-        olds = [self._slots[epoch] for epoch in sorted(self._slots) if epoch < plan.current.epoch]
-        return tuple(state.slot for state in olds if state.is_flipped and not state.is_drained)
+        olds = self._before(plan.current.epoch)
+        return tuple(old.slot for old in olds if old.is_flipped and not old.is_drained)
 
     def _open(self, slot: Slot, *, is_from_start: bool = False) -> None:
         if slot.epoch in self._slots:
@@ -403,7 +403,7 @@ class TaskRelay:
         is_behind = any(source.is_behind(epoch) for source in self._inputs.values())
         for sink in self._outputs.values():
             sink.flip(epoch, drops_held=is_behind)
-        olds = [self._slots[old] for old in sorted(self._slots) if old < epoch]
+        olds = self._before(epoch)
         carrier = self._carrier()
         is_old_dead = carrier is not None and carrier.gone_at is not None
         replayed = sum(
@@ -463,8 +463,8 @@ class TaskRelay:
     def _draining(self) -> _OpenSlot | None:
         """The oldest slot that is left and has not drained: with `HandoverRule.ALL` the later ones wait for it."""
         carrier = self._carrier()
-        olds = [] if carrier is None else [epoch for epoch in sorted(self._slots) if epoch < carrier.slot.epoch]
-        return next((self._slots[epoch] for epoch in olds if not self._slots[epoch].is_drained), None)
+        olds = () if carrier is None else self._before(carrier.slot.epoch)
+        return next((old for old in olds if not old.is_drained), None)
 
     # --- small questions ---------------------------------------------------------------------------------------------
 
@@ -475,8 +475,12 @@ class TaskRelay:
 
     def _carrier(self) -> _OpenSlot | None:
         """The slot that the inputs go to: the newest that was flipped to."""
-        epochs = [epoch for epoch in sorted(self._slots) if self._slots[epoch].is_flipped]
-        return self._slots[epochs[-1]] if epochs else None
+        flipped = (state for state in self._slots.values() if state.is_flipped)
+        return max(flipped, key=lambda state: state.slot.epoch, default=None)
+
+    def _before(self, epoch: int) -> list[_OpenSlot]:
+        """The open slots of older epochs, the oldest first."""
+        return [self._slots[old] for old in sorted(self._slots) if old < epoch]
 
     def _is_counted(self) -> bool:
         """True when something may have to be sent (again) without a sample coming in."""

@@ -297,7 +297,7 @@ def test_who_gets_less_than_its_threads_want_is_short() -> None:
 
 def test_a_worker_that_does_not_tell_its_jobs_ages_is_judged_by_how_long_they_take() -> None:
     """Class latest: what waits gives way, so that a job is as old as it takes."""
-    demands, pinned = Demands(), told(9.0, got=0.5, used=2.0)
+    pinned = told(9.0, got=0.5, used=2.0)
     load = pinned.workers[0]
     assert load.jobs is not None
     young = replace(pinned, workers=(replace(load, jobs=replace(load.jobs, age_s=None)),))

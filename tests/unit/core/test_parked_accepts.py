@@ -66,6 +66,36 @@ def elector() -> Agreement:
     return agreement
 
 
+def elector_node() -> Node:
+    """The same elector in its node."""
+    node = Node(
+        fleet=FLEET, me="robot1", durable=disk(), incarnation=7, electorate="e", rng=Random(1), now=100.0, version="t"
+    )
+    node.start(100.0)
+    for name in ROBOTS[1:]:
+        node.agreement.witness.on_answer(Learnt(node=name, values=()))
+    return node
+
+
+def overtaken(agreement: Agreement) -> None:
+    """A round of this elector's own in which a higher ballot has been promised by the others."""
+    change = MoveOwner(base_revision=3, owner="robot3", reason="test")
+    (sent,) = agreement.propose("guard", change, 101.0).send
+    assert isinstance(sent, do.SendPrepare)
+    for name in ROBOTS[1:]:
+        no = Refused(
+            elector=name,
+            task="guard",
+            ballot=sent.prepare.ballot,
+            refusal=Refusal.BALLOT,
+            promised=Ballot(counter=9, node="robot3", incarnation=1),
+        )
+        agreement.on_answer(ev.ElectorAnswered(answer=no), 101.0)
+
+
+ASKS_TO_LEAVE = Beat(node="robot2", incarnation=1, sequence=9, loop_lag_s=0.0, asked_to_leave=(("guard", "robot2", 3),))
+
+
 def asks(agreement: Agreement, request: int, counter: int, now: float, asker: str = "robot3") -> Effects:
     ballot = Ballot(counter=counter, node=asker, incarnation=1)
     accept = Accept(task="guard", acceptance=Acceptance(ballot=ballot, value=value(4, "robot3")), electorate="e")
@@ -149,12 +179,7 @@ def test_a_question_that_would_be_refused_anyway_does_not_wait() -> None:
 
 def test_a_question_that_waits_is_answered_though_no_task_is_exclusive_any_more() -> None:
     """The task may cease to be leased meanwhile. Its deadline must not lie behind us for ever: the loop would spin."""
-    node = Node(
-        fleet=FLEET, me="robot1", durable=disk(), incarnation=7, electorate="e", rng=Random(1), now=100.0, version="t"
-    )
-    node.start(100.0)
-    for name in ROBOTS[1:]:
-        node.agreement.witness.on_answer(Learnt(node=name, values=()))
+    node = elector_node()
     ballot = Ballot(counter=5, node="robot3", incarnation=1)
     accept = Accept(task="guard", acceptance=Acceptance(ballot=ballot, value=value(4, "robot3")), electorate="e")
     node.handle(ev.AcceptAsked(request=1, asker="robot3", accept=accept), 100.1)
@@ -201,32 +226,8 @@ def test_an_identity_round_does_not_end_the_silence_towards_an_owner_that_is_ask
     assert (said.asked_to_leave, said.echoes) == ((("guard", "robot2", 3),), ())
 
 
-def overtaken(agreement: Agreement) -> None:
-    """A round of this elector's own in which a higher ballot has been promised by the others."""
-    change = MoveOwner(base_revision=3, owner="robot3", reason="test")
-    (sent,) = agreement.propose("guard", change, 101.0).send
-    assert isinstance(sent, do.SendPrepare)
-    for name in ROBOTS[1:]:
-        no = Refused(
-            elector=name,
-            task="guard",
-            ballot=sent.prepare.ballot,
-            refusal=Refusal.BALLOT,
-            promised=Ballot(counter=9, node="robot3", incarnation=1),
-        )
-        agreement.on_answer(ev.ElectorAnswered(answer=no), 101.0)
-
-
-ASKS_TO_LEAVE = Beat(node="robot2", incarnation=1, sequence=9, loop_lag_s=0.0, asked_to_leave=(("guard", "robot2", 3),))
-
-
 def test_a_node_heeds_a_beat_by_which_an_owner_is_asked_to_leave() -> None:
-    node = Node(
-        fleet=FLEET, me="robot1", durable=disk(), incarnation=7, electorate="e", rng=Random(1), now=100.0, version="t"
-    )
-    node.start(100.0)
-    for name in ROBOTS[1:]:
-        node.agreement.witness.on_answer(Learnt(node=name, values=()))
+    node = elector_node()
     overtaken(node.agreement)
     node.handle(ev.BeatReceived(beat=ASKS_TO_LEAVE), 101.0)
     register = node.agreement.registers["guard"]
