@@ -282,11 +282,6 @@ class Dispatcher:
             self._is_held, self._first = False, first
             self._wake.notify()
 
-    def is_over(self, epoch: int) -> bool:
-        """Whether every input that was heard in the epoch has ended."""
-        with self._wake:
-            return self._is_over(epoch)
-
     def has_waiting(self, epoch: int) -> bool:
         """Whether an input of the epoch, or an older one, has come and is not processed."""
         with self._wake:
@@ -481,6 +476,7 @@ class Dispatcher:
         return not self._queue and now - marker.came_at > grace_s
 
     def _is_over(self, epoch: int) -> bool:
+        """Whether every input that was heard in the epoch has ended (under the lock)."""
         return all(state.epoch > epoch for state in self._open.values())
 
 

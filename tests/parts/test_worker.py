@@ -47,6 +47,11 @@ class Echo:
     def payloads(self) -> list[bytes]:
         return [received.payload.to_bytes() for received in self.taken]
 
+    def has_inputs_ended(self, epoch: int) -> bool:
+        dispatcher = self.worker._dispatcher
+        with dispatcher._wake:
+            return dispatcher._is_over(epoch)
+
 
 @pytest.fixture
 def echo(relay: Relay, tmp_path: Path) -> Iterator[Echo]:
@@ -142,7 +147,7 @@ def test_an_end_marker_ends_nothing_while_the_role_holds(relay: Relay, echo: Ech
     relay.put(b"0")
     until(lambda: len(relay.outputs) == 1, "the first")
     relay.end(4, count=1)
-    until(lambda: echo.worker._dispatcher.is_over(4), "the inputs to have ended")
+    until(lambda: echo.has_inputs_ended(4), "the inputs to have ended")
     until(lambda: echo.worker._early_end == 4, "the worker to know it")
     assert echo.output.put(b"still the owner")
     assert relay.ends == []
@@ -479,7 +484,7 @@ def test_who_hears_of_an_epoch_only_that_it_drains_answers_its_backlog_first(
     until(lambda: len(echo.taken) == count, "the backlog")
     if is_end_first:
         relay.end(4)
-        until(lambda: echo.worker._dispatcher.is_over(4), "the inputs to have ended")
+        until(lambda: echo.has_inputs_ended(4), "the inputs to have ended")
     relay.tell(WorkerRole.DRAINING, epoch=4)
     until(lambda: echo.worker.role.epoch == 4, "the role")
     if not is_end_first:
@@ -494,7 +499,7 @@ def test_an_end_marker_of_an_epoch_that_never_came_ends_nothing(relay: Relay, ec
     relay.put(b"a")
     until(lambda: len(echo.taken) == 1, "the input")
     relay.end(10**6)
-    until(lambda: echo.worker._dispatcher.is_over(10**6), "the forged marker")
+    until(lambda: echo.has_inputs_ended(10**6), "the forged marker")
     relay.tell(WorkerRole.ACTIVE, epoch=4)
     until(lambda: f"{ROLE_KEY}/4" in relay.tokens, "the token of the epoch")
     relay.put(b"b")
@@ -502,7 +507,7 @@ def test_an_end_marker_of_an_epoch_that_never_came_ends_nothing(relay: Relay, ec
 
 
 def test_the_end_waits_for_a_backlog_that_is_processed_once_more(relay: Relay, echo: Echo) -> None:
-    """Told that it works and at once that it does not: the end of the inputs came long ago."""
+    """Told that it works and at once that it does not: the end of the inputs is there before the role has begun."""
     gate = threading.Event()
     for name in (b"a", b"b", b"c"):
         relay.put(name)
@@ -513,7 +518,7 @@ def test_the_end_waits_for_a_backlog_that_is_processed_once_more(relay: Relay, e
     relay.tell(WorkerRole.DRAINING, epoch=4)
     until(lambda: echo.worker.role.role is WorkerRole.DRAINING, "the next role")
     relay.end(4)
-    until(lambda: echo.worker._dispatcher.is_over(4), "the inputs to have ended")
+    until(lambda: echo.worker._dispatcher._markers, "the marker")
     gate.set()
     until(lambda: relay.ends, "the end marker")
     assert relay.ends[0][1].count == 3
