@@ -35,7 +35,7 @@ demo: $(VENV)/.lab  ## Watch six machines merge laser maps (DEMO_ARGS="--headles
 test: $(VENV)/.dev  ## All tests: unit, paper, simulator, parts, integration and system (real daemons on localhost)
 	$(BIN)/python -m pytest -q -n $(TEST_JOBS) --dist loadfile tests/unit tests/paper tests/sim tests/planted
 	$(BIN)/python $(PYTEST_REAL) -q --durations=10 tests/system
-	$(BIN)/python $(PYTEST_REAL) -q -n $(REAL_JOBS) --dist loadfile --durations=10 tests/integration tests/parts
+	$(BIN)/python $(PYTEST_REAL) -q -n $(REAL_JOBS) --dist loadfile --no-loadscope-reorder --durations=10 tests/integration tests/parts
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile tests/bench
 
 test-quick: $(VENV)/.dev  ## Unit and paper tests only
