@@ -13,9 +13,9 @@ import threading
 from types import TracebackType
 from typing import Self
 
-from zsched.core.fleet import Timing
+from zsched.core.values.fleet import Timing
 from zsched.guard import guarded
-from zsched.zenoh_config import client_config
+from zsched.sessions.config import client_config
 
 PATIENT = Timing(zenoh_lease_s=20.0)
 """The end of its lease helps nobody."""

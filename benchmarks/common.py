@@ -12,7 +12,7 @@ from contextlib import contextmanager
 import psutil
 import zenoh
 
-from zsched.core.model import NodeId
+from zsched.core.values.model import NodeId
 from zsched.lab.testbed import Testbed
 
 

@@ -28,8 +28,8 @@ from pathlib import Path
 
 from benchmarks.common import machine
 from zsched.clock import monotonic_s
-from zsched.core.books import given_up, unaccounted
-from zsched.core.plan import StreamCount
+from zsched.core.hop.books import given_up, unaccounted
+from zsched.core.values.plan import StreamCount
 from zsched.lab.netbed import Netbed, Probe
 from zsched.lab.testbed import TASK, Json, echo_fleet
 

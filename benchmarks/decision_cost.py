@@ -15,11 +15,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from benchmarks.common import machine, percentile
-from zsched import wire
-from zsched.core.fleet import Demand, Fleet, NodeSpec, TaskSpec, Timing
-from zsched.core.gateway import Gateway
-from zsched.core.messages import Utilities
-from zsched.core.model import (
+from zsched.core.gateway.gateway import Gateway
+from zsched.core.scheduler.judge import Judge
+from zsched.core.scheduler.scoring import compare, score
+from zsched.core.values.fleet import Demand, Fleet, NodeSpec, TaskSpec, Timing
+from zsched.core.values.messages import Utilities
+from zsched.core.values.model import (
     Allocation,
     Link,
     LinkSource,
@@ -30,8 +31,7 @@ from zsched.core.model import (
     UtilityVector,
     Weights,
 )
-from zsched.core.scheduler import Judge
-from zsched.core.scoring import compare, score
+from zsched.wire import codec as wire
 
 CANDIDATES, ROBOTS = (3, 10, 50, 200), (3, 10, 50)
 GOAL_MS = 5.0

@@ -29,7 +29,7 @@ from pathlib import Path
 from benchmarks.common import machine
 from benchmarks.record import Record, progress, save, summary, table, together
 from zsched.clock import monotonic_s
-from zsched.core.model import NodeId
+from zsched.core.values.model import NodeId
 from zsched.lab import netns
 from zsched.lab.netbed import Netbed, Probe, descendants_running, stamped, stop_group
 from zsched.lab.testbed import TASK, TestbedError, echo_fleet
@@ -46,7 +46,7 @@ CUT_S = 20.0
 RECOVERY_S = 3.0
 """After a cut, TCP's own timers hold a link's streams back for up to so long; the next fault waits for it."""
 CYCLE_S = 1.2
-"""No more than 50 faults a minute: escapes are bounded at 60 (`zsched.core.damping`), and that is not measured here."""
+"""No more than 50 faults a minute: escapes are bounded at 60 (`zsched.core.scheduler.damping`), not measured here."""
 CASES = ("killed", "worker", "frozen", "cut", "heal")
 MAX_FAILURES = 5
 CALM_S = 90.0

@@ -27,7 +27,7 @@ from pathlib import Path
 from benchmarks.common import machine
 from benchmarks.record import Record, progress, save, together
 from zsched.clock import monotonic_s
-from zsched.core.model import PeerState
+from zsched.core.values.model import PeerState
 from zsched.lab import netns
 from zsched.lab.netbed import Netbed
 from zsched.lab.testbed import echo_fleet

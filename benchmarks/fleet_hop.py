@@ -26,7 +26,7 @@ import psutil
 
 from benchmarks.common import at_pace, machine
 from zsched.lab.testbed import Testbed, echo_fleet
-from zsched.zenoh_config import client_config
+from zsched.sessions.config import client_config
 
 APPLICATION = """
 import json, os, struct, sys, time, zenoh

@@ -8,11 +8,10 @@ the stream is five times as fast and the workers half as fast as it, and with ``
 processor all the time: overload may lose, but never silently.
 
 It fails (exit code 1) when a sample is lost that no counter of the robot's relay tells of: neither an input's nor an
-answer's; when the counters of an input do not account for every sample (`zsched.core.books`), looked at every second;
-when anything was lost, or in flight to a living worker, without overload; or when an answer came twice or out of order,
-under overload, too.
-A round in which the robot's own relay was replaced (the machine gave it no processor for seconds) says nothing, and is
-counted *void*.
+answer's; when the counters of an input do not account for every sample (`zsched.core.hop.books`), looked at every
+second; when anything was lost, or in flight to a living worker, without overload; or when an answer came twice or out
+of order, under overload, too. A round in which the robot's own relay was replaced (the machine gave it no processor for
+seconds) says nothing, and is counted *void*.
 """
 
 from __future__ import annotations
@@ -33,10 +32,10 @@ from pathlib import Path
 
 from benchmarks.common import machine
 from benchmarks.rig import ROBOT, TASK, Load, Rig, Traffic, routes, told_of, until
-from zsched.core.books import unaccounted
 from zsched.core.events import SlotFlipped, SlotReady, StreamsCounted
-from zsched.core.plan import RoutePhase, Slot, StreamClass, StreamCount, WorkerRole
-from zsched.core.relay_protocol import RelayStarted
+from zsched.core.hop.books import unaccounted
+from zsched.core.values.plan import RoutePhase, Slot, StreamClass, StreamCount, WorkerRole
+from zsched.core.values.relay_protocol import RelayStarted
 
 EDGES = ("edge1", "edge2", "edge3")
 FREEZES_S = (0.0, 0.9, 4.0)

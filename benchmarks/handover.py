@@ -5,8 +5,8 @@
 that a move takes what it takes. ``--recorder``: a foreign subscriber to ``**``. ``--stalled``: a third edge whose
 worker is frozen takes the same streams meanwhile. ``--crash``: the owner's worker is killed before every move.
 ``--all`` makes each of these runs, and a plain one of both classes, in turn. ``--out FILE`` keeps what was printed.
-The exit code is 1 when after a move the counters do not account for every sample (`zsched.core.books`), or when at the
-end more samples have not come back than the counters tell of.
+The exit code is 1 when after a move the counters do not account for every sample (`zsched.core.hop.books`), or when at
+the end more samples have not come back than the counters tell of.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from typing import TextIO
 
 from benchmarks.common import line, machine
 from benchmarks.rig import ROBOT, TASK, Load, Rig, Traffic, routes, until
-from zsched.core.plan import RoutePhase, RoutePlan, StreamClass
+from zsched.core.values.plan import RoutePhase, RoutePlan, StreamClass
 
 SMALL = Load(name="small", hz=1000, size=100)
 LARGE = Load(name="large", hz=50, size=1 << 20)

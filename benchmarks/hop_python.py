@@ -21,14 +21,14 @@ from typing import Any
 import zenoh
 
 from benchmarks.rig import until
-from zsched.core.plan import Direction, HandoverRule, Route, StreamClass, StreamSettings
-from zsched.keyspace import Keyspace
+from zsched.core.values.plan import Direction, HandoverRule, Route, StreamClass, StreamSettings
 from zsched.lab.loopback import free_endpoint
 from zsched.relay.acks import Acks
 from zsched.relay.inputs import InputStream
 from zsched.relay.outputs import OutputStream
 from zsched.relay.receive import undeclare
-from zsched.zenoh_config import data_config, worker_config
+from zsched.sessions.config import data_config, worker_config
+from zsched.wire.keyspace import Keyspace
 
 KEY = "robot1/in"
 OWNER = "edge1/t/1/out"

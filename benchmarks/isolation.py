@@ -21,8 +21,8 @@ import psutil
 import zenoh
 
 from benchmarks.common import at_pace, machine, percentile
-from zsched import places
-from zsched.adapters.operator_socket import ask
+from zsched import paths as places
+from zsched.adapters.host.operator_socket import ask
 from zsched.lab.testbed import ECHO, Testbed, echo_fleet
 
 CLASSES = ("best_effort", "latest", "reliable")

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 
 from benchmarks.common import machine
-from zsched.worker_jobs import JobBook, JobTimer
+from zsched.worker.jobs import JobBook, JobTimer
 
 GOAL_US = 2.0
 THREADS = 20

@@ -27,9 +27,9 @@ import zenoh
 
 from benchmarks.common import machine
 from benchmarks.record import Record, progress, table
-from zsched import zenoh_config
-from zsched.core.fleet import Timing
+from zsched.core.values.fleet import Timing
 from zsched.lab.netns import Network, why_not
+from zsched.sessions import config as zenoh_config
 
 LEASE_S = 1.0
 BEAT_S = 0.1

@@ -21,10 +21,10 @@ import zenoh
 from benchmarks.common import at_pace, machine
 from benchmarks.record import Record, progress, table
 from benchmarks.rig import until
-from zsched.core.plan import Direction, Route, ServiceSettings, StreamSettings
+from zsched.core.values.plan import Direction, Route, ServiceSettings, StreamSettings
 from zsched.lab.loopback import free_endpoints
 from zsched.relay.services import ServiceStream
-from zsched.zenoh_config import data_config, worker_config
+from zsched.sessions.config import data_config, worker_config
 
 ASKED, OWNERS = "robot1/ask", "edge1/echo/robot1/ask"
 TIME_S: Final = 2.0

@@ -22,10 +22,10 @@ from typing import Any, Self
 import psutil
 import zenoh
 
-from zsched.adapters.streams import RelayHandle
-from zsched.core.books import given_up, unaccounted
+from zsched.adapters.relay.streams import RelayHandle
 from zsched.core.events import RelayChanged, SlotDrained, SlotFlipped, SlotReady, StreamsCounted
-from zsched.core.plan import (
+from zsched.core.hop.books import given_up, unaccounted
+from zsched.core.values.plan import (
     Direction,
     HandoverRule,
     ReadyWhen,
@@ -39,9 +39,9 @@ from zsched.core.plan import (
     StreamSettings,
     WorkerRole,
 )
-from zsched.core.relay_protocol import HandleReport, SlotLost, WorkerSeen
+from zsched.core.values.relay_protocol import HandleReport, SlotLost, WorkerSeen
 from zsched.lab.loopback import free_endpoint
-from zsched.zenoh_config import data_config, worker_config
+from zsched.sessions.config import data_config, worker_config
 
 FLEET, ROBOT, TASK = "bench", "robot1", "echo"
 NUMBER_BYTES = 10
@@ -123,7 +123,7 @@ class Rig:
             heard: list[tuple[float, HandleReport]] = []
             self.heard[node] = heard
             connect = () if node == ROBOT else (self.endpoint(ROBOT),)
-            # one side dials every link, as `zsched.daemon_endpoints` has it
+            # one side dials every link, as `zsched.runtime.endpoints` has it
             text = data_config(
                 listen=(self.endpoint(node),), connect=connect, shared_memory=False, dials_by_gossip=False
             )
@@ -166,7 +166,7 @@ class Rig:
         """Start an echo worker and wait for its token."""
         self.incarnation += 1
         path = self.folder / f"{node}.json5"
-        connect = tuple(dict.fromkeys((self.endpoint(node), self.endpoint(ROBOT))))  # as `zsched.daemon_endpoints`
+        connect = tuple(dict.fromkeys((self.endpoint(node), self.endpoint(ROBOT))))  # as `zsched.runtime.endpoints`
         path.write_text(worker_config(connect=connect, listen=(), shared_memory=False, dials_by_gossip=False))
         env = os.environ | {
             "ZSCHED_FLEET": FLEET,
@@ -221,7 +221,7 @@ class Rig:
         return {count.stream: count for count in report.counts}
 
     def unaccounted(self) -> list[str]:
-        """Streams whose newest counters do not account for every sample (`zsched.core.books`); none, at any time."""
+        """Streams whose counters do not account for every sample (`zsched.core.hop.books`); none, at any time."""
         return [
             f"{missing} unaccounted: {count}" for count in self.counts().values() if (missing := unaccounted(count))
         ]

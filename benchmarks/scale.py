@@ -30,19 +30,19 @@ from typing import IO, Any
 
 from benchmarks.common import machine, mean
 from benchmarks.record import Record, Row, progress, save, table
-from zsched import zenoh_config
-from zsched.adapters.control_bus import ControlBus
-from zsched.adapters.state_file import StateFile
+from zsched.adapters.host.state_file import StateFile
+from zsched.adapters.network.control_bus import ControlBus
 from zsched.clock import monotonic_s
-from zsched.config import load_fleet
+from zsched.config.load import load_fleet
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.fleet import Fleet, electorate_hash
-from zsched.core.model import DeviceSample, NodeId, NodeKind, WorkerState
 from zsched.core.node import Node
-from zsched.daemon_endpoints import endpoints_for, free_port
+from zsched.core.values.fleet import Fleet, electorate_hash
+from zsched.core.values.model import DeviceSample, NodeId, NodeKind, WorkerState
 from zsched.lab.testbed import TASK, echo_fleet
-from zsched.lifecycle import init_state
+from zsched.runtime.endpoints import endpoints_for, free_port
+from zsched.runtime.init import init_state
+from zsched.sessions import config as zenoh_config
 
 GOAL = "p99 50 ms at 6"
 IDLE_S = 5.0

@@ -4,8 +4,8 @@
 200 Hz and 100 B to 20 kB, a move to a random other edge every 1 to 5 s, now and then a killed worker or a killed relay
 (of an edge). A second application receives all answers and freezes for seconds at a time; what it may have missed is
 counted, and the first one misses nothing by it. Every minute: private memory, descriptors and threads of the robot's
-relay and of the workers, and whether its counters account for every sample (`zsched.core.books`). The exit code is 1
-if they do not, or if at the end more samples have not come back than the counters tell of.
+relay and of the workers, and whether its counters account for every sample (`zsched.core.hop.books`). The exit code is
+1 if they do not, or if at the end more samples have not come back than the counters tell of.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from pathlib import Path
 from benchmarks.bystander import Bystander
 from benchmarks.common import machine
 from benchmarks.rig import ROBOT, Load, Rig, Traffic, routes, until
-from zsched.core.plan import StreamClass
+from zsched.core.values.plan import StreamClass
 
 EDGES = ("edge1", "edge2", "edge3")
 

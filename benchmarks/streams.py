@@ -27,13 +27,22 @@ import zenoh
 
 from benchmarks.common import machine, percentile
 from benchmarks.rig import FLEET, until
-from zsched.adapters.streams import RelayHandle
+from zsched.adapters.relay.streams import RelayHandle
 from zsched.core.events import RelayChanged, SlotFlipped, SlotReady
-from zsched.core.fleet import WorkerLink
-from zsched.core.plan import Direction, ReadyWhen, Route, RoutePhase, RoutePlan, Slot, StreamClass, StreamSettings
-from zsched.core.relay_protocol import HandleReport
+from zsched.core.values.fleet import WorkerLink
+from zsched.core.values.plan import (
+    Direction,
+    ReadyWhen,
+    Route,
+    RoutePhase,
+    RoutePlan,
+    Slot,
+    StreamClass,
+    StreamSettings,
+)
+from zsched.core.values.relay_protocol import HandleReport
 from zsched.lab.loopback import free_endpoint
-from zsched.zenoh_config import data_config, worker_config
+from zsched.sessions.config import data_config, worker_config
 
 HOPS = ("direct", "router", "naive", "best_effort", "reliable")
 PACE_HZ = {64: 500, 1024: 500, 65536: 250, 1 << 20: 50, 4 << 20: 20}

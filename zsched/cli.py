@@ -20,12 +20,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from zsched.cli_bench import bench_app
-from zsched.cli_common import EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, CliError, Json, Verb, Verbs, print_json
-from zsched.cli_stream_verbs import stream_app
+from zsched.commands.bench import bench_app
+from zsched.commands.common import EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, CliError, Json, Verb, Verbs, print_json
+from zsched.commands.stream_verbs import stream_app
 
 if TYPE_CHECKING:
-    from zsched.lifecycle import Heard  # imports zenoh
+    from zsched.runtime.init import Heard  # imports zenoh
 
 EPILOG = (
     "Exit codes: 0 fine, 1 failed, 2 usage, 3 daemon not reachable, 4 reachable but degraded, 5 timed out, "
@@ -106,7 +106,7 @@ def up(
     log_level: Annotated[LogLevel, typer.Option("--log-level", help="What goes to stderr.")] = LogLevel.INFO,
 ) -> None:
     """Run this machine's daemon in the foreground (what systemd runs)."""
-    from zsched import places  # noqa: PLC0415 - each verb imports what it needs
+    from zsched import paths as places  # noqa: PLC0415 - each verb imports what it needs
 
     file = places.config_path(config, os.environ)
     _need_file(file)
@@ -144,10 +144,10 @@ def init(
     If too many states are lost to agree, stop every daemon, and run it on every node with the --generation that
     `zsched status` names. That is refused while the fleet agrees, and where a good state would be lost.
     """
-    from zsched import places  # noqa: PLC0415 - each verb imports what it needs
-    from zsched.adapters import core_speed  # noqa: PLC0415 - likewise
-    from zsched.config import load_fleet, require_node  # noqa: PLC0415 - ruamel.yaml is slow to import
-    from zsched.lifecycle import check_blank, init_state, settle_dispute, standing_state  # noqa: PLC0415 - imports zenoh
+    from zsched import paths as places  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.adapters.machine import core_speed  # noqa: PLC0415 - likewise
+    from zsched.config.load import load_fleet, require_node  # noqa: PLC0415 - ruamel.yaml is slow to import
+    from zsched.runtime.init import check_blank, init_state, settle_dispute, standing_state  # noqa: PLC0415 - imports zenoh
 
     file = places.config_path(config, os.environ)
     fleet = load_fleet(file)
@@ -200,7 +200,7 @@ def status(
 
     Exits with 4 while the fleet is degraded: no quorum, or a task without a live owner.
     """
-    from zsched.cli_status import StatusView, show, watch_on  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.status import StatusView, show, watch_on  # noqa: PLC0415 - each verb imports what it needs
 
     view = StatusView(runtime_dir=runtime_dir, node=node, is_json=json_, is_plain=no_color)
     raise typer.Exit(watch_on(view, interval) if watch else show(view))
@@ -224,8 +224,8 @@ def weights(
 
     A change is agreed like an allocation: it holds for every robot, or for none (exit 4 without a quorum).
     """
-    from zsched.cli_ask import find_door  # noqa: PLC0415 - each verb imports what it needs
-    from zsched.cli_weights import change_weights, parse_weights, show_weights  # noqa: PLC0415 - as above
+    from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.weights import change_weights, parse_weights, show_weights  # noqa: PLC0415 - as above
 
     if not pairs:
         if revision is not None:
@@ -250,8 +250,8 @@ def retry(
 
     Exits with 5 when some nodes could not be asked: they remember.
     """
-    from zsched.cli_ask import find_door  # noqa: PLC0415 - each verb imports what it needs
-    from zsched.cli_retry import retry as ask_all  # noqa: PLC0415 - as above
+    from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.retry import retry as ask_all  # noqa: PLC0415 - as above
 
     raise typer.Exit(ask_all(find_door(runtime_dir, node), task, whose, is_json=json_))
 
@@ -269,10 +269,10 @@ def check(
 
     Of a file without fault it says in words when each task moves, setting by setting, once for tasks alike.
     """
-    from zsched import places  # noqa: PLC0415 - each verb imports what it needs
-    from zsched.cli_rules import told_once  # noqa: PLC0415 - as above
-    from zsched.config import check_file  # noqa: PLC0415 - ruamel.yaml is slow to import
-    from zsched.core.fleet import fleet_hash  # noqa: PLC0415 - as above
+    from zsched import paths as places  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.rules import told_once  # noqa: PLC0415 - as above
+    from zsched.config.load import check_file  # noqa: PLC0415 - ruamel.yaml is slow to import
+    from zsched.core.values.fleet import fleet_hash  # noqa: PLC0415 - as above
 
     result = check_file(places.config_path(file or config, os.environ))
     fleet = result.fleet
@@ -331,7 +331,8 @@ def version(json_: JsonOption = False) -> None:
     from importlib.metadata import PackageNotFoundError  # noqa: PLC0415 - as above
     from importlib.metadata import version as installed  # noqa: PLC0415 - as above
 
-    from zsched import __version__, wire  # noqa: PLC0415 - as above
+    from zsched import __version__  # noqa: PLC0415 - as above
+    from zsched.wire import codec as wire  # noqa: PLC0415 - as above
 
     try:
         zenoh = installed("eclipse-zenoh")
@@ -350,8 +351,8 @@ def _count(number: int, plural: str) -> str:
 
 def _node_name(given: str | None) -> str:
     """This node's name. Raises `CliError` (2) when it is no name."""
-    from zsched import places  # noqa: PLC0415 - each verb imports what it needs
-    from zsched.core.model import NAME  # noqa: PLC0415 - as above
+    from zsched import paths as places  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.core.values.model import NAME  # noqa: PLC0415 - as above
 
     name = places.node_name(given, os.environ)
     if NAME.fullmatch(name) is None:
@@ -365,7 +366,7 @@ def _node_name(given: str | None) -> str:
 
 def _need_file(file: Path) -> None:
     """Raise `CliError` (78) unless the fleet file can be read."""
-    from zsched.config_reader import MAX_FILE_BYTES  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.config.reader import MAX_FILE_BYTES  # noqa: PLC0415 - each verb imports what it needs
     from zsched.files import owner_of, read_regular  # noqa: PLC0415 - as above
 
     try:

@@ -21,36 +21,39 @@ import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from zsched import __version__, daemon_tls, places, zenoh_config
-from zsched.adapters import zenoh_log
-from zsched.adapters.control_bus import ControlBus
-from zsched.adapters.operator_socket import OperatorSocket
-from zsched.adapters.state_file import StateFile
-from zsched.adapters.streams import SILENCE_S, Bequest, RelayHandle
-from zsched.adapters.systemd import Notifier, watchdog_interval_s
-from zsched.adapters.worker_supervisor import WorkerContext, WorkerSupervisor
+from zsched import __version__
+from zsched import paths as places
+from zsched.adapters.host import zenoh_log
+from zsched.adapters.host.operator_socket import OperatorSocket
+from zsched.adapters.host.state_file import StateFile
+from zsched.adapters.host.systemd import Notifier, watchdog_interval_s
+from zsched.adapters.network.control_bus import ControlBus
+from zsched.adapters.relay.streams import SILENCE_S, Bequest, RelayHandle
+from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
 from zsched.clock import monotonic_s, wall_tenths
-from zsched.config import load_fleet, require_node
+from zsched.config.load import load_fleet, require_node
 from zsched.core import events as ev
-from zsched.core.fleet import electorate_hash, fleet_hash
-from zsched.core.model import DurableState, NodeId, NodeKind, TaskId
+from zsched.core.executor.workers import runs_worker
 from zsched.core.node import Node
-from zsched.core.route import watch_for
+from zsched.core.route.route import watch_for
 from zsched.core.status import status_line
-from zsched.core.workers import runs_worker
-from zsched.daemon_access import StreamAccess, joins_at
-from zsched.daemon_descriptors import take_descriptors
-from zsched.daemon_endpoints import Endpoints, endpoints_for, free_port, is_here
-from zsched.daemon_leaving import Leaving
-from zsched.daemon_memory import shared_memory_objection
-from zsched.daemon_sampler import Sampler
-from zsched.daemon_sessions import SessionsRead
+from zsched.core.values.fleet import electorate_hash, fleet_hash
+from zsched.core.values.model import DurableState, NodeId, NodeKind, TaskId
 from zsched.errors import AdapterError, ConfigError, NameTakenError
 from zsched.files import write_regular
 from zsched.guard import on_failure
+from zsched.ipc.takeover import Door
 from zsched.log_limit import limit_handlers
-from zsched.relay_door import Door
-from zsched.shell import Desk, Inbox, Shell
+from zsched.runtime import tls as daemon_tls
+from zsched.runtime.access import StreamAccess, joins_at
+from zsched.runtime.descriptors import take_descriptors
+from zsched.runtime.endpoints import Endpoints, endpoints_for, free_port, is_here
+from zsched.runtime.leaving import Leaving
+from zsched.runtime.memory import shared_memory_objection
+from zsched.runtime.sampler import Sampler
+from zsched.runtime.sessions import SessionsRead
+from zsched.runtime.shell import Desk, Inbox, Shell
+from zsched.sessions import config as zenoh_config
 
 EXIT_OK, EXIT_FAILED, EXIT_NAME_TAKEN, EXIT_CONFIG = 0, 1, 75, 78
 NAME_TAKEN_WAIT_S = 5.0

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from zsched.adapters.cgroup import LimitedGroup
+from zsched.adapters.machine.cgroup import LimitedGroup
 from zsched.lab.laser_log import malaga_path
 from zsched.lab.netns import why_not
 from zsched.lab.paper.bench import BenchOptions, InputsOf

@@ -15,7 +15,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from support.waiting import until
-from zsched.adapters.cgroup import LimitedGroup
+from zsched.adapters.machine.cgroup import LimitedGroup
 from zsched.lab.janitor import TOKEN_VARIABLE
 from zsched.lab.paper.places import scenario_path
 

@@ -13,8 +13,8 @@ from typing import Any
 
 import zenoh
 
-from zsched.core.plan import RosGraph
-from zsched.core.ros2 import Endpoint, EndpointKind, default_qos, endpoint_token, parse_token
+from zsched.core.route.ros2 import Endpoint, EndpointKind, default_qos, endpoint_token, parse_token
+from zsched.core.values.plan import RosGraph
 
 NODE = os.environ["ZSCHED_NODE"]
 MAPS = f"0/{NODE}/map_merge/*/map/**"

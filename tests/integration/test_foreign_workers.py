@@ -23,10 +23,10 @@ from ruamel.yaml import YAML
 
 from support.ros_host import opened
 from support.waiting import free_endpoint, until
-from zsched.core.plan import RosGraph
-from zsched.core.ros2 import Endpoint, EndpointKind, default_qos, endpoint_token
+from zsched.core.route.ros2 import Endpoint, EndpointKind, default_qos, endpoint_token
+from zsched.core.values.plan import RosGraph
 from zsched.lab.testbed import Testbed, echo_fleet
-from zsched.zenoh_config import client_config
+from zsched.sessions.config import client_config
 
 ROOT = Path(__file__).parents[2]
 MERGER = Path(__file__).with_name("ros_merger.py")

@@ -16,7 +16,7 @@ import pytest
 
 from zsched.lab.loopback import free_endpoint
 from zsched.lab.testbed import DAEMON, Testbed, TestbedError, echo_fleet
-from zsched.lifecycle import init_state
+from zsched.runtime.init import init_state
 
 
 @pytest.fixture

@@ -10,11 +10,11 @@ import zenoh
 
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import until
-from zsched.hop_acks import Acknowledger
-from zsched.stalled_links import StalledLinks
-from zsched.worker_debts import Debts
-from zsched.worker_keep import Keeper
-from zsched.worker_outputs import OUTPUT_DEPTH, Output
+from zsched.hop.acknowledger import Acknowledger
+from zsched.sessions.stalled_links import StalledLinks
+from zsched.worker.debts import Debts
+from zsched.worker.keep import Keeper
+from zsched.worker.outputs import OUTPUT_DEPTH, Output
 
 ANSWERS = 1000
 SIZE = 100

@@ -17,12 +17,21 @@ import zenoh
 from support.books import assert_nothing_is_unaccounted
 from support.sessions import opened
 from support.waiting import free_endpoint, until
-from zsched.adapters.streams import RelayHandle
+from zsched.adapters.relay.streams import RelayHandle
 from zsched.core.events import ProblemReported, RelayChanged, SlotFlipped, SlotReady
-from zsched.core.fleet import LocalMode, LocalSide
-from zsched.core.plan import Direction, ReadyWhen, Route, RoutePhase, RoutePlan, Slot, StreamClass, StreamSettings
-from zsched.core.relay_protocol import HandleReport
-from zsched.zenoh_config import client_config, data_config, local_config, worker_config
+from zsched.core.values.fleet import LocalMode, LocalSide
+from zsched.core.values.plan import (
+    Direction,
+    ReadyWhen,
+    Route,
+    RoutePhase,
+    RoutePlan,
+    Slot,
+    StreamClass,
+    StreamSettings,
+)
+from zsched.core.values.relay_protocol import HandleReport
+from zsched.sessions.config import client_config, data_config, local_config, worker_config
 
 ROBOTS = ("robot1", "robot2", "robot3")
 TASK = "merge"

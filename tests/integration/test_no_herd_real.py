@@ -11,7 +11,7 @@ from typing import Any
 import psutil
 import pytest
 
-from zsched.core.utility import SPARE
+from zsched.core.scheduler.utility import SPARE
 from zsched.lab.testbed import Testbed, echo_fleet
 
 TASKS = ("task1", "task2", "task3")

@@ -12,7 +12,7 @@ from support.relay_rig import ROBOT, TASK, Application, Rig, relay_rig, slot
 from support.waiting import until
 from zsched.clock import monotonic_s
 from zsched.core.events import SlotDrained, SlotFlipped, SlotReady
-from zsched.core.plan import OnCrash, RoutePhase, Slot, StreamClass, WorkerRole
+from zsched.core.values.plan import OnCrash, RoutePhase, Slot, StreamClass, WorkerRole
 
 BEFORE, BACKLOG, BEHIND = 5, 200, 10
 DRAIN_S = 2.0

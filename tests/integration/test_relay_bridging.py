@@ -12,12 +12,21 @@ import zenoh
 from support.books import assert_nothing_is_unaccounted
 from support.sessions import matches
 from support.waiting import free_endpoint, until
-from zsched.adapters.streams import Bequest, RelayHandle
+from zsched.adapters.relay.streams import Bequest, RelayHandle
 from zsched.core.events import RelayChanged, SlotFlipped, SlotReady, StreamsCounted
-from zsched.core.plan import Direction, ReadyWhen, Route, RoutePhase, RoutePlan, Slot, StreamClass, StreamSettings
-from zsched.core.relay_protocol import HandleReport
-from zsched.relay_door import Door
-from zsched.zenoh_config import data_config, worker_config
+from zsched.core.values.plan import (
+    Direction,
+    ReadyWhen,
+    Route,
+    RoutePhase,
+    RoutePlan,
+    Slot,
+    StreamClass,
+    StreamSettings,
+)
+from zsched.core.values.relay_protocol import HandleReport
+from zsched.ipc.takeover import Door
+from zsched.sessions.config import data_config, worker_config
 
 RELIABLE = StreamSettings(stream_class=StreamClass.RELIABLE, depth=500)
 

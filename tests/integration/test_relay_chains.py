@@ -10,7 +10,7 @@ import pytest
 
 from support.relay_rig import ROBOT, Application, Rig, relay_rig
 from support.waiting import until
-from zsched.core.plan import (
+from zsched.core.values.plan import (
     Direction,
     HandoverRule,
     ReadyWhen,

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from support.waiting import within
-from zsched.core.model import NodeId
+from zsched.core.values.model import NodeId
 from zsched.lab.testbed import Testbed, echo_fleet
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from support.relay_rig import Application, Rig, relay_rig, slot
 from support.waiting import until
-from zsched.core.plan import OnCrash, RoutePhase, StreamClass, WorkerRole
+from zsched.core.values.plan import OnCrash, RoutePhase, StreamClass, WorkerRole
 
 LARGE = 1000
 NO_LARGE_ANSWERS = f"""{{low_pass_filter: [{{

@@ -6,7 +6,7 @@ import os
 import signal
 from pathlib import Path
 
-from zsched.core.relay_ends import OFTEN, WINDOW_S
+from zsched.core.profile.relay_ends import OFTEN, WINDOW_S
 from zsched.lab.testbed import Testbed, echo_fleet
 
 WAIT_S = 60.0

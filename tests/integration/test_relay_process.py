@@ -13,9 +13,8 @@ import pytest
 
 from support.relay_rig import FLEET, TASK, relay_rig
 from support.waiting import until
-from zsched import wire
 from zsched.core.events import ProblemReported, StreamsCounted
-from zsched.core.plan import (
+from zsched.core.values.plan import (
     Direction,
     ReadyWhen,
     Role,
@@ -26,11 +25,12 @@ from zsched.core.plan import (
     StreamSettings,
     WorkerRole,
 )
-from zsched.core.relay_life import RelayPulse
-from zsched.core.relay_protocol import RelayStarted, RelayStop
-from zsched.keyspace import Keyspace
-from zsched.relay_pipe import REPORTS, read_frame, write_frame
-from zsched.zenoh_config import data_config
+from zsched.core.values.relay_life import RelayPulse
+from zsched.core.values.relay_protocol import RelayStarted, RelayStop
+from zsched.ipc.pipe import REPORTS, read_frame, write_frame
+from zsched.sessions.config import data_config
+from zsched.wire import codec as wire
+from zsched.wire.keyspace import Keyspace
 
 CONFIG = data_config(listen=("tcp/127.0.0.1:0",), connect=())
 END_S = 5.0

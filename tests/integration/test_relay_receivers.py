@@ -15,9 +15,9 @@ import pytest
 
 from support.relay_rig import ROBOT, Application, Rig, relay_rig, slot
 from support.waiting import POLL_S, TooSlowError, until, within
-from zsched.core.fleet import Timing
-from zsched.core.plan import StreamClass
-from zsched.zenoh_config import client_config
+from zsched.core.values.fleet import Timing
+from zsched.core.values.plan import StreamClass
+from zsched.sessions.config import client_config
 
 READER = """
 import sys, time

@@ -18,9 +18,9 @@ import zenoh
 
 from support.sessions import matches
 from support.waiting import free_endpoint, until
-from zsched.adapters.streams import RelayHandle
+from zsched.adapters.relay.streams import RelayHandle
 from zsched.core.events import RelayChanged, SlotDrained, SlotFlipped, SlotReady, StreamsCounted
-from zsched.core.plan import (
+from zsched.core.values.plan import (
     Direction,
     ReadyWhen,
     Role,
@@ -32,8 +32,8 @@ from zsched.core.plan import (
     StreamSettings,
     WorkerRole,
 )
-from zsched.core.relay_protocol import HandleReport, WorkerSeen
-from zsched.zenoh_config import data_config, worker_config
+from zsched.core.values.relay_protocol import HandleReport, WorkerSeen
+from zsched.sessions.config import data_config, worker_config
 
 FLEET, ROBOT, TASK = "test", "robot1", "jobs"
 SERVICE = f"{ROBOT}/job"
@@ -128,7 +128,7 @@ class Rig:
     def start_worker(self, node: str) -> subprocess.Popen[bytes]:
         self.incarnation += 1
         path = self.folder / f"{node}.json5"
-        connect = tuple(dict.fromkeys((self.endpoint(node), self.endpoint(ROBOT))))  # as `zsched.daemon_endpoints`
+        connect = tuple(dict.fromkeys((self.endpoint(node), self.endpoint(ROBOT))))  # as `zsched.runtime.endpoints`
         path.write_text(worker_config(connect=connect, shared_memory=False))
         env = os.environ | {
             "ZSCHED_FLEET": FLEET,

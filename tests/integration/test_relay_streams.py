@@ -16,15 +16,15 @@ from support.relay_rig import BESIDE, ROBOT, TASK, Application, Rig, relay_rig, 
 from support.sessions import matches
 from support.waiting import between, until, within
 from zsched.core.events import RelayChanged, SlotDrained, SlotFlipped, SlotReady
-from zsched.core.plan import (
+from zsched.core.values.plan import (
     ReadyWhen,
     RoutePhase,
     RoutePlan,
     StreamClass,
     WorkerRole,
 )
-from zsched.core.relay_protocol import WorkerWatch
-from zsched.zenoh_config import DEFAULT_TIMING, worker_config
+from zsched.core.values.relay_protocol import WorkerWatch
+from zsched.sessions.config import DEFAULT_TIMING, worker_config
 
 WAITS_S = 5.0
 """Half of such a link's lease."""

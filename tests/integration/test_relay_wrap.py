@@ -20,19 +20,19 @@ import zenoh
 
 from support.relay_rig import FLEET, ROBOT, TASK, Application, slot
 from support.waiting import free_endpoint, until
-from zsched import worker_outputs
-from zsched.core.books import unaccounted
 from zsched.core.events import SlotDrained, SlotFlipped, SlotReady
-from zsched.core.plan import Role, RoutePhase, RoutePlan, Slot, StreamClass, StreamCount, WorkerRole
-from zsched.core.serial import SPAN
+from zsched.core.hop.books import unaccounted
+from zsched.core.hop.serial import SPAN
+from zsched.core.values.plan import Role, RoutePhase, RoutePlan, Slot, StreamClass, StreamCount, WorkerRole
 from zsched.relay import outlet
 from zsched.relay.lanes import Lane
 from zsched.relay.outputs import OutputStream
 from zsched.relay.process import RelayProcess
+from zsched.sessions.config import data_config, worker_config
 from zsched.tasks.echo import Echo
 from zsched.worker import Worker
-from zsched.worker_inputs import Dispatcher
-from zsched.zenoh_config import data_config, worker_config
+from zsched.worker import outputs as worker_outputs
+from zsched.worker.inputs import Dispatcher
 
 BEFORE = 60
 START = SPAN - BEFORE

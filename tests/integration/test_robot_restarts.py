@@ -9,8 +9,8 @@ import zenoh
 
 from support.sessions import matches
 from zsched.lab.testbed import TASK, Testbed, echo_fleet
-from zsched.worker_keep import TICK_S
-from zsched.worker_lanes import NEWCOMERS_S
+from zsched.worker.keep import TICK_S
+from zsched.worker.lanes import NEWCOMERS_S
 
 COUNT = 60
 

@@ -17,18 +17,18 @@ from zenoh import ext
 
 from support.books import assert_nothing_is_unaccounted
 from support.waiting import free_endpoint, until
-from zsched.adapters.streams import RelayHandle
-from zsched.config import load_fleet
+from zsched.adapters.relay.streams import RelayHandle
+from zsched.config.load import load_fleet
 from zsched.core.events import RelayChanged, SlotFlipped, SlotReady
-from zsched.core.fleet import LocalSide
-from zsched.core.plan import Role, RoutePhase, WorkerRole
-from zsched.core.relay_protocol import HandleReport
-from zsched.core.ros2 import Attachment, decode_attachment, encode_attachment
-from zsched.core.route import plan_for, slot_for
+from zsched.core.route.ros2 import Attachment, decode_attachment, encode_attachment
+from zsched.core.route.route import plan_for, slot_for
+from zsched.core.values.fleet import LocalSide
+from zsched.core.values.plan import Role, RoutePhase, WorkerRole
+from zsched.core.values.relay_protocol import HandleReport
+from zsched.sessions.config import client_config, data_config, local_config, worker_config
 from zsched.tasks.map_merge.cdr import decode_grid, decode_transforms, encode_grid
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid
-from zsched.zenoh_config import client_config, data_config, local_config, worker_config
 
 CONFIG = Path(__file__).parents[2] / "configs" / "ros2.yaml"
 GRID = "nav_msgs::msg::dds_::OccupancyGrid_/RIHS01_8d348150c12913a31ee0ec170fbf25089e4745d17035792a1ba94d6f0bc0cfc7"

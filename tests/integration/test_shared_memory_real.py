@@ -9,7 +9,7 @@ import zenoh
 
 from support.waiting import until
 from zsched.lab.testbed import Testbed, echo_fleet
-from zsched.zenoh_config import client_config
+from zsched.sessions.config import client_config
 
 LARGE = bytes(1 << 18)
 

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import zenoh
 
-from zsched import zenoh_config
-from zsched.daemon_descriptors import WANTED
 from zsched.errors import AdapterError
 from zsched.lab.testbed import Testbed, echo_fleet
+from zsched.runtime.descriptors import WANTED
+from zsched.sessions import config as zenoh_config
 
 SPARE = 12
 """Descriptors that the process has left when the strangers come."""

@@ -9,8 +9,8 @@ import pytest
 import zenoh
 
 from support.sessions import matches
-from zsched.core.books import unaccounted
-from zsched.core.plan import StreamCount
+from zsched.core.hop.books import unaccounted
+from zsched.core.values.plan import StreamCount
 from zsched.lab.testbed import TASK, Testbed, echo_fleet
 
 WORKER = Path(__file__).with_name("slow_echo.py")

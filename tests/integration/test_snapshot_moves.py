@@ -14,10 +14,10 @@ import pytest
 import zenoh
 
 from support.waiting import free_endpoint, until
-from zsched import wire
-from zsched.core.plan import Role, WorkerRole
-from zsched.keyspace import Keyspace
-from zsched.zenoh_config import data_config, worker_config
+from zsched.core.values.plan import Role, WorkerRole
+from zsched.sessions.config import data_config, worker_config
+from zsched.wire import codec as wire
+from zsched.wire.keyspace import Keyspace
 
 TASK, FLEET = "sum", "test"
 KEYS = Keyspace(FLEET)

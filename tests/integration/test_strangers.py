@@ -16,14 +16,14 @@ from typing import Any
 import pytest
 import zenoh
 
-from zsched import wire
-from zsched.core.messages import Learnt
-from zsched.core.model import Allocation, Beat, NodeId, Profile
-from zsched.core.plan import Role, WorkerRole
-from zsched.core.relay_protocol import EndMarker, StreamAck, StreamAcks
-from zsched.keyspace import END_CHUNK, Keyspace
+from zsched.core.values.messages import Learnt
+from zsched.core.values.model import Allocation, Beat, NodeId, Profile
+from zsched.core.values.plan import Role, WorkerRole
+from zsched.core.values.relay_protocol import EndMarker, StreamAck, StreamAcks
+from zsched.ipc.pipe import encode_end
 from zsched.lab.testbed import TASK, Testbed, echo_fleet
-from zsched.relay_pipe import encode_end
+from zsched.wire import codec as wire
+from zsched.wire.keyspace import END_CHUNK, Keyspace
 
 KEYS = Keyspace("testbed")
 FAR = 10**6

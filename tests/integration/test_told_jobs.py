@@ -13,9 +13,9 @@ from typing import Any
 
 import pytest
 
-from zsched.core.demand import Demands
-from zsched.core.fleet import Demand, TaskSpec
-from zsched.core.model import Jobs, Profile, Tuning, Weights, WorkerLoad, WorkerState
+from zsched.core.gateway.demand import Demands
+from zsched.core.values.fleet import Demand, TaskSpec
+from zsched.core.values.model import Jobs, Profile, Tuning, Weights, WorkerLoad, WorkerState
 from zsched.lab.testbed import TASK, Testbed, echo_fleet
 
 WORKER = Path(__file__).with_name("busy_echo.py")

@@ -10,7 +10,7 @@ import pytest
 
 from zsched.lab.netbed import descendants_running
 from zsched.lab.testbed import Testbed, echo_fleet
-from zsched.zenoh_config import TX_THREADS, pool_threads, runtime_pools
+from zsched.sessions.config import TX_THREADS, pool_threads, runtime_pools
 
 NODES, TASKS = 2, 1
 

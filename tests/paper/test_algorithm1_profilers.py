@@ -7,10 +7,10 @@ import math
 
 import pytest
 
-from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing
-from zsched.core.gateway import Gateway
-from zsched.core.model import DeviceSample, LinkSample, LinkSource, NodeKind, Profile, Tuning, Weights
-from zsched.core.profile import Profiler
+from zsched.core.gateway.gateway import Gateway
+from zsched.core.profile.profile import Profiler
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing
+from zsched.core.values.model import DeviceSample, LinkSample, LinkSource, NodeKind, Profile, Tuning, Weights
 
 TIMING = Timing()
 FLEET = Fleet(

@@ -8,11 +8,14 @@ from random import Random
 
 import pytest
 
-from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.gateway import Gateway
+from zsched.core.gateway.gateway import Gateway
 from zsched.core.instructions import AskUtilities, Instruction, PublishProposal
-from zsched.core.messages import Utilities
-from zsched.core.model import (
+from zsched.core.scheduler.judge import Judge, Outcome
+from zsched.core.scheduler.rounds import Rounds
+from zsched.core.scheduler.scoring import compare, pick, score
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.messages import Utilities
+from zsched.core.values.model import (
     Allocation,
     Link,
     LinkSource,
@@ -27,9 +30,6 @@ from zsched.core.model import (
     WorkerLoad,
     WorkerState,
 )
-from zsched.core.rounds import Rounds
-from zsched.core.scheduler import Judge, Outcome
-from zsched.core.scoring import compare, pick, score
 
 BOTH = Weights(cpu=0.5, memory=0.5, network=0.0)
 TUNING = Tuning(weights=BOTH)

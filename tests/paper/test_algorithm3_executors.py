@@ -7,11 +7,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from random import Random
 
-from zsched.core.executor import Executor, Phase
-from zsched.core.fleet import Fleet, NodeSpec, StreamRule, TaskSpec, Timing, WorkerSpec
-from zsched.core.gateway import Gateway
+from zsched.core.executor.handover import Executor, Phase
+from zsched.core.gateway.gateway import Gateway
 from zsched.core.instructions import ApplyRoutes, AskUtilities, Instruction, PublishProposal, StartWorker, StopWorker
-from zsched.core.model import (
+from zsched.core.profile.profile import Profiler
+from zsched.core.scheduler.rounds import Rounds
+from zsched.core.values.fleet import Fleet, NodeSpec, StreamRule, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.model import (
     Allocation,
     DeviceSample,
     LinkSample,
@@ -23,11 +25,9 @@ from zsched.core.model import (
     Weights,
     WorkerState,
 )
-from zsched.core.plan import Direction, RoutePhase, RoutePlan
-from zsched.core.profile import Profiler
-from zsched.core.register import MoveOwner, Retune
-from zsched.core.rounds import Rounds
-from zsched.core.vote import Tally, VoteOutcome, tally
+from zsched.core.values.plan import Direction, RoutePhase, RoutePlan
+from zsched.core.vote.register import MoveOwner, Retune
+from zsched.core.vote.tally import Tally, VoteOutcome, tally
 
 ROBOTS = ("robot1", "robot2", "robot3")
 TUNING = Tuning(weights=Weights(cpu=0.0, memory=0.0, network=1.0))

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import pytest
 
-from zsched.core.fleet import LinkLimits, Reach, TaskSpec
-from zsched.core.model import Aggregate, Allocation, Tuning, Utility, UtilityVector, Weights
-from zsched.core.scoring import Standing, compare, pick
-from zsched.core.utility import cpu_utility, memory_utility, network_utility, predicted_use, total_utility
+from zsched.core.scheduler.scoring import Standing, compare, pick
+from zsched.core.scheduler.utility import cpu_utility, memory_utility, network_utility, predicted_use, total_utility
+from zsched.core.values.fleet import LinkLimits, Reach, TaskSpec
+from zsched.core.values.model import Aggregate, Allocation, Tuning, Utility, UtilityVector, Weights
 
 ALL = frozenset({"cpu", "memory", "network"})
 LIMITS = LinkLimits()

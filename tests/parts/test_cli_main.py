@@ -12,12 +12,12 @@ import pytest
 from typer.testing import CliRunner
 
 from support.waiting import until
-from zsched.adapters.state_file import StateFile
+from zsched.adapters.host.state_file import StateFile
 from zsched.cli import app
 from zsched.errors import AdapterError
 from zsched.lab.testbed import Testbed, echo_fleet
 
-MAIN = "from zsched.cli_main import main; main()"
+MAIN = "from zsched.__main__ import main; main()"
 INTERRUPTED = """
 import sys
 class Finder:

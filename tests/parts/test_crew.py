@@ -11,16 +11,16 @@ from pathlib import Path
 import pytest
 
 from support.waiting import until
-from zsched import crew as crew_module
-from zsched.adapters.worker_supervisor import WorkerContext, WorkerSupervisor
+from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
 from zsched.core import events as ev
-from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.model import MAX_REASON, WAS_READY, NodeKind, Tuning, Weights, WorkerState, told_of_worker
-from zsched.core.plan import ReadyWhen
-from zsched.core.relay_protocol import WorkerMatched, WorkerSeen, WorkerTrouble
-from zsched.crew import OTHERS, Crew
-from zsched.daemon_sessions import SessionsRead
-from zsched.zenoh_config import worker_config
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.model import MAX_REASON, WAS_READY, NodeKind, Tuning, Weights, WorkerState, told_of_worker
+from zsched.core.values.plan import ReadyWhen
+from zsched.core.values.relay_protocol import WorkerMatched, WorkerSeen, WorkerTrouble
+from zsched.runtime import crew as crew_module
+from zsched.runtime.crew import OTHERS, Crew
+from zsched.runtime.sessions import SessionsRead
+from zsched.sessions.config import worker_config
 
 SLEEPER = ("python", "-c", "import time; time.sleep(600)")
 TUNING = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))

@@ -23,23 +23,23 @@ import zenoh
 from support.sessions import matches
 from support.waiting import until
 from zsched import daemon
-from zsched.adapters.operator_socket import ask
-from zsched.adapters.state_file import StateFile
+from zsched.adapters.host.operator_socket import ask
+from zsched.adapters.host.state_file import StateFile
 from zsched.clock import ClockWatch, Drift
 from zsched.core import events as ev
-from zsched.core.clocks import is_bad
-from zsched.core.fleet import Fleet, NodeSpec, Timing
-from zsched.core.model import NodeKind
+from zsched.core.values.fleet import Fleet, NodeSpec, Timing
+from zsched.core.values.model import NodeKind
+from zsched.core.vote.clocks import is_bad
 from zsched.daemon import EXIT_CONFIG, EXIT_FAILED, EXIT_OK
-from zsched.daemon_endpoints import MAX_PORT, MIN_PORT, PORT_RANGE, Endpoints, endpoints_for, free_port, is_here
-from zsched.daemon_sampler import Sampler
 from zsched.errors import AdapterError
-from zsched.keyspace import Keyspace
 from zsched.lab.testbed import echo_fleet
 from zsched.log_limit import BURST, RATE_HZ
-from zsched.places import socket_path
-from zsched.shell import Inbox
-from zsched.zenoh_config import worker_config
+from zsched.paths import socket_path
+from zsched.runtime.endpoints import MAX_PORT, MIN_PORT, PORT_RANGE, Endpoints, endpoints_for, free_port, is_here
+from zsched.runtime.sampler import Sampler
+from zsched.runtime.shell import Inbox
+from zsched.sessions.config import worker_config
+from zsched.wire.keyspace import Keyspace
 
 Json = dict[str, Any]
 

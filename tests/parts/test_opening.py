@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import pytest
 import zenoh
 
-from zsched.opening import why_not_open
-from zsched.zenoh_config import client_config, data_config
+from zsched.sessions.config import client_config, data_config
+from zsched.sessions.problems import why_not_open
 
 
 @pytest.fixture

@@ -12,14 +12,14 @@ import zenoh
 
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import until
-from zsched import wire
-from zsched.core.plan import Direction, HandoverRule, Route, StreamClass, StreamSettings
-from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks
-from zsched.keyspace import AGAIN_CHUNK, END_CHUNK, Keyspace
+from zsched.core.values.plan import Direction, HandoverRule, Route, StreamClass, StreamSettings
+from zsched.core.values.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks
+from zsched.ipc.pipe import encode_end
 from zsched.relay import answers
 from zsched.relay.acks import Acks
 from zsched.relay.outputs import OutputStream
-from zsched.relay_pipe import encode_end
+from zsched.wire import codec as wire
+from zsched.wire.keyspace import AGAIN_CHUNK, END_CHUNK, Keyspace
 
 KEY = "edge1/t/1/out"
 

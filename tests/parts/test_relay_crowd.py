@@ -10,10 +10,10 @@ import pytest
 import zenoh
 
 from support.waiting import free_endpoint, until
-from zsched.link_sockets import LinkSocket, LinkSockets
 from zsched.relay import crowd
 from zsched.relay.crowd import FITS_BYTES, MAX_REST_S, REST_S, Reader, note_feeder
-from zsched.zenoh_config import client_config, data_config
+from zsched.sessions.config import client_config, data_config
+from zsched.sessions.link_sockets import LinkSocket, LinkSockets
 
 NOW = 100.0
 

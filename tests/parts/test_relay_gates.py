@@ -13,16 +13,16 @@ import zenoh
 
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import between, free_endpoint, until
-from zsched import send_queue
-from zsched.core.books import unaccounted
-from zsched.core.plan import Direction, HandoverRule, Route, StreamClass, StreamSettings
-from zsched.core.relay_protocol import EndMarker
-from zsched.keyspace import END_CHUNK
+from zsched.core.hop.books import unaccounted
+from zsched.core.values.plan import Direction, HandoverRule, Route, StreamClass, StreamSettings
+from zsched.core.values.relay_protocol import EndMarker
+from zsched.ipc.pipe import decode_end, encode_end
 from zsched.relay import outlet, outputs, receive, slots
 from zsched.relay.inputs import InputStream
 from zsched.relay.outputs import OutputStream
-from zsched.relay_pipe import decode_end, encode_end
-from zsched.zenoh_config import worker_config
+from zsched.sessions import send_queue
+from zsched.sessions.config import worker_config
+from zsched.wire.keyspace import END_CHUNK
 
 
 @dataclass

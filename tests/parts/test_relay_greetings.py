@@ -11,15 +11,15 @@ import zenoh
 
 from support.sessions import hub_and_neighbour
 from support.waiting import until
-from zsched import wire
-from zsched.core.plan import OnCrash, StreamClass, StreamSettings
-from zsched.core.relay_protocol import EndMarker, StreamAck, StreamAcks
-from zsched.keyspace import END_CHUNK, Keyspace
+from zsched.core.values.plan import OnCrash, StreamClass, StreamSettings
+from zsched.core.values.relay_protocol import EndMarker, StreamAck, StreamAcks
+from zsched.ipc.pipe import decode_end
 from zsched.relay import greetings
 from zsched.relay.acks import Acks
 from zsched.relay.outlet import Outlet
 from zsched.relay.proofs import LeftOpen
-from zsched.relay_pipe import decode_end
+from zsched.wire import codec as wire
+from zsched.wire.keyspace import END_CHUNK, Keyspace
 
 KEYS = Keyspace("t")
 RELIABLE = StreamSettings(stream_class=StreamClass.RELIABLE, depth=100)

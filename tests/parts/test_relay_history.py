@@ -16,12 +16,12 @@ from zenoh import ext
 
 from support.sessions import matches
 from support.waiting import free_endpoint, until
-from zsched.core.fleet import Timing
-from zsched.core.plan import StreamClass, StreamSettings
+from zsched.core.values.fleet import Timing
+from zsched.core.values.plan import StreamClass, StreamSettings
 from zsched.relay import history
 from zsched.relay.questions import Question, Questions
 from zsched.relay.receive import Receiver
-from zsched.zenoh_config import data_config, worker_config
+from zsched.sessions.config import data_config, worker_config
 
 KEY = "robot1/map"
 QUERY_S = 90.0

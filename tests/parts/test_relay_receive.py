@@ -9,7 +9,7 @@ import zenoh
 
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import until
-from zsched.core.plan import StreamClass, StreamSettings
+from zsched.core.values.plan import StreamClass, StreamSettings
 from zsched.relay import receive
 from zsched.relay.receive import Receiver
 

@@ -9,14 +9,14 @@ import zenoh
 
 from support.sessions import hub_and_neighbour
 from support.waiting import until
-from zsched.core.fleet import LocalMode, LocalSide
-from zsched.core.plan import Direction, Route, StreamClass, StreamSettings
-from zsched.keyspace import END_CHUNK
+from zsched.core.values.fleet import LocalMode, LocalSide
+from zsched.core.values.plan import Direction, Route, StreamClass, StreamSettings
+from zsched.ipc.pipe import decode_end
 from zsched.relay import outlet
 from zsched.relay.inputs import InputStream
 from zsched.relay.outputs import OutputStream
-from zsched.relay_pipe import decode_end
-from zsched.zenoh_config import local_config
+from zsched.sessions.config import local_config
+from zsched.wire.keyspace import END_CHUNK
 
 SENSORS = ("front/scan", "rear/scan", "imu")
 

@@ -12,13 +12,12 @@ from typing import Any, cast
 import pytest
 
 from support.waiting import until
-from zsched import shell as shell_module
-from zsched.adapters.state_file import StateFile
-from zsched.adapters.worker_supervisor import WorkerContext, WorkerSupervisor
+from zsched.adapters.host.state_file import StateFile
+from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.fleet import WorkerSpec
-from zsched.core.messages import (
+from zsched.core.values.fleet import WorkerSpec
+from zsched.core.values.messages import (
     Accept,
     Accepted,
     CommandOutcome,
@@ -28,7 +27,7 @@ from zsched.core.messages import (
     SetWeights,
     Utilities,
 )
-from zsched.core.model import (
+from zsched.core.values.model import (
     Acceptance,
     Allocation,
     Ballot,
@@ -40,10 +39,11 @@ from zsched.core.model import (
     Weights,
     WorkerState,
 )
-from zsched.core.plan import Role, RoutePhase, RoutePlan, WorkerRole
-from zsched.core.relay_protocol import RelayStarted, WorkerSeen
+from zsched.core.values.plan import Role, RoutePhase, RoutePlan, WorkerRole
+from zsched.core.values.relay_protocol import RelayStarted, WorkerSeen
 from zsched.errors import AdapterError, WireError
-from zsched.shell import INBOX_LIMIT, LOCAL_REQUESTS_FROM, PROBLEM_TTL_S, WAITING_LIMIT, Desk, Inbox, Shell
+from zsched.runtime import shell as shell_module
+from zsched.runtime.shell import INBOX_LIMIT, LOCAL_REQUESTS_FROM, PROBLEM_TTL_S, WAITING_LIMIT, Desk, Inbox, Shell
 
 TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
 BALLOT = Ballot(counter=1, node="robot1", incarnation=1)

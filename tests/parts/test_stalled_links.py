@@ -1,4 +1,4 @@
-"""`zsched.stalled_links`: a put that waits for a receiver that is frozen is let go, and nobody else's link ends."""
+"""`zsched.sessions.stalled_links`: a put that waits for a frozen receiver is let go, and nobody else's link ends."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from support.hand_relay import INPUT, KEYS, Relay, environment
 from support.sessions import hub_and_neighbour
 from support.waiting import free_endpoint, until, within
 from zsched.clock import monotonic_s
-from zsched.core.plan import StreamClass, StreamSettings, WorkerRole
+from zsched.core.values.plan import StreamClass, StreamSettings, WorkerRole
 from zsched.relay.acks import Acks
 from zsched.relay.outlet import Outlet
-from zsched.stalled_links import StalledLinks
+from zsched.sessions.config import worker_config
+from zsched.sessions.stalled_links import StalledLinks
 from zsched.worker import Worker
-from zsched.zenoh_config import worker_config
 
 OUT = "edge1/t/1/shared/out"
 LISTENER = """

@@ -18,16 +18,18 @@ import zenoh
 
 from support.hand_relay import INPUT, KEYS, ROLE_KEY, Relay, environment
 from support.waiting import free_endpoint, until, within
-from zsched import wire, worker_backlog, worker_inputs
 from zsched.clock import monotonic_s
-from zsched.core.plan import Role, WorkerRole
-from zsched.core.relay_protocol import EndMarker, StreamAck, StreamAcks
+from zsched.core.values.plan import Role, WorkerRole
+from zsched.core.values.relay_protocol import EndMarker, StreamAck, StreamAcks
 from zsched.errors import ConfigError
-from zsched.keyspace import END_CHUNK
-from zsched.relay_pipe import encode_end
+from zsched.ipc.pipe import encode_end
+from zsched.sessions.config import data_config, worker_config
+from zsched.wire import codec as wire
+from zsched.wire.keyspace import END_CHUNK
 from zsched.worker import Output, Received, Worker
-from zsched.worker_backlog import MAX_WITHHELD
-from zsched.zenoh_config import data_config, worker_config
+from zsched.worker import backlog as worker_backlog
+from zsched.worker import inputs as worker_inputs
+from zsched.worker.backlog import MAX_WITHHELD
 
 
 class Echo:

@@ -11,13 +11,13 @@ import zenoh
 
 from support.hand_relay import KEYS, Relay, environment
 from support.waiting import until, within
-from zsched import wire
 from zsched.clock import monotonic_s
-from zsched.core.plan import WorkerRole
-from zsched.core.relay_protocol import StreamAck, StreamAcks
-from zsched.keyspace import AGAIN_CHUNK
+from zsched.core.values.plan import WorkerRole
+from zsched.core.values.relay_protocol import StreamAck, StreamAcks
+from zsched.wire import codec as wire
+from zsched.wire.keyspace import AGAIN_CHUNK
 from zsched.worker import Output, Received, Worker
-from zsched.worker_lanes import STALLED_S
+from zsched.worker.lanes import STALLED_S
 
 OUT = "edge1/t/1/shared/out"
 

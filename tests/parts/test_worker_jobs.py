@@ -12,16 +12,16 @@ import pytest
 
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import until
-from zsched import wire
 from zsched.core.events import FrameDropped, WorkerJobs
-from zsched.core.relay_protocol import WorkerTrouble
-from zsched.hop_acks import Acknowledger
-from zsched.keyspace import Keyspace
+from zsched.core.values.relay_protocol import WorkerTrouble
+from zsched.hop.acknowledger import Acknowledger
 from zsched.relay.troubles import PAUSE_S, Troubles, Word
-from zsched.worker_debts import Debts
-from zsched.worker_inputs import Dispatcher
-from zsched.worker_jobs import TELL_S, JobBook, JobTimer
-from zsched.worker_samples import Input, Received
+from zsched.wire import codec as wire
+from zsched.wire.keyspace import Keyspace
+from zsched.worker.debts import Debts
+from zsched.worker.inputs import Dispatcher
+from zsched.worker.jobs import TELL_S, JobBook, JobTimer
+from zsched.worker.samples import Input, Received
 
 KEYS = Keyspace("test")
 WORD = WorkerJobs(task="t", incarnation="7", at_s=3.0, done=4)
@@ -191,7 +191,7 @@ def test_the_relay_hands_on_every_worker_s_word_and_counts_garbage() -> None:
 
 @pytest.mark.parametrize("incarnation", ["7", "8"])
 def test_only_the_running_worker_s_word_is_believed(incarnation: str) -> None:
-    from zsched.crew import Crew
+    from zsched.runtime.crew import Crew
 
     crew = Crew(lambda _event: None)
     crew.on_started("t", 4711, 7)

@@ -11,15 +11,17 @@ import zenoh
 
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import until
-from zsched import wire, worker_keep, worker_lanes
-from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks
-from zsched.hop_acks import Acknowledger
-from zsched.keyspace import AGAIN_CHUNK, END_CHUNK, Keyspace
-from zsched.relay_pipe import decode_end
-from zsched.stalled_links import StalledLinks
-from zsched.worker_debts import Debts
-from zsched.worker_keep import Keeper
-from zsched.worker_lanes import KeptLane
+from zsched.core.values.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks
+from zsched.hop.acknowledger import Acknowledger
+from zsched.ipc.pipe import decode_end
+from zsched.sessions.stalled_links import StalledLinks
+from zsched.wire import codec as wire
+from zsched.wire.keyspace import AGAIN_CHUNK, END_CHUNK, Keyspace
+from zsched.worker import keep as worker_keep
+from zsched.worker import lanes as worker_lanes
+from zsched.worker.debts import Debts
+from zsched.worker.keep import Keeper
+from zsched.worker.lanes import KeptLane
 
 KEY = "edge1/t/1/out"
 KEYS = Keyspace("t")

@@ -11,13 +11,13 @@ import zenoh
 
 from support.sessions import opened
 from support.waiting import free_endpoint, until
-from zsched import wire
-from zsched.core.plan import Role, WorkerRole
-from zsched.keyspace import Keyspace
+from zsched.core.values.plan import Role, WorkerRole
 from zsched.relay.roles import RoleServer
-from zsched.worker_roles import RoleWatch
-from zsched.worker_start import relay_endpoint
-from zsched.zenoh_config import data_config, worker_config
+from zsched.sessions.config import data_config, worker_config
+from zsched.wire import codec as wire
+from zsched.wire.keyspace import Keyspace
+from zsched.worker.roles import RoleWatch
+from zsched.worker.start import relay_endpoint
 
 KEYS = Keyspace("test")
 KEY = KEYS.role("edge1", "task")

@@ -15,12 +15,12 @@ from hypothesis import strategies as st
 
 from support.sessions import opened
 from support.waiting import free_endpoint, until
-from zsched import worker_snapshot
-from zsched.core.plan import Role, WorkerRole
-from zsched.core.relay_protocol import SnapshotChunk
-from zsched.relay_pipe import encode_chunk
-from zsched.worker_snapshot import CHUNK, MAX_SNAPSHOT, Assembly, Offer, Restorer, StateLink, chunks, fetch
-from zsched.zenoh_config import data_config, worker_config
+from zsched.core.values.plan import Role, WorkerRole
+from zsched.core.values.relay_protocol import SnapshotChunk
+from zsched.ipc.pipe import encode_chunk
+from zsched.sessions.config import data_config, worker_config
+from zsched.worker import snapshot as worker_snapshot
+from zsched.worker.snapshot import CHUNK, MAX_SNAPSHOT, Assembly, Offer, Restorer, StateLink, chunks, fetch
 
 PATIENCE_S = 60.0
 KEY = "@zsched/test/snapshot/edge1/task"

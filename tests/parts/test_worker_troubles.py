@@ -11,19 +11,19 @@ import zenoh
 
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import until
-from zsched import wire
 from zsched.core.events import FrameDropped
-from zsched.core.model import MAX_REASON
-from zsched.core.relay_protocol import WorkerTrouble
-from zsched.hop_acks import Acknowledger
-from zsched.keyspace import Keyspace
+from zsched.core.values.model import MAX_REASON
+from zsched.core.values.relay_protocol import WorkerTrouble
+from zsched.hop.acknowledger import Acknowledger
 from zsched.relay.troubles import Troubles as Heard
 from zsched.relay.troubles import Word
-from zsched.worker_debts import Debts
-from zsched.worker_inputs import Dispatcher
-from zsched.worker_jobs import JobBook
-from zsched.worker_samples import Input, Received
-from zsched.worker_troubles import MAX_KINDS, Troubles
+from zsched.wire import codec as wire
+from zsched.wire.keyspace import Keyspace
+from zsched.worker.debts import Debts
+from zsched.worker.inputs import Dispatcher
+from zsched.worker.jobs import JobBook
+from zsched.worker.samples import Input, Received
+from zsched.worker.troubles import MAX_KINDS, Troubles
 
 KEYS = Keyspace("test")
 

@@ -59,7 +59,7 @@ def test_processes_that_a_test_starts_have_the_bug_too(tmp_path: Path, monkeypat
     monkeypatch.chdir(ROOT)
     monkeypatch.setenv("PYTHONPATH", "")
     (bug,) = [bug for bug in STREAM_BUGS if bug.name == "numbers are compared without their wrap"]
-    code = "from zsched.core.serial import number_near; print(number_near(2, 2**32 - 1))"
+    code = "from zsched.core.hop.serial import number_near; print(number_near(2, 2**32 - 1))"
     command = [sys.executable, "-c", code]
     sound = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=110, check=True).stdout
     for_children(bug, tmp_path)
@@ -83,7 +83,7 @@ def test_a_bug_whose_text_is_gone_says_so() -> None:
 
 
 def test_a_module_that_is_already_there_cannot_be_planted() -> None:
-    from zsched.core.register import Register
+    from zsched.core.vote.register import Register
 
     assert Register.__module__ == HARMLESS.module
     with pytest.raises(PlantError, match="imported already"):
@@ -99,6 +99,6 @@ def test_table_names_survivors() -> None:
             Verdict(bug=BUGS[2], found_by=failed, seconds=3.0),
         ]
     ).splitlines()[2:]
-    assert rows[0] == "| quorum off by one | `core/scoring.py` | seed 1: x | 1.0 |"
+    assert rows[0] == "| quorum off by one | `core/scheduler/scoring.py` | seed 1: x | 1.0 |"
     assert "**survived**" in rows[1]
     assert "| `test_a_rule` |" in rows[2]

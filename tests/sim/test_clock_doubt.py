@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import pytest
 
-from zsched.core.clocks import DOUBT_S, JUMP_S, ClockDoubt
 from zsched.core.events import ClockCompared
-from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.lease import RHO, Leases, hold_s
-from zsched.core.model import Allocation, Beat, Grant, NodeKind, Tuning, Weights, WorkerState
-from zsched.core.plan import WorkerRole
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.model import Allocation, Beat, Grant, NodeKind, Tuning, Weights, WorkerState
+from zsched.core.values.plan import WorkerRole
+from zsched.core.vote.clocks import DOUBT_S, JUMP_S, ClockDoubt
+from zsched.core.vote.lease import RHO, Leases, hold_s
 from zsched.lab.sim_clocks import LOOK_S, slew
 from zsched.lab.simulator import Simulator
 

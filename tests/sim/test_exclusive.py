@@ -10,10 +10,10 @@ from random import Random
 import pytest
 
 from zsched.core.events import BeatReceived
-from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.lease import hold_s
-from zsched.core.model import Beat, NodeId, NodeKind, Tuning, Weights
-from zsched.core.plan import WorkerRole
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.model import Beat, NodeId, NodeKind, Tuning, Weights
+from zsched.core.values.plan import WorkerRole
+from zsched.core.vote.lease import hold_s
 from zsched.lab.simulator import CORES, Simulator
 
 TASK = "merge"

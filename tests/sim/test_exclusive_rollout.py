@@ -8,9 +8,9 @@ import pytest
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.model import DurableState, NodeId, NodeKind, Tuning, Weights
-from zsched.core.plan import WorkerRole
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.model import DurableState, NodeId, NodeKind, Tuning, Weights
+from zsched.core.values.plan import WorkerRole
 from zsched.lab.sim_parts import Machine
 from zsched.lab.simulator import CORES, Simulator
 

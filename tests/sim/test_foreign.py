@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.model import NodeKind, Tuning, Weights
-from zsched.core.plan import ReadyWhen
 from zsched.core.status import build_snapshot
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.model import NodeKind, Tuning, Weights
+from zsched.core.values.plan import ReadyWhen
 from zsched.lab.sim_swarm import plan
 from zsched.lab.simulator import Simulator
 

@@ -8,9 +8,9 @@ import pytest
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.belief import GENERATION_STEP, MAX_GENERATION
-from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.model import NodeId, NodeKind, Tuning, Weights
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.model import NodeId, NodeKind, Tuning, Weights
+from zsched.core.vote.belief import GENERATION_STEP, MAX_GENERATION
 from zsched.lab.simulator import Simulator
 
 TASK = "merge"

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from zsched.core.fleet import Fleet, NodeSpec, OnIsolation, TaskSpec, Timing, WorkerSpec
-from zsched.core.model import NodeKind, Tuning, Weights
-from zsched.core.plan import WorkerRole
 from zsched.core.status import build_snapshot
+from zsched.core.values.fleet import Fleet, NodeSpec, OnIsolation, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.model import NodeKind, Tuning, Weights
+from zsched.core.values.plan import WorkerRole
 from zsched.lab.simulator import Simulator
 
 TASK = "merge"

@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import pytest
 
-from zsched.core.executor import Executor
-from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, lease_terms
+from zsched.core.executor.handover import Executor
+from zsched.core.executor.tenure import Tenure
 from zsched.core.instructions import SetRole
-from zsched.core.lease import RHO, SENT_KEPT, Granter, Holder, Leases, hold_s
-from zsched.core.model import Allocation, Beat, Grant, NodeKind, Tuning, Weights
-from zsched.core.plan import WorkerRole
-from zsched.core.tenure import Tenure
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, lease_terms
+from zsched.core.values.model import Allocation, Beat, Grant, NodeKind, Tuning, Weights
+from zsched.core.values.plan import WorkerRole
+from zsched.core.vote.lease import RHO, SENT_KEPT, Granter, Holder, Leases, hold_s
 
 LEASE_S, HOLD_S = 1.0, hold_s(1.0)
 ELECTORS = ("r1", "r2", "r3")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from zsched.core import events as ev
-from zsched.core.model import PeerState
+from zsched.core.values.model import PeerState
 from zsched.lab.sim_swarm import plan
 from zsched.lab.simulator import Simulator
 

@@ -7,12 +7,21 @@ from random import Random
 
 import pytest
 
-from zsched.core.agreement import Agreement
 from zsched.core.events import AcceptAsked, PrepareAsked
-from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, electorate_hash
-from zsched.core.messages import Accept, Accepted, Prepare, Promise
-from zsched.core.model import Acceptance, Allocation, Ballot, DurableState, NodeKind, RegisterState, Tuning, Weights
-from zsched.core.register import MoveOwner, Register, Step
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, electorate_hash
+from zsched.core.values.messages import Accept, Accepted, Prepare, Promise
+from zsched.core.values.model import (
+    Acceptance,
+    Allocation,
+    Ballot,
+    DurableState,
+    NodeKind,
+    RegisterState,
+    Tuning,
+    Weights,
+)
+from zsched.core.vote.agreement import Agreement
+from zsched.core.vote.register import MoveOwner, Register, Step
 
 ELECTORS = ("r1", "r2", "r3")
 INITIAL = Allocation(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from zsched.core.timing import PROFILES
+from zsched.config.timing import PROFILES
 from zsched.lab.sim_faults import play
 from zsched.lab.sim_rest import AT_MOST_S, FEWEST, QUANTILES_S, quantile, spread, too_slow
 from zsched.lab.sim_swarm import plan

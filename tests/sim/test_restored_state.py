@@ -8,10 +8,10 @@ import pytest
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.messages import Learnt
-from zsched.core.model import Beat, DurableState, NodeId, NodeKind, Tuning, Weights
-from zsched.core.witness import ASK_ALL_S, Witness
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.messages import Learnt
+from zsched.core.values.model import Beat, DurableState, NodeId, NodeKind, Tuning, Weights
+from zsched.core.vote.witness import ASK_ALL_S, Witness
 from zsched.lab.simulator import CORES, Simulator
 
 TASK = "merge"

@@ -20,9 +20,9 @@ from random import Random
 import pytest
 
 from zsched.core import events as ev
-from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.messages import SetWeights
-from zsched.core.model import NodeKind, Tuning, Weights
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.messages import SetWeights
+from zsched.core.values.model import NodeKind, Tuning, Weights
 from zsched.lab.simulator import CORES, Simulator
 
 FOLDER = Path(__file__).parent / "scenarios"

@@ -7,8 +7,8 @@ from random import Random
 
 import pytest
 
-from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.model import NodeId, NodeKind, PeerState, Tuning, Weights
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.model import NodeId, NodeKind, PeerState, Tuning, Weights
 from zsched.lab.simulator import CORES, Simulator
 
 TASK = "merge"

@@ -9,8 +9,8 @@ from random import Random
 
 import pytest
 
-from zsched.core.beat_room import MAX_BEAT_BYTES, most_bytes
-from zsched.core.register import Register
+from zsched.core.membership.beat_room import MAX_BEAT_BYTES, most_bytes
+from zsched.core.vote.register import Register
 from zsched.errors import InvariantError
 from zsched.lab import simulate
 from zsched.lab.sim_checks import DisagreementError

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from functools import partial
 
-from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.model import NodeKind, Tuning, Weights
 from zsched.core.status import build_snapshot
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.model import NodeKind, Tuning, Weights
 from zsched.lab.sim_parts import Machine
 from zsched.lab.simulator import Simulator
 

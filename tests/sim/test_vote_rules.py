@@ -7,11 +7,11 @@ from random import Random
 import pytest
 
 from zsched.core import events as ev
-from zsched.core.fleet import Fleet, NodeSpec, Reach, TaskSpec, Timing, WorkerSpec
-from zsched.core.gateway import Gateway
-from zsched.core.model import Allocation, NodeKind, PeerState, Proposal, Tuning, Weights
-from zsched.core.rounds import Rounds
-from zsched.core.vote import VoteOutcome, tally
+from zsched.core.gateway.gateway import Gateway
+from zsched.core.scheduler.rounds import Rounds
+from zsched.core.values.fleet import Fleet, NodeSpec, Reach, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.model import Allocation, NodeKind, PeerState, Proposal, Tuning, Weights
+from zsched.core.vote.tally import VoteOutcome, tally
 from zsched.lab.sim_swarm import plan
 from zsched.lab.simulator import Simulator
 

@@ -19,7 +19,7 @@ from itertools import pairwise
 
 import zenoh
 
-from zsched.zenoh_config import runtime_pools, worker_config
+from zsched.sessions.config import runtime_pools, worker_config
 
 PERIOD_S = 0.005
 COUPLED = "coupled"

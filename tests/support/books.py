@@ -1,4 +1,5 @@
-"""The invariant of the books at the end of a test: every sample that came in is in one counter (`zsched.core.books`).
+"""The invariant of the books at the end of a test: every sample that came in is in one counter
+(`zsched.core.hop.books`).
 
 Knows: a relay's reports. Does not know: which rig they come from.
 """
@@ -8,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 from support.waiting import until
-from zsched.core.books import unaccounted
 from zsched.core.events import StreamsCounted
-from zsched.core.plan import StreamCount
-from zsched.core.relay_protocol import HandleReport
+from zsched.core.hop.books import unaccounted
+from zsched.core.values.plan import StreamCount
+from zsched.core.values.relay_protocol import HandleReport
 
 
 def newest_counts(reports: Iterable[HandleReport]) -> tuple[StreamCount, ...]:

@@ -1,4 +1,4 @@
-"""Registers, and the messages that pass between them, for one situation at a time. Knows: `zsched.core.register`."""
+"""Registers, and the messages between them, for one situation at a time. Knows: `zsched.core.vote.register`."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from dataclasses import replace
 from random import Random
 
-from zsched.core.messages import Accept, Prepare
-from zsched.core.model import Acceptance, Allocation, Ballot, RegisterState, Tuning, Weights
-from zsched.core.register import MoveOwner, Register, Step
+from zsched.core.values.messages import Accept, Prepare
+from zsched.core.values.model import Acceptance, Allocation, Ballot, RegisterState, Tuning, Weights
+from zsched.core.vote.register import MoveOwner, Register, Step
 
 ELECTORS = ("r1", "r2", "r3")
 TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))

@@ -23,10 +23,10 @@ import zenoh
 
 from support.books import newest_counts, wait_for_balance
 from support.waiting import free_endpoint, until
-from zsched.adapters.streams import RelayHandle
+from zsched.adapters.relay.streams import RelayHandle
 from zsched.core.events import RelayChanged, SlotDrained, SlotFlipped, SlotReady
-from zsched.core.fleet import Timing
-from zsched.core.plan import (
+from zsched.core.values.fleet import Timing
+from zsched.core.values.plan import (
     Direction,
     HandoverRule,
     OnCrash,
@@ -41,8 +41,8 @@ from zsched.core.plan import (
     StreamSettings,
     WorkerRole,
 )
-from zsched.core.relay_protocol import HandleReport, WorkerSeen
-from zsched.zenoh_config import DEFAULT_TIMING, data_config, worker_config
+from zsched.core.values.relay_protocol import HandleReport, WorkerSeen
+from zsched.sessions.config import DEFAULT_TIMING, data_config, worker_config
 
 Kind = TypeVar("Kind")
 FLEET, ROBOT, TASK = "test", "robot1", "echo"
@@ -133,7 +133,7 @@ class Rig:
         """The echo worker, or the one that a ``script`` is."""
         self.incarnation += 1
         path = self.folder / f"{task}-{node}.json5"
-        # its own relay first, then the robot's, as `zsched.daemon_endpoints` has it: what is dialled is dialled again
+        # its own relay first, then the robot's, as `zsched.runtime.endpoints` has it: what is dialled is dialled again
         connect = tuple(dict.fromkeys((self.endpoint(node), self.endpoint(ROBOT))))
         text = worker_config(connect=connect, timing=self.timing, shared_memory=False, operator_json5=operator_json5)
         path.write_text(text)
@@ -188,7 +188,7 @@ class Rig:
         return next((count for count in self.counts() if count.stream == stream), StreamCount(stream=stream))
 
     def assert_nothing_is_unaccounted(self) -> None:
-        """Every sample that came in is somewhere in the counters, of every stream (`zsched.core.books`)."""
+        """Every sample that came in is somewhere in the counters, of every stream (`zsched.core.hop.books`)."""
         wait_for_balance(self.counts)
 
     def drops(self) -> Counter[str]:

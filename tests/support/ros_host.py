@@ -13,13 +13,13 @@ import zenoh
 from support.books import assert_nothing_is_unaccounted
 from support.relay_rig import Reports
 from support.waiting import free_endpoint, until
-from zsched.adapters.streams import RelayHandle
-from zsched.config import check_bytes
+from zsched.adapters.relay.streams import RelayHandle
+from zsched.config.load import check_bytes
 from zsched.core.events import RelayChanged, SlotFlipped, SlotReady
-from zsched.core.fleet import LocalSide
-from zsched.core.plan import RoutePhase, Slot
-from zsched.core.route import plan_for, slot_for
-from zsched.zenoh_config import client_config, data_config, local_config
+from zsched.core.route.route import plan_for, slot_for
+from zsched.core.values.fleet import LocalSide
+from zsched.core.values.plan import RoutePhase, Slot
+from zsched.sessions.config import client_config, data_config, local_config
 
 ROBOT = "robot1"
 
@@ -58,7 +58,7 @@ class RosHost:
         until(lambda: self.reports.find(RelayChanged, is_running=True), "the relay runs")
 
     def assert_nothing_is_unaccounted(self) -> None:
-        """Every sample that came in is somewhere in the counters, of every stream (`zsched.core.books`)."""
+        """Every sample that came in is somewhere in the counters, of every stream (`zsched.core.hop.books`)."""
         assert_nothing_is_unaccounted(self.reports.told)
 
     def move(self, owner: str) -> None:

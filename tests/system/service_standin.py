@@ -14,13 +14,13 @@ import time
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from zsched.adapters.device_profiler import DeviceProfiler
-from zsched.adapters.network_profiler import readers_for
-from zsched.adapters.state_file import StateFile
-from zsched.adapters.systemd import Notifier, watchdog_interval_s
-from zsched.adapters.worker_supervisor import WorkerContext, WorkerSupervisor
-from zsched.core.fleet import LinkSpec, NodeSpec, WorkerSpec
-from zsched.core.model import DurableState, LinkSource, NodeKind, WorkerState
+from zsched.adapters.host.state_file import StateFile
+from zsched.adapters.host.systemd import Notifier, watchdog_interval_s
+from zsched.adapters.machine.device_profiler import DeviceProfiler
+from zsched.adapters.radio.network_profiler import readers_for
+from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
+from zsched.core.values.fleet import LinkSpec, NodeSpec, WorkerSpec
+from zsched.core.values.model import DurableState, LinkSource, NodeKind, WorkerState
 
 WORKER = """
 import json, os, pathlib, subprocess, time

@@ -19,15 +19,15 @@ from pathlib import Path
 
 import pytest
 
-from zsched.adapters.operator_socket import ask
-from zsched.adapters.state_file import StateFile
+from zsched.adapters.host.operator_socket import ask
+from zsched.adapters.host.state_file import StateFile
 from zsched.clock import monotonic_s
-from zsched.core.model import NodeId
+from zsched.core.values.model import NodeId
 from zsched.lab import netns
 from zsched.lab.chaos import TWO_CLASSES
 from zsched.lab.netbed import Netbed, Probe, Received
 from zsched.lab.testbed import TASK, Json, echo_fleet
-from zsched.places import socket_path
+from zsched.paths import socket_path
 
 pytestmark = pytest.mark.root
 

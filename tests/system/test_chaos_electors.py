@@ -18,16 +18,17 @@ from pathlib import Path
 import msgpack
 import pytest
 
-from zsched import wire, zenoh_config
-from zsched.adapters.operator_socket import ask
-from zsched.core.identity import TOLD_YOUNG_S
-from zsched.core.model import Beat
-from zsched.keyspace import Keyspace
+from zsched.adapters.host.operator_socket import ask
+from zsched.core.membership.identity import TOLD_YOUNG_S
+from zsched.core.values.model import Beat
 from zsched.lab import netns
 from zsched.lab.netbed import CONTROL_PORT, Netbed, Probe
 from zsched.lab.testbed import DAEMON, TASK, Json, echo_fleet
-from zsched.lifecycle import init_state
-from zsched.places import socket_path
+from zsched.paths import socket_path
+from zsched.runtime.init import init_state
+from zsched.sessions import config as zenoh_config
+from zsched.wire import codec as wire
+from zsched.wire.keyspace import Keyspace
 
 pytestmark = pytest.mark.root
 

@@ -17,9 +17,9 @@ from pathlib import Path
 
 import pytest
 
-from zsched.adapters.cgroup import LimitedGroup
+from zsched.adapters.machine.cgroup import LimitedGroup
 from zsched.clock import monotonic_s
-from zsched.core.model import PeerState
+from zsched.core.values.model import PeerState
 from zsched.lab import netns
 from zsched.lab.chaos import GUARD, ChaosBed
 from zsched.lab.netbed import descendants, stop_group

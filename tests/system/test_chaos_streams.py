@@ -18,10 +18,10 @@ import pytest
 
 from support.waiting import within
 from zsched.clock import monotonic_s
-from zsched.core.books import given_up
-from zsched.core.fleet import Timing
-from zsched.core.model import NodeId
-from zsched.core.plan import StreamCount
+from zsched.core.hop.books import given_up
+from zsched.core.values.fleet import Timing
+from zsched.core.values.model import NodeId
+from zsched.core.values.plan import StreamCount
 from zsched.lab import netns
 from zsched.lab.chaos import ChaosBed
 from zsched.lab.netbed import Netbed, Probe, descendants_running

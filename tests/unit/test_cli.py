@@ -23,13 +23,13 @@ import typer
 from typer.testing import CliRunner, Result
 
 from support.waiting import within
-from zsched.adapters.operator_socket import OperatorSocket
+from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.cli import app
-from zsched.cli_ask import ask_door, find_door
-from zsched.cli_common import CliError, nearest
-from zsched.cli_report import render_status
-from zsched.cli_status import _fitted
-from zsched.cli_weights import parse_weights
+from zsched.commands.ask import ask_door, find_door
+from zsched.commands.common import CliError, nearest
+from zsched.commands.report import render_status
+from zsched.commands.status import _fitted
+from zsched.commands.weights import parse_weights
 
 RECORDED = Path(__file__).parent / "recorded_status"
 CLI = (sys.executable, "-m", "zsched.cli")

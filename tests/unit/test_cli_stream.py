@@ -10,11 +10,11 @@ import pytest
 from typer.testing import CliRunner
 
 from zsched.cli import app
-from zsched.cli_common import CliError
-from zsched.cli_stream import KeyStats, keys_for, rates
-from zsched.core.fleet import Fleet, LocalSide, NodeSpec, Timing
-from zsched.core.model import NodeKind
-from zsched.daemon_access import StreamAccess
+from zsched.commands.common import CliError
+from zsched.commands.stream import KeyStats, keys_for, rates
+from zsched.core.values.fleet import Fleet, LocalSide, NodeSpec, Timing
+from zsched.core.values.model import NodeKind
+from zsched.runtime.access import StreamAccess
 
 
 def stream(name: str = "merge/in/0", messages: int = 10, size: int = 100, **more: Any) -> dict[str, Any]:

@@ -11,10 +11,10 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from zsched import __version__
-from zsched.adapters import core_speed
+from zsched.adapters.machine import core_speed
 from zsched.cli import app
-from zsched.config import load_fleet
-from zsched.core.fleet import fleet_hash
+from zsched.config.load import load_fleet
+from zsched.core.values.fleet import fleet_hash
 
 RECORDED = Path(__file__).parent / "recorded_status"
 

@@ -105,7 +105,7 @@ def test_wall_time_is_rfc_3339_in_utc_with_milliseconds() -> None:
 
 
 READS_CLOCKS = {"lab", "tasks", "clock.py"}
-LAB_HELPERS = {"adapters/cgroup.py"}  # its clock bounds the removal of the lab's own groups
+LAB_HELPERS = {"adapters/machine/cgroup.py"}  # its clock bounds the removal of the lab's own groups
 
 
 def test_nothing_else_in_the_daemon_reads_a_clock() -> None:

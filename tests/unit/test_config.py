@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from zsched.config import CheckResult, check_bytes, check_file, load_fleet
-from zsched.core.fleet import (
+from zsched.config.load import CheckResult, check_bytes, check_file, load_fleet
+from zsched.core.scheduler.patience import FIRST_PATIENCE
+from zsched.core.values.fleet import (
     DEFAULT_FORESEE_S,
     PAPER_PATIENCE,
     PATIENT_BONUS,
@@ -27,9 +28,8 @@ from zsched.core.fleet import (
     electorate_hash,
     fleet_hash,
 )
-from zsched.core.model import Aggregate, LinkSource, NodeKind, Objective, ScoreForm
-from zsched.core.patience import FIRST_PATIENCE
-from zsched.core.plan import Direction, HandoverRule, ReadyWhen, StreamClass
+from zsched.core.values.model import Aggregate, LinkSource, NodeKind, Objective, ScoreForm
+from zsched.core.values.plan import Direction, HandoverRule, ReadyWhen, StreamClass
 from zsched.errors import ConfigError
 
 ROOT = Path(__file__).parents[2]
@@ -488,7 +488,8 @@ def test_electorate_hash_sees_electors_and_fleet_name_only() -> None:
 def test_hashes_are_the_same_in_another_process(tmp_path: Path) -> None:
     (tmp_path / "fleet.yaml").write_text(GOOD)
     code = (
-        "import sys; from zsched.config import load_fleet; from zsched.core.fleet import fleet_hash, electorate_hash;"
+        "import sys; from zsched.config.load import load_fleet;"
+        "from zsched.core.values.fleet import fleet_hash, electorate_hash;"
         "f = load_fleet(sys.argv[1]); print(fleet_hash(f), electorate_hash(f))"
     )
     run = [sys.executable, "-c", code, str(tmp_path / "fleet.yaml")]
@@ -730,7 +731,7 @@ tasks: {t: {candidates: [r1], weights: {cpu: 0.5, network: 0.5}}}
 
 
 def test_importing_config_loads_neither_the_yaml_reader_nor_anything_heavy() -> None:
-    code = "import sys, zsched.config; print(*sorted({name.split('.')[0] for name in sys.modules}))"
+    code = "import sys, zsched.config.load; print(*sorted({name.split('.')[0] for name in sys.modules}))"
     printed = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
     ).stdout

@@ -3,9 +3,10 @@
 from dataclasses import MISSING, fields
 from pathlib import Path
 
-from zsched.config import check_bytes
-from zsched.config_schema import LINK_LIMITS, RULE, SCHEDULING, TRACE, WORKER, reference
-from zsched.core.fleet import (
+from zsched.config.load import check_bytes
+from zsched.config.schema import LINK_LIMITS, RULE, SCHEDULING, TRACE, WORKER, reference
+from zsched.config.timing import _RELATIONS, PROFILES
+from zsched.core.values.fleet import (
     DEFAULT_FORESEE_S,
     DEFAULT_SCORE,
     PAPER_PATIENCE,
@@ -17,16 +18,15 @@ from zsched.core.fleet import (
     Timing,
     WorkerSpec,
 )
-from zsched.core.model import Tuning
-from zsched.core.plan import StreamSettings
-from zsched.core.timing import _RELATIONS, PROFILES
+from zsched.core.values.model import Tuning
+from zsched.core.values.plan import StreamSettings
 
 DOC = (Path(__file__).parents[2] / "docs" / "fleet-file.md").read_text()
 
 
 def test_reference_is_the_schemas() -> None:
     written = DOC.split("<!-- reference: begin -->\n")[1].split("<!-- reference: end -->")[0]
-    assert written == reference(), "paste the output of zsched.config_schema.reference() between the two marks"
+    assert written == reference(), "paste the output of zsched.config.schema.reference() between the two marks"
 
 
 def test_defaults_told_by_hand_are_the_classes_own() -> None:

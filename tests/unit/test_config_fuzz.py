@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from zsched.config import CheckResult, check_bytes
-from zsched.config_schema import endpoint_fault, host_fault
+from zsched.config.load import CheckResult, check_bytes
+from zsched.config.schema import endpoint_fault, host_fault
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").rglob("*.yaml"))
 SNIPPETS = (

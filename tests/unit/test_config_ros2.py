@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from zsched.config import CheckResult, check_bytes
-from zsched.core.capture import rewriter
-from zsched.core.fleet import Fleet, LocalMode, LocalSide
-from zsched.core.plan import Direction, RosGraph, StreamClass
-from zsched.core.templates import routes_for
+from zsched.config.load import CheckResult, check_bytes
+from zsched.core.route.templates import routes_for
+from zsched.core.route.wildcards import rewriter
+from zsched.core.values.fleet import Fleet, LocalMode, LocalSide
+from zsched.core.values.plan import Direction, RosGraph, StreamClass
 
 HASH = "RIHS01_8d348150c12913a31ee0ec170fbf25089e4745d17035792a1ba94d6f0bc0cfc7"
 GRID = "nav_msgs::msg::dds_::OccupancyGrid_"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from zsched.daemon_leaving import HAND_OVER_S, LEAVE_S, NOBODY_S, TWICE_S, Leaving
+from zsched.runtime.leaving import HAND_OVER_S, LEAVE_S, NOBODY_S, TWICE_S, Leaving
 
 OWNED = ("map", "plan")
 

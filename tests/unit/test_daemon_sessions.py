@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from zsched.daemon_sessions import NAME, OTHER_SETTINGS, SessionsRead, lacking
-from zsched.zenoh_config import worker_config
+from zsched.runtime.sessions import NAME, OTHER_SETTINGS, SessionsRead, lacking
+from zsched.sessions.config import worker_config
 
 ONE, TWO = "tcp/10.0.0.1:7458", "tcp/10.0.0.2:7458"
 

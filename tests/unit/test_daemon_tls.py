@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from zsched.core.fleet import Fleet, NodeSpec, Timing
-from zsched.core.model import NodeKind
-from zsched.daemon_tls import operator_json5, plain_text_problem, protocol_of
+from zsched.core.values.fleet import Fleet, NodeSpec, Timing
+from zsched.core.values.model import NodeKind
 from zsched.errors import ConfigError
+from zsched.runtime.tls import operator_json5, plain_text_problem, protocol_of
 
 FILE = "/etc/zsched/zenoh.json5"
 WHOLE = """{transport: {link: {tls: {root_ca_certificate: "a", listen_certificate: "b", listen_private_key: "c"}}}}"""

@@ -17,12 +17,13 @@ from typing import Any, Final, Union, get_args, get_origin, get_type_hints
 import pytest
 import typer.main
 
-from zsched import relay_pipe, wire  # the pipe's kinds are registered with the codec when its module is imported
 from zsched.cli import app
-from zsched.core.timing import PROFILES
-from zsched.keyspace import Keyspace
+from zsched.config.timing import PROFILES
+from zsched.ipc import pipe as relay_pipe
 from zsched.lab.planted import BUGS, places
 from zsched.lab.planted_bugs import Bug
+from zsched.wire import codec as wire  # the pipe's kinds are registered with the codec when its module is imported
+from zsched.wire.keyspace import Keyspace
 
 ROOT: Final = Path(__file__).parents[2]
 DOCS: Final = sorted(

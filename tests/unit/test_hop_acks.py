@@ -9,10 +9,10 @@ from collections.abc import Iterator
 import pytest
 
 from support.waiting import until
-from zsched import hop_acks
-from zsched.core.relay_protocol import StreamAck, StreamAcks
-from zsched.core.serial import SPAN, serial_of
-from zsched.hop_acks import Acknowledger
+from zsched.core.hop.serial import SPAN, serial_of
+from zsched.core.values.relay_protocol import StreamAck, StreamAcks
+from zsched.hop import acknowledger as hop_acks
+from zsched.hop.acknowledger import Acknowledger
 
 NAME = ("edge1/t/in", "a1", 7)
 

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import pytest
 
-from zsched import hop_acks, keyspace
 from zsched.core import sequence
+from zsched.hop import acknowledger as hop_acks
 from zsched.lab.fuzz_keys import KeyFuzz, main
 from zsched.relay import lanes, slots, tokens
+from zsched.wire import keyspace
 
 
 @pytest.mark.parametrize("seed", range(6))

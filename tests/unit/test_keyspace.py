@@ -9,7 +9,7 @@ from collections.abc import Callable
 import pytest
 import zenoh
 
-from zsched.keyspace import END_CHUNK, ROOT, Keyspace, ParsedKey, counter, parse
+from zsched.wire.keyspace import END_CHUNK, ROOT, Keyspace, ParsedKey, counter, parse
 
 KEYS = Keyspace("warehouse")
 KIND_OF = {"learnt": "allocation", "beat_in_turn": "beat", "profile_in_turn": "profile"}

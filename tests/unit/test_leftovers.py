@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from support.waiting import until
-from zsched.leftovers import GROUPS, end_all, members, own_group, spares_relay
-from zsched.relay_door import Door, Note, relays_in
+from zsched.ipc.takeover import Door, Note, relays_in
+from zsched.runtime.cleanup import GROUPS, end_all, members, own_group, spares_relay
 
 
 @pytest.mark.parametrize(

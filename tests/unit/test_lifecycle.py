@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from zsched.adapters.state_file import StateFile, hardware_id
-from zsched.config import check_bytes
-from zsched.core.belief import GENERATION_STEP, MAX_GENERATION
-from zsched.core.fleet import Fleet, electorate_hash
-from zsched.core.model import MAX_COUNTER, NO_BALLOT, DurableState, RegisterState
-from zsched.core.register import MAX_REVISION
+from zsched.adapters.host.state_file import StateFile, hardware_id
+from zsched.config.load import check_bytes
+from zsched.core.values.fleet import Fleet, electorate_hash
+from zsched.core.values.model import MAX_COUNTER, NO_BALLOT, DurableState, RegisterState
+from zsched.core.vote.belief import GENERATION_STEP, MAX_GENERATION
+from zsched.core.vote.register import MAX_REVISION
 from zsched.errors import AdapterError
-from zsched.lifecycle import init_state
+from zsched.runtime.init import init_state
 
 TEXT = b"""
 fleet: hall

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from zsched import places
-from zsched.core.model import NAME
+from zsched import paths as places
+from zsched.core.values.model import NAME
 
 Find = Callable[[Path | None, Mapping[str, str]], Path]
 GIVEN = Path("/given")

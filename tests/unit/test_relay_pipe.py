@@ -6,11 +6,21 @@ from collections.abc import Iterator
 
 import pytest
 
-from zsched import wire
-from zsched.core.plan import Direction, ReadyWhen, Role, Route, RoutePhase, RoutePlan, Slot, StreamSettings, WorkerRole
-from zsched.core.relay_protocol import EndMarker, WorkerSeen
+from zsched.core.values.plan import (
+    Direction,
+    ReadyWhen,
+    Role,
+    Route,
+    RoutePhase,
+    RoutePlan,
+    Slot,
+    StreamSettings,
+    WorkerRole,
+)
+from zsched.core.values.relay_protocol import EndMarker, WorkerSeen
 from zsched.errors import WireError
-from zsched.relay_pipe import COMMANDS, MAX_FRAME, REPORTS, decode_end, encode_end, read_frame, write_frame
+from zsched.ipc.pipe import COMMANDS, MAX_FRAME, REPORTS, decode_end, encode_end, read_frame, write_frame
+from zsched.wire import codec as wire
 
 ROUTE = Route(
     stream="t/in/0",

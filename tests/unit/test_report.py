@@ -15,11 +15,12 @@ from typing import Any
 
 import pytest
 
-from zsched.cli_page import Page, cut, memory, size, span
-from zsched.cli_report import degradations, printable, render_status
-from zsched.core.model import WAS_READY, Link, LinkSource, Tuning, Utility, Weights, WorkerLoad, WorkerState
-from zsched.core.plan import StreamCount
-from zsched.core.snapshot import (
+from zsched.commands.page import Page, cut, memory, size, span
+from zsched.commands.report import degradations, printable, render_status
+from zsched.core.report import snapshot_json
+from zsched.core.values.model import WAS_READY, Link, LinkSource, Tuning, Utility, Weights, WorkerLoad, WorkerState
+from zsched.core.values.plan import StreamCount
+from zsched.core.values.snapshot import (
     DecisionStatus,
     NodeStatus,
     PastAllocation,
@@ -28,7 +29,6 @@ from zsched.core.snapshot import (
     TaskStatus,
     VoteStatus,
 )
-from zsched.report import snapshot_json
 
 RECORDED = Path(__file__).parent / "recorded_status"
 NAMES = ("healthy", "edge", "degraded")

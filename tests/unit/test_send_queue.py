@@ -9,8 +9,8 @@ from collections.abc import Callable
 import pytest
 
 from support.waiting import until, within
-from zsched import send_queue
-from zsched.send_queue import SendQueue
+from zsched.sessions import send_queue
+from zsched.sessions.send_queue import SendQueue
 
 
 class Receiver:

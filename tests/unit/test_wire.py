@@ -16,10 +16,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from zsched import relay_pipe, wire
-from zsched.core import messages, model
-from zsched.core.beat_room import MAX_BEAT_BYTES
+from zsched.core.membership.beat_room import MAX_BEAT_BYTES
+from zsched.core.values import messages, model
 from zsched.errors import WireError
+from zsched.ipc import pipe as relay_pipe
+from zsched.wire import codec as wire
 
 GOLDEN = Path(__file__).parent / "golden"
 REASONS = {"size", "garbage", "frame", "version", "kind", "type", "missing", "range"}

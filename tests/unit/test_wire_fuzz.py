@@ -12,9 +12,9 @@ from random import Random
 import msgpack
 import pytest
 
-from zsched import wire
 from zsched.errors import WireError
 from zsched.lab.fuzz_wire import CLASSES, LAG_S, REASONS, Fuzz, damaged, main, sample
+from zsched.wire import codec as wire
 
 FRAMES, PARTS = 200_000, 8
 

@@ -8,9 +8,9 @@ from typing import cast
 import pytest
 import zenoh
 
-from zsched import worker_backlog
-from zsched.worker_backlog import QUIET_S, STALE_S, Backlog, Done
-from zsched.worker_samples import Input, KeepLast
+from zsched.worker import backlog as worker_backlog
+from zsched.worker.backlog import QUIET_S, STALE_S, Backlog, Done
+from zsched.worker.samples import Input, KeepLast
 
 
 @dataclass(frozen=True)

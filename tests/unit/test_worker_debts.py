@@ -5,10 +5,10 @@ from __future__ import annotations
 import threading
 from typing import Any, cast
 
-from zsched.core.relay_protocol import StreamAck
-from zsched.hop_acks import Acknowledger
-from zsched.worker_debts import MAX_HELD, Debts
-from zsched.worker_lanes import STALLED_S, KeptLane
+from zsched.core.values.relay_protocol import StreamAck
+from zsched.hop.acknowledger import Acknowledger
+from zsched.worker.debts import MAX_HELD, Debts
+from zsched.worker.lanes import STALLED_S, KeptLane
 
 OWN, OTHER = "aa1", "bb2"
 NAME = ("edge1/t/robot1/in", OWN, 7)

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from zsched.core.plan import Role, WorkerRole
-from zsched.worker_epochs import Epochs, lets_out
+from zsched.core.values.plan import Role, WorkerRole
+from zsched.worker.epochs import Epochs, lets_out
 
 
 def role(kind: WorkerRole, epoch: int) -> Role:

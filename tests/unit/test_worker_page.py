@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
-from zsched.core.plan import Role
+from zsched.core.values.plan import Role
 from zsched.worker import Answer, Output, Received, Request, Worker
-from zsched.worker_start import _ENVIRONMENT
+from zsched.worker.start import _ENVIRONMENT
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "worker.md").read_text(encoding="utf-8")
@@ -62,7 +62,7 @@ def test_every_field_is_there(kind: type[Any]) -> None:
 
 
 def test_every_variable_that_a_worker_is_given_is_there() -> None:
-    sources = [(ROOT / "zsched" / name).read_text() for name in ("daemon.py", "adapters/worker_supervisor.py")]
+    sources = [(ROOT / "zsched" / name).read_text() for name in ("daemon.py", "adapters/workers/supervisor.py")]
     given = {name for text in sources for name in re.findall(r'"((?:ZSCHED|ZENOH|PYTHON)\w+)": ', text)}
     named = [name.strip("`") for name, _ in rows("| variable |")]
     assert given >= set(_ENVIRONMENT)

@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 import zenoh
 
-from zsched.core.fleet import Timing, WorkerLink
-from zsched.zenoh_config import (
+from zsched.core.values.fleet import Timing, WorkerLink
+from zsched.sessions.config import (
     client_config,
     control_config,
     data_config,

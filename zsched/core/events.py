@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from zsched.core.messages import (
+from zsched.core.values.messages import (
     Accept,
     Accepted,
     Command,
@@ -21,7 +21,7 @@ from zsched.core.messages import (
     SetWeights,
     Utilities,
 )
-from zsched.core.model import (
+from zsched.core.values.model import (
     MAX_COUNTER,
     Beat,
     DeviceSample,
@@ -35,7 +35,7 @@ from zsched.core.model import (
     check_name,
     check_range,
 )
-from zsched.core.plan import StreamCount
+from zsched.core.values.plan import StreamCount
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -211,7 +211,7 @@ class WorkerJobs:
     """A worker of this node says what it has done in this life: to the relay, which hands it on.
 
     Counts and sums only rise, so a word that is lost costs nothing; means and rates are made of the differences
-    (`zsched.core.jobs`).
+    (`zsched.core.profile.jobs`).
     """
 
     task: TaskId
@@ -290,7 +290,8 @@ class SlotDrained:
 class RoleEnded:
     """This node's worker says that it does not work in ``epoch`` any more, or it is dead.
 
-    It names no stop: where it might be an earlier one's, `zsched.core.lease.Leases.on_stopped` does not believe it.
+    It names no stop: where it might be an earlier one's, `zsched.core.vote.lease.Leases.on_stopped` does not believe
+    it.
     """
 
     task: TaskId

@@ -11,10 +11,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from zsched.core.messages import Accept, Accepted, CommandResult, Learnt, Prepare, Promise, Refused, Utilities
-from zsched.core.model import Beat, DurableState, NodeId, Profile, Proposal, TaskId
-from zsched.core.plan import Role, RoutePlan
-from zsched.core.snapshot import Snapshot
+from zsched.core.values.messages import Accept, Accepted, CommandResult, Learnt, Prepare, Promise, Refused, Utilities
+from zsched.core.values.model import Beat, DurableState, NodeId, Profile, Proposal, TaskId
+from zsched.core.values.plan import Role, RoutePlan
+from zsched.core.values.snapshot import Snapshot
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

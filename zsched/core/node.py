@@ -19,18 +19,29 @@ from typing import Any
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.agreement import NOTHING, Agreement, Effects
 from zsched.core.batch import Batch
-from zsched.core.beat_room import BeatRoom
-from zsched.core.executor import Executor
-from zsched.core.fleet import Fleet, TaskSpec, fleet_hash
-from zsched.core.gateway import Gateway
-from zsched.core.identity import Identity, Verdict
-from zsched.core.introductions import Introductions
-from zsched.core.knocking import Knocking
-from zsched.core.membership import Membership, Transition
-from zsched.core.messages import CommandOutcome, CommandResult
-from zsched.core.model import (
+from zsched.core.executor.handover import Executor
+from zsched.core.executor.progress import HangWatch
+from zsched.core.executor.sealing import Sealing
+from zsched.core.executor.tenure import Tenure
+from zsched.core.executor.workers import Workers, failed_workers, runs_worker
+from zsched.core.gateway.gateway import Gateway
+from zsched.core.gateway.round_trips import RoundTrips
+from zsched.core.membership.beat_room import BeatRoom
+from zsched.core.membership.identity import Identity, Verdict
+from zsched.core.membership.knocking import Knocking
+from zsched.core.membership.namesakes import Namesakes
+from zsched.core.membership.peers import Membership, Transition
+from zsched.core.membership.relink import Introductions
+from zsched.core.profile.profile import Profiler
+from zsched.core.profile.relay_ends import RelayEnds
+from zsched.core.scheduler.probation import Probation
+from zsched.core.scheduler.rounds import Rounds
+from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts
+from zsched.core.status import PastValue, build_snapshot
+from zsched.core.values.fleet import Fleet, TaskSpec, fleet_hash
+from zsched.core.values.messages import CommandOutcome, CommandResult
+from zsched.core.values.model import (
     Allocation,
     Beat,
     DurableState,
@@ -42,19 +53,8 @@ from zsched.core.model import (
     Weights,
     WorkerState,
 )
-from zsched.core.namesakes import Namesakes
-from zsched.core.plan import StreamCount
-from zsched.core.probation import Probation
-from zsched.core.profile import Profiler
-from zsched.core.progress import HangWatch
-from zsched.core.relay_ends import RelayEnds
-from zsched.core.round_trips import RoundTrips
-from zsched.core.rounds import Rounds
-from zsched.core.scoring import NO_DOUBTS, Doubts
-from zsched.core.sealing import Sealing
-from zsched.core.status import PastValue, build_snapshot
-from zsched.core.tenure import Tenure
-from zsched.core.workers import Workers, failed_workers, runs_worker
+from zsched.core.values.plan import StreamCount
+from zsched.core.vote.agreement import NOTHING, Agreement, Effects
 
 HISTORY = 32
 _OFTEN_QUIET = frozenset(

@@ -11,15 +11,19 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-from zsched.core.agreement import Agreement
 from zsched.core.events import SlotReady
-from zsched.core.executor import Executor, Phase
-from zsched.core.fleet import Fleet, NodeSpec, TaskSpec
-from zsched.core.gateway import Gateway
-from zsched.core.generations import way_out
-from zsched.core.knocking import Knocking
-from zsched.core.membership import Membership
-from zsched.core.model import (
+from zsched.core.executor.handover import Executor, Phase
+from zsched.core.executor.sealing import Sealing
+from zsched.core.gateway.gateway import Gateway
+from zsched.core.gateway.round_trips import RoundTrips
+from zsched.core.membership.knocking import Knocking
+from zsched.core.membership.namesakes import Namesakes
+from zsched.core.membership.peers import Membership
+from zsched.core.profile.relay_ends import RelayEnds
+from zsched.core.scheduler.rounds import Rounds, TaskRound
+from zsched.core.scheduler.scoring import joined, majority
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec
+from zsched.core.values.model import (
     NEVER_INITIALISED,
     RESTARTING,
     Allocation,
@@ -31,15 +35,8 @@ from zsched.core.model import (
     WorkerState,
     told_of_worker,
 )
-from zsched.core.namesakes import Namesakes
-from zsched.core.plan import Direction, ReadyWhen, Route, StreamCount
-from zsched.core.register import Register
-from zsched.core.relay_ends import RelayEnds
-from zsched.core.round_trips import RoundTrips
-from zsched.core.rounds import Rounds, TaskRound
-from zsched.core.scoring import joined, majority
-from zsched.core.sealing import Sealing
-from zsched.core.snapshot import (
+from zsched.core.values.plan import Direction, ReadyWhen, Route, StreamCount
+from zsched.core.values.snapshot import (
     SCHEMA,
     DecisionStatus,
     NodeStatus,
@@ -49,6 +46,9 @@ from zsched.core.snapshot import (
     TaskStatus,
     VoteStatus,
 )
+from zsched.core.vote.agreement import Agreement
+from zsched.core.vote.generations import way_out
+from zsched.core.vote.register import Register
 
 STARTED_BEFORE = (
     "who starts it (the task has no `command`) must start it again if it ran before this robot was in the fleet file "

@@ -13,7 +13,7 @@ import zenoh
 
 from zsched.clock import monotonic_s
 from zsched.lab.signals import StopFlag
-from zsched.zenoh_config import client_config
+from zsched.sessions.config import client_config
 
 CONNECT_S = 30.0
 LOOK_S = 0.2

@@ -11,7 +11,7 @@ import signal
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from zsched.core.model import NodeId
+from zsched.core.values.model import NodeId
 from zsched.lab.history import Admitted, History, Learnt, Worked
 from zsched.lab.netbed import Netbed, Received, owners_of, stop_group
 from zsched.lab.testbed import TASK, Json, echo_fleet

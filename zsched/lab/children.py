@@ -3,8 +3,8 @@
 Knows: process groups, logs, the janitor. Does not know: what the processes are.
 
 Three nets, each for what the one before misses: an orderly stop (SIGTERM, then SIGKILL, by process group), the parent
-death signal (`zsched.adapters.launch`) when the lab is killed, and the janitor, which finds every process of the run by
-its environment. Start children from the main thread only: the death signal follows the thread that forked.
+death signal (`zsched.adapters.workers.launch`) when the lab is killed, and the janitor, which finds every process of
+the run by its environment. Start children from the main thread only: the death signal follows the thread that forked.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from zsched.adapters import launch
+from zsched.adapters.workers import launch
 from zsched.errors import ZschedError
 from zsched.lab.janitor import TOKEN_VARIABLE
 

@@ -14,9 +14,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from zsched.adapters.operator_socket import ask
+from zsched.adapters.host.operator_socket import ask
 from zsched.clock import monotonic_s
-from zsched.core.model import NodeId
+from zsched.core.values.model import NodeId
 from zsched.lab.children import ChildError, Children
 from zsched.lab.evaluate import RunFacts
 from zsched.lab.fleet_runner import CLI, FleetRunner, LabFleet, read_tree, write_fleet

@@ -16,7 +16,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from zsched.core.model import NodeId, TaskId
+from zsched.core.values.model import NodeId, TaskId
 from zsched.lab.fleet_view import Load, Move
 from zsched.lab.map_metrics import MapScore, pose_errors, score_map
 from zsched.lab.plots import Timeline, save_map, save_timeline

@@ -14,7 +14,7 @@ from typing import Any
 
 from ruamel.yaml import YAML
 
-from zsched.core.model import NodeId, TaskId
+from zsched.core.values.model import NodeId, TaskId
 from zsched.errors import ConfigError
 from zsched.lab.children import Child, ChildError, Children
 from zsched.lab.limits import NodeLimits
@@ -29,7 +29,7 @@ POLL_S = 0.05
 Tree = dict[str, Any]
 """A fleet file as plain YAML data."""
 Ask = Callable[[Path, Tree, float], Tree]
-"""`zsched.adapters.operator_socket.ask`: (socket, request, seconds) -> answer."""
+"""`zsched.adapters.host.operator_socket.ask`: (socket, request, seconds) -> answer."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from zsched.core.model import NodeId, TaskId
+from zsched.core.values.model import NodeId, TaskId
 
 Status = Mapping[str, Any]
 """One decoded status snapshot."""

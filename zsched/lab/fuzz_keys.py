@@ -22,23 +22,23 @@ from typing import Any, cast
 
 from zenoh import SampleKind
 
-from zsched import wire
-from zsched.adapters.control_bus import ControlBus
+from zsched.adapters.network.control_bus import ControlBus
 from zsched.core import events as ev
-from zsched.core.model import MAX_COUNTER, NAME
-from zsched.core.relay_protocol import EndMarker, SnapshotChunk, StreamAck, StreamAcks
-from zsched.core.ros2 import parse_token
+from zsched.core.hop.serial import serial_of
+from zsched.core.route.ros2 import parse_token
 from zsched.core.sequence import RUN, Order, Track
-from zsched.core.serial import serial_of
-from zsched.hop_acks import MAX_REPLAYED, RETURN, Acknowledger
-from zsched.keyspace import Keyspace, counter, parse
+from zsched.core.values.model import MAX_COUNTER, NAME
+from zsched.core.values.relay_protocol import EndMarker, SnapshotChunk, StreamAck, StreamAcks
+from zsched.hop.acknowledger import MAX_REPLAYED, RETURN, Acknowledger
+from zsched.ipc.pipe import decode_chunk, decode_end, encode_chunk, encode_end
 from zsched.lab.fuzz_wire import NAMES
 from zsched.relay.lanes import Lane, Sent, near
 from zsched.relay.slots import KeyState
 from zsched.relay.tokens import Tokens
-from zsched.relay_pipe import decode_chunk, decode_end, encode_chunk, encode_end
-from zsched.worker_lanes import MAX_RECEIVERS, KeptLane
-from zsched.worker_snapshot import CHUNK, MAX_OFFERS, MAX_SNAPSHOT, Assembly
+from zsched.wire import codec as wire
+from zsched.wire.keyspace import Keyspace, counter, parse
+from zsched.worker.lanes import MAX_RECEIVERS, KeptLane
+from zsched.worker.snapshot import CHUNK, MAX_OFFERS, MAX_SNAPSHOT, Assembly
 
 KEYS = Keyspace("fuzz")
 NUMBERS = (

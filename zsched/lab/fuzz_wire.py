@@ -24,12 +24,13 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import msgpack
 
-from zsched import relay_pipe, wire
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, electorate_hash
-from zsched.core.messages import Accept, Accepted, Learnt, Prepare, Promise, Refused, SetWeights, Utilities
-from zsched.core.model import (
+from zsched.core.node import Node
+from zsched.core.status import build_snapshot
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, electorate_hash
+from zsched.core.values.messages import Accept, Accepted, Learnt, Prepare, Promise, Refused, SetWeights, Utilities
+from zsched.core.values.model import (
     Beat,
     DeviceSample,
     DurableState,
@@ -42,10 +43,10 @@ from zsched.core.model import (
     WorkerLoad,
     WorkerState,
 )
-from zsched.core.node import Node
-from zsched.core.status import build_snapshot
 from zsched.errors import WireError
+from zsched.ipc import pipe as relay_pipe
 from zsched.lab.sim_network import mutated
+from zsched.wire import codec as wire
 
 REASONS = frozenset({"size", "garbage", "frame", "version", "kind", "type", "missing", "range", "checksum"})
 LAG_S = 0.1

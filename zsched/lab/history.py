@@ -14,8 +14,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
-from zsched.core.belief import GENERATION_STEP
-from zsched.core.model import NodeId, TaskId
+from zsched.core.values.model import NodeId, TaskId
+from zsched.core.vote.belief import GENERATION_STEP
 
 WINDOW_S = 60.0
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from zsched.core.model import NodeId
+from zsched.core.values.model import NodeId
 from zsched.lab.children import Child, Children
 from zsched.lab.fleet_runner import FleetRunner
 from zsched.lab.fleet_view import Load

@@ -13,8 +13,8 @@ import os
 from collections.abc import Mapping
 from enum import StrEnum
 
-from zsched.adapters.cgroup import LimitedGroup
-from zsched.core.model import NodeId
+from zsched.adapters.machine.cgroup import LimitedGroup
+from zsched.core.values.model import NodeId
 from zsched.errors import AdapterError
 
 

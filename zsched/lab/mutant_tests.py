@@ -31,7 +31,7 @@ from typing import Any
 
 import pytest
 
-from zsched.lab.mutants import Mutant, mutated
+from zsched.lab.mutants import Mutant, files_of, module_of, mutated
 
 TESTS = (
     "tests/unit/core",
@@ -115,7 +115,7 @@ def _place(mutant: Mutant) -> str:
 
 def source_hash(root: Path, tests: Sequence[str]) -> str:
     """Of the core and of all tests."""
-    files = sorted({*root.glob("zsched/core/*.py"), *root.glob("zsched/lab/sim*.py"), *root.glob("tests/**/*.py")})
+    files = sorted({*root.glob("zsched/core/**/*.py"), *root.glob("zsched/lab/sim*.py"), *root.glob("tests/**/*.py")})
     digest = hashlib.sha256(" ".join(tests).encode())
     for file in files:
         digest.update(file.read_bytes())
@@ -129,7 +129,7 @@ class Calls:
     """Writes down which functions of the core are called, slowly: while nothing of it is imported yet."""
 
     def __init__(self, core: Path) -> None:
-        self._core = str(core)
+        self._core = core
         self._seen: dict[int, str] = {}
         self.called: set[int] = set()
 
@@ -141,8 +141,8 @@ class Calls:
         self.called.add(number)
         if number not in self._seen:
             code, name = frame.f_code, ""
-            if code.co_filename.startswith(self._core):
-                module = f"zsched.core.{Path(code.co_filename).stem}"
+            if code.co_filename.startswith(str(self._core)):
+                module = module_of(Path(code.co_filename), self._core)
                 name = f"{module}:{code.co_qualname.partition('.<locals>')[0]}"
             self._seen[number] = name
 
@@ -161,9 +161,9 @@ class Probes:
         self._plain: dict[str, list[tuple[types.FunctionType, types.CodeType]]] = {}
         self.called: set[str] = set()
         vars(builtins)[PROBE] = self._on_call
-        for path in sorted(core.glob("*.py")):
+        for path in files_of(core):
             tree = ast.parse(path.read_text(encoding="utf-8"))
-            module = f"zsched.core.{path.stem}"
+            module = module_of(path, core)
             _probe(tree.body, f"{module}:")
             for code in _codes(compile(ast.fix_missing_locations(tree), str(path), "exec")):
                 if PROBE not in code.co_names:

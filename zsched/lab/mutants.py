@@ -15,6 +15,7 @@ import copy
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from types import CodeType
 
 WORDS_FOR_PEOPLE = frozenset({"RecordStory", "TypeVar", "NewType", "cast"})
@@ -70,11 +71,25 @@ class Mutant:
 
     @property
     def path(self) -> str:
-        """Its file, without the package: core/voting.py."""
+        """Its file, without the package: core/vote/voting.py."""
         return self.module.removeprefix("zsched.").replace(".", "/") + ".py"
+
+    def file(self, package: Path) -> Path:
+        """Its file below the package's folder."""
+        return package / self.path
 
     def __str__(self) -> str:
         return f"{self.path}:{self.line}: {self.before} -> {self.after}"
+
+
+def files_of(core: Path) -> list[Path]:
+    """The core's files that hold code."""
+    return sorted(path for path in core.rglob("*.py") if path.name != "__init__.py")
+
+
+def module_of(path: Path, core: Path) -> str:
+    """The full name of one of the core's modules: ``zsched.core.vote.voting``."""
+    return ".".join(("zsched", *path.relative_to(core.parent).with_suffix("").parts))
 
 
 @dataclass(slots=True)

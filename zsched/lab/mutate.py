@@ -49,7 +49,7 @@ from zsched.lab.mutant_tests import (
     silence,
     source_hash,
 )
-from zsched.lab.mutants import Mutant, mutants_of, mutated
+from zsched.lab.mutants import Mutant, files_of, module_of, mutants_of, mutated
 
 ROOT = Path(__file__).parents[2]
 CORE = ROOT / "zsched" / "core"
@@ -114,13 +114,13 @@ def choose(seed: int, count: int, only: Sequence[str] = ()) -> list[Mutant]:
     Args:
         seed: any number.
         count: how many (fewer when there are no more).
-        only: modules ("core/voting.py") or lines ("core/voting.py:103"); none: the whole core.
+        only: modules ("core/vote/voting.py") or lines ("core/vote/voting.py:103"); none: the whole core.
     """
-    sources = {path: path.read_text(encoding="utf-8") for path in sorted(CORE.glob("*.py"))}
+    sources = {path: path.read_text(encoding="utf-8") for path in files_of(CORE)}
     found = [
         mutant
         for path, source in sources.items()
-        for mutant in mutants_of(f"zsched.core.{path.stem}", source)
+        for mutant in mutants_of(module_of(path, CORE), source)
         if not only or mutant.path in only or f"{mutant.path}:{mutant.line}" in only
     ]
     found.sort(key=lambda mutant: hashlib.sha256(f"{seed} {mutant.key}".encode()).digest())
@@ -128,7 +128,7 @@ def choose(seed: int, count: int, only: Sequence[str] = ()) -> list[Mutant]:
     for mutant in found:
         if len(chosen) == count:
             break
-        path = CORE / Path(mutant.path).name
+        path = mutant.file(CORE.parent)
         if mutated(mutant, sources[path], str(path)) is not None:
             chosen.append(mutant)
     return chosen
@@ -172,7 +172,7 @@ def _fork(session: pytest.Session, mutant: Mutant, reach: Reach, functions: Func
         if reach.is_cold(mutant):
             found = _cold(mutant, effort)
         else:
-            path = CORE / Path(mutant.path).name
+            path = mutant.file(CORE.parent)
             code = mutated(mutant, path.read_text(encoding="utf-8"), str(path))
             assert code is not None
             functions.plant(code)
@@ -336,7 +336,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--mutants", type=int, default=100, help="how many")
     parser.add_argument("--jobs", type=int, default=1, help="mutants at a time")
-    parser.add_argument("--module", action="append", default=[], help="core/voting.py, or core/voting.py:103")
+    parser.add_argument("--module", action="append", default=[], help="core/vote/voting.py, or core/vote/voting.py:103")
     parser.add_argument("--resume", type=Path, help="keep the verdicts there, and try only what has none")
     parser.add_argument("--again", action="store_true", help="with --resume: try once more what has survived")
     parser.add_argument("--least", type=float, default=LEAST_PERCENT, help="percent that must be found")

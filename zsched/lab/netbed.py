@@ -21,16 +21,16 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO
 
-from zsched import zenoh_config
-from zsched.adapters.operator_socket import ask
+from zsched.adapters.host.operator_socket import ask
 from zsched.clock import monotonic_s
-from zsched.core.fleet import Timing
-from zsched.core.model import NodeId, PeerState
+from zsched.core.values.fleet import Timing
+from zsched.core.values.model import NodeId, PeerState
 from zsched.guard import guarded
 from zsched.lab.history import History, Learnt, Started
 from zsched.lab.netns import Network
 from zsched.lab.testbed import DAEMON, Json, Testbed
-from zsched.places import socket_path
+from zsched.paths import socket_path
+from zsched.sessions import config as zenoh_config
 
 CONTROL_PORT, DATA_PORT = 7457, 7458
 PROBE = (sys.executable, "-m", "zsched.lab.probe")

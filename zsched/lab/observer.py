@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Self
 
 from zsched.clock import monotonic_s
-from zsched.core.model import NodeId, TaskId
+from zsched.core.values.model import NodeId, TaskId
 from zsched.errors import ZschedError
 from zsched.guard import guarded
 from zsched.lab.fleet_runner import Ask

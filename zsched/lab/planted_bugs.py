@@ -34,14 +34,18 @@ class Bug:
         return (self,) if self.also is None else (self, *self.also.parts)
 
 
-SEQUENCE, IDENTITY = "zsched.core.sequence", "zsched.core.identity"
-REGISTER, LEASE, TENURE = "zsched.core.register", "zsched.core.lease", "zsched.core.tenure"
-SEALING, WITNESS = "zsched.core.sealing", "zsched.core.witness"
-NAMESAKES = "zsched.core.namesakes"
-BELIEF = "zsched.core.belief"
-AGREEMENT, MEMBERSHIP, NODE = "zsched.core.agreement", "zsched.core.membership", "zsched.core.node"
-ROUNDS, VOTE, VOTING = "zsched.core.rounds", "zsched.core.vote", "zsched.core.voting"
-SCHEDULER, SCORING, EXECUTOR = "zsched.core.scheduler", "zsched.core.scoring", "zsched.core.executor"
+SEQUENCE, IDENTITY = "zsched.core.sequence", "zsched.core.membership.identity"
+REGISTER, LEASE, TENURE = "zsched.core.vote.register", "zsched.core.vote.lease", "zsched.core.executor.tenure"
+SEALING, WITNESS = "zsched.core.executor.sealing", "zsched.core.vote.witness"
+NAMESAKES = "zsched.core.membership.namesakes"
+BELIEF = "zsched.core.vote.belief"
+AGREEMENT, MEMBERSHIP, NODE = "zsched.core.vote.agreement", "zsched.core.membership.peers", "zsched.core.node"
+ROUNDS, VOTE, VOTING = "zsched.core.scheduler.rounds", "zsched.core.vote.tally", "zsched.core.vote.voting"
+SCHEDULER, SCORING, EXECUTOR = (
+    "zsched.core.scheduler.judge",
+    "zsched.core.scheduler.scoring",
+    "zsched.core.executor.handover",
+)
 
 _REGISTER = (
     "tests/sim/test_register_rules.py",
@@ -378,7 +382,7 @@ LEASE_BUGS = (
     ),
     _bug(
         "a new generation forgets a longer lease",
-        "zsched.core.generations",
+        "zsched.core.vote.generations",
         "lease_s=0.0 if before is None else before.lease_s",
         "lease_s=0.0",
         ("tests/unit/test_lifecycle.py",),
@@ -498,21 +502,21 @@ MEMBERSHIP_BUGS = (
     ),
     _bug(
         "a slewed clock is believed",
-        "zsched.core.clocks",
+        "zsched.core.vote.clocks",
         "abs(event.error_ratio) > RHO or",
         "abs(event.error_ratio) > 1.0 or",
         ("tests/sim/test_clock_doubt.py",),
     ),
     _bug(
         "a jump of the clock is believed",
-        "zsched.core.clocks",
+        "zsched.core.vote.clocks",
         " or abs(event.jump_s) > JUMP_S + RHO * event.since_s",
         "",
         ("tests/sim/test_clock_doubt.py",),
     ),
     _bug(
         "a beat that is too large is sent whole",
-        "zsched.core.beat_room",
+        "zsched.core.membership.beat_room",
         "if beat_bytes(beat) <= MAX_BEAT_BYTES:",
         "if beat.node:",
         _BEAT_ROOM,
@@ -520,7 +524,7 @@ MEMBERSHIP_BUGS = (
     ),
     _bug(
         "what had no room in a beat has none in the next",
-        "zsched.core.beat_room",
+        "zsched.core.membership.beat_room",
         "first = self._next % len(parts)",
         "first = 0",
         _BEAT_ROOM,
@@ -779,7 +783,7 @@ VOTE_BUGS = (
     ),
     _bug(
         "a worker that has nothing more to do lacks what it lacked before",
-        "zsched.core.jobs",
+        "zsched.core.profile.jobs",
         "if newest.is_idle and undone <= 0:",
         "if newest.is_idle and undone < 0:",
         ("tests/unit/core/test_jobs.py", "tests/unit/core/test_closed_loop.py"),

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from zsched.lab.planted_bugs import Bug
 
-ACKS, SERIAL = "zsched.hop_acks", "zsched.core.serial"
-INPUTS, WORKER_LANES = "zsched.worker_inputs", "zsched.worker_lanes"
+ACKS, SERIAL = "zsched.hop.acknowledger", "zsched.core.hop.serial"
+INPUTS, WORKER_LANES = "zsched.worker.inputs", "zsched.worker.lanes"
 GREETINGS, LANES, OUTLET = "zsched.relay.greetings", "zsched.relay.lanes", "zsched.relay.outlet"
 
 _GREETINGS = ("tests/parts/test_relay_greetings.py",)
@@ -156,14 +156,14 @@ STREAM_BUGS = (
     ),
     _bug(
         "a backlog is answered by keys",
-        "zsched.worker_backlog",
+        "zsched.worker.backlog",
         "deque(sorted((*self._again, *kept), key=_turn_of))",
         "deque((*self._again, *kept))",
         ("tests/unit/test_worker_backlog.py",),
     ),
     _bug(
         "what comes behind a worker's own end goes nowhere",
-        "zsched.worker",
+        "zsched.worker.worker",
         "if epoch is None:  # without",
         "if not has_lease:  # without",
         (f"{_WORKER}::test_what_comes_behind_the_end_of_an_epoch_is_answered_in_the_next_one",),
@@ -177,7 +177,7 @@ STREAM_BUGS = (
     ),
     _bug(
         "what a worker skips of a reliable input counts as processed",
-        "zsched.worker_samples",
+        "zsched.worker.samples",
         "return is_whole or self.keep_last is None",
         "return self.keep_last is None",
         (f"{_WORKER}::test_what_a_slow_worker_keeps_follows_the_class_and_what_it_sheds_of_a_reliable_input_is_lost",),
@@ -247,14 +247,14 @@ STREAM_BUGS = (
     ),
     _bug(
         "an input of an epoch that is not told yet is answered in the old one",
-        "zsched.worker_epochs",
+        "zsched.worker.epochs",
         "if in_hand is not None and in_hand > role.epoch:",
         "if in_hand is not None and in_hand < 0:",
         ("tests/unit/test_worker_epochs.py",),
     ),
     _bug(
         "what is too old for a newer epoch is done all the same",
-        "zsched.worker_backlog",
+        "zsched.worker.backlog",
         "return self.quiet_at is None and 0 < self.slot < epoch and now - self.at > STALE_S",
         "return False",
         ("tests/unit/test_worker_backlog.py",),
@@ -282,7 +282,7 @@ STREAM_BUGS = (
     ),
     _bug(
         "a relay closes links, and reads those it has dialled, with a single thread",
-        "zsched.zenoh_config",
+        "zsched.sessions.config",
         "return _pools(rx=threads, tx=threads, net=threads)",
         "return _pools(rx=threads, tx=threads)",
         ("tests/unit/test_zenoh_config.py", "tests/integration/test_zenoh_pools.py"),
@@ -324,14 +324,14 @@ STREAM_BUGS = (
     ),
     _bug(
         "what an input's rule says of a crash is not read",
-        "zsched.config_tasks",
+        "zsched.config.tasks",
         '"graph", "on_crash")',
         '"graph")',
         (f"{_CHAOS}::test_a_power_cut_loses_nothing_where_the_rule_says_replay",),
     ),
     _bug(
         "a cold standby without a command is let through",
-        "zsched.config_tasks",
+        "zsched.config.tasks",
         'is Standby.COLD and not section.get("command"):',
         'is Standby.COLD and section.get("command") == ():',
         ("tests/unit/test_config.py::test_one_fault_is_reported_once_at_its_place",),
@@ -376,14 +376,14 @@ STREAM_BUGS = (
     ),
     _bug(
         "beats in turn wait for a loop that does not come",
-        "zsched.adapters.control_bus",
+        "zsched.adapters.network.control_bus",
         "zenoh.handlers.RingChannel(RING)",
         "zenoh.handlers.FifoChannel(RING)",
         ("tests/parts/adapters/test_control_bus.py",),
     ),
     _bug(
         "a relay that does not stay is its own node's secret",
-        "zsched.core.profile",
+        "zsched.core.profile.profile",
         "profile = replace(profile, progress=progress, relay=relay)",
         "profile = replace(profile, progress=progress)",
         ("tests/unit/core/test_node.py",),

@@ -18,7 +18,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from zsched.core.model import NodeId
+from zsched.core.values.model import NodeId
 from zsched.lab.fleet_view import Load, Move
 from zsched.tasks.map_merge.compose import compose, extent_of
 from zsched.tasks.map_merge.geometry import Pose2

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from zsched.core.model import NodeId
+from zsched.core.values.model import NodeId
 from zsched.lab.fleet_view import MapView
 from zsched.lab.recorder import Follower, Record
 

@@ -9,7 +9,7 @@ import random
 from dataclasses import dataclass
 from enum import StrEnum
 
-from zsched.core.model import NodeId, check_range
+from zsched.core.values.model import NodeId, check_range
 
 
 class SchedulePolicy(StrEnum):

@@ -10,11 +10,11 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 from zsched.core import instructions as do
-from zsched.core.damping import ESCAPES_PER_MINUTE, WINDOW_S
-from zsched.core.executor import Phase
-from zsched.core.fleet import Fleet
-from zsched.core.messages import Accepted, Promise
-from zsched.core.model import (
+from zsched.core.executor.handover import Phase
+from zsched.core.scheduler.damping import ESCAPES_PER_MINUTE, WINDOW_S
+from zsched.core.values.fleet import Fleet
+from zsched.core.values.messages import Accepted, Promise
+from zsched.core.values.model import (
     NO_BALLOT,
     Acceptance,
     Allocation,
@@ -26,7 +26,7 @@ from zsched.core.model import (
     TaskId,
     WorkerState,
 )
-from zsched.core.plan import Role, RoutePlan, WorkerRole
+from zsched.core.values.plan import Role, RoutePlan, WorkerRole
 from zsched.errors import InvariantError
 from zsched.lab.history import Checker, Learnt, Record, Routed, Started, Stored, Worked
 from zsched.lab.sim_parts import GENERATION_STEP, Machine

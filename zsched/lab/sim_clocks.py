@@ -1,6 +1,7 @@
 """Faults of a simulated machine's clock that its own watch sees: a time service slews it, or the machine has slept.
 
-Knows: what the watch reports meanwhile and afterwards. Does not know: what a node makes of it (`zsched.core.clocks`).
+Knows: what the watch reports meanwhile and afterwards. Does not know: what a node makes of it
+(`zsched.core.vote.clocks`).
 
 Decisions go by a clock that nothing slews (`zsched.clock`), so a slew changes no time here: it is only reported.
 A machine that has slept knows how long, some to a second only: then its clock is wrong from there on.
@@ -13,9 +14,9 @@ from random import Random
 
 from zsched.clock import WINDOW_S, ClockWatch
 from zsched.core import events as ev
-from zsched.core.clocks import DOUBT_S
-from zsched.core.fleet import Fleet
-from zsched.core.model import NodeId
+from zsched.core.values.fleet import Fleet
+from zsched.core.values.model import NodeId
+from zsched.core.vote.clocks import DOUBT_S
 
 LOOK_S = 0.2
 """The watch compares the clocks so often."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from zsched.core.model import NodeId
+from zsched.core.values.model import NodeId
 from zsched.lab.sim_parts import Machine
 from zsched.lab.sim_scene import Carry, Scene
 from zsched.lab.sim_swarm import Fault

@@ -9,10 +9,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from random import Random
 
-from zsched.core.fleet import Fleet, OnIsolation, Standby, StreamRule, TaskSpec
-from zsched.core.model import ScoreForm, Weights
-from zsched.core.plan import Direction
-from zsched.core.timing import PROFILES
+from zsched.config.timing import PROFILES
+from zsched.core.values.fleet import Fleet, OnIsolation, Standby, StreamRule, TaskSpec
+from zsched.core.values.model import ScoreForm, Weights
+from zsched.core.values.plan import Direction
 
 Change = Callable[[Random, Fleet], Fleet]
 

@@ -9,9 +9,9 @@ from dataclasses import replace
 from random import Random
 from typing import Final
 
-from zsched.core.fleet import Fleet
-from zsched.core.model import NodeId
-from zsched.core.plan import ReadyWhen
+from zsched.core.values.fleet import Fleet
+from zsched.core.values.model import NodeId
+from zsched.core.values.plan import ReadyWhen
 
 SHARE: Final = 0.2
 """Of the schedules without an exclusive task."""

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from random import Random
 
 from zsched.core import events as ev
-from zsched.core.model import NodeId
+from zsched.core.values.model import NodeId
 from zsched.lab.sim_loops import Loops
 from zsched.lab.sim_network import Message, Weather
 from zsched.lab.sim_parts import Machine

@@ -1,6 +1,6 @@
 """Fleets with so many exclusive tasks, and such long names, that a beat has no room for all it has to say.
 
-Knows: which schedules have them. Does not know: how a beat is made to fit (`zsched.core.beat_room`).
+Knows: which schedules have them. Does not know: how a beat is made to fit (`zsched.core.membership.beat_room`).
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from dataclasses import replace
 from random import Random
 from typing import Final
 
-from zsched.core.fleet import Fleet
+from zsched.core.values.fleet import Fleet
 
 MOST_NODES: Final = 4
 """They are dear to play: 40 tasks on 4 nodes cost as much as a dozen other schedules."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from zsched.core.model import DurableState
+from zsched.core.values.model import DurableState
 from zsched.lab.sim_links import Links
 from zsched.lab.sim_parts import Machine
 

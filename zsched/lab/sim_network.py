@@ -15,11 +15,11 @@ from dataclasses import dataclass, field, replace
 from random import Random
 from typing import Any
 
-from zsched import wire
 from zsched.core import events as ev
-from zsched.core.model import Ballot, NodeId
+from zsched.core.values.model import Ballot, NodeId
 from zsched.errors import InvariantError, WireError
 from zsched.lab.sim_checks import FORGED
+from zsched.wire import codec as wire
 
 GHOST = "ghost"
 """A name that no fleet file holds: whoever sends in it is a stranger."""

@@ -10,13 +10,13 @@ from collections import deque
 from dataclasses import dataclass, field
 from random import Random
 
-from zsched import wire
 from zsched.core import events as ev
-from zsched.core.fleet import Fleet
-from zsched.core.model import Allocation, DurableState, NodeId, RegisterState, TaskId
 from zsched.core.node import Node
-from zsched.core.plan import Role
+from zsched.core.values.fleet import Fleet
+from zsched.core.values.model import Allocation, DurableState, NodeId, RegisterState, TaskId
+from zsched.core.values.plan import Role
 from zsched.errors import WireError
+from zsched.wire import codec as wire
 
 GENERATION_STEP = 2**32
 """Revision and epoch of generation G start at G times this."""

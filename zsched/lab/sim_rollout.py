@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from random import Random
 
-from zsched.core.fleet import Fleet
-from zsched.core.lease import RHO
-from zsched.core.model import NodeId
+from zsched.core.values.fleet import Fleet
+from zsched.core.values.model import NodeId
+from zsched.core.vote.lease import RHO
 from zsched.lab.sim_files import CHANGES, other_electors
 from zsched.lab.sim_parts import Machine
 from zsched.lab.sim_scene import Carry, Scene

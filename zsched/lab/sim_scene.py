@@ -10,8 +10,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from random import Random
 
-from zsched.core.fleet import Fleet
-from zsched.core.model import NodeId
+from zsched.core.values.fleet import Fleet
+from zsched.core.values.model import NodeId
 from zsched.lab.sim_parts import Machine
 from zsched.lab.sim_swarm import Fault, Plan
 from zsched.lab.simulator import Simulator

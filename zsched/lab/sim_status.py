@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from zsched.core.model import NodeId, PeerState
-from zsched.core.scoring import majority
-from zsched.core.snapshot import Snapshot
+from zsched.core.scheduler.scoring import majority
 from zsched.core.status import build_snapshot
+from zsched.core.values.model import NodeId, PeerState
+from zsched.core.values.snapshot import Snapshot
 from zsched.lab.simulator import Simulator
 
 TOLD_S = 3.0

@@ -13,9 +13,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from random import Random
 
-from zsched.core.fleet import Fleet, NodeSpec, OnIsolation, Standby, TaskSpec, WorkerSpec
-from zsched.core.model import Aggregate, NodeId, NodeKind, Tuning, Weights
-from zsched.core.timing import WAN, WIFI, WIRED
+from zsched.config.timing import WAN, WIFI, WIRED
+from zsched.core.values.fleet import Fleet, NodeSpec, OnIsolation, Standby, TaskSpec, WorkerSpec
+from zsched.core.values.model import Aggregate, NodeId, NodeKind, Tuning, Weights
 from zsched.lab.sim_clocks import clock_faults, suspensions
 from zsched.lab.sim_files import CHANGES
 from zsched.lab.sim_foreign import absences, with_foreign_workers

@@ -14,8 +14,8 @@ from typing import Any, Protocol
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.model import NodeId, TaskId, WorkerState
-from zsched.core.plan import Role, RoutePhase, RoutePlan, WorkerRole
+from zsched.core.values.model import NodeId, TaskId, WorkerState
+from zsched.core.values.plan import Role, RoutePhase, RoutePlan, WorkerRole
 from zsched.lab.sim_checks import Invariants
 from zsched.lab.sim_parts import Machine
 

@@ -14,15 +14,14 @@ from dataclasses import dataclass, field, replace
 from random import Random
 from typing import Any
 
-from zsched import wire
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.fleet import Fleet, electorate_hash
-from zsched.core.generations import blank_state
-from zsched.core.messages import Refused
-from zsched.core.model import Allocation, DeviceSample, DurableState, NodeId, PeerState, TaskId
 from zsched.core.node import Node
-from zsched.core.plan import RoutePlan
+from zsched.core.values.fleet import Fleet, electorate_hash
+from zsched.core.values.messages import Refused
+from zsched.core.values.model import Allocation, DeviceSample, DurableState, NodeId, PeerState, TaskId
+from zsched.core.values.plan import RoutePlan
+from zsched.core.vote.generations import blank_state
 from zsched.errors import InvariantError, WireError
 from zsched.lab.sim_checks import Invariants, unsettled
 from zsched.lab.sim_clocks import LOOK_S, awake
@@ -32,6 +31,7 @@ from zsched.lab.sim_memory import Memory
 from zsched.lab.sim_network import Message
 from zsched.lab.sim_parts import Machine
 from zsched.lab.sim_work import Work
+from zsched.wire import codec as wire
 
 Load = Callable[[NodeId, float], tuple[float, float]]
 """(node, time) -> (CPU cores in use, MiB in use), the raw reading of the device profiler."""

@@ -23,17 +23,18 @@ from typing import Any, Self, TypeVar
 
 import zenoh
 
-from zsched import places, zenoh_config
-from zsched.adapters.operator_socket import ask
-from zsched.config import load_fleet
-from zsched.core.books import unaccounted
-from zsched.core.fleet import Fleet
-from zsched.core.model import NodeId
-from zsched.core.plan import StreamCount
+from zsched import paths as places
+from zsched.adapters.host.operator_socket import ask
+from zsched.config.load import load_fleet
+from zsched.core.hop.books import unaccounted
+from zsched.core.values.fleet import Fleet
+from zsched.core.values.model import NodeId
+from zsched.core.values.plan import StreamCount
 from zsched.errors import AdapterError, ZschedError
+from zsched.ipc.takeover import Door
 from zsched.lab.loopback import free_endpoint, own_address
-from zsched.lifecycle import init_state
-from zsched.relay_door import Door
+from zsched.runtime.init import init_state
+from zsched.sessions import config as zenoh_config
 
 DAEMON = (sys.executable, "-m", "zsched.daemon")
 ECHO = ("python", "-m", "zsched.tasks.echo")
@@ -221,7 +222,7 @@ class Testbed:
         return tuple(StreamCount(**{**stream, "drops": tuple(sorted(stream["drops"].items()))}) for stream in streams)
 
     def unaccounted(self) -> list[str]:
-        """Input streams whose counters do not account for every sample (`zsched.core.books`); none, at any time.
+        """Input streams whose counters do not account for every sample (`zsched.core.hop.books`); none, at any time.
 
         Also daemons that tell no counters, although they neither have ended nor stand still.
         """

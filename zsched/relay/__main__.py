@@ -18,9 +18,9 @@ import os
 import signal
 import sys
 
-from zsched.core.relay_life import RelayHello
+from zsched.core.values.relay_life import RelayHello
 from zsched.log_limit import limit_handlers
-from zsched.zenoh_config import relay_pools
+from zsched.sessions.config import relay_pools
 
 PR_SET_PDEATHSIG = 1
 M_ARENA_MAX = -8

@@ -18,16 +18,16 @@ from weakref import WeakSet
 import zenoh
 from zenoh import Sample, Session
 
-from zsched import wire
 from zsched.clock import monotonic_s
-from zsched.core.fleet import Timing
-from zsched.core.model import NodeId, TaskId
-from zsched.core.relay_protocol import StreamAck, StreamAcks
+from zsched.core.values.fleet import Timing
+from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.relay_protocol import StreamAck, StreamAcks
 from zsched.errors import WireError
 from zsched.guard import guarded
-from zsched.hop_acks import Acknowledger
-from zsched.keyspace import Keyspace, parse
-from zsched.stalled_links import StalledLinks
+from zsched.hop.acknowledger import Acknowledger
+from zsched.sessions.stalled_links import StalledLinks
+from zsched.wire import codec as wire
+from zsched.wire.keyspace import Keyspace, parse
 
 DEFAULT_LEASE_S: Final = Timing().zenoh_lease_s
 

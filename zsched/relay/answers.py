@@ -19,11 +19,11 @@ import zenoh
 from zenoh import Priority, Sample, SampleKind
 
 from zsched.clock import monotonic_s
-from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker
-from zsched.core.serial import serial_of
-from zsched.hop_acks import GIVE_UP_S, Acknowledger, SourceName
+from zsched.core.hop.serial import serial_of
+from zsched.core.values.relay_protocol import SKIP_ENCODING, EndMarker
+from zsched.hop.acknowledger import GIVE_UP_S, Acknowledger, SourceName
+from zsched.ipc.pipe import decode_end
 from zsched.relay.counter import StreamCounter
-from zsched.relay_pipe import decode_end
 
 MAX_WAITING: Final = 4096
 MAX_WAITING_BYTES: Final = 32 << 20

@@ -6,7 +6,7 @@ Knows: `StreamCount`. Does not know: zenoh, routes. Its owner's lock guards it.
 from __future__ import annotations
 
 from zsched.clock import monotonic_s
-from zsched.core.plan import StreamCount
+from zsched.core.values.plan import StreamCount
 from zsched.relay.tally import Tally
 
 

@@ -1,8 +1,8 @@
 """Puts a stream's outputs to all its applications, and leaves behind the one that takes too little.
 
-Knows: whose link has room (`zsched.link_sockets`), which sessions are workers', when to wait and when not. Does not
-know: zenoh's queues, which stream this is, who of those that are linked receives it: whose link fills up receives
-something.
+Knows: whose link has room (`zsched.sessions.link_sockets`), which sessions are workers', when to wait and when not.
+Does not know: zenoh's queues, which stream this is, who of those that are linked receives it: whose link fills up
+receives something.
 
 zenoh hands a sample to one receiver after the other: a put that waits (BLOCK) for a frozen one makes all of them wait,
 for seconds. So, where there are two or more, each put first waits until every link has room. A receiver whose link has
@@ -27,11 +27,11 @@ import zenoh
 from zenoh import CongestionControl, Sample, SampleKind, Session, Timestamp
 
 from zsched.clock import monotonic_s
-from zsched.core.serial import serial_of
-from zsched.link_sockets import LinkSocket, LinkSockets, with_room
+from zsched.core.hop.serial import serial_of
 from zsched.relay.lanes import Lane
-from zsched.send_queue import PATIENCE_S
-from zsched.zenoh_config import DROP_WAIT_S
+from zsched.sessions.config import DROP_WAIT_S
+from zsched.sessions.link_sockets import LinkSocket, LinkSockets, with_room
+from zsched.sessions.send_queue import PATIENCE_S
 
 LOOK_S: Final = 1.0
 """How old our knowledge of the links may be."""

@@ -1,7 +1,7 @@
 """Shows ROS 2 nodes the endpoints that they really talk to: watches graph tokens, declares the mirrored ones.
 
 Knows: liveliness tokens of both sides, which of them are ours. Does not know: which endpoints to mirror
-(`zsched.core.ros_mirror` decides), slots, samples.
+(`zsched.core.route.ros_mirror` decides), slots, samples.
 
 Nothing is watched, and no thread runs, before the first stream of a ROS graph.
 """
@@ -18,10 +18,10 @@ from typing import Any, Final
 import zenoh
 from zenoh import Sample, SampleKind, Session
 
-from zsched.core.model import NodeId, TaskId
-from zsched.core.plan import RosGraph, Route
-from zsched.core.ros2 import Endpoint, endpoint_token, node_token, parse_token, ros_node_name, token_selector
-from zsched.core.ros_mirror import Sides, mirrored
+from zsched.core.route.ros2 import Endpoint, endpoint_token, node_token, parse_token, ros_node_name, token_selector
+from zsched.core.route.ros_mirror import Sides, mirrored
+from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.plan import RosGraph, Route
 from zsched.guard import guarded, tolerant
 from zsched.relay.receive import undeclare
 

@@ -20,7 +20,7 @@ import zenoh
 from zenoh import Sample, SampleKind, Session
 
 from zsched.clock import monotonic_s
-from zsched.core.serial import number_near
+from zsched.core.hop.serial import number_near
 from zsched.guard import guarded, tolerant
 from zsched.relay.questions import ADVANCED, Publisher, Question, Questions
 

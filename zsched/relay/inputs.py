@@ -22,7 +22,7 @@ import zenoh
 from zenoh import Sample, Session, Timestamp
 
 from zsched.clock import monotonic_s
-from zsched.core.plan import OnCrash, Route, StreamClass, StreamCount
+from zsched.core.values.plan import OnCrash, Route, StreamClass, StreamCount
 from zsched.relay.acks import WorkerAcks
 from zsched.relay.answer_times import AnswerTimes
 from zsched.relay.counter import StreamCounter
@@ -31,7 +31,7 @@ from zsched.relay.pace import Pace
 from zsched.relay.proofs import LeftOpen, Stamps, unproven
 from zsched.relay.receive import Receiver
 from zsched.relay.tally import Tally
-from zsched.send_queue import MAX_BYTES
+from zsched.sessions.send_queue import MAX_BYTES
 
 MAX_KEYS: Final = 4096
 """Concrete keys of one wildcard stream whose values are kept; the oldest give way."""

@@ -17,9 +17,9 @@ from typing import Final
 import zenoh
 
 from zsched.core.events import ProblemReported
-from zsched.core.relay_protocol import RelayReport
+from zsched.core.values.relay_protocol import RelayReport
 from zsched.guard import guarded
-from zsched.opening import why_not_open
+from zsched.sessions.problems import why_not_open
 
 RETRY_S: Final = 0.5
 SOURCE: Final = "relay/local"

@@ -7,7 +7,7 @@ timestamp, kind, priority and express. The source info becomes the publisher's o
 number is what the next hop checks and acknowledges.
 
 ``best_effort`` is put at once and dropped where it would wait. ``latest`` and ``reliable`` have a queue and a thread
-(`zsched.send_queue`) and wait there, so that only this target waits when its receiver stalls.
+(`zsched.sessions.send_queue`) and wait there, so that only this target waits when its receiver stalls.
 
 Where the receiver is `zsched.worker`, samples are kept until it acknowledges them. A number that did not come, or no
 progress for a while (`Lane.is_late`), and they are put again under the numbers they had; the worker drops what it has
@@ -27,8 +27,8 @@ import zenoh
 from zenoh import Priority, Sample, Session, Timestamp
 
 from zsched.clock import monotonic_s
-from zsched.core.plan import OnCrash, StreamClass, StreamSettings
-from zsched.core.relay_protocol import EndMarker, StreamAck
+from zsched.core.values.plan import OnCrash, StreamClass, StreamSettings
+from zsched.core.values.relay_protocol import EndMarker, StreamAck
 from zsched.relay.acks import WorkerAcks
 from zsched.relay.crowd import Crowd
 from zsched.relay.greetings import Greetings
@@ -38,7 +38,7 @@ from zsched.relay.publishers import declare_publisher, put_marker
 from zsched.relay.receive import undeclare
 from zsched.relay.rewrite import Rewriting
 from zsched.relay.tally import Tally
-from zsched.send_queue import SendQueue
+from zsched.sessions.send_queue import SendQueue
 
 QUEUE_DEPTH: Final = 1024
 """A reliable outlet's queue holds at least so many samples, whatever its depth says."""

@@ -20,11 +20,11 @@ import zenoh
 from zenoh import CongestionControl, Sample, Session, Timestamp
 
 from zsched.clock import monotonic_s
-from zsched.core.plan import HandoverRule, Route, StreamClass, StreamCount
-from zsched.core.serial import number_near
+from zsched.core.hop.serial import number_near
+from zsched.core.values.plan import HandoverRule, Route, StreamClass, StreamCount
 from zsched.guard import tolerant
-from zsched.hop_acks import Acknowledger, Jump, SourceName
-from zsched.keyspace import AGAIN_CHUNK, END_CHUNK
+from zsched.hop.acknowledger import Acknowledger, Jump, SourceName
+from zsched.ipc.pipe import decode_end
 from zsched.relay.acks import WorkerAcks
 from zsched.relay.answer_times import AnswerTimes
 from zsched.relay.answers import Answers
@@ -35,7 +35,7 @@ from zsched.relay.outlet import Outlet
 from zsched.relay.pace import Pace
 from zsched.relay.receive import Receiver, undeclare
 from zsched.relay.slots import Feed, KeyState, OutputSlot
-from zsched.relay_pipe import decode_end
+from zsched.wire.keyspace import AGAIN_CHUNK, END_CHUNK
 
 HOLD_SAMPLES: Final = 10_000
 HOLD_BYTES: Final = 64 << 20

@@ -21,19 +21,16 @@ from typing import Final
 
 import zenoh
 
-from zsched import wire
 from zsched.clock import awake_s
 from zsched.core.events import ProblemReported, RoleEnded, StreamsCounted
-from zsched.core.introductions import Introductions
-from zsched.core.model import NodeId, TaskId
-from zsched.core.plan import Role, Route, RoutePlan
-from zsched.core.relay_life import RelayHello, RelayPulse
-from zsched.core.relay_protocol import RelayReport, RelayStarted, RelayStop, WorkerSeen, WorkerWatch
+from zsched.core.membership.relink import Introductions
+from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.plan import Role, Route, RoutePlan
+from zsched.core.values.relay_life import RelayHello, RelayPulse
+from zsched.core.values.relay_protocol import RelayReport, RelayStarted, RelayStop, WorkerSeen, WorkerWatch
 from zsched.errors import WireError
 from zsched.guard import guarded, on_failure
-from zsched.introduction import Introducer
-from zsched.keyspace import Keyspace
-from zsched.opening import why_not_open
+from zsched.ipc.pipe import COMMANDS, read_frame, write_frame
 from zsched.relay.acks import DEFAULT_LEASE_S, Acks
 from zsched.relay.graph import GraphMirror
 from zsched.relay.local_side import LocalSide
@@ -43,8 +40,11 @@ from zsched.relay.successors import Successors
 from zsched.relay.task import TaskRelay
 from zsched.relay.tokens import Tokens
 from zsched.relay.troubles import Troubles
-from zsched.relay_pipe import COMMANDS, read_frame, write_frame
-from zsched.zenoh_config import lease_s
+from zsched.sessions.config import lease_s
+from zsched.sessions.problems import why_not_open
+from zsched.sessions.relink import Introducer
+from zsched.wire import codec as wire
+from zsched.wire.keyspace import Keyspace
 
 COUNT_S: Final = 1.0
 """Period of the counters."""

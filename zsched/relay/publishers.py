@@ -16,11 +16,11 @@ from typing import Final
 import zenoh
 from zenoh import CongestionControl, Priority, Reliability, Session, ext
 
-from zsched.core.plan import StreamClass, StreamSettings
-from zsched.core.relay_protocol import EndMarker
-from zsched.core.serial import serial_of
-from zsched.keyspace import END_CHUNK
-from zsched.relay_pipe import encode_end
+from zsched.core.hop.serial import serial_of
+from zsched.core.values.plan import StreamClass, StreamSettings
+from zsched.core.values.relay_protocol import EndMarker
+from zsched.ipc.pipe import encode_end
+from zsched.wire.keyspace import END_CHUNK
 
 _CONGESTION: Final = {
     StreamClass.BEST_EFFORT: CongestionControl.DROP,

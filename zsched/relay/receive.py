@@ -23,7 +23,7 @@ import zenoh
 from zenoh import Sample, Session
 
 from zsched.clock import awake_s
-from zsched.core.plan import StreamClass, StreamSettings
+from zsched.core.values.plan import StreamClass, StreamSettings
 from zsched.guard import guarded
 from zsched.relay.history import History
 

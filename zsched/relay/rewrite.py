@@ -1,4 +1,4 @@
-"""Decides under which key a stream's samples go on towards one place: `zsched.core.capture`, for several owners.
+"""Decides under which key a stream's samples go on towards one place: `zsched.core.route.wildcards`, for several.
 
 Knows: the ``from`` of the newest owners. Does not know: zenoh, streams, who asks. The outlet's thread alone uses it.
 """
@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from typing import Final
 
-from zsched.core.capture import Rewriter, rewriter
-from zsched.core.keyexpr import is_wild
+from zsched.core.route.keyexpr import is_wild
+from zsched.core.route.wildcards import Rewriter, rewriter
 
 KEPT_OWNERS: Final = 4
 

@@ -8,11 +8,11 @@ from __future__ import annotations
 import zenoh
 from zenoh import CongestionControl, Priority, Query, Session
 
-from zsched import wire
-from zsched.core.model import NodeId, TaskId
-from zsched.core.plan import Role, WorkerRole
+from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.plan import Role, WorkerRole
 from zsched.guard import guarded
-from zsched.keyspace import Keyspace
+from zsched.wire import codec as wire
+from zsched.wire.keyspace import Keyspace
 
 
 class RoleServer:

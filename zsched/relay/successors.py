@@ -16,12 +16,12 @@ import socket
 from dataclasses import replace
 from typing import Final
 
-from zsched import wire
 from zsched.clock import monotonic_s
-from zsched.core.relay_life import RelayHello, RelayHere, RelayRefused
+from zsched.core.values.relay_life import RelayHello, RelayHere, RelayRefused
 from zsched.errors import WireError
-from zsched.relay_door import set_patience, user_of
-from zsched.relay_pipe import read_frame, write_frame
+from zsched.ipc.pipe import read_frame, write_frame
+from zsched.ipc.takeover import set_patience, user_of
+from zsched.wire import codec as wire
 
 HELLO_S: Final = 0.5
 

@@ -17,9 +17,19 @@ from zenoh import Session, Timestamp
 
 from zsched.clock import monotonic_s
 from zsched.core.events import ProblemReported, SlotDrained, SlotFlipped, SlotReady
-from zsched.core.model import TaskId
-from zsched.core.plan import Direction, OnCrash, ReadyWhen, Route, RoutePhase, RoutePlan, Slot, StreamClass, StreamCount
-from zsched.core.relay_protocol import RelayReport, SlotLost
+from zsched.core.values.model import TaskId
+from zsched.core.values.plan import (
+    Direction,
+    OnCrash,
+    ReadyWhen,
+    Route,
+    RoutePhase,
+    RoutePlan,
+    Slot,
+    StreamClass,
+    StreamCount,
+)
+from zsched.core.values.relay_protocol import RelayReport, SlotLost
 from zsched.guard import guarded
 from zsched.relay.acks import Acks
 from zsched.relay.answer_times import AnswerTimes
@@ -36,7 +46,7 @@ GONE_GRACE_S: Final = 0.05
 """An old owner whose token went has sent its last; what is still in our queues gets so long."""
 SETTLE_S: Final = 1.5
 """An old owner that has ended has acknowledged all by then, also when one acknowledgement was dropped on the way, or a
-robot has just stalled that gets the same answers (`zsched.worker_lanes.STALLED_S`)."""
+robot has just stalled that gets the same answers (`zsched.worker.lanes.STALLED_S`)."""
 GATHER_S: Final = 0.5
 """What a worker left that restarted in place is told of once, when each of its streams has met the new life."""
 MAX_UNTAKEN: Final = 4

@@ -14,10 +14,10 @@ import zenoh
 from zenoh import Sample, SampleKind, Session
 
 from zsched.core.events import RoleEnded
-from zsched.core.model import NodeId, TaskId
-from zsched.core.relay_protocol import WorkerSeen
+from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.relay_protocol import WorkerSeen
 from zsched.guard import guarded
-from zsched.keyspace import Keyspace, counter, parse
+from zsched.wire.keyspace import Keyspace, counter, parse
 
 MAX_TOKENS = 16_384
 """Tokens that are remembered: a fleet has one or two per worker."""

@@ -12,12 +12,12 @@ from zenoh import Sample, Session
 
 from zsched.clock import monotonic_s
 from zsched.core.events import FrameDropped, WorkerJobs
-from zsched.core.model import NodeId
-from zsched.core.relay_protocol import WorkerTrouble
+from zsched.core.values.model import NodeId
+from zsched.core.values.relay_protocol import WorkerTrouble
 from zsched.errors import WireError
 from zsched.guard import tolerant
-from zsched.keyspace import Keyspace, parse
-from zsched.relay_pipe import decode_word
+from zsched.ipc.pipe import decode_word
+from zsched.wire.keyspace import Keyspace, parse
 
 PAUSE_S: Final = 0.1
 """A worker says something five times a second; more than this is no worker of ours, and is left out."""

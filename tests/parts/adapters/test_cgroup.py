@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from support.waiting import until
-from zsched.adapters.cgroup import CgroupTree, LimitedGroup, parse_flat, parse_membership, parse_mounts
+from zsched.adapters.machine.cgroup import CgroupTree, LimitedGroup, parse_flat, parse_membership, parse_mounts
 from zsched.errors import AdapterError
 
 V2 = "30 25 0:26 / /sys/fs/cgroup rw,nosuid shared:9 - cgroup2 cgroup2 rw,nsdelegate\n"

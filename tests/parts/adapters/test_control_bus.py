@@ -12,13 +12,12 @@ import pytest
 import zenoh
 
 from support.waiting import free_endpoint, until
-from zsched import wire
-from zsched.adapters import control_bus, open_questions
-from zsched.adapters.control_bus import RING, ControlBus
-from zsched.adapters.open_questions import Questions
+from zsched.adapters.network import control_bus, open_questions
+from zsched.adapters.network.control_bus import RING, ControlBus
+from zsched.adapters.network.open_questions import Questions
 from zsched.core import events as ev
-from zsched.core.fleet import Timing
-from zsched.core.messages import (
+from zsched.core.values.fleet import Timing
+from zsched.core.values.messages import (
     Accept,
     Accepted,
     CommandOutcome,
@@ -31,10 +30,11 @@ from zsched.core.messages import (
     SetWeights,
     Utilities,
 )
-from zsched.core.model import Acceptance, Allocation, Ballot, Beat, Profile, Proposal, Tuning, Weights
-from zsched.core.snapshot import QuorumStatus, Snapshot
+from zsched.core.values.model import Acceptance, Allocation, Ballot, Beat, Profile, Proposal, Tuning, Weights
+from zsched.core.values.snapshot import QuorumStatus, Snapshot
 from zsched.errors import AdapterError
-from zsched.zenoh_config import control_config
+from zsched.sessions.config import control_config
+from zsched.wire import codec as wire
 
 T = TypeVar("T")
 TIMING = Timing()

@@ -12,18 +12,18 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from support.waiting import free_endpoint, until, within
-from zsched.adapters.control_bus import ControlBus
+from zsched.adapters.network.control_bus import ControlBus
 from zsched.core import events as ev
-from zsched.core.fleet import Timing
-from zsched.core.model import Beat, Profile, WorkerLoad, WorkerState
+from zsched.core.values.fleet import Timing
+from zsched.core.values.model import Beat, Profile, WorkerLoad, WorkerState
 from zsched.errors import AdapterError
-from zsched.zenoh_config import control_config
+from zsched.sessions.config import control_config
 
 CHILD = textwrap.dedent(
     """
     import sys
-    from zsched.adapters.control_bus import ControlBus
-    from zsched.zenoh_config import control_config
+    from zsched.adapters.network.control_bus import ControlBus
+    from zsched.sessions.config import control_config
 
     events = []
     connect = tuple(sys.argv[2:])

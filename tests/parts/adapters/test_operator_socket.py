@@ -16,8 +16,8 @@ from typing import Any
 import pytest
 
 from support.waiting import until
-from zsched.adapters import operator_socket
-from zsched.adapters.operator_socket import MAX_CONNECTIONS, MAX_LINE, RETRY_S, OperatorSocket, ask
+from zsched.adapters.host import operator_socket
+from zsched.adapters.host.operator_socket import MAX_CONNECTIONS, MAX_LINE, RETRY_S, OperatorSocket, ask
 from zsched.errors import AdapterError
 
 Json = dict[str, Any]

@@ -18,15 +18,15 @@ import pytest
 
 import zsched
 from support.waiting import until
-from zsched import wire
-from zsched.adapters import relay_silence
-from zsched.adapters.streams import Bequest, RelayHandle
+from zsched.adapters.relay import silence as relay_silence
+from zsched.adapters.relay.streams import Bequest, RelayHandle
 from zsched.core.events import RelayChanged
-from zsched.core.relay_life import RelayHello
-from zsched.core.relay_protocol import HandleReport
-from zsched.relay_door import GREETING_S, Door, code_digest, digest_of
-from zsched.relay_pipe import read_frame, write_frame
-from zsched.zenoh_config import data_config
+from zsched.core.values.relay_life import RelayHello
+from zsched.core.values.relay_protocol import HandleReport
+from zsched.ipc.pipe import read_frame, write_frame
+from zsched.ipc.takeover import GREETING_S, Door, code_digest, digest_of
+from zsched.sessions.config import data_config
+from zsched.wire import codec as wire
 
 CONFIG = data_config(listen=("tcp/127.0.0.1:0",), connect=(), shared_memory=False)
 OTHER_CONFIG = data_config(listen=("tcp/127.0.0.1:0",), connect=("tcp/127.0.0.1:1",), shared_memory=False)
@@ -35,9 +35,9 @@ ORPHAN_S = 5.0
 FIRST_DAEMON = """
 import sys, time
 from pathlib import Path
-from zsched.adapters.streams import Bequest, RelayHandle
-from zsched.core.relay_protocol import RelayStarted
-from zsched.relay_door import Door
+from zsched.adapters.relay.streams import Bequest, RelayHandle
+from zsched.core.values.relay_protocol import RelayStarted
+from zsched.ipc.takeover import Door
 config, folder, orphan_s = sys.argv[1], Path(sys.argv[2]), float(sys.argv[3])
 bequest = Bequest(door=Door(folder, "robot1"), orphan_s=orphan_s, incarnation=7, digest="fleet", listen="tcp/h:1")
 started = []

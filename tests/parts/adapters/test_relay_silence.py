@@ -10,8 +10,8 @@ import sys
 import pytest
 
 from support.waiting import until
-from zsched.adapters import relay_silence
-from zsched.adapters.relay_silence import LOOK_S, WORK_S, Silence, is_idle, processor_s, waited_s
+from zsched.adapters.relay import silence as relay_silence
+from zsched.adapters.relay.silence import LOOK_S, WORK_S, Silence, is_idle, processor_s, waited_s
 
 PATIENCE_S = 1.5
 

@@ -11,9 +11,9 @@ import pytest
 import zenoh
 
 from support.waiting import free_endpoint, until
-from zsched.adapters.cgroup import CgroupTree
-from zsched.adapters.shared_memory import POOL_BYTES, why_not
-from zsched.zenoh_config import data_config, worker_config
+from zsched.adapters.machine.cgroup import CgroupTree
+from zsched.adapters.machine.shared_memory import POOL_BYTES, why_not
+from zsched.sessions.config import data_config, worker_config
 
 UNLIMITED = CgroupTree(Path("/nowhere"))
 PUBLISHER = """

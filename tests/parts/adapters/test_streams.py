@@ -15,12 +15,12 @@ from pathlib import Path
 import pytest
 
 from support.waiting import until
-from zsched.adapters import streams
-from zsched.adapters.streams import RelayHandle
+from zsched.adapters.relay import streams
+from zsched.adapters.relay.streams import RelayHandle
 from zsched.core.events import RelayChanged
-from zsched.core.plan import Role, WorkerRole
-from zsched.core.relay_protocol import HandleReport, RelayStarted
-from zsched.zenoh_config import data_config
+from zsched.core.values.plan import Role, WorkerRole
+from zsched.core.values.relay_protocol import HandleReport, RelayStarted
+from zsched.sessions.config import data_config
 
 CONFIG = data_config(listen=("tcp/127.0.0.1:0",), connect=())
 
@@ -102,8 +102,8 @@ SILENT = """#!{python}
 import os, sys, time
 sys.path[:0] = {path!r}
 from zsched import wire
-from zsched.core.relay_protocol import RelayStarted
-from zsched.relay_pipe import write_frame
+from zsched.core.values.relay_protocol import RelayStarted
+from zsched.ipc.pipe import write_frame
 while True:
     write_frame(1, wire.encode(RelayStarted(pid=os.getpid(), zid="1")))
     end = time.monotonic() + 3.0
@@ -236,7 +236,7 @@ def test_a_stopped_relay_never_blocks_the_daemon(daemon: Daemon) -> None:
 def test_the_relay_dies_with_its_daemon_without_a_bequest() -> None:
     script = (
         "import sys, time\n"
-        "from zsched.adapters.streams import RelayHandle\n"
+        "from zsched.adapters.relay.streams import RelayHandle\n"
         "handle = RelayHandle(fleet='test', node='robot1', zenoh_config=sys.argv[1], on_report=lambda r: None)\n"
         "handle.start()\n"
         "while handle.pid is None: time.sleep(0.01)\n"

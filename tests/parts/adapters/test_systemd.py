@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from zsched.adapters.systemd import Notifier, watchdog_interval_s
+from zsched.adapters.host.systemd import Notifier, watchdog_interval_s
 from zsched.daemon import RESTART_SIGNAL
-from zsched.daemon_descriptors import WANTED
+from zsched.runtime.descriptors import WANTED
 
 UNIT = Path(__file__).parents[3] / "systemd" / "zsched.service"
 MAX_EXPOSURE = 1.5
@@ -90,7 +90,7 @@ def test_unit_promises_what_the_daemon_keeps() -> None:
     assert service["KillMode"] == "process"
     assert service["RestartKillSignal"] == RESTART_SIGNAL.name
     assert service["RuntimeDirectoryPreserve"] == "restart"
-    assert service["ExecStopPost"].endswith("-m zsched.leftovers")
+    assert service["ExecStopPost"].endswith("-m zsched.runtime.cleanup")
     assert int(service["LimitNOFILE"]) == WANTED
 
 

@@ -12,7 +12,7 @@ import psutil
 import pytest
 
 from support.waiting import until
-from zsched.adapters.worker_process import LAUNCHER, LINES_BURST, LineLog, WorkerGuard
+from zsched.adapters.workers.process import LAUNCHER, LINES_BURST, LineLog, WorkerGuard
 from zsched.log_limit import LogLimit
 
 

@@ -17,10 +17,10 @@ from pathlib import Path
 import psutil
 import pytest
 
-from zsched.adapters.worker_process import LINES_BURST
-from zsched.adapters.worker_supervisor import RestartPolicy, WorkerContext, WorkerSupervisor
-from zsched.core.fleet import WorkerSpec
-from zsched.core.model import WorkerState
+from zsched.adapters.workers.process import LINES_BURST
+from zsched.adapters.workers.supervisor import RestartPolicy, WorkerContext, WorkerSupervisor
+from zsched.core.values.fleet import WorkerSpec
+from zsched.core.values.model import WorkerState
 
 QUICK = RestartPolicy(first_s=0.02, most_s=0.1)
 SLEEP = "import time; time.sleep(60)"
@@ -365,8 +365,8 @@ def test_restart_delays_double_up_to_the_cap_with_jitter() -> None:
 
 DAEMON = """
 import sys, time
-from zsched.adapters.worker_supervisor import WorkerContext, WorkerSupervisor
-from zsched.core.fleet import WorkerSpec
+from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
+from zsched.core.values.fleet import WorkerSpec
 class Events:
     def on_started(self, task, pid, incarnation): print(pid, flush=True)
     def on_exited(self, *call): pass

@@ -8,7 +8,7 @@ import subprocess
 import sys
 
 from support.waiting import free_endpoint
-from zsched.adapters.zenoh_log import PERIOD_S, Digest
+from zsched.adapters.host.zenoh_log import PERIOD_S, Digest
 
 ERROR = (
     "\x1b[2m2026-11-20T08:55:12.368733Z\x1b[0m \x1b[31mERROR\x1b[0m acc-0 ThreadId(04) "

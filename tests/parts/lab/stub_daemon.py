@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from zsched.adapters.operator_socket import OperatorSocket
+from zsched.adapters.host.operator_socket import OperatorSocket
 
 
 def main() -> int:

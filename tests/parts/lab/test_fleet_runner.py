@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from zsched.adapters.operator_socket import ask
-from zsched.config import load_fleet
+from zsched.adapters.host.operator_socket import ask
+from zsched.config.load import load_fleet
 from zsched.errors import ConfigError
 from zsched.lab.children import ChildError, Children
 from zsched.lab.demo_run import fleet_template, worker_options

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from support.waiting import until
-from zsched.adapters.cgroup import LimitedGroup
+from zsched.adapters.machine.cgroup import LimitedGroup
 from zsched.errors import AdapterError
 from zsched.lab.janitor import groups_of
 from zsched.lab.limits import LimitKind, NodeLimits, by_affinity, make_limits

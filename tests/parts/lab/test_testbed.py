@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from zsched.adapters.state_file import StateFile
-from zsched.config import load_fleet
-from zsched.core.model import NodeKind
+from zsched.adapters.host.state_file import StateFile
+from zsched.config.load import load_fleet
+from zsched.core.values.model import NodeKind
 from zsched.errors import AdapterError
 from zsched.lab import testbed
 from zsched.lab.loopback import own_address

@@ -17,9 +17,9 @@ import zenoh
 
 from support.sessions import matches
 from support.waiting import free_endpoint, until
-from zsched.adapters.streams import RelayHandle
+from zsched.adapters.relay.streams import RelayHandle
 from zsched.core.events import SlotFlipped, SlotReady
-from zsched.core.plan import (
+from zsched.core.values.plan import (
     Direction,
     Role,
     Route,
@@ -30,12 +30,12 @@ from zsched.core.plan import (
     StreamSettings,
     WorkerRole,
 )
-from zsched.core.plan import ReadyWhen as Ready
-from zsched.core.relay_protocol import HandleReport
+from zsched.core.values.plan import ReadyWhen as Ready
+from zsched.core.values.relay_protocol import HandleReport
+from zsched.sessions.config import data_config, worker_config
 from zsched.tasks.map_merge.cdr import decode_grid, decode_transforms, encode_grid
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid
-from zsched.zenoh_config import data_config, worker_config
 
 _FLEET, _TASK, _ROBOT, _EDGE, _EPOCH = "test", "map_merge", "robot1", "edge1", 3
 View = Callable[[tuple[float, float, float, float], Pose2], Grid]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from zsched.adapters import core_speed
+from zsched.adapters.machine import core_speed
 
 
 def test_a_core_has_the_same_speed_twice() -> None:

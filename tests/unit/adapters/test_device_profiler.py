@@ -12,9 +12,9 @@ import psutil
 import pytest
 
 from support.waiting import until
-from zsched.adapters import device_profiler
-from zsched.adapters.cgroup import LimitedGroup
-from zsched.adapters.device_profiler import (
+from zsched.adapters.machine import device_profiler
+from zsched.adapters.machine.cgroup import LimitedGroup
+from zsched.adapters.machine.device_profiler import (
     DeviceProfiler,
     parse_cpu_list,
     parse_cpu_stat,
@@ -23,7 +23,7 @@ from zsched.adapters.device_profiler import (
     parse_running,
     parse_schedstat,
 )
-from zsched.core.model import WorkerState
+from zsched.core.values.model import WorkerState
 
 MEMINFO = "MemTotal:        4096000 kB\nMemFree: 100 kB\nMemAvailable:    3072000 kB\nHugePages_Total: 0\n"
 V2 = "30 25 0:26 / /sys/fs/cgroup rw - cgroup2 cgroup2 rw\n"

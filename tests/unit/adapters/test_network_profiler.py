@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from zsched.adapters.network_profiler import (
+from zsched.adapters.radio.network_profiler import (
     MAX_TRACE_BYTES,
     LinkReader,
     choose_station,
@@ -17,9 +17,9 @@ from zsched.adapters.network_profiler import (
     retry_ratio,
     wireless_dbm,
 )
-from zsched.adapters.nl80211 import GenericNetlink, Nl80211Error, Station
-from zsched.core.fleet import LinkSpec, NodeSpec
-from zsched.core.model import LinkSample, LinkSource, NodeKind
+from zsched.adapters.radio.nl80211 import GenericNetlink, Nl80211Error, Station
+from zsched.core.values.fleet import LinkSpec, NodeSpec
+from zsched.core.values.model import LinkSample, LinkSource, NodeKind
 
 WIRELESS = """Inter-| sta-|   Quality        |   Discarded packets               | Missed | WE
  face | tus | link level noise |  nwid  crypt   frag  retry   misc | beacon | 22

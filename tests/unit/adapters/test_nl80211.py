@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from zsched.adapters import nl80211
-from zsched.adapters.nl80211 import GenericNetlink, Nl80211Error, Station
+from zsched.adapters.radio import nl80211
+from zsched.adapters.radio.nl80211 import GenericNetlink, Nl80211Error, Station
 
 HEADERS = (Path("/usr/include/linux/nl80211.h"), Path("/usr/include/linux/genetlink.h"))
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from zsched.adapters.state_file import NEW_NAME, StateFile, hardware_id, is_same_hardware
-from zsched.core.model import Acceptance, Allocation, Ballot, DurableState, RegisterState, Tuning, Weights
+from zsched.adapters.host.state_file import NEW_NAME, StateFile, hardware_id, is_same_hardware
+from zsched.core.values.model import Acceptance, Allocation, Ballot, DurableState, RegisterState, Tuning, Weights
 from zsched.errors import AdapterError
 
 BALLOT = Ballot(counter=3, node="robot1", incarnation=2)
@@ -147,7 +147,7 @@ def test_file_with_any_byte_changed_is_damaged(tmp_path: Path) -> None:
 
 def test_second_daemon_is_refused_and_told_who_holds_the_folder(tmp_path: Path) -> None:
     code = (
-        "import sys; from pathlib import Path; from zsched.adapters.state_file import StateFile\n"
+        "import sys; from pathlib import Path; from zsched.adapters.host.state_file import StateFile\n"
         "from zsched.errors import AdapterError\n"
         "try: StateFile(Path(sys.argv[1]), fleet='hall', node='robot1').acquire()\n"
         "except AdapterError as error: print(error)"
@@ -169,7 +169,7 @@ SAVER = """
 import sys
 from dataclasses import replace
 from pathlib import Path
-from zsched.adapters.state_file import StateFile
+from zsched.adapters.host.state_file import StateFile
 folder = Path(sys.argv[1])
 with StateFile(folder, fleet="hall", node="robot1", hardware="machine:aa") as file:
     state = file.load().state

@@ -10,17 +10,8 @@ import pytest
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.agreement import (
-    ASK_AT_ONCE_S,
-    ASK_LEARNT_EVERY_S,
-    READ_EVERY_S,
-    SETTLE_AFTER_START_S,
-    Agreement,
-    Effects,
-)
-from zsched.core.belief import GENERATION_STEP, MAX_AHEAD, MAX_GENERATION
-from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing
-from zsched.core.messages import (
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing
+from zsched.core.values.messages import (
     Accept,
     Accepted,
     CommandOutcome,
@@ -32,7 +23,7 @@ from zsched.core.messages import (
     Refused,
     SetWeights,
 )
-from zsched.core.model import (
+from zsched.core.values.model import (
     NO_BALLOT,
     Acceptance,
     Allocation,
@@ -44,7 +35,16 @@ from zsched.core.model import (
     Tuning,
     Weights,
 )
-from zsched.core.register import MoveOwner
+from zsched.core.vote.agreement import (
+    ASK_AT_ONCE_S,
+    ASK_LEARNT_EVERY_S,
+    READ_EVERY_S,
+    SETTLE_AFTER_START_S,
+    Agreement,
+    Effects,
+)
+from zsched.core.vote.belief import GENERATION_STEP, MAX_AHEAD, MAX_GENERATION
+from zsched.core.vote.register import MoveOwner
 
 T = TypeVar("T")
 ROBOTS = ("robot1", "robot2", "robot3")

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import pytest
 
-from zsched import wire
-from zsched.config import check_bytes
-from zsched.core.beat_room import FRAME_BYTES, MAX_BEAT_BYTES, BeatRoom, beat_bytes, most_bytes
-from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.model import MAX_COUNTER, Beat, Grant, NodeKind, Tuning, Weights
+from zsched.config.load import check_bytes
+from zsched.core.membership.beat_room import FRAME_BYTES, MAX_BEAT_BYTES, BeatRoom, beat_bytes, most_bytes
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.model import MAX_COUNTER, Beat, Grant, NodeKind, Tuning, Weights
 from zsched.lab.simulator import Simulator
+from zsched.wire import codec as wire
 
 LONG = "n" * 60
 ROBOTS = tuple(f"{LONG}{number:03}" for number in range(3))

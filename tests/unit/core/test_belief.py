@@ -7,11 +7,11 @@ from random import Random
 
 import pytest
 
-from zsched.core.belief import GENERATION_STEP, MAX_AHEAD, MAX_GENERATION, is_fit, is_proven
-from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing
-from zsched.core.messages import Learnt
-from zsched.core.model import Acceptance, Allocation, Ballot, NodeKind, RegisterState, Tuning, Weights
-from zsched.core.register import MAX_REVISION, Register
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing
+from zsched.core.values.messages import Learnt
+from zsched.core.values.model import Acceptance, Allocation, Ballot, NodeKind, RegisterState, Tuning, Weights
+from zsched.core.vote.belief import GENERATION_STEP, MAX_AHEAD, MAX_GENERATION, is_fit, is_proven
+from zsched.core.vote.register import MAX_REVISION, Register
 
 TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
 TASK = TaskSpec(name="merge", candidates=("edge1", "robot2"), tuning=TUNING)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from zsched.core.belief import GENERATION_STEP
-from zsched.core.generations import generation_of, objection
-from zsched.core.model import DurableState, Tuning, Weights
-from zsched.core.snapshot import QuorumStatus, Snapshot, TaskStatus
+from zsched.core.values.model import DurableState, Tuning, Weights
+from zsched.core.values.snapshot import QuorumStatus, Snapshot, TaskStatus
+from zsched.core.vote.belief import GENERATION_STEP
+from zsched.core.vote.generations import generation_of, objection
 
 TUNING = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
 GOOD = DurableState(fleet="hall", node="robot3", incarnation=1, generation=0, hardware="", electorate="")

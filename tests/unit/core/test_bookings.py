@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import pytest
 
-from zsched.core.fleet import Demand, Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.gateway import Gateway
-from zsched.core.model import (
+from zsched.core.gateway.gateway import Gateway
+from zsched.core.scheduler.scoring import score
+from zsched.core.values.fleet import Demand, Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.model import (
     Allocation,
     NodeKind,
     PeerState,
@@ -19,7 +20,6 @@ from zsched.core.model import (
     WorkerLoad,
     WorkerState,
 )
-from zsched.core.scoring import score
 
 TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
 TASKS = tuple(

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from zsched.core.books import unaccounted
-from zsched.core.plan import StreamCount
+from zsched.core.hop.books import unaccounted
+from zsched.core.values.plan import StreamCount
 
 WHOLE = StreamCount(
     stream="merge/in/0",

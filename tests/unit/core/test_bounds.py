@@ -7,11 +7,21 @@ from typing import Any
 
 import pytest
 
-from zsched.core import model
 from zsched.core.events import RetryCommanded, WeightsCommanded, WorkerJobs, commanded
-from zsched.core.fleet import Demand
-from zsched.core.messages import Accept, Accepted, Learnt, Prepare, Promise, Refusal, Refused, RetryTask, SetWeights
-from zsched.core.model import (
+from zsched.core.values import model
+from zsched.core.values.fleet import Demand
+from zsched.core.values.messages import (
+    Accept,
+    Accepted,
+    Learnt,
+    Prepare,
+    Promise,
+    Refusal,
+    Refused,
+    RetryTask,
+    SetWeights,
+)
+from zsched.core.values.model import (
     MAX_COUNTER,
     Acceptance,
     Allocation,
@@ -33,8 +43,8 @@ from zsched.core.model import (
     WorkerLoad,
     WorkerState,
 )
-from zsched.core.plan import ServiceSettings, StreamSettings
-from zsched.core.relay_protocol import EndMarker, SnapshotChunk, StreamAck, WorkerTrouble
+from zsched.core.values.plan import ServiceSettings, StreamSettings
+from zsched.core.values.relay_protocol import EndMarker, SnapshotChunk, StreamAck, WorkerTrouble
 
 TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0), score=ScoreForm.SERVICE)
 BALLOT = Ballot(counter=1, node="r1", incarnation=1)

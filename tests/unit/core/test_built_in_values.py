@@ -8,7 +8,7 @@ import re
 from pathlib import Path
 
 ROOT = Path(__file__).parents[3]
-ROW = re.compile(r"^\| `(\w+)` \| ([^|]+) \| `core/(\w+)\.py` \| (.+) \|$", re.MULTILINE)
+ROW = re.compile(r"^\| `(\w+)` \| ([^|]+) \| `([\w/]+)\.py` \| (.+) \|$", re.MULTILINE)
 
 
 def told() -> dict[tuple[str, str], str]:
@@ -20,12 +20,15 @@ def told() -> dict[tuple[str, str], str]:
 def built_in() -> dict[tuple[str, str], str]:
     """The same of the modules: numbers with a public name that are made at the import, where they are made."""
     found = {}
-    for path in sorted((ROOT / "zsched" / "core").glob("*.py")):
-        module = importlib.import_module(f"zsched.core.{path.stem}")
+    package = ROOT / "zsched"
+    config = (package / "config" / "rulecheck.py", package / "config" / "timing.py")
+    for path in (*sorted((package / "core").rglob("*.py")), *config):
+        place = path.relative_to(package).with_suffix("")
+        module = importlib.import_module(".".join(("zsched", *place.parts)))
         for name in assigned(path.read_text(encoding="utf-8")):
             value = getattr(module, name)
             if isinstance(value, int | float) and not name.startswith("_"):
-                found[path.stem, name] = f"{value:g}" if isinstance(value, float) else str(value)
+                found[str(place), name] = f"{value:g}" if isinstance(value, float) else str(value)
     return found
 
 

@@ -9,9 +9,9 @@ import zenoh
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from zsched.core import capture
-from zsched.core.capture import ambiguity, capture_fault, rewriter, wildcards
-from zsched.core.keyexpr import is_valid, matches
+from zsched.core.route import wildcards as capture
+from zsched.core.route.keyexpr import is_valid, matches
+from zsched.core.route.wildcards import ambiguity, capture_fault, rewriter, wildcards
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,12 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from zsched.core.events import WorkerJobs
-from zsched.core.fleet import (
+from zsched.core.gateway.gateway import Gateway
+from zsched.core.profile.profile import Profiler
+from zsched.core.scheduler.judge import Judge, Judgement, Outcome, escape_reason
+from zsched.core.scheduler.patience import CHOICES
+from zsched.core.scheduler.scoring import compare, score
+from zsched.core.values.fleet import (
     PAPER_PATIENCE,
     PATIENT_BONUS,
     PATIENT_COOL_DOWN_S,
@@ -27,8 +32,7 @@ from zsched.core.fleet import (
     Timing,
     WorkerSpec,
 )
-from zsched.core.gateway import Gateway
-from zsched.core.model import (
+from zsched.core.values.model import (
     Allocation,
     DeviceSample,
     LinkSample,
@@ -42,11 +46,7 @@ from zsched.core.model import (
     WorkerLoad,
     WorkerState,
 )
-from zsched.core.patience import CHOICES
-from zsched.core.profile import Profiler
-from zsched.core.scheduler import Judge, Judgement, Outcome, escape_reason
-from zsched.core.scoring import compare, score
-from zsched.core.vote import VoteOutcome, tally
+from zsched.core.vote.tally import VoteOutcome, tally
 
 HOUR_S = 3600.0
 MEMORY_MB = 4000.0

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import pytest
 
-from zsched.core.fleet import Reach, TaskSpec
-from zsched.core.model import Aggregate, Allocation, Tuning, Utility, UtilityVector, Weights
-from zsched.core.scoring import Standing, compare, majority, pick, rounded
+from zsched.core.scheduler.scoring import Standing, compare, majority, pick, rounded
+from zsched.core.values.fleet import Reach, TaskSpec
+from zsched.core.values.model import Aggregate, Allocation, Tuning, Utility, UtilityVector, Weights
 
 SPEC = TaskSpec(
     name="merge",

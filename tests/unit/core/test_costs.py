@@ -6,12 +6,12 @@ from random import Random
 
 import pytest
 
-from zsched.core.costs import NEWEST, WINDOW_S, MoveCost
-from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing
-from zsched.core.gateway import Gateway
-from zsched.core.model import NodeKind, Tuning, Weights
-from zsched.core.plan import StreamCount
-from zsched.core.rounds import Rounds
+from zsched.core.gateway.gateway import Gateway
+from zsched.core.scheduler.costs import NEWEST, WINDOW_S, MoveCost
+from zsched.core.scheduler.rounds import Rounds
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing
+from zsched.core.values.model import NodeKind, Tuning, Weights
+from zsched.core.values.plan import StreamCount
 
 
 class Relay:

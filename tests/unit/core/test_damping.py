@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from zsched.core.damping import MAX_PENALTY, PROBATION_S, STEP, WINDOW_S, Damping
-from zsched.core.fleet import TaskSpec
-from zsched.core.model import Allocation, Tuning, Weights
-from zsched.core.scheduler import Judge, Outcome
-from zsched.core.scoring import Standing
+from zsched.core.scheduler.damping import MAX_PENALTY, PROBATION_S, STEP, WINDOW_S, Damping
+from zsched.core.scheduler.judge import Judge, Outcome
+from zsched.core.scheduler.scoring import Standing
+from zsched.core.values.fleet import TaskSpec
+from zsched.core.values.model import Allocation, Tuning, Weights
 
 SPEC = TaskSpec(
     name="merge",

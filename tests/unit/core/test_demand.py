@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zsched.core.demand import QUEUE_RATIO, SETTLE_S, SHORT_RATIO, STARVED_CPU_RATIO, UNSURE, Demands, is_short
-from zsched.core.fleet import Demand, TaskSpec
-from zsched.core.model import Jobs, Profile, Tuning, Weights, WorkerLoad, WorkerState
+from zsched.core.gateway.demand import QUEUE_RATIO, SETTLE_S, SHORT_RATIO, STARVED_CPU_RATIO, UNSURE, Demands, is_short
+from zsched.core.values.fleet import Demand, TaskSpec
+from zsched.core.values.model import Jobs, Profile, Tuning, Weights, WorkerLoad, WorkerState
 
 TASK = TaskSpec(
     name="merge",

@@ -8,11 +8,11 @@ from dataclasses import replace
 import pytest
 
 from support.registers import BLANK, ELECTORS, INITIAL, TUNING, accept, allocation, make, promise_all
-from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing
-from zsched.core.model import NodeKind, PeerState, Proposal
-from zsched.core.register import Change, MoveOwner, Register, Retune, RoundOutcome
-from zsched.core.vote import VoteOutcome
-from zsched.core.voting import Voting
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing
+from zsched.core.values.model import NodeKind, PeerState, Proposal
+from zsched.core.vote.register import Change, MoveOwner, Register, Retune, RoundOutcome
+from zsched.core.vote.tally import VoteOutcome
+from zsched.core.vote.voting import Voting
 
 TODAY = allocation(3)
 STAY = MoveOwner(base_revision=3, owner="e1", reason="test")

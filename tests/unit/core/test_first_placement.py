@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.model import Allocation, NodeKind, Tuning, Weights
-from zsched.core.scheduler import INITIAL_SETTLE_S, Judge, Outcome
-from zsched.core.scoring import Standing
+from zsched.core.scheduler.judge import INITIAL_SETTLE_S, Judge, Outcome
+from zsched.core.scheduler.scoring import Standing
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.model import Allocation, NodeKind, Tuning, Weights
 from zsched.lab.simulator import Simulator
 
 TUNING = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from zsched.core.belief import GENERATION_STEP
-from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing
-from zsched.core.generations import first_registers
-from zsched.core.model import NO_BALLOT, Acceptance, Allocation, Ballot, NodeKind, RegisterState, Tuning, Weights
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing
+from zsched.core.values.model import NO_BALLOT, Acceptance, Allocation, Ballot, NodeKind, RegisterState, Tuning, Weights
+from zsched.core.vote.belief import GENERATION_STEP
+from zsched.core.vote.generations import first_registers
 
 TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
 FLEET = Fleet(

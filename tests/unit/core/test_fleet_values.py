@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from zsched.core.fleet import (
+from zsched.core.values.fleet import (
     Demand,
     Fleet,
     LinkLimits,
@@ -18,8 +18,8 @@ from zsched.core.fleet import (
     electorate_hash,
     fleet_hash,
 )
-from zsched.core.model import Aggregate, LinkSource, NodeKind, Tuning, Weights
-from zsched.core.plan import Direction
+from zsched.core.values.model import Aggregate, LinkSource, NodeKind, Tuning, Weights
+from zsched.core.values.plan import Direction
 
 TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
 TASK = TaskSpec(

@@ -4,9 +4,9 @@ import math
 
 import pytest
 
-from zsched.core.fleet import Demand, Fleet, NodeSpec, TaskSpec, Timing
-from zsched.core.gateway import EdgeData, Gateway
-from zsched.core.model import NodeKind, Profile, Tuning, Weights, WorkerLoad, WorkerState
+from zsched.core.gateway.gateway import EdgeData, Gateway
+from zsched.core.values.fleet import Demand, Fleet, NodeSpec, TaskSpec, Timing
+from zsched.core.values.model import NodeKind, Profile, Tuning, Weights, WorkerLoad, WorkerState
 
 TASK = TaskSpec(
     name="merge",

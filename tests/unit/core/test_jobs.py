@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from zsched.core.events import WorkerJobs
-from zsched.core.jobs import MAX_AT_ONCE, QUEUE_S, JobMeter
-from zsched.core.means import STALE_S
-from zsched.core.model import Jobs
+from zsched.core.profile.jobs import MAX_AT_ONCE, QUEUE_S, JobMeter
+from zsched.core.profile.means import STALE_S
+from zsched.core.values.model import Jobs
 
 LOOK_S = 0.2
 

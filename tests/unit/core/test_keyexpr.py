@@ -8,7 +8,7 @@ import zenoh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from zsched.core import keyexpr
+from zsched.core.route import keyexpr
 
 PIECES = ("a", "b", "ab", "*", "**", "$*", "@a", "@", "a$*", "$*a", "$*b$*", "a$*b", "$*@a", "@a$*", "é", "x y", "{r}")
 FAULTY = ("", "#", "a?", "$", "a*", "**a", "$**", "a$*$*b", "@*", "a$b")

@@ -7,8 +7,8 @@ from random import Random
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zsched.core import keyexpr
-from zsched.core.keytree import KeyTree
+from zsched.core.route import keyexpr
+from zsched.core.route.keytree import KeyTree
 
 CHUNKS = ("a", "b", "ab", "*", "**", "a$*", "$*b", "@a", "@b")
 EXPRS = st.lists(st.sampled_from(CHUNKS), min_size=1, max_size=5).map("/".join).map(keyexpr.canonical)

@@ -8,9 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zsched.core.fleet import Demand, Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.gateway import Gateway
-from zsched.core.model import (
+from zsched.core.gateway.gateway import Gateway
+from zsched.core.scheduler.scoring import score
+from zsched.core.scheduler.utility import on_time, service_utility
+from zsched.core.values.fleet import Demand, Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.model import (
     Allocation,
     Jobs,
     NodeKind,
@@ -22,8 +24,6 @@ from zsched.core.model import (
     WorkerLoad,
     WorkerState,
 )
-from zsched.core.scoring import score
-from zsched.core.utility import on_time, service_utility
 
 TUNING = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0), score=ScoreForm.SERVICE, deadline_ms=100.0)
 EDGES = ("edge1", "edge2")

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import pytest
 
-from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, lease_terms
-from zsched.core.lease import HURRY_S, RHO, Granter, Leases, hold_s
-from zsched.core.model import Allocation, Beat, Grant, NodeKind, Tuning, Weights
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, lease_terms
+from zsched.core.values.model import Allocation, Beat, Grant, NodeKind, Tuning, Weights
+from zsched.core.vote.lease import HURRY_S, RHO, Granter, Leases, hold_s
 
 NAMES = ("r1", "r2", "r3")
 TUNING = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))

@@ -1,4 +1,4 @@
-"""Each rule of `zsched.core.membership`, with a clock that the tests hold."""
+"""Each rule of `zsched.core.membership.peers`, with a clock that the tests hold."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from random import Random
 
 import pytest
 
-from zsched.core.fleet import Timing
-from zsched.core.membership import MAX_DOUBT, Membership
-from zsched.core.model import Beat, NodeId, PeerState
-from zsched.core.timing import WAN, WIFI, WIRED
+from zsched.config.timing import WAN, WIFI, WIRED
+from zsched.core.membership.peers import MAX_DOUBT, Membership
+from zsched.core.values.fleet import Timing
+from zsched.core.values.model import Beat, NodeId, PeerState
 
 SMALL = ("me", "a", "b")
 LARGE = ("me", "a", "b", "c")

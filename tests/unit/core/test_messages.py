@@ -7,10 +7,20 @@ from dataclasses import FrozenInstanceError, fields, is_dataclass, replace
 
 import pytest
 
-from zsched.core import messages
-from zsched.core.messages import Accept, Accepted, Learnt, Prepare, Promise, Refusal, Refused, SetWeights, Utilities
-from zsched.core.model import NO_BALLOT, Acceptance, Allocation, Ballot, Tuning, Weights
-from zsched.core.relay_protocol import EndMarker
+from zsched.core.values import messages
+from zsched.core.values.messages import (
+    Accept,
+    Accepted,
+    Learnt,
+    Prepare,
+    Promise,
+    Refusal,
+    Refused,
+    SetWeights,
+    Utilities,
+)
+from zsched.core.values.model import NO_BALLOT, Acceptance, Allocation, Ballot, Tuning, Weights
+from zsched.core.values.relay_protocol import EndMarker
 
 TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
 BALLOT = Ballot(counter=1, node="r1", incarnation=1)

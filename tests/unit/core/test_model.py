@@ -7,8 +7,8 @@ from dataclasses import FrozenInstanceError, fields, is_dataclass
 
 import pytest
 
-from zsched.core import model
-from zsched.core.model import (
+from zsched.core.values import model
+from zsched.core.values.model import (
     MAX_COUNTER,
     MAX_REASON,
     NO_BALLOT,

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from zsched.core.identity import QUIET_S
-from zsched.core.model import Beat
-from zsched.core.namesakes import BESIDE_BEATS, BESIDE_S, LIVES_KEPT, TWINS_TOLD, WHERE_EVERY_S, Namesakes
+from zsched.core.membership.identity import QUIET_S
+from zsched.core.membership.namesakes import BESIDE_BEATS, BESIDE_S, LIVES_KEPT, TWINS_TOLD, WHERE_EVERY_S, Namesakes
+from zsched.core.values.model import Beat
 
 BEAT_S = 0.2
 

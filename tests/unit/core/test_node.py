@@ -11,10 +11,12 @@ import pytest
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.fleet import Fleet, NodeSpec, StreamRule, TaskSpec, Timing, WorkerSpec, electorate_hash
-from zsched.core.identity import QUIET_S
-from zsched.core.knocking import KNOCKERS_KEPT
-from zsched.core.messages import (
+from zsched.core.membership.identity import QUIET_S
+from zsched.core.membership.knocking import KNOCKERS_KEPT
+from zsched.core.node import Node
+from zsched.core.status import build_snapshot
+from zsched.core.values.fleet import Fleet, NodeSpec, StreamRule, TaskSpec, Timing, WorkerSpec, electorate_hash
+from zsched.core.values.messages import (
     Accept,
     CommandOutcome,
     Learnt,
@@ -25,7 +27,7 @@ from zsched.core.messages import (
     RetryTask,
     Utilities,
 )
-from zsched.core.model import (
+from zsched.core.values.model import (
     Acceptance,
     Allocation,
     Ballot,
@@ -44,9 +46,7 @@ from zsched.core.model import (
     WorkerLoad,
     WorkerState,
 )
-from zsched.core.node import Node
-from zsched.core.plan import Direction, ReadyWhen, RoutePhase, StreamCount, WorkerRole
-from zsched.core.status import build_snapshot
+from zsched.core.values.plan import Direction, ReadyWhen, RoutePhase, StreamCount, WorkerRole
 
 T = TypeVar("T")
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")

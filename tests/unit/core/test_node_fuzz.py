@@ -8,11 +8,13 @@ from random import Random
 
 import pytest
 
-from zsched import wire
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.fleet import Fleet, NodeSpec, Standby, StreamRule, TaskSpec, Timing, WorkerSpec, electorate_hash
-from zsched.core.messages import (
+from zsched.core.node import Node
+from zsched.core.report import snapshot_json
+from zsched.core.status import build_snapshot, status_line
+from zsched.core.values.fleet import Fleet, NodeSpec, Standby, StreamRule, TaskSpec, Timing, WorkerSpec, electorate_hash
+from zsched.core.values.messages import (
     Accept,
     Accepted,
     Learnt,
@@ -24,7 +26,7 @@ from zsched.core.messages import (
     SetWeights,
     Utilities,
 )
-from zsched.core.model import (
+from zsched.core.values.model import (
     Acceptance,
     Allocation,
     Ballot,
@@ -43,10 +45,8 @@ from zsched.core.model import (
     WorkerLoad,
     WorkerState,
 )
-from zsched.core.node import Node
-from zsched.core.plan import Direction, StreamCount
-from zsched.core.status import build_snapshot, status_line
-from zsched.report import snapshot_json
+from zsched.core.values.plan import Direction, StreamCount
+from zsched.wire import codec as wire
 
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
 NAMES = (*ROBOTS, *EDGES, "ghost")

@@ -9,9 +9,10 @@ import pytest
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, lease_terms
-from zsched.core.messages import Learnt
-from zsched.core.model import (
+from zsched.core.node import Node
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, lease_terms
+from zsched.core.values.messages import Learnt
+from zsched.core.values.model import (
     Allocation,
     Beat,
     DurableState,
@@ -22,7 +23,6 @@ from zsched.core.model import (
     Weights,
     WorkerState,
 )
-from zsched.core.node import Node
 
 ROBOTS = ("robot1", "robot2", "robot3")
 TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))

@@ -14,11 +14,11 @@ import pytest
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.executor import Phase
-from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, electorate_hash
-from zsched.core.lease import hold_s
-from zsched.core.messages import Accept, Accepted, Learnt, Promise
-from zsched.core.model import (
+from zsched.core.executor.handover import Phase
+from zsched.core.node import Node
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, electorate_hash
+from zsched.core.values.messages import Accept, Accepted, Learnt, Promise
+from zsched.core.values.model import (
     NO_BALLOT,
     Acceptance,
     Allocation,
@@ -31,8 +31,8 @@ from zsched.core.model import (
     Tuning,
     Weights,
 )
-from zsched.core.node import Node
-from zsched.core.plan import WorkerRole
+from zsched.core.values.plan import WorkerRole
+from zsched.core.vote.lease import hold_s
 from zsched.lab.simulator import Simulator
 
 TASK = "merge"

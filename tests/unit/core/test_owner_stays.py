@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from zsched.core.executor import Executor
-from zsched.core.fleet import OnIsolation, TaskSpec, WorkerSpec
+from zsched.core.executor.handover import Executor
 from zsched.core.instructions import ApplyRoutes, SetRole, StartWorker
-from zsched.core.model import Allocation, Tuning, Weights
-from zsched.core.plan import Role, WorkerRole
+from zsched.core.values.fleet import OnIsolation, TaskSpec, WorkerSpec
+from zsched.core.values.model import Allocation, Tuning, Weights
+from zsched.core.values.plan import Role, WorkerRole
 
 TUNING = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
 SPEC = TaskSpec(name="guard", candidates=("edge1", "edge2"), tuning=TUNING, worker=WorkerSpec(command=("work",)))

@@ -8,11 +8,10 @@ import pytest
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.agreement import PARK_SHARE, Agreement, Effects
-from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing
-from zsched.core.lease import hold_s
-from zsched.core.messages import Accept, Accepted, Learnt, Refusal, Refused
-from zsched.core.model import (
+from zsched.core.node import Node
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing
+from zsched.core.values.messages import Accept, Accepted, Learnt, Refusal, Refused
+from zsched.core.values.model import (
     Acceptance,
     Allocation,
     Ballot,
@@ -23,8 +22,9 @@ from zsched.core.model import (
     Tuning,
     Weights,
 )
-from zsched.core.node import Node
-from zsched.core.register import MoveOwner
+from zsched.core.vote.agreement import PARK_SHARE, Agreement, Effects
+from zsched.core.vote.lease import hold_s
+from zsched.core.vote.register import MoveOwner
 
 ROBOTS = ("robot1", "robot2", "robot3")
 TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))

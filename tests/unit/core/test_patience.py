@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from zsched.core.patience import (
+from zsched.core.scheduler.patience import (
     CHOICES,
     FIRST_PATIENCE,
     FORGIVEN_IN_S,

@@ -1,10 +1,10 @@
 """Who is asked for the state of an epoch: the owner of the one before, while it is there."""
 
-from zsched.core.executor import Executor
-from zsched.core.fleet import TaskSpec, WorkerSpec
+from zsched.core.executor.handover import Executor
 from zsched.core.instructions import Instruction, SetRole
-from zsched.core.model import Allocation, Tuning, Weights
-from zsched.core.plan import Role, WorkerRole
+from zsched.core.values.fleet import TaskSpec, WorkerSpec
+from zsched.core.values.model import Allocation, Tuning, Weights
+from zsched.core.values.plan import Role, WorkerRole
 
 TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
 

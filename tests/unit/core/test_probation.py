@@ -7,12 +7,12 @@ from random import Random
 
 import pytest
 
-from zsched.core.fleet import Fleet, NodeSpec, Standby, TaskSpec, Timing, WorkerSpec
-from zsched.core.membership import Transition
-from zsched.core.model import NodeKind, PeerState, Tuning, Weights
+from zsched.core.membership.peers import Transition
 from zsched.core.node import Node
-from zsched.core.plan import ReadyWhen
-from zsched.core.probation import LEASE_MARGIN_S, LIMIT_S, Probation
+from zsched.core.scheduler.probation import LEASE_MARGIN_S, LIMIT_S, Probation
+from zsched.core.values.fleet import Fleet, NodeSpec, Standby, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.model import NodeKind, PeerState, Tuning, Weights
+from zsched.core.values.plan import ReadyWhen
 
 TASK = TaskSpec(
     name="merge",

@@ -6,10 +6,8 @@ from dataclasses import replace
 import pytest
 
 from zsched.core.events import WorkerJobs
-from zsched.core.fleet import Timing
-from zsched.core.means import STALE_S, Ewma
-from zsched.core.model import DeviceSample, LinkSample, LinkSource, Profile, WorkerLoad, WorkerState
-from zsched.core.profile import (
+from zsched.core.profile.means import STALE_S, Ewma
+from zsched.core.profile.profile import (
     RATIO_CHANGE,
     RSSI_CHANGE_DB,
     RSSI_OUTLIER_DB,
@@ -17,6 +15,8 @@ from zsched.core.profile import (
     Profiler,
     SignalFilter,
 )
+from zsched.core.values.fleet import Timing
+from zsched.core.values.model import DeviceSample, LinkSample, LinkSource, Profile, WorkerLoad, WorkerState
 
 TIMING = Timing()
 READY = {"merge": WorkerState.READY}

@@ -8,11 +8,14 @@ from random import Random
 import pytest
 
 from zsched.core import events as ev
-from zsched.core.executor import Executor, Phase
-from zsched.core.fleet import Fleet, NodeSpec, StreamRule, TaskSpec, Timing, WorkerSpec, electorate_hash
-from zsched.core.gateway import Gateway
+from zsched.core.executor.handover import Executor, Phase
+from zsched.core.executor.progress import COUNT_S, MARGIN_S, HangWatch, Progress
+from zsched.core.gateway.gateway import Gateway
 from zsched.core.instructions import Instruction, RecordStory, RestartWorker
-from zsched.core.model import (
+from zsched.core.node import Node
+from zsched.core.scheduler.probation import LIMIT_S
+from zsched.core.values.fleet import Fleet, NodeSpec, StreamRule, TaskSpec, Timing, WorkerSpec, electorate_hash
+from zsched.core.values.model import (
     Allocation,
     Beat,
     DurableState,
@@ -24,10 +27,7 @@ from zsched.core.model import (
     Weights,
     WorkerState,
 )
-from zsched.core.node import Node
-from zsched.core.plan import Direction, StreamCount
-from zsched.core.probation import LIMIT_S
-from zsched.core.progress import COUNT_S, MARGIN_S, HangWatch, Progress
+from zsched.core.values.plan import Direction, StreamCount
 
 ROBOTS = ("robot1", "robot2")
 DEADLINE_S = 4.0

@@ -1,4 +1,4 @@
-"""Each rule of `zsched.core.register`, one situation at a time.
+"""Each rule of `zsched.core.vote.register`, one situation at a time.
 
 The proposing side is in test_register_proposer.py, random schedules in test_register_schedules.py.
 """
@@ -29,9 +29,9 @@ from support.registers import (
     prepare,
     promise_all,
 )
-from zsched.core.messages import Accepted, Prepare, Promise, Refusal, Refused
-from zsched.core.model import MAX_COUNTER, Acceptance
-from zsched.core.register import BACKOFF_CAP_S, MAX_JUMP, MAX_REVISION, Register, RoundOutcome, Step
+from zsched.core.values.messages import Accepted, Prepare, Promise, Refusal, Refused
+from zsched.core.values.model import MAX_COUNTER, Acceptance
+from zsched.core.vote.register import BACKOFF_CAP_S, MAX_JUMP, MAX_REVISION, Register, RoundOutcome, Step
 
 # --- acceptor --------------------------------------------------------------------------------------------------------
 

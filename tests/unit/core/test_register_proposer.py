@@ -1,4 +1,4 @@
-"""The proposing side of `zsched.core.register`: rounds, conflicts, unknown outcomes, one situation at a time."""
+"""The proposing side of `zsched.core.vote.register`: rounds, conflicts, unknown outcomes, one situation at a time."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from support.registers import (
     prepare,
     promise_all,
 )
-from zsched.core.messages import Accepted, Promise, Refusal, Refused
-from zsched.core.model import Acceptance, Allocation
-from zsched.core.register import MoveOwner, Register, Retune, RoundOutcome, Step
+from zsched.core.values.messages import Accepted, Promise, Refusal, Refused
+from zsched.core.values.model import Acceptance, Allocation
+from zsched.core.vote.register import MoveOwner, Register, Retune, RoundOutcome, Step
 
 # --- proposer --------------------------------------------------------------------------------------------------------
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from zsched.core.events import RelayChanged
-from zsched.core.model import MAX_REASON
-from zsched.core.relay_ends import DOWN_TOLD_S, OFTEN, WINDOW_S, RelayEnds
+from zsched.core.profile.relay_ends import DOWN_TOLD_S, OFTEN, WINDOW_S, RelayEnds
+from zsched.core.values.model import MAX_REASON
 
 UP = RelayChanged(is_running=True, reason="pid 7")
 

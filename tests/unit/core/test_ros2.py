@@ -10,10 +10,9 @@ import zenoh.ext
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zsched.core import keyexpr, ros2
-from zsched.core.keyexpr import includes, is_valid
-from zsched.core.plan import RosGraph
-from zsched.core.ros2 import (
+from zsched.core.route import keyexpr, ros2
+from zsched.core.route.keyexpr import includes, is_valid
+from zsched.core.route.ros2 import (
     Attachment,
     Endpoint,
     EndpointKind,
@@ -30,6 +29,7 @@ from zsched.core.ros2 import (
     token_selector,
     type_fault,
 )
+from zsched.core.values.plan import RosGraph
 
 STRING_HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 CHATTER = f"0/chatter/std_msgs::msg::dds_::String_/{STRING_HASH}"

@@ -5,9 +5,9 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zsched.core.plan import Direction, RosGraph, Route, StreamClass, StreamSettings
-from zsched.core.ros2 import Endpoint, EndpointKind
-from zsched.core.ros_mirror import MAX_ENDPOINTS, Sides, mirrored
+from zsched.core.route.ros2 import Endpoint, EndpointKind
+from zsched.core.route.ros_mirror import MAX_ENDPOINTS, Sides, mirrored
+from zsched.core.values.plan import Direction, RosGraph, Route, StreamClass, StreamSettings
 
 TYPE, HASH, QOS = "std_msgs::msg::dds_::String_", "RIHS01_ab", ":1:,1:,:,:,,"
 MP, MS, SS, SC = EndpointKind.PUBLISHER, EndpointKind.SUBSCRIPTION, EndpointKind.SERVICE, EndpointKind.CLIENT

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from zsched.core.model import Echo, Profile
-from zsched.core.round_trips import ECHO_S, KEPT, SENT, RoundTrips
+from zsched.core.gateway.round_trips import ECHO_S, KEPT, SENT, RoundTrips
+from zsched.core.values.model import Echo, Profile
 
 MINE = Profile(
     node="robot1", incarnation=7, sequence=0, cpu_cores=4.0, cpu_used_cores=1.0, memory_mb=100.0, memory_used_mb=1.0

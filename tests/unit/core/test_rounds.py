@@ -9,11 +9,13 @@ from typing import TypeVar
 
 import pytest
 
-from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.gateway import Gateway
+from zsched.core.gateway.gateway import Gateway
 from zsched.core.instructions import AskUtilities, Instruction, PublishProposal
-from zsched.core.messages import Utilities
-from zsched.core.model import (
+from zsched.core.scheduler.judge import Outcome
+from zsched.core.scheduler.rounds import TIMER_MARGIN_S, Rounds, TaskRound
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.messages import Utilities
+from zsched.core.values.model import (
     Allocation,
     NodeKind,
     PeerState,
@@ -26,10 +28,8 @@ from zsched.core.model import (
     WorkerLoad,
     WorkerState,
 )
-from zsched.core.rounds import TIMER_MARGIN_S, Rounds, TaskRound
-from zsched.core.scheduler import Outcome
-from zsched.core.vote import VoteOutcome
-from zsched.core.voting import vote_time
+from zsched.core.vote.tally import VoteOutcome
+from zsched.core.vote.voting import vote_time
 
 T = TypeVar("T")
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")

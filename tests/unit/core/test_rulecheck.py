@@ -5,12 +5,12 @@ import time
 
 import pytest
 
-from zsched.core import keyexpr
-from zsched.core.fleet import StreamRule, TaskSpec
-from zsched.core.model import Tuning, Weights
-from zsched.core.plan import Direction
-from zsched.core.rulecheck import RuleConflict, rule_conflicts
-from zsched.core.templates import named_rules, routes_for
+from zsched.config.rulecheck import RuleConflict, rule_conflicts
+from zsched.core.route import keyexpr
+from zsched.core.route.templates import named_rules, routes_for
+from zsched.core.values.fleet import StreamRule, TaskSpec
+from zsched.core.values.model import Tuning, Weights
+from zsched.core.values.plan import Direction
 
 ROBOTS = ("robot1", "robot2", "robot3")
 EDGES = ("edge1", "edge2")

@@ -6,8 +6,18 @@ from dataclasses import replace
 
 import pytest
 
-from zsched.core.fleet import TaskSpec, WorkerSpec
-from zsched.core.model import (
+from zsched.core.scheduler.judge import (
+    INITIAL_SETTLE_S,
+    Judge,
+    Judgement,
+    Outcome,
+    escape_ahead,
+    escape_reason,
+)
+from zsched.core.scheduler.patience import FORGIVEN_IN_S
+from zsched.core.scheduler.scoring import Standing, compare
+from zsched.core.values.fleet import TaskSpec, WorkerSpec
+from zsched.core.values.model import (
     Allocation,
     PeerState,
     Profile,
@@ -18,16 +28,6 @@ from zsched.core.model import (
     WorkerLoad,
     WorkerState,
 )
-from zsched.core.patience import FORGIVEN_IN_S
-from zsched.core.scheduler import (
-    INITIAL_SETTLE_S,
-    Judge,
-    Judgement,
-    Outcome,
-    escape_ahead,
-    escape_reason,
-)
-from zsched.core.scoring import Standing, compare
 
 TUNING = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0), bonus=0.10, time_to_trigger_s=2.0, cool_down_s=10.0)
 SPEC = TaskSpec(

@@ -5,7 +5,10 @@ from dataclasses import replace
 
 import pytest
 
-from zsched.core.fleet import (
+from zsched.core.gateway.gateway import Gateway
+from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts, compare, score
+from zsched.core.scheduler.utility import NEARLY_FULL, service_utility
+from zsched.core.values.fleet import (
     PATIENT_BONUS,
     Demand,
     Fleet,
@@ -17,8 +20,7 @@ from zsched.core.fleet import (
     Timing,
     WorkerSpec,
 )
-from zsched.core.gateway import Gateway
-from zsched.core.model import (
+from zsched.core.values.model import (
     Allocation,
     Link,
     LinkSource,
@@ -33,8 +35,6 @@ from zsched.core.model import (
     WorkerLoad,
     WorkerState,
 )
-from zsched.core.scoring import NO_DOUBTS, Doubts, compare, score
-from zsched.core.utility import NEARLY_FULL, service_utility
 
 CPU = Weights(cpu=1.0, memory=0.0, network=0.0)
 HALVES = Weights(cpu=0.5, memory=0.0, network=0.5)

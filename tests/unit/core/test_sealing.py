@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import pytest
 
-from zsched.core.executor import Executor
-from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, fleet_hash, lease_terms
-from zsched.core.messages import Learnt
-from zsched.core.model import Allocation, Beat, NodeKind, Tuning, Weights
-from zsched.core.register import SetLeased
-from zsched.core.sealing import ASK_EVERY_S, Sealing
+from zsched.core.executor.handover import Executor
+from zsched.core.executor.sealing import ASK_EVERY_S, Sealing
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, fleet_hash, lease_terms
+from zsched.core.values.messages import Learnt
+from zsched.core.values.model import Allocation, Beat, NodeKind, Tuning, Weights
+from zsched.core.vote.register import SetLeased
 
 NAMES = ("e1", "e2", "e3")
 TUNING = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))

@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from zsched.core.serial import SPAN, number_near, serial_of
+from zsched.core.hop.serial import SPAN, number_near, serial_of
 
 
 @pytest.mark.parametrize("reference", [0, 1, 1000, SPAN - 1, SPAN, SPAN + 1, 3 * SPAN - 2, 2**50])

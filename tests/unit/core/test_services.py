@@ -2,12 +2,12 @@
 
 import pytest
 
-from zsched.config import CheckResult, check_bytes
-from zsched.core.fleet import StreamRule, TaskSpec
-from zsched.core.model import Tuning, Weights
-from zsched.core.plan import Direction, ServiceSettings
-from zsched.core.rulecheck import rule_conflicts
-from zsched.core.templates import routes_for, template_fault
+from zsched.config.load import CheckResult, check_bytes
+from zsched.config.rulecheck import rule_conflicts
+from zsched.core.route.templates import routes_for, template_fault
+from zsched.core.values.fleet import StreamRule, TaskSpec
+from zsched.core.values.model import Tuning, Weights
+from zsched.core.values.plan import Direction, ServiceSettings
 
 SERVICE = Direction.SERVICE
 ROBOTS = ("robot1", "robot2")

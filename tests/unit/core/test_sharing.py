@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zsched.core.model import Profile, WorkerLoad, WorkerState
-from zsched.core.sharing import Shares
-from zsched.core.utility import fair_share
+from zsched.core.gateway.sharing import Shares
+from zsched.core.scheduler.utility import fair_share
+from zsched.core.values.model import Profile, WorkerLoad, WorkerState
 
 
 def profile(

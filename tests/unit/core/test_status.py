@@ -8,12 +8,16 @@ from typing import Any
 
 import pytest
 
-from zsched.cli_report import degradations, render_status
+from zsched.commands.report import degradations, render_status
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, electorate_hash, lease_terms
-from zsched.core.messages import Learnt
-from zsched.core.model import (
+from zsched.core.node import Node
+from zsched.core.report import snapshot_json
+from zsched.core.scheduler.patience import FIRST_PATIENCE
+from zsched.core.status import build_snapshot, status_line
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, electorate_hash, lease_terms
+from zsched.core.values.messages import Learnt
+from zsched.core.values.model import (
     RESTARTING,
     WAS_READY,
     Allocation,
@@ -32,13 +36,9 @@ from zsched.core.model import (
     WorkerLoad,
     WorkerState,
 )
-from zsched.core.node import Node
-from zsched.core.patience import FIRST_PATIENCE
-from zsched.core.plan import StreamCount
-from zsched.core.snapshot import SCHEMA, Snapshot
-from zsched.core.status import build_snapshot, status_line
+from zsched.core.values.plan import StreamCount
+from zsched.core.values.snapshot import SCHEMA, Snapshot
 from zsched.lab.simulator import Simulator
-from zsched.report import snapshot_json
 
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
 TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))

@@ -7,11 +7,8 @@ import zenoh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from zsched.core import keyexpr, templates
-from zsched.core.fleet import StreamRule, TaskSpec
-from zsched.core.model import Tuning, Weights
-from zsched.core.plan import Direction, StreamClass, StreamSettings
-from zsched.core.templates import (
+from zsched.core.route import keyexpr, templates
+from zsched.core.route.templates import (
     fill,
     merges_keys,
     named_rules,
@@ -21,6 +18,9 @@ from zsched.core.templates import (
     template_fault,
     widened,
 )
+from zsched.core.values.fleet import StreamRule, TaskSpec
+from zsched.core.values.model import Tuning, Weights
+from zsched.core.values.plan import Direction, StreamClass, StreamSettings
 
 IN, OUT = Direction.INPUT, Direction.OUTPUT
 

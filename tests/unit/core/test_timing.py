@@ -4,8 +4,8 @@ from dataclasses import asdict, fields, replace
 
 import pytest
 
-from zsched.core.fleet import Timing
-from zsched.core.timing import PROFILES, WIFI, timing_faults
+from zsched.config.timing import PROFILES, WIFI, timing_faults
+from zsched.core.values.fleet import Timing
 
 
 def changed(field: str, value: float) -> Timing:

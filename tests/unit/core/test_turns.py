@@ -7,9 +7,11 @@ from dataclasses import dataclass
 
 import pytest
 
-from zsched.core.fleet import Demand, Fleet, NodeSpec, TaskSpec, Timing
-from zsched.core.gateway import Gateway
-from zsched.core.model import (
+from zsched.core.gateway.gateway import Gateway
+from zsched.core.scheduler.scoring import book, score
+from zsched.core.scheduler.turns import in_turn, who_moves_first
+from zsched.core.values.fleet import Demand, Fleet, NodeSpec, TaskSpec, Timing
+from zsched.core.values.model import (
     Allocation,
     NodeKind,
     PeerState,
@@ -20,9 +22,7 @@ from zsched.core.model import (
     WorkerLoad,
     WorkerState,
 )
-from zsched.core.scoring import book, score
-from zsched.core.turns import in_turn, who_moves_first
-from zsched.core.voting import Voting
+from zsched.core.vote.voting import Voting
 
 
 @dataclass

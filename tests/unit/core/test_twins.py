@@ -2,8 +2,17 @@
 
 from __future__ import annotations
 
-from zsched.core.identity import ASK_TWINS_S, QUIET_S, STAYS_S, TOLD_FOR_S, TOLD_YOUNG_S, YOUNG_S, Identity, Verdict
-from zsched.core.model import Beat
+from zsched.core.membership.identity import (
+    ASK_TWINS_S,
+    QUIET_S,
+    STAYS_S,
+    TOLD_FOR_S,
+    TOLD_YOUNG_S,
+    YOUNG_S,
+    Identity,
+    Verdict,
+)
+from zsched.core.values.model import Beat
 
 BEAT_S = 0.5
 STAYS = int(STAYS_S / BEAT_S)

@@ -7,11 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from zsched.core import fleet, scoring, utility
-from zsched.core.fleet import PATIENT_BONUS
-from zsched.core.model import ScoreForm, Weights
-from zsched.core.scoring import rounded
-from zsched.core.utility import (
+from zsched.core.scheduler import scoring, utility
+from zsched.core.scheduler.scoring import rounded
+from zsched.core.scheduler.utility import (
     clamp,
     cpu_utility,
     memory_utility,
@@ -20,6 +18,9 @@ from zsched.core.utility import (
     service_utility,
     total_utility,
 )
+from zsched.core.values import fleet
+from zsched.core.values.fleet import PATIENT_BONUS
+from zsched.core.values.model import ScoreForm, Weights
 
 SEEDED = settings(derandomize=True, database=None, deadline=None)
 RATIO = st.floats(0.0, 1.0)

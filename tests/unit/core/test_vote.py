@@ -4,9 +4,9 @@ import itertools
 
 import pytest
 
-from zsched.core.model import Proposal
-from zsched.core.scoring import majority
-from zsched.core.vote import Tally, VoteOutcome, tally
+from zsched.core.scheduler.scoring import majority
+from zsched.core.values.model import Proposal
+from zsched.core.vote.tally import Tally, VoteOutcome, tally
 
 THREE = ("r1", "r2", "r3")
 FIVE = (*THREE, "r4", "r5")

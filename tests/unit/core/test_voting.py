@@ -6,10 +6,10 @@ import math
 
 import pytest
 
-from zsched.core.fleet import Fleet, NodeSpec, TaskSpec, Timing
-from zsched.core.model import Allocation, NodeKind, PeerState, Proposal, Tuning, Weights
-from zsched.core.vote import VoteOutcome
-from zsched.core.voting import Voting, vote_time
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing
+from zsched.core.values.model import Allocation, NodeKind, PeerState, Proposal, Tuning, Weights
+from zsched.core.vote.tally import VoteOutcome
+from zsched.core.vote.voting import Voting, vote_time
 
 ROBOTS = ("robot1", "robot2", "robot3")
 ALL = dict.fromkeys(ROBOTS, PeerState.ALIVE)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from zsched.core.executor import Executor
-from zsched.core.fleet import OnIsolation, TaskSpec, WorkerSpec
+from zsched.core.executor.handover import Executor
 from zsched.core.instructions import StartWorker
-from zsched.core.model import Tuning, Weights
+from zsched.core.values.fleet import OnIsolation, TaskSpec, WorkerSpec
+from zsched.core.values.model import Tuning, Weights
 
 
 @pytest.mark.parametrize(

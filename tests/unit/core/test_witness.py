@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from zsched.core.messages import Learnt
-from zsched.core.model import Beat
-from zsched.core.witness import ASK_ALL_S, Witness, as_seen, as_tuple
+from zsched.core.values.messages import Learnt
+from zsched.core.values.model import Beat
+from zsched.core.vote.witness import ASK_ALL_S, Witness, as_seen, as_tuple
 
 ELECTORS = ("robot1", "robot2", "robot3", "robot4", "robot5")
 NODES = frozenset((*ELECTORS, "edge1"))

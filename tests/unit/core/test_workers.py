@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from zsched.core import events as ev
-from zsched.core.model import MAX_REASON, WorkerState
-from zsched.core.workers import TROUBLE_S, Workers
+from zsched.core.executor.workers import TROUBLE_S, Workers
+from zsched.core.values.model import MAX_REASON, WorkerState
 
 CUT = "x" * (MAX_REASON - 1) + "…"
 

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from zsched import relay_pipe, wire
-from zsched.core import events, messages, model, plan, relay_life, relay_protocol, snapshot
+from zsched.core import events
+from zsched.core.values import messages, model, plan, relay_life, relay_protocol, snapshot
+from zsched.ipc import pipe as relay_pipe
+from zsched.wire import codec as wire
 
 HERE = Path(__file__).parent
 

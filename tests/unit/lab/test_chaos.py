@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from zsched.core.model import NodeId
+from zsched.core.values.model import NodeId
 from zsched.lab.chaos import GUARD, ChaosBed
 from zsched.lab.history import History, Learnt
 from zsched.lab.netbed import Received

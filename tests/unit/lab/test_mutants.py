@@ -91,9 +91,9 @@ def test_a_seed_chooses_the_same_mutants_again_and_another_one_others() -> None:
     assert [one.key for one in first] == [one.key for one in again]
     assert {one.key for one in first} != {one.key for one in other}
     assert len({one.module for one in first}) > 5
-    assert {one.path for one in choose(3, 1000, ["core/turns.py"])} == {"core/turns.py"}
-    (line, *_) = choose(3, 1000, ["core/turns.py"])
-    assert {one.line for one in choose(3, 1000, [f"core/turns.py:{line.line}"])} == {line.line}
+    assert {one.path for one in choose(3, 1000, ["core/scheduler/turns.py"])} == {"core/scheduler/turns.py"}
+    (line, *_) = choose(3, 1000, ["core/scheduler/turns.py"])
+    assert {one.line for one in choose(3, 1000, [f"core/scheduler/turns.py:{line.line}"])} == {line.line}
 
 
 def verdict(number: int, kind: str) -> Verdict:
@@ -179,7 +179,7 @@ def run(tmp_path: Path, tests: Path, *mutants: Mutant) -> str:
 def test_the_command_plants_into_functions_and_into_what_the_import_runs(tmp_path: Path) -> None:
     """Both ways: `majority` is called, `PROBATION_S` is made at the import; an empty test finds neither."""
     scoring, damping = (
-        mutants_of(f"zsched.core.{name}", (CORE / f"{name}.py").read_text(encoding="utf-8"))
+        mutants_of(f"zsched.core.scheduler.{name}", (CORE / "scheduler" / f"{name}.py").read_text(encoding="utf-8"))
         for name in ("scoring", "damping")
     )
     found = [one for one in scoring if one.function == "=majority"]
@@ -188,8 +188,8 @@ def test_the_command_plants_into_functions_and_into_what_the_import_runs(tmp_pat
     assert made
     good = tmp_path / "test_good.py"
     good.write_text(
-        "from zsched.core.damping import PROBATION_S\n"
-        "from zsched.core.scoring import majority\n"
+        "from zsched.core.scheduler.damping import PROBATION_S\n"
+        "from zsched.core.scheduler.scoring import majority\n"
         "def test_majority():\n    assert [majority(n) for n in range(1, 6)] == [1, 2, 2, 3, 3]\n"
         "def test_made():\n    assert PROBATION_S == 30.0\n",
         encoding="utf-8",

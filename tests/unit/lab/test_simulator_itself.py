@@ -8,10 +8,10 @@ from dataclasses import replace
 import pytest
 
 from zsched.core import instructions as do
-from zsched.core.fleet import Fleet, NodeSpec, StreamRule, TaskSpec, Timing, WorkerSpec
-from zsched.core.messages import Accepted, Promise
-from zsched.core.model import Acceptance, Allocation, Ballot, NodeId, NodeKind, PeerState, Tuning, Weights
-from zsched.core.plan import Direction, Role, WorkerRole
+from zsched.core.values.fleet import Fleet, NodeSpec, StreamRule, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.messages import Accepted, Promise
+from zsched.core.values.model import Acceptance, Allocation, Ballot, NodeId, NodeKind, PeerState, Tuning, Weights
+from zsched.core.values.plan import Direction, Role, WorkerRole
 from zsched.errors import InvariantError
 from zsched.lab.simulator import RESTART_S, TOKEN_DELAY_S, Simulator
 

@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from zsched.core.fleet import RADIO_PATIENCE, LinkLimits, PairReading
+from zsched.core.values.fleet import RADIO_PATIENCE, LinkLimits, PairReading
 from zsched.lab.decisions import entries
 from zsched.lab.decisions.radio import Drive, read_drive
 from zsched.lab.decisions.replay import Entry, replay

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from random import Random
 from typing import Any, Final
 
-from zsched.core.fleet import (
+from zsched.core.values.fleet import (
     DEFAULT_FORESEE_S,
     PAPER_PATIENCE,
     PATIENT_BONUS,
@@ -21,7 +21,7 @@ from zsched.core.fleet import (
     LinkLimits,
     PairReading,
 )
-from zsched.core.model import Tuning, Weights
+from zsched.core.values.model import Tuning, Weights
 from zsched.lab.decisions.replay import Entry
 from zsched.lab.decisions.rules import (
     BlindRule,

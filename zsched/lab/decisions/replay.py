@@ -9,8 +9,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from random import Random
 
-from zsched.core.fleet import Fleet, LinkLimits
-from zsched.core.model import Weights
+from zsched.core.values.fleet import Fleet, LinkLimits
+from zsched.core.values.model import Weights
 from zsched.lab.decisions.rules import Move, Rule
 from zsched.lab.decisions.view import START_S, Feed, Look, Sight, View
 from zsched.lab.decisions.world import DT_S, World, with_task

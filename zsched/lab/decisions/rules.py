@@ -3,8 +3,8 @@
 Knows: when each rule looks, and whom it then chooses. Does not know: the truth, what a choice is worth.
 
 `CoreRule` is the production's decision: one `Judge` per robot, a called vote, the tally, flap damping. It does what
-`zsched.core.rounds` does when no message is lost; `tests/unit/lab/decisions/test_same_as_nodes.py` holds the two
-together.
+`zsched.core.scheduler.rounds` does when no message is lost; `tests/unit/lab/decisions/test_same_as_nodes.py` holds the
+two together.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from dataclasses import dataclass, field, replace
 from random import Random
 from typing import Protocol
 
-from zsched.core.damping import Damping
-from zsched.core.fleet import TaskSpec
-from zsched.core.model import Allocation, NodeId, PeerState, Proposal, Tuning
-from zsched.core.rounds import TIMER_MARGIN_S
-from zsched.core.scheduler import Judge, Judgement, Outcome, escape_reason
-from zsched.core.scoring import Standing, pick
-from zsched.core.vote import VoteOutcome, tally
+from zsched.core.scheduler.damping import Damping
+from zsched.core.scheduler.judge import Judge, Judgement, Outcome, escape_reason
+from zsched.core.scheduler.rounds import TIMER_MARGIN_S
+from zsched.core.scheduler.scoring import Standing, pick
+from zsched.core.values.fleet import TaskSpec
+from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, Tuning
+from zsched.core.vote.tally import VoteOutcome, tally
 from zsched.lab.decisions.view import Sight
 
 COMMIT_S = 0.03

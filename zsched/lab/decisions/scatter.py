@@ -15,8 +15,8 @@ import time
 
 import numpy as np
 
-from zsched.adapters.cgroup import LimitedGroup
-from zsched.adapters.device_profiler import DeviceProfiler
+from zsched.adapters.machine.cgroup import LimitedGroup
+from zsched.adapters.machine.device_profiler import DeviceProfiler
 from zsched.errors import AdapterError
 from zsched.lab.decisions.loads import Array
 

@@ -13,9 +13,12 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import Final, Protocol
 
-from zsched.core.fleet import Fleet, TaskSpec
-from zsched.core.gateway import Gateway
-from zsched.core.model import (
+from zsched.config.timing import WIFI
+from zsched.core.gateway.gateway import Gateway
+from zsched.core.profile.profile import Profiler
+from zsched.core.scheduler.scoring import Standing, compare, score
+from zsched.core.values.fleet import Fleet, TaskSpec
+from zsched.core.values.model import (
     Allocation,
     DeviceSample,
     LinkSample,
@@ -24,9 +27,6 @@ from zsched.core.model import (
     PeerState,
     UtilityVector,
 )
-from zsched.core.profile import Profiler
-from zsched.core.scoring import Standing, compare, score
-from zsched.core.timing import WIFI
 from zsched.lab.decisions.world import DT_S, MEMORY_MB, World
 
 START_S: Final = 100.0

@@ -3,7 +3,7 @@
 Knows: true use and true signals, readings, the utility of the true state. Does not know: rules, decisions.
 
 Time goes in steps of 0.2 s, the profilers' period. A candidate's use is that of everything but the task: what the
-task's worker uses itself is subtracted by the core (`zsched.core.utility.predicted_use`), so it cancels.
+task's worker uses itself is subtracted by the core (`zsched.core.scheduler.utility.predicted_use`), so it cancels.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from zsched.core.fleet import Demand, Fleet, LinkLimits, NodeSpec, TaskSpec, Timing
-from zsched.core.model import NodeId, NodeKind, Tuning, Weights
-from zsched.core.scoring import majority
+from zsched.core.scheduler.scoring import majority
+from zsched.core.values.fleet import Demand, Fleet, LinkLimits, NodeSpec, TaskSpec, Timing
+from zsched.core.values.model import NodeId, NodeKind, Tuning, Weights
 from zsched.lab.decisions import loads, radio
 from zsched.lab.decisions.loads import Array, LoadPlan, Scatter
 

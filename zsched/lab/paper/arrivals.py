@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from zsched.core.model import NodeId
+from zsched.core.values.model import NodeId
 
 
 @dataclass(frozen=True, slots=True)

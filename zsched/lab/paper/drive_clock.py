@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from zsched.adapters.network_profiler import Trace, parse_trace, read_text
-from zsched.config import load_fleet
-from zsched.core.fleet import LinkSpec
-from zsched.core.model import LinkSource, NodeId
+from zsched.adapters.radio.network_profiler import Trace, parse_trace, read_text
+from zsched.config.load import load_fleet
+from zsched.core.values.fleet import LinkSpec
+from zsched.core.values.model import LinkSource, NodeId
 
 STEP_S = 0.1
 LONGEST_START_S = 60.0
@@ -83,7 +83,7 @@ def begun_before(said: Series, trace: Trace, offset_s: float, smoothing_s: float
 
 
 def smoothed(trace: Trace, offset_s: float, smoothing_s: float, steps: int) -> np.ndarray:
-    """The drive every `STEP_S` from its begin on, smoothed as daemons do (`zsched.core.profile.Ewma`)."""
+    """The drive every `STEP_S` from its begin on, smoothed as daemons do (`zsched.core.profile.profile.Ewma`)."""
     keep = math.exp(-STEP_S / smoothing_s) if smoothing_s > 0.0 else 0.0
     value = math.nan
     found = np.empty(steps)

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from mcap.reader import make_reader
 
-from zsched.core.model import NodeId
+from zsched.core.values.model import NodeId
 from zsched.lab.fleet_view import Load
 from zsched.lab.map_metrics import score_map
 from zsched.lab.paper.arrivals import Arrival, Streams

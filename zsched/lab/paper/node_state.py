@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from zsched.adapters.cgroup import LimitedGroup
-from zsched.core.model import NodeId
+from zsched.adapters.machine.cgroup import LimitedGroup
+from zsched.core.values.model import NodeId
 from zsched.errors import AdapterError
 from zsched.lab.fleet_runner import LabFleet
 from zsched.lab.fleet_view import Status, find_task

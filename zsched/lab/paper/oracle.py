@@ -11,8 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from zsched.core.model import NodeId
-from zsched.core.utility import clamp
+from zsched.core.scheduler.utility import clamp
+from zsched.core.values.model import NodeId
 from zsched.lab.paper.load import Window, loaded_at
 from zsched.lab.paper.scenario import LoadLevel, NodeShare, Scenario
 

@@ -12,7 +12,7 @@ import math
 import random
 from pathlib import Path
 
-from zsched.core.model import NodeId
+from zsched.core.values.model import NodeId
 from zsched.errors import ConfigError
 from zsched.lab.paper.scenario import Radio
 

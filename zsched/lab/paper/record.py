@@ -28,9 +28,9 @@ from typing import IO
 import zenoh
 from mcap.writer import Writer
 
-from zsched.adapters.cgroup import CgroupTree, CpuQuota, MemoryQuota
+from zsched.adapters.machine.cgroup import CgroupTree, CpuQuota, MemoryQuota
 from zsched.clock import monotonic_s
-from zsched.core.model import NodeId
+from zsched.core.values.model import NodeId
 from zsched.lab.application import connect
 from zsched.lab.signals import StopFlag
 from zsched.tasks.map_merge.cdr import CdrError, decode_grid

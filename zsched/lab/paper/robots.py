@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-from zsched.core.model import NodeId
+from zsched.core.values.model import NodeId
 from zsched.lab.explore.body import Drift
 from zsched.lab.explore.worlds import load_world
 from zsched.lab.laser_log import load_log

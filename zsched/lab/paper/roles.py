@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from zsched.core.model import NodeId
+from zsched.core.values.model import NodeId
 
 ROLES = (
     ("zsched.lab.explore.slam", "slam"),

@@ -3,7 +3,7 @@
 Knows: where the product makes its judges. Does not know: what the rules do.
 
 Everything else is the product's own daemon: this program puts `zsched.lab.paper.rules.JudgeMaker` in the place of
-`zsched.core.rounds.Judge` and then becomes `zsched.daemon`. It must never be used outside the lab.
+`zsched.core.scheduler.rounds.Judge` and then becomes `zsched.daemon`. It must never be used outside the lab.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 
 from zsched import daemon
-from zsched.core import rounds
+from zsched.core.scheduler import rounds
 from zsched.lab.paper.rules import JudgeMaker, RuleName
 
 

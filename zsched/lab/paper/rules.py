@@ -17,9 +17,9 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from zsched.core.model import Allocation, NodeId
-from zsched.core.scheduler import Judge, Judgement
-from zsched.core.scoring import Standing
+from zsched.core.scheduler.judge import Judge, Judgement
+from zsched.core.scheduler.scoring import Standing
+from zsched.core.values.model import Allocation, NodeId
 
 PENALTY = 0.05
 RANDOM_PERIOD_S = 10.0

@@ -20,9 +20,9 @@ from typing import Any
 
 from ruamel.yaml import YAML
 
-from zsched.adapters.operator_socket import ask
+from zsched.adapters.host.operator_socket import ask
 from zsched.clock import monotonic_s
-from zsched.core.model import NodeId
+from zsched.core.values.model import NodeId
 from zsched.lab.children import ChildError, Children
 from zsched.lab.demo_run import worker_options
 from zsched.lab.fleet_runner import CLI, FleetRunner, LabFleet, read_tree, write_fleet

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any
 
-from zsched.core.model import NodeId
+from zsched.core.values.model import NodeId
 from zsched.errors import ConfigError
 from zsched.lab.paper.rules import RuleName
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from ruamel.yaml import YAML
 
-from zsched.core.model import NodeId
+from zsched.core.values.model import NodeId
 from zsched.lab.children import Child, Children
 from zsched.lab.fleet_runner import LabFleet, read_tree
 from zsched.lab.netbed import DATA_PORT, in_namespaces

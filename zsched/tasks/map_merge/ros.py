@@ -9,7 +9,7 @@ import os
 from collections.abc import Callable
 
 from zsched.clock import wall_ns
-from zsched.core.ros2 import GID_BYTES, Attachment, encode_attachment
+from zsched.core.route.ros2 import GID_BYTES, Attachment, encode_attachment
 
 
 class RosPublisher:

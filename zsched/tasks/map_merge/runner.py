@@ -21,7 +21,7 @@ import cv2
 
 import zsched.worker
 from zsched.clock import monotonic_s
-from zsched.core.plan import WorkerRole
+from zsched.core.values.plan import WorkerRole
 from zsched.tasks.map_merge.merger import MergerSettings, Mode
 from zsched.tasks.map_merge.pairs import Rule
 from zsched.tasks.map_merge.poses import read_poses

@@ -18,7 +18,7 @@ from mcap.reader import make_reader
 from rosbags.typesys import Stores, get_typestore
 
 from support.waiting import free_endpoint, until
-from zsched.adapters.cgroup import LimitedGroup
+from zsched.adapters.machine.cgroup import LimitedGroup
 from zsched.lab import application
 from zsched.lab.children import Children
 from zsched.lab.limits import LimitKind, NodeLimits

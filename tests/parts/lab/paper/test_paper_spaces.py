@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from support.waiting import until
-from zsched.config import load_fleet
-from zsched.core.fleet import SharedMemory
+from zsched.config.load import load_fleet
+from zsched.core.values.fleet import SharedMemory
 from zsched.lab.fleet_runner import write_fleet
 from zsched.lab.netns import why_not
 from zsched.lab.paper.places import scenario_path

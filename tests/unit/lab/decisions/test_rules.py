@@ -9,9 +9,9 @@ from random import Random
 import numpy as np
 import pytest
 
-from zsched.config import check_bytes
-from zsched.core.fleet import PAPER_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S
-from zsched.core.model import Tuning
+from zsched.config.load import check_bytes
+from zsched.core.values.fleet import PAPER_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S
+from zsched.core.values.model import Tuning
 from zsched.lab.decisions import entries
 from zsched.lab.decisions.replay import Entry, replay
 from zsched.lab.decisions.report import STARS

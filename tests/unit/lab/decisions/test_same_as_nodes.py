@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from zsched.core.fleet import PAPER_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S, Timing
-from zsched.core.model import Tuning
-from zsched.core.patience import FIRST_PATIENCE
+from zsched.core.scheduler.patience import FIRST_PATIENCE
+from zsched.core.values.fleet import PAPER_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S, Timing
+from zsched.core.values.model import Tuning
 from zsched.lab.decisions.loads import Array
 from zsched.lab.decisions.replay import Entry, replay
 from zsched.lab.decisions.rules import CoreRule

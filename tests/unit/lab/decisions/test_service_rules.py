@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from zsched.core import scoring
-from zsched.core.fleet import PATIENT_BONUS, PATIENT_COOL_DOWN_S, TaskSpec
-from zsched.core.model import ScoreForm, Utility, UtilityVector, Weights
-from zsched.core.patience import FIRST_PATIENCE
+from zsched.core.scheduler import scoring
+from zsched.core.scheduler.patience import FIRST_PATIENCE
+from zsched.core.values.fleet import PATIENT_BONUS, PATIENT_COOL_DOWN_S, TaskSpec
+from zsched.core.values.model import ScoreForm, Utility, UtilityVector, Weights
 from zsched.lab.decisions import __main__ as package
 from zsched.lab.decisions import entries
 from zsched.lab.decisions.rules import CoreRule

@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import pytest
 
-from zsched.core.fleet import Demand, Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.model import NodeId, NodeKind, Tuning
+from zsched.core.values.fleet import Demand, Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.model import NodeId, NodeKind, Tuning
 from zsched.lab.decisions.world import EVEN
 from zsched.lab.simulator import CORES, MEMORY_MB, Simulator
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from zsched.adapters.network_profiler import Trace
-from zsched.core.fleet import Timing
+from zsched.adapters.radio.network_profiler import Trace
+from zsched.core.values.fleet import Timing
 from zsched.lab.paper.drive_clock import begun_before, smoothed
 from zsched.lab.paper.load import Window
 from zsched.lab.paper.metrics import (

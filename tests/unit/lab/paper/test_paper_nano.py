@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from zsched.config import load_fleet
+from zsched.config.load import load_fleet
 from zsched.errors import ConfigError
 from zsched.lab.explore.navigate import main as navigate
 from zsched.lab.explore.robot import parse as parse_explorer

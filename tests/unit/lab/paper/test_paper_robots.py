@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from zsched.config import load_fleet
+from zsched.config.load import load_fleet
 from zsched.lab.explore.robot import parse as parse_explorer
 from zsched.lab.laser_log import malaga_path
 from zsched.lab.paper.cells import Cell

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from zsched.core import rounds
-from zsched.core.damping import Damping
-from zsched.core.fleet import TaskSpec
-from zsched.core.model import Allocation, Tuning, Weights
-from zsched.core.scheduler import Judge, Judgement, Outcome
-from zsched.core.scoring import Standing
+from zsched.core.scheduler import rounds
+from zsched.core.scheduler.damping import Damping
+from zsched.core.scheduler.judge import Judge, Judgement, Outcome
+from zsched.core.scheduler.scoring import Standing
+from zsched.core.values.fleet import TaskSpec
+from zsched.core.values.model import Allocation, Tuning, Weights
 from zsched.lab.paper.ruled_daemon import install
 from zsched.lab.paper.rules import EVERY_S, RANDOM_PERIOD_S, JudgeMaker, Rule, RuleName, RulePlan, read_plan
 

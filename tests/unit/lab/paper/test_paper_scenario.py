@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from zsched.adapters.network_profiler import parse_trace
-from zsched.config import load_fleet
-from zsched.core.fleet import DEFAULT_FORESEE_S, PATIENT_BONUS, PATIENT_COOL_DOWN_S
-from zsched.core.model import ScoreForm
+from zsched.adapters.radio.network_profiler import parse_trace
+from zsched.config.load import load_fleet
+from zsched.core.values.fleet import DEFAULT_FORESEE_S, PATIENT_BONUS, PATIENT_COOL_DOWN_S
+from zsched.core.values.model import ScoreForm
 from zsched.errors import ConfigError
 from zsched.lab.fleet_runner import read_tree, write_fleet
 from zsched.lab.paper.claims import CLAIMS

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from zsched.core.ros2 import Attachment, decode_attachment
+from zsched.core.route.ros2 import Attachment, decode_attachment
 from zsched.tasks.map_merge.__main__ import parser
 from zsched.tasks.map_merge.ros import RosPublisher
 

@@ -11,15 +11,15 @@ from dataclasses import fields
 from enum import Enum
 from typing import Any, Final, Literal, get_args, get_origin, get_type_hints
 
-from zsched.core.fleet import (
+from zsched.core.scheduler.patience import FIRST_PATIENCE
+from zsched.core.values.fleet import (
     DEFAULT_SCORE,
     PAPER_PATIENCE,
     PATIENT_BONUS,
     PATIENT_COOL_DOWN_S,
     TaskSpec,
 )
-from zsched.core.model import ScoreForm, Tuning, Weights
-from zsched.core.patience import FIRST_PATIENCE
+from zsched.core.values.model import ScoreForm, Tuning, Weights
 from zsched.lab.decisions.entries import PAPER_COST, RAW
 from zsched.lab.decisions.rules import CoreRule, PickRule, Rule
 from zsched.lab.decisions.service.replay import Player, is_of_task

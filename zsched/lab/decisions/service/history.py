@@ -15,8 +15,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from zsched.core.fleet import Demand, Fleet, TaskSpec, Timing
-from zsched.core.model import Tuning
+from zsched.core.values.fleet import Demand, Fleet, TaskSpec, Timing
+from zsched.core.values.model import Tuning
 from zsched.lab.decisions.loads import LONG, Array, Scatter, correlated
 from zsched.lab.decisions.service.machines import Machine, Shared, Work, alone_s, share
 from zsched.lab.decisions.world import DT_S, EVEN, MEMORY_MB, build_fleet

@@ -4,7 +4,7 @@ Knows: sampling, smoothing, publication, gathers without loss, bookings. Does no
 
 On a machine that is short, a task's use is no longer its demand and readings end at the machine's size, so what is
 seen depends on who has the task: every rule gets profilers and a gateway of its own. Every task has a rule of its own;
-the tasks' rounds follow each other, and each sees the bookings of those before (`zsched.core.turns`).
+the tasks' rounds follow each other, and each sees the bookings of those before (`zsched.core.scheduler.turns`).
 """
 
 from __future__ import annotations
@@ -14,9 +14,11 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any, Final
 
 from zsched.core.events import WorkerJobs
-from zsched.core.fleet import TaskSpec
-from zsched.core.gateway import Gateway
-from zsched.core.model import (
+from zsched.core.gateway.gateway import Gateway
+from zsched.core.profile.profile import Profiler
+from zsched.core.scheduler.scoring import Standing, book, compare, score
+from zsched.core.values.fleet import TaskSpec
+from zsched.core.values.model import (
     Allocation,
     DeviceSample,
     LinkSample,
@@ -28,8 +30,6 @@ from zsched.core.model import (
     WorkerLoad,
     WorkerState,
 )
-from zsched.core.profile import Profiler
-from zsched.core.scoring import Standing, book, compare, score
 from zsched.lab.decisions.replay import TICKS, rounds
 from zsched.lab.decisions.rules import Move, Rule
 from zsched.lab.decisions.service.history import History, mask_of, rank_of
@@ -47,7 +47,7 @@ class Player:
     name: str
     make: Callable[[Sight], Rule]
     tuning: Tuning
-    """`zsched.core.scoring.score` scores by it."""
+    """`zsched.core.scheduler.scoring.score` scores by it."""
     look: Look = Look()
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Fields of `TaskSpec` that it has otherwise."""

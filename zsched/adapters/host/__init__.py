@@ -1,0 +1,1 @@
+"""The service manager, the state file, the operator's socket."""

@@ -1,0 +1,248 @@
+"""Keeps a node's durable state in one file that is always a whole old or a whole new one.
+
+A save writes a temporary file in the same folder, fsyncs it, renames it over the old one and fsyncs the folder; only
+then has the node promised anything. Two daemons cannot share a folder: its lock file is held with flock(2).
+
+A file that is missing, damaged, another node's, or written on other hardware (a cloned card) is *lost state*: `load`
+says so as a value, and the node works without being an elector (docs/failures.md).
+
+Knows: folders, locks, fsync, what identifies this machine. Does not know: the bytes (`zsched.wire.codec`), ballots,
+epochs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import hashlib
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from zsched.core.values.model import DurableState, NodeId
+from zsched.core.vote.generations import way_out
+from zsched.errors import AdapterError, WireError
+from zsched.files import read_regular
+from zsched.wire.codec import decode_state, encode_state
+
+STATE_NAME, LOCK_NAME, NEW_NAME = "state", "lock", "state.new"
+MAX_STATE_BYTES = 4 * 1024 * 1024
+HARDWARE_SOURCES = (
+    ("machine", "etc/machine-id"),
+    ("dmi", "sys/class/dmi/id/product_uuid"),
+    ("serial", "proc/device-tree/serial-number"),
+)
+"""machine-id(5), the BIOS's UUID (readable by root only), a board's serial number."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoadResult:
+    """The state, or why there is none: one line for `status` and the log."""
+
+    state: DurableState | None = None
+    problem: str | None = None
+    is_missing: bool = False
+    """There is no such file: this node was never initialised, or its folder is gone."""
+
+
+class StateFile:
+    """The durable state of ``node`` in ``folder``. `acquire` (or ``with``) before anything else."""
+
+    def __init__(self, folder: Path, *, fleet: str, node: NodeId, hardware: str | None = None) -> None:
+        """Name the place; touches nothing. ``hardware`` is `hardware_id` but in tests."""
+        self.folder, self.path = folder, folder / STATE_NAME
+        self._fleet, self._node = fleet, node
+        self._hardware = hardware_id() if hardware is None else hardware
+        self._lock_fd: int | None = None
+
+    def acquire(self) -> None:
+        """Make the folder (mode 0700) if need be and take its lock.
+
+        Raises:
+            AdapterError: another process holds it, or the folder cannot be made or written.
+        """
+        if self._lock_fd is not None:
+            return
+        try:
+            self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            fd = os.open(self.folder / LOCK_NAME, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        except OSError as error:
+            is_file = error.errno in (errno.EEXIST, errno.ENOTDIR)
+            advice = "a file is where a folder should be: see --state-dir" if is_file else "check its owner"
+            raise AdapterError(f"cannot use the state folder {self.folder}: {error.strerror}; {advice}") from error
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            holder = os.pread(fd, 32, 0).decode(errors="replace").strip()
+            os.close(fd)
+            raise AdapterError(
+                f"the state folder {self.folder} is in use by process {holder or 'unknown'}; stop that daemon first"
+            ) from error
+        with contextlib.suppress(OSError):  # on a full disk the number is missing, the lock holds all the same
+            os.ftruncate(fd, 0)
+            os.pwrite(fd, f"{os.getpid()}\n".encode("ascii"), 0)
+        _hand_over(fd, self.folder)
+        self._lock_fd = fd
+
+    def release(self) -> None:
+        """Give the lock back; the files stay."""
+        if self._lock_fd is not None:
+            os.close(self._lock_fd)
+            self._lock_fd = None
+
+    def __enter__(self) -> Self:
+        self.acquire()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.release()
+
+    def check_owner(self) -> None:
+        """Look whose folder it is; it is left as it is.
+
+        Raises:
+            AdapterError: another node's or fleet's.
+        """
+        state = self._read().state
+        if state is None or (state.fleet, state.node) == (self._fleet, self._node):
+            return
+        whose = f"or say with --node {state.node} that this machine is {state.node}"
+        if state.fleet != self._fleet:
+            whose = "or name that fleet's file with --config"
+        raise AdapterError(
+            f"{self.path} {self._foreign(state)}, and is left as it is; "
+            f"give {self._node} a folder of its own with --state-dir, {whose}"
+        )
+
+    def create(self, state: DurableState) -> None:
+        """Write a node's blank state (`zsched init`): "this name has never voted in this generation".
+
+        A start counter that can still be read from an older file is kept: incarnations never fall.
+
+        Raises:
+            AdapterError: the folder is another node's or fleet's, or there is a state file already and
+                ``state.generation`` is not above its own (a damaged one counts as generation 0), or it cannot be
+                written.
+        """
+        self.check_owner()
+        found = self._read()
+        standing = 0 if found.state is None else found.state.generation
+        if self.path.exists() and state.generation <= standing:
+            what = f"of generation {standing}" if found.state is not None else f"({found.problem})"
+            raise AdapterError(
+                f"{self.path} exists already {what}: this name may have voted. Without this state the node works all "
+                f"the same and votes no more. To make it an elector again, {way_out(standing + 1)}"
+            )
+        if found.state is not None:
+            state = replace(state, incarnation=max(state.incarnation, found.state.incarnation))
+        self.save(state)
+
+    def load(self) -> LoadResult:
+        """Read and check the state: whole, this fleet's, this node's, written on this machine."""
+        found = self._read()
+        if found.state is None:
+            return found
+        problem = self._foreign(found.state)
+        return found if problem is None else LoadResult(problem=f"{self.path} {problem}")
+
+    def save(self, state: DurableState) -> None:
+        """Replace the state; when this returns it survives a power cut.
+
+        Raises:
+            AdapterError: the disk is full, read-only or gone, or the lock is not held; the old state is whole.
+        """
+        if self._lock_fd is None:
+            raise AdapterError(f"the lock of {self.folder} is not held: acquire it before saving")
+        content, new = encode_state(state), self.folder / NEW_NAME
+        try:
+            _write_synced(new, content)
+            new.replace(self.path)
+            _sync_folder(self.folder)
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                new.unlink()
+            raise AdapterError(
+                f"cannot write {self.path}: {error.strerror}; free or remount the disk (the old state is whole)"
+            ) from error
+
+    def _read(self) -> LoadResult:
+        try:
+            content = read_regular(self.path, MAX_STATE_BYTES)
+        except FileNotFoundError:
+            advice = "if this name has never voted, stop the daemon, run `zsched init`, and start it again"
+            return LoadResult(problem=f"{self.path} does not exist: {advice}", is_missing=True)
+        except OSError as error:
+            return LoadResult(problem=f"{self.path} cannot be read: {error.strerror}")
+        try:
+            return LoadResult(state=decode_state(content))
+        except WireError as error:
+            return LoadResult(problem=f"{self.path} is damaged: {error}")
+
+    def _foreign(self, state: DurableState) -> str | None:
+        if state.fleet != self._fleet:
+            return f"belongs to the fleet {state.fleet!r}, not {self._fleet!r}"
+        if state.node != self._node:
+            return f"belongs to the node {state.node!r}, not {self._node!r}"
+        if not is_same_hardware(state.hardware, self._hardware):
+            return "was written on another machine: was its disk or card copied?"
+        return None
+
+
+def hardware_id(root: Path = Path("/")) -> str:
+    """What identifies this machine: ``name:hash`` of every source that can be read, "" when none can.
+
+    Each source stands alone because some are readable by root only: `zsched init` as root and a service without
+    privileges must still recognise each other (`is_same_hardware`).
+    """
+    parts = []
+    for name, path in HARDWARE_SOURCES:
+        try:
+            content = (root / path).read_bytes().strip(b"\0\n ")
+        except OSError:
+            continue
+        if content:
+            parts.append(f"{name}:{hashlib.blake2s(content, digest_size=8, person=b'zsched').hexdigest()}")
+    return ",".join(parts)
+
+
+def is_same_hardware(stored: str, current: str) -> bool:
+    """Whether two `hardware_id` do not contradict each other: every source that both could read agrees."""
+    theirs, ours = _parts(stored), _parts(current)
+    return all(theirs[name] == ours[name] for name in theirs.keys() & ours.keys())
+
+
+def _parts(hardware: str) -> dict[str, str]:
+    return dict(part.partition(":")[::2] for part in hardware.split(",") if part)
+
+
+def _write_synced(path: Path, content: bytes) -> None:
+    fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NONBLOCK | os.O_CLOEXEC, 0o600)  # waits for no pipe
+    try:
+        written = 0
+        while written < len(content):
+            written += os.write(fd, content[written:])
+        _hand_over(fd, path.parent)
+        os.fsync(fd)
+    finally:
+        os.close(fd)
+
+
+def _hand_over(fd: int, folder: Path) -> None:
+    """Give a file that root writes (`zsched init`) to the folder's owner: the service must be able to read it."""
+    if os.geteuid() == 0:
+        with contextlib.suppress(OSError):  # a file system without owners
+            owner = folder.stat()
+            os.fchown(fd, owner.st_uid, owner.st_gid)
+
+
+def _sync_folder(folder: Path) -> None:
+    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)

@@ -1,0 +1,1 @@
+"""CPU, memory and cgroups of this machine."""

@@ -1,0 +1,364 @@
+"""Measures this machine, or the control group it stands for, and the load of each worker's process tree.
+
+CPU in use is a difference, so the first sample has none. Without a quota it is taken from the CPUs this process may run
+on: everything but idle and iowait (a CPU that waits for a disk can run a task; one that the hypervisor stole cannot).
+Under a quota the machine *is* the group that holds the smallest quota: its cores, its own accounting. Memory in use is
+total - MemAvailable, or under a limit the group's working set, or what the machine has left if that is less.
+
+A worker's load is its whole process tree. CPU: the difference of user and system time, children that were waited for
+included, so short-lived ones count. How long its threads have run and waited to run (schedstat) tells what it wants
+beyond that (`zsched.core.profile.appetite`). Memory: the sum of resident sets, which counts shared pages once per
+process; the exact figure (PSS) would cost milliseconds per sample. How many threads want to run is what /proc/stat
+counts at the moment of the sample.
+
+Knows: /proc and /sys/fs/cgroup (proc(5)), below a root that tests can set. Does not know: smoothing, demand, tasks'
+meaning. Nothing here raises: what cannot be read is ``None``.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from zsched.adapters.machine.cgroup import CgroupTree, CpuQuota, MemoryQuota, parse_flat
+from zsched.clock import monotonic_s
+from zsched.core.profile.appetite import Appetite, Thread
+from zsched.core.values.model import DeviceSample, TaskId, WorkerLoad, WorkerState
+
+LIMITS_EVERY_S = 5.0
+"""How often quotas, limits and the set of CPUs are looked up again; they change by an operator's hand only."""
+MIN_INTERVAL_S = 0.02
+"""Two samples closer than this would divide one tick by nothing: the previous figure stands."""
+TICKS_PER_S = float(os.sysconf("SC_CLK_TCK"))
+PAGE_MB = os.sysconf("SC_PAGE_SIZE") / 1048576.0
+READ_BYTES = 65536
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProcessTimes:
+    """One line of /proc/PID/stat, as far as it is needed here (times in seconds, memory in MiB)."""
+
+    parent: int
+    own_s: float
+    waited_s: float
+    """User and system time of children that ended and were waited for."""
+    threads: int
+    start_s: float
+    """After boot: with the id, the process's identity."""
+    rss_mb: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CpuTimes:
+    """Busy and total seconds summed over some CPUs since boot."""
+
+    busy_s: float
+    total_s: float
+    cpus: int
+
+
+def parse_process_stat(content: bytes) -> ProcessTimes | None:
+    """Read /proc/PID/stat; the name in it may hold blanks and brackets. ``None`` when it is malformed."""
+    fields = content[content.rfind(b")") + 2 :].split()
+    try:
+        user, system, waited_user, waited_system = (int(field) for field in fields[11:15])
+        return ProcessTimes(
+            parent=int(fields[1]),
+            own_s=(user + system) / TICKS_PER_S,
+            waited_s=(waited_user + waited_system) / TICKS_PER_S,
+            threads=int(fields[17]),
+            start_s=int(fields[19]) / TICKS_PER_S,
+            rss_mb=max(0, int(fields[21])) * PAGE_MB,
+        )
+    except (ValueError, IndexError):
+        return None
+
+
+def parse_cpu_stat(content: bytes, allowed: frozenset[int] | None) -> CpuTimes | None:
+    """Read /proc/stat for the CPUs in ``allowed`` (``None``: all); ``None`` when it lists none of them."""
+    busy = total = cpus = 0
+    for line in content.split(b"\n"):
+        name, _, rest = line.partition(b" ")
+        if not name.startswith(b"cpu"):
+            break
+        if name == b"cpu" or (allowed is not None and int(name[3:]) not in allowed):
+            continue
+        # user nice system idle iowait irq softirq steal; guest times are inside user and nice already
+        times = [int(field) for field in rest.split()[:8]]
+        idle = sum(times[3:5])
+        busy, total, cpus = busy + sum(times) - idle, total + sum(times), cpus + 1
+    if not cpus:
+        return None
+    return CpuTimes(busy_s=busy / TICKS_PER_S, total_s=total / TICKS_PER_S, cpus=cpus)
+
+
+def parse_running(content: bytes) -> int | None:
+    """Threads that run or wait to run on the whole machine, of /proc/stat; ``None`` when it does not tell."""
+    _, found, rest = content.partition(b"\nprocs_running ")
+    count = rest.partition(b"\n")[0].strip()
+    return int(count) if found and count.isdigit() else None
+
+
+def parse_schedstat(content: bytes) -> tuple[float, float] | None:
+    """Seconds a thread has run, and has waited to run, of /proc/PID/task/TID/schedstat; ``None`` when malformed."""
+    try:
+        run_ns, wait_ns = (int(field) for field in content.split()[:2])
+    except ValueError:
+        return None
+    return run_ns / 1e9, wait_ns / 1e9
+
+
+def parse_pressure(content: bytes) -> float | None:
+    """Seconds in which some process was stalled, of a PSI file (``some ... total=MICROSECONDS``); ``None`` without."""
+    for line in content.split(b"\n"):
+        kind, _, rest = line.partition(b" ")
+        if kind == b"some":
+            _, _, total = rest.partition(b"total=")
+            return int(total) / 1e6 if total.isdigit() else None
+    return None
+
+
+def parse_cpu_list(text: str) -> frozenset[int]:
+    """A kernel CPU list such as ``0-3,8`` as a set; malformed parts are left out."""
+    cpus: set[int] = set()
+    for part in text.strip().split(","):
+        first, dash, last = part.partition("-")
+        if first.isdecimal() and (last.isdecimal() or not dash):
+            cpus.update(range(int(first), int(last or first) + 1))
+    return frozenset(cpus)
+
+
+class DeviceProfiler:
+    """Takes raw samples of this machine. Used by one thread."""
+
+    def __init__(self, root: Path = Path("/"), pid: str = "self") -> None:
+        """Read everything below ``root`` ("/" but in tests), as process ``pid`` sees it."""
+        self.speed: float | None = None
+        """How fast a core is, when somebody has measured it."""
+        self._root, self._pid = root, pid
+        self._proc = str(root / "proc")
+        self._trees = _ProcessTrees(self._proc)
+        self._limits_at_s: float | None = None
+        self._allowed: frozenset[int] | None = None
+        self._has_all_cpus = False
+        self._cpu_quota: CpuQuota | None = None
+        self._memory_quota: MemoryQuota | None = None
+        self._usage: tuple[float, float] | None = None
+        self._stalled: tuple[float, float] | None = None
+        self._pressure: float | None = None
+        self._used_cores: float | None = None
+
+    def sample(self, workers: Mapping[TaskId, tuple[WorkerState, int | None]]) -> DeviceSample:
+        """Measure now; ``workers`` gives each task's state and process id (``None``: no process)."""
+        now = monotonic_s()
+        if self._limits_at_s is None or now - self._limits_at_s >= LIMITS_EVERY_S:
+            self._look_up_limits(now)
+        stat = _read(f"{self._proc}/stat")
+        times = parse_cpu_stat(stat, self._allowed)
+        memory_mb, memory_used_mb = self._memory()
+        return DeviceSample(
+            cpu_cores=self._capacity(times),
+            cpu_used_cores=self._cpu_used(times, now),
+            memory_mb=memory_mb,
+            memory_used_mb=memory_used_mb,
+            workers=self._trees.loads(workers, now),
+            speed=self.speed,
+            cpu_pressure=self._cpu_pressure(now),
+            runnable=self._runnable(stat),
+        )
+
+    def _cpu_pressure(self, now: float) -> float | None:
+        """Share of the last seconds in which some process of this machine, or of the group that it is, lacked a CPU.
+
+        ``None`` on the first sample, and where the kernel has no pressure stall information.
+        """
+        path = f"{self._proc}/pressure/cpu" if self._cpu_quota is None else self._cpu_quota.pressure_file()
+        stalled_s = None if path is None else parse_pressure(_read(path))
+        before, self._stalled = self._stalled, None if stalled_s is None else (now, stalled_s)
+        if stalled_s is None or before is None:
+            self._pressure = None
+        elif now - before[0] < MIN_INTERVAL_S:
+            self._stalled = before
+        else:
+            self._pressure = min(max(stalled_s - before[1], 0.0) / (now - before[0]), 1.0)
+        return self._pressure
+
+    def _runnable(self, stat: bytes) -> float | None:
+        """Of the whole machine only: under a quota, or on some of its CPUs, nobody counts who else wants them."""
+        running = parse_running(stat) if self._cpu_quota is None and self._has_all_cpus else None
+        return None if running is None else max(running - 1.0, 0.0)  # one of them is this thread
+
+    def _look_up_limits(self, now: float) -> None:
+        self._limits_at_s = now
+        tree = CgroupTree(self._root, self._pid)
+        self._memory_quota = tree.memory_quota()
+        quota, status = tree.cpu_quota(), _read(f"{self._proc}/{self._pid}/status").decode(errors="replace")
+        _, _, allowed = status.partition("Cpus_allowed_list:")
+        self._allowed = parse_cpu_list(allowed.partition("\n")[0]) or None
+        stat = _read(f"{self._proc}/stat")
+        times, every = parse_cpu_stat(stat, self._allowed), parse_cpu_stat(stat, None)
+        self._has_all_cpus = times is not None and every is not None and times.cpus == every.cpus
+        if quota is not None and times is not None and quota.cores >= times.cpus:
+            quota = None  # wider than the machine: no limit
+        if quota != self._cpu_quota:
+            self._usage = self._stalled = None  # another account: its difference to the old one means nothing
+        self._cpu_quota = quota
+
+    def _capacity(self, times: CpuTimes | None) -> float:
+        if self._cpu_quota is not None:
+            return self._cpu_quota.cores
+        return float(times.cpus if times is not None else os.cpu_count() or 1)
+
+    def _cpu_used(self, times: CpuTimes | None, now: float) -> float | None:
+        if self._cpu_quota is not None:
+            used_s, clock_s, scale = self._cpu_quota.used_s(), now, 1.0
+        elif times is not None:  # the kernel's own ticks are the clock: no jitter between two reads
+            used_s, clock_s, scale = times.busy_s, times.total_s, float(times.cpus)
+        else:
+            used_s = None
+        if used_s is None:
+            self._usage = self._used_cores = None
+            return None
+        if self._usage is None:
+            self._usage, self._used_cores = (used_s, clock_s), None
+            return None
+        elapsed_s = clock_s - self._usage[1]
+        if elapsed_s >= MIN_INTERVAL_S:
+            self._used_cores = max(0.0, scale * (used_s - self._usage[0]) / elapsed_s)
+            self._usage = (used_s, clock_s)
+        return self._used_cores
+
+    def _memory(self) -> tuple[float, float | None]:
+        figures = parse_flat(
+            _read(f"{self._proc}/meminfo").decode(errors="replace").replace(":", "").replace(" kB", "")
+        )
+        total_mb = figures.get("MemTotal", 0) / 1024.0 or os.sysconf("SC_PHYS_PAGES") * PAGE_MB
+        available_kb = figures.get("MemAvailable")
+        available_mb = None if available_kb is None else available_kb / 1024.0
+        quota = self._memory_quota
+        if quota is None or quota.limit_mb >= total_mb:
+            return total_mb, None if available_mb is None else max(0.0, total_mb - available_mb)
+        used_mb = quota.used_mb()
+        if used_mb is None or available_mb is None:
+            return quota.limit_mb, used_mb
+        return quota.limit_mb, max(used_mb, quota.limit_mb - available_mb)
+
+
+class _ProcessTrees:
+    """The load of some process trees, by differences between samples."""
+
+    def __init__(self, proc: str) -> None:
+        self._proc = proc
+        self._has_children_files = os.path.exists(f"{proc}/self/task/{os.getpid()}/children")  # noqa: PTH110 - str paths
+        self._seen: dict[TaskId, tuple[float, dict[int, ProcessTimes]]] = {}
+        self._appetites: dict[TaskId, Appetite] = {}
+
+    def loads(self, workers: Mapping[TaskId, tuple[WorkerState, int | None]], now: float) -> tuple[WorkerLoad, ...]:
+        """One load per worker, sorted by task."""
+        children = None if self._has_children_files else self._scan_children()
+        seen = {task: (now, self._tree(pid, children)) for task, (_, pid) in workers.items() if pid is not None}
+        loads = tuple(self._load(task, workers[task][0], seen.get(task)) for task in sorted(workers))
+        self._seen = seen
+        self._appetites = {task: self._appetites[task] for task in seen if task in self._appetites}
+        return loads
+
+    def _load(self, task: TaskId, state: WorkerState, seen: tuple[float, dict[int, ProcessTimes]] | None) -> WorkerLoad:
+        if seen is None or not seen[1]:
+            return WorkerLoad(task=task, state=state)
+        now, tree = seen
+        before = self._seen.get(task)
+        cpu_cores = None if before is None else _cores(before[1], tree, now - before[0], now)
+        appetite = self._appetites.setdefault(task, Appetite())
+        appetite.look(self._threads(tree), now)
+        return WorkerLoad(
+            task=task,
+            state=state,
+            cpu_cores=cpu_cores,
+            memory_mb=sum(times.rss_mb for times in tree.values()),
+            wanted_cores=appetite.wanted_cores(),
+        )
+
+    def _threads(self, tree: Iterable[int]) -> dict[Thread, tuple[float, float]]:
+        """Seconds that each has run, and has waited to run."""
+        found = {}
+        for pid in tree:
+            folder = f"{self._proc}/{pid}/task"
+            for thread in _names(folder):
+                times = parse_schedstat(_read(f"{folder}/{thread}/schedstat"))
+                if times is not None:
+                    found[pid, thread] = times
+        return found
+
+    def _tree(self, pid: int, children: dict[int, list[int]] | None) -> dict[int, ProcessTimes]:
+        tree: dict[int, ProcessTimes] = {}
+        waiting = [pid]
+        while waiting:
+            process = waiting.pop()
+            times = parse_process_stat(_read(f"{self._proc}/{process}/stat"))
+            if times is None or process in tree:
+                continue
+            tree[process] = times
+            waiting += self._children(process) if children is None else children.get(process, [])
+        return tree
+
+    def _children(self, pid: int) -> list[int]:
+        folder = f"{self._proc}/{pid}/task"
+        return [int(child) for thread in _names(folder) for child in _read(f"{folder}/{thread}/children").split()]
+
+    def _scan_children(self) -> dict[int, list[int]]:
+        """``{parent: [child]}`` of the whole machine, for kernels without CONFIG_PROC_CHILDREN."""
+        children: dict[int, list[int]] = {}
+        for name in _names(self._proc):
+            if name.isdecimal() and (times := parse_process_stat(_read(f"{self._proc}/{name}/stat"))) is not None:
+                children.setdefault(times.parent, []).append(int(name))
+        return children
+
+
+def _cores(
+    before: Mapping[int, ProcessTimes], after: Mapping[int, ProcessTimes], elapsed_s: float, now: float
+) -> float | None:
+    """Cores a tree used in ``elapsed_s``, from its processes then and now; ``None``: not to be told.
+
+    The sum over the tree keeps the time of a child that was waited for (it moves to its parent). A process that is new
+    to us but older than the interval (adopted, or its parent was missed) brings in only its share.
+    """
+    if elapsed_s < MIN_INTERVAL_S:
+        return None
+    kept = {pid for pid, times in after.items() if pid in before and before[pid].start_s == times.start_s}
+    if not kept:
+        return None
+    total_s = sum(times.own_s + times.waited_s for pid, times in after.items() if pid in kept)
+    total_s += sum(_share(times, elapsed_s, now) for pid, times in after.items() if pid not in kept)
+    total_s -= sum(times.own_s + times.waited_s for times in before.values())
+    survivors_s = sum(after[pid].own_s - before[pid].own_s for pid in kept)
+    return max(total_s, survivors_s, 0.0) / elapsed_s
+
+
+def _share(times: ProcessTimes, elapsed_s: float, now: float) -> float:
+    """What a newly seen process probably used in the last ``elapsed_s``: all if it is younger, else in proportion."""
+    age_s = max(now - times.start_s, elapsed_s)
+    return (times.own_s + times.waited_s) * elapsed_s / age_s
+
+
+def _names(folder: str) -> list[str]:
+    """The names in a folder; empty when it cannot be read."""
+    try:
+        return os.listdir(folder)  # noqa: PTH208 - names are all we need, 5 times a second
+    except OSError:
+        return []
+
+
+def _read(path: str) -> bytes:
+    """A small kernel file, with three system calls; empty when it cannot be read."""
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    except OSError:
+        return b""
+    try:
+        return os.read(fd, READ_BYTES)
+    except OSError:
+        return b""
+    finally:
+        os.close(fd)

@@ -1,0 +1,1 @@
+"""The control bus: beats, profiles, questions and votes over zenoh."""

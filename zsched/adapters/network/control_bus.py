@@ -1,0 +1,391 @@
+"""The control session: beats, profiles, utilities, proposals and ballots over zenoh.
+
+Knows: zenoh, the control keys, the codec. Does not know: what any of it leads to.
+
+zenoh's callbacks only decode and enqueue (work in them would stall the process), every question is answered later, from
+the loop, by its number. A frame that is malformed, or whose key names another node than its content, becomes a
+`FrameDropped` event and nothing else. One subscriber and one queryable serve all kinds: three threads in all.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import zenoh
+
+from zsched.adapters.network.open_questions import Questions
+from zsched.core import events as ev
+from zsched.core.events import commanded
+from zsched.core.values.messages import (
+    Accept,
+    Accepted,
+    Command,
+    CommandResult,
+    Learnt,
+    Prepare,
+    Promise,
+    Refused,
+    RetryTask,
+    SetWeights,
+    Utilities,
+)
+from zsched.core.values.model import NAME, Beat, NodeId, Profile, Proposal
+from zsched.core.values.snapshot import Snapshot
+from zsched.errors import AdapterError, WireError
+from zsched.guard import guarded, tolerant
+from zsched.sessions.problems import why_not_open
+from zsched.sessions.relink import Introducer
+from zsched.wire import codec as wire
+from zsched.wire.keyspace import Keyspace, counter, parse
+
+OPERATOR_TIMEOUT_S = 3.0
+CLOSE_S = 0.5
+RING = 1024
+"""Frames in turn that wait for the loop; when it does not come the oldest go, and zenoh waits for nobody."""
+
+Post = Callable[[ev.Event], None]
+log = logging.getLogger("zsched.bus")
+
+_PUTS: dict[str, type[Beat | Profile | Proposal | Learnt]] = {
+    "beat": Beat,
+    "profile": Profile,
+    "proposal": Proposal,
+    "allocation": Learnt,
+}
+_QUESTIONS = frozenset({"utility", "register", "allocation", "status", "command"})
+
+
+def _event_of(value: Beat | Profile | Proposal | Learnt) -> tuple[NodeId, ev.Event]:
+    """(the node that the content names, the event)."""
+    if isinstance(value, Beat):
+        return value.node, ev.BeatReceived(beat=value)
+    if isinstance(value, Profile):
+        return value.node, ev.ProfileReceived(profile=value)
+    if isinstance(value, Proposal):
+        return value.voter, ev.ProposalReceived(proposal=value)
+    return value.node, ev.LearntReceived(learnt=value)
+
+
+class ControlBus:
+    """One node's control session. ``post`` must only enqueue; all other methods are called from the loop."""
+
+    def __init__(
+        self,
+        *,
+        fleet: str,
+        node: NodeId,
+        incarnation: int,
+        zenoh_config: str,
+        post: Post,
+        is_voter: bool = True,
+        hears_all_beats_at_once: bool = True,
+    ) -> None:
+        """``is_voter``: peers gather utilities here. What comes in turn is posted at once, or waits for `waiting`."""
+        self._is_voter, self._hears_all_at_once = is_voter, hears_all_beats_at_once
+        self._ring: zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]] | None = None
+        self._keys = Keyspace(fleet)
+        self._node, self._incarnation = node, incarnation
+        self._config = zenoh_config
+        self._introducer = Introducer(zenoh_config)
+        self._post = post
+        self._questions = Questions()
+        self._session: zenoh.Session | None = None
+        self._kept: list[Any] = []
+        self._publishers: dict[str, zenoh.Publisher] = {}
+
+    # --- life --------------------------------------------------------------------------------------------------------
+
+    def open(self) -> None:
+        """Open the session and declare everything.
+
+        Raises:
+            AdapterError: zenoh refuses (port taken, bad operator configuration).
+        """
+        zenoh.init_log_from_env_or("error")
+        try:
+            session = zenoh.open(zenoh.Config.from_json5(self._config))
+        except zenoh.ZError as error:
+            raise AdapterError(f"the control session {why_not_open(self._config, error)}") from error
+        self._session = session
+        keys, node = self._keys, self._node
+        self._publishers = {
+            "beat": self._publisher(session, keys.beat(node), zenoh.Priority.REAL_TIME),
+            "beat_in_turn": self._publisher(session, keys.beat_in_turn(node), zenoh.Priority.REAL_TIME),
+            "profile": self._publisher(session, keys.profile(node), zenoh.Priority.INTERACTIVE_LOW),
+            "profile_in_turn": self._publisher(session, keys.profile_in_turn(node), zenoh.Priority.INTERACTIVE_LOW),
+            "proposal": self._publisher(session, keys.proposal(node), zenoh.Priority.INTERACTIVE_HIGH),
+            "allocation": self._publisher(session, keys.allocation(node), zenoh.Priority.INTERACTIVE_HIGH),
+        }
+        token = keys.alive(node, self._incarnation)
+        # The token goes last: who sees it may ask, and must find the queryable.
+        self._kept = [
+            session.declare_subscriber(keys.all_puts(), tolerant(self._on_sample, "put")),
+            *self._hear_in_turn(session),
+            *(session.declare_queryable(key, tolerant(self._on_query, "question")) for key in self._questions_to_us()),
+            session.liveliness().declare_subscriber(
+                keys.alive("*", "*"), tolerant(self._on_token, "token"), history=True
+            ),
+            session.liveliness().declare_token(token),
+        ]
+
+    def _hear_in_turn(self, session: zenoh.Session) -> list[Any]:
+        """Subscribe to what comes in turn: thirty frames a second in a small fleet, not worth waking up for each."""
+        key = self._keys.all_in_turn()
+        if self._hears_all_at_once:
+            return [session.declare_subscriber(key, tolerant(self._on_sample, "put"))]
+        self._ring = session.declare_subscriber(key, zenoh.handlers.RingChannel(RING))
+        return [self._ring]
+
+    def _questions_to_us(self) -> list[str]:
+        """An edge has no utilities, so it is not to be asked for them."""
+        keys, node = self._keys, self._node
+        if self._is_voter:
+            return [keys.all_questions(node)]
+        return [keys.register(node, "*"), keys.learnt(node, "*"), keys.status(node, "*"), keys.command(node, "*")]
+
+    def waiting(self) -> Iterator[ev.Event]:
+        """The beats and profiles in turn that have come since the last call (the loop)."""
+        ring = self._ring
+        while ring is not None and (sample := ring.handler.try_recv()) is not None:
+            yield self._event(sample)
+
+    def _publisher(self, session: zenoh.Session, key: str, priority: zenoh.Priority) -> zenoh.Publisher:
+        return session.declare_publisher(
+            key,
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=priority,
+            express=True,  # small and rare: not worth a batch's delay
+            allowed_destination=zenoh.Locality.REMOTE,
+        )
+
+    def close(self) -> None:
+        """Withdraw the token, then close; safe to call twice, returns within `CLOSE_S`.
+
+        zenoh waits ten seconds for a frozen peer whose buffers are full; the thread that does ends with the process.
+        """
+        session, self._session = self._session, None
+        if session is None:
+            return
+        self._introducer.close()
+        kept, self._kept, self._publishers, self._ring = self._kept, [], {}, None
+        closing = guarded(self._close, session, kept, name="zsched-bus-close", is_lasting=False)
+        closing.start()
+        closing.join(CLOSE_S)
+        if closing.is_alive():
+            log.warning("close_abandoned why=a peer does not read")
+
+    def _close(self, session: zenoh.Session, kept: list[Any]) -> None:
+        for entity in reversed(kept):
+            with contextlib.suppress(zenoh.ZError):
+                entity.undeclare()
+        self._questions.clear()
+        with contextlib.suppress(zenoh.ZError):
+            session.close()
+
+    def introduce_peers(self) -> None:
+        """Let everybody hear of everybody's address again; returns at once (nothing where addresses are configured)."""
+        self._introducer.introduce()
+
+    def peers(self) -> int:
+        """How many zenoh peers the session has a link to."""
+        return 0 if self._session is None else len(self._session.info.peers_zid())
+
+    # --- what comes in (zenoh's threads) -----------------------------------------------------------------------------
+
+    def _on_sample(self, sample: zenoh.Sample) -> None:
+        self._post(self._event(sample))
+
+    def _event(self, sample: zenoh.Sample) -> ev.Event:
+        key = parse(str(sample.key_expr))
+        if key is None or key.kind not in _PUTS:
+            return ev.FrameDropped(kind="key", reason="unknown")
+        try:
+            value = wire.decode(sample.payload.to_bytes(), _PUTS[key.kind])
+        except WireError as error:
+            return ev.FrameDropped(kind=key.kind, reason=error.reason)
+        owner, event = _event_of(value)
+        return event if owner == key.owner else ev.FrameDropped(kind=key.kind, reason="foreign")
+
+    def _on_token(self, sample: zenoh.Sample) -> None:
+        key = parse(str(sample.key_expr))
+        incarnation = counter(key.rest[0]) if key is not None and len(key.rest) == 1 else None
+        if key is None or key.kind != "alive" or incarnation is None:
+            self._post(ev.FrameDropped(kind="alive", reason="key"))
+            return
+        if sample.kind == zenoh.SampleKind.PUT:
+            self._post(ev.TokenSeen(node=key.owner, incarnation=incarnation))
+        else:
+            self._post(ev.TokenLost(node=key.owner, incarnation=incarnation))
+
+    def _on_query(self, query: zenoh.Query) -> None:
+        chunks = str(query.key_expr).split("/")
+        kind, asker = chunks[2] if len(chunks) > 2 else "", chunks[-1]
+        try:
+            event = self._question(kind, asker, query)
+        except WireError as error:
+            event = ev.FrameDropped(kind=kind if kind in _QUESTIONS else "key", reason=error.reason)
+            query.drop()
+        self._post(event)
+
+    def _question(self, kind: str, asker: str, query: zenoh.Query) -> ev.Event:
+        """The event of one query; whoever answers it does so by number."""
+        if not NAME.fullmatch(asker):
+            raise WireError("key", "no asker")
+        payload = b"" if query.payload is None else query.payload.to_bytes()
+        keys, node = self._keys, self._node
+        if kind == "utility":
+            number = self._questions.keep(query, keys.utility(node, asker))
+            return ev.UtilityAsked(request=number, asker=asker)
+        if kind == "register":
+            value: Any = wire.decode(payload, Prepare, Accept)
+            number = self._questions.keep(query, keys.register(node, asker))
+            if isinstance(value, Prepare):
+                return ev.PrepareAsked(request=number, asker=asker, prepare=value)
+            return ev.AcceptAsked(request=number, asker=asker, accept=value)
+        if kind == "allocation":
+            return ev.LearntAsked(request=self._questions.keep(query, keys.learnt(node, asker)))
+        if kind == "status":
+            return ev.StatusAsked(request=self._questions.keep(query, keys.status(node, asker)))
+        if kind == "command":
+            command: Any = wire.decode(payload, SetWeights, RetryTask)
+            return commanded(self._questions.keep(query, keys.command(node, asker)), command)
+        raise WireError("key", "unknown kind")
+
+    # --- what goes out (the loop) ------------------------------------------------------------------------------------
+
+    def publish(self, kind: str, value: object) -> None:
+        """Put one value under our own key of that kind (``beat``, ``profile``, ``proposal``, ``allocation``).
+
+        Raises:
+            AdapterError: the session is closed or refuses.
+        """
+        publisher = self._publishers.get(kind)
+        if publisher is None:
+            return
+        try:
+            publisher.put(wire.encode(value))
+        except (zenoh.ZError, WireError) as error:
+            raise AdapterError(f"cannot publish {kind}: {error}") from error
+
+    def answer(self, request: int, value: object) -> None:
+        """Answer a question of a peer or an operator."""
+        try:
+            self._questions.answer(request, value)
+        except (zenoh.ZError, WireError) as error:
+            raise AdapterError(f"cannot answer question {request}: {error}") from error
+
+    def ask_utilities(self, gather: int, deadline_s: float) -> None:
+        """One query to every robot; answers are posted as they come."""
+
+        def on_answer(owner: NodeId, value: Utilities, _zid: str) -> None:
+            if owner == value.voter:
+                self._post(ev.UtilityReceived(gather=gather, utilities=value))
+            else:
+                self._post(ev.FrameDropped(kind="utility", reason="foreign"))
+
+        self._ask(self._keys.utility("*", self._node), None, deadline_s, (Utilities,), on_answer, is_remote=True)
+
+    def ask_electors(self, question: Prepare | Accept, deadline_s: float) -> None:
+        """One query to every elector, ourselves included; answers are posted as they come."""
+
+        def on_answer(owner: NodeId, value: Promise | Accepted | Refused, _zid: str) -> None:
+            if owner == value.elector:
+                self._post(ev.ElectorAnswered(answer=value))
+            else:
+                self._post(ev.FrameDropped(kind="register", reason="foreign"))
+
+        kinds = (Promise, Accepted, Refused)
+        self._ask(self._keys.register("*", self._node), wire.encode(question), deadline_s, kinds, on_answer)
+
+    def ask_learnt(self, peer: NodeId, deadline_s: float) -> None:
+        """Ask one peer for what it has learnt."""
+
+        def on_answer(owner: NodeId, value: Learnt, zid: str) -> None:
+            if owner == value.node == peer:
+                self._post(ev.LearntReceived(learnt=value, is_answer=True, where=self._where(zid)))
+            else:
+                self._post(ev.FrameDropped(kind="allocation", reason="foreign"))
+
+        self._ask(self._keys.learnt(peer, self._node), None, deadline_s, (Learnt,), on_answer, is_remote=True)
+
+    def _where(self, zid: str) -> str:
+        """The address at the other end of the link to a session; empty: there is none."""
+        session = self._session
+        if session is not None:
+            with contextlib.suppress(zenoh.ZError):  # it is being closed
+                ends = (str(link.dst) for link in session.info.links() if str(link.zid) == zid)
+                return next((end.partition("?")[0] for end in ends), "")
+        return ""
+
+    def _ask(
+        self,
+        selector: str,
+        payload: bytes | None,
+        deadline_s: float,
+        classes: tuple[type[Any], ...],
+        on_answer: Callable[[NodeId, Any, str], None],
+        *,
+        is_remote: bool = False,
+    ) -> None:
+        def on_reply(reply: zenoh.Reply) -> None:
+            sample = reply.ok
+            if sample is None:
+                return  # the deadline passed for somebody: the core counts answers, not silences
+            key = parse(str(sample.key_expr))
+            try:
+                value = wire.decode(sample.payload.to_bytes(), *classes)
+            except WireError as error:
+                self._post(ev.FrameDropped(kind=key.kind if key is not None else "key", reason=error.reason))
+                return
+            if key is not None:
+                replier = reply.replier_id
+                on_answer(key.owner, value, "" if replier is None else str(replier.zid))
+
+        if self._session is None:
+            return
+        try:
+            self._session.get(
+                selector,
+                tolerant(on_reply, "answer"),
+                payload=payload,
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,  # the default withholds all answers for a frozen peer
+                timeout=deadline_s,
+                priority=zenoh.Priority.INTERACTIVE_HIGH,
+                express=True,
+                allowed_destination=zenoh.Locality.REMOTE if is_remote else zenoh.Locality.ANY,
+            )
+        except zenoh.ZError as error:
+            raise AdapterError(f"cannot ask {selector}: {error}") from error
+
+    # --- for operators (a thread of their own) -----------------------------------------------------------------------
+
+    def ask_node(self, node: NodeId, command: Command | None) -> Snapshot | CommandResult:
+        """Ask another node for its status, or give it a command; blocks up to 3 s, never called from the loop.
+
+        Raises:
+            AdapterError: it did not answer.
+        """
+        if self._session is None:
+            raise AdapterError("the control session is closed")
+        if command is None:
+            selector, payload = self._keys.status(node, self._node), None
+        else:
+            selector, payload = self._keys.command(node, self._node), wire.encode(command)
+        kind: type[Snapshot | CommandResult] = Snapshot if command is None else CommandResult
+        for reply in self._session.get(
+            selector,
+            payload=payload,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=OPERATOR_TIMEOUT_S,
+        ):
+            if reply.ok is None:
+                continue
+            try:
+                return wire.decode(reply.ok.payload.to_bytes(), kind)
+            except WireError as error:
+                raise AdapterError(f"{node} answered something else ({error}); is it another version?") from error
+        raise AdapterError(f"{node} did not answer within {OPERATOR_TIMEOUT_S:g} s; is it up and reachable?")

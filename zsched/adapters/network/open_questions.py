@@ -1,0 +1,58 @@
+"""The questions that others have asked over zenoh and the loop has not answered yet, by number.
+
+Knows: zenoh's queries, how long and how many are kept. Does not know: what is asked, who answers.
+"""
+
+from __future__ import annotations
+
+import itertools
+import threading
+
+import zenoh
+
+from zsched.clock import monotonic_s
+from zsched.wire import codec as wire
+
+QUESTION_TTL_S = 5.0
+MAX_QUESTIONS = 1024
+
+
+class Questions:
+    """Open zenoh queries by number, until they are answered or too old."""
+
+    def __init__(self) -> None:
+        self._numbers = itertools.count(1)
+        self._open: dict[int, tuple[zenoh.Query, str, float]] = {}
+        self._lock = threading.Lock()
+
+    def keep(self, query: zenoh.Query, reply_key: str) -> int:
+        """Remember a query; the oldest ones are dropped when there are too many or they are too old."""
+        now = monotonic_s()
+        with self._lock:
+            number = next(self._numbers)
+            self._open[number] = (query, reply_key, now)
+            expired = [n for n, (_, _, at) in self._open.items() if now - at > QUESTION_TTL_S]
+            expired += list(self._open)[: max(len(self._open) - MAX_QUESTIONS, 0)]
+            dropped = [self._open.pop(n)[0] for n in expired if n in self._open]
+        for old in dropped:
+            old.drop()
+        return number
+
+    def answer(self, number: int, value: object) -> None:
+        """Reply and let go; too late is no error."""
+        with self._lock:
+            entry = self._open.pop(number, None)
+        if entry is None:
+            return
+        query, reply_key, _ = entry
+        try:
+            query.reply(reply_key, wire.encode(value))
+        finally:
+            query.drop()
+
+    def clear(self) -> None:
+        """Let go of everything (the session closes)."""
+        with self._lock:
+            entries, self._open = list(self._open.values()), {}
+        for query, _, _ in entries:
+            query.drop()

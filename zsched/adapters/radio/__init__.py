@@ -1,0 +1,1 @@
+"""Wi-Fi of this machine."""

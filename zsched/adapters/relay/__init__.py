@@ -1,0 +1,1 @@
+"""The relay's process, as the daemon sees it."""

@@ -1,0 +1,135 @@
+"""The relay's process as a daemon holds it: a child that it has started, or one that an earlier daemon left.
+
+Knows: spawning, waiting, ending. Does not know: the pipe's frames, when a relay should end.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import signal
+import socket
+import threading
+import time
+
+from zsched.clock import awake_s
+from zsched.ipc.takeover import Claim, Door, Note
+
+POLL_S = 0.01
+ENDING_S = 0.5
+"""A relay whose pipe has ended is about to end itself."""
+_FIRST_FREE = 10
+"""Descriptors that the child gets are moved above those it gets them as."""
+
+
+class RelayChild:
+    """One relay process and the link to it; every method may be called from any thread."""
+
+    def __init__(
+        self, *, pid: int, link: socket.socket | None, door: Door | None = None, is_child: bool = False
+    ) -> None:
+        """``link`` may be missing where the process only has to end; ``door`` tells whether another's child runs."""
+        self.pid = pid
+        self.is_child = is_child
+        self.ending = "its pipe ended"
+        self._link = link
+        self._door = door
+        self._lock = threading.Lock()
+        self._has_ended = False
+
+    @property
+    def descriptor(self) -> int:
+        """The link's; -1 once closed."""
+        return -1 if self._link is None else self._link.fileno()
+
+    def has_ended(self) -> bool:
+        """Whether the process is gone; a child is reaped by this."""
+        with self._lock:
+            if self._has_ended:
+                return True
+            if not self.is_child:
+                note = None if self._door is None else self._door.note()
+                self._has_ended = note is None or note.pid not in (0, self.pid)
+                return self._has_ended
+            with contextlib.suppress(ChildProcessError):
+                pid, status = os.waitpid(self.pid, os.WNOHANG)
+                if pid == 0:
+                    return False
+                self.ending = f"exit code {os.waitstatus_to_exitcode(status)}"
+            self._has_ended = True
+            return True
+
+    def wait(self, timeout_s: float) -> bool:
+        """Whether the process is gone within ``timeout_s``."""
+        until = awake_s() + timeout_s
+        while not self.has_ended():
+            if awake_s() >= until:
+                return False
+            time.sleep(POLL_S)
+        return True
+
+    def kill(self) -> None:
+        """SIGKILL; returns when it is gone."""
+        if not self.has_ended():
+            self._send(signal.SIGKILL)
+        self.wait(ENDING_S)
+
+    def end(self, timeout_s: float) -> None:
+        """SIGTERM, SIGKILL after half the time; returns when it is gone, or after ``timeout_s``."""
+        self._send(signal.SIGTERM)
+        if not self.wait(timeout_s / 2):
+            self._send(signal.SIGKILL)
+            self.wait(timeout_s / 2)
+
+    def hang_up(self) -> None:
+        """End the link, for the relay as for us: its commands are over."""
+        if self._link is not None:
+            with contextlib.suppress(OSError):
+                self._link.shutdown(socket.SHUT_RDWR)
+
+    def close(self) -> None:
+        """Give the link's descriptor back; nobody may use it any more."""
+        if self._link is not None:
+            self._link.close()
+
+    def _send(self, number: signal.Signals) -> None:
+        if self.pid > 0:
+            with contextlib.suppress(OSError):
+                os.kill(self.pid, number)
+
+
+def start_relay(command: list[str], door: Door | None = None, listen: str = "") -> RelayChild:
+    """Start a relay; with ``door`` it can be found again there, and its session listens on ``listen``.
+
+    Raises:
+        AdapterError: the door is another relay's, or its folder cannot be used.
+        OSError: the command cannot be run.
+    """
+    ours, theirs = socket.socketpair()
+    with contextlib.ExitStack() as stack:
+        stack.callback(theirs.close)
+        stack.callback(ours.close)
+        claim = None if door is None else door.claim()
+        if claim is not None:
+            stack.callback(claim.close)
+        pid = _spawn(command, theirs, claim)
+        if claim is not None and door is not None:
+            door.sign(claim, Note(pid=pid, listen=listen))
+        ours = ours.dup()  # the stack closes the other one
+    return RelayChild(pid=pid, link=ours, door=door, is_child=True)
+
+
+def _spawn(command: list[str], link: socket.socket, claim: Claim | None) -> int:
+    """Not `subprocess`: its objects insist on reaping, and this child may outlive us."""
+    given = [(link.fileno(), 0), (link.fileno(), 1)]
+    if claim is not None:
+        given += [(claim.listener.fileno(), 3), (claim.lock, 4)]
+        command = [*command, "--door", "3"]
+    moved = [(fcntl.fcntl(source, fcntl.F_DUPFD_CLOEXEC, _FIRST_FREE), target) for source, target in given]
+    try:
+        actions = [(os.POSIX_SPAWN_DUP2, source, target) for source, target in moved]
+        return os.posix_spawn(command[0], command, os.environ, file_actions=actions)
+    finally:
+        for source, _ in moved:
+            os.close(source)

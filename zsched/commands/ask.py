@@ -1,0 +1,127 @@
+"""Asks a daemon on this machine: finds its socket, sends one request, and says why when there is no answer.
+
+Knows: which of several sockets is meant, what each refusal means as an exit code. Does not know: what is asked.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from zsched import paths as places
+from zsched.adapters.host.operator_socket import ask
+from zsched.commands.common import EXIT_FAILED, EXIT_TIMED_OUT, EXIT_UNREACHABLE, EXIT_USAGE, CliError, Json, nearest
+from zsched.errors import AdapterError
+
+ASK_TIMEOUT_S = 5.0
+"""Above the daemon's own limits (3 s for its loop, 3 s for another node), so that their reasons arrive."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Door:
+    """The daemon to ask: its socket, and the node to ask through it (``None``: the daemon itself)."""
+
+    socket: Path
+    node: str | None = None
+
+
+def find_door(runtime_dir: Path | None, node: str | None, env: Mapping[str, str] = os.environ) -> Door:
+    """The socket that is meant: ``node``'s own, else any other that passes the question on.
+
+    Without ``node``: this node's own (``ZSCHED_NODE``, host name). Where nothing but the host name says which is this
+    node, the only one there is.
+
+    Raises:
+        CliError: there is no daemon, not the one that is meant (3), or there are several and none is meant (2).
+    """
+    runtime = places.runtime_folder(runtime_dir, env)
+    sockets = {path.stem: path for path in places.local_sockets(runtime)}
+    if not sockets:
+        why = "the folder cannot be read" if runtime.exists() and not os.access(runtime, os.R_OK) else "no socket there"
+        raise CliError(
+            EXIT_UNREACHABLE,
+            f"no daemon in {runtime} ({why}); start one with `zsched up`, or say where it is with --runtime-dir",
+        )
+    own = places.node_name(None, env)
+    if node is not None:
+        if node in sockets:
+            return Door(socket=sockets[node])
+        nearer = sorted(sockets, key=lambda name: name != own)
+        return _through([sockets[name] for name in nearer], node)
+    if own in sockets:
+        return Door(socket=sockets[own])
+    here = ", ".join(sockets)
+    is_told = bool(env.get("ZSCHED_NODE"))
+    if len(sockets) == 1 and not is_told:
+        return Door(socket=next(iter(sockets.values())))
+    fleet, names = _their_fleet(sockets.values())
+    if own in names or (is_told and not names):
+        raise CliError(
+            EXIT_UNREACHABLE,
+            f"no daemon of {own} in {runtime} (here: {here}); start it with `zsched up --node {own}`, "
+            "or ask another one with --node",
+        )
+    if is_told:
+        raise CliError(EXIT_USAGE, f"ZSCHED_NODE: fleet {fleet} has no node {own!r}{nearest(own, names)}")
+    raise CliError(EXIT_USAGE, f"several daemons in {runtime}: {here}; say which one with --node or ZSCHED_NODE")
+
+
+def _their_fleet(sockets: Iterable[Path]) -> tuple[str, tuple[str, ...]]:
+    """The fleet's name and nodes, by the first daemon here that answers; empty when none does."""
+    for path in sockets:
+        try:
+            status = ask_door(Door(socket=path), {"verb": "status"})
+        except CliError:
+            continue
+        return str(status["fleet"]), tuple(str(node["name"]) for node in status["nodes"])
+    return "", ()
+
+
+def _through(sockets: Sequence[Path], node: str) -> Door:
+    """The first daemon here that answers, to ask it for ``node``, which must be in its fleet."""
+    failures = []
+    for path in sockets:
+        door = Door(socket=path)
+        try:
+            status = ask_door(door, {"verb": "status"})
+        except CliError as error:
+            failures.append(error)
+            continue
+        names = [str(known["name"]) for known in status["nodes"]]
+        if node not in names:
+            raise CliError(EXIT_USAGE, f"fleet {status['fleet']} has no node {node!r}{nearest(node, names)}")
+        return Door(socket=path, node=node)
+    raise failures[0]
+
+
+def ask_door(door: Door, request: Json, timeout_s: float = ASK_TIMEOUT_S) -> Json:
+    """The daemon's answer to ``request``.
+
+    Raises:
+        CliError: nobody answers (3), not in time (5), or the daemon refuses (1).
+    """
+    if door.node is not None:
+        request = {**request, "node": door.node}
+    try:
+        answer = ask(door.socket, request, timeout_s)
+    except AdapterError as error:
+        raise _unanswered(door, error) from error
+    if "error" not in answer:
+        return answer
+    text = str(answer["error"])
+    code = EXIT_FAILED
+    if "did not answer within" in text:
+        # the daemon here is up: its loop is stuck, or the other node is silent
+        code = EXIT_TIMED_OUT if door.node is None else EXIT_UNREACHABLE
+    raise CliError(code, text)
+
+
+def _unanswered(door: Door, error: AdapterError) -> CliError:
+    if isinstance(error.__cause__, TimeoutError):
+        return CliError(EXIT_TIMED_OUT, str(error))
+    if isinstance(error.__cause__, PermissionError):
+        advice = "run this as root or as a member of the socket's group"
+        return CliError(EXIT_UNREACHABLE, f"may not open {door.socket} (permission denied); {advice}")
+    return CliError(EXIT_UNREACHABLE, str(error))

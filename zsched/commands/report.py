@@ -1,0 +1,462 @@
+"""A status, as JSON values, as text for people: 80 columns suffice, 100 show more (pure).
+
+Knows: what stands where, in the order of the six stages. Does not know: terminals, sockets; it imports nothing of the
+core, so that `zsched status` starts quickly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from zsched.commands.page import Cell, Page, cut, memory, size, span
+from zsched.core.values.model import NEVER_INITIALISED, RESTARTING, WAS_READY, WorkerState, told_of_worker
+
+Json = dict[str, Any]
+
+BUSY, FULL = 0.6, 0.85
+"""From here a bar is yellow, from here red."""
+MAX_CANDIDATES, MAX_HISTORY = 12, 3
+TROUBLES = "PROBLEMS"
+"""The title of the last block, which a low window keeps."""
+MOST, LITTLE = 0.98, 0.8
+"""From here on nearly all jobs are done; below that, many are not."""
+JOBS_OVER_S = 10.0
+"""What a profile says of jobs that is so old is history, too."""
+CAUSES = (NEVER_INITIALISED, "nothing can be agreed")
+"""How the problems begin from which others follow: they come first."""
+NO_ANSWER_TO = 100
+"""After so many inputs without one output, ever, the key of the output is doubted."""
+DROPS_OVER_S = 60.0
+"""Drops that have not risen for so long are history."""
+STATE_STYLES = {"alive": "green", "ready": "green"} | dict.fromkeys(
+    ("draining", "starting", RESTARTING, "stopped", "suspect", "unknown"), "yellow"
+)
+"""All others are red."""
+
+
+def degradations(status: Json) -> tuple[str, ...]:
+    """Why the fleet is degraded, as this node sees it: no quorum, or a task without a live owner; empty when fine."""
+    quorum, reasons = status["quorum"], []
+    if not quorum["ok"]:
+        reasons.append(
+            f"no quorum: {quorum['alive']} of {quorum['electors']} electors can answer, {quorum['needed']} needed"
+        )
+    for task in status["tasks"]:
+        if task["owner"] is None:
+            reasons.append(f"{task['name']} has no owner")
+        elif task["owner_state"] not in ("alive", "suspect"):
+            reasons.append(f"{task['name']}: its owner {task['owner']} is {task['owner_state']}")
+        elif (lack := _lack_of_worker(status, task)) is not None:
+            reasons.append(f"{task['name']}: {lack}")
+    return tuple(reasons)
+
+
+def _lack_of_worker(status: Json, task: Json) -> str | None:
+    """Why the owner does no work, in the words of the daemon's own problems; ``None`` when it does, or will soon."""
+    owner = task["owner"]
+    workers = (worker for node in status["nodes"] if node["name"] == owner for worker in node["workers"])
+    state, why = next(((one["state"], one.get("reason")) for one in workers if one["task"] == task["name"]), ("", ""))
+    was_ready = state == "starting" and (why or "").startswith(WAS_READY)
+    if state not in ("failed", "stopped") and not was_ready:
+        return None
+    because = f": {why}" if why else ""
+    if state != "failed":
+        return f"the worker on {owner} {told_of_worker(WorkerState(state), why or '')}"
+    return f"the worker on {owner} failed{because}; mend it, then `zsched retry {task['name']} {owner}`"
+
+
+def render_status(status: Json, width: int, color: bool) -> str:
+    """The status for people, in the order of the stages; problems come last.
+
+    ``width`` in columns, from 60 (of more robots than fit, the table shows the first); ``color``: with ANSI colours.
+    Text that came from other nodes cannot steer the terminal.
+    """
+    page, shown = Page(width, color), printable(status)
+    _header(page, shown)
+    _nodes(page, shown)
+    _gateway(page, shown["nodes"])
+    for task in shown["tasks"]:
+        page.lines.append("")
+        _task(page, shown, task)
+    _troubles(page, shown)
+    return "\n".join(page.lines) + "\n"
+
+
+def printable(value: Any) -> Any:
+    """The JSON value with every character that a terminal would obey replaced by ``?``."""
+    if isinstance(value, str):
+        return value if value.isprintable() else "".join(char if char.isprintable() else "?" for char in value)
+    if isinstance(value, list):
+        return [printable(item) for item in value]
+    if isinstance(value, dict):
+        return {printable(key): printable(item) for key, item in value.items()}
+    return value
+
+
+def _header(page: Page, status: Json) -> None:
+    quorum, troubles = status["quorum"], _problems(status)
+    health, style = (f"{len(troubles)} problem{'s'[: len(troubles) != 1]}", "yellow") if troubles else ("ok", "green")
+    away = sum(node["state"] in ("gone", "unknown") for node in status["nodes"])
+    if away and not troubles:
+        health, style = f"ok, {away} node{'s'[: away != 1]} away", "yellow"
+    if degradations(status):
+        health, style = "DEGRADED", "alarm"
+    roles = {"no_elector": "", "lost_state": ", no valid state"}  # it may never have had one
+    role = roles.get(quorum["this_node"], ", " + quorum["this_node"].replace("_", " "))
+    parts = [f"fleet {status['fleet']}", f"{status['node']} ({status['kind']}{role})"]
+    parts.append(f"quorum {quorum['alive']} of {quorum['electors']}, needs {quorum['needed']}")
+    room = page.width - len(health) - 1
+    for extra in (f"up {span(status['up_s'])}", f"zsched {status['version']}"):
+        parts += [extra] if len(" · ".join([*parts, extra])) <= room else []
+    page.row((" · ".join(parts), room, "bold"), (health, len(health), style))
+    page.lines.append("")
+
+
+# --- PROFILE, GATEWAY ------------------------------------------------------------------------------------------------
+
+
+def _nodes(page: Page, status: Json) -> None:
+    nodes: list[Json] = status["nodes"]
+    name = min(max([page.indent - 1, *(len(node["name"]) + 1 for node in nodes)]), 20)
+    is_wide = page.width >= 96
+    bar = 8 if is_wide else 4
+    is_timed = is_wide and any(node.get("speed") is not None for node in nodes)
+    columns = (name, 5, 8, -5, bar, -4, 10 if is_timed else 6, 9, 7, page.width)
+    titles = ("PROFILE", "kind", "state", "age", "cpu", "", "cores", "memory", "link", "workers")
+    styles = ("stage", *["dim"] * (len(titles) - 1))
+    page.row(*zip(titles, columns, styles, strict=True))
+    room = page.width - sum(abs(width) + 1 for width in columns[:-1])
+    for node in nodes:
+        workers = _workers(node["workers"], room, is_single=len(status["tasks"]) == 1)
+        texts = [*_node_cells(node, bar, is_me=node["name"] == status["node"], is_wide=is_wide), workers]
+        if node["state"] in ("gone", "unknown"):  # its last figures are no news
+            texts = [(text, style if index == 2 else "dim") for index, (text, style) in enumerate(texts)]
+        page.row(*((text, width, style) for (text, style), width in zip(texts, columns, strict=True)))
+
+
+def _node_cells(node: Json, bar: int, *, is_me: bool, is_wide: bool) -> list[tuple[str, str]]:
+    state = "draining" if node["draining"] and node["state"] == "alive" else node["state"]
+    cpu, cores = node["cpu_ratio"], node["cpu_cores"]
+    level = "" if cpu is None else "red" if cpu >= FULL else "yellow" if cpu >= BUSY else "green"
+    filled = 0 if cpu is None else round(cpu * bar)
+    is_tight = node["memory_ratio"] is not None and node["memory_ratio"] >= FULL
+    return [
+        (node["name"] + ("*" if is_me else ""), "bold" if is_me else ""),
+        (node["kind"], ""),
+        (state, STATE_STYLES.get(state, "red")),
+        (span(node["age_s"]), ""),
+        ("" if cpu is None else "█" * filled + "░" * (bar - filled), level),
+        (_percent(cpu), ""),
+        (_cores(cores, node.get("speed") if is_wide else None), "dim"),
+        (_memory(node), "red" if is_tight else ""),
+        (_link(node["links"]), ""),
+    ]
+
+
+def _cores(cores: float | None, speed: float | None) -> str:
+    """How many, and how fast each is where that was measured.
+
+    >>> _cores(4.0, 0.713), _cores(0.5, None)
+    ('of 4 x0.71', 'of 0.5')
+    """
+    if cores is None:
+        return ""
+    return f"of {cores:.3g}" + ("" if speed is None else f" x{speed:.2g}")
+
+
+def _memory(node: Json) -> str:
+    total = node["memory_mb"]
+    return "-" if total is None else f"{_percent(node['memory_ratio'])} {memory(total)}"
+
+
+def _percent(ratio: float | None) -> str:
+    return "-" if ratio is None else f"{ratio:.0%}"
+
+
+def _link(links: Sequence[Json]) -> str:
+    """The link to everybody, else the weakest one; its source when it has no signal."""
+    if not links:
+        return "-"
+    common = [link for link in links if link["peer"] is None]
+    measured = [link["rssi_dbm"] for link in (common or links) if link["rssi_dbm"] is not None]
+    return f"{min(measured):.0f} dBm" if measured else str(links[0]["source"])
+
+
+def _workers(workers: Sequence[Json], room: int, *, is_single: bool) -> Cell:
+    """The workers' states, with as much beside as there is room for."""
+    if not workers:
+        return "-", "dim"
+    states = [_worker_state(worker) for worker in workers]
+    styles = [STATE_STYLES.get(state, "red") for state in states]
+    style = next((style for style in ("red", "yellow") if style in styles), "green")
+    full = ", ".join(f"{worker['task']} {state}" for worker, state in zip(workers, states, strict=True))
+    short = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(states))
+    if is_single:
+        (worker,) = workers[:1]
+        wants = "" if worker.get("wanted_cores") is None else f" of {worker['wanted_cores']:.2f}"
+        load = [] if worker["cpu_cores"] is None else [f"{worker['cpu_cores']:.2f}{wants} cores"]
+        load += [] if worker["memory_mb"] is None else [memory(worker["memory_mb"])]
+        full, short = " ".join([states[0], *load]), states[0]
+    return (full if len(full) <= room else short), style
+
+
+def _worker_state(worker: Json) -> str:
+    """In a word what the daemon's problems say at length (`told_of_worker`).
+
+    >>> _worker_state({"state": "starting", "reason": "was ready until 12:00:00 UTC, its token went"})
+    'was ready'
+    """
+    state, why = str(worker["state"]), worker.get("reason") or ""  # a later field of the schema's major version
+    begins = (word for word in (WAS_READY.removesuffix(" until "), RESTARTING) if why.startswith(word))
+    return state if state == "ready" else next(begins, state)
+
+
+def _gateway(page: Page, nodes: Sequence[Json]) -> None:
+    held = [node for node in nodes if node["age_s"] is not None]
+    parts: list[Cell] = [(f"{len(held)} of {len(nodes)} profiles held", "")]
+    if held:
+        oldest = max(held, key=lambda node: float(node["age_s"]))
+        parts.append((f"oldest {span(oldest['age_s'])} ({oldest['name']})", ""))
+    missing = ", ".join(node["name"] for node in nodes if node["age_s"] is None)
+    page.block("GATEWAY", *parts, *([(f"none of {missing}", "yellow")] if missing else []))
+
+
+# --- one task: SCHEDULER, VOTE, EXECUTOR, ROUTE ----------------------------------------------------------------------
+
+
+def _task(page: Page, status: Json, task: Json) -> None:
+    owner, state = task["owner"], task["owner_state"]
+    parts: list[Cell] = [("no owner yet", "red")]
+    if owner is not None:
+        known = [] if task["since_s"] is None else [(f"known here for {span(task['since_s'])}", "")]
+        parts = [(f"{owner} owns it", "bold"), *known, (state, STATE_STYLES.get(state, "red"))]
+    counts = [(f"epoch {task['epoch']}", ""), (f"revision {task['revision']}", "")]
+    page.block(f"TASK {task['name']}", *parts, *counts)
+    _work(page, status, task)
+    _scheduler(page, status, task)
+    _vote(page, task, has_quorum=status["quorum"]["ok"])
+    is_quiet = task["phase"] in ("idle", "settled")
+    page.block("EXECUTOR", (str(task["phase"]), "" if is_quiet else "yellow"))
+    _route(page, status, task)
+
+
+def _work(page: Page, status: Json, task: Json) -> None:
+    """What workers say of their jobs, the owner's first; nothing where none does, or the one that did does not now."""
+    nodes = sorted(status["nodes"], key=lambda node: (node["name"] != task["owner"], node["name"]))
+    told = [
+        (node, worker["jobs"])
+        for node in nodes
+        for worker in node["workers"]
+        if node["state"] == "alive" and (node["age_s"] or 0.0) <= JOBS_OVER_S and worker["state"] == "ready"
+        if worker["task"] == task["name"] and worker.get("jobs")  # a later field of the schema's major version
+    ]
+    deadline_ms = task["tuning"].get("deadline_ms")
+    for number, (node, jobs) in enumerate(told):
+        wanted, done = jobs["wanted_hz"], jobs["done_hz"]
+        share = min(done / wanted, 1.0) if wanted > 0 else None
+        parts: list[Cell] = [
+            (node["name"], "bold" if node["name"] == task["owner"] else ""),
+            (f"{millis(jobs['time_s'])} a job, {millis(jobs['cpu_s'])} of CPU", ""),
+            (f"{done:.3g} of {wanted:.3g} a second", ""),
+        ]
+        if share is not None:
+            parts.append((f"{share:.0%} done", "red" if share < LITTLE else "yellow" if share < MOST else "green"))
+        parts += [(f"{jobs['backlog']} wait", "yellow")] if jobs["backlog"] else []
+        if deadline_ms is not None:
+            late = jobs.get("late_ratio")
+            told_late = "" if late is None else f", {late:.0%} late"
+            age = "" if jobs.get("age_s") is None else f"{millis(jobs['age_s'])} from input to end, "
+            parts.append((f"{age}deadline {deadline_ms:g} ms{told_late}", "yellow" if late and late > 1 - MOST else ""))
+        page.block("" if number else "JOBS", *parts)
+
+
+def millis(seconds: float) -> str:
+    """A job's time.
+
+    >>> millis(0.0352), millis(0.00006), millis(12.3)
+    ('35 ms', '0.06 ms', '12 s')
+    """
+    return f"{seconds:.2g} s" if seconds >= 10.0 else f"{seconds * 1e3:.{2 if seconds < 1e-3 else 0}f} ms"
+
+
+def _scheduler(page: Page, status: Json, task: Json) -> None:
+    tuning, decision = task["tuning"], task["decision"]
+    weights = " ".join(f"{name} {value:g}" for name, value in tuning["weights"].items())
+    patience = task.get("patience")  # a later field of the schema's major version
+    page.block(
+        "SCHEDULER",
+        (weights, ""),
+        (f"bonus {tuning['bonus']:g}", ""),
+        (f"trigger {tuning['time_to_trigger_s']:g}s" if patience is None else f"patience {patience:g}", ""),
+        (f"cool-down {tuning['cool_down_s']:g}s", ""),
+        *([(f"deadline {tuning['deadline_ms']:g} ms", "")] if tuning.get("deadline_ms") is not None else []),
+        *([("by the paper's score", "")] if tuning.get("score") == "paper" else []),
+    )
+    if decision is None:
+        why = "edges do not decide: ask a robot with --node" if status["kind"] == "edge" else "no round yet"
+        page.block("", (why, "dim"))
+        return
+    winner = f" {decision['winner']}" if decision["winner"] else ""
+    outcome = {"stay": "green", "none": "red"}.get(decision["outcome"], "yellow")
+    parts: list[Cell] = [
+        (f"{decision['outcome']}{winner}", outcome),
+        (decision["reason"], ""),
+        (f"{span(decision['age_s'])} ago", "dim"),
+    ]
+    silent = ", ".join(decision["silent"])
+    page.block("", *parts, *([(f"silent: {silent}", "yellow")] if silent else []))
+    _candidates(page, task, decision)
+
+
+def _candidates(page: Page, task: Json, decision: Json) -> None:
+    """Candidate by candidate: the joint utility, each robot's, the mean of its terms, and why it cannot be."""
+    joint, voters = decision["aggregates"], list(decision["utilities"])
+    names = sorted({*task["candidates"], *joint}, key=lambda name: (-joint.get(name, -1.0), name))
+    if not names:
+        return
+    first = min(max([9, *map(len, names)]), 20)
+    widths = [max(len(voter), 5) for voter in voters]
+    room = page.width - page.indent - first - 7 - 3 * 6 - 11  # joint, three terms, a short note
+    while widths and sum(widths) + len(widths) > room:
+        widths.pop()
+    hidden = len(voters) - len(widths)
+    more = f"+{hidden}" if hidden else ""
+    columns = [first, -6, *(-width for width in widths), -5, -5, -5, page.width]
+    titles = ["candidate", task["tuning"]["aggregate"], *voters[: len(widths)], "cpu", "mem", "net", more]
+    page.row(*((title, width, "dim") for title, width in zip(titles, columns, strict=True)), indent=page.indent)
+    for name in names[:MAX_CANDIDATES]:
+        veto = decision["vetoed"].get(name)
+        if veto and not any(name in column for column in decision["utilities"].values()):
+            page.row((name, first, "red"), (f"     - {veto}", page.width, "red"), indent=page.indent)
+            continue
+        cells = _candidate_cells(name, task, decision, voters[: len(widths)])
+        page.row(
+            *((text, width, style) for (text, style), width in zip(cells, columns, strict=True)), indent=page.indent
+        )
+    if len(names) > MAX_CANDIDATES:
+        page.block("", (f"and {len(names) - MAX_CANDIDATES} more candidates: see --json", "dim"))
+
+
+def _candidate_cells(name: str, task: Json, decision: Json, voters: Sequence[str]) -> list[Cell]:
+    columns: dict[str, Json] = decision["utilities"]
+    found = [column[name] for column in columns.values() if name in column]
+    joint, veto = decision["aggregates"].get(name), decision["vetoed"].get(name)
+    best = max(decision["aggregates"].values(), default=None)
+    style = "red" if veto else "bold" if joint is not None and joint == best else ""
+    notes = [f"owner +{task['tuning']['bonus']:g}"] if name == task["owner"] else []
+    penalty = decision.get("penalties", {}).get(name)  # a later field of the schema's major version
+    notes += [f"penalty -{penalty:.2g}"] if penalty else []
+    return [
+        (name, style),
+        (_number(joint, 3), style),
+        *((_opinion(columns[voter].get(name)), "") for voter in voters),
+        *((_number(_mean([utility[term] for utility in found]), 2), "dim") for term in ("cpu", "memory", "network")),
+        (veto or ", ".join(notes), "red" if veto else "dim"),
+    ]
+
+
+def _opinion(utility: Json | None) -> str:
+    """One robot's utility of one candidate; ``cut`` when it does not reach it."""
+    if utility is None:
+        return "-"
+    return f"{utility['value']:.2f}" if utility["reachable"] else "cut"
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known else None
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _vote(page: Page, task: Json, *, has_quorum: bool) -> None:
+    vote = task["vote"]
+    if vote is None:
+        page.block("VOTE", ("none seen by this node", "dim"))
+    else:
+        camps: dict[str, list[str]] = {}
+        for voter, choice in vote["votes"].items():
+            camps.setdefault(choice, []).append(voter)
+        winner = f" {vote['winner']}" if vote["winner"] else ""
+        is_won, is_agreed = vote["outcome"] == "won", vote["base_revision"] < task["revision"]
+        lack = ", not agreed on yet" if has_quorum else ", no quorum to agree on it"
+        so_far = lack if is_won and not is_agreed else ""
+        page.block(
+            "VOTE",
+            (f"{vote['outcome'].replace('_', ' ')}{winner}{so_far}", "green" if is_won and is_agreed else "yellow"),
+            *((f"{choice}: {', '.join(voters)}", "") for choice, voters in camps.items()),
+            (f"on revision {vote['base_revision']}", "dim"),
+            (f"{span(vote['age_s'])} ago", "dim"),
+        )
+    for past in reversed(task["history"][-MAX_HISTORY:]):
+        what = f"{span(past['age_s']):>6} ago  epoch {past['epoch']}  {past['owner'] or 'nobody'}: {past['reason']}"
+        page.lines.append(" " * page.indent + page.paint(cut(what, page.width - page.indent), "dim"))
+
+
+def _route(page: Page, status: Json, task: Json) -> None:
+    prefix, parts = f"{task['name']}/", []
+    for stream in task["streams"]:
+        name, drops = stream["stream"].removeprefix(prefix), stream["drops"]
+        seen = "nothing yet" if stream["last_seen_s"] is None else f"last {span(stream['last_seen_s'])} ago"
+        text = f"{name} {stream['messages']} msg {size(stream['bytes'])}, {seen}"
+        told = {
+            "in flight": stream.get("in_flight"),
+            "lost": stream.get("lost"),
+            "doubled": stream.get("doubled"),
+            "out of order": stream.get("reordered"),
+            "at most lost": stream.get("at_most_lost"),
+            "unconfirmed": stream.get("unconfirmed"),
+        }
+        answer_s = stream.get("answer_s")  # a later field of the schema's major version
+        text += "" if answer_s is None else f", {millis(answer_s)} behind its input"
+        text += "".join(f", {count} {what}" for what, count in told.items() if count)
+        is_over = (stream.get("dropped_s") or 0.0) > DROPS_OVER_S
+        if drops:
+            text += ", dropped " + " ".join(f"{count} {reason}" for reason, count in drops.items())
+            text += f" (none for {span(stream['dropped_s'])})" if is_over else ""
+        parts.append((text, "yellow" if drops and not is_over else ""))
+    parts += [(hint, "yellow") for hint in _unanswered(task)]
+    unheard = [one for one in task["streams"] if one["last_seen_s"] is None and f"{prefix}in/" in one["stream"]]
+    first = next((one["name"] for one in status["tasks"] if one["streams"]), None)
+    if first is None and status["kind"] == "robot":  # no counts yet: an application may join all the same
+        first = status["tasks"][0]["name"]
+    if (unheard or task["name"] == first) and status.get("joins_at"):  # a later field of the schema's major version
+        parts.append((f"applications here join at {', '.join(status['joins_at'])} (mode client)", "dim"))
+    has_streams = bool(task["streams"])
+    page.block("ROUTE", *([] if has_streams else [("no streams here", "dim")]), *parts)
+
+
+def _unanswered(task: Json) -> list[str]:
+    """A hint that the worker may put its outputs under other keys than the rule's; no problem: it may answer rarely."""
+    streams = {way: [one for one in task["streams"] if f"/{way}/" in one["stream"]] for way in ("in", "out")}
+    done = sum(one.get("acknowledged") or 0 for one in streams["in"])
+    keys = [key for one in streams["out"] if (key := one.get("from_expr"))]
+    is_silent = task["phase"] == "settled" and not any(one["messages"] for one in streams["out"])
+    if not keys or not is_silent or done < NO_ANSWER_TO:
+        return []
+    what = f"{task['owner']} has done {done} inputs and nothing has ever come on {', '.join(keys)}"
+    return [f"{what}: does its worker put its outputs under that key?"]
+
+
+# --- problems --------------------------------------------------------------------------------------------------------
+
+
+def _problems(status: Json) -> list[str]:
+    causes = [problem for problem in status["problems"] if problem.startswith(CAUSES)]
+    found = [*causes, *degradations(status), *status["problems"]]
+    found += [f"{task['name']}: {problem}" for task in status["tasks"] for problem in task["problems"]]
+    return list(dict.fromkeys(found))
+
+
+def _troubles(page: Page, status: Json) -> None:
+    dropped = [f"{name.removeprefix('dropped_')} {n}" for name, n in status["counters"].items() if "dropped_" in name]
+    problems = _problems(status)
+    if dropped or problems:
+        page.lines.append("")
+    if dropped:
+        page.block("dropped", *((text, "") for text in dropped))
+    for number, problem in enumerate(problems):
+        page.block("" if number else TROUBLES, (problem, "alarm"))

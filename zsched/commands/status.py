@@ -1,0 +1,130 @@
+"""`zsched status`: asks once or again and again, and prints what the daemon answers.
+
+Knows: terminals, intervals, exit codes. Does not know: what a status looks like (`zsched.core.report`).
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from zsched.commands.ask import Door, ask_door, find_door
+from zsched.commands.common import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK, CliError, Json, print_json, wants_color
+from zsched.commands.page import harmless
+from zsched.commands.report import TROUBLES, degradations, render_status
+
+MIN_WIDTH, DEFAULT_WIDTH, MAX_WIDTH = 60, 100, 160
+MAJOR = "1"
+"""Of the status's schema: within it fields are only added."""
+HOME, CLEAR, REST_OF_LINE, REST_OF_SCREEN = "\x1b[H", "\x1b[2J", "\x1b[K", "\x1b[J"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StatusView:
+    """Whom to ask and how to show it."""
+
+    runtime_dir: Path | None
+    node: str | None
+    is_json: bool
+    is_plain: bool
+
+
+def show(view: StatusView) -> int:
+    """Print one status; returns the exit code."""
+    status = _ask(find_door(view.runtime_dir, view.node))
+    if view.is_json:
+        print_json(_with_reasons(status))
+    else:
+        sys.stdout.write(render_status(status, _width(), wants_color(view.is_plain)))
+    return _code(status)
+
+
+def watch_on(view: StatusView, interval_s: float) -> int:
+    """Print a status every ``interval_s`` until Ctrl-C; a daemon that goes away meanwhile is waited for.
+
+    Returns the exit code of the last status.
+
+    Raises:
+        CliError: already the first question found nobody.
+    """
+    door = find_door(view.runtime_dir, view.node)
+    status: Json | CliError = _ask(door)
+    is_screen = sys.stdout.isatty() and not view.is_json
+    code = EXIT_OK
+    try:
+        sys.stdout.write(CLEAR if is_screen else "")
+        while True:
+            code = status.code if isinstance(status, CliError) else _code(status)
+            _print_next(view, status, is_screen=is_screen)
+            time.sleep(interval_s)
+            status = _ask_again(door)
+    except KeyboardInterrupt:
+        sys.stdout.write("\n" if is_screen else "")
+        return code
+
+
+def _ask_again(door: Door) -> Json | CliError:
+    try:
+        return _ask(door)
+    except CliError as error:
+        return error
+
+
+def _print_next(view: StatusView, status: Json | CliError, *, is_screen: bool) -> None:
+    if isinstance(status, CliError):
+        text = f"zsched status: {harmless(str(status))}\n"
+        if not is_screen:
+            sys.stderr.write(text)
+            return
+        text += "asking again until Ctrl-C\n"
+    elif view.is_json:
+        print_json(_with_reasons(status), is_line=True)
+        return
+    else:
+        text = render_status(status, _width(), wants_color(view.is_plain))
+    sys.stdout.write(_fitted(text) if is_screen else f"{text}\n")
+    sys.stdout.flush()
+
+
+def _fitted(text: str) -> str:
+    """The text from the top of the screen, fitted to its height; what was there is overwritten, so nothing flickers.
+
+    Of a text that is too high the problems stay, at most in the lower half, with a count of those that have no room.
+    """
+    height = shutil.get_terminal_size((DEFAULT_WIDTH, 30)).lines
+    lines = text.splitlines()
+    if len(lines) > height:
+        last = next((at for at, line in enumerate(lines) if TROUBLES in line[:20]), len(lines))
+        last -= last < len(lines) and lines[last - 1] == ""
+        tail, most = lines[last:], height // 2
+        if len(tail) > most:
+            tail = [*tail[: most - 1], f"... {len(tail) - most + 1} more lines of problems: a higher window shows them"]
+        room = height - 1 - len(tail)
+        note = f"... {max(last - room, 0)} more lines: a higher window shows them"
+        lines = [*lines[: min(room, last)], note, *tail]
+    return HOME + f"{REST_OF_LINE}\n".join(lines) + REST_OF_LINE + REST_OF_SCREEN
+
+
+def _ask(door: Door) -> Json:
+    status = ask_door(door, {"verb": "status"})
+    if str(status.get("schema")).partition("/")[2].partition(".")[0] != MAJOR:
+        found = status.get("schema")
+        text = f"the daemon's status is {found!r}, this zsched reads zsched.status/{MAJOR}; update the older of the two"
+        raise CliError(EXIT_FAILED, text)
+    return status
+
+
+def _with_reasons(status: Json) -> Json:
+    """The daemon's answer, and why the exit code says that the fleet is degraded."""
+    return {**status, "degraded": list(degradations(status))}
+
+
+def _code(status: Json) -> int:
+    return EXIT_DEGRADED if degradations(status) else EXIT_OK
+
+
+def _width() -> int:
+    return max(MIN_WIDTH, min(shutil.get_terminal_size((DEFAULT_WIDTH, 30)).columns, MAX_WIDTH))

@@ -1,0 +1,233 @@
+"""Decides whether a fleet file can be used, and what it says: YAML to `Fleet`, every fault at once with its place.
+
+Knows: how the values of the file relate to each other. Does not know: keys and ranges (`zsched.config.schema`), YAML
+(`zsched.config.reader`), this machine.
+"""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from zsched.config.blocks import Located, Section
+from zsched.config.nodes import Cast, read_nodes, select, warn_missing
+from zsched.config.reader import MAX_FILE_BYTES, Collector, Fault, Place, nearest, read_yaml, render_all
+from zsched.config.schema import FLEET
+from zsched.config.tasks import read_tasks
+from zsched.config.timing import WIFI, timing_faults
+from zsched.core.membership.beat_room import MAX_BEAT_BYTES, most_bytes
+from zsched.core.values.fleet import Fleet, NodeSpec, Timing, dial_endpoint
+from zsched.core.values.model import NodeId, NodeKind
+from zsched.errors import ConfigError
+from zsched.files import owner_of, read_regular
+
+__all__ = ["CheckResult", "Fault", "check_bytes", "check_file", "load_fleet", "require_node"]
+
+MORE = "note: more may follow once these are mended: what hangs on a faulty part cannot be judged"
+_SEEDS = 2
+"""How many nodes are seeds when the file names none: one may be down."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CheckResult:
+    """What became of one fleet file: the fleet, or the faults that stand in its way; warnings with either."""
+
+    file: str
+    fleet: Fleet | None
+    faults: tuple[Fault, ...]
+    warnings: tuple[Fault, ...]
+
+    def report(self) -> str:
+        """Faults, then warnings, as a compiler shows them; empty when there are none."""
+        parts = (render_all(self.file, self.faults), render_all(self.file, self.warnings, "warning"))
+        note = f"{self.file}: {MORE}" if any(fault.line for fault in self.faults) else ""
+        return "\n".join(part for part in (*parts, note) if part)
+
+
+def load_fleet(path: str | Path) -> Fleet:
+    """The fleet that the file at ``path`` describes.
+
+    Raises:
+        ConfigError: the file cannot be read or has faults; its text is the whole report.
+    """
+    result = check_file(path)
+    if result.fleet is None:
+        raise ConfigError(render_all(result.file, result.faults))
+    return result.fleet
+
+
+def require_node(fleet: Fleet, name: NodeId, path: str | Path) -> None:
+    """Refuse a name for this machine that the fleet file at ``path`` does not hold.
+
+    Raises:
+        ConfigError: names the nodes that there are, and the nearest.
+    """
+    known = [node.name for node in fleet.nodes]
+    if name in known:
+        return
+    close = nearest(name, known)
+    hint = f"{close} Say" if close.startswith("did you mean") else "say"
+    raise ConfigError(
+        f"{path}: no node {name!r} under 'nodes' (there are {', '.join(known)}); "
+        f"{hint} which one this machine is with --node NAME or ZSCHED_NODE"
+    )
+
+
+def check_file(path: str | Path) -> CheckResult:
+    """Read and check the file at ``path``; never raises for what the file holds or for its absence."""
+    file = Path(path)
+    try:
+        data = read_regular(file, MAX_FILE_BYTES)
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        fault = Fault(line=0, col=0, message=f"cannot be read: {reason}", hint=_unread_hint(file, error))
+        return CheckResult(file=str(path), fleet=None, faults=(fault,), warnings=())
+    return check_bytes(data, str(path))
+
+
+def _unread_hint(file: Path, error: OSError | ValueError) -> str:
+    """What to do about a fleet file that cannot be read."""
+    number = error.errno if isinstance(error, OSError) else None
+    if number in (errno.EACCES, errno.EPERM):
+        return f"{owner_of(file)}; run as that user, or let others read it (chmod a+r), on the way there too"
+    if number == errno.EFBIG:
+        return "a rule stands for every robot and candidate: write {robot} and {target} in place of their names"
+    return "give the path of a fleet file"
+
+
+def check_bytes(data: bytes, file: str = "fleet.yaml") -> CheckResult:
+    """As `check_file` for ``data``; file names in it are relative to the folder of ``file``."""
+    root, out = read_yaml(data)
+    fleet = None
+    if root is not None:
+        section = FLEET.read(root, out)
+        if section is not None:
+            fleet = _fleet(section, Path(file).absolute().parent, out)
+    is_good = fleet is not None and out.count == 0
+    return CheckResult(file=file, fleet=fleet if is_good else None, faults=out.faults, warnings=out.warnings)
+
+
+def _fleet(section: Section, folder: Path, out: Collector) -> Fleet | None:
+    cast = read_nodes(section, folder, out)
+    timing = _timing(section, out)
+    seeds = _seeds(section, cast, out)
+    electors = _electors(section, cast, out)
+    tasks = read_tasks(section, cast, out)
+    zenoh_config = _zenoh_config(section, folder, out)
+    if out.count:
+        return None
+    fleet = Fleet(
+        name=section.get("fleet"),
+        timing=timing,
+        nodes=tuple(sorted(cast.nodes, key=lambda node: node.name)),
+        tasks=tuple(sorted(tasks, key=lambda task: task.name)),
+        electors=electors,
+        seeds=seeds,
+        zenoh_config=zenoh_config,
+        **{name: section.get(name) for name in ("relay_orphan_s", "shared_memory") if name in section.values},
+    )
+    _check_beats(fleet, section.where("tasks"), out)
+    return fleet
+
+
+def _check_beats(fleet: Fleet, place: Place, out: Collector) -> None:
+    """Every beat holds a part for each task and each node: all of them must have room in one."""
+    needed = most_bytes(fleet)
+    if needed > MAX_BEAT_BYTES:
+        count = sum(task.exclusive for task in fleet.tasks)
+        message = f"a beat of this fleet may take {needed} bytes, at most {MAX_BEAT_BYTES} are sent"
+        hint = f"fewer tasks ({len(fleet.tasks)}, {count} of them exclusive) or shorter names; or two fleets"
+        out.error(place, message, hint)
+
+
+# --- timing ----------------------------------------------------------------------------------------------------------
+
+
+def _timing(section: Section, out: Collector) -> Timing:
+    given = section.get("timing", WIFI)
+    if isinstance(given, Timing):
+        return given
+    base: Timing = given.get("profile", WIFI)
+    changes = {name: value for name, value in given.values.items() if name != "profile"}
+    timing = _changed(base, changes)
+    if given.is_whole:
+        for name, message in timing_faults(timing):
+            # a relation may be broken by the other of its fields: point at one that the file sets
+            place = given.places.get(name) or next(
+                (given.places[other] for other in changes if other in message), given.place
+            )
+            out.error(place, message)
+    return timing
+
+
+def _changed(base: Timing, changes: Mapping[str, float]) -> Timing:
+    values = {name: getattr(base, name) for name in base.__dataclass_fields__}
+    return Timing(**{**values, **changes})
+
+
+# --- seeds and electors ----------------------------------------------------------------------------------------------
+
+
+def _seeds(section: Section, cast: Cast, out: Collector) -> tuple[NodeId, ...]:
+    given: tuple[Located[str], ...] | None = section.get("seeds")
+    if given is None:
+        seeds = tuple(node.name for node in cast.nodes if _can_be_dialled(node))[:_SEEDS]
+        if not seeds and len(cast.names) > 1 and cast.is_whole and "seeds" not in section.places:
+            message = "no node can be dialled, so none would find another"
+            hint = "give one or two nodes `host:` and `listen: {control: tcp/0.0.0.0:7457, data: tcp/0.0.0.0:7458}`"
+            out.error(cast.place, message, hint)
+        return seeds
+    for seed in cast.known(given, out):
+        node = next((node for node in cast.nodes if node.name == seed.value), None)
+        if node is not None and node.name in cast.sound and not _can_be_dialled(node):
+            hint = "it needs `listen: {control:, data:}` with fixed ports, and a `host:` when it listens on 0.0.0.0"
+            out.error(seed.place, f"the seed {seed.value!r} cannot be dialled", hint)
+    return tuple(dict.fromkeys(seed.value for seed in given))
+
+
+def _can_be_dialled(node: NodeSpec) -> bool:
+    """Control and data are meshes of their own, and both grow from the seeds."""
+    endpoints = (node.listen_control, node.listen_data)
+    return all(endpoint and dial_endpoint(endpoint, node.host) for endpoint in endpoints)
+
+
+def _electors(section: Section, cast: Cast, out: Collector) -> tuple[NodeId, ...]:
+    robots = cast.of_kind(NodeKind.ROBOT)
+    given = section.get("electorate")
+    electors = robots if given is None else select(given, cast, out)
+    place = section.where("electorate") if given is not None else cast.place
+    if not robots and cast.is_whole:
+        out.error(cast.place, "the fleet has no robot: nobody would vote", "give at least one node `kind: robot`")
+    elif not electors and cast.is_whole:
+        out.error(place, "no node is an elector")
+    elif electors and cast.is_whole:
+        _advise_electors(electors, cast, place, out)
+    return electors
+
+
+def _advise_electors(electors: tuple[NodeId, ...], cast: Cast, place: Place, out: Collector) -> None:
+    spare = [name for name in cast.names if name not in electors]
+    three = (*electors, *spare[: 3 - len(electors)])
+    hint = f"electorate: [{', '.join(sorted(three))}]" if len(three) == 3 else ""  # two would be no better than one
+    if len(electors) == 1:
+        out.warn(place, f"{electors[0]!r} is the only elector: while it is away no task can move", hint)
+    elif len(electors) == 2:
+        out.warn(place, "two electors: while either is away no task can move", hint)
+    elif len(electors) % 2 == 0:
+        count = len(electors)
+        message = f"{count} electors survive the loss of {(count - 1) // 2}, as {count - 1} would"
+        out.warn(place, message, "an odd number is better")
+
+
+# --- zenoh -----------------------------------------------------------------------------------------------------------
+
+
+def _zenoh_config(section: Section, folder: Path, out: Collector) -> str:
+    zenoh: Section | None = section.get("zenoh")
+    if zenoh is None or "config" not in zenoh.values:
+        return ""
+    path = folder / zenoh.get("config")
+    warn_missing(path, zenoh.where("config"), out)
+    return str(path)

@@ -1,0 +1,1 @@
+"""Stage 5: the hand-over from one worker to the next."""

@@ -1,0 +1,352 @@
+"""EXECUTOR: carries a committed allocation out: the worker's role here, and the handover of this robot's streams.
+
+Knows: the handover's table, its deadlines, who is predecessor. Does not know: how streams or workers work, and why the
+task moves.
+
+Handover on a robot, make before break. A legal step is a line of this table; every prefix leaves the streams whole:
+
+===========  =======================================  ============================================  ===========
+in           when                                     do                                            then
+===========  =======================================  ============================================  ===========
+any          a newer epoch is learnt                  plan PREPARE: the new slot opens, the old     PREPARING
+                                                      one still carries
+PREPARING    the new owner's worker is ready          plan FLIP: kept values, switch, end markers   FLIPPING
+FLIPPING     the relay flipped, an old slot is left   (the old slots drain)                         DRAINING
+FLIPPING     the relay flipped, none is left          plan CLOSE                                    SETTLED
+DRAINING     the last old slot drained, or its drain  plan CLOSE: every old slot is dropped         SETTLED
+             time is over
+any          an old slot drained                      (the next plan does not name it)              as before
+any          an old slot's drain time is over, or     the same plan without that slot               as before
+             its owner is gone
+any          isolated (`on_isolation: local`)         the worker here is active; plan PREPARE of    PREPARING
+                                                      a slot to this robot itself, the other
+                                                      one is closed
+PREPARING..  the owner is back (`rejoin`)             the worker here is idle; plan PREPARE of the  PREPARING
+(local)                                               owner's slot, the local one is closed
+===========  =======================================  ============================================  ===========
+
+An abort is never local: while the new owner does not get ready the old slot stays open, and giving up on it is a new
+proposal. The old slots are called predecessors. When the task moves again before a slot has drained, there are several:
+the newest carries until the next flip, and the others go on to drain, each within its own drain time.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+
+from zsched.core.executor.workers import runs_worker
+from zsched.core.instructions import ApplyRoutes, Instruction, RecordStory, SetRole, StartWorker, StopWorker
+from zsched.core.route.route import plan_for, slot_for
+from zsched.core.values.fleet import OnIsolation, Standby, TaskSpec
+from zsched.core.values.model import Allocation, NodeId, NodeKind
+from zsched.core.values.plan import Role, Route, RoutePhase, RoutePlan, Slot, WorkerRole
+
+ROLE_DRAIN_MARGIN_S = 1.0
+"""The old owner's worker goes idle this much after the robots' drain time (a cold standby's start comes on top)."""
+MAX_OLD = 3
+"""So many predecessors are kept; a plan has to fit a frame (`zsched.wire.codec`)."""
+LEAVES_S = 1.0
+"""A worker whose draining is over hears so within this time (it says nothing more)."""
+
+
+class Phase(StrEnum):
+    """How far this node's handover is."""
+
+    IDLE = "idle"  # no owner yet, or this node has no streams of the task
+    PREPARING = "preparing"
+    FLIPPING = "flipping"
+    DRAINING = "draining"
+    SETTLED = "settled"
+
+
+@dataclass(frozen=True, slots=True)
+class _Old:
+    """A slot that another one follows, or will: a predecessor."""
+
+    slot: Slot
+    until: float = math.inf
+    """When its drain time is over; infinity while it carries."""
+
+    @property
+    def is_left(self) -> bool:
+        """Whether the relay has flipped to another slot."""
+        return self.until < math.inf
+
+
+@dataclass(slots=True)
+class Executor:
+    """One task's handover and role on one node."""
+
+    spec: TaskSpec
+    me: NodeId
+    has_streams: bool
+    """Robots have; edges only have workers."""
+    phase: Phase = Phase.IDLE
+    epoch: int = 0
+    owner: NodeId | None = None
+    role: Role = field(init=False)
+    is_leased: bool = False
+    """The worker here may work only under a lease: the task is exclusive by this node's file, or for everybody."""
+    is_local: bool = False
+    """Cut off from the owner and from a quorum, this robot works alone; its output is degraded."""
+    _unleased_epoch: int | None = None
+    """In which epoch the worker here was let work without a lease; ``None`` once it has said that it ended that."""
+    _leaves_until: float = -math.inf
+    """Until when a worker that drained, and so had said already that it left its epoch, hears that it is idle."""
+    _is_owner_gone: bool = False
+    """The owner went during its epoch: its worker's state is not asked for."""
+    _current: Slot | None = None
+    _old: tuple[_Old, ...] = ()
+    """The predecessors, the oldest first."""
+    _role_deadline: float = math.inf
+    started_at: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.role = Role(task=self.spec.name, role=WorkerRole.IDLE)
+        self.is_leased = self.spec.exclusive
+
+    @property
+    def runs_worker(self) -> bool:
+        """Whether this node keeps a worker of the task."""
+        return runs_worker(self.spec, self.me, NodeKind.ROBOT if self.has_streams else NodeKind.EDGE)
+
+    @property
+    def predecessors(self) -> tuple[NodeId, ...]:
+        """The owners of the old slots while a handover runs, the oldest first."""
+        return tuple(dict.fromkeys(old.slot.owner for old in self._old))
+
+    @property
+    def routes(self) -> tuple[Route, ...]:
+        """The streams of the newest slot."""
+        return () if self._current is None else self._current.routes
+
+    def again(self) -> tuple[Instruction, ...]:
+        """The newest worker's state, role and plan once more, after a batch that carried them was cut off."""
+        result: tuple[Instruction, ...] = ()
+        if self.runs_worker:
+            result = (*self.start(), *self._wake_worker(), SetRole(role=self.role))
+            if self.spec.worker.standby is Standby.COLD and self.role.role is WorkerRole.IDLE:
+                result += (StopWorker(task=self.spec.name),)
+        if self._current is not None:
+            phases = {Phase.PREPARING: RoutePhase.PREPARE, Phase.SETTLED: RoutePhase.CLOSE}
+            result += (ApplyRoutes(plan=self._plan(self._current, phases.get(self.phase, RoutePhase.FLIP))),)
+        return result
+
+    def next_deadline(self) -> float:
+        """When `tick` may have something to do; infinity when never."""
+        return min((self._role_deadline, *(old.until for old in self._old)))
+
+    def start(self) -> tuple[Instruction, ...]:
+        """The node starts: warm candidates start their worker."""
+        if self.runs_worker and self.spec.worker.command and self.spec.worker.standby is Standby.WARM:
+            return (StartWorker(task=self.spec.name),)
+        return ()
+
+    def execute(self, allocation: Allocation, now: float) -> tuple[Instruction, ...]:
+        """A learnt allocation: act if its epoch is newer than what is carried out."""
+        if allocation.owner is None or allocation.epoch < self.epoch:
+            return ()
+        was_leased, self.is_leased = self.is_leased, self.spec.exclusive or allocation.leased
+        if allocation.epoch == self.epoch:
+            return () if self.is_leased is was_leased else self._change_terms()
+        back = self._end_local()  # the local slot closes before a committed owner's opens
+        before = None if self._is_owner_gone else self.owner
+        self.epoch, self.owner, self.started_at, self._is_owner_gone = allocation.epoch, allocation.owner, now, False
+        return (*back, *self._change_role(allocation, before, now), *self._prepare(allocation.owner))
+
+    def _change_role(self, allocation: Allocation, before: NodeId | None, now: float) -> tuple[Instruction, ...]:
+        if not self.runs_worker:
+            return ()
+        if allocation.owner == self.me:
+            self._role_deadline = math.inf
+            # An exclusive task's worker may run at once, but works only from its first lease on.
+            lease = 0.0 if self.is_leased else None
+            told = self._become(
+                Role(
+                    task=self.spec.name,
+                    role=WorkerRole.ACTIVE,
+                    epoch=allocation.epoch,
+                    lease_until_s=lease,
+                    predecessor=None if before == self.me else before,
+                )
+            )
+            return (*self._wake_worker(), told)
+        if self.role.role is not WorkerRole.ACTIVE:
+            return ()
+        if self.is_leased:
+            # Whoever owns it now may be working already: nothing of the old epoch may leave any more.
+            self._role_deadline = now
+            return self.leave()
+        worker = self.spec.worker
+        # A cold new owner only starts its worker now, and the robots stay here until it is ready.
+        starts_s = worker.start_deadline_s if worker.standby is Standby.COLD else 0.0
+        self._role_deadline = now + starts_s + self.spec.drain_s + ROLE_DRAIN_MARGIN_S
+        return (self._become(Role(task=self.spec.name, role=WorkerRole.DRAINING, epoch=self.role.epoch)),)
+
+    def _become(self, role: Role) -> SetRole:
+        """Another role; one that lets the worker work without a lease is remembered until it has stopped."""
+        self.role = role
+        if role.role is WorkerRole.ACTIVE and role.lease_until_s is None:
+            self._unleased_epoch = role.epoch
+        return SetRole(role=role)
+
+    def _change_terms(self) -> tuple[Instruction, ...]:
+        """The owner stays, and its worker needs a lease from now on, or none any more."""
+        if self.is_local:
+            return self.rejoin()  # whoever works alone needed no lease until now
+        if self.owner != self.me or not self.runs_worker:
+            return ()
+        if self.is_leased:
+            return self.leave()  # it works again with its first lease
+        told = self._become(Role(task=self.spec.name, role=WorkerRole.ACTIVE, epoch=self.epoch))
+        return (*self._wake_worker(), told)
+
+    def on_role_ended(self, epoch: int) -> None:
+        """The worker says that it has left ``epoch``: believed once it was told to."""
+        if epoch == self._unleased_epoch and self.role.role is not WorkerRole.ACTIVE:
+            self._unleased_epoch = None
+
+    def on_worker_ended(self) -> None:
+        """The worker's process is no more: what it was told before is over."""
+        if self.role.role is not WorkerRole.ACTIVE:
+            self._unleased_epoch = None
+
+    def may_work_unleased(self, now: float) -> bool:
+        """Whether the worker here may be working without a lease: it may, or has not said that it has stopped."""
+        is_let = self.role.role is not WorkerRole.IDLE and self.role.lease_until_s is None
+        return is_let or self._unleased_epoch is not None or now < self._leaves_until
+
+    def isolate(self) -> tuple[Instruction, ...]:
+        """Nobody can be asked and the owner is not heard: this robot's own worker serves its own streams."""
+        may_work = self.spec.on_isolation is OnIsolation.LOCAL and not self.is_leased
+        can = self.has_streams and may_work and self.epoch > 0
+        if self.is_local or not can or self.owner == self.me:
+            return ()
+        self.is_local, self._old, self._role_deadline = True, (), math.inf
+        role = self._become(Role(task=self.spec.name, role=WorkerRole.ACTIVE, epoch=self.epoch))
+        self._current = slot_for(self.spec, self.me, self.me, self.epoch)
+        plan = self._go(Phase.PREPARING, RoutePhase.PREPARE, f"cut off from {self.owner}: works alone (degraded)")
+        return (*self._wake_worker(), role, *plan)
+
+    def rejoin(self) -> tuple[Instruction, ...]:
+        """The committed owner is heard again: back to its slot."""
+        if not self.is_local or self.owner is None:
+            return ()
+        back = self._end_local()
+        self._current = slot_for(self.spec, self.me, self.owner, self.epoch)
+        return (*back, *self._go(Phase.PREPARING, RoutePhase.PREPARE, f"back to {self.owner}"))
+
+    def _end_local(self) -> tuple[Instruction, ...]:
+        if not self.is_local:
+            return ()
+        self.is_local, self._current, self.phase = False, None, Phase.IDLE
+        self.role = Role(task=self.spec.name, role=WorkerRole.IDLE)
+        return (SetRole(role=self.role),)
+
+    def set_lease(self, until_s: float, now: float) -> tuple[Instruction, ...]:
+        """Exclusive tasks: this node's worker may work until ``until_s`` (again, after it had to stop)."""
+        if self.owner != self.me or until_s <= now or until_s == self.role.lease_until_s:
+            return ()
+        came_from = self.role.predecessor
+        self.role = Role(
+            task=self.spec.name,
+            role=WorkerRole.ACTIVE,
+            epoch=self.epoch,
+            lease_until_s=until_s,
+            predecessor=came_from,
+        )
+        return (SetRole(role=self.role),)
+
+    def leave(self) -> tuple[Instruction, ...]:
+        """Exclusive tasks: another owner waits; the worker stops now, before the move is committed."""
+        if self.role.role is WorkerRole.IDLE:
+            return ()
+        self.role = Role(task=self.spec.name, role=WorkerRole.IDLE)
+        story = RecordStory(stage="executor", text="the worker stops", task=self.spec.name, epoch=self.epoch)
+        return (SetRole(role=self.role), story)
+
+    def _wake_worker(self) -> tuple[Instruction, ...]:
+        """An owner's worker must run, cold standby or not."""
+        is_needed = self.role.role is WorkerRole.ACTIVE and self.spec.worker.command
+        return (StartWorker(task=self.spec.name),) if is_needed else ()
+
+    def _prepare(self, owner: NodeId) -> tuple[Instruction, ...]:
+        if not self.has_streams:
+            return ()
+        if self._current is not None and self.phase in (Phase.FLIPPING, Phase.DRAINING, Phase.SETTLED):
+            self._old = (*self._old, _Old(self._current))[-MAX_OLD:]
+        self._current = slot_for(self.spec, self.me, owner, self.epoch)
+        return self._go(Phase.PREPARING, RoutePhase.PREPARE, f"prepares {owner}")
+
+    def _go(self, phase: Phase, plan: RoutePhase | None, text: str) -> tuple[Instruction, ...]:
+        self.phase = phase
+        story = RecordStory(stage="executor", text=text, task=self.spec.name, epoch=self.epoch)
+        if plan is None or self._current is None:
+            return (story,)
+        return (ApplyRoutes(plan=self._plan(self._current, plan)), story)
+
+    def _plan(self, current: Slot, phase: RoutePhase) -> RoutePlan:
+        return plan_for(self.spec, phase, current, tuple(old.slot for old in self._old))
+
+    def on_ready(self, epoch: int) -> tuple[Instruction, ...]:
+        """The relay sees the new owner's worker ready for the slot of ``epoch``."""
+        if epoch != self.epoch or self.phase is not Phase.PREPARING:
+            return ()
+        return self._go(Phase.FLIPPING, RoutePhase.FLIP, f"flips to {self.owner}")
+
+    def on_flipped(self, epoch: int, replayed: int, now: float) -> tuple[Instruction, ...]:
+        """The relay switched every stream to the slot of ``epoch``."""
+        if epoch != self.epoch or self.phase is not Phase.FLIPPING:
+            return ()
+        done = f"flipped to {self.owner} in {(now - self.started_at) * 1000:.0f} ms, {replayed} kept values replayed"
+        if not self._old:
+            return self._go(Phase.SETTLED, RoutePhase.CLOSE, done)
+        drained_by = now + self.spec.drain_s
+        self._old = tuple(old if old.is_left else replace(old, until=drained_by) for old in self._old)
+        return self._go(Phase.DRAINING, None, f"{done}; {', '.join(self.predecessors)} drains")
+
+    def on_drained(self, epoch: int) -> tuple[Instruction, ...]:
+        """The old slot of ``epoch`` has given back all it had."""
+        drained = tuple(old for old in self._old if old.slot.epoch == epoch and old.is_left)
+        if not drained:
+            return ()
+        text = f"{drained[0].slot.owner} drained"
+        return self._close(text) if self._forget(drained) else self._go(self.phase, None, text)
+
+    def on_gone(self, node: NodeId) -> tuple[Instruction, ...]:
+        """A peer is gone: nothing will come from its slots any more."""
+        self._is_owner_gone = self._is_owner_gone or node == self.owner
+        return self._drop(tuple(old for old in self._old if old.slot.owner == node), f"{node} is gone")
+
+    def _drop(self, dropped: tuple[_Old, ...], why: str) -> tuple[Instruction, ...]:
+        if not dropped:
+            return ()
+        if self._forget(dropped):
+            return self._close(why)
+        plan = RoutePhase.PREPARE if self.phase is Phase.PREPARING else RoutePhase.FLIP
+        epochs = ", ".join(str(old.slot.epoch) for old in dropped)
+        return self._go(self.phase, plan, f"drops the slot of epoch {epochs}: {why}")
+
+    def _forget(self, gone: tuple[_Old, ...]) -> bool:
+        """Let go of predecessors; answers whether the handover has nothing to wait for any more."""
+        self._old = tuple(old for old in self._old if old not in gone)
+        return self.phase is Phase.DRAINING and not self._old
+
+    def _close(self, text: str) -> tuple[Instruction, ...]:
+        return self._go(Phase.SETTLED, RoutePhase.CLOSE, f"settled on {self.owner}: {text}")
+
+    def tick(self, now: float) -> tuple[Instruction, ...]:
+        """Time has passed."""
+        late = tuple(old for old in self._old if now >= old.until)
+        result = self._drop(late, f"drain time of {self.spec.drain_s:g} s over")
+        if now >= self._role_deadline:
+            self._role_deadline = math.inf
+            if self.role.role is WorkerRole.DRAINING:
+                self._leaves_until = now + LEAVES_S
+            self.role = Role(task=self.spec.name, role=WorkerRole.IDLE)
+            result += (SetRole(role=self.role),)
+            if self.spec.worker.standby is Standby.COLD:
+                result += (StopWorker(task=self.spec.name),)
+        return result

@@ -1,0 +1,231 @@
+"""EXECUTOR, beside the handover: which workers hang although inputs flow (`output_deadline_s`).
+
+Knows: what every robot's relay counts, when a worker was last given time. Does not know: processes, streams, zenoh.
+
+Inputs and outputs pass through the robots' relays, never through the owner's, and they are the same for a worker that
+uses our library and for any other zenoh program. So a robot says in its profile whether a task answers it
+(`Progress`), and the owner's daemon puts what the robots say together (`HangJudge`).
+
+A robot that was not heard and is back has waited for a link, not for the worker: its complaints count again once links
+have had the time to heal (`zsched.core.scheduler.probation`) and the worker the time to answer.
+
+A node that did not run for a while (its machine was suspended, its daemon stopped) begins to count again, on both
+sides: time counts on while it sleeps, and a worker that slept with it owes nothing for that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass
+
+from zsched.core.executor.handover import Executor, Phase
+from zsched.core.gateway.gateway import Gateway
+from zsched.core.instructions import Instruction, RecordStory, RestartWorker
+from zsched.core.scheduler.probation import LIMIT_S
+from zsched.core.values.fleet import Fleet, TaskSpec
+from zsched.core.values.model import NodeId, Profile, TaskId, TaskProgress, WorkerState
+from zsched.core.values.plan import Direction, StreamCount
+
+COUNT_S = 1.0
+"""Relays count so often: what they say is at most so old."""
+MARGIN_S = 1.5
+"""A complaint may be older than the answer that ends it by the relay's period and the way of a profile."""
+_INPUTS, _OUTPUTS = "in", "out"
+"""How streams' names call their direction (`zsched.core.route.templates`)."""
+
+
+@dataclass(slots=True)
+class _Seen:
+    """What one robot has seen of one task."""
+
+    epoch: int
+    taken: int
+    given: int
+    taken_at: float | None = None
+    """When an input last went to the owner; ``None``: not in this epoch."""
+    given_at: float | None = None
+    waits_since: float | None = None
+    """When the first input behind the newest output was seen; ``None`` while nothing waits."""
+
+
+class Progress:
+    """A robot's view: does the owner's worker give back anything for what it is given?"""
+
+    def __init__(self, specs: Iterable[TaskSpec]) -> None:
+        self._deadlines = {spec.name: spec.worker.output_deadline_s for spec in specs}
+        self._has_outputs = {
+            spec.name: any(rule.direction is Direction.OUTPUT for rule in spec.rules) for spec in specs
+        }
+        self._seen: dict[TaskId, _Seen] = {}
+
+    def absorb(self, counts: tuple[StreamCount, ...], executors: Mapping[TaskId, Executor], now: float) -> None:
+        """Take the relay's counters in."""
+        for task, deadline_s in self._deadlines.items():
+            executor = executors[task]
+            if deadline_s is None or not executor.has_streams:
+                continue
+            if executor.phase is not Phase.SETTLED or executor.is_local:
+                self._seen.pop(task, None)  # during a handover nobody owes anything
+                continue
+            self._note(task, executor.epoch, counts, now)
+
+    def _note(self, task: TaskId, epoch: int, counts: tuple[StreamCount, ...], now: float) -> None:
+        taken, given = self._sums(task, counts)
+        seen = self._seen.get(task)
+        is_new = seen is None or seen.epoch != epoch or taken < seen.taken or given < seen.given
+        if seen is None or is_new:
+            self._seen[task] = _Seen(epoch=epoch, taken=taken, given=given)
+            return
+        if given > seen.given:
+            seen.given_at, seen.waits_since = now, None
+        if taken > seen.taken:
+            seen.taken_at = now
+            if given == seen.given and seen.waits_since is None:
+                seen.waits_since = now
+        seen.taken, seen.given = taken, given
+
+    def _sums(self, task: TaskId, counts: tuple[StreamCount, ...]) -> tuple[int, int]:
+        """(inputs, outputs) so far; a task without outputs gives back acknowledgements, if its worker sends any."""
+        inputs = [count for count in counts if count.stream.startswith(f"{task}/{_INPUTS}/")]
+        outputs = [count for count in counts if count.stream.startswith(f"{task}/{_OUTPUTS}/")]
+        taken = sum(count.messages for count in inputs)
+        if self._has_outputs[task]:
+            return taken, sum(count.messages for count in outputs)
+        if any(count.acknowledged is None for count in inputs):
+            return 0, 0  # nobody can tell
+        return taken, sum(count.acknowledged or 0 for count in inputs)
+
+    def begin_again(self, task: TaskId, now: float) -> None:
+        """What waits has waited since now only."""
+        seen = self._seen.get(task)
+        if seen is not None and seen.waits_since is not None:
+            seen.waits_since = now
+
+    def reports(self, now: float) -> tuple[TaskProgress, ...]:
+        """What this robot can say now: served, or waiting for longer than the deadline while inputs go on."""
+        found = []
+        for task, seen in sorted(self._seen.items()):
+            limit_s = max(self._deadlines[task] or 0.0, 2 * COUNT_S)
+            if seen.waits_since is None:
+                if seen.given_at is not None and now - seen.given_at <= limit_s:
+                    found.append(TaskProgress(task=task, epoch=seen.epoch, is_served=True))
+                continue
+            is_flowing = seen.taken_at is not None and now - seen.taken_at <= limit_s
+            if is_flowing and now - seen.waits_since >= (self._deadlines[task] or 0.0):
+                found.append(TaskProgress(task=task, epoch=seen.epoch, is_served=False))
+        return tuple(found)
+
+
+class HangJudge:
+    """The owner's view: does a worker here hang? One robot that is served speaks for the worker."""
+
+    def __init__(self) -> None:
+        self._given_time_at: dict[TaskId, float] = {}
+        """Since when a worker owes an answer: it became ready, or was ended by us."""
+
+    def note_worker(self, task: TaskId, state: WorkerState, now: float) -> None:
+        """A worker's state has changed; one that only lost its token still owes."""
+        if state is WorkerState.READY:
+            self._given_time_at[task] = now
+        elif state is not WorkerState.STARTING:
+            self._given_time_at.pop(task, None)
+
+    def begin_again(self, task: TaskId, now: float) -> None:
+        """A worker that owes an answer has its whole time again."""
+        if task in self._given_time_at:
+            self._given_time_at[task] = now
+
+    def hangs(
+        self,
+        spec: TaskSpec,
+        executor: Executor,
+        profiles: Iterable[Profile],
+        now: float,
+        unproven: AbstractSet[NodeId] = frozenset(),
+    ) -> str:
+        """Why this node's worker counts as hung; empty when it does not.
+
+        Args:
+            spec: the task, owned by this node.
+            executor: carries it out here.
+            profiles: the robots' fresh ones.
+            now: monotonic seconds.
+            unproven: the robots whose complaints may be about their links; that one is served counts all the same.
+        """
+        deadline_s = spec.worker.output_deadline_s
+        ready_at = self._given_time_at.get(spec.name)
+        if deadline_s is None or ready_at is None:
+            return ""
+        if now < max(ready_at, executor.started_at) + deadline_s + MARGIN_S:
+            return ""
+        said = [
+            one.is_served
+            for profile in profiles
+            for one in profile.progress
+            if (one.task, one.epoch) == (spec.name, executor.epoch) and (one.is_served or profile.node not in unproven)
+        ]
+        if not said or any(said):
+            return ""
+        del self._given_time_at[spec.name]  # one complaint ends one life
+        return f"no output for {deadline_s:g} s while inputs flow"
+
+
+class HangWatch:
+    """Both views of one node, over all tasks that say `output_deadline_s`."""
+
+    def __init__(self, fleet: Fleet) -> None:
+        self._specs = {spec.name: spec for spec in fleet.tasks if spec.worker.output_deadline_s is not None}
+        self._voters = fleet.voters
+        self._progress = Progress(self._specs.values())
+        self._judge = HangJudge()
+        self._back_at: dict[NodeId, float] = {}
+        """{robot: when it was heard again after it had not been}."""
+
+    def absorb(self, counts: tuple[StreamCount, ...], executors: Mapping[TaskId, Executor], now: float) -> None:
+        """Our relay has counted."""
+        if self._specs:
+            self._progress.absorb(counts, executors, now)
+
+    def note_worker(self, task: TaskId, state: WorkerState, now: float) -> None:
+        """A worker of this node has changed."""
+        if task in self._specs:
+            self._judge.note_worker(task, state, now)
+
+    def note_lag(self, lag_s: float, now: float) -> None:
+        """This node did not run for so long (seconds); what is half a deadline or more is nobody's fault."""
+        for task, spec in self._specs.items():
+            if lag_s >= max(spec.worker.output_deadline_s or 0.0, COUNT_S) / 2:
+                self._progress.begin_again(task, now)
+                self._judge.begin_again(task, now)
+
+    def on_back(self, node: NodeId, now: float) -> None:
+        """A peer that was suspect or gone is heard again."""
+        if self._specs and node in self._voters:
+            self._back_at[node] = now
+
+    def _unproven(self, spec: TaskSpec, now: float) -> frozenset[NodeId]:
+        excused_s = LIMIT_S + (spec.worker.output_deadline_s or 0.0) + MARGIN_S
+        return frozenset(node for node, at in self._back_at.items() if now < at + excused_s)
+
+    def reports(self, now: float) -> tuple[TaskProgress, ...]:
+        """What our profile shall say."""
+        return self._progress.reports(now)
+
+    def look(
+        self, owned: Iterable[TaskId], executors: Mapping[TaskId, Executor], gateway: Gateway, now: float
+    ) -> tuple[Instruction, ...]:
+        """A robot's profile came: end the workers here that hang; those of somebody else are only told of."""
+        result: list[Instruction] = []
+        for spec in [self._specs[task] for task in owned if task in self._specs]:
+            profiles = [profile for robot in self._voters if (profile := gateway.fresh(robot, now)) is not None]
+            reason = self._judge.hangs(spec, executors[spec.name], profiles, now, self._unproven(spec, now))
+            if not reason:
+                continue
+            if spec.worker.command:
+                result.append(RestartWorker(task=spec.name, reason=reason))
+            else:
+                reason += "; it is not ours to restart"
+            text = f"worker hangs: {reason}"
+            result.append(RecordStory(stage="executor", text=text, task=spec.name, epoch=executors[spec.name].epoch))
+        return tuple(result)

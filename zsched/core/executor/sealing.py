@@ -1,0 +1,120 @@
+"""EXECUTOR, beside the handover: since when a task is *leased*, that is exclusive for everybody.
+
+A fleet file is brought to the machines one by one, so `exclusive: true` holds here and not yet there. Until the last
+candidate goes by it, one may work without a lease, for as long as it likes if it is cut off. So it is agreed through
+the task's register whether the task is leased (`Allocation.leased`), and everybody obeys the value, whatever its own
+file says:
+
+* A task that nobody has ever owned is leased from its first owner on, if the file of whoever proposes that one says
+  that it is exclusive.
+* Else its owner, if its file says so, has the value changed once nobody else works without a lease: every candidate
+  and whoever else is heard was asked, has learnt this epoch, and answered that no worker there works without one.
+  Until then nothing is granted: an owner whose file says that the task is exclusive waits, and says for whom.
+* It ends being leased when the owner's file does not say so and everybody who is heard has the same file.
+
+Knows: what peers answered, which file they go by. Does not know: grants (`zsched.core.vote.lease`), how a value is
+agreed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from zsched.core.executor.handover import Executor
+from zsched.core.values.fleet import Fleet, TaskSpec, fleet_hash, lease_terms
+from zsched.core.values.messages import Learnt
+from zsched.core.values.model import Allocation, Beat, NodeId, TaskId
+from zsched.core.vote.register import SetLeased
+
+ASK_EVERY_S = 0.2
+
+
+@dataclass(slots=True)
+class Sealing:
+    """What one node knows of those who may work without a lease."""
+
+    fleet: Fleet
+    me: NodeId
+    executors: Mapping[TaskId, Executor]
+    over_at: float
+    """When a lease of an earlier life of this node is over."""
+    _files: dict[NodeId, str] = field(default_factory=dict)
+    """{peer that was heard: its fleet file}."""
+    _answers: dict[NodeId, Learnt] = field(default_factory=dict)
+    _asked_at: float = -math.inf
+
+    def hear(self, beat: Beat) -> None:
+        """A peer's beat came."""
+        self._files[beat.node] = beat.fleet_file
+
+    def on_answer(self, learnt: Learnt) -> None:
+        """A peer answered a question; those that this node asks for another reason are none of this one's."""
+        if self._asked_at > -math.inf:
+            self._answers[learnt.node] = learnt
+
+    def unleased(self, now: float) -> tuple[TaskId, ...]:
+        """The tasks whose worker here may be working without a lease: our answers say so."""
+        return tuple(name for name, executor in self.executors.items() if executor.may_work_unleased(now))
+
+    def due(self, values: Mapping[TaskId, Allocation], now: float) -> list[tuple[TaskId, SetLeased]]:
+        """What this node proposes as an owner.
+
+        What an earlier life of its own was granted is over before it lets its worker do without a lease.
+        """
+        is_young = now < self.over_at
+        return [
+            (spec.name, SetLeased(base_revision=values[spec.name].revision, leased=spec.exclusive))
+            for spec in self._open(values)
+            if not (self._waits_for(spec, values[spec.name]) if spec.exclusive else is_young or self._are_files_mixed())
+        ]
+
+    def to_ask(self, values: Mapping[TaskId, Allocation], now: float) -> tuple[NodeId, ...]:
+        """Whom to ask now for what it has learnt and who works there."""
+        tasks = [spec for spec in self._open(values) if spec.exclusive]
+        if not tasks or now - self._asked_at < ASK_EVERY_S:
+            return ()
+        self._asked_at = now
+        return tuple(sorted({name for spec in tasks for name in self._waits_for(spec, values[spec.name])}))
+
+    def _open(self, values: Mapping[TaskId, Allocation]) -> list[TaskSpec]:
+        """The tasks owned here for which the fleet has not agreed to what this node's file says."""
+        return [
+            spec
+            for spec in self.fleet.tasks
+            if (value := values[spec.name]).owner == self.me and value.leased is not spec.exclusive
+        ]
+
+    def _are_files_mixed(self) -> bool:
+        mine = fleet_hash(self.fleet)
+        return any(file != mine for file in self._files.values())
+
+    def _waits_for(self, spec: TaskSpec, value: Allocation) -> dict[NodeId, str]:
+        """{who must be heard, or must stop, before the task is leased: why}."""
+        others = sorted({*self._files, *spec.candidates} - {self.me})
+        reasons = {name: self._doubt(spec, value, name) for name in others}
+        return {name: reason for name, reason in reasons.items() if reason}
+
+    def _doubt(self, spec: TaskSpec, value: Allocation, node: NodeId) -> str:
+        answer = self._answers.get(node)
+        if answer is None:
+            return "has not answered yet"
+        if answer.lease_terms != lease_terms(self.fleet):
+            return "goes by other leases"
+        if spec.name in answer.unleased:
+            return "works without a lease"
+        epoch = next((known.epoch for known in answer.values if known.task == spec.name), 0)
+        return "" if epoch >= value.epoch else f"has not learnt epoch {value.epoch}"
+
+    def problem(self, spec: TaskSpec, value: Allocation) -> str:
+        """How this node's file and what is agreed differ; empty when they do not."""
+        if value.owner is None or value.leased is spec.exclusive:
+            return ""
+        if not spec.exclusive:
+            return "exclusive for the fleet, though not by this node's fleet file"
+        text = "exclusive by this node's fleet file, not yet for the fleet"
+        if value.owner != self.me:
+            return f"{text}: {value.owner} waits, or works without a lease (see its status)"
+        waits = ", ".join(f"{name} {reason}" for name, reason in self._waits_for(spec, value).items())
+        return f"{text}: nobody works until all candidates go by it ({waits or 'agreeing'})"

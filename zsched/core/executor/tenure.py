@@ -1,0 +1,139 @@
+"""EXECUTOR, beside the handover: who may work right now. Leases of exclusive tasks, and robots that are cut off.
+
+Knows: when a worker here must stop, may go on, or works alone. Does not know: grants and echoes
+(`zsched.core.vote.lease`), the handover's table (`zsched.core.executor.handover`), how a worker is told.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from zsched.core.events import ClockCompared
+from zsched.core.executor.handover import Executor
+from zsched.core.instructions import Instruction
+from zsched.core.membership.peers import Membership
+from zsched.core.scheduler.scoring import majority
+from zsched.core.values.fleet import Fleet, OnIsolation
+from zsched.core.values.model import Allocation, Beat, NodeId, PeerState, TaskId
+from zsched.core.vote.clocks import ClockDoubt
+from zsched.core.vote.lease import Leases
+
+ALONE_AFTER_S = 0.5
+"""So long cut off from the owner and from a quorum, a robot with `on_isolation: local` works alone."""
+
+
+@dataclass(slots=True)
+class Tenure:
+    """One node's right to work, for all tasks."""
+
+    fleet: Fleet
+    me: NodeId
+    leases: Leases
+    executors: Mapping[TaskId, Executor]
+    exclusive: tuple[TaskId, ...] = ()
+    """The tasks whose workers need a lease: by this node's file, or for everybody."""
+    clock: ClockDoubt = field(default_factory=ClockDoubt)
+    _alone_since: dict[TaskId, float] = field(default_factory=dict)
+    _local: tuple[TaskId, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._note_leased()
+        self._local = tuple(task.name for task in self.fleet.tasks if task.on_isolation is OnIsolation.LOCAL)
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether a worker here may have to be given a lease or stopped with any beat."""
+        return self.leases.is_holding
+
+    def next_deadline(self, now: float) -> float:
+        """When `tend` may have something to do."""
+        due = self.leases.next_deadline(now)
+        for name, at in self._alone_since.items():
+            if not self.executors[name].is_local:
+                due = min(due, at + ALONE_AFTER_S)
+        return due
+
+    def _note_leased(self) -> None:
+        self.exclusive = tuple(name for name, executor in self.executors.items() if executor.is_leased)
+
+    # --- exclusive tasks ---------------------------------------------------------------------------------------------
+
+    def hold(self, value: Allocation, next_number: int) -> None:
+        """A newer value was learnt: begin or end this node's side of an exclusive task's lease."""
+        self._note_leased()
+        if value.task in self.exclusive and value.owner == self.me:
+            self.leases.begin(value.task, value.epoch, next_number)
+        else:
+            self.leases.end(value.task, next_number - 1)
+
+    def hear(self, beat: Beat, accepted: Mapping[TaskId, tuple[NodeId, int]], now: float, *, is_newest: bool) -> bool:
+        """A beat (our own too) may grant, echo, release, or ask us to leave. Whether to beat at once."""
+        return self.leases.on_beat(beat, accepted, now, is_newest=is_newest)
+
+    def on_clock(
+        self, event: ClockCompared, standing: Mapping[TaskId, Allocation | None], number: int, now: float
+    ) -> bool:
+        """The clock was compared. Whether that has begun or ended a doubt about it."""
+        is_unsure = self.clock.absorb(event, now)
+        if not self.exclusive or is_unsure == self.leases.is_unsure:
+            return False
+        if is_unsure:
+            self.leases.doubt(standing)
+        else:
+            self.leases.trust(standing, number, now)
+        return True
+
+    def tend_leases(self, number: int, now: float) -> tuple[tuple[Instruction, ...], bool]:
+        """Prolong our workers' leases; stop who is asked to leave, and give back what has stopped or run out.
+
+        Returns:
+            (what to do, whether something was given back: beat at once). ``number`` is our newest beat's.
+        """
+        result: list[Instruction] = []
+        has_released = False
+        if not self.leases.is_holding:
+            return (), False  # nobody works here
+        leaving = self.leases.leaving()
+        for task in self.exclusive:
+            executor = self.executors[task]
+            if self.leases.is_unsure:
+                result += executor.leave()
+                continue
+            if task not in leaving:
+                until = self.leases.until(task)
+                prolonged = executor.set_lease(until, now)
+                if prolonged:
+                    self.leases.on_given(task, until)
+                result += prolonged
+                continue
+            told = executor.leave()
+            if told:
+                self.leases.on_told_to_stop(task)
+            result += told
+            # What the worker was told counts, not what has been echoed since: electors may echo on and on, and a
+            # worker that has stopped already will not say so again.
+            if now >= self.leases.given_until(task):
+                has_released |= self.leases.on_run_out(task, number, now)
+        return tuple(result), has_released
+
+    # --- isolation ---------------------------------------------------------------------------------------------------
+
+    def tend_isolation(self, membership: Membership, now: float) -> tuple[Instruction, ...]:
+        """Work alone while cut off from the owner and from a quorum, and not a moment longer."""
+        if not self._local:
+            return ()
+        voters = self.fleet.voters
+        heard = sum(membership.state(name) is PeerState.ALIVE for name in voters)
+        is_cut_off = heard < majority(len(voters))
+        result: list[Instruction] = []
+        for name in self._local:
+            executor = self.executors[name]
+            if executor.owner is None:
+                continue
+            if not is_cut_off or membership.state(executor.owner) is PeerState.ALIVE:
+                self._alone_since.pop(name, None)
+                result += executor.rejoin()
+            elif now >= self._alone_since.setdefault(name, now) + ALONE_AFTER_S:
+                result += executor.isolate()
+        return tuple(result)

@@ -1,0 +1,83 @@
+"""EXECUTOR, beside the handover: the states of this node's workers, as supervisor and tokens report them.
+
+Knows: which tasks have a worker here. Does not know: processes, tokens, who owns what.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from zsched.core import events as ev
+from zsched.core.instructions import RecordStory
+from zsched.core.values.fleet import Fleet, OnIsolation, TaskSpec
+from zsched.core.values.model import NodeId, NodeKind, Profile, TaskId, WorkerState, as_reason, told_of_worker
+
+TROUBLE_S = 60.0
+"""A callback that has raised is shown for so long behind the last time."""
+
+
+def runs_worker(task: TaskSpec, node: NodeId, kind: NodeKind) -> bool:
+    """Whether ``node`` keeps a worker of the task: candidates do, and robots that work alone when they are cut off."""
+    is_alone = kind is NodeKind.ROBOT and task.on_isolation is OnIsolation.LOCAL
+    return node in task.candidates or is_alone
+
+
+def failed_workers(profile: Profile) -> set[TaskId]:
+    """The tasks whose worker on that node has failed for good."""
+    return {load.task for load in profile.workers if load.state is WorkerState.FAILED}
+
+
+@dataclass(slots=True)
+class Workers:
+    """{task: state} of every worker that this node keeps, and {task: why} of those that are not ready."""
+
+    states: dict[TaskId, WorkerState]
+    reasons: dict[TaskId, str] = field(default_factory=dict)
+    _troubles: dict[TaskId, tuple[str, float]] = field(default_factory=dict)
+    """{task: (what a worker that is ready complains of, since when it has not again)}."""
+    _outdated: dict[TaskId, str] = field(default_factory=dict)
+    """{task: why a worker that is ready should be started again}."""
+
+    @classmethod
+    def of(cls, fleet: Fleet, me: NodeId) -> Workers:
+        """Before anything is started or seen."""
+        kind = fleet.node(me).kind
+        return cls({task.name: WorkerState.STOPPED for task in fleet.tasks if runs_worker(task, me, kind)})
+
+    def on_changed(self, event: ev.WorkerChanged) -> RecordStory | None:
+        """Note a worker's new state; ``None`` when it is no news, or no worker of ours."""
+        if event.task not in self.states:
+            return None
+        if event.state is not WorkerState.READY:
+            self._troubles.pop(event.task, None)
+        if event.state is WorkerState.READY:
+            self.reasons.pop(event.task, None)
+        elif event.reason:
+            self.reasons[event.task] = as_reason(event.reason)
+        if self.states[event.task] is event.state:
+            return None
+        self.states[event.task] = event.state
+        text = f"worker {told_of_worker(event.state, event.reason).removeprefix('is ')}"
+        return RecordStory(stage="executor", text=text, task=event.task)
+
+    def on_troubled(self, event: ev.WorkerTroubled, now: float) -> None:
+        """A worker that is ready says that its callbacks raise."""
+        if self.states.get(event.task) is WorkerState.READY:
+            times = "once" if event.count == 1 else f"{event.count} times"
+            self._troubles[event.task] = (as_reason(f"callback raised {times}: {event.text}"), now)
+
+    def on_outdated(self, event: ev.WorkerOutdated, _now: float) -> None:
+        """A worker that somebody else started should be started again, or has been."""
+        if event.reason and event.task in self.states:
+            self._outdated[event.task] = as_reason(event.reason)
+        else:
+            self._outdated.pop(event.task, None)
+
+    def told(self, now: float) -> Mapping[TaskId, str]:
+        """{task: why its worker is not ready, or what is wrong with it though it is}."""
+        if not self._troubles and not self._outdated:
+            return self.reasons
+        self._troubles = {task: one for task, one in self._troubles.items() if now - one[1] <= TROUBLE_S}
+        outdated = {task: text for task, text in self._outdated.items() if self.states[task] is WorkerState.READY}
+        return {**outdated, **{task: text for task, (text, _) in self._troubles.items()}, **self.reasons}

@@ -1,0 +1,90 @@
+"""GATEWAY: the newest profile of every node, with its age (the paper's ``edge_data``, Alg. 1).
+
+Knows: which report is newer, how old is too old, what the task costs where it runs. Does not know: who is better.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from zsched.core.gateway.demand import Demands
+from zsched.core.gateway.sharing import Shares
+from zsched.core.sequence import Order, Track
+from zsched.core.values.fleet import Demand, Fleet, TaskSpec
+from zsched.core.values.model import NodeId, Profile, TaskId
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EdgeData:
+    """A node's newest profile and its age in seconds since we received it."""
+
+    profile: Profile
+    age_s: float
+
+
+class Gateway:
+    """What this node knows of every node's state, itself included."""
+
+    def __init__(self, fleet: Fleet) -> None:
+        self._names = frozenset(node.name for node in fleet.nodes)
+        self._ttl_s = fleet.timing.profile_ttl_s
+        self._profiles: dict[NodeId, tuple[Profile, float]] = {}
+        self._tracks: dict[NodeId, Track] = {}
+        self.demands = Demands()
+        """What tasks need, as this node has learnt it."""
+        self._shares = Shares()
+        self._candidates = {task.name: task.candidates for task in fleet.tasks}
+        self.version = 0
+        """Rises with every change; what was computed from an older version may be wrong."""
+
+    def absorb(self, profile: Profile, now: float, life: int | None = None) -> str | None:
+        """Take a profile in; returns why it was refused (one word for a counter), or ``None``.
+
+        ``life`` is the incarnation that the node's beats show: profiles of that life count at once.
+        """
+        if profile.node not in self._names:
+            return "foreign"
+        track = self._tracks.setdefault(profile.node, Track())
+        is_over = now - track.at > self._ttl_s or (profile.incarnation == life != track.incarnation)
+        order = track.judge(profile.incarnation, profile.sequence, now, may_begin=is_over)
+        if order is not Order.NEW:
+            return "stale" if order is Order.OLD else "doubtful"
+        self._profiles[profile.node] = (profile, now)
+        self.version += 1
+        return None
+
+    def newest(self, node: NodeId, now: float) -> EdgeData | None:
+        """The newest profile of ``node`` whatever its age, or ``None`` when it never sent one."""
+        known = self._profiles.get(node)
+        return None if known is None else EdgeData(profile=known[0], age_s=max(now - known[1], 0.0))
+
+    def fresh(self, node: NodeId, now: float) -> Profile | None:
+        """The newest profile of ``node`` when it is not older than the profile's time to live, else ``None``."""
+        known = self._profiles.get(node)
+        return known[0] if known is not None and now - known[1] <= self._ttl_s else None
+
+    def fresh_until(self, now: float) -> float:
+        """Up to when (inclusive) the same profiles as now are fresh, if none comes."""
+        ends = (at + self._ttl_s for _, at in self._profiles.values() if now - at <= self._ttl_s)
+        return min(ends, default=math.inf)
+
+    def learn_demand(self, task: TaskId, owner: NodeId, now: float) -> None:
+        """Note what the task's worker wants on its owner, and gets (`zsched.core.gateway.demand` and `sharing`)."""
+        profile = self.fresh(owner, now)
+        if profile is None:
+            return
+        speeds = [
+            known[0].speed for name in self._candidates.get(task, ()) if (known := self._profiles.get(name)) is not None
+        ]
+        fastest = max((speed for speed in speeds if speed is not None), default=None)
+        news = self.demands.learn(task, profile, now, fastest), self._shares.learn(task, profile)
+        self.version += any(news)
+
+    def demand(self, spec: TaskSpec, profile: Profile) -> Demand:
+        """What the task will use on the node of ``profile``."""
+        return self.demands.at(spec, profile)
+
+    def share(self, spec: TaskSpec, profile: Profile, need_cores: float, coming_cores: float) -> float:
+        """Cores that the task would get on the node of ``profile``, were it full (`zsched.core.gateway.sharing`)."""
+        return self._shares.at(spec.name, profile, need_cores, coming_cores)

@@ -1,0 +1,50 @@
+"""GATEWAY, what a task would get on a machine that is full: the fair share of its threads, corrected where it was.
+
+Knows: run queues, what a task got beside how many others. Does not know: what it needs, who is better.
+
+A fair scheduler (CFS, EEVDF) gives every thread that wants to run the same. Groups with weights of their own (services,
+sessions) share otherwise, and nobody can tell from outside. So a share is believed until the task has been there: what
+it then got, as a part of the fair share, counts for that machine from then on. Without that, two machines that both
+promise more than they give would hand the task to each other for ever.
+"""
+
+from __future__ import annotations
+
+from zsched.core.scheduler.utility import fair_share
+from zsched.core.values.model import NodeId, Profile, TaskId
+
+
+class Shares:
+    """What tasks get of full machines, as one node has seen it."""
+
+    def __init__(self) -> None:
+        self._threads: dict[TaskId, float] = {}
+        self._kept: dict[tuple[TaskId, NodeId], float] = {}
+        """What a task got on a machine as a part of its fair share there, at most 1; the newest figure."""
+
+    def learn(self, task: TaskId, profile: Profile) -> bool:
+        """Note by how many threads the task wants to run on its owner, and what they get; whether that is news."""
+        load = profile.worker(task)
+        if load is None or load.wanted_cores is None or load.cpu_cores is None or profile.runnable is None:
+            return False
+        threads = max(load.wanted_cores, 1.0)
+        fair = fair_share(profile.cpu_cores, threads, max(profile.runnable - threads, 0.0))
+        kept = min(load.cpu_cores / fair, 1.0)
+        before = self._threads.get(task), self._kept.get((task, profile.node))
+        self._threads[task], self._kept[task, profile.node] = threads, kept
+        return before != (threads, kept)
+
+    def at(self, task: TaskId, profile: Profile, need_cores: float, coming_cores: float = 0.0) -> float:
+        """Cores that the task would get on the node of ``profile``, were it full; 0 where nobody counts its threads.
+
+        Args:
+            task: which one.
+            profile: of a node that has not the task.
+            need_cores: of the task there; by as many threads it runs that was never seen to lack CPU, by one at least.
+            coming_cores: of other tasks that have just come there, and do not show yet.
+        """
+        if profile.runnable is None:
+            return 0.0
+        threads = self._threads.get(task, max(need_cores, 1.0))
+        fair = fair_share(profile.cpu_cores, threads, profile.runnable + coming_cores)
+        return self._kept.get((task, profile.node), 1.0) * fair

@@ -1,0 +1,1 @@
+"""Who belongs to the fleet, who is there, and who is who."""

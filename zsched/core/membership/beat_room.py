@@ -1,0 +1,80 @@
+"""Membership: a beat is sent whatever it holds. What has no room in one beat is in the next, in turn.
+
+A beat that is too large would not be sent at all, and a healthy node would look dead. `zsched check` refuses fleet
+files whose beats could be too large in the long run (`most_bytes`); a moment in which many tasks move may still be.
+
+Knows: how many bytes a beat's parts take at most. Does not know: the bytes themselves, what a part means.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from zsched.core.values.fleet import Fleet
+from zsched.core.values.model import Beat, Grant
+
+MAX_BEAT_BYTES = 16 * 1024
+FRAME_BYTES = 640
+"""What is left for the frame, the names of the fields and the fields of one value."""
+_NUMBER = 9
+_GRANT = 1 + sum(1 + len(name) for name in ("task", "owner", "incarnation", "epoch", "number")) + 3 * _NUMBER
+_PARTS = ("learnt", "released", "asked_to_leave", "echoes")
+
+
+def _text(text: str) -> int:
+    return 2 + len(text)
+
+
+def _part_bytes(part: object) -> int:
+    if isinstance(part, Grant):
+        return _GRANT + _text(part.task) + _text(part.owner)
+    assert isinstance(part, tuple)
+    return 1 + sum(_text(one) if isinstance(one, str) else _NUMBER for one in part)
+
+
+def beat_bytes(beat: Beat) -> int:
+    """How many bytes a beat's frame takes at most."""
+    parts = sum(_part_bytes(part) for kind in _PARTS for part in getattr(beat, kind))
+    return FRAME_BYTES + parts + _names_bytes(beat)
+
+
+def _names_bytes(beat: Beat) -> int:
+    return sum(map(_text, beat.suspects)) + sum(map(_text, beat.twins))
+
+
+def most_bytes(fleet: Fleet) -> int:
+    """How many bytes a beat of this fleet takes at most in the long run.
+
+    All tasks are learnt, an elector echoes every exclusive one and has given all back itself, and misses everybody (or
+    hears some twice).
+    """
+    longest = max((len(node.name) for node in fleet.nodes), default=0)
+    learnt = sum(1 + _text(task.name) + 2 * _NUMBER for task in fleet.tasks)
+    grants = sum(2 * (_GRANT + _text(task.name) + 2 + longest) for task in fleet.tasks if task.exclusive)
+    return FRAME_BYTES + learnt + grants + sum(_text(node.name) for node in fleet.nodes)
+
+
+@dataclass(slots=True)
+class BeatRoom:
+    """Makes one node's beats fit, and remembers whose turn it is."""
+
+    _next: int = 0
+
+    def fit(self, beat: Beat) -> tuple[Beat, int]:
+        """The beat as it is sent, and how many of its parts wait for the next ones.
+
+        Whom it suspects is always in it: who is not named there is vouched for.
+        """
+        if beat_bytes(beat) <= MAX_BEAT_BYTES:
+            return beat, 0
+        parts = [(kind, part) for kind in _PARTS for part in getattr(beat, kind)]
+        room = MAX_BEAT_BYTES - FRAME_BYTES - _names_bytes(beat)
+        first = self._next % len(parts)
+        chosen: list[tuple[str, object]] = []
+        for kind, part in (*parts[first:], *parts[:first]):
+            room -= _part_bytes(part)
+            if room >= 0:  # it only shrinks: nothing is chosen behind the first part that has no room
+                chosen.append((kind, part))
+        self._next = first + len(chosen)
+        held = {kind: tuple(part for of, part in chosen if of == kind) for kind in _PARTS}
+        return replace(beat, **held), len(parts) - len(chosen)  # type: ignore[arg-type]

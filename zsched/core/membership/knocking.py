@@ -1,0 +1,42 @@
+"""Membership's question about nobody it knows: who beats in this fleet and is in no line of its file?
+
+A fleet file that has grown by a node is not everywhere at once. The new node hears another hash and says so; the others
+know no such node, and would say nothing. Nothing follows from such beats but a line in the status.
+
+Knows: names and beats of unknown nodes. Does not know: anything else that they say.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from zsched.core.membership.identity import ONE_FILE, QUIET_S, here
+from zsched.core.values.model import Beat, NodeId
+
+KNOCKERS_KEPT = 4
+"""So many unknown names are told of; a stranger may use any number."""
+
+
+@dataclass(slots=True)
+class Knocking:
+    """The unknown nodes that one node hears, by its own fleet file's hash."""
+
+    fleet_file: str
+    _heard: dict[NodeId, tuple[Beat, float]] = field(default_factory=dict)
+    """{name: (newest beat, when)}."""
+
+    def on_beat(self, beat: Beat, now: float) -> None:
+        """A beat of a node that the fleet file does not name."""
+        self._heard = {name: known for name, known in self._heard.items() if now < known[1] + QUIET_S}
+        if beat.node in self._heard or len(self._heard) < KNOCKERS_KEPT:
+            self._heard[beat.node] = (beat, now)
+
+    def problems(self, now: float, path: str = "") -> tuple[str, ...]:
+        """What status says of those that were heard lately; our own fleet file is at ``path``."""
+        ours = here(self.fleet_file, path)
+        return tuple(
+            f"fleet/{name}: {name} beats in this fleet, goes by another fleet file ({beat.fleet_file or 'not told'}, "
+            f"{ours}), and is in no line of this one: {ONE_FILE}"
+            for name, (beat, at) in sorted(self._heard.items())
+            if now < at + QUIET_S
+        )

@@ -1,0 +1,287 @@
+"""Membership: who is alive, suspect or gone, by beats, tokens and second observers.
+
+Knows: deadlines, confirmation, incarnations, self-doubt. Does not know: what follows from a peer being gone.
+
+A beat comes out of the peer's decision loop and is the only proof of life; the liveliness token goes within
+milliseconds of a kill, but stays while a wedged process keeps its link, so it can only accuse. Silence or a lost token
+make a peer *suspect*. It is *gone* when a second, living observer suspects it too, or when nobody speaks for it during
+the confirmation time; in fleets of more than three nodes a living observer that still hears it keeps it suspect (a
+partial cut). Any beat refutes. A node whose own loop lags doubts itself first: its deadlines lengthen, at most
+threefold, and never stop (after Lifeguard, arXiv 1707.00788). An observer that has watched for a while without ever
+hearing a peer accuses it as well: it must not vouch for what it does not know.
+
+Whoever comes back after a cut is heard before the others behind the same cut. As long as its beats do not accuse them,
+they are not gone but *suspect*: else a robot that hears a healed network's first node would flee from an owner that
+everybody else hears.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from zsched.core.sequence import Order, Track
+from zsched.core.values.fleet import Timing
+from zsched.core.values.model import Beat, NodeId, PeerState
+
+SMALL_FLEET = 3
+"""Up to so many nodes no second observer is waited for: there is one at most, and it may be the next to go."""
+MAX_DOUBT = 3.0
+IN_FLIGHT_S = 0.03
+"""A beat that arrives so soon after its sender's token went was on its way before: it refutes nothing."""
+
+_NOBODY: frozenset[NodeId] = frozenset()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Transition:
+    """A peer's state changed."""
+
+    node: NodeId
+    before: PeerState
+    after: PeerState
+    reason: str
+
+
+@dataclass(slots=True)
+class _Peer:
+    state: PeerState = PeerState.UNKNOWN
+    track: Track = field(default_factory=Track)
+    order: Order = Order.NEW
+    """Of the beat that came last."""
+    beat_at: float = -math.inf
+    suspect_since: float = math.inf
+    vouched_until: float = -math.inf
+    """A suspect for whom somebody speaks is looked at again then."""
+    token_lost: bool = False
+    token_lost_at: float = -math.inf
+    has_been_gone: bool = False
+    """Gone since it was last alive, even if somebody's word has made it a suspect again."""
+    back_at: float = -math.inf
+    """When it last came back from gone in the same life."""
+    suspects: tuple[NodeId, ...] = ()
+
+
+class Membership:
+    """Every other configured node's state, as this node sees it."""
+
+    def __init__(self, me: NodeId, nodes: tuple[NodeId, ...], timing: Timing) -> None:
+        self._me = me
+        self._timing = timing
+        self._peers = {name: _Peer() for name in sorted(nodes) if name != me}
+        self._size = len(nodes)
+        self._doubt = 1.0
+        self._started_at = math.inf
+        self._deadline: float | None = None
+        """`next_deadline`, until something changes it."""
+        self._states = dict.fromkeys(sorted(nodes), PeerState.UNKNOWN) | {me: PeerState.ALIVE}
+        self._has_suspect = False
+        self._misses_anybody = bool(self._peers)
+        self._has_watched = False
+        """Whether this node has listened for as long as silence takes to mean something."""
+
+    # --- queries -----------------------------------------------------------------------------------------------
+
+    def state(self, node: NodeId) -> PeerState:
+        """A node's state; this node is alive to itself, a stranger unknown."""
+        if node == self._me:
+            return PeerState.ALIVE
+        peer = self._peers.get(node)
+        return PeerState.UNKNOWN if peer is None else peer.state
+
+    def is_known(self, node: NodeId) -> bool:
+        """Whether the fleet file names ``node``."""
+        return node == self._me or node in self._peers
+
+    def states(self) -> dict[NodeId, PeerState]:
+        """{node: state} of the whole fleet, this node included, sorted by name."""
+        return self._states
+
+    def incarnation(self, node: NodeId) -> int | None:
+        """The newest incarnation that a peer's beat showed, or ``None``."""
+        peer = self._peers.get(node)
+        return None if peer is None or peer.track.incarnation < 0 else peer.track.incarnation
+
+    def is_doubtful(self, node: NodeId) -> bool:
+        """Whether the beat that came last in this peer's name is not to be believed, whatever it says."""
+        return self._peers[node].order is Order.DOUBTFUL
+
+    def is_newest(self, node: NodeId) -> bool:
+        """Whether the beat that came last in this peer's name is no repeat and no late one, and is believed."""
+        return self._peers[node].order is Order.NEW
+
+    def alive(self) -> tuple[NodeId, ...]:
+        """The living peers, sorted, without this node."""
+        return tuple(name for name, peer in self._peers.items() if peer.state is PeerState.ALIVE)
+
+    def in_grace(self) -> frozenset[NodeId]:
+        """The suspects whose confirmation time still runs: by then they have beaten again, are gone, or are cut off."""
+        if not self._has_suspect:
+            return _NOBODY
+        suspects = ((name, peer) for name, peer in self._peers.items() if peer.state is PeerState.SUSPECT)
+        return frozenset(name for name, peer in suspects if peer.vouched_until == -math.inf)
+
+    def suspects(self) -> tuple[NodeId, ...]:
+        """Whom this node accuses: suspect, gone, or never heard although it has listened for long enough."""
+        excused = (PeerState.ALIVE,) if self._has_watched else (PeerState.ALIVE, PeerState.UNKNOWN)
+        return tuple(name for name, peer in self._peers.items() if peer.state not in excused)
+
+    @property
+    def misses_anybody(self) -> bool:
+        """Whether some node of the fleet file is not heard."""
+        return self._misses_anybody
+
+    # --- what changes it ---------------------------------------------------------------------------------------
+
+    def note_lag(self, lag_s: float) -> None:
+        """Take in how late this node's own loop woke up (seconds, >= 0), before it judges anybody."""
+        if lag_s > 0.0:
+            self._doubt = max(self._doubt, min(1.0 + lag_s / self._timing.beat_s, MAX_DOUBT))
+            self._deadline = None
+
+    def fade_doubt(self) -> None:
+        """A beat was sent: doubt fades by halves."""
+        if self._doubt > 1.0:
+            self._doubt = 1.0 + (self._doubt - 1.0) / 2
+            self._deadline = None
+
+    def absorb_beat(self, beat: Beat, now: float) -> tuple[Transition, ...]:
+        """A peer's loop is alive: it refutes every accusation. Old and doubtful ones (`Track`) are ignored."""
+        peer = self._peers.get(beat.node)
+        if peer is None:
+            return ()
+        known = peer.track.incarnation
+        peer.order = peer.track.judge(
+            beat.incarnation, beat.sequence, now, may_begin=self._may_begin(peer, beat.incarnation, now)
+        )
+        if peer.order is not Order.NEW:
+            return ()
+        restarted = 0 <= known < beat.incarnation
+        if peer.token_lost and not restarted and now < peer.token_lost_at + IN_FLIGHT_S:
+            return ()
+        before, is_back = peer.state, peer.has_been_gone and not restarted
+        self._deadline = None
+        peer.beat_at = now
+        peer.suspects, peer.token_lost = beat.suspects, False
+        changes = []
+        if before is not PeerState.ALIVE:
+            changes.append(self._change(beat.node, PeerState.ALIVE, "beats again" if restarted else "beats", now))
+            if is_back:
+                peer.back_at = now
+            if is_back and before is PeerState.GONE:
+                changes += self._take_word(beat, now)
+        elif restarted:
+            changes.append(Transition(node=beat.node, before=before, after=before, reason="restarted"))
+        return (*changes, *self._review(now)) if self._has_suspect else tuple(changes)
+
+    def _take_word(self, beat: Beat, now: float) -> list[Transition]:
+        """A peer that we had lost is back: whom it does not accuse we had lost with it, and should hear soon."""
+        changes = []
+        accused = {name for peer in self._peers.values() if peer.state is PeerState.ALIVE for name in peer.suspects}
+        for name, peer in self._peers.items():
+            if peer.state is PeerState.GONE and name not in accused:
+                changes.append(self._change(name, PeerState.SUSPECT, f"{beat.node} is back and hears it", now))
+                peer.vouched_until = now + self._timing.suspect_s * self._doubt
+        return changes
+
+    def _may_begin(self, peer: _Peer, incarnation: int, now: float) -> bool:
+        """Whether another life may begin with its first beat.
+
+        The next one when the known one misses its beats; of a peer that is silent also one with a lower count (its
+        state was made anew).
+        """
+        if incarnation > peer.track.incarnation:
+            return peer.state is not PeerState.ALIVE or now >= peer.beat_at + 2 * self._timing.beat_s
+        is_silent = peer.state is PeerState.GONE or now >= peer.beat_at + self._timing.suspect_s
+        return is_silent and peer.state is not PeerState.ALIVE
+
+    def absorb_token_lost(self, node: NodeId, incarnation: int, now: float) -> tuple[Transition, ...]:
+        """A peer's token went: suspect at once, if it is the token of the life we know.
+
+        Of a peer that has just come back it is most likely the old link's: the beats came by a new one, and zenoh ends
+        the token of the other when it notices. So for a lease only silence counts.
+        """
+        peer = self._peers.get(node)
+        if peer is None or peer.track.incarnation != incarnation or peer.state is not PeerState.ALIVE:
+            return ()
+        if now < peer.back_at + self._timing.zenoh_lease_s:
+            return ()
+        peer.token_lost, peer.token_lost_at = True, now
+        return (self._change(node, PeerState.SUSPECT, "its token went", now), *self._review(now))
+
+    def tick(self, now: float) -> tuple[Transition, ...]:
+        """Time has passed."""
+        changes = []
+        limit = self._timing.suspect_s * self._doubt
+        self._started_at = min(self._started_at, now)
+        self._has_watched = self._has_watched or now >= self._started_at + limit
+        if now < self.next_deadline():
+            return ()  # silence and reviews have their times; a peer's word is reviewed when it comes
+        self._deadline = None
+        for name, peer in self._peers.items():
+            if peer.state is PeerState.ALIVE and now >= peer.beat_at + limit:
+                silent = now - peer.beat_at
+                changes.append(self._change(name, PeerState.SUSPECT, f"silent for {silent:.2f} s", now))
+        return (*changes, *self._review(now))
+
+    def next_deadline(self) -> float:
+        """When `tick` may have something to say; infinity when never."""
+        if self._deadline is None:
+            limit, due = self._timing.suspect_s * self._doubt, math.inf
+            for peer in self._peers.values():
+                due = min(due, self._peer_deadline(peer, limit))
+            self._deadline = due
+        return self._deadline
+
+    def _peer_deadline(self, peer: _Peer, limit: float) -> float:
+        if peer.state is PeerState.ALIVE:
+            return peer.beat_at + limit
+        if peer.state is PeerState.SUSPECT:
+            return self._review_at(peer)
+        return math.inf
+
+    def _review_at(self, peer: _Peer) -> float:
+        return max(peer.suspect_since + self._grace(peer), peer.vouched_until)
+
+    def _grace(self, peer: _Peer) -> float:
+        """How long a suspect has before it is gone without anybody's confirmation."""
+        if self._size <= SMALL_FLEET:
+            return 1.5 * self._timing.beat_s * self._doubt if peer.token_lost else 0.0
+        return self._timing.confirm_s * self._doubt
+
+    def _review(self, now: float) -> list[Transition]:
+        """Turn suspects into gone where that is confirmed."""
+        changes = []
+        for name, peer in self._peers.items():
+            if peer.state is not PeerState.SUSPECT:
+                continue
+            reason = self._verdict(name, peer, now)
+            if reason:
+                changes.append(self._change(name, PeerState.GONE, reason, now))
+        return changes
+
+    def _verdict(self, name: NodeId, peer: _Peer, now: float) -> str:
+        observers = [(other, at) for other, at in self._peers.items() if other != name and at.state is PeerState.ALIVE]
+        for other, observer in observers:
+            if name in observer.suspects:
+                return f"{other} misses it too"
+        if now < self._review_at(peer):
+            return ""
+        if self._size > SMALL_FLEET and any(at.beat_at > peer.suspect_since for _, at in observers):
+            # Somebody alive still hears it: a cut between it and us, not its end. Whoever falls silent vouches no more.
+            peer.vouched_until = now + self._timing.beat_s
+            return ""
+        return "nobody speaks for it"
+
+    def _change(self, node: NodeId, after: PeerState, reason: str, now: float) -> Transition:
+        peer = self._peers[node]
+        before, peer.state = peer.state, after
+        if after is not PeerState.SUSPECT:
+            peer.has_been_gone = after is PeerState.GONE
+        self._states = {**self._states, node: after}  # a new one: whoever holds the old one sees one moment
+        self._has_suspect = PeerState.SUSPECT in self._states.values()
+        self._misses_anybody = any(state is not PeerState.ALIVE for state in self._states.values())
+        self._deadline = None
+        peer.suspect_since = now if after is PeerState.SUSPECT else math.inf
+        peer.vouched_until = -math.inf
+        return Transition(node=node, before=before, after=after, reason=reason)

@@ -1,0 +1,61 @@
+"""PROFILE, what a worker wants: which of its threads would use a whole core if they never had to wait.
+
+Knows: shares of time, smoothing. Does not know: where the kernel tells them
+(`zsched.adapters.machine.device_profiler`), needs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from zsched.core.profile.means import Ewma
+
+ALWAYS = 0.9
+"""A thread that runs or waits to run for so much of the time always wants to run."""
+APPETITE_S = 1.5
+"""Time constant of that share: a job that comes once a second and leaves pauses is no such thread."""
+
+Thread = tuple[int, str]
+"""(process, thread)."""
+
+
+class Appetite:
+    """The threads of one worker."""
+
+    def __init__(self) -> None:
+        self._at = 0.0
+        self._times: Mapping[Thread, tuple[float, float]] = {}
+        self._shares: dict[Thread, tuple[Ewma, Ewma]] = {}
+        """{thread: share of the time that it ran, and that it ran or waited}."""
+
+    def look(self, times: Mapping[Thread, tuple[float, float]], now: float) -> None:
+        """Take in how long every thread has run, and has waited to run, in seconds since it began.
+
+        A wait is told when it ends, so one look may show more than the time since the last: only the mean is bounded.
+        """
+        elapsed_s = now - self._at
+        if elapsed_s <= 0.0:
+            return
+        shares = {}
+        for thread, (run_s, wait_s) in times.items():
+            if thread not in self._times:
+                continue
+            run_before_s, wait_before_s = self._times[thread]
+            known = self._shares.get(thread)
+            ran, wanted = shares[thread] = known or (_from_nothing(self._at), _from_nothing(self._at))
+            ran.update(max(run_s - run_before_s, 0.0) / elapsed_s, now)
+            wanted.update(max(run_s + wait_s - run_before_s - wait_before_s, 0.0) / elapsed_s, now)
+        self._at, self._times, self._shares = now, times, shares
+
+    def wanted_cores(self) -> float | None:
+        """What they would use; ``None`` when no thread always wants to run."""
+        shares = [(ran.value or 0.0, wanted.value or 0.0) for ran, wanted in self._shares.values()]
+        if all(wanted < ALWAYS for _, wanted in shares):
+            return None
+        return sum((min(wanted if wanted >= ALWAYS else ran, 1.0) for ran, wanted in shares), 0.0)
+
+
+def _from_nothing(at: float) -> Ewma:
+    mean = Ewma(APPETITE_S)
+    mean.update(0.0, at)
+    return mean

@@ -1,0 +1,338 @@
+"""PROFILE: turns this machine's raw readings into the smoothed profile that robots decide by (Alg. 1).
+
+Knows: outlier rules, smoothing by elapsed time, when a profile is worth sending. Does not know: how anything is read,
+who receives it, or what it is worth.
+
+Smoothing stands here, at the source, and not at the receivers: samples come at 5 Hz, profiles leave at 1 Hz, and
+smoothing what was already thinned out would alias (docs/decisions/0003).
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import replace
+
+from zsched.core.events import WorkerJobs
+from zsched.core.profile.jobs import JobMeter
+from zsched.core.profile.means import STALE_S, Ewma
+from zsched.core.values.fleet import Timing
+from zsched.core.values.model import (
+    MAX_BITRATE_MBPS,
+    MAX_CPU_CORES,
+    MAX_MEMORY_MB,
+    MAX_RUNNABLE,
+    MAX_TREND_DB_S,
+    DeviceSample,
+    Echo,
+    Link,
+    LinkSample,
+    LinkSource,
+    NodeId,
+    Profile,
+    TaskId,
+    TaskProgress,
+    WorkerLoad,
+    WorkerState,
+)
+
+RATIO_CHANGE = 0.02
+"""A CPU or memory ratio that moved by this much is worth a profile before its time."""
+JOB_SMOOTHING_S = 1.0
+"""Least time constant of what workers say of their jobs: a job or two in a sample is no rate."""
+JOB_CHANGE = 0.2
+"""So is a worker's share of done jobs that moved by this much, or its time per job by this part."""
+RSSI_CHANGE_DB = 1.0
+RSSI_IMPOSSIBLE_ABOVE_DBM = -10.0
+RSSI_IMPOSSIBLE_BELOW_DBM = -100.0
+RSSI_OUTLIER_DB = 25.0
+SIGNAL_SMOOTHING_S = 0.5
+"""A radio is smoothed over this at least: its readings scatter by 2.5 to 2.9 dB, and trends are seen in them."""
+RSSI_WINDOW = 5
+"""A reading further than 25 dB from the median of the last 5 is dropped (measured on real drives)."""
+NO_REASONS: Mapping[TaskId, str] = {}
+
+
+class SignalFilter:
+    """Drops impossible values and outliers of one radio link, and smooths the rest in dBm."""
+
+    __slots__ = ("_mean", "_mean_of_means", "_recent", "_valid_at", "dropped")
+
+    def __init__(self, tau_s: float) -> None:
+        self._mean = Ewma(tau_s)
+        self._mean_of_means = Ewma(tau_s)
+        self._recent: deque[float] = deque(maxlen=RSSI_WINDOW)
+        self._valid_at = -math.inf
+        self.dropped = 0
+
+    def update(self, rssi_dbm: float | None, now: float) -> float | None:
+        """Take one reading in; the smoothed signal in dBm, or ``None`` when there was none for `STALE_S`."""
+        if rssi_dbm is not None and self._is_plausible(rssi_dbm):
+            self._valid_at = now
+            self._mean_of_means.update(self._mean.update(rssi_dbm, now), now)
+        elif rssi_dbm is not None:
+            self.dropped += 1
+        if now - self._valid_at > STALE_S:
+            self._mean.value = self._mean_of_means.value = None
+        return self._mean.value
+
+    @property
+    def trend_db_s(self) -> float | None:
+        """How fast the smoothed signal changes, in dB per second (Brown 1956); ``None`` without a signal.
+
+        On a ramp a mean lags by the time constant, and the mean of the means by twice that.
+        """
+        once, twice, tau_s = self._mean.value, self._mean_of_means.value, self._mean.tau_s
+        if once is None or twice is None or tau_s <= 0.0:
+            return None
+        return min(max((once - twice) / tau_s, -MAX_TREND_DB_S), MAX_TREND_DB_S)
+
+    def _is_plausible(self, rssi_dbm: float) -> bool:
+        if not RSSI_IMPOSSIBLE_BELOW_DBM < rssi_dbm <= RSSI_IMPOSSIBLE_ABOVE_DBM:
+            return False
+        median = statistics.median(self._recent) if len(self._recent) == RSSI_WINDOW else rssi_dbm
+        # Kept in the window even when dropped: a lasting jump moves the median and is believed after three readings.
+        self._recent.append(rssi_dbm)
+        return abs(rssi_dbm - median) <= RSSI_OUTLIER_DB
+
+
+class Profiler:
+    """This node's own profile, built from samples."""
+
+    def __init__(self, node: NodeId, incarnation: int, timing: Timing) -> None:
+        self._node = node
+        self._incarnation = incarnation
+        self._timing = timing
+        self._cpu = Ewma(timing.smoothing_s)
+        self._memory = Ewma(timing.smoothing_s)
+        self._pressure = Ewma(timing.smoothing_s)
+        self._runnable = Ewma(timing.smoothing_s)
+        self._signals: dict[NodeId | None, SignalFilter] = {}
+        self._worker_cpu: dict[TaskId, Ewma] = {}
+        self._worker_memory: dict[TaskId, Ewma] = {}
+        self._jobs: dict[TaskId, JobMeter] = {}
+        self._device: DeviceSample | None = None
+        self._sampled_at = -math.inf
+        self._is_new = False
+        self._flags: tuple[object, ...] = ()
+        self.has_news = True
+        """The profile that was last sent says more than figures that differ."""
+        self._links: tuple[Link, ...] = ()
+        self._workers: tuple[WorkerLoad, ...] = ()
+        self._sent: Profile | None = None
+        self._sent_at = -math.inf
+        self._sequence = 0
+
+    def absorb(self, device: DeviceSample, links: tuple[LinkSample, ...], now: float) -> None:
+        """Take one reading of the machine and its links in."""
+        self._device, self._sampled_at, self._is_new = device, now, True
+        worker_cpu = {load.task: load.cpu_cores for load in device.workers}
+        worker_memory = {load.task: load.memory_mb for load in device.workers}
+        _absorb_use(self._cpu, self._worker_cpu, device.cpu_used_cores, worker_cpu, MAX_CPU_CORES, now)
+        _absorb_use(self._memory, self._worker_memory, device.memory_used_mb, worker_memory, MAX_MEMORY_MB, now)
+        _absorb_known(self._pressure, device.cpu_pressure, 1.0, now)
+        _absorb_known(self._runnable, device.runnable, MAX_RUNNABLE, now)
+        self._links = tuple(self._link(sample, now) for sample in links)
+        for meter in self._jobs.values():
+            meter.look(now)
+        self._workers = tuple(self._worker(load) for load in device.workers)
+
+    def note_jobs(self, report: WorkerJobs, now: float) -> bool:
+        """Take in what a worker of this node says of its jobs; whether it can be true."""
+        meter = self._jobs.setdefault(report.task, JobMeter(max(self._timing.smoothing_s, JOB_SMOOTHING_S)))
+        return meter.absorb(report, now)
+
+    def _link(self, sample: LinkSample, now: float) -> Link:
+        rssi = trend = None
+        if sample.source is not LinkSource.WIRED:
+            signal = self._signals.setdefault(sample.peer, SignalFilter(_signal_tau_s(self._timing)))
+            rssi = signal.update(sample.rssi_dbm, now)
+            trend = signal.trend_db_s
+        return Link(
+            source=sample.source,
+            peer=sample.peer,
+            rssi_dbm=rssi,
+            bitrate_mbps=_possible(sample.bitrate_mbps, MAX_BITRATE_MBPS),
+            retry_ratio=_possible(sample.retry_ratio, 1.0),
+            trend_db_s=trend,
+        )
+
+    def _worker(self, load: WorkerLoad) -> WorkerLoad:
+        cpu, memory = self._worker_cpu.get(load.task), self._worker_memory.get(load.task)
+        return WorkerLoad(
+            task=load.task,
+            state=load.state,
+            cpu_cores=None if cpu is None else cpu.value,
+            memory_mb=None if memory is None else memory.value,
+            wanted_cores=_possible(load.wanted_cores, MAX_CPU_CORES),
+            jobs=self._jobs[load.task].value if load.task in self._jobs else None,
+        )
+
+    def publishable(
+        self,
+        states: dict[TaskId, WorkerState],
+        *,
+        is_draining: bool,
+        now: float,
+        progress: tuple[TaskProgress, ...] = (),
+        reasons: Mapping[TaskId, str] = NO_REASONS,
+        echoes: tuple[Echo, ...] = (),
+        relay: str = "",
+    ) -> Profile | None:
+        """The profile to send now, or ``None`` when nothing is due.
+
+        Args:
+            states: the workers' states as the node knows them (fresher than the sample's).
+            is_draining: the operator drains this node, or it stops.
+            now: monotonic seconds.
+            progress: which watched tasks answer this robot.
+            reasons: why workers are not ready.
+            echoes: which profiles this node has of others; they are no reason to send one.
+            relay: what is wrong with this node's relay.
+        """
+        is_due = now - self._sent_at >= self._timing.publish_s
+        flags = (is_draining, *states.values(), *reasons.values(), progress, bool(relay))
+        if not is_due and not self._is_new and flags == self._flags:
+            return None  # nothing was measured since the last look
+        self._is_new, self._flags = False, flags
+        profile = self._current(states, reasons, is_draining=is_draining, now=now)
+        if profile is None:
+            return None
+        if progress or relay:
+            profile = replace(profile, progress=progress, relay=relay)
+        if not is_due and self._sent is not None and not _differs(profile, self._sent):
+            return None
+        if echoes:
+            profile = replace(profile, echoes=echoes)
+        self._sequence += 1
+        self.has_news = self._sent is None or _kinds(profile) != _kinds(self._sent)
+        self._sent, self._sent_at = profile, now
+        return profile
+
+    def _current(
+        self, states: dict[TaskId, WorkerState], reasons: Mapping[TaskId, str], *, is_draining: bool, now: float
+    ) -> Profile | None:
+        if self._device is None:
+            return None
+        is_measured = now - self._sampled_at <= STALE_S
+        loads = {load.task: load for load in self._workers}
+        workers = tuple(
+            WorkerLoad(
+                task=task,
+                state=states[task],
+                cpu_cores=loads[task].cpu_cores if task in loads else None,
+                memory_mb=loads[task].memory_mb if task in loads else None,
+                wanted_cores=loads[task].wanted_cores if task in loads else None,
+                reason=reasons.get(task, ""),
+                jobs=loads[task].jobs if task in loads else None,
+            )
+            for task in sorted(states)
+        )
+        return Profile(
+            node=self._node,
+            incarnation=self._incarnation,
+            sequence=self._sequence,
+            cpu_cores=self._device.cpu_cores,
+            cpu_used_cores=self._cpu.value if is_measured else None,
+            memory_mb=self._device.memory_mb,
+            memory_used_mb=self._memory.value if is_measured else None,
+            links=self._links,
+            workers=workers,
+            draining=is_draining,
+            speed=self._device.speed,
+            cpu_pressure=self._pressure.value if is_measured else None,
+            runnable=self._runnable.value if is_measured else None,
+        )
+
+
+def _signal_tau_s(timing: Timing) -> float:
+    """Less than the period of samples is no smoothing, neither of signals (no fleet file can say that)."""
+    is_smoothed = timing.smoothing_s >= timing.sample_s
+    return max(timing.smoothing_s, SIGNAL_SMOOTHING_S) if is_smoothed else timing.smoothing_s
+
+
+def _absorb_use(
+    whole: Ewma,
+    shares: dict[TaskId, Ewma],
+    used: float | None,
+    parts: dict[TaskId, float | None],
+    high: float,
+    now: float,
+) -> None:
+    """Smooth what is in use on the machine, and each worker's share of it, in step.
+
+    What is subtracted must be as slow as what it is subtracted from, and see the same samples: a worker without a
+    figure (stopped, just started) uses nothing for that sample. So whole minus share is the smoothed rest, and a
+    worker's start or end makes its node look neither better nor worse.
+    """
+    used = _possible(used, high)
+    if used is None:
+        return
+    for task in {**shares, **parts}:
+        part = _possible(parts.get(task), high)
+        if part is not None and task not in shares:
+            shares[task] = whole.share()
+        if task in shares:
+            shares[task].update(part or 0.0, now)
+    whole.update(used, now)
+
+
+def _absorb_known(mean: Ewma, figure: float | None, high: float, now: float) -> None:
+    """Smooth a figure; where it is not measured, there is no mean either."""
+    known = _possible(figure, high)
+    if known is None:
+        mean.value = None
+    else:
+        mean.update(known, now)
+
+
+def _possible(value: float | None, high: float) -> float | None:
+    """``value`` when it is in [0, ``high``], else ``None``: what a driver makes up is not measured (NaN included)."""
+    return value if value is not None and 0.0 <= value <= high else None
+
+
+def _differs(new: Profile, old: Profile) -> bool:
+    """Whether a robot might decide otherwise by ``new`` than by ``old``."""
+    if _kinds(new) != _kinds(old):
+        return True
+    if _moved(new.cpu_used_cores, old.cpu_used_cores, RATIO_CHANGE * new.cpu_cores):
+        return True
+    if _moved(new.memory_used_mb, old.memory_used_mb, RATIO_CHANGE * new.memory_mb):
+        return True
+    if any(_lost_or_won(new.worker(load.task), load) for load in old.workers):
+        return True
+    before = {link.peer: link.rssi_dbm for link in old.links}
+    return any(_moved(link.rssi_dbm, before.get(link.peer), RSSI_CHANGE_DB) for link in new.links)
+
+
+def _lost_or_won(new: WorkerLoad | None, old: WorkerLoad) -> bool:
+    """Whether a worker's jobs take another time, or another share of them is done."""
+    if new is None or new.jobs is None or old.jobs is None:
+        return (None if new is None else new.jobs) is not old.jobs
+    if _moved(new.jobs.done_ratio, old.jobs.done_ratio, JOB_CHANGE):
+        return True
+    return abs(new.jobs.time_s - old.jobs.time_s) >= JOB_CHANGE * max(new.jobs.time_s, old.jobs.time_s)
+
+
+def _kinds(profile: Profile) -> tuple[object, ...]:
+    """What is no figure: every change of it counts."""
+    workers = [
+        # what a worker that is ready complains of is a count: it goes along with the figures
+        (load.task, load.state, bool(load.reason) if load.state is WorkerState.READY else load.reason)
+        for load in profile.workers
+    ]
+    return (
+        profile.draining,
+        workers,
+        profile.progress,
+        bool(profile.relay),
+        [(link.peer, link.source) for link in profile.links],
+    )
+
+
+def _moved(new: float | None, old: float | None, threshold: float) -> bool:
+    if new is None or old is None:
+        return (new is None) != (old is None)
+    return abs(new - old) >= threshold

@@ -1,0 +1,49 @@
+"""ROUTE: whether this node's relay stays, to be told to the whole fleet.
+
+One end is no news to others: the next relay has its plans within a second. One that ends again and again, or does not
+come back, means that this node's streams do not flow, and whoever asks another node's status has to see that, too.
+
+Knows: when the relay ended and why. Does not know: processes, what it carries.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+
+from zsched.core.events import RelayChanged
+from zsched.core.values.model import as_reason
+
+WINDOW_S = 60.0
+OFTEN = 3
+"""So many ends within the window are a problem, until fewer of them are younger than that."""
+DOWN_TOLD_S = 2.0
+"""Another one takes less to start; a node without a relay for longer is a problem."""
+
+
+@dataclass(slots=True)
+class RelayEnds:
+    """The ends of one node's relay."""
+
+    _ended_at: deque[float] = field(default_factory=deque)
+    _down_since: float = math.inf
+    _reason: str = ""
+
+    def on_changed(self, event: RelayChanged, now: float) -> None:
+        """A relay has ended, could not be started, or runs."""
+        if event.is_running:
+            self._down_since = math.inf
+            return
+        self._ended_at.append(now)
+        self._down_since, self._reason = min(self._down_since, now), event.reason
+
+    def told(self, now: float) -> str:
+        """What is wrong, to be said behind "the relay"; empty: nothing that lasts."""
+        while self._ended_at and now - self._ended_at[0] > WINDOW_S:
+            self._ended_at.popleft()
+        if len(self._ended_at) >= OFTEN:
+            return as_reason(f"has ended {len(self._ended_at)} times in {WINDOW_S:.0f} s, last: {self._reason}")
+        if now - self._down_since >= DOWN_TOLD_S:
+            return as_reason(f"is down: {self._reason}")
+        return ""

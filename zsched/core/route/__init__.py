@@ -1,0 +1,1 @@
+"""Stage 6: key expressions and the routes of the streams."""

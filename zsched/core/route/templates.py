@@ -1,0 +1,204 @@
+"""Decides which concrete routes a task's rules become for one robot, one owner and one epoch.
+
+Knows: the placeholders, where each may stand, how a template becomes a key expression. Does not know: YAML, zenoh,
+other tasks (`zsched.config.rulecheck` holds rules against each other).
+
+====================  =====================================================  =============================
+place                 placeholders                                           must hold
+====================  =====================================================  =============================
+input ``from``        ``{robot} {node} {task}``                              (without ``{robot}``: see below)
+input ``to``          ``{robot} {node} {target} {task}``                     ``{target}``
+output ``from``       ``{robot} {node} {target} {task} {epoch}``             ``{target}``
+output ``to``         ``{robot} {node} {task}``                              (without ``{robot}``: see below)
+service ``from``      ``{robot} {node} {task}``                              (without ``{robot}``: see below)
+service ``to``        ``{robot} {node} {target} {task}``                     ``{target}``
+====================  =====================================================  =============================
+
+``{robot}`` and ``{node}`` are both the robot whose relay carries the stream, ``{target}`` is the owner.
+
+A robot's own side without ``{robot}``: an input is then one stream for everybody, or, on a robot that has a local side,
+that robot's own; outputs and services make sense on local sides only (`shared_key_fault`).
+
+Wildcards (``*``, ``**``, ``$*``) of ``from`` are captured and fill those of ``to`` in order
+(`zsched.core.route.wildcards`).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Final
+
+from zsched.core.route import keyexpr
+from zsched.core.route import wildcards as capture
+from zsched.core.values.fleet import StreamRule, TaskSpec
+from zsched.core.values.model import NodeId
+from zsched.core.values.plan import Direction, Route
+
+PLACEHOLDERS: Final = ("robot", "node", "target", "task", "epoch")
+RESERVED_CHUNK: Final = "@zsched"
+"""Root of the control keys and of the in-band end markers; no rule of a user may touch it."""
+
+_NEEDED: Final[Mapping[tuple[Direction, str], tuple[frozenset[str], str]]] = {
+    (Direction.INPUT, "to"): (
+        frozenset({"target"}),
+        "it lacks {target}: an input goes to whichever node owns the task",
+    ),
+    (Direction.OUTPUT, "from"): (
+        frozenset({"target"}),
+        "it lacks {target}: an output comes from whichever node owns the task",
+    ),
+    (Direction.SERVICE, "to"): (
+        frozenset({"target"}),
+        "it lacks {target}: a request goes to whichever node owns the task",
+    ),
+}
+_BRACES: Final = re.compile(r"\{([^{}]*)\}")
+_A: Final = {Direction.INPUT: "an input", Direction.OUTPUT: "an output", Direction.SERVICE: "a service"}
+_EVERYWHERE: Final = frozenset({"robot", "node", "task"})
+_ALLOWED: Final[Mapping[tuple[Direction, str], frozenset[str]]] = {
+    (Direction.INPUT, "from"): _EVERYWHERE,
+    (Direction.INPUT, "to"): _EVERYWHERE | {"target"},
+    (Direction.OUTPUT, "from"): _EVERYWHERE | {"target", "epoch"},
+    (Direction.OUTPUT, "to"): _EVERYWHERE,
+    (Direction.SERVICE, "from"): _EVERYWHERE,
+    (Direction.SERVICE, "to"): _EVERYWHERE | {"target"},
+}
+_WHY_NOT: Final[Mapping[tuple[Direction, str, str], str]] = {
+    (Direction.INPUT, "from", "target"): "an input comes from the robot's own applications, whoever owns the task",
+    (Direction.OUTPUT, "to", "target"): "an output keeps its key when the owner changes",
+    (Direction.SERVICE, "from", "target"): "a service keeps its key when the owner changes",
+}
+
+
+def placeholders(template: str) -> tuple[str, ...]:
+    """The names between braces, in order, known or not.
+
+    >>> placeholders("{target}/map_merge/{robot}/map")
+    ('target', 'robot')
+    """
+    return tuple(_BRACES.findall(template))
+
+
+def fill(template: str, **names: str) -> str:
+    """``template`` with every placeholder replaced. Raises `KeyError` for a placeholder without a name.
+
+    >>> fill("{robot}/map", robot="robot1")
+    'robot1/map'
+    """
+    return _BRACES.sub(lambda match: names[match.group(1)], template)
+
+
+def template_fault(template: str, direction: Direction, side: str) -> str | None:
+    """Why ``template`` may not stand as ``side`` (``from`` or ``to``) of a rule; ``None`` when it may."""
+    return (
+        _placeholder_fault(template, direction, side)
+        or _missing_fault(template, direction, side)
+        or _expression_fault(template)
+    )
+
+
+def rule_fault(rule: StreamRule) -> str | None:
+    """Why the two valid templates of ``rule`` make no stream together; ``None`` when they do."""
+    if rule.from_template == rule.to_template:
+        return "'from' and 'to' are the same key: the stream would feed itself"
+    return capture.capture_fault(rule.from_template, rule.to_template)
+
+
+def merges_keys(rule: StreamRule) -> bool:
+    """True when several keys of ``from`` become one key of ``to``: a receiver cannot tell them apart any more."""
+    return len(capture.wildcards(rule.to_template)) < len(capture.wildcards(rule.from_template))
+
+
+def routes_for(task: TaskSpec, robot: NodeId, owner: NodeId, epoch: int) -> tuple[Route, ...]:
+    """The streams of ``robot`` towards ``owner`` in ``epoch``, inputs first, in the order of the fleet file.
+
+    Stream names (``<task>/in/<i>``, ``<task>/out/<i>``, ``<task>/srv/<i>``) depend on the rule's place only: counters
+    and kept values that hang on them outlive every move.
+    """
+    names = {"robot": robot, "node": robot, "target": owner, "task": task.name, "epoch": str(epoch)}
+    return tuple(
+        Route(
+            stream=stream,
+            direction=rule.direction,
+            from_expr=fill(rule.from_template, **names),
+            to_expr=fill(rule.to_template, **names),
+            settings=rule.settings,
+            service=rule.service,
+        )
+        for stream, rule in named_rules(task)
+    )
+
+
+def named_rules(task: TaskSpec) -> tuple[tuple[str, StreamRule], ...]:
+    """(stream name, rule) of ``task``: inputs, outputs, services, each counted from 0."""
+    named: list[tuple[str, StreamRule]] = []
+    for direction, word in ((Direction.INPUT, "in"), (Direction.OUTPUT, "out"), (Direction.SERVICE, "srv")):
+        rules = [rule for rule in task.rules if rule.direction is direction]
+        named.extend((f"{task.name}/{word}/{index}", rule) for index, rule in enumerate(rules))
+    return tuple(named)
+
+
+def widened(template: str, **names: str) -> str:
+    """The key expression of everything that ``template`` may become when the placeholders not in ``names`` vary.
+
+    >>> widened("{target}/map_merge/{epoch}/tf", target="edge1")
+    'edge1/map_merge/*/tf'
+    """
+    chunks = [_widened_chunk(chunk, names) for chunk in template.split("/")]
+    return keyexpr.canonical("/".join(chunks))
+
+
+def _widened_chunk(chunk: str, names: Mapping[str, str]) -> str:
+    open_names = dict.fromkeys(PLACEHOLDERS, keyexpr.ANY_RUN)
+    wide = fill(chunk, **{**open_names, **names})
+    while keyexpr.ANY_RUN * 2 in wide:
+        wide = wide.replace(keyexpr.ANY_RUN * 2, keyexpr.ANY_RUN)
+    return keyexpr.SINGLE if wide == keyexpr.ANY_RUN else wide
+
+
+def _placeholder_fault(template: str, direction: Direction, side: str) -> str | None:
+    allowed = _ALLOWED[direction, side]
+    for name in placeholders(template):
+        if name not in PLACEHOLDERS:
+            return f"there is no placeholder {{{name}}}"
+        if name in allowed:
+            continue
+        why = _WHY_NOT.get((direction, side, name), f"only the 'from' of an output has {{{name}}}")
+        return f"{{{name}}} may not stand in the '{side}' of {_A[direction]}: {why}"
+    if "{" in _BRACES.sub("", template) or "}" in _BRACES.sub("", template):
+        return "a brace is not closed"
+    if template.count("{epoch}") > 1 or ("{epoch}" in template and "{epoch}" not in template.split("/")):
+        return "{epoch} must be one whole chunk, once: the gate subscribes to exactly one epoch"
+    return None
+
+
+def _missing_fault(template: str, direction: Direction, side: str) -> str | None:
+    needed, why = _NEEDED.get((direction, side), (frozenset(), ""))
+    is_there = not needed or needed & set(placeholders(template))
+    return None if is_there else why
+
+
+def shared_key_fault(rule: StreamRule) -> str | None:
+    """Why ``rule`` needs a local side on every robot (its applications' key has no ``{robot}``); ``None``: it does not.
+
+    An input may do without: it is then one stream that every robot forwards.
+    """
+    if rule.direction is Direction.INPUT:
+        return None
+    is_output = rule.direction is Direction.OUTPUT
+    if {"robot", "node"} & set(placeholders(rule.to_template if is_output else rule.from_template)):
+        return None
+    if is_output:
+        return "it lacks {robot}: every robot would publish its copy under one key"
+    return "it lacks {robot}: every robot would take the same request, and it would be carried out once for each"
+
+
+def _expression_fault(template: str) -> str | None:
+    sample = fill(template, robot="r", node="r", target="t", task="k", epoch="1")
+    if RESERVED_CHUNK in sample.split("/"):
+        return f"keys with a chunk '{RESERVED_CHUNK}' belong to zsched itself"
+    problem = keyexpr.fault(sample)
+    if problem is not None:
+        return f"it is no key expression: {problem}"
+    return capture.ambiguity(template)

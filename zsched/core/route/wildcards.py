@@ -1,0 +1,91 @@
+"""Decides under which key a sample goes on when a rule's expressions hold wildcards, and which wildcards go together.
+
+Knows: key expressions as text. Does not know: zenoh, streams, templates, who asks.
+
+The n-th wildcard of ``to`` stands for what the n-th wildcard of ``from`` matched. Both are of one kind, so that what
+was captured always fits. A ``to`` with as many wildcards as ``from`` can be turned round: `rewriter` with the two
+expressions swapped gives every key back (that is why a side may hold only one ``**``: with two it could not be told
+where the first ends). A ``to`` with fewer drops the last ones: several keys become one.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import Final
+
+from zsched.core.route.keyexpr import ANY_RUN, DOUBLE
+
+Rewriter = Callable[[str], str | None]
+
+_WILD: Final = re.compile(r"\*\*|\$\*|\*")
+
+
+def wildcards(expr: str) -> tuple[str, ...]:
+    """The wildcards of an expression (or of a template), in order.
+
+    >>> wildcards("robot1/*/cam$*/**")
+    ('*', '$*', '**')
+    """
+    return tuple(_WILD.findall(expr))
+
+
+def ambiguity(expr: str) -> str | None:
+    """Why it could not be told what each wildcard of ``expr`` stands for; ``None`` when it can.
+
+    >>> ambiguity("a/**/b/**")
+    "it has more than one '**': where the first one ends could not be told"
+    """
+    if wildcards(expr).count(DOUBLE) > 1:
+        return "it has more than one '**': where the first one ends could not be told"
+    if any(chunk.count(ANY_RUN) > 1 for chunk in expr.split("/")):
+        return "a chunk of it has more than one '$*': where the first one ends could not be told"
+    return None
+
+
+def capture_fault(from_expr: str, to_expr: str) -> str | None:
+    """Why ``to_expr`` cannot be filled from what ``from_expr`` captures; ``None`` when it can."""
+    sources, places = wildcards(from_expr), wildcards(to_expr)
+    if len(places) > len(sources):
+        return f"{to_expr!r} has more wildcards than {from_expr!r} can fill"
+    for number, (source, place) in enumerate(zip(sources, places, strict=False), start=1):
+        if source != place:
+            return f"wildcard {number} of 'to' is {place!r}, but the one that fills it is {source!r}"
+    return None
+
+
+def rewriter(from_expr: str, to_expr: str) -> Rewriter:
+    """A function from a key that ``from_expr`` matches to its key under ``to_expr`` (``None``: it does not match).
+
+    Raises:
+        ValueError: ``to_expr`` cannot be filled (see `capture_fault`).
+    """
+    problem = capture_fault(from_expr, to_expr)
+    if problem is not None:
+        raise ValueError(problem)
+    pattern = _pattern(from_expr)
+
+    def rewrite(key: str) -> str | None:
+        match = pattern.fullmatch("/" + key)
+        return None if match is None else _fill(to_expr, match.groups())
+
+    return rewrite
+
+
+def _pattern(expr: str) -> re.Pattern[str]:
+    """A pattern over ``"/" + key``, one group per wildcard; ``**`` may match no chunk, none a verbatim one."""
+    parts = []
+    for chunk in expr.split("/"):
+        if chunk == "**":
+            parts.append(r"((?:/[^/@][^/]*)*)")
+        elif chunk == "*":
+            parts.append(r"/([^/@][^/]*)")
+        else:
+            parts.append("/" + "([^/]*)".join(re.escape(piece) for piece in chunk.split("$*")))
+    return re.compile("".join(parts))
+
+
+def _fill(to_expr: str, captures: tuple[str, ...]) -> str:
+    values = iter(captures)
+    filled = _WILD.sub(lambda _match: next(values).strip("/"), to_expr)
+    return "/".join(chunk for chunk in filled.split("/") if chunk)

@@ -1,0 +1,88 @@
+"""SCHEDULER, restraint under faults: a node that failed or was left often pays for it, and moves are capped.
+
+Knows: what every learnt change of owner says about the node that was left. Does not know: why robots prefer a node.
+
+Route flap damping (RFC 2439) in utility units: a node that failed collects two points, one more when it had just got
+the task; one that is left again soon after it was left before, one point: the task came back for nothing. To leave a
+node for a better one is what moves are for and costs it nothing, nor does a node pay that was told to stop. Points
+decay with a half-life, and the penalty grows as ``STEP * (2**points - 1)``, at most `MAX_PENALTY`. A penalised node
+stays eligible: when it is the only one, it serves.
+Every robot learns the same allocations, so all come to the same penalties; but one that was cut off has missed some,
+and one that was restarted has forgotten them. So robots tell each other (`UtilityVector.penalties`), and what any of
+them remembers counts (`zsched.core.scheduler.scoring.joined`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+
+from zsched.core.values.model import NodeId
+
+STEP = 0.03
+MAX_PENALTY = 0.35
+HALF_LIFE_S = 60.0
+PROBATION_S = 30.0
+"""A node that fails so soon after it got the task, or is left so soon after it was left before, had it for nothing."""
+FORGET_BELOW = 0.05
+WINDOW_S = 60.0
+ESCAPES_PER_MINUTE = 60
+"""Even fleeing is bounded: one escape a second, on average."""
+
+
+@dataclass(slots=True)
+class Damping:
+    """One task's record of moves at one node."""
+
+    _points: dict[NodeId, tuple[float, float]] = field(default_factory=dict)
+    _moves: deque[tuple[float, bool]] = field(default_factory=deque)
+    _left_at: dict[NodeId, float] = field(default_factory=dict)
+    _owner_since: float = 0.0
+
+    def note_move(self, left: NodeId | None, *, has_failed: bool, was_draining: bool = False, now: float) -> None:
+        """An epoch was learnt: ``left`` is the owner before (``None``: the first placement, which is no move).
+
+        A node that drained was told to: that says nothing against it, however soon, and though it is gone by now.
+        """
+        if left is not None:
+            since = self._owner_since if has_failed else self._left_at.get(left, -math.inf)
+            gained = 0.0 if was_draining else 2.0 * float(has_failed) + float(now - since < PROBATION_S)
+            if gained:
+                self._points[left] = (self.points(left, now) + gained, now)
+            self._left_at[left] = now
+            self._moves.append((now, has_failed))
+        self._owner_since = now
+
+    def forgive(self, node: NodeId | None) -> None:
+        """An operator has mended ``node`` (``None``: whatever was wrong anywhere); the caps still count the moves."""
+        for name in tuple(self._points) if node is None else (node,):
+            self._points.pop(name, None)
+
+    def points(self, node: NodeId, now: float) -> float:
+        """What a node has collected, decayed to ``now``."""
+        points, at = self._points.get(node, (0.0, now))
+        left: float = points * 0.5 ** (max(now - at, 0.0) / HALF_LIFE_S)
+        return left if left >= FORGET_BELOW else 0.0
+
+    def penalty(self, node: NodeId, now: float) -> float:
+        """What is taken off the node's aggregate, in [0, `MAX_PENALTY`].
+
+        >>> damping = Damping()
+        >>> damping.note_move("edge1", has_failed=True, now=100.0)
+        >>> damping.penalty("edge1", 100.0), damping.penalty("edge1", 160.0), damping.penalty("edge2", 100.0)
+        (0.09, 0.03, 0.0)
+        """
+        grown: float = STEP * (2.0 ** self.points(node, now) - 1.0)
+        return min(grown, MAX_PENALTY)
+
+    def penalties(self, now: float) -> dict[NodeId, float]:
+        """{node: penalty} of every node that has one, sorted."""
+        found = {node: self.penalty(node, now) for node in sorted(self._points)}
+        return {node: penalty for node, penalty in found.items() if penalty > 0.0}
+
+    def moves_within(self, seconds: float, now: float, *, escapes: bool) -> int:
+        """How many moves (escapes or the others) this node has learnt in the last ``seconds`` (at most a minute)."""
+        while self._moves and now - self._moves[0][0] > WINDOW_S:
+            self._moves.popleft()
+        return sum(now - at <= seconds and failed == escapes for at, failed in self._moves)

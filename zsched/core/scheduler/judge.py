@@ -1,0 +1,275 @@
+"""SCHEDULER, second half: from a standing to a proposal, with stickiness.
+
+Knows: bonus, time-to-trigger, cool-down, escapes. Does not know: how utilities were computed or travel, who else
+proposes what, how anything is committed.
+
+`Judge` keeps the little memory that stickiness needs, per task, and turns a `Standing` into a `Judgement`: a candidate
+to propose, or the owner, always with the reason.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+from zsched.core.scheduler.damping import ESCAPES_PER_MINUTE, WINDOW_S, Damping
+from zsched.core.scheduler.patience import LONGEST_GAP_S, LearntPatience, spend
+from zsched.core.scheduler.scoring import Standing, joined, pick
+from zsched.core.values.fleet import TaskSpec
+from zsched.core.values.model import Allocation, NodeId, PeerState, Profile, ScoreForm, WorkerState, told_of_worker
+
+MOST_FOR_COST = 0.3
+"""The bonus rises by no more than this, whatever moves cost: a task must be able to leave a node that is full."""
+INITIAL_SETTLE_S = 3.0
+"""A task that nobody owns yet waits so long for candidates that are still starting."""
+
+
+class Outcome(StrEnum):
+    """What a robot makes of a standing."""
+
+    STAY = "stay"
+    WAIT = "wait"  # another one leads, but not for long enough
+    PROPOSE = "propose"
+    NONE = "none"  # nobody to propose
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Judgement:
+    """A decision with its reason; ``candidate`` is whom this robot would vote for (the owner when it stays)."""
+
+    outcome: Outcome
+    candidate: NodeId | None
+    aggregate: float
+    reason: str
+    is_escape: bool = False
+    aggregates: Mapping[NodeId, float] = field(default_factory=dict)
+    """With the owner's bonus."""
+
+
+@dataclass(slots=True)
+class Judge:
+    """The memory of one task's stickiness at one robot."""
+
+    spec: TaskSpec
+    beaten_since: float | None = None
+    """Since when the owner has been beaten by somebody, without a break."""
+    not_ready_since: float | None = None
+    spent: float = 0.0
+    """What staying has cost so far, in utility seconds (tasks with a ``patience``)."""
+    spent_at: float | None = None
+    learnt: LearntPatience = field(default_factory=LearntPatience)
+    """Of a task that learns its patience."""
+    move_cost_s: float = 0.0
+    """What the last moves have cost, in seconds of work (`zsched.core.scheduler.costs`; tasks with a horizon)."""
+    seen_first_at: float | None = None
+    """When a first candidate could be scored (a task that nobody owns waits for the others)."""
+
+    out: AbstractSet[NodeId] = frozenset()
+    """The candidates that a first placement does not wait for: they cannot have the task."""
+
+    @property
+    def patience(self) -> float | None:
+        """What staying may cost now, in utility seconds; ``None``: the time-to-trigger counts."""
+        return self.learnt.value if self.spec.learns_patience else self.spec.patience
+
+    def reset(self, *, is_new_owner: bool = False) -> None:
+        """A vote was lost or the value changed: wait the whole time-to-trigger again."""
+        self.beaten_since, self.spent = None, 0.0
+        if is_new_owner:
+            self.not_ready_since = None
+
+    def judge(
+        self,
+        standing: Standing,
+        allocation: Allocation,
+        *,
+        settled_for_s: float,
+        escape: str | None,
+        is_called: bool,
+        now: float,
+        damping: Damping | None = None,
+    ) -> Judgement:
+        """Decide by one standing.
+
+        Args:
+            standing: the joint view.
+            allocation: what is agreed now.
+            settled_for_s: seconds since this epoch was learnt (cool-down).
+            escape: why the owner must be left at once (`escape_reason`), or ``None``.
+            is_called: another robot called a vote: answer with today's winner, without waiting for our own timers.
+            now: monotonic seconds.
+            damping: the task's record of moves, for the cap and the penalties (those that other robots remember, in
+                ``standing``, count as well); ``None``: neither.
+        """
+        owner = allocation.owner
+        if self.spec.learns_patience:
+            tuning = allocation.tuning
+            self.learnt.watch(standing.aggregates, tuning.bonus, tuning.cool_down_s, now)
+        bonus = self._bonus(allocation) if escape is None else 0.0
+        penalties = {} if damping is None else joined((damping.penalties(now), standing.penalties))
+        scored = {
+            name: max(value + (bonus if name == owner else 0.0) - penalties.get(name, 0.0), 0.0)
+            for name, value in standing.aggregates.items()
+            if escape is None or name != owner
+        }
+        winner = pick(scored, owner)
+        if winner is None:
+            self.beaten_since = None
+            return Judgement(outcome=Outcome.NONE, candidate=owner, aggregate=0.0, reason="no candidate can have it")
+        self._spend(scored, owner, now)
+        outcome, reason = self._outcome(winner, scored, allocation, settled_for_s, escape, is_called, now)
+        cap = None if damping is None or owner is None else self._cap(damping, is_escape=escape is not None, now=now)
+        if outcome is Outcome.PROPOSE and cap is not None:
+            outcome, reason = Outcome.WAIT, f"{reason}; {cap}"
+        chosen = winner if outcome is Outcome.PROPOSE else owner
+        return Judgement(
+            outcome=outcome,
+            candidate=chosen,
+            aggregate=scored.get(chosen, 0.0) if chosen is not None else 0.0,
+            reason=reason,
+            is_escape=escape is not None and outcome is Outcome.PROPOSE,
+            aggregates=scored,
+        )
+
+    def _bonus(self, allocation: Allocation) -> float:
+        """What a lead must be: the tuning's bonus against noise, and what a move costs, spread over the horizon."""
+        horizon_s = self.spec.pays_off_in_s
+        if horizon_s is None:
+            return allocation.tuning.bonus
+        return allocation.tuning.bonus + min(self.move_cost_s / horizon_s, MOST_FOR_COST)
+
+    def _spend(self, scored: Mapping[NodeId, float], owner: NodeId | None, now: float) -> None:
+        """Add up the lead over the owner with its bonus, over time (`zsched.core.scheduler.patience.spend`)."""
+        patience = self.patience
+        if patience is None or owner is None or owner not in scored:
+            self.spent, self.spent_at = 0.0, None
+            return
+        elapsed_s = 0.0 if self.spent_at is None else min(now - self.spent_at, LONGEST_GAP_S)
+        self.spent = spend(self.spent, max(scored.values()) - scored[owner], patience, elapsed_s)
+        self.spent_at = now
+
+    def _cap(self, damping: Damping, *, is_escape: bool, now: float) -> str | None:
+        """Why no further move is allowed in this minute, or ``None``."""
+        limit = ESCAPES_PER_MINUTE if is_escape else self.spec.max_moves_per_minute
+        done = damping.moves_within(WINDOW_S, now, escapes=is_escape)
+        return None if done < limit else f"{done} moves in the last minute, at most {limit}"
+
+    def _outcome(
+        self,
+        winner: NodeId,
+        scored: Mapping[NodeId, float],
+        allocation: Allocation,
+        settled_for_s: float,
+        escape: str | None,
+        is_called: bool,
+        now: float,
+    ) -> tuple[Outcome, str]:
+        owner, tuning = allocation.owner, allocation.tuning
+        if allocation.paused or allocation.pinned:
+            self.beaten_since = None  # nobody looked meanwhile: afterwards the whole time-to-trigger counts again
+            return Outcome.STAY, "paused by the operator" if allocation.paused else "pinned by the operator"
+        if owner is None:
+            return self._initial(winner, scored, is_called=is_called, now=now)
+        if escape is not None:
+            return Outcome.PROPOSE, escape
+        if winner == owner:
+            self.beaten_since = None
+            return Outcome.STAY, "nobody better"
+        if self.beaten_since is None:
+            self.beaten_since = now
+        lead = scored[winner] - scored.get(owner, 0.0)
+        led_for = now - self.beaten_since
+        why = f"{winner} leads by {lead:.3f} over {owner} with its bonus"
+        if is_called:
+            return Outcome.PROPOSE, f"vote called; {why}"
+        if settled_for_s < tuning.cool_down_s:
+            return Outcome.WAIT, f"{why}; cool-down {settled_for_s:.1f} of {tuning.cool_down_s:g} s"
+        # What an owner that may not be scored is worth, nobody knows: it is left by the time alone.
+        patience = self.patience if owner in scored else None
+        if patience is not None and self.spent < patience:
+            return Outcome.WAIT, f"{why}; staying has cost {self.spent:.3f} of {patience:g}"
+        if patience is None and led_for < tuning.time_to_trigger_s:
+            return Outcome.WAIT, f"{why}; for {led_for:.1f} of {tuning.time_to_trigger_s:g} s"
+        return Outcome.PROPOSE, f"{why} for {led_for:.1f} s"
+
+    def _initial(
+        self, winner: NodeId, scored: Mapping[NodeId, float], *, is_called: bool, now: float
+    ) -> tuple[Outcome, str]:
+        if self.seen_first_at is None:
+            self.seen_first_at = now
+        waited = now - self.seen_first_at
+        missing = [name for name in self.spec.candidates if name not in scored and name not in self.out]
+        if missing and waited < INITIAL_SETTLE_S and not is_called:  # who calls has waited for all of us
+            return Outcome.WAIT, f"first placement waits for {', '.join(missing)}"
+        return Outcome.PROPOSE, f"first placement: {winner} has the highest utility"
+
+
+def escape_reason(
+    spec: TaskSpec,
+    allocation: Allocation,
+    owner_state: PeerState,
+    profile: Profile | None,
+    standing: Standing,
+    not_ready_for_s: float,
+) -> str | None:
+    """Why the owner must be left now, without time-to-trigger or cool-down (but never without the quorum).
+
+    Short memory is such a reason under the paper's score, which does not tell it from enough; `ScoreForm.SERVICE` does.
+
+    Args:
+        spec: the task.
+        allocation: the current one, with an owner.
+        owner_state: how this node sees the owner.
+        profile: the owner's newest fresh profile.
+        standing: the joint view (its veto of the owner is an escape).
+        not_ready_for_s: for how long the owner's worker was heard not to be ready.
+    """
+    owner = allocation.owner
+    if owner is None:
+        return None
+    if owner_state is PeerState.GONE:
+        return f"{owner} is gone"
+    if owner_state is PeerState.SUSPECT:
+        return f"{owner} is silent"
+    if owner not in spec.candidates:
+        return f"{owner} is no candidate any more"
+    if profile is not None:
+        load = profile.worker(spec.name)
+        if profile.draining:
+            return f"{owner} is draining"
+        why = "" if load is None or not load.reason else f": {load.reason}"
+        if load is not None and load.state is WorkerState.FAILED:
+            return f"the worker on {owner} failed{why}"
+        if _is_told(spec, profile) and not_ready_for_s > spec.worker.start_deadline_s:
+            return f"the worker on {owner} has not been ready for {not_ready_for_s:.1f} s{why}"
+        if allocation.tuning.score is ScoreForm.PAPER and profile.memory_used_mb is not None:
+            free_ratio = 1.0 - profile.memory_used_mb / profile.memory_mb
+            if free_ratio < spec.memory_floor_ratio:
+                return f"memory of {owner} is {max(free_ratio, 0.0) * 100:.0f} % free"
+    veto = standing.vetoed.get(owner)
+    return None if veto is None or not veto.startswith("reached by") else f"{owner} is {veto}"
+
+
+def _is_told(spec: TaskSpec, profile: Profile) -> bool:
+    """Whether a node's profile says how its worker is: of a foreign one its daemon may not know."""
+    return profile.worker(spec.name) is not None or bool(spec.worker.command)
+
+
+def escape_ahead(
+    spec: TaskSpec, allocation: Allocation, profile: Profile | None, not_ready_for_s: float, *, has_other: bool
+) -> str:
+    """What comes of an owner whose worker is not ready, and why; empty when nothing will.
+
+    With ``has_other`` (somebody else can have the task) it says when the owner will be left.
+    """
+    is_held = allocation.paused or allocation.pinned
+    if profile is None or is_held or not _is_told(spec, profile):
+        return ""
+    load = profile.worker(spec.name)
+    how = "is not there" if load is None else told_of_worker(load.state, load.reason)
+    if not has_other:
+        return f"the worker on {allocation.owner} {how}; nobody else can have the task"
+    left_s = max(spec.worker.start_deadline_s - not_ready_for_s, 0.0)
+    return f"{allocation.owner} will be left in {left_s:.0f} s, for its worker {how}"

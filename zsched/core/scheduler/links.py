@@ -1,0 +1,94 @@
+"""SCHEDULER, the radio: what one robot's link to one candidate is worth (Eq. 3).
+
+Knows: links that were measured directly, the two ways of a pair that meet at an access point, trends. Does not know:
+weights, who may have the task, how signals are smoothed.
+
+Whether a candidate is *reached* is always a matter of the weaker way as measured: a path with a dead end is dead, and
+nothing foreseen makes it so. What it is *worth* depends on the task's reading of a pair (docs/decisions/0018).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from zsched.core.gateway.gateway import Gateway
+from zsched.core.scheduler.utility import network_utility
+from zsched.core.values.fleet import LinkLimits, PairReading
+from zsched.core.values.model import Link, LinkSource, NodeId, Profile
+
+WIRED_DBM = 0.0
+"""Stands for a cable in comparisons of signals: better than any radio."""
+FORESEE_MOST_DB = 6.0
+"""No signal is foreseen further from the measured one than this: a trend of noise must not outweigh a signal."""
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """One way, in dBm: what is measured now, and what it will be."""
+
+    now_dbm: float
+    ahead_dbm: float
+
+
+@dataclass(frozen=True, slots=True)
+class PairLink:
+    """The link of one (robot, candidate) pair: ``is_reached`` by nu, and Eq. 3's kappa in [0, 1]."""
+
+    is_reached: bool
+    utility: float
+
+
+def pair_link(voter: NodeId, candidate: NodeId, gateway: Gateway, limits: LinkLimits, now: float) -> PairLink | None:
+    """Eq. 3 for one (robot, candidate) pair, or ``None`` when nobody measured it.
+
+    A link measured between the two counts as it is, from either end. Else both reach each other through one access
+    point, and ``limits.pair`` says how the two ways become one.
+    """
+    if voter == candidate:
+        return PairLink(is_reached=True, utility=1.0)
+    ends = (gateway.fresh(voter, now), gateway.fresh(candidate, now))
+    for end, other in ((ends[0], candidate), (ends[1], voter)):
+        direct = None if end is None else _way(end, other, limits)
+        if direct is not None:
+            return PairLink(is_reached=direct.now_dbm >= limits.nu_dbm, utility=_worth(direct.ahead_dbm, limits))
+    if ends[0] is None or ends[1] is None:
+        return None
+    own, its = _way(ends[0], None, limits), _way(ends[1], None, limits)
+    if own is None or its is None:
+        return None
+    is_reached = min(own.now_dbm, its.now_dbm) >= limits.nu_dbm
+    return PairLink(is_reached=is_reached, utility=_joint(own, its, limits))
+
+
+def _joint(own: Way, its: Way, limits: LinkLimits) -> float:
+    """Two ways through one access point as one utility, by the task's reading of a pair."""
+    if limits.pair is PairReading.CANDIDATE:
+        return _worth(its.ahead_dbm, limits)
+    both = (_worth(own.ahead_dbm, limits), _worth(its.ahead_dbm, limits))
+    return min(both) if limits.pair is PairReading.WEAKER else sum(both) / 2.0
+
+
+def _worth(signal_dbm: float, limits: LinkLimits) -> float:
+    return network_utility(signal_dbm, limits.nu_dbm, limits.rho_dbm, limits.knee_dbm)
+
+
+def _way(profile: Profile, peer: NodeId | None, limits: LinkLimits) -> Way | None:
+    """A node's link to ``peer`` (``None``: to the access point or the cable); ``None`` when it measures none."""
+    for link in profile.links:
+        if link.peer != peer:
+            continue
+        if link.source is LinkSource.WIRED:
+            return Way(WIRED_DBM, WIRED_DBM)
+        return None if link.rssi_dbm is None else Way(link.rssi_dbm, foreseen(link, limits.foresee_s))
+    return None
+
+
+def foreseen(link: Link, lead_s: float) -> float:
+    """A radio's smoothed signal ``lead_s`` seconds ahead along its trend, at most `FORESEE_MOST_DB` away, in dBm.
+
+    With a lead of one smoothing time constant this is Brown's double exponential smoothing (1956): on a straight ramp
+    the delay of the smoothing is gone.
+    """
+    assert link.rssi_dbm is not None
+    step_db = lead_s * (link.trend_db_s or 0.0)
+    return link.rssi_dbm + min(max(step_db, -FORESEE_MOST_DB), FORESEE_MOST_DB)

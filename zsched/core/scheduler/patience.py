@@ -1,0 +1,100 @@
+"""SCHEDULER, how long to wait before a planned move: by what every patience would have paid so far.
+
+Knows: the joint utilities of all candidates over time, what a move costs. Does not know: who has the task, votes.
+
+To move or to stay is rent-or-buy with an unknown end: a load that has just begun may be over before the move has paid.
+How patient a task should be depends on its loads and on how noisy its figures are, which nobody can know beforehand.
+But every robot sees every candidate all the time, whoever has the task. So it knows what each patience of a few would
+have led to, and goes by the one that has paid least: follow the leader with full information (Kalai and Vempala,
+J. Comput. Syst. Sci. 71, 2005; here without perturbation, for nobody plays against it), old times fading.
+
+Where nothing comes and goes but noise, each move of an impatient one is a loss, and the task grows patient; where loads
+are real, whoever waits loses, and it grows quick. Robots may come to different values: the quickest calls the vote, and
+each answers with its own winner.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from zsched.core.scheduler.scoring import pick
+from zsched.core.values.model import NodeId
+
+CHOICES = (0.05, 0.15, 0.5, 1.5)
+"""The patiences that are played all the time, in seconds of the task's work."""
+FIRST_PATIENCE = 0.15
+"""Until one of the others has paid less."""
+MOVE_PRICE_S = 0.3
+"""What a move costs, in seconds of the task's work; real fleets: 0.3 to 0.5 s."""
+SEEN_LATE_S = 1.0
+"""A lead is seen so late, and so long after its end: a move earns less than the figures say, by the lead times it."""
+MEMORY_S = 600.0
+"""What was paid counts 1/e after so long."""
+FORGIVEN_IN_S = 2.0
+LONGEST_GAP_S = 2.0
+"""Nothing is charged for longer than this between two judgements: nobody looked."""
+
+
+def spend(spent: float, lead: float, patience: float, elapsed_s: float) -> float:
+    """Add up a lead over the owner with its bonus, over time (Page's CUSUM, Biometrika 41, 1954).
+
+    The bonus is its drift and the patience its threshold. `FORGIVEN_IN_S` without a lead clear the account. It never
+    holds more than is asked for: what a lead within the cool-down leaves behind is forgiven as soon as anything.
+
+    >>> spend(spent=0.1, lead=0.2, patience=0.4, elapsed_s=0.5), spend(0.1, 0.0, 0.4, 0.5)
+    (0.2, 0.0)
+    """
+    rate = lead if lead > 0.0 else -patience / FORGIVEN_IN_S
+    return min(max(spent + elapsed_s * rate, 0.0), patience)
+
+
+@dataclass(slots=True)
+class _Player:
+    """One patience, with the owner that the task would have by it."""
+
+    patience: float
+    owner: NodeId | None = None
+    spent: float = 0.0
+    paid: float = 0.0
+    """Service lost against the best candidate of every moment, and moves; in seconds of work, fading."""
+    moved_at: float = -math.inf
+
+    def play(
+        self, aggregates: Mapping[NodeId, float], bonus: float, cool_down_s: float, now: float, gap_s: float
+    ) -> None:
+        best = pick(aggregates, self.owner)
+        assert best is not None
+        if self.owner is None or self.owner not in aggregates:
+            self.owner, self.spent = best, 0.0  # an escape, or the beginning: the same for everybody
+        behind = aggregates[best] - aggregates[self.owner]
+        self.paid = self.paid * math.exp(-gap_s / MEMORY_S) + behind * gap_s
+        self.spent = spend(self.spent, behind - bonus, self.patience, gap_s)
+        if behind > bonus and self.spent >= self.patience and now - self.moved_at >= cool_down_s:
+            self.paid += MOVE_PRICE_S + SEEN_LATE_S * behind
+            self.owner, self.spent, self.moved_at = best, 0.0, now
+
+
+class LearntPatience:
+    """One task's patience at one robot."""
+
+    def __init__(self) -> None:
+        self._players = tuple(_Player(patience) for patience in CHOICES)
+        self._at: float | None = None
+
+    @property
+    def value(self) -> float:
+        """The patience that has paid least, to a thousandth of a second; of several the nearest to the first."""
+        return min(self._players, key=_rank).patience
+
+    def watch(self, aggregates: Mapping[NodeId, float], bonus: float, cool_down_s: float, now: float) -> None:
+        """Play all choices on: the joint utilities have been ``aggregates`` since the last look (2 s at most)."""
+        gap_s = 0.0 if self._at is None else min(max(now - self._at, 0.0), LONGEST_GAP_S)
+        self._at = now
+        for player in self._players if aggregates else ():
+            player.play(aggregates, bonus, cool_down_s, now, gap_s)
+
+
+def _rank(player: _Player) -> tuple[float, float]:
+    return round(player.paid, 3), abs(math.log(player.patience / FIRST_PATIENCE))

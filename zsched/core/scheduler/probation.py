@@ -1,0 +1,96 @@
+"""SCHEDULER, after a heal: a node that was gone and is back gets no task before its streams are proven again.
+
+Knows: who was gone and came back, and which workers' tokens this node's relay sees. Does not know: who is better, what
+a stream carries.
+
+Beats and streams travel on different links. After a cut both may be dead for TCP, and each comes back by its own
+retransmission timer, so a node may beat again seconds before anything reaches its worker. Two things prove the streams,
+seen from one robot:
+
+* its worker's token appeared on the data session after the node was gone: that came over a living link;
+* the token has stood for a whole zenoh lease since the node is back: zenoh closes a link over which it hears nothing
+  for so long, and its tokens go. (Workers that show no token before they own the task are given this time, too.)
+
+After `LIMIT_S` a node is judged like any other: a token that never comes is no affair of the cut's any more, and the
+handover waits for it. The rule is about *getting* a task: an owner is not left for want of proof.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from zsched.core.values.fleet import Fleet, Standby, TaskSpec
+from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.plan import ReadyWhen
+
+LEASE_MARGIN_S = 0.5
+"""zenoh looks at its leases now and then, and a token's end has a way to go."""
+LIMIT_S = 10.0
+_NONE: Mapping[NodeId, str] = {}
+
+
+@dataclass(slots=True)
+class _Return:
+    gone_at: float
+    back_at: float = math.inf
+
+
+@dataclass(slots=True)
+class Probation:
+    """What one robot knows of the streams to nodes that were gone."""
+
+    fleet: Fleet
+    _returns: dict[NodeId, _Return] = field(default_factory=dict)
+    _tokens: dict[tuple[NodeId, TaskId], dict[str, float]] = field(default_factory=dict)
+    """{(node, task): {worker's incarnation: when its token came}} of the tokens that are there."""
+
+    def on_gone(self, node: NodeId, now: float) -> None:
+        """A peer is gone: what was known of its streams is worth nothing any more."""
+        self._returns[node] = _Return(gone_at=now)
+
+    def on_back(self, node: NodeId, now: float) -> None:
+        """A peer that was gone beats again."""
+        known = self._returns.get(node)
+        if known is not None and known.back_at == math.inf:
+            known.back_at = now
+
+    def on_token(self, node: NodeId, task: TaskId, incarnation: str, *, is_present: bool, now: float) -> None:
+        """Our relay saw a worker's token come or go."""
+        tokens = self._tokens.setdefault((node, task), {})
+        if is_present:
+            tokens[incarnation] = now
+        else:
+            tokens.pop(incarnation, None)
+
+    def forget_tokens(self) -> None:
+        """Our relay is another one: it tells anew what it sees."""
+        self._tokens.clear()
+
+    def doubts(self, spec: TaskSpec, now: float) -> Mapping[NodeId, str]:
+        """{candidate: why it may not get the task yet}."""
+        if not self._returns:
+            return _NONE
+        for node in [node for node, known in self._returns.items() if now - known.back_at >= LIMIT_S]:
+            del self._returns[node]
+        reasons = {node: self._doubt(spec, node, now) for node in spec.candidates if node in self._returns}
+        return {node: reason for node, reason in reasons.items() if reason}
+
+    def _doubt(self, spec: TaskSpec, node: NodeId, now: float) -> str:
+        known = self._returns[node]
+        if known.back_at == math.inf:
+            return ""
+        back_s = now - known.back_at
+        tokens = self._tokens.get((node, spec.name), {})
+        if any(at > known.gone_at for at in tokens.values()):
+            return ""
+        has_stood = bool(tokens) or not _shows_token(spec)
+        if has_stood and back_s >= self.fleet.timing.zenoh_lease_s + LEASE_MARGIN_S:
+            return ""
+        return f"back for {back_s:.1f} s, its streams are not proven yet"
+
+
+def _shows_token(spec: TaskSpec) -> bool:
+    """Whether a candidate's worker shows itself before it owns the task."""
+    return spec.worker.ready_when is ReadyWhen.TOKEN and spec.worker.standby is Standby.WARM

@@ -1,0 +1,465 @@
+"""SCHEDULER in motion at one robot, all tasks: gather, judge, propose, and what follows from a vote's end.
+
+Knows: the round's course and its deadlines. Does not know: how scores arise (`scoring`), stickiness (`scheduler`), when
+a vote is open and how it ends (`voting`), the register, bytes.
+
+A robot gathers the others' utilities every ``decide_s``, and at once when an owner is gone or another robot's proposal
+for a move arrives: the first proposal *calls* the vote, so rounds need no synchronised clocks. In a called vote every
+robot answers with today's winner, or with the owner: its own time-to-trigger and cool-down do not count, the caller's
+did (docs/decisions/0004).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from random import Random
+
+from zsched.core.gateway.gateway import Gateway
+from zsched.core.gateway.round_trips import RoundTrips
+from zsched.core.instructions import AskUtilities, Instruction, PublishProposal, RecordStory
+from zsched.core.scheduler.costs import MoveCost
+from zsched.core.scheduler.damping import Damping
+from zsched.core.scheduler.judge import Judge, Judgement, Outcome, escape_ahead, escape_reason
+from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts, Standing, book, compare, is_out, majority, score
+from zsched.core.scheduler.turns import in_turn, who_moves_first
+from zsched.core.values.fleet import Fleet, TaskSpec
+from zsched.core.values.messages import Utilities
+from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, TaskId, UtilityVector, WorkerState
+from zsched.core.values.plan import StreamCount
+from zsched.core.vote.register import MoveOwner
+from zsched.core.vote.tally import VoteOutcome, present_voters
+from zsched.core.vote.voting import Voting
+
+TIMER_MARGIN_S = 0.001
+"""Sums of floats: a timer has certainly ended this much later."""
+
+
+@dataclass(slots=True)
+class _Gather:
+    number: int
+    deadline: float
+    expected: list[NodeId]
+    vectors: dict[NodeId, tuple[UtilityVector, ...]]
+
+
+@dataclass(slots=True)
+class TaskRound:
+    """One task's standing at this robot: what it last decided, heard and counted."""
+
+    spec: TaskSpec
+    judge: Judge
+    cost: MoveCost
+    voting: Voting
+    settled_at: float
+    """When this node learnt the current epoch."""
+    is_called: bool = False
+    is_called_escape: bool = False
+    standing: Standing | None = None
+    judgement: Judgement | None = None
+    judged_at: float = -math.inf
+    silent: tuple[NodeId, ...] = ()
+    damping: Damping = field(default_factory=Damping)
+    is_waiting_its_turn: bool = False
+    told: str = ""
+    """The last decision written to the journal; the same one again is not."""
+
+
+class Rounds:
+    """All tasks' rounds at one robot (on edges it is idle)."""
+
+    def __init__(
+        self,
+        fleet: Fleet,
+        me: NodeId,
+        gateway: Gateway,
+        rng: Random,
+        now: float,
+        doubts: Callable[[TaskSpec, float], Doubts] = lambda _spec, _now: NO_DOUBTS,
+        round_trips: RoundTrips | None = None,
+    ) -> None:
+        self._fleet, self._me, self._gateway, self._rng = fleet, me, gateway, rng
+        self._doubts = doubts
+        self._round_trips = round_trips or RoundTrips(me)
+        self.is_voter = me in fleet.voters
+        self.tasks = {
+            spec.name: TaskRound(
+                spec=spec, judge=Judge(spec=spec), cost=MoveCost(spec.name), voting=Voting(fleet, me), settled_at=now
+            )
+            for spec in fleet.tasks
+        }
+        self._votings = {name: task.voting for name, task in self.tasks.items()}
+        self._gather: _Gather | None = None
+        self._answer: tuple[int, float, object, Utilities] = (-1, -math.inf, None, Utilities(voter=me, vectors=()))
+        """(gateway's version, until when, (states, values, doubts), vectors): the newest answer to a gather."""
+        self._number = 0
+        self._round_at = now if self.is_voter else math.inf
+
+    # --- time ----------------------------------------------------------------------------------------------------
+
+    def next_deadline(self) -> float:
+        """When `tick` may have something to do."""
+        due = self._round_at if self._gather is None else self._gather.deadline
+        for voting in self._votings.values():
+            due = min(due, voting.next_deadline())
+        return due
+
+    def is_idle(self, now: float) -> bool:
+        """Whether `tick` has nothing to do: no gather runs, none is due, no vote is open."""
+        if self._gather is not None or now >= self._round_at:
+            return False
+        return all(voting.opened_at is None for voting in self._votings.values())
+
+    def hurry(self, now: float) -> None:
+        """Something happened that may need a decision: run a round now."""
+        if self.is_voter:
+            self._round_at = min(self._round_at, now)
+
+    # --- SCHEDULER: the gather -----------------------------------------------------------------------------------
+
+    def vectors(self, values: Mapping[TaskId, Allocation], states: Mapping[NodeId, PeerState], now: float) -> Utilities:
+        """This robot's vectors of all tasks (Alg. 2, Calculate_Utility); none on an edge."""
+        if not self.is_voter:
+            return Utilities(voter=self._me, vectors=())
+        version, until, seen, answer = self._answer
+        doubts = {name: self._doubts(task.spec, now) for name, task in self.tasks.items()}
+        if version == self._gateway.version and now <= until and seen == (states, values, doubts):
+            return answer  # several robots ask within a round, and nothing has changed since
+        bookings = book((task.spec for task in self.tasks.values()), values)
+        round_trips = self._round_trips.seconds()
+        answer = Utilities(
+            voter=self._me,
+            vectors=tuple(
+                score(
+                    task.spec,
+                    values[name],
+                    self._me,
+                    self._gateway,
+                    states,
+                    now,
+                    bookings,
+                    doubts[name],
+                    task.damping.penalties(now),
+                    round_trips,
+                )
+                for name, task in self.tasks.items()
+            ),
+        )
+        # A hair less than the profiles' time: sums of floats.
+        until = self._gateway.fresh_until(now) - TIMER_MARGIN_S
+        self._answer = (self._gateway.version, until, (states, values, doubts), answer)
+        return answer
+
+    def tick(
+        self, values: Mapping[TaskId, Allocation], states: Mapping[NodeId, PeerState], now: float
+    ) -> tuple[Instruction, ...]:
+        """Time has passed: start or close a gather, close votes."""
+        out: list[Instruction] = []
+        if self._gather is not None:
+            running = self._gather  # a robot that is not alive any more is not waited for
+            running.expected = [name for name in running.expected if states[name] is PeerState.ALIVE]
+            if not running.expected or now >= running.deadline:
+                out += self._close(values, states, now)
+        elif now >= self._round_at:
+            out += self._open(values, states, now)
+        for name, task in self.tasks.items():
+            out += self._count(task, values[name], states, now)
+        return tuple(out)
+
+    def _open(
+        self, values: Mapping[TaskId, Allocation], states: Mapping[NodeId, PeerState], now: float
+    ) -> list[Instruction]:
+        timing = self._fleet.timing
+        self._round_at = now + timing.decide_s * (0.9 + 0.2 * self._rng.random())
+        self._number += 1
+        own = self.vectors(values, states, now)
+        expected = [name for name in self._fleet.voters if name != self._me and states[name] is PeerState.ALIVE]
+        self._gather = _Gather(
+            number=self._number,
+            deadline=now + timing.gather_s,
+            expected=expected,
+            vectors={self._me: own.vectors},
+        )
+        if not expected:
+            return self._close(values, states, now)
+        return [AskUtilities(gather=self._number, deadline_s=timing.gather_s)]
+
+    def absorb_utilities(self, gather: int, utilities: Utilities) -> bool:
+        """A robot answered; false when the answer is late, foreign or not its own."""
+        running = self._gather
+        if running is None or gather != running.number or utilities.voter not in running.expected:
+            return False
+        if any(vector.voter != utilities.voter for vector in utilities.vectors):
+            return False
+        running.expected.remove(utilities.voter)
+        if not running.expected:
+            running.deadline = -math.inf  # nobody is waited for any more
+        running.vectors[utilities.voter] = utilities.vectors
+        return True
+
+    def _close(
+        self, values: Mapping[TaskId, Allocation], states: Mapping[NodeId, PeerState], now: float
+    ) -> list[Instruction]:
+        """Everybody alive has answered, or the deadline passed: judge every task."""
+        assert self._gather is not None
+        gathered, self._gather = self._gather, None
+        out: list[Instruction] = []
+        for name in in_turn(self._votings):
+            task = self.tasks[name]
+            vectors = {
+                voter: vector
+                for voter, all_vectors in gathered.vectors.items()
+                for vector in all_vectors
+                if vector.task == name
+            }
+            task.silent = tuple(voter for voter in self._fleet.voters if voter not in vectors)
+            task.standing = compare(task.spec, values[name], vectors)
+            out += self._judge(task, task.standing, values[name], states, now)
+        return out
+
+    # --- SCHEDULER: the decision ---------------------------------------------------------------------------------
+
+    def _judge(
+        self,
+        task: TaskRound,
+        standing: Standing,
+        allocation: Allocation,
+        states: Mapping[NodeId, PeerState],
+        now: float,
+    ) -> list[Instruction]:
+        is_called, is_called_escape = task.is_called, task.is_called_escape
+        task.is_called = task.is_called_escape = False
+        escape = self._escape(task, standing, allocation, states, is_called_escape, now)
+        needed = majority(len(self._fleet.voters))
+        if escape is not None:
+            needed = max(min(needed, majority(len(present_voters(self._fleet.voters, states)))), 1)
+        if standing.voters_heard < needed:
+            reason = f"utilities of {standing.voters_heard} robots, {needed} needed"
+            judgement = Judgement(outcome=Outcome.NONE, candidate=None, aggregate=0.0, reason=reason)
+        else:
+            task.judge.out = self._out(task.spec, now) if allocation.owner is None else frozenset()
+            judgement = task.judge.judge(
+                standing,
+                allocation,
+                settled_for_s=now - task.settled_at,
+                escape=escape,
+                is_called=is_called,
+                now=now,
+                damping=task.damping,
+            )
+        if escape is None:
+            judgement = self._look_ahead(task, judgement, allocation, now)
+        judgement = self._take_turn(task, judgement, allocation, is_called=is_called, now=now)
+        if not is_called:
+            judgement = self._spare(judgement, allocation, states)
+        task.judgement, task.judged_at = judgement, now
+        self._wake_when_due(task, judgement, allocation, now)
+        out: list[Instruction] = [*self._tell(task, judgement, allocation)]
+        if task.voting.commit is not None:
+            return out
+        if judgement.outcome is Outcome.PROPOSE or is_called:
+            if not judgement.is_escape:
+                task.voting.call(now)
+            out += self._propose(task, judgement, allocation, states, now)
+        return out
+
+    def _out(self, spec: TaskSpec, now: float) -> frozenset[NodeId]:
+        """The candidates that say themselves that they cannot have the task now: they are not waited for."""
+        profiles = ((name, self._gateway.fresh(name, now)) for name in spec.candidates)
+        return frozenset(name for name, profile in profiles if profile is not None and is_out(spec, profile))
+
+    def _look_ahead(self, task: TaskRound, judgement: Judgement, allocation: Allocation, now: float) -> Judgement:
+        """While an owner whose worker is not ready has its start-up deadline: say that, and when it will be left."""
+        since, owner = task.judge.not_ready_since, allocation.owner
+        if since is None or owner is None or judgement.outcome is Outcome.PROPOSE:
+            return judgement
+        profile, has_other = self._gateway.fresh(owner, now), any(name != owner for name in judgement.aggregates)
+        ahead = escape_ahead(task.spec, allocation, profile, now - since, has_other=has_other)
+        return replace(judgement, reason=f"{judgement.reason}; {ahead}") if ahead else judgement
+
+    def _take_turn(
+        self, task: TaskRound, judgement: Judgement, allocation: Allocation, *, is_called: bool, now: float
+    ) -> Judgement:
+        """A planned move waits while another task moves; the figures are read again before it is judged once more."""
+        task.is_waiting_its_turn = False
+        if judgement.outcome is not Outcome.PROPOSE or judgement.is_escape:
+            return judgement
+        first = who_moves_first(self._votings, task.spec.name, is_called=is_called, now=now)
+        if first is None:
+            return judgement
+        task.is_waiting_its_turn = True
+        return _put_off(judgement, allocation, f"{first} moves first")
+
+    def _spare(self, judgement: Judgement, allocation: Allocation, states: Mapping[NodeId, PeerState]) -> Judgement:
+        """What too few electors could agree to is not called for.
+
+        It would wait in the register for the very moment in which the network heals, and be committed then.
+        """
+        if judgement.outcome is not Outcome.PROPOSE:
+            return judgement
+        electors = self._fleet.electors
+        heard = sum(states[name] is not PeerState.GONE for name in electors)
+        if heard >= majority(len(electors)):
+            return judgement
+        return _put_off(judgement, allocation, f"{heard} of {len(electors)} electors heard")
+
+    def _escape(
+        self,
+        task: TaskRound,
+        standing: Standing,
+        allocation: Allocation,
+        states: Mapping[NodeId, PeerState],
+        is_called_escape: bool,
+        now: float,
+    ) -> str | None:
+        owner = allocation.owner
+        if owner is None:
+            return None
+        state = states.get(owner, PeerState.GONE)
+        if state is PeerState.SUSPECT and not is_called_escape:
+            state = PeerState.ALIVE  # in grace; only a peer's word makes our own suspicion enough
+        profile = self._gateway.fresh(owner, now)
+        self._gateway.learn_demand(task.spec.name, owner, now)
+        not_ready_for = self._not_ready_for(task, owner, now)
+        return escape_reason(task.spec, allocation, state, profile, standing, not_ready_for)
+
+    def _wake_when_due(self, task: TaskRound, judgement: Judgement, allocation: Allocation, now: float) -> None:
+        """A lead that only waits for its timers is judged again when they end, not up to a whole round later."""
+        if judgement.outcome is not Outcome.WAIT or task.judge.beaten_since is None:
+            return
+        tuning = allocation.tuning
+        due = TIMER_MARGIN_S + max(
+            task.judge.beaten_since + tuning.time_to_trigger_s, task.settled_at + tuning.cool_down_s
+        )
+        if due > now:
+            self._round_at = min(self._round_at, due)
+
+    def _not_ready_for(self, task: TaskRound, owner: NodeId, now: float) -> float:
+        """For how long the owner's worker was heard not to be ready; who is not heard says nothing about it."""
+        profile = self._gateway.fresh(owner, now)
+        load = None if profile is None else profile.worker(task.spec.name)
+        if profile is None or (load is not None and load.state is WorkerState.READY):
+            task.judge.not_ready_since = None
+            return 0.0
+        if task.judge.not_ready_since is None:
+            task.judge.not_ready_since = now
+        return now - task.judge.not_ready_since
+
+    def _tell(self, task: TaskRound, judgement: Judgement, allocation: Allocation) -> list[Instruction]:
+        text = f"{judgement.outcome} {judgement.candidate or '-'}"
+        if text == task.told:
+            return []
+        task.told = text
+        scores = " ".join(f"{name}={value:.3f}" for name, value in sorted(judgement.aggregates.items()))
+        return [
+            RecordStory(
+                stage="scheduler",
+                text=f"{text}: {judgement.reason} [{scores}]",
+                task=task.spec.name,
+                epoch=allocation.epoch,
+            )
+        ]
+
+    # --- VOTE ----------------------------------------------------------------------------------------------------
+
+    def _propose(
+        self,
+        task: TaskRound,
+        judgement: Judgement,
+        allocation: Allocation,
+        states: Mapping[NodeId, PeerState],
+        now: float,
+    ) -> list[Instruction]:
+        candidate = judgement.candidate
+        if candidate is None:  # too few robots heard: not even staying is ours to propose
+            return []
+        proposal = Proposal(
+            voter=self._me,
+            task=task.spec.name,
+            base_revision=allocation.revision,
+            candidate=candidate,
+            aggregate=judgement.aggregate,
+            is_escape=judgement.is_escape,
+            reason=judgement.reason[:200],
+        )
+        return [PublishProposal(proposal=proposal), *self.absorb_proposal(proposal, allocation, states, now)]
+
+    def absorb_proposal(
+        self, proposal: Proposal, allocation: Allocation, states: Mapping[NodeId, PeerState], now: float
+    ) -> list[Instruction]:
+        """A robot's proposal (our own enters here too). On an older or newer base it does not count."""
+        task = self.tasks[proposal.task]
+        if task.voting.absorb(proposal, allocation, now):
+            task.is_called = True
+            task.is_called_escape |= proposal.is_escape
+            if self._gather is None:
+                self.hurry(now)
+        return self._count(task, allocation, states, now)
+
+    def _count(
+        self, task: TaskRound, allocation: Allocation, states: Mapping[NodeId, PeerState], now: float
+    ) -> list[Instruction]:
+        ended = task.voting.count(allocation, states, now)
+        if ended is None:
+            return []
+        if ended.outcome is VoteOutcome.STAY:
+            task.judge.reset()
+        text = f"{ended.outcome}: {ended.reason} ({', '.join(f'{v}->{c}' for v, c in ended.votes)})"
+        return [RecordStory(stage="vote", text=text, task=task.spec.name, epoch=allocation.epoch)]
+
+    def due_commits(self, now: float) -> list[tuple[TaskId, MoveOwner]]:
+        """Changes whose turn has come; each is handed out once."""
+        due = ((name, voting.take_commit(now)) for name, voting in self._votings.items())
+        return [(name, change) for name, change in due if change is not None]
+
+    def on_commit_ended(self, name: TaskId) -> None:
+        """Our change was committed, overtaken or given up: votes may be called again."""
+        self._votings[name].end_commit()
+
+    def on_moved(
+        self, name: TaskId, left: NodeId | None, *, has_failed: bool, now: float, was_draining: bool = False
+    ) -> None:
+        """A new owner is known: ``left`` is the one before, ``has_failed`` whether it was fled from."""
+        self.tasks[name].damping.note_move(left, has_failed=has_failed, was_draining=was_draining, now=now)
+        self.tasks[name].cost.on_moved(is_planned=left is not None and not has_failed, now=now)
+
+    def forgive(self, name: TaskId, node: NodeId | None, now: float) -> None:
+        """An operator has mended what was held against a node (``None``: against any); judge again at once."""
+        self.tasks[name].damping.forgive(node)
+        self.hurry(now)
+
+    def absorb_counts(self, counts: tuple[StreamCount, ...], now: float) -> None:
+        """This robot's relay has counted its streams: what did the last moves cost?"""
+        for task in self.tasks.values():
+            if task.spec.pays_off_in_s is not None:
+                task.cost.absorb(counts, now)
+                task.judge.move_cost_s = task.cost.seconds
+
+    def on_learnt(self, name: TaskId, *, is_new_epoch: bool, now: float) -> None:
+        """A newer revision is known: proposals on older bases are worthless."""
+        task = self.tasks[name]
+        task.voting.on_learnt()
+        task.told = ""
+        task.judge.reset(is_new_owner=is_new_epoch)
+        if is_new_epoch:
+            task.settled_at = now
+        if self._gather is not None and len(self.tasks) > 1:
+            # What was gathered says nothing of what this task will use at its new owner: no other may move by it.
+            self._gather = None
+            self.hurry(now)
+        if any(other.is_waiting_its_turn for other in self.tasks.values()):
+            self.hurry(now)
+
+
+def _put_off(judgement: Judgement, allocation: Allocation, why: str) -> Judgement:
+    """The same judgement, without the move."""
+    owner = allocation.owner
+    return replace(
+        judgement,
+        outcome=Outcome.WAIT,
+        candidate=owner,
+        aggregate=judgement.aggregates.get(owner, 0.0) if owner is not None else 0.0,
+        reason=f"{judgement.reason}; {why}",
+        is_escape=False,
+    )

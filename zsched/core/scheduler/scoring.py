@@ -1,0 +1,358 @@
+"""SCHEDULER, first half: filters and scores candidates and compares the robots' scores (Alg. 2).
+
+Knows: eligibility, Eq. 1-6, vetoes. Does not know: stickiness (`zsched.core.scheduler.judge`), how utilities travel.
+
+Two steps, both pure functions: `score` makes this robot's `UtilityVector` (Calculate_Utility); `compare` joins the
+vectors of all fresh voters into a `Standing` (Compare_Utility), and `pick` names its best.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Iterable, Mapping
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass, field
+
+from zsched.core.gateway.demand import Demands, is_short, speed_of
+from zsched.core.gateway.gateway import Gateway
+from zsched.core.scheduler.links import pair_link
+from zsched.core.scheduler.utility import (
+    cpu_utility,
+    memory_service,
+    memory_utility,
+    on_time,
+    predicted_use,
+    service_utility,
+    total_utility,
+)
+from zsched.core.values.fleet import Demand, Reach, Standby, TaskSpec
+from zsched.core.values.model import (
+    Aggregate,
+    Allocation,
+    NodeId,
+    PeerState,
+    Profile,
+    ScoreForm,
+    TaskId,
+    Tuning,
+    Utility,
+    UtilityVector,
+    WorkerState,
+)
+
+METRICS = ("cpu", "memory", "network")
+
+Bookings = Mapping[NodeId, tuple[TaskSpec, ...]]
+"""{owner: its tasks}: of a task that has just come, profiles show nothing yet."""
+
+
+def majority(count: int) -> int:
+    """The least number that is more than half of ``count``.
+
+    >>> [majority(n) for n in (1, 2, 3, 4, 5)]
+    [1, 2, 2, 3, 3]
+    """
+    return count // 2 + 1
+
+
+def rounded(aggregate: float) -> float:
+    """An aggregate to 1/256: sums of floats differ by their order, and a difference that small decides nothing."""
+    return round(aggregate * 256) / 256
+
+
+# --- score: one robot's view (Calculate_Utility) ---------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class _Terms:
+    """Eq. 1-3 for one candidate; ``None`` where the metric is not measured."""
+
+    cpu: float | None
+    memory: float | None
+    network: float | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Doubts:
+    """Doubts about nodes that are too young, or not enough, to take a task from them."""
+
+    in_grace: AbstractSet[NodeId] = frozenset()
+    """Suspect, but not for long enough to tell a lost beat from a lost node: an owner among them counts as alive."""
+    unproven: Mapping[NodeId, str] = field(default_factory=dict)
+    """{candidate: why it may not get the task} of those that were gone (`zsched.core.scheduler.probation`)."""
+    unfit: Mapping[NodeId, str] = field(default_factory=dict)
+    """{candidate: why it may not have the task, though it has it} of an exclusive task (`zsched.core.vote.lease`)."""
+
+
+NO_DOUBTS = Doubts()
+NOTHING_HELD: Mapping[NodeId, float] = {}
+
+
+def score(
+    spec: TaskSpec,
+    allocation: Allocation,
+    voter: NodeId,
+    gateway: Gateway,
+    states: Mapping[NodeId, PeerState],
+    now: float,
+    bookings: Bookings | None = None,
+    doubts: Doubts = NO_DOUBTS,
+    penalties: Mapping[NodeId, float] = NOTHING_HELD,
+    round_trips: Mapping[NodeId, float] = NOTHING_HELD,
+) -> UtilityVector:
+    """This robot's utilities of a task's candidates, by the tuning of ``allocation``.
+
+    A candidate that this robot cannot reach gets 0 (not: is left out, which would raise its mean); one that may not
+    have the task is refused with the reason. Where there are ``doubts`` about a node, it keeps
+    what it has and gets nothing new. What the other tasks of ``bookings`` will use there, and do not show yet, counts
+    as in use. ``penalties`` are what this robot remembers; they go along, and `compare` joins them. ``round_trips`` are
+    seconds to each candidate and back, where measured (`zsched.core.gateway.round_trips`).
+    """
+    form = allocation.tuning.score
+    terms: dict[NodeId, _Terms] = {}
+    unreachable: list[NodeId] = []
+    refused: list[tuple[NodeId, str]] = []
+    for candidate in spec.candidates:
+        state = states.get(candidate, PeerState.UNKNOWN)
+        if state is PeerState.UNKNOWN:
+            refused.append((candidate, "not heard yet"))  # we may have just started: that says nothing about it
+            continue
+        is_spared = candidate == allocation.owner and candidate in doubts.in_grace
+        if state is not PeerState.ALIVE and not is_spared:
+            unreachable.append(candidate)
+            continue
+        if candidate in doubts.unfit:
+            refused.append((candidate, doubts.unfit[candidate]))
+            continue
+        if candidate in doubts.unproven and candidate != allocation.owner:
+            refused.append((candidate, doubts.unproven[candidate]))
+            continue
+        profile = gateway.fresh(candidate, now)
+        if profile is None:
+            refused.append((candidate, "no fresh profile"))
+            continue
+        demand, unseen = gateway.demand(spec, profile), _unseen(spec, profile, bookings, gateway)
+        reason = _refusal(spec, allocation, profile, demand, unseen)
+        if reason:
+            refused.append((candidate, reason))
+            continue
+        link = pair_link(voter, candidate, gateway, spec.limits, now)
+        if link is not None and not link.is_reached:
+            unreachable.append(candidate)
+            continue
+        network_s = round_trips.get(candidate, 0.0)
+        load = profile.worker(spec.name)
+        # what an owner that is short gets is measured
+        is_measured = candidate == allocation.owner and load is not None and is_short(load)
+        share = 0.0 if is_measured else gateway.share(spec, profile, demand.cpu_cores, unseen.cpu_cores)
+        least = min(share, demand.cpu_cores)
+        cpu = _cpu(spec, profile, demand, unseen, allocation.tuning, gateway.demands, network_s, least)
+        memory = _memory(spec, profile, demand, unseen, form)
+        terms[candidate] = _Terms(cpu, memory, None if link is None else link.utility)
+    measured = frozenset(name for name in METRICS if any(getattr(t, name) is not None for t in terms.values()))
+    utilities = [Utility(candidate=name, value=0.0, reachable=False) for name in unreachable]
+    for candidate, term in terms.items():
+        value = total_utility(
+            allocation.tuning.weights,
+            cpu=term.cpu,
+            memory=term.memory,
+            network=term.network,
+            measured=measured,
+            form=form,
+        )
+        if value is None:
+            refused.append((candidate, "a weighted metric is not measured"))
+            continue
+        utilities.append(
+            Utility(candidate=candidate, value=value, cpu=term.cpu, memory=term.memory, network=term.network)
+        )
+    return UtilityVector(
+        voter=voter,
+        task=spec.name,
+        revision=allocation.revision,
+        utilities=tuple(sorted(utilities, key=lambda utility: utility.candidate)),
+        refused=tuple(sorted(refused)),
+        penalties=tuple(sorted((name, round(penalty, 4)) for name, penalty in penalties.items())),
+    )
+
+
+_NOTHING = Demand()
+
+
+def book(specs: Iterable[TaskSpec], values: Mapping[TaskId, Allocation]) -> Bookings:
+    """{owner: its tasks}; empty with a single task."""
+    booked: dict[NodeId, tuple[TaskSpec, ...]] = {}
+    specs = tuple(specs)
+    for spec in specs if len(specs) > 1 else ():
+        owner = values[spec.name].owner
+        if owner is not None:
+            booked[owner] = (*booked.get(owner, ()), spec)
+    return booked
+
+
+def _unseen(spec: TaskSpec, profile: Profile, bookings: Bookings | None, gateway: Gateway) -> Demand:
+    """What other tasks will use on a node beyond what its profile shows of their workers.
+
+    A worker that somebody else started never shows what it uses, so it is in the profile already, or nowhere.
+    """
+    others = () if bookings is None else bookings.get(profile.node, ())
+    if not others:
+        return _NOTHING
+    cpu = memory = 0.0
+    for other in others:
+        load = profile.worker(other.name)
+        if other.name != spec.name and load is not None:
+            demand = gateway.demand(other, profile)
+            cpu += max(demand.cpu_cores - (load.cpu_cores or 0.0), 0.0)
+            memory += max(demand.memory_mb - (load.memory_mb or 0.0), 0.0)
+    return Demand(cpu_cores=cpu, memory_mb=memory)
+
+
+def is_out(spec: TaskSpec, profile: Profile) -> bool:
+    """Whether a node cannot have the task until an operator or a restart changes something there."""
+    load = profile.worker(spec.name)
+    return profile.draining or (load is not None and load.state is WorkerState.FAILED)
+
+
+def _refusal(spec: TaskSpec, allocation: Allocation, profile: Profile, demand: Demand, unseen: Demand) -> str:
+    """Why the node may not have the task; empty when it may."""
+    if profile.draining:
+        return "draining"
+    load = profile.worker(spec.name)
+    state = None if load is None else load.state
+    if spec.worker.command and state is None:
+        return "runs no worker for it"
+    why = "" if load is None or not load.reason else f": {load.reason}"
+    if state is WorkerState.FAILED:
+        return f"worker failed{why}"
+    is_owner = profile.node == allocation.owner
+    # what somebody else starts is there or is not, cold or warm
+    is_awaited = spec.worker.standby is Standby.WARM or not spec.worker.command
+    if is_awaited and not is_owner and state not in (None, WorkerState.READY):
+        return f"worker {state}{why}"
+    used = _memory_use(profile, spec, demand, unseen)
+    if used is not None and used > profile.memory_mb:
+        return f"needs {demand.memory_mb:.0f} MiB, has {max(profile.memory_mb - used + demand.memory_mb, 0.0):.0f} free"
+    return ""
+
+
+def _memory_use(profile: Profile, spec: TaskSpec, demand: Demand, unseen: Demand) -> float | None:
+    if profile.memory_used_mb is None:
+        return None
+    load = profile.worker(spec.name)
+    own = (load.memory_mb or 0.0) if load is not None else 0.0
+    return predicted_use(profile.memory_used_mb + unseen.memory_mb, own, demand.memory_mb)
+
+
+def _cpu(
+    spec: TaskSpec,
+    profile: Profile,
+    demand: Demand,
+    unseen: Demand,
+    tuning: Tuning,
+    demands: Demands,
+    network_s: float,
+    least_cores: float,
+) -> float | None:
+    """Eq. 1, or the share of its jobs that the task would get done, in time where it has a deadline.
+
+    ``least_cores``: so much it gets, however full the machine is.
+    """
+    if profile.cpu_used_cores is None:
+        return None
+    used_cores = profile.cpu_used_cores + unseen.cpu_cores
+    used = predicted_use(used_cores, profile.cores_of(spec.name), demand.cpu_cores)
+    if tuning.score is ScoreForm.PAPER:
+        return cpu_utility(profile.cpu_cores, used)
+    free, job = max(profile.cpu_cores - used + demand.cpu_cores, least_cores), demands.job(spec.name)
+    share, stretch = demands.experience(spec.name, profile)
+    if job is None:
+        return service_utility(free, demand.cpu_cores, profile.cpu_cores, share=share)
+    speed = speed_of(profile)
+    if tuning.deadline_ms is not None:
+        share *= on_time(stretch * job.age_s(speed, free) + network_s, tuning.deadline_ms / 1e3)
+    return service_utility(free, demand.cpu_cores, profile.cpu_cores, most=job.most_cores(speed), share=share)
+
+
+def _memory(spec: TaskSpec, profile: Profile, demand: Demand, unseen: Demand, form: ScoreForm) -> float | None:
+    used_mb = _memory_use(profile, spec, demand, unseen)
+    if used_mb is None:
+        return None
+    others_mb = used_mb - demand.memory_mb
+    if form is ScoreForm.PAPER:
+        return memory_utility(profile.memory_mb, demand.memory_mb, others_mb)
+    free_mb = profile.memory_mb - others_mb
+    return memory_service(free_mb, demand.memory_mb, profile.memory_mb, spec.memory_floor_ratio)
+
+
+# --- compare: all robots' views (Compare_Utility) --------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Standing:
+    """The joint view of one gather: ``aggregates`` without bonus, ``vetoed`` with reasons, and who was heard."""
+
+    aggregates: Mapping[NodeId, float]
+    vetoed: Mapping[NodeId, str]
+    vectors: tuple[UtilityVector, ...]
+    voters_heard: int
+    penalties: Mapping[NodeId, float] = field(default_factory=dict)
+    """{node: what is held against it}, by the robot that remembers most."""
+
+
+def compare(spec: TaskSpec, allocation: Allocation, vectors: Mapping[NodeId, UtilityVector]) -> Standing:
+    """Join the fresh voters' vectors column by column (Eq. 5-6: argmax over candidates of the aggregate over robots).
+
+    Args:
+        spec: the task.
+        allocation: the current one; vectors under another revision are not counted.
+        vectors: {voter: its vector}, the fresh ones only.
+    """
+    fresh = tuple(vectors[voter] for voter in sorted(vectors) if vectors[voter].revision == allocation.revision)
+    columns: dict[NodeId, list[Utility]] = {candidate: [] for candidate in spec.candidates}
+    reasons: dict[NodeId, str] = {}
+    for vector in fresh:
+        for candidate, utility in {utility.candidate: utility for utility in vector.utilities}.items():
+            columns.setdefault(candidate, []).append(utility)  # once per voter, however often its vector names it
+        reasons.update(vector.refused)
+    mean = statistics.fmean if allocation.tuning.aggregate is Aggregate.MEAN else statistics.median
+    aggregates: dict[NodeId, float] = {}
+    vetoed: dict[NodeId, str] = {}
+    for candidate in spec.candidates:
+        column = columns[candidate]
+        reaching = sum(utility.reachable for utility in column)
+        needed = len(fresh) if spec.reach is Reach.ALL else majority(len(fresh))
+        if len(column) < majority(len(fresh)) or len(column) == reaching < needed:
+            # Not scored is not "not reached": only the latter is a reason to flee from an owner.
+            vetoed[candidate] = reasons.get(candidate, "not scored by enough robots")
+        elif reaching < needed:
+            vetoed[candidate] = f"reached by {reaching} of {len(fresh)} robots"
+        else:
+            aggregates[candidate] = mean([utility.value for utility in column])
+    return Standing(
+        aggregates=aggregates,
+        vetoed=vetoed,
+        vectors=fresh,
+        voters_heard=len(fresh),
+        penalties=joined(dict(vector.penalties) for vector in fresh),
+    )
+
+
+def joined(penalties: Iterable[Mapping[NodeId, float]]) -> dict[NodeId, float]:
+    """What any of them holds against a node, the most of it: forgetting (a restart) and not knowing say nothing.
+
+    >>> joined([{"edge1": 0.09}, {}, {"edge1": 0.03, "edge2": 0.03}])
+    {'edge1': 0.09, 'edge2': 0.03}
+    """
+    most: dict[NodeId, float] = {}
+    for held in penalties:
+        for name, penalty in held.items():
+            most[name] = max(penalty, most.get(name, 0.0))
+    return dict(sorted(most.items()))
+
+
+def pick(aggregates: Mapping[NodeId, float], owner: NodeId | None) -> NodeId | None:
+    """The candidate with the highest aggregate; ties (to 1/256) go to the owner, then to the lowest name."""
+    if not aggregates:
+        return None
+    return min(aggregates, key=lambda name: (-rounded(aggregates[name]), name != owner, name))

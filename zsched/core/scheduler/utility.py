@@ -1,0 +1,232 @@
+"""The paper's equations 1 to 4, by the readings of docs/decisions/0001, and a form of them without a blind spot.
+
+Knows: arithmetic. Does not know: nodes, tasks, time.
+
+The equations as printed contradict the text in places (Eq. 1 with beta "available" would pick the busiest node); here
+beta and mu are what is *in use*, predicted as if the candidate had the task, and every term is clamped to [0, 1].
+
+That clamp makes all machines alike that have less left than the task needs, idle or starved, and in a sum spare memory
+hides a starved CPU. `ScoreForm.SERVICE` (docs/decisions/0030) says which share of its work a task would get done, which
+is never 0 before nothing is left, and multiplies.
+"""
+
+from __future__ import annotations
+
+import math
+
+from zsched.core.values.model import ScoreForm, Weights
+
+
+def clamp(value: float) -> float:
+    """``value`` cut to [0, 1].
+
+    >>> clamp(1.2), clamp(-3.0)
+    (1.0, 0.0)
+    """
+    return min(max(value, 0.0), 1.0)
+
+
+def predicted_use(use: float, own_worker: float, demand: float) -> float:
+    """What would be in use if the candidate had the task: one formula for every candidate, owner or not.
+
+    Without it the owner always looks worse by the load of the task itself, and the task oscillates.
+
+    Args:
+        use: in use now (cores or MiB, >= 0).
+        own_worker: of that, by this task's worker there (idle standby or active).
+        demand: what the task will use where it runs.
+
+    >>> predicted_use(use=1.0, own_worker=0.4, demand=0.5)
+    1.1
+    """
+    return max(use - own_worker, 0.0) + demand
+
+
+def cpu_utility(gamma: float, beta: float) -> float:
+    """Eq. 1, ``eta = (gamma - beta) / gamma``: the free fraction of the CPU.
+
+    Args:
+        gamma: cores that may be used, > 0.
+        beta: cores predicted to be in use, >= 0.
+
+    >>> cpu_utility(gamma=4.0, beta=1.0)
+    0.75
+    """
+    return clamp((gamma - beta) / gamma)
+
+
+def memory_utility(delta: float, theta: float, mu: float) -> float:
+    """Eq. 2, ``sigma = (delta - theta - mu) / delta``: the free fraction of the memory once the task is there.
+
+    Args:
+        delta: memory in all, MiB, > 0.
+        theta: the task's demand, MiB, >= 0.
+        mu: in use without this task, MiB, >= 0.
+
+    >>> memory_utility(delta=4000.0, theta=400.0, mu=1600.0)
+    0.5
+    """
+    return clamp((delta - theta - mu) / delta)
+
+
+LEAST_NEED_RATIO = 0.05
+"""A task counts as needing at least this share of a machine: also of a small one more room is better."""
+SPARE = 0.05
+"""The part of a term that is the machine's free share: enough to place tasks apart, too little to be worth a move."""
+
+
+def service_utility(
+    free: float, demand: float, capacity: float, *, most: float | None = None, share: float = 1.0
+) -> float:
+    """The share of its work that a task would get done, ``min(free / demand, 1)``, and a little for what is left free.
+
+    Args:
+        free: not in use by others, in cores or MiB; below 0 counts as 0. Of an owner with nothing to spare it is what
+            the task gets there.
+        demand: of the task, in the same unit, >= 0.
+        capacity: of the machine, in the same unit, > 0.
+        most: what the task can use there at a time, however much is free; ``None``: any amount.
+        share: what counts of that share of its work, in [0, 1]: less where it got less than was foreseen, or gets it
+            too late (`on_time`).
+
+    >>> round(service_utility(free=1.0, demand=2.0, capacity=4.0), 4)
+    0.4875
+    >>> round(service_utility(free=4.0, demand=2.0, capacity=4.0), 4)
+    1.0
+    >>> round(service_utility(free=4.0, demand=2.0, capacity=4.0, most=1.0), 4)
+    0.525
+    """
+    room = max(free, 0.0) / max(demand, LEAST_NEED_RATIO * capacity)
+    if most is not None and most < demand:
+        room = min(room, most / demand)
+    return (1.0 - SPARE) * share * min(room, 1.0) + SPARE * clamp(free / capacity)
+
+
+STEEPNESS = 4.0
+"""Of the share of jobs within the deadline over their median time: how little the times of one task's jobs spread."""
+
+
+def on_time(job_s: float, deadline_s: float) -> float:
+    """The share of jobs expected within the deadline, where they take ``job_s`` (0 or more) in the middle.
+
+    Times of jobs are skewed to the right; they are taken for log-logistic (Fisk 1961), ``1 / (1 + (t / d)^4)``: the
+    middle half lies within a factor of 1.7. So there is no edge at which a machine is worth nothing, or no better than
+    another one, and what is judged is what counts: deadlines missed, not milliseconds.
+
+    >>> [round(on_time(job_s, 0.1), 3) for job_s in (0.0, 0.05, 0.1, 0.2)]
+    [1.0, 0.941, 0.5, 0.059]
+    """
+    ratio = min(job_s / deadline_s, 1e6)
+    return 1.0 / (1.0 + math.pow(ratio, STEEPNESS))
+
+
+NEARLY_FULL = 0.15
+"""So much of the memory's term goes where nothing is left beside the task: enough to leave for, in some seconds."""
+
+
+def memory_service(free: float, demand: float, capacity: float, floor_ratio: float) -> float:
+    """`service_utility` of memory, and up to `NEARLY_FULL` of it less where the task leaves less than the floor free.
+
+    A task that has its memory works as well on a full machine as on an empty one, until the kernel kills somebody.
+
+    Args:
+        free: not in use by others, MiB.
+        demand: of the task, MiB, >= 0.
+        capacity: of the machine, MiB, > 0.
+        floor_ratio: of the machine, in [0, 1).
+
+    >>> round(memory_service(free=400.0, demand=300.0, capacity=4000.0, floor_ratio=0.05), 3)
+    0.883
+    """
+    floor = floor_ratio * capacity
+    depth = clamp(1.0 - (free - demand) / floor) if floor > 0.0 else 0.0
+    return service_utility(free, demand, capacity) * (1.0 - NEARLY_FULL * depth)
+
+
+def fair_share(capacity: float, threads: float, others: float) -> float:
+    """Cores that a fair scheduler gives ``threads`` beside ``others`` that all want to run; never more than there are.
+
+    Args:
+        capacity: cores of the machine, > 0.
+        threads: of the task, >= 1.
+        others: that run or wait to run there without it, >= 0, on the mean.
+
+    >>> fair_share(capacity=4.0, threads=3.0, others=5.0)
+    1.5
+    """
+    return min(capacity * threads / max(threads + others, capacity), capacity)
+
+
+KNEE_UTILITY = 0.8
+"""What a link is worth at its knee."""
+
+
+def network_utility(signal_dbm: float, nu_dbm: float, rho_dbm: float, knee_dbm: float | None = None) -> float:
+    """Eq. 3, ``kappa = (lambda - nu) / (rho - nu)``: the link's share of what is achievable.
+
+    With a knee it is piecewise linear through (nu, 0), (knee, `KNEE_UTILITY`) and (rho, 1): delays are flat above some
+    signal and rise steeply below it.
+
+    Args:
+        signal_dbm: the link's smoothed signal.
+        nu_dbm: least usable signal.
+        rho_dbm: best achievable signal, > nu.
+        knee_dbm: between the two, or ``None``: linear, as printed.
+
+    >>> network_utility(signal_dbm=-60.0, nu_dbm=-80.0, rho_dbm=-40.0)
+    0.5
+    >>> network_utility(signal_dbm=-70.0, nu_dbm=-80.0, rho_dbm=-40.0, knee_dbm=-60.0)
+    0.4
+    """
+    if knee_dbm is None:
+        return clamp((signal_dbm - nu_dbm) / (rho_dbm - nu_dbm))
+    if signal_dbm < knee_dbm:
+        return KNEE_UTILITY * clamp((signal_dbm - nu_dbm) / (knee_dbm - nu_dbm))
+    return KNEE_UTILITY + (1.0 - KNEE_UTILITY) * clamp((signal_dbm - knee_dbm) / (rho_dbm - knee_dbm))
+
+
+def total_utility(
+    weights: Weights,
+    *,
+    cpu: float | None,
+    memory: float | None,
+    network: float | None,
+    measured: frozenset[str],
+    form: ScoreForm = ScoreForm.PAPER,
+) -> float | None:
+    """Eq. 4, the weighted sum; weights of metrics that nobody measured are dropped and the rest renormalised.
+
+    `ScoreForm.SERVICE`: a product instead, each term to the power of its weight over the largest one. The metric that
+    weighs most counts as it is, one of half its weight as its square root: a weight says by how many percent of it the
+    utility falls when that term falls by one percent, whatever the others are.
+
+    Args:
+        weights: omega, sum 1.
+        cpu: eta, in [0, 1], or ``None`` when not measured here.
+        memory: sigma, likewise.
+        network: kappa, likewise.
+        measured: which of ``cpu``, ``memory``, ``network`` any candidate has.
+        form: sum or product.
+
+    Returns:
+        The utility in [0, 1]; ``None`` when a weighted metric that others have is missing here, or nothing is left.
+
+    >>> w = Weights(cpu=0.5, memory=0.25, network=0.25)
+    >>> total_utility(w, cpu=0.8, memory=0.4, network=None, measured=frozenset({"cpu", "memory"}))
+    0.6666666666666666
+    """
+    terms = (("cpu", weights.cpu, cpu), ("memory", weights.memory, memory), ("network", weights.network, network))
+    weighed: list[tuple[float, float]] = []
+    for name, weight, term in terms:
+        if weight <= 0.0 or name not in measured:
+            continue
+        if term is None:
+            return None
+        weighed.append((weight, term))
+    if not weighed:
+        return None
+    if form is ScoreForm.PAPER:
+        share = sum((weight for weight, _ in weighed), 0.0)
+        return clamp(sum((weight * term for weight, term in weighed), 0.0) / share)
+    most = max(weight for weight, _ in weighed)
+    return clamp(math.prod(term ** (weight / most) for weight, term in weighed))

@@ -1,0 +1,198 @@
+"""What nodes say to each other beyond the stages' own values: ballots of the register, answers, commands.
+
+Knows: the fields of each message and their ranges. Does not know: keys, bytes, or who may send what.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from zsched.core.values.model import (
+    Acceptance,
+    Allocation,
+    Ballot,
+    NodeId,
+    TaskId,
+    UtilityVector,
+    check_counter,
+    check_name,
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Prepare:
+    """Phase 1 of a round: asks an elector to promise ``ballot`` (Synod, phase 1a)."""
+
+    task: TaskId
+    ballot: Ballot
+    electorate: str
+    """Hash of the electorate that the proposer counts with; a differing one is refused."""
+
+    def __post_init__(self) -> None:
+        check_name("prepare.task", self.task)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Promise:
+    """An elector's yes to a `Prepare`: persisted, with what it had accepted before (Synod, phase 1b)."""
+
+    elector: NodeId
+    task: TaskId
+    ballot: Ballot
+    accepted: Acceptance | None = None
+
+    def __post_init__(self) -> None:
+        check_name("promise.elector", self.elector)
+        check_name("promise.task", self.task)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Accept:
+    """Phase 2 of a round: asks an elector to accept ``acceptance`` (Synod, phase 2a)."""
+
+    task: TaskId
+    acceptance: Acceptance
+    electorate: str
+
+    def __post_init__(self) -> None:
+        check_name("accept.task", self.task)
+        if self.acceptance.value.task != self.task:
+            raise ValueError(f"accept: value of {self.acceptance.value.task!r} for task {self.task!r}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Accepted:
+    """An elector's yes to an `Accept`: persisted (Synod, phase 2b)."""
+
+    elector: NodeId
+    task: TaskId
+    ballot: Ballot
+
+    def __post_init__(self) -> None:
+        check_name("accepted.elector", self.elector)
+        check_name("accepted.task", self.task)
+
+
+class Refusal(StrEnum):
+    """Why an elector says no."""
+
+    BALLOT = "ballot"  # it promised a higher one
+    ELECTORATE = "electorate"  # the proposer counts with another electorate
+    NOT_ELECTOR = "not_elector"  # it is none, or lost its state
+    LEASE = "lease"  # an exclusive task's grant is still running
+    RATE = "rate"  # this proposer asks too often
+    DISK = "disk"  # it could not persist
+    VALUE = "value"  # it does not take this value for a true one: its fleet file knows no such node
+    YOUNG = "young"  # it has just started, and asks the others first what they remember of it
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Refused:
+    """An elector's no; ``promised`` tells the proposer which counter to beat."""
+
+    elector: NodeId
+    task: TaskId
+    ballot: Ballot
+    refusal: Refusal
+    promised: Ballot
+
+    def __post_init__(self) -> None:
+        check_name("refused.elector", self.elector)
+        check_name("refused.task", self.task)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Learnt:
+    """Register values that ``node`` has learnt, one per task; sent on every change and to late joiners."""
+
+    node: NodeId
+    values: tuple[Allocation, ...]
+    generation: int = 0
+    has_voted: bool = False
+    """Whether ``node`` has ever promised anything as an elector."""
+    lease_terms: str = ""
+    """What its leases hang on."""
+    unleased: tuple[TaskId, ...] = ()
+    """Tasks whose worker there may be working without a lease."""
+    incarnation: int = 0
+    """Of its state; 0: it has none."""
+    votes: int = 0
+    """How many promises and acceptances it has ever given."""
+    seen: tuple[tuple[NodeId, int, int], ...] = ()
+    """(elector, incarnation, votes): what it remembers of others (`zsched.core.vote.witness`)."""
+    daemon: int = 0
+    """Incarnation of the daemon that answers, whether it has a state or not."""
+    twins: tuple[tuple[NodeId, int, int], ...] = ()
+    """(name, incarnation, newest beat) of daemons whose name it hears twice (`zsched.core.membership.namesakes`)."""
+
+    def __post_init__(self) -> None:
+        check_name("learnt.node", self.node)
+        check_counter("learnt.generation", self.generation)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Utilities:
+    """A robot's answer to a gather: its vectors for all tasks."""
+
+    voter: NodeId
+    vectors: tuple[UtilityVector, ...]
+
+    def __post_init__(self) -> None:
+        check_name("utilities.voter", self.voter)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetWeights:
+    """Operator command: change Eq. 4's weights of one task on the whole fleet, through the register.
+
+    ``base_revision`` is the revision the operator saw; ``None`` means "whatever is current at this node".
+    """
+
+    task: TaskId
+    cpu: float
+    memory: float
+    network: float
+    base_revision: int | None = None
+
+    def __post_init__(self) -> None:
+        check_name("weights.task", self.task)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RetryTask:
+    """Operator command to one node: forget what failures of the task's workers have led to there.
+
+    Given to every node: each remembers something else. ``node`` is whose failures; empty means everybody's.
+    """
+
+    task: TaskId
+    node: NodeId = ""
+
+    def __post_init__(self) -> None:
+        check_name("retry.task", self.task)
+        if self.node:
+            check_name("retry.node", self.node)
+
+
+Command = SetWeights | RetryTask
+
+
+class CommandOutcome(StrEnum):
+    """How a command ended; `OK` and `UNCHANGED` are success."""
+
+    OK = "ok"
+    UNCHANGED = "unchanged"
+    CONFLICT = "conflict"  # the value had changed meanwhile
+    NO_QUORUM = "no_quorum"
+    INVALID = "invalid"
+    UNKNOWN = "unknown"  # the round's outcome is not known; ask status
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CommandResult:
+    """What the operator is told."""
+
+    outcome: CommandOutcome
+    detail: str
+    revision: int | None = None

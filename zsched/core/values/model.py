@@ -1,0 +1,627 @@
+"""The frozen values that every stage exchanges; each checks its own ranges.
+
+Knows: what a value means, in which unit and range. Does not know: how it is measured, sent or stored.
+
+Every class is a frozen dataclass whose fields are plain (str, int, float, bool, enum, tuple, another value), so that
+`zsched.wire.codec` can encode any of them and no object is ever shared with an adapter. ``None`` means "not measured"
+or "not there", never -1. A value out of range raises `ValueError` naming the field: from the wire that is a counted,
+dropped frame; from our own code it is a bug.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from enum import StrEnum
+
+NodeId = str
+"""A node's name: ``[a-z0-9][a-z0-9_-]{0,62}``, unique in the fleet."""
+TaskId = str
+"""A task's name, same alphabet."""
+
+NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}")
+MAX_COUNTER = 2**53
+"""Largest revision, epoch, incarnation or sequence number (exact in every language's float)."""
+MAX_CPU_CORES, MAX_MEMORY_MB, MAX_BITRATE_MBPS = 4096.0, 1e8, 1e6
+MIN_SPEED, MAX_SPEED = 0.001, 1000.0
+MAX_RUNNABLE = 1e6
+MAX_TREND_DB_S = 100.0
+MAX_JOBS_HZ, MAX_JOB_S = 1e6, 1e6
+"""What no machine or link exceeds: a larger figure is a fault of whoever measured or sent it."""
+MAX_REASON = 400
+"""Characters of a worker's reason: it travels with every profile."""
+
+
+def as_reason(text: str, longest: int = MAX_REASON) -> str:
+    """``text``, cut to ``longest`` characters where it has more, visibly."""
+    return text if len(text) <= longest else f"{text[: longest - 1]}…"
+
+
+def check_name(field: str, value: str) -> None:
+    """Raise `ValueError` unless ``value`` is a valid node, task or fleet name."""
+    if NAME.fullmatch(value) is None:
+        raise ValueError(f"{field}: {value!r} is not a name ([a-z0-9][a-z0-9_-]{{0,62}})")
+
+
+def check_range(field: str, value: float | None, low: float, high: float) -> None:
+    """Raise `ValueError` unless ``low <= value <= high`` (``None``, "not measured", passes; NaN does not)."""
+    if value is not None and not low <= value <= high:
+        raise ValueError(f"{field}: {value!r} is not in [{low:g}, {high:g}]")
+
+
+def check_counter(field: str, value: int) -> None:
+    """Raise `ValueError` unless ``0 <= value <= MAX_COUNTER``."""
+    if not 0 <= value <= MAX_COUNTER:
+        check_range(field, value, 0, MAX_COUNTER)
+
+
+class NodeKind(StrEnum):
+    """What a node is: robots vote and have streams; edges are candidates only."""
+
+    ROBOT = "robot"
+    EDGE = "edge"
+
+
+class Aggregate(StrEnum):
+    """How a column of utilities (one per fresh voter) becomes one number (Eq. 5-6)."""
+
+    MEAN = "mean"
+    MEDIAN = "median"
+
+
+class ScoreForm(StrEnum):
+    """How a candidate's CPU and memory become a utility (`zsched.core.scheduler.utility`)."""
+
+    PAPER = "paper"  # Eq. 1, 2 and 4: what is left over, as shares of the machine, and their weighted sum
+    SERVICE = "service"  # which share of its work the task would get done, and a weighted product
+
+
+class Objective(StrEnum):
+    """What a task wants of its machine (`ScoreForm.SERVICE`)."""
+
+    SERVICE = "service"  # as many of its jobs done as possible
+    LATENCY = "latency"  # as many of them as possible done within a deadline
+
+
+# --- what an operator sets -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Weights:
+    """The weights of Eq. 4: each in [0, 1], their sum 1 (to 1e-6)."""
+
+    cpu: float
+    memory: float
+    network: float
+
+    def __post_init__(self) -> None:
+        for field in ("cpu", "memory", "network"):
+            check_range(f"weights.{field}", getattr(self, field), 0.0, 1.0)
+        total = self.cpu + self.memory + self.network
+        if not math.isclose(total, 1.0, abs_tol=1e-6):
+            raise ValueError(f"weights: the sum is {total:g}, not 1")
+
+
+MIN_DEADLINE_MS, MAX_DEADLINE_MS = 1.0, 3.6e6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tuning:
+    """What may be changed on the running fleet: agreed through the register like an allocation.
+
+    ``bonus`` is added to the owner's aggregate (APPLY_COST of Alg. 2), in utility units [0, 1];
+    ``time_to_trigger_s`` is how long another candidate must lead; ``cool_down_s`` the least stay after a move.
+    """
+
+    weights: Weights
+    bonus: float = 0.10
+    time_to_trigger_s: float = 2.0
+    cool_down_s: float = 10.0
+    aggregate: Aggregate = Aggregate.MEAN
+    score: ScoreForm = ScoreForm.PAPER
+    deadline_ms: float | None = None
+    """`Objective.LATENCY`: a job that takes longer from input to output, network included, comes too late. ``None``:
+    `Objective.SERVICE`. `ScoreForm.PAPER` knows no deadlines."""
+
+    @property
+    def objective(self) -> Objective:
+        """What a machine is judged by."""
+        return Objective.SERVICE if self.deadline_ms is None else Objective.LATENCY
+
+    def __post_init__(self) -> None:
+        check_range("deadline_ms", self.deadline_ms, MIN_DEADLINE_MS, MAX_DEADLINE_MS)
+        check_range("bonus", self.bonus, 0.0, 1.0)
+        check_range("time_to_trigger_s", self.time_to_trigger_s, 0.0, 3600.0)
+        check_range("cool_down_s", self.cool_down_s, 0.0, 86400.0)
+
+
+# --- PROFILE ---------------------------------------------------------------------------------------------------------
+
+
+class LinkSource(StrEnum):
+    """Where a link's figure comes from; status shows it."""
+
+    NL80211 = "nl80211"
+    WIRELESS = "wireless"  # /proc/net/wireless
+    WIRED = "wired"
+    FIXED = "fixed"
+    TRACE = "trace"
+
+
+RSSI_MIN_DBM, RSSI_MAX_DBM = -120.0, 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Link:
+    """One radio or wired link as its node measures it.
+
+    ``peer`` is the node at the other end, or ``None`` for "the way to everybody" (the access point, the cable).
+    ``rssi_dbm`` is the smoothed signal in dBm, ``None`` when not measured; a wired link has none and counts 1.
+    """
+
+    source: LinkSource
+    peer: NodeId | None = None
+    rssi_dbm: float | None = None
+    bitrate_mbps: float | None = None
+    retry_ratio: float | None = None
+    trend_db_s: float | None = None
+    """How fast the smoothed signal changes, dB per second; ``None``: not known."""
+
+    def __post_init__(self) -> None:
+        if self.peer is not None:
+            check_name("link.peer", self.peer)
+        check_range("link.rssi_dbm", self.rssi_dbm, RSSI_MIN_DBM, RSSI_MAX_DBM)
+        check_range("link.trend_db_s", self.trend_db_s, -MAX_TREND_DB_S, MAX_TREND_DB_S)
+        check_range("link.bitrate_mbps", self.bitrate_mbps, 0.0, MAX_BITRATE_MBPS)
+        check_range("link.retry_ratio", self.retry_ratio, 0.0, 1.0)
+
+
+class WorkerState(StrEnum):
+    """A worker process as its supervisor (and its token) show it."""
+
+    STOPPED = "stopped"  # startable: a cold standby, or between restarts
+    STARTING = "starting"
+    READY = "ready"
+    FAILED = "failed"  # too many failures in the window, or it said that it cannot: the node is not eligible
+
+
+NEVER_INITIALISED = "never initialised"
+"""How the problem begins of a fleet in which no elector has a state, and nobody remembers one."""
+WAS_READY = "was ready until "
+"""So a reason begins that is one of a worker which is not ready any more: it is starting only for its supervisor."""
+
+RESTARTING = "restarting"
+"""So a reason begins that is one of a worker which has failed, and is or will be started again."""
+
+
+def told_of_worker(state: WorkerState, reason: str) -> str:
+    """How a worker is, to be said behind its name."""
+    if state is not WorkerState.READY and reason.startswith(WAS_READY):
+        return reason
+    if state is not WorkerState.READY and reason.startswith(RESTARTING):
+        return f"is {reason}"
+    return f"is {state}{': ' if reason else ''}{reason}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Jobs:
+    """What a worker says of its own jobs, smoothed (`zsched.core.profile.jobs`).
+
+    A job is one input sample, and its callback. Times are seconds per job, means over the jobs that were done; rates
+    are jobs per second.
+    """
+
+    time_s: float
+    """From the beginning of a job to its end."""
+    cpu_s: float
+    """CPU time of a job, in all threads that work on it."""
+    wait_s: float | None = None
+    """Of ``time_s``, what its thread waited for a CPU; ``None``: the kernel does not tell, or several threads work."""
+    age_s: float | None = None
+    """From a job's arrival to its end, the wait for its turn included; ``None``: not told."""
+    done_hz: float = 0.0
+    wanted_hz: float = 0.0
+    """Done, and left undone: skipped for something newer, or added to those that wait."""
+    backlog: int = 0
+    """So many wait for their turn."""
+    late_ratio: float | None = None
+    """Share of the done ones that took longer than the task's deadline from arrival to end; ``None``: it has none."""
+
+    def __post_init__(self) -> None:
+        for name in ("time_s", "cpu_s", "wait_s", "age_s"):
+            check_range(f"jobs.{name}", getattr(self, name), 0.0, MAX_JOB_S)
+        for name in ("done_hz", "wanted_hz"):
+            check_range(f"jobs.{name}", getattr(self, name), 0.0, MAX_JOBS_HZ)
+        check_counter("jobs.backlog", self.backlog)
+        check_range("jobs.late_ratio", self.late_ratio, 0.0, 1.0)
+
+    @property
+    def done_ratio(self) -> float | None:
+        """Share of the wanted jobs that are done, in [0, 1]; ``None`` while none is wanted."""
+        return min(self.done_hz / self.wanted_hz, 1.0) if self.wanted_hz > 0.0 else None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorkerLoad:
+    """One task's worker on one node: its state and what its process tree uses now (cores, MiB)."""
+
+    task: TaskId
+    state: WorkerState
+    cpu_cores: float | None = None
+    memory_mb: float | None = None
+    wanted_cores: float | None = None
+    """The most that it would use alone, where threads of it always want to run; ``None``: none does, or unknown."""
+    reason: str = ""
+    """Why it is not ready, or what is wrong with it though it is; at most `MAX_REASON` characters."""
+    jobs: Jobs | None = None
+    """What it says of its jobs; ``None``: nothing, or it has none."""
+
+    def __post_init__(self) -> None:
+        check_name("worker.task", self.task)
+        if len(self.reason) > MAX_REASON:
+            raise ValueError(f"worker.reason: {len(self.reason)} characters, at most {MAX_REASON}")
+        check_range("worker.cpu_cores", self.cpu_cores, 0.0, MAX_CPU_CORES)
+        check_range("worker.memory_mb", self.memory_mb, 0.0, MAX_MEMORY_MB)
+        check_range("worker.wanted_cores", self.wanted_cores, 0.0, MAX_CPU_CORES)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TaskProgress:
+    """What a robot sees of a task with `output_deadline_s`: do its inputs of ``epoch`` lead to outputs?"""
+
+    task: TaskId
+    epoch: int
+    is_served: bool
+
+    def __post_init__(self) -> None:
+        check_name("progress.task", self.task)
+        check_counter("progress.epoch", self.epoch)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DeviceSample:
+    """One raw reading of this machine by the device profiler.
+
+    ``cpu_cores`` is what may be used (cgroup quota or number of CPUs), ``cpu_used_cores`` what was in use since the
+    previous sample (``None`` on the first: there is nothing to compare with), memory in MiB, ``*_used`` including
+    everything that is not available (total - MemAvailable, or the cgroup's working set against its limit).
+    ``workers`` holds one load per supervised worker (state as the supervisor knows it).
+    """
+
+    cpu_cores: float
+    cpu_used_cores: float | None
+    memory_mb: float
+    memory_used_mb: float | None
+    workers: tuple[WorkerLoad, ...] = ()
+    speed: float | None = None
+    """How fast one of its cores is; ``None``: not measured."""
+    cpu_pressure: float | None = None
+    """Share of the time since the last sample in which some process wanted a CPU and had none; ``None``: not known."""
+    runnable: float | None = None
+    """Threads that run or wait to run just now, the profiler's own left out; ``None``: not to be told."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkSample:
+    """One raw reading of one link by a network profiler: what was read, before outliers are dropped and smoothed."""
+
+    source: LinkSource
+    peer: NodeId | None = None
+    rssi_dbm: float | None = None
+    bitrate_mbps: float | None = None
+    retry_ratio: float | None = None
+
+
+MAX_HELD_S = 3600.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Echo:
+    """The newest profile that the sender has of another node, and how long it has held it."""
+
+    node: NodeId
+    incarnation: int
+    sequence: int
+    held_s: float
+
+    def __post_init__(self) -> None:
+        check_name("echo.node", self.node)
+        check_counter("echo.incarnation", self.incarnation)
+        check_counter("echo.sequence", self.sequence)
+        check_range("echo.held_s", self.held_s, 0.0, MAX_HELD_S)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Profile:
+    """The smoothed state of a node that goes to every robot's gateway (Alg. 1: beta, mu, lambda).
+
+    CPU in cores: ``cpu_cores`` is Eq. 1's gamma, ``cpu_used_cores`` its beta. Memory in MiB: ``memory_mb`` is Eq. 2's
+    delta, ``memory_used_mb`` its mu. ``links`` are Eq. 3's lambda.
+    """
+
+    node: NodeId
+    incarnation: int
+    sequence: int
+    cpu_cores: float
+    cpu_used_cores: float | None
+    memory_mb: float
+    memory_used_mb: float | None
+    links: tuple[Link, ...] = ()
+    workers: tuple[WorkerLoad, ...] = ()
+    draining: bool = False
+    progress: tuple[TaskProgress, ...] = ()
+    """Robots: the watched tasks that answer here, or do not although inputs flow."""
+    speed: float | None = None
+    """How fast one of its cores is, beside the reference (`zsched.adapters.speed`); ``None``: not measured."""
+    cpu_pressure: float | None = None
+    """Share of the time in which some process wanted a CPU and had none (PSI "some"); ``None``: not measured."""
+    echoes: tuple[Echo, ...] = ()
+    """Which profiles of others the node has, where a task has a deadline (`zsched.core.gateway.round_trips`)."""
+    runnable: float | None = None
+    """Threads that run or wait to run, on the mean: what a task would share a full machine with; ``None``: unknown."""
+    relay: str = ""
+    """What is wrong with its relay (`zsched.core.profile.relay_ends`); at most `MAX_REASON` long; empty: nothing."""
+
+    def __post_init__(self) -> None:
+        check_name("profile.node", self.node)
+        check_counter("profile.incarnation", self.incarnation)
+        check_counter("profile.sequence", self.sequence)
+        check_range("profile.cpu_cores", self.cpu_cores, 0.001, MAX_CPU_CORES)
+        check_range("profile.cpu_used_cores", self.cpu_used_cores, 0.0, MAX_CPU_CORES)
+        check_range("profile.memory_mb", self.memory_mb, 1.0, MAX_MEMORY_MB)
+        check_range("profile.memory_used_mb", self.memory_used_mb, 0.0, MAX_MEMORY_MB)
+        check_range("profile.speed", self.speed, MIN_SPEED, MAX_SPEED)
+        check_range("profile.cpu_pressure", self.cpu_pressure, 0.0, 1.0)
+        check_range("profile.runnable", self.runnable, 0.0, MAX_RUNNABLE)
+        if len(self.relay) > MAX_REASON:
+            raise ValueError(f"profile.relay: {len(self.relay)} characters, at most {MAX_REASON}")
+
+    def worker(self, task: TaskId) -> WorkerLoad | None:
+        """The load of ``task``'s worker on this node, or ``None`` when the node runs none."""
+        for load in self.workers:
+            if load.task == task:
+                return load
+        return None
+
+    def cores_of(self, task: TaskId) -> float:
+        """What ``task``'s worker uses on this node; 0 where the node runs none, or has not measured it."""
+        load = self.worker(task)
+        return 0.0 if load is None else load.cpu_cores or 0.0
+
+
+# --- SCHEDULER -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Utility:
+    """What one robot thinks of one candidate: Eq. 4 and its terms, each in [0, 1] or absent (nobody measured it)."""
+
+    candidate: NodeId
+    value: float
+    cpu: float | None = None
+    memory: float | None = None
+    network: float | None = None
+    reachable: bool = True
+
+    def __post_init__(self) -> None:
+        check_name("utility.candidate", self.candidate)
+        check_range("utility.value", self.value, 0.0, 1.0)
+        check_range("utility.cpu", self.cpu, 0.0, 1.0)
+        check_range("utility.memory", self.memory, 0.0, 1.0)
+        check_range("utility.network", self.network, 0.0, 1.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UtilityVector:
+    """One robot's utilities of a task's candidates, in the candidates' order, under the tuning of ``revision``."""
+
+    voter: NodeId
+    task: TaskId
+    revision: int
+    utilities: tuple[Utility, ...]
+    refused: tuple[tuple[NodeId, str], ...] = ()
+    """Candidates this voter did not score, each with its reason."""
+    penalties: tuple[tuple[NodeId, float], ...] = ()
+    """What this voter remembers against nodes, each in [0, 1] (`zsched.core.scheduler.damping`)."""
+
+    def __post_init__(self) -> None:
+        check_name("vector.voter", self.voter)
+        check_name("vector.task", self.task)
+        check_counter("vector.revision", self.revision)
+        for _, penalty in self.penalties:
+            check_range("vector.penalties", penalty, 0.0, 1.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Proposal:
+    """One robot's ballot paper in Alg. 3: who should own ``task``, judged at ``base_revision``.
+
+    ``aggregate`` is the joint utility that the robot computed for the candidate (a tie-break, rounded to 1/256);
+    ``is_escape`` says that the robot holds the owner for gone, not ready or below its floor.
+    """
+
+    voter: NodeId
+    task: TaskId
+    base_revision: int
+    candidate: NodeId
+    aggregate: float
+    is_escape: bool = False
+    reason: str = ""
+
+    def __post_init__(self) -> None:
+        check_name("proposal.voter", self.voter)
+        check_name("proposal.task", self.task)
+        check_name("proposal.candidate", self.candidate)
+        check_counter("proposal.base_revision", self.base_revision)
+        check_range("proposal.aggregate", self.aggregate, 0.0, 2.0)
+
+
+# --- VOTE: the register ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Allocation:
+    """The register's value: who owns the task, and how it is tuned.
+
+    ``revision`` rises by one with every change, ``epoch`` only when ``owner`` changes. Revision 0 is "nothing agreed
+    yet": no owner, the fleet file's tuning.
+    """
+
+    task: TaskId
+    revision: int
+    epoch: int
+    owner: NodeId | None
+    tuning: Tuning
+    pinned: bool = False
+    paused: bool = False
+    leased: bool = False
+    """The task is exclusive for everybody, whatever their files say: nobody works without a lease any more."""
+
+    def __post_init__(self) -> None:
+        check_name("allocation.task", self.task)
+        check_counter("allocation.revision", self.revision)
+        check_counter("allocation.epoch", self.epoch)
+        if self.owner is not None:
+            check_name("allocation.owner", self.owner)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, order=True)
+class Ballot:
+    """A proposer's attempt, totally ordered by (counter, node, incarnation)."""
+
+    counter: int
+    node: NodeId
+    incarnation: int
+
+    def __post_init__(self) -> None:
+        check_counter("ballot.counter", self.counter)
+        check_counter("ballot.incarnation", self.incarnation)
+        if self.node:
+            check_name("ballot.node", self.node)
+
+
+NO_BALLOT = Ballot(counter=0, node="", incarnation=0)
+"""Lower than every real ballot."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Acceptance:
+    """What an elector has accepted: a value under a ballot."""
+
+    ballot: Ballot
+    value: Allocation
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RegisterState:
+    """The durable part of one task's register on one node; written before any answer leaves."""
+
+    task: TaskId
+    promised: Ballot = NO_BALLOT
+    accepted: Acceptance | None = None
+    learnt: Allocation | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DurableState:
+    """Everything a node keeps across restarts (one file, `zsched.adapters.host.state_file`)."""
+
+    fleet: str
+    node: NodeId
+    incarnation: int
+    generation: int
+    hardware: str
+    electorate: str
+    registers: tuple[RegisterState, ...] = ()
+    voted: tuple[NodeId, ...] = ()
+    """Electors that this node has heard to have voted: such a name must not be initialised anew."""
+    disputed: str = ""
+    """Why this node stands down as elector until the operator settles it; empty: it does not."""
+    lease_s: float = 0.0
+    """How long a lease may last that this elector granted in a life before (its file may have said another length)."""
+    votes: int = 0
+    """How many promises and acceptances this elector has ever given."""
+    seen: tuple[tuple[NodeId, int, int], ...] = ()
+    """(elector, incarnation, votes), as others answered: they may lose their state (`zsched.core.vote.witness`)."""
+    lost: str = ""
+    """Why this state is older than what others have seen of it; empty: it is not."""
+
+
+# --- membership ------------------------------------------------------------------------------------------------------
+
+
+class PeerState(StrEnum):
+    """A peer as this node sees it."""
+
+    UNKNOWN = "unknown"  # configured, never heard
+    ALIVE = "alive"
+    SUSPECT = "suspect"  # silent, or its token went, but in grace
+    GONE = "gone"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Grant:
+    """An exclusive task's lease in numbers: beat ``number`` of ``owner``'s life ``incarnation``, working in ``epoch``.
+
+    In an elector's beat it is the grant (an echo); in the owner's, a release of all numbers up to this one.
+    """
+
+    task: TaskId
+    owner: NodeId
+    incarnation: int
+    epoch: int
+    number: int
+
+    def __post_init__(self) -> None:
+        check_name("grant.task", self.task)
+        check_name("grant.owner", self.owner)
+        check_counter("grant.incarnation", self.incarnation)
+        check_counter("grant.epoch", self.epoch)
+        check_counter("grant.number", self.number)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Beat:
+    """The heartbeat, sent from the decision loop itself (a wedged loop stops it; zenoh's own keep-alives go on)."""
+
+    node: NodeId
+    incarnation: int
+    sequence: int
+    loop_lag_s: float
+    learnt: tuple[tuple[TaskId, int, int], ...] = ()
+    """(task, revision, epoch) of every value this node has learnt."""
+    suspects: tuple[NodeId, ...] = ()
+    """Whom this node suspects or holds for gone: the second observer's word."""
+    echoes: tuple[Grant, ...] = ()
+    """Exclusive tasks: what this elector grants."""
+    released: tuple[Grant, ...] = ()
+    """Exclusive tasks: what this owner has given back."""
+    asked_to_leave: tuple[tuple[TaskId, NodeId, int], ...] = ()
+    """(task, owner, epoch): this elector has refused another owner for their sake."""
+    fleet_file: str = ""
+    """Hash of the fleet file that this node goes by."""
+    has_voted: bool = False
+    """Whether this elector has ever promised anything."""
+    generation: int = 0
+    """Of this node's state; what nodes of another generation have learnt means nothing here."""
+    lease_terms: str = ""
+    """What this node's leases hang on; an echo under other terms is none."""
+    has_lost_state: bool = False
+    """This node is in the electorate and answers no proposer: its state is lost, disputed or cannot be written."""
+
+    votes: int = 0
+    """How many promises and acceptances this elector has ever given."""
+
+    electorate: str = ""
+    """Hash of the electors that this elector counts with, and its generation; empty: it answers no proposer."""
+    twins: tuple[NodeId, ...] = ()
+    """Names that this node hears two daemons of; who is one of them asks."""
+
+    def __post_init__(self) -> None:
+        check_name("beat.node", self.node)
+        check_counter("beat.votes", self.votes)
+        check_counter("beat.incarnation", self.incarnation)
+        check_counter("beat.sequence", self.sequence)
+        check_range("beat.loop_lag_s", self.loop_lag_s, 0.0, 86400.0)
+        check_counter("beat.generation", self.generation)

@@ -1,0 +1,220 @@
+"""The frozen values that pass between the executor, the route stage and the relay process.
+
+Knows: streams, routes, slots, plans, roles, counters. Does not know: zenoh, pipes, or why a task moved.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from zsched.core.values.model import NodeId, TaskId, check_range
+
+
+class Direction(StrEnum):
+    """Inputs go from the robot's applications to the owner's worker, outputs come back; services are asked."""
+
+    INPUT = "input"
+    OUTPUT = "output"
+    SERVICE = "service"
+
+
+class StreamClass(StrEnum):
+    """What a stream needs (design: classes of streams)."""
+
+    BEST_EFFORT = "best_effort"
+    LATEST = "latest"
+    RELIABLE = "reliable"
+
+
+class HandoverRule(StrEnum):
+    """When an output switches to the new owner: at its first sample, or after the old one's last."""
+
+    LATEST = "latest"
+    ALL = "all"
+
+
+class OnCrash(StrEnum):
+    """Inputs of class ``reliable``: what becomes of samples that an owner had not acknowledged when it died."""
+
+    REPORT = "report"  # they are counted: each is done at most once
+    REPLAY = "replay"  # the next owner gets them: each is done at least once
+
+
+class RosGraph(StrEnum):
+    """In which ROS graph a stream's endpoints are announced (`zsched.core.route.ros2`)."""
+
+    NONE = "none"
+    RMW_ZENOH = "rmw_zenoh"
+    ROS2DDS = "ros2dds"
+
+
+class ReadyWhen(StrEnum):
+    """How the relay knows that a worker can take its inputs."""
+
+    TOKEN = "token"  # zsched.worker's liveliness token on the data session
+    MATCHING = "matching"  # a foreign worker: a subscriber matches
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StreamSettings:
+    """How one stream is carried."""
+
+    stream_class: StreamClass = StreamClass.BEST_EFFORT
+    keep_last: int = 1
+    """Samples kept per key and replayed to a new owner (class ``latest``), 0..1000."""
+    depth: int = 16
+    """Bounded queue between subscriber and publisher, 1..100000 samples."""
+    handover: HandoverRule = HandoverRule.LATEST
+    max_hz: float | None = None
+    """Highest rate per key that goes on, Hz, 0.01..10000; the rest is dropped, the newest of class ``latest`` never."""
+    mirror: bool = False
+    """Inputs: until the old slot closes, both owners are fed (outputs with handover ``latest`` only)."""
+    graph: RosGraph = RosGraph.NONE
+    """Set by the fleet file's `ros2:` sections."""
+    on_crash: OnCrash = OnCrash.REPORT
+
+    def __post_init__(self) -> None:
+        check_range("keep_last", self.keep_last, 0, 1000)
+        check_range("depth", self.depth, 1, 100_000)
+        if self.max_hz is not None:
+            check_range("max_hz", self.max_hz, 0.01, 10_000)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServiceSettings:
+    """How the requests of one service are carried."""
+
+    retry: bool = False
+    """Ask the next owner when the old one did not answer: the work may then be done twice."""
+    timeout_s: float = 10.0
+    """A request is answered within this time, with an error if need be; 0.05..3600."""
+    hold_s: float = 3.0
+    """A request that nobody has taken waits so long for an owner, 0..3600 (with `retry`: as long as its time lasts).
+
+    The default is what a killed owner's takeover may take at most with the profile ``wifi``, 1.8 s, and an exclusive
+    task's lease on top (docs/timing.md).
+    """
+    max_pending: int = 16
+    """Requests at the owner at one time, 1..256; the next one is answered "busy"."""
+
+    def __post_init__(self) -> None:
+        check_range("timeout_s", self.timeout_s, 0.05, 3600.0)
+        check_range("hold_s", self.hold_s, 0.0, 3600.0)
+        check_range("max_pending", self.max_pending, 1, 256)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Route:
+    """One stream of one robot for one owner, with every placeholder filled in (concrete key expressions)."""
+
+    stream: str
+    """Stable name of the rule on this node, e.g. ``map_merge/in/0``: counters and kept values hang on it."""
+    direction: Direction
+    from_expr: str
+    to_expr: str
+    settings: StreamSettings
+    service: ServiceSettings = ServiceSettings()
+    """Services only."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Slot:
+    """The routes of one task towards one owner in one epoch."""
+
+    epoch: int
+    owner: NodeId
+    routes: tuple[Route, ...]
+    ready_when: ReadyWhen
+
+
+class RoutePhase(StrEnum):
+    """How far the handover to `RoutePlan.current` may go (the executor's table decides, the relay obeys)."""
+
+    PREPARE = "prepare"  # open the new slot, watch for readiness; the old slot still carries the streams
+    FLIP = "flip"  # warm up and switch; the old slot drains
+    CLOSE = "close"  # drop every old slot
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RoutePlan:
+    """What this node's relay shall do for one task; the newest plan of a task replaces the previous one whole.
+
+    ``predecessors`` are the slots that were left and have not drained, the oldest first, and last the one that carries
+    until the flip. The relay closes every slot that the plan does not name.
+    """
+
+    task: TaskId
+    phase: RoutePhase
+    current: Slot | None
+    predecessors: tuple[Slot, ...] = ()
+    exclusive: bool = False
+    """What the owner puts out must not pass while nobody here would hear of another owner."""
+
+
+class WorkerRole(StrEnum):
+    """What a worker is told to be."""
+
+    IDLE = "idle"
+    ACTIVE = "active"
+    DRAINING = "draining"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Role:
+    """The role of this node's worker for one task; ``epoch`` is 0 while idle.
+
+    ``predecessor`` is the owner of the epoch before, whose worker may still have a snapshot of its state; ``None`` when
+    there was none, or it is known to be gone.
+
+    ``lease_until_s`` is set for exclusive tasks only: the worker publishes nothing from then on (seconds of this
+    machine's CLOCK_BOOTTIME; 0: it has no lease yet).
+    """
+
+    task: TaskId
+    role: WorkerRole
+    epoch: int = 0
+    lease_until_s: float | None = None
+    predecessor: NodeId | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StreamCount:
+    """Counters of one stream since the relay started."""
+
+    stream: str
+    messages: int = 0
+    bytes: int = 0
+    drops: tuple[tuple[str, int], ...] = ()
+    """(reason, count): ``overflow``, ``no_route``, ``stale_epoch``, ``loop``, ``stalled``..."""
+    dropped_s: float | None = None
+    """Filled in by the status: seconds since the drops last rose."""
+    last_seen_s: float | None = None
+    """Seconds since the newest message, ``None`` before the first."""
+    acknowledged: int | None = None
+    """Inputs: samples that workers have processed; ``None``: no worker counts them (a foreign one)."""
+    in_flight: int | None = None
+    """Inputs: samples taken and not processed yet: they wait here, or were sent and are not acknowledged."""
+    lost: int = 0
+    """Numbers that never came over the numbered hop."""
+    doubled: int = 0
+    """Numbers that came twice and were dropped."""
+    reordered: int = 0
+    """Numbers that came behind newer ones and were dropped."""
+    replayed: int = 0
+    """Kept values sent once more to a new owner, and samples sent again for want of an acknowledgement, or after a
+    crash (`OnCrash.REPLAY`)."""
+    at_most_lost: int = 0
+    """Inputs: in flight to workers that died, so at most so many had no result."""
+    repeated: int = 0
+    """Inputs: samples that were given to one more receiver: kept values and mirrors."""
+    unsent: int = 0
+    """Inputs of class ``latest``: values that came while there was no owner; the newest are kept for the next one."""
+    unconfirmed: int = 0
+    """Inputs: sent to a worker that acknowledges nothing (a foreign one): nobody knows what came of them."""
+    answer_s: float | None = None
+    """Outputs: mean seconds from inputs to their answers since the count before, network included. An answer without
+    its input's timestamp counts since the newest input before it, so it took at least so long."""
+    from_expr: str = ""
+    """Filled in by the status: the keys of the newest slot, empty while the task has no owner."""
+    to_expr: str = ""

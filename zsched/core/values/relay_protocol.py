@@ -1,0 +1,244 @@
+"""The frozen values that only the relay's pipe and the streams themselves carry.
+
+Knows: what the daemon and its relay tell each other beside plans, roles and the events of `zsched.core.events`; what an
+end marker says. Does not know: pipes, frames, zenoh.
+
+Commands (daemon to relay): `RoutePlan`, `Role`, `WorkerWatch`, `RelayStop`. Reports (relay to daemon): `RelayStarted`,
+`WorkerSeen`, `WorkerMatched`, `WorkerTrouble`, `WorkerJobs`, `SlotLost` and the events `SlotReady`, `SlotFlipped`,
+`SlotDrained`, `RoleEnded`, `StreamsCounted`, `ProblemReported`, `FrameDropped`. The handle adds `RelayChanged`. Between
+workers and relays: `WorkerTrouble`, `WorkerJobs`, `EndMarker`, `StreamAcks`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+from zsched.core.events import (
+    FrameDropped,
+    ProblemReported,
+    RelayChanged,
+    RoleEnded,
+    SlotDrained,
+    SlotFlipped,
+    SlotReady,
+    StreamsCounted,
+    WorkerJobs,
+)
+from zsched.core.values.model import MAX_REASON, NodeId, TaskId, check_counter, check_name
+from zsched.core.values.plan import Role, Route, RoutePlan
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RelayStop:
+    """Close everything and exit; the end of the pipe means the same."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RelayStarted:
+    """The relay's data session is open."""
+
+    pid: int
+    zid: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorkerSeen:
+    """A worker's token on the data network came (it is ready for its inputs) or went (``is_present`` false)."""
+
+    node: NodeId
+    task: TaskId
+    incarnation: str
+    is_present: bool
+
+    def __post_init__(self) -> None:
+        check_name("worker.node", self.node)
+        check_name("worker.task", self.task)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorkerWatch:
+    """A task's keys that do not depend on its owner; told once, when the daemon starts.
+
+    The first three are for a worker of this node that shows no token (`zsched.relay.matching`).
+    """
+
+    task: TaskId
+    inputs: tuple[str, ...] = ()
+    """What goes to the worker here, over all robots: one key expression per rule."""
+    strangers: tuple[str, ...] = ()
+    """The same for a node that cannot be: who subscribes to these as well is not the worker alone."""
+    services: tuple[tuple[str, ...], ...] = ()
+    """What the worker here is asked: per rule the key of every robot."""
+    standbys: tuple[Route, ...] = ()
+    """Robots: the inputs towards every candidate, to be announced in the ROS graph for warm workers to find."""
+    unowned: tuple[Route, ...] = ()
+    """Robots: the inputs towards nobody, taken from the start: what comes while there is no owner is counted."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorkerMatched:
+    """Whether somebody takes all that goes to this node's worker of the task, as far as zenoh tells."""
+
+    task: TaskId
+    is_matched: bool
+    is_certain: bool = True
+    """False: somebody else, who listens to everything, may be all that matches."""
+    missing: str = ""
+    """What nobody takes, in words."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorkerTrouble:
+    """The worker's own callbacks raise: a worker's word to its node's relay, and the relay's to the daemon."""
+
+    task: TaskId
+    incarnation: str
+    count: int
+    """How many of them have failed in this life."""
+    text: str
+    """The newest error, in one line."""
+
+    def __post_init__(self) -> None:
+        check_name("trouble.task", self.task)
+        check_counter("trouble.count", self.count)
+        if len(self.text) > MAX_REASON:
+            raise ValueError(f"trouble.text: {len(self.text)} characters, at most {MAX_REASON}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EndMarker:
+    """Behind a stream's last sample of ``epoch``: ``count`` samples went before it on this key (source number - 1).
+
+    With epoch 0 it ends nothing and is a *start marker*: no number below ``count`` will come any more.
+    """
+
+    epoch: int
+    count: int
+    replayed: int = 0
+    """Start markers: so many samples from ``count`` on may have gone to an earlier owner, which died."""
+    is_whole: bool = False
+    """Start markers: the stream is of class ``reliable``, every sample is wanted."""
+    had: int | None = None
+    """Start markers among answers: the numbers below this one an earlier life of the same relay has acknowledged;
+    ``None``: no other life of it is known."""
+    age_s: float | None = None
+    """Start markers among answers: number 0 was put so long ago."""
+    slot: int = 0
+    """Start markers of inputs: the epoch of the slot that this publisher feeds; 0: it does not say. Of class ``latest``
+    that is all such a marker says."""
+    is_given_up: bool = False
+    """Start markers of inputs: the slot is closed. What of this publisher has not been acknowledged is counted as lost
+    by now, or goes to another owner, and shall not be done any more."""
+
+    def __post_init__(self) -> None:
+        check_counter("end.epoch", self.epoch)
+        check_counter("end.count", self.count)
+        check_counter("end.slot", self.slot)
+        check_counter("end.replayed", self.replayed)
+        check_counter("end.had", self.had or 0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SnapshotChunk:
+    """Beside each piece of a worker's snapshot: its place, and by what the whole is known (blake2s, 16 bytes, hex)."""
+
+    index: int
+    count: int
+    size: int
+    checksum: str
+
+    def __post_init__(self) -> None:
+        for name in ("index", "count", "size"):
+            check_counter(f"snapshot.{name}", getattr(self, name))
+
+
+ERROR_ENCODING: Final = "text/plain;zsched.error"
+"""Of an error reply that zsched gives in place of the owner's answer."""
+REFUSED_ENCODING: Final = "text/plain;zsched.refused"
+"""Of a worker's word that it is not the owner and has done nothing."""
+
+
+SKIP_ENCODING: Final = "application/zsched.skip"
+"""Of an end marker among answers that are sent again: no number below its count is kept any more."""
+
+
+class ServiceProblem(StrEnum):
+    """Why a request was not answered: the first words of an error reply."""
+
+    BUSY = "busy"
+    NO_OWNER = "no owner"
+    OWNER_GONE = "owner gone"
+    MOVED = "moved"
+    TIMEOUT = "timeout"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StreamAck:
+    """What a worker has had of one publisher of a relay, or a relay of a worker's; the hop's numbers are 0, 1, 2..."""
+
+    eid: int
+    """The publisher's entity id in the sender's session."""
+    first: int
+    """The first number the receiver has seen."""
+    arrived: int
+    """The number it waits for: everything from `first` up to it has come, or is given up."""
+    processed: int
+    """Everything below this number is processed (or gave way to something newer)."""
+    lost: int = 0
+    doubled: int = 0
+    reordered: int = 0
+    has_gap: bool = False
+    """Something newer than `arrived` has come and cannot go on yet: it wants the rest again..."""
+    until: int = 0
+    """...up to this number, which it has; 0: it has kept nothing newer."""
+    is_ended: bool = False
+    """The end marker has come."""
+    has_left: bool = False
+    """The receiver wants nothing more of it: nobody need wait until it has the rest."""
+    is_whole: bool | None = None
+    """A worker's: what a start marker has told it of the stream's class (`EndMarker.is_whole`); ``None``: nothing."""
+    replays: int = 0
+    """A worker's: so many numbers from `arrived` on it takes for replays, by a start marker."""
+
+    def __post_init__(self) -> None:
+        for name in ("eid", "first", "arrived", "processed", "lost", "doubled", "reordered", "until", "replays"):
+            check_counter(f"ack.{name}", getattr(self, name))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StreamAcks:
+    """A receiver's acknowledgements for one session, those that changed."""
+
+    acks: tuple[StreamAck, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SlotLost:
+    """A slot closed, or its worker restarted, with samples not acknowledged: at most so many had no result."""
+
+    task: TaskId
+    epoch: int
+    owner: NodeId
+    samples: int
+
+
+RelayCommand = RoutePlan | Role | WorkerWatch | RelayStop
+RelayReport = (
+    RelayStarted
+    | WorkerSeen
+    | WorkerMatched
+    | WorkerTrouble
+    | WorkerJobs
+    | FrameDropped
+    | SlotReady
+    | SlotFlipped
+    | SlotDrained
+    | SlotLost
+    | RoleEnded
+    | StreamsCounted
+    | ProblemReported
+)
+HandleReport = RelayReport | RelayChanged
+"""What `zsched.adapters.relay.streams.RelayHandle` hands to the daemon."""

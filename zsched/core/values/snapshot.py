@@ -1,0 +1,151 @@
+"""The status of a node as frozen values: what `zsched status` shows, and nothing that it does not.
+
+Knows: the fields of the schema ``zsched.status/1``. Does not know: tables, colours, JSON.
+
+Fields are only ever added within a major version of the schema. Times are ages in seconds at the moment of the answer
+(clocks of two machines are never compared).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from zsched.core.values.model import Link, NodeId, TaskId, Tuning, Utility, WorkerLoad
+from zsched.core.values.plan import StreamCount
+
+SCHEMA = "zsched.status/1"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NodeStatus:
+    """One node as the answering node sees it; ratios in [0, 1], ``None`` when not measured."""
+
+    name: NodeId
+    kind: str
+    state: str
+    age_s: float | None
+    """Age of its newest profile."""
+    incarnation: int | None = None
+    cpu_cores: float | None = None
+    cpu_used_cores: float | None = None
+    cpu_ratio: float | None = None
+    memory_mb: float | None = None
+    memory_used_mb: float | None = None
+    memory_ratio: float | None = None
+    links: tuple[Link, ...] = ()
+    workers: tuple[WorkerLoad, ...] = ()
+    draining: bool = False
+    speed: float | None = None
+    """How fast one of its cores is."""
+    cpu_pressure: float | None = None
+    """Share of the time in which some process lacked a CPU (PSI)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DecisionStatus:
+    """The last round of one task at this robot."""
+
+    outcome: str
+    """``stay``, ``wait`` (a better one, not long enough), ``propose`` (a vote was called), ``none`` (nobody scored)."""
+    winner: NodeId | None
+    reason: str
+    age_s: float
+    aggregates: tuple[tuple[NodeId, float], ...] = ()
+    """Joint utility per candidate, the owner's with its bonus."""
+    utilities: tuple[tuple[NodeId, tuple[Utility, ...]], ...] = ()
+    """(voter, its utilities)."""
+    vetoed: tuple[tuple[NodeId, str], ...] = ()
+    penalties: tuple[tuple[NodeId, float], ...] = ()
+    """What nodes that failed or were left often pay, in utility units."""
+    silent: tuple[NodeId, ...] = ()
+    """Robots whose utilities did not come in time."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VoteStatus:
+    """The last vote of one task that this node heard: who proposed whom, and what came out."""
+
+    base_revision: int
+    votes: tuple[tuple[NodeId, NodeId], ...]
+    outcome: str
+    winner: NodeId | None
+    age_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PastAllocation:
+    """One allocation that this node has learnt since it started."""
+
+    epoch: int
+    revision: int
+    owner: NodeId | None
+    age_s: float
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TaskStatus:
+    """One task as this node sees it."""
+
+    name: TaskId
+    owner: NodeId | None
+    epoch: int
+    revision: int
+    since_s: float | None
+    """Seconds since this node learnt the current owner."""
+    owner_state: str
+    phase: str
+    """The handover's phase on this node: ``idle``, ``preparing``, ``flipping``, ``draining``, ``settled``."""
+    tuning: Tuning
+    candidates: tuple[NodeId, ...]
+    decision: DecisionStatus | None = None
+    vote: VoteStatus | None = None
+    streams: tuple[StreamCount, ...] = ()
+    history: tuple[PastAllocation, ...] = ()
+    problems: tuple[str, ...] = ()
+    patience: float | None = None
+    """Utility seconds that staying may cost; ``None``: the tuning's time-to-trigger counts."""
+    round_trips: tuple[tuple[NodeId, float], ...] = ()
+    """(node, seconds from the answering node to it and back), of a task with a deadline."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class QuorumStatus:
+    """Whether a change could be committed now, as far as this node knows."""
+
+    electors: int
+    needed: int
+    alive: int
+    """Electors that are alive, have their state, and are not apart."""
+    ok: bool
+    this_node: str
+    """``elector``, ``no_elector`` (not in the electorate), ``lost_state`` or ``other_electorate`` (its state is)."""
+    voted: tuple[NodeId, ...] = ()
+    """Electors that this node knows to have voted (they must not be initialised anew)."""
+    stateless: tuple[NodeId, ...] = ()
+    """Electors that have lost their state, as they say themselves; also of those that are not alive any more."""
+    apart: tuple[NodeId, ...] = ()
+    """Electors of another generation, or with other electors in their file: they and this node refuse each other."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Snapshot:
+    """The whole answer."""
+
+    schema: str
+    version: str
+    fleet: str
+    node: NodeId
+    kind: str
+    incarnation: int
+    up_s: float
+    loop_lag_s: float
+    quorum: QuorumStatus
+    nodes: tuple[NodeStatus, ...]
+    tasks: tuple[TaskStatus, ...]
+    fleet_file: str = ""
+    """Hash of the fleet file that the answering node goes by."""
+    joins_at: tuple[str, ...] = ()
+    """Where applications on this machine join its streams: zenoh endpoints for a client to dial."""
+    counters: tuple[tuple[str, int], ...] = ()
+    problems: tuple[str, ...] = ()

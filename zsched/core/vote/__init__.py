@@ -1,0 +1,1 @@
+"""Stage 4: votes, the register and the lease."""

@@ -1,0 +1,132 @@
+"""VOTE, a node's blank state: what speaks against it, and what it holds of each task in a new generation.
+
+Knows: what the state before says, and what the fleet answers. Does not know: disks, how anybody is asked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from zsched.core.values.fleet import Fleet, electorate_hash
+from zsched.core.values.model import NO_BALLOT, Acceptance, Allocation, DurableState, NodeId, RegisterState
+from zsched.core.values.snapshot import Snapshot
+from zsched.core.vote.belief import GENERATION_STEP
+
+
+def first_registers(fleet: Fleet, generation: int, before: Iterable[RegisterState]) -> tuple[RegisterState, ...]:
+    """The registers of a blank state of ``generation``; none for generation 0.
+
+    Accepted everywhere, too: a majority that had learnt a value and accepted none would count as one that forgot.
+    A task whose last owner, by the state ``before``, needed no lease is not leased from the start: it may still work.
+    """
+    if not generation:
+        return ()
+    unleased = {state.task for state in before if _is_unleased(state)}
+    values = (task.first_value(generation * GENERATION_STEP, is_new=task.name not in unleased) for task in fleet.tasks)
+    return tuple(
+        RegisterState(task=value.task, accepted=Acceptance(ballot=NO_BALLOT, value=value), learnt=value)
+        for value in values
+    )
+
+
+def _is_unleased(state: RegisterState) -> bool:
+    values: list[Allocation] = [] if state.learnt is None else [state.learnt]
+    values += [] if state.accepted is None else [state.accepted.value]
+    newest = max(values, key=lambda value: value.revision, default=None)
+    return newest is not None and not newest.leased and newest.revision > 0
+
+
+def blank_state(
+    fleet: Fleet, node: NodeId, generation: int, before: DurableState | None, *, incarnation: int, hardware: str
+) -> DurableState:
+    """What `zsched init` writes: this name has never voted, in ``generation``.
+
+    How long the leases were that the state ``before`` granted is kept: who was granted one may still work by it, and by
+    a file that says another length.
+    """
+    return DurableState(
+        fleet=fleet.name,
+        node=node,
+        incarnation=incarnation,
+        generation=generation,
+        hardware=hardware,
+        electorate=electorate_hash(fleet),
+        registers=first_registers(fleet, generation, () if before is None else before.registers),
+        lease_s=0.0 if before is None else before.lease_s,
+    )
+
+
+def way_out(generation: int) -> str:
+    """The steps that lead from any mix of states to a fleet of one generation, which agrees."""
+    return (
+        f"stop every daemon, run `zsched init --generation {generation} --force` on every node, "
+        "and start them when all have it"
+    )
+
+
+# --- what speaks against a blank state -------------------------------------------------------------------------------
+
+
+def generation_of(answer: Snapshot) -> int:
+    """The generation that a node goes by, as its status shows it: revisions of generation G start at G * 2^32."""
+    return max((task.revision for task in answer.tasks), default=0) // GENERATION_STEP
+
+
+def objection(
+    node: NodeId,
+    generation: int,
+    good: DurableState | None,
+    answers: Sequence[Snapshot],
+    *,
+    is_elector: bool,
+    is_forced: bool,
+) -> str | None:
+    """Why ``node`` must not get a blank state of ``generation``, and what to do instead; ``None``: nothing is known.
+
+    Args:
+        node: whose state it would be.
+        generation: 0, or a new one for a fleet that cannot agree any more.
+        good: its valid state of an older generation, which would be lost with it.
+        answers: what the other nodes say.
+        is_elector: whether ``node`` is one.
+        is_forced: the operator knows better whether the fleet needs a new generation. That a node has voted in this
+            one, or that the fleet is ahead of it, no operator can change.
+    """
+    newest = max(map(generation_of, answers), default=0)
+    current = [answer for answer in answers if generation_of(answer) == newest]
+    knows = next((answer.node for answer in current if node in answer.quorum.voted), None)
+    if newest >= generation and knows is not None:
+        return (
+            f"{knows} knows {node} as an elector that has voted; a blank state would let it vote twice. Without a "
+            f"state it works all the same and votes no more. To make it an elector again, {way_out(newest + 1)}"
+        )
+    if newest > generation:
+        return (
+            f"{current[0].node} says that the fleet lives in generation {newest}; join it with "
+            f"`zsched init --generation {newest}`"
+        )
+    if newest == generation:
+        return None
+    if is_forced:
+        return None
+    agreeing = next((answer for answer in current if answer.quorum.ok), None)
+    if agreeing is not None:
+        quorum = agreeing.quorum
+        return (
+            f"the fleet lives in generation {newest} and agrees ({agreeing.node}: {quorum.alive} of {quorum.electors} "
+            f"electors can answer, {quorum.needed} needed); it needs no generation {generation}. "
+            "To make one all the same, stop every daemon first, or add --force"
+        )
+    if good is None or not is_elector or any(_has_lost_too_many(answer) for answer in current):
+        return None
+    heard = "nobody who answered says" if answers else "no other node answered, so nobody says"
+    return (
+        f"{node} has a good state of generation {good.generation} here, and {heard} that the fleet needs a new "
+        "generation. If `zsched status`, or `zsched init` on another node, has said so, stop every daemon and add "
+        "--force"
+    )
+
+
+def _has_lost_too_many(answer: Snapshot) -> bool:
+    quorum = answer.quorum
+    return quorum.electors - len(quorum.stateless) < quorum.needed

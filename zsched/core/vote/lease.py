@@ -1,0 +1,504 @@
+"""Exclusive tasks: the lease that makes two active owners impossible, held by a majority's echoes of the owner's beats.
+
+Knows: grants, echoes, releases and their clocks. Does not know: how a worker is stopped, ballots, bytes.
+
+L is the lease, rho the bound on how far two clocks' rates differ. Nobody compares clocks: each side counts on its own.
+
+* The owner's beats are numbered. An elector echoes a number, per task, only to the owner and epoch of the value that it
+  last *accepted*; the echo is the grant.
+* The owner is active only while a majority has echoed a number that it sent *after learning this epoch*; the lease ends
+  L after the *sending* of the largest number that a majority has echoed or exceeded. An elector that echoes what was
+  not sent yet, for somebody else beats in the owner's name, counts from an earlier moment than the owner would: its
+  echo of that number never counts. It grants the real, lower numbers again once they are believed
+  (`zsched.core.sequence`).
+* Only a task that is *leased* for everybody (`Allocation.leased`, `zsched.core.executor.sealing`) is granted.
+* An elector never grants to two owners, or two lives of one, at once: to another only after the hold, or a release.
+* An elector that granted refuses an accept for another owner until L(1+rho)/(1-rho) after its last grant on its own
+  clock, or until the owner released; one that has just started refuses every owner but that of its own persisted
+  accepted value for as long, and echoes nobody: that owner's life may be another one than it granted to before.
+* When it refuses, it stops echoing the owner for whose sake it refused (at most twice that time, or until it accepts or
+  learns a newer revision), and its beats ask that owner to leave; the owner drains and releases all numbers up to now,
+  which are never granted again. Without this a planned move would never happen.
+* An echo counts only under the same terms (`lease_terms`): the electors and L of both fleet files. The majority of
+  another electorate need not meet the one that granted to this owner's earlier life. Such a node gets no such task.
+* A node whose clock's rate is in doubt (`zsched.core.vote.clocks`) neither works nor grants, and its beats name other
+  terms; afterwards it begins like an elector, and an owner, that has just started.
+* The worker's own word that it has stopped ends the owner's wait before the lease does, but only while no earlier word
+  of the same epoch is missing: a late one would give back a lease that the worker has been given since.
+
+Source: Gray & Cheriton 1989 (leases), with the epoch as fencing token.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from zsched.core.scheduler.scoring import majority
+from zsched.core.values.fleet import Fleet, lease_terms
+from zsched.core.values.model import Allocation, Beat, Grant, NodeId, TaskId
+
+RHO = 1e-3
+"""Bound on the relative difference of two clocks' rates (a crystal is within 1e-4)."""
+SENT_KEPT = 128
+"""An owner knows when it sent so many of its newest numbers; of older ones there is no lease."""
+HURRY_S = 0.05
+"""A release of nothing that was used is worth a beat of its own at most so often."""
+
+
+def hold_s(lease_s: float) -> float:
+    """How long after its last grant an elector must refuse others, on its own clock.
+
+    >>> round(hold_s(1.0), 4)
+    1.002
+    """
+    return lease_s * (1 + RHO) / (1 - RHO)
+
+
+@dataclass(slots=True)
+class Granter:
+    """One elector's side of one exclusive task.
+
+    Args:
+        task: the task.
+        lease_s: L.
+        until: until when what this elector granted before it started may last (monotonic seconds).
+        standing: owner of the persisted accepted value at the start (``None``: there was none).
+    """
+
+    task: TaskId
+    lease_s: float
+    until: float
+    standing: NodeId | None
+    _last: Grant | None = None
+    _granted_at: float = -math.inf
+    _released: dict[tuple[NodeId, int], int] = field(default_factory=dict)
+    """{(owner, incarnation): the largest released number}."""
+    _silent_for: tuple[NodeId, int] | None = None
+    """(owner, epoch) that is not echoed any more because another one waits."""
+    _silent_until: float = -math.inf
+
+    def on_beat(self, beat: Beat, accepted: tuple[NodeId, int] | None, now: float, *, is_newest: bool = True) -> bool:
+        """Take a beat in: grant it if its sender is the accepted owner. Whether this begins a new grant.
+
+        Args:
+            beat: of any node.
+            accepted: (owner, epoch) of the value that this elector last accepted.
+            now: monotonic seconds.
+            is_newest: it is no repeat and no late one. A lower number than the last is then the sender's true one.
+        """
+        for grant in beat.released:
+            if grant.task == self.task and grant.owner == beat.node:
+                self._release(grant)
+        if accepted is None or accepted[0] != beat.node:
+            return False
+        epoch = next((epoch for task, _, epoch in beat.learnt if task == self.task), None)
+        if epoch != accepted[1] or self._is_silenced(beat.node, epoch, now):
+            return False
+        if beat.sequence <= self._released.get((beat.node, beat.incarnation), -1):
+            return False
+        if self._is_held(beat, now):
+            return False
+        is_new = self._last is None or (self._last.owner, self._last.incarnation, self._last.epoch) != (
+            beat.node,
+            beat.incarnation,
+            epoch,
+        )
+        if not is_new and not is_newest and self._last is not None and beat.sequence <= self._last.number:
+            return False
+        self._last = Grant(
+            task=self.task, owner=beat.node, incarnation=beat.incarnation, epoch=epoch, number=beat.sequence
+        )
+        self._granted_at = now
+        return is_new
+
+    def _is_held(self, beat: Beat, now: float) -> bool:
+        """Whether another owner, or an earlier life of this one, may still hold our grant."""
+        last = self._last
+        if now < self.until:
+            return True  # what this elector granted before it started is forgotten, and to whom
+        if last is None or (last.owner, last.incarnation) == (beat.node, beat.incarnation):
+            return False
+        return now < self._granted_at + hold_s(self.lease_s)
+
+    def _release(self, grant: Grant) -> None:
+        key = (grant.owner, grant.incarnation)
+        self._released[key] = max(self._released.get(key, grant.number), grant.number)
+        last = self._last
+        if last is not None and (last.owner, last.incarnation) == key and last.number <= grant.number:
+            self._last, self._granted_at = None, -math.inf
+
+    def _is_silenced(self, owner: NodeId, epoch: int, now: float) -> bool:
+        return self._silent_for == (owner, epoch) and now < self._silent_until
+
+    def restart(self, standing: Allocation | None, until: float) -> None:
+        """It is not known when this elector granted, only to whom: as after a start."""
+        self.standing, self.until = None if standing is None else standing.owner, until
+        self._last, self._granted_at = None, -math.inf
+        self.on_newer_value()
+
+    def may_accept(self, owner: NodeId | None, now: float) -> bool:
+        """Whether a value with this owner may be accepted now; a no begins the silence towards the present owner."""
+        hold = hold_s(self.lease_s)
+        if now < self.until and owner != self.standing:
+            return False
+        last = self._last
+        if last is None or last.owner == owner or now >= self._granted_at + hold:
+            return True
+        if not self._is_silenced(last.owner, last.epoch, now):
+            self._silent_for = (last.owner, last.epoch)
+            self._silent_until = now + 2 * hold
+        return False
+
+    def on_newer_value(self) -> None:
+        """A newer revision was accepted or learnt: nobody is waited for any more."""
+        self._silent_for, self._silent_until = None, -math.inf
+
+    def echo(self, now: float) -> Grant | None:
+        """What this elector's beat echoes, or ``None``."""
+        last = self._last
+        if last is None or self._is_silenced(last.owner, last.epoch, now) or now >= self._granted_at + self.lease_s:
+            return None
+        return last
+
+    def asked_to_leave(self, now: float) -> tuple[TaskId, NodeId, int] | None:
+        """(task, owner, epoch) that this elector's beats ask to leave, or ``None``."""
+        if self._silent_for is None or now >= self._silent_until:
+            return None
+        return self.task, *self._silent_for
+
+    def next_deadline(self, now: float) -> float:
+        """When `may_accept` may change its mind; infinity when never."""
+        grant = self._granted_at + hold_s(self.lease_s)
+        return min(self.until if self.until > now else math.inf, grant if grant > now else math.inf)
+
+
+@dataclass(slots=True)
+class Holder:
+    """One owner's side of one exclusive task in one epoch.
+
+    Args:
+        task: the task.
+        epoch: the epoch in which this node is the owner.
+        me: this node.
+        incarnation: of this daemon.
+        electors: the configured electors.
+        lease_s: L.
+        first_number: the first beat that will be sent after this epoch was learnt.
+    """
+
+    task: TaskId
+    epoch: int
+    me: NodeId
+    incarnation: int
+    electors: tuple[NodeId, ...]
+    lease_s: float
+    first_number: int
+    is_leaving: bool = False
+    released: int = -1
+    """The largest number that was given back."""
+    given_until: float = -math.inf
+    """Until when the worker was told that it may work; minus infinity once it has stopped."""
+    awaits_report: bool = False
+    """The worker was told to stop and has not said yet that it has."""
+    is_doubtful: bool = False
+    """A word of an earlier stop in this epoch may still come: from now on only the end of what was given counts."""
+    hurried_at: float = -math.inf
+    """When a release of nothing that was used last had a beat of its own."""
+    _sent: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=SENT_KEPT))
+    _echoed: dict[NodeId, int] = field(default_factory=dict)
+    _ahead: dict[NodeId, list[int]] = field(default_factory=dict)
+    """{elector: the numbers that it echoed before we sent them, the lowest first}: of somebody else's beats."""
+
+    def on_sent(self, number: int, now: float) -> None:
+        """A beat leaves."""
+        self._sent.append((number, now))
+
+    def on_echo(self, elector: NodeId, grant: Grant) -> None:
+        """An elector echoed one of our numbers; of another life or epoch, or from a stranger, it counts nothing."""
+        if elector not in self.electors or (grant.task, grant.owner) != (self.task, self.me):
+            return
+        if (grant.incarnation, grant.epoch) != (self.incarnation, self.epoch):
+            return
+        if not self._sent or grant.number > self._sent[-1][0]:  # somebody else beats in our name
+            self._note_ahead(elector, grant.number)
+        elif grant.number < self.first_number or grant.number <= self.released:
+            return
+        elif grant.number not in self._ahead.get(elector, ()):
+            self._echoed[elector] = max(self._echoed.get(elector, -1), grant.number)
+
+    def _note_ahead(self, elector: NodeId, number: int) -> None:
+        """Keep the lowest: what is `SENT_KEPT` numbers behind those was echoed long before we could send it."""
+        known = {*self._ahead.get(elector, ()), number}
+        echoed = self._echoed.get(elector, -1)
+        self._ahead[elector] = sorted(one for one in known if one > echoed)[:SENT_KEPT]
+
+    def lease_until(self) -> float:
+        """When the lease ends (monotonic seconds on this machine); minus infinity when there is none."""
+        needed = majority(len(self.electors))
+        numbers = sorted((number for number in self._echoed.values() if number > self.released), reverse=True)
+        if len(numbers) < needed:
+            return -math.inf
+        number = numbers[needed - 1]
+        at = next((at for sent, at in self._sent if sent == number), None)
+        return -math.inf if at is None else at + self.lease_s
+
+    def ask(self) -> None:
+        """Another owner waits. Electors may have granted what they do not echo, so whatever was sent is asked for."""
+        if self._sent and self._sent[-1][0] > self.released:
+            self.is_leaving = True
+
+    def release(self, number: int) -> Grant:
+        """Give back every number up to ``number``: the worker has stopped."""
+        self.released = max(self.released, number)
+        self.is_leaving, self.given_until = False, -math.inf
+        return Grant(
+            task=self.task, owner=self.me, incarnation=self.incarnation, epoch=self.epoch, number=self.released
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BeatParts:
+    """What this node's beat says about leases."""
+
+    echoes: tuple[Grant, ...]
+    released: tuple[Grant, ...]
+    asked_to_leave: tuple[tuple[TaskId, NodeId, int], ...]
+
+
+@dataclass(slots=True)
+class Leases:
+    """Both sides of every exclusive task at one node.
+
+    Args:
+        fleet: the fleet file.
+        me: this node.
+        incarnation: of this daemon.
+        standing: {task: the newest persisted value, or ``None``}; empty when this node is no elector.
+        now: monotonic seconds.
+        granted_s: how long a lease may last from this node's life before (0: as long as today's).
+    """
+
+    fleet: Fleet
+    me: NodeId
+    incarnation: int
+    standing: Mapping[TaskId, Allocation | None]
+    now: float
+    granted_s: float = 0.0
+    terms: str = field(init=False)
+    is_unsure: bool = False
+    """How long anything takes on this node's clock is not known: it holds and grants nothing."""
+    _others: dict[NodeId, str] = field(default_factory=dict)
+    """{node: its terms} of those that go by other terms than this node."""
+    _granters: dict[TaskId, Granter] = field(init=False)
+    _holders: dict[TaskId, Holder] = field(default_factory=dict)
+    _releases: dict[TaskId, Grant] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.terms = lease_terms(self.fleet)
+        self._granters = {}
+        for task in self.fleet.tasks:
+            value = self.standing.get(task.name)
+            is_leased = task.exclusive or (value is not None and value.leased)
+            if is_leased and task.name in self.standing:
+                self._watch(task.name, None if value is None else value.owner, self.over_at)
+
+    def _watch(self, task: TaskId, standing: NodeId | None, until: float) -> None:
+        self._granters[task] = Granter(task=task, lease_s=self.fleet.timing.lease_s, until=until, standing=standing)
+
+    @property
+    def over_at(self) -> float:
+        """When whatever was granted, to or by a life of this node before, is over."""
+        return self.now + hold_s(max(self.fleet.timing.lease_s, self.granted_s))
+
+    @property
+    def terms_told(self) -> str:
+        """What this node's beats say that its leases hang on; not the others' terms while it is unsure."""
+        return f"{self.terms}, clock in doubt" if self.is_unsure and self.terms else self.terms
+
+    def doubt(self, standing: Mapping[TaskId, Allocation | None]) -> None:
+        """The clock's rate is in doubt: hold and grant nothing from now on."""
+        self.is_unsure = True
+        for task, granter in self._granters.items():
+            granter.restart(standing[task], math.inf)
+
+    def trust(self, standing: Mapping[TaskId, Allocation | None], number: int, now: float) -> None:
+        """The clock runs right again: begin anew, with beats behind ``number``."""
+        self.is_unsure = False
+        for task, granter in self._granters.items():
+            granter.restart(standing[task], now + hold_s(self.fleet.timing.lease_s))
+        for task in tuple(self._holders):
+            holder = self._holders.pop(task)
+            self.begin(task, holder.epoch, number + 1)
+            # The worker was told to stop: its word may still come, and until then it may be at work.
+            self._holders[task].is_doubtful, self._holders[task].given_until = True, holder.given_until
+
+    # --- electors ----------------------------------------------------------------------------------------------------
+
+    def may_accept(self, task: TaskId, owner: NodeId | None, now: float) -> bool:
+        """Whether this elector may accept a value with ``owner`` now (always, for tasks that are not exclusive)."""
+        granter = self._granters.get(task)
+        return granter is None or granter.may_accept(owner, now)
+
+    def on_newer_value(self, value: Allocation) -> None:
+        """A newer revision was accepted or learnt."""
+        if value.task in self._granters:
+            self._granters[value.task].on_newer_value()
+        elif value.leased and value.task in self.standing:
+            # Not leased until now: nothing was granted.
+            self._watch(value.task, None, math.inf if self.is_unsure else -math.inf)
+
+    def is_news(self, remembered_s: float) -> bool:
+        """Whether this elector may grant for longer than its state file says: it must be there before the first one."""
+        return bool(self._granters) and remembered_s < self.fleet.timing.lease_s
+
+    def to_remember_s(self, now: float) -> float:
+        """How long a lease may last that this elector has granted, or its life before: for its next life."""
+        own_s = self.fleet.timing.lease_s
+        return own_s if now >= self.now + hold_s(self.granted_s) else max(own_s, self.granted_s)
+
+    def stop_granting(self) -> None:
+        """This node is no elector any more: what it granted runs out."""
+        self._granters.clear()
+        self.standing = {}
+
+    # --- owners ------------------------------------------------------------------------------------------------------
+
+    def begin(self, task: TaskId, epoch: int, first_number: int) -> None:
+        """This node learnt that it owns the task in ``epoch``; ``first_number`` is its next beat's."""
+        if task in self._holders and self._holders[task].epoch == epoch:
+            return
+        self._holders[task] = Holder(
+            task=task,
+            epoch=epoch,
+            me=self.me,
+            incarnation=self.incarnation,
+            electors=self.fleet.electors,
+            lease_s=self.fleet.timing.lease_s,
+            first_number=first_number,
+        )
+        self._releases.pop(task, None)
+
+    def end(self, task: TaskId, number: int) -> None:
+        """Another owner was learnt: whatever this node still holds is given back."""
+        holder = self._holders.pop(task, None)
+        if holder is not None:
+            self._releases[task] = holder.release(number)
+
+    def until(self, task: TaskId) -> float:
+        """When this node's lease of the task ends; minus infinity without one."""
+        holder = self._holders.get(task)
+        return -math.inf if holder is None or self.is_unsure else holder.lease_until()
+
+    @property
+    def is_holding(self) -> bool:
+        """Whether this node owns an exclusive task."""
+        return bool(self._holders)
+
+    def leaving(self) -> tuple[TaskId, ...]:
+        """Tasks whose worker here is asked to stop and has not yet."""
+        return tuple(task for task, holder in self._holders.items() if holder.is_leaving)
+
+    def on_given(self, task: TaskId, until: float) -> None:
+        """The worker here, of a task that this node holds, is told that it may work ``until`` then."""
+        self._holders[task].given_until = until
+
+    def given_until(self, task: TaskId) -> float:
+        """Until when the worker here may be working; minus infinity when it is not."""
+        holder = self._holders.get(task)
+        return -math.inf if holder is None else holder.given_until
+
+    def on_told_to_stop(self, task: TaskId) -> None:
+        """The worker here, of a task that this node holds, is told to stop: it will say when it has."""
+        self._holders[task].awaits_report = True
+
+    def on_worker_lost(self, task: TaskId) -> None:
+        """The worker's process here has ended; another one may be given leases before its end is told."""
+        if task in self._holders:
+            self._holders[task].is_doubtful = True
+
+    def on_stopped(self, task: TaskId, epoch: int, number: int) -> bool:
+        """The worker says that it has stopped: give everything back; false when nobody asked.
+
+        False, too, when this may be the late word of an earlier stop in this epoch, or of a process that is dead: the
+        worker may be at it again, so `on_run_out` decides.
+        """
+        holder = self._holders.get(task)
+        if holder is None or holder.epoch != epoch or not holder.is_leaving or holder.is_doubtful:
+            return False
+        holder.awaits_report = False
+        self._releases[task] = holder.release(number)
+        return True
+
+    def on_run_out(self, task: TaskId, number: int, now: float) -> bool:
+        """All that a leaving worker was ever given is over: give everything back. Whether that is worth a beat at once.
+
+        It is when the worker was given something since the last time, and now and then when it was not. Two owners,
+        each an elector that asks the other one to leave, would otherwise answer every beat with a beat.
+        """
+        holder = self._holders.get(task)
+        if holder is None or not holder.is_leaving:
+            return False
+        was_given = holder.given_until > -math.inf or holder.awaits_report
+        holder.is_doubtful |= holder.awaits_report
+        holder.awaits_report = False  # when it comes, it is of a stop that is over
+        self._releases[task] = holder.release(number)
+        if was_given:
+            return True
+        if now - holder.hurried_at < HURRY_S:
+            return False
+        holder.hurried_at = now
+        return True
+
+    # --- beats -------------------------------------------------------------------------------------------------------
+
+    def on_sent(self, number: int, now: float) -> BeatParts:
+        """This node's beat ``number`` leaves: what it says."""
+        for holder in self._holders.values():
+            holder.on_sent(number, now)
+        echoes = [granter.echo(now) for granter in self._granters.values()]
+        asked = [granter.asked_to_leave(now) for granter in self._granters.values()]
+        return BeatParts(
+            echoes=tuple(echo for echo in echoes if echo is not None),
+            released=tuple(self._releases.values()),
+            asked_to_leave=tuple(ask for ask in asked if ask is not None),
+        )
+
+    def on_beat(
+        self, beat: Beat, accepted: Mapping[TaskId, tuple[NodeId, int]], now: float, *, is_newest: bool = True
+    ) -> bool:
+        """A beat came, or our own left: grant, count echoes, hear who must leave. Whether to beat at once."""
+        is_new = False
+        for task, granter in self._granters.items():
+            is_new |= granter.on_beat(beat, accepted.get(task), now, is_newest=is_newest)
+        if beat.lease_terms == self.terms:
+            self._others.pop(beat.node, None)
+        else:
+            self._others[beat.node] = beat.lease_terms
+        for grant in beat.echoes if beat.lease_terms == self.terms else ():
+            if grant.task in self._holders:
+                self._holders[grant.task].on_echo(beat.node, grant)
+        for task, owner, epoch in beat.asked_to_leave:
+            holder = self._holders.get(task)
+            if holder is not None and owner == self.me and epoch == holder.epoch:
+                holder.ask()
+        return is_new
+
+    def unfit(self) -> dict[NodeId, str]:
+        """{node: why it could never hold a lease that counts here}."""
+        return {
+            node: f"goes by other leases ({terms or 'it does not say'}, here {self.terms})"
+            for node, terms in self._others.items()
+        }
+
+    def next_deadline(self, now: float) -> float:
+        """When an elector may accept what it refused, or a leaving owner's lease ends."""
+        due = math.inf
+        for granter in self._granters.values():
+            due = min(due, granter.next_deadline(now))
+        for holder in self._holders.values():
+            if holder.is_leaving and holder.given_until > now:
+                due = min(due, holder.given_until)
+        return due

@@ -1,0 +1,486 @@
+"""VOTE, the agreement under it: one rewritable value, agreed by a majority of electors (CASPaxos).
+
+Knows: ballots, promises, acceptances, rounds, what is learnt. Does not know: tasks' meaning, who won which vote, how
+anything travels or is stored.
+
+Synod on a register that can be rewritten (Rystsov, arXiv 1802.07000): no leader, no log. The rules that keep it safe:
+
+* an elector's promise and acceptance are persisted before the answer leaves (`Step.is_dirty`);
+* a ballot carries exactly one value: a proposer that reads an accepted value it has not learnt re-accepts that one, and
+  its own change follows under a higher ballot;
+* where too many electors refuse that value for good (their fleet files know no such node), a move is applied to it at
+  once, as CASPaxos has it: else a value that a minority has accepted would stop its task for ever;
+* among accepted values "newer" means the higher ballot;
+* accepted is not learnt: an elector with an acceptance that it has not learnt runs an *identity round* (it re-accepts
+  what it reads), and so does a proposer that does not know how its round ended; it never applies its change twice;
+* every change names the revision that it is based on and is a function of the value read; one that leaves owner or
+  tuning as they are writes nothing, so a higher epoch always means another owner.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from random import Random
+
+from zsched.core.scheduler.scoring import majority
+from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refusal, Refused
+from zsched.core.values.model import Acceptance, Allocation, Ballot, NodeId, RegisterState, Tuning
+
+BACKOFF_CAP_S = 5.0
+MAX_REVISION = 2**52  # half of what a counter may be: a value so far ahead is refused, for nothing could follow it
+MAX_JUMP = 2**32  # no honest counter is so far ahead; one hostile frame must not use them all up
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MoveOwner:
+    """Change: another owner; the epoch rises with the revision."""
+
+    base_revision: int
+    owner: NodeId
+    reason: str
+
+    def apply(self, read: Allocation) -> Allocation:
+        """The new value; touches owner, epoch and revision only. For the owner that is there already: what was read."""
+        if self.owner == read.owner:
+            return read
+        return replace(read, revision=read.revision + 1, epoch=read.epoch + 1, owner=self.owner)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Retune:
+    """Change: another tuning; owner and epoch stay, so routes do not move."""
+
+    base_revision: int
+    tuning: Tuning
+    request: int | None = None
+    """The operator's question that waits for this change."""
+
+    def apply(self, read: Allocation) -> Allocation:
+        """The new value; touches tuning and revision only. For the tuning in force: what was read."""
+        if self.tuning == read.tuning:
+            return read
+        return replace(read, revision=read.revision + 1, tuning=self.tuning)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetLeased:
+    """Change: from now on nobody works without a lease, or everybody may (`zsched.core.executor.sealing`)."""
+
+    base_revision: int
+    leased: bool
+
+    def apply(self, read: Allocation) -> Allocation:
+        """The new value; touches that and the revision only."""
+        return read if read.leased is self.leased else replace(read, revision=read.revision + 1, leased=self.leased)
+
+
+Change = MoveOwner | Retune | SetLeased
+
+
+class RoundOutcome(StrEnum):
+    """How a change ended."""
+
+    COMMITTED = "committed"
+    CONFLICT = "conflict"  # its base is no longer the newest revision
+    UNCHANGED = "unchanged"  # it asks for what is there already: nothing was written
+    NO_QUORUM = "no_quorum"  # not started: no majority promised
+    UNKNOWN = "unknown"  # some elector may have it, and no majority could be asked
+
+
+@dataclass(slots=True)
+class Step:
+    """What one call changed and wants done, in this order: persist if dirty, send, apply what was learnt."""
+
+    is_dirty: bool = False
+    prepare: Prepare | None = None
+    accept: Accept | None = None
+    learnt: Allocation | None = None
+    finished: tuple[Change, RoundOutcome] | None = None
+    problem: str = ""
+
+
+class _Phase(StrEnum):
+    WAIT = "wait"
+    PREPARE = "prepare"
+    ACCEPT = "accept"
+
+
+@dataclass(slots=True)
+class _Round:
+    """One proposer's attempts at one change (or, without a change, an identity round)."""
+
+    change: Change | None
+    give_up_at: float
+    phase: _Phase = _Phase.WAIT
+    deadline: float = 0.0
+    ballot: Ballot | None = None
+    known: int = 0  # the revision that was learnt when the prepare left
+    promises: dict[NodeId, Acceptance | None] = field(default_factory=dict)
+    yes: dict[NodeId, bool] = field(default_factory=dict)
+    no: dict[NodeId, Refusal] = field(default_factory=dict)
+    value: Allocation | None = None
+    sent: Allocation | None = None
+    """Our own new value once an accept for it left: from then on the outcome may be unknown."""
+    unfit: Allocation | None = None
+    """A value of somebody else's that no majority will accept, for too many electors do not take it for a true one."""
+    attempt: int = 0
+
+
+class Register:
+    """One task's register on one node: acceptor (if it is an elector), proposer and learner."""
+
+    def __init__(
+        self,
+        *,
+        me: NodeId,
+        incarnation: int,
+        electors: tuple[NodeId, ...],
+        electorate: str,
+        is_elector: bool,
+        initial: Allocation,
+        state: RegisterState,
+        ballot_s: float,
+        stagger_s: float,
+        rng: Random,
+    ) -> None:
+        self._me, self._incarnation = me, incarnation
+        self._electors, self._electorate = electors, electorate
+        self._is_elector = is_elector
+        self._initial = initial
+        self._ballot_s, self._stagger_s, self._rng = ballot_s, stagger_s, rng
+        self.state = state
+        self._counter = state.promised.counter
+        self._round: _Round | None = None
+        self._queue: list[Change] = []
+        self._settle_at = math.inf
+        self._settle_tries = 0
+        self._lease_over_at = -math.inf
+        """The owner is asked to leave, for somebody's accept: when its lease must be over."""
+
+    @property
+    def value(self) -> Allocation:
+        """The newest learnt value (revision 0 before anything was agreed)."""
+        return self.state.learnt or self._initial
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether a change of this node's is under way."""
+        return bool(self._queue) or (self._round is not None and self._round.change is not None)
+
+    def next_deadline(self) -> float:
+        """When `tick` may have something to do; infinity when never."""
+        return self._settle_at if self._round is None else self._round.deadline
+
+    def stop_electing(self) -> None:
+        """This node lost its right to be an elector (disk, duplicate name): it answers no more."""
+        self._is_elector = False
+
+    def follow(self, electorate: str, initial: Allocation) -> None:
+        """A node without a state has been told which generation the fleet is of: count, and begin, with that one's."""
+        self._electorate, self._initial = electorate, initial
+        learnt = self.state.learnt
+        if learnt is not None and learnt.revision < initial.revision:
+            self.state = RegisterState(task=self.state.task)  # it never promised anything, and this was another fleet's
+
+    # --- acceptor ----------------------------------------------------------------------------------------------
+
+    def on_prepare(self, prepare: Prepare) -> tuple[Step, Promise | Refused]:
+        """Phase 1b. The answer must not leave before a dirty step is on disk."""
+        refusal = self._refusal(prepare.electorate, prepare.ballot)
+        if refusal is None and prepare.ballot <= self.state.promised:
+            refusal = Refusal.BALLOT
+        if refusal is not None:
+            return Step(), self._no(prepare.ballot, refusal)
+        self._set_state(promised=prepare.ballot)
+        promise = Promise(elector=self._me, task=self.state.task, ballot=prepare.ballot, accepted=self.state.accepted)
+        return Step(is_dirty=True), promise
+
+    def would_accept(self, accept: Accept) -> bool:
+        """Whether `on_accept` would say yes now."""
+        ballot = accept.acceptance.ballot
+        return self._refusal(accept.electorate, ballot) is None and ballot >= self.state.promised
+
+    def refuse(self, ballot: Ballot, refusal: Refusal) -> Refused:
+        """A no for a reason that lies outside the register (an exclusive task's lease)."""
+        return self._no(ballot, refusal)
+
+    def on_accept(self, accept: Accept, now: float) -> tuple[Step, Accepted | Refused]:
+        """Phase 2b. The answer must not leave before a dirty step is on disk."""
+        ballot = accept.acceptance.ballot
+        refusal = self._refusal(accept.electorate, ballot)
+        value = accept.acceptance.value
+        if refusal is None and (ballot < self.state.promised or max(value.revision, value.epoch) > MAX_REVISION):
+            refusal = Refusal.BALLOT
+        if refusal is not None:
+            return Step(), self._no(ballot, refusal)
+        self._set_state(promised=ballot, accepted=accept.acceptance)
+        if self._is_unlearnt():
+            self._settle_tries = 0
+            self._settle_at = now + 2 * self._ballot_s + self._jitter(0)
+        return Step(is_dirty=True), Accepted(elector=self._me, task=self.state.task, ballot=ballot)
+
+    def _refusal(self, electorate: str, ballot: Ballot) -> Refusal | None:
+        if not self._is_elector:
+            return Refusal.NOT_ELECTOR
+        if electorate != self._electorate:
+            return Refusal.ELECTORATE
+        return Refusal.BALLOT if ballot.counter > self.state.promised.counter + MAX_JUMP else None
+
+    def _no(self, ballot: Ballot, refusal: Refusal) -> Refused:
+        return Refused(
+            elector=self._me, task=self.state.task, ballot=ballot, refusal=refusal, promised=self.state.promised
+        )
+
+    def _is_unlearnt(self) -> bool:
+        accepted = self.state.accepted
+        return accepted is not None and accepted.value.revision > self.value.revision
+
+    def _set_state(
+        self, *, promised: Ballot | None = None, accepted: Acceptance | None = None, learnt: Allocation | None = None
+    ) -> None:
+        self.state = RegisterState(
+            task=self.state.task,
+            promised=promised or self.state.promised,
+            accepted=accepted or self.state.accepted,
+            learnt=learnt or self.state.learnt,
+        )
+
+    # --- learner -----------------------------------------------------------------------------------------------
+
+    def learn(self, value: Allocation, now: float) -> Step:
+        """A committed value is known; older ones change nothing."""
+        step = Step()
+        self._learn(value, step, now)
+        return step
+
+    def _learn(self, value: Allocation, step: Step, now: float) -> None:
+        if max(value.revision, value.epoch) > MAX_REVISION:
+            step.problem = f"revision {value.revision} cannot be"
+            return
+        current = self.state.learnt
+        if current is not None and value.revision <= current.revision:
+            if value.revision == current.revision and value != current:
+                step.problem = f"two values for revision {value.revision}: {current.owner} and {value.owner}"
+            return
+        self._set_state(learnt=value)
+        self._lease_over_at = -math.inf
+        step.is_dirty, step.learnt = True, value
+        if not self._is_unlearnt():
+            self._settle_at = math.inf
+        outcome = self._outcome_by(value)
+        if outcome is not None:
+            self._finish(step, outcome, now)
+
+    def _outcome_by(self, value: Allocation) -> RoundOutcome | None:
+        """How our change under way has ended, now that ``value`` is learnt; ``None``: it has not."""
+        running = self._round
+        if running is None or running.change is None:
+            return None
+        if running.sent is None:
+            return RoundOutcome.CONFLICT if value.revision > running.change.base_revision else None
+        if value.revision == running.sent.revision:
+            return RoundOutcome.COMMITTED if value == running.sent else RoundOutcome.CONFLICT
+        return RoundOutcome.UNKNOWN if value.revision > running.sent.revision else None  # ours may lie under it
+
+    # --- proposer ----------------------------------------------------------------------------------------------
+
+    def expect_release(self, now: float, at_most: float) -> None:
+        """An exclusive task's owner is asked to leave, for an accept that waits; its lease is over ``at_most`` then."""
+        if now >= self._lease_over_at:
+            self._lease_over_at = at_most
+
+    def propose(self, change: Change, now: float) -> Step:
+        """Try to commit a change; its end comes as `Step.finished` of this or a later call."""
+        self._queue.append(change)
+        step = Step()
+        if self._round is None:
+            self._start_next(step, now)
+        return step
+
+    def settle(self, now: float) -> Step:
+        """Run an identity round, unless a round is under way: learn whatever was accepted before."""
+        step = Step()
+        if self._round is None:
+            self._round = _Round(change=None, give_up_at=now + 3 * self._ballot_s)
+            if self._is_unlearnt() and self._settle_at == math.inf:
+                self._settle_at = now + 2 * self._ballot_s  # after a restart nobody else asks again
+            self._prepare(step, now)
+        return step
+
+    def _start_next(self, step: Step, now: float) -> None:
+        if not self._queue:
+            return
+        change = self._queue.pop(0)
+        self._round = _Round(change=change, give_up_at=now + 6 * self._ballot_s)
+        self._begin(step, now)
+
+    def _begin(self, step: Step, now: float) -> None:
+        """Prepare, unless the change is outdated; a base that is newer than what we know is read first."""
+        if self._outcome_by(self.value) is None:
+            self._prepare(step, now)
+        elif step.finished is None:
+            self._finish(step, RoundOutcome.CONFLICT, now)
+        else:
+            self._running().deadline = now  # a step reports one end; this one comes with the next tick
+
+    def _prepare(self, step: Step, now: float) -> None:
+        running = self._running()
+        self._counter = max(self._counter, self.state.promised.counter) + 1
+        running.ballot = Ballot(counter=self._counter, node=self._me, incarnation=self._incarnation)
+        running.phase, running.deadline = _Phase.PREPARE, now + self._ballot_s
+        running.promises, running.yes, running.no, running.value = {}, {}, {}, None
+        running.known = self.value.revision
+        step.prepare = Prepare(task=self.state.task, ballot=running.ballot, electorate=self._electorate)
+
+    def _running(self) -> _Round:
+        assert self._round is not None
+        return self._round
+
+    def on_answer(self, answer: Promise | Accepted | Refused, now: float) -> Step:
+        """An elector answered; answers to older ballots and from strangers change nothing."""
+        step = Step()
+        running = self._round
+        if running is None or answer.ballot != running.ballot or answer.elector not in self._electors:
+            return step
+        if isinstance(answer, Refused):
+            self._on_refused(running, answer, step, now)
+        elif isinstance(answer, Promise) and running.phase is _Phase.PREPARE:
+            running.promises[answer.elector] = answer.accepted
+            if len(running.promises) >= majority(len(self._electors)):
+                self._read(running, step, now)
+        elif isinstance(answer, Accepted) and running.phase is _Phase.ACCEPT:
+            running.yes[answer.elector] = True
+            if len(running.yes) >= majority(len(self._electors)):
+                self._commit(running, step, now)
+        return step
+
+    def _read(self, running: _Round, step: Step, now: float) -> None:
+        """A majority promised: decide what this ballot carries."""
+        accepted = [acceptance for acceptance in running.promises.values() if acceptance is not None]
+        # First values of a generation are equal but for their leases: what is not leased for one is so for nobody.
+        newest = max(accepted, key=lambda acceptance: (acceptance.ballot, not acceptance.value.leased), default=None)
+        read = self._initial if newest is None else newest.value
+        if read.revision < running.known:
+            step.problem = f"a majority of electors has forgotten revision {running.known}"
+            self._give_up(running, step, now)
+            return
+        if read.revision < self.value.revision:  # learnt since we asked: a higher ballot has overtaken this one
+            self._again(running, step, now)
+            return
+        is_identity = running.change is None or running.sent is not None
+        if is_identity and newest is None:
+            self._finish(step, RoundOutcome.COMMITTED if running.sent is None else RoundOutcome.UNKNOWN, now)
+            return
+        if (moved := self._moved_on(running, read)) is not None:
+            running.value = running.sent = moved
+        elif read.revision > self.value.revision or running.change is None or running.sent is not None:
+            running.value = read
+        elif running.change.base_revision != read.revision:
+            self._finish(step, RoundOutcome.CONFLICT, now)
+            return
+        elif (changed := running.change.apply(read)) == read:
+            self._finish(step, RoundOutcome.UNCHANGED, now)
+            return
+        else:
+            running.value = running.sent = changed
+        assert running.ballot is not None
+        self._accept(running, running.ballot, running.value, step, now)
+
+    def _moved_on(self, running: _Round, read: Allocation) -> Allocation | None:
+        """Our move applied to a value that was read and cannot be settled; ``None``: it is not that, or no move."""
+        if read != running.unfit or running.sent is not None or not isinstance(running.change, MoveOwner):
+            return None
+        moved = running.change.apply(read)
+        return None if moved == read else moved
+
+    def _commit(self, running: _Round, step: Step, now: float) -> None:
+        """A majority accepted: the value is chosen."""
+        assert running.value is not None
+        self._learn(running.value, step, now)
+        if self._round is not running:
+            return  # learning it has ended the round
+        if running.change is None:
+            self._finish(step, RoundOutcome.COMMITTED, now)
+        elif running.sent is None:
+            self._prepare(step, now)  # the other's value is settled; ours follows under a higher ballot
+        else:
+            self._finish(step, RoundOutcome.CONFLICT, now)  # a majority has passed the ballot that carried ours
+
+    def _on_refused(self, running: _Round, answer: Refused, step: Step, now: float) -> None:
+        if answer.refusal is Refusal.BALLOT and answer.promised <= answer.ballot:
+            return  # the echo of a duplicated prepare: it has promised this very ballot
+        if answer.promised.counter <= self._counter + MAX_JUMP:
+            self._counter = max(self._counter, answer.promised.counter)
+        running.no[answer.elector] = answer.refusal
+        if len(self._electors) - len(running.no) < majority(len(self._electors)):
+            if self._waits_for_leases(running):
+                return  # the same accept is sent once more at its deadline
+            if Refusal.VALUE in running.no.values():
+                running.unfit = running.value
+            self._again(running, step, now)
+
+    @staticmethod
+    def _waits_for_leases(running: _Round) -> bool:
+        """Whether nothing but an exclusive task's lease stands against our accept: it will end, the ballot is good."""
+        return running.phase is _Phase.ACCEPT and set(running.no.values()) == {Refusal.LEASE}
+
+    def _ask_again(self, running: _Round, step: Step, now: float) -> None:
+        """Send the same accept once more: a new ballot could only find out what became of it, without a move."""
+        if now >= running.give_up_at:
+            self._give_up(running, step, now)
+            return
+        assert running.ballot is not None
+        assert running.value is not None
+        self._accept(running, running.ballot, running.value, step, now)
+
+    def _accept(self, running: _Round, ballot: Ballot, value: Allocation, step: Step, now: float) -> None:
+        running.phase, running.deadline, running.no = _Phase.ACCEPT, now + self._ballot_s, {}
+        acceptance = Acceptance(ballot=ballot, value=value)
+        step.accept = Accept(task=self.state.task, acceptance=acceptance, electorate=self._electorate)
+
+    def _again(self, running: _Round, step: Step, now: float) -> None:
+        """This ballot cannot win: wait a little and try a higher one (only to find out, once ours was sent), or end."""
+        wait = self._jitter(running.attempt)
+        if now + wait >= running.give_up_at:
+            self._give_up(running, step, now)
+            return
+        running.attempt += 1
+        running.phase, running.deadline, running.ballot = _Phase.WAIT, now + wait, None
+
+    def _give_up(self, running: _Round, step: Step, now: float) -> None:
+        self._finish(step, RoundOutcome.NO_QUORUM if running.sent is None else RoundOutcome.UNKNOWN, now)
+
+    def _finish(self, step: Step, outcome: RoundOutcome, now: float) -> None:
+        running = self._running()
+        if running.change is not None:
+            step.finished = (running.change, outcome)
+        self._round = None
+        self._start_next(step, now)
+
+    def _jitter(self, attempt: int) -> float:
+        """Doubling back-off with jitter, so that duelling proposers part."""
+        base = self._stagger_s * 2.0 ** min(attempt, 16)  # bounded: a cut may last for days
+        return min(base, BACKOFF_CAP_S) * (0.5 + self._rng.random())
+
+    def tick(self, now: float) -> Step:
+        """Time has passed."""
+        step = Step()
+        running = self._round
+        if running is not None and now >= running.deadline:
+            if running.phase is _Phase.WAIT and now < (until := min(self._lease_over_at, running.give_up_at)):
+                running.deadline = until  # our next ballot would end the accept that waits
+            elif running.phase is _Phase.WAIT:
+                self._begin(step, now)
+            elif self._waits_for_leases(running):
+                self._ask_again(running, step, now)
+            else:
+                self._again(running, step, now)
+        elif running is None and now >= self._settle_at:
+            self._settle_tries += 1
+            self._settle_at = now + 2 * self._ballot_s + self._jitter(self._settle_tries)
+            if self._is_unlearnt():
+                return self.settle(now)
+            self._settle_at = math.inf
+        return step

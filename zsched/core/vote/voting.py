@@ -1,0 +1,150 @@
+"""VOTE in motion: one task's proposals at one robot, whether a vote is open, what it gave, when to commit the winner.
+
+Knows: which proposals are fresh, who answers a call, who commits and when. Does not know: why a robot proposes what it
+does (`rounds`), the count's rules (`vote`), how a winner is committed (`register`).
+
+The first proposal for a move *opens* a vote, and so calls all others to it; whoever has proposed within `vote_time` has
+answered already. A proposal counts as fresh for as long: twice a gather, since answering one may take a whole gather
+when a peer is frozen. The winner's voters commit it, staggered by rank so that one usually suffices.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from zsched.core.values.fleet import Fleet, Timing
+from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal
+from zsched.core.vote.register import MoveOwner
+from zsched.core.vote.tally import Tally, VoteOutcome, present_voters, tally
+
+VOTE_MARGIN_S = 0.1
+
+
+def vote_time(timing: Timing) -> float:
+    """How long a vote stays open and a proposal fresh, in seconds."""
+    return 2 * timing.gather_s + VOTE_MARGIN_S
+
+
+class Voting:
+    """One task's voting at one robot. Times are monotonic seconds."""
+
+    def __init__(self, fleet: Fleet, me: NodeId) -> None:
+        self._voters, self._timing, self._me = fleet.voters, fleet.timing, me
+        self._vote_s = vote_time(fleet.timing)
+        self.proposals: dict[NodeId, tuple[Proposal, float]] = {}
+        """Each robot's newest proposal and when it came."""
+        self.called_at = -math.inf
+        """When this robot last proposed a planned move, first tries in vain left out."""
+        self._first_call_at: float | None = None
+        """When it proposed one on today's value for the first time; ``None``: not yet, or twice already."""
+        self.opened_at: float | None = None
+        """Since when a vote on a move is open."""
+        self.tally: Tally | None = None
+        self.tally_base = 0
+        self.tally_at = -math.inf
+        self.commit: MoveOwner | None = None
+        """The change that this robot will or does propose to the register."""
+        self.commit_at = math.inf
+        self.awaited_until = -math.inf
+        """A vote on a move was won: until when its value should be learnt."""
+
+    def next_deadline(self) -> float:
+        """When a commit is due or the open vote ends; infinity when neither."""
+        return self.commit_at if self.opened_at is None else min(self.commit_at, self.opened_at + self._vote_s)
+
+    def call(self, now: float) -> None:
+        """This robot proposes a planned move.
+
+        The first try on a value keeps the task's turn: an owner that is asked to leave and slow to stop leaves by the
+        next vote, if that comes before its lease is granted again.
+        """
+        if self._first_call_at is None:
+            self._first_call_at = now
+        else:
+            self.called_at, self._first_call_at = now, None
+
+    # --- proposals -----------------------------------------------------------------------------------------------
+
+    def absorb(self, proposal: Proposal, allocation: Allocation, now: float) -> bool:
+        """Take in a proposal, our own too; whether it calls this robot to propose as well.
+
+        On an older or newer base than today's value, ``allocation``, it does not count.
+        """
+        if proposal.base_revision != allocation.revision:
+            return False
+        self.proposals[proposal.voter] = (proposal, now)
+        if proposal.candidate == allocation.owner:
+            return False
+        if self.opened_at is None and self.commit is None:
+            self.opened_at = now
+        return proposal.voter != self._me and self._must_answer(now)
+
+    def _must_answer(self, now: float) -> bool:
+        mine = self.proposals.get(self._me)
+        return self._me in self._voters and self.commit is None and (mine is None or now - mine[1] > self._vote_s)
+
+    # --- the count -----------------------------------------------------------------------------------------------
+
+    def count(self, allocation: Allocation, states: Mapping[NodeId, PeerState], now: float) -> Tally | None:
+        """Count the open vote; its tally when it has ended by that, ``None`` while it goes on or none is open.
+
+        Args:
+            allocation: today's value: whose revision proposals must name, and who the owner is.
+            states: what this node holds every node for.
+            now: monotonic seconds.
+        """
+        if self.opened_at is None:
+            return None
+        fresh = {
+            voter: proposal
+            for voter, (proposal, at) in self.proposals.items()
+            if now - at <= self._vote_s and proposal.base_revision == allocation.revision
+        }
+        is_over = now >= self.opened_at + self._vote_s
+        counted = tally(
+            fresh,
+            voters=self._voters,
+            present=present_voters(self._voters, states),
+            owner=allocation.owner,
+            is_over=is_over,
+        )
+        self.tally, self.tally_base, self.tally_at = counted, allocation.revision, now
+        if counted.outcome is VoteOutcome.PENDING:
+            return None
+        self.opened_at = None
+        if counted.outcome is VoteOutcome.WON:
+            self.awaited_until = now + self._timing.ballot_s + self._timing.stagger_s
+            self._schedule_commit(counted, allocation, fresh, now)
+        return counted
+
+    def _schedule_commit(
+        self, counted: Tally, allocation: Allocation, fresh: Mapping[NodeId, Proposal], now: float
+    ) -> None:
+        supporters = [voter for voter, candidate in counted.votes if candidate == counted.winner]
+        if self._me not in supporters or counted.winner is None:
+            return
+        self.commit = MoveOwner(base_revision=allocation.revision, owner=counted.winner, reason=fresh[self._me].reason)
+        self.commit_at = now + self._timing.stagger_s * supporters.index(self._me)
+
+    # --- the commit ----------------------------------------------------------------------------------------------
+
+    def take_commit(self, now: float) -> MoveOwner | None:
+        """The change whose turn has come; it is handed out once."""
+        if self.commit is None or now < self.commit_at:
+            return None
+        self.commit_at = math.inf
+        return self.commit
+
+    def end_commit(self) -> None:
+        """Our change was committed, overtaken or given up: votes may be called again."""
+        self.commit, self.commit_at, self.awaited_until = None, math.inf, -math.inf
+
+    def on_learnt(self) -> None:
+        """A newer revision is known: proposals on older bases are worthless, and so is a commit not yet handed out."""
+        self.proposals.clear()
+        self.opened_at, self.awaited_until = None, -math.inf
+        if self._first_call_at is not None:
+            self.called_at, self._first_call_at = self._first_call_at, None
+        if self.commit is not None and self.commit_at < math.inf:
+            self.end_commit()

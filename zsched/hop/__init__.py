@@ -1,0 +1,1 @@
+"""Numbered, acknowledged streams."""

@@ -1,0 +1,1 @@
+"""Between the daemon and its relay."""

@@ -1,0 +1,71 @@
+"""Where things are on this machine: the fleet file, the state and runtime folders, this node's own name.
+
+Knows: defaults for root, for a user and under systemd, and the environment's words. Does not know: what lies there.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import socket
+from collections.abc import Mapping
+from pathlib import Path
+
+from zsched.core.values.model import NodeId
+
+SYSTEM_CONFIG = Path("/etc/zsched/fleet.yaml")
+
+
+def config_path(given: Path | None, env: Mapping[str, str]) -> Path:
+    """The fleet file: the argument, ``ZSCHED_CONFIG``, ``/etc/zsched/fleet.yaml`` or the user's own."""
+    if given is not None:
+        return given
+    if "ZSCHED_CONFIG" in env:
+        return Path(env["ZSCHED_CONFIG"])
+    user = Path(env.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "zsched" / "fleet.yaml"
+    return user if user.exists() and not SYSTEM_CONFIG.exists() else SYSTEM_CONFIG
+
+
+def state_folder(given: Path | None, env: Mapping[str, str]) -> Path:
+    """The state folder: the argument, ``ZSCHED_STATE_DIR``, systemd's, ``/var/lib/zsched`` or the user's own."""
+    return _folder(given, env, "ZSCHED_STATE_DIR", "STATE_DIRECTORY", Path("/var/lib/zsched"), "XDG_STATE_HOME")
+
+
+def runtime_folder(given: Path | None, env: Mapping[str, str]) -> Path:
+    """Where the operator socket is: the argument, ``ZSCHED_RUNTIME_DIR``, systemd's, ``/run/zsched`` or the user's."""
+    return _folder(given, env, "ZSCHED_RUNTIME_DIR", "RUNTIME_DIRECTORY", Path("/run/zsched"), "XDG_RUNTIME_DIR")
+
+
+def _folder(given: Path | None, env: Mapping[str, str], own: str, systemd: str, system: Path, xdg: str) -> Path:
+    if given is not None:
+        return given
+    if env.get(own):
+        return Path(env[own])
+    if env.get(systemd):
+        return Path(env[systemd].partition(":")[0])
+    if os.geteuid() == 0:
+        return system
+    fallback = Path.home() / ".local" / "state"
+    return Path(env.get(xdg) or fallback) / "zsched"
+
+
+def socket_path(runtime: Path, node: NodeId) -> Path:
+    """The operator socket of one node on this machine."""
+    return runtime / f"{node}.sock"
+
+
+def local_sockets(runtime: Path) -> tuple[Path, ...]:
+    """Every operator socket in the runtime folder, sorted: usually one, several in a lab."""
+    return tuple(sorted(runtime.glob("*.sock")))
+
+
+def node_name(given: str | None, env: Mapping[str, str]) -> NodeId:
+    """This node's name: ``--node``, ``ZSCHED_NODE`` or the host name, as the fleet file would spell it.
+
+    The host name loses its domain and is put into the alphabet of names (``Robot.1.local`` becomes ``robot``).
+    """
+    if given:
+        return given
+    if env.get("ZSCHED_NODE"):
+        return env["ZSCHED_NODE"]
+    return re.sub(r"[^a-z0-9_-]", "-", socket.gethostname().partition(".")[0].lower()).strip("-_")

@@ -1,0 +1,145 @@
+"""Decides where a node's sessions listen and whom they dial.
+
+Knows: the fleet file's addresses, the seeds, who dials whom. Does not know: zenoh, what the links carry.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import secrets
+import socket
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from zsched.core.values.fleet import Fleet, NodeSpec, dial_endpoint
+from zsched.core.values.model import NodeId, NodeKind
+
+PORT_RANGE: Final = Path("/proc/sys/net/ipv4/ip_local_port_range")
+MIN_PORT: Final = 20_000
+"""Below it there are more registered services."""
+MAX_PORT: Final = 65_535
+PORT_TRIES: Final = 64
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Endpoints:
+    """Where this node's sessions listen and whom they dial."""
+
+    control_listen: tuple[str, ...]
+    control_connect: tuple[str, ...]
+    data_listen: tuple[str, ...]
+    data_connect: tuple[str, ...]
+    worker_connect: tuple[str, ...]
+    control_by_gossip: bool
+    """Whether the control session dials whom it hears of by gossip; the same for the relay's and the workers'."""
+    data_by_gossip: bool
+    worker_by_gossip: bool
+
+
+def endpoints_for(
+    fleet: Fleet,
+    me: NodeSpec,
+    free_port: Callable[[], int],
+    is_here: Callable[[str], bool] = lambda _host: True,
+    protocol: str = "tcp",
+) -> Endpoints:
+    """The endpoints of one node: its own to listen on, the others' to dial.
+
+    What the fleet file does not say listens with ``protocol`` (`zsched.runtime.tls`).
+
+    A link is dialled by one side only: of two that redial each other one may take the other's new link for a part of
+    its old session, and tells it nothing again (eclipse-zenoh/zenoh#2806). Who gives no address dials everybody who
+    does; only two that give none meet by gossip, and then zenoh's ids decide who dials. Workers dial their own relay
+    first, then the robots', and listen nowhere, so nobody dials them.
+    Our own address on another machine (``is_here``) is dialled too: there a twin of ours may be, and must be heard.
+    """
+    robots = [node for node in fleet.nodes if node.kind is NodeKind.ROBOT and node.name != me.name]
+    data_listen = me.listen_data or f"{protocol}/0.0.0.0:0"
+    if not dial_endpoint(data_listen, "127.0.0.1"):  # any port will do, but workers must know which
+        address, _, rest = data_listen.rpartition(":")
+        data_listen = f"{address}:{free_port()}{rest.removeprefix('0')}"
+    return Endpoints(
+        control_listen=(me.listen_control or f"{protocol}/0.0.0.0:0",),
+        control_connect=_dialled(_targets(fleet, me, _control, is_here), _control),
+        data_listen=(data_listen,),
+        data_connect=_dialled(_targets(fleet, me, _data), _data),
+        worker_connect=(dial_endpoint(data_listen, "127.0.0.1"), *_dialled(robots, _data)),
+        control_by_gossip=not _dialled([me], _control) and len(_hidden(list(fleet.nodes), _control)) > 1,
+        data_by_gossip=not _dialled([me], _data),
+        worker_by_gossip=bool(_hidden(robots, _data)),
+    )
+
+
+def _control(node: NodeSpec) -> str:
+    return node.listen_control
+
+
+def _data(node: NodeSpec) -> str:
+    return node.listen_data
+
+
+def _targets(
+    fleet: Fleet, me: NodeSpec, endpoint: Callable[[NodeSpec], str], is_here: Callable[[str], bool] = lambda _host: True
+) -> list[NodeSpec]:
+    """Whom this node dials: everybody dials the seeds; of other pairs the one whose name comes later, if it can."""
+
+    def rank(node: NodeSpec) -> tuple[int, NodeId]:
+        return (fleet.seeds.index(node.name) if node.name in fleet.seeds else len(fleet.seeds), node.name)
+
+    has_mine = bool(_dialled([me], endpoint))
+    mine = [me] if has_mine and not is_here(me.host) else []
+    others = [node for node in fleet.nodes if node.name != me.name and _dialled([node], endpoint)]
+    return mine + [node for node in others if rank(node) < rank(me) or not has_mine]
+
+
+def _hidden(nodes: list[NodeSpec], endpoint: Callable[[NodeSpec], str]) -> list[NodeSpec]:
+    """Who cannot be dialled by the fleet file alone."""
+    return [node for node in nodes if not _dialled([node], endpoint)]
+
+
+def _dialled(nodes: list[NodeSpec], endpoint: Callable[[NodeSpec], str]) -> tuple[str, ...]:
+    dialled = (dial_endpoint(endpoint(node), node.host) for node in nodes if endpoint(node))
+    return tuple(target for target in dialled if target)
+
+
+def is_here(host: str) -> bool:
+    """Whether ``host`` is an address of this machine (of its network namespace); unknown names are taken for ours."""
+    try:
+        family, *_, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family) as probe:
+            probe.bind(address)
+    except OSError as error:
+        return error.errno != errno.EADDRNOTAVAIL
+    return True
+
+
+def free_port(outgoing: range | None = None) -> int:
+    """A TCP port that is free now (a node without a fixed data endpoint: its workers must know it).
+
+    It is none of those that the kernel gives to ``outgoing`` connections, unless those are all: such a connection may
+    last for hours, and would keep the relay out, before it listens or when it starts again.
+    """
+    outgoing = _outgoing_ports() if outgoing is None else outgoing
+    for ports in (range(outgoing.stop, MAX_PORT + 1), range(MIN_PORT, outgoing.start)):
+        for port in secrets.SystemRandom().sample(ports, min(len(ports), PORT_TRIES)):
+            with contextlib.suppress(OSError):
+                return _bound_port(port)
+    return _bound_port(0)
+
+
+def _outgoing_ports() -> range:
+    try:
+        low, high = (int(word) for word in PORT_RANGE.read_text().split())
+    except (OSError, ValueError):
+        low, high = 32768, 60999  # Linux's default
+    return range(low, high + 1)
+
+
+def _bound_port(port: int) -> int:
+    with socket.socket() as probe:
+        probe.bind(("0.0.0.0", port))  # noqa: S104 - only asks the kernel, never listens
+        bound: int = probe.getsockname()[1]
+        return bound

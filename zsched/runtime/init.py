@@ -1,0 +1,136 @@
+"""`zsched init`: creates a node's blank durable state, which states "this name has never voted here".
+
+Knows: what a blank state holds, and whom to ask whether that is true. Does not know: how daemons use it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from zsched.adapters.host.state_file import StateFile, hardware_id
+from zsched.adapters.network.fleet_poll import ask_fleet
+from zsched.clock import wall_tenths
+from zsched.core.values.fleet import Fleet, dial_endpoint, electorate_hash
+from zsched.core.values.model import DurableState, NodeId
+from zsched.core.values.snapshot import Snapshot
+from zsched.core.vote.belief import MAX_GENERATION
+from zsched.core.vote.generations import blank_state, objection
+from zsched.errors import AdapterError
+from zsched.runtime.tls import operator_json5, protocol_of
+from zsched.sessions import config as zenoh_config
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Heard:
+    """What the other nodes said: how many have an address in the fleet file, and who of them answered."""
+
+    asked: int
+    answers: tuple[Snapshot, ...]
+
+
+def init_state(fleet: Fleet, node: NodeId, folder: Path, generation: int) -> Path:
+    """Write the blank state of ``node``; returns the file's path. Asks nobody: see `check_blank`.
+
+    With a generation above 0 every task starts at revision and epoch ``generation * 2**32`` without an owner: for a
+    fleet that lost too many states to agree, on every node.
+
+    Raises:
+        AdapterError: there is a state already, another node's for instance, or the folder cannot be written.
+    """
+    _check_range(generation)
+    before = StateFile(folder, fleet=fleet.name, node=node).load().state
+    state = blank_state(fleet, node, generation, before, incarnation=wall_tenths(), hardware=hardware_id())
+    with StateFile(folder, fleet=fleet.name, node=node) as file:
+        file.create(state)
+        return file.path
+
+
+def _check_range(generation: int) -> None:
+    if not 0 <= generation <= MAX_GENERATION:
+        raise AdapterError(f"generation {generation}: at most {MAX_GENERATION}, or no revision could follow its first")
+
+
+def standing_state(fleet: Fleet, node: NodeId, folder: Path) -> DurableState | None:
+    """This node's valid state for this electorate; ``None`` when `init` has something to do.
+
+    Raises:
+        AdapterError: the folder is another node's or fleet's.
+    """
+    file = StateFile(folder, fleet=fleet.name, node=node)
+    file.check_owner()
+    state = file.load().state
+    return state if state is not None and state.electorate == electorate_hash(fleet) else None
+
+
+def check_blank(
+    fleet: Fleet, node: NodeId, folder: Path, generation: int, standing: DurableState | None, *, is_forced: bool
+) -> Heard:
+    """Ask every node that has an address whether ``node`` may have a blank state of ``generation``.
+
+    Args:
+        fleet: the fleet file.
+        node: whose state it would be.
+        folder: where.
+        generation: 0, or a new one.
+        standing: what `standing_state` has found there.
+        is_forced: the operator says that a new generation is needed.
+
+    Raises:
+        ConfigError: the operator's zenoh file is not usable.
+        AdapterError: a daemon runs in that folder, or what is known speaks against it (`objection`).
+    """
+    _check_range(generation)
+    if standing is not None and generation <= standing.generation:
+        raise AdapterError(
+            f"{folder} holds {node}'s state of generation {standing.generation}, which is newer than {generation}"
+        )
+    if _is_there(folder):
+        with StateFile(folder, fleet=fleet.name, node=node):
+            pass  # in use, or not to be written: said before anybody is asked
+    heard = _ask(fleet, node)
+    is_elector = node in fleet.electors
+    good = standing if standing is not None and not standing.lost else None
+    why = objection(node, generation, good, heard.answers, is_elector=is_elector, is_forced=is_forced)
+    if why is not None:
+        raise AdapterError(why)
+    return heard
+
+
+def _is_there(folder: Path) -> bool:
+    try:
+        return folder.exists()
+    except OSError:  # who opens it says why it cannot be used
+        return True
+
+
+def _ask(fleet: Fleet, node: NodeId) -> Heard:
+    others = [spec for spec in fleet.nodes if spec.name != node and spec.listen_control]
+    endpoints = tuple(filter(None, (dial_endpoint(spec.listen_control, spec.host) for spec in others)))
+    text = operator_json5(fleet)
+    protocol_of(fleet, text)  # with TLS that cannot work nobody would answer
+    configs = [
+        zenoh_config.client_config(connect=(endpoint,), timing=fleet.timing, operator_json5=text)
+        for endpoint in endpoints
+    ]
+    answers = ask_fleet(fleet.name, node, configs)
+    return Heard(asked=len(endpoints), answers=tuple(answer for answer in answers if answer.node != node))
+
+
+def settle_dispute(fleet: Fleet, node: NodeId, folder: Path) -> bool:
+    """The operator has removed the other machine of this name: let this one be an elector again.
+
+    Returns:
+        Whether there was anything to settle.
+
+    Raises:
+        AdapterError: no valid state, or it cannot be written.
+    """
+    with StateFile(folder, fleet=fleet.name, node=node) as file:
+        loaded = file.load()
+        if loaded.state is None:
+            raise AdapterError(f"nothing to settle: {loaded.problem}")
+        if not loaded.state.disputed:
+            return False
+        file.save(replace(loaded.state, disputed=""))
+        return True

@@ -1,0 +1,71 @@
+"""When a daemon that was told to stop goes: once what it owns has moved, or when it has waited for long enough.
+
+Knows: how long each wait is, and that somebody who asks twice wants it now. Does not know: signals, clocks, what moves
+a task.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+from zsched.core.values.model import TaskId
+
+HAND_OVER_S = 3.0
+"""How long a stopping owner waits for tasks that another node could take. With what follows (`LEAVE_S`, workers, relay,
+session: 2.6 s at most) it fits into the unit's TimeoutStopSec=8."""
+NOBODY_S = 0.8
+"""...and for those that nobody else can: their answers are still to come."""
+LEAVE_S = 0.4
+"""...and how long it stays when they are moved: the next owner's worker asks ours for its state, and what ours has in
+hand is still to come."""
+TWICE_S = 0.3
+"""Two signals so close together are one: a terminal and a wrapper may both pass on the same Ctrl-C."""
+
+
+@dataclass(slots=True)
+class Leaving:
+    """One daemon's way out."""
+
+    asked_at: float | None = None
+    _moved_at: float | None = None
+    _is_hurried: bool = False
+
+    def ask(self, owned: Collection[TaskId], now: float) -> bool:
+        """Somebody asks to stop; whether that is the first time. The second time means: at once."""
+        if self.asked_at is None:
+            self.asked_at = now
+            if not owned:
+                self._is_hurried = True  # nothing is to be handed over
+            return True
+        self._is_hurried |= now - self.asked_at >= TWICE_S
+        return False
+
+    def is_over(self, owned: Collection[TaskId], movable: Collection[TaskId], now: float) -> bool:
+        """Whether to go now.
+
+        Args:
+            owned: what this node owns.
+            movable: what of it another node could take.
+            now: monotonic seconds.
+        """
+        if self.asked_at is None:
+            return False
+        if self._is_hurried:
+            return True
+        if not owned:
+            self._moved_at = now if self._moved_at is None else self._moved_at
+            return now >= self._moved_at + LEAVE_S
+        self._moved_at = None
+        return now >= self.asked_at + (HAND_OVER_S if movable else NOBODY_S)
+
+    def last_words(self, owned: Collection[TaskId], now: float) -> str:
+        """What is left behind, for the log; empty: nothing."""
+        if not owned or self.asked_at is None:
+            return ""
+        tasks = f"{len(owned)} task{'s'[: len(owned) != 1]}"
+        why = "told to stop twice" if self._is_hurried else "nobody has taken over"
+        return (
+            f"leaves {tasks} behind after {now - self.asked_at:.1f} s ({', '.join(sorted(owned))}): {why}; "
+            "the robots move what they can once they miss this node"
+        )

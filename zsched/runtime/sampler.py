@@ -1,0 +1,82 @@
+"""Measures this machine, its links and its clocks again and again, and posts what it finds.
+
+Knows: which reader there is for what, how often. Does not know: what a reading is for.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from pathlib import Path
+
+from zsched.adapters.machine import core_speed
+from zsched.adapters.machine.device_profiler import DeviceProfiler
+from zsched.adapters.radio.network_profiler import readers_for
+from zsched.clock import ClockWatch
+from zsched.core import events as ev
+from zsched.core.values.fleet import NodeSpec
+from zsched.core.vote.clocks import is_bad
+from zsched.guard import guarded
+from zsched.runtime.shell import Inbox, Shell
+
+log = logging.getLogger("zsched.daemon")
+
+
+class Sampler:
+    """Measures the machine and its links in a thread of its own: a slow driver must not stop the beats."""
+
+    def __init__(self, spec: NodeSpec, period_s: float, state_dir: Path, shell: Shell, inbox: Inbox) -> None:
+        self._readers = readers_for(spec)
+        self._state_dir = state_dir
+        self._device, self._clocks = DeviceProfiler(), ClockWatch()
+        self._period_s, self._shell, self._inbox = period_s, shell, inbox
+        self._stop = threading.Event()
+        self._problems: dict[str, str | None] = {}
+        self._thread = guarded(self._run, name="zsched-sampler")
+
+    def start(self) -> None:
+        """Begin measuring."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End measuring; the thread ends with its current reading."""
+        self._stop.set()
+        self._thread.join(timeout=0.5)
+
+    def _run(self) -> None:
+        self._device.speed = core_speed.kept_or_new(self._state_dir)
+        while not self._stop.is_set():
+            try:
+                self._compare_clocks()
+                self._sample()
+            except Exception as error:
+                log.exception("sample_failed")
+                self._report("profile", f"cannot measure: {error}")
+            else:
+                self._report("profile", None)
+            self._stop.wait(self._period_s)
+
+    def _report(self, source: str, problem: str | None) -> None:
+        """Report a problem, or its end, when it is news."""
+        if self._problems.get(source) != problem:
+            self._problems[source] = problem
+            self._inbox.post(ev.ProblemReported(source=source, problem=problem))
+
+    def _compare_clocks(self) -> None:
+        drift = self._clocks.look()
+        if drift is None:
+            return
+        event = ev.ClockCompared(error_ratio=drift.error_ratio, jump_s=drift.jump_s, since_s=drift.since_s)
+        if is_bad(event):
+            self._inbox.post(event)
+        else:
+            self._inbox.post_quietly(event)
+
+    def _sample(self) -> None:
+        supervisor = self._shell.crew.supervisor
+        states, pids = (supervisor.states(), supervisor.pids()) if supervisor is not None else ({}, {})
+        device = self._device.sample({task: (state, pids.get(task)) for task, state in states.items()})
+        links = tuple(reader.read() for reader in self._readers)
+        self._inbox.post_quietly(ev.ProfileSampled(device=device, links=links))
+        for index, reader in enumerate(self._readers):
+            self._report(f"profile/link{index}", reader.problem)

@@ -1,0 +1,343 @@
+"""Carries a node's instructions out: one line per instruction, in order, and the failure of one is an event.
+
+Only a failed `PersistState` cuts its batch off: nothing after it may happen unless the state is on disk. Any other
+failure is shown in the status until the same instruction works again, at most `PROBLEM_TTL_S`.
+
+Knows: which adapter an instruction is for. Does not know: why it was given.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import math
+import queue
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator
+from typing import Any, assert_never
+
+from zsched.adapters.host.state_file import StateFile
+from zsched.adapters.network.control_bus import ControlBus
+from zsched.adapters.relay.streams import RelayHandle
+from zsched.adapters.workers.supervisor import WorkerSupervisor
+from zsched.clock import monotonic_s
+from zsched.core import events as ev
+from zsched.core import instructions as do
+from zsched.core.report import snapshot_json
+from zsched.core.values.fleet import Fleet
+from zsched.core.values.messages import Command, CommandResult, RetryTask, SetWeights
+from zsched.core.values.model import NAME, NodeId
+from zsched.core.values.relay_protocol import (
+    HandleReport,
+    RelayStarted,
+    SlotLost,
+    WorkerMatched,
+    WorkerSeen,
+    WorkerTrouble,
+)
+from zsched.core.values.snapshot import Snapshot
+from zsched.errors import AdapterError, WireError
+from zsched.runtime.crew import Crew
+
+INBOX_LIMIT = 20_000
+WAITING_LIMIT = 64
+ANSWER_TIMEOUT_S = 3.0
+PROBLEM_TTL_S = 60.0
+"""An instruction that failed and was never tried again is no problem any more after so long."""
+LOCAL_REQUESTS_FROM = 1 << 40
+"""Numbers of questions that came over the operator socket; smaller ones came over the bus."""
+
+_stages = {
+    name: logging.getLogger(f"zsched.{name}")
+    for name in ("membership", "profile", "gateway", "scheduler", "vote", "executor", "route")
+}
+
+
+class Inbox:
+    """The one queue into the loop; bounded, and what does not fit is counted."""
+
+    def __init__(self) -> None:
+        self._queue: queue.SimpleQueue[ev.Event] = queue.SimpleQueue()
+        self._first: ev.Event | None = None
+        self._waiting: deque[ev.Event] = deque(maxlen=WAITING_LIMIT)
+        self.overflowed = 0
+
+    def post(self, event: ev.Event) -> None:
+        """Enqueue; from any thread, never blocks."""
+        if self._queue.qsize() >= INBOX_LIMIT and not isinstance(event, ev.StopRequested):
+            self.overflowed += 1
+            return
+        self._queue.put(event)
+
+    def post_quietly(self, event: ev.Event) -> None:
+        """Enqueue without waking the loop: it is taken by `waiting` when the loop is awake anyway; the oldest go."""
+        self._waiting.append(event)
+
+    def waiting(self) -> Iterator[ev.Event]:
+        """What has been posted quietly, in order."""
+        while self._waiting:
+            yield self._waiting.popleft()
+
+    def put_first(self, event: ev.Event) -> None:
+        """Let ``event`` be the next one taken; from the loop only."""
+        self._first = event
+
+    def take_first(self) -> ev.Event | None:
+        """What must be taken before anything else, if there is something."""
+        event, self._first = self._first, None
+        return event
+
+    def take(self, timeout_s: float) -> ev.Event | None:
+        """The next event, waiting at most ``timeout_s`` (<= 0: not at all); ``None`` when there is none."""
+        event = self.take_first()
+        if event is not None:
+            return event
+        try:
+            return self._queue.get(timeout=timeout_s) if timeout_s > 0 else self._queue.get_nowait()
+        except queue.Empty:
+            return None
+
+
+class Desk:
+    """Operators' questions from the local socket: posted into the loop, awaited in the socket's thread."""
+
+    def __init__(
+        self, node: NodeId, inbox: Inbox, bus: ControlBus, access: Callable[[NodeId], dict[str, Any]] | None = None
+    ) -> None:
+        """``access`` says how a tool on this machine joins a node's data network."""
+        self._node, self._inbox, self._bus = node, inbox, bus
+        self._access = access
+        self._numbers = itertools.count(LOCAL_REQUESTS_FROM)
+        self._waiting: dict[int, queue.SimpleQueue[object]] = {}
+        self._lock = threading.Lock()
+
+    def answer(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Answer one request of the socket (``status``, ``weights``, ``retry``, ``access``).
+
+        With ``node``: what another node answers.
+        """
+        verb, node = request["verb"], request.get("node") or self._node
+        if not isinstance(node, str) or not NAME.fullmatch(node):
+            return {"error": f"node: {node!r:.80} is not a name"}
+        if verb == "status":
+            return self._ask(node, None)
+        if verb in _COMMANDS:
+            try:
+                command = _COMMANDS[verb](request)
+            except KeyError as error:
+                return {"error": f"{verb}: {error} is missing"}
+            except (TypeError, ValueError, OverflowError) as error:
+                return {"error": f"{verb}: {error}"}
+            return self._ask(node, command)
+        if verb == "access" and self._access is not None:
+            return self._access(node)
+        return {"error": f"unknown verb {verb!r:.80}; known: access, retry, status, weights"}
+
+    def _ask(self, node: NodeId, command: Command | None) -> dict[str, Any]:
+        if node != self._node:
+            try:
+                return _as_json(self._bus.ask_node(node, command))
+            except AdapterError as error:
+                return {"error": str(error)}
+        number = next(self._numbers)
+        slot: queue.SimpleQueue[object] = queue.SimpleQueue()
+        with self._lock:
+            self._waiting[number] = slot
+        self._inbox.post(ev.StatusAsked(request=number) if command is None else ev.commanded(number, command))
+        try:
+            return _as_json(slot.get(timeout=ANSWER_TIMEOUT_S))
+        except queue.Empty:
+            return {"error": f"the decision loop of {self._node} did not answer within {ANSWER_TIMEOUT_S:g} s"}
+        finally:
+            with self._lock:
+                self._waiting.pop(number, None)
+
+    def deliver(self, number: int, value: object) -> None:
+        """The loop's answer; nobody waiting any more is no error."""
+        with self._lock:
+            slot = self._waiting.get(number)
+        if slot is not None:
+            slot.put(value)
+
+
+def _weights_of(request: dict[str, Any]) -> SetWeights:
+    base = request.get("base_revision")
+    if base is not None and type(base) is not int:
+        raise ValueError(f"base_revision: expected a whole number, not {base!r:.80}")
+    cpu, memory, network = (float(request[name]) for name in ("cpu", "memory", "network"))
+    if not all(map(math.isfinite, (cpu, memory, network))):
+        raise ValueError("expected finite numbers")
+    return SetWeights(task=str(request["task"]), cpu=cpu, memory=memory, network=network, base_revision=base)
+
+
+def _retry_of(request: dict[str, Any]) -> RetryTask:
+    return RetryTask(task=str(request["task"]), node=str(request.get("whose") or ""))
+
+
+_COMMANDS: dict[str, Callable[[dict[str, Any]], Command]] = {"weights": _weights_of, "retry": _retry_of}
+
+
+def _as_json(value: object) -> dict[str, Any]:
+    if isinstance(value, Snapshot):
+        return snapshot_json(value)
+    assert isinstance(value, CommandResult)
+    return {"outcome": value.outcome.value, "detail": value.detail, "revision": value.revision}
+
+
+class Shell:
+    """The adapters of one daemon, and what each instruction means for them."""
+
+    def __init__(
+        self,
+        *,
+        node: NodeId,
+        inbox: Inbox,
+        bus: ControlBus,
+        state_file: StateFile,
+        desk: Desk,
+        fleet: Fleet | None = None,
+    ) -> None:
+        """``fleet`` says how workers show themselves; see `Crew`."""
+        self._node, self._inbox = node, inbox
+        self._bus, self._state_file, self._desk = bus, state_file, desk
+        self.crew = Crew(inbox.post, fleet, node)
+        self.relay: RelayHandle | None = None
+        """It reports to this shell, so it is made after it."""
+        self.stand_down = ""
+        """Why this daemon must end, for its name is taken; empty: it need not."""
+        self._failed_at: dict[str, float] = {}
+
+    # --- instructions ------------------------------------------------------------------------------------------------
+
+    def carry_out(self, batch: tuple[do.Instruction, ...]) -> None:
+        """Carry a batch out in order; a failed write drops the rest, any other failure is only reported."""
+        for instruction in batch:
+            kind = type(instruction).__name__
+            try:
+                self._carry_out(instruction)
+            except (AdapterError, WireError) as error:
+                if isinstance(instruction, do.PersistState):
+                    # Before anything else: what the node believes to be on disk must not lead to a beat or an answer.
+                    self._inbox.put_first(ev.PersistFailed(reason=str(error)))
+                    return
+                self._failed_at[kind] = monotonic_s()
+                self._inbox.post(ev.ProblemReported(source=kind, problem=str(error)))
+            else:
+                if self._failed_at:
+                    self._forget(kind)
+
+    def waiting_frames(self) -> Iterator[ev.Event]:
+        """The beats and profiles that have come and woken nobody up."""
+        return self._bus.waiting()
+
+    def _forget(self, works: str) -> None:
+        """End the problem of an instruction that works again, and those that are too old to mean anything."""
+        now = monotonic_s()
+        for kind, at in tuple(self._failed_at.items()):
+            if kind == works or now - at > PROBLEM_TTL_S:
+                del self._failed_at[kind]
+                self._inbox.post(ev.ProblemReported(source=kind, problem=None))
+
+    def _carry_out(self, instruction: do.Instruction) -> None:
+        bus = self._bus
+        match instruction:
+            case do.PersistState(state=state):
+                self._state_file.save(state)
+            case do.PublishBeat(beat=beat, is_news=is_news):
+                bus.publish("beat" if is_news else "beat_in_turn", beat)
+            case do.PublishProfile(profile=profile, is_news=is_news):
+                bus.publish("profile" if is_news else "profile_in_turn", profile)
+            case do.PublishProposal(proposal=proposal):
+                bus.publish("proposal", proposal)
+            case do.PublishLearnt(learnt=learnt):
+                bus.publish("allocation", learnt)
+            case do.AskUtilities(gather=gather, deadline_s=deadline_s):
+                bus.ask_utilities(gather, deadline_s)
+            case do.SendPrepare(prepare=prepare, deadline_s=deadline_s):
+                bus.ask_electors(prepare, deadline_s)
+            case do.SendAccept(accept=accept, deadline_s=deadline_s):
+                bus.ask_electors(accept, deadline_s)
+            case do.AskLearnt(peer=peer, deadline_s=deadline_s):
+                bus.ask_learnt(peer, deadline_s)
+            case do.IntroducePeers():
+                bus.introduce_peers()
+            case do.AnswerUtilities(request=request, utilities=value):
+                bus.answer(request, value)
+            case do.AnswerElection(request=request, answer=vote):
+                bus.answer(request, vote)
+            case do.AnswerLearnt(request=request, learnt=learnt):
+                bus.answer(request, learnt)
+            case do.AnswerStatus(request=request, snapshot=snapshot):
+                self._answer_operator(request, snapshot)
+            case do.AnswerCommand(request=request, result=result):
+                self._answer_operator(request, result)
+            case do.ApplyRoutes(plan=plan):
+                self._streams().apply(plan)
+            case do.SetRole(role=role):
+                self._streams().set_role(role)
+            case do.StartWorker(task=task):
+                self._workers().start(task)
+            case do.StopWorker(task=task):
+                self._workers().stop(task)
+            case do.ResetWorker(task=task):
+                self._workers().reset(task)
+            case do.RestartWorker(task=task, reason=reason):
+                self._workers().report_hung(task, self.crew.life_of(task), reason)
+            case do.StandDown(reason=reason):
+                self.stand_down = reason
+            case do.RecordStory():
+                _tell(instruction)
+            case _:
+                assert_never(instruction)
+
+    def _workers(self) -> WorkerSupervisor:
+        assert self.crew.supervisor is not None
+        return self.crew.supervisor
+
+    def _streams(self) -> RelayHandle:
+        assert self.relay is not None
+        return self.relay
+
+    def _answer_operator(self, request: int, value: object) -> None:
+        if request >= LOCAL_REQUESTS_FROM:
+            self._desk.deliver(request, value)
+        else:
+            self._bus.answer(request, value)
+
+    # --- what adapters report (their threads) ------------------------------------------------------------------------
+
+    def on_report(self, report: HandleReport) -> None:
+        """The relay's handle: most reports are events; what is seen of our own workers goes by the crew."""
+        if isinstance(report, RelayStarted):
+            self.crew.on_relay_started()
+            return
+        if isinstance(report, SlotLost):
+            text = f"{report.owner} left {report.samples} samples unacknowledged: at most so many had no result"
+            _tell(do.RecordStory(stage="route", text=text, task=report.task, epoch=report.epoch))
+            return
+        if isinstance(report, WorkerMatched):
+            self.crew.on_matched(report)
+            return
+        if isinstance(report, WorkerTrouble):
+            self.crew.on_trouble(report)
+            return
+        if isinstance(report, ev.WorkerJobs):
+            if self.crew.is_ours(report):
+                self._inbox.post_quietly(report)
+            return
+        if not isinstance(report, WorkerSeen):
+            self._inbox.post(report)
+            return
+        if report.node == self._node:
+            self.crew.on_token(report)
+            return
+        shown = ev.WorkerShown(
+            node=report.node, task=report.task, incarnation=report.incarnation, is_present=report.is_present
+        )
+        self._inbox.post(shown)
+
+
+def _tell(story: do.RecordStory) -> None:
+    where = f"task={story.task} epoch={story.epoch} " if story.task else ""
+    _stages[story.stage].info("%s%s", where, story.text)

@@ -1,0 +1,73 @@
+"""Decides whether a fleet's sessions are encrypted, by the operator's zenoh file and the fleet's endpoints.
+
+Knows: which of zenoh's settings make TLS. Does not know: certificates, sessions.
+
+Where TLS is set up, nothing of ours listens in plain text: what the fleet file does not say, we choose alike.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+from zsched.core.values.fleet import Fleet, NodeSpec
+from zsched.errors import ConfigError
+from zsched.files import read_regular
+from zsched.sessions import config as zenoh_config
+
+MAX_BYTES: Final = 1 << 20
+PLAIN: Final = "tcp"
+ENCRYPTED: Final = ("tls", "quic")
+TO_LISTEN: Final = ("listen_certificate", "listen_private_key")
+
+
+def operator_json5(fleet: Fleet) -> str:
+    """The text of the operator's zenoh file; empty when the fleet file names none.
+
+    Raises:
+        ConfigError: it cannot be read.
+    """
+    if not fleet.zenoh_config:
+        return ""
+    try:
+        return read_regular(Path(fleet.zenoh_config), MAX_BYTES).decode("utf-8")
+    except (OSError, ValueError) as error:
+        reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
+        raise ConfigError(
+            f"{fleet.zenoh_config}: cannot be read: {reason}; the fleet file names it under `zenoh: {{config: ...}}`"
+        ) from error
+
+
+def protocol_of(fleet: Fleet, text: str) -> str:
+    """What sessions listen with where the fleet file does not say: ``tls`` or ``tcp``; ``text``: the operator's file.
+
+    Raises:
+        ConfigError: it is no zenoh configuration, or there is TLS, but nothing to listen with.
+    """
+    try:
+        settings = zenoh_config.tls_settings(text)
+    except ValueError as error:
+        raise ConfigError(f"{fleet.zenoh_config}: {error}") from error
+    endpoints = [end for node in fleet.nodes for end in (node.listen_control, node.listen_data) if end]
+    if not settings and not any(_scheme(end) in ENCRYPTED for end in endpoints):
+        return PLAIN
+    missing = [name for name in TO_LISTEN if name not in settings]
+    if missing:
+        raise ConfigError(
+            f"{fleet.zenoh_config or 'the fleet file'}: TLS without {' and '.join(missing)}, with which every node's "
+            "sessions listen; set them under transport/link/tls in the file that `zenoh: {config: ...}` names"
+        )
+    return "tls"
+
+
+def plain_text_problem(me: NodeSpec, protocol: str) -> str | None:
+    """Where this node listens in plain text although the fleet has TLS, because the fleet file says so."""
+    given = (me.listen_control, me.listen_data)
+    plain = [end for end in given if end and _scheme(end) not in ENCRYPTED]
+    if protocol == PLAIN or not plain:
+        return None
+    return f"TLS is set up, but the fleet file lets {me.name} listen on {', '.join(plain)}: write tls/ there"
+
+
+def _scheme(endpoint: str) -> str:
+    return endpoint.partition("/")[0]

@@ -1,0 +1,1 @@
+"""Configurations and links of zenoh sessions."""

@@ -1,0 +1,336 @@
+"""Builds the zenoh configurations of every session zsched opens: control, data, workers, applications.
+
+Knows: zenoh's configuration paths and the values that keep beats, data and workers out of each other's way.
+Does not know: zenoh itself (imported only to read an operator's JSON5), which node is whose neighbour, what is sent.
+
+Every function returns JSON text for ``zenoh.Config.from_json5``. Our settings lie on top of the operator's own file.
+What they are for: multicast scouting off and explicit endpoints (no surprise neighbours), gossip on (seeds suffice),
+a short lease (a frozen peer is seen after 0.75-1 lease; zenoh's default is 10 s), a quick and bounded connect retry,
+random zids (a fixed one keeps a restarted node out until its old link's lease ends), a small send buffer on data links
+(a full default buffer delays everything behind it by 0.4 s on a 20 Mbit/s radio).
+"""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any, Final
+
+from zsched.core.values.fleet import LocalMode, LocalSide, Timing, WorkerLink
+
+if TYPE_CHECKING:
+    import zenoh
+
+DATA_SEND_BUFFER: Final = 65536
+"""Kernel send buffer of data links in bytes: bounds what lies between a publisher and a slow radio."""
+CONTROL_MAX_MESSAGE: Final = 1 << 20
+"""Largest control message a peer may make us assemble, bytes (zenoh's default is 1 GiB)."""
+LOOPBACK_LISTEN: Final = "tcp/127.0.0.1:0"
+
+OPEN_TIMEOUT_S: Final = 1.5
+"""How long zenoh tries one dial: well between the times at which TCP sends a lost packet again (decision 0025).
+
+When it ends just as the handshake succeeds, zenoh drops the dial half done: a link that sends, never reads, never ends,
+and keeps every other link to the same peer out. A redial into a cut that has healed meanwhile succeeds with TCP's next
+SYN, 1 s (then 2 s or 3 s) after the first, and the rest of the handshake 0.2 s, 0.6 s, 1.4 s after a packet was lost.
+"""
+ACCEPT_TIMEOUT_S: Final = 1.0
+"""The other end, which begins with the connection, not with the SYN: between 0.6 s and 1.4 s."""
+RELAY_START_S: Final = 10.0
+"""A worker that is started together with its relay, on a busy machine, waits so long for it."""
+TX_THREADS: Final = 4
+DEFAULT_TIMING: Final = Timing()
+
+Settings = dict[str, Any]
+DROP_WAIT_S: Final = 0.05
+"""How long a put with congestion control DROP waits for room at one link (zenoh's default is 1 ms).
+
+A receiver that keeps up may not run for some milliseconds on a busy machine, and then loses what it could have had.
+One that takes nothing costs this time once: zenoh then drops at its link at once, until it takes something.
+"""
+_RECEIVERS: Final[Settings] = {
+    "transport/link/tx/queue/congestion_control/drop/wait_before_drop": round(DROP_WAIT_S * 1e6),
+}
+"""Of sessions that applications receive outputs from."""
+
+
+def control_config(
+    *,
+    listen: tuple[str, ...],
+    connect: tuple[str, ...],
+    timing: Timing = DEFAULT_TIMING,
+    operator_json5: str = "",
+    dials_by_gossip: bool = True,
+) -> str:
+    """The daemon's control session: beats, ballots, status. Shared memory off, messages bounded, nothing shared.
+
+    Without ``dials_by_gossip`` only ``connect`` is dialled: when that covers every pair from one side, two sessions
+    never redial each other at once after a cut, which can leave a link that is kept alive and delivers nothing.
+    ``listen`` and ``connect`` are zenoh endpoints such as ``tcp/0.0.0.0:7457``; never those of the data session.
+
+    Raises:
+        ValueError: the operator's JSON5 is not a zenoh configuration.
+    """
+    settings = _peer(listen, connect, timing)
+    settings["connect/retry"] = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
+    settings["transport/shared_memory/enabled"] = False
+    settings["transport/link/rx/max_message_size"] = CONTROL_MAX_MESSAGE
+    _set_gossip(settings, dials=dials_by_gossip)
+    return _render(settings, operator_json5)
+
+
+def data_config(
+    *,
+    listen: tuple[str, ...],
+    connect: tuple[str, ...],
+    timing: Timing = DEFAULT_TIMING,
+    shared_memory: bool = True,
+    operator_json5: str = "",
+    dials_by_gossip: bool = True,
+) -> str:
+    """The relay's data session: the node's hub for local workers and applications, meshed with the other relays.
+
+    ``shared_memory`` is used for local hops and puts only: a receiver that is descheduled for 0.1-0.2 s loses such a
+    message silently, which a query would turn into a hang. Off it must be in network namespaces (they share
+    ``/dev/shm``) and under a CPU quota.
+
+    Raises:
+        ValueError: the operator's JSON5 is not a zenoh configuration.
+    """
+    settings = _peer(_small_buffers(listen), _small_buffers(connect), timing)
+    _set_shared_memory(settings, is_on=shared_memory)
+    _set_gossip(settings, dials=dials_by_gossip)
+    settings.update(_RECEIVERS)
+    return _render(settings, operator_json5)
+
+
+def worker_config(
+    *,
+    connect: tuple[str, ...],
+    listen: tuple[str, ...] = (LOOPBACK_LISTEN,),
+    timing: Timing = DEFAULT_TIMING,
+    link: WorkerLink = WorkerLink.PEER,
+    shared_memory: bool = True,
+    operator_json5: str = "",
+    dials_by_gossip: bool = True,
+) -> str:
+    """A worker's session: joined to its own node's relay (the first of ``connect``), by the rest or gossip to others.
+
+    A daemon's workers ``listen`` nowhere: they dial, and nobody dials them (`zsched.runtime.endpoints` says why). With
+    ``link: client`` everything goes through the node's relay (robots that the worker cannot dial).
+
+    Raises:
+        ValueError: the operator's JSON5 is not a zenoh configuration.
+    """
+    if link is WorkerLink.CLIENT:
+        return client_config(
+            connect=connect[:1],
+            timing=timing,
+            shared_memory=shared_memory,
+            operator_json5=operator_json5,
+            patience_s=RELAY_START_S,
+        )
+    settings = _peer(_small_buffers(listen), _small_buffers(connect), timing)
+    _set_shared_memory(settings, is_on=shared_memory)
+    _set_gossip(settings, dials=dials_by_gossip, is_dialled=bool(listen))
+    return _render(settings, operator_json5)
+
+
+def local_config(side: LocalSide, *, timing: Timing = DEFAULT_TIMING) -> str:
+    """The relay's session on the host's own side: a client of its router, or a peer of its applications.
+
+    The operator's zenoh file is the fleet's and does not apply here.
+    """
+    if side.mode is LocalMode.CLIENT:
+        return client_config(connect=side.connect, timing=timing)
+    settings = _peer(side.listen or (LOOPBACK_LISTEN,), side.connect, timing)
+    _set_shared_memory(settings, is_on=False)
+    settings.update(_RECEIVERS)
+    return _render(settings, "")
+
+
+def client_config(
+    *,
+    connect: tuple[str, ...],
+    timing: Timing = DEFAULT_TIMING,
+    shared_memory: bool = False,
+    operator_json5: str = "",
+    patience_s: float = 0.0,
+) -> str:
+    """A session that hangs on one node: an application, the command line, a worker with ``link: client``.
+
+    A client's ``open`` fails when nobody listens for ``patience_s`` (a peer's goes on trying in the background).
+
+    Raises:
+        ValueError: the operator's JSON5 is not a zenoh configuration.
+    """
+    settings = _common(timing)
+    settings["mode"] = "client"
+    settings["connect/endpoints"] = list(connect)
+    settings["connect/timeout_ms"] = round(patience_s * 1000)
+    _set_shared_memory(settings, is_on=shared_memory)
+    return _render(settings, operator_json5)
+
+
+def introduction_config(session: str) -> str | None:
+    """Of a session (its configuration) that meets others by gossip: one that dials whom it dials, and all they know.
+
+    ``None`` when the session does not dial by gossip, or nobody at all by its configuration: there is nothing to mend,
+    or nobody to begin with. See `zsched.sessions.relink`.
+    """
+    import zenoh  # noqa: PLC0415 - the operator's own settings (TLS, access control) hold here, too
+
+    config = zenoh.Config.from_json5(session)
+    if json.loads(config.get_json("mode")) != "peer" or not json.loads(config.get_json("connect/endpoints")):
+        return None
+    if json.loads(config.get_json("scouting/gossip/autoconnect")) is not None:
+        return None  # our own setting for "only who is in `connect`"
+    for path, value in {
+        "listen/endpoints": [],
+        "scouting/gossip/autoconnect": {"router": [], "peer": ["router", "peer"]},
+        "scouting/gossip/autoconnect_strategy": {"peer": {"to_router": "always", "to_peer": "always"}},
+        "transport/shared_memory/enabled": False,
+    }.items():
+        config.insert_json5(path, json.dumps(value))
+    return str(config)
+
+
+def lease_s(session: str) -> float:
+    """How long a peer of a session (its configuration) may be silent before zenoh ends the link."""
+    import zenoh  # noqa: PLC0415 - as above
+
+    return float(json.loads(zenoh.Config.from_json5(session).get_json("transport/link/tx/lease"))) / 1000
+
+
+def tls_settings(operator_json5: str) -> frozenset[str]:
+    """Which settings of ``transport/link/tls`` the operator's own text makes.
+
+    Raises:
+        ValueError: it is not a zenoh configuration.
+    """
+    if not operator_json5.strip():
+        return frozenset()
+    found = json.loads(_parsed(operator_json5).get_json("transport/link/tls"))
+    return frozenset(name for name, value in (found or {}).items() if value is not None)
+
+
+# --- threads ---------------------------------------------------------------------------------------------------------
+
+
+def pool_threads(nodes: int, tasks: int = 0) -> int:
+    """How many threads zenoh's pools of one process need in a fleet of so many nodes and tasks (4..64).
+
+    A link that falls silent holds one of them when its lease ends: about a second, or 10 s (zenoh's SO_LINGER) where
+    something was still to be sent. With fewer threads than links, a split that takes all of them also silences those
+    that still work: beats stop, the living look dead, a robot that is cut off is not served by its own worker. On the
+    data network every worker is a peer of its own: a node may have a relay and one worker per task.
+    """
+    return min(max(nodes * (1 + tasks) + 2, 4), 64)
+
+
+def runtime_pools(nodes: int, tasks: int = 0) -> str:
+    """The value of ``ZENOH_RUNTIME`` for a process with links to so many nodes (zenoh reads it once).
+
+    ``net`` closes links and dials, ``acc`` shakes hands with who dials us; both have one thread by default. Closing a
+    link that is dead one way holds a thread for zenoh's SO_LINGER, 10 s, in which no other link came or went.
+    """
+    threads = pool_threads(nodes, tasks)
+    return _pools(rx=threads, tx=TX_THREADS, net=threads, acc=threads)
+
+
+def relay_pools(threads: int) -> str:
+    """The value of ``ZENOH_RUNTIME`` for a relay: ``threads`` that receive, transmit, and close links, each.
+
+    One stalled target holds one thread that transmits, and later the one that closes its link. ``net`` has as many as
+    ``rx``, because a socket is read by the pool that opened it: ``net`` also receives on every link that this process
+    has dialled (docs/decisions/0016).
+    """
+    return _pools(rx=threads, tx=threads, net=threads)
+
+
+def _pools(**threads: int) -> str:
+    return f"({', '.join(f'{name}: (worker_threads: {count})' for name, count in threads.items())})"
+
+
+# --- parts -----------------------------------------------------------------------------------------------------------
+
+
+def _common(timing: Timing) -> Settings:
+    return {
+        "scouting/multicast/enabled": False,
+        "transport/link/tx/lease": round(timing.zenoh_lease_s * 1000),
+        "transport/link/tx/keep_alive": 4,
+        "transport/unicast/open_timeout": round(OPEN_TIMEOUT_S * 1000),
+        "transport/unicast/accept_timeout": round(ACCEPT_TIMEOUT_S * 1000),
+        "timestamping/enabled": False,
+        # also of clients: a relay that dies is back within 0.3 s, zenoh's default looks after 1 s, then 2, then 4
+        "connect/retry": {"period_init_ms": 50, "period_max_ms": 1000, "period_increase_factor": 1.25},
+    }
+
+
+def _peer(listen: tuple[str, ...], connect: tuple[str, ...], timing: Timing) -> Settings:
+    settings = _common(timing)
+    settings["mode"] = "peer"
+    settings["scouting/gossip/enabled"] = True
+    settings["listen/endpoints"] = list(listen)
+    settings["connect/endpoints"] = list(connect)
+    settings["connect/exit_on_failure"] = False
+    return settings
+
+
+def _set_gossip(settings: Settings, *, dials: bool, is_dialled: bool = True) -> None:
+    """``is_dialled``: others can dial this session, too."""
+    if not dials:
+        settings["scouting/gossip/autoconnect"] = {"router": [], "peer": []}
+        return
+    # Of two that hear of each other one dials: where both redial after a cut, a link may come back dead.
+    to_peer = "greater-zid" if is_dialled else "always"
+    settings["scouting/gossip/autoconnect_strategy"] = {"peer": {"to_router": "always", "to_peer": to_peer}}
+
+
+def _set_shared_memory(settings: Settings, *, is_on: bool) -> None:
+    settings["transport/shared_memory/enabled"] = is_on
+    if is_on:
+        settings["transport/shared_memory/transport_optimization/messages"] = ["put"]
+
+
+def _small_buffers(endpoints: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(_small_buffer(endpoint) for endpoint in endpoints)
+
+
+def _small_buffer(endpoint: str) -> str:
+    """The endpoint with our send buffer, unless the operator has set one or the protocol has none."""
+    if not endpoint.startswith(("tcp/", "tls/")) or "so_sndbuf=" in endpoint:
+        return endpoint
+    separator = ";" if "#" in endpoint else "#"
+    return f"{endpoint}{separator}so_sndbuf={DATA_SEND_BUFFER}"
+
+
+def _render(settings: Settings, operator_json5: str) -> str:
+    if operator_json5.strip():
+        return _on_top_of(operator_json5, settings)
+    tree: Settings = {}
+    for path, value in settings.items():
+        *parents, leaf = path.split("/")
+        node = tree
+        for parent in parents:
+            node = node.setdefault(parent, {})
+        node[leaf] = value
+    return json.dumps(tree)
+
+
+def _on_top_of(operator_json5: str, settings: Settings) -> str:
+    """The operator's file with our settings over it."""
+    config = _parsed(operator_json5)
+    for path, value in settings.items():
+        config.insert_json5(path, json.dumps(value))
+    return str(config)
+
+
+def _parsed(operator_json5: str) -> zenoh.Config:
+    """JSON5 is read by zenoh itself, so that its rules hold."""
+    import zenoh  # noqa: PLC0415 - only who passes a file of his own pays for it here
+
+    try:
+        return zenoh.Config.from_json5(operator_json5)
+    except Exception as error:
+        raise ValueError(f"zenoh: config is not a zenoh configuration: {error}") from error

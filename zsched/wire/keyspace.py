@@ -1,0 +1,148 @@
+"""The address plan: every control key is built and parsed here, and nowhere else.
+
+Knows: the shape of each key. Does not know: what travels under it.
+
+All control keys start with a verbatim ``@`` chunk, which no wildcard (``*``, ``**``) matches: a user who subscribes to
+everything never receives our ballots. The chunk after the kind is the node that *owns* the key, so that an access rule
+can bind it to that node's certificate; a request carries its asker behind it. `docs/keyspace.md` is this file as a
+table.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from zsched.core.values.model import MAX_COUNTER, NAME, NodeId, TaskId
+
+ROOT = "@zsched"
+MAX_DIGITS = len(str(MAX_COUNTER))
+END_CHUNK = "@zsched/end"
+"""Suffix of the in-band end markers behind a stream's last sample, and the start markers: ``{to}/@zsched/end``."""
+AGAIN_CHUNK = "@zsched/again"
+"""Behind an output's key, with a relay's zenoh id behind it: what that relay has missed, sent once more."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ParsedKey:
+    """A control key taken apart: ``kind``, the ``owner`` node and what follows it."""
+
+    fleet: str
+    kind: str
+    owner: NodeId
+    rest: tuple[str, ...]
+
+
+def parse(key: str) -> ParsedKey | None:
+    """Take a control key apart; ``None`` when it is not one of ours or a name in it is malformed."""
+    chunks = key.split("/")
+    if len(chunks) < 4 or chunks[0] != ROOT:
+        return None
+    if not all(NAME.fullmatch(chunk) for chunk in chunks[1:]):
+        return None
+    return ParsedKey(fleet=chunks[1], kind=chunks[2], owner=chunks[3], rest=tuple(chunks[4:]))
+
+
+def counter(chunk: str) -> int | None:
+    """The number in a key's chunk (an incarnation, an epoch); ``None`` when it is none that any node may have.
+
+    >>> counter("12"), counter("9" * 25), counter("-1"), counter("")
+    (12, None, None, None)
+    """
+    if not chunk.isascii() or not chunk.isdigit() or len(chunk) > MAX_DIGITS:
+        return None
+    number = int(chunk)
+    return number if number <= MAX_COUNTER else None
+
+
+@dataclass(frozen=True, slots=True)
+class Keyspace:
+    """The keys of one fleet. Pass ``"*"`` for a name to get the selector over all of them."""
+
+    fleet: str
+
+    def _key(self, *chunks: str) -> str:
+        return "/".join((ROOT, self.fleet, *chunks))
+
+    def alive(self, node: NodeId, incarnation: int | str) -> str:
+        """Liveliness token of a daemon: presence, seen to go within milliseconds of a kill."""
+        return self._key("alive", node, str(incarnation))
+
+    def beat(self, node: NodeId) -> str:
+        """Put, best effort: a heartbeat out of turn, for it has news; receivers wake up for it."""
+        return self._key("beat", node)
+
+    def beat_in_turn(self, node: NodeId) -> str:
+        """Put, best effort: the heartbeat out of the decision loop; receivers look at it when they are awake anyway."""
+        return self._key("beat", node, "in", "turn")
+
+    def profile(self, node: NodeId) -> str:
+        """Put: `Profile`, for something has happened: a worker's state, draining, a link that came or went."""
+        return self._key("profile", node)
+
+    def profile_in_turn(self, node: NodeId) -> str:
+        """Put: `Profile` with new figures; receivers look at it when they are awake anyway."""
+        return self._key("profile", node, "in", "turn")
+
+    def utility(self, node: NodeId, asker: NodeId) -> str:
+        """Queryable of ``node``: its utility vectors for all tasks."""
+        return self._key("utility", node, asker)
+
+    def proposal(self, node: NodeId) -> str:
+        """Put: `Proposal`."""
+        return self._key("proposal", node)
+
+    def register(self, elector: NodeId, proposer: NodeId) -> str:
+        """Queryable of ``elector``: prepare and accept."""
+        return self._key("register", elector, proposer)
+
+    def allocation(self, node: NodeId) -> str:
+        """Put: the register values that ``node`` has learnt."""
+        return self._key("allocation", node)
+
+    def learnt(self, node: NodeId, asker: NodeId) -> str:
+        """Queryable of ``node``: the same values, for one asker."""
+        return self._key("allocation", node, asker)
+
+    def all_puts(self) -> str:
+        """Selector over every put of every node that wakes its receivers (beat, profile, proposal, allocation)."""
+        return self._key("*", "*")
+
+    def all_in_turn(self) -> str:
+        """Selector over every put of every node that wakes nobody up."""
+        return self._key("*", "*", "in", "turn")
+
+    def all_questions(self, node: NodeId) -> str:
+        """Key expression of every question to ``node``: ``<kind>/<node>/<asker>``."""
+        return self._key("*", node, "*")
+
+    def worker(self, node: NodeId, task: TaskId, incarnation: int | str) -> str:
+        """Liveliness token of a worker on its data session: ready."""
+        return self._key("worker", node, task, str(incarnation))
+
+    def role(self, node: NodeId, task: TaskId) -> str:
+        """Put and queryable, to the worker from its own node: idle, active or draining."""
+        return self._key("role", node, task)
+
+    def trouble(self, node: NodeId, task: TaskId, incarnation: int | str) -> str:
+        """Put of a worker, to its own node's relay: its callbacks raise, or what jobs it has done."""
+        return self._key("trouble", node, task, str(incarnation))
+
+    def ack(self, node: NodeId, task: TaskId, incarnation: int | str, relay: str) -> str:
+        """Put of a worker, to the relay with that zenoh id: how far it has processed that relay's samples."""
+        return self._key("ack", node, task, str(incarnation), relay)
+
+    def received(self, node: NodeId, relay: str, worker: str) -> str:
+        """Put of ``node``'s relay (its zenoh id), to the worker with that zenoh id: how far it has its answers."""
+        return self._key("received", node, relay, worker)
+
+    def snapshot(self, node: NodeId, task: TaskId) -> str:
+        """Queryable of a worker: its state, chunked."""
+        return self._key("snapshot", node, task)
+
+    def status(self, node: NodeId, asker: NodeId) -> str:
+        """Queryable of ``node``: what `zsched status` shows."""
+        return self._key("status", node, asker)
+
+    def command(self, node: NodeId, operator: NodeId) -> str:
+        """Queryable of ``node``: operator commands."""
+        return self._key("command", node, operator)

@@ -1,0 +1,162 @@
+"""What a worker processed while it was not the owner: kept for the day it is, then given back in order.
+
+Knows: which samples wait, their order, bounds. Does not know: roles, epochs, threads (the dispatcher's lock guards it).
+
+A sample whose output was withheld because the worker was not the owner (a warm-up, or one that outran the role) is kept
+and processed again when it becomes the owner: else the newest map of a crashed owner would have no result at all.
+So is, where a predecessor's state takes the place of its own, every sample processed before: it was sent to nobody else
+(a flip waits only so long for the role), and what it had done to the state is gone.
+
+Every sample has a *turn*, its place among all that were ever taken. What is given back goes by turns, and nothing of a
+later turn may be answered before it: neither the sample that is in hand when the worker becomes the owner, nor what was
+given back already when the role comes a second time.
+
+A robot counts what a slot left open as lost when the slot closes, or gives it to the next owner; then nobody shall do
+it later, behind newer work. It says so to the worker that had it; a word that does not arrive (the link was broken, the
+robot's relay died) is replaced by `STALE_S`.
+"""
+
+from __future__ import annotations
+
+from bisect import insort
+from collections import deque
+from operator import attrgetter
+from typing import Final, Generic, NamedTuple, Protocol, TypeVar
+
+import zenoh
+
+from zsched.hop.acknowledger import SourceName
+from zsched.worker.debts import Held
+
+MAX_WITHHELD: Final = 256
+"""Samples per key of an input without ``keep_last`` that a predecessor's state may want again."""
+MAX_BACKLOG: Final = 4096
+MAX_BACKLOG_BYTES: Final = 32 << 20
+"""Of such an input, whose output was withheld, that are kept for the day this worker becomes the owner; older ones are
+lost, and said to be."""
+STALE_S: Final = 2.5
+"""What was withheld so long before a newer epoch than its own begins is given up; until then the robot may still be at
+its slot (as `zsched.worker.epochs.CARRY_S`)."""
+QUIET_S: Final = 10.0
+"""What was processed longer ago than this came with another move, or the predecessor had it, too."""
+
+_turn_of = attrgetter("turn")
+
+
+class Source(Protocol):
+    """An input: what of it is kept; ``is_whole``: the sample's publisher is of class ``reliable``."""
+
+    def newest(self, *, is_whole: bool) -> int | None:
+        """How many samples of a key are kept, ``None``: all."""
+
+    def wants(self, *, is_whole: bool) -> bool:
+        """Whether a sample that gives way is lost."""
+
+
+SourceT = TypeVar("SourceT", bound=Source)
+
+
+class Done(NamedTuple, Generic[SourceT]):
+    """A sample processed while this worker was not the owner."""
+
+    source: SourceT
+    sample: zenoh.Sample
+    turn: int
+    epoch: int
+    """The epoch in which its publisher was first heard."""
+    quiet_at: float | None = None
+    """When it was processed, if nothing was withheld of it: it counts where the state that it went into is replaced."""
+    replayed: bool = False
+    name: SourceName | None = None
+    is_whole: bool = False
+    """Its publisher is of class ``reliable``."""
+    held: Held | None = None
+    """What waits until it has been answered."""
+    slot: int = 0
+    """The epoch that it was sent in, 0: its publisher has not said."""
+    at: float = 0.0
+    """When it was first processed."""
+
+    def is_over(self, *, is_restored: bool, now: float) -> bool:
+        """True when it need not be processed again."""
+        return self.quiet_at is not None and not (is_restored and now - self.quiet_at < QUIET_S)
+
+    def is_open(self, name: SourceName) -> bool:
+        """Whether it is this publisher's, and what it was answered was withheld."""
+        return self.name == name and self.quiet_at is None
+
+    def is_stale(self, epoch: int, now: float) -> bool:
+        """True when it is too late for it in ``epoch``: it was sent in an older one, long ago, and has no answer."""
+        return self.quiet_at is None and 0 < self.slot < epoch and now - self.at > STALE_S
+
+
+class Backlog(Generic[SourceT]):
+    """Samples that are *kept* until the worker becomes the owner, and samples that are to be processed *again*."""
+
+    def __init__(self) -> None:
+        self._kept: dict[tuple[int, str], deque[Done[SourceT]]] = {}
+        self._bytes = 0
+        self._again: deque[Done[SourceT]] = deque()
+
+    @property
+    def is_due(self) -> bool:
+        """True while something is to be processed again."""
+        return bool(self._again)
+
+    def owes(self, epoch: int) -> bool:
+        """Whether a sample of the epoch, or an older one, is still to be answered."""
+        return any(done.epoch <= epoch and done.quiet_at is None for done in self._again)
+
+    def is_before(self, turn: int) -> bool:
+        """Whether a sample of an earlier turn is still to be processed again (the dispatch thread needs no lock)."""
+        again = self._again  # replaced whole by other threads
+        return bool(again) and again[0].turn < turn
+
+    def keep(self, done: Done[SourceT]) -> list[Done[SourceT]]:
+        """Keep a sample; answers those that gave way to it unanswered, and are lost."""
+        source = done.source
+        line = self._kept.setdefault((id(source), str(done.sample.key_expr)), deque())
+        line.append(done)
+        self._bytes += len(done.sample.payload)
+        limit = source.newest(is_whole=done.is_whole) or (MAX_BACKLOG if done.quiet_at is None else MAX_WITHHELD)
+        lost = []
+        while len(line) > limit or (self._bytes > MAX_BACKLOG_BYTES and len(line) > 1):
+            oldest = line.popleft()
+            self._bytes -= len(oldest.sample.payload)
+            is_lost = oldest.quiet_at is None and source.wants(is_whole=oldest.is_whole)
+            if is_lost and oldest.name is not None:
+                lost.append(oldest)
+        return lost
+
+    def stale(self, epoch: int, now: float) -> set[SourceName]:
+        """The publishers of what is too old to be done in ``epoch``."""
+        waiting = [*self._again, *(done for line in self._kept.values() for done in line)]
+        return {done.name for done in waiting if done.name is not None and done.is_stale(epoch, now)}
+
+    def forget(self, name: SourceName) -> int:
+        """Let go of what one publisher has no answer to; answers how many samples that was."""
+        before = len(self._again) + sum(len(line) for line in self._kept.values())
+        self._again = deque(done for done in self._again if not done.is_open(name))
+        for key, line in tuple(self._kept.items()):
+            self._kept[key] = left = deque(done for done in line if not done.is_open(name))
+            self._bytes -= sum(len(done.sample.payload) for done in line) - sum(len(one.sample.payload) for one in left)
+        return before - len(self._again) - sum(len(line) for line in self._kept.values())
+
+    def begin(self) -> None:
+        """This worker is the owner: everything that is kept is to be processed again."""
+        kept = (done for line in self._kept.values() for done in line)
+        self._again = deque(sorted((*self._again, *kept), key=_turn_of))
+        self._kept.clear()
+        self._bytes = 0
+
+    def settle(self, *, is_restored: bool, now: float) -> None:
+        """The worker's state stays, or a predecessor's has taken its place: let go of what has its result."""
+        self._again = deque(done for done in self._again if not done.is_over(is_restored=is_restored, now=now))
+
+    def take(self) -> Done[SourceT] | None:
+        """The next sample that is to be processed again."""
+        return self._again.popleft() if self._again else None
+
+    def put_back(self, done: Done[SourceT]) -> None:
+        """A sample was withheld although the worker became the owner meanwhile: it is processed again in its turn."""
+        insort(self._again, done, key=_turn_of)

@@ -1,0 +1,177 @@
+"""One output of a worker: stamped with the epoch, numbered, ended by a marker.
+
+Knows: publishers per epoch, how many samples went out. Does not know: roles (it asks for the epoch), inputs, which
+answers have arrived (`zsched.worker.keep`).
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
+
+import zenoh
+from zenoh import CongestionControl, ext
+
+from zsched.core.hop.serial import serial_of
+from zsched.core.values.relay_protocol import EndMarker
+from zsched.sessions.send_queue import SendQueue
+from zsched.worker.keep import Keeper, put_end
+from zsched.worker.lanes import KeptLane
+
+LATEST_DEPTH: Final = 16
+"""Values of class ``latest`` that may wait for a receiver that keeps up; behind a stalled one, ``keep_last`` do."""
+OUTPUT_DEPTH: Final = 4096
+"""Answers of class ``reliable`` that an output keeps at most until they are acknowledged."""
+RECEIVE_BUFFER: Final = 1 << 16
+"""Bytes of zenoh's batches (``transport/link/rx/buffer_size``); what is larger has come in several, and has its own."""
+KEPT_EPOCHS: Final = 2
+"""Publishers of older epochs are given back: nobody admits them any more."""
+
+
+@dataclass(slots=True, eq=False)
+class _Stamped:
+    """The publisher of one epoch."""
+
+    key: str
+    publisher: zenoh.Publisher | ext.AdvancedPublisher
+    lane: KeptLane | None
+    """Of what is kept until the robots' relays have it (classes ``latest`` and ``reliable``)."""
+    count: int = 0
+
+
+class Output:
+    """An output declared with `Worker.publisher`; `put` may be called from any thread."""
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        template: str,
+        *,
+        latest: bool,
+        reliable: bool,
+        keep_last: int,
+        depth: int,
+        keeper: Keeper,
+        epoch_now: Callable[[], int | None],
+        stamp_now: Callable[[], zenoh.Timestamp | None],
+        owe: Callable[[KeptLane, int], None],
+    ) -> None:
+        """``owe`` is told of an answer of class ``reliable`` before it is put: (its lane, its number)."""
+        self._session = session
+        self._template = template
+        self.is_latest = latest
+        """Whether the last value is kept for who comes late."""
+        self._keep_last = max(1, keep_last)
+        self._keeper = keeper if latest or reliable else None
+        self._stalled = keeper.stalled
+        self._kept = self._keep_last if latest else depth
+        self._congestion = CongestionControl.BLOCK if latest or reliable else CongestionControl.DROP
+        self._epoch_now = epoch_now
+        self._stamp_now = stamp_now
+        self._owe = owe
+        self._lock = threading.Lock()
+        self._epochs: dict[int, _Stamped] = {}
+        self._queue: SendQueue | None = None
+        if latest:
+            depth = max(LATEST_DEPTH, self._keep_last)
+            self._queue = SendQueue(f"out {template}", depth=depth, sheds=True, keep_last=self._keep_last)
+        self.sent = 0
+        """Samples that went out, or wait for their receiver."""
+        self.withheld = 0
+        """Samples that went nowhere, since this worker is not the owner."""
+        self.shed = 0
+        """Samples that gave way to newer ones behind a stalled receiver (class ``latest``)."""
+
+    def put(self, payload: Any, *, attachment: Any = None, encoding: Any = None, timestamp: Any = None) -> bool:
+        """Publish (``bytes`` or ``zenoh.ZBytes``); ``False``, and counted, while this worker is not the owner.
+
+        Without ``timestamp`` the value inherits that of the input it was made of, if that had one: gates tell by it
+        that a new owner's first values are older than the old owner's last.
+        """
+        with self._lock:
+            epoch = self._epoch_now()
+            if epoch is None:
+                self.withheld += 1
+                return False
+            stamped = self._epochs.get(epoch) or self._declare(epoch)
+            stamp = timestamp or self._stamp_now()
+            self.sent += 1
+            if self._queue is None:
+                self._put(stamped, payload, attachment, encoding, stamp)
+                return True
+            action = lambda: self._put(stamped, payload, attachment, encoding, stamp)  # noqa: E731 - named for its type
+            self.shed += self._queue.send(stamped.key, action, len(payload) if hasattr(payload, "__len__") else 0)
+            return True
+
+    def send_end(self, epoch: int) -> None:
+        """Put the end marker behind the last sample of an epoch (also when there was none)."""
+        with self._lock:
+            stamped = self._epochs.get(epoch) or self._declare(epoch)
+            if self._queue is None:
+                self._put_end(stamped, epoch)
+            else:
+                self._queue.then(lambda: self._put_end(stamped, epoch))
+
+    def close(self) -> None:
+        """End the thread of a class ``latest`` output."""
+        if self._queue is not None:
+            self._queue.close()
+
+    def _put_end(self, stamped: _Stamped, epoch: int) -> None:
+        marker = EndMarker(epoch=epoch, count=stamped.count)
+        with self._stalled:
+            put_end(self._session, stamped.key, stamped.publisher.id, marker)
+        if stamped.lane is not None:
+            stamped.lane.note_end(marker)
+
+    def _declare(self, epoch: int) -> _Stamped:
+        key = self._template.replace("{epoch}", str(epoch))
+        publisher: zenoh.Publisher | ext.AdvancedPublisher
+        if self.is_latest:
+            publisher = ext.declare_advanced_publisher(
+                self._session,
+                key,
+                congestion_control=self._congestion,
+                cache=ext.CacheConfig(self._keep_last),
+                sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),
+                publisher_detection=True,
+            )
+        else:
+            publisher = self._session.declare_publisher(key, congestion_control=self._congestion)
+        lane = None if self._keeper is None else self._keeper.lane(key, publisher.id, self._kept)
+        stamped = self._epochs[epoch] = _Stamped(key=key, publisher=publisher, lane=lane)
+        for old in sorted(self._epochs)[:-KEPT_EPOCHS]:
+            gone = self._epochs.pop(old)
+            gone.publisher.undeclare()  # type: ignore[no-untyped-call] # zenoh's stubs
+            if gone.lane is not None:
+                gone.lane.is_closed = True
+        return stamped
+
+    def _put(self, stamped: _Stamped, payload: Any, attachment: Any, encoding: Any, timestamp: Any) -> None:
+        publisher, number = stamped.publisher, stamped.count
+        stamped.count += 1
+        if stamped.lane is not None:
+            payload, attachment = _own(payload), _own(attachment)
+            size = len(payload) if hasattr(payload, "__len__") else 0
+            stamped.lane.keep(number, payload, attachment, encoding, timestamp, size)
+            if not self.is_latest:
+                self._owe(stamped.lane, number)
+        more = {"attachment": attachment, "encoding": encoding, "timestamp": timestamp}
+        if isinstance(publisher, zenoh.Publisher):
+            more["source_info"] = zenoh.SourceInfo(publisher.id, serial_of(number))
+        with self._stalled:
+            publisher.put(payload, **more)
+
+
+def _own(value: Any) -> Any:
+    """As bytes of our own: what its caller may change afterwards (a ``bytearray``), and a small part of what came in.
+
+    The latter lies in zenoh's receive buffer, which it would hold as a whole for as long as it is kept.
+    """
+    if isinstance(value, bytearray):
+        return zenoh.ZBytes(value)
+    if isinstance(value, zenoh.ZBytes) and len(value) < RECEIVE_BUFFER:
+        return zenoh.ZBytes(value.to_bytes())
+    return value

@@ -1,0 +1,346 @@
+"""A worker's state on its way to the next owner: offered in chunks, fetched before the first input, checked as a whole.
+
+Knows: chunks, their checksum, how long a new owner waits. Does not know: what is in a snapshot, when roles change.
+
+One query, many replies: each at most `CHUNK` bytes, its attachment a `SnapshotChunk` that names its place, the size of
+the whole and its checksum. A new owner waits `FIRST_S` for the first chunk and for each next one, and ``timeout_s`` for
+all of them; whatever goes wrong is a cold start with a reason, never an error.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import queue
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+import zenoh
+
+from zsched.clock import monotonic_s
+from zsched.core.values.model import NodeId
+from zsched.core.values.plan import Role, WorkerRole
+from zsched.core.values.relay_protocol import ERROR_ENCODING, SnapshotChunk
+from zsched.guard import guarded, tolerant
+from zsched.ipc.pipe import decode_chunk, encode_chunk
+
+CHUNK: Final = 256 * 1024
+MAX_SNAPSHOT: Final = 32 << 20
+"""Bytes; a larger one is refused by both sides."""
+FIRST_S: Final = 0.3
+"""Silence after which the predecessor is taken for dead; a relay's flip waits as long for the new owner."""
+TIMEOUT_S: Final = 2.0
+CONTEST_S: Final = 0.1
+"""So long a whole state waits for whoever else answers the same question."""
+MAX_OFFERS: Final = 2
+RELAY_S: Final = 5.0
+"""So long a worker that starts waits for its node's relay, which may start later than it does (or again)."""
+
+_log = logging.getLogger("zsched.worker")
+
+
+class StateLink:
+    """The session for snapshots: a client of this node's relay, opened when it is first needed.
+
+    Workers are peers, and peers carry nothing between two others: two workers of different machines need not have a
+    link of their own. Their nodes' relays have, and a relay does carry for its clients.
+    """
+
+    def __init__(self, main: zenoh.Session, zenoh_config: str) -> None:
+        """``zenoh_config``: that of the worker's ``main`` session (JSON5), whose first ``connect`` is the relay."""
+        self._main, self._zenoh_config = main, zenoh_config
+        self._lock = threading.Lock()
+        self._own: zenoh.Session | None = None
+
+    @property
+    def session(self) -> zenoh.Session:
+        """The session; the worker's own one where that is a client already, or no relay is known."""
+        with self._lock:
+            if self._own is None:
+                self._own = self._opened()
+            return self._own
+
+    def open(self) -> None:
+        """Open it now, so that it need not be in a move."""
+        _ = self.session
+
+    def close(self) -> None:
+        """Close it, if it was opened."""
+        own = self._own
+        if own is not None and own is not self._main:
+            own.close()
+
+    def _opened(self) -> zenoh.Session:
+        try:
+            config = zenoh.Config.from_json5(self._zenoh_config)
+            endpoints = json.loads(config.get_json("connect/endpoints"))
+            if json.loads(config.get_json("mode")) == "client" or not isinstance(endpoints, list) or not endpoints:
+                return self._main
+            config.insert_json5("mode", json.dumps("client"))
+            config.insert_json5("listen/endpoints", "[]")
+            config.insert_json5("connect/endpoints", json.dumps(endpoints[:1]))
+            config.insert_json5("connect/timeout_ms", json.dumps(round(RELAY_S * 1000)))
+            return zenoh.open(config)
+        except (zenoh.ZError, ValueError) as error:
+            _log.warning("no session of its own for snapshots (%s): only direct neighbours are asked", error)
+            return self._main
+
+
+class Offer:
+    """The queryable under which a worker's successor finds its state."""
+
+    def __init__(self, session: zenoh.Session, key: str, snapshot: Callable[[], bytes]) -> None:
+        """Declare it; ``snapshot`` is called in a thread of its own, once per query."""
+        self._key = key
+        self._snapshot = snapshot
+        self._queryable = session.declare_queryable(key, zenoh.handlers.FifoChannel(16), complete=True)
+        handler = self._queryable.handler
+        guarded(self._run, handler, name="zsched snapshot").start()
+
+    def undeclare(self) -> None:
+        """Offer it no more."""
+        self._queryable.undeclare()
+
+    def _run(self, handler: zenoh.handlers.Handler[zenoh.Query]) -> None:
+        for query in handler:
+            try:
+                with query:
+                    self._answer(query)
+            except zenoh.ZError as error:
+                _log.info("a snapshot could not be sent (%s)", error)
+
+    def _answer(self, query: zenoh.Query) -> None:
+        try:
+            content = self._snapshot()
+        except Exception as error:  # noqa: BLE001 - the worker's own bug is the successor's cold start
+            _log.exception("the worker's snapshot failed")
+            query.reply_err(f"failed: {type(error).__name__}: {error}"[:400], encoding=ERROR_ENCODING)
+            return
+        if len(content) > MAX_SNAPSHOT:
+            _log.warning("the snapshot has %d bytes, at most %d are carried", len(content), MAX_SNAPSHOT)
+            query.reply_err(f"too large: {len(content)} bytes, at most {MAX_SNAPSHOT}", encoding=ERROR_ENCODING)
+            return
+        for chunk, part in chunks(content):
+            query.reply(self._key, part, attachment=encode_chunk(chunk))
+
+
+def chunks(content: bytes) -> list[tuple[SnapshotChunk, bytes]]:
+    """``content`` cut up; at least one chunk, each with what is needed to check the whole."""
+    checksum = _checksum(content)
+    starts = range(0, max(1, len(content)), CHUNK)
+    return [
+        (
+            SnapshotChunk(index=index, count=len(starts), size=len(content), checksum=checksum),
+            content[start : start + CHUNK],
+        )
+        for index, start in enumerate(starts)
+    ]
+
+
+def _checksum(content: bytes) -> str:
+    return hashlib.blake2s(content, digest_size=16).hexdigest()
+
+
+class Assembly:
+    """Puts chunks together, in any order; chunks of two workers (one is restarting) never mix."""
+
+    def __init__(self) -> None:
+        self._parts: dict[tuple[str, int, int], dict[int, bytes]] = {}
+
+    @property
+    def is_contested(self) -> bool:
+        """Whether two different states are offered: one of them is a stranger's."""
+        return len(self._parts) > 1
+
+    def add(self, chunk: SnapshotChunk, part: bytes) -> bytes | str | None:
+        """The whole content once it is complete, why it cannot be (``str``), ``None`` while something is missing.
+
+        What is kept is bounded: `MAX_OFFERS` states of `MAX_SNAPSHOT` bytes.
+        """
+        if chunk.size > MAX_SNAPSHOT or chunk.count != max(1, -(-chunk.size // CHUNK)) or chunk.index >= chunk.count:
+            return f"a chunk that fits no snapshot ({chunk.index} of {chunk.count}, {chunk.size} bytes)"
+        if len(part) != min(CHUNK, chunk.size - chunk.index * CHUNK):
+            return f"corrupt: piece {chunk.index} of {chunk.count} has {len(part)} bytes"
+        name = (chunk.checksum, chunk.count, chunk.size)
+        if name not in self._parts and len(self._parts) >= MAX_OFFERS:
+            return "too many different states"
+        parts = self._parts.setdefault(name, {})
+        parts[chunk.index] = part
+        if len(parts) < chunk.count:
+            return None
+        content = b"".join(parts[index] for index in range(chunk.count))
+        if _checksum(content) != chunk.checksum:
+            return "corrupt: its checksum does not match"
+        return content
+
+
+def fetch(session: zenoh.Session, key: str, timeout_s: float) -> bytes | str:
+    """The snapshot under ``key``, or why there is none; never takes longer than ``timeout_s``."""
+    replies: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()
+    token = zenoh.CancellationToken()
+    until = monotonic_s() + timeout_s
+    try:
+        session.get(
+            key,
+            zenoh.handlers.Callback(tolerant(replies.put, "snapshot"), lambda: replies.put(None), indirect=False),
+            target=zenoh.QueryTarget.ALL,  # a stranger's offer may call itself complete, and must not be the only one
+            timeout=timeout_s + 1.0,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            cancellation_token=token,
+        )
+        return _assembled(replies, until)
+    except zenoh.ZError as error:
+        return f"it could not be asked for ({error})"
+    finally:
+        token.cancel()
+
+
+def _assembled(replies: queue.SimpleQueue[zenoh.Reply | None], until: float) -> bytes | str:
+    """The one state that is offered. Who answers beside it is waited for, shortly: two states are one too many."""
+    assembly = Assembly()
+    has_come, whole, problem = False, b"", ""
+    is_whole = False
+    while True:
+        left_s = until - monotonic_s()
+        try:
+            reply = replies.get(timeout=max(0.0, min(left_s, CONTEST_S if is_whole else FIRST_S)))
+        except queue.Empty:
+            if is_whole:
+                break
+            return problem or ("late: it had not come in time" if has_come else f"no answer within {FIRST_S:g} s")
+        if reply is None:
+            break
+        has_come = True
+        result = _added(assembly, reply)
+        if isinstance(result, bytes):
+            is_whole, whole = True, result
+        problem = result if isinstance(result, str) else problem
+        if left_s <= 0:
+            return "late: it had not come in time"
+    if assembly.is_contested:
+        return "contested: two different states are offered"
+    if is_whole:
+        return whole
+    return problem or ("incomplete: its worker died meanwhile" if has_come else "nobody offers one")
+
+
+def _added(assembly: Assembly, reply: zenoh.Reply) -> bytes | str | None:
+    sample = reply.ok
+    if sample is None:
+        error = reply.err
+        return f"refused: {error.payload.to_bytes()[:200]!r}" if error is not None else "an empty reply"
+    chunk = decode_chunk(sample.attachment.to_bytes()) if sample.attachment is not None else None
+    if chunk is None:
+        return "corrupt: a piece without its place"
+    return assembly.add(chunk, sample.payload.to_bytes())
+
+
+@dataclass(frozen=True, slots=True)
+class _Fetched:
+    epoch: int
+    predecessor: NodeId
+    content: bytes | str
+    took_s: float
+
+
+class Restorer:
+    """A new owner's side: while it `is_pending`, no input is processed and nothing is put out.
+
+    `note` says that a role has come, `begin` starts the fetch in a thread of its own, `deliver` lets ``inputs`` go on
+    behind the worker's callback. Calls come from several threads.
+    """
+
+    def __init__(self, fetched: Callable[[NodeId, float], bytes | str], node: NodeId, inputs: Held) -> None:
+        self._fetch = fetched
+        self._node = node
+        self._inputs = inputs
+        self._lock = threading.Lock()
+        self._callback: Callable[[bytes], None] | None = None
+        self._timeout_s = TIMEOUT_S
+        self._noted: Role | None = None
+        self._has_begun = False
+        self._result: _Fetched | None = None
+        self.is_pending = False
+        """A snapshot is on its way: this worker is not the owner yet."""
+        self.restored = 0
+        self.cold_starts = 0
+
+    def register(self, callback: Callable[[bytes], None], timeout_s: float) -> None:
+        """Take the worker's callback."""
+        self._callback, self._timeout_s = callback, timeout_s
+
+    def note(self, role: Role) -> None:
+        """A role has come: stop the inputs when it begins an epoch that has a predecessor to ask."""
+        with self._lock:
+            is_new = self._noted is None or role.epoch > self._noted.epoch
+            is_owner = role.role is WorkerRole.ACTIVE and role.predecessor not in (None, self._node)
+            if self._callback is None or not is_new or not is_owner:
+                return
+            self._noted, self._has_begun, self._result = role, False, None
+            self.is_pending = True
+            self._inputs.hold()
+
+    def begin(self, role: Role, then: Callable[[], None]) -> bool:
+        """Start the fetch of this role's epoch, once; ``then`` follows in its thread. ``False``: nothing to await."""
+        with self._lock:
+            noted = self._noted
+            is_ours = noted is not None and noted.epoch == role.epoch
+            if not self.is_pending or not is_ours or noted is None or noted.predecessor is None:
+                return False
+            if self._has_begun:
+                return self._result is None  # under way: who asks again (a lease was renewed) waits like the first
+            self._has_begun = True
+            predecessor = noted.predecessor
+        arguments = (role.epoch, predecessor, then)
+        guarded(self._run, *arguments, name="zsched restore", is_lasting=False).start()
+        return True
+
+    def deliver(self) -> None:
+        """Hand over what has come, in the dispatch thread, and let the inputs follow; nothing while it is awaited."""
+        with self._lock:
+            result, self._result = self._result, None
+        if result is not None:
+            self._inputs.release(lambda: self._hand_over(result))
+
+    def _run(self, epoch: int, predecessor: NodeId, then: Callable[[], None]) -> None:
+        started = monotonic_s()
+        content = self._fetch(predecessor, self._timeout_s)
+        with self._lock:
+            if self._noted is not None and self._noted.epoch == epoch:  # else the next epoch's fetch goes on
+                self._result = _Fetched(epoch, predecessor, content, monotonic_s() - started)
+        then()
+
+    def _hand_over(self, result: _Fetched) -> bool:
+        """Give the worker its predecessor's state; answers whether it has it."""
+        content, callback = result.content, self._callback
+        if isinstance(content, bytes) and callback is not None:
+            try:
+                callback(content)
+            except Exception:  # noqa: BLE001 - the worker goes on cold
+                _log.exception("the worker's on_snapshot failed")
+                content = "its own on_snapshot failed"
+        with self._lock:
+            is_newest = self._noted is not None and self._noted.epoch == result.epoch
+            self.is_pending = self.is_pending and not is_newest
+            self.restored += isinstance(content, bytes)
+            self.cold_starts += isinstance(content, str)
+        where = (result.epoch, result.predecessor)
+        if isinstance(content, bytes):
+            took_ms = result.took_s * 1000
+            _log.info("restored epoch=%d from=%s bytes=%d took_ms=%.0f", *where, len(content), took_ms)
+        else:
+            _log.warning("cold_start epoch=%d from=%s why=%r", *where, content)
+        return isinstance(content, bytes)
+
+
+class Held(Protocol):
+    """What a `Restorer` stops and starts: `zsched.worker.inputs.Dispatcher` is one."""
+
+    def hold(self) -> None:
+        """Process no input until `release`."""
+
+    def release(self, first: Callable[[], bool]) -> None:
+        """Call ``first`` in the dispatch thread, then go on; it answers whether the worker's state is another now."""

@@ -1,0 +1,81 @@
+"""Counts what a worker's own callbacks raise, logs a little of it, and lets its node know.
+
+Knows: how often a failure is worth a line or a message. Does not know: zenoh, keys, what a callback does.
+
+A callback that raises on every sample raises a thousand times a second: the log has one traceback per kind of error in
+`LOG_S`, and `status` the count and the newest error's first line.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+from collections.abc import Callable
+from typing import Final
+
+from zsched.clock import monotonic_s
+from zsched.core.values.model import MAX_REASON
+from zsched.guard import guarded
+
+TELL_S: Final = 1.0
+"""The node is told no more often."""
+LOG_S: Final = 10.0
+MAX_KINDS: Final = 32
+"""Kinds of errors that are told apart in the log."""
+_ROOM: Final = 60
+"""Of `MAX_REASON`, for the words before the error's own."""
+
+_log = logging.getLogger("zsched.worker")
+
+
+class Troubles:
+    """One worker's failures. `note` may be called from any thread; ``tell`` runs in a thread of its own."""
+
+    def __init__(self, tell: Callable[[int, str], None]) -> None:
+        """``tell`` takes (how many callbacks have failed so far, the newest error in one line)."""
+        self._tell = tell
+        self._lock = threading.Lock()
+        self._count = 0
+        self._text = ""
+        self._told_at = -TELL_S
+        self._timer: threading.Thread | None = None
+        self._log_at: dict[str, float] = {}
+        self._closed = threading.Event()
+
+    def note(self, where: str, error: Exception) -> None:
+        """A callback for ``where`` raised (to be called while the error is handled)."""
+        now, kind = monotonic_s(), type(error).__name__
+        with self._lock:
+            self._count += 1
+            count = self._count
+            self._text = _one_line(f"{kind}: {error}" if str(error) else kind)
+            known = kind if kind in self._log_at or len(self._log_at) < MAX_KINDS else "another"
+            is_worth_a_line = now >= self._log_at.get(known, now)
+            if is_worth_a_line:
+                self._log_at[known] = now + LOG_S
+            if self._timer is None and not self._closed.is_set():
+                delay_s = max(self._told_at + TELL_S - now, 0.0)
+                self._timer = guarded(self._send_after, delay_s, name="zsched troubles", is_lasting=False)
+                self._timer.start()
+        if is_worth_a_line:
+            so_far = "" if count == 1 else f", {count} times in all; at most one line in {LOG_S:g} s"
+            _log.exception("%s: the worker's callback failed%s", where, so_far)
+
+    def close(self) -> None:
+        """Tell nothing any more."""
+        self._closed.set()
+
+    def _send_after(self, delay_s: float) -> None:
+        if self._closed.wait(delay_s):
+            return
+        with self._lock:
+            self._timer, self._told_at = None, monotonic_s()
+            count, text = self._count, self._text
+        with contextlib.suppress(Exception):  # the session closes: whoever is left without a word sees the worker's end
+            self._tell(count, text)
+
+
+def _one_line(text: str) -> str:
+    """The first line of an error, as short as it has to be to be carried."""
+    return text.strip().partition("\n")[0][: MAX_REASON - _ROOM]

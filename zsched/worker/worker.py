@@ -1,0 +1,496 @@
+"""The library a Python worker imports: its inputs, its epoch-stamped outputs, its role, its orderly end.
+
+Knows: the worker's side of a handover (token, role, end markers). Does not know: what the task computes, who decides.
+
+    with Worker.from_env() as worker:
+        out = worker.publisher("{prefix}/{epoch}/global_map", latest=True)
+        worker.subscribe(f"{worker.prefix}/*/map", on_map)
+        worker.ready()
+        while worker.wait(1.0):
+            ...
+
+Every sample goes through one dispatch thread, in order per key; zenoh's own threads only enqueue. A warm standby takes
+and processes its inputs like an owner, but its outputs go nowhere (`Output.put` answers ``False``); what it took then
+is processed once more when it becomes the owner. When the task moves away, each input ends with an in-band marker
+behind its last sample; when all inputs seen have ended and their samples are processed, the worker sends the same
+marker behind its last output: that is how the robots know that nothing is missing.
+
+By hand, without a daemon: ``Worker.from_env(standalone="my_task")``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import signal
+import threading
+from collections.abc import Callable, Mapping
+from functools import partial
+from types import FrameType, TracebackType
+from typing import Any, Final, Self
+
+import zenoh
+
+from zsched.clock import monotonic_s
+from zsched.core.events import WorkerJobs
+from zsched.core.values.plan import Role, WorkerRole
+from zsched.core.values.relay_protocol import StreamAcks, WorkerTrouble
+from zsched.guard import guarded, tolerant
+from zsched.hop.acknowledger import Acknowledger
+from zsched.ipc.pipe import decode_end
+from zsched.log_limit import limit_library
+from zsched.sessions.config import lease_s
+from zsched.sessions.stalled_links import StalledLinks
+from zsched.wire import codec as wire
+from zsched.wire.keyspace import END_CHUNK, Keyspace
+from zsched.worker.debts import Debts
+from zsched.worker.epochs import CARRY_LOOK_S, CARRY_S, Epochs, lets_out
+from zsched.worker.errands import Errands
+from zsched.worker.inputs import Dispatcher
+from zsched.worker.jobs import Job, JobBook
+from zsched.worker.keep import Keeper
+from zsched.worker.lanes import STALLED_S
+from zsched.worker.outputs import OUTPUT_DEPTH, Output
+from zsched.worker.roles import RoleWatch
+from zsched.worker.samples import BY_CLASS, Input, KeepLast, Marker, Received
+from zsched.worker.services import Answer, Handler, Request, Service
+from zsched.worker.snapshot import TIMEOUT_S, Offer, Restorer, StateLink, fetch
+from zsched.worker.start import open_session, relay_endpoint, surroundings
+from zsched.worker.troubles import Troubles
+
+__all__ = ["Answer", "Output", "Received", "Request", "Worker"]
+
+CLOSE_S: Final = 0.6
+"""Closing a session towards a stopped peer can take seconds; so long we wait."""
+ALARM_S: Final = 0.9
+"""...and should zenoh hold Python's global lock meanwhile, the kernel ends a process that was told to stop."""
+
+_log = logging.getLogger("zsched.worker")
+
+
+class Worker:
+    """One worker process on the data network. Use it as a context manager: leaving it closes the session."""
+
+    def __init__(
+        self,
+        *,
+        fleet: str,
+        node: str,
+        task: str,
+        incarnation: str,
+        zenoh_config: str,
+        is_standalone: bool = False,
+        drains_itself: bool = False,
+        deadline_s: float | None = None,
+    ) -> None:
+        """Open the session (``zenoh_config``: JSON5 text). See `from_env` for the other arguments.
+
+        Raises:
+            ConfigError: zenoh refuses the configuration.
+        """
+        limit_library()
+        self.prefix = f"{node}/{task}"
+        self._keyspace = Keyspace(fleet)
+        self._node, self._task, self._incarnation = node, task, incarnation
+        self._drains_itself = drains_itself
+        self._is_standalone = is_standalone
+        self._lock = threading.Lock()
+        idle = Role(task=task, role=WorkerRole.IDLE)
+        self._role = Role(task=task, role=WorkerRole.ACTIVE, epoch=1) if is_standalone else idle
+        self._epochs = Epochs()
+        self._early_end = 0
+        """The newest epoch whose inputs have ended although our role in it has not, or has not come yet."""
+        self._stop = threading.Event()
+        self._is_signalled = False
+        self._outputs: list[Output] = []
+        self._declared: list[Any] = []
+        self._errands = Errands(self._stop)
+        self._token: zenoh.LivelinessToken | None = None
+        self._session = open_session(zenoh_config)
+        self._state_link = StateLink(self._session, zenoh_config)
+        self._acks = Acknowledger(self._send_acks)
+        self._debts = Debts(self._acks)
+        acks_key = self._keyspace.received("*", "*", str(self._session.zid()))
+        self._stalled = StalledLinks(self._session, lease_s(zenoh_config), STALLED_S)
+        self._keeper = Keeper(self._session, acks_key, self._debts, self._stalled)
+        self._troubles = Troubles(self._tell_trouble)
+        self._jobs = JobBook(task, incarnation, self._tell_jobs, deadline_s)
+        self._dispatcher = Dispatcher(self._inputs_ended, self._acks, self._troubles, self._debts, self._jobs)
+        self._restorer = Restorer(self._fetch_snapshot, node, self._dispatcher)
+        self._dispatcher.start()
+        self._watch: RoleWatch | None = None
+        if not is_standalone:
+            key = self._keyspace.role(node, task)
+            self._watch = RoleWatch(self._session, key, self._on_role, self._stop, relay_endpoint(zenoh_config))
+            self._declared.append(self._watch)
+            self._watch.start()
+
+    @classmethod
+    def from_env(
+        cls,
+        env: Mapping[str, str] = os.environ,
+        *,
+        standalone: str = "",
+        drains_itself: bool = False,
+        handles_signals: bool = True,
+    ) -> Self:
+        """The worker that the daemon's environment describes.
+
+        ``standalone`` names the task of a worker started by hand: without ``ZSCHED_*`` it is then the owner on node
+        ``local``, epoch 1, on zenoh's default session. ``drains_itself`` says that outputs also leave outside of the
+        input callbacks: the end markers then wait for `drained`; no input waits until what another thread puts has
+        reached the robots. SIGTERM and SIGINT end `wait` (main thread only).
+
+        Raises:
+            ConfigError: a variable is missing, or the zenoh configuration cannot be read.
+        """
+        around = surroundings(env, standalone)
+        worker = cls(
+            fleet=around.fleet,
+            node=around.node,
+            task=around.task,
+            incarnation=around.incarnation,
+            zenoh_config=around.zenoh_config,
+            is_standalone=around.is_standalone,
+            drains_itself=drains_itself and not around.is_standalone,
+            deadline_s=around.deadline_s,
+        )
+        if handles_signals and threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, worker._on_signal)
+            signal.signal(signal.SIGINT, worker._on_signal)
+        return worker
+
+    # --- what a worker does ------------------------------------------------------------------------------------------
+
+    @property
+    def role(self) -> Role:
+        """The newest role that this node's daemon has told us; idle until it has, and while a snapshot is awaited."""
+        return Role(task=self._task, role=WorkerRole.IDLE) if self._restorer.is_pending else self._role
+
+    @property
+    def session(self) -> zenoh.Session:
+        """The data session, for what this library does not offer (never block in its callbacks)."""
+        return self._session
+
+    def subscribe(
+        self, key_expr: str, on_sample: Callable[[Received], None], keep_last: KeepLast = BY_CLASS, depth: int = 4096
+    ) -> None:
+        """Take an input; call it before `ready`. ``{prefix}`` is filled in.
+
+        ``on_sample`` runs in the dispatch thread. When it falls behind, samples wait: of an input of class ``reliable``
+        all, of any other the newest per key. ``keep_last`` says otherwise: so many of the newest per key, ``None``:
+        all. Of all, at most ``depth`` per key wait, then the oldest go. What goes of a ``reliable`` input is counted
+        `lost` in `zsched status`; of others, what gives way to something newer counts as processed.
+
+        Raises:
+            ValueError: ``keep_last`` or ``depth`` is below 1.
+        """
+        expr = key_expr.replace("{prefix}", self.prefix)
+        source = Input(on_sample=on_sample, keep_last=keep_last, depth=depth)
+        marker = tolerant(self._on_marker, "marker")
+        ends = self._session.declare_subscriber(f"{expr}/{END_CHUNK}", marker)  # who sees the other sees this
+        put = tolerant(partial(self._dispatcher.put, source), "input")
+        data = self._session.declare_subscriber(expr, put)
+        self._declared += [data, ends]
+
+    def publisher(
+        self,
+        template: str,
+        *,
+        latest: bool = False,
+        reliable: bool = False,
+        keep_last: int = 1,
+        depth: int = OUTPUT_DEPTH,
+    ) -> Output:
+        """An output; ``{prefix}`` and ``{epoch}`` are filled in, the epoch anew whenever this worker becomes the owner.
+
+        ``latest``: the last ``keep_last`` values are cached for who comes late; a put never waits, behind a stalled
+        receiver the newest wait. ``reliable``: a put waits for a slow receiver (up to a lease) instead of dropping, and
+        the last ``depth`` answers (at most `zsched.worker.lanes.KEPT_BYTES`) are kept until the robots' relays have
+        acknowledged them: what a broken link lost is sent again.
+        """
+        output = Output(
+            self._session,
+            template.replace("{prefix}", self.prefix),
+            latest=latest,
+            reliable=reliable,
+            keep_last=keep_last,
+            depth=depth,
+            keeper=self._keeper,
+            epoch_now=self._epoch_now,
+            stamp_now=self._dispatcher.stamp,
+            owe=self._dispatcher.owe,
+        )
+        with self._lock:
+            self._outputs.append(output)
+        return output
+
+    def serve(self, key_expr: str, handler: Handler, depth: int = 16) -> None:
+        """Answer requests under a key; call it before `ready`. ``{prefix}`` is filled in.
+
+        ``handler`` runs in a thread of its own per service, one request after another; at most ``depth`` wait, the next
+        one is answered "busy". What it raises becomes an error reply. It is only called while this worker is the owner.
+        """
+        expr = key_expr.replace("{prefix}", self.prefix)
+        service = Service(
+            self._session,
+            expr,
+            handler,
+            is_owner=self._is_owner,
+            later=self._errands.put,
+            troubles=self._troubles,
+            jobs=self._jobs,
+            depth=depth,
+        )
+        self._declared.append(service)
+
+    def offer_snapshot(self, snapshot: Callable[[], bytes]) -> None:
+        """Offer this worker's state to its successor, at most `MAX_SNAPSHOT` bytes; call it before `ready`.
+
+        ``snapshot`` is called in a thread of its own whenever the next owner asks, usually while this one still works.
+        """
+        key = self._keyspace.snapshot(self._node, self._task)
+        self._declared.append(Offer(self._state_link.session, key, snapshot))
+
+    def on_snapshot(self, restore: Callable[[bytes], None], timeout_s: float = TIMEOUT_S) -> None:
+        """Take the predecessor's state over when this worker becomes the owner; call it before `subscribe`.
+
+        ``restore`` runs in the dispatch thread before any input of the new epoch, at most ``timeout_s`` (0.3 s if the
+        predecessor is silent) after the role came; until then `role` is idle. Without a snapshot it is not called.
+        """
+        self._errands.put(self._state_link.open)  # before it is needed, not in a move
+        self._restorer.register(restore, timeout_s)
+        self._dispatcher.remember(lambda: self.role.role is WorkerRole.IDLE)
+        role = self._role
+        self._restorer.note(role)
+        self._errands.put(lambda: self._begin(role))
+
+    def ready(self) -> None:
+        """Say that the inputs are declared: the token that the robots' relays wait for. Call it once."""
+        if self._is_standalone or self._token is not None:
+            return
+        key = self._keyspace.worker(self._node, self._task, self._incarnation)
+        self._token = self._session.liveliness().declare_token(key)
+
+    def wait(self, timeout_s: float | None = None) -> bool:
+        """Sleep at most so long; ``False`` as soon as the worker shall end."""
+        return not self._stop.wait(timeout_s)
+
+    def job(self, *, skipped: int = 0, came_s: float | None = None) -> Job:
+        """A piece of work that is not done in a callback: ``with worker.job(): ...``, in whatever thread does it.
+
+        The daemon is told how long jobs take, how much CPU, and how many are left undone (docs/worker.md); from the
+        first one on, callbacks are no jobs any more. ``skipped``: so many were left undone for this one. ``came_s``:
+        when what it works on came, by ``time.monotonic``.
+        """
+        return self._jobs.job(skipped, came_s)
+
+    def drained(self) -> None:
+        """Say that everything taken so far is published (only with ``drains_itself``): ends may go out now."""
+        role = self._role
+        if self._drains_itself and role.role is WorkerRole.DRAINING:
+            self._send_ends(role.epoch)
+
+    # --- the end -----------------------------------------------------------------------------------------------------
+
+    def stop(self) -> None:
+        """Let `wait` answer ``False`` (any thread)."""
+        self._stop.set()
+
+    def close(self) -> None:
+        """Close the session, within a second; after a signal the process ends here when zenoh would hold it longer."""
+        self._stop.set()
+        has_alarm = self._is_signalled and threading.current_thread() is threading.main_thread()
+        if has_alarm:
+            signal.signal(signal.SIGALRM, signal.SIG_DFL)
+            signal.setitimer(signal.ITIMER_REAL, ALARM_S)
+        self._dispatcher.close()
+        self._troubles.close()
+        self._debts.settle(monotonic_s())
+        self._acks.close()
+        self._keeper.close()
+        for output in tuple(self._outputs):
+            output.close()
+        self._errands.close()
+        closing = guarded(self._close_session, name="zsched close", is_lasting=False)
+        closing.start()
+        closing.join(CLOSE_S)
+        if closing.is_alive() and self._is_signalled:
+            logging.shutdown()
+            os._exit(0)  # a stopped peer holds zenoh's close for seconds, and its threads hold the interpreter
+        if has_alarm:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _close_session(self) -> None:
+        for entity in self._declared:  # advanced subscribers hold a closed session open otherwise
+            with contextlib.suppress(zenoh.ZError):
+                entity.undeclare()
+        for close in (self._state_link.close, self._session.close):
+            with contextlib.suppress(zenoh.ZError):
+                close()
+
+    def _on_signal(self, _signal: int, _frame: FrameType | None) -> None:
+        self._is_signalled = True
+        self._stop.set()
+
+    # --- role --------------------------------------------------------------------------------------------------------
+
+    def _on_role(self, role: Role) -> None:
+        with self._lock:
+            self._restorer.note(role)  # first: from the moment that we are the owner, inputs wait for the snapshot
+            before = self._role
+            if role.role is WorkerRole.IDLE or lets_out(before, role, monotonic_s()):
+                self._dispatcher.expect_begin(is_due=role.role is not WorkerRole.IDLE)
+            self._role = role
+            if not self._drains_itself:
+                self._epochs.follow(before, role)
+        if role != before:
+            self._errands.put(lambda: self._change_role(before, role))
+
+    def _change_role(self, before: Role, role: Role) -> None:
+        """Follow a new role: the token that says in which epoch we work; the ends of an epoch that was cut short."""
+        if self._epochs.is_carried(before.epoch):
+            guarded(self._end_later, before.epoch, name="zsched carry", is_lasting=False).start()
+        elif before.epoch and before.epoch != role.epoch:
+            self._send_ends(before.epoch)
+        if role.role is WorkerRole.DRAINING:
+            if before.epoch != role.epoch:  # that we work in it was told us too late: what was withheld is answered now
+                self._begin(role)
+            self._look_for_end(role.epoch)
+        if role.role is WorkerRole.IDLE and before.epoch:
+            self._dispatcher.forget(before.epoch)
+        is_active = role.role is WorkerRole.ACTIVE
+        if self._watch is not None and (not is_active or before.epoch != role.epoch):
+            self._watch.hide()
+        if is_active:
+            self._epochs.resume(role.epoch)
+        was_held = before.lease_until_s is not None and monotonic_s() >= before.lease_until_s
+        is_shown = self._watch is not None and self._watch.is_shown
+        if is_active and (not is_shown or was_held):
+            self._begin(role)  # also what was withheld for want of a lease
+
+    def _end_later(self, epoch: int) -> None:
+        """End an epoch that is carried, also when the end of its inputs never comes."""
+        if self._stop.wait(CARRY_S):
+            return
+        while self._epochs.is_carried(epoch) and self._dispatcher.has_waiting(epoch):
+            if self._stop.wait(CARRY_LOOK_S):
+                return
+        self._send_ends(epoch)
+
+    def _begin(self, role: Role) -> None:
+        """Work in the role's epoch from now on, behind the predecessor's snapshot if there is one to be had."""
+        then = partial(self._errands.put, lambda: self._begin(role))
+        now = self._role
+        is_stale = now.role is WorkerRole.IDLE or now.epoch != role.epoch
+        if not is_stale and self._restorer.begin(role, then):
+            return
+        if not is_stale:
+            self._dispatcher.begin(role.epoch)
+            if now.role is WorkerRole.ACTIVE:
+                self._show_role(role.epoch)
+            self._look_for_end(role.epoch)
+        self._restorer.deliver()
+
+    def _show_role(self, epoch: int) -> None:
+        if self._watch is not None:
+            self._watch.show(epoch)
+
+    def _fetch_snapshot(self, predecessor: str, timeout_s: float) -> bytes | str:
+        return fetch(self._state_link.session, self._keyspace.snapshot(predecessor, self._task), timeout_s)
+
+    def _is_owner(self) -> bool:
+        role = self.role
+        has_lease = role.lease_until_s is None or monotonic_s() < role.lease_until_s
+        return role.role is not WorkerRole.IDLE and has_lease
+
+    def _epoch_now(self) -> int | None:
+        """The epoch that outputs are stamped with, ``None`` while they go nowhere."""
+        role = self._role
+        if role.role is WorkerRole.IDLE or self._restorer.is_pending:
+            self._dispatcher.note_withheld()
+            return None
+        if self._dispatcher.must_wait(role.epoch) and not self._is_standalone:  # what was withheld before comes first
+            self._dispatcher.note_withheld()
+            return None
+        has_lease = role.lease_until_s is None or monotonic_s() < role.lease_until_s
+        epoch = self._epochs.stamp(role, self._dispatcher.epoch_in_hand()) if has_lease else None
+        if epoch is None:  # without a lease, or behind our own end: the next role answers it
+            self._dispatcher.note_withheld()
+        return epoch
+
+    def _send_acks(self, relay: str, frame: StreamAcks) -> None:
+        """Tell a relay how far its samples are; what is dropped here is mended by the next one."""
+        self._session.put(
+            self._keyspace.ack(self._node, self._task, self._incarnation, relay),
+            wire.encode(frame),
+            priority=zenoh.Priority.INTERACTIVE_HIGH,
+            congestion_control=zenoh.CongestionControl.DROP,
+        )
+
+    def _tell_trouble(self, count: int, text: str) -> None:
+        trouble = WorkerTrouble(task=self._task, incarnation=self._incarnation, count=count, text=text)
+        self._tell(trouble)
+
+    def _tell_jobs(self, jobs: WorkerJobs) -> None:
+        if not self._is_standalone:
+            self._tell(jobs)
+
+    def _tell(self, word: WorkerTrouble | WorkerJobs) -> None:
+        """Say something of this worker to its node; what is dropped here is said by the next word."""
+        key = self._keyspace.trouble(self._node, self._task, self._incarnation)
+        self._session.put(key, wire.encode(word), congestion_control=zenoh.CongestionControl.DROP)
+
+    # --- ends --------------------------------------------------------------------------------------------------------
+
+    def _on_marker(self, sample: zenoh.Sample) -> None:
+        marker = decode_end(sample.payload.to_bytes())
+        source = sample.source_info
+        if marker is None or source is None:
+            return
+        key = str(sample.key_expr).removesuffix(f"/{END_CHUNK}")
+        name = (key, str(source.source_id.zid), source.source_id.eid)
+        self._dispatcher.put_marker(Marker(name=name, end=marker, came_at=monotonic_s()))
+
+    def _inputs_ended(self, epoch: int) -> None:
+        """Every input seen in ``epoch`` has ended and is processed (dispatch thread).
+
+        While we are to work in it, that is somebody's forgery, or our daemon learns of the move later than the robots:
+        its word decides. So it is before we have begun with it, and then what was withheld is not answered yet.
+        """
+        if self._drains_itself:
+            return
+        with self._lock:
+            is_at_work = self._role.role is WorkerRole.ACTIVE and self._role.epoch == epoch
+            if is_at_work or not self._dispatcher.has_begun(epoch):
+                self._early_end = epoch
+                return
+        self._send_ends(epoch)
+
+    def _look_for_end(self, epoch: int) -> None:
+        """Our role has changed: an end that came too early for it may count now."""
+        with self._lock:
+            is_early = self._early_end == epoch
+        if is_early:
+            self._dispatcher.look_for_end(epoch)
+
+    def _send_ends(self, epoch: int) -> None:
+        with self._lock:
+            if not self._epochs.close(epoch):
+                return
+            outputs = tuple(self._outputs)
+        self._errands.put(lambda: _end_all(outputs, epoch))
+
+
+def _end_all(outputs: tuple[Output, ...], epoch: int) -> None:
+    for output in outputs:
+        output.send_end(epoch)
