@@ -37,12 +37,14 @@ TESTS = (
     "tests/unit/core",
     "tests/paper",
     "tests/sim",
-    "tests/unit/test_config.py",
-    "tests/unit/test_config_docs.py",
-    "tests/unit/test_config_ros2.py",
+    "tests/unit/config/test_load.py",
+    "tests/unit/config/test_docs.py",
+    "tests/unit/config/test_ros2.py",
+    "tests/unit/config/test_rulecheck.py",
+    "tests/unit/config/test_timing.py",
     "tests/unit/test_docs.py",
-    "tests/unit/test_report.py",
-    "tests/unit/test_wire.py",
+    "tests/unit/commands/test_report.py",
+    "tests/unit/wire/test_codec.py",
 )
 SCHEDULES = 24
 """What no test has found is looked for by so many schedules."""

@@ -49,28 +49,32 @@ SCHEDULER, SCORING, EXECUTOR = (
 
 _REGISTER = (
     "tests/sim/test_register_rules.py",
-    "tests/unit/core/test_register.py",
-    "tests/unit/core/test_register_proposer.py",
+    "tests/unit/core/vote/test_register.py",
+    "tests/unit/core/vote/test_register_proposer.py",
 )
-_SCHEDULES = ("tests/unit/core/test_register_schedules.py",)
-_AGREEMENT = ("tests/unit/core/test_agreement.py",)
+_SCHEDULES = ("tests/unit/core/vote/test_register_schedules.py",)
+_AGREEMENT = ("tests/unit/core/vote/test_agreement.py",)
 _LEASE = ("tests/sim/test_lease_rules.py", "tests/sim/test_exclusive.py")
 _GENERATIONS = ("tests/sim/test_generations.py",)
-_BEAT_ROOM = ("tests/unit/core/test_beat_room.py",)
-_NAMESAKES = ("tests/unit/core/test_namesakes.py",)
-_TWINS = ("tests/unit/core/test_twins.py",)
-_WITNESS = ("tests/unit/core/test_witness.py",)
+_BEAT_ROOM = ("tests/unit/core/membership/test_beat_room.py",)
+_NAMESAKES = ("tests/unit/core/membership/test_namesakes.py",)
+_TWINS = ("tests/unit/core/membership/test_twins.py",)
+_WITNESS = ("tests/unit/core/vote/test_witness.py",)
 _RESTORED = ("tests/sim/test_restored_state.py",)
 _ROLLOUT = ("tests/sim/test_exclusive_rollout.py",)
 _MEMBERSHIP = (
     "tests/sim/test_membership_rules.py",
-    "tests/unit/core/test_membership.py",
+    "tests/unit/core/membership/test_peers.py",
     "tests/sim/test_simulator.py",
 )
 _NODE = ("tests/unit/core/test_node.py",)
-_ROUNDS = ("tests/sim/test_vote_rules.py", "tests/unit/core/test_rounds.py", "tests/unit/core/test_vote.py")
-_SCHEDULER = ("tests/unit/core/test_scheduler.py", "tests/unit/core/test_scoring.py", "tests/paper")
-_EXECUTOR = ("tests/unit/core/test_executor.py",)
+_ROUNDS = (
+    "tests/sim/test_vote_rules.py",
+    "tests/unit/core/scheduler/test_rounds.py",
+    "tests/unit/core/vote/test_tally.py",
+)
+_SCHEDULER = ("tests/unit/core/scheduler/test_judge.py", "tests/unit/core/scheduler/test_scoring.py", "tests/paper")
+_EXECUTOR = ("tests/unit/core/executor/test_handover.py",)
 
 
 def _bug(name: str, module: str, old: str, new: str, tests: tuple[str, ...] = (), seed: int | None = None) -> Bug:
@@ -385,7 +389,7 @@ LEASE_BUGS = (
         "zsched.core.vote.generations",
         "lease_s=0.0 if before is None else before.lease_s",
         "lease_s=0.0",
-        ("tests/unit/test_lifecycle.py",),
+        ("tests/unit/runtime/test_init.py",),
         seed=2140,
     ),
     _bug(
@@ -423,7 +427,7 @@ LEASE_BUGS = (
         AGREEMENT,
         "if step.is_dirty and (known is None or accept.acceptance.value.revision > known.revision):",
         "if step.is_dirty:",
-        (*_LEASE, "tests/unit/core/test_parked_accepts.py"),
+        (*_LEASE, "tests/unit/core/vote/test_parked_accepts.py"),
     ),
     _bug(
         "echoes prolong the wait for a stopped worker",
@@ -534,7 +538,7 @@ MEMBERSHIP_BUGS = (
         VOTING,
         "            self._first_call_at = now\n",
         "            self.called_at = now\n",
-        ("tests/unit/core/test_turns.py",),
+        ("tests/unit/core/scheduler/test_turns.py",),
         seed=598,
     ),
     _bug(
@@ -542,14 +546,14 @@ MEMBERSHIP_BUGS = (
         REGISTER,
         "return running.phase is _Phase.ACCEPT and set(running.no.values()) == {Refusal.LEASE}",
         "return False",
-        ("tests/unit/core/test_register_proposer.py",),
+        ("tests/unit/core/vote/test_register_proposer.py",),
     ),
     _bug(
         "who is overtaken ends the accept that waits",
         REGISTER,
         "now < (until := min(self._lease_over_at, running.give_up_at))",
         "now < (until := -math.inf)",
-        ("tests/unit/core/test_register_proposer.py", "tests/sim/test_exclusive.py"),
+        ("tests/unit/core/vote/test_register_proposer.py", "tests/sim/test_exclusive.py"),
     ),
     _bug(
         "token resurrects a peer",
@@ -715,7 +719,7 @@ VOTE_BUGS = (
         name="a vote that stays is committed",
         module=VOTING,
         changes=(("if counted.outcome is VoteOutcome.WON:", "if counted.winner is not None:"),),
-        tests=("tests/unit/core/test_epochs.py",),
+        tests=("tests/unit/core/vote/test_epochs.py",),
         seed=44,
         also=_bug(
             "a move to the owner raises the epoch",
@@ -744,7 +748,7 @@ VOTE_BUGS = (
         SCHEDULER,
         "return None if done < limit else f",
         "return None if done < 10 * limit else f",
-        ("tests/unit/core/test_damping.py",),
+        ("tests/unit/core/scheduler/test_damping.py",),
     ),
     _bug(
         "bonus twice",
@@ -786,7 +790,7 @@ VOTE_BUGS = (
         "zsched.core.profile.jobs",
         "if newest.is_idle and undone <= 0:",
         "if newest.is_idle and undone < 0:",
-        ("tests/unit/core/test_jobs.py", "tests/unit/core/test_closed_loop.py"),
+        ("tests/unit/core/profile/test_jobs.py", "tests/unit/core/test_closed_loop.py"),
     ),
     _bug(
         "an owner without work gives the task nothing",

@@ -12,11 +12,11 @@ ACKS, SERIAL = "zsched.hop.acknowledger", "zsched.core.hop.serial"
 INPUTS, WORKER_LANES = "zsched.worker.inputs", "zsched.worker.lanes"
 GREETINGS, LANES, OUTLET = "zsched.relay.greetings", "zsched.relay.lanes", "zsched.relay.outlet"
 
-_GREETINGS = ("tests/parts/test_relay_greetings.py",)
-_RECEIVE = ("tests/parts/test_relay_receive.py",)
-_ACKS = ("tests/unit/test_hop_acks.py",)
-_LANES = ("tests/unit/test_relay_lanes.py",)
-_WORKER = "tests/parts/test_worker.py"
+_GREETINGS = ("tests/parts/relay/test_greetings.py",)
+_RECEIVE = ("tests/parts/relay/test_receive.py",)
+_ACKS = ("tests/unit/hop/test_acknowledger.py",)
+_LANES = ("tests/unit/relay/test_lanes.py",)
+_WORKER = "tests/parts/worker/test_worker.py"
 _FROZEN = "tests/integration/test_relay_frozen_moves.py"
 _REPLAY = "tests/integration/test_relay_replay.py"
 _CHAOS = "tests/system/test_chaos_streams.py"
@@ -110,7 +110,7 @@ STREAM_BUGS = (
         SERIAL,
         "number = reference + (ahead if ahead < _HALF else ahead - SPAN)",
         "number = serial",
-        ("tests/unit/core/test_serial.py", *_ACKS),
+        ("tests/unit/core/hop/test_serial.py", *_ACKS),
     ),
     _bug(
         "a forged jump stands",
@@ -159,7 +159,7 @@ STREAM_BUGS = (
         "zsched.worker.backlog",
         "deque(sorted((*self._again, *kept), key=_turn_of))",
         "deque((*self._again, *kept))",
-        ("tests/unit/test_worker_backlog.py",),
+        ("tests/unit/worker/test_backlog.py",),
     ),
     _bug(
         "what comes behind a worker's own end goes nowhere",
@@ -187,56 +187,56 @@ STREAM_BUGS = (
         "zsched.relay.answers",
         "before if marker.had is None else marker.had",
         "before",
-        ("tests/parts/test_relay_answers.py",),
+        ("tests/parts/relay/test_answers.py",),
     ),
     _bug(
         "a relay's next life is sent what the former one has had",
         WORKER_LANES,
         "arrived = max(receiver.waits_for, receiver.had or 0)",
         "arrived = receiver.waits_for",
-        ("tests/parts/test_worker_keep.py",),
+        ("tests/parts/worker/test_keep.py",),
     ),
     _bug(
         "an input is done before its answers have come",
         INPUTS,
         "processed(name, number, size, self._owed, ",
         "processed(name, number, size, {}, ",
-        ("tests/integration/test_relay_last_answers.py", "tests/parts/test_worker_done.py"),
+        ("tests/integration/test_relay_last_answers.py", "tests/parts/worker/test_done.py"),
     ),
     _bug(
         "an input whose answer was withheld is done",
         INPUTS,
         "is_unanswered = self._has_withheld and waiting.is_whole",
         "is_unanswered = False",
-        ("tests/parts/test_worker_done.py",),
+        ("tests/parts/worker/test_done.py",),
     ),
     _bug(
         "an input does not wait for its robot's first word",
         WORKER_LANES,
         "low = self.count if is_known or not self._is_expected(relay, now) else 0",
         "low = self.count",
-        ("tests/unit/test_worker_debts.py",),
+        ("tests/unit/worker/test_debts.py",),
     ),
     _bug(
         "a robot that takes long over a large answer has it",
         WORKER_LANES,
         "return not self.has_left and (is_own or is_moving)",
         "return not self.has_left and is_moving",
-        ("tests/unit/test_worker_debts.py",),
+        ("tests/unit/worker/test_debts.py",),
     ),
     _bug(
         "a frozen robot stalls the inputs of the others",
         WORKER_LANES,
         "return not self.has_left and (is_own or is_moving)",
         "return not self.has_left",
-        ("tests/unit/test_worker_debts.py",),
+        ("tests/unit/worker/test_debts.py",),
     ),
     _bug(
         "a slot that closes does not say so",
         "zsched.relay.answers",
         "self._acks.leave(self._names)",
         "self._acks.flush()",
-        ("tests/parts/test_relay_answers.py",),
+        ("tests/parts/relay/test_answers.py",),
     ),
     _bug(
         "what a foreign worker was sent is in no counter",
@@ -250,14 +250,14 @@ STREAM_BUGS = (
         "zsched.worker.epochs",
         "if in_hand is not None and in_hand > role.epoch:",
         "if in_hand is not None and in_hand < 0:",
-        ("tests/unit/test_worker_epochs.py",),
+        ("tests/unit/worker/test_epochs.py",),
     ),
     _bug(
         "what is too old for a newer epoch is done all the same",
         "zsched.worker.backlog",
         "return self.quiet_at is None and 0 < self.slot < epoch and now - self.at > STALE_S",
         "return False",
-        ("tests/unit/test_worker_backlog.py",),
+        ("tests/unit/worker/test_backlog.py",),
     ),
     _bug(
         "a slot that leaves work does not give it up",
@@ -271,21 +271,21 @@ STREAM_BUGS = (
         "zsched.relay.proofs",
         "if not is_answered or one.lane not in answered:",
         "if not is_answered:",
-        ("tests/unit/test_relay_proofs.py",),
+        ("tests/unit/relay/test_proofs.py",),
     ),
     _bug(
         "a relay leaves a put to a frozen worker to zenoh",
         OUTLET,
         "= acks.stalled if acks else contextlib.nullcontext()",
         "= contextlib.nullcontext()",
-        ("tests/parts/test_stalled_links.py::test_a_relay_ends_the_link_of_a_frozen_worker_behind_its_put",),
+        ("tests/parts/sessions/test_stalled_links.py::test_a_relay_ends_the_link_of_a_frozen_worker_behind_its_put",),
     ),
     _bug(
         "a relay closes links, and reads those it has dialled, with a single thread",
         "zsched.sessions.config",
         "return _pools(rx=threads, tx=threads, net=threads)",
         "return _pools(rx=threads, tx=threads)",
-        ("tests/unit/test_zenoh_config.py", "tests/integration/test_zenoh_pools.py"),
+        ("tests/unit/sessions/test_config.py", "tests/integration/test_zenoh_pools.py"),
     ),
     _bug(
         "a node's processes have as many threads as zenoh likes",
@@ -334,7 +334,7 @@ STREAM_BUGS = (
         "zsched.config.tasks",
         'is Standby.COLD and not section.get("command"):',
         'is Standby.COLD and section.get("command") == ():',
-        ("tests/unit/test_config.py::test_one_fault_is_reported_once_at_its_place",),
+        ("tests/unit/config/test_load.py::test_one_fault_is_reported_once_at_its_place",),
     ),
     _bug(
         "one forged acknowledgement lets go of what is kept",
@@ -342,7 +342,7 @@ STREAM_BUGS = (
         "        self._take_back(limit)\n",
         "",
         (
-            "tests/unit/test_relay_lanes.py::test_what_an_acknowledgement_says_is_taken_back_by_one_that_says_less",
+            "tests/unit/relay/test_lanes.py::test_what_an_acknowledgement_says_is_taken_back_by_one_that_says_less",
             "tests/integration/test_relay_reliable.py",
         ),
     ),
@@ -358,14 +358,14 @@ STREAM_BUGS = (
         "zsched.relay.proofs",
         "return self._alone.get(stamp, False)",
         "return stamp in self._alone",
-        ("tests/unit/test_relay_proofs.py",),
+        ("tests/unit/relay/test_proofs.py",),
     ),
     _bug(
         "a timestamp that was forgotten is alone when it comes again",
         "zsched.relay.proofs",
         "if self._floor is not None and not self._floor < stamp:",
         "if self._floor is not None and False:",
-        ("tests/unit/test_relay_proofs.py",),
+        ("tests/unit/relay/test_proofs.py",),
     ),
     _bug(
         "nobody asks whether a timestamp is one sample's",
@@ -379,7 +379,7 @@ STREAM_BUGS = (
         "zsched.adapters.network.control_bus",
         "zenoh.handlers.RingChannel(RING)",
         "zenoh.handlers.FifoChannel(RING)",
-        ("tests/parts/adapters/test_control_bus.py",),
+        ("tests/parts/adapters/network/test_control_bus.py",),
     ),
     _bug(
         "a relay that does not stay is its own node's secret",

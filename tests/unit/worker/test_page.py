@@ -15,7 +15,7 @@ from zsched.core.values.plan import Role
 from zsched.worker import Answer, Output, Received, Request, Worker
 from zsched.worker.start import _ENVIRONMENT
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 PAGE = (ROOT / "docs" / "worker.md").read_text(encoding="utf-8")
 CALLED_BY_THE_LIBRARY = {"Output.send_end", "Output.close"}
 

@@ -1,8 +1,9 @@
 """Write the golden frames that are missing; what is there is never written again.
 
 One file per kind of frame and wire version: what an older node once sent must be read for ever. Run it after a kind
-was added: ``python tests/unit/golden/make.py``. A value here is frozen with its file; a new shape gets a new entry.
-Only what passes between a daemon and its relay may be made anew: a relay of another build is replaced first.
+was added: ``python tests/unit/wire/golden/make.py``. A value here is frozen with its file; a new shape gets
+a new entry. Only what passes between a daemon and its relay may be made anew: a relay of another build is replaced
+first.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from zsched.config.load import CheckResult, check_bytes
 from zsched.config.schema import endpoint_fault, host_fault
 
-CONFIGS = sorted((Path(__file__).parents[2] / "configs").rglob("*.yaml"))
+CONFIGS = sorted((Path(__file__).parents[3] / "configs").rglob("*.yaml"))
 SNIPPETS = (
     "[", "]", "{", "}", ":", ",", "\n", "  ", "- ", "&a ", "*a", "!!int ", "!x ", "? ", "| ", "> ", "'", '"', "#", "%",
     "@", "`", "\t", "\r", "\0", "\x85", "\u2028", "\ufeff", "~", "null", "true", "1e999", "-1", ".nan", "0x", "<<: *a",

@@ -17,7 +17,7 @@ from zsched.adapters.host.systemd import Notifier, watchdog_interval_s
 from zsched.daemon import RESTART_SIGNAL
 from zsched.runtime.descriptors import WANTED
 
-UNIT = Path(__file__).parents[3] / "systemd" / "zsched.service"
+UNIT = Path(__file__).parents[4] / "systemd" / "zsched.service"
 MAX_EXPOSURE = 1.5
 
 

@@ -32,7 +32,7 @@ from zsched.core.values.model import Aggregate, LinkSource, NodeKind, Objective,
 from zsched.core.values.plan import Direction, HandoverRule, ReadyWhen, StreamClass
 from zsched.errors import ConfigError
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 CONFIGS = sorted((ROOT / "configs").rglob("*.yaml"))
 
 GOOD = """\

@@ -215,6 +215,6 @@ def test_a_local_side_must_lead_somewhere_else(local: str, said: str) -> None:
 
 def test_type_hashes_in_the_shipped_files_are_what_rosbags_computes() -> None:
     types = get_typestore(Stores.ROS2_JAZZY)
-    text = (Path(__file__).parents[2] / "configs" / "ros2.yaml").read_text()
+    text = (Path(__file__).parents[3] / "configs" / "ros2.yaml").read_text()
     for name in ("nav_msgs/msg/OccupancyGrid", "tf2_msgs/msg/TFMessage"):
         assert f"type: {name}\n          hash: {types.hash_rihs01(name)}\n" in text

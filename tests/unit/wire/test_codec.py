@@ -58,7 +58,7 @@ def reason_of(frame: bytes, *classes: type[Any]) -> str:
 
 @pytest.mark.parametrize("kind", sorted(wire.KINDS))
 def test_golden_frame_of_this_version_is_read_and_is_what_we_send(kind: str) -> None:
-    assert kind in SAMPLES, f"add a sample of {kind!r} to tests/unit/golden/make.py and run it"
+    assert kind in SAMPLES, f"add a sample of {kind!r} to tests/unit/wire/golden/make.py and run it"
     frame = (GOLDEN / f"{kind}.v{wire.VERSION}.bin").read_bytes()
     assert wire.decode(frame, *CLASSES) == SAMPLES[kind]
     assert wire.decode(wire.encode(SAMPLES[kind]), *CLASSES) == SAMPLES[kind]
