@@ -34,8 +34,8 @@ from benchmarks.common import machine
 from benchmarks.rig import ROBOT, TASK, Load, Rig, Traffic, routes, told_of, until
 from zsched.core.events import SlotFlipped, SlotReady, StreamsCounted
 from zsched.core.hop.books import unaccounted
+from zsched.core.relay_protocol import RelayStarted
 from zsched.core.values.plan import RoutePhase, Slot, StreamClass, StreamCount, WorkerRole
-from zsched.core.values.relay_protocol import RelayStarted
 
 EDGES = ("edge1", "edge2", "edge3")
 FREEZES_S = (0.0, 0.9, 4.0)

@@ -1,7 +1,7 @@
 """The size and shape of the code: rooms, arrows and floors of the import graph, lines, functions, words of documents.
 
-``python -m benchmarks.house [CHECKOUT ...]``: a column for each checkout; none given: this one. A room of a package is a
-folder or a module directly in it; an arrow is an import from one room into another, counted once; the floors are the
+``python -m benchmarks.house [CHECKOUT ...]``: a column for each checkout; none given: this one. A room of a package is
+a folder or a module directly in it; an arrow is an import from one room into another, counted once; the floors are the
 rooms on the longest way along arrows, where rooms that import each other stand on one floor. The lab counts apart.
 """
 

@@ -25,6 +25,7 @@ import zenoh
 from zsched.adapters.relay.streams import RelayHandle
 from zsched.core.events import RelayChanged, SlotDrained, SlotFlipped, SlotReady, StreamsCounted
 from zsched.core.hop.books import given_up, unaccounted
+from zsched.core.relay_protocol import HandleReport, SlotLost, WorkerSeen
 from zsched.core.values.plan import (
     Direction,
     HandoverRule,
@@ -39,7 +40,6 @@ from zsched.core.values.plan import (
     StreamSettings,
     WorkerRole,
 )
-from zsched.core.values.relay_protocol import HandleReport, SlotLost, WorkerSeen
 from zsched.lab.loopback import free_endpoint
 from zsched.sessions.config import data_config, worker_config
 

@@ -29,6 +29,7 @@ from benchmarks.common import machine, percentile
 from benchmarks.rig import FLEET, until
 from zsched.adapters.relay.streams import RelayHandle
 from zsched.core.events import RelayChanged, SlotFlipped, SlotReady
+from zsched.core.relay_protocol import HandleReport
 from zsched.core.values.fleet import WorkerLink
 from zsched.core.values.plan import (
     Direction,
@@ -40,7 +41,6 @@ from zsched.core.values.plan import (
     StreamClass,
     StreamSettings,
 )
-from zsched.core.values.relay_protocol import HandleReport
 from zsched.lab.loopback import free_endpoint
 from zsched.sessions.config import data_config, worker_config
 

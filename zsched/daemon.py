@@ -33,11 +33,10 @@ from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
 from zsched.clock import monotonic_s, wall_tenths
 from zsched.config.load import load_fleet, require_node
 from zsched.core import events as ev
-from zsched.core.executor.workers import runs_worker
 from zsched.core.node import Node
 from zsched.core.route.route import watch_for
 from zsched.core.status import status_line
-from zsched.core.values.fleet import electorate_hash, fleet_hash
+from zsched.core.values.fleet import electorate_hash, fleet_hash, runs_worker
 from zsched.core.values.model import DurableState, NodeId, NodeKind, TaskId
 from zsched.errors import AdapterError, ConfigError, NameTakenError
 from zsched.files import write_regular

@@ -19,6 +19,7 @@ from support.sessions import opened
 from support.waiting import free_endpoint, until
 from zsched.adapters.relay.streams import RelayHandle
 from zsched.core.events import ProblemReported, RelayChanged, SlotFlipped, SlotReady
+from zsched.core.relay_protocol import HandleReport
 from zsched.core.values.fleet import LocalMode, LocalSide
 from zsched.core.values.plan import (
     Direction,
@@ -30,7 +31,6 @@ from zsched.core.values.plan import (
     StreamClass,
     StreamSettings,
 )
-from zsched.core.values.relay_protocol import HandleReport
 from zsched.sessions.config import client_config, data_config, local_config, worker_config
 
 ROBOTS = ("robot1", "robot2", "robot3")

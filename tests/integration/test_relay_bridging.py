@@ -14,6 +14,7 @@ from support.sessions import matches
 from support.waiting import free_endpoint, until
 from zsched.adapters.relay.streams import Bequest, RelayHandle
 from zsched.core.events import RelayChanged, SlotFlipped, SlotReady, StreamsCounted
+from zsched.core.relay_protocol import HandleReport
 from zsched.core.values.plan import (
     Direction,
     ReadyWhen,
@@ -24,7 +25,6 @@ from zsched.core.values.plan import (
     StreamClass,
     StreamSettings,
 )
-from zsched.core.values.relay_protocol import HandleReport
 from zsched.ipc.takeover import Door
 from zsched.sessions.config import data_config, worker_config
 

@@ -14,6 +14,7 @@ import pytest
 from support.relay_rig import FLEET, TASK, relay_rig
 from support.waiting import until
 from zsched.core.events import ProblemReported, StreamsCounted
+from zsched.core.relay_protocol import RelayStarted, RelayStop
 from zsched.core.values.plan import (
     Direction,
     ReadyWhen,
@@ -25,9 +26,8 @@ from zsched.core.values.plan import (
     StreamSettings,
     WorkerRole,
 )
-from zsched.core.values.relay_life import RelayPulse
-from zsched.core.values.relay_protocol import RelayStarted, RelayStop
 from zsched.ipc.pipe import REPORTS, read_frame, write_frame
+from zsched.ipc.protocol import RelayPulse
 from zsched.sessions.config import data_config
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import Keyspace

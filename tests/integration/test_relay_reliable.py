@@ -20,8 +20,8 @@ from support.beside import COUPLED, Beside
 from support.relay_rig import BESIDE, FLEET, ROBOT, TASK, Application, Rig, relay_rig, slot
 from support.sessions import matches
 from support.waiting import until, within
+from zsched.core.relay_protocol import SlotLost, StreamAck, StreamAcks, WorkerSeen
 from zsched.core.values.plan import ReadyWhen, RoutePhase, RoutePlan, StreamClass, StreamCount
-from zsched.core.values.relay_protocol import SlotLost, StreamAck, StreamAcks, WorkerSeen
 from zsched.sessions.config import worker_config
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import Keyspace

@@ -20,6 +20,7 @@ from support.sessions import matches
 from support.waiting import free_endpoint, until
 from zsched.adapters.relay.streams import RelayHandle
 from zsched.core.events import RelayChanged, SlotDrained, SlotFlipped, SlotReady, StreamsCounted
+from zsched.core.relay_protocol import HandleReport, WorkerSeen
 from zsched.core.values.plan import (
     Direction,
     ReadyWhen,
@@ -32,7 +33,6 @@ from zsched.core.values.plan import (
     StreamSettings,
     WorkerRole,
 )
-from zsched.core.values.relay_protocol import HandleReport, WorkerSeen
 from zsched.sessions.config import data_config, worker_config
 
 FLEET, ROBOT, TASK = "test", "robot1", "jobs"

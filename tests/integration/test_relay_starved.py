@@ -13,7 +13,7 @@ from zsched.adapters.machine.cgroup import LimitedGroup
 from zsched.adapters.relay import streams
 from zsched.adapters.relay.streams import RelayHandle
 from zsched.core.events import ProblemReported, RelayChanged
-from zsched.core.values.relay_protocol import HandleReport
+from zsched.core.relay_protocol import HandleReport
 from zsched.errors import AdapterError
 from zsched.sessions.config import data_config
 

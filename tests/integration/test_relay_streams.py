@@ -16,6 +16,7 @@ from support.relay_rig import BESIDE, ROBOT, TASK, Application, Rig, relay_rig, 
 from support.sessions import matches
 from support.waiting import between, until, within
 from zsched.core.events import RelayChanged, SlotDrained, SlotFlipped, SlotReady
+from zsched.core.relay_protocol import WorkerWatch
 from zsched.core.values.plan import (
     ReadyWhen,
     RoutePhase,
@@ -23,7 +24,6 @@ from zsched.core.values.plan import (
     StreamClass,
     WorkerRole,
 )
-from zsched.core.values.relay_protocol import WorkerWatch
 from zsched.sessions.config import DEFAULT_TIMING, worker_config
 
 WAITS_S = 5.0

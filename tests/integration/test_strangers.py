@@ -16,10 +16,10 @@ from typing import Any
 import pytest
 import zenoh
 
+from zsched.core.relay_protocol import EndMarker, StreamAck, StreamAcks
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import Allocation, Beat, NodeId, Profile
 from zsched.core.values.plan import Role, WorkerRole
-from zsched.core.values.relay_protocol import EndMarker, StreamAck, StreamAcks
 from zsched.ipc.pipe import encode_end
 from zsched.lab.testbed import TASK, Testbed, echo_fleet
 from zsched.wire import codec as wire

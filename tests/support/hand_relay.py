@@ -10,8 +10,8 @@ from pathlib import Path
 import zenoh
 
 from support.waiting import free_endpoint, until
+from zsched.core.relay_protocol import EndMarker, StreamAck, StreamAcks
 from zsched.core.values.plan import Role, WorkerRole
-from zsched.core.values.relay_protocol import EndMarker, StreamAck, StreamAcks
 from zsched.ipc.pipe import decode_end, encode_end
 from zsched.sessions.config import data_config, worker_config
 from zsched.wire import codec as wire

@@ -25,6 +25,7 @@ from support.books import newest_counts, wait_for_balance
 from support.waiting import free_endpoint, until
 from zsched.adapters.relay.streams import RelayHandle
 from zsched.core.events import RelayChanged, SlotDrained, SlotFlipped, SlotReady
+from zsched.core.relay_protocol import HandleReport, WorkerSeen
 from zsched.core.values.fleet import Timing
 from zsched.core.values.plan import (
     Direction,
@@ -41,7 +42,6 @@ from zsched.core.values.plan import (
     StreamSettings,
     WorkerRole,
 )
-from zsched.core.values.relay_protocol import HandleReport, WorkerSeen
 from zsched.sessions.config import DEFAULT_TIMING, data_config, worker_config
 
 Kind = TypeVar("Kind")

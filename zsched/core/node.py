@@ -24,7 +24,7 @@ from zsched.core.executor.handover import Executor
 from zsched.core.executor.progress import HangWatch
 from zsched.core.executor.sealing import Sealing
 from zsched.core.executor.tenure import Tenure
-from zsched.core.executor.workers import Workers, failed_workers, runs_worker
+from zsched.core.executor.workers import Workers, failed_workers
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.gateway.round_trips import RoundTrips
 from zsched.core.membership.beat_room import BeatRoom
@@ -39,7 +39,7 @@ from zsched.core.scheduler.probation import Probation
 from zsched.core.scheduler.rounds import Rounds
 from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts
 from zsched.core.status import PastValue, build_snapshot
-from zsched.core.values.fleet import Fleet, TaskSpec, fleet_hash
+from zsched.core.values.fleet import Fleet, TaskSpec, fleet_hash, runs_worker
 from zsched.core.values.messages import CommandOutcome, CommandResult
 from zsched.core.values.model import (
     Allocation,

@@ -21,7 +21,7 @@ from zsched.core.membership.namesakes import Namesakes
 from zsched.core.membership.peers import Membership
 from zsched.core.profile.relay_ends import RelayEnds
 from zsched.core.scheduler.rounds import Rounds, TaskRound
-from zsched.core.scheduler.scoring import joined, majority
+from zsched.core.scheduler.scoring import joined
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec
 from zsched.core.values.model import (
     NEVER_INITIALISED,
@@ -36,6 +36,7 @@ from zsched.core.values.model import (
     told_of_worker,
 )
 from zsched.core.values.plan import Direction, ReadyWhen, Route, StreamCount
+from zsched.core.values.quorum import majority
 from zsched.core.values.snapshot import (
     SCHEMA,
     DecisionStatus,

@@ -25,7 +25,7 @@ from typing import Final
 
 from zsched.clock import monotonic_s
 from zsched.core.hop.serial import number_near, serial_of
-from zsched.core.values.relay_protocol import StreamAck, StreamAcks
+from zsched.core.relay_protocol import StreamAck, StreamAcks
 from zsched.guard import guarded
 
 ACK_S: Final = 0.05

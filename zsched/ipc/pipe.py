@@ -13,10 +13,10 @@ import os
 import struct
 from typing import Any, Final
 
-from zsched.core import events
-from zsched.core.values import relay_life, relay_protocol
+from zsched.core import events, relay_protocol
 from zsched.core.values.plan import Role, RoutePlan
 from zsched.errors import WireError
+from zsched.ipc import protocol
 from zsched.wire import codec as wire
 
 MAX_FRAME: Final = 1 << 20
@@ -26,10 +26,10 @@ _SMALL: Final = 8 * 1024
 _REGISTERED: Final[tuple[tuple[str, type, int], ...]] = (
     ("relay_stop", relay_protocol.RelayStop, _SMALL),
     ("relay_started", relay_protocol.RelayStarted, _SMALL),
-    ("relay_pulse", relay_life.RelayPulse, _SMALL),
-    ("relay_hello", relay_life.RelayHello, _SMALL),
-    ("relay_here", relay_life.RelayHere, _SMALL),
-    ("relay_refused", relay_life.RelayRefused, _SMALL),
+    ("relay_pulse", protocol.RelayPulse, _SMALL),
+    ("relay_hello", protocol.RelayHello, _SMALL),
+    ("relay_here", protocol.RelayHere, _SMALL),
+    ("relay_refused", protocol.RelayRefused, _SMALL),
     ("worker_seen", relay_protocol.WorkerSeen, _SMALL),
     ("worker_watch", relay_protocol.WorkerWatch, wire.LARGE),
     ("worker_matched", relay_protocol.WorkerMatched, _SMALL),
@@ -58,7 +58,7 @@ COMMANDS: Final[tuple[type[Any], ...]] = (
 )
 REPORTS: Final[tuple[type[Any], ...]] = (
     relay_protocol.RelayStarted,
-    relay_life.RelayPulse,
+    protocol.RelayPulse,
     relay_protocol.WorkerSeen,
     relay_protocol.WorkerMatched,
     relay_protocol.WorkerTrouble,

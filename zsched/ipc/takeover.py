@@ -28,9 +28,9 @@ from typing import Any, Final
 from zsched import __version__
 from zsched.clock import awake_s
 from zsched.core.values.model import NodeId
-from zsched.core.values.relay_life import RelayHello, RelayHere, RelayRefused
 from zsched.errors import AdapterError, WireError
 from zsched.ipc.pipe import read_frame, write_frame
+from zsched.ipc.protocol import RelayHello, RelayHere, RelayRefused
 from zsched.wire import codec as wire
 
 _NOT_THE_RELAYS: Final = frozenset({"lab", "tasks", "commands", "cli.py", "__main__.py"})

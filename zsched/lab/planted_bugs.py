@@ -82,7 +82,13 @@ def _bug(name: str, module: str, old: str, new: str, tests: tuple[str, ...] = ()
 
 
 REGISTER_BUGS = (
-    _bug("quorum off by one", SCORING, "return count // 2 + 1", "return max(count // 2, 1)", _REGISTER),
+    _bug(
+        "quorum off by one",
+        "zsched.core.values.quorum",
+        "return count // 2 + 1",
+        "return max(count // 2, 1)",
+        _REGISTER,
+    ),
     _bug(
         "a value that nobody takes stops its task",
         REGISTER,

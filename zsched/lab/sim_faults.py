@@ -14,9 +14,9 @@ from random import Random
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.scheduler.scoring import majority
 from zsched.core.values.messages import CommandOutcome, SetWeights
 from zsched.core.values.model import NodeId
+from zsched.core.values.quorum import majority
 from zsched.errors import InvariantError
 from zsched.lab.sim_checks import DisagreementError
 from zsched.lab.sim_clocks import slew

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from zsched.core.scheduler.scoring import majority
 from zsched.core.status import build_snapshot
 from zsched.core.values.model import NodeId, PeerState
+from zsched.core.values.quorum import majority
 from zsched.core.values.snapshot import Snapshot
 from zsched.lab.simulator import Simulator
 

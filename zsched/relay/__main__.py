@@ -18,7 +18,7 @@ import os
 import signal
 import sys
 
-from zsched.core.values.relay_life import RelayHello
+from zsched.ipc.protocol import RelayHello
 from zsched.log_limit import limit_handlers
 from zsched.sessions.config import relay_pools
 

@@ -19,9 +19,9 @@ import zenoh
 from zenoh import Sample, Session
 
 from zsched.clock import monotonic_s
+from zsched.core.relay_protocol import StreamAck, StreamAcks
 from zsched.core.values.fleet import Timing
 from zsched.core.values.model import NodeId, TaskId
-from zsched.core.values.relay_protocol import StreamAck, StreamAcks
 from zsched.errors import WireError
 from zsched.guard import guarded
 from zsched.hop.acknowledger import Acknowledger

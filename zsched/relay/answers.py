@@ -20,7 +20,7 @@ from zenoh import Priority, Sample, SampleKind
 
 from zsched.clock import monotonic_s
 from zsched.core.hop.serial import serial_of
-from zsched.core.values.relay_protocol import SKIP_ENCODING, EndMarker
+from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker
 from zsched.hop.acknowledger import GIVE_UP_S, Acknowledger, SourceName
 from zsched.ipc.pipe import decode_end
 from zsched.relay.counter import StreamCounter

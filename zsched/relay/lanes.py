@@ -19,7 +19,7 @@ import zenoh
 from zenoh import CongestionControl, Sample, SampleKind, Session, Timestamp, ext
 
 from zsched.core.hop.serial import number_near, serial_of
-from zsched.core.values.relay_protocol import StreamAck
+from zsched.core.relay_protocol import StreamAck
 
 KEPT_SAMPLES: Final = 2048
 KEPT_BYTES: Final = 16 << 20

@@ -17,7 +17,7 @@ from typing import Final
 import zenoh
 
 from zsched.core.events import ProblemReported
-from zsched.core.values.relay_protocol import RelayReport
+from zsched.core.relay_protocol import RelayReport
 from zsched.guard import guarded
 from zsched.sessions.problems import why_not_open
 

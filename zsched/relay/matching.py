@@ -22,8 +22,8 @@ import zenoh
 from zenoh import Locality, Session
 
 from zsched.clock import monotonic_s
+from zsched.core.relay_protocol import WorkerMatched, WorkerWatch
 from zsched.core.values.model import TaskId
-from zsched.core.values.relay_protocol import WorkerMatched, WorkerWatch
 from zsched.guard import guarded, tolerant
 from zsched.relay.receive import Declared, undeclare
 

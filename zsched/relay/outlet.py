@@ -27,8 +27,8 @@ import zenoh
 from zenoh import Priority, Sample, Session, Timestamp
 
 from zsched.clock import monotonic_s
+from zsched.core.relay_protocol import EndMarker, StreamAck
 from zsched.core.values.plan import OnCrash, StreamClass, StreamSettings
-from zsched.core.values.relay_protocol import EndMarker, StreamAck
 from zsched.relay.acks import WorkerAcks
 from zsched.relay.crowd import Crowd
 from zsched.relay.greetings import Greetings

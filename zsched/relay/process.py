@@ -24,13 +24,13 @@ import zenoh
 from zsched.clock import awake_s
 from zsched.core.events import ProblemReported, RoleEnded, StreamsCounted
 from zsched.core.membership.relink import Introductions
+from zsched.core.relay_protocol import RelayReport, RelayStarted, RelayStop, WorkerSeen, WorkerWatch
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.plan import Role, Route, RoutePlan
-from zsched.core.values.relay_life import RelayHello, RelayPulse
-from zsched.core.values.relay_protocol import RelayReport, RelayStarted, RelayStop, WorkerSeen, WorkerWatch
 from zsched.errors import WireError
 from zsched.guard import guarded, on_failure
 from zsched.ipc.pipe import COMMANDS, read_frame, write_frame
+from zsched.ipc.protocol import RelayHello, RelayPulse
 from zsched.relay.acks import DEFAULT_LEASE_S, Acks
 from zsched.relay.graph import GraphMirror
 from zsched.relay.local_side import LocalSide

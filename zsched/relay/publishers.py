@@ -17,8 +17,8 @@ import zenoh
 from zenoh import CongestionControl, Priority, Reliability, Session, ext
 
 from zsched.core.hop.serial import serial_of
+from zsched.core.relay_protocol import EndMarker
 from zsched.core.values.plan import StreamClass, StreamSettings
-from zsched.core.values.relay_protocol import EndMarker
 from zsched.ipc.pipe import encode_end
 from zsched.wire.keyspace import END_CHUNK
 

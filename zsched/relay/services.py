@@ -34,10 +34,10 @@ import zenoh
 from zenoh import Query, Reply, Sample, SampleKind, Session
 
 from zsched.clock import monotonic_s
+from zsched.core.relay_protocol import ERROR_ENCODING, REFUSED_ENCODING, ServiceProblem
 from zsched.core.route.keyexpr import is_wild
 from zsched.core.route.wildcards import Rewriter, rewriter
 from zsched.core.values.plan import Route, StreamCount
-from zsched.core.values.relay_protocol import ERROR_ENCODING, REFUSED_ENCODING, ServiceProblem
 from zsched.guard import guarded
 from zsched.relay.counter import StreamCounter
 from zsched.relay.receive import undeclare

@@ -17,9 +17,9 @@ from dataclasses import replace
 from typing import Final
 
 from zsched.clock import monotonic_s
-from zsched.core.values.relay_life import RelayHello, RelayHere, RelayRefused
 from zsched.errors import WireError
 from zsched.ipc.pipe import read_frame, write_frame
+from zsched.ipc.protocol import RelayHello, RelayHere, RelayRefused
 from zsched.ipc.takeover import set_patience, user_of
 from zsched.wire import codec as wire
 

@@ -17,6 +17,7 @@ from zenoh import Session, Timestamp
 
 from zsched.clock import monotonic_s
 from zsched.core.events import ProblemReported, SlotDrained, SlotFlipped, SlotReady
+from zsched.core.relay_protocol import RelayReport, SlotLost
 from zsched.core.values.model import TaskId
 from zsched.core.values.plan import (
     Direction,
@@ -29,7 +30,6 @@ from zsched.core.values.plan import (
     StreamClass,
     StreamCount,
 )
-from zsched.core.values.relay_protocol import RelayReport, SlotLost
 from zsched.guard import guarded
 from zsched.relay.acks import Acks
 from zsched.relay.answer_times import AnswerTimes

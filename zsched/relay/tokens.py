@@ -14,8 +14,8 @@ import zenoh
 from zenoh import Sample, SampleKind, Session
 
 from zsched.core.events import RoleEnded
+from zsched.core.relay_protocol import WorkerSeen
 from zsched.core.values.model import NodeId, TaskId
-from zsched.core.values.relay_protocol import WorkerSeen
 from zsched.guard import guarded
 from zsched.wire.keyspace import Keyspace, counter, parse
 

@@ -12,8 +12,8 @@ from zenoh import Sample, Session
 
 from zsched.clock import monotonic_s
 from zsched.core.events import FrameDropped, WorkerJobs
+from zsched.core.relay_protocol import WorkerTrouble
 from zsched.core.values.model import NodeId
-from zsched.core.values.relay_protocol import WorkerTrouble
 from zsched.errors import WireError
 from zsched.guard import tolerant
 from zsched.ipc.pipe import decode_word

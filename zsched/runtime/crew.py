@@ -16,10 +16,10 @@ from typing import Final
 from zsched.adapters.workers.supervisor import WorkerSupervisor
 from zsched.clock import monotonic_s, wall_time
 from zsched.core import events as ev
+from zsched.core.relay_protocol import WorkerMatched, WorkerSeen, WorkerTrouble
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import MAX_REASON, WAS_READY, NodeId, TaskId, WorkerState
 from zsched.core.values.plan import ReadyWhen
-from zsched.core.values.relay_protocol import WorkerMatched, WorkerSeen, WorkerTrouble
 from zsched.runtime.sessions import SessionsRead
 from zsched.wire.keyspace import Keyspace, counter
 

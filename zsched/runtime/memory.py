@@ -6,8 +6,7 @@ Knows: the fleet file's word, what the machine allows, which streams cannot bear
 from __future__ import annotations
 
 from zsched.adapters.machine.shared_memory import why_not
-from zsched.core.executor.workers import runs_worker
-from zsched.core.values.fleet import Fleet, NodeSpec, SharedMemory
+from zsched.core.values.fleet import Fleet, NodeSpec, SharedMemory, runs_worker
 from zsched.core.values.plan import StreamClass
 
 

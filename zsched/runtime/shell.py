@@ -24,11 +24,7 @@ from zsched.adapters.workers.supervisor import WorkerSupervisor
 from zsched.clock import monotonic_s
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.report import snapshot_json
-from zsched.core.values.fleet import Fleet
-from zsched.core.values.messages import Command, CommandResult, RetryTask, SetWeights
-from zsched.core.values.model import NAME, NodeId
-from zsched.core.values.relay_protocol import (
+from zsched.core.relay_protocol import (
     HandleReport,
     RelayStarted,
     SlotLost,
@@ -36,6 +32,10 @@ from zsched.core.values.relay_protocol import (
     WorkerSeen,
     WorkerTrouble,
 )
+from zsched.core.report import snapshot_json
+from zsched.core.values.fleet import Fleet
+from zsched.core.values.messages import Command, CommandResult, RetryTask, SetWeights
+from zsched.core.values.model import NAME, NodeId
 from zsched.core.values.snapshot import Snapshot
 from zsched.errors import AdapterError, WireError
 from zsched.runtime.crew import Crew

@@ -24,7 +24,7 @@ from zenoh import CongestionControl, Sample, Session
 
 from zsched.clock import monotonic_s
 from zsched.core.hop.serial import number_near, serial_of
-from zsched.core.values.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks
+from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks
 from zsched.errors import WireError
 from zsched.guard import guarded, tolerant
 from zsched.ipc.pipe import encode_end

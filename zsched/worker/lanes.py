@@ -22,7 +22,7 @@ import zenoh
 
 from zsched.clock import monotonic_s
 from zsched.core.hop.serial import number_near, serial_of
-from zsched.core.values.relay_protocol import EndMarker, StreamAck
+from zsched.core.relay_protocol import EndMarker, StreamAck
 
 KEPT_BYTES: Final = 32 << 20
 RESEND_S: Final = 0.3

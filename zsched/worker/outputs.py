@@ -15,7 +15,7 @@ import zenoh
 from zenoh import CongestionControl, ext
 
 from zsched.core.hop.serial import serial_of
-from zsched.core.values.relay_protocol import EndMarker
+from zsched.core.relay_protocol import EndMarker
 from zsched.sessions.send_queue import SendQueue
 from zsched.worker.keep import Keeper, put_end
 from zsched.worker.lanes import KeptLane

@@ -14,7 +14,7 @@ from typing import Final, Literal
 
 import zenoh
 
-from zsched.core.values.relay_protocol import EndMarker
+from zsched.core.relay_protocol import EndMarker
 from zsched.hop.acknowledger import SourceName
 from zsched.worker.backlog import Done
 

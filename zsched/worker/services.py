@@ -20,8 +20,8 @@ from typing import Final
 import zenoh
 
 from zsched.clock import monotonic_s
+from zsched.core.relay_protocol import ERROR_ENCODING, REFUSED_ENCODING
 from zsched.core.route.keyexpr import is_wild
-from zsched.core.values.relay_protocol import ERROR_ENCODING, REFUSED_ENCODING
 from zsched.guard import guarded, tolerant
 from zsched.worker.jobs import JobBook
 from zsched.worker.troubles import Troubles

@@ -21,9 +21,9 @@ from typing import Final, Protocol
 import zenoh
 
 from zsched.clock import monotonic_s
+from zsched.core.relay_protocol import ERROR_ENCODING, SnapshotChunk
 from zsched.core.values.model import NodeId
 from zsched.core.values.plan import Role, WorkerRole
-from zsched.core.values.relay_protocol import ERROR_ENCODING, SnapshotChunk
 from zsched.guard import guarded, tolerant
 from zsched.ipc.pipe import decode_chunk, encode_chunk
 

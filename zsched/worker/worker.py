@@ -34,8 +34,8 @@ import zenoh
 
 from zsched.clock import monotonic_s
 from zsched.core.events import WorkerJobs
+from zsched.core.relay_protocol import StreamAcks, WorkerTrouble
 from zsched.core.values.plan import Role, WorkerRole
-from zsched.core.values.relay_protocol import StreamAcks, WorkerTrouble
 from zsched.guard import guarded, tolerant
 from zsched.hop.acknowledger import Acknowledger
 from zsched.ipc.pipe import decode_end

@@ -12,8 +12,8 @@ import zenoh
 
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import until
+from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks
 from zsched.core.values.plan import Direction, HandoverRule, Route, StreamClass, StreamSettings
-from zsched.core.values.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks
 from zsched.ipc.pipe import encode_end
 from zsched.relay import answers
 from zsched.relay.acks import Acks

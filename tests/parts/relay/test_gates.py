@@ -14,8 +14,8 @@ import zenoh
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import between, free_endpoint, until
 from zsched.core.hop.books import unaccounted
+from zsched.core.relay_protocol import EndMarker
 from zsched.core.values.plan import Direction, HandoverRule, Route, StreamClass, StreamSettings
-from zsched.core.values.relay_protocol import EndMarker
 from zsched.ipc.pipe import decode_end, encode_end
 from zsched.relay import outlet, outputs, receive, slots
 from zsched.relay.inputs import InputStream

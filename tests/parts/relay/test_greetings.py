@@ -11,8 +11,8 @@ import zenoh
 
 from support.sessions import hub_and_neighbour
 from support.waiting import until
+from zsched.core.relay_protocol import EndMarker, StreamAck, StreamAcks
 from zsched.core.values.plan import OnCrash, StreamClass, StreamSettings
-from zsched.core.values.relay_protocol import EndMarker, StreamAck, StreamAcks
 from zsched.ipc.pipe import decode_end
 from zsched.relay import greetings
 from zsched.relay.acks import Acks

@@ -13,10 +13,10 @@ import pytest
 from support.waiting import until
 from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
 from zsched.core import events as ev
+from zsched.core.relay_protocol import WorkerMatched, WorkerSeen, WorkerTrouble
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.model import MAX_REASON, WAS_READY, NodeKind, Tuning, Weights, WorkerState, told_of_worker
 from zsched.core.values.plan import ReadyWhen
-from zsched.core.values.relay_protocol import WorkerMatched, WorkerSeen, WorkerTrouble
 from zsched.runtime import crew as crew_module
 from zsched.runtime.crew import OTHERS, Crew
 from zsched.runtime.sessions import SessionsRead

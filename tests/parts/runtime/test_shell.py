@@ -16,6 +16,7 @@ from zsched.adapters.host.state_file import StateFile
 from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
 from zsched.core import events as ev
 from zsched.core import instructions as do
+from zsched.core.relay_protocol import RelayStarted, WorkerSeen
 from zsched.core.values.fleet import WorkerSpec
 from zsched.core.values.messages import (
     Accept,
@@ -40,7 +41,6 @@ from zsched.core.values.model import (
     WorkerState,
 )
 from zsched.core.values.plan import Role, RoutePhase, RoutePlan, WorkerRole
-from zsched.core.values.relay_protocol import RelayStarted, WorkerSeen
 from zsched.errors import AdapterError, WireError
 from zsched.runtime import shell as shell_module
 from zsched.runtime.shell import INBOX_LIMIT, LOCAL_REQUESTS_FROM, PROBLEM_TTL_S, WAITING_LIMIT, Desk, Inbox, Shell

@@ -12,8 +12,8 @@ import zenoh
 from support.hand_relay import KEYS, Relay, environment
 from support.waiting import until, within
 from zsched.clock import monotonic_s
+from zsched.core.relay_protocol import StreamAck, StreamAcks
 from zsched.core.values.plan import WorkerRole
-from zsched.core.values.relay_protocol import StreamAck, StreamAcks
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import AGAIN_CHUNK
 from zsched.worker import Output, Received, Worker

@@ -13,7 +13,7 @@ import pytest
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import until
 from zsched.core.events import FrameDropped, WorkerJobs
-from zsched.core.values.relay_protocol import WorkerTrouble
+from zsched.core.relay_protocol import WorkerTrouble
 from zsched.hop.acknowledger import Acknowledger
 from zsched.relay.troubles import PAUSE_S, Troubles, Word
 from zsched.wire import codec as wire

@@ -11,7 +11,7 @@ import zenoh
 
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import until
-from zsched.core.values.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks
+from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks
 from zsched.hop.acknowledger import Acknowledger
 from zsched.ipc.pipe import decode_end
 from zsched.sessions.stalled_links import StalledLinks

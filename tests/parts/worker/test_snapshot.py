@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 from support.sessions import opened
 from support.waiting import free_endpoint, until
+from zsched.core.relay_protocol import SnapshotChunk
 from zsched.core.values.plan import Role, WorkerRole
-from zsched.core.values.relay_protocol import SnapshotChunk
 from zsched.ipc.pipe import encode_chunk
 from zsched.sessions.config import data_config, worker_config
 from zsched.worker import snapshot as worker_snapshot

@@ -12,8 +12,8 @@ import zenoh
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import until
 from zsched.core.events import FrameDropped
+from zsched.core.relay_protocol import WorkerTrouble
 from zsched.core.values.model import MAX_REASON
-from zsched.core.values.relay_protocol import WorkerTrouble
 from zsched.hop.acknowledger import Acknowledger
 from zsched.relay.troubles import Troubles as Heard
 from zsched.relay.troubles import Word

@@ -19,8 +19,8 @@ import zenoh
 from support.hand_relay import INPUT, KEYS, ROLE_KEY, Relay, environment
 from support.waiting import free_endpoint, until, within
 from zsched.clock import monotonic_s
+from zsched.core.relay_protocol import EndMarker, StreamAck, StreamAcks
 from zsched.core.values.plan import Role, WorkerRole
-from zsched.core.values.relay_protocol import EndMarker, StreamAck, StreamAcks
 from zsched.errors import ConfigError
 from zsched.ipc.pipe import encode_end
 from zsched.sessions.config import data_config, worker_config

@@ -10,7 +10,7 @@ import pytest
 
 from support.waiting import until
 from zsched.core.hop.serial import SPAN, serial_of
-from zsched.core.values.relay_protocol import StreamAck, StreamAcks
+from zsched.core.relay_protocol import StreamAck, StreamAcks
 from zsched.hop import acknowledger as hop_acks
 from zsched.hop.acknowledger import Acknowledger
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from zsched.core.relay_protocol import EndMarker, WorkerSeen
 from zsched.core.values.plan import (
     Direction,
     ReadyWhen,
@@ -17,7 +18,6 @@ from zsched.core.values.plan import (
     StreamSettings,
     WorkerRole,
 )
-from zsched.core.values.relay_protocol import EndMarker, WorkerSeen
 from zsched.errors import WireError
 from zsched.ipc.pipe import COMMANDS, MAX_FRAME, REPORTS, decode_end, encode_end, read_frame, write_frame
 from zsched.wire import codec as wire

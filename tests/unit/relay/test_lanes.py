@@ -7,7 +7,7 @@ from typing import Any, cast
 import pytest
 
 from zsched.core.hop.serial import SPAN, serial_of
-from zsched.core.values.relay_protocol import StreamAck
+from zsched.core.relay_protocol import StreamAck
 from zsched.relay.lanes import KEPT_BYTES_LATEST, MAX_RESEND_S, RESEND_S, Lane, Sent, near
 from zsched.relay.tally import Tally
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from typing import Any, cast
 
-from zsched.core.values.relay_protocol import StreamAck
+from zsched.core.relay_protocol import StreamAck
 from zsched.hop.acknowledger import Acknowledger
 from zsched.worker.debts import MAX_HELD, Debts
 from zsched.worker.lanes import STALLED_S, KeptLane

@@ -23,13 +23,13 @@ from zsched.adapters.relay.child import ENDING_S, RelayChild, start_relay
 from zsched.adapters.relay.silence import Silence
 from zsched.clock import awake_s
 from zsched.core.events import ProblemReported, RelayChanged
+from zsched.core.relay_protocol import HandleReport, RelayStarted, RelayStop, WorkerWatch
 from zsched.core.values.model import NodeId
 from zsched.core.values.plan import Role, RoutePlan
-from zsched.core.values.relay_life import RelayHello, RelayPulse
-from zsched.core.values.relay_protocol import HandleReport, RelayStarted, RelayStop, WorkerWatch
 from zsched.errors import AdapterError, WireError
 from zsched.guard import guarded
 from zsched.ipc.pipe import REPORTS, read_frame, write_frame
+from zsched.ipc.protocol import RelayHello, RelayPulse
 from zsched.ipc.takeover import GREETING_S, Door, code_digest, digest_of
 from zsched.wire import codec as wire
 

@@ -36,10 +36,9 @@ import math
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
-from zsched.core.executor.workers import runs_worker
 from zsched.core.instructions import ApplyRoutes, Instruction, RecordStory, SetRole, StartWorker, StopWorker
 from zsched.core.route.route import plan_for, slot_for
-from zsched.core.values.fleet import OnIsolation, Standby, TaskSpec
+from zsched.core.values.fleet import OnIsolation, Standby, TaskSpec, runs_worker
 from zsched.core.values.model import Allocation, NodeId, NodeKind
 from zsched.core.values.plan import Role, Route, RoutePhase, RoutePlan, Slot, WorkerRole
 

@@ -13,9 +13,9 @@ from zsched.core.events import ClockCompared
 from zsched.core.executor.handover import Executor
 from zsched.core.instructions import Instruction
 from zsched.core.membership.peers import Membership
-from zsched.core.scheduler.scoring import majority
 from zsched.core.values.fleet import Fleet, OnIsolation
 from zsched.core.values.model import Allocation, Beat, NodeId, PeerState, TaskId
+from zsched.core.values.quorum import majority
 from zsched.core.vote.clocks import ClockDoubt
 from zsched.core.vote.lease import Leases
 

@@ -10,17 +10,11 @@ from dataclasses import dataclass, field
 
 from zsched.core import events as ev
 from zsched.core.instructions import RecordStory
-from zsched.core.values.fleet import Fleet, OnIsolation, TaskSpec
-from zsched.core.values.model import NodeId, NodeKind, Profile, TaskId, WorkerState, as_reason, told_of_worker
+from zsched.core.values.fleet import Fleet, runs_worker
+from zsched.core.values.model import NodeId, Profile, TaskId, WorkerState, as_reason, told_of_worker
 
 TROUBLE_S = 60.0
 """A callback that has raised is shown for so long behind the last time."""
-
-
-def runs_worker(task: TaskSpec, node: NodeId, kind: NodeKind) -> bool:
-    """Whether ``node`` keeps a worker of the task: candidates do, and robots that work alone when they are cut off."""
-    is_alone = kind is NodeKind.ROBOT and task.on_isolation is OnIsolation.LOCAL
-    return node in task.candidates or is_alone
 
 
 def failed_workers(profile: Profile) -> set[TaskId]:

@@ -10,8 +10,21 @@ promise more than they give would hand the task to each other for ever.
 
 from __future__ import annotations
 
-from zsched.core.scheduler.utility import fair_share
 from zsched.core.values.model import NodeId, Profile, TaskId
+
+
+def fair_share(capacity: float, threads: float, others: float) -> float:
+    """Cores that a fair scheduler gives ``threads`` beside ``others`` that all want to run; never more than there are.
+
+    Args:
+        capacity: cores of the machine, > 0.
+        threads: of the task, >= 1.
+        others: that run or wait to run there without it, >= 0, on the mean.
+
+    >>> fair_share(capacity=4.0, threads=3.0, others=5.0)
+    1.5
+    """
+    return min(capacity * threads / max(threads + others, capacity), capacity)
 
 
 class Shares:

@@ -6,13 +6,12 @@ processes.
 
 from __future__ import annotations
 
-from zsched.core.executor.workers import runs_worker
+from zsched.core.relay_protocol import WorkerWatch
 from zsched.core.route import keyexpr
 from zsched.core.route.templates import fill, routes_for, widened
-from zsched.core.values.fleet import Fleet, Standby, TaskSpec
+from zsched.core.values.fleet import Fleet, Standby, TaskSpec, runs_worker
 from zsched.core.values.model import NodeId, NodeKind
 from zsched.core.values.plan import Direction, ReadyWhen, RosGraph, Route, RoutePhase, RoutePlan, Slot
-from zsched.core.values.relay_protocol import WorkerWatch
 
 NOBODY = "Nobody"
 """No node is called so (names have no capitals): what is sent to it nobody takes but who takes everything."""

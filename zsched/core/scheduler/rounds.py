@@ -22,12 +22,13 @@ from zsched.core.instructions import AskUtilities, Instruction, PublishProposal,
 from zsched.core.scheduler.costs import MoveCost
 from zsched.core.scheduler.damping import Damping
 from zsched.core.scheduler.judge import Judge, Judgement, Outcome, escape_ahead, escape_reason
-from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts, Standing, book, compare, is_out, majority, score
+from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts, Standing, book, compare, is_out, score
 from zsched.core.scheduler.turns import in_turn, who_moves_first
 from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.messages import Utilities
 from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, TaskId, UtilityVector, WorkerState
 from zsched.core.values.plan import StreamCount
+from zsched.core.values.quorum import majority
 from zsched.core.vote.register import MoveOwner
 from zsched.core.vote.tally import VoteOutcome, present_voters
 from zsched.core.vote.voting import Voting

@@ -39,20 +39,12 @@ from zsched.core.values.model import (
     UtilityVector,
     WorkerState,
 )
+from zsched.core.values.quorum import majority
 
 METRICS = ("cpu", "memory", "network")
 
 Bookings = Mapping[NodeId, tuple[TaskSpec, ...]]
 """{owner: its tasks}: of a task that has just come, profiles show nothing yet."""
-
-
-def majority(count: int) -> int:
-    """The least number that is more than half of ``count``.
-
-    >>> [majority(n) for n in (1, 2, 3, 4, 5)]
-    [1, 2, 2, 3, 3]
-    """
-    return count // 2 + 1
 
 
 def rounded(aggregate: float) -> float:

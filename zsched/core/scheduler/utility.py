@@ -143,20 +143,6 @@ def memory_service(free: float, demand: float, capacity: float, floor_ratio: flo
     return service_utility(free, demand, capacity) * (1.0 - NEARLY_FULL * depth)
 
 
-def fair_share(capacity: float, threads: float, others: float) -> float:
-    """Cores that a fair scheduler gives ``threads`` beside ``others`` that all want to run; never more than there are.
-
-    Args:
-        capacity: cores of the machine, > 0.
-        threads: of the task, >= 1.
-        others: that run or wait to run there without it, >= 0, on the mean.
-
-    >>> fair_share(capacity=4.0, threads=3.0, others=5.0)
-    1.5
-    """
-    return min(capacity * threads / max(threads + others, capacity), capacity)
-
-
 KNEE_UTILITY = 0.8
 """What a link is worth at its knee."""
 

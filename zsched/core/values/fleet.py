@@ -357,3 +357,9 @@ def _canonical(value: object) -> Iterable[bytes]:
         yield float(value).hex().encode()  # 2 and 2.0 are one setting
         return
     yield f"{type(value).__name__}:{value}".encode()
+
+
+def runs_worker(task: TaskSpec, node: NodeId, kind: NodeKind) -> bool:
+    """Whether ``node`` keeps a worker of the task: candidates do, and robots that work alone when they are cut off."""
+    is_alone = kind is NodeKind.ROBOT and task.on_isolation is OnIsolation.LOCAL
+    return node in task.candidates or is_alone

@@ -36,9 +36,9 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from zsched.core.scheduler.scoring import majority
 from zsched.core.values.fleet import Fleet, lease_terms
 from zsched.core.values.model import Allocation, Beat, Grant, NodeId, TaskId
+from zsched.core.values.quorum import majority
 
 RHO = 1e-3
 """Bound on the relative difference of two clocks' rates (a crystal is within 1e-4)."""

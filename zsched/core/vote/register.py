@@ -24,9 +24,9 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from random import Random
 
-from zsched.core.scheduler.scoring import majority
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refusal, Refused
 from zsched.core.values.model import Acceptance, Allocation, Ballot, NodeId, RegisterState, Tuning
+from zsched.core.values.quorum import majority
 
 BACKOFF_CAP_S = 5.0
 MAX_REVISION = 2**52  # half of what a counter may be: a value so far ahead is refused, for nothing could follow it

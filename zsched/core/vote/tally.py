@@ -16,8 +16,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
-from zsched.core.scheduler.scoring import majority, rounded
+from zsched.core.scheduler.scoring import rounded
 from zsched.core.values.model import NodeId, PeerState, Proposal
+from zsched.core.values.quorum import majority
 
 
 class VoteOutcome(StrEnum):

@@ -17,9 +17,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from zsched.core.scheduler.scoring import majority
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import Beat, NodeId
+from zsched.core.values.quorum import majority
 
 ASK_ALL_S = 0.5
 """A starting elector waits so long for the answers of all others, and longer only for those of a majority."""

@@ -14,9 +14,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from zsched.core.scheduler.scoring import majority
 from zsched.core.values.fleet import Demand, Fleet, LinkLimits, NodeSpec, TaskSpec, Timing
 from zsched.core.values.model import NodeId, NodeKind, Tuning, Weights
+from zsched.core.values.quorum import majority
 from zsched.lab.decisions import loads, radio
 from zsched.lab.decisions.loads import Array, LoadPlan, Scatter
 

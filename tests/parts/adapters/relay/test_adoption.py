@@ -21,9 +21,9 @@ from support.waiting import until
 from zsched.adapters.relay import silence as relay_silence
 from zsched.adapters.relay.streams import Bequest, RelayHandle
 from zsched.core.events import RelayChanged
-from zsched.core.values.relay_life import RelayHello
-from zsched.core.values.relay_protocol import HandleReport
+from zsched.core.relay_protocol import HandleReport
 from zsched.ipc.pipe import read_frame, write_frame
+from zsched.ipc.protocol import RelayHello
 from zsched.ipc.takeover import GREETING_S, Door, code_digest, digest_of
 from zsched.sessions.config import data_config
 from zsched.wire import codec as wire
@@ -36,7 +36,7 @@ FIRST_DAEMON = """
 import sys, time
 from pathlib import Path
 from zsched.adapters.relay.streams import Bequest, RelayHandle
-from zsched.core.values.relay_protocol import RelayStarted
+from zsched.core.relay_protocol import RelayStarted
 from zsched.ipc.takeover import Door
 config, folder, orphan_s = sys.argv[1], Path(sys.argv[2]), float(sys.argv[3])
 bequest = Bequest(door=Door(folder, "robot1"), orphan_s=orphan_s, incarnation=7, digest="fleet", listen="tcp/h:1")

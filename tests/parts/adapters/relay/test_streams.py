@@ -18,8 +18,8 @@ from support.waiting import until
 from zsched.adapters.relay import streams
 from zsched.adapters.relay.streams import RelayHandle
 from zsched.core.events import RelayChanged
+from zsched.core.relay_protocol import HandleReport, RelayStarted
 from zsched.core.values.plan import Role, WorkerRole
-from zsched.core.values.relay_protocol import HandleReport, RelayStarted
 from zsched.sessions.config import data_config
 
 CONFIG = data_config(listen=("tcp/127.0.0.1:0",), connect=())
@@ -102,7 +102,7 @@ SILENT = """#!{python}
 import os, sys, time
 sys.path[:0] = {path!r}
 from zsched import wire
-from zsched.core.values.relay_protocol import RelayStarted
+from zsched.core.relay_protocol import RelayStarted
 from zsched.ipc.pipe import write_frame
 while True:
     write_frame(1, wire.encode(RelayStarted(pid=os.getpid(), zid="1")))

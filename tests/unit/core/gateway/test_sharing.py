@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zsched.core.gateway.sharing import Shares
-from zsched.core.scheduler.utility import fair_share
+from zsched.core.gateway.sharing import Shares, fair_share
 from zsched.core.values.model import Profile, WorkerLoad, WorkerState
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from zsched.core.relay_protocol import WorkerWatch
 from zsched.core.route.route import plan_for, slot_for, watch_for
 from zsched.core.values.fleet import Fleet, NodeSpec, Standby, StreamRule, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.model import NodeKind, Tuning, Weights
@@ -18,7 +19,6 @@ from zsched.core.values.plan import (
     StreamClass,
     StreamSettings,
 )
-from zsched.core.values.relay_protocol import WorkerWatch
 
 SETTINGS = StreamSettings(stream_class=StreamClass.RELIABLE, depth=7, handover=HandoverRule.ALL)
 SPEC = TaskSpec(

@@ -5,9 +5,10 @@ from dataclasses import replace
 
 import pytest
 
-from zsched.core.scheduler.scoring import Standing, compare, majority, pick, rounded
+from zsched.core.scheduler.scoring import Standing, compare, pick, rounded
 from zsched.core.values.fleet import Reach, TaskSpec
 from zsched.core.values.model import Aggregate, Allocation, Tuning, Utility, UtilityVector, Weights
+from zsched.core.values.quorum import majority
 
 SPEC = TaskSpec(
     name="merge",

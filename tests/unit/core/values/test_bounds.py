@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from zsched.core.events import RetryCommanded, WeightsCommanded, WorkerJobs, commanded
+from zsched.core.relay_protocol import EndMarker, SnapshotChunk, StreamAck, WorkerTrouble
 from zsched.core.values import model
 from zsched.core.values.fleet import Demand
 from zsched.core.values.messages import (
@@ -44,7 +45,6 @@ from zsched.core.values.model import (
     WorkerState,
 )
 from zsched.core.values.plan import ServiceSettings, StreamSettings
-from zsched.core.values.relay_protocol import EndMarker, SnapshotChunk, StreamAck, WorkerTrouble
 
 TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0), score=ScoreForm.SERVICE)
 BALLOT = Ballot(counter=1, node="r1", incarnation=1)

@@ -7,6 +7,7 @@ from dataclasses import FrozenInstanceError, fields, is_dataclass, replace
 
 import pytest
 
+from zsched.core.relay_protocol import EndMarker
 from zsched.core.values import messages
 from zsched.core.values.messages import (
     Accept,
@@ -20,7 +21,6 @@ from zsched.core.values.messages import (
     Utilities,
 )
 from zsched.core.values.model import NO_BALLOT, Acceptance, Allocation, Ballot, Tuning, Weights
-from zsched.core.values.relay_protocol import EndMarker
 
 TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
 BALLOT = Ballot(counter=1, node="r1", incarnation=1)

@@ -14,9 +14,9 @@ from random import Random
 import pytest
 
 from support.registers import BALLOT_S, INITIAL, TUNING
-from zsched.core.scheduler.scoring import majority
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refused
 from zsched.core.values.model import Acceptance, Allocation, Ballot, RegisterState
+from zsched.core.values.quorum import majority
 from zsched.core.vote.register import Change, MoveOwner, Register, Retune, RoundOutcome, Step
 
 FAULTS_END_S = 3.0

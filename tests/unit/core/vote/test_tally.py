@@ -4,8 +4,8 @@ import itertools
 
 import pytest
 
-from zsched.core.scheduler.scoring import majority
 from zsched.core.values.model import Proposal
+from zsched.core.values.quorum import majority
 from zsched.core.vote.tally import Tally, VoteOutcome, tally
 
 THREE = ("r1", "r2", "r3")

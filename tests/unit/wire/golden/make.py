@@ -10,9 +10,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from zsched.core import events
-from zsched.core.values import messages, model, plan, relay_life, relay_protocol, snapshot
+from zsched.core import events, relay_protocol
+from zsched.core.values import messages, model, plan, snapshot
 from zsched.ipc import pipe as relay_pipe
+from zsched.ipc import protocol
 from zsched.wire import codec as wire
 
 HERE = Path(__file__).parent
@@ -159,10 +160,10 @@ SAMPLES: dict[str, object] = {
         task="map_merge", phase=plan.RoutePhase.FLIP, current=_SLOT, predecessors=(_SLOT, _SLOT)
     ),
     "relay_stop": relay_protocol.RelayStop(),
-    "relay_pulse": relay_life.RelayPulse(counted_s=0.5),
-    "relay_hello": relay_life.RelayHello(fleet="warehouse", node="robot1", incarnation=3, digest="0123456789abcdef"),
-    "relay_here": relay_life.RelayHere(pid=4711),
-    "relay_refused": relay_life.RelayRefused(reason="it is not ours"),
+    "relay_pulse": protocol.RelayPulse(counted_s=0.5),
+    "relay_hello": protocol.RelayHello(fleet="warehouse", node="robot1", incarnation=3, digest="0123456789abcdef"),
+    "relay_here": protocol.RelayHere(pid=4711),
+    "relay_refused": protocol.RelayRefused(reason="it is not ours"),
     "relay_started": relay_protocol.RelayStarted(pid=4711, zid="a1b2c3"),
     "worker_seen": relay_protocol.WorkerSeen(node="edge1", task="map_merge", incarnation="3-1", is_present=True),
     "worker_watch": relay_protocol.WorkerWatch(
