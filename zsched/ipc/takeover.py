@@ -33,6 +33,7 @@ from zsched.ipc.pipe import read_frame, write_frame
 from zsched.ipc.protocol import RelayHello, RelayHere, RelayRefused
 from zsched.wire import codec as wire
 
+PACKAGE: Final = Path(__file__).parents[1]
 _NOT_THE_RELAYS: Final = frozenset({"lab", "tasks", "commands", "cli.py", "__main__.py"})
 PROTOCOL: Final = 1
 """Raised whenever an older relay would misunderstand a newer daemon."""
@@ -164,15 +165,18 @@ def digest_of(*parts: str) -> str:
     return state.hexdigest()
 
 
+def code_files() -> list[Path]:
+    """The sources that decide how a relay behaves, sorted."""
+    found = sorted(PACKAGE.rglob("*.py"))
+    return [path for path in found if path.relative_to(PACKAGE).parts[0] not in _NOT_THE_RELAYS]
+
+
 @functools.cache
 def code_digest() -> str:
     """16 hex digits over the code that daemons and relays run: this package's, and which zenoh library it loads."""
-    package = Path(__file__).parents[1]
     state = blake2s(digest_size=8)
-    for path in sorted(package.rglob("*.py")):
-        name = path.relative_to(package)
-        if name.parts[0] not in _NOT_THE_RELAYS:
-            state.update(f"{name} {path.stat().st_size}\n".encode() + path.read_bytes())
+    for path in code_files():
+        state.update(f"{path.relative_to(PACKAGE)} {path.stat().st_size}\n".encode() + path.read_bytes())
     zenoh = find_spec("zenoh")
     for library in sorted(Path(zenoh.origin).parent.glob("*.so")) if zenoh is not None and zenoh.origin else ():
         found = library.stat()
