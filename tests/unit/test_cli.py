@@ -31,7 +31,7 @@ from zsched.commands.report import render_status
 from zsched.commands.status import _fitted
 from zsched.commands.weights import parse_weights
 
-RECORDED = Path(__file__).parent / "recorded_status"
+RECORDED = Path(__file__).parent / "commands" / "recorded_status"
 CLI = (sys.executable, "-m", "zsched.cli")
 Json = dict[str, Any]
 
