@@ -49,7 +49,7 @@ class LogLimit(logging.Filter):
 
 
 LIMIT: Final = LogLimit()
-LIBRARY: Final = ("zsched.guard", "zsched.sessions.relink", "zsched.streams", "zsched.worker")
+LIBRARY: Final = ("zsched.guard", "zsched.introduction", "zsched.streams", "zsched.worker")
 """The loggers of the worker library, whose handlers are the program's own."""
 
 

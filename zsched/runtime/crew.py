@@ -34,7 +34,7 @@ OTHER_NETWORK: Final = "did it open $ZSCHED_ZENOH_CONFIG?"
 REJOIN_S: Final = 4.0
 """A worker that runs already is seen so soon after its relay's start: it dials at least once a second."""
 
-_log = logging.getLogger("zsched.runtime.crew")
+_log = logging.getLogger("zsched.crew")
 
 
 class Crew:

@@ -23,7 +23,7 @@ from zsched.sessions.config import introduction_config
 STAY_S = 1.0
 """Measured: two peers had their link 0.03 s after the third had opened; the rest is for slow radios."""
 
-_log = logging.getLogger("zsched.sessions.relink")
+_log = logging.getLogger("zsched.introduction")
 
 
 class Introducer:
