@@ -353,7 +353,7 @@ class Profile:
     progress: tuple[TaskProgress, ...] = ()
     """Robots: the watched tasks that answer here, or do not although inputs flow."""
     speed: float | None = None
-    """How fast one of its cores is, beside the reference (`zsched.adapters.speed`); ``None``: not measured."""
+    """How fast one of its cores is (`zsched.adapters.machine.core_speed`); ``None``: not measured."""
     cpu_pressure: float | None = None
     """Share of the time in which some process wanted a CPU and had none (PSI "some"); ``None``: not measured."""
     echoes: tuple[Echo, ...] = ()

@@ -43,7 +43,7 @@ def test_what_is_no_line_of_zenoh_s_is_passed_on_and_nothing_is_not() -> None:
 SCRIPT = """
 import logging, os, sys, time
 logging.basicConfig(stream=sys.stderr, format="%(levelname)s %(name)s %(message)s")
-from zsched.adapters import zenoh_log
+from zsched.adapters.host import zenoh_log
 print("captured" if zenoh_log.capture(os.environ) else "left alone", file=sys.stderr)
 import zenoh
 zenoh.init_log_from_env_or("error")

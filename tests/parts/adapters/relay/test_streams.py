@@ -101,7 +101,7 @@ def test_a_wedged_relay_is_replaced(daemon: Daemon) -> None:
 SILENT = """#!{python}
 import os, sys, time
 sys.path[:0] = {path!r}
-from zsched import wire
+from zsched.wire import codec as wire
 from zsched.core.relay_protocol import RelayStarted
 from zsched.ipc.pipe import write_frame
 while True:
