@@ -54,12 +54,10 @@ from zsched.worker.lanes import STALLED_S
 from zsched.worker.outputs import OUTPUT_DEPTH, Output
 from zsched.worker.roles import RoleWatch
 from zsched.worker.samples import BY_CLASS, Input, KeepLast, Marker, Received
-from zsched.worker.services import Answer, Handler, Request, Service
+from zsched.worker.services import Handler, Service
 from zsched.worker.snapshot import TIMEOUT_S, Offer, Restorer, StateLink, fetch
 from zsched.worker.start import open_session, relay_endpoint, surroundings
 from zsched.worker.troubles import Troubles
-
-__all__ = ["Answer", "Output", "Received", "Request", "Worker"]
 
 CLOSE_S: Final = 0.6
 """Closing a session towards a stopped peer can take seconds; so long we wait."""
