@@ -20,12 +20,12 @@ $(VENV)/.python:
 	$(PYTHON) -m venv $(VENV)
 	@touch $@
 
-$(VENV)/.lab: pyproject.toml $(VENV)/.python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[lab]'
+$(VENV)/.lab: pyproject.toml lab/pyproject.toml $(VENV)/.python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e . -e ./lab
 	@touch $@
 
-$(VENV)/.dev: pyproject.toml $(VENV)/.python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
+$(VENV)/.dev: pyproject.toml lab/pyproject.toml $(VENV)/.python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]' -e ./lab
 	@touch $@ $(VENV)/.lab
 
 demo: $(VENV)/.lab  ## Watch six machines merge laser maps (DEMO_ARGS="--headless --out DIR" to choose)

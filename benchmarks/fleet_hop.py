@@ -25,8 +25,8 @@ from typing import Any
 import psutil
 
 from benchmarks.common import at_pace, machine
-from zsched.lab.testbed import Testbed, echo_fleet
 from zsched.sessions.config import client_config
+from zsched_lab.testbed import Testbed, echo_fleet
 
 APPLICATION = """
 import json, os, struct, sys, time, zenoh

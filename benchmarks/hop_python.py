@@ -22,13 +22,13 @@ import zenoh
 
 from benchmarks.rig import until
 from zsched.core.values.plan import Direction, HandoverRule, Route, StreamClass, StreamSettings
-from zsched.lab.loopback import free_endpoint
 from zsched.relay.acks import Acks
 from zsched.relay.inputs import InputStream
 from zsched.relay.outputs import OutputStream
 from zsched.relay.receive import undeclare
 from zsched.sessions.config import data_config, worker_config
 from zsched.wire.keyspace import Keyspace
+from zsched_lab.loopback import free_endpoint
 
 KEY = "robot1/in"
 OWNER = "edge1/t/1/out"

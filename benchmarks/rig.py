@@ -40,8 +40,8 @@ from zsched.core.values.plan import (
     StreamSettings,
     WorkerRole,
 )
-from zsched.lab.loopback import free_endpoint
 from zsched.sessions.config import data_config, worker_config
+from zsched_lab.loopback import free_endpoint
 
 FLEET, ROBOT, TASK = "bench", "robot1", "echo"
 NUMBER_BYTES = 10

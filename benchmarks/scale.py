@@ -39,10 +39,10 @@ from zsched.core import instructions as do
 from zsched.core.node import Node
 from zsched.core.values.fleet import Fleet, electorate_hash
 from zsched.core.values.model import DeviceSample, NodeId, NodeKind, WorkerState
-from zsched.lab.testbed import TASK, echo_fleet
 from zsched.runtime.endpoints import endpoints_for, free_port
 from zsched.runtime.init import init_state
 from zsched.sessions import config as zenoh_config
+from zsched_lab.testbed import TASK, echo_fleet
 
 GOAL = "p99 50 ms at 6"
 IDLE_S = 5.0

@@ -22,10 +22,10 @@ from pathlib import Path
 from benchmarks.common import line, machine
 from zsched.clock import monotonic_s
 from zsched.core.values.model import PeerState
-from zsched.lab import netns
-from zsched.lab.netbed import PROBE, Netbed, Probe, descendants_running
-from zsched.lab.testbed import Json, echo_fleet
 from zsched.sessions import config as zenoh_config
+from zsched_lab import netns
+from zsched_lab.netbed import PROBE, Netbed, Probe, descendants_running
+from zsched_lab.testbed import Json, echo_fleet
 
 PING_PORT = 7990
 WORKER = "zsched.tasks.echo"

@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from zsched.commands.bench import bench_app
-from zsched.commands.common import EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, CliError, Json, Verb, Verbs, print_json
+from zsched.commands.common import EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, CliError, Json, Verb, print_json
+from zsched.commands.program import Program
 from zsched.commands.stream_verbs import stream_app
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ EPILOG = (
 
 app = typer.Typer(
     name="zsched",
-    cls=Verbs,
+    cls=Program,
     help="Masterless scheduling of shared robot tasks: profile, score, vote, commit, reroute.",
     epilog=EPILOG,
     no_args_is_help=True,
@@ -46,21 +46,10 @@ app = typer.Typer(
 
 
 app.add_typer(stream_app)
-app.add_typer(bench_app)
 
 UNWRITABLE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 """Why stdout takes no more: the disk behind ``>`` is full, or gone."""
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
-LAB_NEEDS = ("cv2", "matplotlib", "numpy", "onnxruntime", "rich")
-"""What the extra ``lab`` installs."""
-
-
-class MergeMode(StrEnum):
-    """How the demo's worker learns where the robots' maps lie."""
-
-    KNOWN = "known"
-    TRACK = "track"
-    ESTIMATE = "estimate"
 
 
 class LogLevel(StrEnum):
@@ -299,29 +288,6 @@ def check(
 
 
 # --- everything else -------------------------------------------------------------------------------------------------
-
-
-@app.command(cls=Verb)
-def demo(
-    headless: Annotated[bool, typer.Option("--headless", help="Plain lines instead of the live view.")] = False,
-    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for pictures and figures.")] = None,
-    log: Annotated[Path | None, typer.Option(metavar="FILE", help="CARMEN laser log. [Malaga, shipped]")] = None,
-    duration: Annotated[float, typer.Option(metavar="S", help="Seconds to run.")] = 60.0,
-    mode: Annotated[MergeMode, typer.Option(help="Where the robots' poses come from.")] = MergeMode.KNOWN,
-    seed: Annotated[int, typer.Option(min=0, metavar="N", help="Of poses and injected loads.")] = 1,
-) -> None:
-    """Run a whole fleet on this machine: three robots and three edges merge real laser maps."""
-    from importlib.util import find_spec  # noqa: PLC0415 - each verb imports what it needs
-
-    missing = [name for name in LAB_NEEDS if find_spec(name) is None]
-    if missing:
-        raise CliError(
-            EXIT_FAILED, f"the lab needs {', '.join(missing)}, not installed here; run `pip install 'zsched[lab]'`"
-        )
-    from zsched.lab.demo import DemoOptions, run_demo  # noqa: PLC0415 - the lab is an extra
-
-    options = DemoOptions(headless=headless, out=out, log=log, duration_s=duration, mode=mode.value, seed=seed)
-    raise typer.Exit(run_demo(options))
 
 
 @app.command(cls=Verb)

@@ -10,17 +10,17 @@ import pytest
 from mcap.reader import make_reader
 
 from zsched.adapters.machine.cgroup import LimitedGroup
-from zsched.lab.laser_log import malaga_path
-from zsched.lab.netns import why_not
-from zsched.lab.paper.bench import BenchOptions, InputsOf
-from zsched.lab.paper.cells import Cell, bandwidth_of, world_of
-from zsched.lab.paper.metrics import Truth, measure
-from zsched.lab.paper.places import robots_scenario_path, scenario_path, shipped_scenario
-from zsched.lab.paper.robots import ExploreRobots, LogRobots
-from zsched.lab.paper.run import CellRun, Inputs
-from zsched.lab.paper.scenario import LoadPlan, load_scenario
-from zsched.lab.paper.schemes import SCHEMES
-from zsched.lab.recorder import read_records
+from zsched_lab.laser_log import malaga_path
+from zsched_lab.netns import why_not
+from zsched_lab.paper.bench import BenchOptions, InputsOf
+from zsched_lab.paper.cells import Cell, bandwidth_of, world_of
+from zsched_lab.paper.metrics import Truth, measure
+from zsched_lab.paper.places import robots_scenario_path, scenario_path, shipped_scenario
+from zsched_lab.paper.robots import ExploreRobots, LogRobots
+from zsched_lab.paper.run import CellRun, Inputs
+from zsched_lab.paper.scenario import LoadPlan, load_scenario
+from zsched_lab.paper.schemes import SCHEMES
+from zsched_lab.recorder import read_records
 
 WHY_NOT = LimitedGroup.why_not()
 NO_SPACES = WHY_NOT or why_not()

@@ -16,8 +16,8 @@ from ruamel.yaml import YAML
 
 from support.waiting import until
 from zsched.adapters.machine.cgroup import LimitedGroup
-from zsched.lab.janitor import TOKEN_VARIABLE
-from zsched.lab.paper.places import scenario_path
+from zsched_lab.janitor import TOKEN_VARIABLE
+from zsched_lab.paper.places import scenario_path
 
 WHY_NOT = LimitedGroup.why_not()
 CELL_S = 300.0

@@ -22,11 +22,11 @@ from support.waiting import within
 from zsched.adapters.host.operator_socket import ask
 from zsched.adapters.machine.cgroup import LimitedGroup
 from zsched.core.values.model import Proposal
-from zsched.lab.testbed import DAEMON, Testbed, echo_fleet
 from zsched.paths import socket_path
 from zsched.sessions import config as zenoh_config
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import Keyspace
+from zsched_lab.testbed import DAEMON, Testbed, echo_fleet
 
 STOP_S = 4.0
 """A daemon gives its children 1.5 s; the rest is for a machine that is busy with other things."""

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from zsched.lab.testbed import Testbed, echo_fleet
+from zsched_lab.testbed import Testbed, echo_fleet
 
 
 @pytest.fixture

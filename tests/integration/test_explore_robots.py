@@ -16,12 +16,12 @@ import pytest
 import zenoh
 
 from support.programs import running
-from zsched.lab.explore.worlds import load_world
-from zsched.lab.loopback import free_endpoints
-from zsched.lab.map_metrics import score_map
-from zsched.lab.recorder import Record, read_records
 from zsched.tasks.map_merge.cdr import StampedTransform, decode_grid, encode_grid, encode_transforms
 from zsched.tasks.map_merge.merger import Merger, MergerSettings, Mode
+from zsched_lab.explore.worlds import load_world
+from zsched_lab.loopback import free_endpoints
+from zsched_lab.map_metrics import score_map
+from zsched_lab.recorder import Record, read_records
 
 ROBOTS = ("robot1", "robot2")
 WORLD = "turtlebot3"
@@ -98,7 +98,7 @@ def hub(endpoints: list[str]) -> Iterator[Hub]:
 
 
 def robot(index: int, endpoint: str, records: Path, *more: str) -> list[str]:
-    command = ["zsched.lab.explore.robot", "--robot", ROBOTS[index], "--world", WORLD, "--index", str(index)]
+    command = ["zsched_lab.explore.robot", "--robot", ROBOTS[index], "--world", WORLD, "--index", str(index)]
     command += ["--robots", str(len(ROBOTS)), "--endpoint", endpoint, "--records", str(records)]
     return [*command, "--target", str(TARGET), *more]
 
@@ -129,7 +129,7 @@ def test_two_robots_explore_on_the_merged_map(hub: Hub, endpoints: list[str], tm
 
 
 def test_slam_on_an_edge_maps_for_a_robot_that_only_sends_scans(hub: Hub, endpoints: list[str], tmp_path: Path) -> None:
-    slam = ["zsched.lab.explore.slam", "--robot", "robot1", "--endpoint", endpoints[1]]
+    slam = ["zsched_lab.explore.slam", "--robot", "robot1", "--endpoint", endpoints[1]]
     with running(robot(0, endpoints[0], tmp_path, "--slam-on", "edge1"), slam):
         hub.until(
             lambda: any(record["coverage"] > 0.4 for record in records_of(tmp_path, "robot1", "progress")),

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import pytest
 
-from zsched.lab.loopback import free_endpoint
-from zsched.lab.testbed import DAEMON, Testbed, TestbedError, echo_fleet
 from zsched.runtime.init import init_state
+from zsched_lab.loopback import free_endpoint
+from zsched_lab.testbed import DAEMON, Testbed, TestbedError, echo_fleet
 
 
 @pytest.fixture

@@ -18,21 +18,21 @@ import pytest
 import zenoh
 
 from support.programs import running
-from zsched.lab.explore.laser import Laser
-from zsched.lab.explore.localizer import LOST_S
-from zsched.lab.explore.messages import decode_correction, encode_scan
-from zsched.lab.explore.worlds import load_world
-from zsched.lab.loopback import free_endpoints
-from zsched.lab.recorder import Record, read_records
-from zsched.lab.testbed import Testbed, echo_fleet
 from zsched.tasks.map_merge.cdr import decode_grid
 from zsched.tasks.map_merge.geometry import Pose2
+from zsched_lab.explore.laser import Laser
+from zsched_lab.explore.localizer import LOST_S
+from zsched_lab.explore.messages import decode_correction, encode_scan
+from zsched_lab.explore.worlds import load_world
+from zsched_lab.loopback import free_endpoints
+from zsched_lab.recorder import Record, read_records
+from zsched_lab.testbed import Testbed, echo_fleet
 
 WORLD = "office:3"
 DEADLINE_S = 45.0
 SLIP_M = 0.02
 """What the wheels of a robot that stands tell too much at every scan."""
-SLAM_WORKER = ("python", "-m", "zsched.lab.explore.slam_worker", "--robot", "robot1")
+SLAM_WORKER = ("python", "-m", "zsched_lab.explore.slam_worker", "--robot", "robot1")
 
 
 def until(condition: Callable[[], bool], what: str) -> None:
@@ -58,10 +58,10 @@ def endpoint() -> Iterator[str]:
 
 def test_a_robot_drives_by_its_slam_and_stands_while_that_is_silent(endpoint: str, tmp_path: Path) -> None:
     """It is not placed in any merged map here, so navigation plans on its own one."""
-    robot = ["zsched.lab.explore.robot", "--robot", "robot1", "--world", WORLD, "--endpoint", endpoint]
+    robot = ["zsched_lab.explore.robot", "--robot", "robot1", "--world", WORLD, "--endpoint", endpoint]
     robot += ["--records", str(tmp_path), "--slam-on", "edge1", "--led", "--drift-yaw", "0.02", "--drift-way", "0.02"]
-    slam = ["zsched.lab.explore.slam", "--robot", "robot1", "--endpoint", endpoint, "--match", "0.02"]
-    navigate = ["zsched.lab.explore.navigate", "--robot", "robot1", "--endpoint", endpoint, "--cores", "0.01"]
+    slam = ["zsched_lab.explore.slam", "--robot", "robot1", "--endpoint", endpoint, "--match", "0.02"]
+    navigate = ["zsched_lab.explore.navigate", "--robot", "robot1", "--endpoint", endpoint, "--cores", "0.01"]
 
     def newest() -> Record:
         found = [record for record in read_records(tmp_path / "robot1.ndjson") if record["kind"] == "progress"]

@@ -8,9 +8,9 @@ from pathlib import Path
 import zenoh
 
 from support.sessions import matches
-from zsched.lab.testbed import TASK, Testbed, echo_fleet
 from zsched.worker.keep import TICK_S
 from zsched.worker.lanes import NEWCOMERS_S
+from zsched_lab.testbed import TASK, Testbed, echo_fleet
 
 COUNT = 60
 

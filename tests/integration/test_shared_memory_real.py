@@ -8,8 +8,8 @@ import pytest
 import zenoh
 
 from support.waiting import until
-from zsched.lab.testbed import Testbed, echo_fleet
 from zsched.sessions.config import client_config
+from zsched_lab.testbed import Testbed, echo_fleet
 
 LARGE = bytes(1 << 18)
 

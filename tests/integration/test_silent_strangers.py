@@ -12,9 +12,9 @@ from pathlib import Path
 import zenoh
 
 from zsched.errors import AdapterError
-from zsched.lab.testbed import Testbed, echo_fleet
 from zsched.runtime.descriptors import WANTED
 from zsched.sessions import config as zenoh_config
+from zsched_lab.testbed import Testbed, echo_fleet
 
 SPARE = 12
 """Descriptors that the process has left when the strangers come."""

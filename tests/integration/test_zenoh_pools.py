@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from zsched.lab.netbed import descendants_running
-from zsched.lab.testbed import Testbed, echo_fleet
 from zsched.sessions.config import TX_THREADS, pool_threads, runtime_pools
+from zsched_lab.netbed import descendants_running
+from zsched_lab.testbed import Testbed, echo_fleet
 
 NODES, TASKS = 2, 1
 

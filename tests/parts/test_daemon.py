@@ -32,7 +32,6 @@ from zsched.core.values.model import NodeKind
 from zsched.core.vote.clocks import is_bad
 from zsched.daemon import EXIT_CONFIG, EXIT_FAILED, EXIT_OK
 from zsched.errors import AdapterError
-from zsched.lab.testbed import echo_fleet
 from zsched.log_limit import BURST, RATE_HZ
 from zsched.paths import socket_path
 from zsched.runtime.endpoints import MAX_PORT, MIN_PORT, PORT_RANGE, Endpoints, endpoints_for, free_port, is_here
@@ -40,6 +39,7 @@ from zsched.runtime.sampler import Sampler
 from zsched.runtime.shell import Inbox
 from zsched.sessions.config import worker_config
 from zsched.wire.keyspace import Keyspace
+from zsched_lab.testbed import echo_fleet
 
 Json = dict[str, Any]
 

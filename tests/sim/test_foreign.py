@@ -6,8 +6,8 @@ from zsched.core.status import build_snapshot
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.model import NodeKind, Tuning, Weights
 from zsched.core.values.plan import ReadyWhen
-from zsched.lab.sim_swarm import plan
-from zsched.lab.simulator import Simulator
+from zsched_lab.sim_swarm import plan
+from zsched_lab.simulator import Simulator
 
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
 DEADLINE_S = 3.0

@@ -11,7 +11,7 @@ from zsched.core import instructions as do
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.model import NodeId, NodeKind, Tuning, Weights
 from zsched.core.vote.belief import GENERATION_STEP, MAX_GENERATION
-from zsched.lab.simulator import Simulator
+from zsched_lab.simulator import Simulator
 
 TASK = "merge"
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2", "edge3")

@@ -12,7 +12,7 @@ from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSp
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import Beat, DurableState, NodeId, NodeKind, Tuning, Weights
 from zsched.core.vote.witness import ASK_ALL_S, Witness
-from zsched.lab.simulator import CORES, Simulator
+from zsched_lab.simulator import CORES, Simulator
 
 TASK = "merge"
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")

@@ -9,7 +9,7 @@ import pytest
 
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.model import NodeId, NodeKind, PeerState, Tuning, Weights
-from zsched.lab.simulator import CORES, Simulator
+from zsched_lab.simulator import CORES, Simulator
 
 TASK = "merge"
 

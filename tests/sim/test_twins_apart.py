@@ -7,8 +7,8 @@ from functools import partial
 from zsched.core.status import build_snapshot
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.model import NodeKind, Tuning, Weights
-from zsched.lab.sim_parts import Machine
-from zsched.lab.simulator import Simulator
+from zsched_lab.sim_parts import Machine
+from zsched_lab.simulator import Simulator
 
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
 FLEET = Fleet(

@@ -12,8 +12,8 @@ from zsched.core.scheduler.rounds import Rounds
 from zsched.core.values.fleet import Fleet, NodeSpec, Reach, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.model import Allocation, NodeKind, PeerState, Proposal, Tuning, Weights
 from zsched.core.vote.tally import VoteOutcome, tally
-from zsched.lab.sim_swarm import plan
-from zsched.lab.simulator import Simulator
+from zsched_lab.sim_swarm import plan
+from zsched_lab.simulator import Simulator
 
 VOTERS = ("robot1", "robot2", "robot3")
 

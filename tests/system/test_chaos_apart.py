@@ -23,11 +23,11 @@ from zsched.adapters.host.operator_socket import ask
 from zsched.adapters.host.state_file import StateFile
 from zsched.clock import monotonic_s
 from zsched.core.values.model import NodeId
-from zsched.lab import netns
-from zsched.lab.chaos import TWO_CLASSES
-from zsched.lab.netbed import Netbed, Probe, Received
-from zsched.lab.testbed import TASK, Json, echo_fleet
 from zsched.paths import socket_path
+from zsched_lab import netns
+from zsched_lab.chaos import TWO_CLASSES
+from zsched_lab.netbed import Netbed, Probe, Received
+from zsched_lab.testbed import TASK, Json, echo_fleet
 
 pytestmark = pytest.mark.root
 

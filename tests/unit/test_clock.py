@@ -104,7 +104,7 @@ def test_wall_time_is_rfc_3339_in_utc_with_milliseconds() -> None:
     assert abs((datetime.now(UTC) - datetime.fromisoformat(text)).total_seconds()) < 60
 
 
-READS_CLOCKS = {"lab", "tasks", "clock.py"}
+READS_CLOCKS = {"tasks", "clock.py"}
 LAB_HELPERS = {"adapters/machine/cgroup.py"}  # its clock bounds the removal of the lab's own groups
 
 

@@ -20,10 +20,10 @@ import typer.main
 from zsched.cli import app
 from zsched.config.timing import PROFILES
 from zsched.ipc import pipe as relay_pipe
-from zsched.lab.planted import BUGS, places
-from zsched.lab.planted_bugs import Bug
 from zsched.wire import codec as wire  # the pipe's kinds are registered with the codec when its module is imported
 from zsched.wire.keyspace import Keyspace
+from zsched_lab.planted import BUGS, places
+from zsched_lab.planted_bugs import Bug
 
 ROOT: Final = Path(__file__).parents[2]
 DOCS: Final = sorted(
@@ -131,8 +131,9 @@ def test_named_tests_exist() -> None:
 
 def test_glossary_s_python_names_are_the_code_s() -> None:
     """The last part of every name in the third column is a word of the sources."""
-    words = {word for path in (ROOT / "zsched").rglob("*.py") for word in re.findall(r"\w+", path.read_text())}
-    words |= {path.stem for path in (ROOT / "zsched").rglob("*")} | {"FLOORS", "py"}
+    sources = [*(ROOT / "zsched").rglob("*.py"), *(ROOT / "lab").rglob("*.py")]
+    words = {word for path in sources for word in re.findall(r"\w+", path.read_text())}
+    words |= {path.stem for base in ("zsched", "lab") for path in (ROOT / base).rglob("*")} | {"FLOORS", "py"}
     cells = [line.split(" | ")[2] for line in text_of("docs/glossary.md").splitlines() if line.count(" | ") == 3]
     names = {name for cell in cells for name in re.findall(r"`([^`]+)`", cell)}
     assert len(names) > 50
@@ -278,7 +279,8 @@ def test_profiles_are_told_as_the_code_s_differences() -> None:
 
 # --- commands --------------------------------------------------------------------------------------------------------
 
-VERBS: Final[dict[str, Any]] = dict(getattr(typer.main.get_command(app), "commands", {}))
+PROGRAM: Final[Any] = typer.main.get_command(app)
+VERBS: Final[dict[str, Any]] = {name: PROGRAM.get_command(None, name) for name in PROGRAM.list_commands(None)}
 
 
 def wrong_commands(text: str) -> list[str]:
@@ -333,7 +335,8 @@ def test_decision_has_its_four_parts(name: str) -> None:
 def test_decisions_that_the_code_cites_exist() -> None:
     cited = {
         number
-        for path in (ROOT / "zsched").rglob("*.py")
+        for folder in ("zsched", "lab")
+        for path in (ROOT / folder).rglob("*.py")
         for number in re.findall(r"decisions/(\d{4})", path.read_text(encoding="utf-8"))
     }
     assert cited <= {Path(name).name[:4] for name in DECISIONS}

@@ -311,14 +311,6 @@ def test_up_without_a_fleet_file_exits_with_78_and_says_which(tmp_path: Path) ->
     assert "--config" in result.stderr
 
 
-def test_demo_without_the_lab_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name in ("cv2", "rich") else object())
-    result = run("demo", "--headless")
-    assert (result.exit_code, result.stdout) == (1, "")
-    assert "cv2, rich" in result.stderr
-    assert "pip install 'zsched[lab]'" in result.stderr
-
-
 def test_demo_hands_its_options_on_to_the_lab() -> None:
     """The lab refuses an impossible duration before it starts anything."""
     result = run("demo", "--headless", "--duration", "1")

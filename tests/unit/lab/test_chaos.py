@@ -8,10 +8,10 @@ from types import SimpleNamespace
 import pytest
 
 from zsched.core.values.model import NodeId
-from zsched.lab.chaos import GUARD, ChaosBed
-from zsched.lab.history import History, Learnt
-from zsched.lab.netbed import Received
-from zsched.lab.testbed import TASK
+from zsched_lab.chaos import GUARD, ChaosBed
+from zsched_lab.history import History, Learnt
+from zsched_lab.netbed import Received
+from zsched_lab.testbed import TASK
 
 
 def sample(node: NodeId, at: float, epoch: int | None = None) -> Received:

@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from zsched.lab.laser_log import Scan, load_log, malaga_path
-from zsched.lab.mapping import GridMapper, displacements, map_scans, truth_grid
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid
+from zsched_lab.laser_log import Scan, load_log, malaga_path
+from zsched_lab.mapping import GridMapper, displacements, map_scans, truth_grid
 
 
 def _scan(pose: Pose2, *beams: tuple[float, float]) -> Scan:

@@ -13,7 +13,7 @@ from zsched.core.values.messages import Accepted, Promise
 from zsched.core.values.model import Acceptance, Allocation, Ballot, NodeId, NodeKind, PeerState, Tuning, Weights
 from zsched.core.values.plan import Direction, Role, WorkerRole
 from zsched.errors import InvariantError
-from zsched.lab.simulator import RESTART_S, TOKEN_DELAY_S, Simulator
+from zsched_lab.simulator import RESTART_S, TOKEN_DELAY_S, Simulator
 
 TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
 RULE = StreamRule(direction=Direction.INPUT, from_template="{robot}/map", to_template="{target}/merge/{robot}/map")

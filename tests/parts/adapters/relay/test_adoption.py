@@ -156,7 +156,7 @@ def test_a_relay_that_is_not_ours_is_replaced_never_doubled(
 @pytest.mark.parametrize("is_changed", [False, True], ids=["the same code elsewhere", "changed code"])
 def test_code_that_changed_under_one_version_replaces_the_relay(tmp_path: Path, *, is_changed: bool) -> None:
     package = Path(zsched.__file__).parent
-    copy = shutil.copytree(package, tmp_path / "code" / "zsched", ignore=shutil.ignore_patterns("__pycache__", "lab"))
+    copy = shutil.copytree(package, tmp_path / "code" / "zsched", ignore=shutil.ignore_patterns("__pycache__"))
     if is_changed:
         with (copy / "relay" / "inputs.py").open("a") as file:
             file.write("# a line more\n")

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from zsched.lab.neural_load import Network
-from zsched.lab.paper.cameras import Camera, main, next_frame
-from zsched.lab.signals import StopFlag
+from zsched_lab.neural_load import Network
+from zsched_lab.paper.cameras import Camera, main, next_frame
+from zsched_lab.signals import StopFlag
 
 
 @pytest.mark.parametrize("wrong", [["--streams", "0"], ["--side", "100"], ["--cores", "-1"]])
@@ -27,7 +27,7 @@ def test_streams_run_side_by_side_and_end_on_sigterm(tmp_path: Path) -> None:
         command = [
             sys.executable,
             "-m",
-            "zsched.lab.paper.cameras",
+            "zsched_lab.paper.cameras",
             "--streams",
             "3",
             "--cores",

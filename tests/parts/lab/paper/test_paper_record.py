@@ -19,11 +19,14 @@ from rosbags.typesys import Stores, get_typestore
 
 from support.waiting import free_endpoint, until
 from zsched.adapters.machine.cgroup import LimitedGroup
-from zsched.lab import application
-from zsched.lab.children import Children
-from zsched.lab.limits import LimitKind, NodeLimits
-from zsched.lab.paper.load import Loads, Window
-from zsched.lab.paper.record import (
+from zsched.tasks.map_merge.cdr import encode_grid
+from zsched.tasks.map_merge.geometry import Pose2
+from zsched.tasks.map_merge.grid import Grid
+from zsched_lab import application
+from zsched_lab.children import Children
+from zsched_lab.limits import LimitKind, NodeLimits
+from zsched_lab.paper.load import Loads, Window
+from zsched_lab.paper.record import (
     OCCUPANCY_GRID,
     PRECEDENCE,
     Heard,
@@ -35,11 +38,8 @@ from zsched.lab.paper.record import (
     record,
     stamp_ns,
 )
-from zsched.lab.paper.scenario import LoadLevel, NodeShare
-from zsched.lab.signals import StopFlag
-from zsched.tasks.map_merge.cdr import encode_grid
-from zsched.tasks.map_merge.geometry import Pose2
-from zsched.tasks.map_merge.grid import Grid
+from zsched_lab.paper.scenario import LoadLevel, NodeShare
+from zsched_lab.signals import StopFlag
 
 NO_GROUPS = LimitedGroup.why_not()
 needs_groups = pytest.mark.skipif(NO_GROUPS is not None, reason=f"no control groups: {NO_GROUPS}")
@@ -93,7 +93,7 @@ def test_the_recorder_hears_what_a_robot_sends_and_ends_whole(tmp_path: Path) ->
     config.insert_json5("listen/endpoints", json.dumps([endpoint]))
     config.insert_json5("scouting/multicast/enabled", "false")
     with zenoh.open(config) as session:
-        command = [sys.executable, "-m", "zsched.lab.paper.record", "--robot", f"robot1={endpoint}", "--out", str(out)]
+        command = [sys.executable, "-m", "zsched_lab.paper.record", "--robot", f"robot1={endpoint}", "--out", str(out)]
         process = subprocess.Popen(command, stderr=subprocess.PIPE)
         try:
             publisher = session.declare_publisher("robot1/map")

@@ -9,11 +9,11 @@ import pytest
 from support.waiting import until
 from zsched.config.load import load_fleet
 from zsched.core.values.fleet import SharedMemory
-from zsched.lab.fleet_runner import write_fleet
-from zsched.lab.netns import why_not
-from zsched.lab.paper.places import scenario_path
-from zsched.lab.paper.scenario import load_scenario
-from zsched.lab.paper.spaces import NodeChildren, narrow_links, spaced
+from zsched_lab.fleet_runner import write_fleet
+from zsched_lab.netns import why_not
+from zsched_lab.paper.places import scenario_path
+from zsched_lab.paper.scenario import load_scenario
+from zsched_lab.paper.spaces import NodeChildren, narrow_links, spaced
 
 NO_SPACES = why_not()
 needs_spaces = pytest.mark.skipif(NO_SPACES is not None, reason=f"no network namespaces: {NO_SPACES}")

@@ -10,8 +10,8 @@ from zsched.config.load import check_bytes
 from zsched.core.membership.beat_room import FRAME_BYTES, MAX_BEAT_BYTES, BeatRoom, beat_bytes, most_bytes
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.model import MAX_COUNTER, Beat, Grant, NodeKind, Tuning, Weights
-from zsched.lab.simulator import Simulator
 from zsched.wire import codec as wire
+from zsched_lab.simulator import Simulator
 
 LONG = "n" * 60
 ROBOTS = tuple(f"{LONG}{number:03}" for number in range(3))

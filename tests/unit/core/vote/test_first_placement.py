@@ -8,7 +8,7 @@ from zsched.core.scheduler.judge import INITIAL_SETTLE_S, Judge, Outcome
 from zsched.core.scheduler.scoring import Standing
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.model import Allocation, NodeKind, Tuning, Weights
-from zsched.lab.simulator import Simulator
+from zsched_lab.simulator import Simulator
 
 TUNING = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
 SPEC = TaskSpec(

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from zsched.lab.decisions import drives, radio
+from zsched_lab.decisions import drives, radio
 
 
 def test_path_loss_falls_by_28_db_for_every_ten_times_the_distance() -> None:

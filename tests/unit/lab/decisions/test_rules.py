@@ -12,12 +12,12 @@ import pytest
 from zsched.config.load import check_bytes
 from zsched.core.values.fleet import PAPER_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S
 from zsched.core.values.model import Tuning
-from zsched.lab.decisions import entries
-from zsched.lab.decisions.replay import Entry, replay
-from zsched.lab.decisions.report import STARS
-from zsched.lab.decisions.rules import BlindRule, CoreRule, Move, PickRule, drawn, first_match, fixed
-from zsched.lab.decisions.view import Feed, Look, View
-from zsched.lab.decisions.world import DT_S, EVEN, World, equal_world, loaded_world
+from zsched_lab.decisions import entries
+from zsched_lab.decisions.replay import Entry, replay
+from zsched_lab.decisions.report import STARS
+from zsched_lab.decisions.rules import BlindRule, CoreRule, Move, PickRule, drawn, first_match, fixed
+from zsched_lab.decisions.view import Feed, Look, View
+from zsched_lab.decisions.world import DT_S, EVEN, World, equal_world, loaded_world
 
 STEP_AT_S = 60.0
 PLAIN = """\

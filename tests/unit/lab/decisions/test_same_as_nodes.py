@@ -10,11 +10,11 @@ import pytest
 from zsched.core.scheduler.patience import FIRST_PATIENCE
 from zsched.core.values.fleet import PAPER_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S, Timing
 from zsched.core.values.model import Tuning
-from zsched.lab.decisions.loads import Array
-from zsched.lab.decisions.replay import Entry, replay
-from zsched.lab.decisions.rules import CoreRule
-from zsched.lab.decisions.world import DT_S, EVEN, World, build_fleet
-from zsched.lab.simulator import CORES, MEMORY_MB, Simulator
+from zsched_lab.decisions.loads import Array
+from zsched_lab.decisions.replay import Entry, replay
+from zsched_lab.decisions.rules import CoreRule
+from zsched_lab.decisions.world import DT_S, EVEN, World, build_fleet
+from zsched_lab.simulator import CORES, MEMORY_MB, Simulator
 
 TIMER = Tuning(weights=EVEN, cool_down_s=10.0)
 PATIENT = Tuning(weights=EVEN, cool_down_s=PATIENT_COOL_DOWN_S, bonus=PATIENT_BONUS)

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from zsched.lab.decisions import loads
-from zsched.lab.decisions.rules import Move
-from zsched.lab.decisions.score import MOVE_COST_S, figures, oracle, truth_of, wasted_moves
-from zsched.lab.decisions.view import START_S, Feed, Look, View
-from zsched.lab.decisions.world import DT_S, World, bad, loaded_world, true_utility
+from zsched_lab.decisions import loads
+from zsched_lab.decisions.rules import Move
+from zsched_lab.decisions.score import MOVE_COST_S, figures, oracle, truth_of, wasted_moves
+from zsched_lab.decisions.view import START_S, Feed, Look, View
+from zsched_lab.decisions.world import DT_S, World, bad, loaded_world, true_utility
 
 
 def still(*, with_radio: bool) -> World:

@@ -12,15 +12,15 @@ from zsched.core.scheduler import scoring
 from zsched.core.scheduler.patience import FIRST_PATIENCE
 from zsched.core.values.fleet import PATIENT_BONUS, PATIENT_COOL_DOWN_S, TaskSpec
 from zsched.core.values.model import ScoreForm, Utility, UtilityVector, Weights
-from zsched.lab.decisions import __main__ as package
-from zsched.lab.decisions import entries
-from zsched.lab.decisions.rules import CoreRule
-from zsched.lab.decisions.service import cast, command, picture, study, tables
-from zsched.lab.decisions.service import replay as closed
-from zsched.lab.decisions.service.history import MEASURED, History, build
-from zsched.lab.decisions.service.replay import Player, Scene, TaskView, replay
-from zsched.lab.decisions.view import START_S
-from zsched.lab.decisions.world import DT_S, loaded_world
+from zsched_lab.decisions import __main__ as package
+from zsched_lab.decisions import entries
+from zsched_lab.decisions.rules import CoreRule
+from zsched_lab.decisions.service import cast, command, picture, study, tables
+from zsched_lab.decisions.service import replay as closed
+from zsched_lab.decisions.service.history import MEASURED, History, build
+from zsched_lab.decisions.service.replay import Player, Scene, TaskView, replay
+from zsched_lab.decisions.view import START_S
+from zsched_lab.decisions.world import DT_S, loaded_world
 
 HOURS = 0.03
 ZSCHED = cast.players()[0]

@@ -8,15 +8,15 @@ import itertools
 import numpy as np
 import pytest
 
-from zsched.lab.decisions.rules import Move
-from zsched.lab.decisions.service import history as histories
-from zsched.lab.decisions.service import machines
-from zsched.lab.decisions.service.history import BURSTS_S, IDLE_SHARE, Activity, History, build
-from zsched.lab.decisions.service.judge import SKIP_S, judge, oracle, truth
-from zsched.lab.decisions.service.machines import Machine, Work, share, share_out
-from zsched.lab.decisions.service.oracle import best_path
-from zsched.lab.decisions.service.present import LAG_S, present
-from zsched.lab.decisions.world import DT_S
+from zsched_lab.decisions.rules import Move
+from zsched_lab.decisions.service import history as histories
+from zsched_lab.decisions.service import machines
+from zsched_lab.decisions.service.history import BURSTS_S, IDLE_SHARE, Activity, History, build
+from zsched_lab.decisions.service.judge import SKIP_S, judge, oracle, truth
+from zsched_lab.decisions.service.machines import Machine, Work, share, share_out
+from zsched_lab.decisions.service.oracle import best_path
+from zsched_lab.decisions.service.present import LAG_S, present
+from zsched_lab.decisions.world import DT_S
 
 HOURS = 0.05
 NOBODY = np.zeros((1, 0, 2))

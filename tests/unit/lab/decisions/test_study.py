@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from zsched.lab.decisions import report, study
-from zsched.lab.decisions.drives import DriveFigures
-from zsched.lab.decisions.figures import grid as grid_picture
-from zsched.lab.decisions.figures import rules as rules_picture
+from zsched_lab.decisions import report, study
+from zsched_lab.decisions.drives import DriveFigures
+from zsched_lab.decisions.figures import grid as grid_picture
+from zsched_lab.decisions.figures import rules as rules_picture
 
 ONLY = frozenset({"zsched", "argmax", "fixed_e1"})
 CASES = tuple(case for case in study.compared((3,)) if case.name in ("long", "step"))
@@ -95,7 +95,7 @@ def test_the_spread_is_two_standard_errors_of_the_mean() -> None:
 
 def test_the_command_refuses_to_mix_results_unless_told_to_resume(tmp_path: Path) -> None:
     (tmp_path / "results-test.ndjson").write_text("")
-    command = [sys.executable, "-m", "zsched.lab.decisions", "--out", str(tmp_path)]
+    command = [sys.executable, "-m", "zsched_lab.decisions", "--out", str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 1
     assert "--resume" in done.stderr

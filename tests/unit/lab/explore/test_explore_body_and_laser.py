@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from zsched.lab.explore.body import LONGEST_S, RADIUS_M, Body, Drift, Limits, Twist
-from zsched.lab.explore.laser import BEAMS, RANGE_M, Laser
-from zsched.lab.explore.world import World, make_world
 from zsched.tasks.map_merge.geometry import Pose2
+from zsched_lab.explore.body import LONGEST_S, RADIUS_M, Body, Drift, Limits, Twist
+from zsched_lab.explore.laser import BEAMS, RANGE_M, Laser
+from zsched_lab.explore.world import World, make_world
 
 NO_DRIFT = Drift(yaw=0.0, way=0.0)
 

@@ -10,21 +10,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zsched.errors import WireError
-from zsched.lab.explore.agent import Agent, RobotSettings
-from zsched.lab.explore.body import Limits
-from zsched.lab.explore.follower import BACK_S, Follower
-from zsched.lab.explore.localizer import KEPT, LOST_S, Localizer
-from zsched.lab.explore.messages import (
+from zsched.tasks.map_merge.geometry import Pose2
+from zsched_lab.explore.agent import Agent, RobotSettings
+from zsched_lab.explore.body import Limits
+from zsched_lab.explore.follower import BACK_S, Follower
+from zsched_lab.explore.localizer import KEPT, LOST_S, Localizer
+from zsched_lab.explore.messages import (
     Correction,
     decode_correction,
     decode_way,
     encode_correction,
     encode_way,
 )
-from zsched.lab.explore.navigate import SAVED_S, Budget
-from zsched.lab.explore.world import World
-from zsched.lab.explore.worlds import load_world
-from zsched.tasks.map_merge.geometry import Pose2
+from zsched_lab.explore.navigate import SAVED_S, Budget
+from zsched_lab.explore.world import World
+from zsched_lab.explore.worlds import load_world
 
 SECOND_NS = 1_000_000_000
 

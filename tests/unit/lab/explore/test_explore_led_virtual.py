@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import pytest
 
-from zsched.lab.explore.body import Drift, Limits
-from zsched.lab.explore.led import LedResult, LedRun, run_led
-from zsched.lab.explore.worlds import load_world
+from zsched_lab.explore.body import Drift, Limits
+from zsched_lab.explore.led import LedResult, LedRun, run_led
+from zsched_lab.explore.worlds import load_world
 
 
 def test_led_robots_find_each_other_and_cover_a_world_with_odometry_that_drifts() -> None:

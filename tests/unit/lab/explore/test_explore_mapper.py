@@ -2,14 +2,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from zsched.lab.explore.laser import Laser, LaserScan
-from zsched.lab.explore.mapper import ScanMapper
-from zsched.lab.explore.referee import Referee
-from zsched.lab.explore.world import World, make_world
-from zsched.lab.explore.worlds import load_world
-from zsched.lab.map_metrics import score_map
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid
+from zsched_lab.explore.laser import Laser, LaserScan
+from zsched_lab.explore.mapper import ScanMapper
+from zsched_lab.explore.referee import Referee
+from zsched_lab.explore.world import World, make_world
+from zsched_lab.explore.worlds import load_world
+from zsched_lab.map_metrics import score_map
 
 
 def drive_through(world: World, stops: list[Pose2], noise_m: float = 0.01) -> Grid:

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from zsched.errors import WireError
-from zsched.lab.explore.body import Body, Drift, Limits, Twist
-from zsched.lab.explore.laser import Laser, LaserScan
-from zsched.lab.explore.mapper import ScanMapper
-from zsched.lab.explore.matching import LEAST_ROUNDS, ROUND, ScanMatcher
-from zsched.lab.explore.slam_state import Slam, SlamSettings
-from zsched.lab.explore.world import World
-from zsched.lab.explore.worlds import load_world
-from zsched.lab.paper.robots import ODOMETRY
 from zsched.tasks.map_merge.geometry import Pose2
+from zsched_lab.explore.body import Body, Drift, Limits, Twist
+from zsched_lab.explore.laser import Laser, LaserScan
+from zsched_lab.explore.mapper import ScanMapper
+from zsched_lab.explore.matching import LEAST_ROUNDS, ROUND, ScanMatcher
+from zsched_lab.explore.slam_state import Slam, SlamSettings
+from zsched_lab.explore.world import World
+from zsched_lab.explore.worlds import load_world
+from zsched_lab.paper.robots import ODOMETRY
 
 SECONDS = 40
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from zsched.errors import WireError
-from zsched.lab.explore.frontier import Claim
-from zsched.lab.explore.laser import RANGE_M, LaserScan
-from zsched.lab.explore.messages import decode_claim, decode_scan, encode_claim, encode_scan
 from zsched.tasks.map_merge.geometry import Pose2
+from zsched_lab.explore.frontier import Claim
+from zsched_lab.explore.laser import RANGE_M, LaserScan
+from zsched_lab.explore.messages import decode_claim, decode_scan, encode_claim, encode_scan
 
 POSE = Pose2(x=1.5, y=-2.0, yaw=0.25)
 

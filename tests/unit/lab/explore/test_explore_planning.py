@@ -6,12 +6,12 @@ import math
 import numpy as np
 import pytest
 
-from zsched.lab.explore.body import Limits
-from zsched.lab.explore.explorer import AVOID_M, AVOID_S, CLAIM_LIFE_S, Explorer, State, avoid_s
-from zsched.lab.explore.frontier import Claim, Frontier, choose, find_frontiers, utility
-from zsched.lab.explore.planner import INFLATION_M, distances, plan_map, way_to
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import FREE, OCCUPIED, UNKNOWN, Cells, Grid
+from zsched_lab.explore.body import Limits
+from zsched_lab.explore.explorer import AVOID_M, AVOID_S, CLAIM_LIFE_S, Explorer, State, avoid_s
+from zsched_lab.explore.frontier import Claim, Frontier, choose, find_frontiers, utility
+from zsched_lab.explore.planner import INFLATION_M, distances, plan_map, way_to
 
 SIDE = 0.05
 

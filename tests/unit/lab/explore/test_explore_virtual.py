@@ -6,12 +6,12 @@ from pathlib import Path
 import cv2
 import pytest
 
-from zsched.lab.explore.__main__ import main, paired_interval, table
-from zsched.lab.explore.agent import MAP_PERIOD_S, Agent, RobotSettings
-from zsched.lab.explore.virtual import VirtualResult, VirtualRun, run_virtual
-from zsched.lab.explore.world import World
-from zsched.lab.explore.worlds import load_world
-from zsched.lab.map_metrics import score_map
+from zsched_lab.explore.__main__ import main, paired_interval, table
+from zsched_lab.explore.agent import MAP_PERIOD_S, Agent, RobotSettings
+from zsched_lab.explore.virtual import VirtualResult, VirtualRun, run_virtual
+from zsched_lab.explore.world import World
+from zsched_lab.explore.worlds import load_world
+from zsched_lab.map_metrics import score_map
 
 SEEDS = (1, 2, 3, 4, 5)
 LATE_S = 5.0

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from zsched.errors import ConfigError
-from zsched.lab.explore.office import OfficeSize, office
-from zsched.lab.explore.world import START_CLEARANCE_M, START_SPACING_M, make_world, read_map_server, shipped
-from zsched.lab.explore.worlds import load_world
 from zsched.tasks.map_merge.grid import FREE, OCCUPIED
+from zsched_lab.explore.office import OfficeSize, office
+from zsched_lab.explore.world import START_CLEARANCE_M, START_SPACING_M, make_world, read_map_server, shipped
+from zsched_lab.explore.worlds import load_world
 
 
 def write_map(folder: Path, text: str, image: np.ndarray[tuple[int, int], np.dtype[np.uint8]] | None) -> Path:

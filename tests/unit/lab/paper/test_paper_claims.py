@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from zsched.lab.paper.claims import (
+from zsched_lab.paper.claims import (
     CLAIMS,
     Claim,
     Difference,
@@ -19,8 +19,8 @@ from zsched.lab.paper.claims import (
     table_of,
     verdict,
 )
-from zsched.lab.paper.figures import save_all, save_gains, save_panels, save_radio
-from zsched.lab.paper.report import (
+from zsched_lab.paper.figures import save_all, save_gains, save_panels, save_radio
+from zsched_lab.paper.report import (
     blocks_parts,
     gains_parts,
     groups_of,
@@ -31,8 +31,8 @@ from zsched.lab.paper.report import (
     radio_text,
     report,
 )
-from zsched.lab.paper.schemes import FIXED_SCHEMES, PAPER_SCHEMES, SCHEMES
-from zsched.lab.paper.snippet import snippet
+from zsched_lab.paper.schemes import FIXED_SCHEMES, PAPER_SCHEMES, SCHEMES
+from zsched_lab.paper.snippet import snippet
 
 HIGHER = Claim(source="paper", says="x", metric="map_hz", mine=("a",), theirs=("b",), target=0.2)
 LOWER = Claim(source="paper", says="x", metric="task_latency_s", mine=("a",), theirs=("b",), target=-0.28)

@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from zsched.lab.children import ChildError
-from zsched.lab.paper.bench import BenchOptions, InputsOf, claim_folder, command_of, plan_body, planned, run_bench
-from zsched.lab.paper.cells import Cell, bandwidth_of, cells_of, merge_of, world_of
-from zsched.lab.paper.matrix import (
+from zsched_lab.children import ChildError
+from zsched_lab.paper.bench import BenchOptions, InputsOf, claim_folder, command_of, plan_body, planned, run_bench
+from zsched_lab.paper.cells import Cell, bandwidth_of, cells_of, merge_of, world_of
+from zsched_lab.paper.matrix import (
     ATTEMPTS,
     DEFINITIONS,
     GIVE_UP,
@@ -21,10 +21,10 @@ from zsched.lab.paper.matrix import (
     invalid_reason,
     set_aside,
 )
-from zsched.lab.paper.places import robots_scenario_path, scenario_path
-from zsched.lab.paper.plan import AROUND_S, leave_out, plan_text, without
-from zsched.lab.paper.scenario import MATRIX, LinkLimits, MergeTask, Scenario, Sweep, load_scenario
-from zsched.lab.paper.schemes import SCHEMES
+from zsched_lab.paper.places import robots_scenario_path, scenario_path
+from zsched_lab.paper.plan import AROUND_S, leave_out, plan_text, without
+from zsched_lab.paper.scenario import MATRIX, LinkLimits, MergeTask, Scenario, Sweep, load_scenario
+from zsched_lab.paper.schemes import SCHEMES
 
 
 @pytest.fixture

@@ -10,22 +10,22 @@ import pytest
 
 from zsched.config.load import load_fleet
 from zsched.errors import ConfigError
-from zsched.lab.explore.navigate import main as navigate
-from zsched.lab.explore.robot import parse as parse_explorer
-from zsched.lab.explore.slam import main as slam
-from zsched.lab.explore.slam_worker import main as slam_worker
-from zsched.lab.paper.arrivals import Arrival, Streams
-from zsched.lab.paper.bench import BenchOptions, InputsOf, planned
-from zsched.lab.paper.cells import Cell, cells_of
-from zsched.lab.paper.claims import GAINS, best_fixed, over_best_fixed, over_fixed
-from zsched.lab.paper.coverage_report import coverage_parts, coverage_table, roles_table, save_coverage
-from zsched.lab.paper.latency_floor import ceiling_of, floor_of, tell_ceiling
-from zsched.lab.paper.latency_floor import main as latency_floor
-from zsched.lab.paper.led_metrics import coverage_figures, led_of, merge_cpu_s, pose_errors
-from zsched.lab.paper.matrix import invalid_reason
-from zsched.lab.paper.places import robots_scenario_path, scenario_path, shipped_names, shipped_scenario
-from zsched.lab.paper.plan import AROUND_S, cell_s, plan_text
-from zsched.lab.paper.report import (
+from zsched_lab.explore.navigate import main as navigate
+from zsched_lab.explore.robot import parse as parse_explorer
+from zsched_lab.explore.slam import main as slam
+from zsched_lab.explore.slam_worker import main as slam_worker
+from zsched_lab.paper.arrivals import Arrival, Streams
+from zsched_lab.paper.bench import BenchOptions, InputsOf, planned
+from zsched_lab.paper.cells import Cell, cells_of
+from zsched_lab.paper.claims import GAINS, best_fixed, over_best_fixed, over_fixed
+from zsched_lab.paper.coverage_report import coverage_parts, coverage_table, roles_table, save_coverage
+from zsched_lab.paper.latency_floor import ceiling_of, floor_of, tell_ceiling
+from zsched_lab.paper.latency_floor import main as latency_floor
+from zsched_lab.paper.led_metrics import coverage_figures, led_of, merge_cpu_s, pose_errors
+from zsched_lab.paper.matrix import invalid_reason
+from zsched_lab.paper.places import robots_scenario_path, scenario_path, shipped_names, shipped_scenario
+from zsched_lab.paper.plan import AROUND_S, cell_s, plan_text
+from zsched_lab.paper.report import (
     blocks_parts,
     claims_text,
     gains_text,
@@ -33,12 +33,12 @@ from zsched.lab.paper.report import (
     over_fixed_text,
     report,
 )
-from zsched.lab.paper.robots import ODOMETRY, ExploreRobots, Place, slam_task
-from zsched.lab.paper.roles import REST, RoleMeter, mean_shares, role_figures
-from zsched.lab.paper.run import CellRun, Inputs
-from zsched.lab.paper.scenario import MATRIX, NodeShare, Scenario, load_scenario
-from zsched.lab.paper.schemes import FIXED_SCHEMES, SCHEMES
-from zsched.lab.paper.snippet import moves_text
+from zsched_lab.paper.robots import ODOMETRY, ExploreRobots, Place, slam_task
+from zsched_lab.paper.roles import REST, RoleMeter, mean_shares, role_figures
+from zsched_lab.paper.run import CellRun, Inputs
+from zsched_lab.paper.scenario import MATRIX, NodeShare, Scenario, load_scenario
+from zsched_lab.paper.schemes import FIXED_SCHEMES, SCHEMES
+from zsched_lab.paper.snippet import moves_text
 
 AUTHORS = {"slam": 0.352, "model": 0.60, "merge": 0.096, "navigation": 0.027}
 """Shares of a Jetson Nano's CPU: config/task_req.yaml of herolab-uga/ros-edge-orchestration, rounded."""
@@ -225,7 +225,7 @@ def test_nano_s_robots_are_led_by_slam_and_navigation_on_their_edges(tmp_path: P
 def test_slam_that_is_a_task_is_not_started_beside(tmp_path: Path) -> None:
     robots = the_robots("nano-moves", tmp_path)
     endpoints = {f"edge{number}": f"tcp/127.0.0.1:{number}" for number in (1, 2, 3)}
-    assert {command[2] for _, command in robots.helpers(endpoints)} == {"zsched.lab.explore.navigate"}
+    assert {command[2] for _, command in robots.helpers(endpoints)} == {"zsched_lab.explore.navigate"}
     assert parse_explorer(robots.command(a_place(tmp_path))[3:]).slam_task == "slam_robot2"
 
 
@@ -298,14 +298,14 @@ def test_processes_are_told_apart_by_their_programs_and_the_dead_are_remembered(
     meter = RoleMeter(lambda: pids, tmp_path)
     names = ("explore.slam --robot r", "explore.navigate", "paper.cameras", "explore.slam_worker")
     for pid, name in enumerate(names, start=1):
-        a_process(tmp_path, pid, f"python -m zsched.lab.{name}", 100)
+        a_process(tmp_path, pid, f"python -m zsched_lab.{name}", 100)
     a_process(tmp_path, 5, "python -m zsched.tasks.map_merge --mode estimate", 50)
     a_process(tmp_path, 6, "python -I -S launch.py", 1)
 
     first = meter.read()
     pids.remove(3)
     a_process(tmp_path, 6, "zsched up", 300)
-    a_process(tmp_path, 1, "python -m zsched.lab.explore.slam --robot r", 150)
+    a_process(tmp_path, 1, "python -m zsched_lab.explore.slam --robot r", 150)
     second = meter.read()
     pids.append(77)  # gone before it was looked at
 

@@ -6,17 +6,17 @@ from pathlib import Path
 import pytest
 
 from zsched.config.load import load_fleet
-from zsched.lab.explore.robot import parse as parse_explorer
-from zsched.lab.laser_log import malaga_path
-from zsched.lab.paper.cells import Cell
-from zsched.lab.paper.node_state import is_calm, ready_workers
-from zsched.lab.paper.places import robots_scenario_path, scenario_path
-from zsched.lab.paper.robots import ExploreRobots, LogRobots, Place
-from zsched.lab.paper.run import CellRun, Inputs, Seen
-from zsched.lab.paper.scenario import LinkView, MergeTask, load_scenario
-from zsched.lab.paper.schemes import SCHEMES
-from zsched.lab.recorder import Recorder
-from zsched.lab.robot_app import parse
+from zsched_lab.explore.robot import parse as parse_explorer
+from zsched_lab.laser_log import malaga_path
+from zsched_lab.paper.cells import Cell
+from zsched_lab.paper.node_state import is_calm, ready_workers
+from zsched_lab.paper.places import robots_scenario_path, scenario_path
+from zsched_lab.paper.robots import ExploreRobots, LogRobots, Place
+from zsched_lab.paper.run import CellRun, Inputs, Seen
+from zsched_lab.paper.scenario import LinkView, MergeTask, load_scenario
+from zsched_lab.paper.schemes import SCHEMES
+from zsched_lab.recorder import Recorder
+from zsched_lab.robot_app import parse
 
 
 def a_place(records: Path, robot: str = "robot2", index: int = 1) -> Place:
@@ -71,7 +71,7 @@ def test_mapping_may_be_placed_on_other_nodes(tmp_path: Path) -> None:
     assert parse_explorer(robots.command(a_place(tmp_path, "robot1", 0))[3:]).settings.has_slam
     assert (node, command[2:]) == (
         "edge1",
-        ["zsched.lab.explore.slam", "--resolution", "0.05", "--robot", "robot2", "--endpoint", "tcp/127.0.0.1:1"],
+        ["zsched_lab.explore.slam", "--resolution", "0.05", "--robot", "robot2", "--endpoint", "tcp/127.0.0.1:1"],
     )
     assert LogRobots(log=malaga_path()).helpers({}) == ()
     fine = replace(robots, resolution_m=0.02)

@@ -11,8 +11,8 @@ from zsched.core.scheduler.judge import Judge, Judgement, Outcome
 from zsched.core.scheduler.scoring import Standing
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.model import Allocation, Tuning, Weights
-from zsched.lab.paper.ruled_daemon import install
-from zsched.lab.paper.rules import EVERY_S, RANDOM_PERIOD_S, JudgeMaker, Rule, RuleName, RulePlan, read_plan
+from zsched_lab.paper.ruled_daemon import install
+from zsched_lab.paper.rules import EVERY_S, RANDOM_PERIOD_S, JudgeMaker, Rule, RuleName, RulePlan, read_plan
 
 TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0), bonus=0.0, time_to_trigger_s=0.0, cool_down_s=0.0)
 SPEC = TaskSpec(name="merge", candidates=("e1", "e2", "e3"), tuning=TUNING)

@@ -10,14 +10,14 @@ from zsched.config.load import load_fleet
 from zsched.core.values.fleet import DEFAULT_FORESEE_S, PATIENT_BONUS, PATIENT_COOL_DOWN_S
 from zsched.core.values.model import ScoreForm
 from zsched.errors import ConfigError
-from zsched.lab.fleet_runner import read_tree, write_fleet
-from zsched.lab.paper.claims import CLAIMS
-from zsched.lab.paper.load import Window, loaded_at, schedule
-from zsched.lab.paper.oracle import best_nodes, changes, utilities, utility
-from zsched.lab.paper.places import robots_scenario_path, scenario_path
-from zsched.lab.paper.radio import drive_file, simulated_drive
-from zsched.lab.paper.scenario import LinkView, LoadLevel, LoadPlan, NodeShare, Radio, Scenario, load_scenario
-from zsched.lab.paper.schemes import SCHEMES, Family, candidates_of, find_schemes, scheme_tree
+from zsched_lab.fleet_runner import read_tree, write_fleet
+from zsched_lab.paper.claims import CLAIMS
+from zsched_lab.paper.load import Window, loaded_at, schedule
+from zsched_lab.paper.oracle import best_nodes, changes, utilities, utility
+from zsched_lab.paper.places import robots_scenario_path, scenario_path
+from zsched_lab.paper.radio import drive_file, simulated_drive
+from zsched_lab.paper.scenario import LinkView, LoadLevel, LoadPlan, NodeShare, Radio, Scenario, load_scenario
+from zsched_lab.paper.schemes import SCHEMES, Family, candidates_of, find_schemes, scheme_tree
 
 EDGES = ("edge1", "edge2", "edge3")
 SMALL = """

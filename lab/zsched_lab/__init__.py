@@ -1,0 +1,3 @@
+"""The lab: a whole fleet on one machine."""
+
+__version__ = "0.1.0"

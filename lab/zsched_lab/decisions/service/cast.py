@@ -1,0 +1,127 @@
+"""Who takes part: today's rule, the same with ``score: paper``, the paper's, plain argmax, and described ones.
+
+Knows: every rule's name and settings. Does not know: histories, results.
+"""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Callable, Mapping
+from dataclasses import fields
+from enum import Enum
+from typing import Any, Final, Literal, get_args, get_origin, get_type_hints
+
+from zsched.core.scheduler.patience import FIRST_PATIENCE
+from zsched.core.values.fleet import (
+    DEFAULT_SCORE,
+    PAPER_PATIENCE,
+    PATIENT_BONUS,
+    PATIENT_COOL_DOWN_S,
+    TaskSpec,
+)
+from zsched.core.values.model import ScoreForm, Tuning, Weights
+from zsched_lab.decisions.entries import PAPER_COST, RAW
+from zsched_lab.decisions.rules import CoreRule, PickRule, Rule
+from zsched_lab.decisions.service.replay import Player, is_of_task
+from zsched_lab.decisions.view import Look, Sight
+from zsched_lab.decisions.world import EVEN, RADIO_ONLY
+
+OWN: Final = ("smoothing_s", "move_cost_s", "is_told", "tells_jobs")
+"""Settings of a rule that are neither of `Tuning` nor of `TaskSpec`; ``is_told=0``: run queues are not read;
+``tells_jobs=0``: the worker says nothing of its jobs."""
+
+
+def players() -> tuple[Player, ...]:
+    """The rules that are always compared."""
+    return (
+        zsched("service"),
+        zsched("paper", score=ScoreForm.PAPER),
+        _picks("dyna_both", EVEN, PAPER_COST),
+        _picks("dyna_net", RADIO_ONLY, PAPER_COST),
+        _picks("argmax", EVEN, 0.0),
+    )
+
+
+def zsched(name: str, **settings: Any) -> Player:
+    """The production's decision. What ``settings`` do not say is what a fleet file gets that does not say it.
+
+    They are fields of `Tuning` and `TaskSpec`, and those of `OWN`.
+    """
+    given = dict(settings)
+    smoothing_s = given.pop("smoothing_s", Look().smoothing_s)
+    move_cost_s = given.pop("move_cost_s", 0.0)
+    is_told, tells_jobs = bool(given.pop("is_told", True)), bool(given.pop("tells_jobs", True))
+    changes = {key: given.pop(key) for key in tuple(given) if is_of_task(key)}
+    is_service = given.setdefault("score", DEFAULT_SCORE) is ScoreForm.SERVICE  # no task here weighs the network
+    if "time_to_trigger_s" not in given and "patience" not in changes:
+        changes.setdefault("learns_patience", is_service)
+        changes["patience"] = FIRST_PATIENCE if is_service else PAPER_PATIENCE
+    if changes.get("patience") is not None:
+        given = {"bonus": PATIENT_BONUS, "cool_down_s": PATIENT_COOL_DOWN_S, **given}
+    tuning = Tuning(**{"weights": EVEN, **given})
+    return Player(
+        name=name,
+        make=_core(tuning, changes, move_cost_s),
+        tuning=tuning,
+        look=Look(smoothing_s=smoothing_s),
+        changes=changes,
+        is_told=is_told,
+        tells_jobs=tells_jobs,
+    )
+
+
+def _core(tuning: Tuning, changes: Mapping[str, Any], move_cost_s: float) -> Callable[[Sight], Rule]:
+    own = {name: changes[name] for name in ("patience", "learns_patience", "pays_off_in_s") if name in changes}
+    return lambda view: CoreRule(view, tuning, move_cost_s=move_cost_s, **own)
+
+
+def _picks(name: str, weights: Weights, cost: float) -> Player:
+    """The paper's scheduler by its own equations: once a second the argmax, with a cost for leaving."""
+    tuning = Tuning(weights=weights, score=ScoreForm.PAPER)
+    return Player(name=name, make=lambda view: PickRule(view, cost=cost), tuning=tuning, look=RAW)
+
+
+def described(text: str) -> Player:
+    """A rule by its description, ``NAME:key=value,key=value``. Raises `ValueError` when there is no such setting.
+
+    >>> described("hasty:smoothing_s=0.5,patience=0.3,weights=0.7/0.3/0").tuning.weights
+    Weights(cpu=0.7, memory=0.3, network=0.0)
+    """
+    name, _, rest = text.partition(":")
+    settings: dict[str, Any] = {}
+    for part in filter(None, rest.split(",")):
+        key, sign, value = part.partition("=")
+        if not sign:
+            raise ValueError(f"{part!r} is no key=value")
+        settings[key] = _value(key, value)
+    if not name:
+        raise ValueError("a rule needs a name")
+    return zsched(name, **settings)
+
+
+def _value(key: str, text: str) -> Any:
+    kinds = _kinds()
+    if key not in kinds:
+        raise ValueError(f"no setting {key!r}; there are {', '.join(sorted(kinds))}")
+    kind = kinds[key]
+    if text == "none" and type(None) in get_args(kind):
+        return None
+    if isinstance(kind, types.UnionType):
+        kind = next(one for one in get_args(kind) if one is not type(None))
+    if kind is Weights:
+        cpu, memory, network = (float(one) for one in text.split("/"))
+        return Weights(cpu=cpu, memory=memory, network=network)
+    if kind is bool or get_origin(kind) is Literal:
+        found = {str(one).lower(): one for one in ((False, True) if kind is bool else get_args(kind))}
+        if text not in found:
+            raise ValueError(f"{key} is one of {', '.join(found)}, not {text!r}")
+        return found[text]
+    if isinstance(kind, type) and issubclass(kind, Enum | int | float | str):
+        return kind(text)
+    raise ValueError(f"{key} cannot be given here")
+
+
+def _kinds() -> Mapping[str, Any]:
+    hints = {**get_type_hints(TaskSpec), **get_type_hints(Tuning)}
+    names = {one.name for one in fields(Tuning)} | {name for name in hints if is_of_task(name)}
+    return {**{name: hints[name] for name in names}, **dict.fromkeys(OWN, float)}

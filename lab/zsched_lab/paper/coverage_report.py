@@ -1,0 +1,154 @@
+"""What a report says and draws of robots that SLAM on the edges leads: coverage over time, and whose CPU an edge's was.
+
+Knows: Markdown, the curves, intervals over seeds. Does not know: how a run was made or measured.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from zsched_lab.paper.claims import T_975
+from zsched_lab.paper.roles import ROLES, mean_shares
+from zsched_lab.paper.schemes import SCHEMES
+from zsched_lab.plots import COLOURS, DPI
+
+Json = Mapping[str, Any]
+OURS = {"zsched": "#111111", "zsched_slam": "#8a1c1c"}
+"""Colours that stand out among the others' lines and bands."""
+Curve = tuple[list[float], list[float], list[float | None]]
+"""(t_s, mean share, half of its 95 % interval or ``None`` of one run)."""
+MARKS = 5
+"""So many instants of the run stand in the table."""
+STATES = (
+    ("idle", "SLAM and navigation alone"),
+    ("merge", "and the merger"),
+    ("model", "and the model"),
+    ("both", "and both: the tipping point"),
+)
+
+
+def coverage_parts(runs: Sequence[Json]) -> list[str]:
+    """Both tables under their headings; nothing of runs whose robots nobody leads."""
+    led = [figures for figures in runs if figures.get("stopped_ratio") is not None]
+    if not led:
+        return []
+    return [
+        "### Coverage over time\n",
+        "Share of the truth that the newest merged map knows, mean over the robots; 95 % interval over the runs.\n",
+        coverage_table(led),
+        "### Whose CPU an edge's was\n",
+        "Shares of an edge's CPU, the mean over edges and runs by time. zsched's own has a quota of its own on top.\n",
+        roles_table(led),
+    ]
+
+
+def interval(values: Sequence[float]) -> float | None:
+    """Half of the 95 % interval of a mean (Student's t); ``None`` of one value.
+
+    >>> interval([1.0]), round(interval([1.0, 2.0, 3.0]), 3)
+    (None, 2.484)
+    """
+    if len(values) < 2:
+        return None
+    t = T_975[min(len(values) - 1, len(T_975)) - 1]
+    return t * statistics.stdev(values) / math.sqrt(len(values))
+
+
+def mean_curve(runs: Sequence[Json]) -> Curve:
+    """The mean coverage of a scheme's runs at every instant that all of them have."""
+    curves = [{float(t_s): float(share) for t_s, share in figures["coverage_curve"]} for figures in runs]
+    instants = sorted(set.intersection(*(set(curve) for curve in curves)))
+    values = [[curve[t_s] for curve in curves] for t_s in instants]
+    return instants, [statistics.fmean(row) for row in values], [interval(row) for row in values]
+
+
+def with_interval(mean: float, half: float | None, runs: int) -> str:
+    """A mean share for people.
+
+    >>> with_interval(0.5, 0.04, 5), with_interval(0.5, None, 1)
+    ('0.500 ±0.040', '0.500 (n = 1)')
+    """
+    return f"{mean:.3f} (n = {runs})" if half is None else f"{mean:.3f} ±{half:.3f}"
+
+
+def coverage_table(runs: Sequence[Json]) -> str:
+    """A row per scheme: coverage at some instants, its mean over the run, and how the robots were led."""
+    by_scheme = {name: own for name in SCHEMES if (own := [f for f in runs if f["scheme"] == name])}
+    instants = mean_curve(runs)[0]
+    chosen = [instants[round(number * (len(instants) - 1) / MARKS)] for number in range(1, MARKS + 1)]
+    heads = ["scheme", "runs", *(f"{t_s:g} s" for t_s in chosen), "mean over the run", "m² at the end"]
+    heads += ["stood", "corrections/s", "oldest s", "pose error m", "merge CPU s"]
+    lines = [f"| {' | '.join(heads)} |", "| --- " * len(heads) + "|"]
+    for name, own in by_scheme.items():
+        times, means, halves = mean_curve(own)
+        at = dict(zip(times, zip(means, halves, strict=True), strict=True))
+        over = [float(figures["coverage_mean"]) for figures in own]
+        cells = [with_interval(*at[t_s], len(own)) for t_s in chosen]
+        cells += [with_interval(statistics.fmean(over), interval(over), len(own)), mean_of(own, "explored_m2", 0)]
+        cells += [mean_of(own, "stopped_ratio", 3), mean_of(own, "corrections_hz", 2)]
+        cells += [
+            mean_of(own, "correction_age_max_s", 2),
+            mean_of(own, "pose_error_m", 3),
+            mean_of(own, "merge_cpu_s", 3),
+        ]
+        lines.append(f"| {name} | {len(own)} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def mean_of(runs: Sequence[Json], metric: str, digits: int) -> str:
+    """The mean of a figure; a dash where nothing was measured."""
+    known = [float(figures[metric]) for figures in runs if figures.get(metric) is not None]
+    return f"{statistics.fmean(known):.{digits}f}" if known else "-"
+
+
+def roles_table(runs: Sequence[Json]) -> str:
+    """A row per state of an edge: what each role took of its CPU, and their sum without zsched's own."""
+    roles = [*dict.fromkeys(role for _, role in ROLES)]
+    lines = [f"| on the edge | {' | '.join(roles)} | sum | zsched itself |", "| --- " * (len(roles) + 3) + "|"]
+    measured = [figures["roles"] for figures in runs if figures.get("roles")]
+    for state, says in STATES:
+        if shares := mean_shares(measured, state):
+            cells = [f"{shares.get(role, 0.0):.1%}" for role in roles]
+            total = sum(shares.get(role, 0.0) for role in roles)
+            row = f"| {says} | {' | '.join(cells)} | {total:.1%} | {shares.get('zsched', 0.0):.1%} |"
+            lines.append(row.replace("%", " %"))
+    return "\n".join(lines) + "\n"
+
+
+def save_coverage(path: Path, runs: Sequence[Json], title: str) -> str | None:
+    """Coverage over time, a line per scheme with its interval; ``None``, and no picture, without any curve."""
+    known = [figures for figures in runs if figures.get("stopped_ratio") is not None and figures.get("coverage_curve")]
+    schemes = [name for name in SCHEMES if any(figures["scheme"] == name for figures in known)]
+    if not schemes:
+        return None
+    figure = Figure(figsize=(9.0, 5.0), layout="constrained", dpi=DPI)
+    axes = figure.subplots()
+    for index, name in enumerate(schemes):
+        own = [figures for figures in known if figures["scheme"] == name]
+        times, means, halves = mean_curve(own)
+        is_ours = name.startswith("zsched")
+        colour = OURS[name] if name in OURS else COLOURS[index % len(COLOURS)]
+        low = [max(mean - (half or 0.0), 0.0) for mean, half in zip(means, halves, strict=True)]
+        high = [min(mean + (half or 0.0), 1.0) for mean, half in zip(means, halves, strict=True)]
+        axes.fill_between(times, low, high, color=colour, alpha=0.1, linewidth=0)
+        style = "--" if name.startswith("fixed") else "-"
+        label = f"{name} (n = {len(own)})"
+        axes.plot(times, means, style, color=colour, linewidth=2.4 if is_ours else 1.4, label=label)
+    axes.set_xlabel("seconds since the robots may drive", fontsize=8)
+    axes.set_ylabel("known share of the world, newest merged map", fontsize=8)
+    axes.set_ylim(bottom=0.0)
+    axes.set_xlim(left=0.0)
+    axes.tick_params(labelsize=8)
+    axes.legend(fontsize=8, frameon=False, loc="upper left")
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    axes.set_title(f"{title}; bands: 95 % over the runs", fontsize=8, color="#666666", loc="left")
+    FigureCanvasAgg(figure).print_figure(path)
+    return path.name

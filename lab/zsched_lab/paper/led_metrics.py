@@ -1,0 +1,104 @@
+"""Figures of coverage over time, and of robots that SLAM on the edges leads: how long they stood, how well they knew.
+
+Knows: the records of a run. Does not know: other runs, schemes.
+"""
+
+from __future__ import annotations
+
+import bisect
+import itertools
+import math
+import statistics
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from zsched.tasks.map_merge.geometry import Pose2
+from zsched_lab.paper.arrivals import Arrival, Streams
+from zsched_lab.recorder import read_records
+
+CURVE_S = 5.0
+"""Coverage over time is told so often."""
+Json = dict[str, Any]
+
+
+def coverage_figures(streams: Streams, duration_s: float, area_m2: float) -> Json:
+    """Coverage over time: the share of the truth's known cells that the robots' newest merged map knows, their mean.
+
+    ``coverage_curve`` is [[t_s, share], ...] every `CURVE_S` from 0 and at the end; ``coverage_mean`` its mean over the
+    run's time (each value holds until the next), ``explored_m2`` the known area at the end. A robot without a map
+    knows nothing.
+    """
+    by_robot = [([arrival.t_s for arrival in maps], maps) for maps in streams.maps.values()]
+    instants = [CURVE_S * number for number in range(int(duration_s / CURVE_S) + 1)]
+    instants += [duration_s] if instants[-1] < duration_s else []
+    curve = [[t_s, statistics.fmean(known_at(times, maps, t_s) for times, maps in by_robot)] for t_s in instants]
+    mean = statistics.fmean(held_mean(times, maps, duration_s) for times, maps in by_robot)
+    return {
+        "coverage_curve": [[t_s, round(share, 4)] for t_s, share in curve],
+        "coverage_mean": mean,
+        "explored_m2": curve[-1][1] * area_m2,
+    }
+
+
+def known_at(times: Sequence[float], maps: Sequence[Arrival], t_s: float) -> float:
+    """What the newest map at ``t_s`` knows; ``times`` are those of ``maps``."""
+    index = bisect.bisect_right(times, t_s)
+    return maps[index - 1].known if index else 0.0
+
+
+def held_mean(times: Sequence[float], maps: Sequence[Arrival], duration_s: float) -> float:
+    """The mean over [0, ``duration_s``] of what the newest map knows."""
+    steps = [0.0, *(t_s for t_s in times if 0.0 < t_s < duration_s), duration_s]
+    return sum((b - a) * known_at(times, maps, a) for a, b in itertools.pairwise(steps)) / duration_s
+
+
+def led_figures(folder: Path, run: Mapping[str, Any]) -> Json:
+    """Of robots that SLAM elsewhere leads, over the drive, their mean: how long they stood, corrections, pose errors.
+
+    ``stopped_ratio`` of the time with a last correction older than 1 s; ``corrections_hz``; ``correction_age_max_s``;
+    ``pose_error_m``: how far the belief is from the truth, its median. ``None``: no such robots.
+    """
+    told = [led_of(read_records(folder / "records" / f"{robot}.ndjson"), run) for robot in run["robots"]]
+    names = ("stopped_ratio", "corrections_hz", "correction_age_max_s", "pose_error_m")
+    known = [one for one in told if one is not None]
+    return {name: statistics.fmean(one[name] for one in known) if known else None for name in names}
+
+
+def led_of(records: Sequence[Json], run: Mapping[str, Any]) -> dict[str, float] | None:
+    """The same of one robot; ``None`` where nothing led it."""
+    zero_s, duration_s = float(run["zero_s"]), float(run["duration_s"])
+    inside = [record for record in records if zero_s <= float(record["t_s"]) <= zero_s + duration_s]
+    progress = [record for record in inside if record["kind"] == "progress"]
+    if len(progress) < 2 or not progress[-1].get("corrections"):
+        return None
+    first, last = progress[0], progress[-1]
+    seconds = float(last["t_s"]) - float(first["t_s"])
+    return {
+        "stopped_ratio": (float(last["stopped_s"]) - float(first["stopped_s"])) / seconds,
+        "corrections_hz": (int(last["corrections"]) - int(first["corrections"])) / seconds,
+        "correction_age_max_s": max(float(record["correction_age_s"]) for record in progress),
+        "pose_error_m": statistics.median(pose_errors(records)),
+    }
+
+
+def pose_errors(records: Iterable[Json]) -> list[float]:
+    """How far (m) a robot's belief was from the truth at each record of its path; [0] without any."""
+    start = Pose2()
+    errors = []
+    for record in records:
+        if record["kind"] == "start":
+            start = Pose2(x=record["x"], y=record["y"], yaw=record["yaw"])
+        elif record["kind"] == "path":
+            believed = start.compose(Pose2(x=record["belief_x"], y=record["belief_y"]))
+            errors.append(math.dist((believed.x, believed.y), (record["x"], record["y"])))
+    return errors or [0.0]
+
+
+def merge_cpu_s(nodes: Sequence[Json], merges: int) -> float | None:
+    """CPU seconds of the mergers, standbys included, for each merged map of the drive; ``None``: not measured."""
+    known = [record["roles"] for record in nodes if record.get("roles")]
+    if len(known) < 2 or not merges:
+        return None
+    spent = [float(known[-1][node].get("merge", 0.0)) - float(known[0][node].get("merge", 0.0)) for node in known[0]]
+    return sum(spent) / merges

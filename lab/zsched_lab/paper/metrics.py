@@ -1,0 +1,394 @@
+"""Turns one run's folder into figures, each by one definition (docs/evaluation/README.md has them all).
+
+Knows: the records of a run, the truth of its log. Does not know: other runs, whether a figure is good.
+
+Times are seconds since the robots started. A map counts when a robot received it, not when a node sent it.
+"""
+
+from __future__ import annotations
+
+import bisect
+import heapq
+import itertools
+import json
+import statistics
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.reader import make_reader
+
+from zsched.core.values.model import NodeId
+from zsched.tasks.map_merge.cdr import CdrError, decode_grid
+from zsched.tasks.map_merge.grid import Grid
+from zsched_lab.fleet_view import Load
+from zsched_lab.map_metrics import score_map
+from zsched_lab.paper.arrivals import Arrival, Streams
+from zsched_lab.paper.led_metrics import coverage_figures, led_figures, merge_cpu_s
+from zsched_lab.paper.load import Window, loaded_at
+from zsched_lab.paper.oracle import changes, utilities
+from zsched_lab.paper.roles import role_figures
+from zsched_lab.paper.scenario import Scenario
+from zsched_lab.recorder import read_records
+
+WASTED_S = 30.0
+"""A move back to the node that was left within so long was for nothing."""
+HELD_EVERY_S = 5.0
+Json = dict[str, Any]
+
+
+class Truth:
+    """The grid of the whole log, and how much of it a map knows."""
+
+    def __init__(self, grid: Grid) -> None:
+        self.grid = grid
+        rows, columns = np.nonzero(grid.known)
+        self._x = grid.origin.x + (columns + 0.5) * grid.resolution
+        self._y = grid.origin.y + (rows + 0.5) * grid.resolution
+        self.area_m2 = self._x.size * grid.resolution**2
+        """What can be known."""
+
+    def coverage(self, payload: bytes) -> float:
+        """Share of the known cells that the map in ``payload`` knows; 0 for what is no map.
+
+        Looked up at the middle of each of the truth's cells (neither is turned).
+        """
+        grid = grid_of(payload)
+        if grid is None or not self._x.size:
+            return 0.0
+        columns = np.floor((self._x - grid.origin.x) / grid.resolution).astype(np.int64)
+        rows = np.floor((self._y - grid.origin.y) / grid.resolution).astype(np.int64)
+        inside = (columns >= 0) & (columns < grid.width) & (rows >= 0) & (rows < grid.height)
+        return float(grid.known[rows[inside], columns[inside]].sum()) / self._x.size
+
+
+def measure(folder: Path, scenario: Scenario, truth: Truth) -> Json:
+    """All figures of the run in ``folder``.
+
+    Raises:
+        OSError: the folder holds no finished run.
+        ValueError: its records are damaged.
+    """
+    run: Json = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+    streams = read_streams(folder, run, truth)
+    nodes = read_records(folder / "records" / "nodes.ndjson")
+    duration_s = float(run["duration_s"])
+    owners = owners_within(run["allocations"], duration_s)
+    reached = {
+        robot: covered_s(folder / "records" / f"{robot}.ndjson", float(run["zero_s"]))
+        or reached_s(maps, scenario.target_coverage)
+        for robot, maps in streams.maps.items()
+    }
+    done = [t_s for t_s in reached.values() if t_s is not None]
+    is_done = len(done) == len(run["robots"]) and max(done, default=duration_s) <= duration_s
+    per_edge = {node: edge_figures(node, nodes, streams, owners, duration_s) for node in run["shares"]}
+    return {
+        **{
+            key: run[key]
+            for key in ("scheme", "family", "block", "level", "run", "seed", "host", "mode", "input", "links")
+        },
+        "nodes": per_edge,
+        **over_nodes(per_edge),
+        **stream_figures(streams, len(run["robots"]), duration_s),
+        "task_latency_s": max(done) if is_done else duration_s,
+        "is_done": is_done,
+        "duration_s": duration_s,
+        **map_figures(streams, truth, len(run["robots"])),
+        **coverage_figures(streams, duration_s, truth.area_m2),
+        **led_figures(folder, run),
+        "merge_cpu_s": merge_cpu_s(nodes, len(streams.stamps)),
+        "roles": role_figures(nodes, run["shares"], partial(owner_at, owners)),
+        "other_moves": sum(
+            len(owners_within(own, duration_s)) - 1 for own in (run.get("others") or {}).values() if own
+        ),
+        **move_figures(run, streams, owners),
+        "regret": regret(scenario, run, owners),
+    }
+
+
+def brief(figures: Mapping[str, Any]) -> str:
+    """One run in a line."""
+    latency = f"{figures['task_latency_s']:.1f} s" if figures["is_done"] else "not done"
+    pressure = figures["host"]["pressure"]
+    short = "-" if pressure is None else f"{pressure:.2f}"
+    return (
+        f"{figures['map_hz']:.2f} maps/s, {figures['throughput_mb_s']:.1f} MB/s, task {latency}, "
+        f"{figures['moves']} moves, pressure {short}"
+    )
+
+
+# --- streams ---------------------------------------------------------------------------------------------------------
+
+
+def read_streams(folder: Path, run: Mapping[str, Any], truth: Truth) -> Streams:
+    """The maps of a run, out of its MCAP files; only those whose payload is needed later are kept."""
+    offset_ns = int(run["zero_wall_ns"])
+    found = Streams(maps={robot: [] for robot in run["robots"]}, sent={robot: [] for robot in run["robots"]})
+    known: dict[int, float] = {}
+    newest: dict[NodeId, int] = {}
+    instants = held_instants(float(run["duration_s"]))
+    for topic, log_ns, sent_ns, data in messages(sorted(folder.glob("streams*.mcap"))):
+        robot, _, name = topic.partition("/")
+        t_s = (log_ns - offset_ns) / 1e9
+        if name == "map":
+            found.sent[robot].append((t_s, len(data)))
+        if name != "global_map":
+            continue
+        while instants and instants[0] <= t_s:
+            keep(found, newest, instants.pop(0))
+        key = hash(data)
+        if key not in known:
+            known[key] = truth.coverage(data)
+        newest[robot] = key
+        if 0.0 <= t_s <= float(run["duration_s"]):
+            found.stamps.add(key)
+        found.payloads[key] = data
+        found.maps[robot].append(Arrival(t_s, (log_ns - sent_ns) / 1e9, len(data), known[key]))
+        drop_unheld(found, newest)
+    for instant in instants:
+        keep(found, newest, instant)
+    return found
+
+
+def held_instants(duration_s: float) -> list[float]:
+    """When it is looked at what the robots hold: every few seconds, and at the end."""
+    count = int(duration_s / HELD_EVERY_S)
+    before = [HELD_EVERY_S * number for number in range(1, count + 1)]
+    return [*(instant for instant in before if instant < duration_s), duration_s]
+
+
+def keep(found: Streams, newest: Mapping[NodeId, int], instant: float) -> None:
+    """Remember which maps the robots hold at ``instant``."""
+    found.held[instant] = list(newest.values())
+
+
+def drop_unheld(found: Streams, newest: Mapping[NodeId, int]) -> None:
+    """Forget payloads that nobody holds: a run has hundreds of megabytes of them."""
+    wanted = set(newest.values()) | {key for keys in found.held.values() for key in keys}
+    for key in [key for key in found.payloads if key not in wanted]:
+        del found.payloads[key]
+
+
+def messages(paths: Iterable[Path]) -> Iterator[tuple[str, int, int, bytes]]:
+    """(topic, log time, publish time, payload) of all files by log time."""
+    return heapq.merge(*(one_files(path) for path in paths), key=lambda message: message[1])
+
+
+def one_files(path: Path) -> Iterator[tuple[str, int, int, bytes]]:
+    """The same of one file."""
+    with path.open("rb") as stream:
+        for _, channel, message in make_reader(stream).iter_messages():
+            yield channel.topic, message.log_time, message.publish_time, message.data
+
+
+def covered_s(path: Path, zero_s: float) -> float | None:
+    """When an exploring robot's own referee found that its map covers the target, by which its run ends; else ``None``.
+
+    It and `Truth.coverage` differ by a cell here and there, enough for 0.7999 and 0.8001.
+    """
+    if not path.exists():
+        return None
+    return next((float(r["t_s"]) - zero_s for r in read_records(path) if r["kind"] == "covered"), None)
+
+
+def reached_s(maps: Iterable[Arrival], target: float) -> float | None:
+    """When a robot first held a map that covers ``target``; ``None``: never."""
+    return next((arrival.t_s for arrival in maps if arrival.known >= target), None)
+
+
+def stream_figures(streams: Streams, robots: int, duration_s: float) -> Json:
+    """Throughput, map frequency, latency per merged map; within the robots' drive."""
+    inside = [arrival for maps in streams.maps.values() for arrival in maps if 0.0 <= arrival.t_s <= duration_s]
+    sent = [size for own in streams.sent.values() for t_s, size in own if 0.0 <= t_s <= duration_s]
+    latencies = sorted(arrival.latency_s for arrival in inside)
+    received = sum(arrival.size for arrival in inside)
+    return {
+        "throughput_mb_s": (received + sum(sent)) / duration_s / 1e6,
+        "received_mb_s": received / duration_s / 1e6,
+        "map_hz": len(inside) / robots / duration_s,
+        "mb_per_map": received / len(inside) / 1e6 if inside else None,
+        **{f"merge_latency_p{p}_s": percentile(latencies, p / 100) for p in (50, 95, 99)},
+    }
+
+
+def percentile(ordered: Sequence[float], share: float) -> float | None:
+    """Nearest rank in sorted values; ``None`` of nothing.
+
+    >>> percentile([1.0, 2.0, 3.0, 4.0], 0.5)
+    2.0
+    """
+    if not ordered:
+        return None
+    rank = max(1, -(-round(share * 1e6) * len(ordered) // 1_000_000))
+    return ordered[min(rank, len(ordered)) - 1]
+
+
+# --- nodes -----------------------------------------------------------------------------------------------------------
+
+
+def edge_figures(
+    node: NodeId, nodes: Sequence[Json], streams: Streams, owners: Sequence[tuple[float, NodeId]], duration_s: float
+) -> Json:
+    """One node: CPU and memory, peak and mean, as shares of what it may use; its throughput; how long it owned."""
+    inside = [record for record in nodes if 0.0 <= record["t_s"] <= duration_s]
+    cpu = [min(r[node]["cpu_ratio"], 1.0) for r in inside if node in r and r[node]["cpu_ratio"] is not None]
+    memory = [r[node]["memory_ratio"] for r in inside if node in r and r[node]["memory_ratio"] is not None]
+    seconds = pairs(cpu)
+    moved = sum(size for t_s, size in transfers(streams) if 0.0 <= t_s <= duration_s and owner_at(owners, t_s) == node)
+    return {
+        "cpu_peak": max(seconds, default=None),
+        "cpu_mean": statistics.fmean(cpu) if cpu else None,
+        "memory_peak": max(memory, default=None),
+        "memory_mean": statistics.fmean(memory) if memory else None,
+        "throughput_mb_s": moved / duration_s / 1e6,
+        "owned_s": owned_s(owners, node, duration_s),
+    }
+
+
+def pairs(values: Sequence[float]) -> list[float]:
+    """Means of two and two: half seconds to seconds; an odd one at the end is left out."""
+    return [statistics.fmean(values[index : index + 2]) for index in range(0, len(values) - 1, 2)]
+
+
+def over_nodes(per_edge: Mapping[NodeId, Mapping[str, Any]]) -> Json:
+    """The same over all nodes: means, and how far apart the nodes are (0: the work is spread evenly)."""
+    found: Json = {}
+    for name in ("cpu_peak", "cpu_mean", "memory_peak", "memory_mean"):
+        values = [figures[name] for figures in per_edge.values() if figures[name] is not None]
+        found[name] = statistics.fmean(values) if values else None
+        found[f"{name}_spread"] = max(values) - min(values) if values else None
+    return found
+
+
+def transfers(streams: Streams) -> Iterator[tuple[float, int]]:
+    """(when, bytes) of everything between robots and owner, both ways."""
+    for maps in streams.maps.values():
+        yield from ((arrival.t_s, arrival.size) for arrival in maps)
+    for own in streams.sent.values():
+        yield from own
+
+
+def owners_within(allocations: Iterable[Mapping[str, Any]], duration_s: float) -> list[tuple[float, NodeId]]:
+    """(from when, who) of the robots' drive; whoever had the task when they started has it from 0.
+
+    What was decided before, while the workers started, and after the drive is nobody's merit or fault.
+    """
+    made = [(float(move["t_s"]), str(move["node"])) for move in allocations]
+    before = [node for t_s, node in made if t_s <= 0.0]
+    return [*((0.0, node) for node in before[-1:]), *((t_s, node) for t_s, node in made if 0.0 < t_s <= duration_s)]
+
+
+def owner_at(owners: Sequence[tuple[float, NodeId]], t_s: float) -> NodeId | None:
+    """Who owned the task at ``t_s``; ``None`` before the first."""
+    index = bisect.bisect_right([start for start, _ in owners], t_s)
+    return owners[index - 1][1] if index else None
+
+
+def owned_s(owners: Sequence[tuple[float, NodeId]], node: NodeId, duration_s: float) -> float:
+    """Seconds within the run for which ``node`` owned the task."""
+    ends = [*(start for start, _ in owners[1:]), duration_s]
+    return sum(
+        max(min(end, duration_s) - start, 0.0)
+        for (start, owner), end in zip(owners, ends, strict=True)
+        if owner == node
+    )
+
+
+# --- maps, moves, regret ---------------------------------------------------------------------------------------------
+
+
+def map_figures(streams: Streams, truth: Truth, robots: int) -> Json:
+    """The last map that the robots held, and (``held_``) what they held on the way, against the truth of the end.
+
+    A robot without a map counts as one with a blank map.
+    """
+    blank = score_map(None, truth.grid)
+    held = {key for keys in streams.held.values() for key in keys}
+    scored = {key: score_map(grid_of(streams.payloads[key]), truth.grid) for key in held}
+    by_instant = [
+        [*(scored[key] for key in keys), *[blank] * (robots - len(keys))] for _, keys in sorted(streams.held.items())
+    ]
+    on_way = [statistics.fmean(one.ssim_rebased for one in scores) for scores in by_instant]
+    names = ("ssim_rebased", "wall_f1", "coverage", "ssim_crop")
+    final = by_instant[-1] if by_instant else []
+    means = {name: statistics.fmean(getattr(one, name) for one in final) if final else None for name in names}
+    return {**means, "held_ssim_rebased": statistics.fmean(on_way) if on_way else None}
+
+
+def grid_of(payload: bytes) -> Grid | None:
+    """The map, or ``None`` for what is none (it scores as a blank)."""
+    try:
+        return decode_grid(payload)
+    except CdrError:
+        return None
+
+
+def move_figures(run: Mapping[str, Any], streams: Streams, owners: Sequence[tuple[float, NodeId]]) -> Json:
+    """Moves, wasted ones, the silence around each, and what was lost in the streams.
+
+    The relays count losses from their start on, so they are shared out over all moves, earlier ones included.
+    """
+    moves = [start for start, _ in owners[1:]]
+    in_all = max(len(run["allocations"]) - 1, 0)
+    gaps = [gap for t_s in moves if (gap := gap_around(streams, t_s, float(run["duration_s"]))) is not None]
+    counts = [count for node in run["robots"] for count in (run["streams"].get(node) or [])]
+    lost = sum(int(count.get("lost") or 0) + int(count.get("at_most_lost") or 0) for count in counts)
+    return {
+        "moves": len(moves),
+        "wasted_moves": wasted(owners),
+        "move_gap_mean_s": statistics.fmean(gaps) if gaps else None,
+        "move_gap_max_s": max(gaps, default=None),
+        "gap_max_s": max((gap for maps in streams.maps.values() for gap in silences(maps)), default=None),
+        "lost": lost,
+        "lost_per_move": lost / in_all if in_all else None,
+        "dropped": sum(sum((count.get("drops") or {}).values()) for count in counts),
+        "owners": [[round(start, 3), node] for start, node in owners],
+    }
+
+
+def wasted(owners: Sequence[tuple[float, NodeId]]) -> int:
+    """Moves back to the node that was left, within `WASTED_S`.
+
+    >>> wasted([(0.0, "a"), (5.0, "b"), (9.0, "a"), (50.0, "b")])
+    1
+    """
+    triples = zip(owners, owners[1:], owners[2:], strict=False)
+    return sum(before[1] == after[1] and after[0] - left[0] < WASTED_S for before, left, after in triples)
+
+
+def gap_around(streams: Streams, t_s: float, end_s: float) -> float | None:
+    """The longest silence at any robot from its last map before ``t_s`` to the next one, or to the run's end."""
+    found = []
+    for maps in streams.maps.values():
+        times = [arrival.t_s for arrival in maps]
+        index = bisect.bisect_right(times, t_s)
+        if index > 0:
+            found.append((times[index] if index < len(times) else max(end_s, t_s)) - times[index - 1])
+    return max(found, default=None)
+
+
+def silences(maps: Sequence[Arrival]) -> Iterator[float]:
+    """Seconds between one robot's merged maps."""
+    return (after.t_s - before.t_s for before, after in itertools.pairwise(maps))
+
+
+def regret(scenario: Scenario, run: Mapping[str, Any], owners: Sequence[tuple[float, NodeId]]) -> float | None:
+    """What the owners' utility lacked to the best node's in hindsight, as a share of the latter, over the run.
+
+    Both by the load as it was really injected (`zsched_lab.paper.oracle`); ``None`` without nodes that differ.
+    """
+    level, duration_s = scenario.levels[run["level"]], float(run["duration_s"])
+    windows = tuple(Window(**asdict(Load(**load))) for load in run["loads"])
+    steps = sorted({*changes(windows, duration_s), *(start for start, _ in owners if start < duration_s), duration_s})
+    best = had = 0.0
+    for start, end in itertools.pairwise(steps):
+        scored = utilities(scenario, level, loaded_at(windows, start))
+        owner = owner_at(owners, start)
+        if not scored:
+            return None
+        best += (end - start) * max(scored.values())
+        had += (end - start) * (scored.get(owner, 0.0) if owner is not None else 0.0)
+    return (best - had) / best if best > 0 else None

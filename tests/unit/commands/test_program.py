@@ -1,0 +1,58 @@
+"""Verbs that other distributions bring."""
+
+from __future__ import annotations
+
+from importlib.metadata import EntryPoint
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from zsched.cli import app
+from zsched.commands import program
+from zsched.commands.program import GROUP, installed_verbs
+
+
+def run(*arguments: str) -> Result:
+    return CliRunner().invoke(app, arguments)
+
+
+def bring(monkeypatch: pytest.MonkeyPatch, **verbs: str) -> None:
+    """These verbs are installed, and no others."""
+    found = {name: EntryPoint(name=name, value=value, group=GROUP) for name, value in verbs.items()}
+    monkeypatch.setattr(program, "installed_verbs", lambda: found)
+
+
+def test_the_lab_brings_its_verbs() -> None:
+    assert {"bench", "demo"} <= set(installed_verbs())
+    told = run("--help").stdout
+    assert "demo" in told
+    assert "bench" in told
+    assert run("demo", "--help").stdout.startswith("Usage: ")
+
+
+@pytest.mark.parametrize("verb", [["demo", "--headless"], ["bench", "paper", "--runs", "3"]])
+def test_without_the_lab_its_verbs_say_what_brings_them(monkeypatch: pytest.MonkeyPatch, verb: list[str]) -> None:
+    bring(monkeypatch)
+    result = run(*verb)
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert f"zsched {verb[0]}: it comes with zsched-lab" in result.stderr
+    assert "pip install . ./lab" in result.stderr
+
+
+def test_a_verb_that_cannot_be_loaded_takes_no_other_along(monkeypatch: pytest.MonkeyPatch) -> None:
+    bring(monkeypatch, sing="zsched_choir:app")
+    assert "sing" in run("--help").stdout
+    result = run("sing", "--loud", "twice")
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert "zsched sing: zsched_choir:app cannot be loaded: ModuleNotFoundError" in result.stderr
+    assert run("version").exit_code == 0
+
+
+def test_nobody_takes_a_verb_of_the_program(monkeypatch: pytest.MonkeyPatch) -> None:
+    bring(monkeypatch, version="zsched_choir:app")
+    assert run("version").stdout.startswith("zsched ")
+    assert run("--help").stdout.count("\n  version ") == 1
+
+
+def test_what_nobody_brings_is_a_usage_error() -> None:
+    assert run("fly").exit_code == 2

@@ -1,0 +1,67 @@
+"""The program's verbs: its own, and those that other installed distributions bring.
+
+Knows: the entry point group `zsched.commands`, whose names are verbs and whose values are typer apps. Does not know:
+any verb. What is installed is looked at only when a verb is not the program's own, or for the help: `status` is quick.
+"""
+
+from __future__ import annotations
+
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, Final
+
+import typer
+
+from zsched.commands.common import EXIT_FAILED, CliError, Verb, Verbs
+
+GROUP: Final = "zsched.commands"
+LAB_VERBS: Final = frozenset({"bench", "demo"})
+"""Verbs of the distribution ``zsched-lab``, which a robot has not."""
+
+
+def installed_verbs() -> dict[str, EntryPoint]:
+    """{verb: what brings it}, by name; of two of one name the first that is found."""
+    found: dict[str, EntryPoint] = {}
+    for point in entry_points(group=GROUP):
+        found.setdefault(point.name, point)
+    return dict(sorted(found.items()))
+
+
+class Program(Verbs):
+    """The group of all verbs."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """All verbs, for the help."""
+        own = super().list_commands(ctx)
+        return [*own, *(name for name in installed_verbs() if name not in own)]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """One verb; ``None`` when there is none of that name.
+
+        One whose distribution is not installed, or cannot be loaded, is a verb that says so: the help must list it.
+        """
+        own = super().get_command(ctx, cmd_name)
+        if own is not None:
+            return own
+        point = installed_verbs().get(cmd_name)
+        if point is None:
+            if cmd_name in LAB_VERBS:
+                return _refusing(cmd_name, "it comes with zsched-lab; in a checkout of zsched: pip install . ./lab")
+            return None
+        try:
+            command = typer.main.get_command(point.load())
+        except Exception as error:  # noqa: BLE001 - another distribution's fault must not take the others' verbs along
+            brought = point.value if point.dist is None else f"{point.value} of {point.dist.name} {point.dist.version}"
+            return _refusing(cmd_name, f"{brought} cannot be loaded: {type(error).__name__}: {error}")
+        command.name = cmd_name
+        return command
+
+
+def _refusing(name: str, text: str) -> Any:
+    """A verb that does nothing but say why it cannot."""
+    app = typer.Typer(rich_markup_mode=None)
+
+    @app.command(name, cls=Verb, help=text, context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
+    def refuse() -> None:
+        raise CliError(EXIT_FAILED, text)
+
+    return typer.main.get_command(app)

@@ -1,1 +1,0 @@
-"""The lab: a whole fleet on one machine."""
