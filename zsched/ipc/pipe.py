@@ -10,6 +10,7 @@ value.
 from __future__ import annotations
 
 import os
+import select
 import struct
 from typing import Any, Final
 
@@ -101,6 +102,23 @@ def read_frame(descriptor: int) -> bytes | None:
     if length > MAX_FRAME:
         raise WireError("size", f"frame of {length} bytes, at most {MAX_FRAME}")
     return _read_exactly(descriptor, length)
+
+
+def wait_readable(descriptor: int, wakeups: int) -> None:
+    """Wait until there is something to read, or the pipe has ended; handlers of signals run meanwhile (main thread).
+
+    A signal that comes just before a plain read begins has its handler called when that read ends, perhaps never. Where
+    ``wakeups`` is the reading end of `signal.set_wakeup_fd` (not blocking) it ends the wait.
+    """
+    poller = select.poll()
+    poller.register(descriptor, select.POLLIN)
+    poller.register(wakeups, select.POLLIN)
+    while True:
+        ready = {found for found, _ in poller.poll()}
+        if wakeups in ready:
+            os.read(wakeups, 512)
+        if descriptor in ready:
+            return
 
 
 def encode_end(marker: relay_protocol.EndMarker) -> bytes:

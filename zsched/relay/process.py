@@ -29,7 +29,7 @@ from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.plan import Role, Route, RoutePlan
 from zsched.errors import WireError
 from zsched.guard import guarded, on_failure
-from zsched.ipc.pipe import COMMANDS, read_frame, write_frame
+from zsched.ipc.pipe import COMMANDS, read_frame, wait_readable, write_frame
 from zsched.ipc.protocol import RelayHello, RelayPulse
 from zsched.relay.acks import DEFAULT_LEASE_S, Acks
 from zsched.relay.graph import GraphMirror
@@ -195,9 +195,10 @@ class RelayProcess:
             for task, routes in self._standbys.items():
                 self._graph.set_routes(_standbys_of(task), routes)
 
-    def obey(self, commands: int) -> bool:
-        """Read commands until the daemon says stop (true) or is gone (false)."""
+    def obey(self, commands: int, wakeups: int) -> bool:
+        """Read commands until the daemon says stop (true) or is gone (false); ``wakeups``: see `wait_readable`."""
         while True:
+            wait_readable(commands, wakeups)
             try:
                 frame = read_frame(commands)
             except (WireError, OSError) as error:
@@ -337,8 +338,9 @@ def run(
         return 1
     relay = RelayProcess(session, me.fleet, me.node, reporter, local.decode(), Introducer(config), lease_s(config))
     successors = None if door is None else Successors(socket.socket(fileno=door), me)
+    wakeups = _signals_wake()
     try:
-        while not relay.obey(commands) and successors is not None:
+        while not relay.obey(commands, wakeups) and successors is not None:
             link = _bridge(relay, successors, orphan_s)
             if link is None:
                 break
@@ -352,6 +354,15 @@ def run(
         closing.start()
         closing.join(CLOSE_S)
     return 0
+
+
+def _signals_wake() -> int:
+    """What becomes readable with every signal that has a handler."""
+    wakeups, at_signal = os.pipe()
+    os.set_blocking(wakeups, False)
+    os.set_blocking(at_signal, False)
+    signal.set_wakeup_fd(at_signal, warn_on_full_buffer=False)
+    return wakeups
 
 
 def _bridge(relay: RelayProcess, successors: Successors, orphan_s: float) -> socket.socket | None:
