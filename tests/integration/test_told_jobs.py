@@ -13,9 +13,10 @@ from typing import Any
 
 import pytest
 
+from support.fleets import tuning_of
 from zsched.core.gateway.demand import Demands
 from zsched.core.values.fleet import Demand, TaskSpec
-from zsched.core.values.model import Jobs, Profile, Tuning, Weights, WorkerLoad, WorkerState
+from zsched.core.values.model import Jobs, Profile, WorkerLoad, WorkerState
 from zsched_lab.testbed import TASK, Testbed, echo_fleet
 
 WORKER = Path(__file__).with_name("busy_echo.py")
@@ -76,7 +77,7 @@ def needed(bed: Testbed, for_s: float) -> tuple[float, float, float]:
     spec = TaskSpec(
         name=TASK,
         candidates=("edge1",),
-        tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0)),
+        tuning=tuning_of(cpu=1.0, memory=0.0),
         demand=Demand(),
     )
     found = []

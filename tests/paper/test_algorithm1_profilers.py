@@ -7,10 +7,11 @@ import math
 
 import pytest
 
+from support.fleets import tuning_of
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.profile.profile import Profiler
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing
-from zsched.core.values.model import DeviceSample, LinkSample, LinkSource, NodeKind, Profile, Tuning, Weights
+from zsched.core.values.model import DeviceSample, LinkSample, LinkSource, NodeKind, Profile
 
 TIMING = Timing()
 FLEET = Fleet(
@@ -26,7 +27,7 @@ FLEET = Fleet(
         TaskSpec(
             name="merge",
             candidates=("edge1", "edge2"),
-            tuning=Tuning(weights=Weights(cpu=0.5, memory=0.25, network=0.25)),
+            tuning=tuning_of(cpu=0.5, memory=0.25, network=0.25),
         ),
     ),
     electors=("robot1", "robot2"),

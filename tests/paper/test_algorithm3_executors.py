@@ -7,22 +7,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from random import Random
 
+from support.fleets import fleet_of, tuning_of
 from zsched.core.executor.handover import Executor, Phase
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.instructions import ApplyRoutes, AskUtilities, Instruction, PublishProposal, StartWorker, StopWorker
 from zsched.core.profile.profile import Profiler
 from zsched.core.scheduler.rounds import Rounds
-from zsched.core.values.fleet import Fleet, NodeSpec, StreamRule, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.fleet import StreamRule, TaskSpec, WorkerSpec
 from zsched.core.values.model import (
     Allocation,
     DeviceSample,
     LinkSample,
     LinkSource,
-    NodeKind,
     PeerState,
     Proposal,
-    Tuning,
-    Weights,
     WorkerState,
 )
 from zsched.core.values.plan import Direction, RoutePhase, RoutePlan
@@ -30,7 +28,7 @@ from zsched.core.vote.register import MoveOwner, Retune
 from zsched.core.vote.tally import Tally, VoteOutcome, tally
 
 ROBOTS = ("robot1", "robot2", "robot3")
-TUNING = Tuning(weights=Weights(cpu=0.0, memory=0.0, network=1.0))
+TUNING = tuning_of(cpu=0.0, memory=0.0, network=1.0)
 SPEC = TaskSpec(
     name="merge",
     candidates=("edge1", "edge2", "edge3"),
@@ -223,13 +221,7 @@ class Team:
 
     def __post_init__(self) -> None:
         self.spec = replace(SPEC, candidates=ROBOTS)
-        self.fleet = Fleet(
-            name="lab",
-            timing=Timing(),
-            nodes=tuple(NodeSpec(name=name, kind=NodeKind.ROBOT) for name in ROBOTS),
-            tasks=(self.spec,),
-            electors=ROBOTS,
-        )
+        self.fleet = fleet_of(self.spec, of=ROBOTS, electors=ROBOTS)
         self.value = allocation(self.owner, 1)
         self.states = dict.fromkeys(ROBOTS, PeerState.ALIVE)
         self.profilers = {name: Profiler(name, 1, self.fleet.timing) for name in ROBOTS}

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import pytest
 
+from support.fleets import tuning_of
 from zsched.core.scheduler.scoring import Standing, compare, pick
 from zsched.core.scheduler.utility import cpu_utility, memory_utility, network_utility, predicted_use, total_utility
 from zsched.core.values.fleet import LinkLimits, Reach, TaskSpec
@@ -126,7 +127,7 @@ def test_eq4_a_metric_absent_for_one_candidate_only_is_not_guessed() -> None:
 SPEC = TaskSpec(
     name="merge",
     candidates=("edge1", "edge2", "edge3"),
-    tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0)),
+    tuning=tuning_of(cpu=1.0, memory=0.0),
 )
 
 

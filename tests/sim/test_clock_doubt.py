@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import pytest
 
+from support.fleets import fleet_of, tuning_of
 from zsched.core.events import ClockCompared
-from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.values.model import Allocation, Beat, Grant, NodeKind, Tuning, Weights, WorkerState
+from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec
+from zsched.core.values.model import Allocation, Beat, Grant, WorkerState
 from zsched.core.values.plan import WorkerRole
 from zsched.core.vote.clocks import DOUBT_S, JUMP_S, ClockDoubt
 from zsched.core.vote.lease import RHO, Leases, hold_s
@@ -21,7 +22,7 @@ WELL = ClockCompared(error_ratio=1e-5, since_s=0.2)
 TASK = TaskSpec(
     name="guard",
     candidates=("edge1", "edge2"),
-    tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0), time_to_trigger_s=0.5, cool_down_s=0.0),
+    tuning=tuning_of(cpu=1.0, memory=0.0, time_to_trigger_s=0.5, cool_down_s=0.0),
     worker=WorkerSpec(command=("true",)),
     exclusive=True,
 )
@@ -29,16 +30,7 @@ ROBOTS = ("robot1", "robot2", "robot3")
 
 
 def fleet(*candidates: str) -> Fleet:
-    return Fleet(
-        name="clocks",
-        timing=Timing(),
-        nodes=tuple(
-            NodeSpec(name=name, kind=NodeKind.ROBOT if name in ROBOTS else NodeKind.EDGE)
-            for name in sorted({*candidates, *ROBOTS})
-        ),
-        tasks=(replace(TASK, candidates=candidates),),
-        electors=ROBOTS,
-    )
+    return fleet_of(replace(TASK, candidates=candidates), of=sorted({*candidates, *ROBOTS}), electors=ROBOTS)
 
 
 def started(*candidates: str) -> tuple[Simulator, str]:
@@ -121,9 +113,7 @@ def beat(node: str, number: int, echoes: tuple[Grant, ...] = (), terms: str = ""
     )
 
 
-OF_EDGE1 = Allocation(
-    task="guard", revision=7, epoch=3, owner="edge1", tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
-)
+OF_EDGE1 = Allocation(task="guard", revision=7, epoch=3, owner="edge1", tuning=tuning_of(cpu=1.0, memory=0.0))
 
 
 def test_an_elector_in_doubt_grants_nothing_and_afterwards_begins_as_after_a_start() -> None:

@@ -9,9 +9,10 @@ from random import Random
 
 import pytest
 
+from support.fleets import tuning_of
 from zsched.core.events import BeatReceived
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.values.model import Beat, NodeId, NodeKind, Tuning, Weights
+from zsched.core.values.model import Beat, NodeId, NodeKind
 from zsched.core.values.plan import WorkerRole
 from zsched.core.vote.lease import hold_s
 from zsched_lab.simulator import CORES, Simulator
@@ -30,7 +31,7 @@ def fleet(*, exclusive: bool = True, robots_only: bool = False) -> Fleet:
     task = TaskSpec(
         name=TASK,
         candidates=edges or robots,
-        tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0), time_to_trigger_s=0.5, cool_down_s=0.0),
+        tuning=tuning_of(cpu=1.0, memory=0.0, time_to_trigger_s=0.5, cool_down_s=0.0),
         worker=WorkerSpec(command=("true",)),
         exclusive=exclusive,
         max_moves_per_minute=1000,

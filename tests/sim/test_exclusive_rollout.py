@@ -6,30 +6,25 @@ from dataclasses import replace
 
 import pytest
 
+from support.fleets import fleet_of, tuning_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.values.model import DurableState, NodeId, NodeKind, Tuning, Weights
+from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec
+from zsched.core.values.model import DurableState, NodeId
 from zsched.core.values.plan import WorkerRole
 from zsched_lab.sim_parts import Machine
 from zsched_lab.simulator import CORES, Simulator
 
 TASK, LOOK_S = "merge", 0.01
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2", "edge3")
-OLD = Fleet(
-    name="sim",
-    timing=Timing(),
-    nodes=tuple(
-        NodeSpec(name=name, kind=NodeKind.EDGE if name in EDGES else NodeKind.ROBOT) for name in sorted(EDGES + ROBOTS)
+OLD = fleet_of(
+    TaskSpec(
+        name=TASK,
+        candidates=EDGES,
+        tuning=tuning_of(cpu=1.0, memory=0.0, time_to_trigger_s=0.5, cool_down_s=0.0),
+        worker=WorkerSpec(command=("true",)),
     ),
-    tasks=(
-        TaskSpec(
-            name=TASK,
-            candidates=EDGES,
-            tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0), time_to_trigger_s=0.5, cool_down_s=0.0),
-            worker=WorkerSpec(command=("true",)),
-        ),
-    ),
+    of=sorted(EDGES + ROBOTS),
     electors=ROBOTS,
 )
 NEW = replace(OLD, tasks=(replace(OLD.tasks[0], exclusive=True),))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from support.fleets import tuning_of
 from zsched.core.status import build_snapshot
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.values.model import NodeKind, Tuning, Weights
+from zsched.core.values.model import NodeKind
 from zsched.core.values.plan import ReadyWhen
 from zsched_lab.sim_swarm import plan
 from zsched_lab.simulator import Simulator
@@ -17,7 +18,7 @@ def fleet() -> Simulator:
     task = TaskSpec(
         name="merge",
         candidates=EDGES,
-        tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0), time_to_trigger_s=0.0, cool_down_s=0.0),
+        tuning=tuning_of(cpu=1.0, memory=0.0, time_to_trigger_s=0.0, cool_down_s=0.0),
         worker=WorkerSpec(ready_when=ReadyWhen.MATCHING, start_deadline_s=DEADLINE_S),
     )
     kinds = {**dict.fromkeys(EDGES, NodeKind.EDGE), **dict.fromkeys(ROBOTS, NodeKind.ROBOT)}

@@ -6,29 +6,24 @@ from dataclasses import replace
 
 import pytest
 
+from support.fleets import fleet_of, tuning_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.values.model import NodeId, NodeKind, Tuning, Weights
+from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec
+from zsched.core.values.model import NodeId
 from zsched.core.vote.belief import GENERATION_STEP, MAX_GENERATION
 from zsched_lab.simulator import Simulator
 
 TASK = "merge"
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2", "edge3")
-BY_EDGES = Fleet(
-    name="sim",
-    timing=Timing(),
-    nodes=tuple(
-        NodeSpec(name=name, kind=NodeKind.EDGE if name in EDGES else NodeKind.ROBOT) for name in (*EDGES, *ROBOTS)
+BY_EDGES = fleet_of(
+    TaskSpec(
+        name=TASK,
+        candidates=EDGES,
+        tuning=tuning_of(cpu=1.0, memory=0.0),
+        worker=WorkerSpec(command=("true",)),
     ),
-    tasks=(
-        TaskSpec(
-            name=TASK,
-            candidates=EDGES,
-            tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0)),
-            worker=WorkerSpec(command=("true",)),
-        ),
-    ),
+    of=(*EDGES, *ROBOTS),
     electors=EDGES,
 )
 BY_ROBOTS = replace(BY_EDGES, electors=ROBOTS)

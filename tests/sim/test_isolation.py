@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from support.fleets import tuning_of
 from zsched.core.status import build_snapshot
 from zsched.core.values.fleet import Fleet, NodeSpec, OnIsolation, TaskSpec, Timing, WorkerSpec
-from zsched.core.values.model import NodeKind, Tuning, Weights
+from zsched.core.values.model import NodeKind
 from zsched.core.values.plan import WorkerRole
 from zsched_lab.simulator import Simulator
 
@@ -22,7 +23,7 @@ def fleet(on_isolation: OnIsolation) -> Fleet:
     task = TaskSpec(
         name=TASK,
         candidates=EDGES,
-        tuning=Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0)),
+        tuning=tuning_of(),
         worker=WorkerSpec(command=("true",)),
         on_isolation=on_isolation,
     )

@@ -7,11 +7,12 @@ from dataclasses import replace
 
 import pytest
 
+from support.fleets import fleet_of, tuning_of
 from zsched.core.executor.handover import Executor
 from zsched.core.executor.tenure import Tenure
 from zsched.core.instructions import SetRole
-from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, lease_terms
-from zsched.core.values.model import Allocation, Beat, Grant, NodeKind, Tuning, Weights
+from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec, lease_terms
+from zsched.core.values.model import Allocation, Beat, Grant
 from zsched.core.values.plan import WorkerRole
 from zsched.core.vote.lease import RHO, SENT_KEPT, Granter, Holder, Leases, hold_s
 
@@ -244,17 +245,11 @@ def test_what_was_given_back_holds_no_lease_any_more() -> None:
 GUARD = TaskSpec(
     name="guard",
     candidates=ELECTORS,
-    tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0)),
+    tuning=tuning_of(cpu=1.0, memory=0.0),
     worker=WorkerSpec(command=("true",)),
     exclusive=True,
 )
-FLEET = Fleet(
-    name="rules",
-    timing=Timing(),
-    nodes=tuple(NodeSpec(name=name, kind=NodeKind.ROBOT) for name in ELECTORS),
-    tasks=(GUARD,),
-    electors=ELECTORS,
-)
+FLEET = fleet_of(GUARD, of=ELECTORS, electors=ELECTORS)
 
 
 def leases() -> Leases:

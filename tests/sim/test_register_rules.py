@@ -7,26 +7,22 @@ from random import Random
 
 import pytest
 
+from support.fleets import fleet_of, tuning_of
 from zsched.core.events import AcceptAsked, PrepareAsked
-from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, electorate_hash
+from zsched.core.values.fleet import TaskSpec, WorkerSpec, electorate_hash
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise
 from zsched.core.values.model import (
     Acceptance,
     Allocation,
     Ballot,
     DurableState,
-    NodeKind,
     RegisterState,
-    Tuning,
-    Weights,
 )
 from zsched.core.vote.agreement import Agreement
 from zsched.core.vote.register import MoveOwner, Register, Step
 
 ELECTORS = ("r1", "r2", "r3")
-INITIAL = Allocation(
-    task="merge", revision=0, epoch=0, owner=None, tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
-)
+INITIAL = Allocation(task="merge", revision=0, epoch=0, owner=None, tuning=tuning_of(cpu=1.0, memory=0.0))
 
 
 def proposer(incarnation: int = 4) -> Register:
@@ -109,15 +105,9 @@ def test_newer_among_accepted_values_is_the_higher_ballot_not_the_higher_revisio
 @pytest.mark.parametrize(("node", "asker"), [("r3", "r2"), ("ghost", "ghost"), ("r2x", "r2")])
 def test_a_ballot_that_is_not_its_asker_s_or_a_stranger_s_gets_no_answer(node: str, asker: str) -> None:
     spec = TaskSpec(name="merge", candidates=ELECTORS, tuning=INITIAL.tuning, worker=WorkerSpec(command=("true",)))
-    fleet = Fleet(
-        name="rules",
-        timing=Timing(),
-        nodes=tuple(NodeSpec(name=name, kind=NodeKind.ROBOT) for name in ELECTORS),
-        tasks=(spec,),
-        electors=ELECTORS,
-    )
+    fleet = fleet_of(spec, of=ELECTORS, electors=ELECTORS)
     electorate = electorate_hash(fleet)
-    state = DurableState(fleet="rules", node="r1", incarnation=1, generation=0, hardware="", electorate=electorate)
+    state = DurableState(fleet=fleet.name, node="r1", incarnation=1, generation=0, hardware="", electorate=electorate)
     elector = Agreement(
         fleet=fleet, me="r1", durable=state, incarnation=1, electorate=electorate, rng=Random(1), now=0.0
     )

@@ -6,32 +6,27 @@ from dataclasses import replace
 
 import pytest
 
+from support.fleets import fleet_of, tuning_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.fleet import TaskSpec, WorkerSpec
 from zsched.core.values.messages import Learnt
-from zsched.core.values.model import Beat, DurableState, NodeId, NodeKind, Tuning, Weights
+from zsched.core.values.model import Beat, DurableState, NodeId
 from zsched.core.vote.witness import ASK_ALL_S, Witness
 from zsched_lab.simulator import CORES, Simulator
 
 TASK = "merge"
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
-FLEET = Fleet(
-    name="sim",
-    timing=Timing(),
-    nodes=tuple(
-        NodeSpec(name=name, kind=NodeKind.EDGE if name in EDGES else NodeKind.ROBOT) for name in (*EDGES, *ROBOTS)
+FLEET = fleet_of(
+    TaskSpec(
+        name=TASK,
+        candidates=EDGES,
+        tuning=tuning_of(cpu=1.0, memory=0.0, time_to_trigger_s=0.2, cool_down_s=0.0),
+        worker=WorkerSpec(command=("true",)),
+        exclusive=True,
+        max_moves_per_minute=1000,
     ),
-    tasks=(
-        TaskSpec(
-            name=TASK,
-            candidates=EDGES,
-            tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0), time_to_trigger_s=0.2, cool_down_s=0.0),
-            worker=WorkerSpec(command=("true",)),
-            exclusive=True,
-            max_moves_per_minute=1000,
-        ),
-    ),
+    of=(*EDGES, *ROBOTS),
     electors=ROBOTS,
 )
 

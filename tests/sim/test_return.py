@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from support.fleets import tuning_of
 from zsched.core.scheduler.probation import LEASE_MARGIN_S
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.values.model import NodeKind, PeerState, Tuning, Weights
+from zsched.core.values.model import NodeKind, PeerState
 from zsched_lab.simulator import CORES, Simulator
 
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2", "edge3")
@@ -16,7 +17,7 @@ def settled_on_edge1() -> Simulator:
     task = TaskSpec(
         name="merge",
         candidates=EDGES,
-        tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0), time_to_trigger_s=0.0, cool_down_s=0.0),
+        tuning=tuning_of(cpu=1.0, memory=0.0, time_to_trigger_s=0.0, cool_down_s=0.0),
         worker=WorkerSpec(command=("true",)),
     )
     kinds = {**dict.fromkeys(EDGES, NodeKind.EDGE), **dict.fromkeys(ROBOTS, NodeKind.ROBOT)}

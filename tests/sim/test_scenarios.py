@@ -19,10 +19,11 @@ from random import Random
 
 import pytest
 
+from support.fleets import tuning_of
 from zsched.core import events as ev
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.messages import SetWeights
-from zsched.core.values.model import NodeKind, Tuning, Weights
+from zsched.core.values.model import NodeKind
 from zsched_lab.simulator import CORES, Simulator
 
 FOLDER = Path(__file__).parent / "scenarios"
@@ -37,7 +38,7 @@ def fleet_of(words: list[str]) -> Fleet:
     task = TaskSpec(
         name=TASK,
         candidates=edges,
-        tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0), time_to_trigger_s=0.5, cool_down_s=0.0),
+        tuning=tuning_of(cpu=1.0, memory=0.0, time_to_trigger_s=0.5, cool_down_s=0.0),
         worker=WorkerSpec(command=("work",)),
         exclusive="exclusive" in words,
         drain_s=0.2,

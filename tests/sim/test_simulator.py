@@ -7,8 +7,9 @@ from random import Random
 
 import pytest
 
+from support.fleets import tuning_of
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.values.model import NodeId, NodeKind, PeerState, Tuning, Weights
+from zsched.core.values.model import NodeId, NodeKind, PeerState
 from zsched_lab.simulator import CORES, Simulator
 
 TASK = "merge"
@@ -23,7 +24,7 @@ def fleet(robots: int = 3, edges: int = 3, *, ttt: float = 2.0, cool_down: float
     task = TaskSpec(
         name=TASK,
         candidates=tuple(f"edge{i}" for i in range(1, edges + 1)),
-        tuning=Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0), time_to_trigger_s=ttt, cool_down_s=cool_down),
+        tuning=tuning_of(time_to_trigger_s=ttt, cool_down_s=cool_down),
         worker=WorkerSpec(command=("true",)),
     )
     electors = tuple(f"robot{i}" for i in range(1, robots + 1))

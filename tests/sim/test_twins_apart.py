@@ -4,27 +4,21 @@ from __future__ import annotations
 
 from functools import partial
 
+from support.fleets import fleet_of, tuning_of
 from zsched.core.status import build_snapshot
-from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.values.model import NodeKind, Tuning, Weights
+from zsched.core.values.fleet import TaskSpec, WorkerSpec
 from zsched_lab.sim_parts import Machine
 from zsched_lab.simulator import Simulator
 
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
-FLEET = Fleet(
-    name="sim",
-    timing=Timing(),
-    nodes=tuple(
-        NodeSpec(name=name, kind=NodeKind.EDGE if name in EDGES else NodeKind.ROBOT) for name in sorted(EDGES + ROBOTS)
+FLEET = fleet_of(
+    TaskSpec(
+        name="merge",
+        candidates=EDGES,
+        tuning=tuning_of(),
+        worker=WorkerSpec(command=("true",)),
     ),
-    tasks=(
-        TaskSpec(
-            name="merge",
-            candidates=EDGES,
-            tuning=Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0)),
-            worker=WorkerSpec(command=("true",)),
-        ),
-    ),
+    of=sorted(EDGES + ROBOTS),
     electors=ROBOTS,
 )
 

@@ -6,11 +6,12 @@ from random import Random
 
 import pytest
 
+from support.fleets import tuning_of
 from zsched.core import events as ev
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.rounds import Rounds
 from zsched.core.values.fleet import Fleet, NodeSpec, Reach, TaskSpec, Timing, WorkerSpec
-from zsched.core.values.model import Allocation, NodeKind, PeerState, Proposal, Tuning, Weights
+from zsched.core.values.model import Allocation, NodeKind, PeerState, Proposal
 from zsched.core.vote.tally import VoteOutcome, tally
 from zsched_lab.sim_swarm import plan
 from zsched_lab.simulator import Simulator
@@ -60,7 +61,7 @@ def reaching_all(robots: int) -> Simulator:
     task = TaskSpec(
         name="merge",
         candidates=edges,
-        tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0), time_to_trigger_s=0.0, cool_down_s=0.0),
+        tuning=tuning_of(cpu=1.0, memory=0.0, time_to_trigger_s=0.0, cool_down_s=0.0),
         worker=WorkerSpec(command=("true",)),
         reach=Reach.ALL,
     )

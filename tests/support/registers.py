@@ -6,12 +6,13 @@ from collections.abc import Iterable
 from dataclasses import replace
 from random import Random
 
+from support.fleets import tuning_of
 from zsched.core.values.messages import Accept, Prepare
-from zsched.core.values.model import Acceptance, Allocation, Ballot, RegisterState, Tuning, Weights
+from zsched.core.values.model import Acceptance, Allocation, Ballot, RegisterState
 from zsched.core.vote.register import MoveOwner, Register, Step
 
 ELECTORS = ("r1", "r2", "r3")
-TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
+TUNING = tuning_of()
 INITIAL = Allocation(task="merge", revision=0, epoch=0, owner=None, tuning=TUNING)
 BLANK = RegisterState(task="merge")
 FIRST = MoveOwner(base_revision=0, owner="e1", reason="test")

@@ -10,12 +10,13 @@ from pathlib import Path
 
 import pytest
 
+from support.fleets import fleet_of, tuning_of
 from support.waiting import until
 from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
 from zsched.core import events as ev
 from zsched.core.relay_protocol import WorkerMatched, WorkerSeen, WorkerTrouble
-from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.values.model import MAX_REASON, WAS_READY, NodeKind, Tuning, Weights, WorkerState, told_of_worker
+from zsched.core.values.fleet import TaskSpec, WorkerSpec
+from zsched.core.values.model import MAX_REASON, WAS_READY, WorkerState, told_of_worker
 from zsched.core.values.plan import ReadyWhen
 from zsched.runtime import crew as crew_module
 from zsched.runtime.crew import OTHERS, Crew
@@ -23,18 +24,16 @@ from zsched.runtime.sessions import SessionsRead
 from zsched.sessions.config import worker_config
 
 SLEEPER = ("python", "-c", "import time; time.sleep(600)")
-TUNING = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
+TUNING = tuning_of(cpu=1.0, memory=0.0)
 SPECS = {
     "node": WorkerSpec(command=SLEEPER, ready_when=ReadyWhen.MATCHING, start_deadline_s=4.0, stop_grace_s=0.1),
     "others": WorkerSpec(ready_when=ReadyWhen.MATCHING),
     "alone": WorkerSpec(),
     "token": WorkerSpec(command=SLEEPER, start_deadline_s=4.0, stop_grace_s=0.1),
 }
-FLEET = Fleet(
-    name="test",
-    timing=Timing(),
-    nodes=(NodeSpec(name="edge1", kind=NodeKind.EDGE),),
-    tasks=tuple(TaskSpec(name=name, candidates=("edge1",), tuning=TUNING, worker=one) for name, one in SPECS.items()),
+FLEET = fleet_of(
+    *((TaskSpec(name=name, candidates=("edge1",), tuning=TUNING, worker=one) for name, one in SPECS.items())),
+    of=("edge1",),
     electors=("edge1",),
 )
 Told = list[tuple[str, WorkerState, str]]

@@ -11,6 +11,7 @@ from typing import Any, cast
 
 import pytest
 
+from support.fleets import tuning_of
 from support.waiting import until
 from zsched.adapters.host.state_file import StateFile
 from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
@@ -36,8 +37,6 @@ from zsched.core.values.model import (
     DurableState,
     Profile,
     Proposal,
-    Tuning,
-    Weights,
     WorkerState,
 )
 from zsched.core.values.plan import Role, RoutePhase, RoutePlan, WorkerRole
@@ -45,7 +44,7 @@ from zsched.errors import AdapterError, WireError
 from zsched.runtime import shell as shell_module
 from zsched.runtime.shell import INBOX_LIMIT, LOCAL_REQUESTS_FROM, PROBLEM_TTL_S, WAITING_LIMIT, Desk, Inbox, Shell
 
-TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
+TUNING = tuning_of()
 BALLOT = Ballot(counter=1, node="robot1", incarnation=1)
 VALUE = Allocation(task="merge", revision=1, epoch=1, owner="edge1", tuning=TUNING)
 BEAT = Beat(node="robot1", incarnation=1, sequence=1, loop_lag_s=0.0)

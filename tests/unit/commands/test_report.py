@@ -15,10 +15,11 @@ from typing import Any
 
 import pytest
 
+from support.fleets import tuning_of
 from zsched.commands.page import Page, cut, memory, size, span
 from zsched.commands.report import degradations, printable, render_status
 from zsched.core.report import snapshot_json
-from zsched.core.values.model import WAS_READY, Link, LinkSource, Tuning, Utility, Weights, WorkerLoad, WorkerState
+from zsched.core.values.model import WAS_READY, Link, LinkSource, Utility, WorkerLoad, WorkerState
 from zsched.core.values.plan import StreamCount
 from zsched.core.values.snapshot import (
     DecisionStatus,
@@ -57,7 +58,7 @@ def snapshot() -> Snapshot:
         since_s=12.0,
         owner_state="alive",
         phase="settled",
-        tuning=Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0)),
+        tuning=tuning_of(),
         candidates=("edge1",),
         decision=DecisionStatus(
             outcome="stay",

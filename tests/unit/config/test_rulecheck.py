@@ -5,11 +5,11 @@ import time
 
 import pytest
 
+from support.fleets import tuning_of
 from zsched.config.rulecheck import RuleConflict, rule_conflicts
 from zsched.core.route import keyexpr
 from zsched.core.route.templates import named_rules, routes_for
 from zsched.core.values.fleet import StreamRule, TaskSpec
-from zsched.core.values.model import Tuning, Weights
 from zsched.core.values.plan import Direction
 
 ROBOTS = ("robot1", "robot2", "robot3")
@@ -26,7 +26,7 @@ def task(
     return TaskSpec(
         name=name,
         candidates=candidates,
-        tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0)),
+        tuning=tuning_of(cpu=1.0, memory=0.0),
         rules=tuple(StreamRule(direction=way, from_template=one, to_template=two) for way, (one, two) in pairs),
     )
 

@@ -9,13 +9,14 @@ from typing import Any, TypeVar
 
 import pytest
 
+from support.fleets import fleet_of, tuning_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.membership.identity import QUIET_S
 from zsched.core.membership.knocking import KNOCKERS_KEPT
 from zsched.core.node import Node
 from zsched.core.status import build_snapshot
-from zsched.core.values.fleet import Fleet, NodeSpec, StreamRule, TaskSpec, Timing, WorkerSpec, electorate_hash
+from zsched.core.values.fleet import StreamRule, TaskSpec, WorkerSpec, electorate_hash
 from zsched.core.values.messages import (
     Accept,
     CommandOutcome,
@@ -35,14 +36,11 @@ from zsched.core.values.model import (
     DeviceSample,
     DurableState,
     Echo,
-    NodeKind,
     PeerState,
     Profile,
     Proposal,
     RegisterState,
-    Tuning,
     UtilityVector,
-    Weights,
     WorkerLoad,
     WorkerState,
 )
@@ -50,18 +48,11 @@ from zsched.core.values.plan import Direction, ReadyWhen, RoutePhase, StreamCoun
 
 T = TypeVar("T")
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
-TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
+TUNING = tuning_of()
 RULE = StreamRule(direction=Direction.INPUT, from_template="{robot}/map", to_template="{target}/merge/{robot}/map")
-FLEET = Fleet(
-    name="test",
-    timing=Timing(),
-    nodes=tuple(
-        NodeSpec(name=name, kind=NodeKind.ROBOT if name in ROBOTS else NodeKind.EDGE)
-        for name in sorted((*ROBOTS, *EDGES))
-    ),
-    tasks=(
-        TaskSpec(name="merge", candidates=EDGES, tuning=TUNING, worker=WorkerSpec(command=("merge",)), rules=(RULE,)),
-    ),
+FLEET = fleet_of(
+    TaskSpec(name="merge", candidates=EDGES, tuning=TUNING, worker=WorkerSpec(command=("merge",)), rules=(RULE,)),
+    of=sorted((*ROBOTS, *EDGES)),
     electors=ROBOTS,
 )
 ELECTORATE = electorate_hash(FLEET)

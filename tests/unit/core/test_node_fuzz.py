@@ -8,12 +8,13 @@ from random import Random
 
 import pytest
 
+from support.fleets import fleet_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.node import Node
 from zsched.core.report import snapshot_json
 from zsched.core.status import build_snapshot, status_line
-from zsched.core.values.fleet import Fleet, NodeSpec, Standby, StreamRule, TaskSpec, Timing, WorkerSpec, electorate_hash
+from zsched.core.values.fleet import Standby, StreamRule, TaskSpec, WorkerSpec, electorate_hash
 from zsched.core.values.messages import (
     Accept,
     Accepted,
@@ -34,7 +35,6 @@ from zsched.core.values.model import (
     DeviceSample,
     DurableState,
     Grant,
-    NodeKind,
     Profile,
     Proposal,
     TaskProgress,
@@ -69,18 +69,11 @@ def task(name: str, candidates: tuple[str, ...], *, standby: Standby, exclusive:
     )
 
 
-FLEET = Fleet(
-    name="test",
-    timing=Timing(),
-    nodes=tuple(
-        NodeSpec(name=name, kind=NodeKind.ROBOT if name in ROBOTS else NodeKind.EDGE)
-        for name in sorted((*ROBOTS, *EDGES))
-    ),
-    tasks=(
-        task("alone", (*EDGES, "robot1"), standby=Standby.WARM, exclusive=True),
-        task("cold", (*EDGES, "robot1"), standby=Standby.COLD),
-        task("merge", EDGES, standby=Standby.WARM),
-    ),
+FLEET = fleet_of(
+    task("alone", (*EDGES, "robot1"), standby=Standby.WARM, exclusive=True),
+    task("cold", (*EDGES, "robot1"), standby=Standby.COLD),
+    task("merge", EDGES, standby=Standby.WARM),
+    of=sorted((*ROBOTS, *EDGES)),
     electors=ROBOTS,
 )
 ELECTORATE = electorate_hash(FLEET)

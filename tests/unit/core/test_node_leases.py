@@ -7,32 +7,26 @@ from random import Random
 
 import pytest
 
+from support.fleets import fleet_of, tuning_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.node import Node
-from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, lease_terms
+from zsched.core.values.fleet import TaskSpec, WorkerSpec, lease_terms
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import (
     Allocation,
     Beat,
     DurableState,
     Grant,
-    NodeKind,
     RegisterState,
-    Tuning,
-    Weights,
     WorkerState,
 )
 
 ROBOTS = ("robot1", "robot2", "robot3")
-TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
+TUNING = tuning_of()
 WORKER = WorkerSpec(command=("true",))
-FLEET = Fleet(
-    name="owners",
-    timing=Timing(),
-    nodes=tuple(NodeSpec(name=name, kind=NodeKind.ROBOT) for name in ROBOTS),
-    tasks=(TaskSpec(name="guard", candidates=ROBOTS, tuning=TUNING, worker=WORKER, exclusive=True),),
-    electors=ROBOTS,
+FLEET = fleet_of(
+    TaskSpec(name="guard", candidates=ROBOTS, tuning=TUNING, worker=WORKER, exclusive=True), of=ROBOTS, electors=ROBOTS
 )
 
 
@@ -45,7 +39,7 @@ class Owner:
 
     def __init__(self) -> None:
         state = DurableState(
-            fleet="owners",
+            fleet=FLEET.name,
             node="robot1",
             incarnation=7,
             generation=0,

@@ -12,6 +12,7 @@ from random import Random
 
 import pytest
 
+from support.fleets import tuning_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.executor.handover import Phase
@@ -28,8 +29,6 @@ from zsched.core.values.model import (
     NodeKind,
     RegisterState,
     TaskId,
-    Tuning,
-    Weights,
 )
 from zsched.core.values.plan import WorkerRole
 from zsched.core.vote.lease import hold_s
@@ -46,7 +45,7 @@ def fleet(*, exclusive: bool = False) -> Fleet:
         NodeSpec(name=name, kind=NodeKind.ROBOT if name in ROBOTS else NodeKind.EDGE)
         for name in sorted((*ROBOTS, *EDGES))
     )
-    tuning = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0), time_to_trigger_s=0.2, cool_down_s=0.0)
+    tuning = tuning_of(time_to_trigger_s=0.2, cool_down_s=0.0)
     task = TaskSpec(
         name=TASK,
         candidates=EDGES,

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from support.fleets import fleet_of, tuning_of
 from zsched.commands.report import degradations, render_status
 from zsched.core import events as ev
 from zsched.core import instructions as do
@@ -15,7 +16,7 @@ from zsched.core.node import Node
 from zsched.core.report import snapshot_json
 from zsched.core.scheduler.patience import FIRST_PATIENCE
 from zsched.core.status import build_snapshot, status_line
-from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, electorate_hash, lease_terms
+from zsched.core.values.fleet import TaskSpec, WorkerSpec, electorate_hash, lease_terms
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import (
     RESTARTING,
@@ -27,12 +28,9 @@ from zsched.core.values.model import (
     Echo,
     LinkSample,
     LinkSource,
-    NodeKind,
     Profile,
     Proposal,
     ScoreForm,
-    Tuning,
-    Weights,
     WorkerLoad,
     WorkerState,
 )
@@ -41,18 +39,13 @@ from zsched.core.values.snapshot import SCHEMA, Snapshot
 from zsched_lab.simulator import Simulator
 
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
-TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
-FLEET = Fleet(
-    name="test",
-    timing=Timing(),
-    nodes=tuple(
-        NodeSpec(name=name, kind=NodeKind.ROBOT if name in ROBOTS else NodeKind.EDGE)
-        for name in sorted((*ROBOTS, *EDGES))
-    ),
-    tasks=tuple(
+TUNING = tuning_of()
+FLEET = fleet_of(
+    *(
         TaskSpec(name=name, candidates=EDGES, tuning=TUNING, worker=WorkerSpec(command=("work",)))
         for name in ("merge", "merge2")
     ),
+    of=sorted((*ROBOTS, *EDGES)),
     electors=ROBOTS,
 )
 

@@ -7,32 +7,26 @@ from dataclasses import replace
 
 import pytest
 
+from support.fleets import fleet_of, tuning_of
 from zsched.core import instructions as do
-from zsched.core.values.fleet import Fleet, NodeSpec, StreamRule, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.fleet import StreamRule, TaskSpec, WorkerSpec
 from zsched.core.values.messages import Accepted, Promise
-from zsched.core.values.model import Acceptance, Allocation, Ballot, NodeId, NodeKind, PeerState, Tuning, Weights
+from zsched.core.values.model import Acceptance, Allocation, Ballot, NodeId, PeerState
 from zsched.core.values.plan import Direction, Role, WorkerRole
 from zsched.errors import InvariantError
 from zsched_lab.simulator import RESTART_S, TOKEN_DELAY_S, Simulator
 
-TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
+TUNING = tuning_of()
 RULE = StreamRule(direction=Direction.INPUT, from_template="{robot}/map", to_template="{target}/merge/{robot}/map")
-FLEET = Fleet(
-    name="sim",
-    timing=Timing(),
-    nodes=tuple(
-        NodeSpec(name=name, kind=NodeKind.ROBOT if name.startswith("robot") else NodeKind.EDGE)
-        for name in ("edge1", "edge2", "robot1", "robot2", "robot3")
+FLEET = fleet_of(
+    TaskSpec(
+        name="merge",
+        candidates=("edge1", "edge2"),
+        tuning=TUNING,
+        worker=WorkerSpec(command=("true",)),
+        rules=(RULE,),
     ),
-    tasks=(
-        TaskSpec(
-            name="merge",
-            candidates=("edge1", "edge2"),
-            tuning=TUNING,
-            worker=WorkerSpec(command=("true",)),
-            rules=(RULE,),
-        ),
-    ),
+    of=("edge1", "edge2", "robot1", "robot2", "robot3"),
     electors=("robot1", "robot2", "robot3"),
 )
 

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 import pytest
 import zenoh
 
+from support.fleets import tuning_of
 from support.waiting import free_endpoint, until
 from zsched.adapters.network import control_bus, open_questions
 from zsched.adapters.network.control_bus import RING, ControlBus
@@ -30,7 +31,7 @@ from zsched.core.values.messages import (
     SetWeights,
     Utilities,
 )
-from zsched.core.values.model import Acceptance, Allocation, Ballot, Beat, Profile, Proposal, Tuning, Weights
+from zsched.core.values.model import Acceptance, Allocation, Ballot, Beat, Profile, Proposal
 from zsched.core.values.snapshot import QuorumStatus, Snapshot
 from zsched.errors import AdapterError
 from zsched.sessions.config import control_config
@@ -38,7 +39,7 @@ from zsched.wire import codec as wire
 
 T = TypeVar("T")
 TIMING = Timing()
-TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
+TUNING = tuning_of()
 VALUE = Allocation(task="merge", revision=1, epoch=1, owner="edge1", tuning=TUNING)
 BALLOT = Ballot(counter=1, node="a", incarnation=1)
 PREPARE = Prepare(task="merge", ballot=BALLOT, electorate="e")

@@ -10,14 +10,13 @@ from pathlib import Path
 
 import pytest
 
+from support.fleets import tuning_of
 from zsched.adapters.host.state_file import NEW_NAME, StateFile, hardware_id, is_same_hardware
-from zsched.core.values.model import Acceptance, Allocation, Ballot, DurableState, RegisterState, Tuning, Weights
+from zsched.core.values.model import Acceptance, Allocation, Ballot, DurableState, RegisterState
 from zsched.errors import AdapterError
 
 BALLOT = Ballot(counter=3, node="robot1", incarnation=2)
-VALUE = Allocation(
-    task="merge", revision=9, epoch=4, owner="edge1", tuning=Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
-)
+VALUE = Allocation(task="merge", revision=9, epoch=4, owner="edge1", tuning=tuning_of())
 REGISTER = RegisterState(task="merge", promised=BALLOT, accepted=Acceptance(ballot=BALLOT, value=VALUE), learnt=VALUE)
 STATE = DurableState(
     fleet="hall",

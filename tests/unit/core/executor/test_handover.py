@@ -9,14 +9,15 @@ from typing import TypeVar
 
 import pytest
 
+from support.fleets import tuning_of
 from zsched.core.executor.handover import LEAVES_S, MAX_OLD, ROLE_DRAIN_MARGIN_S, Executor, Phase
 from zsched.core.instructions import ApplyRoutes, Instruction, RecordStory, SetRole, StartWorker, StopWorker
 from zsched.core.values.fleet import Standby, StreamRule, TaskSpec, WorkerSpec
-from zsched.core.values.model import Allocation, Tuning, Weights
+from zsched.core.values.model import Allocation
 from zsched.core.values.plan import Direction, RoutePlan, WorkerRole
 
 T = TypeVar("T")
-TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
+TUNING = tuning_of()
 SPEC = TaskSpec(
     name="merge",
     candidates=("edge1", "edge2", "edge3"),

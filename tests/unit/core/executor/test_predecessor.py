@@ -1,12 +1,13 @@
 """Who is asked for the state of an epoch: the owner of the one before, while it is there."""
 
+from support.fleets import tuning_of
 from zsched.core.executor.handover import Executor
 from zsched.core.instructions import Instruction, SetRole
 from zsched.core.values.fleet import TaskSpec, WorkerSpec
-from zsched.core.values.model import Allocation, Tuning, Weights
+from zsched.core.values.model import Allocation
 from zsched.core.values.plan import Role, WorkerRole
 
-TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
+TUNING = tuning_of()
 
 
 def edge(*, exclusive: bool = False) -> Executor:

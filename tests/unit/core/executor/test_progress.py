@@ -7,6 +7,7 @@ from random import Random
 
 import pytest
 
+from support.fleets import tuning_of
 from zsched.core import events as ev
 from zsched.core.executor.handover import Executor, Phase
 from zsched.core.executor.progress import COUNT_S, MARGIN_S, HangWatch, Progress
@@ -23,8 +24,6 @@ from zsched.core.values.model import (
     Profile,
     RegisterState,
     TaskProgress,
-    Tuning,
-    Weights,
     WorkerState,
 )
 from zsched.core.values.plan import Direction, StreamCount
@@ -36,7 +35,7 @@ OUTPUT = StreamRule(direction=Direction.OUTPUT, from_template="{target}/merge/ou
 SPEC = TaskSpec(
     name="merge",
     candidates=("edge1",),
-    tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0)),
+    tuning=tuning_of(cpu=1.0, memory=0.0),
     worker=WorkerSpec(command=("merge",), output_deadline_s=DEADLINE_S),
     rules=(INPUT, OUTPUT),
 )

@@ -6,28 +6,23 @@ from dataclasses import replace
 
 import pytest
 
+from support.fleets import fleet_of, tuning_of
 from zsched.core.executor.handover import Executor
 from zsched.core.executor.sealing import ASK_EVERY_S, Sealing
-from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, fleet_hash, lease_terms
+from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec, fleet_hash, lease_terms
 from zsched.core.values.messages import Learnt
-from zsched.core.values.model import Allocation, Beat, NodeKind, Tuning, Weights
+from zsched.core.values.model import Allocation, Beat
 from zsched.core.vote.register import SetLeased
 
 NAMES = ("e1", "e2", "e3")
-TUNING = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
+TUNING = tuning_of(cpu=1.0, memory=0.0)
 OPEN = TaskSpec(name="guard", candidates=NAMES[:2], tuning=TUNING, worker=WorkerSpec(command=("true",)))
 EXCLUSIVE = replace(OPEN, exclusive=True)
 YOUNG_S = 5.0
 
 
 def fleet(*tasks: TaskSpec) -> Fleet:
-    return Fleet(
-        name="rules",
-        timing=Timing(),
-        nodes=tuple(NodeSpec(name=name, kind=NodeKind.EDGE) for name in NAMES),
-        tasks=tasks,
-        electors=NAMES,
-    )
+    return fleet_of(*tasks, of=NAMES, electors=NAMES)
 
 
 NEW, OLD = fleet(EXCLUSIVE), fleet(OPEN)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from support.fleets import tuning_of
 from zsched.core.executor.handover import Executor
 from zsched.core.instructions import StartWorker
 from zsched.core.values.fleet import OnIsolation, TaskSpec, WorkerSpec
-from zsched.core.values.model import Tuning, Weights
 
 
 @pytest.mark.parametrize(
@@ -26,7 +26,7 @@ def test_candidates_and_robots_that_work_alone_start_a_warm_worker(
     spec = TaskSpec(
         name="merge",
         candidates=("edge1",),
-        tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0)),
+        tuning=tuning_of(cpu=1.0, memory=0.0),
         worker=WorkerSpec(command=("work",)),
         on_isolation=isolation,
     )

@@ -8,14 +8,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from support.fleets import tuning_of
 from zsched.core.gateway.demand import QUEUE_RATIO, SETTLE_S, SHORT_RATIO, STARVED_CPU_RATIO, UNSURE, Demands, is_short
 from zsched.core.values.fleet import Demand, TaskSpec
-from zsched.core.values.model import Jobs, Profile, Tuning, Weights, WorkerLoad, WorkerState
+from zsched.core.values.model import Jobs, Profile, WorkerLoad, WorkerState
 
 TASK = TaskSpec(
     name="merge",
     candidates=("edge1", "edge2"),
-    tuning=Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0)),
+    tuning=tuning_of(),
     demand=Demand(cpu_cores=0.4, memory_mb=250.0),
 )
 EVERY_S = 2 * SETTLE_S

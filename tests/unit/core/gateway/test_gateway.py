@@ -4,27 +4,18 @@ import math
 
 import pytest
 
+from support.fleets import fleet_of, tuning_of
 from zsched.core.gateway.gateway import EdgeData, Gateway
-from zsched.core.values.fleet import Demand, Fleet, NodeSpec, TaskSpec, Timing
-from zsched.core.values.model import NodeKind, Profile, Tuning, Weights, WorkerLoad, WorkerState
+from zsched.core.values.fleet import Demand, TaskSpec
+from zsched.core.values.model import Profile, WorkerLoad, WorkerState
 
 TASK = TaskSpec(
     name="merge",
     candidates=("edge1", "edge2"),
-    tuning=Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0)),
+    tuning=tuning_of(),
     demand=Demand(cpu_cores=0.4, memory_mb=250.0),
 )
-FLEET = Fleet(
-    name="lab",
-    timing=Timing(),
-    nodes=(
-        NodeSpec(name="edge1", kind=NodeKind.EDGE),
-        NodeSpec(name="edge2", kind=NodeKind.EDGE),
-        NodeSpec(name="robot1", kind=NodeKind.ROBOT),
-    ),
-    tasks=(TASK,),
-    electors=("robot1",),
-)
+FLEET = fleet_of(TASK, of=("edge1", "edge2", "robot1"), electors=("robot1",))
 TTL_S = FLEET.timing.profile_ttl_s
 
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from zsched.core.values.model import DurableState, Tuning, Weights
+from support.fleets import tuning_of
+from zsched.core.values.model import DurableState
 from zsched.core.values.snapshot import QuorumStatus, Snapshot, TaskStatus
 from zsched.core.vote.belief import GENERATION_STEP
 from zsched.core.vote.generations import generation_of, objection
 
-TUNING = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
+TUNING = tuning_of(cpu=1.0, memory=0.0)
 GOOD = DurableState(fleet="hall", node="robot3", incarnation=1, generation=0, hardware="", electorate="")
 LOST = ("robot1", "robot2")
 

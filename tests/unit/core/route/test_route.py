@@ -6,10 +6,11 @@ from dataclasses import replace
 
 import pytest
 
+from support.fleets import tuning_of
 from zsched.core.relay_protocol import WorkerWatch
 from zsched.core.route.route import plan_for, slot_for, watch_for
 from zsched.core.values.fleet import Fleet, NodeSpec, Standby, StreamRule, TaskSpec, Timing, WorkerSpec
-from zsched.core.values.model import NodeKind, Tuning, Weights
+from zsched.core.values.model import NodeKind
 from zsched.core.values.plan import (
     Direction,
     HandoverRule,
@@ -24,7 +25,7 @@ SETTINGS = StreamSettings(stream_class=StreamClass.RELIABLE, depth=7, handover=H
 SPEC = TaskSpec(
     name="merge",
     candidates=("edge1", "edge2"),
-    tuning=Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0)),
+    tuning=tuning_of(),
     worker=WorkerSpec(ready_when=ReadyWhen.MATCHING),
     rules=(
         StreamRule(

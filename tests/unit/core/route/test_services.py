@@ -2,11 +2,11 @@
 
 import pytest
 
+from support.fleets import tuning_of
 from zsched.config.load import CheckResult, check_bytes
 from zsched.config.rulecheck import rule_conflicts
 from zsched.core.route.templates import routes_for, template_fault
 from zsched.core.values.fleet import StreamRule, TaskSpec
-from zsched.core.values.model import Tuning, Weights
 from zsched.core.values.plan import Direction, ServiceSettings
 
 SERVICE = Direction.SERVICE
@@ -33,7 +33,7 @@ def check(service: str) -> CheckResult:
 
 def task_of(*pairs: tuple[str, str], name: str = "merge", direction: Direction = SERVICE) -> TaskSpec:
     rules = tuple(StreamRule(direction=direction, from_template=a, to_template=b) for a, b in pairs)
-    tuning = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
+    tuning = tuning_of(cpu=1.0, memory=0.0)
     return TaskSpec(name=name, candidates=("edge1", "robot1"), tuning=tuning, rules=rules)
 
 

@@ -7,6 +7,7 @@ import zenoh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from support.fleets import tuning_of
 from zsched.core.route import keyexpr, templates
 from zsched.core.route.templates import (
     fill,
@@ -19,7 +20,6 @@ from zsched.core.route.templates import (
     widened,
 )
 from zsched.core.values.fleet import StreamRule, TaskSpec
-from zsched.core.values.model import Tuning, Weights
 from zsched.core.values.plan import Direction, StreamClass, StreamSettings
 
 IN, OUT = Direction.INPUT, Direction.OUTPUT
@@ -38,7 +38,7 @@ def task_of(*rules: StreamRule, name: str = "map_merge", candidates: tuple[str, 
     return TaskSpec(
         name=name,
         candidates=candidates,
-        tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0)),
+        tuning=tuning_of(cpu=1.0, memory=0.0),
         rules=rules,
     )
 

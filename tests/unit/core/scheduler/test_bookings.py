@@ -6,22 +6,20 @@ from dataclasses import replace
 
 import pytest
 
+from support.fleets import fleet_of, tuning_of
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.scoring import score
-from zsched.core.values.fleet import Demand, Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.fleet import Demand, TaskSpec, WorkerSpec
 from zsched.core.values.model import (
     Allocation,
-    NodeKind,
     PeerState,
     Profile,
-    Tuning,
     Utility,
-    Weights,
     WorkerLoad,
     WorkerState,
 )
 
-TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
+TUNING = tuning_of()
 TASKS = tuple(
     TaskSpec(
         name=name,
@@ -33,13 +31,7 @@ TASKS = tuple(
     for name in ("map", "plan", "watch")
 )
 MAP, PLAN, WATCH = TASKS
-FLEET = Fleet(
-    name="books",
-    timing=Timing(),
-    nodes=(NodeSpec(name="edge1", kind=NodeKind.EDGE), NodeSpec(name="robot1", kind=NodeKind.ROBOT)),
-    tasks=TASKS,
-    electors=("robot1",),
-)
+FLEET = fleet_of(*TASKS, of=("edge1", "robot1"), electors=("robot1",))
 NOBODY = Allocation(task="map", revision=1, epoch=1, owner=None, tuning=TUNING)
 READY = WorkerState.READY
 

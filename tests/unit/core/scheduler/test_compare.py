@@ -5,15 +5,16 @@ from dataclasses import replace
 
 import pytest
 
+from support.fleets import tuning_of
 from zsched.core.scheduler.scoring import Standing, compare, pick, rounded
 from zsched.core.values.fleet import Reach, TaskSpec
-from zsched.core.values.model import Aggregate, Allocation, Tuning, Utility, UtilityVector, Weights
+from zsched.core.values.model import Aggregate, Allocation, Utility, UtilityVector
 from zsched.core.values.quorum import majority
 
 SPEC = TaskSpec(
     name="merge",
     candidates=("edge1", "edge2", "edge3"),
-    tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0)),
+    tuning=tuning_of(cpu=1.0, memory=0.0),
 )
 GONE = -1.0
 """In `vote`: this robot does not reach the candidate."""

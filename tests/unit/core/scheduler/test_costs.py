@@ -6,11 +6,12 @@ from random import Random
 
 import pytest
 
+from support.fleets import tuning_of
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.costs import NEWEST, WINDOW_S, MoveCost
 from zsched.core.scheduler.rounds import Rounds
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing
-from zsched.core.values.model import NodeKind, Tuning, Weights
+from zsched.core.values.model import NodeKind
 from zsched.core.values.plan import StreamCount
 
 
@@ -165,7 +166,7 @@ def test_a_robots_rounds_tell_the_judge_what_planned_moves_have_cost(horizon_s: 
     spec = TaskSpec(
         name="merge",
         candidates=("edge1",),
-        tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0)),
+        tuning=tuning_of(cpu=1.0, memory=0.0),
         pays_off_in_s=horizon_s,
     )
     nodes = (NodeSpec(name="edge1", kind=NodeKind.EDGE), NodeSpec(name="robot1", kind=NodeKind.ROBOT))

@@ -7,16 +7,17 @@ from typing import Any
 
 import pytest
 
+from support.fleets import tuning_of
 from zsched.core.scheduler.damping import MAX_PENALTY, PROBATION_S, STEP, WINDOW_S, Damping
 from zsched.core.scheduler.judge import Judge, Outcome
 from zsched.core.scheduler.scoring import Standing
 from zsched.core.values.fleet import TaskSpec
-from zsched.core.values.model import Allocation, Tuning, Weights
+from zsched.core.values.model import Allocation
 
 SPEC = TaskSpec(
     name="merge",
     candidates=("edge1", "edge2"),
-    tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0), time_to_trigger_s=0.0, cool_down_s=0.0),
+    tuning=tuning_of(cpu=1.0, memory=0.0, time_to_trigger_s=0.0, cool_down_s=0.0),
     max_moves_per_minute=2,
 )
 OWNED = Allocation(task="merge", revision=1, epoch=1, owner="edge1", tuning=SPEC.tuning)

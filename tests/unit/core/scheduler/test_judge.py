@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from support.fleets import tuning_of
 from zsched.core.scheduler.judge import (
     INITIAL_SETTLE_S,
     Judge,
@@ -21,15 +22,13 @@ from zsched.core.values.model import (
     Allocation,
     PeerState,
     Profile,
-    Tuning,
     Utility,
     UtilityVector,
-    Weights,
     WorkerLoad,
     WorkerState,
 )
 
-TUNING = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0), bonus=0.10, time_to_trigger_s=2.0, cool_down_s=10.0)
+TUNING = tuning_of(cpu=1.0, memory=0.0, bonus=0.10, time_to_trigger_s=2.0, cool_down_s=10.0)
 SPEC = TaskSpec(
     name="merge", candidates=("edge1", "edge2", "edge3"), tuning=TUNING, worker=WorkerSpec(command=("worker",))
 )

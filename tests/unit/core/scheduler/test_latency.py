@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from support.fleets import tuning_of
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.scoring import score
 from zsched.core.scheduler.utility import on_time, service_utility
@@ -20,12 +21,11 @@ from zsched.core.values.model import (
     Profile,
     ScoreForm,
     Tuning,
-    Weights,
     WorkerLoad,
     WorkerState,
 )
 
-TUNING = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0), score=ScoreForm.SERVICE, deadline_ms=100.0)
+TUNING = tuning_of(cpu=1.0, memory=0.0, score=ScoreForm.SERVICE, deadline_ms=100.0)
 EDGES = ("edge1", "edge2")
 JOBS = Jobs(time_s=0.08, cpu_s=0.08, wait_s=0.0, age_s=0.08, done_hz=2.0, wanted_hz=2.0)
 

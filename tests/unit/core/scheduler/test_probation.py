@@ -7,26 +7,21 @@ from random import Random
 
 import pytest
 
+from support.fleets import fleet_of, tuning_of
 from zsched.core.membership.peers import Transition
 from zsched.core.node import Node
 from zsched.core.scheduler.probation import LEASE_MARGIN_S, LIMIT_S, Probation
-from zsched.core.values.fleet import Fleet, NodeSpec, Standby, TaskSpec, Timing, WorkerSpec
-from zsched.core.values.model import NodeKind, PeerState, Tuning, Weights
+from zsched.core.values.fleet import Standby, TaskSpec, WorkerSpec
+from zsched.core.values.model import PeerState
 from zsched.core.values.plan import ReadyWhen
 
 TASK = TaskSpec(
     name="merge",
     candidates=("edge1", "edge2"),
-    tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0)),
+    tuning=tuning_of(cpu=1.0, memory=0.0),
     worker=WorkerSpec(command=("true",)),
 )
-FLEET = Fleet(
-    name="test",
-    timing=Timing(),
-    nodes=tuple(NodeSpec(name=name, kind=NodeKind.EDGE) for name in TASK.candidates),
-    tasks=(TASK,),
-    electors=("edge1",),
-)
+FLEET = fleet_of(TASK, of=TASK.candidates, electors=("edge1",))
 GONE_AT, BACK_AT = 100.0, 105.0
 STOOD_S = FLEET.timing.zenoh_lease_s + LEASE_MARGIN_S
 

@@ -9,22 +9,20 @@ from typing import TypeVar
 
 import pytest
 
+from support.fleets import fleet_of, tuning_of
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.instructions import AskUtilities, Instruction, PublishProposal
 from zsched.core.scheduler.judge import Outcome
 from zsched.core.scheduler.rounds import TIMER_MARGIN_S, Rounds, TaskRound
-from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec
 from zsched.core.values.messages import Utilities
 from zsched.core.values.model import (
     Allocation,
-    NodeKind,
     PeerState,
     Profile,
     Proposal,
-    Tuning,
     Utility,
     UtilityVector,
-    Weights,
     WorkerLoad,
     WorkerState,
 )
@@ -33,15 +31,10 @@ from zsched.core.vote.voting import vote_time
 
 T = TypeVar("T")
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
-TUNING = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0), time_to_trigger_s=2.0, cool_down_s=0.0)
-FLEET = Fleet(
-    name="test",
-    timing=Timing(),
-    nodes=tuple(
-        NodeSpec(name=name, kind=NodeKind.ROBOT if name in ROBOTS else NodeKind.EDGE)
-        for name in sorted((*ROBOTS, *EDGES))
-    ),
-    tasks=(TaskSpec(name="merge", candidates=EDGES, tuning=TUNING, worker=WorkerSpec(command=("merge",))),),
+TUNING = tuning_of(cpu=1.0, memory=0.0, time_to_trigger_s=2.0, cool_down_s=0.0)
+FLEET = fleet_of(
+    TaskSpec(name="merge", candidates=EDGES, tuning=TUNING, worker=WorkerSpec(command=("merge",))),
+    of=sorted((*ROBOTS, *EDGES)),
     electors=ROBOTS,
 )
 GATHER_S, STAGGER_S = FLEET.timing.gather_s, FLEET.timing.stagger_s

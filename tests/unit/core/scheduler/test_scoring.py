@@ -5,15 +5,14 @@ from dataclasses import replace
 
 import pytest
 
+from support.fleets import fleet_of
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts, compare, score
 from zsched.core.scheduler.utility import NEARLY_FULL, service_utility
 from zsched.core.values.fleet import (
     PATIENT_BONUS,
     Demand,
-    Fleet,
     LinkLimits,
-    NodeSpec,
     PairReading,
     Standby,
     TaskSpec,
@@ -24,7 +23,6 @@ from zsched.core.values.model import (
     Allocation,
     Link,
     LinkSource,
-    NodeKind,
     PeerState,
     Profile,
     ScoreForm,
@@ -90,13 +88,7 @@ def scored(
     doubts: Doubts = NO_DOUBTS,
 ) -> UtilityVector:
     names = sorted({*spec.candidates, voter, *(one.node for one in profiles)})
-    fleet = Fleet(
-        name="lab",
-        timing=Timing(),
-        nodes=tuple(NodeSpec(name=name, kind=NodeKind.EDGE) for name in names),
-        tasks=(spec,),
-        electors=(voter,),
-    )
+    fleet = fleet_of(spec, of=names, electors=(voter,))
     gateway = Gateway(fleet)
     for one in profiles:
         assert gateway.absorb(one, 0.0) is None

@@ -7,18 +7,16 @@ from dataclasses import dataclass
 
 import pytest
 
+from support.fleets import fleet_of, tuning_of
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.scoring import book, score
 from zsched.core.scheduler.turns import in_turn, who_moves_first
-from zsched.core.values.fleet import Demand, Fleet, NodeSpec, TaskSpec, Timing
+from zsched.core.values.fleet import Demand, TaskSpec
 from zsched.core.values.model import (
     Allocation,
-    NodeKind,
     PeerState,
     Profile,
-    Tuning,
     UtilityVector,
-    Weights,
     WorkerLoad,
     WorkerState,
 )
@@ -80,16 +78,10 @@ def test_a_move_keeps_its_turn_for_a_second_try_and_loses_it_then_or_when_it_has
 
 # --- bookings --------------------------------------------------------------------------------------------------------
 
-TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
+TUNING = tuning_of()
 DEMAND = Demand(cpu_cores=1.0, memory_mb=800.0)
 A, B = (TaskSpec(name=name, candidates=("edge1", "edge2"), tuning=TUNING, demand=DEMAND) for name in ("a", "b"))
-FLEET = Fleet(
-    name="two",
-    timing=Timing(),
-    nodes=(NodeSpec(name="edge1", kind=NodeKind.EDGE), NodeSpec(name="edge2", kind=NodeKind.EDGE)),
-    tasks=(A, B),
-    electors=("robot1",),
-)
+FLEET = fleet_of(A, B, of=("edge1", "edge2"), electors=("robot1",))
 ALIVE = dict.fromkeys(("edge1", "edge2"), PeerState.ALIVE)
 
 

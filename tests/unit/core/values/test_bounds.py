@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from support.fleets import tuning_of
 from zsched.core.events import RetryCommanded, WeightsCommanded, WorkerJobs, commanded
 from zsched.core.relay_protocol import EndMarker, SnapshotChunk, StreamAck, WorkerTrouble
 from zsched.core.values import model
@@ -37,16 +38,14 @@ from zsched.core.values.model import (
     Proposal,
     ScoreForm,
     TaskProgress,
-    Tuning,
     Utility,
     UtilityVector,
-    Weights,
     WorkerLoad,
     WorkerState,
 )
 from zsched.core.values.plan import ServiceSettings, StreamSettings
 
-TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0), score=ScoreForm.SERVICE)
+TUNING = tuning_of(score=ScoreForm.SERVICE)
 BALLOT = Ballot(counter=1, node="r1", incarnation=1)
 VALUE = Allocation(task="merge", revision=1, epoch=1, owner="e1", tuning=TUNING)
 ACCEPT = Accept(task="merge", acceptance=Acceptance(ballot=BALLOT, value=VALUE), electorate="x")

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 
+from support.fleets import tuning_of
 from zsched.core.values.fleet import (
     Demand,
     Fleet,
@@ -18,10 +19,10 @@ from zsched.core.values.fleet import (
     electorate_hash,
     fleet_hash,
 )
-from zsched.core.values.model import Aggregate, LinkSource, NodeKind, Tuning, Weights
+from zsched.core.values.model import Aggregate, LinkSource, NodeKind, Weights
 from zsched.core.values.plan import Direction
 
-TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
+TUNING = tuning_of()
 TASK = TaskSpec(
     name="merge",
     candidates=("edge1", "edge2"),

@@ -7,6 +7,7 @@ from dataclasses import FrozenInstanceError, fields, is_dataclass, replace
 
 import pytest
 
+from support.fleets import tuning_of
 from zsched.core.relay_protocol import EndMarker
 from zsched.core.values import messages
 from zsched.core.values.messages import (
@@ -20,9 +21,9 @@ from zsched.core.values.messages import (
     SetWeights,
     Utilities,
 )
-from zsched.core.values.model import NO_BALLOT, Acceptance, Allocation, Ballot, Tuning, Weights
+from zsched.core.values.model import NO_BALLOT, Acceptance, Allocation, Ballot
 
-TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
+TUNING = tuning_of()
 BALLOT = Ballot(counter=1, node="r1", incarnation=1)
 VALUE = Allocation(task="merge", revision=1, epoch=1, owner="e1", tuning=TUNING)
 ACCEPTANCE = Acceptance(ballot=BALLOT, value=VALUE)

@@ -8,9 +8,10 @@ from typing import TypeVar
 
 import pytest
 
+from support.fleets import fleet_of, tuning_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing
+from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.messages import (
     Accept,
     Accepted,
@@ -30,10 +31,7 @@ from zsched.core.values.model import (
     Ballot,
     Beat,
     DurableState,
-    NodeKind,
     RegisterState,
-    Tuning,
-    Weights,
 )
 from zsched.core.vote.agreement import (
     ASK_AT_ONCE_S,
@@ -48,14 +46,10 @@ from zsched.core.vote.register import MoveOwner
 
 T = TypeVar("T")
 ROBOTS = ("robot1", "robot2", "robot3")
-TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
-FLEET = Fleet(
-    name="test",
-    timing=Timing(),
-    nodes=tuple(
-        NodeSpec(name=name, kind=NodeKind.ROBOT if name in ROBOTS else NodeKind.EDGE) for name in ("edge1", *ROBOTS)
-    ),
-    tasks=tuple(TaskSpec(name=name, candidates=("edge1", "robot2"), tuning=TUNING) for name in ("merge", "plan")),
+TUNING = tuning_of()
+FLEET = fleet_of(
+    *(TaskSpec(name=name, candidates=("edge1", "robot2"), tuning=TUNING) for name in ("merge", "plan")),
+    of=("edge1", *ROBOTS),
     electors=ROBOTS,
 )
 

@@ -7,22 +7,17 @@ from random import Random
 
 import pytest
 
-from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing
+from support.fleets import fleet_of, tuning_of
+from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.messages import Learnt
-from zsched.core.values.model import Acceptance, Allocation, Ballot, NodeKind, RegisterState, Tuning, Weights
+from zsched.core.values.model import Acceptance, Allocation, Ballot, RegisterState
 from zsched.core.vote.belief import GENERATION_STEP, MAX_AHEAD, MAX_GENERATION, is_fit, is_proven
 from zsched.core.vote.register import MAX_REVISION, Register
 
-TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
+TUNING = tuning_of()
 TASK = TaskSpec(name="merge", candidates=("edge1", "robot2"), tuning=TUNING)
 NAMES = ("edge1", "robot1", "robot2")
-FLEET = Fleet(
-    name="test",
-    timing=Timing(),
-    nodes=tuple(NodeSpec(name=name, kind=NodeKind.EDGE if "edge" in name else NodeKind.ROBOT) for name in NAMES),
-    tasks=(TASK,),
-    electors=("robot1", "robot2"),
-)
+FLEET = fleet_of(TASK, of=NAMES, electors=("robot1", "robot2"))
 STRAY = MAX_AHEAD * 3
 
 

@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import pytest
 
+from support.fleets import fleet_of
 from support.registers import BLANK, ELECTORS, INITIAL, TUNING, accept, allocation, make, promise_all
-from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing
-from zsched.core.values.model import NodeKind, PeerState, Proposal
+from zsched.core.values.fleet import TaskSpec
+from zsched.core.values.model import PeerState, Proposal
 from zsched.core.vote.register import Change, MoveOwner, Register, Retune, RoundOutcome
 from zsched.core.vote.tally import VoteOutcome
 from zsched.core.vote.voting import Voting
@@ -18,13 +19,7 @@ TODAY = allocation(3)
 STAY = MoveOwner(base_revision=3, owner="e1", reason="test")
 SAME = Retune(base_revision=3, tuning=TUNING)
 ROBOTS = ("r1", "r2", "r3")
-FLEET = Fleet(
-    name="stays",
-    timing=Timing(),
-    nodes=tuple(NodeSpec(name=name, kind=NodeKind.ROBOT) for name in ROBOTS),
-    tasks=(TaskSpec(name="merge", candidates=("e1", "e2"), tuning=TUNING),),
-    electors=ROBOTS,
-)
+FLEET = fleet_of(TaskSpec(name="merge", candidates=("e1", "e2"), tuning=TUNING), of=ROBOTS, electors=ROBOTS)
 
 
 def agreed_on_today() -> list[Register]:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import pytest
 
+from support.fleets import fleet_of, tuning_of
 from zsched.core.scheduler.judge import INITIAL_SETTLE_S, Judge, Outcome
 from zsched.core.scheduler.scoring import Standing
-from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.values.model import Allocation, NodeKind, Tuning, Weights
+from zsched.core.values.fleet import TaskSpec, WorkerSpec
+from zsched.core.values.model import Allocation
 from zsched_lab.simulator import Simulator
 
-TUNING = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
+TUNING = tuning_of(cpu=1.0, memory=0.0)
 SPEC = TaskSpec(
     name="merge", candidates=("edge1", "edge2", "edge3"), tuning=TUNING, worker=WorkerSpec(command=("worker",))
 )
@@ -30,16 +31,7 @@ def test_a_called_robot_answers_during_its_own_wait(is_called: bool, outcome: Ou
 def test_a_robot_that_has_just_started_does_not_hold_up_a_vote_that_the_others_have_called() -> None:
     """Two robots of three and a candidate that never comes; one of the two is restarted during the wait."""
     robots, edges = ("robot1", "robot2", "robot3"), SPEC.candidates
-    fleet = Fleet(
-        name="first",
-        timing=Timing(),
-        nodes=tuple(
-            NodeSpec(name=name, kind=NodeKind.ROBOT if name in robots else NodeKind.EDGE)
-            for name in sorted((*robots, *edges))
-        ),
-        tasks=(SPEC,),
-        electors=robots,
-    )
+    fleet = fleet_of(SPEC, of=sorted((*robots, *edges)), electors=robots)
     sim = Simulator(fleet=fleet, seed=3)
     sim.start("robot1", "robot2", "edge1", "edge2")
     assert sim.run_until(lambda: sim.node("robot1").rounds.tasks["merge"].judge.seen_first_at is not None, 5.0)

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import pytest
 
-from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing
-from zsched.core.values.model import NO_BALLOT, Acceptance, Allocation, Ballot, NodeKind, RegisterState, Tuning, Weights
+from support.fleets import fleet_of, tuning_of
+from zsched.core.values.fleet import TaskSpec
+from zsched.core.values.model import NO_BALLOT, Acceptance, Allocation, Ballot, RegisterState
 from zsched.core.vote.belief import GENERATION_STEP
 from zsched.core.vote.generations import first_registers
 
-TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
-FLEET = Fleet(
-    name="test",
-    timing=Timing(),
-    nodes=(NodeSpec(name="robot1", kind=NodeKind.ROBOT),),
-    tasks=(
-        TaskSpec(name="guard", candidates=("robot1",), tuning=TUNING, exclusive=True),
-        TaskSpec(name="merge", candidates=("robot1",), tuning=TUNING),
-    ),
+TUNING = tuning_of()
+FLEET = fleet_of(
+    TaskSpec(name="guard", candidates=("robot1",), tuning=TUNING, exclusive=True),
+    TaskSpec(name="merge", candidates=("robot1",), tuning=TUNING),
+    of=("robot1",),
     electors=("robot1",),
 )
 

@@ -7,20 +7,15 @@ from dataclasses import replace
 
 import pytest
 
-from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, lease_terms
-from zsched.core.values.model import Allocation, Beat, Grant, NodeKind, Tuning, Weights
+from support.fleets import fleet_of, tuning_of
+from zsched.core.values.fleet import Fleet, TaskSpec, lease_terms
+from zsched.core.values.model import Allocation, Beat, Grant
 from zsched.core.vote.lease import HURRY_S, RHO, Granter, Leases, hold_s
 
 NAMES = ("r1", "r2", "r3")
-TUNING = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
+TUNING = tuning_of(cpu=1.0, memory=0.0)
 GUARD = TaskSpec(name="guard", candidates=NAMES, tuning=TUNING, exclusive=True)
-FLEET = Fleet(
-    name="rules",
-    timing=Timing(),
-    nodes=tuple(NodeSpec(name=name, kind=NodeKind.ROBOT) for name in NAMES),
-    tasks=(GUARD,),
-    electors=NAMES,
-)
+FLEET = fleet_of(GUARD, of=NAMES, electors=NAMES)
 OPEN = replace(FLEET, tasks=(replace(GUARD, exclusive=False),))
 L, HOLD_S = FLEET.timing.lease_s, hold_s(FLEET.timing.lease_s)
 ACCEPTED = {"guard": ("r2", 3)}

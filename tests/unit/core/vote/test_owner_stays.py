@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from support.fleets import tuning_of
 from zsched.core.executor.handover import Executor
 from zsched.core.instructions import ApplyRoutes, SetRole, StartWorker
 from zsched.core.values.fleet import OnIsolation, TaskSpec, WorkerSpec
-from zsched.core.values.model import Allocation, Tuning, Weights
+from zsched.core.values.model import Allocation
 from zsched.core.values.plan import Role, WorkerRole
 
-TUNING = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
+TUNING = tuning_of(cpu=1.0, memory=0.0)
 SPEC = TaskSpec(name="guard", candidates=("edge1", "edge2"), tuning=TUNING, worker=WorkerSpec(command=("work",)))
 FIRST = Allocation(task="guard", revision=1, epoch=1, owner="edge1", tuning=TUNING)
 

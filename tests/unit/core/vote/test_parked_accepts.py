@@ -6,10 +6,11 @@ from random import Random
 
 import pytest
 
+from support.fleets import fleet_of, tuning_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.node import Node
-from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing
+from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.messages import Accept, Accepted, Learnt, Refusal, Refused
 from zsched.core.values.model import (
     Acceptance,
@@ -17,24 +18,15 @@ from zsched.core.values.model import (
     Ballot,
     Beat,
     DurableState,
-    NodeKind,
     RegisterState,
-    Tuning,
-    Weights,
 )
 from zsched.core.vote.agreement import PARK_SHARE, Agreement, Effects
 from zsched.core.vote.lease import hold_s
 from zsched.core.vote.register import MoveOwner
 
 ROBOTS = ("robot1", "robot2", "robot3")
-TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0))
-FLEET = Fleet(
-    name="parks",
-    timing=Timing(),
-    nodes=tuple(NodeSpec(name=name, kind=NodeKind.ROBOT) for name in ROBOTS),
-    tasks=(TaskSpec(name="guard", candidates=ROBOTS, tuning=TUNING, exclusive=True),),
-    electors=ROBOTS,
-)
+TUNING = tuning_of()
+FLEET = fleet_of(TaskSpec(name="guard", candidates=ROBOTS, tuning=TUNING, exclusive=True), of=ROBOTS, electors=ROBOTS)
 HOLD_S = hold_s(FLEET.timing.lease_s)
 PARKED_S = PARK_SHARE * FLEET.timing.ballot_s
 
@@ -46,7 +38,7 @@ def value(revision: int, owner: str) -> Allocation:
 def disk() -> DurableState:
     """With robot2 as owner."""
     return DurableState(
-        fleet="parks",
+        fleet=FLEET.name,
         node="robot1",
         incarnation=7,
         generation=0,

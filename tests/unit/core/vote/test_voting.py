@@ -6,21 +6,16 @@ import math
 
 import pytest
 
-from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing
-from zsched.core.values.model import Allocation, NodeKind, PeerState, Proposal, Tuning, Weights
+from support.fleets import fleet_of, tuning_of
+from zsched.core.values.fleet import TaskSpec
+from zsched.core.values.model import Allocation, PeerState, Proposal
 from zsched.core.vote.tally import VoteOutcome
 from zsched.core.vote.voting import Voting, vote_time
 
 ROBOTS = ("robot1", "robot2", "robot3")
 ALL = dict.fromkeys(ROBOTS, PeerState.ALIVE)
-TUNING = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
-FLEET = Fleet(
-    name="votes",
-    timing=Timing(),
-    nodes=tuple(NodeSpec(name=name, kind=NodeKind.ROBOT) for name in ROBOTS),
-    tasks=(TaskSpec(name="merge", candidates=("edge1", "edge2"), tuning=TUNING),),
-    electors=ROBOTS,
-)
+TUNING = tuning_of(cpu=1.0, memory=0.0)
+FLEET = fleet_of(TaskSpec(name="merge", candidates=("edge1", "edge2"), tuning=TUNING), of=ROBOTS, electors=ROBOTS)
 VALUE = Allocation(task="merge", revision=5, epoch=5, owner="edge1", tuning=TUNING)
 VOTE_S = vote_time(FLEET.timing)
 

@@ -5,16 +5,17 @@ from pathlib import Path
 
 import pytest
 
+from support.fleets import tuning_of
 from zsched.core.scheduler import rounds
 from zsched.core.scheduler.damping import Damping
 from zsched.core.scheduler.judge import Judge, Judgement, Outcome
 from zsched.core.scheduler.scoring import Standing
 from zsched.core.values.fleet import TaskSpec
-from zsched.core.values.model import Allocation, Tuning, Weights
+from zsched.core.values.model import Allocation
 from zsched_lab.paper.ruled_daemon import install
 from zsched_lab.paper.rules import EVERY_S, RANDOM_PERIOD_S, JudgeMaker, Rule, RuleName, RulePlan, read_plan
 
-TUNING = Tuning(weights=Weights(cpu=0.5, memory=0.5, network=0.0), bonus=0.0, time_to_trigger_s=0.0, cool_down_s=0.0)
+TUNING = tuning_of(bonus=0.0, time_to_trigger_s=0.0, cool_down_s=0.0)
 SPEC = TaskSpec(name="merge", candidates=("e1", "e2", "e3"), tuning=TUNING)
 OWNED = Allocation(task="merge", revision=1, epoch=1, owner="e1", tuning=TUNING)
 VALUES = {"e1": 0.50, "e2": 0.52, "e3": 0.30}
