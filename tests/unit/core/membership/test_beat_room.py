@@ -6,11 +6,10 @@ from dataclasses import replace
 
 import pytest
 
-from support.fleets import fleet_of, tuning_of
 from zsched.config.load import check_bytes
 from zsched.core.membership.beat_room import FRAME_BYTES, MAX_BEAT_BYTES, BeatRoom, beat_bytes, most_bytes
-from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, WorkerSpec
-from zsched.core.values.model import MAX_COUNTER, Beat, Grant, NodeKind
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.model import MAX_COUNTER, Beat, Grant, NodeKind, Tuning, Weights
 from zsched.wire import codec as wire
 from zsched_lab.simulator import Simulator
 
@@ -163,9 +162,12 @@ def test_a_part_that_has_no_room_is_the_next_beat_s_first() -> None:
 
 
 def fleet(tasks: int, length: int) -> Fleet:
-    tuning = tuning_of(cpu=1.0, memory=0.0)
-    return fleet_of(
-        *(
+    tuning = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
+    return Fleet(
+        name="sim",
+        timing=Timing(),
+        nodes=tuple(NodeSpec(name=robot, kind=NodeKind.ROBOT) for robot in ROBOTS),
+        tasks=tuple(
             TaskSpec(
                 name=name(number, length),
                 candidates=ROBOTS,
@@ -175,7 +177,6 @@ def fleet(tasks: int, length: int) -> Fleet:
             )
             for number in range(tasks)
         ),
-        of=ROBOTS,
         electors=ROBOTS,
     )
 
