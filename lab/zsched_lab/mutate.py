@@ -116,7 +116,12 @@ def choose(seed: int, count: int, only: Sequence[str] = ()) -> list[Mutant]:
         count: how many (fewer when there are no more).
         only: modules ("core/vote/voting.py") or lines ("core/vote/voting.py:103"); none: the whole core.
     """
-    sources = {path: path.read_text(encoding="utf-8") for path in files_of(CORE)}
+    wanted = {one.partition(":")[0] for one in only}
+    sources = {
+        path: path.read_text(encoding="utf-8")
+        for path in files_of(CORE)
+        if not only or path.relative_to(CORE.parent).as_posix() in wanted
+    }
     found = [
         mutant
         for path, source in sources.items()

@@ -14,7 +14,7 @@ from zsched.wire import keyspace
 from zsched_lab.fuzz_keys import KeyFuzz, main
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(4))
 def test_no_hostile_key_token_number_or_marker_raises_or_ends_anything(seed: int) -> None:
     fuzz = KeyFuzz(seed)
     fuzz.run(500)

@@ -80,10 +80,14 @@ def _at(table: Array, step: int, column: int) -> float:
 
 
 @pytest.mark.parametrize(
-    ("tuning", "patience", "learns"),
-    [(TIMER, None, False), (PATIENT, PAPER_PATIENCE, False), (PATIENT, FIRST_PATIENCE, True)],
+    ("seed", "scatter", "tuning", "patience", "learns"),
+    [
+        (1, 0.0, TIMER, None, False),
+        (2, 0.03, PATIENT, PAPER_PATIENCE, False),
+        (1, 0.0, PATIENT, FIRST_PATIENCE, True),
+        (2, 0.03, PATIENT, FIRST_PATIENCE, True),
+    ],
 )
-@pytest.mark.parametrize(("seed", "scatter"), [(1, 0.0), (2, 0.03)])
 def test_the_replay_makes_the_moves_that_full_nodes_make(
     seed: int, scatter: float, tuning: Tuning, patience: float | None, *, learns: bool
 ) -> None:
