@@ -34,6 +34,7 @@ class Bug:
         return (self,) if self.also is None else (self, *self.also.parts)
 
 
+CHANGE, BEATS = "zsched.core.values.change", "zsched.core.beats"
 SEQUENCE, IDENTITY = "zsched.core.sequence", "zsched.core.membership.identity"
 REGISTER, LEASE, TENURE = "zsched.core.vote.register", "zsched.core.vote.lease", "zsched.core.executor.tenure"
 SEALING, WITNESS = "zsched.core.executor.sealing", "zsched.core.vote.witness"
@@ -105,13 +106,17 @@ REGISTER_BUGS = (
         seed=8008456,
     ),
     _bug(
-        "promise not persisted", REGISTER, "return Step(is_dirty=True), promise", "return Step(), promise", _SCHEDULES
+        "promise not persisted",
+        REGISTER,
+        "        todo.must_persist = True\n        return Promise(",
+        "        return Promise(",
+        _SCHEDULES,
     ),
     _bug(
         "acceptance not persisted",
         REGISTER,
-        "return Step(is_dirty=True), Accepted(",
-        "return Step(), Accepted(",
+        "        todo.must_persist = True\n        return Accepted(",
+        "        return Accepted(",
         _SCHEDULES,
     ),
     _bug(
@@ -159,7 +164,7 @@ REGISTER_BUGS = (
     ),
     _bug(
         "a retune raises the epoch",
-        REGISTER,
+        CHANGE,
         "return replace(read, revision=read.revision + 1, tuning=self.tuning)",
         "return replace(read, revision=read.revision + 1, epoch=read.epoch + 1, tuning=self.tuning)",
         _REGISTER,
@@ -193,8 +198,8 @@ REGISTER_BUGS = (
     _bug(
         "learnt value not persisted before routes",
         REGISTER,
-        "step.is_dirty, step.learnt = True, value",
-        "step.learnt = value",
+        "        todo.must_persist = True\n        todo.learnt",
+        "        todo.learnt",
         _REGISTER,
     ),
     _bug(
@@ -257,8 +262,8 @@ REGISTER_BUGS = (
     _bug(
         "batch in the wrong order",
         NODE,
-        "return (*first, *batch.send, *batch.apply)",
-        "return (*batch.send, *first, *batch.apply)",
+        "return (*first, *todo.send, *todo.apply)",
+        "return (*todo.send, *first, *todo.apply)",
         ("tests/unit/core/test_node_prefixes.py",),
     ),
 )
@@ -431,8 +436,8 @@ LEASE_BUGS = (
     _bug(
         "identity round ends the silence",
         AGREEMENT,
-        "if step.is_dirty and (known is None or accept.acceptance.value.revision > known.revision):",
-        "if step.is_dirty:",
+        "if has_accepted and (known is None or value.revision > known.revision):",
+        "if has_accepted:",
         (*_LEASE, "tests/unit/core/vote/test_parked_accepts.py"),
     ),
     _bug(
@@ -469,9 +474,9 @@ LEASE_BUGS = (
 MEMBERSHIP_BUGS = (
     _bug(
         "a beat does not tell that its elector has lost its state",
-        NODE,
-        "        if beat.has_lost_state:\n",
-        "        if beat.twins:\n",
+        BEATS,
+        "    if beat.has_lost_state:\n",
+        "    if beat.twins:\n",
         ("tests/sim/test_status_words.py", "tests/sim/test_restored_state.py"),
         seed=9000013,
     ),
@@ -563,12 +568,12 @@ MEMBERSHIP_BUGS = (
     ),
     _bug(
         "token resurrects a peer",
-        NODE,
-        '        self.counters["tokens_seen"] += 1\n',
-        '        self.counters["tokens_seen"] += 1\n'
-        "        if event.node in self.membership._peers:\n"
-        "            self.membership._change(event.node, PeerState.ALIVE, 'token', _now)\n"
-        "            self.membership._peers[event.node].beat_at = _now\n",
+        BEATS,
+        '    node.counters["tokens_seen"] += 1\n',
+        '    node.counters["tokens_seen"] += 1\n'
+        "    if event.node in node.membership._peers:\n"
+        "        node.membership._change(event.node, PeerState.ALIVE, 'token', now)\n"
+        "        node.membership._peers[event.node].beat_at = now\n",
         (*_MEMBERSHIP, "tests/unit/core/test_node.py"),
     ),
     _bug(
@@ -610,8 +615,8 @@ MEMBERSHIP_BUGS = (
     _bug(
         "restored state votes on",
         AGREEMENT,
-        "effects = self._lose(self.witness.on_answer(learnt))",
-        "effects = Effects()",
+        "self._lose(self.witness.on_answer(learnt), todo)",
+        "pass",
         _RESTORED,
         2,
     ),
@@ -729,7 +734,7 @@ VOTE_BUGS = (
         seed=44,
         also=_bug(
             "a move to the owner raises the epoch",
-            REGISTER,
+            CHANGE,
             "if self.owner == read.owner:",
             "if False:",
             _REGISTER,
@@ -818,15 +823,15 @@ HANDOVER_BUGS = (
     _bug(
         "epoch compared with >=",
         EXECUTOR,
-        "        if allocation.epoch == self.epoch:\n            return",
-        "        if self.epoch < 0:\n            return",
+        "        if allocation.epoch == self.epoch:\n            if",
+        "        if self.epoch < 0:\n            if",
         _EXECUTOR,
     ),
     _bug(
         "drain ends the gate too early",
         EXECUTOR,
-        "        if not self._old:\n            return self._go(Phase.SETTLED, RoutePhase.CLOSE, done)",
-        "        if True:\n            return self._go(Phase.SETTLED, RoutePhase.CLOSE, done)",
+        "        if not self._old:\n            self._go(Phase.SETTLED, RoutePhase.CLOSE, done, todo)",
+        "        if True:\n            self._go(Phase.SETTLED, RoutePhase.CLOSE, done, todo)",
         _EXECUTOR,
     ),
     _bug(
@@ -839,8 +844,8 @@ HANDOVER_BUGS = (
     _bug(
         "flips for another epoch's readiness",
         EXECUTOR,
-        "if epoch != self.epoch or self.phase is not Phase.PREPARING:",
-        "if self.phase is not Phase.PREPARING:",
+        "if epoch == self.epoch and self.phase is Phase.PREPARING:",
+        "if self.phase is Phase.PREPARING:",
         _EXECUTOR,
     ),
 )

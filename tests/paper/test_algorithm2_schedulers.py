@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from random import Random
 
 import pytest
 
+from support.robots import Decider
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.instructions import AskUtilities, Instruction, PublishProposal
 from zsched.core.scheduler.judge import Judge, Outcome
-from zsched.core.scheduler.rounds import Rounds
 from zsched.core.scheduler.scoring import compare, pick, score
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.messages import Utilities
@@ -85,7 +84,7 @@ def answer(robot: str, **utilities: float) -> Utilities:
     return Utilities(voter=robot, vectors=(row(robot, 4, **utilities),))
 
 
-def proposals(out: tuple[Instruction, ...]) -> list[Proposal]:
+def proposals(out: list[Instruction]) -> list[Proposal]:
     return [step.proposal for step in out if isinstance(step, PublishProposal)]
 
 
@@ -127,9 +126,9 @@ def test_utilities_under_other_weights_are_not_summed_up() -> None:
 # --- get U_r of the other robots -----------------------------------------------------------------------------------
 
 
-def opened(now: float = SETTLED_S) -> tuple[Rounds, int]:
+def opened(now: float = SETTLED_S) -> tuple[Decider, int]:
     """robot1 just asked the others; edge1 owns the task since long ago."""
-    rounds = Rounds(FLEET, "robot1", gateway_with(now, edge1=(0.9, 0.9), edge2=(0.1, 0.1)), Random(1), 0.0)
+    rounds = Decider(FLEET, "robot1", gateway_with(now, edge1=(0.9, 0.9), edge2=(0.1, 0.1)))
     (asked,) = rounds.tick({"merge": allocation()}, ALIVE, now)
     assert isinstance(asked, AskUtilities)
     return rounds, asked.gather
@@ -140,10 +139,10 @@ def test_the_scheduler_requests_the_utilities_of_the_other_robots() -> None:
     rounds, gather = opened()
     values = {"merge": allocation()}
 
-    assert rounds.absorb_utilities(gather, answer("robot2", edge1=0.1, edge2=0.9))
+    assert rounds.rounds.absorb_utilities(gather, answer("robot2", edge1=0.1, edge2=0.9))
     rounds.tick(values, ALIVE, SETTLED_S)
     assert rounds.tasks["merge"].judgement is None, "robot3 has not answered: nothing is decided on partial sums"
-    assert rounds.absorb_utilities(gather, answer("robot3", edge1=0.1, edge2=0.9))
+    assert rounds.rounds.absorb_utilities(gather, answer("robot3", edge1=0.1, edge2=0.9))
     rounds.tick(values, ALIVE, SETTLED_S)
     standing = rounds.tasks["merge"].standing
     assert standing is not None
@@ -153,7 +152,7 @@ def test_the_scheduler_requests_the_utilities_of_the_other_robots() -> None:
 def test_a_robot_that_does_not_answer_is_not_waited_for_longer_than_the_gather() -> None:
     """Reading of "for each r in R get U": what is missing at the deadline is counted as silent, and told."""
     rounds, gather = opened()
-    rounds.absorb_utilities(gather, answer("robot2", edge1=0.1, edge2=0.9))
+    rounds.rounds.absorb_utilities(gather, answer("robot2", edge1=0.1, edge2=0.9))
     rounds.tick({"merge": allocation()}, ALIVE, SETTLED_S + FLEET.timing.gather_s)
     task = rounds.tasks["merge"]
 
@@ -167,11 +166,11 @@ def test_an_answer_counts_once_and_only_for_the_one_who_gives_it() -> None:
     rounds, gather = opened()
     forged = Utilities(voter="robot2", vectors=(row("robot3", edge1=1.0),))
 
-    assert not rounds.absorb_utilities(gather, forged)
-    assert not rounds.absorb_utilities(gather + 1, answer("robot2", edge1=1.0))
-    assert not rounds.absorb_utilities(gather, answer("robot1", edge1=1.0))
-    assert rounds.absorb_utilities(gather, answer("robot2", edge1=1.0))
-    assert not rounds.absorb_utilities(gather, answer("robot2", edge1=1.0))
+    assert not rounds.rounds.absorb_utilities(gather, forged)
+    assert not rounds.rounds.absorb_utilities(gather + 1, answer("robot2", edge1=1.0))
+    assert not rounds.rounds.absorb_utilities(gather, answer("robot1", edge1=1.0))
+    assert rounds.rounds.absorb_utilities(gather, answer("robot2", edge1=1.0))
+    assert not rounds.rounds.absorb_utilities(gather, answer("robot2", edge1=1.0))
 
 
 # --- Compare_Utility -----------------------------------------------------------------------------------------------
@@ -286,7 +285,7 @@ def test_an_owner_that_is_gone_is_left_at_once() -> None:
 # --- the proposal --------------------------------------------------------------------------------------------------
 
 
-def lead_for(rounds: Rounds, seconds: float, *, heard: int = 3, start: float = SETTLED_S) -> list[Proposal]:
+def lead_for(rounds: Decider, seconds: float, *, heard: int = 3, start: float = SETTLED_S) -> list[Proposal]:
     """Gathers in which everybody heard prefers edge2."""
     made: list[Proposal] = []
     values, now = {"merge": allocation()}, start
@@ -296,15 +295,15 @@ def lead_for(rounds: Rounds, seconds: float, *, heard: int = 3, start: float = S
         for step in out:
             if isinstance(step, AskUtilities):
                 for robot in ROBOTS[1:heard]:
-                    rounds.absorb_utilities(step.gather, answer(robot, edge1=0.2, edge2=0.8))
+                    rounds.rounds.absorb_utilities(step.gather, answer(robot, edge1=0.2, edge2=0.8))
         made += proposals(rounds.tick(values, ALIVE, now))
         now += 0.05
     return made
 
 
-def robot1(seed: int = 1) -> Rounds:
+def robot1(seed: int = 1) -> Decider:
     gateway = gateway_with(edge1=(0.8, 0.8), edge2=(0.2, 0.2))
-    return Rounds(FLEET, "robot1", gateway, Random(seed), 0.0)
+    return Decider(FLEET, "robot1", gateway, seed)
 
 
 def test_the_scheduler_proposes_its_maximum_to_the_executors() -> None:

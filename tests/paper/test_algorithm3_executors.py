@@ -5,14 +5,15 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from random import Random
 
 from support.fleets import fleet_of, tuning_of
+from support.robots import Decider
+from support.todos import done
 from zsched.core.executor.handover import Executor, Phase
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.instructions import ApplyRoutes, AskUtilities, Instruction, PublishProposal, StartWorker, StopWorker
 from zsched.core.profile.profile import Profiler
-from zsched.core.scheduler.rounds import Rounds
+from zsched.core.values.change import MoveOwner, Retune
 from zsched.core.values.fleet import StreamRule, TaskSpec, WorkerSpec
 from zsched.core.values.model import (
     Allocation,
@@ -24,7 +25,6 @@ from zsched.core.values.model import (
     WorkerState,
 )
 from zsched.core.values.plan import Direction, RoutePhase, RoutePlan
-from zsched.core.vote.register import MoveOwner, Retune
 from zsched.core.vote.tally import Tally, VoteOutcome, tally
 
 ROBOTS = ("robot1", "robot2", "robot3")
@@ -113,8 +113,8 @@ def test_the_same_winner_as_the_current_allocation_moves_nothing() -> None:
 
     assert result.outcome is VoteOutcome.STAY, "nothing is committed"
     executor = make_executor()
-    assert plans(executor.execute(allocation("edge1", 1), 0.0))
-    assert executor.execute(allocation("edge1", 1), 1.0) == ()
+    assert plans(done(executor.execute, allocation("edge1", 1), 0.0))
+    assert done(executor.execute, allocation("edge1", 1), 1.0) == ()
 
 
 def test_new_weights_move_no_stream() -> None:
@@ -122,20 +122,20 @@ def test_new_weights_move_no_stream() -> None:
     tuned = Retune(base_revision=1, tuning=replace(TUNING, bonus=0.3)).apply(allocation("edge1", 1))
     moved = MoveOwner(base_revision=2, owner="edge2", reason="").apply(tuned)
     executor = make_executor()
-    executor.execute(allocation("edge1", 1), 0.0)
+    done(executor.execute, allocation("edge1", 1), 0.0)
 
     assert (tuned.revision, tuned.epoch) == (2, 1)
     assert (moved.revision, moved.epoch) == (3, 2)
-    assert executor.execute(tuned, 1.0) == ()
-    assert plans(executor.execute(moved, 2.0))
+    assert done(executor.execute, tuned, 1.0) == ()
+    assert plans(done(executor.execute, moved, 2.0))
 
 
 def test_an_older_allocation_that_comes_late_moves_nothing() -> None:
     """Reading: with lost and late messages only a newer epoch may remap."""
     executor = make_executor()
-    executor.execute(allocation("edge2", 5), 0.0)
+    done(executor.execute, allocation("edge2", 5), 0.0)
 
-    assert executor.execute(allocation("edge1", 4), 1.0) == ()
+    assert done(executor.execute, allocation("edge1", 4), 1.0) == ()
     assert executor.owner == "edge2"
 
 
@@ -150,15 +150,15 @@ def remapped(plan: RoutePlan) -> list[tuple[str, str]]:
 def test_offload_remaps_the_in_and_out_topics_of_the_task_to_the_selected_edge() -> None:
     """Alg. 3, Offload: do remapping[in][out] for the mapping key e*; applications keep their own topics."""
     executor = make_executor()
-    (first,) = plans(executor.execute(allocation("edge1", 1), 0.0))
+    (first,) = plans(done(executor.execute, allocation("edge1", 1), 0.0))
     assert remapped(first) == [
         ("robot1/map", "edge1/merge/robot1/map"),
         ("edge1/merge/1/global_map", "robot1/global_map"),
     ]
-    executor.on_ready(1)
-    executor.on_flipped(1, 0, 0.1)
+    done(executor.on_ready, 1)
+    done(executor.on_flipped, 1, 0, 0.1)
 
-    (second,) = plans(executor.execute(allocation("edge2", 2), 1.0))
+    (second,) = plans(done(executor.execute, allocation("edge2", 2), 1.0))
     assert remapped(second) == [
         ("robot1/map", "edge2/merge/robot1/map"),
         ("edge2/merge/2/global_map", "robot1/global_map"),
@@ -169,7 +169,7 @@ def test_every_robot_remaps_its_own_streams() -> None:
     """Sec. V, Executor: executors run on the robots; together they offload the data collectively to one edge."""
     targets = set()
     for robot in ROBOTS:
-        (plan,) = plans(make_executor(robot).execute(allocation("edge2", 1), 0.0))
+        (plan,) = plans(done(make_executor(robot).execute, allocation("edge2", 1), 0.0))
         mapped = remapped(plan)
         targets.add(mapped[0][1])
         assert mapped[1] == ("edge2/merge/1/global_map", f"{robot}/global_map")
@@ -180,17 +180,17 @@ def test_every_robot_remaps_its_own_streams() -> None:
 def test_the_old_edge_carries_the_streams_until_the_new_one_is_ready() -> None:
     """Sec. V, Topic Remappings: messages go on being exchanged; reading: make before break."""
     executor = make_executor()
-    executor.execute(allocation("edge1", 1), 0.0)
-    executor.on_ready(1)
-    executor.on_flipped(1, 0, 0.1)
-    (prepare,) = plans(executor.execute(allocation("edge2", 2), 1.0))
+    done(executor.execute, allocation("edge1", 1), 0.0)
+    done(executor.on_ready, 1)
+    done(executor.on_flipped, 1, 0, 0.1)
+    (prepare,) = plans(done(executor.execute, allocation("edge2", 2), 1.0))
     assert prepare.phase is RoutePhase.PREPARE
     assert [slot.owner for slot in prepare.predecessors] == ["edge1"]
 
-    (flip,) = plans(executor.on_ready(2))
+    (flip,) = plans(done(executor.on_ready, 2))
     assert flip.phase is RoutePhase.FLIP
-    executor.on_flipped(2, 1, 1.1)
-    (close,) = plans(executor.on_drained(1))
+    done(executor.on_flipped, 2, 1, 1.1)
+    (close,) = plans(done(executor.on_drained, 1))
     assert (close.phase, close.predecessors, executor.phase) == (RoutePhase.CLOSE, (), Phase.SETTLED)
 
 
@@ -199,10 +199,10 @@ def test_a_move_does_not_initialise_the_task_anew() -> None:
     edges = [make_executor(edge) for edge in SPEC.candidates]
 
     for executor in edges:
-        assert executor.start() == (StartWorker(task="merge"),)
-        executor.execute(allocation("edge1", 1), 0.0)
-        moved = executor.execute(allocation("edge2", 2), 5.0)
-        assert not any(isinstance(step, StopWorker) for step in (*moved, *executor.tick(60.0)))
+        assert done(executor.start) == (StartWorker(task="merge"),)
+        done(executor.execute, allocation("edge1", 1), 0.0)
+        moved = done(executor.execute, allocation("edge2", 2), 5.0)
+        assert not any(isinstance(step, StopWorker) for step in (*moved, *done(executor.tick, 60.0)))
 
 
 # --- the three algorithms together ---------------------------------------------------------------------------------
@@ -227,8 +227,7 @@ class Team:
         self.profilers = {name: Profiler(name, 1, self.fleet.timing) for name in ROBOTS}
         self.gateways = {name: Gateway(self.fleet) for name in ROBOTS}
         self.rounds = {
-            name: Rounds(self.fleet, name, gateway, Random(at), 0.0)
-            for at, (name, gateway) in enumerate(self.gateways.items())
+            name: Decider(self.fleet, name, gateway, at) for at, (name, gateway) in enumerate(self.gateways.items())
         }
         self.now = 0.0
         self.called_at = 0.0
@@ -252,12 +251,12 @@ class Team:
                 for gateway in self.gateways.values():
                     gateway.absorb(profile, self.now)
 
-    def _carry(self, asker: Rounds, out: tuple[Instruction, ...] | list[Instruction]) -> None:
+    def _carry(self, asker: Decider, out: list[Instruction]) -> None:
         for step in out:
             if isinstance(step, AskUtilities):
                 for rounds in self.rounds.values():
-                    answer = rounds.vectors({"merge": self.value}, self.states, self.now)
-                    asker.absorb_utilities(step.gather, answer)
+                    answer = rounds.rounds.vectors({"merge": self.value}, self.states, self.now)
+                    asker.rounds.absorb_utilities(step.gather, answer)
             elif isinstance(step, PublishProposal):
                 self.papers.append(step.proposal)
                 for name, rounds in self.rounds.items():
@@ -268,8 +267,8 @@ class Team:
     def _commit(self) -> None:
         """Stands for the register: the first change based on the current revision is chosen, the others fail."""
         for rounds in self.rounds.values():
-            for _, change in rounds.due_commits(self.now):
-                rounds.on_commit_ended("merge")
+            for _, change in rounds.votes.due_commits(self.now):
+                rounds.votes.on_commit_ended("merge")
                 if change.base_revision == self.value.revision:
                     self.value = change.apply(self.value)
                     self.moves.append((self.now, change.owner))
@@ -314,7 +313,7 @@ def test_the_owner_s_death_moves_the_task_without_waiting_for_the_timers() -> No
     team.states["robot2"] = PeerState.GONE
     del team.rounds["robot2"]
     for rounds in team.rounds.values():
-        rounds.hurry(team.now)
+        rounds.rounds.hurry(team.now)
     team.run(1.0)
 
     ((at, owner),) = team.moves

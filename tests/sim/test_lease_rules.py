@@ -8,6 +8,8 @@ from dataclasses import replace
 import pytest
 
 from support.fleets import fleet_of, tuning_of
+from support.todos import done, todo_of
+from zsched.core import instructions as do
 from zsched.core.executor.handover import Executor
 from zsched.core.executor.tenure import Tenure
 from zsched.core.instructions import SetRole
@@ -357,21 +359,27 @@ def worked(tenure: Tenure, number: int, now: float) -> None:
     tenure.leases.on_sent(number, now)
     for elector in ("r1", "r2"):
         tenure.leases.on_beat(echo(elector, number), {}, now)
-    roles, _ = tenure.tend_leases(number, now)
+    roles, _ = tended(tenure, number, now)
     assert [one.role.role for one in roles if isinstance(one, SetRole)] == [WorkerRole.ACTIVE]
 
 
 def asked(tenure: Tenure, number: int, now: float) -> None:
     """An elector asks the owner to leave, and its worker is told to stop."""
     tenure.leases.on_beat(ask(), {}, now)
-    roles, has_released = tenure.tend_leases(number, now)
+    roles, has_released = tended(tenure, number, now)
     assert [one.role.role for one in roles if isinstance(one, SetRole)] == [WorkerRole.IDLE]
     assert not has_released
 
 
+def tended(tenure: Tenure, number: int, now: float) -> tuple[list[do.Instruction], bool]:
+    """(what to do, whether something was given back)."""
+    todo = todo_of(tenure.tend_leases, number, now)
+    return todo.apply + todo.send, todo.must_beat
+
+
 def tenured() -> Tenure:
     executor = Executor(spec=GUARD, me="r1", has_streams=True)
-    executor.execute(Allocation(task="guard", revision=7, epoch=3, owner="r1", tuning=GUARD.tuning), 10.0)
+    done(executor.execute, Allocation(task="guard", revision=7, epoch=3, owner="r1", tuning=GUARD.tuning), 10.0)
     return Tenure(fleet=FLEET, me="r1", leases=leases(), executors={"guard": executor})
 
 
@@ -380,19 +388,19 @@ def test_the_late_word_of_an_earlier_stop_does_not_give_back_the_lease_that_came
     tenure = tenured()
     worked(tenure, 6, 10.0)
     asked(tenure, 6, 10.1)
-    assert tenure.tend_leases(6, 11.0) == ((), True), "the lease is over, whatever the worker says"
+    assert tended(tenure, 6, 11.0) == ([], True), "the lease is over, whatever the worker says"
     worked(tenure, 7, 12.0)
     asked(tenure, 7, 12.1)
     assert not tenure.leases.on_stopped("guard", 3, 7), "this may be the first stop's word"
     assert tenure.leases.given_until("guard") == 13.0
-    assert tenure.tend_leases(7, 12.99) == ((), False)
-    assert tenure.tend_leases(7, 13.0) == ((), True)
+    assert tended(tenure, 7, 12.99) == ([], False)
+    assert tended(tenure, 7, 13.0) == ([], True)
 
 
 def test_the_word_of_a_stop_before_the_first_lease_is_not_taken_for_a_later_one_s() -> None:
     tenure = tenured()
     tenure.leases.on_beat(ask(), {}, 10.1)
-    assert tenure.tend_leases(5, 10.1)[1], "nothing was given yet"
+    assert tended(tenure, 5, 10.1)[1], "nothing was given yet"
     worked(tenure, 6, 12.0)
     asked(tenure, 6, 12.1)
     assert not tenure.leases.on_stopped("guard", 3, 6)
@@ -404,7 +412,7 @@ def test_the_word_of_a_process_that_is_dead_does_not_speak_for_the_next_one() ->
     tenure.leases.on_worker_lost("guard")
     asked(tenure, 6, 10.3)
     assert not tenure.leases.on_stopped("guard", 3, 6)
-    assert tenure.tend_leases(6, 11.0) == ((), True)
+    assert tended(tenure, 6, 11.0) == ([], True)
 
 
 def test_stops_that_are_told_in_time_are_believed_again_and_again() -> None:
@@ -419,20 +427,20 @@ def test_an_owner_that_is_asked_again_gives_back_at_once_when_its_worker_has_sto
     """Found by the simulator (seed 60191): it waited for a second stop, and echoes prolonged the wait for ever."""
     held = leases()
     executor = Executor(spec=GUARD, me="r1", has_streams=True)
-    executor.execute(Allocation(task="guard", revision=7, epoch=3, owner="r1", tuning=GUARD.tuning), 10.0)
+    done(executor.execute, Allocation(task="guard", revision=7, epoch=3, owner="r1", tuning=GUARD.tuning), 10.0)
     tenure = Tenure(fleet=FLEET, me="r1", leases=held, executors={"guard": executor})
     for elector in ("r1", "r2"):
         held.on_beat(echo(elector, 5), {}, 10.01)
-    roles, _ = tenure.tend_leases(5, 10.01)
+    roles, _ = tended(tenure, 5, 10.01)
     assert [one.role.role for one in roles if isinstance(one, SetRole)] == [WorkerRole.ACTIVE]
     held.on_beat(ask(), {}, 10.02)
-    _, has_released = tenure.tend_leases(5, 10.02)
+    _, has_released = tended(tenure, 5, 10.02)
     assert not has_released, "the worker is still at it"
     assert held.on_stopped("guard", 3, 5)
     held.on_sent(6, 10.03)
     for elector in ("r1", "r2"):
         held.on_beat(echo(elector, 6), {}, 10.04)
     held.on_beat(ask(), {}, 10.04)
-    roles, has_released = tenure.tend_leases(6, 10.04)
+    roles, has_released = tended(tenure, 6, 10.04)
     assert has_released
-    assert roles == ()
+    assert roles == []

@@ -8,7 +8,10 @@ from random import Random
 import pytest
 
 from support.fleets import fleet_of, tuning_of
+from support.registers import Step, did
+from support.todos import agreed
 from zsched.core.events import AcceptAsked, PrepareAsked
+from zsched.core.values.change import MoveOwner
 from zsched.core.values.fleet import TaskSpec, WorkerSpec, electorate_hash
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise
 from zsched.core.values.model import (
@@ -19,7 +22,7 @@ from zsched.core.values.model import (
     RegisterState,
 )
 from zsched.core.vote.agreement import Agreement
-from zsched.core.vote.register import MoveOwner, Register, Step
+from zsched.core.vote.register import Register
 
 ELECTORS = ("r1", "r2", "r3")
 INITIAL = Allocation(task="merge", revision=0, epoch=0, owner=None, tuning=tuning_of(cpu=1.0, memory=0.0))
@@ -41,7 +44,7 @@ def proposer(incarnation: int = 4) -> Register:
 
 
 def proposed(register: Register, now: float = 0.0) -> Ballot:
-    step = register.propose(MoveOwner(base_revision=0, owner="e1", reason="test"), now)
+    step = did(register.propose, MoveOwner(base_revision=0, owner="e1", reason="test"), now)
     assert step.prepare is not None
     return step.prepare.ballot
 
@@ -53,13 +56,13 @@ def promise(elector: str, ballot: Ballot, accepted: Acceptance | None = None) ->
 def test_an_elector_s_promise_and_acceptance_count_once_however_often_they_come() -> None:
     register = proposer()
     ballot = proposed(register)
-    assert register.on_answer(promise("r1", ballot), 0.01) == Step()
-    assert register.on_answer(promise("r1", ballot), 0.02) == Step()
-    assert register.on_answer(promise("r2", ballot), 0.03).accept is not None
+    assert did(register.on_answer, promise("r1", ballot), 0.01) == Step()
+    assert did(register.on_answer, promise("r1", ballot), 0.02) == Step()
+    assert did(register.on_answer, promise("r2", ballot), 0.03).accept is not None
     yes = Accepted(elector="r1", task="merge", ballot=ballot)
-    assert register.on_answer(yes, 0.04) == Step()
-    assert register.on_answer(yes, 0.05) == Step()
-    assert register.on_answer(Accepted(elector="r2", task="merge", ballot=ballot), 0.06).learnt is not None
+    assert did(register.on_answer, yes, 0.04) == Step()
+    assert did(register.on_answer, yes, 0.05) == Step()
+    assert did(register.on_answer, Accepted(elector="r2", task="merge", ballot=ballot), 0.06).learnt is not None
 
 
 def test_promises_and_acceptances_of_an_earlier_attempt_count_nothing() -> None:
@@ -68,16 +71,16 @@ def test_promises_and_acceptances_of_an_earlier_attempt_count_nothing() -> None:
     now, step = 0.0, Step()
     while step.prepare is None:
         now = max(register.next_deadline(), now + 0.001)
-        step = register.tick(now)
+        step = did(register.tick, now)
     second = step.prepare.ballot
     assert second > first
     for elector in ELECTORS:
-        assert register.on_answer(promise(elector, first), now) == Step()
+        assert did(register.on_answer, promise(elector, first), now) == Step()
     for elector in ELECTORS[:2]:
-        step = register.on_answer(promise(elector, second), now)
+        step = did(register.on_answer, promise(elector, second), now)
     assert step.accept is not None
     for elector in ELECTORS:
-        assert register.on_answer(Accepted(elector=elector, task="merge", ballot=first), now) == Step()
+        assert did(register.on_answer, Accepted(elector=elector, task="merge", ballot=first), now) == Step()
     assert register.value == INITIAL
 
 
@@ -96,8 +99,8 @@ def test_newer_among_accepted_values_is_the_higher_ballot_not_the_higher_revisio
         ballot=Ballot(counter=1, node="r3", incarnation=1),
         value=Allocation(task="merge", revision=1, epoch=1, owner="e3", tuning=INITIAL.tuning),
     )
-    register.on_answer(promise("r2", ballot, older), 0.01)
-    step = register.on_answer(promise("r3", ballot, newer), 0.02)
+    did(register.on_answer, promise("r2", ballot, older), 0.01)
+    step = did(register.on_answer, promise("r3", ballot, newer), 0.02)
     assert step.accept is not None
     assert step.accept.acceptance.value == newer.value
 
@@ -115,8 +118,8 @@ def test_a_ballot_that_is_not_its_asker_s_or_a_stranger_s_gets_no_answer(node: s
     prepare = Prepare(task="merge", ballot=ballot, electorate=electorate)
     value = replace(INITIAL, revision=1, epoch=1, owner="r2")
     accept = Accept(task="merge", acceptance=Acceptance(ballot=ballot, value=value), electorate=electorate)
-    assert not elector.on_prepare(PrepareAsked(request=1, asker=asker, prepare=prepare), 1.0).send
-    assert not elector.on_accept(AcceptAsked(request=2, asker=asker, accept=accept), 1.0).send
+    assert not agreed(elector.on_prepare, PrepareAsked(request=1, asker=asker, prepare=prepare), 1.0).send
+    assert not agreed(elector.on_accept, AcceptAsked(request=2, asker=asker, accept=accept), 1.0).send
     assert elector.counters == {"prepare_foreign": 1, "accept_foreign": 1}
     own = replace(prepare, ballot=replace(ballot, node="r2"))
-    assert elector.on_prepare(PrepareAsked(request=3, asker="r2", prepare=own), 1.0).send, "its own one does"
+    assert agreed(elector.on_prepare, PrepareAsked(request=3, asker="r2", prepare=own), 1.0).send, "its own one does"

@@ -10,6 +10,8 @@ from random import Random
 import pytest
 
 from zsched.core.membership.beat_room import MAX_BEAT_BYTES, most_bytes
+from zsched.core.todo import ToDo
+from zsched.core.values.messages import Prepare, Promise, Refused
 from zsched.core.vote.register import Register
 from zsched.errors import InvariantError
 from zsched_lab import simulate
@@ -122,10 +124,8 @@ def forgetful(monkeypatch: pytest.MonkeyPatch) -> None:
     """Electors that answer before their promise is on disk."""
     original = Register.on_prepare
 
-    def on_prepare(self: Register, prepare: object) -> object:
-        step, answer = original(self, prepare)  # type: ignore[arg-type]
-        step.is_dirty = False
-        return step, answer
+    def on_prepare(self: Register, prepare: Prepare, _todo: ToDo) -> Promise | Refused:
+        return original(self, prepare, ToDo())
 
     monkeypatch.setattr(Register, "on_prepare", on_prepare)
 

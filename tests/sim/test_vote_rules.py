@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from random import Random
-
 import pytest
 
 from support.fleets import tuning_of
+from support.robots import Decider
 from zsched.core import events as ev
 from zsched.core.gateway.gateway import Gateway
-from zsched.core.scheduler.rounds import Rounds
 from zsched.core.values.fleet import Fleet, NodeSpec, Reach, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.model import Allocation, NodeKind, PeerState, Proposal
 from zsched.core.vote.tally import VoteOutcome, tally
@@ -46,13 +44,13 @@ def test_an_escape_needs_a_majority_of_the_robots_that_are_not_gone(
 @pytest.mark.parametrize(("mine", "commits"), [("edge1", 0), ("edge2", 1)])
 def test_only_a_robot_that_voted_for_the_winner_commits_it(mine: str, commits: int) -> None:
     fleet = next(one.fleet for one in map(plan, range(1000)) if one.fleet.voters == VOTERS)
-    rounds = Rounds(fleet, "robot1", Gateway(fleet), Random(1), 0.0)
+    robot = Decider(fleet, "robot1", Gateway(fleet))
     spec = fleet.task("merge")
     value = Allocation(task="merge", revision=3, epoch=3, owner="edge1", tuning=spec.tuning)
     states = dict.fromkeys((node.name for node in fleet.nodes), PeerState.ALIVE)
     for voter, candidate in (("robot1", mine), ("robot2", "edge2"), ("robot3", "edge2")):
-        rounds.absorb_proposal(proposal(voter, candidate), value, states, 1.0)
-    assert len(rounds.due_commits(5.0)) == commits
+        robot.absorb_proposal(proposal(voter, candidate), value, states, 1.0)
+    assert len(robot.votes.due_commits(5.0)) == commits
 
 
 def reaching_all(robots: int) -> Simulator:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import replace
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 from random import Random
+from typing import Any
 
 from support.fleets import tuning_of
-from zsched.core.values.messages import Accept, Prepare
+from zsched.core.instructions import SendAccept, SendPrepare
+from zsched.core.todo import ToDo
+from zsched.core.values.change import Change, MoveOwner, RoundOutcome
+from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refused
 from zsched.core.values.model import Acceptance, Allocation, Ballot, RegisterState
-from zsched.core.vote.register import MoveOwner, Register, Step
+from zsched.core.vote.register import Register
 
 ELECTORS = ("r1", "r2", "r3")
 TUNING = tuning_of()
@@ -64,21 +68,79 @@ def accept(counter: int, value: Allocation, node: str = "r9", electorate: str = 
     return Accept(task="merge", acceptance=Acceptance(ballot=ballot(counter, node), value=value), electorate=electorate)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Step:
+    """What one call into a register has left to do."""
+
+    is_dirty: bool = False
+    prepare: Prepare | None = None
+    accept: Accept | None = None
+    learnt: Allocation | None = None
+    reason: str = ""
+    """Why what was learnt is what it is."""
+    ends: tuple[tuple[Change, RoundOutcome], ...] = ()
+    problem: str = ""
+
+    @property
+    def finished(self) -> tuple[Change, RoundOutcome] | None:
+        """The first change that has ended."""
+        return self.ends[0] if self.ends else None
+
+
+def _step(register: Register, problem: str, todo: ToDo) -> Step:
+    prepares = [one.prepare for one in todo.send if isinstance(one, SendPrepare)]
+    accepts = [one.accept for one in todo.send if isinstance(one, SendAccept)]
+    assert len(todo.send) == len(prepares) + len(accepts) <= 1, "a register has one round at a time"
+    assert len(todo.learnt) <= 1
+    learnt, reason = todo.learnt[0] if todo.learnt else (None, "")
+    return Step(
+        is_dirty=todo.must_persist,
+        prepare=prepares[0] if prepares else None,
+        accept=accepts[0] if accepts else None,
+        learnt=learnt,
+        reason=reason,
+        ends=tuple((one.change, one.outcome) for one in todo.ended),
+        problem=register.problem if register.problem != problem else "",
+    )
+
+
+def did(call: Callable[..., None], *args: Any) -> Step:
+    """One call of a register's method whose last argument is the time."""
+    register: Register = call.__self__  # type: ignore[attr-defined] # a bound method
+    todo, problem = ToDo(), register.problem
+    call(*args[:-1], todo, args[-1])
+    return _step(register, problem, todo)
+
+
+def promised(register: Register, prepare: Prepare) -> tuple[Step, Promise | Refused]:
+    """What an elector makes of a prepare, and its answer."""
+    todo = ToDo()
+    answer = register.on_prepare(prepare, todo)
+    return _step(register, register.problem, todo), answer
+
+
+def accepted(register: Register, accept: Accept, now: float) -> tuple[Step, Accepted | Refused]:
+    """What an elector makes of an accept, and its answer."""
+    todo = ToDo()
+    answer = register.on_accept(accept, todo, now)
+    return _step(register, register.problem, todo), answer
+
+
 def promise_all(proposer: Register, asked: Step, acceptors: Iterable[Register], now: float = 0.0) -> Step:
     """Hand a prepare to acceptors and their answers back; the last step that wants something."""
     assert asked.prepare is not None
-    return last(proposer.on_answer(acceptor.on_prepare(asked.prepare)[1], now) for acceptor in acceptors)
+    return last(did(proposer.on_answer, promised(acceptor, asked.prepare)[1], now) for acceptor in acceptors)
 
 
 def accept_all(proposer: Register, asked: Step, acceptors: Iterable[Register], now: float = 0.0) -> Step:
     """Hand an accept to acceptors and their answers back; the last step that wants something."""
     assert asked.accept is not None
-    return last(proposer.on_answer(acceptor.on_accept(asked.accept, now)[1], now) for acceptor in acceptors)
+    return last(did(proposer.on_answer, accepted(acceptor, asked.accept, now)[1], now) for acceptor in acceptors)
 
 
 def last(steps: Iterable[Step]) -> Step:
     """The last step that is not empty (every one is taken, as the daemon would)."""
-    wanted = [step for step in steps if step != Step()]
+    wanted = [one for one in steps if one != Step()]
     return wanted[-1] if wanted else Step()
 
 

@@ -6,31 +6,21 @@ Knows: which figure stands where. Does not know: how it is shown.
 from __future__ import annotations
 
 import math
-from collections import Counter, deque
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import Protocol
+from dataclasses import replace
 
 from zsched.core.events import SlotReady
 from zsched.core.executor.handover import Executor, Phase
-from zsched.core.executor.sealing import Sealing
-from zsched.core.gateway.gateway import Gateway
-from zsched.core.gateway.round_trips import RoundTrips
-from zsched.core.membership.knocking import Knocking
-from zsched.core.membership.namesakes import Namesakes
-from zsched.core.membership.peers import Membership
-from zsched.core.profile.relay_ends import RelayEnds
-from zsched.core.scheduler.rounds import Rounds, TaskRound
+from zsched.core.scheduler.rounds import TaskRound
 from zsched.core.scheduler.scoring import joined
-from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec
+from zsched.core.stages import Stages
+from zsched.core.values.fleet import NodeSpec, TaskSpec
 from zsched.core.values.model import (
     NEVER_INITIALISED,
     RESTARTING,
     Allocation,
     NodeId,
-    NodeKind,
     PeerState,
-    TaskId,
     WorkerLoad,
     WorkerState,
     told_of_worker,
@@ -47,9 +37,8 @@ from zsched.core.values.snapshot import (
     TaskStatus,
     VoteStatus,
 )
-from zsched.core.vote.agreement import Agreement
 from zsched.core.vote.generations import way_out
-from zsched.core.vote.register import Register
+from zsched.core.vote.voting import Voting
 
 STARTED_BEFORE = (
     "who starts it (the task has no `command`) must start it again if it ran before this robot was in the fleet file "
@@ -59,54 +48,7 @@ UNREADY_SHOWN_S = 2.0
 """A handover takes less; a slot that nobody takes for longer is a problem."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PastValue:
-    """A learnt value, when this node learnt it and why it came about."""
-
-    value: Allocation
-    at: float
-    reason: str
-
-
-class NodeView(Protocol):
-    """What status reads of a node (`zsched.core.node.Node` is one)."""
-
-    fleet: Fleet
-    me: NodeId
-    version: str
-    fleet_file: str
-    fleet_path: str
-    kind: NodeKind
-    incarnation: int
-    started_at: float
-    has_state: bool
-    has_foreign_state: bool
-    lacks_state_file: bool
-    """There is none at all, rather than one that cannot be used."""
-    stateless: set[NodeId]
-    unready: dict[TaskId, tuple[int, float]]
-    lacks: dict[TaskId, SlotReady]
-    agreement: Agreement
-    loop_lag_s: float
-    counters: Counter[str]
-    problems: dict[str, str]
-    membership: Membership
-    gateway: Gateway
-    rounds: Rounds
-    round_trips: RoundTrips
-    registers: dict[TaskId, Register]
-    executors: dict[TaskId, Executor]
-    sealing: Sealing
-    namesakes: Namesakes
-    knocking: Knocking
-    stream_counts: tuple[StreamCount, ...]
-    dropped: dict[str, tuple[int, float]]
-    relay_ends: RelayEnds
-    joins_at: tuple[str, ...]
-    history: dict[TaskId, deque[PastValue]]
-
-
-def build_snapshot(node: NodeView, now: float) -> Snapshot:
+def build_snapshot(node: Stages, now: float) -> Snapshot:
     """The whole status of ``node`` at ``now`` (monotonic seconds)."""
     quorum = _quorum(node)
     return Snapshot(
@@ -133,7 +75,7 @@ def build_snapshot(node: NodeView, now: float) -> Snapshot:
     )
 
 
-def _problems(node: NodeView, quorum: QuorumStatus) -> tuple[str, ...]:
+def _problems(node: Stages, quorum: QuorumStatus) -> tuple[str, ...]:
     if _is_never_initialised(node, quorum):
         others = {source: text for source, text in node.problems.items() if source != "state"}
         names = ", ".join(quorum.stateless)
@@ -178,7 +120,7 @@ def _problems(node: NodeView, quorum: QuorumStatus) -> tuple[str, ...]:
     return tuple(problems)
 
 
-def _is_never_initialised(node: NodeView, quorum: QuorumStatus) -> bool:
+def _is_never_initialised(node: Stages, quorum: QuorumStatus) -> bool:
     """Whether too many electors have no state, none is known to have one, and nobody remembers that one ever had."""
     agreement, electors = node.agreement, node.fleet.electors
     if node.me in electors and not node.lacks_state_file:
@@ -189,7 +131,7 @@ def _is_never_initialised(node: NodeView, quorum: QuorumStatus) -> bool:
     return quorum.alive == 0 and quorum.electors - len(quorum.stateless) < quorum.needed
 
 
-def _relay_problems(node: NodeView, now: float) -> Iterator[str]:
+def _relay_problems(node: Stages, now: float) -> Iterator[str]:
     """Relays that do not stay: their robots' streams pause each time, whatever the tasks look like from here."""
     for name in node.membership.states():
         told = _relay_told(node, name, now)
@@ -197,23 +139,23 @@ def _relay_problems(node: NodeView, now: float) -> Iterator[str]:
             yield f"the relay of {name} {told}; its streams rest meanwhile: look at the log of zsched on {name}"
 
 
-def _relay_told(node: NodeView, name: NodeId, now: float) -> str:
+def _relay_told(node: Stages, name: NodeId, now: float) -> str:
     if name == node.me:
         return node.relay_ends.told(now)
     data = node.gateway.newest(name, now)
     return "" if data is None or node.membership.state(name) is not PeerState.ALIVE else data.profile.relay
 
 
-def _has_lost_state(node: NodeView, name: NodeId) -> bool:
+def _has_lost_state(node: Stages, name: NodeId) -> bool:
     return not node.agreement.is_elector if name == node.me else name in node.stateless
 
 
-def _can_answer(node: NodeView, name: NodeId) -> bool:
+def _can_answer(node: Stages, name: NodeId) -> bool:
     is_there = node.membership.state(name) is PeerState.ALIVE and name not in node.agreement.apart
     return is_there and not _has_lost_state(node, name)
 
 
-def _quorum(node: NodeView) -> QuorumStatus:
+def _quorum(node: Stages) -> QuorumStatus:
     electors = node.fleet.electors
     stateless = [name for name in electors if _has_lost_state(node, name)]
     alive = [name for name in electors if _can_answer(node, name)]
@@ -232,7 +174,7 @@ def _quorum(node: NodeView) -> QuorumStatus:
     )
 
 
-def _node_status(node: NodeView, spec: NodeSpec, now: float) -> NodeStatus:
+def _node_status(node: Stages, spec: NodeSpec, now: float) -> NodeStatus:
     state = node.membership.state(spec.name)
     incarnation = node.incarnation if spec.name == node.me else node.membership.incarnation(spec.name)
     data = node.gateway.newest(spec.name, now)
@@ -260,7 +202,7 @@ def _node_status(node: NodeView, spec: NodeSpec, now: float) -> NodeStatus:
     )
 
 
-def _task_status(node: NodeView, spec: TaskSpec, now: float) -> TaskStatus:
+def _task_status(node: Stages, spec: TaskSpec, now: float) -> TaskStatus:
     value = node.registers[spec.name].value
     executor, standing = node.executors[spec.name], node.rounds.tasks[spec.name]
     owner_state = "none" if value.owner is None else node.membership.state(value.owner).value
@@ -279,7 +221,7 @@ def _task_status(node: NodeView, spec: TaskSpec, now: float) -> TaskStatus:
         patience=standing.judge.patience,
         round_trips=_round_trips(node, spec) if value.tuning.deadline_ms is not None else (),
         decision=_decision(standing, now),
-        vote=_vote(standing, now),
+        vote=_vote(node.votes.tasks[spec.name], now),
         problems=tuple(_task_problems(node, spec, value, now)),
         streams=tuple(
             _with_keys(_with_age(count, node.dropped, now), routes.get(count.stream))
@@ -299,13 +241,13 @@ def _task_status(node: NodeView, spec: TaskSpec, now: float) -> TaskStatus:
     )
 
 
-def _round_trips(node: NodeView, spec: TaskSpec) -> tuple[tuple[NodeId, float], ...]:
+def _round_trips(node: Stages, spec: TaskSpec) -> tuple[tuple[NodeId, float], ...]:
     return tuple(
         (name, round_trip_s) for name, round_trip_s in node.round_trips.seconds().items() if name in spec.candidates
     )
 
 
-def _task_problems(node: NodeView, task: TaskSpec, value: Allocation, now: float) -> Iterator[str]:
+def _task_problems(node: Stages, task: TaskSpec, value: Allocation, now: float) -> Iterator[str]:
     executor, owner = node.executors[task.name], value.owner
     if differs := node.sealing.problem(task, value):
         yield differs
@@ -339,7 +281,7 @@ def _is_in_the_way(task: TaskSpec, load: WorkerLoad) -> bool:
     return is_missed or (load.state is not WorkerState.READY and load.reason.startswith(RESTARTING))
 
 
-def _unready_since(node: NodeView, executor: Executor) -> float:
+def _unready_since(node: Stages, executor: Executor) -> float:
     """Since when our relay has not seen that the newest slot is taken; infinity when it does."""
     if executor.phase is Phase.PREPARING:
         return executor.started_at
@@ -394,8 +336,7 @@ def _decision(standing: TaskRound, now: float) -> DecisionStatus | None:
     )
 
 
-def _vote(standing: TaskRound, now: float) -> VoteStatus | None:
-    voting = standing.voting
+def _vote(voting: Voting, now: float) -> VoteStatus | None:
     counted = voting.tally
     if counted is None:
         return None
@@ -408,7 +349,7 @@ def _vote(standing: TaskRound, now: float) -> VoteStatus | None:
     )
 
 
-def status_line(node: NodeView) -> str:
+def status_line(node: Stages) -> str:
     """One line for a service manager: role, peers, tasks with their owners and epochs."""
     states = node.membership.states()
     alive = sum(state is PeerState.ALIVE for state in states.values())

@@ -36,8 +36,9 @@ import math
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
-from zsched.core.instructions import ApplyRoutes, Instruction, RecordStory, SetRole, StartWorker, StopWorker
+from zsched.core.instructions import ApplyRoutes, RecordStory, SetRole, StartWorker, StopWorker
 from zsched.core.route.route import plan_for, slot_for
+from zsched.core.todo import ToDo
 from zsched.core.values.fleet import OnIsolation, Standby, TaskSpec, runs_worker
 from zsched.core.values.model import Allocation, NodeId, NodeKind
 from zsched.core.values.plan import Role, Route, RoutePhase, RoutePlan, Slot, WorkerRole
@@ -121,86 +122,86 @@ class Executor:
         """The streams of the newest slot."""
         return () if self._current is None else self._current.routes
 
-    def again(self) -> tuple[Instruction, ...]:
+    def again(self, todo: ToDo) -> None:
         """The newest worker's state, role and plan once more, after a batch that carried them was cut off."""
-        result: tuple[Instruction, ...] = ()
         if self.runs_worker:
-            result = (*self.start(), *self._wake_worker(), SetRole(role=self.role))
+            self.start(todo)
+            self._wake_worker(self.role, todo)
+            todo.add(SetRole(role=self.role))
             if self.spec.worker.standby is Standby.COLD and self.role.role is WorkerRole.IDLE:
-                result += (StopWorker(task=self.spec.name),)
+                todo.add(StopWorker(task=self.spec.name))
         if self._current is not None:
             phases = {Phase.PREPARING: RoutePhase.PREPARE, Phase.SETTLED: RoutePhase.CLOSE}
-            result += (ApplyRoutes(plan=self._plan(self._current, phases.get(self.phase, RoutePhase.FLIP))),)
-        return result
+            todo.add(ApplyRoutes(plan=self._plan(self._current, phases.get(self.phase, RoutePhase.FLIP))))
 
     def next_deadline(self) -> float:
         """When `tick` may have something to do; infinity when never."""
         return min((self._role_deadline, *(old.until for old in self._old)))
 
-    def start(self) -> tuple[Instruction, ...]:
+    def start(self, todo: ToDo) -> None:
         """The node starts: warm candidates start their worker."""
         if self.runs_worker and self.spec.worker.command and self.spec.worker.standby is Standby.WARM:
-            return (StartWorker(task=self.spec.name),)
-        return ()
+            todo.add(StartWorker(task=self.spec.name))
 
-    def execute(self, allocation: Allocation, now: float) -> tuple[Instruction, ...]:
+    def execute(self, allocation: Allocation, todo: ToDo, now: float) -> None:
         """A learnt allocation: act if its epoch is newer than what is carried out."""
         if allocation.owner is None or allocation.epoch < self.epoch:
-            return ()
+            return
         was_leased, self.is_leased = self.is_leased, self.spec.exclusive or allocation.leased
         if allocation.epoch == self.epoch:
-            return () if self.is_leased is was_leased else self._change_terms()
-        back = self._end_local()  # the local slot closes before a committed owner's opens
+            if self.is_leased is not was_leased:
+                self._change_terms(todo)
+            return
+        self._end_local(todo)  # the local slot closes before a committed owner's opens
         before = None if self._is_owner_gone else self.owner
         self.epoch, self.owner, self.started_at, self._is_owner_gone = allocation.epoch, allocation.owner, now, False
-        return (*back, *self._change_role(allocation, before, now), *self._prepare(allocation.owner))
+        self._change_role(allocation, before, todo, now)
+        self._prepare(allocation.owner, todo)
 
-    def _change_role(self, allocation: Allocation, before: NodeId | None, now: float) -> tuple[Instruction, ...]:
+    def _change_role(self, allocation: Allocation, before: NodeId | None, todo: ToDo, now: float) -> None:
         if not self.runs_worker:
-            return ()
+            return
         if allocation.owner == self.me:
             self._role_deadline = math.inf
-            # An exclusive task's worker may run at once, but works only from its first lease on.
-            lease = 0.0 if self.is_leased else None
-            told = self._become(
-                Role(
-                    task=self.spec.name,
-                    role=WorkerRole.ACTIVE,
-                    epoch=allocation.epoch,
-                    lease_until_s=lease,
-                    predecessor=None if before == self.me else before,
-                )
+            role = Role(
+                task=self.spec.name,
+                role=WorkerRole.ACTIVE,
+                epoch=allocation.epoch,
+                # An exclusive task's worker may run at once, but works only from its first lease on.
+                lease_until_s=0.0 if self.is_leased else None,
+                predecessor=None if before == self.me else before,
             )
-            return (*self._wake_worker(), told)
-        if self.role.role is not WorkerRole.ACTIVE:
-            return ()
-        if self.is_leased:
+            self._wake_worker(role, todo)
+            self._become(role, todo)
+        elif self.role.role is WorkerRole.ACTIVE and self.is_leased:
             # Whoever owns it now may be working already: nothing of the old epoch may leave any more.
             self._role_deadline = now
-            return self.leave()
-        worker = self.spec.worker
-        # A cold new owner only starts its worker now, and the robots stay here until it is ready.
-        starts_s = worker.start_deadline_s if worker.standby is Standby.COLD else 0.0
-        self._role_deadline = now + starts_s + self.spec.drain_s + ROLE_DRAIN_MARGIN_S
-        return (self._become(Role(task=self.spec.name, role=WorkerRole.DRAINING, epoch=self.role.epoch)),)
+            self.leave(todo)
+        elif self.role.role is WorkerRole.ACTIVE:
+            worker = self.spec.worker
+            # A cold new owner only starts its worker now, and the robots stay here until it is ready.
+            starts_s = worker.start_deadline_s if worker.standby is Standby.COLD else 0.0
+            self._role_deadline = now + starts_s + self.spec.drain_s + ROLE_DRAIN_MARGIN_S
+            self._become(Role(task=self.spec.name, role=WorkerRole.DRAINING, epoch=self.role.epoch), todo)
 
-    def _become(self, role: Role) -> SetRole:
+    def _become(self, role: Role, todo: ToDo) -> None:
         """Another role; one that lets the worker work without a lease is remembered until it has stopped."""
         self.role = role
         if role.role is WorkerRole.ACTIVE and role.lease_until_s is None:
             self._unleased_epoch = role.epoch
-        return SetRole(role=role)
+        todo.add(SetRole(role=role))
 
-    def _change_terms(self) -> tuple[Instruction, ...]:
+    def _change_terms(self, todo: ToDo) -> None:
         """The owner stays, and its worker needs a lease from now on, or none any more."""
         if self.is_local:
-            return self.rejoin()  # whoever works alone needed no lease until now
-        if self.owner != self.me or not self.runs_worker:
-            return ()
-        if self.is_leased:
-            return self.leave()  # it works again with its first lease
-        told = self._become(Role(task=self.spec.name, role=WorkerRole.ACTIVE, epoch=self.epoch))
-        return (*self._wake_worker(), told)
+            self.rejoin(todo)  # whoever works alone needed no lease until now
+        elif self.owner == self.me and self.runs_worker:
+            if self.is_leased:
+                self.leave(todo)  # it works again with its first lease
+            else:
+                role = Role(task=self.spec.name, role=WorkerRole.ACTIVE, epoch=self.epoch)
+                self._wake_worker(role, todo)
+                self._become(role, todo)
 
     def on_role_ended(self, epoch: int) -> None:
         """The worker says that it has left ``epoch``: believed once it was told to."""
@@ -217,135 +218,135 @@ class Executor:
         is_let = self.role.role is not WorkerRole.IDLE and self.role.lease_until_s is None
         return is_let or self._unleased_epoch is not None or now < self._leaves_until
 
-    def isolate(self) -> tuple[Instruction, ...]:
+    def isolate(self, todo: ToDo) -> None:
         """Nobody can be asked and the owner is not heard: this robot's own worker serves its own streams."""
         may_work = self.spec.on_isolation is OnIsolation.LOCAL and not self.is_leased
         can = self.has_streams and may_work and self.epoch > 0
         if self.is_local or not can or self.owner == self.me:
-            return ()
+            return
         self.is_local, self._old, self._role_deadline = True, (), math.inf
-        role = self._become(Role(task=self.spec.name, role=WorkerRole.ACTIVE, epoch=self.epoch))
+        role = Role(task=self.spec.name, role=WorkerRole.ACTIVE, epoch=self.epoch)
+        self._wake_worker(role, todo)
+        self._become(role, todo)
         self._current = slot_for(self.spec, self.me, self.me, self.epoch)
-        plan = self._go(Phase.PREPARING, RoutePhase.PREPARE, f"cut off from {self.owner}: works alone (degraded)")
-        return (*self._wake_worker(), role, *plan)
+        self._go(Phase.PREPARING, RoutePhase.PREPARE, f"cut off from {self.owner}: works alone (degraded)", todo)
 
-    def rejoin(self) -> tuple[Instruction, ...]:
+    def rejoin(self, todo: ToDo) -> None:
         """The committed owner is heard again: back to its slot."""
         if not self.is_local or self.owner is None:
-            return ()
-        back = self._end_local()
+            return
+        self._end_local(todo)
         self._current = slot_for(self.spec, self.me, self.owner, self.epoch)
-        return (*back, *self._go(Phase.PREPARING, RoutePhase.PREPARE, f"back to {self.owner}"))
+        self._go(Phase.PREPARING, RoutePhase.PREPARE, f"back to {self.owner}", todo)
 
-    def _end_local(self) -> tuple[Instruction, ...]:
+    def _end_local(self, todo: ToDo) -> None:
         if not self.is_local:
-            return ()
+            return
         self.is_local, self._current, self.phase = False, None, Phase.IDLE
-        self.role = Role(task=self.spec.name, role=WorkerRole.IDLE)
-        return (SetRole(role=self.role),)
+        self._become(Role(task=self.spec.name, role=WorkerRole.IDLE), todo)
 
-    def set_lease(self, until_s: float, now: float) -> tuple[Instruction, ...]:
+    def set_lease(self, until_s: float, todo: ToDo, now: float) -> None:
         """Exclusive tasks: this node's worker may work until ``until_s`` (again, after it had to stop)."""
         if self.owner != self.me or until_s <= now or until_s == self.role.lease_until_s:
-            return ()
+            return
         came_from = self.role.predecessor
-        self.role = Role(
+        role = Role(
             task=self.spec.name,
             role=WorkerRole.ACTIVE,
             epoch=self.epoch,
             lease_until_s=until_s,
             predecessor=came_from,
         )
-        return (SetRole(role=self.role),)
+        self._become(role, todo)
 
-    def leave(self) -> tuple[Instruction, ...]:
+    def leave(self, todo: ToDo) -> None:
         """Exclusive tasks: another owner waits; the worker stops now, before the move is committed."""
         if self.role.role is WorkerRole.IDLE:
-            return ()
-        self.role = Role(task=self.spec.name, role=WorkerRole.IDLE)
-        story = RecordStory(stage="executor", text="the worker stops", task=self.spec.name, epoch=self.epoch)
-        return (SetRole(role=self.role), story)
+            return
+        self._become(Role(task=self.spec.name, role=WorkerRole.IDLE), todo)
+        todo.add(RecordStory(stage="executor", text="the worker stops", task=self.spec.name, epoch=self.epoch))
 
-    def _wake_worker(self) -> tuple[Instruction, ...]:
+    def _wake_worker(self, role: Role, todo: ToDo) -> None:
         """An owner's worker must run, cold standby or not."""
-        is_needed = self.role.role is WorkerRole.ACTIVE and self.spec.worker.command
-        return (StartWorker(task=self.spec.name),) if is_needed else ()
+        if role.role is WorkerRole.ACTIVE and self.spec.worker.command:
+            todo.add(StartWorker(task=self.spec.name))
 
-    def _prepare(self, owner: NodeId) -> tuple[Instruction, ...]:
+    def _prepare(self, owner: NodeId, todo: ToDo) -> None:
         if not self.has_streams:
-            return ()
+            return
         if self._current is not None and self.phase in (Phase.FLIPPING, Phase.DRAINING, Phase.SETTLED):
             self._old = (*self._old, _Old(self._current))[-MAX_OLD:]
         self._current = slot_for(self.spec, self.me, owner, self.epoch)
-        return self._go(Phase.PREPARING, RoutePhase.PREPARE, f"prepares {owner}")
+        self._go(Phase.PREPARING, RoutePhase.PREPARE, f"prepares {owner}", todo)
 
-    def _go(self, phase: Phase, plan: RoutePhase | None, text: str) -> tuple[Instruction, ...]:
+    def _go(self, phase: Phase, plan: RoutePhase | None, text: str, todo: ToDo) -> None:
         self.phase = phase
-        story = RecordStory(stage="executor", text=text, task=self.spec.name, epoch=self.epoch)
-        if plan is None or self._current is None:
-            return (story,)
-        return (ApplyRoutes(plan=self._plan(self._current, plan)), story)
+        if plan is not None and self._current is not None:
+            todo.add(ApplyRoutes(plan=self._plan(self._current, plan)))
+        todo.add(RecordStory(stage="executor", text=text, task=self.spec.name, epoch=self.epoch))
 
     def _plan(self, current: Slot, phase: RoutePhase) -> RoutePlan:
         return plan_for(self.spec, phase, current, tuple(old.slot for old in self._old))
 
-    def on_ready(self, epoch: int) -> tuple[Instruction, ...]:
+    def on_ready(self, epoch: int, todo: ToDo) -> None:
         """The relay sees the new owner's worker ready for the slot of ``epoch``."""
-        if epoch != self.epoch or self.phase is not Phase.PREPARING:
-            return ()
-        return self._go(Phase.FLIPPING, RoutePhase.FLIP, f"flips to {self.owner}")
+        if epoch == self.epoch and self.phase is Phase.PREPARING:
+            self._go(Phase.FLIPPING, RoutePhase.FLIP, f"flips to {self.owner}", todo)
 
-    def on_flipped(self, epoch: int, replayed: int, now: float) -> tuple[Instruction, ...]:
+    def on_flipped(self, epoch: int, replayed: int, todo: ToDo, now: float) -> None:
         """The relay switched every stream to the slot of ``epoch``."""
         if epoch != self.epoch or self.phase is not Phase.FLIPPING:
-            return ()
+            return
         done = f"flipped to {self.owner} in {(now - self.started_at) * 1000:.0f} ms, {replayed} kept values replayed"
         if not self._old:
-            return self._go(Phase.SETTLED, RoutePhase.CLOSE, done)
+            self._go(Phase.SETTLED, RoutePhase.CLOSE, done, todo)
+            return
         drained_by = now + self.spec.drain_s
         self._old = tuple(old if old.is_left else replace(old, until=drained_by) for old in self._old)
-        return self._go(Phase.DRAINING, None, f"{done}; {', '.join(self.predecessors)} drains")
+        self._go(Phase.DRAINING, None, f"{done}; {', '.join(self.predecessors)} drains", todo)
 
-    def on_drained(self, epoch: int) -> tuple[Instruction, ...]:
+    def on_drained(self, epoch: int, todo: ToDo) -> None:
         """The old slot of ``epoch`` has given back all it had."""
         drained = tuple(old for old in self._old if old.slot.epoch == epoch and old.is_left)
         if not drained:
-            return ()
+            return
         text = f"{drained[0].slot.owner} drained"
-        return self._close(text) if self._forget(drained) else self._go(self.phase, None, text)
+        if self._forget(drained):
+            self._close(text, todo)
+        else:
+            self._go(self.phase, None, text, todo)
 
-    def on_gone(self, node: NodeId) -> tuple[Instruction, ...]:
+    def on_gone(self, node: NodeId, todo: ToDo) -> None:
         """A peer is gone: nothing will come from its slots any more."""
         self._is_owner_gone = self._is_owner_gone or node == self.owner
-        return self._drop(tuple(old for old in self._old if old.slot.owner == node), f"{node} is gone")
+        self._drop(tuple(old for old in self._old if old.slot.owner == node), f"{node} is gone", todo)
 
-    def _drop(self, dropped: tuple[_Old, ...], why: str) -> tuple[Instruction, ...]:
+    def _drop(self, dropped: tuple[_Old, ...], why: str, todo: ToDo) -> None:
         if not dropped:
-            return ()
+            return
         if self._forget(dropped):
-            return self._close(why)
+            self._close(why, todo)
+            return
         plan = RoutePhase.PREPARE if self.phase is Phase.PREPARING else RoutePhase.FLIP
         epochs = ", ".join(str(old.slot.epoch) for old in dropped)
-        return self._go(self.phase, plan, f"drops the slot of epoch {epochs}: {why}")
+        self._go(self.phase, plan, f"drops the slot of epoch {epochs}: {why}", todo)
 
     def _forget(self, gone: tuple[_Old, ...]) -> bool:
         """Let go of predecessors; answers whether the handover has nothing to wait for any more."""
         self._old = tuple(old for old in self._old if old not in gone)
         return self.phase is Phase.DRAINING and not self._old
 
-    def _close(self, text: str) -> tuple[Instruction, ...]:
-        return self._go(Phase.SETTLED, RoutePhase.CLOSE, f"settled on {self.owner}: {text}")
+    def _close(self, text: str, todo: ToDo) -> None:
+        self._go(Phase.SETTLED, RoutePhase.CLOSE, f"settled on {self.owner}: {text}", todo)
 
-    def tick(self, now: float) -> tuple[Instruction, ...]:
+    def tick(self, todo: ToDo, now: float) -> None:
         """Time has passed."""
         late = tuple(old for old in self._old if now >= old.until)
-        result = self._drop(late, f"drain time of {self.spec.drain_s:g} s over")
+        self._drop(late, f"drain time of {self.spec.drain_s:g} s over", todo)
         if now >= self._role_deadline:
             self._role_deadline = math.inf
             if self.role.role is WorkerRole.DRAINING:
                 self._leaves_until = now + LEAVES_S
-            self.role = Role(task=self.spec.name, role=WorkerRole.IDLE)
-            result += (SetRole(role=self.role),)
+            self._become(Role(task=self.spec.name, role=WorkerRole.IDLE), todo)
             if self.spec.worker.standby is Standby.COLD:
-                result += (StopWorker(task=self.spec.name),)
-        return result
+                todo.add(StopWorker(task=self.spec.name))

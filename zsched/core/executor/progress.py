@@ -21,8 +21,9 @@ from dataclasses import dataclass
 
 from zsched.core.executor.handover import Executor, Phase
 from zsched.core.gateway.gateway import Gateway
-from zsched.core.instructions import Instruction, RecordStory, RestartWorker
+from zsched.core.instructions import RecordStory, RestartWorker
 from zsched.core.scheduler.probation import LIMIT_S
+from zsched.core.todo import ToDo
 from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.model import NodeId, Profile, TaskId, TaskProgress, WorkerState
 from zsched.core.values.plan import Direction, StreamCount
@@ -213,19 +214,22 @@ class HangWatch:
         return self._progress.reports(now)
 
     def look(
-        self, owned: Iterable[TaskId], executors: Mapping[TaskId, Executor], gateway: Gateway, now: float
-    ) -> tuple[Instruction, ...]:
+        self,
+        owned: Iterable[TaskId],
+        executors: Mapping[TaskId, Executor],
+        gateway: Gateway,
+        todo: ToDo,
+        now: float,
+    ) -> None:
         """A robot's profile came: end the workers here that hang; those of somebody else are only told of."""
-        result: list[Instruction] = []
         for spec in [self._specs[task] for task in owned if task in self._specs]:
             profiles = [profile for robot in self._voters if (profile := gateway.fresh(robot, now)) is not None]
             reason = self._judge.hangs(spec, executors[spec.name], profiles, now, self._unproven(spec, now))
             if not reason:
                 continue
             if spec.worker.command:
-                result.append(RestartWorker(task=spec.name, reason=reason))
+                todo.add(RestartWorker(task=spec.name, reason=reason))
             else:
                 reason += "; it is not ours to restart"
             text = f"worker hangs: {reason}"
-            result.append(RecordStory(stage="executor", text=text, task=spec.name, epoch=executors[spec.name].epoch))
-        return tuple(result)
+            todo.add(RecordStory(stage="executor", text=text, task=spec.name, epoch=executors[spec.name].epoch))

@@ -23,10 +23,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from zsched.core.executor.handover import Executor
+from zsched.core.values.change import SetLeased
 from zsched.core.values.fleet import Fleet, TaskSpec, fleet_hash, lease_terms
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import Allocation, Beat, NodeId, TaskId
-from zsched.core.vote.register import SetLeased
 
 ASK_EVERY_S = 0.2
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 
 from zsched.core.events import ClockCompared
 from zsched.core.executor.handover import Executor
-from zsched.core.instructions import Instruction
 from zsched.core.membership.peers import Membership
+from zsched.core.todo import ToDo
 from zsched.core.values.fleet import Fleet, OnIsolation
 from zsched.core.values.model import Allocation, Beat, NodeId, PeerState, TaskId
 from zsched.core.values.quorum import majority
@@ -67,9 +67,17 @@ class Tenure:
         else:
             self.leases.end(value.task, next_number - 1)
 
-    def hear(self, beat: Beat, accepted: Mapping[TaskId, tuple[NodeId, int]], now: float, *, is_newest: bool) -> bool:
-        """A beat (our own too) may grant, echo, release, or ask us to leave. Whether to beat at once."""
-        return self.leases.on_beat(beat, accepted, now, is_newest=is_newest)
+    def hear(
+        self,
+        beat: Beat,
+        accepted: Mapping[TaskId, tuple[NodeId, int]],
+        todo: ToDo,
+        now: float,
+        *,
+        is_newest: bool,
+    ) -> None:
+        """A beat (our own too) may grant, echo, release, or ask us to leave. A first grant waits for its echo."""
+        todo.must_beat |= self.leases.on_beat(beat, accepted, now, is_newest=is_newest)
 
     def on_clock(
         self, event: ClockCompared, standing: Mapping[TaskId, Allocation | None], number: int, now: float
@@ -84,56 +92,49 @@ class Tenure:
             self.leases.trust(standing, number, now)
         return True
 
-    def tend_leases(self, number: int, now: float) -> tuple[tuple[Instruction, ...], bool]:
+    def tend_leases(self, number: int, todo: ToDo, now: float) -> None:
         """Prolong our workers' leases; stop who is asked to leave, and give back what has stopped or run out.
 
-        Returns:
-            (what to do, whether something was given back: beat at once). ``number`` is our newest beat's.
+        ``number`` is our newest beat's.
         """
-        result: list[Instruction] = []
-        has_released = False
         if not self.leases.is_holding:
-            return (), False  # nobody works here
+            return  # nobody works here
         leaving = self.leases.leaving()
         for task in self.exclusive:
             executor = self.executors[task]
             if self.leases.is_unsure:
-                result += executor.leave()
+                executor.leave(todo)
                 continue
             if task not in leaving:
-                until = self.leases.until(task)
-                prolonged = executor.set_lease(until, now)
-                if prolonged:
+                until, before = self.leases.until(task), executor.role
+                executor.set_lease(until, todo, now)
+                if executor.role is not before:
                     self.leases.on_given(task, until)
-                result += prolonged
                 continue
-            told = executor.leave()
-            if told:
+            before = executor.role
+            executor.leave(todo)
+            if executor.role is not before:
                 self.leases.on_told_to_stop(task)
-            result += told
             # What the worker was told counts, not what has been echoed since: electors may echo on and on, and a
             # worker that has stopped already will not say so again.
             if now >= self.leases.given_until(task):
-                has_released |= self.leases.on_run_out(task, number, now)
-        return tuple(result), has_released
+                todo.must_beat |= self.leases.on_run_out(task, number, now)
 
     # --- isolation ---------------------------------------------------------------------------------------------------
 
-    def tend_isolation(self, membership: Membership, now: float) -> tuple[Instruction, ...]:
+    def tend_isolation(self, membership: Membership, todo: ToDo, now: float) -> None:
         """Work alone while cut off from the owner and from a quorum, and not a moment longer."""
         if not self._local:
-            return ()
+            return
         voters = self.fleet.voters
         heard = sum(membership.state(name) is PeerState.ALIVE for name in voters)
         is_cut_off = heard < majority(len(voters))
-        result: list[Instruction] = []
         for name in self._local:
             executor = self.executors[name]
             if executor.owner is None:
                 continue
             if not is_cut_off or membership.state(executor.owner) is PeerState.ALIVE:
                 self._alone_since.pop(name, None)
-                result += executor.rejoin()
+                executor.rejoin(todo)
             elif now >= self._alone_since.setdefault(name, now) + ALONE_AFTER_S:
-                result += executor.isolate()
-        return tuple(result)
+                executor.isolate(todo)

@@ -61,7 +61,7 @@ class Workers:
             times = "once" if event.count == 1 else f"{event.count} times"
             self._troubles[event.task] = (as_reason(f"callback raised {times}: {event.text}"), now)
 
-    def on_outdated(self, event: ev.WorkerOutdated, _now: float) -> None:
+    def on_outdated(self, event: ev.WorkerOutdated) -> None:
         """A worker that somebody else started should be started again, or has been."""
         if event.reason and event.task in self.states:
             self._outdated[event.task] = as_reason(event.reason)

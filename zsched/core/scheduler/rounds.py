@@ -1,7 +1,7 @@
-"""SCHEDULER in motion at one robot, all tasks: gather, judge, propose, and what follows from a vote's end.
+"""SCHEDULER in motion at one robot, all tasks: gather, judge, hand out proposals.
 
-Knows: the round's course and its deadlines. Does not know: how scores arise (`scoring`), stickiness (`scheduler`), when
-a vote is open and how it ends (`voting`), the register, bytes.
+Knows: the round's course and its deadlines. Does not know: how scores arise (`scoring`), stickiness (`judge`), what
+becomes of a proposal (`zsched.core.vote.votes`), bytes.
 
 A robot gathers the others' utilities every ``decide_s``, and at once when an owner is gone or another robot's proposal
 for a move arrives: the first proposal *calls* the vote, so rounds need no synchronised clocks. In a called vote every
@@ -12,26 +12,24 @@ did (docs/decisions/0004).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from random import Random
 
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.gateway.round_trips import RoundTrips
-from zsched.core.instructions import AskUtilities, Instruction, PublishProposal, RecordStory
+from zsched.core.instructions import AskUtilities, RecordStory
 from zsched.core.scheduler.costs import MoveCost
 from zsched.core.scheduler.damping import Damping
 from zsched.core.scheduler.judge import Judge, Judgement, Outcome, escape_ahead, escape_reason
 from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts, Standing, book, compare, is_out, score
-from zsched.core.scheduler.turns import in_turn, who_moves_first
+from zsched.core.scheduler.turns import Turn, in_turn, who_moves_first
+from zsched.core.todo import ToDo
 from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.messages import Utilities
 from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, TaskId, UtilityVector, WorkerState
 from zsched.core.values.plan import StreamCount
-from zsched.core.values.quorum import majority
-from zsched.core.vote.register import MoveOwner
-from zsched.core.vote.tally import VoteOutcome, present_voters
-from zsched.core.vote.voting import Voting
+from zsched.core.values.quorum import majority, present_voters
 
 TIMER_MARGIN_S = 0.001
 """Sums of floats: a timer has certainly ended this much later."""
@@ -52,7 +50,6 @@ class TaskRound:
     spec: TaskSpec
     judge: Judge
     cost: MoveCost
-    voting: Voting
     settled_at: float
     """When this node learnt the current epoch."""
     is_called: bool = False
@@ -75,22 +72,20 @@ class Rounds:
         fleet: Fleet,
         me: NodeId,
         gateway: Gateway,
+        turns: Mapping[TaskId, Turn],
         rng: Random,
         now: float,
         doubts: Callable[[TaskSpec, float], Doubts] = lambda _spec, _now: NO_DOUBTS,
         round_trips: RoundTrips | None = None,
     ) -> None:
-        self._fleet, self._me, self._gateway, self._rng = fleet, me, gateway, rng
+        self._fleet, self._me, self._gateway, self._turns, self._rng = fleet, me, gateway, turns, rng
         self._doubts = doubts
         self._round_trips = round_trips or RoundTrips(me)
         self.is_voter = me in fleet.voters
         self.tasks = {
-            spec.name: TaskRound(
-                spec=spec, judge=Judge(spec=spec), cost=MoveCost(spec.name), voting=Voting(fleet, me), settled_at=now
-            )
+            spec.name: TaskRound(spec=spec, judge=Judge(spec=spec), cost=MoveCost(spec.name), settled_at=now)
             for spec in fleet.tasks
         }
-        self._votings = {name: task.voting for name, task in self.tasks.items()}
         self._gather: _Gather | None = None
         self._answer: tuple[int, float, object, Utilities] = (-1, -math.inf, None, Utilities(voter=me, vectors=()))
         """(gateway's version, until when, (states, values, doubts), vectors): the newest answer to a gather."""
@@ -101,16 +96,11 @@ class Rounds:
 
     def next_deadline(self) -> float:
         """When `tick` may have something to do."""
-        due = self._round_at if self._gather is None else self._gather.deadline
-        for voting in self._votings.values():
-            due = min(due, voting.next_deadline())
-        return due
+        return self._round_at if self._gather is None else self._gather.deadline
 
     def is_idle(self, now: float) -> bool:
-        """Whether `tick` has nothing to do: no gather runs, none is due, no vote is open."""
-        if self._gather is not None or now >= self._round_at:
-            return False
-        return all(voting.opened_at is None for voting in self._votings.values())
+        """Whether `tick` has nothing to do: no gather runs, and none is due."""
+        return self._gather is None and now < self._round_at
 
     def hurry(self, now: float) -> None:
         """Something happened that may need a decision: run a round now."""
@@ -153,24 +143,26 @@ class Rounds:
         return answer
 
     def tick(
-        self, values: Mapping[TaskId, Allocation], states: Mapping[NodeId, PeerState], now: float
-    ) -> tuple[Instruction, ...]:
-        """Time has passed: start or close a gather, close votes."""
-        out: list[Instruction] = []
+        self, values: Mapping[TaskId, Allocation], states: Mapping[NodeId, PeerState], todo: ToDo, now: float
+    ) -> Iterator[Proposal]:
+        """Time has passed: start or close a gather, and hand out what this robot proposes.
+
+        One at a time, for moves take turns: the next task is judged when the vote has taken in the one before.
+        """
         if self._gather is not None:
             running = self._gather  # a robot that is not alive any more is not waited for
             running.expected = [name for name in running.expected if states[name] is PeerState.ALIVE]
             if not running.expected or now >= running.deadline:
-                out += self._close(values, states, now)
+                yield from self._close(values, states, todo, now)
         elif now >= self._round_at:
-            out += self._open(values, states, now)
-        for name, task in self.tasks.items():
-            out += self._count(task, values[name], states, now)
-        return tuple(out)
+            others = self._open(values, states, todo, now)
+            if not others:
+                yield from self._close(values, states, todo, now)
 
     def _open(
-        self, values: Mapping[TaskId, Allocation], states: Mapping[NodeId, PeerState], now: float
-    ) -> list[Instruction]:
+        self, values: Mapping[TaskId, Allocation], states: Mapping[NodeId, PeerState], todo: ToDo, now: float
+    ) -> list[NodeId]:
+        """Start a gather; the other robots that it asks."""
         timing = self._fleet.timing
         self._round_at = now + timing.decide_s * (0.9 + 0.2 * self._rng.random())
         self._number += 1
@@ -182,9 +174,9 @@ class Rounds:
             expected=expected,
             vectors={self._me: own.vectors},
         )
-        if not expected:
-            return self._close(values, states, now)
-        return [AskUtilities(gather=self._number, deadline_s=timing.gather_s)]
+        if expected:
+            todo.add(AskUtilities(gather=self._number, deadline_s=timing.gather_s))
+        return expected
 
     def absorb_utilities(self, gather: int, utilities: Utilities) -> bool:
         """A robot answered; false when the answer is late, foreign or not its own."""
@@ -200,13 +192,12 @@ class Rounds:
         return True
 
     def _close(
-        self, values: Mapping[TaskId, Allocation], states: Mapping[NodeId, PeerState], now: float
-    ) -> list[Instruction]:
+        self, values: Mapping[TaskId, Allocation], states: Mapping[NodeId, PeerState], todo: ToDo, now: float
+    ) -> Iterator[Proposal]:
         """Everybody alive has answered, or the deadline passed: judge every task."""
         assert self._gather is not None
         gathered, self._gather = self._gather, None
-        out: list[Instruction] = []
-        for name in in_turn(self._votings):
+        for name in in_turn(self._turns):
             task = self.tasks[name]
             vectors = {
                 voter: vector
@@ -216,8 +207,9 @@ class Rounds:
             }
             task.silent = tuple(voter for voter in self._fleet.voters if voter not in vectors)
             task.standing = compare(task.spec, values[name], vectors)
-            out += self._judge(task, task.standing, values[name], states, now)
-        return out
+            proposal = self._judge(task, task.standing, values[name], states, todo, now)
+            if proposal is not None:
+                yield proposal
 
     # --- SCHEDULER: the decision ---------------------------------------------------------------------------------
 
@@ -227,8 +219,9 @@ class Rounds:
         standing: Standing,
         allocation: Allocation,
         states: Mapping[NodeId, PeerState],
+        todo: ToDo,
         now: float,
-    ) -> list[Instruction]:
+    ) -> Proposal | None:
         is_called, is_called_escape = task.is_called, task.is_called_escape
         task.is_called = task.is_called_escape = False
         escape = self._escape(task, standing, allocation, states, is_called_escape, now)
@@ -256,14 +249,25 @@ class Rounds:
             judgement = self._spare(judgement, allocation, states)
         task.judgement, task.judged_at = judgement, now
         self._wake_when_due(task, judgement, allocation, now)
-        out: list[Instruction] = [*self._tell(task, judgement, allocation)]
-        if task.voting.commit is not None:
-            return out
-        if judgement.outcome is Outcome.PROPOSE or is_called:
-            if not judgement.is_escape:
-                task.voting.call(now)
-            out += self._propose(task, judgement, allocation, states, now)
-        return out
+        self._tell(task, judgement, allocation, todo)
+        if self._turns[task.spec.name].commit is not None:
+            return None
+        if judgement.outcome is not Outcome.PROPOSE and not is_called:
+            return None
+        return self._proposal(task, judgement, allocation)
+
+    def _proposal(self, task: TaskRound, judgement: Judgement, allocation: Allocation) -> Proposal | None:
+        if judgement.candidate is None:  # too few robots heard: not even staying is ours to propose
+            return None
+        return Proposal(
+            voter=self._me,
+            task=task.spec.name,
+            base_revision=allocation.revision,
+            candidate=judgement.candidate,
+            aggregate=judgement.aggregate,
+            is_escape=judgement.is_escape,
+            reason=judgement.reason[:200],
+        )
 
     def _out(self, spec: TaskSpec, now: float) -> frozenset[NodeId]:
         """The candidates that say themselves that they cannot have the task now: they are not waited for."""
@@ -286,7 +290,7 @@ class Rounds:
         task.is_waiting_its_turn = False
         if judgement.outcome is not Outcome.PROPOSE or judgement.is_escape:
             return judgement
-        first = who_moves_first(self._votings, task.spec.name, is_called=is_called, now=now)
+        first = who_moves_first(self._turns, task.spec.name, is_called=is_called, now=now)
         if first is None:
             return judgement
         task.is_waiting_its_turn = True
@@ -347,76 +351,28 @@ class Rounds:
             task.judge.not_ready_since = now
         return now - task.judge.not_ready_since
 
-    def _tell(self, task: TaskRound, judgement: Judgement, allocation: Allocation) -> list[Instruction]:
+    @staticmethod
+    def _tell(task: TaskRound, judgement: Judgement, allocation: Allocation, todo: ToDo) -> None:
         text = f"{judgement.outcome} {judgement.candidate or '-'}"
         if text == task.told:
-            return []
+            return
         task.told = text
         scores = " ".join(f"{name}={value:.3f}" for name, value in sorted(judgement.aggregates.items()))
-        return [
-            RecordStory(
-                stage="scheduler",
-                text=f"{text}: {judgement.reason} [{scores}]",
-                task=task.spec.name,
-                epoch=allocation.epoch,
-            )
-        ]
+        told = f"{text}: {judgement.reason} [{scores}]"
+        todo.add(RecordStory(stage="scheduler", text=told, task=task.spec.name, epoch=allocation.epoch))
 
-    # --- VOTE ----------------------------------------------------------------------------------------------------
+    # --- what the later stages tell ------------------------------------------------------------------------------
 
-    def _propose(
-        self,
-        task: TaskRound,
-        judgement: Judgement,
-        allocation: Allocation,
-        states: Mapping[NodeId, PeerState],
-        now: float,
-    ) -> list[Instruction]:
-        candidate = judgement.candidate
-        if candidate is None:  # too few robots heard: not even staying is ours to propose
-            return []
-        proposal = Proposal(
-            voter=self._me,
-            task=task.spec.name,
-            base_revision=allocation.revision,
-            candidate=candidate,
-            aggregate=judgement.aggregate,
-            is_escape=judgement.is_escape,
-            reason=judgement.reason[:200],
-        )
-        return [PublishProposal(proposal=proposal), *self.absorb_proposal(proposal, allocation, states, now)]
+    def on_called(self, name: TaskId, *, is_escape: bool, now: float) -> None:
+        """Another robot has called this one to a vote: judge now, and answer it."""
+        self.tasks[name].is_called = True
+        self.tasks[name].is_called_escape |= is_escape
+        if self._gather is None:
+            self.hurry(now)
 
-    def absorb_proposal(
-        self, proposal: Proposal, allocation: Allocation, states: Mapping[NodeId, PeerState], now: float
-    ) -> list[Instruction]:
-        """A robot's proposal (our own enters here too). On an older or newer base it does not count."""
-        task = self.tasks[proposal.task]
-        if task.voting.absorb(proposal, allocation, now):
-            task.is_called = True
-            task.is_called_escape |= proposal.is_escape
-            if self._gather is None:
-                self.hurry(now)
-        return self._count(task, allocation, states, now)
-
-    def _count(
-        self, task: TaskRound, allocation: Allocation, states: Mapping[NodeId, PeerState], now: float
-    ) -> list[Instruction]:
-        ended = task.voting.count(allocation, states, now)
-        if ended is None:
-            return []
-        if ended.outcome is VoteOutcome.STAY:
-            task.judge.reset()
-        text = f"{ended.outcome}: {ended.reason} ({', '.join(f'{v}->{c}' for v, c in ended.votes)})"
-        return [RecordStory(stage="vote", text=text, task=task.spec.name, epoch=allocation.epoch)]
-
-    def due_commits(self, now: float) -> list[tuple[TaskId, MoveOwner]]:
-        """Changes whose turn has come; each is handed out once."""
-        due = ((name, voting.take_commit(now)) for name, voting in self._votings.items())
-        return [(name, change) for name, change in due if change is not None]
-
-    def on_commit_ended(self, name: TaskId) -> None:
-        """Our change was committed, overtaken or given up: votes may be called again."""
-        self._votings[name].end_commit()
+    def on_stayed(self, name: TaskId) -> None:
+        """A vote has ended with: stay."""
+        self.tasks[name].judge.reset()
 
     def on_moved(
         self, name: TaskId, left: NodeId | None, *, has_failed: bool, now: float, was_draining: bool = False
@@ -438,9 +394,8 @@ class Rounds:
                 task.judge.move_cost_s = task.cost.seconds
 
     def on_learnt(self, name: TaskId, *, is_new_epoch: bool, now: float) -> None:
-        """A newer revision is known: proposals on older bases are worthless."""
+        """A newer revision is known."""
         task = self.tasks[name]
-        task.voting.on_learnt()
         task.told = ""
         task.judge.reset(is_new_owner=is_new_epoch)
         if is_new_epoch:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+from zsched.core.values.model import NodeId, PeerState
+
 
 def majority(count: int) -> int:
     """The least number that is more than half of ``count``.
@@ -10,3 +14,8 @@ def majority(count: int) -> int:
     [1, 2, 2, 3, 3]
     """
     return count // 2 + 1
+
+
+def present_voters(voters: tuple[NodeId, ...], states: Mapping[NodeId, PeerState]) -> frozenset[NodeId]:
+    """The robots that are not gone."""
+    return frozenset(name for name in voters if states[name] is not PeerState.GONE)

@@ -9,13 +9,15 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from random import Random
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
+from zsched.core.todo import ToDo
+from zsched.core.values.change import Change, Ended, MoveOwner, Retune, RoundOutcome
 from zsched.core.values.fleet import Fleet
-from zsched.core.values.messages import CommandOutcome, CommandResult, Learnt, Promise, Refusal, Refused
+from zsched.core.values.messages import Accepted, CommandOutcome, CommandResult, Learnt, Promise, Refusal, Refused
 from zsched.core.values.model import (
     NO_BALLOT,
     Allocation,
@@ -30,7 +32,7 @@ from zsched.core.values.model import (
 from zsched.core.vote.belief import GENERATION_STEP, MAX_GENERATION, is_fit, is_proven
 from zsched.core.vote.generations import way_out
 from zsched.core.vote.lease import Leases, hold_s
-from zsched.core.vote.register import Change, MoveOwner, Register, Retune, RoundOutcome, Step
+from zsched.core.vote.register import Register
 from zsched.core.vote.witness import Witness, as_seen, as_tuple
 
 SETTLE_AFTER_START_S = 0.3
@@ -53,24 +55,6 @@ _RETUNED = {
     RoundOutcome.NO_QUORUM: (CommandOutcome.NO_QUORUM, "no majority of the electors answered"),
     RoundOutcome.UNKNOWN: (CommandOutcome.UNKNOWN, "the electors fell silent; `zsched status` tells"),
 }
-
-
-@dataclass(slots=True)
-class Effects:
-    """What one call leads to: ``is_dirty`` first to disk, then ``send``, then every ``learnt`` value is applied."""
-
-    is_dirty: bool = False
-    send: list[do.Instruction] = field(default_factory=list)
-    learnt: list[tuple[Allocation, str]] = field(default_factory=list)
-    """(value, why it came about)."""
-    is_urgent: bool = False
-    """Beat at once: an owner must hear that it is asked to leave."""
-    ended: list[TaskId] = field(default_factory=list)
-    """Tasks whose move, proposed by this node, was committed, overtaken or given up."""
-
-
-NOTHING = Effects()
-"""Most calls lead to nothing: one shared value, never changed."""
 
 
 class Agreement:
@@ -121,11 +105,11 @@ class Agreement:
         )
         self.voted = set() if durable is None else set(durable.voted)
         self.is_elector = durable is not None and me in fleet.electors and not self._disputed and not self._lost
-        self.problems: dict[str, str] = {}
+        self._problems: dict[str, str] = {}
         if self._lost:
-            self.problems["state"] = _lost_text(self._lost, self.newest_generation)
+            self._problems["state"] = _lost_text(self._lost, self.newest_generation)
         if self._disputed:
-            self.problems["state"] = f"{self._disputed}; no elector until `zsched init --settle`"
+            self._problems["state"] = f"{self._disputed}; no elector until `zsched init --settle`"
         self.counters: Counter[str] = Counter()
         self._buckets: dict[NodeId, tuple[float, float]] = {}
         stored = {} if durable is None else {state.task: state for state in durable.registers}
@@ -172,6 +156,12 @@ class Agreement:
         return f"{self._electorate}/{self.generation}" if self.generation else self._electorate
 
     # --- queries -----------------------------------------------------------------------------------------------------
+
+    @property
+    def problems(self) -> dict[str, str]:
+        """{what: why agreement does not work here as it should}."""
+        stuck = {f"register/{name}": register.problem for name, register in self.registers.items() if register.problem}
+        return {**self._problems, **stuck}
 
     def values(self) -> Mapping[TaskId, Allocation]:
         """{task: the newest learnt value}; a new mapping whenever one changes."""
@@ -257,22 +247,23 @@ class Agreement:
 
     # --- electors ----------------------------------------------------------------------------------------------------
 
-    def on_prepare(self, event: ev.PrepareAsked, now: float) -> Effects:
+    def on_prepare(self, event: ev.PrepareAsked, todo: ToDo, now: float) -> None:
         """A proposer asks for a promise; only for its own ballots, and not too often (each promise costs an fsync)."""
         register = self.registers.get(event.prepare.task)
         if register is None or not self._is_its_own(event.prepare.ballot, event.asker):
             self.counters["prepare_foreign"] += 1
-            return Effects()
+            return
+        ballot = event.prepare.ballot
+        answer: Promise | Refused
         if not self._may_ask(event.asker, now):
             self.counters["prepare_rate"] += 1
-            answer: Promise | Refused = register.refuse(event.prepare.ballot, Refusal.RATE)
-            return Effects(send=[do.AnswerElection(request=event.request, answer=answer)])
-        if self.is_elector and not self.witness.may_vote(now):
-            answer = register.refuse(event.prepare.ballot, Refusal.YOUNG)
-            return Effects(send=[do.AnswerElection(request=event.request, answer=answer)])
-        step, answer = register.on_prepare(event.prepare)
-        self.witness.votes += step.is_dirty
-        return Effects(is_dirty=step.is_dirty, send=[do.AnswerElection(request=event.request, answer=answer)])
+            answer = register.refuse(ballot, Refusal.RATE)
+        elif self.is_elector and not self.witness.may_vote(now):
+            answer = register.refuse(ballot, Refusal.YOUNG)
+        else:
+            answer = register.on_prepare(event.prepare, todo)
+            self.witness.votes += isinstance(answer, Promise)
+        todo.add(do.AnswerElection(request=event.request, answer=answer))
 
     def _may_ask(self, asker: NodeId, now: float) -> bool:
         """One token of the asker's bucket (`PREPARES_PER_S`, at most `PREPARE_BURST` saved); a no costs none."""
@@ -282,48 +273,46 @@ class Agreement:
         self._buckets[asker] = (tokens - may_ask, now)
         return may_ask
 
-    def on_accept(self, event: ev.AcceptAsked, now: float) -> Effects:
+    def on_accept(self, event: ev.AcceptAsked, todo: ToDo, now: float) -> None:
         """A proposer asks to accept a value; only under its own ballots."""
+        acceptance = event.accept.acceptance
         register = self.registers.get(event.accept.task)
-        if register is None or not self._is_its_own(event.accept.acceptance.ballot, event.asker):
+        if register is None or not self._is_its_own(acceptance.ballot, event.asker):
             self.counters["accept_foreign"] += 1
-            return Effects()
-        effects = Effects()
-        if not is_fit(self._fleet, event.accept.acceptance.value, register):
+            return
+        if not is_fit(self._fleet, acceptance.value, register):
             self.counters["accept_unfit"] += 1
-            answer = register.refuse(event.accept.acceptance.ballot, Refusal.VALUE)
-            return Effects(send=[do.AnswerElection(request=event.request, answer=answer)])
-        if self.is_elector and not self.witness.may_vote(now):
-            answer = register.refuse(event.accept.acceptance.ballot, Refusal.YOUNG)
-            return Effects(send=[do.AnswerElection(request=event.request, answer=answer)])
-        self._accept_or_park(event, now + PARK_SHARE * self._fleet.timing.ballot_s, effects, now)
-        return effects
+            refused = register.refuse(acceptance.ballot, Refusal.VALUE)
+        elif self.is_elector and not self.witness.may_vote(now):
+            refused = register.refuse(acceptance.ballot, Refusal.YOUNG)
+        else:
+            self._accept_or_park(event, now + PARK_SHARE * self._fleet.timing.ballot_s, todo, now)
+            return
+        todo.add(do.AnswerElection(request=event.request, answer=refused))
 
-    def _accept_or_park(self, event: ev.AcceptAsked, deadline: float, effects: Effects, now: float) -> None:
+    def _accept_or_park(self, event: ev.AcceptAsked, deadline: float, todo: ToDo, now: float) -> None:
         """Accept, refuse, or let the question wait while an exclusive task's owner is asked to leave."""
         accept = event.accept
         register = self.registers[accept.task]
         key = (accept.task, event.asker)
         older = self._parked.pop(key, None)
         if older is not None and older[0] != event:
-            effects.send.append(do.AnswerElection(request=older[0].request, answer=self._leased(older[0])))
-        is_free = not register.would_accept(accept) or self.leases.may_accept(
-            accept.task, accept.acceptance.value.owner, now
-        )
-        if is_free:
+            todo.add(do.AnswerElection(request=older[0].request, answer=self._leased(older[0])))
+        value = accept.acceptance.value
+        if not register.would_accept(accept) or self.leases.may_accept(accept.task, value.owner, now):
             known = _newest(register)
-            step, answer = register.on_accept(accept, now)
-            if step.is_dirty and (known is None or accept.acceptance.value.revision > known.revision):
+            answer = register.on_accept(accept, todo, now)
+            has_accepted = isinstance(answer, Accepted)
+            if has_accepted and (known is None or value.revision > known.revision):
                 # An identity round's is none: the next owner may still wait.
-                self.leases.on_newer_value(accept.acceptance.value)
-            effects.is_dirty |= step.is_dirty
-            self.witness.votes += step.is_dirty
-            effects.send.append(do.AnswerElection(request=event.request, answer=answer))
+                self.leases.on_newer_value(value)
+            self.witness.votes += has_accepted
+            todo.add(do.AnswerElection(request=event.request, answer=answer))
         elif now >= deadline:
-            effects.send.append(do.AnswerElection(request=event.request, answer=self._leased(event)))
+            todo.add(do.AnswerElection(request=event.request, answer=self._leased(event)))
         else:
             self._parked[key] = (event, deadline)
-            effects.is_urgent = older is None
+            todo.must_beat |= older is None  # an owner must hear that it is asked to leave
 
     def _leased(self, event: ev.AcceptAsked) -> Refused:
         register = self.registers[event.accept.task]
@@ -334,24 +323,18 @@ class Agreement:
         """Whether a question waits for an exclusive task's owner to leave."""
         return bool(self._parked)
 
-    def retry_parked(self, now: float) -> Effects:
+    def retry_parked(self, todo: ToDo, now: float) -> None:
         """A lease may have been released or run out, or a parked question may have waited long enough."""
-        if not self._parked:
-            return NOTHING
-        effects = Effects()
         for event, deadline in tuple(self._parked.values()):
-            self._accept_or_park(event, deadline, effects, now)
-        return effects
+            self._accept_or_park(event, deadline, todo, now)
 
-    def on_answer(self, event: ev.ElectorAnswered, now: float) -> Effects:
+    def on_answer(self, event: ev.ElectorAnswered, todo: ToDo, now: float) -> None:
         """An elector answered our prepare or accept."""
-        effects = Effects()
         register = self.registers.get(event.answer.task)
         if register is None or event.answer.elector not in self._fleet.electors:
             self.counters["answer_foreign"] += 1
         else:
-            self._take(event.answer.task, register.on_answer(event.answer, now), effects)
-        return effects
+            register.on_answer(event.answer, todo, now)
 
     def _is_its_own(self, ballot: Ballot, asker: NodeId) -> bool:
         return ballot.node == asker and asker in self._nodes
@@ -367,44 +350,48 @@ class Agreement:
 
     # --- learners ----------------------------------------------------------------------------------------------------
 
-    def on_learnt(self, event: ev.LearntReceived, now: float) -> Effects:
+    def on_learnt(self, event: ev.LearntReceived, todo: ToDo, now: float) -> None:
         """A peer told what it has learnt: unasked, that is a reason to ask it; its answer may be believed."""
         learnt = event.learnt
         if learnt.node == self._me:
-            return NOTHING
+            return
         if learnt.node not in self._nodes:
             self.counters["learnt_foreign"] += 1
-            return NOTHING
+            return
         if event.is_answer:
             self._follow(learnt)
         if not self._is_our_generation(learnt.node, learnt.generation):
-            return NOTHING
+            return
         if not event.is_answer:
             newer = [(value.task, value.revision) for value in learnt.values]
-            return self._ask(learnt.node, newer, ASK_AT_ONCE_S, now)
-        effects = self._lose(self.witness.on_answer(learnt))
+            self._ask(learnt.node, newer, ASK_AT_ONCE_S, todo, now)
+            return
+        self._lose(self.witness.on_answer(learnt), todo)
         if learnt.has_voted and learnt.node in self._fleet.electors and learnt.node not in self.voted:
             self.voted.add(learnt.node)
-            effects.is_dirty |= self._durable is not None
+            todo.must_persist |= self._durable is not None
         for value in learnt.values:
-            register = self.registers.get(value.task)
-            if register is None:
-                self.counters["learnt_foreign"] += 1
-            elif is_proven(self._fleet, learnt, value, register, has_generation=self.generation is not None):
-                step = register.learn(value, now)
-                if step.learnt is not None:
-                    self.leases.on_newer_value(value)
-                self._take(value.task, step, effects)
-            elif value.revision > register.value.revision:
-                self._read(value.task, register, effects, now)
-        return effects
+            self._learn(learnt, value, todo, now)
 
-    def _read(self, task: TaskId, register: Register, effects: Effects, now: float) -> None:
+    def _learn(self, learnt: Learnt, value: Allocation, todo: ToDo, now: float) -> None:
+        """A peer has answered that it has learnt ``value``."""
+        register = self.registers.get(value.task)
+        if register is None:
+            self.counters["learnt_foreign"] += 1
+        elif is_proven(self._fleet, learnt, value, register, has_generation=self.generation is not None):
+            known = register.state.learnt
+            register.learn(value, todo, now)
+            if register.state.learnt is not known:
+                self.leases.on_newer_value(value)
+        elif value.revision > register.value.revision:
+            self._read(value.task, register, todo, now)
+
+    def _read(self, task: TaskId, register: Register, todo: ToDo, now: float) -> None:
         """Ask a majority what is in force (an identity round), for one peer's word is not enough."""
         self.counters["learnt_unproven"] += 1
         if now - self._read_at.get(task, -math.inf) >= READ_EVERY_S:
             self._read_at[task] = now
-            self._take(task, register.settle(now), effects)
+            register.settle(todo, now)
 
     def _hear_electorate(self, beat: Beat) -> None:
         """Keep whether an elector refuses our ballots, and we its: it has other electors, or another generation."""
@@ -427,18 +414,18 @@ class Agreement:
     def _is_our_generation(self, node: NodeId, generation: int) -> bool:
         """Whether a node's learnt values mean anything here; the difference is shown."""
         is_ours = generation == self.generation or self._is_guest_of(generation)
-        if is_ours and not self.problems:
+        if is_ours and not self._problems:
             return True  # thirty beats a second come by here
         source = f"generation/{node}"
         if is_ours:
-            self.problems.pop(source, None)
+            self._problems.pop(source, None)
             return True
         ours = self.generation or 0
         command = f"`zsched init --generation {max(generation, ours)}`"
         where = f"there, with that daemon stopped: {command}"
         if generation > ours:
             where = f"stop this daemon, {command} here, start it; so on every node that is behind"
-        self.problems[source] = f"{node} is of generation {generation}, this node of {ours}; {where}"
+        self._problems[source] = f"{node} is of generation {generation}, this node of {ours}; {where}"
         return False
 
     def _is_guest_of(self, generation: int) -> bool:
@@ -457,99 +444,118 @@ class Agreement:
             initial = task.first_value(learnt.generation * GENERATION_STEP)
             self.registers[task.name].follow(self.electorate, initial)
 
-    def dispute(self, reason: str) -> Effects:
+    def dispute(self, reason: str, todo: ToDo) -> None:
         """Our name is used by somebody else too: no elector any more, on disk, until the operator settles it."""
         if self._disputed:
-            return Effects()
+            return
         self._disputed = reason
-        self.problems["state"] = f"{reason}; no elector until `zsched init --settle`"
+        self._problems["state"] = f"{reason}; no elector until `zsched init --settle`"
         self._stop_electing()
-        return Effects(is_dirty=self._durable is not None)
+        todo.must_persist |= self._durable is not None
 
-    def _lose(self, why: str) -> Effects:
+    def _lose(self, why: str, todo: ToDo) -> None:
         """Our state has forgotten what others have seen of it: no elector any more, on disk."""
         if not why or self._lost or not self.is_elector:
-            return Effects()
+            return
         self._lost = why
-        self.problems["state"] = _lost_text(why, self.newest_generation)
+        self._problems["state"] = _lost_text(why, self.newest_generation)
         self._stop_electing()
-        return Effects(is_dirty=True)
+        todo.must_persist = True
 
-    def compare(self, beat: Beat, now: float) -> Effects:
+    def compare(self, beat: Beat, todo: ToDo, now: float) -> None:
         """A peer's beat may show that it has learnt more than we, or has voted: then ask it."""
         self.newest_generation = max(self.newest_generation, min(beat.generation, MAX_GENERATION))
         self._hear_electorate(beat)
         if not self._is_our_generation(beat.node, beat.generation):
-            return NOTHING
+            return
         is_news = beat.has_voted and beat.node not in self.voted and beat.node in self._fleet.electors
         is_news |= self.witness.must_ask(beat)
         is_news |= self._is_guest_of(beat.generation) and beat.node in self._fleet.electors
         newer = [(task, revision) for task, revision, _ in beat.learnt]
-        return self._ask(beat.node, newer, ASK_LEARNT_EVERY_S, now, is_news=is_news)
+        self._ask(beat.node, newer, ASK_LEARNT_EVERY_S, todo, now, is_news=is_news)
 
     def _ask(
-        self, peer: NodeId, told: list[tuple[TaskId, int]], every_s: float, now: float, *, is_news: bool = False
-    ) -> Effects:
+        self,
+        peer: NodeId,
+        told: list[tuple[TaskId, int]],
+        every_s: float,
+        todo: ToDo,
+        now: float,
+        *,
+        is_news: bool = False,
+    ) -> None:
         """Ask a peer for what it has learnt, when it tells of a newer revision (or of other news)."""
         is_behind = False
         for task, revision in told:
             register = self.registers.get(task)
             is_behind |= register is not None and revision > register.value.revision
         if not is_behind and not is_news:
-            return NOTHING
+            return
         if now - self._asked_at.get((peer, is_behind), -math.inf) < every_s:
-            return NOTHING
+            return
         self._asked_at[peer, is_behind] = now
-        return Effects(send=[do.AskLearnt(peer=peer, deadline_s=self._fleet.timing.ballot_s)])
+        todo.add(do.AskLearnt(peer=peer, deadline_s=self._fleet.timing.ballot_s))
 
     # --- proposers ---------------------------------------------------------------------------------------------------
 
-    def propose(self, task: TaskId, change: Change, now: float) -> Effects:
+    def propose(self, task: TaskId, change: Change, todo: ToDo, now: float) -> None:
         """Try to commit a change."""
-        effects = Effects()
         if self.generation is None:  # nobody would answer, for every ballot names the generation
-            self._end(task, change, RoundOutcome.NO_QUORUM, effects)
-            return effects
-        self._take(task, self.registers[task].propose(change, now), effects)
-        return effects
+            todo.end(task, change, RoundOutcome.NO_QUORUM)
+        else:
+            self.registers[task].propose(change, todo, now)
 
-    def retune(self, event: ev.WeightsCommanded, now: float) -> Effects:
+    def retune(self, event: ev.WeightsCommanded, todo: ToDo, now: float) -> None:
         """An operator changes a task's weights; the answer comes when the change has ended."""
-        command = event.command
+        command, request = event.command, event.request
         register = self.registers.get(command.task)
         if register is None:
             known = ", ".join(sorted(self.registers))
-            return _refusal(event.request, CommandOutcome.INVALID, f"no task {command.task!r}; tasks: {known}")
+            _refuse(request, CommandOutcome.INVALID, f"no task {command.task!r}; tasks: {known}", todo)
+            return
         try:
             weights = Weights(cpu=command.cpu, memory=command.memory, network=command.network)
         except ValueError as error:
-            return _refusal(event.request, CommandOutcome.INVALID, str(error))
+            _refuse(request, CommandOutcome.INVALID, str(error), todo)
+            return
         value = register.value
         if command.base_revision not in (None, value.revision):
             detail = f"revision is {value.revision}, not {command.base_revision}"
-            return _refusal(event.request, CommandOutcome.CONFLICT, detail)
-        if weights == value.tuning.weights:
-            return _refusal(event.request, CommandOutcome.UNCHANGED, "these are the weights in force")
-        change = Retune(
-            base_revision=value.revision, tuning=replace(value.tuning, weights=weights), request=event.request
-        )
-        return self.propose(command.task, change, now)
+            _refuse(request, CommandOutcome.CONFLICT, detail, todo)
+        elif weights == value.tuning.weights:
+            _refuse(request, CommandOutcome.UNCHANGED, _RETUNED[RoundOutcome.UNCHANGED][1], todo)
+        else:
+            tuning = replace(value.tuning, weights=weights)
+            change = Retune(base_revision=value.revision, tuning=tuning, request=request)
+            self.propose(command.task, change, todo, now)
 
-    def tick(self, now: float) -> Effects:
+    def tick(self, todo: ToDo, now: float) -> None:
         """Time has passed."""
-        effects = Effects()
-        for name, register in self.registers.items():
+        for register in self.registers.values():
             if now >= self._settle_at:
-                self._take(name, register.settle(now), effects)
+                register.settle(todo, now)
             if now >= register.next_deadline():
-                self._take(name, register.tick(now), effects)
+                register.tick(todo, now)
         if now >= self._settle_at:
             self._settle_at = math.inf
-        return effects
+
+    def on_ended(self, ended: Ended, todo: ToDo) -> None:
+        """A change that this node proposed has ended: tell the others, and whoever waits for it."""
+        task, change, outcome = ended.task, ended.change, ended.outcome
+        value = self.registers[task].value
+        if outcome is RoundOutcome.COMMITTED:
+            todo.add(do.PublishLearnt(learnt=self.learnt()))
+        if isinstance(change, MoveOwner):
+            text = f"move to {change.owner} on revision {change.base_revision}: {outcome}"
+            todo.add(do.RecordStory(stage="vote", text=text, task=task, epoch=value.epoch))
+        elif isinstance(change, Retune) and change.request is not None:
+            kind, detail = _RETUNED[outcome]
+            result = CommandResult(outcome=kind, detail=f"{task}: {detail}", revision=value.revision)
+            todo.add(do.AnswerCommand(request=change.request, result=result))
 
     def on_persist_failed(self, reason: str) -> None:
         """The disk refused: no elector any more, and nothing is written any more."""
-        self.problems["state"] = f"{reason}; this node is no elector until it is restarted"
+        self._problems["state"] = f"{reason}; this node is no elector until it is restarted"
         self._durable = None
         self._stop_electing()
 
@@ -559,46 +565,9 @@ class Agreement:
         for register in self.registers.values():
             register.stop_electing()
 
-    # --- steps -------------------------------------------------------------------------------------------------------
 
-    def _take(self, task: TaskId, step: Step, effects: Effects) -> None:
-        effects.is_dirty |= step.is_dirty
-        if step.problem:
-            self.problems[f"register/{task}"] = step.problem
-        elif step.learnt is not None:
-            self.problems.pop(f"register/{task}", None)  # agreement goes on
-        deadline_s = self._fleet.timing.ballot_s
-        if step.prepare is not None:
-            effects.send.append(do.SendPrepare(prepare=step.prepare, deadline_s=deadline_s))
-        if step.accept is not None:
-            effects.send.append(do.SendAccept(accept=step.accept, deadline_s=deadline_s))
-        reason = "learnt from a peer"
-        if step.finished is not None:
-            reason = self._end(task, *step.finished, effects) or reason
-        if step.learnt is not None:
-            effects.learnt.append((step.learnt, reason))
-
-    def _end(self, task: TaskId, change: Change, outcome: RoundOutcome, effects: Effects) -> str:
-        """A change that this node proposed has ended; why the value is what it is, if it was committed."""
-        value = self.registers[task].value
-        reason = ""
-        if outcome is RoundOutcome.COMMITTED:
-            reason = _why(change)
-            effects.send.append(do.PublishLearnt(learnt=self.learnt()))
-        if isinstance(change, MoveOwner):
-            effects.ended.append(task)
-            text = f"move to {change.owner} on revision {change.base_revision}: {outcome}"
-            effects.send.append(do.RecordStory(stage="vote", text=text, task=task, epoch=value.epoch))
-        elif isinstance(change, Retune) and change.request is not None:
-            kind, detail = _RETUNED[outcome]
-            result = CommandResult(outcome=kind, detail=f"{task}: {detail}", revision=value.revision)
-            effects.send.append(do.AnswerCommand(request=change.request, result=result))
-        return reason
-
-
-def _refusal(request: int, outcome: CommandOutcome, detail: str) -> Effects:
-    result = CommandResult(outcome=outcome, detail=detail)
-    return Effects(send=[do.AnswerCommand(request=request, result=result)])
+def _refuse(request: int, outcome: CommandOutcome, detail: str, todo: ToDo) -> None:
+    todo.add(do.AnswerCommand(request=request, result=CommandResult(outcome=outcome, detail=detail)))
 
 
 def _newest(register: Register) -> Allocation | None:
@@ -614,11 +583,3 @@ def _lost_text(why: str, newest_generation: int) -> str:
         f"{why}: it was brought back from a backup, or its disk has lost what it said was written; "
         f"no elector until a new generation ({way_out(newest_generation + 1)})"
     )
-
-
-def _why(change: Change) -> str:
-    if isinstance(change, MoveOwner):
-        return change.reason
-    if isinstance(change, Retune):
-        return "retuned by an operator"
-    return "nobody works without a lease any more" if change.leased else "not exclusive any more"

@@ -5,7 +5,7 @@ anything travels or is stored.
 
 Synod on a register that can be rewritten (Rystsov, arXiv 1802.07000): no leader, no log. The rules that keep it safe:
 
-* an elector's promise and acceptance are persisted before the answer leaves (`Step.is_dirty`);
+* an elector's promise and acceptance are persisted before the answer leaves (`ToDo.must_persist`);
 * a ballot carries exactly one value: a proposer that reads an accepted value it has not learnt re-accepts that one, and
   its own change follows under a higher ballot;
 * where too many electors refuse that value for good (their fleet files know no such node), a move is applied to it at
@@ -20,85 +20,20 @@ Synod on a register that can be rewritten (Rystsov, arXiv 1802.07000): no leader
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import StrEnum
 from random import Random
 
+from zsched.core.instructions import SendAccept, SendPrepare
+from zsched.core.todo import ToDo
+from zsched.core.values.change import Change, MoveOwner, RoundOutcome
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refusal, Refused
-from zsched.core.values.model import Acceptance, Allocation, Ballot, NodeId, RegisterState, Tuning
+from zsched.core.values.model import Acceptance, Allocation, Ballot, NodeId, RegisterState
 from zsched.core.values.quorum import majority
 
 BACKOFF_CAP_S = 5.0
 MAX_REVISION = 2**52  # half of what a counter may be: a value so far ahead is refused, for nothing could follow it
 MAX_JUMP = 2**32  # no honest counter is so far ahead; one hostile frame must not use them all up
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MoveOwner:
-    """Change: another owner; the epoch rises with the revision."""
-
-    base_revision: int
-    owner: NodeId
-    reason: str
-
-    def apply(self, read: Allocation) -> Allocation:
-        """The new value; touches owner, epoch and revision only. For the owner that is there already: what was read."""
-        if self.owner == read.owner:
-            return read
-        return replace(read, revision=read.revision + 1, epoch=read.epoch + 1, owner=self.owner)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Retune:
-    """Change: another tuning; owner and epoch stay, so routes do not move."""
-
-    base_revision: int
-    tuning: Tuning
-    request: int | None = None
-    """The operator's question that waits for this change."""
-
-    def apply(self, read: Allocation) -> Allocation:
-        """The new value; touches tuning and revision only. For the tuning in force: what was read."""
-        if self.tuning == read.tuning:
-            return read
-        return replace(read, revision=read.revision + 1, tuning=self.tuning)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SetLeased:
-    """Change: from now on nobody works without a lease, or everybody may (`zsched.core.executor.sealing`)."""
-
-    base_revision: int
-    leased: bool
-
-    def apply(self, read: Allocation) -> Allocation:
-        """The new value; touches that and the revision only."""
-        return read if read.leased is self.leased else replace(read, revision=read.revision + 1, leased=self.leased)
-
-
-Change = MoveOwner | Retune | SetLeased
-
-
-class RoundOutcome(StrEnum):
-    """How a change ended."""
-
-    COMMITTED = "committed"
-    CONFLICT = "conflict"  # its base is no longer the newest revision
-    UNCHANGED = "unchanged"  # it asks for what is there already: nothing was written
-    NO_QUORUM = "no_quorum"  # not started: no majority promised
-    UNKNOWN = "unknown"  # some elector may have it, and no majority could be asked
-
-
-@dataclass(slots=True)
-class Step:
-    """What one call changed and wants done, in this order: persist if dirty, send, apply what was learnt."""
-
-    is_dirty: bool = False
-    prepare: Prepare | None = None
-    accept: Accept | None = None
-    learnt: Allocation | None = None
-    finished: tuple[Change, RoundOutcome] | None = None
-    problem: str = ""
 
 
 class _Phase(StrEnum):
@@ -151,6 +86,8 @@ class Register:
         self._initial = initial
         self._ballot_s, self._stagger_s, self._rng = ballot_s, stagger_s, rng
         self.state = state
+        self.problem = ""
+        """Why agreement stands still; a value that is learnt ends it."""
         self._counter = state.promised.counter
         self._round: _Round | None = None
         self._queue: list[Change] = []
@@ -186,16 +123,16 @@ class Register:
 
     # --- acceptor ----------------------------------------------------------------------------------------------
 
-    def on_prepare(self, prepare: Prepare) -> tuple[Step, Promise | Refused]:
-        """Phase 1b. The answer must not leave before a dirty step is on disk."""
+    def on_prepare(self, prepare: Prepare, todo: ToDo) -> Promise | Refused:
+        """Phase 1b. A promise must not leave before it is on disk."""
         refusal = self._refusal(prepare.electorate, prepare.ballot)
         if refusal is None and prepare.ballot <= self.state.promised:
             refusal = Refusal.BALLOT
         if refusal is not None:
-            return Step(), self._no(prepare.ballot, refusal)
+            return self._no(prepare.ballot, refusal)
         self._set_state(promised=prepare.ballot)
-        promise = Promise(elector=self._me, task=self.state.task, ballot=prepare.ballot, accepted=self.state.accepted)
-        return Step(is_dirty=True), promise
+        todo.must_persist = True
+        return Promise(elector=self._me, task=self.state.task, ballot=prepare.ballot, accepted=self.state.accepted)
 
     def would_accept(self, accept: Accept) -> bool:
         """Whether `on_accept` would say yes now."""
@@ -206,20 +143,21 @@ class Register:
         """A no for a reason that lies outside the register (an exclusive task's lease)."""
         return self._no(ballot, refusal)
 
-    def on_accept(self, accept: Accept, now: float) -> tuple[Step, Accepted | Refused]:
-        """Phase 2b. The answer must not leave before a dirty step is on disk."""
+    def on_accept(self, accept: Accept, todo: ToDo, now: float) -> Accepted | Refused:
+        """Phase 2b. A yes must not leave before it is on disk."""
         ballot = accept.acceptance.ballot
         refusal = self._refusal(accept.electorate, ballot)
         value = accept.acceptance.value
         if refusal is None and (ballot < self.state.promised or max(value.revision, value.epoch) > MAX_REVISION):
             refusal = Refusal.BALLOT
         if refusal is not None:
-            return Step(), self._no(ballot, refusal)
+            return self._no(ballot, refusal)
         self._set_state(promised=ballot, accepted=accept.acceptance)
         if self._is_unlearnt():
             self._settle_tries = 0
             self._settle_at = now + 2 * self._ballot_s + self._jitter(0)
-        return Step(is_dirty=True), Accepted(elector=self._me, task=self.state.task, ballot=ballot)
+        todo.must_persist = True
+        return Accepted(elector=self._me, task=self.state.task, ballot=ballot)
 
     def _refusal(self, electorate: str, ballot: Ballot) -> Refusal | None:
         if not self._is_elector:
@@ -249,29 +187,31 @@ class Register:
 
     # --- learner -----------------------------------------------------------------------------------------------
 
-    def learn(self, value: Allocation, now: float) -> Step:
+    def learn(self, value: Allocation, todo: ToDo, now: float) -> None:
         """A committed value is known; older ones change nothing."""
-        step = Step()
-        self._learn(value, step, now)
-        return step
-
-    def _learn(self, value: Allocation, step: Step, now: float) -> None:
         if max(value.revision, value.epoch) > MAX_REVISION:
-            step.problem = f"revision {value.revision} cannot be"
+            self.problem = f"revision {value.revision} cannot be"
             return
         current = self.state.learnt
         if current is not None and value.revision <= current.revision:
             if value.revision == current.revision and value != current:
-                step.problem = f"two values for revision {value.revision}: {current.owner} and {value.owner}"
+                self.problem = f"two values for revision {value.revision}: {current.owner} and {value.owner}"
             return
         self._set_state(learnt=value)
         self._lease_over_at = -math.inf
-        step.is_dirty, step.learnt = True, value
+        self.problem = ""  # agreement goes on
         if not self._is_unlearnt():
             self._settle_at = math.inf
         outcome = self._outcome_by(value)
+        todo.must_persist = True
+        todo.learnt.append((value, self._why(outcome)))
         if outcome is not None:
-            self._finish(step, outcome, now)
+            self._finish(todo, outcome, now)
+
+    def _why(self, outcome: RoundOutcome | None) -> str:
+        """Why a value that is learnt is what it is: by our own change, or somebody else's."""
+        change = None if self._round is None else self._round.change
+        return "learnt from a peer" if change is None or outcome is not RoundOutcome.COMMITTED else change.reason
 
     def _outcome_by(self, value: Allocation) -> RoundOutcome | None:
         """How our change under way has ended, now that ``value`` is learnt; ``None``: it has not."""
@@ -291,102 +231,95 @@ class Register:
         if now >= self._lease_over_at:
             self._lease_over_at = at_most
 
-    def propose(self, change: Change, now: float) -> Step:
-        """Try to commit a change; its end comes as `Step.finished` of this or a later call."""
+    def propose(self, change: Change, todo: ToDo, now: float) -> None:
+        """Try to commit a change; its end is one of `ToDo.ended`, of this or a later call."""
         self._queue.append(change)
-        step = Step()
         if self._round is None:
-            self._start_next(step, now)
-        return step
+            self._start_next(todo, now)
 
-    def settle(self, now: float) -> Step:
+    def settle(self, todo: ToDo, now: float) -> None:
         """Run an identity round, unless a round is under way: learn whatever was accepted before."""
-        step = Step()
         if self._round is None:
             self._round = _Round(change=None, give_up_at=now + 3 * self._ballot_s)
             if self._is_unlearnt() and self._settle_at == math.inf:
                 self._settle_at = now + 2 * self._ballot_s  # after a restart nobody else asks again
-            self._prepare(step, now)
-        return step
+            self._prepare(todo, now)
 
-    def _start_next(self, step: Step, now: float) -> None:
+    def _start_next(self, todo: ToDo, now: float) -> None:
         if not self._queue:
             return
         change = self._queue.pop(0)
         self._round = _Round(change=change, give_up_at=now + 6 * self._ballot_s)
-        self._begin(step, now)
+        self._begin(todo, now)
 
-    def _begin(self, step: Step, now: float) -> None:
+    def _begin(self, todo: ToDo, now: float) -> None:
         """Prepare, unless the change is outdated; a base that is newer than what we know is read first."""
         if self._outcome_by(self.value) is None:
-            self._prepare(step, now)
-        elif step.finished is None:
-            self._finish(step, RoundOutcome.CONFLICT, now)
+            self._prepare(todo, now)
         else:
-            self._running().deadline = now  # a step reports one end; this one comes with the next tick
+            self._finish(todo, RoundOutcome.CONFLICT, now)
 
-    def _prepare(self, step: Step, now: float) -> None:
+    def _prepare(self, todo: ToDo, now: float) -> None:
         running = self._running()
         self._counter = max(self._counter, self.state.promised.counter) + 1
         running.ballot = Ballot(counter=self._counter, node=self._me, incarnation=self._incarnation)
         running.phase, running.deadline = _Phase.PREPARE, now + self._ballot_s
         running.promises, running.yes, running.no, running.value = {}, {}, {}, None
         running.known = self.value.revision
-        step.prepare = Prepare(task=self.state.task, ballot=running.ballot, electorate=self._electorate)
+        prepare = Prepare(task=self.state.task, ballot=running.ballot, electorate=self._electorate)
+        todo.add(SendPrepare(prepare=prepare, deadline_s=self._ballot_s))
 
     def _running(self) -> _Round:
         assert self._round is not None
         return self._round
 
-    def on_answer(self, answer: Promise | Accepted | Refused, now: float) -> Step:
+    def on_answer(self, answer: Promise | Accepted | Refused, todo: ToDo, now: float) -> None:
         """An elector answered; answers to older ballots and from strangers change nothing."""
-        step = Step()
         running = self._round
         if running is None or answer.ballot != running.ballot or answer.elector not in self._electors:
-            return step
+            return
         if isinstance(answer, Refused):
-            self._on_refused(running, answer, step, now)
+            self._on_refused(running, answer, todo, now)
         elif isinstance(answer, Promise) and running.phase is _Phase.PREPARE:
             running.promises[answer.elector] = answer.accepted
             if len(running.promises) >= majority(len(self._electors)):
-                self._read(running, step, now)
+                self._read(running, todo, now)
         elif isinstance(answer, Accepted) and running.phase is _Phase.ACCEPT:
             running.yes[answer.elector] = True
             if len(running.yes) >= majority(len(self._electors)):
-                self._commit(running, step, now)
-        return step
+                self._commit(running, todo, now)
 
-    def _read(self, running: _Round, step: Step, now: float) -> None:
+    def _read(self, running: _Round, todo: ToDo, now: float) -> None:
         """A majority promised: decide what this ballot carries."""
         accepted = [acceptance for acceptance in running.promises.values() if acceptance is not None]
         # First values of a generation are equal but for their leases: what is not leased for one is so for nobody.
         newest = max(accepted, key=lambda acceptance: (acceptance.ballot, not acceptance.value.leased), default=None)
         read = self._initial if newest is None else newest.value
         if read.revision < running.known:
-            step.problem = f"a majority of electors has forgotten revision {running.known}"
-            self._give_up(running, step, now)
+            self.problem = f"a majority of electors has forgotten revision {running.known}"
+            self._give_up(running, todo, now)
             return
         if read.revision < self.value.revision:  # learnt since we asked: a higher ballot has overtaken this one
-            self._again(running, step, now)
+            self._again(running, todo, now)
             return
         is_identity = running.change is None or running.sent is not None
         if is_identity and newest is None:
-            self._finish(step, RoundOutcome.COMMITTED if running.sent is None else RoundOutcome.UNKNOWN, now)
+            self._finish(todo, RoundOutcome.COMMITTED if running.sent is None else RoundOutcome.UNKNOWN, now)
             return
         if (moved := self._moved_on(running, read)) is not None:
             running.value = running.sent = moved
         elif read.revision > self.value.revision or running.change is None or running.sent is not None:
             running.value = read
         elif running.change.base_revision != read.revision:
-            self._finish(step, RoundOutcome.CONFLICT, now)
+            self._finish(todo, RoundOutcome.CONFLICT, now)
             return
         elif (changed := running.change.apply(read)) == read:
-            self._finish(step, RoundOutcome.UNCHANGED, now)
+            self._finish(todo, RoundOutcome.UNCHANGED, now)
             return
         else:
             running.value = running.sent = changed
         assert running.ballot is not None
-        self._accept(running, running.ballot, running.value, step, now)
+        self._accept(running, running.ballot, running.value, todo, now)
 
     def _moved_on(self, running: _Round, read: Allocation) -> Allocation | None:
         """Our move applied to a value that was read and cannot be settled; ``None``: it is not that, or no move."""
@@ -395,20 +328,20 @@ class Register:
         moved = running.change.apply(read)
         return None if moved == read else moved
 
-    def _commit(self, running: _Round, step: Step, now: float) -> None:
+    def _commit(self, running: _Round, todo: ToDo, now: float) -> None:
         """A majority accepted: the value is chosen."""
         assert running.value is not None
-        self._learn(running.value, step, now)
+        self.learn(running.value, todo, now)
         if self._round is not running:
             return  # learning it has ended the round
         if running.change is None:
-            self._finish(step, RoundOutcome.COMMITTED, now)
+            self._finish(todo, RoundOutcome.COMMITTED, now)
         elif running.sent is None:
-            self._prepare(step, now)  # the other's value is settled; ours follows under a higher ballot
+            self._prepare(todo, now)  # the other's value is settled; ours follows under a higher ballot
         else:
-            self._finish(step, RoundOutcome.CONFLICT, now)  # a majority has passed the ballot that carried ours
+            self._finish(todo, RoundOutcome.CONFLICT, now)  # a majority has passed the ballot that carried ours
 
-    def _on_refused(self, running: _Round, answer: Refused, step: Step, now: float) -> None:
+    def _on_refused(self, running: _Round, answer: Refused, todo: ToDo, now: float) -> None:
         if answer.refusal is Refusal.BALLOT and answer.promised <= answer.ballot:
             return  # the echo of a duplicated prepare: it has promised this very ballot
         if answer.promised.counter <= self._counter + MAX_JUMP:
@@ -419,68 +352,68 @@ class Register:
                 return  # the same accept is sent once more at its deadline
             if Refusal.VALUE in running.no.values():
                 running.unfit = running.value
-            self._again(running, step, now)
+            self._again(running, todo, now)
 
     @staticmethod
     def _waits_for_leases(running: _Round) -> bool:
         """Whether nothing but an exclusive task's lease stands against our accept: it will end, the ballot is good."""
         return running.phase is _Phase.ACCEPT and set(running.no.values()) == {Refusal.LEASE}
 
-    def _ask_again(self, running: _Round, step: Step, now: float) -> None:
+    def _ask_again(self, running: _Round, todo: ToDo, now: float) -> None:
         """Send the same accept once more: a new ballot could only find out what became of it, without a move."""
         if now >= running.give_up_at:
-            self._give_up(running, step, now)
+            self._give_up(running, todo, now)
             return
         assert running.ballot is not None
         assert running.value is not None
-        self._accept(running, running.ballot, running.value, step, now)
+        self._accept(running, running.ballot, running.value, todo, now)
 
-    def _accept(self, running: _Round, ballot: Ballot, value: Allocation, step: Step, now: float) -> None:
+    def _accept(self, running: _Round, ballot: Ballot, value: Allocation, todo: ToDo, now: float) -> None:
         running.phase, running.deadline, running.no = _Phase.ACCEPT, now + self._ballot_s, {}
         acceptance = Acceptance(ballot=ballot, value=value)
-        step.accept = Accept(task=self.state.task, acceptance=acceptance, electorate=self._electorate)
+        accept = Accept(task=self.state.task, acceptance=acceptance, electorate=self._electorate)
+        todo.add(SendAccept(accept=accept, deadline_s=self._ballot_s))
 
-    def _again(self, running: _Round, step: Step, now: float) -> None:
+    def _again(self, running: _Round, todo: ToDo, now: float) -> None:
         """This ballot cannot win: wait a little and try a higher one (only to find out, once ours was sent), or end."""
         wait = self._jitter(running.attempt)
         if now + wait >= running.give_up_at:
-            self._give_up(running, step, now)
+            self._give_up(running, todo, now)
             return
         running.attempt += 1
         running.phase, running.deadline, running.ballot = _Phase.WAIT, now + wait, None
 
-    def _give_up(self, running: _Round, step: Step, now: float) -> None:
-        self._finish(step, RoundOutcome.NO_QUORUM if running.sent is None else RoundOutcome.UNKNOWN, now)
+    def _give_up(self, running: _Round, todo: ToDo, now: float) -> None:
+        self._finish(todo, RoundOutcome.NO_QUORUM if running.sent is None else RoundOutcome.UNKNOWN, now)
 
-    def _finish(self, step: Step, outcome: RoundOutcome, now: float) -> None:
+    def _finish(self, todo: ToDo, outcome: RoundOutcome, now: float) -> None:
         running = self._running()
         if running.change is not None:
-            step.finished = (running.change, outcome)
+            todo.end(self.state.task, running.change, outcome)
         self._round = None
-        self._start_next(step, now)
+        self._start_next(todo, now)
 
     def _jitter(self, attempt: int) -> float:
         """Doubling back-off with jitter, so that duelling proposers part."""
         base = self._stagger_s * 2.0 ** min(attempt, 16)  # bounded: a cut may last for days
         return min(base, BACKOFF_CAP_S) * (0.5 + self._rng.random())
 
-    def tick(self, now: float) -> Step:
+    def tick(self, todo: ToDo, now: float) -> None:
         """Time has passed."""
-        step = Step()
         running = self._round
         if running is not None and now >= running.deadline:
             if running.phase is _Phase.WAIT and now < (until := min(self._lease_over_at, running.give_up_at)):
                 running.deadline = until  # our next ballot would end the accept that waits
             elif running.phase is _Phase.WAIT:
-                self._begin(step, now)
+                self._begin(todo, now)
             elif self._waits_for_leases(running):
-                self._ask_again(running, step, now)
+                self._ask_again(running, todo, now)
             else:
-                self._again(running, step, now)
+                self._again(running, todo, now)
         elif running is None and now >= self._settle_at:
             self._settle_tries += 1
             self._settle_at = now + 2 * self._ballot_s + self._jitter(self._settle_tries)
             if self._is_unlearnt():
-                return self.settle(now)
-            self._settle_at = math.inf
-        return step
+                self.settle(todo, now)
+            else:
+                self._settle_at = math.inf

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from zsched.core.scheduler.scoring import rounded
-from zsched.core.values.model import NodeId, PeerState, Proposal
+from zsched.core.values.model import NodeId, Proposal
 from zsched.core.values.quorum import majority
 
 
@@ -40,11 +40,6 @@ class Tally:
     """(voter, candidate), sorted by voter."""
     is_escape: bool
     reason: str
-
-
-def present_voters(voters: tuple[NodeId, ...], states: Mapping[NodeId, PeerState]) -> frozenset[NodeId]:
-    """The robots that are not gone."""
-    return frozenset(name for name in voters if states[name] is not PeerState.GONE)
 
 
 def tally(

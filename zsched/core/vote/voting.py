@@ -1,7 +1,7 @@
 """VOTE in motion: one task's proposals at one robot, whether a vote is open, what it gave, when to commit the winner.
 
 Knows: which proposals are fresh, who answers a call, who commits and when. Does not know: why a robot proposes what it
-does (`rounds`), the count's rules (`vote`), how a winner is committed (`register`).
+does (`zsched.core.scheduler.rounds`), the count's rules (`tally`), how a winner is committed (`register`).
 
 The first proposal for a move *opens* a vote, and so calls all others to it; whoever has proposed within `vote_time` has
 answered already. A proposal counts as fresh for as long: twice a gather, since answering one may take a whole gather
@@ -13,10 +13,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+from zsched.core.values.change import MoveOwner
 from zsched.core.values.fleet import Fleet, Timing
 from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal
-from zsched.core.vote.register import MoveOwner
-from zsched.core.vote.tally import Tally, VoteOutcome, present_voters, tally
+from zsched.core.values.quorum import present_voters
+from zsched.core.vote.tally import Tally, VoteOutcome, tally
 
 VOTE_MARGIN_S = 0.1
 

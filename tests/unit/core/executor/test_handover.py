@@ -10,6 +10,7 @@ from typing import TypeVar
 import pytest
 
 from support.fleets import tuning_of
+from support.todos import done
 from zsched.core.executor.handover import LEAVES_S, MAX_OLD, ROLE_DRAIN_MARGIN_S, Executor, Phase
 from zsched.core.instructions import ApplyRoutes, Instruction, RecordStory, SetRole, StartWorker, StopWorker
 from zsched.core.values.fleet import Standby, StreamRule, TaskSpec, WorkerSpec
@@ -68,18 +69,18 @@ def of(out: tuple[Instruction, ...], kind: type[T]) -> list[T]:
 def at(phase: Phase) -> Executor:
     """A robot's executor in a phase of its second handover: edge1 (epoch 1) to edge2 (epoch 2), at 10 s."""
     one = robot()
-    one.execute(allocation("edge1", 1), 0.0)
-    one.on_ready(1)
-    one.on_flipped(1, 0, 0.0)
+    done(one.execute, allocation("edge1", 1), 0.0)
+    done(one.on_ready, 1)
+    done(one.on_flipped, 1, 0, 0.0)
     if phase is Phase.SETTLED:
         return one
-    one.execute(allocation("edge2", 2), 10.0)
+    done(one.execute, allocation("edge2", 2), 10.0)
     if phase is Phase.PREPARING:
         return one
-    one.on_ready(2)
+    done(one.on_ready, 2)
     if phase is Phase.FLIPPING:
         return one
-    one.on_flipped(2, 3, 10.0)
+    done(one.on_flipped, 2, 3, 10.0)
     assert one.phase is Phase.DRAINING
     return one
 
@@ -89,29 +90,29 @@ def at(phase: Phase) -> Executor:
 
 def test_first_owner_is_prepared_flipped_and_closed_without_a_predecessor() -> None:
     one = robot()
-    assert plan(one.execute(allocation("edge1", 1), 0.0)) == ("prepare", 1, None)
+    assert plan(done(one.execute, allocation("edge1", 1), 0.0)) == ("prepare", 1, None)
     phases = [one.phase]
-    assert plan(one.on_ready(1)) == ("flip", 1, None)
+    assert plan(done(one.on_ready, 1)) == ("flip", 1, None)
     phases.append(one.phase)
-    assert plan(one.on_flipped(1, 2, 0.5)) == ("close", 1, None)
+    assert plan(done(one.on_flipped, 1, 2, 0.5)) == ("close", 1, None)
     assert [*phases, one.phase] == [Phase.PREPARING, Phase.FLIPPING, Phase.SETTLED]
 
 
 def test_move_goes_through_every_phase_and_keeps_the_old_slot_until_it_is_drained() -> None:
     one = at(Phase.SETTLED)
-    assert plan(one.execute(allocation("edge2", 2), 1.0)) == ("prepare", 2, 1)
-    assert plan(one.on_ready(2)) == ("flip", 2, 1)
-    assert plan(one.on_flipped(2, 1, 1.1)) is None, "the flip's plan stands while the old slot drains"
+    assert plan(done(one.execute, allocation("edge2", 2), 1.0)) == ("prepare", 2, 1)
+    assert plan(done(one.on_ready, 2)) == ("flip", 2, 1)
+    assert plan(done(one.on_flipped, 2, 1, 1.1)) is None, "the flip's plan stands while the old slot drains"
     assert (one.phase, one.predecessors) == (Phase.DRAINING, ("edge1",))
-    assert plan(one.on_drained(1)) == ("close", 2, None)
+    assert plan(done(one.on_drained, 1)) == ("close", 2, None)
     assert (one.phase, one.predecessors) == (Phase.SETTLED, ())
 
 
 def test_drain_time_closes_the_old_slot() -> None:
     one = at(Phase.DRAINING)
     assert one.next_deadline() == 12.0
-    assert one.tick(11.99) == ()
-    assert plan(one.tick(12.0)) == ("close", 2, None)
+    assert done(one.tick, 11.99) == ()
+    assert plan(done(one.tick, 12.0)) == ("close", 2, None)
     assert (one.phase, one.next_deadline()) == (Phase.SETTLED, math.inf)
 
 
@@ -128,15 +129,15 @@ def test_gone_predecessor_leaves_the_plan_in_every_phase(
     phase: Phase, expected: tuple[str | int | None, ...] | None, after: Phase
 ) -> None:
     one = at(phase)
-    assert plan(one.on_gone("edge1")) == expected
+    assert plan(done(one.on_gone, "edge1")) == expected
     assert (one.phase, one.predecessors) == (after, ())
 
 
 @pytest.mark.parametrize("phase", [Phase.PREPARING, Phase.FLIPPING, Phase.DRAINING, Phase.SETTLED])
 def test_other_nodes_that_go_change_nothing(phase: Phase) -> None:
     one = at(phase)
-    assert one.on_gone("edge3") == ()
-    assert one.on_gone("edge2") == (), "giving up on the new owner is a new proposal, never local"
+    assert done(one.on_gone, "edge3") == ()
+    assert done(one.on_gone, "edge2") == (), "giving up on the new owner is a new proposal, never local"
     assert one.phase is phase
 
 
@@ -153,7 +154,7 @@ def test_newer_epoch_in_any_phase_prepares_and_keeps_the_slots_that_carry_or_dra
     phase: Phase, expected: tuple[str, int, int], deadline: float
 ) -> None:
     one = at(phase)
-    assert plan(one.execute(allocation("edge3", 3), 11.0)) == expected
+    assert plan(done(one.execute, allocation("edge3", 3), 11.0)) == expected
     assert one.phase is Phase.PREPARING
     assert one.next_deadline() == deadline
 
@@ -161,77 +162,77 @@ def test_newer_epoch_in_any_phase_prepares_and_keeps_the_slots_that_carry_or_dra
 def moved_twice() -> Executor:
     """Epoch 1 (edge1) drains since 10 s, epoch 2 (edge2) carries, epoch 3 (edge1) is prepared at 11 s."""
     one = at(Phase.DRAINING)
-    one.execute(allocation("edge1", 3), 11.0)
+    done(one.execute, allocation("edge1", 3), 11.0)
     return one
 
 
 def test_a_slot_that_drains_goes_on_to_when_the_task_moves_again() -> None:
     one = moved_twice()
-    assert plan(one.on_ready(3)) == ("flip", 3, 1, 2)
-    assert plan(one.on_flipped(3, 0, 11.5)) is None
-    assert plan(one.on_drained(1)) is None, "the other one still drains"
+    assert plan(done(one.on_ready, 3)) == ("flip", 3, 1, 2)
+    assert plan(done(one.on_flipped, 3, 0, 11.5)) is None
+    assert plan(done(one.on_drained, 1)) is None, "the other one still drains"
     assert one.phase is Phase.DRAINING
     assert one.predecessors == ("edge2",)
     assert one.next_deadline() == 13.5
-    assert plan(one.on_drained(2)) == ("close", 3, None)
+    assert plan(done(one.on_drained, 2)) == ("close", 3, None)
 
 
 def test_a_slot_that_has_drained_is_not_in_the_next_plan() -> None:
     one = moved_twice()
-    assert plan(one.on_drained(1)) is None
-    assert one.on_drained(2) == (), "it still carries"
-    assert plan(one.on_ready(3)) == ("flip", 3, 2)
+    assert plan(done(one.on_drained, 1)) is None
+    assert done(one.on_drained, 2) == (), "it still carries"
+    assert plan(done(one.on_ready, 3)) == ("flip", 3, 2)
 
 
 @pytest.mark.parametrize("steps", [0, 1, 2], ids=["preparing", "flipping", "draining"])
 def test_each_slot_has_its_own_drain_time(steps: int) -> None:
     one = moved_twice()
     if steps:
-        one.on_ready(3)
+        done(one.on_ready, 3)
     if steps == 2:
-        one.on_flipped(3, 0, 11.5)
-    assert plan(one.tick(11.99)) is None
-    assert plan(one.tick(12.0)) == ("flip" if steps else "prepare", 3, 2)
-    assert plan(one.tick(13.5)) == (("close", 3, None) if steps == 2 else None), "what carries has none"
+        done(one.on_flipped, 3, 0, 11.5)
+    assert plan(done(one.tick, 11.99)) is None
+    assert plan(done(one.tick, 12.0)) == ("flip" if steps else "prepare", 3, 2)
+    assert plan(done(one.tick, 13.5)) == (("close", 3, None) if steps == 2 else None), "what carries has none"
 
 
 def test_every_slot_of_an_owner_that_is_gone_is_dropped() -> None:
     one = moved_twice()
-    assert plan(one.on_gone("edge1")) == ("prepare", 3, 2)
+    assert plan(done(one.on_gone, "edge1")) == ("prepare", 3, 2)
     two = moved_twice()
-    assert plan(two.on_gone("edge2")) == ("prepare", 3, 1)
-    assert plan(two.on_ready(3)) == ("flip", 3, 1)
-    two.on_flipped(3, 0, 11.5)
+    assert plan(done(two.on_gone, "edge2")) == ("prepare", 3, 1)
+    assert plan(done(two.on_ready, 3)) == ("flip", 3, 1)
+    done(two.on_flipped, 3, 0, 11.5)
     assert two.next_deadline() == 12.0, "the older one's time goes on"
-    assert plan(two.on_gone("edge1")) == ("close", 3, None)
+    assert plan(done(two.on_gone, "edge1")) == ("close", 3, None)
 
 
 def test_only_so_many_slots_drain_at_once() -> None:
     one = at(Phase.SETTLED)
     for epoch in range(2, 9):
-        one.execute(allocation(f"edge{1 + epoch % 2}", epoch), 0.0)
-        one.on_ready(epoch)
-        out = one.on_flipped(epoch, 0, 0.0)
+        done(one.execute, allocation(f"edge{1 + epoch % 2}", epoch), 0.0)
+        done(one.on_ready, epoch)
+        out = done(one.on_flipped, epoch, 0, 0.0)
     assert plan(out) is None
-    assert plan(one.again()) == ("flip", 8, *range(8 - MAX_OLD, 8))
+    assert plan(done(one.again)) == ("flip", 8, *range(8 - MAX_OLD, 8))
 
 
 def test_there_and_back_ends_on_the_first_owner_with_its_own_old_slot_to_drain() -> None:
     """A -> B -> A before B was ready: the old slot of A stays open beside A's new one."""
     one = at(Phase.PREPARING)
-    assert plan(one.execute(allocation("edge1", 3), 11.0)) == ("prepare", 3, 1)
+    assert plan(done(one.execute, allocation("edge1", 3), 11.0)) == ("prepare", 3, 1)
     assert (one.predecessors, one.owner) == (("edge1",), "edge1")
-    assert plan(one.on_ready(3)) == ("flip", 3, 1)
-    one.on_flipped(3, 0, 11.1)
-    assert plan(one.on_drained(1)) == ("close", 3, None)
+    assert plan(done(one.on_ready, 3)) == ("flip", 3, 1)
+    done(one.on_flipped, 3, 0, 11.1)
+    assert plan(done(one.on_drained, 1)) == ("close", 3, None)
 
 
 # --- what is not in the table ----------------------------------------------------------------------------------------
 
 EVENTS: dict[str, Callable[[Executor, int], tuple[Instruction, ...]]] = {
-    "ready": lambda one, epoch: one.on_ready(epoch),
-    "flipped": lambda one, epoch: one.on_flipped(epoch, 0, 10.5),
-    "drained": lambda one, epoch: one.on_drained(epoch),
+    "ready": lambda one, epoch: done(one.on_ready, epoch),
+    "flipped": lambda one, epoch: done(one.on_flipped, epoch, 0, 10.5),
+    "drained": lambda one, epoch: done(one.on_drained, epoch),
 }
 LEGAL = {("ready", Phase.PREPARING, 2), ("flipped", Phase.FLIPPING, 2), ("drained", Phase.DRAINING, 1)}
 
@@ -253,14 +254,14 @@ def test_idle_executor_ignores_reports_and_needs_no_time() -> None:
     one = robot()
     for act in EVENTS.values():
         assert act(one, 0) == ()
-    assert one.on_gone("edge1") == ()
-    assert (one.phase, one.next_deadline(), one.again()) == (Phase.IDLE, math.inf, ())
+    assert done(one.on_gone, "edge1") == ()
+    assert (one.phase, one.next_deadline(), done(one.again)) == (Phase.IDLE, math.inf, ())
 
 
 @pytest.mark.parametrize("late", [allocation("edge3", 1), allocation("edge3", 2), allocation(None, 3)])
 def test_older_equal_and_empty_allocations_are_not_carried_out(late: Allocation) -> None:
     one = at(Phase.DRAINING)
-    assert one.execute(late, 11.0) == ()
+    assert done(one.execute, late, 11.0) == ()
     assert one.phase is Phase.DRAINING
 
 
@@ -275,17 +276,17 @@ def test_older_equal_and_empty_allocations_are_not_carried_out(late: Allocation)
 )
 def test_again_repeats_the_plan_that_stands(phase: Phase, expected: tuple[str, int, int | None]) -> None:
     one, twin = at(phase), at(phase)
-    assert plan(one.again()) == expected
+    assert plan(done(one.again)) == expected
     assert one == twin
 
 
 def test_every_step_says_what_it_did() -> None:
     one = at(Phase.SETTLED)
     steps = (
-        one.execute(allocation("edge2", 2), 10.0),
-        one.on_ready(2),
-        one.on_flipped(2, 7, 10.25),
-        one.on_drained(1),
+        done(one.execute, allocation("edge2", 2), 10.0),
+        done(one.on_ready, 2),
+        done(one.on_flipped, 2, 7, 10.25),
+        done(one.on_drained, 1),
     )
     told = [story.text for out in steps for story in of(out, RecordStory)]
     assert told == [
@@ -314,16 +315,16 @@ def test_every_step_says_what_it_did() -> None:
 def test_only_warm_candidates_with_a_command_start_their_worker_at_once(
     one: Executor, expected: tuple[Instruction, ...]
 ) -> None:
-    assert one.start() == expected
+    assert done(one.start) == expected
 
 
 def test_role_goes_from_idle_over_active_and_draining_to_idle() -> None:
     one = edge()
     assert one.role.role is WorkerRole.IDLE
-    assert roles(one.execute(allocation("edge1", 1), 0.0)) == [(WorkerRole.ACTIVE, 1)]
-    assert roles(one.execute(allocation("edge2", 2), 10.0)) == [(WorkerRole.DRAINING, 1)]
+    assert roles(done(one.execute, allocation("edge1", 1), 0.0)) == [(WorkerRole.ACTIVE, 1)]
+    assert roles(done(one.execute, allocation("edge2", 2), 10.0)) == [(WorkerRole.DRAINING, 1)]
     assert one.next_deadline() == 10.0 + SPEC.drain_s + ROLE_DRAIN_MARGIN_S
-    out = one.tick(one.next_deadline())
+    out = done(one.tick, one.next_deadline())
     assert roles(out) == [(WorkerRole.IDLE, 0)]
     assert not of(out, StopWorker), "a warm standby keeps running"
     assert one.next_deadline() == math.inf
@@ -331,30 +332,30 @@ def test_role_goes_from_idle_over_active_and_draining_to_idle() -> None:
 
 def test_owner_that_is_chosen_again_while_it_drains_stays_active() -> None:
     one = edge()
-    one.execute(allocation("edge1", 1), 0.0)
-    one.execute(allocation("edge2", 2), 1.0)
-    assert roles(one.execute(allocation("edge1", 3), 1.5)) == [(WorkerRole.ACTIVE, 3)]
+    done(one.execute, allocation("edge1", 1), 0.0)
+    done(one.execute, allocation("edge2", 2), 1.0)
+    assert roles(done(one.execute, allocation("edge1", 3), 1.5)) == [(WorkerRole.ACTIVE, 3)]
     assert one.next_deadline() == math.inf
-    assert one.tick(100.0) == ()
+    assert done(one.tick, 100.0) == ()
 
 
 def test_moves_between_others_do_not_touch_the_role() -> None:
     one = edge("edge3")
-    assert one.execute(allocation("edge1", 1), 0.0) == ()
-    assert one.execute(allocation("edge2", 2), 0.0) == ()
+    assert done(one.execute, allocation("edge1", 1), 0.0) == ()
+    assert done(one.execute, allocation("edge2", 2), 0.0) == ()
     drained = edge()
-    drained.execute(allocation("edge1", 1), 0.0)
-    drained.execute(allocation("edge2", 2), 10.0)
+    done(drained.execute, allocation("edge1", 1), 0.0)
+    done(drained.execute, allocation("edge2", 2), 10.0)
     deadline = drained.next_deadline()
-    assert drained.execute(allocation("edge3", 3), 11.0) == ()
+    assert done(drained.execute, allocation("edge3", 3), 11.0) == ()
     assert drained.next_deadline() == deadline
 
 
 def test_cold_standby_is_started_by_its_allocation_and_stopped_after_its_drain() -> None:
     one = edge(spec=COLD)
-    assert of(one.execute(allocation("edge1", 1), 0.0), StartWorker)
-    assert not of(one.execute(allocation("edge2", 2), 10.0), StopWorker)
-    out = one.tick(one.next_deadline())
+    assert of(done(one.execute, allocation("edge1", 1), 0.0), StartWorker)
+    assert not of(done(one.execute, allocation("edge2", 2), 10.0), StopWorker)
+    out = done(one.tick, one.next_deadline())
     assert out[-1] == StopWorker(task="merge")
     assert roles(out) == [(WorkerRole.IDLE, 0)]
 
@@ -362,15 +363,15 @@ def test_cold_standby_is_started_by_its_allocation_and_stopped_after_its_drain()
 def test_cold_standbys_old_owner_works_until_the_new_one_can_have_started() -> None:
     """Make before break: the robots stay with the old owner while the new one's worker starts."""
     one = edge(spec=COLD)
-    one.execute(allocation("edge1", 1), 0.0)
-    one.execute(allocation("edge2", 2), 10.0)
-    assert one.tick(10.0 + COLD.worker.start_deadline_s + COLD.drain_s) == ()
+    done(one.execute, allocation("edge1", 1), 0.0)
+    done(one.execute, allocation("edge2", 2), 10.0)
+    assert done(one.tick, 10.0 + COLD.worker.start_deadline_s + COLD.drain_s) == ()
     assert one.role.role is WorkerRole.DRAINING
 
 
 def test_foreign_worker_is_told_its_role_and_never_started() -> None:
     one = edge(spec=FOREIGN)
-    out = one.execute(allocation("edge1", 1), 0.0)
+    out = done(one.execute, allocation("edge1", 1), 0.0)
     assert roles(out) == [(WorkerRole.ACTIVE, 1)]
     assert not of(out, StartWorker)
 
@@ -378,7 +379,7 @@ def test_foreign_worker_is_told_its_role_and_never_started() -> None:
 def test_robot_that_is_candidate_and_has_streams_gets_both() -> None:
     spec = replace(SPEC, candidates=("robot1",))
     one = Executor(spec=spec, me="robot1", has_streams=True)
-    out = one.execute(allocation("robot1", 1), 0.0)
+    out = done(one.execute, allocation("robot1", 1), 0.0)
     assert [type(step) for step in out] == [StartWorker, SetRole, ApplyRoutes, RecordStory]
 
 
@@ -400,8 +401,8 @@ def test_again_repeats_the_workers_wish_and_role(
     """A batch that was cut off may have held any of them; each may be given twice."""
     one = edge(spec=spec)
     for epoch, owner in enumerate(moves, 1):
-        one.execute(allocation(owner, epoch), 0.0)
-    out = one.again()
+        done(one.execute, allocation(owner, epoch), 0.0)
+    out = done(one.again)
     assert [type(step) for step in out] == expected
     assert roles(out) == [(one.role.role, one.role.epoch)]
 
@@ -410,10 +411,10 @@ def test_an_owner_that_went_stays_gone_whoever_goes_next() -> None:
     """Its worker's state is not asked for by the next owner."""
     for gone in ((), ("edge1",), ("edge1", "edge3"), ("edge3",)):
         one = edge("edge2")
-        one.execute(allocation("edge1", 1), 0.0)
+        done(one.execute, allocation("edge1", 1), 0.0)
         for node in gone:
-            one.on_gone(node)
-        (told,) = [out.role for out in one.execute(allocation("edge2", 2), 1.0) if isinstance(out, SetRole)]
+            done(one.on_gone, node)
+        (told,) = [out.role for out in done(one.execute, allocation("edge2", 2), 1.0) if isinstance(out, SetRole)]
         assert told.predecessor == (None if "edge1" in gone else "edge1")
 
 
@@ -423,10 +424,10 @@ def test_an_owner_that_went_stays_gone_whoever_goes_next() -> None:
 def test_a_worker_may_work_without_a_lease_until_it_has_said_that_it_has_stopped() -> None:
     one = edge()
     assert not one.may_work_unleased(0.0)
-    one.execute(allocation("edge1", 1), 0.0)
+    done(one.execute, allocation("edge1", 1), 0.0)
     one.on_role_ended(1)
     assert one.may_work_unleased(0.0), "nobody told it to stop"
-    one.execute(replace(allocation("edge1", 1), leased=True), 1.0)
+    done(one.execute, replace(allocation("edge1", 1), leased=True), 1.0)
     assert one.role.role is WorkerRole.IDLE
     assert one.may_work_unleased(100.0), "it has not said that it has"
     one.on_role_ended(0)
@@ -437,21 +438,21 @@ def test_a_worker_may_work_without_a_lease_until_it_has_said_that_it_has_stopped
 
 def test_a_worker_whose_process_ended_works_no_more_unless_the_next_one_may() -> None:
     one = edge()
-    one.execute(allocation("edge1", 1), 0.0)
+    done(one.execute, allocation("edge1", 1), 0.0)
     one.on_worker_ended()
     assert one.may_work_unleased(0.0), "the next process may work at once"
-    one.execute(replace(allocation("edge1", 1), leased=True), 1.0)
+    done(one.execute, replace(allocation("edge1", 1), leased=True), 1.0)
     one.on_worker_ended()
     assert not one.may_work_unleased(1.0)
 
 
 def test_a_worker_that_has_drained_hears_of_its_end_a_little_later() -> None:
     one = edge()
-    one.execute(allocation("edge1", 1), 0.0)
-    one.execute(allocation("edge2", 2), 1.0)
+    done(one.execute, allocation("edge1", 1), 0.0)
+    done(one.execute, allocation("edge2", 2), 1.0)
     assert one.role.role is WorkerRole.DRAINING
     ends_at = one.next_deadline()
-    (told,) = [out.role.role for out in one.tick(ends_at) if isinstance(out, SetRole)]
+    (told,) = [out.role.role for out in done(one.tick, ends_at) if isinstance(out, SetRole)]
     assert told is WorkerRole.IDLE
     one.on_role_ended(1)
     assert one.may_work_unleased(ends_at + LEAVES_S - 0.001)
@@ -460,8 +461,8 @@ def test_a_worker_that_has_drained_hears_of_its_end_a_little_later() -> None:
 
 def test_a_worker_that_was_told_to_stop_at_once_has_nothing_to_hear() -> None:
     one = edge(spec=replace(SPEC, exclusive=True))
-    one.execute(replace(allocation("edge1", 1), leased=True), 0.0)
-    one.set_lease(2.0, 0.0)
-    one.execute(replace(allocation("edge2", 2), leased=True), 1.0)
-    one.tick(one.next_deadline())
+    done(one.execute, replace(allocation("edge1", 1), leased=True), 0.0)
+    done(one.set_lease, 2.0, 0.0)
+    done(one.execute, replace(allocation("edge2", 2), leased=True), 1.0)
+    done(one.tick, one.next_deadline())
     assert not one.may_work_unleased(1.0)

@@ -1,6 +1,7 @@
 """Who is asked for the state of an epoch: the owner of the one before, while it is there."""
 
 from support.fleets import tuning_of
+from support.todos import done
 from zsched.core.executor.handover import Executor
 from zsched.core.instructions import Instruction, SetRole
 from zsched.core.values.fleet import TaskSpec, WorkerSpec
@@ -22,7 +23,7 @@ def edge(*, exclusive: bool = False) -> Executor:
 
 
 def execute(one: Executor, owner: str, epoch: int) -> tuple[Instruction, ...]:
-    return one.execute(Allocation(task="merge", revision=epoch, epoch=epoch, owner=owner, tuning=TUNING), 0.0)
+    return done(one.execute, Allocation(task="merge", revision=epoch, epoch=epoch, owner=owner, tuning=TUNING), 0.0)
 
 
 def role(out: tuple[Instruction, ...]) -> Role:
@@ -44,15 +45,15 @@ def test_the_owner_before_is_the_predecessor() -> None:
 def test_an_owner_that_is_gone_is_not_asked() -> None:
     one = edge()
     execute(one, "edge2", 1)
-    one.on_gone("edge2")
+    done(one.on_gone, "edge2")
     assert role(execute(one, "edge1", 2)).predecessor is None
 
 
 def test_somebody_elses_going_changes_nothing_and_is_forgotten_with_the_epoch() -> None:
     one = edge()
     execute(one, "edge3", 1)
-    one.on_gone("edge2")
-    one.on_gone("edge3")
+    done(one.on_gone, "edge2")
+    done(one.on_gone, "edge3")
     execute(one, "edge2", 2)
     assert role(execute(one, "edge1", 3)).predecessor == "edge2"
 
@@ -68,4 +69,4 @@ def test_a_lease_keeps_the_predecessor() -> None:
     one = edge(exclusive=True)
     execute(one, "edge2", 1)
     execute(one, "edge1", 2)
-    assert role(one.set_lease(5.0, 1.0)).predecessor == "edge2"
+    assert role(done(one.set_lease, 5.0, 1.0)).predecessor == "edge2"

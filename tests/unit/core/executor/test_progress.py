@@ -8,6 +8,7 @@ from random import Random
 import pytest
 
 from support.fleets import tuning_of
+from support.todos import todo_of
 from zsched.core import events as ev
 from zsched.core.executor.handover import Executor, Phase
 from zsched.core.executor.progress import COUNT_S, MARGIN_S, HangWatch, Progress
@@ -175,7 +176,7 @@ class Owner:
     def hear(self, robot: str, now: float, *progress: TaskProgress) -> tuple[Instruction, ...]:
         self.sequence += 1
         assert self.gateway.absorb(profile(robot, self.sequence, *progress), now) is None
-        return self.watch.look(["merge"], {"merge": self.executor}, self.gateway, now)
+        return tuple(todo_of(self.watch.look, ["merge"], {"merge": self.executor}, self.gateway, now).apply)
 
 
 LATE = 100.0 + DEADLINE_S + MARGIN_S + 0.1

@@ -7,12 +7,13 @@ from dataclasses import replace
 import pytest
 
 from support.fleets import fleet_of, tuning_of
+from support.todos import done
 from zsched.core.executor.handover import Executor
 from zsched.core.executor.sealing import ASK_EVERY_S, Sealing
+from zsched.core.values.change import SetLeased
 from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec, fleet_hash, lease_terms
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import Allocation, Beat
-from zsched.core.vote.register import SetLeased
 
 NAMES = ("e1", "e2", "e3")
 TUNING = tuning_of(cpu=1.0, memory=0.0)
@@ -185,7 +186,7 @@ def test_the_tasks_whose_worker_may_work_without_a_lease_are_told() -> None:
     one = sealing(fleet(OPEN, replace(EXCLUSIVE, name="other")))
     assert one.unleased(0.0) == ()
     for executor in one.executors.values():
-        executor.execute(value(executor.spec.name, leased=executor.spec.exclusive), 0.0)
+        done(executor.execute, value(executor.spec.name, leased=executor.spec.exclusive), 0.0)
     assert one.unleased(0.0) == ("guard",)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from support.fleets import tuning_of
+from support.todos import done
 from zsched.core.executor.handover import Executor
 from zsched.core.instructions import StartWorker
 from zsched.core.values.fleet import OnIsolation, TaskSpec, WorkerSpec
@@ -32,4 +33,4 @@ def test_candidates_and_robots_that_work_alone_start_a_warm_worker(
     )
     executor = Executor(spec=spec, me=me, has_streams=is_robot)
     assert executor.runs_worker is runs
-    assert executor.start() == ((StartWorker(task="merge"),) if runs else ())
+    assert done(executor.start) == ((StartWorker(task="merge"),) if runs else ())

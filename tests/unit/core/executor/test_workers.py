@@ -45,8 +45,8 @@ def test_an_unknown_task_is_nobody_s_worker() -> None:
 
 def test_a_worker_that_should_be_started_again_is_told_of_while_it_is_ready() -> None:
     workers = Workers(states={"merge": WorkerState.READY})
-    workers.on_outdated(ev.WorkerOutdated(task="merge", reason="x" * 500), 0.0)
-    workers.on_outdated(ev.WorkerOutdated(task="other", reason="not ours"), 0.0)
+    workers.on_outdated(ev.WorkerOutdated(task="merge", reason="x" * 500))
+    workers.on_outdated(ev.WorkerOutdated(task="other", reason="not ours"))
     assert workers.told(0.0) == {"merge": CUT}
     workers.on_troubled(ev.WorkerTroubled(task="merge", count=1, text="ValueError"), 0.0)
     assert workers.told(0.0) == {"merge": "callback raised once: ValueError"}, "which is the worse"
@@ -54,13 +54,13 @@ def test_a_worker_that_should_be_started_again_is_told_of_while_it_is_ready() ->
     workers.on_changed(ev.WorkerChanged(task="merge", state=WorkerState.STOPPED, reason="gone"))
     assert workers.told(100.0) == {"merge": "gone"}
     workers.on_changed(ev.WorkerChanged(task="merge", state=WorkerState.READY))
-    workers.on_outdated(ev.WorkerOutdated(task="merge", reason=""), 100.0)
+    workers.on_outdated(ev.WorkerOutdated(task="merge", reason=""))
     assert workers.told(100.0) == {}
 
 
 def test_a_worker_that_should_be_started_again_and_starts_is_not_told_of() -> None:
     workers = Workers(states={"merge": WorkerState.READY})
-    workers.on_outdated(ev.WorkerOutdated(task="merge", reason="its file has changed"), 0.0)
+    workers.on_outdated(ev.WorkerOutdated(task="merge", reason="its file has changed"))
     assert workers.told(0.0) == {"merge": "its file has changed"}
     workers.on_changed(ev.WorkerChanged(task="merge", state=WorkerState.STARTING))
     assert workers.told(0.0) == {}

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from random import Random
-
 import pytest
 
 from support.fleets import tuning_of
+from support.robots import Decider
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.costs import NEWEST, WINDOW_S, MoveCost
-from zsched.core.scheduler.rounds import Rounds
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing
 from zsched.core.values.model import NodeKind
 from zsched.core.values.plan import StreamCount
@@ -171,7 +169,7 @@ def test_a_robots_rounds_tell_the_judge_what_planned_moves_have_cost(horizon_s: 
     )
     nodes = (NodeSpec(name="edge1", kind=NodeKind.EDGE), NodeSpec(name="robot1", kind=NodeKind.ROBOT))
     fleet = Fleet(name="lab", timing=Timing(), nodes=nodes, tasks=(spec,), electors=("robot1",))
-    rounds = Rounds(fleet, "robot1", Gateway(fleet), Random(1), 0.0)
+    rounds = Decider(fleet, "robot1", Gateway(fleet)).rounds
     for second in range(1, 40):
         if second == 20:
             rounds.on_moved("merge", "edge1", has_failed=False, now=19.5)

@@ -8,9 +8,11 @@ from random import Random
 import pytest
 
 from support.fleets import fleet_of, tuning_of
+from zsched.core.beats import on_transition
 from zsched.core.membership.peers import Transition
 from zsched.core.node import Node
 from zsched.core.scheduler.probation import LEASE_MARGIN_S, LIMIT_S, Probation
+from zsched.core.todo import ToDo
 from zsched.core.values.fleet import Standby, TaskSpec, WorkerSpec
 from zsched.core.values.model import PeerState
 from zsched.core.values.plan import ReadyWhen
@@ -119,11 +121,11 @@ def test_a_node_doubts_a_peer_that_was_gone_and_is_back() -> None:
     node = Node(
         fleet=FLEET, me="edge2", durable=None, incarnation=7, electorate="e", rng=Random(1), now=100.0, version="t"
     )
-    node._on_transition(
-        Transition(node="edge1", before=PeerState.SUSPECT, after=PeerState.GONE, reason="silent"), 100.0
+    on_transition(
+        node, Transition(node="edge1", before=PeerState.SUSPECT, after=PeerState.GONE, reason="silent"), ToDo(), 100.0
     )
-    assert node._probation.doubts(TASK, 101.0) == {}, "it is not there at all"
-    node._on_transition(
-        Transition(node="edge1", before=PeerState.GONE, after=PeerState.ALIVE, reason="it beats"), 101.0
+    assert node.probation.doubts(TASK, 101.0) == {}, "it is not there at all"
+    on_transition(
+        node, Transition(node="edge1", before=PeerState.GONE, after=PeerState.ALIVE, reason="it beats"), ToDo(), 101.0
     )
-    assert list(node._probation.doubts(TASK, 101.1)) == ["edge1"]
+    assert list(node.probation.doubts(TASK, 101.1)) == ["edge1"]

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from random import Random
 from typing import TypeVar
 
 import pytest
 
 from support.fleets import fleet_of, tuning_of
+from support.robots import Decider
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.instructions import AskUtilities, Instruction, PublishProposal
 from zsched.core.scheduler.judge import Outcome
-from zsched.core.scheduler.rounds import TIMER_MARGIN_S, Rounds, TaskRound
+from zsched.core.scheduler.rounds import TIMER_MARGIN_S, TaskRound
 from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec
 from zsched.core.values.messages import Utilities
 from zsched.core.values.model import (
@@ -27,7 +27,7 @@ from zsched.core.values.model import (
     WorkerState,
 )
 from zsched.core.vote.tally import VoteOutcome
-from zsched.core.vote.voting import vote_time
+from zsched.core.vote.voting import Voting, vote_time
 
 T = TypeVar("T")
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
@@ -49,7 +49,8 @@ class Robot:
         self.me, self.now = me, 100.0
         self.states = dict.fromkeys((*ROBOTS, *EDGES), PeerState.ALIVE)
         self.gateway = Gateway(fleet)
-        self.rounds = Rounds(fleet, me, self.gateway, Random(1), self.now)
+        self.decider = Decider(fleet, me, self.gateway, now=self.now)
+        self.rounds, self.votes = self.decider.rounds, self.decider.votes
         revision = 0 if owner is None else 5
         self.value = Allocation(task="merge", revision=revision, epoch=revision, owner=owner, tuning=TUNING)
         self.sequence = 0
@@ -58,6 +59,10 @@ class Robot:
     @property
     def task(self) -> TaskRound:
         return self.rounds.tasks["merge"]
+
+    @property
+    def voting(self) -> Voting:
+        return self.votes.tasks["merge"]
 
     def outcome(self) -> Outcome | None:
         return None if self.task.judgement is None else self.task.judgement.outcome
@@ -81,9 +86,9 @@ class Robot:
     def values(self) -> dict[str, Allocation]:
         return {"merge": self.value}
 
-    def tick(self, seconds: float = 0.0) -> tuple[Instruction, ...]:
+    def tick(self, seconds: float = 0.0) -> list[Instruction]:
         self.now += seconds
-        return self.rounds.tick(self.values(), self.states, self.now)
+        return self.decider.tick(self.values(), self.states, self.now)
 
     def hear(self, voter: str, gather: int, revision: int | None = None, /, **values: float) -> bool:
         return self.rounds.absorb_utilities(gather, self.answer(voter, revision, **values))
@@ -95,15 +100,15 @@ class Robot:
             voter=voter, vectors=(UtilityVector(voter=voter, task="merge", revision=base, utilities=column),)
         )
 
-    def round(self, seconds: float = 0.0, **values: float) -> tuple[Instruction, ...]:
+    def round(self, seconds: float = 0.0, **values: float) -> list[Instruction]:
         """A whole gather in which everybody answers with ``values``."""
-        self.now = max(self.now + seconds, self.rounds.next_deadline())
+        self.now = max(self.now + seconds, self.decider.next_deadline())
         out = self.tick()
         for ask in of(out, AskUtilities):
             for name in ROBOTS:
                 if name != self.me:
                     self.hear(name, ask.gather, **values)
-        return (*out, *self.tick())
+        return [*out, *self.tick()]
 
     def paper(
         self, voter: str, candidate: str, *, base: int | None = None, is_escape: bool = False, task: str = "merge"
@@ -117,14 +122,14 @@ class Robot:
             aggregate=0.5,
             is_escape=is_escape,
         )
-        return self.rounds.absorb_proposal(proposal, value, self.states, self.now)
+        return self.decider.absorb_proposal(proposal, value, self.states, self.now)
 
 
-def of(out: tuple[Instruction, ...] | list[Instruction], kind: type[T]) -> list[T]:
+def of(out: list[Instruction], kind: type[T]) -> list[T]:
     return [one for one in out if isinstance(one, kind)]
 
 
-def proposed(out: tuple[Instruction, ...] | list[Instruction]) -> list[str]:
+def proposed(out: list[Instruction]) -> list[str]:
     return [one.proposal.candidate for one in of(out, PublishProposal)]
 
 
@@ -135,7 +140,7 @@ def test_gather_closes_as_soon_as_all_living_robots_have_answered() -> None:
     robot = Robot()
     (ask,) = robot.tick()
     assert ask == AskUtilities(gather=1, deadline_s=GATHER_S)
-    assert robot.rounds.next_deadline() == robot.now + GATHER_S
+    assert robot.decider.next_deadline() == robot.now + GATHER_S
     assert robot.hear("robot2", 1)
     robot.tick(0.01)
     assert robot.task.judgement is None, "robot3 is still awaited"
@@ -195,7 +200,7 @@ def test_rounds_come_by_themselves_about_every_decide_s() -> None:
     starts = []
     for _ in range(20):
         robot.round()
-        starts.append(robot.rounds.next_deadline() - robot.now)
+        starts.append(robot.decider.next_deadline() - robot.now)
     assert all(0.9 * FLEET.timing.decide_s <= wait <= 1.1 * FLEET.timing.decide_s for wait in starts)
     assert len(set(starts)) > 10, "jitter keeps the robots' rounds apart"
 
@@ -203,9 +208,9 @@ def test_rounds_come_by_themselves_about_every_decide_s() -> None:
 def test_hurry_brings_the_next_round_forward_and_never_back() -> None:
     robot = Robot()
     robot.round()
-    later = robot.rounds.next_deadline()
+    later = robot.decider.next_deadline()
     robot.rounds.hurry(later + 1.0)
-    assert robot.rounds.next_deadline() == later
+    assert robot.decider.next_deadline() == later
     robot.rounds.hurry(robot.now)
     assert of(robot.tick(), AskUtilities)
 
@@ -268,7 +273,7 @@ def test_called_vote_is_answered_at_once_with_the_owner_when_nobody_is_better() 
     robot = Robot()
     robot.round()
     robot.paper("robot2", "edge2")
-    assert robot.rounds.next_deadline() == robot.now
+    assert robot.decider.next_deadline() == robot.now
     assert proposed(robot.round()) == ["edge1"]
 
 
@@ -301,7 +306,7 @@ def test_a_proposal_to_stay_calls_nobody() -> None:
     robot = Robot()
     robot.round()
     assert robot.paper("robot2", "edge1") == []
-    assert robot.task.voting.opened_at is None
+    assert robot.voting.opened_at is None
     assert proposed(robot.round()) == []
 
 
@@ -310,7 +315,7 @@ def test_proposal_on_an_older_or_newer_base_does_not_count(base: int) -> None:
     robot = Robot()
     robot.round()
     assert robot.paper("robot2", "edge2", base=base) == []
-    assert robot.task.voting.proposals == {}
+    assert robot.voting.proposals == {}
     assert proposed(robot.round()) == []
 
 
@@ -320,12 +325,12 @@ def test_vote_that_is_not_completed_ends_without_a_quorum() -> None:
     robot.states.update(robot2=PeerState.SUSPECT, robot3=PeerState.SUSPECT)
     robot.paper("robot2", "edge2")
     opened = robot.now
-    while robot.task.voting.opened_at is not None:
-        robot.now = max(robot.rounds.next_deadline(), robot.now)
+    while robot.voting.opened_at is not None:
+        robot.now = max(robot.decider.next_deadline(), robot.now)
         robot.tick()
     assert robot.now == pytest.approx(opened + vote_time(FLEET.timing))
-    assert robot.task.voting.tally is not None
-    assert robot.task.voting.tally.outcome is VoteOutcome.NO_QUORUM
+    assert robot.voting.tally is not None
+    assert robot.voting.tally.outcome is VoteOutcome.NO_QUORUM
 
 
 # --- the commit ------------------------------------------------------------------------------------------------------
@@ -338,10 +343,10 @@ def won(me: str, other: str) -> Robot:
     while not proposed(out):
         robot.profiles({"edge1": 3.9})
         out = robot.round(edge1=0.02)
-    assert robot.task.voting.commit is None, "one paper of three is no majority"
+    assert robot.voting.commit is None, "one paper of three is no majority"
     robot.paper(other, "edge2")
-    assert robot.task.voting.tally is not None
-    assert robot.task.voting.tally.outcome is VoteOutcome.WON
+    assert robot.voting.tally is not None
+    assert robot.voting.tally.outcome is VoteOutcome.WON
     return robot
 
 
@@ -352,12 +357,12 @@ def test_winners_voters_commit_staggered_by_rank_and_once(me: str, other: str, r
     robot = won(me, other)
     wait = rank * STAGGER_S
     if rank:
-        assert robot.rounds.due_commits(robot.now + wait - 0.001) == []
-        assert robot.rounds.next_deadline() <= robot.now + wait
-    ((name, change),) = robot.rounds.due_commits(robot.now + wait)
+        assert robot.votes.due_commits(robot.now + wait - 0.001) == []
+        assert robot.decider.next_deadline() <= robot.now + wait
+    ((name, change),) = robot.votes.due_commits(robot.now + wait)
     assert (name, change.owner, change.base_revision) == ("merge", "edge2", 5)
     assert "edge2 leads" in change.reason, "its own reason goes into the history"
-    assert robot.rounds.due_commits(robot.now + 9.0) == [], "handed out once"
+    assert robot.votes.due_commits(robot.now + 9.0) == [], "handed out once"
 
 
 def test_who_voted_otherwise_does_not_commit_the_winner() -> None:
@@ -365,38 +370,38 @@ def test_who_voted_otherwise_does_not_commit_the_winner() -> None:
     robot.paper("robot2", "edge2")
     assert proposed(robot.round()) == ["edge1"]
     robot.paper("robot3", "edge2")
-    assert robot.task.voting.tally is not None
-    assert robot.task.voting.tally.winner == "edge2"
-    assert robot.rounds.due_commits(robot.now + 9.0) == []
+    assert robot.voting.tally is not None
+    assert robot.voting.tally.winner == "edge2"
+    assert robot.votes.due_commits(robot.now + 9.0) == []
 
 
 def test_no_vote_is_called_or_answered_while_a_commit_is_under_way() -> None:
     robot = won("robot1", "robot2")
-    robot.rounds.due_commits(robot.now)
+    robot.votes.due_commits(robot.now)
     assert proposed(robot.round(edge1=0.02)) == []
     robot.paper("robot3", "edge2")
-    assert robot.task.voting.opened_at is None
-    robot.rounds.on_commit_ended("merge")
+    assert robot.voting.opened_at is None
+    robot.votes.on_commit_ended("merge")
     robot.paper("robot3", "edge2")
-    assert robot.task.voting.opened_at == robot.now
+    assert robot.voting.opened_at == robot.now
 
 
 def test_learnt_value_ends_the_vote_and_a_commit_that_was_not_handed_out() -> None:
     robot = won("robot2", "robot1")
-    robot.rounds.on_learnt("merge", is_new_epoch=True, now=robot.now)
-    assert robot.rounds.due_commits(robot.now + 9.0) == []
-    assert (robot.task.voting.commit, robot.task.voting.proposals, robot.task.settled_at) == (None, {}, robot.now)
+    robot.decider.on_learnt("merge", is_new_epoch=True, now=robot.now)
+    assert robot.votes.due_commits(robot.now + 9.0) == []
+    assert (robot.voting.commit, robot.voting.proposals, robot.task.settled_at) == (None, {}, robot.now)
 
 
 def test_learnt_value_leaves_a_handed_out_commit_to_the_register() -> None:
     """The register ends it (it knows whether it was ours): no second one may start meanwhile."""
     robot = won("robot1", "robot2")
-    robot.rounds.due_commits(robot.now)
-    robot.rounds.on_learnt("merge", is_new_epoch=False, now=robot.now)
-    under_way = robot.task.voting.commit
-    robot.rounds.on_commit_ended("merge")
+    robot.votes.due_commits(robot.now)
+    robot.decider.on_learnt("merge", is_new_epoch=False, now=robot.now)
+    under_way = robot.voting.commit
+    robot.votes.on_commit_ended("merge")
     assert under_way is not None
-    assert (robot.task.voting.commit, robot.task.voting.commit_at) == (None, math.inf)
+    assert (robot.voting.commit, robot.voting.commit_at) == (None, math.inf)
 
 
 # --- several tasks ---------------------------------------------------------------------------------------------------
@@ -423,9 +428,9 @@ class RobotOfTwo(Robot):
 
     def learn_plan(self, owner: str) -> None:
         self.plan = replace(self.plan, revision=1, epoch=1, owner=owner)
-        self.rounds.on_learnt("plan", is_new_epoch=True, now=self.now)
+        self.decider.on_learnt("plan", is_new_epoch=True, now=self.now)
 
-    def gathered(self) -> tuple[Instruction, ...]:
+    def gathered(self) -> list[Instruction]:
         """A whole gather, from its question to what follows from it."""
         (ask,) = of(self.tick(), AskUtilities)
         self.hear_all(ask.gather)
@@ -447,10 +452,10 @@ def test_a_value_that_comes_while_nothing_is_gathered_hurries_nobody() -> None:
     robot = RobotOfTwo("robot2")
     robot.value, robot.plan = (replace(one, revision=5, owner="edge1") for one in (robot.value, robot.plan))
     robot.gathered()
-    due = robot.rounds.next_deadline()
+    due = robot.decider.next_deadline()
     assert due > robot.now
-    robot.rounds.on_learnt("plan", is_new_epoch=False, now=robot.now)
-    assert robot.rounds.next_deadline() == due
+    robot.decider.on_learnt("plan", is_new_epoch=False, now=robot.now)
+    assert robot.decider.next_deadline() == due
 
 
 def test_only_a_planned_move_costs_a_task_its_turn() -> None:
@@ -460,15 +465,15 @@ def test_only_a_planned_move_costs_a_task_its_turn() -> None:
         robot.states["edge1"] = PeerState.ALIVE if is_planned else PeerState.GONE
         robot.round(edge1=0.5, edge2=0.9)
         assert robot.outcome() is Outcome.PROPOSE
-        assert robot.task.voting.called_at == -math.inf, "not before it has moved, or has been tried again"
-        robot.task.voting.on_learnt()
-        assert (robot.task.voting.called_at > -math.inf) is is_planned
+        assert robot.voting.called_at == -math.inf, "not before it has moved, or has been tried again"
+        robot.voting.on_learnt()
+        assert (robot.voting.called_at > -math.inf) is is_planned
 
 
 def test_a_single_task_needs_no_second_gather() -> None:
     robot = Robot()
     (ask,) = of(robot.tick(), AskUtilities)
-    robot.rounds.on_learnt("merge", is_new_epoch=False, now=robot.now)
+    robot.decider.on_learnt("merge", is_new_epoch=False, now=robot.now)
     assert robot.hear("robot2", ask.gather)
 
 
@@ -477,7 +482,7 @@ def test_no_other_task_moves_between_a_vote_that_others_won_and_its_value(ends: 
     robot = RobotOfTwo("robot1")
     robot.paper("robot2", "edge1", task="plan")
     robot.paper("robot3", "edge1", task="plan")
-    assert robot.rounds.tasks["plan"].voting.commit is None, "the others commit it"
+    assert robot.votes.tasks["plan"].commit is None, "the others commit it"
     assert [one.proposal.task for one in of(robot.gathered(), PublishProposal)] == ["plan"], "it was asked about that"
     judgement = robot.rounds.tasks["merge"].judgement
     assert judgement is not None
@@ -485,7 +490,7 @@ def test_no_other_task_moves_between_a_vote_that_others_won_and_its_value(ends: 
     if ends == "learnt":
         robot.learn_plan("edge1")
     else:
-        robot.rounds.on_commit_ended("plan")
+        robot.votes.on_commit_ended("plan")
         robot.rounds.hurry(robot.now)
     assert "merge" in {one.proposal.task for one in of(robot.gathered(), PublishProposal)}
 
@@ -495,10 +500,10 @@ def test_no_other_task_moves_between_a_vote_that_others_won_and_its_value(ends: 
 
 def test_edges_have_no_rounds() -> None:
     robot = Robot("edge1")
-    assert robot.rounds.next_deadline() == math.inf
+    assert robot.decider.next_deadline() == math.inf
     robot.rounds.hurry(robot.now)
-    assert robot.rounds.next_deadline() == math.inf
-    assert robot.tick(1.0) == ()
+    assert robot.decider.next_deadline() == math.inf
+    assert robot.tick(1.0) == []
     assert robot.rounds.vectors({"merge": robot.value}, robot.states, robot.now) == Utilities(voter="edge1", vectors=())
 
 
@@ -541,7 +546,7 @@ def test_a_first_placement_does_not_wait_for_a_node_that_cannot_have_the_task(
 ) -> None:
     robot = Robot(owner=None)
     robot.profiles({}, workers=(WorkerLoad(task="merge", state=state),), draining=is_draining)
-    robot.now = robot.rounds.next_deadline()
+    robot.now = robot.decider.next_deadline()
     (ask,) = of(robot.tick(), AskUtilities)
     for voter in ("robot2", "robot3"):
         seen = (
@@ -585,8 +590,8 @@ def test_a_vote_that_stays_starts_the_caller_s_time_to_trigger_again() -> None:
     for voter in ("robot2", "robot3"):
         robot.paper(voter, "edge1")
     robot.paper("robot1", "edge2")
-    assert robot.task.voting.tally is not None
-    assert robot.task.voting.tally.outcome is VoteOutcome.STAY
+    assert robot.voting.tally is not None
+    assert robot.voting.tally.outcome is VoteOutcome.STAY
     assert robot.task.judge.beaten_since is None
     robot.now = began + TUNING.time_to_trigger_s
     robot.profiles({"edge1": 3.9})
@@ -599,8 +604,8 @@ def test_a_vote_without_a_quorum_does_not() -> None:
     robot.round(edge1=0.02)
     robot.paper("robot1", "edge2")
     robot.tick(vote_time(FLEET.timing))
-    assert robot.task.voting.tally is not None
-    assert robot.task.voting.tally.outcome is VoteOutcome.NO_QUORUM
+    assert robot.voting.tally is not None
+    assert robot.voting.tally.outcome is VoteOutcome.NO_QUORUM
     assert robot.task.judge.beaten_since is not None
 
 
@@ -609,6 +614,6 @@ def test_a_new_owner_has_all_its_time_to_get_ready_and_new_weights_give_none(is_
     robot = Robot(owner_cpu=3.9)
     robot.round(edge1=0.02)
     robot.task.judge.not_ready_since = 90.0
-    robot.rounds.on_learnt("merge", is_new_epoch=is_new_epoch, now=robot.now)
+    robot.decider.on_learnt("merge", is_new_epoch=is_new_epoch, now=robot.now)
     assert robot.task.judge.beaten_since is None
     assert robot.task.judge.not_ready_since == (None if is_new_epoch else 90.0)

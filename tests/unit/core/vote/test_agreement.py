@@ -9,8 +9,11 @@ from typing import TypeVar
 import pytest
 
 from support.fleets import fleet_of, tuning_of
+from support.todos import agreed
 from zsched.core import events as ev
 from zsched.core import instructions as do
+from zsched.core.todo import ToDo
+from zsched.core.values.change import MoveOwner
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.messages import (
     Accept,
@@ -39,10 +42,8 @@ from zsched.core.vote.agreement import (
     READ_EVERY_S,
     SETTLE_AFTER_START_S,
     Agreement,
-    Effects,
 )
 from zsched.core.vote.belief import GENERATION_STEP, MAX_AHEAD, MAX_GENERATION
-from zsched.core.vote.register import MoveOwner
 
 T = TypeVar("T")
 ROBOTS = ("robot1", "robot2", "robot3")
@@ -97,11 +98,11 @@ def answer(learnt: Learnt) -> ev.LearntReceived:
     return ev.LearntReceived(learnt=learnt, is_answer=True)
 
 
-def of(effects: Effects, kind: type[T]) -> list[T]:
-    return [one for one in effects.send if isinstance(one, kind)]
+def of(effects: ToDo, kind: type[T]) -> list[T]:
+    return [one for one in (*effects.send, *effects.apply) if isinstance(one, kind)]
 
 
-def told(effects: Effects) -> CommandResult | None:
+def told(effects: ToDo) -> CommandResult | None:
     answers = of(effects, do.AnswerCommand)
     assert len(answers) <= 1
     if not answers:
@@ -110,30 +111,30 @@ def told(effects: Effects) -> CommandResult | None:
     return answers[0].result
 
 
-def promises(agreement: Agreement, effects: Effects, *, held: Acceptance | None = None) -> Effects:
+def promises(agreement: Agreement, effects: ToDo, *, held: Acceptance | None = None) -> ToDo:
     """A majority promises what was asked."""
     (asked,) = of(effects, do.SendPrepare)
     for elector in ROBOTS[:2]:
         promise = Promise(elector=elector, task=asked.prepare.task, ballot=asked.prepare.ballot, accepted=held)
-        effects = agreement.on_answer(ev.ElectorAnswered(answer=promise), 100.0)
+        effects = agreed(agreement.on_answer, ev.ElectorAnswered(answer=promise), 100.0)
     return effects
 
 
-def accepts(agreement: Agreement, effects: Effects) -> Effects:
+def accepts(agreement: Agreement, effects: ToDo) -> ToDo:
     (asked,) = of(effects, do.SendAccept)
     for elector in ROBOTS[:2]:
         accepted = Accepted(elector=elector, task=asked.accept.task, ballot=asked.accept.acceptance.ballot)
-        effects = agreement.on_answer(ev.ElectorAnswered(answer=accepted), 100.0)
+        effects = agreed(agreement.on_answer, ev.ElectorAnswered(answer=accepted), 100.0)
     return effects
 
 
-def run_dry(agreement: Agreement, effects: Effects) -> CommandResult:
+def run_dry(agreement: Agreement, effects: ToDo) -> CommandResult:
     """Nobody answers any more: time passes until the command has ended."""
     for _ in range(200):
         result = told(effects)
         if result is not None:
             return result
-        effects = agreement.tick(agreement.next_deadline())
+        effects = agreed(agreement.tick, agreement.next_deadline())
     raise AssertionError("the command never ends")
 
 
@@ -142,20 +143,20 @@ def run_dry(agreement: Agreement, effects: Effects) -> CommandResult:
 
 def test_command_that_a_majority_accepts_is_ok_learnt_and_published() -> None:
     agreement = make()
-    effects = accepts(agreement, promises(agreement, agreement.retune(command(), 100.0)))
+    effects = accepts(agreement, promises(agreement, agreed(agreement.retune, command(), 100.0)))
 
     result = told(effects)
     assert result is not None
     assert (result.outcome, result.revision) == (CommandOutcome.OK, 1)
     ((learnt, reason),) = effects.learnt
     assert (learnt.tuning.weights.cpu, learnt.epoch, reason) == (0.75, 0, "retuned by an operator")
-    assert effects.is_dirty
+    assert effects.must_persist
     assert [one.learnt for one in of(effects, do.PublishLearnt)] == [agreement.learnt()]
 
 
 def test_weights_in_force_are_unchanged_without_a_round() -> None:
     agreement = make()
-    effects = agreement.retune(command(0.5), 100.0)
+    effects = agreed(agreement.retune, command(0.5), 100.0)
     result = told(effects)
     assert result is not None
     assert result.outcome is CommandOutcome.UNCHANGED
@@ -175,49 +176,49 @@ def test_command_that_cannot_be_is_refused_at_once(
     asked: ev.WeightsCommanded, outcome: CommandOutcome, says: str
 ) -> None:
     agreement = make()
-    effects = agreement.retune(asked, 100.0)
+    effects = agreed(agreement.retune, asked, 100.0)
     result = told(effects)
     assert result is not None
     assert result.outcome is outcome
     assert says in result.detail
-    assert not effects.is_dirty
+    assert not effects.must_persist
     assert len(effects.send) == 1, "no round was started"
 
 
 def test_command_on_the_revision_that_is_current_starts_a_round() -> None:
-    assert of(make().retune(command(base=0), 100.0), do.SendPrepare)
+    assert of(agreed(make().retune, command(base=0), 100.0), do.SendPrepare)
 
 
 def test_command_that_another_change_overtakes_is_a_conflict() -> None:
     agreement = make()
-    agreement.retune(command(), 100.0)
-    result = told(agreement.on_learnt(answer(Learnt(node="robot2", values=(value(1),))), 100.1))
+    agreed(agreement.retune, command(), 100.0)
+    result = told(agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(value(1),))), 100.1))
     assert result is not None
     assert (result.outcome, result.revision) == (CommandOutcome.CONFLICT, 1)
 
 
 def test_command_without_a_majority_of_promises_ends_as_no_quorum() -> None:
     agreement = make()
-    effects = agreement.retune(command(), 100.0)
+    effects = agreed(agreement.retune, command(), 100.0)
     (asked,) = of(effects, do.SendPrepare)
     promise = Promise(elector="robot1", task="merge", ballot=asked.prepare.ballot)
-    effects = agreement.on_answer(ev.ElectorAnswered(answer=promise), 100.0)
+    effects = agreed(agreement.on_answer, ev.ElectorAnswered(answer=promise), 100.0)
     assert run_dry(agreement, effects).outcome is CommandOutcome.NO_QUORUM
 
 
 def test_command_whose_accept_left_and_was_not_answered_ends_as_unknown() -> None:
     agreement = make()
-    effects = promises(agreement, agreement.retune(command(), 100.0))
+    effects = promises(agreement, agreed(agreement.retune, command(), 100.0))
     assert of(effects, do.SendAccept)
     assert run_dry(agreement, effects).outcome is CommandOutcome.UNKNOWN
 
 
 def test_answers_of_strangers_are_counted_and_complete_no_majority() -> None:
     agreement = make()
-    (asked,) = of(agreement.retune(command(), 100.0), do.SendPrepare)
+    (asked,) = of(agreed(agreement.retune, command(), 100.0), do.SendPrepare)
     for name in ("edge1", "ghost", "ghost2"):
         promise = Promise(elector=name, task="merge", ballot=asked.prepare.ballot)
-        assert agreement.on_answer(ev.ElectorAnswered(answer=promise), 100.0) == Effects()
+        assert agreed(agreement.on_answer, ev.ElectorAnswered(answer=promise), 100.0) == ToDo()
     assert agreement.counters == {"answer_foreign": 3}
 
 
@@ -230,16 +231,16 @@ def beat(node: str, revision: int, *, task: str = "merge") -> Beat:
 
 def test_peer_that_knows_more_is_asked_at_most_every_so_often() -> None:
     agreement = make()
-    assert [one.peer for one in of(agreement.compare(beat("robot2", 1), 100.0), do.AskLearnt)] == ["robot2"]
-    assert agreement.compare(beat("robot2", 2), 100.0 + ASK_LEARNT_EVERY_S - 0.01) == Effects()
-    assert of(agreement.compare(beat("robot3", 2), 100.0), do.AskLearnt), "the limit is per peer"
-    assert of(agreement.compare(beat("robot2", 2), 100.01 + ASK_LEARNT_EVERY_S), do.AskLearnt)
+    assert [one.peer for one in of(agreed(agreement.compare, beat("robot2", 1), 100.0), do.AskLearnt)] == ["robot2"]
+    assert agreed(agreement.compare, beat("robot2", 2), 100.0 + ASK_LEARNT_EVERY_S - 0.01) == ToDo()
+    assert of(agreed(agreement.compare, beat("robot3", 2), 100.0), do.AskLearnt), "the limit is per peer"
+    assert of(agreed(agreement.compare, beat("robot2", 2), 100.01 + ASK_LEARNT_EVERY_S), do.AskLearnt)
 
 
 @pytest.mark.parametrize("heard", [beat("robot2", 3), beat("robot2", 2), beat("robot2", 9, task="other")])
 def test_peer_that_knows_no_more_is_not_asked(heard: Beat) -> None:
     agreement = make(RegisterState(task="merge", learnt=value(3)))
-    assert agreement.compare(heard, 100.0) == Effects()
+    assert agreed(agreement.compare, heard, 100.0) == ToDo()
 
 
 def test_only_learnt_values_are_told_never_accepted_ones() -> None:
@@ -252,21 +253,21 @@ def test_only_learnt_values_are_told_never_accepted_ones() -> None:
 def test_values_of_several_tasks_are_learnt_from_one_message() -> None:
     agreement = make()
     both = Learnt(node="robot2", values=(value(2), value(5, task="plan"), value(1, task="gone")))
-    effects = agreement.on_learnt(answer(both), 100.0)
+    effects = agreed(agreement.on_learnt, answer(both), 100.0)
     assert [one.task for one, _ in effects.learnt] == ["merge", "plan"]
     assert {reason for _, reason in effects.learnt} == {"learnt from a peer"}
     assert agreement.counters == {"learnt_foreign": 1}
-    assert agreement.on_learnt(answer(replace(both, node="robot1")), 100.0) == Effects(), "our own"
-    assert agreement.on_learnt(answer(replace(both, node="stranger")), 100.0) == Effects()
+    assert agreed(agreement.on_learnt, answer(replace(both, node="robot1")), 100.0) == ToDo(), "our own"
+    assert agreed(agreement.on_learnt, answer(replace(both, node="stranger")), 100.0) == ToDo()
     assert agreement.counters == {"learnt_foreign": 2}
-    assert agreement.on_learnt(answer(both), 100.0) == Effects(), "the same again changes nothing"
+    assert agreed(agreement.on_learnt, answer(both), 100.0) == ToDo(), "the same again changes nothing"
 
 
 def test_two_values_for_one_revision_are_a_problem_that_is_shown() -> None:
     agreement = make(RegisterState(task="merge", learnt=value(3)))
-    assert agreement.on_learnt(answer(Learnt(node="robot2", values=(value(3, "robot2"),))), 100.0).learnt == []
+    assert agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(value(3, "robot2"),))), 100.0).learnt == []
     assert "two values for revision 3" in agreement.problems["register/merge"]
-    assert agreement.on_learnt(answer(Learnt(node="robot2", values=(value(4, "robot2"),))), 100.1).learnt != []
+    assert agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(value(4, "robot2"),))), 100.1).learnt != []
     assert agreement.problems == {}, "agreement goes on"
 
 
@@ -277,13 +278,13 @@ def test_what_is_said_unasked_is_not_learnt_but_asked_about() -> None:
     """One put from anybody who can reach the network must not end a task."""
     agreement = make()
     said = Learnt(node="robot2", values=(value(3),))
-    effects = agreement.on_learnt(ev.LearntReceived(learnt=said), 100.0)
-    assert (effects.learnt, effects.is_dirty) == ([], False)
+    effects = agreed(agreement.on_learnt, ev.LearntReceived(learnt=said), 100.0)
+    assert (effects.learnt, effects.must_persist) == ([], False)
     assert [one.peer for one in of(effects, do.AskLearnt)] == ["robot2"]
-    assert agreement.on_learnt(ev.LearntReceived(learnt=said), 100.01) == Effects(), "it has just been asked"
-    assert of(agreement.on_learnt(ev.LearntReceived(learnt=said), 100.01 + ASK_AT_ONCE_S), do.AskLearnt) != []
-    assert agreement.on_learnt(answer(said), 100.2).learnt != []
-    assert agreement.on_learnt(ev.LearntReceived(learnt=said), 101.0) == Effects(), "nothing new"
+    assert agreed(agreement.on_learnt, ev.LearntReceived(learnt=said), 100.01) == ToDo(), "it has just been asked"
+    assert of(agreed(agreement.on_learnt, ev.LearntReceived(learnt=said), 100.01 + ASK_AT_ONCE_S), do.AskLearnt) != []
+    assert agreed(agreement.on_learnt, answer(said), 100.2).learnt != []
+    assert agreed(agreement.on_learnt, ev.LearntReceived(learnt=said), 101.0) == ToDo(), "nothing new"
 
 
 ABSURD = [
@@ -298,12 +299,12 @@ ABSURD = [
 @pytest.mark.parametrize("absurd", ABSURD)
 def test_an_absurd_answer_is_not_learnt_and_a_majority_is_asked_now_and_then(absurd: Allocation) -> None:
     agreement = make(RegisterState(task="merge", learnt=value(2)))
-    effects = agreement.on_learnt(answer(Learnt(node="robot2", values=(absurd,))), 200.0)
-    assert (effects.learnt, effects.is_dirty) == ([], False)
+    effects = agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(absurd,))), 200.0)
+    assert (effects.learnt, effects.must_persist) == ([], False)
     assert [one.prepare.task for one in of(effects, do.SendPrepare)] == ["merge"]
     for number in range(40):  # the identity round ends unanswered
-        agreement.tick(200.0 + number / 10)
-    again = agreement.on_learnt(answer(Learnt(node="robot2", values=(absurd,))), 200.0 + READ_EVERY_S / 2)
+        agreed(agreement.tick, 200.0 + number / 10)
+    again = agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(absurd,))), 200.0 + READ_EVERY_S / 2)
     assert again.send == []
     assert agreement.registers["merge"].value == value(2)
     assert agreement.counters["learnt_unproven"] == 2
@@ -313,7 +314,7 @@ def test_an_owner_that_is_no_candidate_any_more_can_be_learnt_and_accepted() -> 
     """Found by the simulator (seed 8008456): a node that could not learn it had no voice in moving the task away."""
     before = value(3, "robot3")
     agreement = make(RegisterState(task="merge", learnt=value(2)))
-    effects = agreement.on_learnt(answer(Learnt(node="robot2", values=(before,))), 200.0)
+    effects = agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(before,))), 200.0)
     assert [one for one, _ in effects.learnt] == [before]
     elector = make(RegisterState(task="merge", learnt=value(2)))
     asked = Accept(
@@ -321,7 +322,7 @@ def test_an_owner_that_is_no_candidate_any_more_can_be_learnt_and_accepted() -> 
         acceptance=Acceptance(ballot=Ballot(counter=5, node="robot2", incarnation=1), value=before),
         electorate="e",
     )
-    elector.on_accept(ev.AcceptAsked(request=1, asker="robot2", accept=asked), 200.0)
+    agreed(elector.on_accept, ev.AcceptAsked(request=1, asker="robot2", accept=asked), 200.0)
     accepted = elector.registers["merge"].state.accepted
     assert accepted is not None
     assert accepted.value == before
@@ -331,7 +332,7 @@ def test_what_no_single_answer_proves_is_learnt_from_a_majority() -> None:
     """A candidate left the fleet file here and owns the task: the electors' own word is enough."""
     held = Acceptance(ballot=Ballot(counter=5, node="robot2", incarnation=1), value=value(4, "edge9"))
     agreement = make()
-    asked = agreement.on_learnt(answer(Learnt(node="robot2", values=(held.value,))), 100.0)
+    asked = agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(held.value,))), 100.0)
     effects = accepts(agreement, promises(agreement, asked, held=held))
     assert [one for one, _ in effects.learnt] == [held.value]
 
@@ -340,19 +341,19 @@ def test_only_an_elector_s_answer_is_believed_or_one_about_what_was_accepted_her
     """edge1 is no elector; if it had committed something, electors would have accepted it."""
     agreement = make()
     said = answer(Learnt(node="edge1", values=(value(3),)))
-    assert agreement.on_learnt(said, 100.0).learnt == []
+    assert agreed(agreement.on_learnt, said, 100.0).learnt == []
     held = Acceptance(ballot=Ballot(counter=5, node="edge1", incarnation=1), value=value(3))
     agreement = make(RegisterState(task="merge", promised=held.ballot, accepted=held))
-    assert [one for one, _ in agreement.on_learnt(said, 100.0).learnt] == [value(3)]
+    assert [one for one, _ in agreed(agreement.on_learnt, said, 100.0).learnt] == [value(3)]
 
 
 def test_a_node_without_a_state_goes_by_the_generation_of_whom_it_asked() -> None:
     agreement = make(has_state=False)
     start = 3 * GENERATION_STEP
     old = answer(Learnt(node="robot2", values=(value(start + 5),), generation=2))
-    assert agreement.on_learnt(old, 100.0).learnt == []
+    assert agreed(agreement.on_learnt, old, 100.0).learnt == []
     new = answer(Learnt(node="robot2", values=(value(start + 5),), generation=3))
-    assert [one for one, _ in agreement.on_learnt(new, 110.0).learnt] == [value(start + 5)]
+    assert [one for one, _ in agreed(agreement.on_learnt, new, 110.0).learnt] == [value(start + 5)]
 
 
 @pytest.mark.parametrize("absurd", ABSURD)
@@ -363,12 +364,12 @@ def test_an_absurd_value_is_not_accepted(absurd: Allocation) -> None:
         acceptance=Acceptance(ballot=Ballot(counter=5, node="robot2", incarnation=1), value=absurd),
         electorate="e",
     )
-    effects = agreement.on_accept(ev.AcceptAsked(request=1, asker="robot2", accept=asked), 100.0)
+    effects = agreed(agreement.on_accept, ev.AcceptAsked(request=1, asker="robot2", accept=asked), 100.0)
     (said,) = of(effects, do.AnswerElection)
     assert isinstance(said.answer, Refused)
     assert said.answer.refusal is Refusal.VALUE
     assert agreement.counters["accept_unfit"] == 1
-    assert not effects.is_dirty
+    assert not effects.must_persist
 
 
 # --- settling at the start -------------------------------------------------------------------------------------------
@@ -377,17 +378,17 @@ def test_an_absurd_value_is_not_accepted(absurd: Allocation) -> None:
 def test_starting_elector_asks_what_was_accepted_once_per_task() -> None:
     agreement = make()
     assert agreement.next_deadline() == 100.0 + SETTLE_AFTER_START_S
-    assert agreement.tick(100.1) == Effects()
-    asked = of(agreement.tick(100.0 + SETTLE_AFTER_START_S), do.SendPrepare)
+    assert agreed(agreement.tick, 100.1) == ToDo()
+    asked = of(agreed(agreement.tick, 100.0 + SETTLE_AFTER_START_S), do.SendPrepare)
     assert [one.prepare.task for one in asked] == ["merge", "plan"]
-    assert agreement.tick(100.0 + SETTLE_AFTER_START_S) == Effects()
+    assert agreed(agreement.tick, 100.0 + SETTLE_AFTER_START_S) == ToDo()
 
 
 def test_starting_elector_learns_what_a_majority_had_accepted() -> None:
     held = Acceptance(ballot=Ballot(counter=5, node="robot2", incarnation=1), value=value(4))
     agreement = make()
-    asked = agreement.tick(100.0 + SETTLE_AFTER_START_S)
-    merge = Effects(send=[one for one in of(asked, do.SendPrepare) if one.prepare.task == "merge"])
+    asked = agreed(agreement.tick, 100.0 + SETTLE_AFTER_START_S)
+    merge = ToDo(send=[one for one in of(asked, do.SendPrepare) if one.prepare.task == "merge"])
     effects = accepts(agreement, promises(agreement, merge, held=held))
     assert [one for one, _ in effects.learnt] == [value(4)]
 
@@ -396,7 +397,7 @@ def test_starting_elector_learns_what_a_majority_had_accepted() -> None:
 def test_who_is_no_elector_does_not_ask_at_its_start(me: str, has_state: bool) -> None:
     agreement = make(me=me, has_state=has_state)
     assert not agreement.is_elector
-    assert agreement.tick(200.0) == Effects()
+    assert agreed(agreement.tick, 200.0) == ToDo()
 
 
 # --- the disk --------------------------------------------------------------------------------------------------------
@@ -406,7 +407,7 @@ def test_registers_of_tasks_that_left_the_file_stay_on_disk() -> None:
     """The task may come back: its promises must not be forgotten."""
     gone = RegisterState(task="gone", promised=Ballot(counter=9, node="robot2", incarnation=1), learnt=value(3))
     agreement = make(gone, RegisterState(task="merge", learnt=value(2)))
-    agreement.on_learnt(answer(Learnt(node="robot2", values=(value(3),))), 100.0)
+    agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(value(3),))), 100.0)
     state = agreement.to_persist(100.0)
     assert state is not None
     by_task = {one.task: one for one in state.registers}
@@ -418,7 +419,7 @@ def test_registers_of_tasks_that_left_the_file_stay_on_disk() -> None:
 
 def test_without_a_state_nothing_is_written() -> None:
     agreement = make(has_state=False)
-    assert agreement.on_learnt(answer(Learnt(node="robot2", values=(value(1),))), 100.0).is_dirty
+    assert agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(value(1),))), 100.0).must_persist
     assert agreement.to_persist(100.0) is None
 
 
@@ -429,18 +430,20 @@ def test_refused_write_ends_the_electorship_and_the_writing() -> None:
     assert agreement.to_persist(100.0) is None
     assert agreement.problems == {"state": "disk full; this node is no elector until it is restarted"}
     ballot = Ballot(counter=1, node="robot2", incarnation=1)
-    effects = agreement.on_prepare(
-        ev.PrepareAsked(request=1, asker="robot2", prepare=replace(_prepare(agreement), ballot=ballot)), 100.0
+    effects = agreed(
+        agreement.on_prepare,
+        ev.PrepareAsked(request=1, asker="robot2", prepare=replace(_prepare(agreement), ballot=ballot)),
+        100.0,
     )
     assert [one.answer for one in of(effects, do.AnswerElection)] == [
         Refused(elector="robot1", task="merge", ballot=ballot, refusal=Refusal.NOT_ELECTOR, promised=NO_BALLOT)
     ]
-    assert not effects.is_dirty
+    assert not effects.must_persist
 
 
 def _prepare(agreement: Agreement) -> Prepare:
     (sent, *_) = of(
-        agreement.propose("merge", MoveOwner(base_revision=0, owner="edge1", reason=""), 100.0), do.SendPrepare
+        agreed(agreement.propose, "merge", MoveOwner(base_revision=0, owner="edge1", reason=""), 100.0), do.SendPrepare
     )
     return sent.prepare
 
@@ -451,8 +454,8 @@ def _prepare(agreement: Agreement) -> Prepare:
 def test_end_of_a_move_is_told_to_the_rounds_and_to_the_journal() -> None:
     agreement = make()
     move = MoveOwner(base_revision=0, owner="edge1", reason="edge1 leads")
-    effects = accepts(agreement, promises(agreement, agreement.propose("merge", move, 100.0)))
-    assert effects.ended == ["merge"]
+    effects = accepts(agreement, promises(agreement, agreed(agreement.propose, "merge", move, 100.0)))
+    assert [one.task for one in effects.ended] == ["merge"]
     assert effects.learnt == [(value(1), "edge1 leads")]
     (story,) = of(effects, do.RecordStory)
     assert story.text == "move to edge1 on revision 0: committed"
@@ -461,9 +464,9 @@ def test_end_of_a_move_is_told_to_the_rounds_and_to_the_journal() -> None:
 
 def test_move_on_an_outdated_revision_ends_as_a_conflict_without_a_message() -> None:
     agreement = make(RegisterState(task="merge", learnt=value(3)))
-    effects = agreement.propose("merge", MoveOwner(base_revision=2, owner="edge1", reason=""), 100.0)
-    assert effects.ended == ["merge"]
-    assert [type(one) for one in effects.send] == [do.RecordStory]
+    effects = agreed(agreement.propose, "merge", MoveOwner(base_revision=2, owner="edge1", reason=""), 100.0)
+    assert [one.task for one in effects.ended] == ["merge"]
+    assert (effects.send, [type(one) for one in effects.apply]) == ([], [do.RecordStory])
 
 
 # --- identity --------------------------------------------------------------------------------------------------------
@@ -475,7 +478,7 @@ def test_prepares_of_one_peer_are_rate_limited_and_others_are_not() -> None:
     answers = []
     for number in range(60):
         prepare = Prepare(task="merge", ballot=Ballot(counter=number + 1, node="robot2", incarnation=1), electorate="e")
-        effects = agreement.on_prepare(ev.PrepareAsked(request=number, asker="robot2", prepare=prepare), 100.0)
+        effects = agreed(agreement.on_prepare, ev.PrepareAsked(request=number, asker="robot2", prepare=prepare), 100.0)
         answers += [i.answer for i in of(effects, do.AnswerElection)]
     refused = [answer for answer in answers if isinstance(answer, Refused)]
     assert len(answers) == 60
@@ -483,16 +486,19 @@ def test_prepares_of_one_peer_are_rate_limited_and_others_are_not() -> None:
     assert {answer.refusal for answer in refused} == {Refusal.RATE}
     other = Prepare(task="merge", ballot=Ballot(counter=99, node="robot3", incarnation=1), electorate="e")
     (answer,) = of(
-        agreement.on_prepare(ev.PrepareAsked(request=1, asker="robot3", prepare=other), 100.0), do.AnswerElection
+        agreed(agreement.on_prepare, ev.PrepareAsked(request=1, asker="robot3", prepare=other), 100.0),
+        do.AnswerElection,
     )
     assert isinstance(answer.answer, Promise)
     again = Prepare(task="merge", ballot=Ballot(counter=100, node="robot2", incarnation=1), electorate="e")
     (soon,) = of(
-        agreement.on_prepare(ev.PrepareAsked(request=1, asker="robot2", prepare=again), 100.04), do.AnswerElection
+        agreed(agreement.on_prepare, ev.PrepareAsked(request=1, asker="robot2", prepare=again), 100.04),
+        do.AnswerElection,
     )
     assert isinstance(soon.answer, Refused), "one is saved in a twentieth of a second"
     (later,) = of(
-        agreement.on_prepare(ev.PrepareAsked(request=1, asker="robot2", prepare=again), 101.0), do.AnswerElection
+        agreed(agreement.on_prepare, ev.PrepareAsked(request=1, asker="robot2", prepare=again), 101.0),
+        do.AnswerElection,
     )
     assert isinstance(later.answer, Promise)
 
@@ -506,7 +512,7 @@ def test_a_broken_proposer_costs_an_elector_twenty_promises_a_second_and_an_hone
             asked = ev.PrepareAsked(
                 request=number, asker="robot2", prepare=Prepare(task="merge", ballot=ballot, electorate="e")
             )
-            (said,) = of(agreement.on_prepare(asked, 100.0 + number / per_s), do.AnswerElection)
+            (said,) = of(agreed(agreement.on_prepare, asked, 100.0 + number / per_s), do.AnswerElection)
             count += isinstance(said.answer, Promise)
         assert count in promised, per_s
 
@@ -514,13 +520,13 @@ def test_a_broken_proposer_costs_an_elector_twenty_promises_a_second_and_an_hone
 def test_who_has_voted_is_remembered_on_disk_once() -> None:
     agreement = make()
     heard = replace(beat("robot2", 0), has_voted=True)
-    assert of(agreement.compare(heard, 100.0), do.AskLearnt) == [do.AskLearnt(peer="robot2", deadline_s=0.3)]
+    assert of(agreed(agreement.compare, heard, 100.0), do.AskLearnt) == [do.AskLearnt(peer="robot2", deadline_s=0.3)]
     assert not agreement.to_persist(100.0).voted, "nothing durable on the word of a beat"  # type: ignore[union-attr]
     said = Learnt(node="robot2", values=(), has_voted=True)
-    assert agreement.on_learnt(answer(said), 100.1).is_dirty
-    assert not agreement.on_learnt(answer(said), 100.2).is_dirty
-    assert agreement.compare(heard, 200.0) == Effects(), "nothing to ask"
-    assert not agreement.on_learnt(answer(replace(said, node="edge1")), 100.3).is_dirty, "no elector"
+    assert agreed(agreement.on_learnt, answer(said), 100.1).must_persist
+    assert not agreed(agreement.on_learnt, answer(said), 100.2).must_persist
+    assert agreed(agreement.compare, heard, 200.0) == ToDo(), "nothing to ask"
+    assert not agreed(agreement.on_learnt, answer(replace(said, node="edge1")), 100.3).must_persist, "no elector"
     state = agreement.to_persist(100.0)
     assert state is not None
     assert state.voted == ("robot2",)
@@ -528,7 +534,9 @@ def test_who_has_voted_is_remembered_on_disk_once() -> None:
 
 def test_disputed_name_is_no_elector_in_this_life_and_the_next() -> None:
     agreement = make()
-    assert agreement.dispute("another daemon calls itself 'robot1'").is_dirty
+    todo = ToDo()
+    agreement.dispute("another daemon calls itself 'robot1'", todo)
+    assert todo.must_persist
     assert not agreement.is_elector
     state = agreement.to_persist(100.0)
     assert state is not None
@@ -553,10 +561,10 @@ def test_a_state_that_was_brought_back_says_so_in_this_life_and_the_next() -> No
 def test_another_generation_teaches_nothing_and_is_shown_until_it_is_gone() -> None:
     agreement = make()
     told_by = Learnt(node="robot2", values=(value(2**32, None),), generation=1)
-    assert agreement.on_learnt(answer(told_by), 100.0) == Effects()
+    assert agreed(agreement.on_learnt, answer(told_by), 100.0) == ToDo()
     assert agreement.registers["merge"].value.revision == 0
     assert "generation 1" in agreement.problems["generation/robot2"]
-    agreement.on_learnt(answer(Learnt(node="robot2", values=(value(3),))), 100.0)
+    agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(value(3),))), 100.0)
     assert "generation/robot2" not in agreement.problems
     assert agreement.registers["merge"].value.revision == 3
 
@@ -565,7 +573,8 @@ def test_generations_refuse_each_others_ballots() -> None:
     agreement = make()
     stranger = Prepare(task="merge", ballot=Ballot(counter=1, node="robot2", incarnation=1), electorate="e/1")
     (said,) = of(
-        agreement.on_prepare(ev.PrepareAsked(request=1, asker="robot2", prepare=stranger), 0.0), do.AnswerElection
+        agreed(agreement.on_prepare, ev.PrepareAsked(request=1, asker="robot2", prepare=stranger), 0.0),
+        do.AnswerElection,
     )
     assert isinstance(said.answer, Refused)
     assert said.answer.refusal is Refusal.ELECTORATE
@@ -573,7 +582,7 @@ def test_generations_refuse_each_others_ballots() -> None:
 
 def test_node_without_state_believes_whatever_generation_it_is_told() -> None:
     agreement = make(has_state=False)
-    agreement.on_learnt(answer(Learnt(node="robot2", values=(value(2**32 + 1),), generation=1)), 100.0)
+    agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(value(2**32 + 1),), generation=1)), 100.0)
     assert agreement.registers["merge"].value.revision == 2**32 + 1
 
 
@@ -591,10 +600,10 @@ def test_node_without_state_believes_whatever_generation_it_is_told() -> None:
 )
 def test_a_node_without_a_state_follows_an_elector_that_keeps_one(said: Learnt, *, follows: bool) -> None:
     agreement = make(me="edge2", has_state=False)
-    agreement.on_learnt(answer(said), 100.0)
+    agreed(agreement.on_learnt, answer(said), 100.0)
     assert agreement.generation == (said.generation if follows else None)
     unasked = make(me="edge2", has_state=False)
-    unasked.on_learnt(ev.LearntReceived(learnt=said), 100.0)
+    agreed(unasked.on_learnt, ev.LearntReceived(learnt=said), 100.0)
     assert unasked.generation is None, "whatever is said unasked is no answer"
 
 
@@ -603,7 +612,7 @@ def test_a_node_without_a_state_goes_to_a_newer_generation_only_and_forgets_what
 
     def hear(generation: int, votes: int) -> tuple[int | None, dict[str, tuple[int, int]]]:
         said = Learnt(node="robot2", values=(), generation=generation, incarnation=5, votes=votes)
-        agreement.on_learnt(answer(said), 100.0)
+        agreed(agreement.on_learnt, answer(said), 100.0)
         return agreement.generation, {name: seen for name, seen in agreement.witness.seen.items() if seen != (0, 0)}
 
     assert hear(3, 8) == (3, {"robot2": (5, 8)})
@@ -614,13 +623,13 @@ def test_a_node_without_a_state_goes_to_a_newer_generation_only_and_forgets_what
 
 def test_a_node_with_a_state_follows_nobody() -> None:
     agreement = make()
-    agreement.on_learnt(answer(Learnt(node="robot2", values=(), generation=3, incarnation=5)), 100.0)
+    agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(), generation=3, incarnation=5)), 100.0)
     assert agreement.generation == 0
     assert "generation 3" in agreement.problems["generation/robot2"]
 
 
 def test_revision_that_nothing_could_follow_is_refused_and_shown() -> None:
     agreement = make()
-    agreement.on_learnt(answer(Learnt(node="robot2", values=(value(2**53 - 1),))), 100.0)
+    agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(value(2**53 - 1),))), 100.0)
     assert agreement.registers["merge"].value.revision == 0
     assert agreement.counters["learnt_unproven"] == 1

@@ -8,10 +8,22 @@ from dataclasses import replace
 import pytest
 
 from support.fleets import fleet_of
-from support.registers import BLANK, ELECTORS, INITIAL, TUNING, accept, allocation, make, promise_all
+from support.registers import (
+    BLANK,
+    ELECTORS,
+    INITIAL,
+    TUNING,
+    accept,
+    accepted,
+    allocation,
+    did,
+    make,
+    promise_all,
+)
+from zsched.core.values.change import Change, MoveOwner, Retune, RoundOutcome
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.model import PeerState, Proposal
-from zsched.core.vote.register import Change, MoveOwner, Register, Retune, RoundOutcome
+from zsched.core.vote.register import Register
 from zsched.core.vote.tally import VoteOutcome
 from zsched.core.vote.voting import Voting
 
@@ -26,7 +38,7 @@ def agreed_on_today() -> list[Register]:
     """Three electors that have accepted and learnt the value of revision 3."""
     electors = [make(name, state=replace(BLANK, learnt=TODAY)) for name in ELECTORS]
     for elector in electors:
-        elector.on_accept(accept(1, TODAY), 0.0)
+        accepted(elector, accept(1, TODAY), 0.0)
     return electors
 
 
@@ -34,7 +46,7 @@ def agreed_on_today() -> list[Register]:
 def test_a_change_that_changes_nothing_writes_nothing(change: Change) -> None:
     """A new epoch with the same owner would open a slot beside the one that carries, on every robot, for nothing."""
     electors = agreed_on_today()
-    step = promise_all(electors[0], electors[0].propose(change, 0.0), electors)
+    step = promise_all(electors[0], did(electors[0].propose, change, 0.0), electors)
     assert (step.accept, step.learnt, step.finished) == (None, None, (change, RoundOutcome.UNCHANGED))
     assert {elector.value for elector in electors} == {TODAY}
     assert not electors[0].is_busy
@@ -43,8 +55,8 @@ def test_a_change_that_changes_nothing_writes_nothing(change: Change) -> None:
 @pytest.mark.parametrize("change", [STAY, SAME])
 def test_what_follows_in_the_queue_is_tried_all_the_same(change: Change) -> None:
     electors = agreed_on_today()
-    asked = electors[0].propose(change, 0.0)
-    electors[0].propose(replace(STAY, owner="e2"), 0.0)
+    asked = did(electors[0].propose, change, 0.0)
+    did(electors[0].propose, replace(STAY, owner="e2"), 0.0)
     then = promise_all(electors[0], asked, electors)
     step = promise_all(electors[0], then, electors)
     assert step.accept is not None

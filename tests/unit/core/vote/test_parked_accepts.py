@@ -7,9 +7,12 @@ from random import Random
 import pytest
 
 from support.fleets import fleet_of, tuning_of
+from support.todos import agreed
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.node import Node
+from zsched.core.todo import ToDo
+from zsched.core.values.change import MoveOwner
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.messages import Accept, Accepted, Learnt, Refusal, Refused
 from zsched.core.values.model import (
@@ -20,9 +23,8 @@ from zsched.core.values.model import (
     DurableState,
     RegisterState,
 )
-from zsched.core.vote.agreement import PARK_SHARE, Agreement, Effects
+from zsched.core.vote.agreement import PARK_SHARE, Agreement
 from zsched.core.vote.lease import hold_s
-from zsched.core.vote.register import MoveOwner
 
 ROBOTS = ("robot1", "robot2", "robot3")
 TUNING = tuning_of()
@@ -72,7 +74,7 @@ def elector_node() -> Node:
 def overtaken(agreement: Agreement) -> None:
     """A round of this elector's own in which a higher ballot has been promised by the others."""
     change = MoveOwner(base_revision=3, owner="robot3", reason="test")
-    (sent,) = agreement.propose("guard", change, 101.0).send
+    (sent,) = agreed(agreement.propose, "guard", change, 101.0).send
     assert isinstance(sent, do.SendPrepare)
     for name in ROBOTS[1:]:
         no = Refused(
@@ -82,19 +84,19 @@ def overtaken(agreement: Agreement) -> None:
             refusal=Refusal.BALLOT,
             promised=Ballot(counter=9, node="robot3", incarnation=1),
         )
-        agreement.on_answer(ev.ElectorAnswered(answer=no), 101.0)
+        agreed(agreement.on_answer, ev.ElectorAnswered(answer=no), 101.0)
 
 
 ASKS_TO_LEAVE = Beat(node="robot2", incarnation=1, sequence=9, loop_lag_s=0.0, asked_to_leave=(("guard", "robot2", 3),))
 
 
-def asks(agreement: Agreement, request: int, counter: int, now: float, asker: str = "robot3") -> Effects:
+def asks(agreement: Agreement, request: int, counter: int, now: float, asker: str = "robot3") -> ToDo:
     ballot = Ballot(counter=counter, node=asker, incarnation=1)
     accept = Accept(task="guard", acceptance=Acceptance(ballot=ballot, value=value(4, "robot3")), electorate="e")
-    return agreement.on_accept(ev.AcceptAsked(request=request, asker=asker, accept=accept), now)
+    return agreed(agreement.on_accept, ev.AcceptAsked(request=request, asker=asker, accept=accept), now)
 
 
-def answers(effects: Effects) -> list[tuple[int, str]]:
+def answers(effects: ToDo) -> list[tuple[int, str]]:
     found = []
     for one in effects.send:
         assert isinstance(one, do.AnswerElection)
@@ -106,11 +108,11 @@ def answers(effects: Effects) -> list[tuple[int, str]]:
 def test_it_waits_for_the_lease_and_is_refused_when_its_ballot_is_nearly_over() -> None:
     agreement = elector()
     effects = asks(agreement, 1, 5, 100.1)
-    assert (answers(effects), effects.is_urgent, agreement.has_parked) == ([], True, True)
-    effects = agreement.retry_parked(100.1 + PARKED_S / 2)
-    assert (answers(effects), effects.is_urgent, agreement.has_parked) == ([], False, True)
+    assert (answers(effects), effects.must_beat, agreement.has_parked) == ([], True, True)
+    effects = agreed(agreement.retry_parked, 100.1 + PARKED_S / 2)
+    assert (answers(effects), effects.must_beat, agreement.has_parked) == ([], False, True)
     assert agreement.next_deadline() <= 100.1 + PARKED_S
-    assert answers(agreement.retry_parked(100.1 + PARKED_S)) == [(1, Refusal.LEASE)]
+    assert answers(agreed(agreement.retry_parked, 100.1 + PARKED_S)) == [(1, Refusal.LEASE)]
     assert not agreement.has_parked
 
 
@@ -118,8 +120,8 @@ def test_it_is_accepted_as_soon_as_the_lease_is_over() -> None:
     agreement = elector()
     at = 100.0 + HOLD_S
     asks(agreement, 1, 5, at - PARKED_S / 2)
-    effects = agreement.retry_parked(at)
-    assert (answers(effects), effects.is_dirty, agreement.has_parked) == ([(1, "accepted")], True, False)
+    effects = agreed(agreement.retry_parked, at)
+    assert (answers(effects), effects.must_persist, agreement.has_parked) == ([(1, "accepted")], True, False)
 
 
 @pytest.mark.parametrize(("waited", "expected"), [(0.7, "accepted"), (0.9, Refusal.LEASE)])
@@ -129,32 +131,33 @@ def test_it_waits_for_most_of_its_ballot_s_time_and_the_no_still_comes_before_th
     agreement = elector()
     at = 100.0 + HOLD_S
     asks(agreement, 1, 5, at - waited * FLEET.timing.ballot_s)
-    early = answers(agreement.retry_parked(at - 0.01))
-    assert early + answers(agreement.retry_parked(at)) == [(1, expected)]
+    early = answers(agreed(agreement.retry_parked, at - 0.01))
+    assert early + answers(agreed(agreement.retry_parked, at)) == [(1, expected)]
 
 
 def test_the_asker_s_next_ballot_ends_the_wait_of_the_one_before_and_an_echo_of_it_does_not() -> None:
     agreement = elector()
     asks(agreement, 1, 5, 100.1)
     effects = asks(agreement, 1, 5, 100.15)
-    assert (answers(effects), effects.is_urgent) == ([], False), "the same question once more"
+    assert (answers(effects), effects.must_beat) == ([], False), "the same question once more"
     effects = asks(agreement, 2, 6, 100.2)
-    assert (answers(effects), effects.is_urgent) == ([(1, Refusal.LEASE)], False)
+    assert (answers(effects), effects.must_beat) == ([(1, Refusal.LEASE)], False)
     assert agreement.has_parked
-    assert answers(agreement.retry_parked(100.2 + PARKED_S)) == [(2, Refusal.LEASE)]
+    assert answers(agreed(agreement.retry_parked, 100.2 + PARKED_S)) == [(2, Refusal.LEASE)]
 
 
 def test_two_askers_wait_beside_each_other() -> None:
     agreement = elector()
     asks(agreement, 1, 5, 100.1)
     assert answers(asks(agreement, 2, 5, 100.1, "robot2")) == []
-    assert sorted(answers(agreement.retry_parked(100.1 + PARKED_S))) == [(1, Refusal.LEASE), (2, Refusal.LEASE)]
+    assert sorted(answers(agreed(agreement.retry_parked, 100.1 + PARKED_S))) == [(1, Refusal.LEASE), (2, Refusal.LEASE)]
 
 
 def test_a_question_that_would_be_refused_anyway_does_not_wait() -> None:
     agreement = elector()
     asks(agreement, 1, 5, 100.1)
-    effects = agreement.on_accept(
+    effects = agreed(
+        agreement.on_accept,
         ev.AcceptAsked(
             request=9,
             asker="robot3",
@@ -176,7 +179,7 @@ def test_a_question_that_waits_is_answered_though_no_task_is_exclusive_any_more(
     accept = Accept(task="guard", acceptance=Acceptance(ballot=ballot, value=value(4, "robot3")), electorate="e")
     node.handle(ev.AcceptAsked(request=1, asker="robot3", accept=accept), 100.1)
     assert node.agreement.has_parked
-    node._tenure.exclusive = ()
+    node.tenure.exclusive = ()
     now = 100.1 + PARKED_S
     told = [one for one in node.handle(ev.DeadlineReached(), now) if isinstance(one, do.AnswerElection)]
     assert [one.request for one in told] == [1]
@@ -198,10 +201,10 @@ def test_who_is_overtaken_while_an_elector_asks_this_owner_to_leave_waits_for_a_
         Beat(node=node, incarnation=1, sequence=9, loop_lag_s=0.0, asked_to_leave=asks_to_leave), 101.0
     )
     at = agreement.registers["guard"].next_deadline()
-    assert (agreement.tick(at).send == []) is waits
+    assert (agreed(agreement.tick, at).send == []) is waits
     if waits:
         assert agreement.registers["guard"].next_deadline() == pytest.approx(101.0 + HOLD_S)
-        assert agreement.tick(101.0 + HOLD_S).send != []
+        assert agreed(agreement.tick, 101.0 + HOLD_S).send != []
 
 
 def test_an_identity_round_does_not_end_the_silence_towards_an_owner_that_is_asked_to_leave() -> None:
@@ -212,7 +215,7 @@ def test_an_identity_round_does_not_end_the_silence_towards_an_owner_that_is_ask
     asks(agreement, 1, 5, now)
     acceptance = Acceptance(ballot=Ballot(counter=6, node="robot2", incarnation=1), value=value(3, "robot2"))
     identity = Accept(task="guard", acceptance=acceptance, electorate="e")
-    effects = agreement.on_accept(ev.AcceptAsked(request=2, asker="robot2", accept=identity), now)
+    effects = agreed(agreement.on_accept, ev.AcceptAsked(request=2, asker="robot2", accept=identity), now)
     assert answers(effects) == [(2, "accepted")]
     said = agreement.leases.on_sent(1, now + 0.1)
     assert (said.asked_to_leave, said.echoes) == ((("guard", "robot2", 3),), ())
@@ -223,16 +226,16 @@ def test_a_node_heeds_a_beat_by_which_an_owner_is_asked_to_leave() -> None:
     overtaken(node.agreement)
     node.handle(ev.BeatReceived(beat=ASKS_TO_LEAVE), 101.0)
     register = node.agreement.registers["guard"]
-    assert node.agreement.tick(register.next_deadline()).send == []
+    assert agreed(node.agreement.tick, register.next_deadline()).send == []
     assert register.next_deadline() == pytest.approx(101.0 + HOLD_S)
 
 
 def test_a_round_that_nobody_answers_waits_for_no_owner_s_leaving() -> None:
     """Only a ballot that would end another one's accept does."""
     agreement = elector()
-    agreement.propose("guard", MoveOwner(base_revision=3, owner="robot3", reason="test"), 101.0)
+    agreed(agreement.propose, "guard", MoveOwner(base_revision=3, owner="robot3", reason="test"), 101.0)
     agreement.note_asked(ASKS_TO_LEAVE, 101.0)
     register = agreement.registers["guard"]
     at = register.next_deadline()
-    agreement.tick(at)
+    agreed(agreement.tick, at)
     assert at < register.next_deadline() < 101.0 + HOLD_S

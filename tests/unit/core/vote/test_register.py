@@ -19,26 +19,32 @@ from support.registers import (
     FIRST,
     INITIAL,
     STAGGER_S,
+    Step,
     accept,
     accept_all,
+    accepted,
     allocation,
     ballot,
     commit,
+    did,
     last,
     make,
     prepare,
     promise_all,
+    promised,
 )
+from zsched.core.todo import ToDo
+from zsched.core.values.change import RoundOutcome
 from zsched.core.values.messages import Accepted, Prepare, Promise, Refusal, Refused
 from zsched.core.values.model import MAX_COUNTER, Acceptance
-from zsched.core.vote.register import BACKOFF_CAP_S, MAX_JUMP, MAX_REVISION, Register, RoundOutcome, Step
+from zsched.core.vote.register import BACKOFF_CAP_S, MAX_JUMP, MAX_REVISION, Register
 
 # --- acceptor --------------------------------------------------------------------------------------------------------
 
 
 def test_prepare_higher_ballot_is_promised_and_persisted_first() -> None:
     register = make()
-    step, answer = register.on_prepare(prepare(1))
+    step, answer = promised(register, prepare(1))
     assert step.is_dirty
     assert register.state.promised == ballot(1)
     assert answer == Promise(elector="r1", task="merge", ballot=ballot(1))
@@ -47,8 +53,8 @@ def test_prepare_higher_ballot_is_promised_and_persisted_first() -> None:
 @pytest.mark.parametrize("counter", [4, 5])
 def test_prepare_needs_a_strictly_greater_ballot(counter: int) -> None:
     register = make()
-    register.on_prepare(prepare(5))
-    step, answer = register.on_prepare(prepare(counter))
+    promised(register, prepare(5))
+    step, answer = promised(register, prepare(counter))
     assert isinstance(answer, Refused)
     assert (answer.refusal, answer.promised) == (Refusal.BALLOT, ballot(5))
     assert not step.is_dirty
@@ -56,16 +62,16 @@ def test_prepare_needs_a_strictly_greater_ballot(counter: int) -> None:
 
 def test_promise_brings_what_was_accepted() -> None:
     register = make()
-    register.on_accept(accept(1, allocation(1)), 0.0)
-    _, answer = register.on_prepare(prepare(2))
+    accepted(register, accept(1, allocation(1)), 0.0)
+    _, answer = promised(register, prepare(2))
     assert isinstance(answer, Promise)
     assert answer.accepted == Acceptance(ballot=ballot(1), value=allocation(1))
 
 
 def test_accept_of_the_promised_ballot_is_persisted_first() -> None:
     register = make()
-    register.on_prepare(prepare(3))
-    step, answer = register.on_accept(accept(3, allocation(1)), 0.0)
+    promised(register, prepare(3))
+    step, answer = accepted(register, accept(3, allocation(1)), 0.0)
     assert step.is_dirty
     assert register.state.accepted == Acceptance(ballot=ballot(3), value=allocation(1))
     assert answer == Accepted(elector="r1", task="merge", ballot=ballot(3))
@@ -73,14 +79,14 @@ def test_accept_of_the_promised_ballot_is_persisted_first() -> None:
 
 def test_accept_under_a_higher_ballot_than_promised_raises_the_promise() -> None:
     register = make()
-    register.on_accept(accept(4, allocation(1)), 0.0)
+    accepted(register, accept(4, allocation(1)), 0.0)
     assert register.state.promised == ballot(4)
 
 
 def test_accept_below_the_promise_is_refused() -> None:
     register = make()
-    register.on_prepare(prepare(3))
-    step, answer = register.on_accept(accept(2, allocation(1)), 0.0)
+    promised(register, prepare(3))
+    step, answer = accepted(register, accept(2, allocation(1)), 0.0)
     assert isinstance(answer, Refused)
     assert answer.refusal is Refusal.BALLOT
     assert not step.is_dirty
@@ -89,7 +95,7 @@ def test_accept_below_the_promise_is_refused() -> None:
 
 @pytest.mark.parametrize("register", [make("edge"), make(is_elector=False)])
 def test_no_elector_answers_neither_prepare_nor_accept(register: Register) -> None:
-    for step, answer in (register.on_prepare(prepare(1)), register.on_accept(accept(1, allocation(1)), 0.0)):
+    for step, answer in (promised(register, prepare(1)), accepted(register, accept(1, allocation(1)), 0.0)):
         assert isinstance(answer, Refused)
         assert answer.refusal is Refusal.NOT_ELECTOR
         assert not step.is_dirty
@@ -99,7 +105,7 @@ def test_no_elector_answers_neither_prepare_nor_accept(register: Register) -> No
 def test_stop_electing_ends_an_electors_answers() -> None:
     register = make()
     register.stop_electing()
-    _, answer = register.on_prepare(prepare(1))
+    _, answer = promised(register, prepare(1))
     assert isinstance(answer, Refused)
     assert answer.refusal is Refusal.NOT_ELECTOR
 
@@ -107,8 +113,8 @@ def test_stop_electing_ends_an_electors_answers() -> None:
 def test_another_electorate_is_refused() -> None:
     register = make()
     for step, answer in (
-        register.on_prepare(prepare(1, electorate="xyz")),
-        register.on_accept(accept(1, allocation(1), electorate="xyz"), 0.0),
+        promised(register, prepare(1, electorate="xyz")),
+        accepted(register, accept(1, allocation(1), electorate="xyz"), 0.0),
     ):
         assert isinstance(answer, Refused)
         assert answer.refusal is Refusal.ELECTORATE
@@ -119,7 +125,7 @@ def test_another_electorate_is_refused() -> None:
 def test_two_electorates_never_commit_together() -> None:
     proposer = make("r1", electorate="xyz")
     others = [make("r2"), make("r3")]
-    step = promise_all(proposer, proposer.propose(FIRST, 0.0), [proposer, *others])
+    step = promise_all(proposer, did(proposer.propose, FIRST, 0.0), [proposer, *others])
     assert step.accept is None
 
 
@@ -129,22 +135,22 @@ def test_two_electorates_never_commit_together() -> None:
 class ForgetsPromises(Register):
     """Planted bug: answers before the promise is on disk."""
 
-    def on_prepare(self, prepare: Prepare) -> tuple[Step, Promise | Refused]:
-        return Step(), super().on_prepare(prepare)[1]
+    def on_prepare(self, prepare: Prepare, _todo: ToDo) -> Promise | Refused:
+        return super().on_prepare(prepare, ToDo())
 
 
 def duel_with_a_crash(kind: type[Register]) -> set[str | None]:
     """r2 promises the higher ballot, crashes, and then the lower ballot's accept arrives; {owner learnt}."""
     first, second, witness = make("r1"), make("r3"), make("r2", kind=kind)
-    low = promise_all(first, first.propose(FIRST, 0.0), [first, witness])
+    low = promise_all(first, did(first.propose, FIRST, 0.0), [first, witness])
     disk = witness.state
-    second.on_prepare(prepare(7))  # so that its own ballot is the higher one
-    asked = second.propose(replace(FIRST, owner="e2"), 0.0)
+    promised(second, prepare(7))  # so that its own ballot is the higher one
+    asked = did(second.propose, replace(FIRST, owner="e2"), 0.0)
     assert asked.prepare is not None
-    step, answer = witness.on_prepare(asked.prepare)
+    step, answer = promised(witness, asked.prepare)
     disk = witness.state if step.is_dirty else disk
     high = last(
-        [second.on_answer(answer, 0.0), second.on_answer(second.on_prepare(asked.prepare)[1], 0.0)],
+        [did(second.on_answer, answer, 0.0), did(second.on_answer, promised(second, asked.prepare)[1], 0.0)],
     )
     restarted = make("r2", state=disk, incarnation=2)
     ends = [accept_all(first, low, [first, restarted]), accept_all(second, high, [second, restarted])]
@@ -161,17 +167,17 @@ def test_crash_between_promise_and_acceptance_cannot_commit_two_values() -> None
 
 def test_learn_only_rises_and_is_persisted_before_it_is_applied() -> None:
     register = make("edge")
-    step = register.learn(allocation(2), 0.0)
+    step = did(register.learn, allocation(2), 0.0)
     assert (step.is_dirty, step.learnt) == (True, allocation(2))
-    assert register.learn(allocation(1, "e9"), 0.0) == Step()
-    assert register.learn(allocation(2), 0.0) == Step()
+    assert did(register.learn, allocation(1, "e9"), 0.0) == Step()
+    assert did(register.learn, allocation(2), 0.0) == Step()
     assert make("edge", state=register.state, incarnation=2).value == allocation(2)
 
 
 def test_two_values_for_one_revision_are_reported_and_the_first_stays() -> None:
     register = make()
-    register.learn(allocation(2), 0.0)
-    step = register.learn(allocation(2, "e2"), 0.0)
+    did(register.learn, allocation(2), 0.0)
+    step = did(register.learn, allocation(2, "e2"), 0.0)
     assert "two values for revision 2" in step.problem
     assert register.value == allocation(2)
 
@@ -179,29 +185,29 @@ def test_two_values_for_one_revision_are_reported_and_the_first_stays() -> None:
 def test_elector_asks_what_became_of_an_acceptance_it_has_not_learnt() -> None:
     electors = [make(name) for name in ELECTORS]
     for elector in electors[:2]:
-        elector.on_accept(accept(1, allocation(1)), 5.0)
+        accepted(elector, accept(1, allocation(1)), 5.0)
     assert 5.0 < electors[0].next_deadline() <= 5.0 + 2 * BALLOT_S + 2 * STAGGER_S
     now = electors[0].next_deadline()
-    step = commit(electors[0], electors[0].tick(now), electors, now)
+    step = commit(electors[0], did(electors[0].tick, now), electors, now)
     assert step.learnt == allocation(1)
     assert electors[0].next_deadline() == math.inf
 
 
 def test_elector_that_learns_in_time_asks_nobody() -> None:
     register = make()
-    register.on_accept(accept(1, allocation(1)), 0.0)
-    register.learn(allocation(1), 0.1)
+    accepted(register, accept(1, allocation(1)), 0.0)
+    did(register.learn, allocation(1), 0.1)
     assert register.next_deadline() == math.inf
 
 
 def test_identity_rounds_of_a_lonely_elector_back_off_to_the_cap_for_ever() -> None:
     """Two hours alone with an unlearnt acceptance: some 1300 tries, never more than cap + round apart, no overflow."""
     register = make()
-    register.on_accept(accept(1, allocation(1)), 0.0)
+    accepted(register, accept(1, allocation(1)), 0.0)
     now, asked = 0.0, []
     while now < 7200.0:
         now = register.next_deadline()
-        if register.tick(now).prepare is not None:
+        if did(register.tick, now).prepare is not None:
             asked.append(now)
     gaps = [right - left for left, right in itertools.pairwise(asked)]
     assert max(gaps) <= 1.5 * BACKOFF_CAP_S + 2 * BALLOT_S + 3 * BALLOT_S
@@ -211,18 +217,18 @@ def test_identity_rounds_of_a_lonely_elector_back_off_to_the_cap_for_ever() -> N
 def test_starting_elector_that_reaches_nobody_asks_again_when_it_holds_an_unlearnt_acceptance() -> None:
     state = replace(BLANK, accepted=Acceptance(ballot=ballot(1), value=allocation(1)), promised=ballot(1))
     register, other = make("r1", state=state, incarnation=2), make("r2", state=state, incarnation=2)
-    register.settle(0.0)
+    did(register.settle, 0.0)
     asked = Step()
     for _ in range(20):
-        asked = register.tick(register.next_deadline())
+        asked = did(register.tick, register.next_deadline())
     while asked.prepare is None:
-        asked = register.tick(register.next_deadline())
+        asked = did(register.tick, register.next_deadline())
     assert commit(register, asked, [register, other], 60.0).learnt == allocation(1)
 
 
 def test_identity_round_of_a_blank_fleet_writes_nothing() -> None:
     electors = [make(name) for name in ELECTORS]
-    step = promise_all(electors[0], electors[0].settle(0.0), electors)
+    step = promise_all(electors[0], did(electors[0].settle, 0.0), electors)
     assert (step.accept, step.finished, step.learnt) == (None, None, None)
     assert electors[0].next_deadline() == math.inf
 
@@ -230,17 +236,17 @@ def test_identity_round_of_a_blank_fleet_writes_nothing() -> None:
 def test_a_value_that_nothing_could_follow_is_not_learnt() -> None:
     register = make("r1")
     for beyond in (replace(allocation(1), revision=MAX_REVISION + 1), replace(allocation(1), epoch=MAX_REVISION + 1)):
-        assert "cannot be" in register.learn(beyond, 0.0).problem
+        assert "cannot be" in did(register.learn, beyond, 0.0).problem
         assert register.value == INITIAL
     last_one = allocation(MAX_REVISION)
-    assert register.learn(last_one, 0.0).problem == ""
+    assert did(register.learn, last_one, 0.0).problem == ""
     assert register.value == last_one
 
 
 def test_an_acceptance_is_asked_about_only_once_its_proposer_has_had_its_time() -> None:
     for _ in range(5):
         register = make("r1")
-        register.on_accept(accept(1, allocation(1)), 10.0)
+        accepted(register, accept(1, allocation(1)), 10.0)
         assert register.next_deadline() > 10.0 + 2 * BALLOT_S
 
 
@@ -256,30 +262,30 @@ def test_who_hears_of_a_later_generation_forgets_what_another_fleet_has_learnt()
 def test_time_alone_changes_nothing_where_nothing_waits() -> None:
     register = make("r1")
     assert register.next_deadline() == math.inf
-    assert register.tick(1e9) == Step()
+    assert did(register.tick, 1e9) == Step()
 
 
 def test_settle_leaves_a_round_under_way_alone() -> None:
     register = make()
-    register.propose(FIRST, 0.0)
-    assert register.settle(0.1) == Step()
+    did(register.propose, FIRST, 0.0)
+    assert did(register.settle, 0.1) == Step()
 
 
 def test_promises_that_were_overtaken_are_no_sign_of_lost_state() -> None:
     """Revision 1 was chosen and learnt while our identity round's promises were on their way."""
     proposer, others = make("r1"), [make("r2"), make("r3")]
-    asked = proposer.settle(0.0).prepare
+    asked = did(proposer.settle, 0.0).prepare
     assert asked is not None
-    late = [other.on_prepare(asked)[1] for other in others]
-    proposer.learn(allocation(1), 0.1)
-    steps = [proposer.on_answer(answer, 0.2) for answer in late]
+    late = [promised(other, asked)[1] for other in others]
+    did(proposer.learn, allocation(1), 0.1)
+    steps = [did(proposer.on_answer, answer, 0.2) for answer in late]
     assert [step.problem for step in steps] == ["", ""]
     assert steps[-1].accept is None  # and it does not write the older value again
 
 
 def test_majority_that_has_forgotten_a_learnt_value_is_reported_and_nothing_moves() -> None:
     proposer = make("r1", state=replace(BLANK, learnt=allocation(3)))
-    step = promise_all(proposer, proposer.propose(replace(FIRST, base_revision=3), 0.0), [make("r2"), make("r3")])
+    step = promise_all(proposer, did(proposer.propose, replace(FIRST, base_revision=3), 0.0), [make("r2"), make("r3")])
     assert "forgotten revision 3" in step.problem
     assert step.finished == (replace(FIRST, base_revision=3), RoundOutcome.NO_QUORUM)
 
@@ -290,9 +296,9 @@ def test_majority_that_has_forgotten_a_learnt_value_is_reported_and_nothing_move
 def test_deadline_during_a_round_is_the_rounds_own() -> None:
     """An identity round that is due waits for the round under way; its deadline in the past would spin the loop."""
     register = make()
-    register.on_accept(accept(1, allocation(1)), 0.0)
+    accepted(register, accept(1, allocation(1)), 0.0)
     due = register.next_deadline()
-    register.propose(replace(FIRST, base_revision=1), due - 0.01)
+    did(register.propose, replace(FIRST, base_revision=1), due - 0.01)
     assert register.next_deadline() > due
 
 
@@ -303,7 +309,7 @@ def test_duelling_proposers_part() -> None:
         for number, dueller in enumerate(duellers):
             dueller._rng = Random(seed * 2 + number)
         ended: dict[int, RoundOutcome] = {}
-        steps = {i: dueller.propose(replace(FIRST, owner=f"e{i}"), 0.0) for i, dueller in enumerate(duellers)}
+        steps = {i: did(dueller.propose, replace(FIRST, owner=f"e{i}"), 0.0) for i, dueller in enumerate(duellers)}
         now = 0.0
         for _ in range(200):
             prepared = {i: promise_all(duellers[i], s, electors, now) for i, s in steps.items() if s.prepare}
@@ -312,41 +318,41 @@ def test_duelling_proposers_part() -> None:
             if ended:
                 break
             now = min(dueller.next_deadline() for dueller in duellers)
-            steps = {i: d.tick(now) for i, d in enumerate(duellers) if d.next_deadline() <= now}
+            steps = {i: did(d.tick, now) for i, d in enumerate(duellers) if d.next_deadline() <= now}
         assert RoundOutcome.COMMITTED in ended.values()
         assert now < 6 * BALLOT_S
 
 
 def test_one_hostile_ballot_does_not_use_up_the_counters() -> None:
     register = make()
-    _, answer = register.on_prepare(prepare(MAX_COUNTER))
+    _, answer = promised(register, prepare(MAX_COUNTER))
     assert isinstance(answer, Refused)
-    _, accepted = register.on_accept(accept(MAX_COUNTER, allocation(1)), 0.0)
-    assert isinstance(accepted, Refused)
+    _, no = accepted(register, accept(MAX_COUNTER, allocation(1)), 0.0)
+    assert isinstance(no, Refused)
     assert register.state == BLANK
-    assert isinstance(register.on_prepare(prepare(MAX_JUMP))[1], Promise)
+    assert isinstance(promised(register, prepare(MAX_JUMP))[1], Promise)
 
 
 def test_hostile_refusals_do_not_use_up_the_counters() -> None:
     proposer = make("r1")
-    asked = proposer.propose(FIRST, 0.0).prepare
+    asked = did(proposer.propose, FIRST, 0.0).prepare
     assert asked is not None
     for name in ("r2", "r3"):
         refused = Refused(
             elector=name, task="merge", ballot=asked.ballot, refusal=Refusal.BALLOT, promised=ballot(MAX_COUNTER)
         )
-        proposer.on_answer(refused, 0.0)
-    again = proposer.tick(proposer.next_deadline()).prepare
+        did(proposer.on_answer, refused, 0.0)
+    again = did(proposer.tick, proposer.next_deadline()).prepare
     assert again is not None
     assert again.ballot.counter == 2
 
 
 def test_restart_keeps_promises_and_its_ballots_are_new() -> None:
     before = make("r1")
-    old = before.propose(FIRST, 0.0).prepare
+    old = did(before.propose, FIRST, 0.0).prepare
     assert old is not None
-    before.on_prepare(old)
+    promised(before, old)
     after = make("r1", state=before.state, incarnation=2)
-    new = after.propose(FIRST, 0.0).prepare
+    new = did(after.propose, FIRST, 0.0).prepare
     assert new is not None
     assert new.ballot > old.ballot

@@ -14,26 +14,31 @@ from support.registers import (
     FIRST,
     INITIAL,
     TUNING,
+    Step,
     accept,
     accept_all,
+    accepted,
     allocation,
     ballot,
     commit,
+    did,
     last,
     make,
     prepare,
     promise_all,
+    promised,
 )
+from zsched.core.values.change import MoveOwner, Retune, RoundOutcome
 from zsched.core.values.messages import Accepted, Promise, Refusal, Refused
 from zsched.core.values.model import Acceptance, Allocation
-from zsched.core.vote.register import MoveOwner, Register, Retune, RoundOutcome, Step
+from zsched.core.vote.register import Register
 
 # --- proposer --------------------------------------------------------------------------------------------------------
 
 
 def test_move_commits_by_a_majority_and_is_learnt() -> None:
     electors = [make(name) for name in ELECTORS]
-    step = commit(electors[0], electors[0].propose(FIRST, 0.0), electors[:2])
+    step = commit(electors[0], did(electors[0].propose, FIRST, 0.0), electors[:2])
     assert step.finished == (FIRST, RoundOutcome.COMMITTED)
     assert step.learnt == allocation(1)
     assert step.is_dirty
@@ -44,32 +49,32 @@ def test_move_commits_by_a_majority_and_is_learnt() -> None:
 def test_minority_does_not_commit() -> None:
     electors = tuple(f"r{i}" for i in range(1, 6))
     registers = [make(name, electors=electors) for name in electors]
-    asked = promise_all(registers[0], registers[0].propose(FIRST, 0.0), registers[:3])
+    asked = promise_all(registers[0], did(registers[0].propose, FIRST, 0.0), registers[:3])
     assert accept_all(registers[0], asked, registers[:2]) == Step()
     assert registers[0].value == INITIAL
 
 
 def test_one_elector_counts_once_and_a_stranger_never() -> None:
     proposer, other = make("r1"), make("r2")
-    asked = proposer.propose(FIRST, 0.0).prepare
+    asked = did(proposer.propose, FIRST, 0.0).prepare
     assert asked is not None
-    _, promise = other.on_prepare(asked)
-    assert proposer.on_answer(promise, 0.0) == Step()
-    assert proposer.on_answer(promise, 0.0) == Step()
+    _, promise = promised(other, asked)
+    assert did(proposer.on_answer, promise, 0.0) == Step()
+    assert did(proposer.on_answer, promise, 0.0) == Step()
     stranger = Promise(elector="e1", task="merge", ballot=asked.ballot)
-    assert proposer.on_answer(stranger, 0.0) == Step()
+    assert did(proposer.on_answer, stranger, 0.0) == Step()
 
 
 def test_answers_to_an_older_ballot_change_nothing() -> None:
     proposer, other = make("r1"), make("r2")
-    old = proposer.propose(FIRST, 0.0).prepare
+    old = did(proposer.propose, FIRST, 0.0).prepare
     assert old is not None
-    _, late = other.on_prepare(old)
-    proposer.tick(BALLOT_S)
-    again = proposer.tick(proposer.next_deadline()).prepare
+    _, late = promised(other, old)
+    did(proposer.tick, BALLOT_S)
+    again = did(proposer.tick, proposer.next_deadline()).prepare
     assert again is not None
     assert again.ballot > old.ballot
-    assert proposer.on_answer(late, 1.0) == Step()
+    assert did(proposer.on_answer, late, 1.0) == Step()
 
 
 def test_move_raises_epoch_and_revision_retune_only_the_revision() -> None:
@@ -81,14 +86,14 @@ def test_move_raises_epoch_and_revision_retune_only_the_revision() -> None:
 
 def test_newer_among_accepted_means_the_higher_ballot_never_the_higher_revision() -> None:
     proposer = make("r1")
-    asked = proposer.settle(0.0).prepare
+    asked = did(proposer.settle, 0.0).prepare
     assert asked is not None
     accepted = {
         "r2": Acceptance(ballot=ballot(9), value=allocation(1)),
         "r3": Acceptance(ballot=ballot(2), value=allocation(5)),
     }
     step = last(
-        proposer.on_answer(Promise(elector=name, task="merge", ballot=asked.ballot, accepted=held), 0.0)
+        did(proposer.on_answer, Promise(elector=name, task="merge", ballot=asked.ballot, accepted=held), 0.0)
         for name, held in accepted.items()
     )
     assert step.accept is not None
@@ -97,8 +102,8 @@ def test_newer_among_accepted_means_the_higher_ballot_never_the_higher_revision(
 
 def test_unlearnt_value_is_settled_first_and_our_outdated_change_ends_as_conflict() -> None:
     electors = [make(name) for name in ELECTORS]
-    electors[2].on_accept(accept(1, allocation(1, "e2"), "r0"), 0.0)
-    asked = promise_all(electors[0], electors[0].propose(FIRST, 0.0), electors[1:])
+    accepted(electors[2], accept(1, allocation(1, "e2"), "r0"), 0.0)
+    asked = promise_all(electors[0], did(electors[0].propose, FIRST, 0.0), electors[1:])
     assert asked.accept is not None
     assert asked.accept.acceptance.value == allocation(1, "e2")  # a ballot carries exactly one value: not ours
     step = accept_all(electors[0], asked, electors[1:])
@@ -110,9 +115,9 @@ def test_change_on_a_base_that_we_have_not_learnt_follows_under_a_higher_ballot(
     """The operator saw revision 1 at another node; here it is accepted but not learnt."""
     electors = [make(name) for name in ELECTORS]
     for elector in electors[1:]:
-        elector.on_accept(accept(1, allocation(1), "r0"), 0.0)
+        accepted(elector, accept(1, allocation(1), "r0"), 0.0)
     change = Retune(base_revision=1, tuning=replace(TUNING, bonus=0.4))
-    first = commit(electors[0], electors[0].propose(change, 0.0), electors[1:])
+    first = commit(electors[0], did(electors[0].propose, change, 0.0), electors[1:])
     assert (first.learnt, first.finished) == (allocation(1), None)
     assert first.prepare is not None
     second = commit(electors[0], first, electors[1:])
@@ -123,47 +128,45 @@ def test_change_on_a_base_that_we_have_not_learnt_follows_under_a_higher_ballot(
 def test_change_on_a_base_that_nobody_has_ends_as_conflict() -> None:
     electors = [make(name) for name in ELECTORS]
     change = replace(FIRST, base_revision=4)
-    step = promise_all(electors[0], electors[0].propose(change, 0.0), electors)
+    step = promise_all(electors[0], did(electors[0].propose, change, 0.0), electors)
     assert step.finished == (change, RoundOutcome.CONFLICT)
 
 
 def test_outdated_change_ends_at_once_without_a_ballot() -> None:
     register = make(state=replace(BLANK, learnt=allocation(3)))
-    step = register.propose(replace(FIRST, base_revision=2), 0.0)
+    step = did(register.propose, replace(FIRST, base_revision=2), 0.0)
     assert step.prepare is None
     assert step.finished == (replace(FIRST, base_revision=2), RoundOutcome.CONFLICT)
 
 
 def test_every_queued_change_reports_its_own_end() -> None:
-    """One step carries one end: the second and third change, outdated by the first, must not swallow it."""
+    """The second and third change, outdated by the first, must not swallow its end."""
     electors = [make(name) for name in ELECTORS]
     changes = [replace(FIRST, owner=owner) for owner in ("e1", "e2", "e3")]
-    asked = electors[0].propose(changes[0], 0.0)
-    assert electors[0].propose(changes[1], 0.0) == Step()
-    assert electors[0].propose(changes[2], 0.0) == Step()
-    ends = [commit(electors[0], asked, electors).finished]
-    while electors[0].is_busy:
-        ends.append(electors[0].tick(electors[0].next_deadline()).finished)
-    assert ends == [
+    asked = did(electors[0].propose, changes[0], 0.0)
+    assert did(electors[0].propose, changes[1], 0.0) == Step()
+    assert did(electors[0].propose, changes[2], 0.0) == Step()
+    assert commit(electors[0], asked, electors).ends == (
         (changes[0], RoundOutcome.COMMITTED),
         (changes[1], RoundOutcome.CONFLICT),
         (changes[2], RoundOutcome.CONFLICT),
-    ]
+    )
+    assert not electors[0].is_busy
 
 
 def test_learning_a_newer_value_ends_a_change_that_has_not_been_sent() -> None:
     register = make()
-    register.propose(FIRST, 0.0)
-    step = register.learn(allocation(1, "e2"), 0.1)
+    did(register.propose, FIRST, 0.0)
+    step = did(register.learn, allocation(1, "e2"), 0.1)
     assert step.finished == (FIRST, RoundOutcome.CONFLICT)
 
 
 def test_no_majority_gives_up_as_no_quorum() -> None:
     register = make()
-    step, ends = register.propose(FIRST, 0.0), []
+    step, ends = did(register.propose, FIRST, 0.0), []
     while register.next_deadline() < math.inf:
         assert register.next_deadline() < 7 * BALLOT_S
-        step = register.tick(register.next_deadline())
+        step = did(register.tick, register.next_deadline())
         ends.append(step.finished)
     assert ends[-1] == (FIRST, RoundOutcome.NO_QUORUM)
     assert ends[:-1] == [None] * (len(ends) - 1)
@@ -172,10 +175,10 @@ def test_no_majority_gives_up_as_no_quorum() -> None:
 def test_refused_by_a_majority_tries_above_the_promised_counter() -> None:
     proposer, others = make("r1"), [make("r2"), make("r3")]
     for other in others:
-        other.on_prepare(prepare(40))
-    promise_all(proposer, proposer.propose(FIRST, 0.0), others)
+        promised(other, prepare(40))
+    promise_all(proposer, did(proposer.propose, FIRST, 0.0), others)
     assert proposer.next_deadline() < BALLOT_S  # it need not wait for the deadline
-    again = proposer.tick(proposer.next_deadline())
+    again = did(proposer.tick, proposer.next_deadline())
     assert again.prepare is not None
     assert again.prepare.ballot.counter == 41
     assert commit(proposer, again, others).finished == (FIRST, RoundOutcome.COMMITTED)
@@ -183,13 +186,13 @@ def test_refused_by_a_majority_tries_above_the_promised_counter() -> None:
 
 def test_duplicated_prepare_does_not_count_as_refusal() -> None:
     proposer, others = make("r1"), [make("r2"), make("r3")]
-    asked = proposer.propose(FIRST, 0.0)
+    asked = did(proposer.propose, FIRST, 0.0)
     assert asked.prepare is not None
     for other in others:
-        other.on_prepare(asked.prepare)
-        _, echo = other.on_prepare(asked.prepare)
+        promised(other, asked.prepare)
+        _, echo = promised(other, asked.prepare)
         assert isinstance(echo, Refused)
-        proposer.on_answer(echo, 0.0)
+        did(proposer.on_answer, echo, 0.0)
     assert proposer.next_deadline() == BALLOT_S  # still the same attempt
 
 
@@ -199,18 +202,18 @@ def test_duplicated_prepare_does_not_count_as_refusal() -> None:
 def sent_and_unanswered(acceptors: list[Register]) -> Register:
     """r1 has sent its accept to ``acceptors`` and heard nothing; it waits for its next attempt."""
     proposer = make("r1")
-    asked = promise_all(proposer, proposer.propose(FIRST, 0.0), acceptors)
+    asked = promise_all(proposer, did(proposer.propose, FIRST, 0.0), acceptors)
     assert asked.accept is not None
     for acceptor in acceptors:
-        acceptor.on_accept(asked.accept, 0.0)
-    assert proposer.tick(BALLOT_S) == Step()
+        accepted(acceptor, asked.accept, 0.0)
+    assert did(proposer.tick, BALLOT_S) == Step()
     return proposer
 
 
 def test_unknown_outcome_is_found_out_by_an_identity_round_not_applied_again() -> None:
     others = [make("r2"), make("r3")]
     proposer = sent_and_unanswered(others)
-    step = commit(proposer, proposer.tick(proposer.next_deadline()), others)
+    step = commit(proposer, did(proposer.tick, proposer.next_deadline()), others)
     assert step.finished == (FIRST, RoundOutcome.COMMITTED)
     assert step.learnt == allocation(1)  # revision 1, not 2: applied once
 
@@ -219,7 +222,7 @@ def test_unknown_outcome_that_nobody_can_tell_ends_as_unknown() -> None:
     proposer = sent_and_unanswered([make("r2"), make("r3")])
     end = None
     while proposer.next_deadline() < math.inf:
-        end = proposer.tick(proposer.next_deadline()).finished or end
+        end = did(proposer.tick, proposer.next_deadline()).finished or end
     assert end == (FIRST, RoundOutcome.UNKNOWN)
 
 
@@ -227,12 +230,12 @@ def test_lost_accept_is_not_sent_again() -> None:
     """Nobody has our value: the identity round carries what it reads, and the change does not stand."""
     others = [make("r2"), make("r3")]
     for other in others:
-        other.on_accept(accept(1, allocation(1), "r0"), 0.0)
+        accepted(other, accept(1, allocation(1), "r0"), 0.0)
     proposer = make("r1", state=replace(BLANK, learnt=allocation(1)))
     change = replace(FIRST, base_revision=1, owner="e5")
-    promise_all(proposer, proposer.propose(change, 0.0), others)
-    proposer.tick(BALLOT_S)  # the accept is lost
-    asked = promise_all(proposer, proposer.tick(proposer.next_deadline()), others)
+    promise_all(proposer, did(proposer.propose, change, 0.0), others)
+    did(proposer.tick, BALLOT_S)  # the accept is lost
+    asked = promise_all(proposer, did(proposer.tick, proposer.next_deadline()), others)
     assert asked.accept is not None
     assert asked.accept.acceptance.value == allocation(1)
     step = accept_all(proposer, asked, others)
@@ -250,16 +253,16 @@ def test_lost_accept_is_not_sent_again() -> None:
 )
 def test_what_a_peer_learnt_ends_a_round_whose_outcome_was_unknown(learnt: Allocation, outcome: RoundOutcome) -> None:
     proposer = sent_and_unanswered([make("r2"), make("r3")])
-    assert proposer.learn(learnt, 1.0).finished == (FIRST, outcome)
+    assert did(proposer.learn, learnt, 1.0).finished == (FIRST, outcome)
 
 
 def test_an_elector_that_nobody_answers_asks_more_and_more_seldom_what_became_of_an_acceptance() -> None:
     register = make("r1")
-    register.on_accept(accept(1, allocation(1)), 0.0)
+    accepted(register, accept(1, allocation(1)), 0.0)
     now = 0.0
     asked_at: list[float] = []
     while now < 80.0:
-        if register.tick(now).prepare is not None:
+        if did(register.tick, now).prepare is not None:
             asked_at.append(now)
         now = max(register.next_deadline(), now + 0.001)
     early, late = (sum(start <= at < start + 10.0 for at in asked_at) for start in (0.0, 70.0))
@@ -273,8 +276,8 @@ def stuck(change: MoveOwner | Retune | None) -> tuple[Register, list[Register], 
     """r1 alone has accepted a value of owner "gone", which the others refuse; (proposer r2, all, its first accept)."""
     electors = [make(name) for name in ELECTORS]
     proposer = electors[1]
-    assert electors[0].on_accept(accept(1, GONE, "r0"), 0.0)[0].is_dirty
-    asked = proposer.settle(0.0) if change is None else proposer.propose(change, 0.0)
+    assert accepted(electors[0], accept(1, GONE, "r0"), 0.0)[0].is_dirty
+    asked = did(proposer.settle, 0.0) if change is None else did(proposer.propose, change, 0.0)
     return proposer, electors, promise_all(proposer, asked, electors)
 
 
@@ -282,9 +285,9 @@ def refuse_value(proposer: Register, electors: list[Register], asked: Step) -> S
     """The elector that has it accepts it once more, the other two say that it can be no true one."""
     assert asked.accept is not None
     carried = asked.accept.acceptance
-    answers: list[Accepted | Refused] = [electors[0].on_accept(asked.accept, 0.0)[1]]
+    answers: list[Accepted | Refused] = [accepted(electors[0], asked.accept, 0.0)[1]]
     answers += [one.refuse(carried.ballot, Refusal.VALUE) for one in electors[1:]]
-    return last(proposer.on_answer(answer, 0.0) for answer in answers)
+    return last(did(proposer.on_answer, answer, 0.0) for answer in answers)
 
 
 GONE = allocation(1, "gone")
@@ -296,7 +299,7 @@ def test_a_move_is_applied_at_once_to_a_value_that_no_majority_takes() -> None:
     assert asked.accept is not None
     assert asked.accept.acceptance.value == GONE, "it may have been chosen: first it is tried"
     assert refuse_value(proposer, electors, asked) == Step()
-    again = proposer.tick(proposer.next_deadline())
+    again = did(proposer.tick, proposer.next_deadline())
     step = commit(proposer, again, electors)
     assert step.finished == (SECOND, RoundOutcome.COMMITTED)
     assert step.learnt == allocation(2, "e2")
@@ -310,7 +313,7 @@ def test_a_move_is_applied_at_once_to_a_value_that_no_majority_takes() -> None:
 def test_nothing_but_a_move_away_goes_on_from_it(change: MoveOwner | Retune | None) -> None:
     proposer, electors, asked = stuck(change)
     refuse_value(proposer, electors, asked)
-    asked = promise_all(proposer, proposer.tick(proposer.next_deadline()), electors)
+    asked = promise_all(proposer, did(proposer.tick, proposer.next_deadline()), electors)
     assert asked.accept is not None
     assert asked.accept.acceptance.value == GONE
 
@@ -318,9 +321,9 @@ def test_nothing_but_a_move_away_goes_on_from_it(change: MoveOwner | Retune | No
 def test_a_value_that_is_refused_for_a_higher_ballot_is_tried_again() -> None:
     proposer, electors, asked = stuck(SECOND)
     for one in electors:
-        one.on_prepare(prepare(9))
+        promised(one, prepare(9))
     assert accept_all(proposer, asked, electors) == Step()
-    asked = promise_all(proposer, proposer.tick(proposer.next_deadline()), electors)
+    asked = promise_all(proposer, did(proposer.tick, proposer.next_deadline()), electors)
     assert asked.accept is not None
     assert asked.accept.acceptance.value == GONE
 
@@ -331,14 +334,14 @@ def test_a_value_that_is_refused_for_a_higher_ballot_is_tried_again() -> None:
 def asked(others: tuple[Register, ...]) -> tuple[Register, Acceptance]:
     """A proposer whose accept is on its way to r2 and r3."""
     proposer = make("r1", is_elector=False)
-    carried = promise_all(proposer, proposer.propose(FIRST, 0.0), others).accept
+    carried = promise_all(proposer, did(proposer.propose, FIRST, 0.0), others).accept
     assert carried is not None
     return proposer, carried.acceptance
 
 
 def refused(proposer: Register, others: tuple[Register, ...], held: Acceptance, *whys: Refusal) -> Step:
     answers = [one.refuse(held.ballot, why) for one, why in zip(others, whys, strict=False)]
-    return last(proposer.on_answer(answer, 0.25) for answer in answers)
+    return last(did(proposer.on_answer, answer, 0.25) for answer in answers)
 
 
 def test_an_accept_that_only_leases_forbid_is_sent_once_more_under_its_ballot() -> None:
@@ -346,8 +349,8 @@ def test_an_accept_that_only_leases_forbid_is_sent_once_more_under_its_ballot() 
     others = (make("r2"), make("r3"))
     proposer, held = asked(others)
     assert refused(proposer, others, held, Refusal.LEASE, Refusal.LEASE) == Step()
-    assert proposer.tick(BALLOT_S - 0.001) == Step()
-    again = proposer.tick(BALLOT_S)
+    assert did(proposer.tick, BALLOT_S - 0.001) == Step()
+    again = did(proposer.tick, BALLOT_S)
     assert (again.accept and again.accept.acceptance, again.prepare) == (held, None)
     assert accept_all(proposer, again, others, BALLOT_S).finished == (FIRST, RoundOutcome.COMMITTED)
 
@@ -356,9 +359,9 @@ def test_who_has_accepted_before_the_others_were_free_counts() -> None:
     others = (make("r2"), make("r3"))
     proposer, held = asked(others)
     yes = Accepted(elector="r2", task="merge", ballot=held.ballot)
-    assert proposer.on_answer(yes, 0.1) == Step()
-    proposer.on_answer(others[1].refuse(held.ballot, Refusal.LEASE), 0.25)
-    again = proposer.tick(BALLOT_S)
+    assert did(proposer.on_answer, yes, 0.1) == Step()
+    did(proposer.on_answer, others[1].refuse(held.ballot, Refusal.LEASE), 0.25)
+    again = did(proposer.tick, BALLOT_S)
     assert accept_all(proposer, again, others[1:], BALLOT_S).finished == (FIRST, RoundOutcome.COMMITTED)
 
 
@@ -368,7 +371,7 @@ def test_a_lease_that_does_not_end_is_waited_for_as_long_as_any_other_answer() -
     for _ in range(100):
         refused(proposer, others, held, Refusal.LEASE, Refusal.LEASE)
         at = proposer.next_deadline()
-        step = proposer.tick(at)
+        step = did(proposer.tick, at)
         if step.finished is not None:
             break
     assert (step.finished, step.accept) == ((FIRST, RoundOutcome.UNKNOWN), None)
@@ -380,9 +383,9 @@ def test_a_no_for_any_other_reason_than_a_lease_takes_a_higher_ballot(why: Refus
     others = (make("r2"), make("r3"))
     proposer, held = asked(others)
     for other in others:
-        other.on_prepare(prepare(9))
+        promised(other, prepare(9))
     assert refused(proposer, others, held, Refusal.LEASE, why) == Step()
-    again = proposer.tick(proposer.next_deadline())
+    again = did(proposer.tick, proposer.next_deadline())
     assert (again.accept, again.prepare is None) == (None, False)
 
 
@@ -391,7 +394,7 @@ def overtaken() -> tuple[Register, float]:
     others = (make("r2"), make("r3"))
     proposer, held = asked(others)
     for other in others:
-        other.on_prepare(prepare(9))
+        promised(other, prepare(9))
     refused(proposer, others, held, Refusal.BALLOT, Refusal.BALLOT)
     at = proposer.next_deadline()
     assert at < 0.25 + BALLOT_S
@@ -402,26 +405,26 @@ def test_who_is_overtaken_lets_the_accept_end_that_waits_for_the_owner_to_leave(
     proposer, at = overtaken()
     proposer.expect_release(0.2, 1.2)
     proposer.expect_release(0.26, 1.26)
-    assert (proposer.tick(at), proposer.next_deadline()) == (Step(), 1.2)
+    assert (did(proposer.tick, at), proposer.next_deadline()) == (Step(), 1.2)
     proposer.expect_release(1.0, 2.0)
-    assert proposer.tick(1.2).prepare is not None, "no later than the first question said"
+    assert did(proposer.tick, 1.2).prepare is not None, "no later than the first question said"
 
 
 def test_who_is_overtaken_waits_no_longer_than_its_change_may_take_and_for_nobody_s_owner_but_this_one() -> None:
     proposer, at = overtaken()
     proposer.expect_release(0.2, 99.0)
-    assert (proposer.tick(at), proposer.next_deadline()) == (Step(), 6 * BALLOT_S)
-    assert proposer.tick(6 * BALLOT_S).prepare is not None
+    assert (did(proposer.tick, at), proposer.next_deadline()) == (Step(), 6 * BALLOT_S)
+    assert did(proposer.tick, 6 * BALLOT_S).prepare is not None
 
     proposer, at = overtaken()
-    assert proposer.tick(at).prepare is not None, "nobody was asked to leave"
+    assert did(proposer.tick, at).prepare is not None, "nobody was asked to leave"
 
     proposer = make("r1", is_elector=False)
     proposer.expect_release(0.0, 99.0)
-    proposer.learn(allocation(1), 0.0)
+    did(proposer.learn, allocation(1), 0.0)
     others = (make("r2"), make("r3"))
-    proposer.propose(MoveOwner(base_revision=1, owner="e2", reason="test"), 0.0)
+    did(proposer.propose, MoveOwner(base_revision=1, owner="e2", reason="test"), 0.0)
     for other in others:
-        other.on_prepare(prepare(9))
-    proposer.tick(BALLOT_S)
-    assert proposer.tick(proposer.next_deadline()).prepare is not None, "who was asked to leave has left"
+        promised(other, prepare(9))
+    did(proposer.tick, BALLOT_S)
+    assert did(proposer.tick, proposer.next_deadline()).prepare is not None, "who was asked to leave has left"

@@ -13,11 +13,13 @@ from random import Random
 
 import pytest
 
-from support.registers import BALLOT_S, INITIAL, TUNING
+from support.registers import BALLOT_S, INITIAL, TUNING, Step, accepted, did, promised
+from zsched.core.todo import ToDo
+from zsched.core.values.change import Change, MoveOwner, Retune, RoundOutcome
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refused
 from zsched.core.values.model import Acceptance, Allocation, Ballot, RegisterState
 from zsched.core.values.quorum import majority
-from zsched.core.vote.register import Change, MoveOwner, Register, Retune, RoundOutcome, Step
+from zsched.core.vote.register import Register
 
 FAULTS_END_S = 3.0
 Message = Prepare | Accept | Promise | Accepted | Refused | Allocation
@@ -76,7 +78,7 @@ class World:
             stagger_s=0.03,
             rng=Random(self.rng.random()),
         )
-        self.take(host, host.register.settle(self.now))
+        self.take(host, did(host.register.settle, self.now))
 
     def crash(self, host: Host) -> None:
         host.register = None
@@ -100,8 +102,8 @@ class World:
         risk = self.promise_risk if answer is not None and isinstance(answer[1], Promise) else self.crash_rate
         if self.faulty() and self.rng.random() < risk:
             return self.crash(host)
-        if step.finished is not None:
-            self.on_end(host, *step.finished)
+        for end in step.ends:
+            self.on_end(host, *end)
         if step.learnt is not None:
             for other in self.hosts:
                 self.send(other, step.learnt, host.name)
@@ -168,15 +170,15 @@ class World:
         if register is None:
             return
         if isinstance(message, Prepare):
-            step, promise = register.on_prepare(message)
+            step, promise = promised(register, message)
             self.take(host, step, (by, promise))
         elif isinstance(message, Accept):
-            step, accepted = register.on_accept(message, self.now)
-            self.take(host, step, (by, accepted))
+            step, answer = accepted(register, message, self.now)
+            self.take(host, step, (by, answer))
         elif isinstance(message, Allocation):
-            self.take(host, register.learn(message, self.now))
+            self.take(host, did(register.learn, message, self.now))
         else:
-            self.take(host, register.on_answer(message, self.now))
+            self.take(host, did(register.on_answer, message, self.now))
 
     def propose(self, name: str, *, stale: bool = False) -> Change | None:
         register = self.hosts[name].register
@@ -187,7 +189,7 @@ class World:
         change: Change = MoveOwner(base_revision=base, owner=f"c{self.changes}", reason="test")
         if self.rng.random() < 0.3:
             change = Retune(base_revision=base, tuning=replace(TUNING, bonus=self.changes / 1000))
-        self.take(self.hosts[name], register.propose(change, self.now))
+        self.take(self.hosts[name], did(register.propose, change, self.now))
         return change
 
     def run(self, until: float) -> None:
@@ -209,7 +211,7 @@ class World:
             self.ticked_at = self.now
             if self.spins > 20:
                 raise ViolationError(f"{name}: a deadline in the past spins the loop")
-            self.take(host, host.register.tick(self.now))
+            self.take(host, did(host.register.tick, self.now))
 
     def fault_phase(self) -> None:
         window = self.rng.choice((0.2, FAULTS_END_S))  # duels, or one after another
@@ -227,7 +229,7 @@ class World:
         for host in self.hosts.values():
             assert host.register is not None
             if newest.revision:
-                self.take(host, host.register.learn(newest, self.now))
+                self.take(host, did(host.register.learn, newest, self.now))
         change = self.propose(self.rng.choice(tuple(self.hosts)))
         assert change is not None
         self.run(self.now + 3.0)
@@ -299,26 +301,25 @@ def test_register_unlearnt_majority_after_power_loss_is_learnt_without_a_new_pro
 class ForgetsAcceptances(Register):
     """Answers before the acceptance is on disk."""
 
-    def on_accept(self, accept: Accept, now: float) -> tuple[Step, Accepted | Refused]:
-        _, answer = super().on_accept(accept, now)
-        return Step(), answer
+    def on_accept(self, accept: Accept, _todo: ToDo, now: float) -> Accepted | Refused:
+        return super().on_accept(accept, ToDo(), now)
 
 
 class PromisesBackwards(Register):
     """Promises a lower ballot after a higher one."""
 
-    def on_prepare(self, prepare: Prepare) -> tuple[Step, Promise | Refused]:
+    def on_prepare(self, prepare: Prepare, todo: ToDo) -> Promise | Refused:
         self.state = replace(self.state, promised=replace(self.state.promised, counter=0))
-        return super().on_prepare(prepare)
+        return super().on_prepare(prepare, todo)
 
 
 class IgnoresWhatItReads(Register):
     """Puts its own change through, whatever the promises brought."""
 
-    def on_answer(self, answer: Promise | Accepted | Refused, now: float) -> Step:
+    def on_answer(self, answer: Promise | Accepted | Refused, todo: ToDo, now: float) -> None:
         if isinstance(answer, Promise):
             answer = replace(answer, accepted=None)
-        return super().on_answer(answer, now)
+        super().on_answer(answer, todo, now)
 
 
 class TellsNobody(Register):

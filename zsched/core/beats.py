@@ -1,0 +1,207 @@
+"""Membership at the door: the beats that are sent and heard, tokens, and who has come, gone or taken our name.
+
+Knows: which stage each part of a beat comes from and goes to. Does not know: the rules of each (membership, witness,
+leases, sealing), the scheduler's and the executor's own events.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+from zsched.core import events as ev
+from zsched.core import instructions as do
+from zsched.core.membership.identity import Verdict
+from zsched.core.membership.peers import Transition
+from zsched.core.stages import Handler, Stages
+from zsched.core.todo import ToDo
+from zsched.core.values.model import Beat, NodeId, PeerState
+
+# --- sent ------------------------------------------------------------------------------------------------------------
+
+
+def send_beat(node: Stages, todo: ToDo, now: float) -> None:
+    """Send the beat that is due, or that somebody waits for."""
+    is_news, todo.must_beat = todo.must_beat, False
+    node.beat_sequence += 1
+    if "membership" in node.problems:
+        _complain(node, now)
+    node.membership.fade_doubt()
+    parts = node.agreement.leases.on_sent(node.beat_sequence, now)
+    beat = Beat(
+        node=node.me,
+        incarnation=node.incarnation,
+        sequence=node.beat_sequence,
+        loop_lag_s=min(node.loop_lag_s, 86400.0),
+        learnt=tuple((name, value.revision, value.epoch) for name, value in node.values().items()),
+        suspects=node.membership.suspects(),
+        echoes=parts.echoes,
+        released=parts.released,
+        asked_to_leave=parts.asked_to_leave,
+        fleet_file=node.fleet_file,
+        has_voted=node.agreement.has_voted,
+        generation=node.agreement.generation or 0,
+        lease_terms=node.agreement.leases.terms_told,
+        votes=node.agreement.witness.votes,
+        has_lost_state=node.me in node.fleet.electors and not node.agreement.is_elector,
+        electorate=node.agreement.electorate if node.agreement.is_elector else "",
+        twins=node.namesakes.names(now),
+    )
+    node.loop_lag_s = 0.0
+    node.beat_at = now + node.fleet.timing.beat_s
+    todo.add(do.PublishBeat(beat=_fitting(node, beat), is_news=is_news))
+    _seal(node, todo, now)
+    _hear_leases(node, beat, todo, now, is_newest=True)
+    if node.introductions.is_due(now, is_missing=node.membership.misses_anybody):
+        todo.add(do.IntroducePeers())
+
+
+def _fitting(node: Stages, beat: Beat) -> Beat:
+    """The beat as it is sent: never too large to be sent."""
+    sent, left_out = node.beat_room.fit(beat)
+    if left_out:
+        node.counters["beat_parts_left_out"] += left_out
+    if left_out or "beat" in node.problems:
+        text = f"{left_out} parts have no room in a beat and come in turn: fewer exclusive tasks, or shorter names"
+        node.set_problem("beat", text if left_out else None)
+    return sent
+
+
+def _seal(node: Stages, todo: ToDo, now: float) -> None:
+    """As an owner: what our file says of exclusive tasks shall hold for everybody."""
+    for task, change in node.sealing.due(node.values(), now):
+        if not node.registers[task].is_busy:
+            node.agreement.propose(task, change, todo, now)
+    for peer in node.sealing.to_ask(node.values(), now):
+        _ask(node, peer, todo)
+
+
+# --- heard -----------------------------------------------------------------------------------------------------------
+
+
+def _on_beat(node: Stages, event: ev.BeatReceived, todo: ToDo, now: float) -> None:
+    beat = event.beat
+    if beat.node == node.me:
+        node.agreement.witness.on_twin()
+        _heed(node, node.identity.on_own_name(beat, node.beat_sequence, now), todo, now)
+        return
+    if not node.membership.is_known(beat.node):
+        node.counters["beat_foreign"] += 1
+        node.knocking.on_beat(beat, now)
+        return
+    if node.namesakes.on_beat(beat, now):
+        todo.must_beat = True  # the two of them may not hear each other
+        text = f"two daemons call themselves {beat.node}"
+        todo.add(do.RecordStory(stage="membership", text=text))
+    if node.namesakes.must_ask(beat.node, now):
+        _ask(node, beat.node, todo)
+    for change in node.membership.absorb_beat(beat, now):
+        on_transition(node, change, todo, now)
+    if node.membership.is_doubtful(beat.node):
+        node.counters["beat_doubtful"] += 1
+        return
+    if node.me in beat.twins:
+        node.agreement.witness.on_twin()
+        if node.identity.must_ask(beat.node, now):
+            _ask(node, beat.node, todo)
+    node.agreement.compare(beat, todo, now)
+    if beat.has_lost_state:
+        node.stateless.add(beat.node)
+    elif node.stateless:
+        node.stateless.discard(beat.node)
+    node.sealing.hear(beat)
+    if beat.fleet_file != node.fleet_file or node.problems:
+        node.set_problem(f"fleet/{beat.node}", node.identity.file_complaint(beat, node.fleet_path))
+    _hear_leases(node, beat, todo, now, is_newest=node.membership.is_newest(beat.node))
+
+
+def _ask(node: Stages, peer: NodeId, todo: ToDo) -> None:
+    todo.add(do.AskLearnt(peer=peer, deadline_s=node.fleet.timing.ballot_s))
+
+
+def _hear_leases(node: Stages, beat: Beat, todo: ToDo, now: float, *, is_newest: bool) -> None:
+    if not node.tenure.exclusive:
+        return  # thirty beats a second come by here
+    node.tenure.hear(beat, node.agreement.accepted(), todo, now, is_newest=is_newest)
+    node.agreement.note_asked(beat, now)
+    if beat.released:
+        node.agreement.retry_parked(todo, now)
+
+
+def on_twins(node: Stages, event: ev.LearntReceived, todo: ToDo, now: float) -> None:
+    """A peer's answer says where it is, and whether it hears our name twice."""
+    learnt = event.learnt
+    node.namesakes.on_answer(learnt.node, learnt.daemon, event.where)
+    lives = {incarnation: sequence for name, incarnation, sequence in learnt.twins if name == node.me}
+    if lives and learnt.node != node.me:
+        _heed(node, node.identity.on_told(learnt.node, lives, node.beat_sequence, now), todo, now)
+
+
+def _heed(node: Stages, verdict: Verdict, todo: ToDo, now: float) -> None:
+    """Do what another daemon of our name means for this one."""
+    if verdict is Verdict.OURS:
+        return
+    complaint = _complain(node, now)
+    if verdict is Verdict.LEAVE:
+        todo.add(do.StandDown(reason=f"{complaint}; stop it, or give this machine a name of its own"))
+    elif verdict is Verdict.DISPUTE:
+        node.agreement.dispute(complaint, todo)
+
+
+def _complain(node: Stages, now: float) -> str:
+    """Show whether somebody else uses our name."""
+    complaint = node.identity.complaint(now)
+    node.set_problem("membership", complaint)
+    return complaint or ""
+
+
+def _on_token_seen(node: Stages, event: ev.TokenSeen, _todo: ToDo, now: float) -> None:
+    node.counters["tokens_seen"] += 1
+    _note_token(node, event.node, event.incarnation, now, is_present=True)
+
+
+def _on_token_lost(node: Stages, event: ev.TokenLost, todo: ToDo, now: float) -> None:
+    _note_token(node, event.node, event.incarnation, now, is_present=False)
+    for change in node.membership.absorb_token_lost(event.node, event.incarnation, now):
+        on_transition(node, change, todo, now)
+
+
+def _note_token(node: Stages, of: NodeId, incarnation: int, now: float, *, is_present: bool) -> None:
+    if of == node.me:
+        node.identity.on_token(incarnation, is_present=is_present)
+        _complain(node, now)
+    elif node.membership.is_known(of):
+        node.namesakes.on_token(of, incarnation, is_present=is_present)
+
+
+# --- what follows ----------------------------------------------------------------------------------------------------
+
+
+def on_transition(node: Stages, change: Transition, todo: ToDo, now: float) -> None:
+    """A peer has come, is suspected or has gone: every stage that goes by that hears of it."""
+    text = f"{change.node} {change.before} -> {change.after}: {change.reason}"
+    todo.add(do.RecordStory(stage="membership", text=text))
+    todo.must_beat = True  # tell the others at once: they wait for a second observer
+    if change.after is PeerState.ALIVE:
+        node.probation.on_back(change.node, now)
+        if change.before in (PeerState.SUSPECT, PeerState.GONE):
+            node.hangs.on_back(change.node, now)
+    if change.after is PeerState.GONE:
+        node.probation.on_gone(change.node, now)
+        for executor in node.executors.values():
+            executor.on_gone(change.node, todo)
+    todo.must_decide |= any(value.owner == change.node for value in node.values().values())
+
+
+def _on_clock(node: Stages, event: ev.ClockCompared, todo: ToDo, now: float) -> None:
+    if node.tenure.on_clock(event, node.agreement.standing(), node.beat_sequence, now):
+        todo.must_beat = True  # the others must hear whether our echoes count
+        node.set_problem("clock", node.tenure.clock.complaint)
+
+
+HANDLERS: Final[Mapping[type[Any], Handler]] = {
+    ev.BeatReceived: _on_beat,
+    ev.TokenSeen: _on_token_seen,
+    ev.TokenLost: _on_token_lost,
+    ev.ClockCompared: _on_clock,
+}

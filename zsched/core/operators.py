@@ -1,0 +1,79 @@
+"""Operators at the door: status, a task's weights, failures that are to be forgotten, and the order to stop.
+
+Knows: what each command asks of which stage. Does not know: how the snapshot is put together (`zsched.core.status`),
+how a change is agreed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+from zsched.core import events as ev
+from zsched.core import instructions as do
+from zsched.core.stages import Handler, Stages
+from zsched.core.status import build_snapshot
+from zsched.core.todo import ToDo
+from zsched.core.values.fleet import runs_worker
+from zsched.core.values.messages import CommandOutcome, CommandResult
+from zsched.core.values.model import NodeId, TaskId
+
+
+def _on_status(node: Stages, event: ev.StatusAsked, todo: ToDo, now: float) -> None:
+    todo.add(do.AnswerStatus(request=event.request, snapshot=build_snapshot(node, now)))
+
+
+def _on_weights(node: Stages, event: ev.WeightsCommanded, todo: ToDo, now: float) -> None:
+    node.agreement.retune(event, todo, now)
+
+
+def _on_retry(node: Stages, event: ev.RetryCommanded, todo: ToDo, now: float) -> None:
+    """Forget failures: of our own worker if it is meant, and what we hold against nodes."""
+    task, whose = event.command.task, event.command.node
+    if task not in node.executors or (whose and not _may_work(node, task, whose)):
+        detail = f"no task {task!r}" if task not in node.executors else f"{whose!r} is no candidate of {task}"
+        result = CommandResult(outcome=CommandOutcome.INVALID, detail=detail)
+        todo.add(do.AnswerCommand(request=event.request, result=result))
+        return
+    node.rounds.forgive(task, whose or None, now)
+    state = node.worker_states.get(task) if whose in ("", node.me) else None
+    if state is not None:
+        todo.add(do.ResetWorker(task=task))
+    detail = _forgiven(node, whose) if state is None else f"its failures are forgotten, it was {state}"
+    result = CommandResult(outcome=CommandOutcome.OK, detail=detail)
+    todo.add(do.AnswerCommand(request=event.request, result=result))
+
+
+def _may_work(node: Stages, task: TaskId, whose: NodeId) -> bool:
+    return node.membership.is_known(whose) and runs_worker(node.fleet.task(task), whose, node.fleet.node(whose).kind)
+
+
+def _forgiven(node: Stages, whose: NodeId) -> str:
+    """What a node forgets that has no worker that is meant: robots take penalties off candidates."""
+    if not node.rounds.is_voter:
+        return "nothing to forget here"
+    return f"takes no penalty off {whose or 'any candidate'} any more"
+
+
+def _on_dropped(node: Stages, event: ev.FrameDropped, _todo: ToDo, _now: float) -> None:
+    node.counters[f"dropped_{event.kind}_{event.reason}"] += 1
+
+
+def _on_problem(node: Stages, event: ev.ProblemReported, _todo: ToDo, _now: float) -> None:
+    node.set_problem(event.source, event.problem)
+
+
+def _on_stop(node: Stages, _event: ev.StopRequested, todo: ToDo, _now: float) -> None:
+    """Drain: the profile says so, and the robots move what this node owns."""
+    node.is_draining = True
+    todo.must_decide |= bool(node.owned())
+
+
+HANDLERS: Final[Mapping[type[Any], Handler]] = {
+    ev.StatusAsked: _on_status,
+    ev.WeightsCommanded: _on_weights,
+    ev.RetryCommanded: _on_retry,
+    ev.FrameDropped: _on_dropped,
+    ev.ProblemReported: _on_problem,
+    ev.StopRequested: _on_stop,
+}

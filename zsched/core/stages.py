@@ -1,0 +1,196 @@
+"""What one daemon consists of: the six stages, membership beside them, and what they share.
+
+Knows: which parts there are, and what is asked of several of them together. Does not know: what an event means to them
+(`beats`, `work`, `operators`), in which order they act (`zsched.core.node`).
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from random import Random
+from typing import Any
+
+from zsched.core.events import SlotReady
+from zsched.core.executor.handover import Executor
+from zsched.core.executor.progress import HangWatch
+from zsched.core.executor.sealing import Sealing
+from zsched.core.executor.tenure import Tenure
+from zsched.core.executor.workers import Workers
+from zsched.core.gateway.gateway import Gateway
+from zsched.core.gateway.round_trips import RoundTrips
+from zsched.core.membership.beat_room import BeatRoom
+from zsched.core.membership.identity import Identity
+from zsched.core.membership.knocking import Knocking
+from zsched.core.membership.namesakes import Namesakes
+from zsched.core.membership.peers import Membership
+from zsched.core.membership.relink import Introductions
+from zsched.core.profile.profile import Profiler
+from zsched.core.profile.relay_ends import RelayEnds
+from zsched.core.scheduler.probation import Probation
+from zsched.core.scheduler.rounds import Rounds
+from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts
+from zsched.core.todo import ToDo
+from zsched.core.values.fleet import Fleet, TaskSpec, fleet_hash
+from zsched.core.values.model import Allocation, DurableState, NodeId, NodeKind, PeerState, TaskId
+from zsched.core.values.plan import StreamCount
+from zsched.core.vote.agreement import Agreement
+from zsched.core.vote.votes import Votes
+
+HISTORY = 32
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PastValue:
+    """A learnt value, when this node learnt it and why it came about."""
+
+    value: Allocation
+    at: float
+    reason: str
+
+
+class Stages:
+    """One daemon's whole decision state.
+
+    Args:
+        fleet: the validated fleet file.
+        me: this node's name.
+        durable: what the state file holds, with the incarnation of *this* start; ``None`` when there is no valid file
+            (then this node is no elector).
+        incarnation: this start's number (the durable one, or a guess above any seen when there is none).
+        electorate: hash of the electorate in force.
+        rng: seeded by the shell; the only source of chance.
+        now: monotonic seconds.
+        version: of the program, for status.
+    """
+
+    def __init__(
+        self,
+        *,
+        fleet: Fleet,
+        me: NodeId,
+        durable: DurableState | None,
+        incarnation: int,
+        electorate: str,
+        rng: Random,
+        now: float,
+        version: str = "",
+    ) -> None:
+        self.fleet, self.me, self.version = fleet, me, version
+        self.kind = fleet.node(me).kind
+        self.incarnation = incarnation
+        self.started_at = now
+        self.has_state = durable is not None
+        self.has_foreign_state = False
+        """The state file is whole, and of another electorate than the fleet file: it stays on its disk."""
+        self.lacks_state_file = False
+        """There is none at all, rather than one that cannot be used."""
+        self.fleet_file = fleet_hash(fleet)
+        self.fleet_path = ""
+        """Where that file lies, for the status."""
+        self.joins_at: tuple[str, ...] = ()
+        """Where applications on this machine join its streams, for the status."""
+        self.counters: Counter[str] = Counter()
+        self.problems: dict[str, str] = {}
+        self.is_draining = False
+        self.loop_lag_s = 0.0
+        self.history: dict[TaskId, deque[PastValue]] = {task.name: deque(maxlen=HISTORY) for task in fleet.tasks}
+
+        # PROFILE, GATEWAY
+        self.profiler = Profiler(me, incarnation, fleet.timing)
+        self.relay_ends = RelayEnds()
+        self.gateway = Gateway(fleet)
+        self.round_trips = RoundTrips(me)
+        self.has_deadlines = any(task.tuning.deadline_ms is not None for task in fleet.tasks)
+        # SCHEDULER, VOTE
+        self.votes = Votes(fleet, me)
+        self.probation = Probation(fleet)
+        self.rounds = Rounds(fleet, me, self.gateway, self.votes.tasks, rng, now, self._doubts, self.round_trips)
+        self.agreement = Agreement(
+            fleet=fleet,
+            me=me,
+            durable=durable,
+            incarnation=incarnation,
+            electorate=electorate,
+            rng=rng,
+            now=now,
+        )
+        self.registers = self.agreement.registers
+        # EXECUTOR, ROUTE
+        self.executors = {
+            task.name: Executor(spec=task, me=me, has_streams=self.kind is NodeKind.ROBOT) for task in fleet.tasks
+        }
+        self.workers = Workers.of(fleet, me)
+        self.worker_states = self.workers.states
+        self.hangs = HangWatch(fleet)
+        self.tenure = Tenure(fleet, me, self.agreement.leases, self.executors)
+        self.sealing = Sealing(fleet, me, self.executors, self.agreement.leases.over_at)
+        self.stream_counts: tuple[StreamCount, ...] = ()
+        self.dropped: dict[str, tuple[int, float]] = {}
+        """{stream: (how many samples it has dropped, when that last rose)}."""
+        self.unready: dict[TaskId, tuple[int, float]] = {}
+        """{task: (epoch, since when)} of the slots whose worker our relay does not see any more."""
+        self.lacks: dict[TaskId, SlotReady] = {}
+        """{task: what our relay misses of such a worker}."""
+        # membership
+        self.membership = Membership(me, tuple(node.name for node in fleet.nodes), fleet.timing)
+        self.identity = Identity(me, incarnation, self.fleet_file, now, fleet.timing.beat_s)
+        self.namesakes = Namesakes(fleet.timing.beat_s)
+        self.knocking = Knocking(self.fleet_file)
+        self.introductions = Introductions()
+        self.stateless: set[NodeId] = set()
+        """Electors whose newest beat says that they answer no proposer."""
+        self.beat_room = BeatRoom()
+        self.beat_at = now
+        """When the next beat is due that nothing brings forward."""
+        self.beat_sequence = 0
+
+    # --- queries -----------------------------------------------------------------------------------------------------
+
+    def values(self) -> Mapping[TaskId, Allocation]:
+        """{task: the newest learnt register value}."""
+        return self.agreement.values()
+
+    def owned(self) -> tuple[TaskId, ...]:
+        """The tasks that this node owns, as far as it has learnt."""
+        return tuple(name for name, value in self.values().items() if value.owner == self.me)
+
+    def movable(self, now: float) -> tuple[TaskId, ...]:
+        """What of it another candidate could take, as far as is known: one that lives and does not drain itself."""
+        return tuple(
+            name
+            for name in self.owned()
+            if any(self._can_take(candidate, now) for candidate in self.fleet.task(name).candidates)
+        )
+
+    def _can_take(self, node: NodeId, now: float) -> bool:
+        is_there = node != self.me and self.membership.state(node) is PeerState.ALIVE
+        return is_there and not self.was_draining(node, now)
+
+    def was_draining(self, node: NodeId | None, now: float) -> bool:
+        """Whether an owner was told to stop, by the last that was heard of it."""
+        data = None if node is None else self.gateway.newest(node, now)
+        return data is not None and data.profile.draining
+
+    def is_orphan(self, owner: NodeId | None) -> bool:
+        """Whether a task's owner is gone: nobody could be found for it so far."""
+        return owner is not None and self.membership.state(owner) is PeerState.GONE
+
+    def _doubts(self, spec: TaskSpec, now: float) -> Doubts:
+        in_grace, unproven = self.membership.in_grace(), self.probation.doubts(spec, now)
+        unfit = self.agreement.leases.unfit() if self.executors[spec.name].is_leased else {}
+        if not in_grace and not unproven and not unfit:
+            return NO_DOUBTS
+        return Doubts(in_grace=in_grace, unproven=unproven, unfit=unfit)
+
+    def set_problem(self, source: str, problem: str | None) -> None:
+        """Show a problem in the status, or (``None``) that it is over."""
+        if problem is None:
+            self.problems.pop(source, None)
+        else:
+            self.problems[source] = problem
+
+
+Handler = Callable[[Stages, Any, ToDo, float], None]
+"""What an event means: it changes the stages and writes down what is to be done. The time is monotonic seconds."""

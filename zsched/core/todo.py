@@ -1,0 +1,72 @@
+"""The one answer of every stage: what one event, and the time that has passed, lead to.
+
+Knows: what there is to do, and its order: *persist, then send, then apply*, so that every prefix of it is safe. Does
+not know: why it is to be done.
+
+A stage writes into the `ToDo` that it is handed and returns nothing of the kind. `Node` hands the same one from stage
+to stage and turns it into a batch of instructions at the end.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from zsched.core import instructions as do
+from zsched.core.values.change import Change, Ended, RoundOutcome
+from zsched.core.values.model import Allocation, TaskId
+
+_LOCAL = frozenset(
+    {
+        do.ApplyRoutes,
+        do.SetRole,
+        do.StartWorker,
+        do.StopWorker,
+        do.ResetWorker,
+        do.RestartWorker,
+        do.RecordStory,
+        do.StandDown,
+    }
+)
+
+
+@dataclass(slots=True)
+class ToDo:
+    """What is to be done, by whom it concerns."""
+
+    must_persist: bool = False
+    """The durable state has changed: it is on disk before anything is sent."""
+    must_beat: bool = False
+    """The others must hear at once what the next beat says."""
+    must_decide: bool = False
+    """Something happened that may need a decision: a round now."""
+    called: list[tuple[TaskId, bool]] = field(default_factory=list)
+    """(task, whether its owner is to be left at once) of the votes to which another robot has called this one."""
+    stayed: list[TaskId] = field(default_factory=list)
+    """Tasks of which a vote has ended with: stay."""
+    ended: list[Ended] = field(default_factory=list)
+    """Changes of this node's that were committed, overtaken or given up."""
+    learnt: list[tuple[Allocation, str]] = field(default_factory=list)
+    """(a newer value, why it came about)."""
+    send: list[do.Instruction] = field(default_factory=list)
+    """What other nodes or whoever asks will see."""
+    apply: list[do.Instruction] = field(default_factory=list)
+    """What only this machine does."""
+
+    def add(self, *instructions: do.Instruction) -> None:
+        """Sort instructions into sending and applying."""
+        for instruction in instructions:
+            (self.apply if type(instruction) in _LOCAL else self.send).append(instruction)
+
+    def end(self, task: TaskId, change: Change, outcome: RoundOutcome) -> None:
+        """A change has ended."""
+        self.ended.append(Ended(task=task, change=change, outcome=outcome))
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether no stage has left anything for another stage to look at."""
+        return not (self.called or self.stayed or self.ended or self.learnt)
+
+    @property
+    def is_only_sent(self) -> bool:
+        """Whether it is nothing but what is sent at once: answers, most of all."""
+        return not (self.must_persist or self.must_beat or self.must_decide or self.apply) and self.is_settled

@@ -1,0 +1,87 @@
+"""What a node wants changed in a task's register, and how that ends.
+
+Knows: which fields of an allocation each change touches. Does not know: ballots and rounds
+(`zsched.core.vote.register`), who wants it and why.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+from zsched.core.values.model import Allocation, NodeId, TaskId, Tuning
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MoveOwner:
+    """Change: another owner; the epoch rises with the revision."""
+
+    base_revision: int
+    owner: NodeId
+    reason: str
+
+    def apply(self, read: Allocation) -> Allocation:
+        """The new value; touches owner, epoch and revision only. For the owner that is there already: what was read."""
+        if self.owner == read.owner:
+            return read
+        return replace(read, revision=read.revision + 1, epoch=read.epoch + 1, owner=self.owner)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Retune:
+    """Change: another tuning; owner and epoch stay, so routes do not move."""
+
+    base_revision: int
+    tuning: Tuning
+    request: int | None = None
+    """The operator's question that waits for this change."""
+
+    @property
+    def reason(self) -> str:
+        """Why the value is what it is, once this is committed."""
+        return "retuned by an operator"
+
+    def apply(self, read: Allocation) -> Allocation:
+        """The new value; touches tuning and revision only. For the tuning in force: what was read."""
+        if self.tuning == read.tuning:
+            return read
+        return replace(read, revision=read.revision + 1, tuning=self.tuning)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetLeased:
+    """Change: from now on nobody works without a lease, or everybody may (`zsched.core.executor.sealing`)."""
+
+    base_revision: int
+    leased: bool
+
+    @property
+    def reason(self) -> str:
+        """Why the value is what it is, once this is committed."""
+        return "nobody works without a lease any more" if self.leased else "not exclusive any more"
+
+    def apply(self, read: Allocation) -> Allocation:
+        """The new value; touches that and the revision only."""
+        return read if read.leased is self.leased else replace(read, revision=read.revision + 1, leased=self.leased)
+
+
+Change = MoveOwner | Retune | SetLeased
+
+
+class RoundOutcome(StrEnum):
+    """How a change ended."""
+
+    COMMITTED = "committed"
+    CONFLICT = "conflict"  # its base is no longer the newest revision
+    UNCHANGED = "unchanged"  # it asks for what is there already: nothing was written
+    NO_QUORUM = "no_quorum"  # not started: no majority promised
+    UNKNOWN = "unknown"  # some elector may have it, and no majority could be asked
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ended:
+    """A change that this node proposed has ended."""
+
+    task: TaskId
+    change: Change
+    outcome: RoundOutcome

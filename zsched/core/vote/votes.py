@@ -1,0 +1,89 @@
+"""VOTE in motion at one robot, all tasks: proposals are taken in, votes counted, winners handed on to be committed.
+
+Knows: every task's voting, and what a vote's end is told as. Does not know: why a robot proposes what it does
+(`zsched.core.scheduler.rounds`), when a vote is open and how it ends (`zsched.core.vote.voting`), the register.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from zsched.core.instructions import PublishProposal, RecordStory
+from zsched.core.todo import ToDo
+from zsched.core.values.change import MoveOwner
+from zsched.core.values.fleet import Fleet
+from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, TaskId
+from zsched.core.vote.tally import VoteOutcome
+from zsched.core.vote.voting import Voting
+
+
+class Votes:
+    """All tasks' votes at one robot (on edges none is ever open)."""
+
+    def __init__(self, fleet: Fleet, me: NodeId) -> None:
+        self.tasks = {spec.name: Voting(fleet, me) for spec in fleet.tasks}
+
+    def next_deadline(self) -> float:
+        """When a commit is due or an open vote ends; infinity when neither."""
+        return min((voting.next_deadline() for voting in self.tasks.values()), default=math.inf)
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether no vote is open."""
+        return all(voting.opened_at is None for voting in self.tasks.values())
+
+    def propose(
+        self, proposal: Proposal, allocation: Allocation, states: Mapping[NodeId, PeerState], todo: ToDo, now: float
+    ) -> None:
+        """This robot's own proposal: to everybody, and into its own box."""
+        if not proposal.is_escape:
+            self.tasks[proposal.task].call(now)
+        todo.add(PublishProposal(proposal=proposal))
+        self.absorb(proposal, allocation, states, todo, now)
+
+    def absorb(
+        self, proposal: Proposal, allocation: Allocation, states: Mapping[NodeId, PeerState], todo: ToDo, now: float
+    ) -> None:
+        """Any robot's proposal. On an older or newer base than ``allocation``, today's value, it does not count."""
+        voting = self.tasks[proposal.task]
+        if voting.absorb(proposal, allocation, now):
+            todo.called.append((proposal.task, proposal.is_escape))
+        self._count(voting, allocation, states, todo, now)
+
+    def count(
+        self,
+        values: Mapping[TaskId, Allocation],
+        states: Mapping[NodeId, PeerState],
+        todo: ToDo,
+        now: float,
+    ) -> None:
+        """Time has passed, or robots have come or gone: count what is open."""
+        for name, voting in self.tasks.items():
+            if voting.opened_at is not None:
+                self._count(voting, values[name], states, todo, now)
+
+    @staticmethod
+    def _count(
+        voting: Voting, allocation: Allocation, states: Mapping[NodeId, PeerState], todo: ToDo, now: float
+    ) -> None:
+        ended = voting.count(allocation, states, now)
+        if ended is None:
+            return
+        if ended.outcome is VoteOutcome.STAY:
+            todo.stayed.append(allocation.task)
+        text = f"{ended.outcome}: {ended.reason} ({', '.join(f'{v}->{c}' for v, c in ended.votes)})"
+        todo.add(RecordStory(stage="vote", text=text, task=allocation.task, epoch=allocation.epoch))
+
+    def due_commits(self, now: float) -> list[tuple[TaskId, MoveOwner]]:
+        """Changes whose turn has come; each is handed out once."""
+        due = ((name, voting.take_commit(now)) for name, voting in self.tasks.items())
+        return [(name, change) for name, change in due if change is not None]
+
+    def on_commit_ended(self, task: TaskId) -> None:
+        """Our change was committed, overtaken or given up: votes may be called again."""
+        self.tasks[task].end_commit()
+
+    def on_learnt(self, task: TaskId) -> None:
+        """A newer revision is known: proposals on older bases are worthless."""
+        self.tasks[task].on_learnt()

@@ -1,0 +1,166 @@
+"""EXECUTOR and ROUTE at the door: what is learnt is carried out, and what workers and the relay report is taken in.
+
+Knows: which stages a learnt value, a worker's state and a slot's progress concern. Does not know: the handover's table
+(`zsched.core.executor.handover`), how a value is agreed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+from zsched.core import events as ev
+from zsched.core import instructions as do
+from zsched.core.executor.workers import failed_workers
+from zsched.core.stages import Handler, PastValue, Stages
+from zsched.core.todo import ToDo
+from zsched.core.values.model import Allocation, NodeId, PeerState, TaskId, Weights, WorkerState
+
+# --- learnt values ---------------------------------------------------------------------------------------------------
+
+
+def carry_out(node: Stages, value: Allocation, reason: str, todo: ToDo, now: float) -> None:
+    """A newer value is learnt (and will be on disk before this batch does anything)."""
+    task, executor = value.task, node.executors[value.task]
+    is_new_epoch = value.epoch > executor.epoch
+    node.history[task].append(PastValue(value=value, at=now, reason=reason))
+    if is_new_epoch:
+        left = executor.owner
+        failed, drained = _has_failed(node, task, left, now), node.was_draining(left, now)
+        node.rounds.on_moved(task, left, has_failed=failed, was_draining=drained, now=now)
+    node.votes.on_learnt(task)
+    node.rounds.on_learnt(task, is_new_epoch=is_new_epoch, now=now)
+    text = f"learnt revision {value.revision}: owner {value.owner}, weights {_told(value.tuning.weights)}"
+    todo.add(do.RecordStory(stage="vote", text=text, task=task, epoch=value.epoch))
+    executor.execute(value, todo, now)
+    node.tenure.hold(value, node.beat_sequence + 1)
+    for old in executor.predecessors:
+        if node.membership.state(old) is PeerState.GONE:
+            executor.on_gone(old, todo)
+    todo.must_beat = True
+
+
+def _has_failed(node: Stages, task: TaskId, owner: NodeId | None, now: float) -> bool:
+    """Whether an owner was fled from: it is not there, or its worker has failed."""
+    if owner is None or owner == node.me:
+        return False
+    if node.membership.state(owner) in (PeerState.SUSPECT, PeerState.GONE):
+        return True
+    profile = node.gateway.fresh(owner, now)
+    return profile is not None and task in failed_workers(profile)
+
+
+def _told(weights: Weights) -> str:
+    return f"cpu={weights.cpu:g} memory={weights.memory:g} network={weights.network:g}"
+
+
+# --- workers ---------------------------------------------------------------------------------------------------------
+
+
+def _on_worker(node: Stages, event: ev.WorkerChanged, todo: ToDo, now: float) -> None:
+    was_ready = node.worker_states.get(event.task) is WorkerState.READY
+    story = node.workers.on_changed(event)
+    if story is None:
+        return
+    if event.state in (WorkerState.STOPPED, WorkerState.FAILED):
+        node.executors[event.task].on_worker_ended()
+    if was_ready:
+        node.agreement.leases.on_worker_lost(event.task)
+    node.hangs.note_worker(event.task, event.state, now)
+    todo.add(story)
+    todo.must_decide |= event.task in node.owned()
+
+
+def _on_worker_troubled(node: Stages, event: ev.WorkerTroubled, _todo: ToDo, now: float) -> None:
+    node.workers.on_troubled(event, now)
+
+
+def _on_worker_outdated(node: Stages, event: ev.WorkerOutdated, _todo: ToDo, _now: float) -> None:
+    node.workers.on_outdated(event)
+
+
+def _on_worker_shown(node: Stages, event: ev.WorkerShown, todo: ToDo, now: float) -> None:
+    if event.task not in node.executors or not node.membership.is_known(event.node):
+        return
+    node.probation.on_token(event.node, event.task, event.incarnation, is_present=event.is_present, now=now)
+    if event.is_present and node.is_orphan(node.registers[event.task].value.owner):
+        todo.must_decide = True  # this may be the candidate that the task waits for
+
+
+def _on_jobs(node: Stages, event: ev.WorkerJobs, _todo: ToDo, now: float) -> None:
+    if event.task not in node.worker_states or not node.profiler.note_jobs(event, now):
+        node.counters["jobs_refused"] += 1
+
+
+# --- the relay -------------------------------------------------------------------------------------------------------
+
+
+def _on_slot_ready(node: Stages, event: ev.SlotReady, todo: ToDo, now: float) -> None:
+    if event.task not in node.executors:
+        return
+    if not event.is_ready:
+        known, since = node.unready.get(event.task, (-1, now))
+        node.unready[event.task] = (event.epoch, since if known == event.epoch else now)
+        node.lacks[event.task] = event
+        return
+    node.unready.pop(event.task, None)
+    node.lacks.pop(event.task, None)
+    node.executors[event.task].on_ready(event.epoch, todo)
+
+
+def _on_slot_flipped(node: Stages, event: ev.SlotFlipped, todo: ToDo, now: float) -> None:
+    if event.task in node.executors:
+        node.executors[event.task].on_flipped(event.epoch, event.replayed, todo, now)
+
+
+def _on_slot_drained(node: Stages, event: ev.SlotDrained, todo: ToDo, _now: float) -> None:
+    if event.task in node.executors:
+        node.executors[event.task].on_drained(event.epoch, todo)
+
+
+def _on_role_ended(node: Stages, event: ev.RoleEnded, todo: ToDo, _now: float) -> None:
+    if event.task in node.executors:
+        node.executors[event.task].on_role_ended(event.epoch)
+    todo.must_beat |= node.agreement.leases.on_stopped(event.task, event.epoch, node.beat_sequence)
+
+
+def _on_counted(node: Stages, event: ev.StreamsCounted, _todo: ToDo, now: float) -> None:
+    node.stream_counts = event.counts
+    for count in event.counts:
+        dropped = sum(number for _, number in count.drops)
+        if dropped and node.dropped.get(count.stream, (0, 0.0))[0] != dropped:
+            node.dropped[count.stream] = (dropped, now)
+    node.hangs.absorb(event.counts, node.executors, now)
+    node.rounds.absorb_counts(event.counts, now)
+
+
+def _on_relay(node: Stages, event: ev.RelayChanged, _todo: ToDo, now: float) -> None:
+    node.relay_ends.on_changed(event, now)
+    node.set_problem("relay", None if event.is_running else f"the relay is down: {event.reason}")
+    if not event.is_running:
+        node.probation.forget_tokens()
+        node.unready |= {name: (one.epoch, now) for name, one in node.executors.items() if one.routes}
+        node.counters["relay_exits"] += 1
+
+
+def _on_persist_failed(node: Stages, event: ev.PersistFailed, todo: ToDo, _now: float) -> None:
+    """The disk refused: routes and workers go on (what was cut off is given again)."""
+    node.agreement.on_persist_failed(event.reason)
+    for executor in node.executors.values():
+        executor.again(todo)
+
+
+HANDLERS: Final[Mapping[type[Any], Handler]] = {
+    ev.WorkerChanged: _on_worker,
+    ev.WorkerTroubled: _on_worker_troubled,
+    ev.WorkerOutdated: _on_worker_outdated,
+    ev.WorkerShown: _on_worker_shown,
+    ev.WorkerJobs: _on_jobs,
+    ev.SlotReady: _on_slot_ready,
+    ev.SlotFlipped: _on_slot_flipped,
+    ev.SlotDrained: _on_slot_drained,
+    ev.RoleEnded: _on_role_ended,
+    ev.StreamsCounted: _on_counted,
+    ev.RelayChanged: _on_relay,
+    ev.PersistFailed: _on_persist_failed,
+}
