@@ -24,12 +24,13 @@ from zenoh import SampleKind
 
 from zsched.adapters.network.control_bus import ControlBus
 from zsched.core import events as ev
+from zsched.core.hop.receiver import MAX_REPLAYED, RETURN
 from zsched.core.hop.serial import serial_of
 from zsched.core.relay_protocol import EndMarker, SnapshotChunk, StreamAck, StreamAcks
 from zsched.core.route.ros2 import parse_token
 from zsched.core.sequence import RUN, Order, Track
 from zsched.core.values.model import MAX_COUNTER, NAME
-from zsched.hop.acknowledger import MAX_REPLAYED, RETURN, Acknowledger
+from zsched.hop.acknowledger import Acknowledger
 from zsched.ipc.pipe import decode_chunk, decode_end, encode_chunk, encode_end
 from zsched.relay.lanes import Lane, Sent, near
 from zsched.relay.slots import KeyState

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from zsched_lab.planted_bugs import Bug
 
-ACKS, SERIAL = "zsched.hop.acknowledger", "zsched.core.hop.serial"
+ACKS, RECEIVER, SERIAL = "zsched.hop.acknowledger", "zsched.core.hop.receiver", "zsched.core.hop.serial"
 INPUTS, WORKER_LANES = "zsched.worker.inputs", "zsched.worker.lanes"
 GREETINGS, LANES, OUTLET = "zsched.relay.greetings", "zsched.relay.lanes", "zsched.relay.outlet"
 
@@ -86,8 +86,8 @@ STREAM_BUGS = (
     ),
     _bug(
         "a forged start that is taken back leaves a loss",
-        ACKS,
-        "source.first = min(source.first, jump.at)",
+        RECEIVER,
+        "self.first = min(self.first, jump.at)",
         "pass",
         _ACKS,
     ),
@@ -114,7 +114,7 @@ STREAM_BUGS = (
     ),
     _bug(
         "a forged jump stands",
-        ACKS,
+        RECEIVER,
         "        return self.count >= RETURN",
         "        return False",
         _ACKS,

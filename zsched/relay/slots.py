@@ -14,10 +14,11 @@ from typing import Final
 
 from zenoh import Sample
 
+from zsched.core.hop.receiver import Jump
 from zsched.core.hop.serial import number_near, serial_of
 from zsched.core.relay_protocol import EndMarker
 from zsched.core.route import keyexpr
-from zsched.hop.acknowledger import Jump, SourceName
+from zsched.hop.acknowledger import SourceName
 from zsched.relay.answers import Answers
 from zsched.relay.receive import Receiver
 

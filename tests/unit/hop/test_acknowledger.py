@@ -9,9 +9,10 @@ from collections.abc import Iterator
 import pytest
 
 from support.waiting import until
+from zsched.core.hop import receiver
 from zsched.core.hop.serial import SPAN, serial_of
 from zsched.core.relay_protocol import StreamAck, StreamAcks
-from zsched.hop import acknowledger as hop_acks
+from zsched.hop import acknowledger
 from zsched.hop.acknowledger import Acknowledger
 
 NAME = ("edge1/t/in", "a1", 7)
@@ -66,7 +67,7 @@ def test_a_number_out_of_turn_is_refused_and_the_missing_ones_are_asked_for(book
 
 
 def test_what_never_comes_is_given_up(book: Book, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(hop_acks, "GIVE_UP_S", 0.05)
+    monkeypatch.setattr(receiver, "GIVE_UP_S", 0.05)
     assert book.admit(0, 3) == [True, False]
     until(lambda: book.admit(4) == [True], "the gap is given up")
     book.acks.processed(NAME, 4, 1)
@@ -100,7 +101,7 @@ def test_at_20_hz_while_it_changes_and_at_once_when_much_was_processed(book: Boo
     assert len(book.sent) <= 3 + 20 * (time.monotonic() - began)
     before = len(book.sent)
     book.admit(number)
-    book.acks.processed(NAME, number, hop_acks.ACK_BYTES)
+    book.acks.processed(NAME, number, acknowledger.ACK_BYTES)
     end = time.monotonic() + 60
     while len(book.sent) == before and time.monotonic() < end:
         time.sleep(0.001)

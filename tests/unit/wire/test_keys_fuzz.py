@@ -8,7 +8,7 @@ from __future__ import annotations
 import pytest
 
 from zsched.core import sequence
-from zsched.hop import acknowledger as hop_acks
+from zsched.core.hop import receiver
 from zsched.relay import lanes, slots, tokens
 from zsched.wire import keyspace
 from zsched_lab.fuzz_keys import KeyFuzz, main
@@ -38,7 +38,7 @@ def test_what_was_broken_from_outside_is_found(monkeypatch: pytest.MonkeyPatch) 
         patch.setattr(keyspace, "MAX_COUNTER", 10**99)
         assert "_key" in found()
     with monkeypatch.context() as patch:  # one skip marker or number ended a stream
-        patch.setattr(hop_acks, "RETURN", 10**9)
+        patch.setattr(receiver, "RETURN", 10**9)
         assert "_hop" in found()
         assert "_start" in found()  # one start marker made a queue of a `latest` input for good
     with monkeypatch.context() as patch:  # one end marker, long before, ended a slot in the move
