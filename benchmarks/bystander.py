@@ -26,7 +26,7 @@ class Bystander:
 
     def __init__(self, endpoint: str, watch: str, seed: int) -> None:
         config = client_config(connect=(endpoint,), timing=PATIENT)
-        command = [sys.executable, "-m", "zsched_lab.probe", config, "--watch", watch]
+        command = [sys.executable, "-m", "zsched_lab.fleet.probe", config, "--watch", watch]
         self._random = random.Random(seed)
         self._stop = threading.Event()
         self.freezes = 0

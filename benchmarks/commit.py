@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.common import line, machine
-from zsched_lab.testbed import TASK, Testbed, echo_fleet
+from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 
 GOAL = "p99 50 ms"
 PERIOD_S = 1.0

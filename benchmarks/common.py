@@ -13,7 +13,7 @@ import psutil
 import zenoh
 
 from zsched.core.values.model import NodeId
-from zsched_lab.testbed import Testbed
+from zsched_lab.fleet.testbed import Testbed
 
 
 def percentile(values: Sequence[float], share: float) -> float:

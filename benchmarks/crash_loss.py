@@ -30,8 +30,8 @@ from benchmarks.common import machine
 from zsched.clock import monotonic_s
 from zsched.core.hop.books import given_up, unaccounted
 from zsched.core.values.plan import StreamCount
-from zsched_lab.netbed import Netbed, Probe
-from zsched_lab.testbed import TASK, Json, echo_fleet
+from zsched_lab.fleet.netbed import Netbed, Probe
+from zsched_lab.fleet.testbed import TASK, Json, echo_fleet
 
 SETTLE_S = 1.0
 JUST_S = 0.03

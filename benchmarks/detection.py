@@ -30,9 +30,9 @@ from benchmarks.common import machine
 from benchmarks.record import Record, progress, save, summary, table, together
 from zsched.clock import monotonic_s
 from zsched.core.values.model import NodeId
-from zsched_lab import netns
-from zsched_lab.netbed import Netbed, Probe, descendants_running, stamped, stop_group
-from zsched_lab.testbed import TASK, TestbedError, echo_fleet
+from zsched_lab.fleet import netns
+from zsched_lab.fleet.netbed import Netbed, Probe, descendants_running, stamped, stop_group
+from zsched_lab.fleet.testbed import TASK, TestbedError, echo_fleet
 
 GOALS = {
     ("killed", "wifi"): "p99 300 ms",

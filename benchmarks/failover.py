@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 
 from benchmarks.common import Pinger, line, machine
-from zsched_lab.testbed import Json, Testbed, echo_fleet
+from zsched_lab.fleet.testbed import Json, Testbed, echo_fleet
 
 GOAL = "p99 300 ms"
 

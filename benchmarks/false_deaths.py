@@ -28,9 +28,9 @@ from benchmarks.common import machine
 from benchmarks.record import Record, progress, save, together
 from zsched.clock import monotonic_s
 from zsched.core.values.model import PeerState
-from zsched_lab import netns
-from zsched_lab.netbed import Netbed
-from zsched_lab.testbed import echo_fleet
+from zsched_lab.fleet import netns
+from zsched_lab.fleet.netbed import Netbed
+from zsched_lab.fleet.testbed import echo_fleet
 
 SETTLE_S = 5.0
 SLICE_S = 60.0

@@ -26,7 +26,7 @@ import psutil
 
 from benchmarks.common import at_pace, machine
 from zsched.sessions.config import client_config
-from zsched_lab.testbed import Testbed, echo_fleet
+from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
 APPLICATION = """
 import json, os, struct, sys, time, zenoh

@@ -28,7 +28,7 @@ from zsched.relay.outputs import OutputStream
 from zsched.relay.receive import undeclare
 from zsched.sessions.config import data_config, worker_config
 from zsched.wire.keyspace import Keyspace
-from zsched_lab.loopback import free_endpoint
+from zsched_lab.fleet.loopback import free_endpoint
 
 KEY = "robot1/in"
 OWNER = "edge1/t/1/out"

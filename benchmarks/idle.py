@@ -15,7 +15,7 @@ from pathlib import Path
 import psutil
 
 from benchmarks.common import machine, mean
-from zsched_lab.testbed import Testbed, echo_fleet
+from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
 MIB = 1024 * 1024
 

@@ -23,7 +23,7 @@ import zenoh
 from benchmarks.common import at_pace, machine, percentile
 from zsched import paths as places
 from zsched.adapters.host.operator_socket import ask
-from zsched_lab.testbed import ECHO, Testbed, echo_fleet
+from zsched_lab.fleet.testbed import ECHO, Testbed, echo_fleet
 
 CLASSES = ("best_effort", "latest", "reliable")
 BULK, BULK_HZ, SMALL_HZ, ASK_HZ = 65536, 200.0, 100.0, 20.0

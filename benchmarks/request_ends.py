@@ -24,7 +24,7 @@ from benchmarks.rig import until
 from zsched.core.values.plan import Direction, Route, ServiceSettings, StreamSettings
 from zsched.relay.services import ServiceStream
 from zsched.sessions.config import data_config, worker_config
-from zsched_lab.loopback import free_endpoints
+from zsched_lab.fleet.loopback import free_endpoints
 
 ASKED, OWNERS = "robot1/ask", "edge1/echo/robot1/ask"
 TIME_S: Final = 2.0

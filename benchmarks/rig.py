@@ -41,7 +41,7 @@ from zsched.core.values.plan import (
     WorkerRole,
 )
 from zsched.sessions.config import data_config, worker_config
-from zsched_lab.loopback import free_endpoint
+from zsched_lab.fleet.loopback import free_endpoint
 
 FLEET, ROBOT, TASK = "bench", "robot1", "echo"
 NUMBER_BYTES = 10

@@ -42,7 +42,7 @@ from zsched.core.values.model import DeviceSample, NodeId, NodeKind, WorkerState
 from zsched.runtime.endpoints import endpoints_for, free_port
 from zsched.runtime.init import init_state
 from zsched.sessions import config as zenoh_config
-from zsched_lab.testbed import TASK, echo_fleet
+from zsched_lab.fleet.testbed import TASK, echo_fleet
 
 GOAL = "p99 50 ms at 6"
 IDLE_S = 5.0

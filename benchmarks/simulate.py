@@ -11,8 +11,8 @@ import os
 import time
 
 from benchmarks.common import line, machine
-from zsched_lab.sim_swarm import MAX_NODES, MIN_NODES
-from zsched_lab.simulate import Job, play_all
+from zsched_lab.sim.simulate import Job, play_all
+from zsched_lab.sim.swarm import MAX_NODES, MIN_NODES
 
 GOAL = "3000 in 240 s on 2 cores: 160 ms of a core each"
 MILLISECONDS = 1000.0

@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 
 from benchmarks.common import line, machine
-from zsched_lab.testbed import Testbed, echo_fleet
+from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
 
 def wall_ms(command: list[str]) -> float:

@@ -42,7 +42,7 @@ from zsched.core.values.plan import (
     StreamSettings,
 )
 from zsched.sessions.config import data_config, worker_config
-from zsched_lab.loopback import free_endpoint
+from zsched_lab.fleet.loopback import free_endpoint
 
 HOPS = ("direct", "router", "naive", "best_effort", "reliable")
 PACE_HZ = {64: 500, 1024: 500, 65536: 250, 1 << 20: 50, 4 << 20: 20}

@@ -23,9 +23,9 @@ from benchmarks.common import line, machine
 from zsched.clock import monotonic_s
 from zsched.core.values.model import PeerState
 from zsched.sessions import config as zenoh_config
-from zsched_lab import netns
-from zsched_lab.netbed import PROBE, Netbed, Probe, descendants_running
-from zsched_lab.testbed import Json, echo_fleet
+from zsched_lab.fleet import netns
+from zsched_lab.fleet.netbed import PROBE, Netbed, Probe, descendants_running
+from zsched_lab.fleet.testbed import Json, echo_fleet
 
 PING_PORT = 7990
 WORKER = "zsched.tasks.echo"

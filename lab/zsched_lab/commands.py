@@ -1,7 +1,7 @@
 """The lab's verbs, `zsched demo` and `zsched bench paper`: their arguments.
 
-Knows: options. Does not know: what is run (`zsched_lab.demo`, `zsched_lab.paper`), which is imported when it is needed:
-the program's help loads this module.
+Knows: options. Does not know: what is run (`zsched_lab.demo.demo`, `zsched_lab.paper`), which is imported when it is
+needed: the program's help loads this module.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def demo(
     seed: Annotated[int, typer.Option(min=0, metavar="N", help="Of poses and injected loads.")] = 1,
 ) -> None:
     """Run a whole fleet on this machine: three robots and three edges merge real laser maps."""
-    from zsched_lab.demo import DemoOptions, run_demo  # noqa: PLC0415 - heavy
+    from zsched_lab.demo.demo import DemoOptions, run_demo  # noqa: PLC0415 - heavy
 
     options = DemoOptions(headless=headless, out=out, log=log, duration_s=duration, mode=mode.value, seed=seed)
     raise typer.Exit(run_demo(options))

@@ -16,7 +16,7 @@ from ruamel.yaml import YAML
 
 from support.waiting import until
 from zsched.adapters.machine.cgroup import LimitedGroup
-from zsched_lab.janitor import TOKEN_VARIABLE
+from zsched_lab.fleet.janitor import TOKEN_VARIABLE
 from zsched_lab.paper.places import scenario_path
 
 WHY_NOT = LimitedGroup.why_not()

@@ -26,7 +26,7 @@ from zsched.paths import socket_path
 from zsched.sessions import config as zenoh_config
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import Keyspace
-from zsched_lab.testbed import DAEMON, Testbed, echo_fleet
+from zsched_lab.fleet.testbed import DAEMON, Testbed, echo_fleet
 
 STOP_S = 4.0
 """A daemon gives its children 1.5 s; the rest is for a machine that is busy with other things."""

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from support.waiting import within
-from zsched_lab.testbed import echo_fleet
+from zsched_lab.fleet.testbed import echo_fleet
 
 CLI = (sys.executable, "-m", "zsched.cli")
 VERB_S, UP_S = 20.0, 30.0

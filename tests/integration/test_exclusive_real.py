@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from zsched_lab.testbed import Testbed, echo_fleet
+from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
 
 @pytest.fixture

@@ -19,9 +19,9 @@ from support.programs import running
 from zsched.tasks.map_merge.cdr import StampedTransform, decode_grid, encode_grid, encode_transforms
 from zsched.tasks.map_merge.merger import Merger, MergerSettings, Mode
 from zsched_lab.explore.worlds import load_world
-from zsched_lab.loopback import free_endpoints
-from zsched_lab.map_metrics import score_map
-from zsched_lab.recorder import Record, read_records
+from zsched_lab.fleet.loopback import free_endpoints
+from zsched_lab.fleet.recorder import Record, read_records
+from zsched_lab.maps.metrics import score_map
 
 ROBOTS = ("robot1", "robot2")
 WORLD = "turtlebot3"

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from zsched_lab.netbed import descendants_running
-from zsched_lab.testbed import TASK, Testbed, echo_fleet
+from zsched_lab.fleet.netbed import descendants_running
+from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 
 WORKER = Path(__file__).with_name("hangable_echo.py")
 DEADLINE_S = 1.0

@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 
 from zsched.runtime.init import init_state
-from zsched_lab.loopback import free_endpoint
-from zsched_lab.testbed import DAEMON, Testbed, TestbedError, echo_fleet
+from zsched_lab.fleet.loopback import free_endpoint
+from zsched_lab.fleet.testbed import DAEMON, Testbed, TestbedError, echo_fleet
 
 
 @pytest.fixture

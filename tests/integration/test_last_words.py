@@ -7,8 +7,8 @@ import signal
 from collections.abc import Callable
 from pathlib import Path
 
-from zsched_lab.netbed import descendants_running
-from zsched_lab.testbed import Testbed, echo_fleet
+from zsched_lab.fleet.netbed import descendants_running
+from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
 LAST_WORDS = "Fatal Python error: Aborted"
 TRIPPED = "Fatal Python error: Segmentation fault"

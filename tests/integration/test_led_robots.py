@@ -24,9 +24,9 @@ from zsched_lab.explore.laser import Laser
 from zsched_lab.explore.localizer import LOST_S
 from zsched_lab.explore.messages import decode_correction, encode_scan
 from zsched_lab.explore.worlds import load_world
-from zsched_lab.loopback import free_endpoints
-from zsched_lab.recorder import Record, read_records
-from zsched_lab.testbed import Testbed, echo_fleet
+from zsched_lab.fleet.loopback import free_endpoints
+from zsched_lab.fleet.recorder import Record, read_records
+from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
 WORLD = "office:3"
 DEADLINE_S = 45.0

@@ -12,7 +12,7 @@ import psutil
 import pytest
 
 from zsched.core.scheduler.utility import SPARE
-from zsched_lab.testbed import Testbed, echo_fleet
+from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
 TASKS = ("task1", "task2", "task3")
 SHARE = 0.1

@@ -10,7 +10,7 @@ from pathlib import Path
 import zenoh
 
 from zsched.runtime.crew import REJOIN_S
-from zsched_lab.testbed import TASK, Json, Testbed, echo_fleet
+from zsched_lab.fleet.testbed import TASK, Json, Testbed, echo_fleet
 
 WAIT_S = 60.0
 SAID = "the worker on edge1: seems to run since before its session changed: start it again on edge1"

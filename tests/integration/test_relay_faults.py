@@ -15,7 +15,7 @@ import pytest
 
 from support.waiting import within
 from zsched.core.values.model import NodeId
-from zsched_lab.testbed import Testbed, echo_fleet
+from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import signal
 from pathlib import Path
 
 from zsched.core.profile.relay_ends import OFTEN, WINDOW_S
-from zsched_lab.testbed import Testbed, echo_fleet
+from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
 WAIT_S = 60.0
 

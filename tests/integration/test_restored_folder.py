@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-from zsched_lab.testbed import Testbed, echo_fleet
+from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
 
 def test_an_elector_whose_folder_was_restored_votes_no_more_and_says_so_on_every_node(tmp_path: Path) -> None:

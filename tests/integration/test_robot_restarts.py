@@ -10,7 +10,7 @@ import zenoh
 from support.sessions import matches
 from zsched.worker.keep import TICK_S
 from zsched.worker.lanes import NEWCOMERS_S
-from zsched_lab.testbed import TASK, Testbed, echo_fleet
+from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 
 COUNT = 60
 

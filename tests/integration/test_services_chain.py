@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from zsched_lab.testbed import Testbed, echo_fleet
+from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
 SERVICES = [{"from": "{robot}/ask", "to": "{target}/echo/{robot}/ask", "timeout_s": 5}]
 

@@ -9,7 +9,7 @@ import zenoh
 
 from support.waiting import until
 from zsched.sessions.config import client_config
-from zsched_lab.testbed import Testbed, echo_fleet
+from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
 LARGE = bytes(1 << 18)
 

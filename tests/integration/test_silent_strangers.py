@@ -14,7 +14,7 @@ import zenoh
 from zsched.errors import AdapterError
 from zsched.runtime.descriptors import WANTED
 from zsched.sessions import config as zenoh_config
-from zsched_lab.testbed import Testbed, echo_fleet
+from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
 SPARE = 12
 """Descriptors that the process has left when the strangers come."""

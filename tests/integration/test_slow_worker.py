@@ -11,7 +11,7 @@ import zenoh
 from support.sessions import matches
 from zsched.core.hop.books import unaccounted
 from zsched.core.values.plan import StreamCount
-from zsched_lab.testbed import TASK, Testbed, echo_fleet
+from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 
 WORKER = Path(__file__).with_name("slow_echo.py")
 SENT = 200

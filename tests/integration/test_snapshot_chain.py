@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from zsched_lab.testbed import Testbed, echo_fleet
+from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
 WORKER = '''
 """Counts its inputs; its state is the count."""

@@ -23,7 +23,7 @@ from zsched.core.values.plan import Role, WorkerRole
 from zsched.ipc.pipe import encode_end
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import END_CHUNK, Keyspace
-from zsched_lab.testbed import TASK, Testbed, echo_fleet
+from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 
 KEYS = Keyspace("testbed")
 FAR = 10**6

@@ -17,7 +17,7 @@ import pytest
 import zenoh
 
 from support.waiting import between
-from zsched_lab.testbed import Testbed, echo_fleet
+from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
 HZ, SIZE = 50.0, 1000
 VERB_S = 30.0

@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 
 from support.certificates import make_tls
-from zsched_lab.netbed import descendants
-from zsched_lab.testbed import Json, Testbed, echo_fleet
+from zsched_lab.fleet.netbed import descendants
+from zsched_lab.fleet.testbed import Json, Testbed, echo_fleet
 
 LISTENING = "0A"
 SOCKET = re.compile(r"socket:\[(\d+)\]")

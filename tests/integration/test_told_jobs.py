@@ -17,7 +17,7 @@ from support.fleets import tuning_of
 from zsched.core.gateway.demand import Demands
 from zsched.core.values.fleet import Demand, TaskSpec
 from zsched.core.values.model import Jobs, Profile, WorkerLoad, WorkerState
-from zsched_lab.testbed import TASK, Testbed, echo_fleet
+from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 
 WORKER = Path(__file__).with_name("busy_echo.py")
 BUSY_MS, RATE_HZ = 40.0, 10.0

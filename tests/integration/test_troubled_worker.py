@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from zsched_lab.testbed import TASK, Testbed, echo_fleet
+from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 
 WORKER = Path(__file__).with_name("touchy_echo.py")
 

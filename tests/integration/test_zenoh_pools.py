@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from zsched.sessions.config import TX_THREADS, pool_threads, runtime_pools
-from zsched_lab.netbed import descendants_running
-from zsched_lab.testbed import Testbed, echo_fleet
+from zsched_lab.fleet.netbed import descendants_running
+from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
 NODES, TASKS = 2, 1
 

@@ -15,7 +15,7 @@ from support.waiting import until
 from zsched.adapters.host.state_file import StateFile
 from zsched.cli import app
 from zsched.errors import AdapterError
-from zsched_lab.testbed import Testbed, echo_fleet
+from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
 MAIN = "from zsched.__main__ import main; main()"
 INTERRUPTED = """

@@ -39,7 +39,7 @@ from zsched.runtime.sampler import Sampler
 from zsched.runtime.shell import Inbox
 from zsched.sessions.config import worker_config
 from zsched.wire.keyspace import Keyspace
-from zsched_lab.testbed import echo_fleet
+from zsched_lab.fleet.testbed import echo_fleet
 
 Json = dict[str, Any]
 

@@ -1,4 +1,4 @@
-"""The planted bugs: all can be planted, and a few are hunted here. All of them: ``python -m zsched_lab.planted``."""
+"""The planted bugs: all can be planted, a few are hunted here. All of them: ``python -m zsched_lab.bugs.planted``."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from zsched_lab.planted import BUGS, PlantError, Verdict, changed, for_children, judge, plant, table
-from zsched_lab.planted_bugs import REGISTER, Bug
-from zsched_lab.planted_stream_bugs import STREAM_BUGS
+from zsched_lab.bugs.core_bugs import REGISTER, Bug
+from zsched_lab.bugs.planted import BUGS, PlantError, Verdict, changed, for_children, judge, plant, table
+from zsched_lab.bugs.stream_bugs import STREAM_BUGS
 
 ROOT = Path(__file__).parents[2]
 QUICK = ("quorum off by one", "promise not persisted", "node without state is an elector", "silence rule left out")
@@ -70,7 +70,7 @@ def test_processes_that_a_test_starts_have_the_bug_too(tmp_path: Path, monkeypat
 def test_a_change_without_effect_is_not_called_found() -> None:
     """The hunt does not cry wolf: in a process of its own, schedules of a harmless change end without a finding."""
     code = (
-        "import sys; from zsched_lab.planted import hunt; from zsched_lab.planted_bugs import Bug\n"
+        "import sys; from zsched_lab.bugs.planted import hunt; from zsched_lab.bugs.core_bugs import Bug\n"
         f"sys.exit(hunt({HARMLESS!r}, 0.2))"
     )
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, timeout=110, check=False).returncode == 0

@@ -14,8 +14,8 @@ from zsched.core.values.model import Allocation, Beat, Grant, WorkerState
 from zsched.core.values.plan import WorkerRole
 from zsched.core.vote.clocks import DOUBT_S, JUMP_S, ClockDoubt
 from zsched.core.vote.lease import RHO, Leases, hold_s
-from zsched_lab.sim_clocks import LOOK_S, slew
-from zsched_lab.simulator import Simulator
+from zsched_lab.sim.clocks import LOOK_S, slew
+from zsched_lab.sim.simulator import Simulator
 
 SLEW = ClockCompared(error_ratio=0.083, since_s=0.2)
 WELL = ClockCompared(error_ratio=1e-5, since_s=0.2)

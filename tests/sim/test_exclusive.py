@@ -15,7 +15,7 @@ from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSp
 from zsched.core.values.model import Beat, NodeId, NodeKind
 from zsched.core.values.plan import WorkerRole
 from zsched.core.vote.lease import hold_s
-from zsched_lab.simulator import CORES, Simulator
+from zsched_lab.sim.simulator import CORES, Simulator
 
 TASK = "merge"
 TIMING = Timing()

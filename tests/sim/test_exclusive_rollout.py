@@ -12,8 +12,8 @@ from zsched.core import instructions as do
 from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec
 from zsched.core.values.model import DurableState, NodeId
 from zsched.core.values.plan import WorkerRole
-from zsched_lab.sim_parts import Machine
-from zsched_lab.simulator import CORES, Simulator
+from zsched_lab.sim.parts import Machine
+from zsched_lab.sim.simulator import CORES, Simulator
 
 TASK, LOOK_S = "merge", 0.01
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2", "edge3")

@@ -7,8 +7,8 @@ from zsched.core.status import build_snapshot
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.model import NodeKind
 from zsched.core.values.plan import ReadyWhen
-from zsched_lab.sim_swarm import plan
-from zsched_lab.simulator import Simulator
+from zsched_lab.sim.simulator import Simulator
+from zsched_lab.sim.swarm import plan
 
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
 DEADLINE_S = 3.0

@@ -12,7 +12,7 @@ from zsched.core import instructions as do
 from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec
 from zsched.core.values.model import NodeId
 from zsched.core.vote.belief import GENERATION_STEP, MAX_GENERATION
-from zsched_lab.simulator import Simulator
+from zsched_lab.sim.simulator import Simulator
 
 TASK = "merge"
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2", "edge3")

@@ -9,7 +9,7 @@ from zsched.core.status import build_snapshot
 from zsched.core.values.fleet import Fleet, NodeSpec, OnIsolation, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.model import NodeKind
 from zsched.core.values.plan import WorkerRole
-from zsched_lab.simulator import Simulator
+from zsched_lab.sim.simulator import Simulator
 
 TASK = "merge"
 ROBOTS = ("robot1", "robot2", "robot3")

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from zsched.core import events as ev
 from zsched.core.values.model import PeerState
-from zsched_lab.sim_swarm import plan
-from zsched_lab.simulator import Simulator
+from zsched_lab.sim.simulator import Simulator
+from zsched_lab.sim.swarm import plan
 
 
 def test_a_token_accuses_and_never_clears() -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from zsched.config.timing import PROFILES
-from zsched_lab.sim_faults import play
-from zsched_lab.sim_rest import AT_MOST_S, FEWEST, QUANTILES_S, quantile, spread, too_slow
-from zsched_lab.sim_swarm import plan
+from zsched_lab.sim.faults import play
+from zsched_lab.sim.rest import AT_MOST_S, FEWEST, QUANTILES_S, quantile, spread, too_slow
+from zsched_lab.sim.swarm import plan
 
 
 def test_every_profile_has_its_bounds_and_those_of_a_batch_are_the_narrower_ones() -> None:

@@ -13,7 +13,7 @@ from zsched.core.values.fleet import TaskSpec, WorkerSpec
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import Beat, DurableState, NodeId
 from zsched.core.vote.witness import ASK_ALL_S, Witness
-from zsched_lab.simulator import CORES, Simulator
+from zsched_lab.sim.simulator import CORES, Simulator
 
 TASK = "merge"
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")

@@ -6,7 +6,7 @@ from support.fleets import tuning_of
 from zsched.core.scheduler.probation import LEASE_MARGIN_S
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.model import NodeKind, PeerState
-from zsched_lab.simulator import CORES, Simulator
+from zsched_lab.sim.simulator import CORES, Simulator
 
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2", "edge3")
 TIMING = Timing()

@@ -24,7 +24,7 @@ from zsched.core import events as ev
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.messages import SetWeights
 from zsched.core.values.model import NodeKind
-from zsched_lab.simulator import CORES, Simulator
+from zsched_lab.sim.simulator import CORES, Simulator
 
 FOLDER = Path(__file__).parent / "scenarios"
 FILES = sorted(FOLDER.glob("*.txt"))

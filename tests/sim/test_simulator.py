@@ -10,7 +10,7 @@ import pytest
 from support.fleets import tuning_of
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.model import NodeId, NodeKind, PeerState
-from zsched_lab.simulator import CORES, Simulator
+from zsched_lab.sim.simulator import CORES, Simulator
 
 TASK = "merge"
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 
 from zsched.core import status
-from zsched_lab.sim_faults import play
-from zsched_lab.sim_swarm import plan
+from zsched_lab.sim.faults import play
+from zsched_lab.sim.swarm import plan
 
 WITHOUT_A_STATE = 9000013
 """A seed at whose end an elector has no state, and enough others have theirs."""

@@ -1,4 +1,4 @@
-"""Random fault schedules by seed: the short form of ``python -m zsched_lab.simulate`` (CI plays thousands)."""
+"""Random fault schedules by seed: the short form of ``python -m zsched_lab.sim.simulate`` (CI plays thousands)."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from zsched.core.todo import ToDo
 from zsched.core.values.messages import Prepare, Promise, Refused
 from zsched.core.vote.register import Register
 from zsched.errors import InvariantError
-from zsched_lab import simulate
-from zsched_lab.sim_checks import DisagreementError
-from zsched_lab.sim_faults import BEYOND, Stage, play
-from zsched_lab.sim_files import CHANGES
-from zsched_lab.sim_links import Held
-from zsched_lab.sim_parts import GENERATION_STEP, Clock, Disk
-from zsched_lab.sim_rest import AT_MOST_S
-from zsched_lab.sim_swarm import KINDS, LATER, MAKERS, MAX_NODES, MIN_NODES, PENDING, Fault, Plan, plan
-from zsched_lab.simulate import Job, main, shrink
-from zsched_lab.simulator import Simulator
+from zsched_lab.sim import simulate
+from zsched_lab.sim.checks import DisagreementError
+from zsched_lab.sim.faults import BEYOND, Stage, play
+from zsched_lab.sim.files import CHANGES
+from zsched_lab.sim.links import Held
+from zsched_lab.sim.parts import GENERATION_STEP, Clock, Disk
+from zsched_lab.sim.rest import AT_MOST_S
+from zsched_lab.sim.simulate import Job, main, shrink
+from zsched_lab.sim.simulator import Simulator
+from zsched_lab.sim.swarm import KINDS, LATER, MAKERS, MAX_NODES, MIN_NODES, PENDING, Fault, Plan, plan
 
 
 @pytest.mark.parametrize("seed", range(25))
@@ -153,7 +153,7 @@ def test_whatever_a_node_raises_is_a_violation(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_a_fleet_that_does_not_come_to_rest_is_a_violation(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("zsched_lab.simulator.unsettled", lambda *_: "never")
+    monkeypatch.setattr("zsched_lab.sim.simulator.unsettled", lambda *_: "never")
     with pytest.raises(InvariantError, match="not at rest"):
         Stage(Plan(seed=1, fleet=plan(1).fleet, faults=(), seconds=4.0)).play(None, 2.0)
 

@@ -7,8 +7,8 @@ from functools import partial
 from support.fleets import fleet_of, tuning_of
 from zsched.core.status import build_snapshot
 from zsched.core.values.fleet import TaskSpec, WorkerSpec
-from zsched_lab.sim_parts import Machine
-from zsched_lab.simulator import Simulator
+from zsched_lab.sim.parts import Machine
+from zsched_lab.sim.simulator import Simulator
 
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
 FLEET = fleet_of(

@@ -11,8 +11,8 @@ from zsched.core.gateway.gateway import Gateway
 from zsched.core.values.fleet import Fleet, NodeSpec, Reach, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.model import Allocation, NodeKind, PeerState, Proposal
 from zsched.core.vote.tally import VoteOutcome, tally
-from zsched_lab.sim_swarm import plan
-from zsched_lab.simulator import Simulator
+from zsched_lab.sim.simulator import Simulator
+from zsched_lab.sim.swarm import plan
 
 VOTERS = ("robot1", "robot2", "robot3")
 

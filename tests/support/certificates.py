@@ -10,7 +10,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from zsched_lab.loopback import own_address
+from zsched_lab.fleet.loopback import own_address
 
 
 def make_tls(folder: Path) -> Path:

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from zsched_lab.loopback import free_endpoint
+from zsched_lab.fleet.loopback import free_endpoint
 
 __all__ = ["DEADLINE_S", "POLL_S", "TooSlowError", "between", "free_endpoint", "until", "within"]
 

@@ -24,10 +24,10 @@ from zsched.adapters.host.state_file import StateFile
 from zsched.clock import monotonic_s
 from zsched.core.values.model import NodeId
 from zsched.paths import socket_path
-from zsched_lab import netns
-from zsched_lab.chaos import TWO_CLASSES
-from zsched_lab.netbed import Netbed, Probe, Received
-from zsched_lab.testbed import TASK, Json, echo_fleet
+from zsched_lab.fleet import netns
+from zsched_lab.fleet.chaos import TWO_CLASSES
+from zsched_lab.fleet.netbed import Netbed, Probe, Received
+from zsched_lab.fleet.testbed import TASK, Json, echo_fleet
 
 pytestmark = pytest.mark.root
 

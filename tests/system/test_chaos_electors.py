@@ -26,9 +26,9 @@ from zsched.runtime.init import init_state
 from zsched.sessions import config as zenoh_config
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import Keyspace
-from zsched_lab import netns
-from zsched_lab.netbed import CONTROL_PORT, Netbed, Probe
-from zsched_lab.testbed import DAEMON, TASK, Json, echo_fleet
+from zsched_lab.fleet import netns
+from zsched_lab.fleet.netbed import CONTROL_PORT, Netbed, Probe
+from zsched_lab.fleet.testbed import DAEMON, TASK, Json, echo_fleet
 
 pytestmark = pytest.mark.root
 
@@ -246,7 +246,7 @@ def test_what_a_killed_test_leaves_is_swept() -> None:
     if reason is not None:
         pytest.skip(f"no network namespaces here: {reason}")
     script = (
-        "import os, subprocess; from zsched_lab.netns import Network; network = Network(['one']); "
+        "import os, subprocess; from zsched_lab.fleet.netns import Network; network = Network(['one']); "
         "quiet = {'stdout': subprocess.DEVNULL, 'stderr': subprocess.DEVNULL}; "
         "child = subprocess.Popen(network.wrap('one', ['sleep', '1000']), **quiet); "
         "print(network.name_of('one'), child.pid, flush=True); os.kill(os.getpid(), 9)"

@@ -20,10 +20,10 @@ import pytest
 from zsched.adapters.machine.cgroup import LimitedGroup
 from zsched.clock import monotonic_s
 from zsched.core.values.model import PeerState
-from zsched_lab import netns
-from zsched_lab.chaos import GUARD, ChaosBed
-from zsched_lab.netbed import descendants, stop_group
-from zsched_lab.testbed import TASK
+from zsched_lab.fleet import netns
+from zsched_lab.fleet.chaos import GUARD, ChaosBed
+from zsched_lab.fleet.netbed import descendants, stop_group
+from zsched_lab.fleet.testbed import TASK
 
 pytestmark = pytest.mark.root
 

@@ -22,10 +22,10 @@ from zsched.core.hop.books import given_up
 from zsched.core.values.fleet import Timing
 from zsched.core.values.model import NodeId
 from zsched.core.values.plan import StreamCount
-from zsched_lab import netns
-from zsched_lab.chaos import ChaosBed
-from zsched_lab.netbed import Netbed, Probe, descendants_running
-from zsched_lab.testbed import TASK, TestbedError, echo_fleet
+from zsched_lab.fleet import netns
+from zsched_lab.fleet.chaos import ChaosBed
+from zsched_lab.fleet.netbed import Netbed, Probe, descendants_running
+from zsched_lab.fleet.testbed import TASK, TestbedError, echo_fleet
 
 CUTS: Final = int(os.environ.get("ZSCHED_CUTS", "3"))
 LONGEST_S: Final = 4.0

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 import pytest
 
-from zsched_lab.janitor import TOKEN_VARIABLE, groups_of, tagged_processes
+from zsched_lab.fleet.janitor import TOKEN_VARIABLE, groups_of, tagged_processes
 
 DEMO = (sys.executable, "-m", "zsched.cli", "demo", "--headless")
 

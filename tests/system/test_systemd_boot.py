@@ -21,7 +21,7 @@ from typing import Any
 import pytest
 
 from support.debian import NoDebianError, debian_root
-from zsched_lab.loopback import free_endpoints
+from zsched_lab.fleet.loopback import free_endpoints
 
 HERE, REPO = Path(__file__).parent, Path(__file__).parents[2]
 BOOT_TIMEOUT_S = 150.0

@@ -22,8 +22,8 @@ from zsched.config.timing import PROFILES
 from zsched.ipc import pipe as relay_pipe
 from zsched.wire import codec as wire  # the pipe's kinds are registered with the codec when its module is imported
 from zsched.wire.keyspace import Keyspace
-from zsched_lab.planted import BUGS, places
-from zsched_lab.planted_bugs import Bug
+from zsched_lab.bugs.core_bugs import Bug
+from zsched_lab.bugs.planted import BUGS, places
 
 ROOT: Final = Path(__file__).parents[2]
 DOCS: Final = sorted(

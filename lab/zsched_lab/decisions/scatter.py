@@ -41,7 +41,15 @@ def describe(read: Array) -> tuple[float, float, float, float]:
 def watch(seconds: float, rate_hz: float) -> tuple[Array, Array]:
     """CPU and memory readings, as shares of a group of `QUOTA_CORES`, while the network runs at ``rate_hz`` in it."""
     group = LimitedGroup.create(f"scatter-{os.getpid()}", cpu_cores=QUOTA_CORES, memory_mb=768)
-    command = [sys.executable, "-m", "zsched_lab.neural_load", "--hz", f"{rate_hz:g}", "--duration", str(seconds + 20)]
+    command = [
+        sys.executable,
+        "-m",
+        "zsched_lab.fleet.neural_load",
+        "--hz",
+        f"{rate_hz:g}",
+        "--duration",
+        str(seconds + 20),
+    ]
     load = subprocess.Popen(command, stdout=subprocess.DEVNULL) if rate_hz else None
     try:
         if load is not None:

@@ -23,7 +23,7 @@ from zsched_lab.explore.body import Limits
 from zsched_lab.explore.picture import Picture, save_pictures
 from zsched_lab.explore.virtual import VirtualResult, VirtualRun, run_virtual
 from zsched_lab.explore.worlds import load_world
-from zsched_lab.map_metrics import score_map
+from zsched_lab.maps.metrics import score_map
 
 RESAMPLES = 10_000
 EXIT_CONFIG = 78

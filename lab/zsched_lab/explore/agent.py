@@ -19,7 +19,7 @@ from zsched_lab.explore.laser import SCAN_PERIOD_S, Laser, LaserScan
 from zsched_lab.explore.localizer import Localizer
 from zsched_lab.explore.mapper import ScanMapper
 from zsched_lab.explore.world import World
-from zsched_lab.mapping import RESOLUTION_M
+from zsched_lab.maps.mapping import RESOLUTION_M
 
 MAP_PERIOD_S = 0.5
 CLAIM_PERIOD_S = 0.5

@@ -4,7 +4,7 @@ Knows: log-odds, scans with and without echo, poses in the robot's own map frame
 
 For every cell round the robot: which beam looks at it, and does it end behind it? Then the cell is free. The cells in
 which echoes end are walls. A beam counts as far as the shortest of itself and its two neighbours: at a grazing angle
-the middle one would look through the wall. Occupancy grid mapping by log-odds as in `zsched_lab.mapping`, whose
+the middle one would look through the wall. Occupancy grid mapping by log-odds as in `zsched_lab.maps.mapping`, whose
 values it shares; the poses are given (`zsched_lab.explore.body`: truth plus the drift that SLAM leaves).
 """
 
@@ -20,7 +20,7 @@ import numpy.typing as npt
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import FREE, OCCUPIED, UNKNOWN, Grid, Mask
 from zsched_lab.explore.laser import RANGE_M, LaserScan
-from zsched_lab.mapping import CLIP, FREE_BELOW, HIT, MISS, OCCUPIED_ABOVE, RESOLUTION_M
+from zsched_lab.maps.mapping import CLIP, FREE_BELOW, HIT, MISS, OCCUPIED_ABOVE, RESOLUTION_M
 
 _GROWTH_CELLS = 128
 ONE_WALL_M = 0.25

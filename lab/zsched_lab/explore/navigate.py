@@ -30,7 +30,6 @@ from zsched.clock import monotonic_s
 from zsched.errors import WireError
 from zsched.tasks.map_merge.cdr import CdrError, decode_grid
 from zsched.tasks.map_merge.geometry import Pose2
-from zsched_lab import application
 from zsched_lab.explore.agent import CLAIM_PERIOD_S
 from zsched_lab.explore.body import Limits
 from zsched_lab.explore.explorer import Explorer, avoid_s
@@ -42,7 +41,8 @@ from zsched_lab.explore.messages import (
     encode_way,
     pose_of_map,
 )
-from zsched_lab.signals import StopFlag
+from zsched_lab.fleet import application
+from zsched_lab.fleet.signals import StopFlag
 
 POLL_S = 0.05
 AGAIN_S = 1.0

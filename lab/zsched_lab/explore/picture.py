@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid
-from zsched_lab.plots import COLOURS, DPI, difference, on_one_canvas, shade, write
+from zsched_lab.demo.plots import COLOURS, DPI, difference, on_one_canvas, shade, write
 
 PANEL_INCHES = 5.5
 CURVE_INCHES = 3.2

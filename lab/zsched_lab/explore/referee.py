@@ -2,7 +2,7 @@
 
 Knows: the truth's known cells. Does not know: who drives where.
 
-Coverage is the share of the truth's known cells that the map knows, as in `zsched_lab.map_metrics`, but looked up cell
+Coverage is the share of the truth's known cells that the map knows, as in `zsched_lab.maps.metrics`, but looked up cell
 by cell: a millisecond, so that it can be taken of every map that comes.
 """
 

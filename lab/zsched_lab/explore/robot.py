@@ -23,7 +23,7 @@ With ``--slam-task`` its scans go to ``<robot>/TASK/scan``.
 
 The merger's ``--pose <robot>=x,y,yaw`` is the robot's start: ``load_world(world).starts(robots)[index]``.
 
-Records go to ``<records>/<robot>.ndjson`` as those of `zsched_lab.robot_app` (``map``, ``status``, ``progress``), and
+Records go to ``<records>/<robot>.ndjson`` as those of `zsched_lab.robots.app` (``map``, ``status``, ``progress``), and
 besides ``start`` (once), ``path`` (2 Hz, true pose and belief) and ``covered``: once, when the merged map that this
 robot holds first knows ``--target`` of the world. Then the robot goes on until it is stopped (SIGTERM, SIGINT); at the
 end it writes ``<robot>-global_map.cdr`` and ``<robot>-map.cdr``. ``t_s`` is the daemon's clock.
@@ -47,7 +47,6 @@ from zsched.errors import ConfigError, WireError
 from zsched.tasks.map_merge.__main__ import metres_per_cell
 from zsched.tasks.map_merge.cdr import CdrError, decode_grid, encode_grid
 from zsched.tasks.map_merge.geometry import Pose2
-from zsched_lab import application
 from zsched_lab.explore.agent import Agent, Outputs, RobotSettings
 from zsched_lab.explore.body import Drift, Limits
 from zsched_lab.explore.messages import (
@@ -61,9 +60,10 @@ from zsched_lab.explore.messages import (
 from zsched_lab.explore.referee import Referee
 from zsched_lab.explore.world import World
 from zsched_lab.explore.worlds import load_world
-from zsched_lab.mapping import RESOLUTION_M
-from zsched_lab.recorder import Record, Recorder
-from zsched_lab.signals import StopFlag
+from zsched_lab.fleet import application
+from zsched_lab.fleet.recorder import Record, Recorder
+from zsched_lab.fleet.signals import StopFlag
+from zsched_lab.maps.mapping import RESOLUTION_M
 
 TICK_S = 0.1
 PATH_PERIOD_S = 0.5

@@ -28,13 +28,13 @@ from zsched.clock import monotonic_s
 from zsched.errors import WireError
 from zsched.tasks.map_merge.__main__ import metres_per_cell
 from zsched.tasks.map_merge.cdr import encode_grid
-from zsched_lab import application
 from zsched_lab.explore.agent import MAP_PERIOD_S
 from zsched_lab.explore.mapper import ScanMapper
 from zsched_lab.explore.messages import decode_scan, encode_correction
 from zsched_lab.explore.slam_state import Slam, SlamSettings
-from zsched_lab.mapping import RESOLUTION_M
-from zsched_lab.signals import StopFlag
+from zsched_lab.fleet import application
+from zsched_lab.fleet.signals import StopFlag
+from zsched_lab.maps.mapping import RESOLUTION_M
 
 POLL_S = 0.02
 WAITING_SCANS = 16

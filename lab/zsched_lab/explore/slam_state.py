@@ -23,7 +23,7 @@ from zsched_lab.explore.laser import SCAN_PERIOD_S, LaserScan
 from zsched_lab.explore.mapper import ScanMapper
 from zsched_lab.explore.matching import ScanMatcher
 from zsched_lab.explore.messages import Correction
-from zsched_lab.mapping import RESOLUTION_M
+from zsched_lab.maps.mapping import RESOLUTION_M
 
 SNAPSHOT_SCHEMA = "zsched.slam.snapshot/1"
 _HEAD = struct.Struct("<4sI")

@@ -3,9 +3,10 @@
 Knows: how many streams, how fast, when to stop. Does not know: which node it loads, or why; its starter puts the
 process into that node's share.
 
-One session of the network (`zsched_lab.neural_load`) serves all streams, one thread each, as a detector on an edge does
-for its robots' cameras. Streams do not wait for one another: N of them compete for the CPU like N busy threads, while
-the threads inside one inference would mostly wait at its barriers. Every second one line of JSON goes to stdout:
+One session of the network (`zsched_lab.fleet.neural_load`) serves all streams, one thread each, as a detector on an
+edge does for its robots' cameras. Streams do not wait for one another: N of them compete for the CPU like N busy
+threads, while the threads inside one inference would mostly wait at its barriers. Every second one line of JSON goes to
+stdout:
 ``{"t_s", "frames", "fps", "model", "streams"}``.
 
 A stream's strength is the CPU that it takes, not its frames: it pauses after each frame for as long as that frame's own
@@ -23,8 +24,8 @@ import threading
 import time
 
 from zsched.clock import monotonic_s
-from zsched_lab.neural_load import Network, frames, load_network
-from zsched_lab.signals import StopFlag
+from zsched_lab.fleet.neural_load import Network, frames, load_network
+from zsched_lab.fleet.signals import StopFlag
 
 REPORT_S = 1.0
 LAST_FRAME_S = 2.0

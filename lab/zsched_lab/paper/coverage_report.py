@@ -14,10 +14,10 @@ from typing import Any
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from zsched_lab.demo.plots import COLOURS, DPI
 from zsched_lab.paper.claims import T_975
 from zsched_lab.paper.roles import ROLES, mean_shares
 from zsched_lab.paper.schemes import SCHEMES
-from zsched_lab.plots import COLOURS, DPI
 
 Json = Mapping[str, Any]
 OURS = {"zsched": "#111111", "zsched_slam": "#8a1c1c"}

@@ -15,9 +15,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from zsched_lab.demo.plots import COLOURS, DPI
 from zsched_lab.paper.claims import over_fixed, shared
 from zsched_lab.paper.schemes import SCHEMES, Family
-from zsched_lab.plots import COLOURS, DPI
 
 Json = Mapping[str, Any]
 FAMILY_COLOURS = {Family.FIXED: "#9aa0a6", Family.PAPER: "#56B4E9", Family.OURS: "#D55E00", Family.YARDSTICK: "#c9b458"}

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from zsched.tasks.map_merge.geometry import Pose2
+from zsched_lab.fleet.recorder import read_records
 from zsched_lab.paper.arrivals import Arrival, Streams
-from zsched_lab.recorder import read_records
 
 CURVE_S = 5.0
 """Coverage over time is told so often."""

@@ -18,11 +18,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from zsched.core.values.model import NodeId
-from zsched_lab.children import Child, Children
-from zsched_lab.fleet_view import Load
-from zsched_lab.limits import NodeLimits
+from zsched_lab.fleet.children import Child, Children
+from zsched_lab.fleet.limits import NodeLimits
+from zsched_lab.fleet.signals import StopFlag
+from zsched_lab.fleet.view import Load
 from zsched_lab.paper.scenario import LoadLevel, LoadPlan, NodeShare
-from zsched_lab.signals import StopFlag
 
 Tell = Callable[[float, str], None]
 

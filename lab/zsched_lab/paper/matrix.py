@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from zsched_lab.children import ChildError
+from zsched_lab.fleet.children import ChildError
 from zsched_lab.paper.cells import Cell
 from zsched_lab.paper.plan import clock
 from zsched_lab.paper.run import write_json

@@ -24,15 +24,15 @@ from mcap.reader import make_reader
 from zsched.core.values.model import NodeId
 from zsched.tasks.map_merge.cdr import CdrError, decode_grid
 from zsched.tasks.map_merge.grid import Grid
-from zsched_lab.fleet_view import Load
-from zsched_lab.map_metrics import score_map
+from zsched_lab.fleet.recorder import read_records
+from zsched_lab.fleet.view import Load
+from zsched_lab.maps.metrics import score_map
 from zsched_lab.paper.arrivals import Arrival, Streams
 from zsched_lab.paper.led_metrics import coverage_figures, led_figures, merge_cpu_s
 from zsched_lab.paper.load import Window, loaded_at
 from zsched_lab.paper.oracle import changes, utilities
 from zsched_lab.paper.roles import role_figures
 from zsched_lab.paper.scenario import Scenario
-from zsched_lab.recorder import read_records
 
 WASTED_S = 30.0
 """A move back to the node that was left within so long was for nothing."""

@@ -10,9 +10,9 @@ from collections.abc import Mapping
 from zsched.adapters.machine.cgroup import LimitedGroup
 from zsched.core.values.model import NodeId
 from zsched.errors import AdapterError
-from zsched_lab.fleet_runner import LabFleet
-from zsched_lab.fleet_view import Status, find_task
-from zsched_lab.limits import LimitKind, NodeLimits
+from zsched_lab.fleet.limits import LimitKind, NodeLimits
+from zsched_lab.fleet.runner import LabFleet
+from zsched_lab.fleet.view import Status, find_task
 from zsched_lab.paper.scenario import Scenario
 
 CALM_RATIO = 0.3

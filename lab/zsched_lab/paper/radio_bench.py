@@ -16,6 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from zsched_lab.fleet.recorder import read_records
 from zsched_lab.paper.cells import Cell
 from zsched_lab.paper.drive_clock import DriveClock, clocks
 from zsched_lab.paper.figures import save_radio
@@ -24,7 +25,6 @@ from zsched_lab.paper.metrics import owners_within, wasted
 from zsched_lab.paper.run import CellRun, Inputs
 from zsched_lab.paper.scenario import Scenario
 from zsched_lab.paper.schemes import NETWORK, SCHEMES
-from zsched_lab.recorder import read_records
 
 RADIO_SCHEMES = ("zsched", "dyna_net", "argmax")
 STEP_S = 0.5

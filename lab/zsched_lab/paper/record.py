@@ -32,8 +32,8 @@ from zsched.adapters.machine.cgroup import CgroupTree, CpuQuota, MemoryQuota
 from zsched.clock import monotonic_s
 from zsched.core.values.model import NodeId
 from zsched.tasks.map_merge.cdr import CdrError, decode_grid
-from zsched_lab.application import connect
-from zsched_lab.signals import StopFlag
+from zsched_lab.fleet.application import connect
+from zsched_lab.fleet.signals import StopFlag
 
 PRECEDENCE = 10
 """How much more of a contended CPU goes to what has no quota than to a node."""

@@ -16,8 +16,8 @@ from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid
 from zsched_lab.explore.body import Drift
 from zsched_lab.explore.worlds import load_world
-from zsched_lab.laser_log import load_log
-from zsched_lab.mapping import RESOLUTION_M, displacements, truth_grid
+from zsched_lab.maps.mapping import RESOLUTION_M, displacements, truth_grid
+from zsched_lab.robots.laser_log import load_log
 
 ODOMETRY = Drift(yaw=0.02, way=0.02)
 """Of robots whose SLAM corrects it: half a metre to two after 30 to 60 m, and up to 11 degrees (three offices)."""
@@ -95,8 +95,8 @@ class LogRobots:
         return displacements(robots, seed)
 
     def command(self, place: Place) -> list[str]:
-        """`zsched_lab.robot_app`."""
-        command = [sys.executable, "-m", "zsched_lab.robot_app", "--robot", place.robot, "--index", str(place.index)]
+        """`zsched_lab.robots.app`."""
+        command = [sys.executable, "-m", "zsched_lab.robots.app", "--robot", place.robot, "--index", str(place.index)]
         command += ["--robots", str(place.robots), "--seed", str(place.seed), "--log", str(self.log)]
         command += ["--endpoint", place.endpoint, "--records", str(place.records)]
         return [*command, *place.begin, "--replay-s", f"{place.duration_s:.3f}"]

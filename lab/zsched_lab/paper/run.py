@@ -24,13 +24,14 @@ from zsched.adapters.host.operator_socket import ask
 from zsched.clock import monotonic_s
 from zsched.core.values.model import NodeId
 from zsched.tasks.map_merge.merger import Mode
-from zsched_lab.children import ChildError, Children
-from zsched_lab.demo_run import worker_options
-from zsched_lab.fleet_runner import CLI, FleetRunner, LabFleet, read_tree, write_fleet
-from zsched_lab.fleet_view import find_task
-from zsched_lab.limits import LimitKind, NodeLimits
-from zsched_lab.netns import Network
-from zsched_lab.observer import Observer
+from zsched_lab.demo.run import worker_options
+from zsched_lab.fleet.children import ChildError, Children
+from zsched_lab.fleet.limits import LimitKind, NodeLimits
+from zsched_lab.fleet.netns import Network
+from zsched_lab.fleet.observer import Observer
+from zsched_lab.fleet.recorder import Follower, Recorder
+from zsched_lab.fleet.runner import CLI, FleetRunner, LabFleet, read_tree, write_fleet
+from zsched_lab.fleet.view import find_task
 from zsched_lab.paper.cells import Cell, bandwidth_of, merge_of
 from zsched_lab.paper.load import Loads, Window, schedule
 from zsched_lab.paper.node_state import is_calm, node_limits, own_links, owners_of, ready_workers, task_streams
@@ -43,7 +44,6 @@ from zsched_lab.paper.rules import RulePlan
 from zsched_lab.paper.scenario import LinkView, Scenario
 from zsched_lab.paper.schemes import scheme_tree
 from zsched_lab.paper.spaces import NodeChildren, narrow_links, spaced
-from zsched_lab.recorder import Follower, Recorder
 
 TICK_S = 0.1
 SAMPLE_S = 0.5

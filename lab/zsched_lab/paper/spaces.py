@@ -16,10 +16,10 @@ from pathlib import Path
 from ruamel.yaml import YAML
 
 from zsched.core.values.model import NodeId
-from zsched_lab.children import Child, Children
-from zsched_lab.fleet_runner import LabFleet, read_tree
-from zsched_lab.netbed import DATA_PORT, in_namespaces
-from zsched_lab.netns import Network
+from zsched_lab.fleet.children import Child, Children
+from zsched_lab.fleet.netbed import DATA_PORT, in_namespaces
+from zsched_lab.fleet.netns import Network
+from zsched_lab.fleet.runner import LabFleet, read_tree
 
 
 @contextlib.contextmanager
@@ -27,7 +27,7 @@ def narrow_links(nodes: Sequence[NodeId], bandwidth_mbit: float | None) -> Itera
     """A namespace per node behind a link of so many Mbit/s; ``None`` without a limit: all nodes share this machine's.
 
     Raises:
-        NetworkError: this user may not; `zsched_lab.netns.why_not` tells beforehand.
+        NetworkError: this user may not; `zsched_lab.fleet.netns.why_not` tells beforehand.
     """
     if bandwidth_mbit is None:
         yield None

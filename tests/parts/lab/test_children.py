@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from zsched_lab.children import ChildError, Children
-from zsched_lab.janitor import SHARED_MEMORY, tagged_processes
+from zsched_lab.fleet.children import ChildError, Children
+from zsched_lab.fleet.janitor import SHARED_MEMORY, tagged_processes
 
 SLEEP = [sys.executable, "-c", "import time; time.sleep(60)"]
 # Shrugs SIGTERM off, starts a child in a session of its own and says when both are there.
@@ -27,7 +27,7 @@ time.sleep(60)
 LAB = f"""
 import sys, time
 from pathlib import Path
-from zsched_lab.children import Children
+from zsched_lab.fleet.children import Children
 folder = Path(sys.argv[1])
 with Children(folder / "logs") as children:
     children.janitor.remove(folder / "runtime")
@@ -41,8 +41,8 @@ with Children(folder / "logs") as children:
 ENDING = f"""
 import sys
 from pathlib import Path
-from zsched_lab.children import Children
-from zsched_lab.signals import Interrupted, interruptible
+from zsched_lab.fleet.children import Children
+from zsched_lab.fleet.signals import Interrupted, interruptible
 folder = Path(sys.argv[1])
 try:
     with interruptible(), Children(folder / "logs") as children:

@@ -11,13 +11,13 @@ from zsched.adapters.host.operator_socket import ask
 from zsched.config.load import load_fleet
 from zsched.errors import ConfigError
 from zsched.tasks.map_merge.geometry import Pose2
-from zsched_lab.children import ChildError, Children
-from zsched_lab.demo_run import fleet_template, worker_options
-from zsched_lab.fleet_runner import FleetRunner, LabFleet, with_options, write_fleet
-from zsched_lab.injector import Injector
-from zsched_lab.limits import LimitKind, NodeLimits
-from zsched_lab.observer import Observer
-from zsched_lab.schedule import Injection
+from zsched_lab.demo.run import fleet_template, worker_options
+from zsched_lab.fleet.children import ChildError, Children
+from zsched_lab.fleet.injector import Injector
+from zsched_lab.fleet.limits import LimitKind, NodeLimits
+from zsched_lab.fleet.observer import Observer
+from zsched_lab.fleet.runner import FleetRunner, LabFleet, with_options, write_fleet
+from zsched_lab.fleet.schedule import Injection
 
 STUB = (sys.executable, str(Path(__file__).parent / "stub_daemon.py"))
 NO_LIMITS = NodeLimits(LimitKind.NONE, "none")

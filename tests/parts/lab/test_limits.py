@@ -12,8 +12,8 @@ import pytest
 from support.waiting import until
 from zsched.adapters.machine.cgroup import LimitedGroup
 from zsched.errors import AdapterError
-from zsched_lab.janitor import groups_of
-from zsched_lab.limits import LimitKind, NodeLimits, by_affinity, make_limits
+from zsched_lab.fleet.janitor import groups_of
+from zsched_lab.fleet.limits import LimitKind, NodeLimits, by_affinity, make_limits
 
 BUSY = [sys.executable, "-c", "while True: pass"]
 WHY_NOT = LimitedGroup.why_not(memory=False)

@@ -13,14 +13,14 @@ from pathlib import Path
 
 import pytest
 
-from zsched_lab import loopback
-from zsched_lab.loopback import PORTS, free_endpoints, own_address
+from zsched_lab.fleet import loopback
+from zsched_lab.fleet.loopback import PORTS, free_endpoints, own_address
 
-TELL = "from zsched_lab.loopback import free_endpoints; print(*free_endpoints(300), flush=True); input()"
+TELL = "from zsched_lab.fleet.loopback import free_endpoints; print(*free_endpoints(300), flush=True); input()"
 
 FORK = """
 import os
-from zsched_lab.loopback import own_address
+from zsched_lab.fleet.loopback import own_address
 print(own_address(), flush=True)
 if (pid := os.fork()) == 0:
     print(own_address(), flush=True)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from zsched_lab.neural_load import (
+from zsched_lab.fleet.neural_load import (
     LoadOptions,
     candidates,
     fit,
@@ -22,7 +22,7 @@ from zsched_lab.neural_load import (
     run,
     synthetic_network,
 )
-from zsched_lab.signals import StopFlag
+from zsched_lab.fleet.signals import StopFlag
 
 HAS_DETECTOR = importlib.util.find_spec("rapidocr") is not None
 
@@ -83,7 +83,7 @@ def test_it_reports_each_second_and_stops_on_sigterm(tmp_path: Path) -> None:
     output = tmp_path / "out"
     with output.open("wb") as file:
         process = subprocess.Popen(
-            [sys.executable, "-m", "zsched_lab.neural_load", "--side", "64", "--hz", "20"],
+            [sys.executable, "-m", "zsched_lab.fleet.neural_load", "--side", "64", "--hz", "20"],
             stdout=file,
             stderr=subprocess.DEVNULL,
         )

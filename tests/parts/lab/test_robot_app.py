@@ -13,9 +13,9 @@ import zenoh
 
 from support.waiting import free_endpoint
 from zsched.tasks.map_merge.cdr import decode_grid
-from zsched_lab.laser_log import LaserLog, load_log, malaga_path
-from zsched_lab.recorder import read_records
-from zsched_lab.robot_app import Drive, parse
+from zsched_lab.fleet.recorder import read_records
+from zsched_lab.robots.app import Drive, parse
+from zsched_lab.robots.laser_log import LaserLog, load_log, malaga_path
 
 REQUIRED = ["--robot", "robot1", "--endpoint", "tcp/127.0.0.1:1", "--records", "records"]
 
@@ -66,7 +66,7 @@ def peer(endpoint: str) -> zenoh.Session:
 
 def test_it_publishes_its_growing_map_and_counts_the_merged_ones(tmp_path: Path) -> None:
     endpoint = free_endpoint()
-    command = [sys.executable, "-m", "zsched_lab.robot_app", "--robot", "robot1", "--index", "0", "--robots", "3"]
+    command = [sys.executable, "-m", "zsched_lab.robots.app", "--robot", "robot1", "--index", "0", "--robots", "3"]
     command += ["--endpoint", endpoint, "--records", str(tmp_path), "--replay-s", "1.5"]
     process = subprocess.Popen(command)
     try:

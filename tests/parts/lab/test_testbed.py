@@ -13,9 +13,9 @@ from zsched.adapters.host.state_file import StateFile
 from zsched.config.load import load_fleet
 from zsched.core.values.model import NodeKind
 from zsched.errors import AdapterError
-from zsched_lab import testbed
-from zsched_lab.loopback import own_address
-from zsched_lab.testbed import TASK, Testbed, TestbedError, echo_fleet
+from zsched_lab.fleet import testbed
+from zsched_lab.fleet.loopback import own_address
+from zsched_lab.fleet.testbed import TASK, Testbed, TestbedError, echo_fleet
 
 
 def is_there(pid: int) -> bool:

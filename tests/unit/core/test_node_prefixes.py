@@ -32,7 +32,7 @@ from zsched.core.values.model import (
 )
 from zsched.core.values.plan import WorkerRole
 from zsched.core.vote.lease import hold_s
-from zsched_lab.simulator import Simulator
+from zsched_lab.sim.simulator import Simulator
 
 TASK = "merge"
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")

@@ -36,7 +36,7 @@ from zsched.core.values.model import (
 )
 from zsched.core.values.plan import StreamCount
 from zsched.core.values.snapshot import SCHEMA, Snapshot
-from zsched_lab.simulator import Simulator
+from zsched_lab.sim.simulator import Simulator
 
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
 TUNING = tuning_of()

@@ -8,10 +8,10 @@ from types import SimpleNamespace
 import pytest
 
 from zsched.core.values.model import NodeId
-from zsched_lab.chaos import GUARD, ChaosBed
-from zsched_lab.history import History, Learnt
-from zsched_lab.netbed import Received
-from zsched_lab.testbed import TASK
+from zsched_lab.fleet.chaos import GUARD, ChaosBed
+from zsched_lab.fleet.netbed import Received
+from zsched_lab.fleet.testbed import TASK
+from zsched_lab.sim.history import History, Learnt
 
 
 def sample(node: NodeId, at: float, epoch: int | None = None) -> Received:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from zsched_lab.coverage import File, merge, reached, table, watch
+from zsched_lab.sim.coverage import File, merge, reached, table, watch
 
 ROOT = Path(__file__).parents[3]
 

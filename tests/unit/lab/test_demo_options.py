@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from zsched_lab.demo import DemoOptions, run_demo
-from zsched_lab.signals import LOOK_AGAIN_S, Interrupted, interruptible
+from zsched_lab.demo.demo import DemoOptions, run_demo
+from zsched_lab.fleet.signals import LOOK_AGAIN_S, Interrupted, interruptible
 
 
 @pytest.mark.parametrize(

@@ -10,11 +10,11 @@ import pytest
 from zsched.tasks.map_merge.cdr import encode_grid
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import FREE, OCCUPIED, UNKNOWN, Grid
-from zsched_lab.evaluate import RunFacts, evaluate, print_summary
-from zsched_lab.fleet_view import Load, Move
-from zsched_lab.plots import Timeline, difference, on_one_canvas, save_timeline, windowed_rate
-from zsched_lab.recorder import Follower
-from zsched_lab.robot_watch import RobotWatch
+from zsched_lab.demo.evaluate import RunFacts, evaluate, print_summary
+from zsched_lab.demo.plots import Timeline, difference, on_one_canvas, save_timeline, windowed_rate
+from zsched_lab.fleet.recorder import Follower
+from zsched_lab.fleet.view import Load, Move
+from zsched_lab.robots.watch import RobotWatch
 
 START_S = 1000.0
 FRAMES = {"robot1": Pose2(x=2.0, y=-1.0, yaw=0.0), "robot2": Pose2(x=-1.0, y=0.5, yaw=0.0)}

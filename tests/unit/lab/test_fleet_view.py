@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from zsched_lab.fleet_view import Move, merge_moves, node_views, past_allocations, problems, task_view
+from zsched_lab.fleet.view import Move, merge_moves, node_views, past_allocations, problems, task_view
 
 KINDS = {"edge1": "edge", "edge2": "edge", "robot1": "robot"}
 

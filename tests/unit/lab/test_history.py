@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from zsched_lab.history import Admitted, History, Learnt, Record, Routed, Started, Stored, Worked
+from zsched_lab.sim.history import Admitted, History, Learnt, Record, Routed, Started, Stored, Worked
 
 
 def learnt(at: float, node: str, revision: int, epoch: int, owner: str | None = "e1", detail: str = "") -> Learnt:

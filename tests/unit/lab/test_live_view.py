@@ -5,8 +5,8 @@ import io
 import pytest
 from rich.console import Console
 
-from zsched_lab.fleet_view import FleetView, MapView, NodeView, TaskView
-from zsched_lab.live_view import PlainLines, cpu_bar, make_view, render
+from zsched_lab.demo.live_view import PlainLines, cpu_bar, make_view, render
+from zsched_lab.fleet.view import FleetView, MapView, NodeView, TaskView
 
 EDGES = ("edge1", "edge2", "edge3")
 ROBOTS = ("robot1", "robot2", "robot3")

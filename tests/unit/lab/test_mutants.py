@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from zsched_lab.mutant_tests import KILLED, SURVIVED, TIMEOUT, UNJUDGED, Reach
-from zsched_lab.mutants import Mutant, mutants_of, mutated
-from zsched_lab.mutate import CORE, Fork, Results, Verdict, choose, score, table
+from zsched_lab.bugs.mutant_tests import KILLED, SURVIVED, TIMEOUT, UNJUDGED, Reach
+from zsched_lab.bugs.mutants import Mutant, mutants_of, mutated
+from zsched_lab.bugs.mutate import CORE, Fork, Results, Verdict, choose, score, table
 
 ROOT = Path(__file__).parents[3]
 
@@ -162,7 +162,7 @@ def run(tmp_path: Path, tests: Path, *mutants: Mutant) -> str:
     """The command on the line of one mutant, with tests of our own."""
     lines = sorted({f"{one.path}:{one.line}" for one in mutants})
     words = [word for line in lines for word in ("--module", line)]
-    command = [sys.executable, "-m", "zsched_lab.mutate", *words, "--mutants", "50", "--tests", str(tests)]
+    command = [sys.executable, "-m", "zsched_lab.bugs.mutate", *words, "--mutants", "50", "--tests", str(tests)]
     done = subprocess.run(
         command,
         cwd=ROOT,

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from zsched_lab.recorder import Follower, Recorder, read_records
+from zsched_lab.fleet.recorder import Follower, Recorder, read_records
 
 
 def test_what_is_written_is_read(tmp_path: Path) -> None:

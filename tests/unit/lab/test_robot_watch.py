@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from zsched_lab.recorder import Recorder
-from zsched_lab.robot_watch import RobotWatch
+from zsched_lab.fleet.recorder import Recorder
+from zsched_lab.robots.watch import RobotWatch
 
 
 def test_a_robots_records_become_rates_and_gaps(tmp_path: Path) -> None:

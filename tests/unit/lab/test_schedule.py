@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 
-from zsched_lab.schedule import Injection, SchedulePolicy, make_schedule, push_schedule, random_schedule
+from zsched_lab.fleet.schedule import Injection, SchedulePolicy, make_schedule, push_schedule, random_schedule
 
 NODES = ("edge1", "edge2", "edge3")
 

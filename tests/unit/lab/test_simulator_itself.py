@@ -14,7 +14,7 @@ from zsched.core.values.messages import Accepted, Promise
 from zsched.core.values.model import Acceptance, Allocation, Ballot, NodeId, PeerState
 from zsched.core.values.plan import Direction, Role, WorkerRole
 from zsched.errors import InvariantError
-from zsched_lab.simulator import RESTART_S, TOKEN_DELAY_S, Simulator
+from zsched_lab.sim.simulator import RESTART_S, TOKEN_DELAY_S, Simulator
 
 TUNING = tuning_of()
 RULE = StreamRule(direction=Direction.INPUT, from_template="{robot}/map", to_template="{target}/merge/{robot}/map")

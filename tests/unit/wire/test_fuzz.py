@@ -1,6 +1,6 @@
 """Damaged frames of every kind, by seed: nothing but `WireError` escapes, nothing but a counter moves, nothing lags.
 
-The long runs: ``python -m zsched_lab.fuzz_wire --frames 5000000``.
+The long runs: ``python -m zsched_lab.bugs.fuzz_wire --frames 5000000``.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import pytest
 
 from zsched.errors import WireError
 from zsched.wire import codec as wire
-from zsched_lab.fuzz_wire import CLASSES, LAG_S, REASONS, Fuzz, damaged, main, sample
+from zsched_lab.bugs.fuzz_wire import CLASSES, LAG_S, REASONS, Fuzz, damaged, main, sample
 
 FRAMES, PARTS = 200_000, 8
 

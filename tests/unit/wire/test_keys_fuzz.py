@@ -1,6 +1,6 @@
 """Hostile keys, tokens, numbers, markers and acknowledgements, by seed, through the real parsers and books.
 
-The long runs: ``python -m zsched_lab.fuzz_keys --rounds 200000``.
+The long runs: ``python -m zsched_lab.bugs.fuzz_keys --rounds 200000``.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from zsched.core import sequence
 from zsched.core.hop import receiver
 from zsched.relay import lanes, slots, tokens
 from zsched.wire import keyspace
-from zsched_lab.fuzz_keys import KeyFuzz, main
+from zsched_lab.bugs.fuzz_keys import KeyFuzz, main
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from zsched_lab.neural_load import Network
+from zsched_lab.fleet.neural_load import Network
+from zsched_lab.fleet.signals import StopFlag
 from zsched_lab.paper.cameras import Camera, main, next_frame
-from zsched_lab.signals import StopFlag
 
 
 @pytest.mark.parametrize("wrong", [["--streams", "0"], ["--side", "100"], ["--cores", "-1"]])

@@ -22,9 +22,10 @@ from zsched.adapters.machine.cgroup import LimitedGroup
 from zsched.tasks.map_merge.cdr import encode_grid
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid
-from zsched_lab import application
-from zsched_lab.children import Children
-from zsched_lab.limits import LimitKind, NodeLimits
+from zsched_lab.fleet import application
+from zsched_lab.fleet.children import Children
+from zsched_lab.fleet.limits import LimitKind, NodeLimits
+from zsched_lab.fleet.signals import StopFlag
 from zsched_lab.paper.load import Loads, Window
 from zsched_lab.paper.record import (
     OCCUPANCY_GRID,
@@ -39,7 +40,6 @@ from zsched_lab.paper.record import (
     stamp_ns,
 )
 from zsched_lab.paper.scenario import LoadLevel, NodeShare
-from zsched_lab.signals import StopFlag
 
 NO_GROUPS = LimitedGroup.why_not()
 needs_groups = pytest.mark.skipif(NO_GROUPS is not None, reason=f"no control groups: {NO_GROUPS}")

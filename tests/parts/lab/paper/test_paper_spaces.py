@@ -9,8 +9,8 @@ import pytest
 from support.waiting import until
 from zsched.config.load import load_fleet
 from zsched.core.values.fleet import SharedMemory
-from zsched_lab.fleet_runner import write_fleet
-from zsched_lab.netns import why_not
+from zsched_lab.fleet.netns import why_not
+from zsched_lab.fleet.runner import write_fleet
 from zsched_lab.paper.places import scenario_path
 from zsched_lab.paper.scenario import load_scenario
 from zsched_lab.paper.spaces import NodeChildren, narrow_links, spaced

@@ -11,7 +11,7 @@ from zsched.core.membership.beat_room import FRAME_BYTES, MAX_BEAT_BYTES, BeatRo
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.model import MAX_COUNTER, Beat, Grant, NodeKind, Tuning, Weights
 from zsched.wire import codec as wire
-from zsched_lab.simulator import Simulator
+from zsched_lab.sim.simulator import Simulator
 
 LONG = "n" * 60
 ROBOTS = tuple(f"{LONG}{number:03}" for number in range(3))

@@ -9,7 +9,7 @@ from zsched.core.scheduler.judge import INITIAL_SETTLE_S, Judge, Outcome
 from zsched.core.scheduler.scoring import Standing
 from zsched.core.values.fleet import TaskSpec, WorkerSpec
 from zsched.core.values.model import Allocation
-from zsched_lab.simulator import Simulator
+from zsched_lab.sim.simulator import Simulator
 
 TUNING = tuning_of(cpu=1.0, memory=0.0)
 SPEC = TaskSpec(

@@ -14,7 +14,7 @@ from zsched_lab.decisions.loads import Array
 from zsched_lab.decisions.replay import Entry, replay
 from zsched_lab.decisions.rules import CoreRule
 from zsched_lab.decisions.world import DT_S, EVEN, World, build_fleet
-from zsched_lab.simulator import CORES, MEMORY_MB, Simulator
+from zsched_lab.sim.simulator import CORES, MEMORY_MB, Simulator
 
 TIMER = Tuning(weights=EVEN, cool_down_s=10.0)
 PATIENT = Tuning(weights=EVEN, cool_down_s=PATIENT_COOL_DOWN_S, bonus=PATIENT_BONUS)

@@ -10,7 +10,7 @@ import pytest
 from zsched.core.values.fleet import Demand, Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.model import NodeId, NodeKind, Tuning
 from zsched_lab.decisions.world import EVEN
-from zsched_lab.simulator import CORES, MEMORY_MB, Simulator
+from zsched_lab.sim.simulator import CORES, MEMORY_MB, Simulator
 
 ROBOTS = ("robot1", "robot2", "robot3")
 STARTED_AT_S = 100.0

@@ -9,7 +9,7 @@ from zsched_lab.explore.mapper import ScanMapper
 from zsched_lab.explore.referee import Referee
 from zsched_lab.explore.world import World, make_world
 from zsched_lab.explore.worlds import load_world
-from zsched_lab.map_metrics import score_map
+from zsched_lab.maps.metrics import score_map
 
 
 def drive_through(world: World, stops: list[Pose2], noise_m: float = 0.01) -> Grid:

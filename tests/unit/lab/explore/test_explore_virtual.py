@@ -11,7 +11,7 @@ from zsched_lab.explore.agent import MAP_PERIOD_S, Agent, RobotSettings
 from zsched_lab.explore.virtual import VirtualResult, VirtualRun, run_virtual
 from zsched_lab.explore.world import World
 from zsched_lab.explore.worlds import load_world
-from zsched_lab.map_metrics import score_map
+from zsched_lab.maps.metrics import score_map
 
 SEEDS = (1, 2, 3, 4, 5)
 LATE_S = 5.0

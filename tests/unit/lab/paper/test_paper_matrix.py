@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from zsched_lab.children import ChildError
+from zsched_lab.fleet.children import ChildError
 from zsched_lab.paper.bench import BenchOptions, InputsOf, claim_folder, command_of, plan_body, planned, run_bench
 from zsched_lab.paper.cells import Cell, bandwidth_of, cells_of, merge_of, world_of
 from zsched_lab.paper.matrix import (

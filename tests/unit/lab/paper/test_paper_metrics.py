@@ -14,6 +14,7 @@ from zsched.core.values.fleet import Timing
 from zsched.tasks.map_merge.cdr import encode_grid
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import FREE, OCCUPIED, UNKNOWN, Grid
+from zsched_lab.fleet.recorder import Recorder
 from zsched_lab.paper.drive_clock import begun_before, smoothed
 from zsched_lab.paper.load import Window
 from zsched_lab.paper.metrics import (
@@ -34,7 +35,6 @@ from zsched_lab.paper.places import scenario_path
 from zsched_lab.paper.radio_bench import radio_figures
 from zsched_lab.paper.record import Heard, StreamFile
 from zsched_lab.paper.scenario import LoadLevel, NodeShare, Scenario, load_scenario
-from zsched_lab.recorder import Recorder
 
 ZERO_NS = 1_700_000_000_000_000_000
 SIDE = 0.05

@@ -10,7 +10,7 @@ from zsched.config.load import load_fleet
 from zsched.core.values.fleet import DEFAULT_FORESEE_S, PATIENT_BONUS, PATIENT_COOL_DOWN_S
 from zsched.core.values.model import ScoreForm
 from zsched.errors import ConfigError
-from zsched_lab.fleet_runner import read_tree, write_fleet
+from zsched_lab.fleet.runner import read_tree, write_fleet
 from zsched_lab.paper.claims import CLAIMS
 from zsched_lab.paper.load import Window, loaded_at, schedule
 from zsched_lab.paper.oracle import best_nodes, changes, utilities, utility

@@ -1,0 +1,1 @@
+"""What the tests must find: planted bugs, mutants, hostile frames and keys."""

@@ -1,0 +1,853 @@
+"""The bugs that the suite must find: one per rule of the agreement, the lease, membership, vote and handover.
+
+Knows: which text of which module each bug replaces, and which tests may find it. Does not know: how it is planted, the
+bugs in relays and workers (`zsched_lab.bugs.stream_bugs`).
+
+A bug is a few words of source. When the source changes so that the words are no longer there, planting fails and says
+so: then the bug is written anew for the new source.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bug:
+    """One planted bug: in ``module`` each of ``changes`` (old text, new text), the old text exactly once."""
+
+    name: str
+    module: str
+    changes: tuple[tuple[str, str], ...]
+    tests: tuple[str, ...] = ()
+    """Directed tests that are run when no schedule has found it within its budget."""
+    seed: int | None = None
+    """A schedule that has found it before: tried first."""
+    has_schedules: bool = True
+    """Whether the simulator runs the module at all."""
+    also: Bug | None = None
+    """Its part in another module, for a rule that is kept in two places."""
+
+    @property
+    def parts(self) -> tuple[Bug, ...]:
+        """What is planted, one module each."""
+        return (self,) if self.also is None else (self, *self.also.parts)
+
+
+CHANGE, BEATS = "zsched.core.values.change", "zsched.core.beats"
+SEQUENCE, IDENTITY = "zsched.core.sequence", "zsched.core.membership.identity"
+REGISTER, LEASE, TENURE = "zsched.core.vote.register", "zsched.core.vote.lease", "zsched.core.executor.tenure"
+SEALING, WITNESS = "zsched.core.executor.sealing", "zsched.core.vote.witness"
+NAMESAKES = "zsched.core.membership.namesakes"
+BELIEF = "zsched.core.vote.belief"
+AGREEMENT, MEMBERSHIP, NODE = "zsched.core.vote.agreement", "zsched.core.membership.peers", "zsched.core.node"
+ROUNDS, VOTE, VOTING = "zsched.core.scheduler.rounds", "zsched.core.vote.tally", "zsched.core.vote.voting"
+SCHEDULER, SCORING, EXECUTOR = (
+    "zsched.core.scheduler.judge",
+    "zsched.core.scheduler.scoring",
+    "zsched.core.executor.handover",
+)
+
+_REGISTER = (
+    "tests/sim/test_register_rules.py",
+    "tests/unit/core/vote/test_register.py",
+    "tests/unit/core/vote/test_register_proposer.py",
+)
+_SCHEDULES = ("tests/unit/core/vote/test_register_schedules.py",)
+_AGREEMENT = ("tests/unit/core/vote/test_agreement.py",)
+_LEASE = ("tests/sim/test_lease_rules.py", "tests/sim/test_exclusive.py")
+_GENERATIONS = ("tests/sim/test_generations.py",)
+_BEAT_ROOM = ("tests/unit/core/membership/test_beat_room.py",)
+_NAMESAKES = ("tests/unit/core/membership/test_namesakes.py",)
+_TWINS = ("tests/unit/core/membership/test_twins.py",)
+_WITNESS = ("tests/unit/core/vote/test_witness.py",)
+_RESTORED = ("tests/sim/test_restored_state.py",)
+_ROLLOUT = ("tests/sim/test_exclusive_rollout.py",)
+_MEMBERSHIP = (
+    "tests/sim/test_membership_rules.py",
+    "tests/unit/core/membership/test_peers.py",
+    "tests/sim/test_simulator.py",
+)
+_NODE = ("tests/unit/core/test_node.py",)
+_ROUNDS = (
+    "tests/sim/test_vote_rules.py",
+    "tests/unit/core/scheduler/test_rounds.py",
+    "tests/unit/core/vote/test_tally.py",
+)
+_SCHEDULER = ("tests/unit/core/scheduler/test_judge.py", "tests/unit/core/scheduler/test_scoring.py", "tests/paper")
+_EXECUTOR = ("tests/unit/core/executor/test_handover.py",)
+
+
+def _bug(name: str, module: str, old: str, new: str, tests: tuple[str, ...] = (), seed: int | None = None) -> Bug:
+    return Bug(name=name, module=module, changes=((old, new),), tests=tests, seed=seed)
+
+
+REGISTER_BUGS = (
+    _bug(
+        "quorum off by one",
+        "zsched.core.values.quorum",
+        "return count // 2 + 1",
+        "return max(count // 2, 1)",
+        _REGISTER,
+    ),
+    _bug(
+        "a value that nobody takes stops its task",
+        REGISTER,
+        "if read != running.unfit or",
+        "if read.revision >= 0 or",
+        _REGISTER,
+    ),
+    _bug(
+        "an owner that is no candidate any more cannot be learnt",
+        BELIEF,
+        "any(node.name == value.owner for node in fleet.nodes)",
+        "value.owner in fleet.task(value.task).candidates",
+        _AGREEMENT,
+        seed=8008456,
+    ),
+    _bug(
+        "promise not persisted",
+        REGISTER,
+        "        todo.must_persist = True\n        return Promise(",
+        "        return Promise(",
+        _SCHEDULES,
+    ),
+    _bug(
+        "acceptance not persisted",
+        REGISTER,
+        "        todo.must_persist = True\n        return Accepted(",
+        "        return Accepted(",
+        _SCHEDULES,
+    ),
+    _bug(
+        "promise with >=",
+        REGISTER,
+        "prepare.ballot <= self.state.promised",
+        "prepare.ballot < self.state.promised",
+        _REGISTER,
+    ),
+    _bug(
+        "accepts below its promise",
+        REGISTER,
+        "(ballot < self.state.promised or max(",
+        "(ballot.counter < self.state.promised.counter - 9 or max(",
+        _REGISTER + _SCHEDULES,
+    ),
+    _bug(
+        "accepted value not re-accepted",
+        REGISTER,
+        "newest = max(accepted, key=lambda acceptance: (acceptance.ballot, not acceptance.value.leased), default=None)",
+        "newest = None",
+        _SCHEDULES,
+    ),
+    _bug(
+        "newest by revision instead of ballot",
+        REGISTER,
+        "key=lambda acceptance: (acceptance.ballot, not",
+        "key=lambda acceptance: (-acceptance.value.revision, acceptance.ballot, not",
+        _REGISTER + _SCHEDULES,
+    ),
+    Bug(
+        name="own change in the same ballot as a foreign value",
+        module=REGISTER,
+        changes=(
+            (
+                "if read.revision > self.value.revision or running.change is None or running.sent is not None:",
+                "if running.change is None or running.sent is not None:",
+            ),
+            (
+                "elif running.change.base_revision != read.revision:",
+                "elif running.change.base_revision > read.revision:",
+            ),
+        ),
+        tests=_REGISTER + _SCHEDULES,
+    ),
+    _bug(
+        "a retune raises the epoch",
+        CHANGE,
+        "return replace(read, revision=read.revision + 1, tuning=self.tuning)",
+        "return replace(read, revision=read.revision + 1, epoch=read.epoch + 1, tuning=self.tuning)",
+        _REGISTER,
+        seed=15,
+    ),
+    _bug(
+        "a change is applied again after an unknown outcome",
+        REGISTER,
+        "is_identity = running.change is None or running.sent is not None",
+        "running.sent = None; is_identity = running.change is None",
+        _REGISTER + _SCHEDULES,
+    ),
+    Bug(
+        name="identity rounds skipped",
+        module=REGISTER,
+        changes=(
+            (
+                "        if self._is_unlearnt():\n            self._settle_tries = 0",
+                "        if False:\n            pass",
+            ),
+        ),
+        tests=_REGISTER + _SCHEDULES,
+    ),
+    _bug(
+        "restart forgets the incarnation",
+        REGISTER,
+        "running.ballot = Ballot(counter=self._counter, node=self._me, incarnation=self._incarnation)",
+        "running.ballot = Ballot(counter=self._counter, node=self._me, incarnation=0)",
+        _REGISTER,
+    ),
+    _bug(
+        "learnt value not persisted before routes",
+        REGISTER,
+        "        todo.must_persist = True\n        todo.learnt",
+        "        todo.learnt",
+        _REGISTER,
+    ),
+    _bug(
+        "stranger's answer counts",
+        REGISTER,
+        "answer.ballot != running.ballot or answer.elector not in self._electors",
+        "answer.ballot != running.ballot",
+        _REGISTER,
+    ),
+    _bug(
+        "answer to an older ballot counts",
+        REGISTER,
+        "running is None or answer.ballot != running.ballot or",
+        "running is None or",
+        _REGISTER,
+    ),
+    _bug(
+        "repeated answer counts twice",
+        REGISTER,
+        "running.yes[answer.elector] = True",
+        'running.yes[f"{answer.elector}/{len(running.yes)}"] = True',
+        _REGISTER,
+    ),
+    _bug(
+        "another electorate's ballot is answered",
+        REGISTER,
+        "if electorate != self._electorate:",
+        "if not electorate:",
+        _REGISTER,
+    ),
+    _bug(
+        "node without state is an elector",
+        AGREEMENT,
+        "self.is_elector = durable is not None and me in fleet.electors",
+        "self.is_elector = me in fleet.electors",
+        _AGREEMENT,
+    ),
+    _bug(
+        "accepted values are told as learnt",
+        AGREEMENT,
+        "values = tuple(value for value in self.values().values() if value.revision > 0)",
+        "values = tuple(r.state.accepted.value for r in self.registers.values() if r.state.accepted is not None)",
+        _AGREEMENT,
+    ),
+    _bug(
+        "refused disk keeps electing",
+        AGREEMENT,
+        "        for register in self.registers.values():\n            register.stop_electing()",
+        "",
+        _AGREEMENT,
+    ),
+    _bug(
+        "ballot in another's name is answered",
+        AGREEMENT,
+        "return ballot.node == asker and asker in self._nodes",
+        "return True",
+        _REGISTER,
+        13,
+    ),
+    _bug(
+        "batch in the wrong order",
+        NODE,
+        "return (*first, *todo.send, *todo.apply)",
+        "return (*todo.send, *first, *todo.apply)",
+        ("tests/unit/core/test_node_prefixes.py",),
+    ),
+)
+
+LEASE_BUGS = (
+    _bug(
+        "an echo of what was not sent yet counts later",
+        LEASE,
+        "elif grant.number not in self._ahead.get(elector, ()):",
+        "else:",
+        _LEASE,
+    ),
+    _bug(
+        "an elector holds on to a forged number",
+        LEASE,
+        "if not is_new and not is_newest and self._last is not None and",
+        "if not is_new and self._last is not None and",
+        _LEASE,
+        seed=9003597,
+    ),
+    _bug(
+        "an elector that has echoed a forged number counts no more",
+        LEASE,
+        "elif grant.number not in self._ahead.get(elector, ()):",
+        "elif grant.number > max(self._ahead.get(elector, [-1])):",
+        _LEASE,
+        seed=9003597,
+    ),
+    Bug(
+        name="echo to an owner that was not accepted",
+        module=LEASE,
+        changes=(
+            ("if accepted is None or accepted[0] != beat.node:", "if accepted is None:"),
+            ("if epoch != accepted[1] or self._is_silenced", "if epoch is None or self._is_silenced"),
+        ),
+        tests=_LEASE,
+    ),
+    _bug(
+        "echo counts before the epoch was learnt",
+        LEASE,
+        "elif grant.number < self.first_number or grant.number <= self.released:",
+        "elif grant.number <= self.released:",
+        _LEASE,
+    ),
+    _bug(
+        "grant not honoured after a restart",
+        LEASE,
+        "if now < self.until and owner != self.standing:",
+        "if hold < 0.0:",
+        _LEASE,
+        114,
+    ),
+    _bug(
+        "silence rule left out",
+        LEASE,
+        "return self._silent_for == (owner, epoch) and now < self._silent_until",
+        "return False",
+        _LEASE,
+    ),
+    _bug(
+        "release of another life honoured",
+        LEASE,
+        "if last is not None and (last.owner, last.incarnation) == key and last.number <= grant.number:",
+        "if last is not None and last.owner == grant.owner:",
+        _LEASE,
+    ),
+    _bug(
+        "lease from receiving instead of sending",
+        LEASE,
+        "                self._holders[grant.task].on_echo(beat.node, grant)",
+        "                held = self._holders[grant.task]\n"
+        "                held.on_echo(beat.node, grant)\n"
+        "                held._sent.append((grant.number, now))\n"
+        "                held._sent.reverse()",
+        _LEASE,
+        42,
+    ),
+    _bug(
+        "an empty release is worth a beat at once",
+        LEASE,
+        "if now - holder.hurried_at < HURRY_S:",
+        "if now < holder.hurried_at:",
+        _LEASE,
+    ),
+    _bug(
+        "echo of another electorate counts",
+        LEASE,
+        "for grant in beat.echoes if beat.lease_terms == self.terms else ():",
+        "for grant in beat.echoes:",
+        _LEASE,
+    ),
+    _bug("lease of a minority", LEASE, "number = numbers[needed - 1]", "number = numbers[0]", _LEASE, 26),
+    _bug(
+        "released number is granted again",
+        LEASE,
+        "if beat.sequence <= self._released.get((beat.node, beat.incarnation), -1):",
+        "if beat.sequence < 0:",
+        _LEASE,
+    ),
+    _bug("next life is granted at once", LEASE, "if self._is_held(beat, now):", "if not epoch:", _LEASE, 30),
+    _bug(
+        "next owner is granted at once",
+        LEASE,
+        "if last is None or (last.owner, last.incarnation) == (beat.node, beat.incarnation):",
+        "if last is None or last.owner != beat.node or last.incarnation == beat.incarnation:",
+        _LEASE,
+    ),
+    _bug(
+        "granted although others need no lease",
+        AGREEMENT,
+        "and value.owner is not None and value.leased",
+        "and value.owner is not None",
+        _ROLLOUT,
+        150,
+    ),
+    _bug(
+        "worker without a lease is not waited for",
+        SEALING,
+        "if spec.name in answer.unleased:",
+        "if False:",
+        _ROLLOUT,
+        38,
+    ),
+    _bug(
+        "old fleet file needs no lease",
+        EXECUTOR,
+        "self.spec.exclusive or allocation.leased",
+        "self.spec.exclusive",
+        _ROLLOUT,
+        42,
+    ),
+    _bug(
+        "a new generation forgets a longer lease",
+        "zsched.core.vote.generations",
+        "lease_s=0.0 if before is None else before.lease_s",
+        "lease_s=0.0",
+        ("tests/unit/runtime/test_init.py",),
+        seed=2140,
+    ),
+    _bug(
+        "restart forgets a longer lease",
+        LEASE,
+        "hold_s(max(self.fleet.timing.lease_s, self.granted_s))",
+        "hold_s(self.fleet.timing.lease_s)",
+        _ROLLOUT,
+    ),
+    _bug(
+        "restarted elector echoes at once",
+        LEASE,
+        "        if now < self.until:\n            return True",
+        "        if self.lease_s < 0.0:\n            return True",
+        _LEASE,
+        74,
+    ),
+    _bug(
+        "hold shorter than the lease",
+        LEASE,
+        "return lease_s * (1 + RHO) / (1 - RHO)",
+        "return lease_s * (1 - RHO) / (1 + RHO) - 0.02",
+        _LEASE,
+        50,
+    ),
+    _bug(
+        "accepts without asking the lease",
+        LEASE,
+        "return granter is None or granter.may_accept",
+        "return True or granter.may_accept",
+        _LEASE,
+    ),
+    _bug(
+        "identity round ends the silence",
+        AGREEMENT,
+        "if has_accepted and (known is None or value.revision > known.revision):",
+        "if has_accepted:",
+        (*_LEASE, "tests/unit/core/vote/test_parked_accepts.py"),
+    ),
+    _bug(
+        "echoes prolong the wait for a stopped worker",
+        TENURE,
+        "if now >= self.leases.given_until(task):",
+        "if now >= self.leases.until(task):",
+        _LEASE,
+        60191,
+    ),
+    _bug(
+        "late word of an earlier stop gives a newer lease back",
+        LEASE,
+        "not holder.is_leaving or holder.is_doubtful:",
+        "not holder.is_leaving:",
+        _LEASE,
+    ),
+    _bug(
+        "asked to leave only for echoed grants",
+        LEASE,
+        "if self._sent and self._sent[-1][0] > self.released:",
+        "if self._echoed and max(self._echoed.values()) > self.released:",
+        _LEASE,
+    ),
+    _bug(
+        "a worker that never says that it has stopped is waited for again and again",
+        LEASE,
+        "        holder.awaits_report = False  # when it comes",
+        "        pass  # when it comes",
+        _LEASE,
+    ),
+)
+
+MEMBERSHIP_BUGS = (
+    _bug(
+        "a beat does not tell that its elector has lost its state",
+        BEATS,
+        "    if beat.has_lost_state:\n",
+        "    if beat.twins:\n",
+        ("tests/sim/test_status_words.py", "tests/sim/test_restored_state.py"),
+        seed=9000013,
+    ),
+    _bug(
+        "two tokens of one name are twins at their first beats",
+        NAMESAKES,
+        "if life.stays_s() >= self._beside_s > now - life.at",
+        "if self._beside_s > now - life.at",
+        _NAMESAKES,
+    ),
+    _bug(
+        "beats of a life without a token make a twin",
+        NAMESAKES,
+        "        if beat.incarnation not in name.tokens:\n            return False\n",
+        "",
+        _NAMESAKES,
+    ),
+    _bug(
+        "a twin's later life is this elector's forgotten one",
+        WITNESS,
+        "if incarnation > self.incarnation and not self._has_twin:",
+        "if incarnation > self.incarnation:",
+        _WITNESS,
+    ),
+    _bug(
+        "a life that begins after our own start is no twin's",
+        WITNESS,
+        "self._has_twin |= learnt.node in self._answered and self._is_later(learnt)",
+        "self._has_twin |= False",
+        _WITNESS,
+    ),
+    _bug(
+        "a twin's life is not compared with our own votes",
+        WITNESS,
+        "if incarnation >= self.incarnation else self._at_start",
+        "if incarnation == self.incarnation else self._at_start",
+        _WITNESS,
+    ),
+    _bug(
+        "a slewed clock is believed",
+        "zsched.core.vote.clocks",
+        "abs(event.error_ratio) > RHO or",
+        "abs(event.error_ratio) > 1.0 or",
+        ("tests/sim/test_clock_doubt.py",),
+    ),
+    _bug(
+        "a jump of the clock is believed",
+        "zsched.core.vote.clocks",
+        " or abs(event.jump_s) > JUMP_S + RHO * event.since_s",
+        "",
+        ("tests/sim/test_clock_doubt.py",),
+    ),
+    _bug(
+        "a beat that is too large is sent whole",
+        "zsched.core.membership.beat_room",
+        "if beat_bytes(beat) <= MAX_BEAT_BYTES:",
+        "if beat.node:",
+        _BEAT_ROOM,
+        seed=242,
+    ),
+    _bug(
+        "what had no room in a beat has none in the next",
+        "zsched.core.membership.beat_room",
+        "first = self._next % len(parts)",
+        "first = 0",
+        _BEAT_ROOM,
+    ),
+    _bug(
+        "a vote in vain loses its task's turn",
+        VOTING,
+        "            self._first_call_at = now\n",
+        "            self.called_at = now\n",
+        ("tests/unit/core/scheduler/test_turns.py",),
+        seed=598,
+    ),
+    _bug(
+        "a lease that forbids an accept ends its ballot",
+        REGISTER,
+        "return running.phase is _Phase.ACCEPT and set(running.no.values()) == {Refusal.LEASE}",
+        "return False",
+        ("tests/unit/core/vote/test_register_proposer.py",),
+    ),
+    _bug(
+        "who is overtaken ends the accept that waits",
+        REGISTER,
+        "now < (until := min(self._lease_over_at, running.give_up_at))",
+        "now < (until := -math.inf)",
+        ("tests/unit/core/vote/test_register_proposer.py", "tests/sim/test_exclusive.py"),
+    ),
+    _bug(
+        "token resurrects a peer",
+        BEATS,
+        '    node.counters["tokens_seen"] += 1\n',
+        '    node.counters["tokens_seen"] += 1\n'
+        "    if event.node in node.membership._peers:\n"
+        "        node.membership._change(event.node, PeerState.ALIVE, 'token', now)\n"
+        "        node.membership._peers[event.node].beat_at = now\n",
+        (*_MEMBERSHIP, "tests/unit/core/test_node.py"),
+    ),
+    _bug(
+        "vouching ignored",
+        MEMBERSHIP,
+        "any(at.beat_at > peer.suspect_since for _, at in observers)",
+        "any(at.beat_at < 0.0 for _, at in observers)",
+        _MEMBERSHIP,
+    ),
+    _bug("suspicion never confirmed", MEMBERSHIP, 'return "nobody speaks for it"', 'return ""', _MEMBERSHIP),
+    _bug(
+        "second observer not needed",
+        MEMBERSHIP,
+        "            if name in observer.suspects:",
+        "            if observer.suspects or True:",
+        _MEMBERSHIP,
+    ),
+    _bug(
+        "older life's beats count",
+        SEQUENCE,
+        "if self.incarnation < 0 or (may_begin and incarnation != self.incarnation):",
+        "if self.incarnation < 0 or incarnation != self.incarnation:",
+        _MEMBERSHIP,
+    ),
+    _bug(
+        "any number ahead is believed",
+        SEQUENCE,
+        "0 < ahead <= WINDOW + RATE_HZ * (now - self.at)",
+        "0 < ahead",
+        _MEMBERSHIP,
+    ),
+    _bug(
+        "a number that was overtaken never counts again",
+        SEQUENCE,
+        "return other.count >= RUN",
+        "return False",
+        _MEMBERSHIP,
+    ),
+    _bug(
+        "restored state votes on",
+        AGREEMENT,
+        "self._lose(self.witness.on_answer(learnt), todo)",
+        "pass",
+        _RESTORED,
+        2,
+    ),
+    _bug(
+        "votes of an earlier life are not compared",
+        WITNESS,
+        'if votes > known else ""',
+        'if votes > known + 10**9 else ""',
+        _RESTORED,
+    ),
+    _bug("starting elector asks nobody", WITNESS, "return is_enough and (", "return True or (", _RESTORED),
+    _bug(
+        "node without state proposes by generation 0",
+        AGREEMENT,
+        "self.registers[task.name].follow(self.electorate, initial)",
+        "self.registers[task.name].follow(self._electorate, initial)",
+        _GENERATIONS,
+        26,
+    ),
+    _bug("a put teaches an allocation", AGREEMENT, "if not event.is_answer:", "if False:", _AGREEMENT),
+    _bug("any answer is believed", AGREEMENT, "elif is_proven(", "elif True or is_proven(", _AGREEMENT),
+    _bug("beats alone dispute a name", IDENTITY, " if beat.incarnation in self._tokens else Verdict.TWIN", "", _NODE),
+    _bug(
+        "of twins the older one leaves",
+        IDENTITY,
+        "(my_sequence, -self.incarnation) < (sequence, -incarnation)",
+        "(my_sequence, -self.incarnation) > (sequence, -incarnation)",
+        _TWINS,
+    ),
+    _bug(
+        "an echo that does not rise is a twin",
+        IDENTITY,
+        "if sequence <= self._twin[1]:",
+        "if sequence < self._twin[1]:",
+        _TWINS,
+    ),
+    _bug(
+        "one answer of a peer proves a twin",
+        IDENTITY,
+        "return verdict if is_lasting else Verdict.TWIN",
+        "return verdict",
+        _TWINS,
+    ),
+    _bug(
+        "a twin that has left disputes the name of who stood still meanwhile",
+        IDENTITY,
+        "min(now - self._twin[2], lived_s) >= STAYS_S",
+        "now - self._twin[2] >= STAYS_S",
+        _TWINS,
+    ),
+    _bug(
+        "the first node heard after a cut speaks for nobody",
+        MEMBERSHIP,
+        "if is_back and before is PeerState.GONE:",
+        "if is_back and before is PeerState.ALIVE:",
+        _MEMBERSHIP,
+    ),
+    _bug(
+        "the old link's token accuses a node that has just come back",
+        MEMBERSHIP,
+        "if now < peer.back_at + self._timing.zenoh_lease_s:",
+        "if now < peer.back_at:",
+        _MEMBERSHIP,
+    ),
+    _bug(
+        "a node without memory speaks for those it has not heard yet",
+        MEMBERSHIP,
+        "before, is_back = peer.state, peer.has_been_gone and not restarted",
+        "before, is_back = peer.state, peer.has_been_gone",
+        _MEMBERSHIP,
+    ),
+    _bug(
+        "a minority's wish waits for the network to heal",
+        ROUNDS,
+        "heard >= majority(len(electors)):",
+        "heard >= 1:",
+        _ROUNDS,
+    ),
+)
+
+VOTE_BUGS = (
+    Bug(
+        name="stale proposal counted",
+        module=VOTING,
+        changes=(
+            ("if proposal.base_revision != allocation.revision:\n            return False", "pass"),
+            ("and proposal.base_revision == allocation.revision", ""),
+        ),
+        tests=_ROUNDS,
+    ),
+    _bug(
+        "escape ignores the quorum",
+        VOTE,
+        "needed = max(min(needed, majority(len([voter for voter in voters if voter in present]))), 1)",
+        "needed = 1",
+        _ROUNDS,
+    ),
+    Bug(
+        name="commit without supporters",
+        module=VOTING,
+        changes=(
+            (
+                "if self._me not in supporters or counted.winner is None:\n            return\n",
+                "supporters.append(self._me)\n        if counted.winner is None:\n            return\n",
+            ),
+            ("reason=fresh[self._me].reason", "reason=counted.reason"),
+        ),
+        tests=_ROUNDS,
+    ),
+    Bug(
+        name="a vote that stays is committed",
+        module=VOTING,
+        changes=(("if counted.outcome is VoteOutcome.WON:", "if counted.winner is not None:"),),
+        tests=("tests/unit/core/vote/test_epochs.py",),
+        seed=44,
+        also=_bug(
+            "a move to the owner raises the epoch",
+            CHANGE,
+            "if self.owner == read.owner:",
+            "if False:",
+            _REGISTER,
+        ),
+    ),
+    _bug(
+        "called vote ignored",
+        VOTING,
+        "return self._me in self._voters and self.commit is None and (",
+        "return False and (",
+        _ROUNDS,
+    ),
+    _bug(
+        "cool-down skipped",
+        SCHEDULER,
+        "if settled_for_s < tuning.cool_down_s:",
+        "if settled_for_s < 0.0:",
+        _SCHEDULER,
+    ),
+    _bug(
+        "cap of moves forgotten",
+        SCHEDULER,
+        "return None if done < limit else f",
+        "return None if done < 10 * limit else f",
+        ("tests/unit/core/scheduler/test_damping.py",),
+    ),
+    _bug(
+        "bonus twice",
+        SCHEDULER,
+        "max(value + (bonus if name == owner else 0.0)",
+        "max(value + (2 * bonus if name == owner else 0.0)",
+        _SCHEDULER,
+    ),
+    _bug(
+        "unreachable left out instead of 0",
+        SCORING,
+        "utilities = [Utility(candidate=name, value=0.0, reachable=False) for name in unreachable]",
+        "utilities: list[Utility] = []",
+        _SCHEDULER,
+    ),
+    _bug(
+        "a young suspicion takes the owner for unreachable",
+        SCORING,
+        "is_spared = candidate == allocation.owner and candidate in doubts.in_grace",
+        "is_spared = False",
+        (*_SCHEDULER, "tests/sim/test_vote_rules.py"),
+    ),
+    _bug(
+        "a node that is back gets a task before its streams are proven",
+        SCORING,
+        "if candidate in doubts.unproven and candidate != allocation.owner:",
+        "if candidate in doubts.unproven and not candidate:",
+        (*_SCHEDULER, "tests/sim/test_return.py"),
+    ),
+    _bug(
+        "what other robots hold against a node is not heard",
+        SCHEDULER,
+        "joined((damping.penalties(now), standing.penalties))",
+        "joined((damping.penalties(now),))",
+        (*_SCHEDULER, "tests/sim/test_vote_rules.py"),
+    ),
+    _bug(
+        "a worker that has nothing more to do lacks what it lacked before",
+        "zsched.core.profile.jobs",
+        "if newest.is_idle and undone <= 0:",
+        "if newest.is_idle and undone < 0:",
+        ("tests/unit/core/profile/test_jobs.py", "tests/unit/core/test_closed_loop.py"),
+    ),
+    _bug(
+        "an owner without work gives the task nothing",
+        SCORING,
+        "load is not None and is_short(load)",
+        "load is not None",
+        ("tests/unit/core/test_closed_loop.py",),
+    ),
+    _bug(
+        "median and mean swapped",
+        SCORING,
+        "if allocation.tuning.aggregate is Aggregate.MEAN",
+        "if allocation.tuning.aggregate is not Aggregate.MEAN",
+        _SCHEDULER,
+    ),
+)
+
+HANDOVER_BUGS = (
+    _bug(
+        "epoch compared with >=",
+        EXECUTOR,
+        "        if allocation.epoch == self.epoch:\n            if",
+        "        if self.epoch < 0:\n            if",
+        _EXECUTOR,
+    ),
+    _bug(
+        "drain ends the gate too early",
+        EXECUTOR,
+        "        if not self._old:\n            self._go(Phase.SETTLED, RoutePhase.CLOSE, done, todo)",
+        "        if True:\n            self._go(Phase.SETTLED, RoutePhase.CLOSE, done, todo)",
+        _EXECUTOR,
+    ),
+    _bug(
+        "closes a slot that drains when the task moves again",
+        EXECUTOR,
+        "            self._old = (*self._old, _Old(self._current))[-MAX_OLD:]",
+        "            self._old = (_Old(self._current),)",
+        _EXECUTOR,
+    ),
+    _bug(
+        "flips for another epoch's readiness",
+        EXECUTOR,
+        "if epoch == self.epoch and self.phase is Phase.PREPARING:",
+        "if self.phase is Phase.PREPARING:",
+        _EXECUTOR,
+    ),
+)
+
+CORE_BUGS: tuple[Bug, ...] = (*REGISTER_BUGS, *LEASE_BUGS, *MEMBERSHIP_BUGS, *VOTE_BUGS, *HANDOVER_BUGS)

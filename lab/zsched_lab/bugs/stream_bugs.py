@@ -1,0 +1,391 @@
+"""Bugs in relays and workers that the tests with real sessions and processes must find.
+
+Knows: which text of which module each bug replaces, and which tests must find it. Does not know: how it is planted. The
+simulator has no streams, so no schedules are played for these.
+"""
+
+from __future__ import annotations
+
+from zsched_lab.bugs.core_bugs import Bug
+
+ACKS, RECEIVER, SERIAL = "zsched.hop.acknowledger", "zsched.core.hop.receiver", "zsched.core.hop.serial"
+INPUTS, WORKER_LANES = "zsched.worker.inputs", "zsched.worker.lanes"
+GREETINGS, LANES, OUTLET = "zsched.relay.greetings", "zsched.relay.lanes", "zsched.relay.outlet"
+
+_GREETINGS = ("tests/parts/relay/test_greetings.py",)
+_RECEIVE = ("tests/parts/relay/test_receive.py",)
+_ACKS = ("tests/unit/hop/test_acknowledger.py",)
+_LANES = ("tests/unit/relay/test_lanes.py",)
+_WORKER = "tests/parts/worker/test_worker.py"
+_FROZEN = "tests/integration/test_relay_frozen_moves.py"
+_REPLAY = "tests/integration/test_relay_replay.py"
+_CHAOS = "tests/system/test_chaos_streams.py"
+_RELAY_STREAMS = "tests/integration/test_relay_streams.py"
+
+
+def _bug(name: str, module: str, old: str, new: str, tests: tuple[str, ...]) -> Bug:
+    return Bug(name=name, module=module, changes=((old, new),), tests=tests, has_schedules=False)
+
+
+STREAM_BUGS = (
+    _bug(
+        "what gives way in front of a stream is in no counter",
+        "zsched.relay.receive",
+        "self._give_way(waiting.popleft())",
+        "waiting.popleft()",
+        _RECEIVE,
+    ),
+    _bug(
+        "zenoh's ring in front of a stream drops what it likes",
+        "zsched.relay.receive",
+        "zenoh.handlers.FifoChannel(max(settings.depth, QUEUE_DEPTH))",
+        "zenoh.handlers.RingChannel(max(settings.depth, QUEUE_DEPTH))",
+        _RECEIVE,
+    ),
+    _bug(
+        "a new lane does not wait for its greeting's answer",
+        OUTLET,
+        "if greetings.is_waiting and not greetings.greet(len(self._lanes)):\n                return False",
+        "if greetings.is_waiting:\n                greetings.greet(len(self._lanes))",
+        _GREETINGS,
+    ),
+    _bug(
+        "a worker that lost its link is not greeted again",
+        GREETINGS,
+        "                for lane in lanes.values():\n                    lane.part(now)\n",
+        "                for lane in ():\n                    lane.part(now)\n",
+        _GREETINGS,
+    ),
+    _bug(
+        "any word of a receiver answers its greeting",
+        LANES,
+        "if self.is_met or self.greeted_at is None or self.ack is None or self.ack.arrived < self.base:",
+        "if self.is_met or self.ack is None:",
+        _LANES,
+    ),
+    _bug(
+        "a new life's first number is not asked for",
+        OUTLET,
+        "start = lane.count if self._greetings is not None else min(",
+        "start = lane.processed if self._greetings is not None else min(",
+        _GREETINGS,
+    ),
+    _bug(
+        "a replay skips what is on its way",
+        OUTLET,
+        "lane.replay_end, lowest = lane.count + count, lane.lowest",
+        "lane.replay_end, lowest = lane.count + count, lane.count",
+        _GREETINGS,
+    ),
+    _bug(
+        "a sample that the thread has just taken is not replayed",
+        OUTLET,
+        "                owed.append(LeftOpen(*self._queue.in_hand))",
+        "                pass",
+        _GREETINGS,
+    ),
+    _bug(
+        "a forged start that is taken back leaves a loss",
+        RECEIVER,
+        "self.first = min(self.first, jump.at)",
+        "pass",
+        _ACKS,
+    ),
+    _bug(
+        "a sample that was shed counts as acknowledged",
+        ACKS,
+        "            if source is not None:\n                source.lost += 1\n                self._mark(name)",
+        "            if source is not None:\n                self._mark(name)",
+        _ACKS,
+    ),
+    _bug(
+        "what was given up is not counted",
+        LANES,
+        "known = max(0, self.ack.lost - before) + max(0, first - self.base)",
+        "known = max(0, first - self.base)",
+        (*_LANES, *_GREETINGS),
+    ),
+    _bug(
+        "numbers are compared without their wrap",
+        SERIAL,
+        "number = reference + (ahead if ahead < _HALF else ahead - SPAN)",
+        "number = serial",
+        ("tests/unit/core/hop/test_serial.py", *_ACKS),
+    ),
+    _bug(
+        "a forged jump stands",
+        RECEIVER,
+        "        return self.count >= RETURN",
+        "        return False",
+        _ACKS,
+    ),
+    _bug(
+        "applications are not asked whether they have room",
+        OUTLET,
+        "self._crowd = self._make_crowd() if has_crowd else None",
+        "self._crowd = None",
+        ("tests/integration/test_relay_receivers.py::test_a_frozen_application_delays_no_other",),
+    ),
+    _bug(
+        "a sample in hand overtakes what a worker withheld",
+        INPUTS,
+        "return is_early or is_behind",
+        "return is_early",
+        (f"{_WORKER}::test_the_sample_in_hand_when_the_role_comes_does_not_overtake_what_was_withheld",),
+    ),
+    _bug(
+        "a lease that is back lets newer samples out first",
+        INPUTS,
+        "is_early = self._is_begin_due or self._epoch != epoch",
+        "is_early = self._epoch != epoch",
+        (f"{_WORKER}::test_what_was_withheld_for_want_of_a_lease_goes_out_before_what_comes_with_it",),
+    ),
+    _bug(
+        "the name of a slot comes too late for its first value",
+        INPUTS,
+        "if in_turn and self._epoch:  # a standby's",
+        "if False:  # a standby's",
+        (f"{_WORKER}::test_a_name_that_comes_behind_the_first_value_counts_for_it_too",),
+    ),
+    _bug(
+        "the name of a slot is heard once only",
+        INPUTS,
+        "if state is not None and state.in_turn:",
+        "if False:",
+        (f"{_WORKER}::test_a_name_that_comes_behind_the_first_value_counts_for_it_too",),
+    ),
+    _bug(
+        "a backlog is answered by keys",
+        "zsched.worker.backlog",
+        "deque(sorted((*self._again, *kept), key=_turn_of))",
+        "deque((*self._again, *kept))",
+        ("tests/unit/worker/test_backlog.py",),
+    ),
+    _bug(
+        "what comes behind a worker's own end goes nowhere",
+        "zsched.worker.worker",
+        "if epoch is None:  # without",
+        "if not has_lease:  # without",
+        (f"{_WORKER}::test_what_comes_behind_the_end_of_an_epoch_is_answered_in_the_next_one",),
+    ),
+    _bug(
+        "a worker skips what a reliable input brings",
+        INPUTS,
+        "is_whole=end.is_whole, replayed=end.replayed",
+        "is_whole=bool(end.replayed), replayed=end.replayed",
+        (f"{_WORKER}::test_what_a_slow_worker_keeps_follows_the_class_and_what_it_sheds_of_a_reliable_input_is_lost",),
+    ),
+    _bug(
+        "what a worker skips of a reliable input counts as processed",
+        "zsched.worker.samples",
+        "return is_whole or self.keep_last is None",
+        "return self.keep_last is None",
+        (f"{_WORKER}::test_what_a_slow_worker_keeps_follows_the_class_and_what_it_sheds_of_a_reliable_input_is_lost",),
+    ),
+    _bug(
+        "what a relay's former life has had is lost",
+        "zsched.relay.answers",
+        "before if marker.had is None else marker.had",
+        "before",
+        ("tests/parts/relay/test_answers.py",),
+    ),
+    _bug(
+        "a relay's next life is sent what the former one has had",
+        WORKER_LANES,
+        "arrived = max(receiver.waits_for, receiver.had or 0)",
+        "arrived = receiver.waits_for",
+        ("tests/parts/worker/test_keep.py",),
+    ),
+    _bug(
+        "an input is done before its answers have come",
+        INPUTS,
+        "processed(name, number, size, self._owed, ",
+        "processed(name, number, size, {}, ",
+        ("tests/integration/test_relay_last_answers.py", "tests/parts/worker/test_done.py"),
+    ),
+    _bug(
+        "an input whose answer was withheld is done",
+        INPUTS,
+        "is_unanswered = self._has_withheld and waiting.is_whole",
+        "is_unanswered = False",
+        ("tests/parts/worker/test_done.py",),
+    ),
+    _bug(
+        "an input does not wait for its robot's first word",
+        WORKER_LANES,
+        "low = self.count if is_known or not self._is_expected(relay, now) else 0",
+        "low = self.count",
+        ("tests/unit/worker/test_debts.py",),
+    ),
+    _bug(
+        "a robot that takes long over a large answer has it",
+        WORKER_LANES,
+        "return not self.has_left and (is_own or is_moving)",
+        "return not self.has_left and is_moving",
+        ("tests/unit/worker/test_debts.py",),
+    ),
+    _bug(
+        "a frozen robot stalls the inputs of the others",
+        WORKER_LANES,
+        "return not self.has_left and (is_own or is_moving)",
+        "return not self.has_left",
+        ("tests/unit/worker/test_debts.py",),
+    ),
+    _bug(
+        "a slot that closes does not say so",
+        "zsched.relay.answers",
+        "self._acks.leave(self._names)",
+        "self._acks.flush()",
+        ("tests/parts/relay/test_answers.py",),
+    ),
+    _bug(
+        "what a foreign worker was sent is in no counter",
+        OUTLET,
+        "self.tally.unconfirmed += 1",
+        "self.tally.unconfirmed += 0",
+        (f"{_RELAY_STREAMS}::test_what_a_foreign_worker_was_sent_is_unconfirmed_and_never_dropped",),
+    ),
+    _bug(
+        "an input of an epoch that is not told yet is answered in the old one",
+        "zsched.worker.epochs",
+        "if in_hand is not None and in_hand > role.epoch:",
+        "if in_hand is not None and in_hand < 0:",
+        ("tests/unit/worker/test_epochs.py",),
+    ),
+    _bug(
+        "what is too old for a newer epoch is done all the same",
+        "zsched.worker.backlog",
+        "return self.quiet_at is None and 0 < self.slot < epoch and now - self.at > STALE_S",
+        "return False",
+        ("tests/unit/worker/test_backlog.py",),
+    ),
+    _bug(
+        "a slot that leaves work does not give it up",
+        OUTLET,
+        "left = self._queue.close(self._leave)",
+        "left = self._queue.close(self._undeclare)",
+        _GREETINGS,
+    ),
+    _bug(
+        "one answer proves its sample done",
+        "zsched.relay.proofs",
+        "if not is_answered or one.lane not in answered:",
+        "if not is_answered:",
+        ("tests/unit/relay/test_proofs.py",),
+    ),
+    _bug(
+        "a relay leaves a put to a frozen worker to zenoh",
+        OUTLET,
+        "= acks.stalled if acks else contextlib.nullcontext()",
+        "= contextlib.nullcontext()",
+        ("tests/parts/sessions/test_stalled_links.py::test_a_relay_ends_the_link_of_a_frozen_worker_behind_its_put",),
+    ),
+    _bug(
+        "a relay closes links, and reads those it has dialled, with a single thread",
+        "zsched.sessions.config",
+        "return _pools(rx=threads, tx=threads, net=threads)",
+        "return _pools(rx=threads, tx=threads)",
+        ("tests/unit/sessions/test_config.py", "tests/integration/test_zenoh_pools.py"),
+    ),
+    _bug(
+        "a node's processes have as many threads as zenoh likes",
+        "zsched.daemon",
+        'os.environ.setdefault(\n            "ZENOH_RUNTIME",',
+        'os.environ.setdefault(\n            "ZENOH_RUNTIME_UNREAD",',
+        ("tests/integration/test_zenoh_pools.py",),
+    ),
+    _bug(
+        "a relay has the threads that its daemon has",
+        "zsched.relay.__main__",
+        'os.environ["ZENOH_RUNTIME"] = relay_pools(arguments.threads)',
+        "relay_pools(arguments.threads)",
+        ("tests/integration/test_zenoh_pools.py",),
+    ),
+    _bug(
+        "a relay does not tell a role again whose token goes",
+        "zsched.relay.process",
+        "self._roles.remind(ended.task, ended.epoch)",
+        "pass",
+        ("tests/integration/test_relay_process.py::test_a_role_whose_token_goes_is_told_again_by_the_relay",),
+    ),
+    _bug(
+        "a reliable lane sends to whoever subscribes",
+        OUTLET,
+        "is_open=self._is_open if is_reliable and self._acks is not None else None,",
+        "is_open=None,",
+        (f"{_FROZEN}::test_an_owner_that_is_frozen_before_it_is_greeted_misses_nothing",),
+    ),
+    _bug(
+        "a lane waits for an answer to a greeting that was not put",
+        GREETINGS,
+        "                self._put_start(lane, lowest)\n",
+        "",
+        (f"{_FROZEN}::test_an_owner_that_is_frozen_before_it_is_greeted_misses_nothing",),
+    ),
+    _bug(
+        "what an input's rule says of a crash is not read",
+        "zsched.config.tasks",
+        '"graph", "on_crash")',
+        '"graph")',
+        (f"{_CHAOS}::test_a_power_cut_loses_nothing_where_the_rule_says_replay",),
+    ),
+    _bug(
+        "a cold standby without a command is let through",
+        "zsched.config.tasks",
+        'is Standby.COLD and not section.get("command"):',
+        'is Standby.COLD and section.get("command") == ():',
+        ("tests/unit/config/test_load.py::test_one_fault_is_reported_once_at_its_place",),
+    ),
+    _bug(
+        "one forged acknowledgement lets go of what is kept",
+        LANES,
+        "        self._take_back(limit)\n",
+        "",
+        (
+            "tests/unit/relay/test_lanes.py::test_what_an_acknowledgement_says_is_taken_back_by_one_that_says_less",
+            "tests/integration/test_relay_reliable.py",
+        ),
+    ),
+    _bug(
+        "a start marker skips what one forged acknowledgement has let go of",
+        LANES,
+        "first = self.spare[0] if self.spare else self.kept[0] if self.kept else None",
+        "first = self.kept[0] if self.kept else None",
+        (*_LANES, *_GREETINGS),
+    ),
+    _bug(
+        "a timestamp that several samples have proves one of them done",
+        "zsched.relay.proofs",
+        "return self._alone.get(stamp, False)",
+        "return stamp in self._alone",
+        ("tests/unit/relay/test_proofs.py",),
+    ),
+    _bug(
+        "a timestamp that was forgotten is alone when it comes again",
+        "zsched.relay.proofs",
+        "if self._floor is not None and not self._floor < stamp:",
+        "if self._floor is not None and False:",
+        ("tests/unit/relay/test_proofs.py",),
+    ),
+    _bug(
+        "nobody asks whether a timestamp is one sample's",
+        "zsched.relay.task",
+        "is_proof and self._stamps.is_alone(stamp) and",
+        "is_proof and",
+        (f"{_REPLAY}::test_a_timestamp_that_several_samples_have_proves_none_of_them_done",),
+    ),
+    _bug(
+        "beats in turn wait for a loop that does not come",
+        "zsched.adapters.network.control_bus",
+        "zenoh.handlers.RingChannel(RING)",
+        "zenoh.handlers.FifoChannel(RING)",
+        ("tests/parts/adapters/network/test_control_bus.py",),
+    ),
+    _bug(
+        "a relay that does not stay is its own node's secret",
+        "zsched.core.profile.profile",
+        "profile = replace(profile, progress=progress, relay=relay)",
+        "profile = replace(profile, progress=progress)",
+        ("tests/unit/core/test_node.py",),
+    ),
+)

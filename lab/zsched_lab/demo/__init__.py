@@ -1,0 +1,1 @@
+"""`zsched demo`: its run, its screen, its figures."""

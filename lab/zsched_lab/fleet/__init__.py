@@ -1,0 +1,1 @@
+"""Real fleets on this machine: daemons, loads, links, and what watches them."""

@@ -1,0 +1,1 @@
+"""Maps of laser scans, and how good they are."""

@@ -1,0 +1,1 @@
+"""The lab's robots: their applications and their laser logs."""

@@ -1,0 +1,433 @@
+"""A fleet of real `Node`s on a fake network, clock and disk: deterministic by seed, hundreds of times real time.
+
+Knows: delivery, the loop of each machine (pauses, slow events and disks included), lives, a stand-in for workers and
+relays. Does not know: how a node decides (it runs the production core, codec and state format), which faults a
+schedule has (`zsched_lab.sim.faults`), what must hold (`zsched_lab.sim.checks`).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from random import Random
+from typing import Any
+
+from zsched.core import events as ev
+from zsched.core import instructions as do
+from zsched.core.node import Node
+from zsched.core.values.fleet import Fleet, electorate_hash
+from zsched.core.values.messages import Refused
+from zsched.core.values.model import Allocation, DeviceSample, DurableState, NodeId, PeerState, TaskId
+from zsched.core.values.plan import RoutePlan
+from zsched.core.vote.generations import blank_state
+from zsched.errors import InvariantError, WireError
+from zsched.wire import codec as wire
+from zsched_lab.sim.checks import Invariants, unsettled
+from zsched_lab.sim.clocks import LOOK_S, awake
+from zsched_lab.sim.links import Links
+from zsched_lab.sim.loops import TICK_S
+from zsched_lab.sim.memory import Memory
+from zsched_lab.sim.network import Message
+from zsched_lab.sim.parts import Machine
+from zsched_lab.sim.work import Work
+
+Load = Callable[[NodeId, float], tuple[float, float]]
+"""(node, time) -> (CPU cores in use, MiB in use), the raw reading of the device profiler."""
+Cut = Callable[[NodeId, tuple[do.Instruction, ...]], int | None]
+"""(node, batch) -> after how many instructions the node crashes; ``None``: it carries out all of them and lives."""
+Make = Callable[[Any], ev.Event]
+
+CORES, MEMORY_MB = 4.0, 4000.0
+TOKEN_DELAY_S = 0.005
+RESTART_S = 0.3
+"""A node that crashed in the middle of a batch comes back this much later."""
+WALL_MS = 1_700_000_000_000
+"""The wall clock when a simulation begins, in milliseconds since 1970 (plus the simulation's own)."""
+QUESTIONS_KEPT = 4000
+
+
+def idle(_node: NodeId, _now: float) -> tuple[float, float]:
+    """Every machine a quarter busy, for ever."""
+    return 1.0, 1000.0
+
+
+@dataclass(slots=True, kw_only=True)
+class Simulator(Links):
+    """One fleet in one schedule. `run` until a time or a condition; faults in between."""
+
+    fleet: Fleet
+    seed: int
+    generation: int = 0
+    """The generation that the fleet begins with."""
+    load: Load = idle
+    cut_batch: Cut | None = None
+    broken_disks: set[NodeId] = field(default_factory=set)
+    """Nodes that cannot write their state."""
+    stories: list[str] = field(default_factory=list)
+    invariants: Invariants = field(init=False)
+    memory: Memory = field(init=False)
+    work: Work = field(init=False)
+    events: int = 0
+    most_events: float = math.inf
+    """More than this is a storm: nodes that answer each other without end."""
+    answers: list[do.AnswerCommand] = field(default_factory=list)
+    """What operators were told."""
+    _asked: dict[int, tuple[Machine, Machine, Make]] = field(default_factory=dict)
+    _frames: dict[tuple[str, type[Any]], tuple[object, bytes, Any]] = field(default_factory=dict)
+    """{(sender, class): (the newest value of this class, its frame, what is read in it)}."""
+    _requests: Iterator[int] = field(default_factory=lambda: itertools.count(1))
+
+    def __post_init__(self) -> None:
+        self.rng = Random(self.seed)
+        self.invariants = Invariants(self.fleet)
+        self.memory, self.work = Memory(self), Work(self)
+        for spec in self.fleet.nodes:
+            machine = self.machines[spec.name] = Machine(key=spec.name, name=spec.name, fleet=self.fleet)
+            self.initialise(machine, generation=self.generation)
+
+    def initialise(self, machine: Machine, *, incarnation: int = 0, generation: int = 0) -> None:
+        """`zsched init`: a blank durable state, which says that this name has never voted."""
+        before = machine.disk.state
+        blank = blank_state(machine.fleet, machine.name, generation, before, incarnation=incarnation, hardware="")
+        machine.disk.wipe()
+        self.invariants.expect(generation, machine.fleet.electors)
+        machine.disk.write(blank)
+        machine.disk.sync()
+
+    # --- what a test does --------------------------------------------------------------------------------------------
+
+    @property
+    def wall_count(self) -> int:
+        """The incarnation that a blank state or none begins with (`zsched.clock.wall_tenths`).
+
+        Finer than a tenth of a second: these machines can be wiped and started more often than any real one.
+        """
+        return WALL_MS + int(self.now * 1000)
+
+    @property
+    def learnt(self) -> dict[tuple[TaskId, int], Allocation]:
+        """{(task, revision): the one value}."""
+        return self.invariants.told
+
+    @property
+    def owners(self) -> dict[tuple[TaskId, int], NodeId]:
+        """{(task, epoch): the one owner}."""
+        return {key: first.owner for key, first in self.invariants.checker.epochs.items() if first.owner is not None}
+
+    @property
+    def plans(self) -> dict[tuple[NodeId, TaskId], RoutePlan]:
+        """{(node, task): the newest plan}."""
+        return self.work.plans
+
+    @property
+    def working(self) -> dict[TaskId, tuple[NodeId, float]]:
+        """{exclusive task: (who works, until when at most)}."""
+        return self.work.working
+
+    def start(self, *names: NodeId) -> None:
+        """Start nodes (default: all) from what their disks hold."""
+        for name in names or tuple(self.machines):
+            if self.machines[name].node is None:
+                self._start(self.machines[name])
+
+    def crash(self, name: NodeId, *, is_power_lost: bool = False) -> None:
+        """A node's process and its worker end at once.
+
+        Its token goes at the others a little later; when the power is lost, only with their links' lease, and what was
+        written and not synced may be lost.
+        """
+        machine = self.machines[name]
+        if machine.node is None:
+            return
+        incarnation = machine.node.incarnation
+        delay_s = self.fleet.timing.zenoh_lease_s if is_power_lost else TOKEN_DELAY_S
+        for other in self.machines.values():
+            if other is not machine and (machine.key, other.key) not in self.cuts:
+                self.work.lose(machine, other, delay_s)
+        self.work.end(machine)
+        machine.end()
+        machine.disk.lose_power(self.rng)
+        self._tell_token(machine, ev.TokenLost(node=machine.name, incarnation=incarnation), delay_s)
+
+    def node(self, name: NodeId) -> Node:
+        """A running node. Raises `KeyError` when it is down."""
+        node = self.machines[name].node
+        if node is None:
+            raise KeyError(name)
+        return node
+
+    def running(self) -> tuple[NodeId, ...]:
+        """The nodes that are up, sorted."""
+        return tuple(key for key, machine in sorted(self.machines.items()) if machine.node is not None)
+
+    def fit_electors(self) -> tuple[NodeId, ...]:
+        """The electors that are up and have their state."""
+        running = self.running()
+        return tuple(name for name in self.fleet.electors if name in running and self.node(name).agreement.is_elector)
+
+    def agreed(self, task: TaskId, *names: NodeId) -> NodeId | None:
+        """The owner that ``names`` (default: all running) have learnt, when it is one and the same; else ``None``."""
+        values = {self.node(name).registers[task].value for name in names or self.running()}
+        return values.pop().owner if len(values) == 1 else None
+
+    def disk(self, name: NodeId) -> DurableState | None:
+        """What a node would find if it started now."""
+        return self.machines[name].disk.state
+
+    def sees(self, observer: NodeId, target: NodeId) -> PeerState:
+        """How one running node sees another."""
+        return self.node(observer).membership.state(target)
+
+    def unsettled(self) -> str:
+        """Why the fleet is not at rest, empty when it is (see `zsched_lab.sim.checks.unsettled`)."""
+        return unsettled(self.fleet, self.machines, self.work.working, self.now)
+
+    # --- lives -------------------------------------------------------------------------------------------------------
+
+    def _start(self, machine: Machine) -> None:
+        """As the daemon starts: read the state, check it, count the life, persist that, build the node."""
+        electorate = electorate_hash(machine.fleet)
+        kept, local = machine.is_durable, machine.clock.local(self.now)
+        is_first = machine.life == 0
+        state = machine.disk.read()
+        if state is not None and (state.electorate != electorate or self._is_refused(machine)):
+            state = None
+        # No two machines' clocks agree to the millisecond, not even where power comes back to all of them at once.
+        wall_count = self.wall_count + (machine.key != machine.name)
+        if state is not None:
+            state = replace(state, incarnation=max(state.incarnation + 1, wall_count))
+            machine.disk.write(state)
+            machine.disk.sync()
+        machine.life += 1
+        machine.is_durable = state is not None
+        machine.is_elector = state is not None and machine.name in machine.fleet.electors
+        self.invariants.on_started(machine, self.now, has_state=state is not None and (kept or is_first))
+        machine.node = Node(
+            fleet=machine.fleet,
+            me=machine.name,
+            durable=state,
+            incarnation=state.incarnation if state is not None else wall_count,
+            electorate=electorate,
+            rng=Random(self.rng.random()),
+            now=local,
+        )
+        self.memory.on_started(machine, state)
+        self._tell_token(machine, ev.TokenSeen(node=machine.name, incarnation=machine.node.incarnation), TOKEN_DELAY_S)
+        self._carry_out(machine, machine.node.start(local), 0)
+        self.work.greet(machine)
+        self.work.meet(machine)
+        self.later(self.rng.uniform(0, machine.fleet.timing.sample_s), self._sample, machine, machine.life)
+        self.arm(machine)
+
+    def _is_refused(self, machine: Machine) -> bool:
+        return machine.disk.is_broken or machine.key in self.broken_disks
+
+    def _tell_token(self, machine: Machine, event: ev.Event, delay_s: float) -> None:
+        for other in self.machines.values():
+            if other is not machine and (machine.key, other.key) not in self.cuts:
+                self.later(delay_s, self.deliver, other, event)
+
+    def _sample(self, machine: Machine, life: int) -> None:
+        if machine.life != life or machine.node is None:
+            return
+        cpu, memory = self.load(machine.name, self.now)
+        sample = DeviceSample(cpu_cores=CORES, cpu_used_cores=cpu, memory_mb=MEMORY_MB, memory_used_mb=memory)
+        self.later(self.fleet.timing.sample_s, self._sample, machine, life)
+        self.deliver(machine, ev.ProfileSampled(device=sample))
+
+    def frozen(self, machine: Machine) -> None:
+        """Its workers stand still with it."""
+        self.work.freeze(machine)
+
+    def thawed(self, machine: Machine) -> None:
+        """Its workers go on by a clock that stood still."""
+        self.work.thaw(machine, self.fleet.timing.lease_s)
+
+    def woken_up(self, machine: Machine, slept_s: float) -> None:
+        """Its workers go on; its watch looks at the clocks a little later, as often as the daemon's does."""
+        life = machine.life
+        self.work.thaw(machine, max(-machine.sleep_error_s, 0.0))
+
+        def tell(event: ev.Event) -> None:
+            if machine.life == life:
+                self.deliver(machine, event)
+
+        def is_believed() -> bool:
+            node, is_behind = machine.node, machine.is_paused or bool(machine.inbox)  # it has not heard of it yet
+            return machine.life != life or node is None or not (is_behind or "clock" in node.problems)
+
+        self.later(LOOK_S, lambda: awake(slept_s, tell=tell, later=self.later, is_believed=is_believed))
+
+    # --- events ------------------------------------------------------------------------------------------------------
+
+    def woken(self, machine: Machine) -> None:
+        """A machine's deadline has come; it must let time pass now and then."""
+        self.invariants.on_woken(machine, self.now)
+
+    def handle(self, machine: Machine, event: ev.Event) -> None:
+        """Let a machine handle one event now, and carry out what it asks for."""
+        node = machine.node
+        assert node is not None
+        self.events += 1
+        if self.events > self.most_events:
+            raise InvariantError(f"{self.events} events until {self.now:.3f}: the fleet storms")
+        local = self.now if machine.clock.is_true else machine.clock.local(self.now)
+        try:
+            batch = node.handle(event, local)
+        except Exception as error:
+            raise InvariantError(f"{machine.key} raised {error!r} on {event}") from error
+        self.invariants.on_handled(machine, self.now, local)
+        if machine.event_s:
+            machine.busy_until = self.now + machine.event_s
+        if batch:
+            self._carry_out(machine, batch, 0)
+        self.arm(machine)
+
+    # --- instructions ------------------------------------------------------------------------------------------------
+
+    def _carry_out(self, machine: Machine, batch: tuple[do.Instruction, ...], first: int) -> None:
+        end = None if self.cut_batch is None else self.cut_batch(machine.name, batch)
+        self._do(machine, machine.life, batch, first, end)
+
+    def _do(self, machine: Machine, life: int, batch: tuple[do.Instruction, ...], first: int, end: int | None) -> None:
+        """Carry out ``batch[first:end]``; a slow disk holds the rest of it up, a refused write ends it."""
+        if machine.life != life:
+            return
+        for index in range(first, len(batch) if end is None else min(end, len(batch))):
+            instruction = batch[index]
+            if isinstance(instruction, do.PersistState):
+                if self._is_refused(machine):
+                    machine.is_durable = False
+                    self.handle(machine, ev.PersistFailed(reason="no space left on device"))
+                    break
+                machine.disk.write(instruction.state)
+                if machine.disk_s[1] > 0.0:
+                    machine.busy_until = self.now + self.rng.uniform(*machine.disk_s)
+                    self.later(machine.busy_until - self.now, self._synced, machine, life, batch, index, end)
+                    return
+                self._sync(machine, instruction.state)
+                continue
+            self.invariants.on_leaving(machine, instruction, self.now)
+            self._one(machine, instruction)
+        if end is not None:
+            self.crash(machine.key)
+            self.later(RESTART_S, self._restart, machine)
+
+    def _restart(self, machine: Machine) -> None:
+        if machine.node is None and machine.key in self.machines:
+            self._start(machine)
+
+    def _sync(self, machine: Machine, state: DurableState) -> None:
+        self.invariants.on_synced(machine, state, self.now)
+        machine.disk.sync()
+
+    def _synced(
+        self, machine: Machine, life: int, batch: tuple[do.Instruction, ...], index: int, end: int | None
+    ) -> None:
+        if machine.life != life:
+            return
+        persist = batch[index]
+        assert isinstance(persist, do.PersistState)
+        if machine.is_paused:  # the write is done, the process is not there to go on
+            self.later(TICK_S, self._synced, machine, life, batch, index, end)
+            machine.busy_until = self.now + TICK_S
+            return
+        self._sync(machine, persist.state)
+        machine.busy_until = self.now
+        self._do(machine, life, batch, index + 1, end)
+        self.pump_later(machine)
+        self.arm(machine)
+
+    def _one(self, me: Machine, instruction: do.Instruction) -> None:
+        match instruction:
+            case do.PublishBeat(beat=beat):
+                self._put(me, beat, lambda value: ev.BeatReceived(beat=value))
+            case do.PublishProfile(profile=profile):
+                self._put(me, profile, lambda value: ev.ProfileReceived(profile=value))
+            case do.PublishProposal(proposal=proposal):
+                self._put(me, proposal, lambda value: ev.ProposalReceived(proposal=value))
+            case do.PublishLearnt(learnt=learnt):
+                self._put(me, learnt, lambda value: ev.LearntReceived(learnt=value))
+            case do.AskUtilities(gather=gather):
+                self._gather(me, gather)
+            case do.SendPrepare(prepare=prepare):
+                self._elect(me, prepare, lambda n, value: ev.PrepareAsked(request=n, asker=me.name, prepare=value))
+            case do.SendAccept(accept=accept):
+                self._elect(me, accept, lambda n, value: ev.AcceptAsked(request=n, asker=me.name, accept=value))
+            case do.AskLearnt(peer=peer):
+                for other in self.named(peer):
+                    number = self._question(other, me, lambda value: ev.LearntReceived(learnt=value, is_answer=True))
+                    self.send(me, other, Message(ev.LearntAsked(request=number)))
+            case do.AnswerUtilities(request=request, utilities=value):
+                self._answer(request, value)
+            case do.AnswerElection(request=request, answer=vote):
+                if not isinstance(vote, Refused):
+                    self.memory.on_vote(me)
+                self._answer(request, vote)
+            case do.AnswerLearnt(request=request, learnt=learnt):
+                self._answer(request, learnt)
+            case do.AnswerCommand(result=result):
+                wire.encode(result)
+                self.answers.append(instruction)
+            case do.AnswerStatus(snapshot=snapshot):
+                wire.encode(snapshot)
+            case do.RecordStory():
+                where = f"{instruction.task}#{instruction.epoch} " if instruction.task else ""
+                self.stories.append(f"{self.now:9.3f} {me.key} {instruction.stage} {where}{instruction.text}")
+            case do.StandDown():
+                self.stories.append(f"{self.now:9.3f} {me.key} stands down: {instruction.reason}")
+                self.crash(me.key)
+            case _:
+                self.work.do(me, instruction)
+
+    # --- the network -------------------------------------------------------------------------------------------------
+
+    def _framed(self, me: Machine, value: object) -> tuple[bytes, Any]:
+        """(the frame of a value, what a receiver reads in it); the same value again is the same frame."""
+        key = (me.key, type(value))
+        known = self._frames.get(key)
+        if known is None or known[0] is not value:
+            try:
+                frame = wire.encode(value)
+            except WireError as error:
+                raise InvariantError(f"{me.key} cannot send what it says: {error}") from error
+            known = self._frames[key] = (value, frame, wire.decode(frame, type(value)))
+        return known[1], known[2]
+
+    def _put(self, me: Machine, value: object, make: Make) -> None:
+        frame, read = self._framed(me, value)
+        self.spread(me, Message(make(read), frame, type(value)))
+
+    def _question(self, asked: Machine, asker: Machine, make: Make) -> int:
+        """A request number whose answers travel back from ``asked`` to ``asker`` (a repeated question's, too)."""
+        number = next(self._requests)
+        self._asked[number] = (asked, asker, make)
+        if len(self._asked) > QUESTIONS_KEPT:
+            del self._asked[next(iter(self._asked))]
+        return number
+
+    def _answer(self, request: int, value: object) -> None:
+        question = self._asked.get(request)
+        if question is None:
+            return
+        asked, asker, make = question
+        frame, read = self._framed(asked, value)
+        self.send(asked, asker, Message(make(read), frame, type(value)))
+
+    def _gather(self, me: Machine, gather: int) -> None:
+        def make(value: Any) -> ev.Event:
+            return ev.UtilityReceived(gather=gather, utilities=value)
+
+        for name in self.fleet.voters:
+            for other in self.named(name) if name != me.name else ():
+                number = self._question(other, me, make)
+                self.send(me, other, Message(ev.UtilityAsked(request=number, asker=me.name)))
+
+    def _elect(self, me: Machine, question: object, make: Callable[[int, Any], ev.Event]) -> None:
+        (frame, value), kind = self._framed(me, question), type(question)
+        for elector in me.fleet.electors:
+            for other in self.named(elector):
+                number = self._question(other, me, lambda answer: ev.ElectorAnswered(answer=answer))
+                self.send(me, other, Message(make(number, value), frame, kind))
