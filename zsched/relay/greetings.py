@@ -1,7 +1,7 @@
 """Decides when the lanes of a ``reliable`` outlet may send: greets each receiver and waits for its answer.
 
 Knows: which lanes nobody has answered for yet, how long to wait for an answer. Does not know: samples, slots, what the
-answer leads to (`zsched.relay.lanes`).
+answer leads to (`zsched.core.hop.sender`).
 
 A start marker (an end marker of epoch 0) says the lowest number that may still come; `zsched.worker` acknowledges it at
 once. Whoever subscribes and never answers is no `zsched.worker`: after `FOREIGN_S`, longer than any lease of a frozen

@@ -27,12 +27,13 @@ import zenoh
 from zenoh import Priority, Sample, Session, Timestamp
 
 from zsched.clock import monotonic_s
+from zsched.core.hop.sender import KEPT_BYTES, KEPT_SAMPLES, Sent, near
 from zsched.core.relay_protocol import EndMarker, StreamAck
 from zsched.core.values.plan import OnCrash, StreamClass, StreamSettings
 from zsched.relay.acks import WorkerAcks
 from zsched.relay.crowd import Crowd
 from zsched.relay.greetings import Greetings
-from zsched.relay.lanes import KEPT_BYTES, KEPT_BYTES_LATEST, KEPT_SAMPLES, Lane, Sent, near
+from zsched.relay.lanes import KEPT_BYTES_LATEST, Lane
 from zsched.relay.proofs import LeftOpen
 from zsched.relay.publishers import declare_publisher, put_marker
 from zsched.relay.receive import undeclare

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 
-from zsched.relay.lanes import Lane
+from zsched.core.hop.sender import Sender
 
 
 @dataclass(slots=True)
@@ -38,7 +38,7 @@ class Tally:
         for field in fields(self):
             setattr(self, field.name, getattr(self, field.name) + getattr(other, field.name))
 
-    def plus(self, lanes: Iterable[Lane]) -> Tally:
+    def plus(self, lanes: Iterable[Sender]) -> Tally:
         """This and what open publishers say now."""
         total = Tally()
         total.add(self)
@@ -47,12 +47,12 @@ class Tally:
             total._take(lane)
         return total
 
-    def new_life(self, lane: Lane, start: int) -> None:
+    def new_life(self, lane: Sender, start: int) -> None:
         """The receiver died: what its last word left open below ``start`` may be lost."""
         self._take(lane)
         self.at_most_lost += max(0, start - lane.processed)
 
-    def _take(self, lane: Lane) -> None:
+    def _take(self, lane: Sender) -> None:
         self.acknowledged += lane.acknowledged
         self.lost += lane.lost
         if lane.ack is not None:

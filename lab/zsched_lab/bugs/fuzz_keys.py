@@ -25,6 +25,7 @@ from zenoh import SampleKind
 from zsched.adapters.network.control_bus import ControlBus
 from zsched.core import events as ev
 from zsched.core.hop.receiver import MAX_REPLAYED, RETURN
+from zsched.core.hop.sender import Sender, Sent, near
 from zsched.core.hop.serial import serial_of
 from zsched.core.relay_protocol import EndMarker, SnapshotChunk, StreamAck, StreamAcks
 from zsched.core.route.ros2 import parse_token
@@ -32,7 +33,6 @@ from zsched.core.sequence import RUN, Order, Track
 from zsched.core.values.model import MAX_COUNTER, NAME
 from zsched.hop.acknowledger import Acknowledger
 from zsched.ipc.pipe import decode_chunk, decode_end, encode_chunk, encode_end
-from zsched.relay.lanes import Lane, Sent, near
 from zsched.relay.slots import KeyState
 from zsched.relay.tokens import Tokens
 from zsched.wire import codec as wire
@@ -211,7 +211,7 @@ class KeyFuzz:
 
     def _lane(self) -> None:
         """A relay's book of one publisher: whatever is acknowledged, it stays within what was sent."""
-        lane = Lane(key="k", publisher=cast("Any", None), source_id=cast("Any", None), eid=1)
+        lane = Sender()
         for _ in range(30):
             if self._rng.random() < 0.5:
                 lane.count += 1

@@ -10,12 +10,12 @@ from zsched_lab.bugs.core_bugs import Bug
 
 ACKS, RECEIVER, SERIAL = "zsched.hop.acknowledger", "zsched.core.hop.receiver", "zsched.core.hop.serial"
 INPUTS, WORKER_LANES = "zsched.worker.inputs", "zsched.worker.lanes"
-GREETINGS, LANES, OUTLET = "zsched.relay.greetings", "zsched.relay.lanes", "zsched.relay.outlet"
+GREETINGS, SENDER, OUTLET = "zsched.relay.greetings", "zsched.core.hop.sender", "zsched.relay.outlet"
 
 _GREETINGS = ("tests/parts/relay/test_greetings.py",)
 _RECEIVE = ("tests/parts/relay/test_receive.py",)
 _ACKS = ("tests/unit/hop/test_acknowledger.py",)
-_LANES = ("tests/unit/relay/test_lanes.py",)
+_SENDER = ("tests/unit/core/hop/test_sender.py",)
 _WORKER = "tests/parts/worker/test_worker.py"
 _FROZEN = "tests/integration/test_relay_frozen_moves.py"
 _REPLAY = "tests/integration/test_relay_replay.py"
@@ -58,10 +58,10 @@ STREAM_BUGS = (
     ),
     _bug(
         "any word of a receiver answers its greeting",
-        LANES,
+        SENDER,
         "if self.is_met or self.greeted_at is None or self.ack is None or self.ack.arrived < self.base:",
         "if self.is_met or self.ack is None:",
-        _LANES,
+        _SENDER,
     ),
     _bug(
         "a new life's first number is not asked for",
@@ -100,10 +100,10 @@ STREAM_BUGS = (
     ),
     _bug(
         "what was given up is not counted",
-        LANES,
+        SENDER,
         "known = max(0, self.ack.lost - before) + max(0, first - self.base)",
         "known = max(0, first - self.base)",
-        (*_LANES, *_GREETINGS),
+        (*_SENDER, *_GREETINGS),
     ),
     _bug(
         "numbers are compared without their wrap",
@@ -338,20 +338,20 @@ STREAM_BUGS = (
     ),
     _bug(
         "one forged acknowledgement lets go of what is kept",
-        LANES,
+        SENDER,
         "        self._take_back(limit)\n",
         "",
         (
-            "tests/unit/relay/test_lanes.py::test_what_an_acknowledgement_says_is_taken_back_by_one_that_says_less",
+            "tests/unit/core/hop/test_sender.py::test_what_an_acknowledgement_says_is_taken_back_by_one_that_says_less",
             "tests/integration/test_relay_reliable.py",
         ),
     ),
     _bug(
         "a start marker skips what one forged acknowledgement has let go of",
-        LANES,
+        SENDER,
         "first = self.spare[0] if self.spare else self.kept[0] if self.kept else None",
         "first = self.kept[0] if self.kept else None",
-        (*_LANES, *_GREETINGS),
+        (*_SENDER, *_GREETINGS),
     ),
     _bug(
         "a timestamp that several samples have proves one of them done",

@@ -8,8 +8,8 @@ from __future__ import annotations
 import pytest
 
 from zsched.core import sequence
-from zsched.core.hop import receiver
-from zsched.relay import lanes, slots, tokens
+from zsched.core.hop import receiver, sender
+from zsched.relay import slots, tokens
 from zsched.wire import keyspace
 from zsched_lab.bugs.fuzz_keys import KeyFuzz, main
 
@@ -48,7 +48,7 @@ def test_what_was_broken_from_outside_is_found(monkeypatch: pytest.MonkeyPatch) 
         patch.setattr(sequence, "RUN", 10**9)
         assert "_track" in found()
     with monkeypatch.context() as patch:  # an acknowledgement of what was never sent
-        patch.setattr(lanes.Lane, "arrived", property(lambda lane: 0 if lane.ack is None else lane.ack.arrived))
+        patch.setattr(sender.Sender, "arrived", property(lambda lane: 0 if lane.ack is None else lane.ack.arrived))
         assert "_lane" in found()
 
 

@@ -6,25 +6,26 @@ from typing import Any, cast
 
 import pytest
 
+from zsched.core.hop.sender import MAX_RESEND_S, RESEND_S, Sender, Sent, near
 from zsched.core.hop.serial import SPAN, serial_of
 from zsched.core.relay_protocol import StreamAck
-from zsched.relay.lanes import KEPT_BYTES_LATEST, MAX_RESEND_S, RESEND_S, Lane, Sent, near
+from zsched.relay.lanes import KEPT_BYTES_LATEST
 from zsched.relay.tally import Tally
 
 
-def lane() -> Lane:
+def lane() -> Sender:
     """One that nothing is put on: only its books."""
-    return Lane(key="edge1/in", publisher=cast("Any", None), source_id=cast("Any", None), eid=1)
+    return Sender()
 
 
-def sent(books: Lane, *, at: float, size: int = 100, took_s: float = 0.0) -> None:
+def sent(books: Sender, *, at: float, size: int = 100, took_s: float = 0.0) -> None:
     """A sample went out; class ``latest`` with ``depth`` 16 and ``keep_last`` 1."""
     books.count += 1
     one = Sent(books.count - 1, cast("Any", None), None, size, at, took_s)
     books.keep(one, samples=16, least=1, size=KEPT_BYTES_LATEST)
 
 
-def acknowledged(books: Lane, arrived: int, now: float) -> None:
+def acknowledged(books: Sender, arrived: int, now: float) -> None:
     books.acknowledge(StreamAck(eid=1, first=0, arrived=arrived, processed=arrived), "1", now)
 
 

@@ -1,0 +1,224 @@
+"""The sending side of a numbered hop: what was sent under which number, and what the receiver has said of it.
+
+Knows: the numbers of one publisher, what is kept to be sent again and when. Does not know: what a sample is, how it is
+put, threads. The time is passed in (monotonic seconds).
+
+Class ``reliable`` greets its receiver before the first sample: a start marker says the lowest number that may come, and
+the receiver's acknowledgement of it says who it is and what it waits for. Only then samples go out (the receiver is
+*met*). What a receiver has never been told of it refuses, so nothing is ever sent into the blue: not to a worker that
+stands still, has no link or has just begun another life.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field, replace
+from typing import Any, Final, NamedTuple
+
+from zsched.core.hop.serial import number_near, serial_of
+from zsched.core.relay_protocol import StreamAck
+
+KEPT_SAMPLES: Final = 2048
+KEPT_BYTES: Final = 16 << 20
+"""Bounds of what one publisher keeps until it is acknowledged."""
+GREET_S: Final = 0.1
+"""An unanswered start marker is put again after this time, and then after twice as long each time."""
+RESEND_S: Final = 0.3
+MAX_RESEND_S: Final = 10.0
+"""Bounds of the time without progress after which what is not acknowledged is put again."""
+
+
+class Sent(NamedTuple):
+    """A sample that went out under ``number`` and is kept (a tuple: one is made for every sample)."""
+
+    number: int
+    sample: Any
+    """Whatever its publisher needs to put it again."""
+    stamp: Any
+    size: int
+    at: float
+    """When its put had returned (monotonic seconds)."""
+    took_s: float
+    """How long the put waited for the link."""
+
+
+@dataclass(slots=True, eq=False, kw_only=True)
+class Sender:
+    """One publisher towards one receiver."""
+
+    count: int = 0
+    """Samples put so far, and the number of the next one."""
+    base: int = 0
+    """The first number that the receiver's present life answers for."""
+    is_met: bool = False
+    """This life of the receiver has answered our start marker, so it knows the first number and misses none."""
+    is_foreign: bool = False
+    """Whoever subscribes here acknowledges nothing."""
+    was_foreign: bool = False
+    forgiven: int | None = None
+    """What this receiver counts as lost of numbers below `base`; ``None``: all of them, if it began before."""
+    unmet_since: float = 0.0
+    keeps_work: bool = False
+    """Keep samples until they are processed, not only until they have arrived: the next owner may have to do them."""
+    replay_end: int = 0
+    """Numbers below this one may have gone to a receiver that died."""
+    greeted_at: float | None = None
+    greet_pause_s: float = GREET_S
+    ack: StreamAck | None = None
+    incarnation: str = ""
+    kept: deque[Sent] = field(default_factory=deque)
+    kept_bytes: int = 0
+    spare: list[Sent] = field(default_factory=list)
+    """What the newest acknowledgement has let go of: until one that goes further, it may be taken back."""
+    resend_from: int | None = None
+    is_misheard: bool = False
+    """The receiver believes a start marker that was not ours: ours goes out again."""
+    moved_at: float = 0.0
+    """When something was last sent or newly acknowledged (monotonic seconds)."""
+    pause_s: float = RESEND_S
+    """How long nothing may move before it is put again: twice what acknowledgements take here, or as long as a put
+    takes; doubled each time."""
+
+    def keep(self, sent: Sent, *, samples: int, least: int, size: int) -> None:
+        """Keep what was just put: at most so many ``samples`` and ``size`` bytes, but ``least`` of them; oldest go."""
+        self.kept.append(sent)
+        self.kept_bytes += sent.size
+        self.moved_at, self.pause_s = sent.at, max(self.pause_s, min(sent.took_s, MAX_RESEND_S))
+        while len(self.kept) > samples or (self.kept_bytes > size and len(self.kept) > least):
+            self.kept_bytes -= self.kept.popleft().size
+
+    def is_late(self, now: float) -> bool:
+        """Whether what is not acknowledged should be put again.
+
+        As TCP's retransmission timer (RFC 6298): a slow radio takes its time for every large sample, and sending it
+        twice would make it slower.
+        """
+        return self.arrived < self.count and now - self.moved_at > self.pause_s
+
+    def ask_again(self, start: int, now: float) -> None:
+        """Have everything from ``start`` on put again; the next time with twice the patience, while nothing moves."""
+        self.resend_from, self.moved_at = start, now
+        self.pause_s = min(2 * self.pause_s, MAX_RESEND_S)
+
+    def acknowledge(self, ack: StreamAck, incarnation: str, now: float) -> bool:
+        """Take an acknowledgement (`near` our count); ``False``, and nothing is taken: another life of it sent it."""
+        if self.incarnation and incarnation != self.incarnation:
+            return False
+        if not ack.processed <= ack.arrived <= self.count + 1:
+            return True  # of what was never sent (one may be on its way and not counted yet): nobody of ours says so
+        self.incarnation, self.is_foreign = incarnation, False
+        limit = ack.processed if self.keeps_work else ack.arrived
+        self.ack = ack
+        self._take_back(limit)
+        gone: list[Sent] = []
+        while self.kept and self.kept[0].number < limit:
+            gone.append(self.kept.popleft())
+        if gone:
+            newest, self.spare = gone[-1], gone
+            self.kept_bytes -= sum(sent.size for sent in gone)
+            self.pause_s = min(max(2 * (now - newest.at), newest.took_s, RESEND_S), MAX_RESEND_S)
+        return True
+
+    def _take_back(self, limit: int) -> None:
+        """An acknowledgement that says less than the one before: the worker's own never does, so that was a stranger's.
+
+        Anybody can put one under the worker's key. What it let go of is kept again.
+        """
+        while self.spare and self.spare[-1].number >= limit:
+            sent = self.spare.pop()
+            self.kept.appendleft(sent)
+            self.kept_bytes += sent.size
+
+    def mishears(self, ack: StreamAck, *, is_whole: bool) -> bool:
+        """Whether the receiver believes of this stream what is not so (`near` our count); ``is_whole``: its class."""
+        replays = max(0, self.replay_end - ack.arrived)
+        return ack.is_whole is not None and (ack.is_whole != is_whole or ack.replays != replays)
+
+    def meet(self, now: float) -> bool:
+        """The receiver has said something: whether it answers a start marker, and is met by that."""
+        if self.is_met or self.greeted_at is None or self.ack is None or self.ack.arrived < self.base:
+            return False
+        self.is_met = True
+        if self.was_foreign:
+            self.was_foreign, self.forgiven = False, self.ack.lost
+        if self.arrived < self.count:
+            self.ask_again(self.arrived, now)
+        return True
+
+    def part(self, now: float) -> None:
+        """The receiver is not there (any more), or there is another one: greet it before anything more is sent."""
+        self.is_met = self.is_foreign = False
+        self.unmet_since, self.greeted_at, self.greet_pause_s = now, None, GREET_S
+
+    def begin_life(self, incarnation: str, start: int, *, is_foreign: bool = False) -> None:
+        """Another life of the receiver answers from ``start`` on; what the former one left open is the caller's.
+
+        ``is_foreign``: so far nobody does, and whoever does later may be the former one.
+        """
+        self.incarnation, self.base = incarnation, start
+        self.was_foreign, self.forgiven = is_foreign, None
+        self.replay_end = self.count if self.keeps_work else 0
+        self.ack, self.resend_from = None, None
+        self.spare.clear()
+        while self.kept and self.kept[0].number < start:
+            self.kept_bytes -= self.kept.popleft().size
+
+    @property
+    def lowest(self) -> int:
+        """The lowest number that may still be sent: what a start marker says."""
+        first = self.spare[0] if self.spare else self.kept[0] if self.kept else None
+        return self.count if first is None else max(self.base, first.number)
+
+    def unprocessed(self) -> list[Sent]:
+        """What is kept of the samples that the receiver has not acknowledged as processed."""
+        return [sent for sent in self.kept if sent.number >= self.processed]
+
+    @property
+    def arrived(self) -> int:
+        """Number of the sample the receiver waits for; everything, while it never acknowledged."""
+        return self.count if self.ack is None else min(self.ack.arrived, self.count)
+
+    @property
+    def processed(self) -> int:
+        """Everything below this number is acknowledged, or known to be lost."""
+        return self.base if self.ack is None else min(max(self.ack.processed, self.ack.first, self.base), self.count)
+
+    @property
+    def in_flight(self) -> int:
+        """Samples sent and not processed yet, as far as we know."""
+        return self.count - self.processed
+
+    @property
+    def lost(self) -> int:
+        """What this life of the receiver has not had of that: given up, or before the first number it saw."""
+        if self.ack is None:
+            return 0
+        first = min(self.ack.first, self.count)
+        before = max(0, self.base - first) if self.forgiven is None else self.forgiven
+        known = max(0, self.ack.lost - before) + max(0, first - self.base)
+        return min(known, self.processed - self.base)
+
+    @property
+    def acknowledged(self) -> int:
+        """What this life of the receiver has processed."""
+        return self.processed - self.base - self.lost
+
+    def is_full(self) -> bool:
+        """True when nothing more may be sent before an acknowledgement (class ``reliable``)."""
+        if self.ack is None:
+            return False
+        return self.count - self.processed >= KEPT_SAMPLES or self.kept_bytes >= KEPT_BYTES
+
+
+def near(ack: StreamAck, count: int) -> StreamAck:
+    """An acknowledgement in numbers around ``count``: the receiver may have heard only their lowest bits."""
+    shift = number_near(serial_of(ack.arrived), count) - ack.arrived
+    if not shift:
+        return ack
+    return replace(
+        ack,
+        first=max(0, ack.first + shift),
+        arrived=ack.arrived + shift,
+        processed=max(0, ack.processed + shift),
+        until=max(0, ack.until + shift) if ack.until else 0,
+    )
