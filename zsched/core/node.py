@@ -1,7 +1,7 @@
 """The one door: `Node.handle` takes what happened and returns what to do; nothing else changes a node's state.
 
 Knows: how the six stages follow each other, and the order of a batch (persist, then send, then apply). Does not know:
-what each event means (`choice`, `work`, `beats`, `operators`), clocks, random sources, sockets, files, processes; time
+what each event means (`zsched.core.handlers`), clocks, random sources, sockets, files, processes; time
 and the generator are passed in.
 
 After the event is absorbed, `_advance` lets every stage act on the time that has passed, in the order in which the data
@@ -16,9 +16,9 @@ from collections.abc import Mapping
 from random import Random
 from typing import Any, Final
 
-from zsched.core import beats, choice, operators, work
 from zsched.core import events as ev
 from zsched.core import instructions as do
+from zsched.core.handlers import beats, choice, operators, work
 from zsched.core.stages import Handler, Stages
 from zsched.core.todo import ToDo
 from zsched.core.values.change import MoveOwner

@@ -34,7 +34,7 @@ class Bug:
         return (self,) if self.also is None else (self, *self.also.parts)
 
 
-CHANGE, BEATS = "zsched.core.values.change", "zsched.core.beats"
+CHANGE, BEATS = "zsched.core.values.change", "zsched.core.handlers.beats"
 SEQUENCE, IDENTITY = "zsched.core.sequence", "zsched.core.membership.identity"
 REGISTER, LEASE, TENURE = "zsched.core.vote.register", "zsched.core.vote.lease", "zsched.core.executor.tenure"
 SEALING, WITNESS = "zsched.core.executor.sealing", "zsched.core.vote.witness"

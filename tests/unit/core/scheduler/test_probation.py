@@ -8,7 +8,7 @@ from random import Random
 import pytest
 
 from support.fleets import fleet_of, tuning_of
-from zsched.core.beats import on_transition
+from zsched.core.handlers.beats import on_transition
 from zsched.core.membership.peers import Transition
 from zsched.core.node import Node
 from zsched.core.scheduler.probation import LEASE_MARGIN_S, LIMIT_S, Probation

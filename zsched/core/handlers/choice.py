@@ -11,8 +11,8 @@ from typing import Any, Final
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.beats import on_twins
 from zsched.core.executor.workers import failed_workers
+from zsched.core.handlers.beats import on_twins
 from zsched.core.stages import Handler, Stages
 from zsched.core.todo import ToDo
 from zsched.core.values.model import Proposal

@@ -1,0 +1,1 @@
+"""What each event means to the stages: a file for what it is about."""
