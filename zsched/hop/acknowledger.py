@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable
 from typing import Final
 
 from zsched.clock import monotonic_s
-from zsched.core.hop.receiver import Source
+from zsched.core.hop.receiver import RunningTime, Source
 from zsched.core.relay_protocol import StreamAck, StreamAcks
 from zsched.guard import guarded
 
@@ -43,6 +43,9 @@ class Acknowledger:
         """When this process began to listen."""
         self._sources: dict[SourceName, Source] = {}
         self._dirty: set[SourceName] = set()
+        self._time = RunningTime()
+        self._gaps: dict[SourceName, Source] = {}
+        """Where something is missing and waited for: the time is looked at meanwhile."""
         self._wake = threading.Condition()
         self._sending = threading.Lock()
         """Frames leave in the order in which they were made: one that says less than the one before is a stranger's."""
@@ -63,8 +66,9 @@ class Acknowledger:
         with self._wake:
             source = self._sources.get(name) or self._add(name, 0 if in_turn else serial)
             number = source.number(serial)
-            if source.admit(number, monotonic_s(), in_turn=in_turn):
+            if source.admit(number, self._time.at(monotonic_s()), in_turn=in_turn):
                 return number
+            self._note_gap(name, source)
             self._mark(name)
             return None
 
@@ -105,7 +109,9 @@ class Acknowledger:
             source = self._sources.get(name) or self._add(name, until)
             source.until = until
             self._mark(name)
-            return source.waits_s(monotonic_s())
+            waits_s = source.waits_s(self._time.at(monotonic_s()))
+            self._note_gap(name, source)
+            return waits_s
 
     def skip(self, name: SourceName, number: int) -> int:
         """Nothing below ``number`` will come any more; answers how many are lost by that. It is always answered."""
@@ -185,6 +191,16 @@ class Acknowledger:
 
     # --- the thread --------------------------------------------------------------------------------------------------
 
+    def _note_gap(self, name: SourceName, source: Source) -> None:
+        if source.gap_since is not None and name not in self._gaps:
+            self._gaps[name] = source
+            self._wake.notify()
+
+    def _look_at_gaps(self) -> None:
+        if self._gaps:
+            now = self._time.at(monotonic_s())
+            self._gaps = {name: source for name, source in self._gaps.items() if source.is_waiting(now)}
+
     def _note_done(self, name: SourceName, size: int) -> None:
         self._samples += 1
         self._bytes += size
@@ -225,7 +241,8 @@ class Acknowledger:
         while True:
             with self._wake:
                 while not self._dirty and not self._is_closed:
-                    self._wake.wait()
+                    self._wake.wait(ACK_S if self._gaps else None)
+                    self._look_at_gaps()
                 rest = due - monotonic_s()
                 if rest > 0 and not self._is_closed and not self._is_urgent():
                     self._wake.wait(rest)

@@ -45,9 +45,12 @@ class Greetings:
             lane.part(monotonic_s())
             self._unmet[lane.eid] = lane
 
-    def met(self, lane: Lane) -> None:
-        """A lane's receiver has answered (under the lock)."""
-        self._unmet.pop(lane.eid, None)
+    def heard(self, lane: Lane) -> None:
+        """A lane's receiver has said something (under the lock): whether it is met by that, or must be greeted."""
+        if lane.is_met:
+            self._unmet.pop(lane.eid, None)
+        else:
+            self.add(lane)
 
     def part(self, *, is_parted: bool) -> None:
         """The worker's token went (nothing goes out until another one comes), or a new one came."""

@@ -27,7 +27,7 @@ import zenoh
 from zenoh import Priority, Sample, Session, Timestamp
 
 from zsched.clock import monotonic_s
-from zsched.core.hop.sender import KEPT_BYTES, KEPT_SAMPLES, Sent, near
+from zsched.core.hop.sender import KEPT_BYTES, KEPT_SAMPLES, Sent
 from zsched.core.relay_protocol import EndMarker, StreamAck
 from zsched.core.values.plan import OnCrash, StreamClass, StreamSettings
 from zsched.relay.acks import WorkerAcks
@@ -261,7 +261,7 @@ class Outlet:
             return  # what a put waits for now, one more would wait for behind it
         now = monotonic_s()
         with self._lock:
-            late = [lane for lane in self._lanes.values() if lane.is_late(now) and self._may_resend(lane)]
+            late = [lane for lane in self._lanes.values() if lane.is_late(now) and lane.may_resend]
             for lane in late:
                 lane.ask_again(lane.arrived, now)
         if late or (greetings is not None and greetings.is_waiting):
@@ -300,9 +300,6 @@ class Outlet:
         total.waiting += self._handed - self._left
         return total
 
-    def _may_resend(self, lane: Lane) -> bool:
-        return self._greetings is None or lane.is_met
-
     # --- lanes -------------------------------------------------------------------------------------------------------
 
     def _lane(self, sample: Sample) -> Lane | None:
@@ -325,7 +322,14 @@ class Outlet:
     def _declare(self, key: str, priority: Priority, *, is_express: bool) -> Lane:
         publisher = declare_publisher(self._session, key, self._settings, priority, is_express=is_express)
         eid = publisher.id.eid
-        lane = Lane(key=key, publisher=publisher, source_id=publisher.id, eid=eid, keeps_work=self._replays)
+        lane = Lane(
+            key=key,
+            publisher=publisher,
+            source_id=publisher.id,
+            eid=eid,
+            is_whole=self._greetings is not None,
+            keeps_work=self._replays,
+        )
         with self._lock:
             self._lanes[key, f"{priority}{is_express}"] = lane
             if self._greetings is not None:
@@ -409,9 +413,7 @@ class Outlet:
                 self._leave_unconfirmed(lane)
                 return
             if lane.is_foreign:
-                self.tally.new_life(lane, lane.count)
-                lane.count += 1
-                lane.begin_life("", lane.count, is_foreign=True)
+                self.tally.take(lane.pass_on())
                 self.tally.uncounted += 1
                 return
             lane.count += 1
@@ -449,7 +451,7 @@ class Outlet:
     def _resend(self) -> None:
         for lane in tuple(self._lanes.values()):
             with self._lock:
-                if not self._may_resend(lane):
+                if not lane.may_resend:
                     continue
                 start, lane.resend_from = lane.resend_from, None
                 is_misheard, lane.is_misheard, lowest = lane.is_misheard, False, lane.lowest
@@ -467,7 +469,7 @@ class Outlet:
             with self._stalled:
                 lane.put_again(self._session, sent)
         with self._lock:
-            lane.moved_at = monotonic_s()
+            lane.resent(monotonic_s())
             self.tally.resent += len(wanted)
 
     # --- acknowledgements (their thread) -----------------------------------------------------------------------------
@@ -478,33 +480,10 @@ class Outlet:
         if is_new and (self._acks is None or not self._acks.has_token(incarnation)):
             return  # a stranger's; or a life that has just begun, which is greeted when its token comes
         with self._lock:
-            before, ack = lane.ack, near(ack, lane.count)
-            if not lane.acknowledge(ack, incarnation, now):
-                self._begin_life(lane, ack, incarnation, now)
-            elif before is None or ack.arrived > before.arrived:
-                lane.moved_at = now
-            lane.is_misheard |= lane.mishears(ack, is_whole=self._is_reliable)
-            if self._greetings is not None and not lane.is_met:
-                self._answered(self._greetings, lane, now)
-            is_gap = ack.has_gap and now - lane.moved_at > lane.pause_s / 3
-            if ack.has_gap and (is_gap or before is None or not before.has_gap) and self._may_resend(lane):
-                lane.ask_again(ack.arrived, now)
+            ended = lane.hear(ack, incarnation, now)
+            if ended is not None:
+                self.tally.take(ended)
+            if self._greetings is not None:
+                self._greetings.heard(lane)
         if self._queue is not None:
             self._queue.kick()
-
-    def _answered(self, greetings: Greetings, lane: Lane, now: float) -> None:
-        if lane.meet(now):
-            greetings.met(lane)
-        else:
-            greetings.add(lane)
-
-    def _begin_life(self, lane: Lane, ack: StreamAck, incarnation: str, now: float) -> None:
-        """Another worker answers: what the former one left open may be lost; who has not been greeted had nothing."""
-        start = lane.count if self._greetings is not None else min(max(ack.first, lane.processed), lane.count)
-        if self._replays and lane.kept:
-            start = max(lane.kept[0].number, lane.processed)
-        self.tally.new_life(lane, start)
-        lane.begin_life(incarnation, start)
-        lane.acknowledge(ack, incarnation, now)
-        if self._greetings is not None:
-            lane.part(now)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 
-from zsched.core.hop.sender import Sender
+from zsched.core.hop.sender import Sender, Sums
 
 
 @dataclass(slots=True)
@@ -44,17 +44,13 @@ class Tally:
         total.add(self)
         for lane in lanes:
             total.in_flight += lane.in_flight
-            total._take(lane)
+            total.take(lane.sums())
         return total
 
-    def new_life(self, lane: Sender, start: int) -> None:
-        """The receiver died: what its last word left open below ``start`` may be lost."""
-        self._take(lane)
-        self.at_most_lost += max(0, start - lane.processed)
-
-    def _take(self, lane: Sender) -> None:
-        self.acknowledged += lane.acknowledged
-        self.lost += lane.lost
-        if lane.ack is not None:
-            self.doubled += lane.ack.doubled
-            self.reordered += lane.ack.reordered
+    def take(self, sums: Sums) -> None:
+        """Add what a life of a receiver has said."""
+        self.acknowledged += sums.acknowledged
+        self.lost += sums.lost
+        self.doubled += sums.doubled
+        self.reordered += sums.reordered
+        self.at_most_lost += sums.at_most_lost

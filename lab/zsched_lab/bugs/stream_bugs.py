@@ -15,6 +15,8 @@ GREETINGS, SENDER, OUTLET = "zsched.relay.greetings", "zsched.core.hop.sender", 
 _GREETINGS = ("tests/parts/relay/test_greetings.py",)
 _RECEIVE = ("tests/parts/relay/test_receive.py",)
 _ACKS = ("tests/unit/hop/test_acknowledger.py",)
+_RECEIVER = ("tests/unit/core/hop/test_receiver.py",)
+_HOP = ("tests/sim/test_hop.py",)
 _SENDER = ("tests/unit/core/hop/test_sender.py",)
 _WORKER = "tests/parts/worker/test_worker.py"
 _FROZEN = "tests/integration/test_relay_frozen_moves.py"
@@ -64,11 +66,32 @@ STREAM_BUGS = (
         _SENDER,
     ),
     _bug(
+        "what a stopped process slept counts as waiting",
+        RECEIVER,
+        "self._stood_s += max(0.0, now - self._asked_at - STEP_S)",
+        "pass",
+        _RECEIVER,
+    ),
+    _bug(
+        "newer samples pass for an answer to a gap",
+        SENDER,
+        "is_still = now - self.asked_at > self.pause_s / 3",
+        "is_still = now - self.moved_at > self.pause_s / 3",
+        _SENDER,
+    ),
+    _bug(
+        "what a worker that died left open is not told",
+        SENDER,
+        "ended = self.sums()._replace(at_most_lost=max(0, start - self.processed))",
+        "ended = self.sums()",
+        _HOP,
+    ),
+    _bug(
         "a new life's first number is not asked for",
-        OUTLET,
-        "start = lane.count if self._greetings is not None else min(",
-        "start = lane.processed if self._greetings is not None else min(",
-        _GREETINGS,
+        SENDER,
+        "start = self.count if self.is_whole else min(",
+        "start = self.processed if self.is_whole else min(",
+        (*_HOP, *_GREETINGS),
     ),
     _bug(
         "a replay skips what is on its way",

@@ -32,6 +32,28 @@ MAX_REPLAYED: Final = 1 << 13
 """No start marker speaks of more replays: a relay keeps fewer."""
 
 
+STEP_S: Final = 0.25
+"""Who did not look for longer did not run."""
+
+
+class RunningTime:
+    """The time in which a process runs: while it is stopped nothing can come, so nothing is given up for that.
+
+    It is asked at least every `STEP_S` while something is waited for.
+    """
+
+    def __init__(self) -> None:
+        self._asked_at: float | None = None
+        self._stood_s = 0.0
+
+    def at(self, now: float) -> float:
+        """The time that has run by ``now`` (monotonic seconds, never less than before)."""
+        if self._asked_at is not None:
+            self._stood_s += max(0.0, now - self._asked_at - STEP_S)
+        self._asked_at = now
+        return now - self._stood_s
+
+
 @dataclass(slots=True)
 class Jump:
     """The newest jump over numbers that have not come: where it began and ended, what has come of them since.
@@ -116,7 +138,10 @@ class Source:
     # --- samples -----------------------------------------------------------------------------------------------------
 
     def admit(self, number: int, now: float, *, in_turn: bool) -> bool:
-        """Whether a sample that came is taken; else drop it. ``in_turn``: nothing may be missing before it."""
+        """Whether a sample that came is taken; else drop it. ``in_turn``: nothing may be missing before it.
+
+        ``now`` is `RunningTime`, here and in `waits_s`.
+        """
         if number == self.arrived:
             self.arrived += 1
             self.gap_since = None
@@ -137,6 +162,10 @@ class Source:
 
     def _is_given_up(self, now: float) -> bool:
         return self.waits_s(now) > GIVE_UP_S
+
+    def is_waiting(self, now: float) -> bool:
+        """Whether something is missing that is not given up yet."""
+        return self.gap_since is not None and now - self.gap_since <= GIVE_UP_S
 
     def waits_s(self, now: float) -> float:
         """For how long something newer waits, from now on at the latest (seconds)."""

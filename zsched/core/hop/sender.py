@@ -42,10 +42,23 @@ class Sent(NamedTuple):
     """How long the put waited for the link."""
 
 
+class Sums(NamedTuple):
+    """What a life of the receiver has said, in samples."""
+
+    acknowledged: int
+    lost: int
+    doubled: int
+    reordered: int
+    at_most_lost: int = 0
+    """It left so many open when another life followed."""
+
+
 @dataclass(slots=True, eq=False, kw_only=True)
 class Sender:
     """One publisher towards one receiver."""
 
+    is_whole: bool = False
+    """Every sample is wanted (class ``reliable``), so the receiver is greeted first."""
     count: int = 0
     """Samples put so far, and the number of the next one."""
     base: int = 0
@@ -75,6 +88,8 @@ class Sender:
     """The receiver believes a start marker that was not ours: ours goes out again."""
     moved_at: float = 0.0
     """When something was last sent or newly acknowledged (monotonic seconds)."""
+    asked_at: float = 0.0
+    """When it was last put again, or the receiver came further: newer samples that go out fill no gap."""
     pause_s: float = RESEND_S
     """How long nothing may move before it is put again: twice what acknowledgements take here, or as long as a put
     takes; doubled each time."""
@@ -97,8 +112,44 @@ class Sender:
 
     def ask_again(self, start: int, now: float) -> None:
         """Have everything from ``start`` on put again; the next time with twice the patience, while nothing moves."""
-        self.resend_from, self.moved_at = start, now
+        self.resend_from = start
+        self.resent(now)
         self.pause_s = min(2 * self.pause_s, MAX_RESEND_S)
+
+    def resent(self, now: float) -> None:
+        """What was asked for has been put again."""
+        self.moved_at = self.asked_at = now
+
+    def hear(self, ack: StreamAck, incarnation: str, now: float) -> Sums | None:
+        """Take an acknowledgement; answers the sums of the receiver's life before, when another one has said it."""
+        before, ack, ended = self.ack, near(ack, self.count), None
+        if not self.acknowledge(ack, incarnation, now):
+            ended = self._follow(ack, incarnation, now)
+        elif before is None or ack.arrived > before.arrived:
+            self.moved_at = self.asked_at = now
+        self.is_misheard |= self._mishears(ack)
+        if self.is_whole:
+            self.meet(now)
+        is_still = now - self.asked_at > self.pause_s / 3
+        if ack.has_gap and (is_still or before is None or not before.has_gap) and self.may_resend:
+            self.ask_again(ack.arrived, now)
+        return ended
+
+    @property
+    def may_resend(self) -> bool:
+        """Whether the receiver knows where this stream begins for it."""
+        return not self.is_whole or self.is_met
+
+    def _follow(self, ack: StreamAck, incarnation: str, now: float) -> Sums:
+        """Another life answers: what the former one left open may be lost; who has not been greeted had nothing."""
+        start = self.count if self.is_whole else min(max(ack.first, self.processed), self.count)
+        if self.keeps_work and self.kept:
+            start = max(self.kept[0].number, self.processed)
+        ended = self.begin_life(incarnation, start)
+        self.acknowledge(ack, incarnation, now)
+        if self.is_whole:
+            self.part(now)
+        return ended
 
     def acknowledge(self, ack: StreamAck, incarnation: str, now: float) -> bool:
         """Take an acknowledgement (`near` our count); ``False``, and nothing is taken: another life of it sent it."""
@@ -129,10 +180,10 @@ class Sender:
             self.kept.appendleft(sent)
             self.kept_bytes += sent.size
 
-    def mishears(self, ack: StreamAck, *, is_whole: bool) -> bool:
-        """Whether the receiver believes of this stream what is not so (`near` our count); ``is_whole``: its class."""
+    def _mishears(self, ack: StreamAck) -> bool:
+        """Whether the receiver believes of this stream what is not so."""
         replays = max(0, self.replay_end - ack.arrived)
-        return ack.is_whole is not None and (ack.is_whole != is_whole or ack.replays != replays)
+        return ack.is_whole is not None and (ack.is_whole != self.is_whole or ack.replays != replays)
 
     def meet(self, now: float) -> bool:
         """The receiver has said something: whether it answers a start marker, and is met by that."""
@@ -150,11 +201,12 @@ class Sender:
         self.is_met = self.is_foreign = False
         self.unmet_since, self.greeted_at, self.greet_pause_s = now, None, GREET_S
 
-    def begin_life(self, incarnation: str, start: int, *, is_foreign: bool = False) -> None:
-        """Another life of the receiver answers from ``start`` on; what the former one left open is the caller's.
+    def begin_life(self, incarnation: str, start: int, *, is_foreign: bool = False) -> Sums:
+        """Another life of the receiver answers from ``start`` on; answers the sums of the former one.
 
         ``is_foreign``: so far nobody does, and whoever does later may be the former one.
         """
+        ended = self.sums()._replace(at_most_lost=max(0, start - self.processed))
         self.incarnation, self.base = incarnation, start
         self.was_foreign, self.forgiven = is_foreign, None
         self.replay_end = self.count if self.keeps_work else 0
@@ -162,6 +214,19 @@ class Sender:
         self.spare.clear()
         while self.kept and self.kept[0].number < start:
             self.kept_bytes -= self.kept.popleft().size
+        return ended
+
+    def pass_on(self) -> Sums:
+        """A sample went to a subscriber that acknowledges nothing; answers the sums of whoever did before."""
+        ended = self.sums()._replace(at_most_lost=self.in_flight)
+        self.count += 1
+        self.begin_life("", self.count, is_foreign=True)
+        return ended
+
+    def sums(self) -> Sums:
+        """What this life of the receiver has said."""
+        doubled, reordered = (0, 0) if self.ack is None else (self.ack.doubled, self.ack.reordered)
+        return Sums(self.acknowledged, self.lost, doubled, reordered)
 
     @property
     def lowest(self) -> int:

@@ -6,7 +6,7 @@ from random import Random
 
 import pytest
 
-from zsched.core.hop.receiver import GIVE_UP_S, MAX_AHEAD, Source
+from zsched.core.hop.receiver import GIVE_UP_S, MAX_AHEAD, STEP_S, RunningTime, Source
 from zsched.core.hop.serial import SPAN, serial_of
 
 
@@ -113,3 +113,20 @@ def test_every_number_is_admitted_once_or_lost_whatever_the_way_does(seed: int) 
     assert len(admitted) + source.lost + (source.first - start) == source.arrived - start
     if in_turn:
         assert admitted == sorted(admitted)
+
+
+def test_what_a_stopped_process_slept_is_not_waited_for() -> None:
+    """Found by the simulated hop: frozen right behind a gap, it gave up what nobody had been asked for."""
+    time, source = RunningTime(), Source.at(0)
+    assert heard(source, 0, 2, now=time.at(10.0)) == [True, False]
+    assert heard(source, 3, now=time.at(14.0)) == [False], "it was stopped"
+    for step in range(18):  # it runs, and looks
+        assert heard(source, 3, now=time.at(14.0 + step / 25)) == [False]
+    assert heard(source, 3, now=time.at(14.8)) == [True]
+
+
+def test_time_runs_on_while_somebody_looks() -> None:
+    time = RunningTime()
+    assert [time.at(now) for now in (5.0, 5.2, 5.4)] == pytest.approx([5.0, 5.2, 5.4])
+    assert time.at(9.4) == pytest.approx(5.4 + STEP_S)
+    assert time.at(9.5) == pytest.approx(5.5 + STEP_S)

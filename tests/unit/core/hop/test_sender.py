@@ -99,8 +99,7 @@ def test_each_life_of_a_worker_answers_for_its_own_numbers() -> None:
         sent(books, at=10.0)
     books.acknowledge(ack(0, 6, lost=1), "1", 10.1)
     assert not books.acknowledge(ack(0, 0), "2", 10.2)
-    tally.new_life(books, books.count)
-    books.begin_life("2", books.count)
+    tally.take(books.begin_life("2", books.count))
     assert (tally.acknowledged, tally.lost, tally.at_most_lost) == (5, 1, 4)
     assert (books.acknowledged, books.lost, books.in_flight) == (0, 0, 0)
     sent(books, at=10.3)
@@ -184,3 +183,23 @@ def test_an_acknowledgement_of_what_was_never_sent_is_nobody_s(forged: StreamAck
     assert (books.arrived, books.in_flight, len(books.kept)) == (2, 3, 3)
     acknowledged(books, 4, 10.3)
     assert (books.arrived, books.in_flight, len(books.kept)) == (4, 1, 1)
+
+
+def test_a_gap_is_asked_for_again_while_newer_samples_flow() -> None:
+    """Found by the simulated hop: what was put again was lost as well, and new samples passed for progress."""
+    books = lane()
+    for number in range(4):
+        sent(books, at=10.0 + number / 100)
+    gap = StreamAck(eid=1, first=0, arrived=2, processed=2, has_gap=True)
+    books.hear(gap, "1", 10.05)
+    assert books.resend_from == 2
+    books.resend_from = None
+    books.resent(10.06)
+    for step in range(1, 40):  # a new sample every 10 ms, and the receiver says the same again
+        now = 10.06 + step / 100
+        sent(books, at=now)
+        books.hear(gap, "1", now)
+        if books.resend_from is not None:
+            break
+    assert books.resend_from == 2
+    assert 10.06 + 2 * RESEND_S / 3 < now < 10.06 + 2 * RESEND_S
