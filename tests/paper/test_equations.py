@@ -74,15 +74,6 @@ def test_eq3_link_utility_is_the_share_of_the_achievable_signal(signal: float, k
     assert network_utility(signal, LIMITS.nu_dbm, LIMITS.rho_dbm) == pytest.approx(kappa)
 
 
-@pytest.mark.parametrize(
-    ("signal", "kappa"),
-    [(-80.0, 0.0), (-72.5, 0.4), (-65.0, 0.8), (-52.5, 0.9), (-40.0, 1.0), (-30.0, 1.0), (-95.0, 0.0)],
-)
-def test_eq3_option_with_a_knee_the_link_is_flat_above_it_and_steep_below(signal: float, kappa: float) -> None:
-    """Beyond the paper: measured delays are flat down to some signal and rise steeply below it."""
-    assert network_utility(signal, LIMITS.nu_dbm, LIMITS.rho_dbm, -65.0) == pytest.approx(kappa)
-
-
 # --- Eq. 4: U = omega_eta eta + omega_sigma sigma + omega_kappa kappa ----------------------------------------------
 
 

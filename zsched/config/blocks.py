@@ -267,6 +267,14 @@ class Field:
     default: str = ""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Removed:
+    """A key or a word that fleet files had once: why it is gone, and what to write instead."""
+
+    why: str
+    instead: str
+
+
 @dataclass(slots=True)
 class Section:
     """A record that was read: values by key, with places. Keys that were absent or faulty are not there."""
@@ -305,6 +313,8 @@ class Record:
     what: str
     items: Lookup[str, Field]
     kind: type | None = None
+    removed: Lookup[str, Removed] = field(default_factory=dict)
+    """Keys that it had once."""
 
     def read(self, node: Node, out: Collector) -> Section | None:
         """Every key that could be read; unknown, double and missing ones are faults."""
@@ -316,7 +326,7 @@ class Record:
         for key, value in _distinct(node, out):
             item = self.items.get(key.text)
             if item is None:
-                out.error(key.place, f"{self.what} has no key {key.text!r}", nearest(key.text, self.items))
+                self._refuse_key(key, out)
                 continue
             section.places[key.text] = value.place
             read = item.block.read(value, out)
@@ -327,6 +337,13 @@ class Record:
                 out.error(node.place, f"{self.what} lacks the key {name!r}", f"{name}: {item.block.says()}")
         section.is_whole = out.count == before
         return section
+
+    def _refuse_key(self, key: Scalar, out: Collector) -> None:
+        gone = self.removed.get(key.text)
+        if gone is None:
+            out.error(key.place, f"{self.what} has no key {key.text!r}", nearest(key.text, self.items))
+        else:
+            out.error(key.place, f"{self.what} has no key {key.text!r} any more: {gone.why}", gone.instead)
 
     def says(self) -> str:
         """Its keys."""

@@ -23,6 +23,7 @@ from zsched.config.blocks import (
     MapOf,
     Number,
     Record,
+    Removed,
     Text,
     Whole,
 )
@@ -275,11 +276,6 @@ LINK_LIMITS: Final = Record(
     {
         "nu_dbm": Field(_DBM, "Least usable signal (Eq. 3): below it the candidate's utility is 0."),
         "rho_dbm": Field(_DBM, "Best achievable signal (Eq. 3); above `nu_dbm`."),
-        "knee_dbm": Field(
-            _DBM,
-            "Between the two: a signal that is worth 0.8; links are flat above it and steep below.",
-            default="none: linear (Eq. 3)",
-        ),
         "pair": Field(
             Choice.of(PairReading),
             "Worth of a link through an access point: by the candidate's way (as printed), the weaker, or the mean.",
@@ -291,6 +287,12 @@ LINK_LIMITS: Final = Record(
         ),
     },
     LinkLimits,
+    removed={
+        "knee_dbm": Removed(
+            why="a knee gained nothing, and which signal it is depends on the radio",
+            instead="delete it: between nu_dbm and rho_dbm a link's worth is linear",
+        ),
+    },
 )
 
 WORKER: Final = Record(

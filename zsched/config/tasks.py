@@ -206,9 +206,6 @@ def _limits(given: Section, out: Collector) -> LinkLimits:
     if section.is_whole and limits.nu_dbm >= limits.rho_dbm:
         place = section.where("nu_dbm" if "nu_dbm" in section.places else "rho_dbm")
         out.error(place, f"nu_dbm ({limits.nu_dbm:g}) must be below rho_dbm ({limits.rho_dbm:g})")
-    elif limits.knee_dbm is not None and not limits.nu_dbm < limits.knee_dbm < limits.rho_dbm:
-        bounds = f"between nu_dbm ({limits.nu_dbm:g}) and rho_dbm ({limits.rho_dbm:g})"
-        out.error(section.where("knee_dbm"), f"knee_dbm ({limits.knee_dbm:g}) must lie {bounds}")
     return limits
 
 

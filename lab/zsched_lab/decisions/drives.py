@@ -81,7 +81,6 @@ def cast(world: World) -> tuple[Entry, ...]:
             )
             for bonus in (0.05, 0.1)
         ),
-        Entry(name="with a knee", limits=entries.foreseeing(world, knee_dbm=-65.0), make=entries.core(world)),
         *entries.foresights(world),
         *entries.smoothings(world),
         *(

@@ -168,12 +168,8 @@ def smoothings(world: World) -> tuple[Entry, ...]:
 
 
 def fading(world: World) -> tuple[Entry, ...]:
-    """Prediction of a fading link, with patience (3 s is the default) and with the timer; and a knee on the default."""
-    return (
-        *ours(world),
-        *foresights(world),
-        Entry(name="knee -65 dBm", limits=foreseeing(world, knee_dbm=-65.0), make=core(world)),
-    )
+    """Prediction of a fading link, with patience (3 s is the default) and with the timer."""
+    return (*ours(world), *foresights(world))
 
 
 def foresights(world: World) -> tuple[Entry, ...]:

@@ -293,7 +293,7 @@ def test_every_setting_of_a_task_arrives() -> None:
     scheduling:
       {bonus: 0.2, time_to_trigger_s: 3, cool_down_s: 4, aggregate: median, reach: all, memory_floor_ratio: 0.1,
        patience: 0.3, pays_off_in_s: 60}
-    link: {nu_dbm: -75, rho_dbm: -45, knee_dbm: -60, pair: weaker, foresee_s: 2}
+    link: {nu_dbm: -75, rho_dbm: -45, pair: weaker, foresee_s: 2}
     on_isolation: local
     drain_s: 5
     worker:
@@ -314,7 +314,7 @@ def test_every_setting_of_a_task_arrives() -> None:
     assert (task.tuning.aggregate, task.reach, task.memory_floor_ratio) == (Aggregate.MEDIAN, Reach.ALL, 0.1)
     assert (task.patience, task.pays_off_in_s) == (0.3, 60)
     assert (task.limits.pair, task.limits.foresee_s) == (PairReading.WEAKER, 2)
-    assert (task.limits.nu_dbm, task.limits.rho_dbm, task.limits.knee_dbm) == (-75, -45, -60)
+    assert (task.limits.nu_dbm, task.limits.rho_dbm) == (-75, -45)
     assert (task.on_isolation, task.drain_s) == (OnIsolation.LOCAL, 5)
     worker = task.worker
     assert worker.command == ("run", "8080", "1.10"), "text stays as written"
@@ -597,7 +597,7 @@ ONE_FAULT = [
     ("[python, -m, zsched.tasks.map_merge]", "[]", "expected a list", "[]"),
     ("standby: warm", "env: {ZSCHED_NODE: x}", "is set by zsched itself", "ZSCHED_NODE"),
     ("command: [python, -m, zsched.tasks.map_merge], standby: warm", "standby: cold", "no `command`", "cold"),
-    ("    outputs:  ", "    link: {knee_dbm: -40}\n    outputs:  ", "must lie between nu_dbm (-80)", "-40}"),
+    ("    outputs:  ", "    link: {nu_dbm: -40}\n    outputs:  ", "must be below rho_dbm (-40)", "-40}"),
     ("keep_last: 1", "keep_last: 1001", "not in the allowed range 0..1000", "1001"),
     ("keep_last: 1", "keep_last: 1.5", "expected a whole number", "1.5"),
     ("class: latest, keep_last: 1", "keep_last: 1", "only streams of class latest", "1}]"),
@@ -633,6 +633,21 @@ def test_one_fault_is_reported_once_at_its_place(old: str, new: str, said: str |
         assert [said in fault.message for fault in check(text).faults] == [True]
     else:
         only_fault(text, said, at)
+
+
+@pytest.mark.parametrize(
+    ("given", "said", "at", "instead"),
+    [
+        ("link: {knee_dbm: -60}", "no key 'knee_dbm' any more: a knee gained nothing", "knee_dbm", "delete it"),
+    ],
+)
+def test_what_fleet_files_had_once_says_that_it_is_gone_and_what_to_write(
+    given: str, said: str, at: str, instead: str
+) -> None:
+    text = swapped("    outputs:  ", f"    {given}\n    outputs:  ")
+    only_fault(text, said, at)
+    (fault,) = check(text).faults
+    assert instead in fault.hint
 
 
 def test_relay_loop_names_every_rule_with_its_place() -> None:

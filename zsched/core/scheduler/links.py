@@ -69,7 +69,7 @@ def _joint(own: Way, its: Way, limits: LinkLimits) -> float:
 
 
 def _worth(signal_dbm: float, limits: LinkLimits) -> float:
-    return network_utility(signal_dbm, limits.nu_dbm, limits.rho_dbm, limits.knee_dbm)
+    return network_utility(signal_dbm, limits.nu_dbm, limits.rho_dbm)
 
 
 def _way(profile: Profile, peer: NodeId | None, limits: LinkLimits) -> Way | None:

@@ -143,32 +143,18 @@ def memory_service(free: float, demand: float, capacity: float, floor_ratio: flo
     return service_utility(free, demand, capacity) * (1.0 - NEARLY_FULL * depth)
 
 
-KNEE_UTILITY = 0.8
-"""What a link is worth at its knee."""
-
-
-def network_utility(signal_dbm: float, nu_dbm: float, rho_dbm: float, knee_dbm: float | None = None) -> float:
+def network_utility(signal_dbm: float, nu_dbm: float, rho_dbm: float) -> float:
     """Eq. 3, ``kappa = (lambda - nu) / (rho - nu)``: the link's share of what is achievable.
-
-    With a knee it is piecewise linear through (nu, 0), (knee, `KNEE_UTILITY`) and (rho, 1): delays are flat above some
-    signal and rise steeply below it.
 
     Args:
         signal_dbm: the link's smoothed signal.
         nu_dbm: least usable signal.
         rho_dbm: best achievable signal, > nu.
-        knee_dbm: between the two, or ``None``: linear, as printed.
 
     >>> network_utility(signal_dbm=-60.0, nu_dbm=-80.0, rho_dbm=-40.0)
     0.5
-    >>> network_utility(signal_dbm=-70.0, nu_dbm=-80.0, rho_dbm=-40.0, knee_dbm=-60.0)
-    0.4
     """
-    if knee_dbm is None:
-        return clamp((signal_dbm - nu_dbm) / (rho_dbm - nu_dbm))
-    if signal_dbm < knee_dbm:
-        return KNEE_UTILITY * clamp((signal_dbm - nu_dbm) / (knee_dbm - nu_dbm))
-    return KNEE_UTILITY + (1.0 - KNEE_UTILITY) * clamp((signal_dbm - knee_dbm) / (rho_dbm - knee_dbm))
+    return clamp((signal_dbm - nu_dbm) / (rho_dbm - nu_dbm))
 
 
 def total_utility(

@@ -165,12 +165,10 @@ class PairReading(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkLimits:
-    """Eq. 3: nu (least usable) and rho (best achievable) in dBm, the knee between them, and how links are read."""
+    """Eq. 3: nu (least usable) and rho (best achievable) in dBm, and how links are read."""
 
     nu_dbm: float = -80.0
     rho_dbm: float = -40.0
-    knee_dbm: float | None = None
-    """Above it a link is nearly as good as it gets, below it gets bad fast; ``None``: Eq. 3 as printed, linear."""
     pair: PairReading = PairReading.CANDIDATE
     foresee_s: float = 0.0
     """Signals count as they will be so many seconds ahead along their trend; 0: as they are."""
