@@ -125,22 +125,36 @@ class Flag:
         return "`true` or `false`" if self.only is None else f"`{str(self.only).lower()}`"
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Removed:
+    """A key or a word that fleet files had once: why it is gone, and what to write instead."""
+
+    why: str
+    instead: str
+
+
 @dataclass(frozen=True, slots=True)
 class Choice(Generic[T]):
     """One of some words, each standing for a value."""
 
     values: Lookup[str, T]
+    removed: Lookup[str, Removed] = field(default_factory=dict)
+    """Words that it had once."""
 
     @classmethod
-    def of(cls, kind: type[T]) -> Choice[T]:
+    def of(cls, kind: type[T], removed: Lookup[str, Removed] | None = None) -> Choice[T]:
         """The words of an enumeration of strings."""
         assert issubclass(kind, StrEnum)
-        return cls({str(member): member for member in kind})
+        return cls({str(member): member for member in kind}, removed or {})
 
     def read(self, node: Node, out: Collector) -> T | None:
         """The value that the word stands for."""
         if not isinstance(node, Scalar) or node.is_null:
             _refuse(node, out, self.says())
+            return None
+        gone = self.removed.get(node.text)
+        if gone is not None:
+            out.error(node.place, f"there is no {node.text!r} here any more: {gone.why}", gone.instead)
             return None
         if node.text not in self.values:
             out.error(node.place, f"{node.text!r} is not {self.says()}", nearest(node.text, self.values))
@@ -265,14 +279,6 @@ class Field:
     doc: str
     required: bool = False
     default: str = ""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Removed:
-    """A key or a word that fleet files had once: why it is gone, and what to write instead."""
-
-    why: str
-    instead: str
 
 
 @dataclass(slots=True)

@@ -277,8 +277,16 @@ LINK_LIMITS: Final = Record(
         "nu_dbm": Field(_DBM, "Least usable signal (Eq. 3): below it the candidate's utility is 0."),
         "rho_dbm": Field(_DBM, "Best achievable signal (Eq. 3); above `nu_dbm`."),
         "pair": Field(
-            Choice.of(PairReading),
-            "Worth of a link through an access point: by the candidate's way (as printed), the weaker, or the mean.",
+            Choice.of(
+                PairReading,
+                {
+                    "mean": Removed(
+                        why="its leads were a quarter of candidate's, less than the bonus that noise asks for",
+                        instead="pair: candidate, which ranks three robots and more as mean did; of two: pair: weaker",
+                    )
+                },
+            ),
+            "Worth of a link through an access point: by the candidate's way (as printed), or by the weaker one.",
         ),
         "foresee_s": Field(
             Number(0, 30, "s"),

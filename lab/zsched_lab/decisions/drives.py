@@ -83,16 +83,19 @@ def cast(world: World) -> tuple[Entry, ...]:
         ),
         *entries.foresights(world),
         *entries.smoothings(world),
-        *(
-            Entry(name=name, limits=entries.foreseeing(world, pair=pair), make=entries.core(world))
-            for name, pair in (("the weaker way", PairReading.WEAKER), ("the mean way", PairReading.MEAN))
+        Entry(
+            name="the weaker way",
+            limits=entries.foreseeing(world, pair=PairReading.WEAKER),
+            make=entries.core(world),
         ),
         Entry(name="dyna_net", look=UNSMOOTHED, make=lambda view: PickRule(view, cost=entries.PAPER_COST)),
         Entry(name="dyna_net_penalty", look=UNSMOOTHED, make=lambda view: PickRule(view, cost=-entries.PAPER_COST)),
         Entry(name="argmax", look=UNSMOOTHED, make=PickRule),
-        *(
-            Entry(name=f"argmax, {pair}", look=UNSMOOTHED, limits=LinkLimits(pair=pair), make=PickRule)
-            for pair in (PairReading.WEAKER, PairReading.MEAN)
+        Entry(
+            name="argmax, weaker",
+            look=UNSMOOTHED,
+            limits=LinkLimits(pair=PairReading.WEAKER),
+            make=PickRule,
         ),
         Entry(name="argmax, every 0.5 s", look=UNSMOOTHED, make=lambda view: PickRule(view, period_s=0.5)),
         Entry(name="every_25s", look=UNSMOOTHED, make=lambda view: PickRule(view, period_s=25.0)),

@@ -639,6 +639,7 @@ def test_one_fault_is_reported_once_at_its_place(old: str, new: str, said: str |
     ("given", "said", "at", "instead"),
     [
         ("link: {knee_dbm: -60}", "no key 'knee_dbm' any more: a knee gained nothing", "knee_dbm", "delete it"),
+        ("link: {pair: mean}", "no 'mean' here any more: its leads were", "mean}", "pair: candidate"),
     ],
 )
 def test_what_fleet_files_had_once_says_that_it_is_gone_and_what_to_write(

@@ -62,10 +62,8 @@ def pair_link(voter: NodeId, candidate: NodeId, gateway: Gateway, limits: LinkLi
 
 def _joint(own: Way, its: Way, limits: LinkLimits) -> float:
     """Two ways through one access point as one utility, by the task's reading of a pair."""
-    if limits.pair is PairReading.CANDIDATE:
-        return _worth(its.ahead_dbm, limits)
-    both = (_worth(own.ahead_dbm, limits), _worth(its.ahead_dbm, limits))
-    return min(both) if limits.pair is PairReading.WEAKER else sum(both) / 2.0
+    is_candidates = limits.pair is PairReading.CANDIDATE
+    return _worth(its.ahead_dbm if is_candidates else min(own.ahead_dbm, its.ahead_dbm), limits)
 
 
 def _worth(signal_dbm: float, limits: LinkLimits) -> float:

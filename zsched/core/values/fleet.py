@@ -159,8 +159,6 @@ class PairReading(StrEnum):
     """The candidate's own way, as the paper prints Eq. 3: the robot's is part of every path, and decides nothing."""
     WEAKER = "weaker"
     """The weaker of the two ways: the bottleneck."""
-    MEAN = "mean"
-    """Half of what the two ways are worth together: their delays add up."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

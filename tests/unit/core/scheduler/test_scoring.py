@@ -328,34 +328,30 @@ def pair_of(mine: tuple[Link, ...], theirs: tuple[Link, ...], limits: LinkLimits
 
 
 @pytest.mark.parametrize(
-    ("mine", "theirs", "weaker", "mean", "candidate"),
+    ("mine", "theirs", "weaker", "candidate"),
     [
-        (radio(-50.0), WIRED, 0.75, 0.875, 1.0),
-        (radio(-50.0), radio(-60.0), 0.5, 0.625, 0.5),
-        (radio(-60.0), radio(-50.0), 0.5, 0.625, 0.75),
-        (WIRED, WIRED, 1.0, 1.0, 1.0),
-        (WIRED, radio(-60.0), 0.5, 0.75, 0.5),
-        (radio(-50.0), (), None, None, None),
-        ((), WIRED, None, None, None),
-        (radio(None), WIRED, None, None, None),
-        ((*radio(-70.0), *radio(-50.0, "edge1")), radio(-79.0), 0.75, 0.75, 0.75),
-        (radio(-70.0), (*radio(-79.0), *radio(-50.0, "robot1")), 0.75, 0.75, 0.75),
-        ((*radio(-70.0), Link(source=LinkSource.WIRED, peer="edge1")), radio(-79.0), 1.0, 1.0, 1.0),
-        ((*radio(-50.0), *radio(None, "edge1")), WIRED, 0.75, 0.875, 1.0),
-        ((*radio(-50.0), *radio(-70.0, "edge2")), WIRED, 0.75, 0.875, 1.0),
+        (radio(-50.0), WIRED, 0.75, 1.0),
+        (radio(-50.0), radio(-60.0), 0.5, 0.5),
+        (radio(-60.0), radio(-50.0), 0.5, 0.75),
+        (WIRED, WIRED, 1.0, 1.0),
+        (WIRED, radio(-60.0), 0.5, 0.5),
+        (radio(-50.0), (), None, None),
+        ((), WIRED, None, None),
+        (radio(None), WIRED, None, None),
+        ((*radio(-70.0), *radio(-50.0, "edge1")), radio(-79.0), 0.75, 0.75),
+        (radio(-70.0), (*radio(-79.0), *radio(-50.0, "robot1")), 0.75, 0.75),
+        ((*radio(-70.0), Link(source=LinkSource.WIRED, peer="edge1")), radio(-79.0), 1.0, 1.0),
+        ((*radio(-50.0), *radio(None, "edge1")), WIRED, 0.75, 1.0),
+        ((*radio(-50.0), *radio(-70.0, "edge2")), WIRED, 0.75, 1.0),
     ],
 )
 def test_the_link_of_a_pair(
-    mine: tuple[Link, ...],
-    theirs: tuple[Link, ...],
-    weaker: float | None,
-    mean: float | None,
-    candidate: float | None,
+    mine: tuple[Link, ...], theirs: tuple[Link, ...], weaker: float | None, candidate: float | None
 ) -> None:
     """Directly measured as it is, from either end; else through the access point, by the task's reading of a pair."""
     found = {pair: pair_of(mine, theirs, LinkLimits(pair=pair)).network for pair in PairReading}
 
-    assert found == {PairReading.WEAKER: weaker, PairReading.MEAN: mean, PairReading.CANDIDATE: candidate}
+    assert found == {PairReading.WEAKER: weaker, PairReading.CANDIDATE: candidate}
 
 
 @pytest.mark.parametrize("pair", list(PairReading))
@@ -407,7 +403,6 @@ def test_of_three_robots_the_best_and_the_second_best_tie_by_the_weaker_way_only
 
     assert leads[PairReading.WEAKER] == pytest.approx(0.0)
     assert leads[PairReading.CANDIDATE] == pytest.approx(2 / 3 * 0.5)
-    assert leads[PairReading.MEAN] == pytest.approx(1 / 6 * 0.5)
 
 
 def test_a_robot_that_is_a_candidate_reaches_itself() -> None:
