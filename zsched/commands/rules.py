@@ -50,8 +50,6 @@ def told(spec: TaskSpec) -> list[str]:
         lines.append(f"an owner with less than {floor} of its memory free is left at once (memory_floor_ratio)")
     if tuning.deadline_ms is not None:
         lines.append(LATENCY.format(deadline=f"{tuning.deadline_ms:g}"))
-    if spec.pays_off_in_s is not None:
-        lines.append(f"a move must earn what moves have cost within {spec.pays_off_in_s:g} s (pays_off_in_s)")
     if weights.network > 0.0:
         lines.append(f"signals count as they will be in {spec.limits.foresee_s:g} s (link.foresee_s)")
     lines.append(f"a candidate counts that {_REACH[spec.reach.value]} (reach); the robots' {tuning.aggregate} decides")

@@ -262,13 +262,14 @@ SCHEDULING: Final = Record(
             default=f"learnt, {CHOICES[0]:g} to {CHOICES[-1]:g}; `{RADIO_PATIENCE:g}` with a weight for the network; "
             f"`{PAPER_PATIENCE:g}` with `score: paper`; none with `time_to_trigger_s` alone",
         ),
-        "pays_off_in_s": Field(
-            Number(1, 86400, "s"),
-            "A move must earn what the last moves have cost within so long: the bonus rises by measured cost / this.",
-            default="the bonus alone",
-        ),
     },
     Tuning,
+    removed={
+        "pays_off_in_s": Removed(
+            why="it gained only where a move costs ten seconds and more, and no more than a larger bonus does there",
+            instead="delete it; where moves are that dear: bonus: 0.2",
+        ),
+    },
 )
 
 LINK_LIMITS: Final = Record(

@@ -51,8 +51,6 @@ def core(
     time_to_trigger_s: float | None = None,
     cool_down_s: float | None = None,
     patience: float | None = None,
-    pays_off_in_s: float | None = None,
-    move_cost_s: float = 0.0,
 ) -> Callable[[Sight], Rule]:
     """The production's decision; what is ``None`` is what a fleet file with ``score: paper`` gets that leaves it out.
 
@@ -67,7 +65,7 @@ def core(
     given = {"bonus": bonus, "time_to_trigger_s": time_to_trigger_s, "cool_down_s": cool_down_s}
     settings: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     tuning = Tuning(weights=world.spec.tuning.weights, **settings)
-    return lambda view: CoreRule(view, tuning, patience=patience, pays_off_in_s=pays_off_in_s, move_cost_s=move_cost_s)
+    return lambda view: CoreRule(view, tuning, patience=patience)
 
 
 def foreseeing(world: World, lead_s: float = DEFAULT_FORESEE_S, **more: Any) -> LinkLimits | None:
@@ -188,24 +186,10 @@ def foresights(world: World) -> tuple[Entry, ...]:
 
 
 def costly(world: World, move_cost_s: float) -> tuple[Entry, ...]:
-    """What to do when a move costs so many seconds of work: fixed bonuses, patience, and the measured cost."""
+    """What to do when a move costs so many seconds of work: other bonuses, and a patience by the cost."""
     return (
         *ours(world),
         *(Entry(name=f"timer, bonus {bonus:g}", make=timed(world, bonus=bonus)) for bonus in (0.05, 0.15, 0.2, 0.3)),
-        *(
-            Entry(
-                name=f"timer, bonus {bonus:g} + cost over {horizon_s:g} s",
-                make=timed(world, bonus=bonus, pays_off_in_s=horizon_s, move_cost_s=move_cost_s),
-            )
-            for bonus, horizon_s in ((0.05, 60.0), (0.05, 120.0), (0.1, 60.0), (0.1, 120.0))
-        ),
-        *(
-            Entry(
-                name=f"patience + cost over {horizon_s:g} s",
-                make=core(world, pays_off_in_s=horizon_s, move_cost_s=move_cost_s),
-            )
-            for horizon_s in (60.0, 120.0)
-        ),
         Entry(name="patience of the cost", make=core(world, patience=max(PAPER_PATIENCE, 0.5 * move_cost_s))),
     )
 

@@ -56,9 +56,6 @@ class CoreRule:
     tuning: Tuning
     patience: float | None = None
     learns_patience: bool = False
-    pays_off_in_s: float | None = None
-    move_cost_s: float = 0.0
-    """What the robots have measured of their last moves."""
     moves: list[Move] = field(default_factory=list)
     _judges: list[Judge] = field(init=False)
     _allocation: Allocation = field(init=False)
@@ -68,13 +65,8 @@ class CoreRule:
     _spec: TaskSpec = field(init=False)
 
     def __post_init__(self) -> None:
-        self._spec = replace(
-            self.view.spec,
-            patience=self.patience,
-            learns_patience=self.learns_patience,
-            pays_off_in_s=self.pays_off_in_s,
-        )
-        self._judges = [Judge(spec=self._spec, move_cost_s=self.move_cost_s) for _ in self.view.fleet.voters]
+        self._spec = replace(self.view.spec, patience=self.patience, learns_patience=self.learns_patience)
+        self._judges = [Judge(spec=self._spec) for _ in self.view.fleet.voters]
         self._allocation = Allocation(task=self._spec.name, revision=0, epoch=0, owner=None, tuning=self.tuning)
 
     def round(self, seats: tuple[int, ...], at_s: float, now: float) -> None:

@@ -98,7 +98,7 @@ def swept() -> tuple[Case, ...]:
 
 
 def options() -> tuple[Case, ...]:
-    """What might be better than the paper's: prediction of a fading link, a measured cost, readings of a pair."""
+    """What might be better than the paper's: prediction of a fading link, readings of a pair, dear moves."""
     radio = _loads(3, loads.LONG, with_radio=True)
     return (
         Case(name="fading", build=radio, cast=lambda world, _seed: entries.fading(world), hours=1.0),

@@ -292,7 +292,7 @@ def test_every_setting_of_a_task_arrives() -> None:
         """\
     scheduling:
       {bonus: 0.2, time_to_trigger_s: 3, cool_down_s: 4, aggregate: median, reach: all, memory_floor_ratio: 0.1,
-       patience: 0.3, pays_off_in_s: 60}
+       patience: 0.3}
     link: {nu_dbm: -75, rho_dbm: -45, pair: weaker, foresee_s: 2}
     on_isolation: local
     drain_s: 5
@@ -312,8 +312,7 @@ def test_every_setting_of_a_task_arrives() -> None:
     task = fleet_of(text).task("map_merge")
     assert (task.tuning.bonus, task.tuning.time_to_trigger_s, task.tuning.cool_down_s) == (0.2, 3, 4)
     assert (task.tuning.aggregate, task.reach, task.memory_floor_ratio) == (Aggregate.MEDIAN, Reach.ALL, 0.1)
-    assert (task.patience, task.pays_off_in_s) == (0.3, 60)
-    assert (task.limits.pair, task.limits.foresee_s) == (PairReading.WEAKER, 2)
+    assert (task.patience, task.limits.pair, task.limits.foresee_s) == (0.3, PairReading.WEAKER, 2)
     assert (task.limits.nu_dbm, task.limits.rho_dbm) == (-75, -45)
     assert (task.on_isolation, task.drain_s) == (OnIsolation.LOCAL, 5)
     worker = task.worker
@@ -636,16 +635,17 @@ def test_one_fault_is_reported_once_at_its_place(old: str, new: str, said: str |
 
 
 @pytest.mark.parametrize(
-    ("given", "said", "at", "instead"),
+    ("old", "new", "said", "at", "instead"),
     [
-        ("link: {knee_dbm: -60}", "no key 'knee_dbm' any more: a knee gained nothing", "knee_dbm", "delete it"),
-        ("link: {pair: mean}", "no 'mean' here any more: its leads were", "mean}", "pair: candidate"),
+        ("    outputs:", "    link: {knee_dbm: -60}\n    outputs:", "any more: a knee gained", "knee_dbm", "delete it"),
+        ("    outputs:", "    link: {pair: mean}\n    outputs:", "any more: its leads", "mean}", "pair: candidate"),
+        ("bonus: 0.10,", "pays_off_in_s: 60,", "any more: it gained only where", "pays_off_in_s", "bonus: 0.2"),
     ],
 )
 def test_what_fleet_files_had_once_says_that_it_is_gone_and_what_to_write(
-    given: str, said: str, at: str, instead: str
+    old: str, new: str, said: str, at: str, instead: str
 ) -> None:
-    text = swapped("    outputs:  ", f"    {given}\n    outputs:  ")
+    text = swapped(old, new)
     only_fault(text, said, at)
     (fault,) = check(text).faults
     assert instead in fault.hint

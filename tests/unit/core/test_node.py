@@ -44,7 +44,7 @@ from zsched.core.values.model import (
     WorkerLoad,
     WorkerState,
 )
-from zsched.core.values.plan import Direction, ReadyWhen, RoutePhase, StreamCount, WorkerRole
+from zsched.core.values.plan import Direction, ReadyWhen, RoutePhase, WorkerRole
 
 T = TypeVar("T")
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
@@ -720,28 +720,6 @@ def test_a_retry_of_what_there_is_not_is_refused(command: RetryTask) -> None:
     batch = node.handle(ev.RetryCommanded(request=7, command=command), 100.0)
     assert of(batch, do.ResetWorker) == []
     assert of(batch, do.AnswerCommand)[0].result.outcome is CommandOutcome.INVALID
-
-
-def test_what_a_move_has_cost_is_reckoned_from_the_relay_s_counts() -> None:
-    (task,) = FLEET.tasks
-    fleet = replace(FLEET, tasks=(replace(task, pays_off_in_s=60.0),))
-    node = Node(
-        fleet=fleet, me="robot1", durable=durable("robot1"), incarnation=7, electorate="e", rng=Random(1), now=100.0
-    )
-
-    def learn(revision: int, owner: str, now: float) -> None:
-        learnt = Learnt(node="robot2", values=(value(revision, owner),))
-        node.handle(ev.LearntReceived(learnt=learnt, is_answer=True), now)
-
-    for second in range(40):
-        if second in (0, 20):
-            learn(1 + second, "edge2" if second else "edge1", 99.5 + second)
-        counts = (
-            StreamCount(stream="merge/in/0", messages=10 * second),
-            StreamCount(stream="merge/out/0", messages=10 * (second if second < 20 else max(second - 2, 19))),
-        )
-        node.handle(ev.StreamsCounted(counts=counts), 100.0 + second)
-    assert node.rounds.tasks["merge"].judge.move_cost_s == pytest.approx(2.0, abs=0.05)
 
 
 @pytest.mark.parametrize("is_draining", [False, True])

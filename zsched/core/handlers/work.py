@@ -131,7 +131,6 @@ def _on_counted(node: Stages, event: ev.StreamsCounted, _todo: ToDo, now: float)
         if dropped and node.dropped.get(count.stream, (0, 0.0))[0] != dropped:
             node.dropped[count.stream] = (dropped, now)
     node.hangs.absorb(event.counts, node.executors, now)
-    node.rounds.absorb_counts(event.counts, now)
 
 
 def _on_relay(node: Stages, event: ev.RelayChanged, _todo: ToDo, now: float) -> None:

@@ -20,8 +20,6 @@ from zsched.core.scheduler.scoring import Standing, joined, pick
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.model import Allocation, NodeId, PeerState, Profile, ScoreForm, WorkerState, told_of_worker
 
-MOST_FOR_COST = 0.3
-"""The bonus rises by no more than this, whatever moves cost: a task must be able to leave a node that is full."""
 INITIAL_SETTLE_S = 3.0
 """A task that nobody owns yet waits so long for candidates that are still starting."""
 
@@ -61,8 +59,6 @@ class Judge:
     spent_at: float | None = None
     learnt: LearntPatience = field(default_factory=LearntPatience)
     """Of a task that learns its patience."""
-    move_cost_s: float = 0.0
-    """What the last moves have cost, in seconds of work (`zsched.core.scheduler.costs`; tasks with a horizon)."""
     seen_first_at: float | None = None
     """When a first candidate could be scored (a task that nobody owns waits for the others)."""
 
@@ -107,7 +103,7 @@ class Judge:
         if self.spec.learns_patience:
             tuning = allocation.tuning
             self.learnt.watch(standing.aggregates, tuning.bonus, tuning.cool_down_s, now)
-        bonus = self._bonus(allocation) if escape is None else 0.0
+        bonus = allocation.tuning.bonus if escape is None else 0.0
         penalties = {} if damping is None else joined((damping.penalties(now), standing.penalties))
         scored = {
             name: max(value + (bonus if name == owner else 0.0) - penalties.get(name, 0.0), 0.0)
@@ -132,13 +128,6 @@ class Judge:
             is_escape=escape is not None and outcome is Outcome.PROPOSE,
             aggregates=scored,
         )
-
-    def _bonus(self, allocation: Allocation) -> float:
-        """What a lead must be: the tuning's bonus against noise, and what a move costs, spread over the horizon."""
-        horizon_s = self.spec.pays_off_in_s
-        if horizon_s is None:
-            return allocation.tuning.bonus
-        return allocation.tuning.bonus + min(self.move_cost_s / horizon_s, MOST_FOR_COST)
 
     def _spend(self, scored: Mapping[NodeId, float], owner: NodeId | None, now: float) -> None:
         """Add up the lead over the owner with its bonus, over time (`zsched.core.scheduler.patience.spend`)."""

@@ -19,7 +19,6 @@ from random import Random
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.gateway.round_trips import RoundTrips
 from zsched.core.instructions import AskUtilities, RecordStory
-from zsched.core.scheduler.costs import MoveCost
 from zsched.core.scheduler.damping import Damping
 from zsched.core.scheduler.judge import Judge, Judgement, Outcome, escape_ahead, escape_reason
 from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts, Standing, book, compare, is_out, score
@@ -28,7 +27,6 @@ from zsched.core.todo import ToDo
 from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.messages import Utilities
 from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, TaskId, UtilityVector, WorkerState
-from zsched.core.values.plan import StreamCount
 from zsched.core.values.quorum import majority, present_voters
 
 TIMER_MARGIN_S = 0.001
@@ -49,7 +47,6 @@ class TaskRound:
 
     spec: TaskSpec
     judge: Judge
-    cost: MoveCost
     settled_at: float
     """When this node learnt the current epoch."""
     is_called: bool = False
@@ -82,10 +79,7 @@ class Rounds:
         self._doubts = doubts
         self._round_trips = round_trips or RoundTrips(me)
         self.is_voter = me in fleet.voters
-        self.tasks = {
-            spec.name: TaskRound(spec=spec, judge=Judge(spec=spec), cost=MoveCost(spec.name), settled_at=now)
-            for spec in fleet.tasks
-        }
+        self.tasks = {spec.name: TaskRound(spec=spec, judge=Judge(spec=spec), settled_at=now) for spec in fleet.tasks}
         self._gather: _Gather | None = None
         self._answer: tuple[int, float, object, Utilities] = (-1, -math.inf, None, Utilities(voter=me, vectors=()))
         """(gateway's version, until when, (states, values, doubts), vectors): the newest answer to a gather."""
@@ -379,19 +373,11 @@ class Rounds:
     ) -> None:
         """A new owner is known: ``left`` is the one before, ``has_failed`` whether it was fled from."""
         self.tasks[name].damping.note_move(left, has_failed=has_failed, was_draining=was_draining, now=now)
-        self.tasks[name].cost.on_moved(is_planned=left is not None and not has_failed, now=now)
 
     def forgive(self, name: TaskId, node: NodeId | None, now: float) -> None:
         """An operator has mended what was held against a node (``None``: against any); judge again at once."""
         self.tasks[name].damping.forgive(node)
         self.hurry(now)
-
-    def absorb_counts(self, counts: tuple[StreamCount, ...], now: float) -> None:
-        """This robot's relay has counted its streams: what did the last moves cost?"""
-        for task in self.tasks.values():
-            if task.spec.pays_off_in_s is not None:
-                task.cost.absorb(counts, now)
-                task.judge.move_cost_s = task.cost.seconds
 
     def on_learnt(self, name: TaskId, *, is_new_epoch: bool, now: float) -> None:
         """A newer revision is known."""

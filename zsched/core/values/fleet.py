@@ -191,8 +191,6 @@ class TaskSpec:
     """Utility seconds that staying may cost before the task moves, in place of the time-to-trigger; ``None``: that."""
     learns_patience: bool = False
     """Its patience is learnt (`zsched.core.scheduler.patience`); ``patience`` is what it begins with."""
-    pays_off_in_s: float | None = None
-    """A move must earn what moves have cost (measured) within so many seconds; ``None``: the bonus alone counts."""
     on_isolation: OnIsolation = OnIsolation.HOLD
     exclusive: bool = False
     drain_s: float = 2.0

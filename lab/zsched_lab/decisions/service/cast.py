@@ -26,7 +26,7 @@ from zsched_lab.decisions.service.replay import Player, is_of_task
 from zsched_lab.decisions.view import Look, Sight
 from zsched_lab.decisions.world import EVEN, RADIO_ONLY
 
-OWN: Final = ("smoothing_s", "move_cost_s", "is_told", "tells_jobs")
+OWN: Final = ("smoothing_s", "is_told", "tells_jobs")
 """Settings of a rule that are neither of `Tuning` nor of `TaskSpec`; ``is_told=0``: run queues are not read;
 ``tells_jobs=0``: the worker says nothing of its jobs."""
 
@@ -49,7 +49,6 @@ def zsched(name: str, **settings: Any) -> Player:
     """
     given = dict(settings)
     smoothing_s = given.pop("smoothing_s", Look().smoothing_s)
-    move_cost_s = given.pop("move_cost_s", 0.0)
     is_told, tells_jobs = bool(given.pop("is_told", True)), bool(given.pop("tells_jobs", True))
     changes = {key: given.pop(key) for key in tuple(given) if is_of_task(key)}
     is_service = given.setdefault("score", DEFAULT_SCORE) is ScoreForm.SERVICE  # no task here weighs the network
@@ -61,7 +60,7 @@ def zsched(name: str, **settings: Any) -> Player:
     tuning = Tuning(**{"weights": EVEN, **given})
     return Player(
         name=name,
-        make=_core(tuning, changes, move_cost_s),
+        make=_core(tuning, changes),
         tuning=tuning,
         look=Look(smoothing_s=smoothing_s),
         changes=changes,
@@ -70,9 +69,9 @@ def zsched(name: str, **settings: Any) -> Player:
     )
 
 
-def _core(tuning: Tuning, changes: Mapping[str, Any], move_cost_s: float) -> Callable[[Sight], Rule]:
-    own = {name: changes[name] for name in ("patience", "learns_patience", "pays_off_in_s") if name in changes}
-    return lambda view: CoreRule(view, tuning, move_cost_s=move_cost_s, **own)
+def _core(tuning: Tuning, changes: Mapping[str, Any]) -> Callable[[Sight], Rule]:
+    own = {name: changes[name] for name in ("patience", "learns_patience") if name in changes}
+    return lambda view: CoreRule(view, tuning, **own)
 
 
 def _picks(name: str, weights: Weights, cost: float) -> Player:

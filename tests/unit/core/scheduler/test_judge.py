@@ -450,16 +450,3 @@ def test_a_vote_that_was_lost_is_paid_for_anew_and_a_gap_in_the_judgements_is_no
     judge = Judge(spec=PATIENT)
     assert judged(judge, slight, 100.0).outcome is Outcome.WAIT
     assert judged(judge, slight, 900.0).outcome is Outcome.WAIT, "nobody looked for so long"
-
-
-# --- what a move costs -----------------------------------------------------------------------------------------------
-
-
-def test_a_move_must_earn_what_moves_have_cost_within_the_horizon() -> None:
-    """6 s of work over 60 s: the challenger must lead by 0.1 more than the bonus; at most 0.3 more, however dear."""
-    spec = replace(SPEC, pays_off_in_s=60.0)
-    for cost_s, owners in ((0.0, 0.6), (6.0, 0.7), (1e6, 0.9)):
-        judge = Judge(spec=spec, move_cost_s=cost_s)
-        assert judged(judge, EQUAL, 100.0).aggregates["edge1"] == pytest.approx(owners)
-    careless = Judge(spec=SPEC, move_cost_s=6.0)
-    assert judged(careless, EQUAL, 100.0).aggregates["edge1"] == pytest.approx(0.6)
