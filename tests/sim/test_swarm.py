@@ -91,6 +91,11 @@ def test_a_task_is_not_made_exclusive_while_two_machines_have_one_name(seed: int
     assert alone.faults["rollout of exclusive"] == 1
 
 
+def test_a_daemon_that_leaves_its_name_does_so_behind_all_else() -> None:
+    """Found by the simulator: one answer told a newer value and that our name lives twice; the role came after us."""
+    assert play(plan(9040656)).violation == ""
+
+
 def test_every_fault_that_is_planned_is_carried_out() -> None:
     done: set[str] = set()
     planned: set[str] = set()

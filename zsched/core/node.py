@@ -140,8 +140,10 @@ class Node(Stages):
 
     def _finish(self, now: float) -> tuple[do.Instruction, ...]:
         self._advance(self._todo, now)
-        # What our own beat has led to is the next one's.
-        todo, self._todo = self._todo, ToDo(must_beat=self._todo.must_beat)
+        # What our own beat has led to is the next batch's.
+        todo, self._todo = self._todo, ToDo(must_beat=self._todo.must_beat, must_decide=self._todo.must_decide)
+        if todo.stand_down is not None:
+            todo.add(todo.stand_down)
         # A limit that shrank may lie in the past already; that is no lag of this loop.
         self._promised = max(self._next_deadline(now), now)
         state = self.agreement.to_persist(now) if todo.must_persist else None

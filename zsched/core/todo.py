@@ -52,6 +52,9 @@ class ToDo:
     apply: list[do.Instruction] = field(default_factory=list)
     """What only this machine does."""
 
+    stand_down: do.StandDown | None = None
+    """This daemon ends: the last thing that it does, whatever else the same event leads to."""
+
     def add(self, *instructions: do.Instruction) -> None:
         """Sort instructions into sending and applying."""
         for instruction in instructions:
@@ -69,4 +72,5 @@ class ToDo:
     @property
     def is_only_sent(self) -> bool:
         """Whether it is nothing but what is sent at once: answers, most of all."""
-        return not (self.must_persist or self.must_beat or self.must_decide or self.apply) and self.is_settled
+        is_called_on = self.must_persist or self.must_beat or self.must_decide or self.stand_down is not None
+        return not (is_called_on or self.apply) and self.is_settled

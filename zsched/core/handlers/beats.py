@@ -143,7 +143,7 @@ def _heed(node: Stages, verdict: Verdict, todo: ToDo, now: float) -> None:
         return
     complaint = _complain(node, now)
     if verdict is Verdict.LEAVE:
-        todo.add(do.StandDown(reason=f"{complaint}; stop it, or give this machine a name of its own"))
+        todo.stand_down = do.StandDown(reason=f"{complaint}; stop it, or give this machine a name of its own")
     elif verdict is Verdict.DISPUTE:
         node.agreement.dispute(complaint, todo)
 
