@@ -33,7 +33,7 @@ def examples(name: str, language: str) -> list[str]:
 
 def worker_of(name: str, number: int) -> tuple[str, str]:
     """A worker's program and its task in the fleet file."""
-    tasks = examples(name, "yaml") if name == "docs/worker.md" else [README_TASK]
+    tasks = examples(name, "yaml") if name == "docs/guide/worker.md" else [README_TASK]
     return examples(name, "python")[number], tasks[number]
 
 
@@ -47,8 +47,8 @@ def fleet_of(folder: Path, program: str, task: str) -> dict[str, Any]:
 
 
 def run_application(bed: Testbed) -> list[str]:
-    """The application of docs/streams.md on robot1: what it prints; it must end by itself."""
-    program = examples("docs/streams.md", "python")[0]
+    """The application of docs/guide/streams.md on robot1: what it prints; it must end by itself."""
+    program = examples("docs/guide/streams.md", "python")[0]
     endpoint = bed.fleet.node("robot1").listen_data
     assert "tcp/127.0.0.1:7458" in program
     text = program.replace("tcp/127.0.0.1:7458", endpoint)
@@ -60,7 +60,7 @@ def run_application(bed: Testbed) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("name", "number", "is_loud"), [("docs/worker.md", 0, True), ("docs/worker.md", 1, True), ("README.md", 0, False)]
+    ("name", "number", "is_loud"), [("docs/guide/worker.md", 0, True), ("docs/guide/worker.md", 1, True), ("README.md", 0, False)]
 )
 def test_a_worker_of_the_documents_answers_the_application_of_the_documents(
     tmp_path: Path, name: str, number: int, is_loud: bool
@@ -77,7 +77,7 @@ def test_a_worker_of_the_documents_answers_the_application_of_the_documents(
 
 
 def test_a_program_without_the_library_is_told_to_say_ready_matching(tmp_path: Path) -> None:
-    program, task = worker_of("docs/worker.md", 1)
+    program, task = worker_of("docs/guide/worker.md", 1)
     tree = fleet_of(tmp_path, program, task.replace(", ready: matching", ""))
     tree["tasks"]["shout"]["worker"] |= {"start_deadline_s": 2, "max_failures": 1}
     with Testbed(tmp_path, tree) as bed:

@@ -1,6 +1,6 @@
 """The documentation says what the code says: links, key and wire tables, commands, decisions, no foreign paths.
 
-Run as a program, this file writes the tables of docs/wire.md anew.
+Run as a program, this file writes the tables of docs/design/wire.md anew.
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ def test_glossary_s_python_names_are_the_code_s() -> None:
     sources = [*(ROOT / "zsched").rglob("*.py"), *(ROOT / "lab").rglob("*.py")]
     words = {word for path in sources for word in re.findall(r"\w+", path.read_text())}
     words |= {path.stem for base in ("zsched", "lab") for path in (ROOT / base).rglob("*")} | {"FLOORS", "py"}
-    cells = [line.split(" | ")[2] for line in text_of("docs/glossary.md").splitlines() if line.count(" | ") == 3]
+    cells = [line.split(" | ")[2] for line in text_of("docs/design/glossary.md").splitlines() if line.count(" | ") == 3]
     names = {name for cell in cells for name in re.findall(r"`([^`]+)`", cell)}
     assert len(names) > 50
     assert sorted(name for name in names if re.findall(r"\w+", name)[-1] not in words) == []
@@ -184,7 +184,7 @@ def between(text: str, mark: str) -> str:
 
 
 def test_key_table_is_the_code_s() -> None:
-    rows = re.findall(r"^\| `(\w+)` \| `([^`]+)` \|", between(text_of("docs/keyspace.md"), "keys"), re.MULTILINE)
+    rows = re.findall(r"^\| `(\w+)` \| `([^`]+)` \|", between(text_of("docs/design/keyspace.md"), "keys"), re.MULTILINE)
     assert len(rows) == len(dict(rows))
     assert dict(rows) == rendered_keys()
 
@@ -243,21 +243,21 @@ TABLES: Final = {"kinds": kinds_table, "parts": parts_table}
 
 
 def write_tables() -> None:
-    text = text_of("docs/wire.md")
+    text = text_of("docs/design/wire.md")
     for mark, table in TABLES.items():
         text = text.replace(between(text, mark), table())
-    (ROOT / "docs" / "wire.md").write_text(text, encoding="utf-8")
+    (ROOT / "docs" / "design" / "wire.md").write_text(text, encoding="utf-8")
 
 
 @pytest.mark.parametrize(("mark", "table"), TABLES.items())
 def test_wire_tables_are_the_codec_s(mark: str, table: Any) -> None:
-    assert between(text_of("docs/wire.md"), mark) == table(), (
+    assert between(text_of("docs/design/wire.md"), mark) == table(), (
         "write them anew: .venv/bin/python tests/unit/test_docs.py"
     )
 
 
 def test_wire_version_told_is_the_codec_s() -> None:
-    assert f"This is version {wire.VERSION}." in text_of("docs/wire.md")
+    assert f"This is version {wire.VERSION}." in text_of("docs/design/wire.md")
 
 
 # --- timing.md -------------------------------------------------------------------------------------------------------
@@ -265,7 +265,7 @@ def test_wire_version_told_is_the_codec_s() -> None:
 
 def test_profiles_are_told_as_the_code_s_differences() -> None:
     rows = {}
-    for line in between(text_of("docs/timing.md"), "profiles").splitlines()[2:]:
+    for line in between(text_of("docs/design/timing.md"), "profiles").splitlines()[2:]:
         name, *cells = [cell.strip(" `") for cell in line.strip("|").split("|")]
         rows[name] = cells[:3]
     base, expected = PROFILES["wifi"], {}
@@ -346,7 +346,7 @@ def test_decisions_that_the_code_cites_exist() -> None:
 
 
 def faults_of_bug_table(text: str, bugs: Sequence[Bug]) -> list[str]:
-    """What docs/planted-bugs.md says otherwise than the code: how many there are, which, where, in which order."""
+    """What docs/develop/planted-bugs.md says otherwise than the code: how many there are, which, where, in which order."""
     found = [] if f"each of these {len(bugs)} bugs" in text else [f"there are {len(bugs)}"]
     cells = [line.split("|") for line in text.splitlines() if line.startswith("| ")][2:]
     rows = [(row[1].strip(), row[2].strip()) for row in cells]
@@ -357,11 +357,11 @@ def faults_of_bug_table(text: str, bugs: Sequence[Bug]) -> list[str]:
 
 
 def test_every_planted_bug_has_a_row() -> None:
-    assert faults_of_bug_table(text_of("docs/planted-bugs.md"), BUGS) == []
+    assert faults_of_bug_table(text_of("docs/develop/planted-bugs.md"), BUGS) == []
 
 
 def test_planted_faults_of_the_bug_table_are_found() -> None:
-    text = text_of("docs/planted-bugs.md")
+    text = text_of("docs/develop/planted-bugs.md")
     row = next(line for line in text.splitlines() if line.startswith(f"| {BUGS[0].name} |"))
     assert faults_of_bug_table(text.replace(row + "\n", ""), BUGS) == [f"no row of {BUGS[0].name}"]
     assert faults_of_bug_table(text, BUGS[1:]) == [f"there are {len(BUGS) - 1}", f"no such bug: {BUGS[0].name}"]

@@ -1,7 +1,7 @@
 """The house's floors: who may import whom, what the pure core may use, what the daemon and the CLI never load.
 
 Read from the sources with ast, so that imports inside functions and under TYPE_CHECKING count too. A new folder needs a
-line in `FLOORS` (and a place in docs/architecture.md).
+line in `FLOORS` (and a place in docs/design/architecture.md).
 """
 
 from __future__ import annotations

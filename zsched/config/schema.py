@@ -447,7 +447,7 @@ FLEET: Final = Record(
 def reference() -> str:
     """The reference of every key as Markdown: one table per section, sections in the order of the file.
 
-    `docs/fleet-file.md` holds it, and a test compares the two.
+    `docs/guide/fleet-file.md` holds it, and a test compares the two.
     """
     sections: dict[int, tuple[Record, list[str]]] = {}
     _collect(FLEET, "", sections)

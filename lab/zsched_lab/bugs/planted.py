@@ -195,7 +195,7 @@ def _found(bug: Bug, how: str, budget_s: float) -> str:
 
 
 def table(verdicts: Sequence[Verdict]) -> str:
-    """The verdicts as Markdown, as docs/planted-bugs.md keeps them."""
+    """The verdicts as Markdown, as docs/develop/planted-bugs.md keeps them."""
     rows = ["| bug | in | found by | s |", "| --- | --- | --- | ---: |"]
     rows += [f"| {one.bug.name} | {places(one.bug)} | {_short(one.found_by)} | {one.seconds:.1f} |" for one in verdicts]
     return "\n".join(rows)

@@ -1,4 +1,4 @@
-"""The invariants that every event of a simulated fleet is checked against (docs/testing.md lists them).
+"""The invariants that every event of a simulated fleet is checked against (docs/develop/testing.md lists them).
 
 Knows: what must hold, over all nodes and all their lives. Does not know: what happens next, how a node decides.
 """

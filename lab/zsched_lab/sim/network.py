@@ -4,7 +4,7 @@ Knows: frames and the events they become; the production codec decides what is a
 anything arrives, cuts (the simulator's).
 
 A frame that was damaged and still reads as *another* valid value is not delivered: that takes an insider's key, and
-against insiders zsched does not protect (docs/failures.md).
+against insiders zsched does not protect (docs/design/failures.md).
 """
 
 from __future__ import annotations

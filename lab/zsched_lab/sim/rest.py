@@ -4,7 +4,7 @@ Knows: the bounds, and how a batch of schedules is held against them. Does not k
 
 One schedule has a bound of its own, which leaves room for the rarest: every detection, vote, lease and first placement
 of the profile one after the other. A batch is held to its quantiles, at about twice what was measured
-(docs/testing.md): a regression to three times as long fails, though no single schedule may break its own bound.
+(docs/develop/testing.md): a regression to three times as long fails, though no single schedule may break its own bound.
 """
 
 from __future__ import annotations

@@ -154,7 +154,7 @@ def test_without_a_daemon_every_verb_exits_with_3(verb: str, tmp_path: Path) -> 
 
 
 def test_the_manual_shows_every_verb() -> None:
-    manual = (Path(__file__).parents[3] / "docs" / "cli.md").read_text()
+    manual = (Path(__file__).parents[3] / "docs" / "guide" / "cli.md").read_text()
     assert "| `zsched stream` |" in manual
     for verb in ("list", "hz", "bw", "tail"):
         assert f"zsched stream {verb}" in manual

@@ -346,7 +346,7 @@ def test_help_of_every_verb_fits_a_small_terminal(verb: str, monkeypatch: pytest
 
 
 def test_the_manual_shows_what_the_program_shows() -> None:
-    manual = (Path(__file__).parents[3] / "docs" / "cli.md").read_text()
+    manual = (Path(__file__).parents[3] / "docs" / "guide" / "cli.md").read_text()
     assert (RECORDED / "healthy.100.txt").read_text() in manual
     for verb in ("up", "init", "status", "weights", "check", "demo", "version"):
         assert f"| `zsched {verb}` |" in manual
@@ -355,7 +355,7 @@ def test_the_manual_shows_what_the_program_shows() -> None:
 
 
 def test_the_manual_names_every_field_of_the_status() -> None:
-    manual = (Path(__file__).parents[3] / "docs" / "cli.md").read_text()
+    manual = (Path(__file__).parents[3] / "docs" / "guide" / "cli.md").read_text()
     (row,) = [line for line in manual.splitlines() if "`zsched.status/1`" in line]
     fields = json.loads((RECORDED / "healthy.json").read_text()).keys() - {"schema"} | {"degraded"}
     assert fields == set(row.split("|")[3].strip(" `").split())

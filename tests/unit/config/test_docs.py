@@ -1,4 +1,4 @@
-"""docs/fleet-file.md says what the schema says, and its examples are real."""
+"""docs/guide/fleet-file.md says what the schema says, and its examples are real."""
 
 from dataclasses import MISSING, fields
 from pathlib import Path
@@ -21,7 +21,7 @@ from zsched.core.values.fleet import (
 from zsched.core.values.model import Tuning
 from zsched.core.values.plan import StreamSettings
 
-DOC = (Path(__file__).parents[3] / "docs" / "fleet-file.md").read_text()
+DOC = (Path(__file__).parents[3] / "docs" / "guide" / "fleet-file.md").read_text()
 
 
 def test_reference_is_the_schemas() -> None:

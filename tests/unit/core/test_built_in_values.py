@@ -1,4 +1,4 @@
-"""docs/built-in-values.md tells every number that the core goes by, and tells it as it is."""
+"""docs/design/built-in-values.md tells every number that the core goes by, and tells it as it is."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ ROW = re.compile(r"^\| `(\w+)` \| ([^|]+) \| `([\w/]+)\.py` \| (.+) \|$", re.MUL
 
 def told() -> dict[tuple[str, str], str]:
     """{(module, name): value} of the table."""
-    text = (ROOT / "docs" / "built-in-values.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "design" / "built-in-values.md").read_text(encoding="utf-8")
     return {(module, name): value for name, value, module, _ in ROW.findall(text)}
 
 

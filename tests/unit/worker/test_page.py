@@ -1,4 +1,4 @@
-"""docs/worker.md says what the library's code says: its calls with their options, the fields, the environment."""
+"""docs/guide/worker.md says what the library's code says: its calls with their options, the fields, the environment."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from zsched.worker import Answer, Output, Received, Request, Worker
 from zsched.worker.start import _ENVIRONMENT
 
 ROOT = Path(__file__).parents[3]
-PAGE = (ROOT / "docs" / "worker.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "guide" / "worker.md").read_text(encoding="utf-8")
 CALLED_BY_THE_LIBRARY = {"Output.send_end", "Output.close"}
 
 

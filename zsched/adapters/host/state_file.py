@@ -4,7 +4,7 @@ A save writes a temporary file in the same folder, fsyncs it, renames it over th
 then has the node promised anything. Two daemons cannot share a folder: its lock file is held with flock(2).
 
 A file that is missing, damaged, another node's, or written on other hardware (a cloned card) is *lost state*: `load`
-says so as a value, and the node works without being an elector (docs/failures.md).
+says so as a value, and the node works without being an elector (docs/design/failures.md).
 
 Knows: folders, locks, fsync, what identifies this machine. Does not know: the bytes (`zsched.wire.codec`), ballots,
 epochs.

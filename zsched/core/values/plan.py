@@ -93,7 +93,7 @@ class ServiceSettings:
     """A request that nobody has taken waits so long for an owner, 0..3600 (with `retry`: as long as its time lasts).
 
     The default is what a killed owner's takeover may take at most with the profile ``wifi``, 1.8 s, and an exclusive
-    task's lease on top (docs/timing.md).
+    task's lease on top (docs/design/timing.md).
     """
     max_pending: int = 16
     """Requests at the owner at one time, 1..256; the next one is answered "busy"."""

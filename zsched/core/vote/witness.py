@@ -7,7 +7,7 @@ starts asks them before it votes: who remembers a higher count, or a later life,
 state forgot.
 
 Nothing here rests on a beat: a beat leads to a question at most, and only the answer of whom it was asked is kept, or
-believed. What nobody living has seen is not found out (docs/failures.md).
+believed. What nobody living has seen is not found out (docs/design/failures.md).
 
 Knows: counts, incarnations, who has answered. Does not know: what was voted, how anything is asked.
 """

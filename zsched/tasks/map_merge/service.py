@@ -293,7 +293,7 @@ class MapMergeService:
         self._publish(Output.STATUS, json.dumps(self.status()).encode())
 
     def status(self) -> dict[str, Any]:
-        """What the status stream carries (docs/map_merge.md lists the fields)."""
+        """What the status stream carries (docs/guide/map_merge.md lists the fields)."""
         result = self._result
         statuses = {} if result is None else {status.robot: status for status in result.statuses}
         grid = None if result is None else result.grid
