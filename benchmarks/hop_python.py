@@ -22,10 +22,10 @@ import zenoh
 
 from benchmarks.rig import until
 from zsched.core.values.plan import Direction, HandoverRule, Route, StreamClass, StreamSettings
-from zsched.relay.acks import Acks
-from zsched.relay.inputs import InputStream
-from zsched.relay.outputs import OutputStream
-from zsched.relay.receive import undeclare
+from zsched.relay.streams.acks import Acks
+from zsched.relay.streams.inputs import InputStream
+from zsched.relay.streams.outputs import OutputStream
+from zsched.relay.streams.receive import undeclare
 from zsched.sessions.config import data_config, worker_config
 from zsched.wire.keyspace import Keyspace
 from zsched_lab.fleet.loopback import free_endpoint

@@ -22,7 +22,7 @@ from benchmarks.common import at_pace, machine
 from benchmarks.record import Record, progress, table
 from benchmarks.rig import until
 from zsched.core.values.plan import Direction, Route, ServiceSettings, StreamSettings
-from zsched.relay.services import ServiceStream
+from zsched.relay.services.service import ServiceStream
 from zsched.sessions.config import data_config, worker_config
 from zsched_lab.fleet.loopback import free_endpoints
 

@@ -60,7 +60,8 @@ def run_application(bed: Testbed) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("name", "number", "is_loud"), [("docs/guide/worker.md", 0, True), ("docs/guide/worker.md", 1, True), ("README.md", 0, False)]
+    ("name", "number", "is_loud"),
+    [("docs/guide/worker.md", 0, True), ("docs/guide/worker.md", 1, True), ("README.md", 0, False)],
 )
 def test_a_worker_of_the_documents_answers_the_application_of_the_documents(
     tmp_path: Path, name: str, number: int, is_loud: bool

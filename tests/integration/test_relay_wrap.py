@@ -24,10 +24,10 @@ from zsched.core.events import SlotDrained, SlotFlipped, SlotReady
 from zsched.core.hop.books import unaccounted
 from zsched.core.hop.serial import SPAN
 from zsched.core.values.plan import Role, RoutePhase, RoutePlan, Slot, StreamClass, StreamCount, WorkerRole
-from zsched.relay import outlet
-from zsched.relay.lanes import Lane
-from zsched.relay.outputs import OutputStream
 from zsched.relay.process import RelayProcess
+from zsched.relay.streams import outlet
+from zsched.relay.streams.lanes import Lane
+from zsched.relay.streams.outputs import OutputStream
 from zsched.sessions.config import data_config, worker_config
 from zsched.tasks.echo import Echo
 from zsched.worker import Worker

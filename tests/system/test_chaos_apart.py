@@ -5,7 +5,7 @@ electors than its state.
 
 One fleet for the module: three robots and two edges; the edges and one robot give no address, so that these three can
 only meet by gossip. Every robot keeps a standby of the task (`on_isolation: local`). Its streams are of two classes:
-of ``latest`` the newest value may be answered by both owners of a move (docs/guide/streams.md), of ``reliable`` nothing.
+of ``latest`` both owners of a move may answer the newest value (docs/guide/streams.md), of ``reliable`` none.
 """
 
 from __future__ import annotations

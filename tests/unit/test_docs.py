@@ -346,7 +346,7 @@ def test_decisions_that_the_code_cites_exist() -> None:
 
 
 def faults_of_bug_table(text: str, bugs: Sequence[Bug]) -> list[str]:
-    """What docs/develop/planted-bugs.md says otherwise than the code: how many there are, which, where, in which order."""
+    """Differences of docs/develop/planted-bugs.md from the code: how many bugs, which, where, in which order."""
     found = [] if f"each of these {len(bugs)} bugs" in text else [f"there are {len(bugs)}"]
     cells = [line.split("|") for line in text.splitlines() if line.startswith("| ")][2:]
     rows = [(row[1].strip(), row[2].strip()) for row in cells]

@@ -23,7 +23,7 @@ from zsched.core.route.ros_mirror import Sides, mirrored
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.plan import RosGraph, Route
 from zsched.guard import guarded, tolerant
-from zsched.relay.receive import undeclare
+from zsched.relay.streams.receive import undeclare
 
 MAX_TOKENS: Final = 20_000
 """Foreign tokens remembered per side; those of a larger graph are not mirrored."""

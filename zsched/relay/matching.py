@@ -25,7 +25,7 @@ from zsched.clock import monotonic_s
 from zsched.core.relay_protocol import WorkerMatched, WorkerWatch
 from zsched.core.values.model import TaskId
 from zsched.guard import guarded, tolerant
-from zsched.relay.receive import Declared, undeclare
+from zsched.relay.streams.receive import Declared, undeclare
 
 SETTLE_S: Final = 1.5
 """A relay that has just started has no links yet: so long it does not say that nobody is there."""

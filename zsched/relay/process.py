@@ -31,11 +31,11 @@ from zsched.errors import WireError
 from zsched.guard import guarded, on_failure
 from zsched.ipc.pipe import COMMANDS, read_frame, wait_readable, write_frame
 from zsched.ipc.protocol import RelayHello, RelayPulse
-from zsched.relay.acks import DEFAULT_LEASE_S, Acks
 from zsched.relay.graph import GraphMirror
 from zsched.relay.local_side import LocalSide
 from zsched.relay.matching import Matching
 from zsched.relay.roles import RoleServer
+from zsched.relay.streams.acks import DEFAULT_LEASE_S, Acks
 from zsched.relay.successors import Successors
 from zsched.relay.task import TaskRelay
 from zsched.relay.tokens import Tokens

@@ -31,13 +31,13 @@ from zsched.core.values.plan import (
     StreamCount,
 )
 from zsched.guard import guarded
-from zsched.relay.acks import Acks
-from zsched.relay.answer_times import AnswerTimes
 from zsched.relay.graph import GraphMirror
-from zsched.relay.inputs import InputStream
-from zsched.relay.outputs import OutputStream
-from zsched.relay.proofs import Stamps
-from zsched.relay.services import Services
+from zsched.relay.services.service import Services
+from zsched.relay.streams.acks import Acks
+from zsched.relay.streams.answer_times import AnswerTimes
+from zsched.relay.streams.inputs import InputStream
+from zsched.relay.streams.outputs import OutputStream
+from zsched.relay.streams.proofs import Stamps
 from zsched.relay.tokens import Tokens
 
 FLIP_WAIT_S: Final = 0.3

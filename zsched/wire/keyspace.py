@@ -4,8 +4,8 @@ Knows: the shape of each key. Does not know: what travels under it.
 
 All control keys start with a verbatim ``@`` chunk, which no wildcard (``*``, ``**``) matches: a user who subscribes to
 everything never receives our ballots. The chunk after the kind is the node that *owns* the key, so that an access rule
-can bind it to that node's certificate; a request carries its asker behind it. `docs/design/keyspace.md` is this file as a
-table.
+can bind it to that node's certificate; a request carries its asker behind it. `docs/design/keyspace.md` is this file as
+a table.
 """
 
 from __future__ import annotations

@@ -278,9 +278,9 @@ class Worker:
     def job(self, *, skipped: int = 0, came_s: float | None = None) -> Job:
         """A piece of work that is not done in a callback: ``with worker.job(): ...``, in whatever thread does it.
 
-        The daemon is told how long jobs take, how much CPU, and how many are left undone (docs/guide/worker.md); from the
-        first one on, callbacks are no jobs any more. ``skipped``: so many were left undone for this one. ``came_s``:
-        when what it works on came, by ``time.monotonic``.
+        The daemon is told how long jobs take, how much CPU, and how many are left undone (docs/guide/worker.md); from
+        the first one on, callbacks are no jobs any more. ``skipped``: so many were left undone for this one.
+        ``came_s``: when what it works on came, by ``time.monotonic``.
         """
         return self._jobs.job(skipped, came_s)
 

@@ -33,7 +33,7 @@ from zsched.core.sequence import RUN, Order, Track
 from zsched.core.values.model import MAX_COUNTER, NAME
 from zsched.hop.acknowledger import Acknowledger
 from zsched.ipc.pipe import decode_chunk, decode_end, encode_chunk, encode_end
-from zsched.relay.slots import KeyState
+from zsched.relay.streams.slots import KeyState
 from zsched.relay.tokens import Tokens
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import Keyspace, counter, parse

@@ -10,10 +10,10 @@ from zsched_lab.bugs.core_bugs import Bug
 
 ACKS, RECEIVER, SERIAL = "zsched.hop.acknowledger", "zsched.core.hop.receiver", "zsched.core.hop.serial"
 INPUTS, WORKER_LANES = "zsched.worker.inputs", "zsched.worker.lanes"
-GREETINGS, SENDER, OUTLET = "zsched.relay.greetings", "zsched.core.hop.sender", "zsched.relay.outlet"
+GREETINGS, SENDER, OUTLET = "zsched.relay.streams.greetings", "zsched.core.hop.sender", "zsched.relay.streams.outlet"
 
-_GREETINGS = ("tests/parts/relay/test_greetings.py",)
-_RECEIVE = ("tests/parts/relay/test_receive.py",)
+_GREETINGS = ("tests/parts/relay/streams/test_greetings.py",)
+_RECEIVE = ("tests/parts/relay/streams/test_receive.py",)
 _ACKS = ("tests/unit/hop/test_acknowledger.py",)
 _RECEIVER = ("tests/unit/core/hop/test_receiver.py",)
 _HOP = ("tests/sim/test_hop.py",)
@@ -32,14 +32,14 @@ def _bug(name: str, module: str, old: str, new: str, tests: tuple[str, ...]) -> 
 STREAM_BUGS = (
     _bug(
         "what gives way in front of a stream is in no counter",
-        "zsched.relay.receive",
+        "zsched.relay.streams.receive",
         "self._give_way(waiting.popleft())",
         "waiting.popleft()",
         _RECEIVE,
     ),
     _bug(
         "zenoh's ring in front of a stream drops what it likes",
-        "zsched.relay.receive",
+        "zsched.relay.streams.receive",
         "zenoh.handlers.FifoChannel(max(settings.depth, QUEUE_DEPTH))",
         "zenoh.handlers.RingChannel(max(settings.depth, QUEUE_DEPTH))",
         _RECEIVE,
@@ -207,10 +207,10 @@ STREAM_BUGS = (
     ),
     _bug(
         "what a relay's former life has had is lost",
-        "zsched.relay.answers",
+        "zsched.relay.streams.answers",
         "before if marker.had is None else marker.had",
         "before",
-        ("tests/parts/relay/test_answers.py",),
+        ("tests/parts/relay/streams/test_answers.py",),
     ),
     _bug(
         "a relay's next life is sent what the former one has had",
@@ -256,10 +256,10 @@ STREAM_BUGS = (
     ),
     _bug(
         "a slot that closes does not say so",
-        "zsched.relay.answers",
+        "zsched.relay.streams.answers",
         "self._acks.leave(self._names)",
         "self._acks.flush()",
-        ("tests/parts/relay/test_answers.py",),
+        ("tests/parts/relay/streams/test_answers.py",),
     ),
     _bug(
         "what a foreign worker was sent is in no counter",
@@ -291,10 +291,10 @@ STREAM_BUGS = (
     ),
     _bug(
         "one answer proves its sample done",
-        "zsched.relay.proofs",
+        "zsched.relay.streams.proofs",
         "if not is_answered or one.lane not in answered:",
         "if not is_answered:",
-        ("tests/unit/relay/test_proofs.py",),
+        ("tests/unit/relay/streams/test_proofs.py",),
     ),
     _bug(
         "a relay leaves a put to a frozen worker to zenoh",
@@ -378,17 +378,17 @@ STREAM_BUGS = (
     ),
     _bug(
         "a timestamp that several samples have proves one of them done",
-        "zsched.relay.proofs",
+        "zsched.relay.streams.proofs",
         "return self._alone.get(stamp, False)",
         "return stamp in self._alone",
-        ("tests/unit/relay/test_proofs.py",),
+        ("tests/unit/relay/streams/test_proofs.py",),
     ),
     _bug(
         "a timestamp that was forgotten is alone when it comes again",
-        "zsched.relay.proofs",
+        "zsched.relay.streams.proofs",
         "if self._floor is not None and not self._floor < stamp:",
         "if self._floor is not None and False:",
-        ("tests/unit/relay/test_proofs.py",),
+        ("tests/unit/relay/streams/test_proofs.py",),
     ),
     _bug(
         "nobody asks whether a timestamp is one sample's",

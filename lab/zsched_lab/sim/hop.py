@@ -2,8 +2,8 @@
 
 ``python -m zsched_lab.sim.hop --seed S --runs N`` plays class ``reliable``: samples, start markers, acknowledgements
 and what is put again, while links break and take with them what is on them, and the receiver freezes, or dies and
-begins another life. Knows: what the relay's threads do with the state (`zsched.relay.outlet`), what must hold. Does not
-know: how the numbers work (`zsched.core.hop`).
+begins another life. Knows: what the relay's threads do with the state (`zsched.relay.streams.outlet`), what must hold.
+Does not know: how the numbers work (`zsched.core.hop`).
 
 What must hold: nothing is processed twice in one life; nothing is lost while the receiver lives; and when the faults
 are over, everything that was sent is processed, or told as lost or left open.
@@ -24,7 +24,7 @@ from zsched.core.hop.receiver import RunningTime, Source
 from zsched.core.hop.sender import KEPT_BYTES, KEPT_SAMPLES, Sender, Sent
 from zsched.core.hop.serial import SPAN, serial_of
 from zsched.core.relay_protocol import StreamAck
-from zsched.relay.tally import Tally
+from zsched.relay.streams.tally import Tally
 
 FAULTS_END_S: Final = 12.0
 REST_S: Final = 60.0

@@ -1,7 +1,7 @@
 """Votes beyond what is promised: an elector has forgotten some, and nobody in its reach has seen them.
 
-That is not found out, and two values may be chosen (docs/design/failures.md). What such a schedule does to the agreement is no
-violation; where somebody in reach remembers, it is one.
+That is not found out, and two values may be chosen (docs/design/failures.md). What such a schedule does to the
+agreement is no violation; where somebody in reach remembers, it is one.
 
 Knows: how many votes each disk has stood for, who remembers them, who reaches whom. Does not know: what was voted, how
 a disk forgets.

@@ -23,8 +23,8 @@ from support.sessions import hub_and_neighbour
 from support.waiting import free_endpoint, until, within
 from zsched.clock import monotonic_s
 from zsched.core.values.plan import StreamClass, StreamSettings, WorkerRole
-from zsched.relay.acks import Acks
-from zsched.relay.outlet import Outlet
+from zsched.relay.streams.acks import Acks
+from zsched.relay.streams.outlet import Outlet
 from zsched.sessions.config import worker_config
 from zsched.sessions.stalled_links import StalledLinks
 from zsched.worker import Worker

@@ -9,7 +9,8 @@ import pytest
 
 from zsched.core import sequence
 from zsched.core.hop import receiver, sender
-from zsched.relay import slots, tokens
+from zsched.relay import tokens
+from zsched.relay.streams import slots
 from zsched.wire import keyspace
 from zsched_lab.bugs.fuzz_keys import KeyFuzz, main
 

@@ -205,7 +205,7 @@ class TaskSpec:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Timing:
-    """The clocks of the protocol; profiles `wired`, `wifi`, `wan` are written as differences (`docs/design/timing.md`)."""
+    """The clocks of the protocol; profiles `wired`, `wifi`, `wan` are differences from it (`docs/design/timing.md`)."""
 
     name: str = "wifi"
     beat_s: float = 0.2

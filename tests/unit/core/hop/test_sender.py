@@ -9,8 +9,8 @@ import pytest
 from zsched.core.hop.sender import MAX_RESEND_S, RESEND_S, Sender, Sent, near
 from zsched.core.hop.serial import SPAN, serial_of
 from zsched.core.relay_protocol import StreamAck
-from zsched.relay.lanes import KEPT_BYTES_LATEST
-from zsched.relay.tally import Tally
+from zsched.relay.streams.lanes import KEPT_BYTES_LATEST
+from zsched.relay.streams.tally import Tally
 
 
 def lane() -> Sender:

@@ -6,8 +6,8 @@ from typing import Any, cast
 
 import pytest
 
-from zsched.relay import proofs
-from zsched.relay.proofs import LeftOpen, Stamps, unproven
+from zsched.relay.streams import proofs
+from zsched.relay.streams.proofs import LeftOpen, Stamps, unproven
 
 SAMPLE: Any = None
 

@@ -14,10 +14,10 @@ from support.waiting import until
 from zsched.core.relay_protocol import EndMarker, StreamAck, StreamAcks
 from zsched.core.values.plan import OnCrash, StreamClass, StreamSettings
 from zsched.ipc.pipe import decode_end
-from zsched.relay import greetings
-from zsched.relay.acks import Acks
-from zsched.relay.outlet import Outlet
-from zsched.relay.proofs import LeftOpen
+from zsched.relay.streams import greetings
+from zsched.relay.streams.acks import Acks
+from zsched.relay.streams.outlet import Outlet
+from zsched.relay.streams.proofs import LeftOpen
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import END_CHUNK, Keyspace
 

@@ -10,8 +10,8 @@ import zenoh
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import until
 from zsched.core.values.plan import StreamClass, StreamSettings
-from zsched.relay import receive
-from zsched.relay.receive import Receiver
+from zsched.relay.streams import receive
+from zsched.relay.streams.receive import Receiver
 
 KEY = "robot1/in"
 COUNT = 200

@@ -19,8 +19,8 @@ from zsched.core.hop.serial import number_near, serial_of
 from zsched.core.relay_protocol import EndMarker
 from zsched.core.route import keyexpr
 from zsched.hop.acknowledger import SourceName
-from zsched.relay.answers import Answers
-from zsched.relay.receive import Receiver
+from zsched.relay.streams.answers import Answers
+from zsched.relay.streams.receive import Receiver
 
 END_GRACE_S: Final = 0.1
 """A marker travels behind its data on one link; so long after it, what is still missing was dropped on the way."""

@@ -39,9 +39,9 @@ from zsched.core.route.keyexpr import is_wild
 from zsched.core.route.wildcards import Rewriter, rewriter
 from zsched.core.values.plan import Route, StreamCount
 from zsched.guard import guarded
-from zsched.relay.counter import StreamCounter
-from zsched.relay.receive import undeclare
-from zsched.relay.replies import Replies
+from zsched.relay.services.replies import Replies
+from zsched.relay.streams.counter import StreamCounter
+from zsched.relay.streams.receive import undeclare
 
 LOOK_AGAIN_S: Final = 0.02
 """How often a waiting request looks for an owner; a flip wakes it at once."""

@@ -8,9 +8,9 @@ import pytest
 import zenoh
 
 from support.sessions import hub_and_neighbour
-from zsched.relay import answer_times
-from zsched.relay.answer_times import MAX_SENT, AnswerTimes
-from zsched.relay.counter import StreamCounter
+from zsched.relay.streams import answer_times
+from zsched.relay.streams.answer_times import MAX_SENT, AnswerTimes
+from zsched.relay.streams.counter import StreamCounter
 
 
 @pytest.fixture

@@ -17,9 +17,9 @@ from zsched.core.hop.books import unaccounted
 from zsched.core.relay_protocol import EndMarker
 from zsched.core.values.plan import Direction, HandoverRule, Route, StreamClass, StreamSettings
 from zsched.ipc.pipe import decode_end, encode_end
-from zsched.relay import outlet, outputs, receive, slots
-from zsched.relay.inputs import InputStream
-from zsched.relay.outputs import OutputStream
+from zsched.relay.streams import outlet, outputs, receive, slots
+from zsched.relay.streams.inputs import InputStream
+from zsched.relay.streams.outputs import OutputStream
 from zsched.sessions import send_queue
 from zsched.sessions.config import worker_config
 from zsched.wire.keyspace import END_CHUNK

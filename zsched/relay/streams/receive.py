@@ -25,7 +25,7 @@ from zenoh import Sample, Session
 from zsched.clock import awake_s
 from zsched.core.values.plan import StreamClass, StreamSettings
 from zsched.guard import guarded
-from zsched.relay.history import History
+from zsched.relay.streams.history import History
 
 JOIN_S: Final = 0.3
 QUEUE_DEPTH: Final = 256

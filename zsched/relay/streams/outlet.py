@@ -11,7 +11,8 @@ number is what the next hop checks and acknowledges.
 
 Where the receiver is `zsched.worker`, samples are kept until it acknowledges them. A number that did not come, or no
 progress for a while (`Lane.is_late`), and they are put again under the numbers they had; the worker drops what it has
-already. Class ``reliable`` sends nothing before its receiver has said where it begins (`zsched.relay.greetings`).
+already. Class ``reliable`` sends nothing before its receiver has said where it begins
+(`zsched.relay.streams.greetings`).
 """
 
 from __future__ import annotations
@@ -30,15 +31,15 @@ from zsched.clock import monotonic_s
 from zsched.core.hop.sender import KEPT_BYTES, KEPT_SAMPLES, Sent
 from zsched.core.relay_protocol import EndMarker, StreamAck
 from zsched.core.values.plan import OnCrash, StreamClass, StreamSettings
-from zsched.relay.acks import WorkerAcks
-from zsched.relay.crowd import Crowd
-from zsched.relay.greetings import Greetings
-from zsched.relay.lanes import KEPT_BYTES_LATEST, Lane
-from zsched.relay.proofs import LeftOpen
-from zsched.relay.publishers import declare_publisher, put_marker
-from zsched.relay.receive import undeclare
-from zsched.relay.rewrite import Rewriting
-from zsched.relay.tally import Tally
+from zsched.relay.streams.acks import WorkerAcks
+from zsched.relay.streams.crowd import Crowd
+from zsched.relay.streams.greetings import Greetings
+from zsched.relay.streams.lanes import KEPT_BYTES_LATEST, Lane
+from zsched.relay.streams.proofs import LeftOpen
+from zsched.relay.streams.publishers import declare_publisher, put_marker
+from zsched.relay.streams.receive import undeclare
+from zsched.relay.streams.rewrite import Rewriting
+from zsched.relay.streams.tally import Tally
 from zsched.sessions.send_queue import SendQueue
 
 QUEUE_DEPTH: Final = 1024

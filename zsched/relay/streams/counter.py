@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from zsched.clock import monotonic_s
 from zsched.core.values.plan import StreamCount
-from zsched.relay.tally import Tally
+from zsched.relay.streams.tally import Tally
 
 
 class StreamCounter:

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from typing import Any, Final
 
 from zsched.clock import monotonic_s
-from zsched.relay.lanes import Lane
+from zsched.relay.streams.lanes import Lane
 
 MAX_GREET_PAUSE_S: Final = 1.0
 STRANGE_S: Final = 1.0

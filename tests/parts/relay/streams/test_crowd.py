@@ -1,4 +1,4 @@
-"""`zsched.relay.crowd` and `.sockets`: who is waited for, who is left behind; TCP's own word on real connections."""
+"""`zsched.relay.streams.crowd`: which application is waited for or left behind; TCP's word on real connections."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import pytest
 import zenoh
 
 from support.waiting import free_endpoint, until
-from zsched.relay import crowd
-from zsched.relay.crowd import FITS_BYTES, MAX_REST_S, REST_S, Reader, note_feeder
+from zsched.relay.streams import crowd
+from zsched.relay.streams.crowd import FITS_BYTES, MAX_REST_S, REST_S, Reader, note_feeder
 from zsched.sessions.config import client_config, data_config
 from zsched.sessions.link_sockets import LinkSocket, LinkSockets
 

@@ -28,7 +28,7 @@ from zenoh import CongestionControl, Sample, SampleKind, Session, Timestamp
 
 from zsched.clock import monotonic_s
 from zsched.core.hop.serial import serial_of
-from zsched.relay.lanes import Lane
+from zsched.relay.streams.lanes import Lane
 from zsched.sessions.config import DROP_WAIT_S
 from zsched.sessions.link_sockets import LinkSocket, LinkSockets, with_room
 from zsched.sessions.send_queue import PATIENCE_S

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from zsched.relay import pace
-from zsched.relay.pace import Pace
+from zsched.relay.streams import pace
+from zsched.relay.streams.pace import Pace
 
 
 @pytest.mark.parametrize(("hz", "max_hz", "expected"), [(30.0, 20.0, 200), (100.0, 10.0, 100), (5.0, 10.0, 50)])

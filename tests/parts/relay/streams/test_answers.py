@@ -15,9 +15,9 @@ from support.waiting import until
 from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks
 from zsched.core.values.plan import Direction, HandoverRule, Route, StreamClass, StreamSettings
 from zsched.ipc.pipe import encode_end
-from zsched.relay import answers
-from zsched.relay.acks import Acks
-from zsched.relay.outputs import OutputStream
+from zsched.relay.streams import answers
+from zsched.relay.streams.acks import Acks
+from zsched.relay.streams.outputs import OutputStream
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import AGAIN_CHUNK, END_CHUNK, Keyspace
 

@@ -12,9 +12,9 @@ from support.waiting import until
 from zsched.core.values.fleet import LocalMode, LocalSide
 from zsched.core.values.plan import Direction, Route, StreamClass, StreamSettings
 from zsched.ipc.pipe import decode_end
-from zsched.relay import outlet
-from zsched.relay.inputs import InputStream
-from zsched.relay.outputs import OutputStream
+from zsched.relay.streams import outlet
+from zsched.relay.streams.inputs import InputStream
+from zsched.relay.streams.outputs import OutputStream
 from zsched.sessions.config import local_config
 from zsched.wire.keyspace import END_CHUNK
 

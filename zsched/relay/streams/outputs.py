@@ -26,16 +26,16 @@ from zsched.core.values.plan import HandoverRule, Route, StreamClass, StreamCoun
 from zsched.guard import tolerant
 from zsched.hop.acknowledger import Acknowledger, SourceName
 from zsched.ipc.pipe import decode_end
-from zsched.relay.acks import WorkerAcks
-from zsched.relay.answer_times import AnswerTimes
-from zsched.relay.answers import Answers
-from zsched.relay.counter import StreamCounter
-from zsched.relay.crowd import note_feeder
-from zsched.relay.fence import Fence
-from zsched.relay.outlet import Outlet
-from zsched.relay.pace import Pace
-from zsched.relay.receive import Receiver, undeclare
-from zsched.relay.slots import Feed, KeyState, OutputSlot
+from zsched.relay.streams.acks import WorkerAcks
+from zsched.relay.streams.answer_times import AnswerTimes
+from zsched.relay.streams.answers import Answers
+from zsched.relay.streams.counter import StreamCounter
+from zsched.relay.streams.crowd import note_feeder
+from zsched.relay.streams.fence import Fence
+from zsched.relay.streams.outlet import Outlet
+from zsched.relay.streams.pace import Pace
+from zsched.relay.streams.receive import Receiver, undeclare
+from zsched.relay.streams.slots import Feed, KeyState, OutputSlot
 from zsched.wire.keyspace import AGAIN_CHUNK, END_CHUNK
 
 HOLD_SAMPLES: Final = 10_000

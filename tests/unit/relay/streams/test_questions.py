@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from zsched.relay.questions import (
+from zsched.relay.streams.questions import (
     BLIND_TRIES,
     EMPTY_TRIES,
     MAX_PAUSE_S,

@@ -18,9 +18,9 @@ from support.sessions import matches
 from support.waiting import free_endpoint, until
 from zsched.core.values.fleet import Timing
 from zsched.core.values.plan import StreamClass, StreamSettings
-from zsched.relay import history
-from zsched.relay.questions import Question, Questions
-from zsched.relay.receive import Receiver
+from zsched.relay.streams import history
+from zsched.relay.streams.questions import Question, Questions
+from zsched.relay.streams.receive import Receiver
 from zsched.sessions.config import data_config, worker_config
 
 KEY = "robot1/map"

@@ -5,7 +5,7 @@ Knows: which slots are open and which one the stream feeds. Does not know: why o
 Everything happens under the stream's lock, the sample that just came included: between the kept values that a flip
 sends and the first sample behind it there is no gap. A kept value reaches a new owner at least once; it may have
 reached the old one too. With ``on_crash: replay`` the same holds for what an owner that died had not acknowledged,
-unless its answers prove it done (`zsched.relay.proofs`); and what comes while there is no owner waits for one.
+unless its answers prove it done (`zsched.relay.streams.proofs`); and what comes while there is no owner waits for one.
 An owner that is left may stop before it has done all that was on its way to it (an exclusive one does so at once): so
 with ``replay`` what comes behind a flip is held until its slot has ended, and goes out behind what it leaves.
 """
@@ -23,14 +23,14 @@ from zenoh import Sample, Session, Timestamp
 
 from zsched.clock import monotonic_s
 from zsched.core.values.plan import OnCrash, Route, StreamClass, StreamCount
-from zsched.relay.acks import WorkerAcks
-from zsched.relay.answer_times import AnswerTimes
-from zsched.relay.counter import StreamCounter
-from zsched.relay.outlet import MAX_OWED, Outlet, Owed
-from zsched.relay.pace import Pace
-from zsched.relay.proofs import LeftOpen, Stamps, unproven
-from zsched.relay.receive import Receiver
-from zsched.relay.tally import Tally
+from zsched.relay.streams.acks import WorkerAcks
+from zsched.relay.streams.answer_times import AnswerTimes
+from zsched.relay.streams.counter import StreamCounter
+from zsched.relay.streams.outlet import MAX_OWED, Outlet, Owed
+from zsched.relay.streams.pace import Pace
+from zsched.relay.streams.proofs import LeftOpen, Stamps, unproven
+from zsched.relay.streams.receive import Receiver
+from zsched.relay.streams.tally import Tally
 from zsched.sessions.send_queue import MAX_BYTES
 
 MAX_KEYS: Final = 4096

@@ -22,7 +22,7 @@ from zenoh import Sample, SampleKind, Session
 from zsched.clock import monotonic_s
 from zsched.core.hop.serial import number_near
 from zsched.guard import guarded, tolerant
-from zsched.relay.questions import ADVANCED, Publisher, Question, Questions
+from zsched.relay.streams.questions import ADVANCED, Publisher, Question, Questions
 
 TIMEOUT_S: Final = 0.5
 MAX_FETCHES: Final = 8

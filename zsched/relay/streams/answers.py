@@ -24,7 +24,7 @@ from zsched.core.hop.serial import serial_of
 from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker
 from zsched.hop.acknowledger import Acknowledger, SourceName
 from zsched.ipc.pipe import decode_end
-from zsched.relay.counter import StreamCounter
+from zsched.relay.streams.counter import StreamCounter
 
 MAX_WAITING: Final = 4096
 MAX_WAITING_BYTES: Final = 32 << 20

@@ -1,0 +1,1 @@
+"""The services of a task at this node: requests to the owner, and their answers."""
