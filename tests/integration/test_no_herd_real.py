@@ -81,7 +81,7 @@ def test_three_tasks_that_are_first_placed_together_end_on_three_nodes(bed: Test
     placed = bed.wait(lambda: owners(bed), 60, "owners of all tasks at all nodes") or {}
 
     if Counter(placed.values()) != dict.fromkeys(bed.names, 1):
-        # Behind a commit that takes longer than a ballot, the next vote goes by older figures (`core/scheduler/turns.py`).
+        # Behind a commit that takes longer than a ballot, the next vote goes by older figures (`turns.py`).
         raise TooSlowError(f"two tasks were placed by the same figures: {placed}")
     for node in bed.names:
         history = {task["name"]: task["history"] for task in bed.status(node)["tasks"]}
