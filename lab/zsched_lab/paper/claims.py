@@ -55,7 +55,8 @@ class Difference:
         """For people: ``+12 % [+8, +17]``; of one run, which has no interval, ``+12 % (n = 1)``."""
         if not math.isfinite(self.low):
             return f"{self.value:+.0%} (n = {self.runs})".replace("%", " %")
-        return f"{self.value:+.0%} [{self.low:+.0%}, {self.high:+.0%}]".replace("%", " %")
+        low, high = (f"{100 * end:+.0f}" for end in (self.low, self.high))
+        return f"{self.value:+.0%} [{low}, {high}]".replace("%", " %")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -212,7 +213,6 @@ GAINS = (
     "received_mb_s",
     "map_hz",
     "task_latency_s",
-    "merge_latency_p50_s",
     "merge_latency_p95_s",
 )
 """What a better place is to bring."""

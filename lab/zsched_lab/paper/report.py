@@ -1,4 +1,4 @@
-"""Writes report.md: every claim beside our figure, all schemes, the sweep over load, the blocks, what was run and how.
+"""Writes report.md: what placing gains, every claim with its verdict, all schemes, the sweep, the blocks, the runs.
 
 Knows: Markdown, which figure stands where. Does not know: how a figure or a verdict comes
 about.
@@ -6,17 +6,13 @@ about.
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from zsched_lab.paper.claims import (
-    GAINS,
+    CLAIMS,
     LEAST_RUNS,
-    Claim,
     Difference,
     Verdict,
-    best_fixed,
     better_than_ours,
     judged,
     over_best_fixed,
@@ -27,18 +23,35 @@ from zsched_lab.paper.coverage_report import coverage_parts
 from zsched_lab.paper.plan import merge_text
 from zsched_lab.paper.scenario import MATRIX, MergeTask
 from zsched_lab.paper.schemes import FIXED_SCHEMES, PAPER_SCHEMES, SCHEMES
+from zsched_lab.paper.tables import (
+    SMALL_COLUMNS,
+    TITLES,
+    Gains,
+    Json,
+    gains_table,
+    head_of,
+    known_columns,
+    mean_text,
+    scheme_rows,
+    schemes_text,
+)
 
-Json = Mapping[str, Any]
-Gains = Mapping[tuple[str, ...], Mapping[str, Difference]]
-"""{names of a row: {metric: difference}}."""
+PROMISE = (
+    "For readers who want the figures: what placing gains, and for every claim of the paper and every goal of ours an "
+    "interval and a verdict. [README](README.md) defines every figure; `results.json` has the figures of every run.\n"
+)
+PAIRED = "Differences are relative, between the same runs, with 95 % intervals (Student's t).\n"
 NOT_COMPARED = (
-    "Not measured: better map frequency and accuracy of the network variant on the real robots (they replay a log "
-    "here). That it follows the strongest signal is under *Robot to robot*.\n"
+    "Not measured: map frequency and accuracy of the network variant on the real robots. "
+    "*Robot to robot* tells whether it follows the strongest signal.\n"
 )
 GAINS_SAY = (
-    "Against the mean of the three fixed schemes, same runs, 95 %. The oracle knows the load beforehand and is at the "
-    "best node by Eq. 1 and 2 at every moment.\n"
+    "Against the mean of the three fixed schemes. The oracle knows the load beforehand and is at the best node by "
+    "Eq. 1 and 2 at every moment.\n"
 )
+BEST_SAY = "zsched against the best fixed scheme of each figure, which is known only afterwards:\n"
+RANKED = ("zsched", "dyna_both", "oracle")
+"""The schemes in the table of gains."""
 EXHAUSTED = 0.95
 """Of a node's memory: beyond, the kernel reclaims what is in use."""
 FOLLOWS_DB = 1.5
@@ -46,39 +59,8 @@ FOLLOWS_DB = 1.5
 FOLLOWS_RULE = (
     f"(At most {FOLLOWS_DB:g} dB under the best robot of every moment, and above the best single one; one drive.)"
 )
-COLUMNS = (
-    ("map_hz", "maps/s", 2),
-    ("throughput_mb_s", "MB/s", 1),
-    ("received_mb_s", "received MB/s", 2),
-    ("mb_per_map", "MB/map", 2),
-    ("task_latency_s", "task s", 1),
-    ("is_done", "done", 2),
-    ("merge_latency_p50_s", "p50 s", 2),
-    ("merge_latency_p95_s", "p95 s", 2),
-    ("merge_latency_p99_s", "p99 s", 2),
-    ("cpu_peak", "CPU peak", 2),
-    ("cpu_mean", "CPU mean", 2),
-    ("memory_mean", "mem mean", 2),
-    ("memory_peak", "mem peak", 2),
-    ("ssim_rebased", "SSIM", 3),
-    ("held_ssim_rebased", "SSIM held", 3),
-    ("wall_f1", "wall F1", 3),
-    ("coverage", "coverage", 3),
-    ("coverage_mean", "covered on the way", 3),
-    ("stopped_ratio", "stood", 2),
-    ("moves", "moves", 1),
-    ("wasted_moves", "wasted", 1),
-    ("other_moves", "moves of others", 1),
-    ("move_gap_mean_s", "gap s", 2),
-    ("move_gap_max_s", "max gap s", 2),
-    ("lost_per_move", "lost/move", 1),
-    ("regret", "regret", 3),
-    ("ssim_crop", "<sub>plain SSIM</sub>", 3),
-)
-
-
 FLOORS = {MATRIX: -0.10, "heavy": -0.17, "heavy_again": -0.17}
-"""{block: the task latency of a merger that costs nothing, against fixed placement}, no scheduler can gain more there.
+"""{block: the task latency of a merger that costs nothing, against fixed placement}: no scheduler can gain more there.
 
 `zsched_lab.paper.latency_floor` printed them of docs/evaluation/results.json."""
 
@@ -88,34 +70,44 @@ FLOORS = {MATRIX: -0.10, "heavy": -0.17, "heavy_again": -0.17}
 
 def report(results: Json, pictures: Sequence[str]) -> str:
     """The whole report."""
-    scenario, main = results["scenario"], main_runs(results)
+    scenario, main, groups = results["scenario"], main_runs(results), judged_groups(results)
     runs = in_block(results["runs"], main_block(results))
+    placed = {"gains.png", "sweep.png", *(f"{name}.png" for name in scenario.get("blocks", {}))}
+    others = [name for name in pictures if name not in placed]
     parts = [
         "# The paper's evaluation, by zsched\n",
+        PROMISE,
         headline(results),
-        "Definitions of every figure: [docs/evaluation/README.md](README.md). Intervals: 95 %, paired, Student's t.\n",
+        PAIRED,
+        *gains_parts(results, pictures),
         "## The claims\n",
-        claims_text(main),
+        claims_text(groups),
+        floors_text(groups),
         memory_text(main),
         NOT_COMPARED,
-        *gains_parts(results),
         "## No scheme of the paper better than ours?\n",
-        better_text(main),
+        better_text(groups),
         "## All schemes\n",
+        uneven_text(main),
         schemes_text(main),
-        over_fixed_text(main),
+        others_text(main),
         *coverage_parts(main),
-        *same_runs_parts(main),
+        *[shown(name) for name in others],
         "## Strength of the injected load\n",
         sweep_text(runs, scenario),
-        *blocks_parts(results),
+        *[shown(name) for name in pictures if name == "sweep.png"],
+        *blocks_parts(results, pictures),
         "## What was run\n",
         conditions_text(results),
     ]
-    parts += [f"![{name}]({name})\n" for name in pictures]
     if results.get("radio"):
         parts += ["## Robot to robot\n", radio_text(results["radio"])]
-    return "\n".join(parts)
+    return "\n".join(part for part in parts if part)
+
+
+def shown(picture: str) -> str:
+    """A picture, in Markdown."""
+    return f"![{picture}]({picture})\n"
 
 
 def in_block(runs: Sequence[Json], block: str) -> list[Json]:
@@ -149,35 +141,52 @@ def headline(results: Json) -> str:
     return f"`{results['command']}`: {what}, {count}. zsched {results['version']}, {results['machine']}.\n"
 
 
-def claims_text(runs: Sequence[Json]) -> str:
-    """Each claim beside our figure."""
-    lines = ["| from | claim | figure | ours | against | difference | runs | verdict |", "| --- " * 8 + "|"]
-    for claim, found, outcome in judged(runs):
-        says = claim.says + floor_text(claim, runs)
-        shown = (
-            "- | - | - | 0"
-            if found is None
-            else f"{found.mine:.3g} | {found.theirs:.3g} | {found.text()} | {found.runs}"
-        )
-        lines.append(f"| {claim.source} | {says} | {claim.metric} | {shown} | **{outcome}** |")
+def judged_groups(results: Json) -> dict[str, list[Json]]:
+    """{name: runs}: the main block, and every other block that is a whole matrix."""
+    main = main_block(results)
+    blocks = {name: in_block(results["runs"], name) for name in results["scenario"].get("blocks", {}) if name != main}
+    return {main: main_runs(results)} | {name: own for name, own in blocks.items() if is_whole(own)}
+
+
+def claims_text(groups: Mapping[str, Sequence[Json]]) -> str:
+    """A row per claim: our difference and the verdict in every group."""
+    titles = " | ".join(f"{name} | verdict" for name in groups)
+    lines = [f"| from | claim | {titles} |", "| --- " * (2 + 2 * len(groups)) + "|"]
+    found = [judged(runs) for runs in groups.values()]
+    for index, claim in enumerate(CLAIMS):
+        cells = [
+            f"{'-' if one is None else one.text()} | **{outcome}**" for _, one, outcome in (g[index] for g in found)
+        ]
+        lines.append(f"| {claim.source} | {claim.says} | {' | '.join(cells)} |")
+    counts = {one.runs for group in found for _, one, _ in group if one is not None}
+    if counts:
+        fewest, most = min(counts), max(counts)
+        lines += ["", f"Paired runs of each claim: {fewest if fewest == most else f'{fewest} to {most}'}."]
     return "\n".join(lines) + "\n"
 
 
-def floor_text(claim: Claim, runs: Sequence[Json]) -> str:
-    """What stands beside a goal for the task latency: how much of it is within any scheduler's reach."""
-    block = next((str(figures.get("block", MATRIX)) for figures in runs), "")
-    floor = FLOORS.get(block) if claim.metric == "task_latency_s" else None
+def floors_text(groups: Mapping[str, Sequence[Json]]) -> str:
+    """How much of the task latency is within any scheduler's reach, where that is known; else empty."""
+    known = {str(runs[0].get("block", MATRIX)): name for name, runs in groups.items() if runs}
+    floors = [f"{-FLOORS[block]:.0%} ({name})".replace("%", " %") for block, name in known.items() if block in FLOORS]
+    if not floors:
+        return ""
     return (
-        ""
-        if floor is None
-        else f" (out of reach here: a merger that costs nothing gains {-floor:.0%})".replace("%", " %")
+        f"A merger that costs nothing gains {', '.join(floors)} of the task latency. No scheduler can gain more, "
+        "so the claim and the goal of -28 % are out of reach there.\n"
     )
 
 
-def gains_parts(results: Json) -> list[str]:
-    """What zsched and the oracle gain, under its heading; nothing without enough runs."""
-    table = gains_text(results, ("zsched", "oracle"))
-    return ["## Where placing pays\n", GAINS_SAY, table] if table else []
+def gains_parts(results: Json, pictures: Sequence[str] = ()) -> list[str]:
+    """What the `RANKED` schemes gain, under its heading; nothing without enough runs."""
+    table = gains_text(results, RANKED)
+    if not table:
+        return []
+    best = gains_table(
+        ("where",), {(title,): over_best_fixed(runs, "zsched") for title, runs in groups_of(results).items()}
+    )
+    picture = [shown("gains.png")] if "gains.png" in pictures else []
+    return ["## Where placing pays\n", GAINS_SAY, table, *picture, BEST_SAY, best]
 
 
 def gains_text(results: Json, schemes: Sequence[str]) -> str:
@@ -202,79 +211,33 @@ def groups_of(results: Json) -> dict[str, list[Json]]:
     return {f"matrix ({scenario['level']})": main} | {name: own for name, own in blocks.items() if own}
 
 
-def better_text(runs: Sequence[Json]) -> str:
-    """Where the paper's schemes beat ours, beyond the interval."""
-    if sum(figures["scheme"] == "zsched" for figures in runs) < LEAST_RUNS:
-        return f"zsched was run less than {LEAST_RUNS} times: no verdict.\n"
-    found = better_than_ours(runs)
-    if not found:
-        return "None is, on none of the six metrics, beyond the interval.\n"
-    return "\n".join(f"* {scheme}: {metric} {one.text()} against zsched" for scheme, metric, one in found) + "\n"
-
-
-def schemes_text(runs: Sequence[Json]) -> str:
-    """One row per scheme: means over its runs."""
-    columns = [column for column in COLUMNS if any(figures.get(column[0]) is not None for figures in runs)]
-    lines = [
-        "| scheme | runs | " + " | ".join(title for _, title, _ in columns) + " |",
-        "| --- " * (len(columns) + 2) + "|",
-    ]
-    for name in SCHEMES:
-        own = [figures for figures in runs if figures["scheme"] == name]
-        if own:
-            cells = [mean_text([figures.get(metric) for figures in own], digits) for metric, _, digits in columns]
-            lines.append(f"| {name} | {len(own)} | " + " | ".join(cells) + " |")
+def better_text(groups: Mapping[str, Sequence[Json]]) -> str:
+    """Where the paper's schemes beat ours, beyond the interval: a line per group."""
+    lines = []
+    for name, runs in groups.items():
+        if sum(figures["scheme"] == "zsched" for figures in runs) < LEAST_RUNS:
+            lines.append(f"* {name}: zsched was run less than {LEAST_RUNS} times: no verdict.")
+            continue
+        found = [f"{scheme} {TITLES[metric]} {one.text()}" for scheme, metric, one in better_than_ours(runs)]
+        says = "; ".join(found) or "none, on none of the six metrics, beyond the interval"
+        lines.append(f"* {name}, against zsched: {says}.")
     return "\n".join(lines) + "\n"
 
 
-def over_fixed_text(runs: Sequence[Json]) -> str:
-    """How far the dynamic schemes are from the mean of the fixed ones, zsched from each; empty without runs enough."""
-    to_mean: Gains = {(name,): over_fixed(runs, name) for name in SCHEMES if name not in FIXED_SCHEMES}
-    to_best: Gains = {(name,): over_best_fixed(runs, name) for name in SCHEMES if name not in FIXED_SCHEMES}
-    to_each: Gains = {(name,): over_fixed(runs, "zsched", (name,)) for name in FIXED_SCHEMES}
-    told = (
-        ("Against the mean of the three fixed schemes, same runs, 95 %:\n", "scheme", to_mean),
-        (f"Against the best fixed scheme, chosen in hindsight by {best_text(runs)}:\n", "scheme", to_best),
-        ("zsched against each of them:\n", "against", to_each),
-    )
-    return "\n".join(f"{says}\n{table}" for says, who, rows in told if (table := gains_table((who,), rows)))
-
-
-def best_text(runs: Sequence[Json]) -> str:
-    """Which fixed scheme is the best one of each figure.
-
-    >>> best_text([])
-    'nothing'
-    """
-    heads = {metric: title for metric, title, _ in COLUMNS}
-    best = {heads[metric]: name for metric in GAINS if (name := best_fixed(runs, metric)) is not None}
-    return ", ".join(f"{title}: {name}" for title, name in best.items()) or "nothing"
-
-
-def gains_table(titles: Sequence[str], rows: Gains) -> str:
-    """Rows of differences in `GAINS`, those without any left out; ``titles`` head their names. Empty without rows."""
-    known = {names: found for names, found in rows.items() if found}
-    metrics = [metric for metric in GAINS if any(metric in found for found in known.values())]
-    if not known:
+def uneven_text(runs: Sequence[Json]) -> str:
+    """What to mind where some schemes have more runs than others; else empty."""
+    if len(shared(runs, "scheme")) == len(runs):
         return ""
-    heads = {metric: title for metric, title, _ in COLUMNS}
-    lines = [
-        f"| {' | '.join(titles)} | runs | " + " | ".join(heads[metric] for metric in metrics) + " |",
-        "| --- " * (len(titles) + 1 + len(metrics)) + "|",
-    ]
-    for names, found in known.items():
-        cells = [found[metric].text() if metric in found else "-" for metric in metrics]
-        lines.append(f"| {' | '.join(names)} | {min(one.runs for one in found.values())} | " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+    return (
+        "Means over each scheme's runs. Where the numbers of runs differ, so do the worlds: compare by differences.\n"
+    )
 
 
-def same_runs_parts(runs: Sequence[Json]) -> list[str]:
-    """The table again over the runs that every scheme has, where some have more: each run has a world of its own."""
-    common = shared(runs, "scheme")
-    if not common or len(common) == len(runs):
-        return []
-    numbers = ", ".join(str(number + 1) for number in sorted({int(figures["run"]) for figures in common}))
-    return [f"Only the runs that every scheme has ({numbers}), so that rows compare:\n", schemes_text(common)]
+def others_text(runs: Sequence[Json]) -> str:
+    """How far the schemes that the table of gains leaves out are from the mean of the fixed ones; empty without any."""
+    rows: Gains = {(name,): over_fixed(runs, name) for name in SCHEMES if name not in (*FIXED_SCHEMES, *RANKED)}
+    table = gains_table(("scheme",), rows)
+    return f"The other schemes against the mean of the three fixed ones:\n\n{table}" if table else ""
 
 
 def comparable(runs: Sequence[Json]) -> Sequence[Json]:
@@ -307,17 +270,10 @@ def memory_text(runs: Sequence[Json]) -> str:
     return f"{told} **{outcome}**{same}.\n"
 
 
-def mean_text(values: Sequence[float | None], digits: int) -> str:
-    """The mean of what was measured; a dash for nothing."""
-    known = [float(value) for value in values if value is not None]
-    return f"{statistics.fmean(known):.{digits}f}" if known else "-"
-
-
 def sweep_text(runs: Sequence[Json], scenario: Json) -> str:
     """The main figures of each scheme at every level, over the runs that all levels have."""
     metrics = (
         ("map_hz", "maps/s", 2),
-        ("throughput_mb_s", "MB/s", 1),
         ("task_latency_s", "task s", 1),
         ("regret", "regret", 3),
     )
@@ -339,24 +295,47 @@ def sweep_text(runs: Sequence[Json], scenario: Json) -> str:
     return "\n".join(lines) + "\n"
 
 
-def blocks_parts(results: Json) -> list[str]:
-    """Each block's table under its own heading, or why there is none."""
-    parts = []
-    for name, block in results["scenario"].get("blocks", {}).items():
-        if name == main_block(results):
-            continue  # its tables stand where the matrix's would
-        rate = (block.get("links") or {}).get("bandwidth_mbit")
-        world = f"world {block['world']}" if block.get("world") else "the matrix's worlds"
-        links = "" if rate is None else f", every node sends at most {rate:g} Mbit/s"
-        level = f", load {block['level']}" if block.get("level") else ""
-        merge = {**results["scenario"]["merge"], **(block.get("merge") or {})}
-        task = f", {merge_text(MergeTask(**merge))}" if block.get("merge") else ""
+def blocks_parts(results: Json, pictures: Sequence[str] = ()) -> list[str]:
+    """Every block but the main one: a heading for each that has most schemes, one table for all others."""
+    alone, notes, rows = [], [], []
+    named = [name for name in results["scenario"].get("blocks", {}) if name != main_block(results)]
+    small = [figures for name in named for figures in in_block(results["runs"], name)]
+    columns = known_columns(small, SMALL_COLUMNS)
+    for name in named:
+        says = block_text(results, name)
         why = results.get("skipped", {}).get(name)
         own = comparable(in_block(results["runs"], name))
-        shown = "\n".join((schemes_text(own), over_fixed_text(own), *coverage_parts(own), *judged_parts(own)))
-        text = f"Left out: {why}.\n" if why else shown if own else "Not run.\n"
-        parts += [f"## Block {name}\n", f"As the matrix, but for: {world}{links}{level}{task}.\n", text]
-    return parts
+        if why or not own:
+            notes.append(f"* `{name}`: {says}. {f'Left out: {why}' if why else 'Not run'}.")
+        elif is_whole(own) or coverage_parts(own):
+            picture = [shown(f"{name}.png")] if f"{name}.png" in pictures else []
+            alone += [f"## Block {name}\n", f"As the matrix, but for: {says}.\n", schemes_text(own), others_text(own)]
+            alone += [*coverage_parts(own), *picture]
+        else:
+            notes.append(f"* `{name}`: {says}.")
+            rows += scheme_rows(own, columns, f"| {name} ")
+    if not notes:
+        return alone
+    table = "\n".join([*head_of(("block", "scheme"), columns), *rows]) + "\n"
+    return [
+        *alone,
+        "## Other blocks\n",
+        "As the matrix, but for:\n",
+        "\n".join(notes) + "\n",
+        *([table] if rows else []),
+    ]
+
+
+def block_text(results: Json, name: str) -> str:
+    """What a block does otherwise than the matrix."""
+    block = results["scenario"]["blocks"][name]
+    rate = (block.get("links") or {}).get("bandwidth_mbit")
+    world = f"world {block['world']}" if block.get("world") else "the matrix's worlds"
+    links = "" if rate is None else f", every node sends at most {rate:g} Mbit/s"
+    level = f", load {block['level']}" if block.get("level") else ""
+    merge = {**results["scenario"]["merge"], **(block.get("merge") or {})}
+    task = f", {merge_text(MergeTask(**merge))}" if block.get("merge") else ""
+    return f"{world}{links}{level}{task}"
 
 
 def is_whole(runs: Sequence[Json]) -> bool:
@@ -364,13 +343,6 @@ def is_whole(runs: Sequence[Json]) -> bool:
     schemes = (*FIXED_SCHEMES, *PAPER_SCHEMES, "zsched")
     counts = [sum(bool(figures["scheme"] == name) for figures in runs) for name in schemes]
     return min(counts) >= LEAST_RUNS
-
-
-def judged_parts(runs: Sequence[Json]) -> list[str]:
-    """The claims again, for a block that has every scheme of the paper and enough runs; else nothing."""
-    if not is_whole(runs):
-        return []
-    return ["The claims, here:\n", claims_text(runs), "Schemes of the paper better than ours:\n", better_text(runs)]
 
 
 def conditions_text(results: Json) -> str:
@@ -389,7 +361,7 @@ def conditions_text(results: Json) -> str:
     worst = f"{max(waits):.2f}" if waits else "not measured"
     lines = [
         f"* Nodes: {'; '.join(shares) or 'no shares'}.",
-        f"* Load levels: {'; '.join(levels)}. {main_block(results).capitalize()} was run at {main_level(results)}.",
+        f"* Load levels: {'; '.join(levels)}. Block `{main_block(results)}` ran at {main_level(results)}.",
         f"* Merging: {merge_text(MergeTask(**scenario['merge']))}; done at coverage {scenario['target_coverage']:g}.",
         f"* Links: {', '.join(sorted({f['links'] for f in results['runs']})) or '-'} drives.",
         f"* Warm-up before the drive: {scenario.get('warm_up_s', 0.0):g} s.",
@@ -414,13 +386,12 @@ def radio_text(radio: Json) -> str:
             f"| {name} | {row['moves']} | {row['wasted_moves']} | {row['mean_dbm']:.1f} | "
             f"{row['under_best_db']:.1f} dB | {row['below_70_ratio']:.0%} |".replace("%", " %")
         )
+    verdicts = []
     for name in ("dyna_net", "zsched"):
         row = radio["schemes"].get(name)
         if row is not None:
             is_best = row["under_best_db"] <= FOLLOWS_DB and row["mean_dbm"] > radio["best_fixed_dbm"]
-            outcome = Verdict.REPRODUCED if is_best else Verdict.NOT_REPRODUCED
-            lines += [
-                "",
-                f"The task follows the strongest signal, says the paper: {name}: **{outcome}**. {FOLLOWS_RULE}",
-            ]
-    return "\n".join([*lines, "", f"![{radio['picture']}]({radio['picture']})\n"])
+            verdicts.append(f"{name}: **{Verdict.REPRODUCED if is_best else Verdict.NOT_REPRODUCED}**")
+    if verdicts:
+        lines += ["", f"The task follows the strongest signal, says the paper: {', '.join(verdicts)}. {FOLLOWS_RULE}"]
+    return "\n".join([*lines, "", shown(radio["picture"])])

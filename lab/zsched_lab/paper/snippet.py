@@ -8,11 +8,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from zsched_lab.paper.claims import Verdict, judged
-from zsched_lab.paper.report import Json, floor_text, gains_text, groups_of, main_block, main_runs, mean_text
+from zsched_lab.paper.report import RANKED, floors_text, gains_text, groups_of, main_block, main_runs
 from zsched_lab.paper.scenario import MATRIX
-
-RANKED = ("zsched", "dyna_both", "oracle")
-"""Whose gains the README shows."""
+from zsched_lab.paper.tables import Json, mean_text
 
 
 def snippet(results: Json, pictures: Sequence[str]) -> str:
@@ -34,9 +32,8 @@ def snippet(results: Json, pictures: Sequence[str]) -> str:
         "| --- | --- | --- |",
     ]
     for claim, found, outcome in judged(main):
-        says = claim.says + floor_text(claim, main)
-        lines.append(f"| {claim.source}: {says} | {'-' if found is None else found.text()} | {outcome} |")
-    lines.append("")
+        lines.append(f"| {claim.source}: {claim.says} | {'-' if found is None else found.text()} | {outcome} |")
+    lines += ["", *([floors] if (floors := floors_text({main_block(results): main})) else [])]
     if "gains.png" in pictures:
         lines += ["![What placing gains over fixed placement](docs/evaluation/gains.png)", ""]
     lines.append("All figures: [docs/evaluation/report.md](docs/evaluation/report.md).\n")

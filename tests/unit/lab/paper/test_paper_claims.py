@@ -22,12 +22,14 @@ from zsched_lab.paper.claims import (
 from zsched_lab.paper.figures import save_all, save_gains, save_panels, save_radio
 from zsched_lab.paper.report import (
     blocks_parts,
+    claims_text,
     gains_parts,
     groups_of,
     in_block,
     is_whole,
+    judged_groups,
     memory_text,
-    over_fixed_text,
+    others_text,
     radio_text,
     report,
 )
@@ -80,7 +82,7 @@ def test_the_difference_is_paired_and_its_interval_holds_the_mean() -> None:
     assert found is not None
     assert (found.value, found.low, found.high) == pytest.approx((0.3, 0.3, 0.3))  # run by run the same ratio
     assert found.runs == 4
-    assert found.text() == "+30 % [+30 %, +30 %]"
+    assert found.text() == "+30 % [+30, +30]"
 
 
 def test_the_interval_by_hand() -> None:
@@ -181,13 +183,15 @@ def test_each_table_says_how_far_a_scheme_is_from_the_fixed_ones() -> None:
 
     assert over_fixed(runs, "zsched")["map_hz"].value == pytest.approx(0.25)
     assert over_fixed(runs, "random") == {}, "two runs say nothing"
-    text = over_fixed_text(runs)
-    assert "| scheme | runs | MB/s | maps/s | task s | p50 s | p95 s |" in text
-    assert "+25 % [+25 %, +25 %]" in text
-    assert "| against | runs |" in text
-    assert "| fixed_e2 | 3 |" in text
+    text = "\n".join(gains_parts({"scenario": {"level": "one"}, "runs": runs}, ["gains.png"]))
+    assert "| where | scheme | runs | MB/s | maps/s | task s | p95 s |" in text
+    assert "+25 % [+25, +25]" in text
+    assert "| matrix (one) | 3 |" in text, "against the best one"
+    assert "![gains.png](gains.png)" in text
     assert "random" not in text
-    assert over_fixed_text(runs[:3]) == ""
+    assert others_text(runs) == "", "zsched is in the table of gains, and two runs of random say nothing"
+    runs += [a_run("random", 2, map_hz=2.0)]
+    assert "| random | 3 |" in others_text(runs)
 
 
 def a_block(name: str, schemes: tuple[str, ...], runs: int = 3) -> list[dict[str, Any]]:
@@ -217,9 +221,16 @@ def test_the_report_says_where_placing_pays_and_judges_a_block_that_is_a_whole_m
     assert not is_whole(in_block(runs, "part"))
     assert not is_whole(in_block(runs, "thin"))
     blocks: dict[str, Any] = {"heavy": {}, "part": {}}
-    shown = "\n".join(blocks_parts({"scenario": {"blocks": blocks, "merge": {}}, "runs": runs}))
-    assert shown.count("zsched: map frequency at least +20 % over fixed") == 1
-    assert "| **exceeded** |" in shown
+    told = {"scenario": {"level": "one", "blocks": blocks, "merge": {}}, "runs": runs}
+    shown = "\n".join(blocks_parts(told, ["heavy.png"]))
+    assert "## Block heavy" in shown
+    assert "![heavy.png](heavy.png)" in shown
+    assert "## Block part" not in shown
+    assert "| part | zsched | 3 |" in shown
+    assert "| heavy | verdict |" in claims_text(judged_groups(told))
+    assert "| part | verdict |" not in claims_text(judged_groups(told))
+    row = next(line for line in claims_text(judged_groups(told)).splitlines() if "at least +20 % over fixed" in line)
+    assert row.endswith("| - | **not measured** | +49 % [+46, +52] | **exceeded** |")
 
     groups = groups_of(results)
     assert save_gains(tmp_path / "gains.png", groups, "title") == "gains.png"
@@ -267,12 +278,13 @@ def test_the_report_holds_every_claim_scheme_level_and_picture(tmp_path: Any) ->
     assert all(claim.says in text for claim in CLAIMS)
     assert "| zsched | 3 | 2.00 |" in text  # the matrix's, without the block's
     assert "| zsched | 1 | 7.50 |" in text
-    assert "Only the runs that every scheme has (1)" in text
+    assert "Where the numbers of runs differ, so do the worlds" in text
+    assert "| narrow | zsched | 1 | 7.50 |" in text
     assert "every node sends at most 9.8 Mbit/s" in text
     assert "Left out: no exploring robots." in text
     assert "No valid run of 1 cells: one-random-3." in text
     assert "in any run: zsched 0.60, fixed 0.60." in text
-    assert "<sub>plain SSIM</sub>" in text
+    assert "plain SSIM" not in text, "results.json has it"
     shown = snippet(results, pictures)
     assert all(claim.says in shown for claim in CLAIMS)
     assert f"0 of 0 claims hold, {len(CLAIMS)} could not be judged" in shown
