@@ -147,7 +147,7 @@ def test_python_examples_compile(name: str) -> None:
 
 
 ABSOLUTE: Final = re.compile(r"(?<![\w.}*<>:/@-])/([A-Za-z][\w.-]*)/[\w.*<-]")
-PLACES: Final = frozenset({"opt", "etc", "var", "run", "proc", "sys", "dev", "path"})
+PLACES: Final = frozenset({"opt", "etc", "usr", "var", "run", "proc", "sys", "dev", "path"})
 """Folders that every Linux machine has (and ``/path/to``)."""
 
 
