@@ -46,12 +46,14 @@ def fleet_of(folder: Path, program: str, task: str) -> dict[str, Any]:
     return tree
 
 
-def run_application(bed: Testbed) -> list[str]:
-    """The application of docs/guide/streams.md on robot1: what it prints; it must end by itself."""
-    program = examples("docs/guide/streams.md", "python")[0]
-    endpoint = bed.fleet.node("robot1").listen_data
-    assert "tcp/127.0.0.1:7458" in program
-    text = program.replace("tcp/127.0.0.1:7458", endpoint)
+def run_application(
+    bed: Testbed, page: str = "docs/guide/streams.md", changes: dict[str, str] | None = None
+) -> list[str]:
+    """A page's application on robot1: what it prints; it must end by itself."""
+    text = examples(page, "python")[0]
+    for old, new in {"tcp/127.0.0.1:7458": bed.fleet.node("robot1").listen_data, **(changes or {})}.items():
+        assert old in text
+        text = text.replace(old, new)
     done = subprocess.run(
         [sys.executable, "-c", text], capture_output=True, text=True, timeout=30, check=False, stdin=subprocess.DEVNULL
     )
@@ -88,3 +90,21 @@ def test_a_program_without_the_library_is_told_to_say_ready_matching(tmp_path: P
         assert "the worker on edge1 failed: not ready within 2 s" in told[0]
         assert "`ready: matching`" in told[0]
         assert "@zsched/testbed/worker/edge1/shout/" in told[0]
+
+
+def test_the_first_fleet_answers_its_application(tmp_path: Path) -> None:
+    """The task and the application of docs/guide/first-fleet.md, on two robots and an edge that all may own it."""
+    page = YAML(typ="safe").load(examples("docs/guide/first-fleet.md", "yaml")[0])
+    tree = echo_fleet(robots=2, edges=1, timing=page["timing"])
+    tree["electorate"], tree["tasks"] = page["electorate"], page["tasks"]
+    assert sorted(tree["nodes"]) == sorted(page["nodes"])
+    with Testbed(tmp_path, tree) as bed:
+        bed.init()
+        bed.start()
+        owner = bed.wait_settled()
+        bed.wait(lambda: not bed.task("robot1")["problems"], 60, "the worker takes its inputs")
+        said = run_application(bed, "docs/guide/first-fleet.md", {"range(1000)": "range(20)"})
+    assert len(said) >= 17  # the first ones may be put too early, and the last answers come too late
+    first = int(said[0].split()[1])
+    last = first + len(said)
+    assert said == [f"message {number} application/octet-stream;{owner}" for number in range(first, last)]

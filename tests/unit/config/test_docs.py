@@ -1,7 +1,10 @@
 """docs/guide/fleet-file.md says what the schema says, and its examples are real."""
 
+import re
 from dataclasses import MISSING, fields
 from pathlib import Path
+
+import pytest
 
 from zsched.config.load import check_bytes
 from zsched.config.schema import LINK_LIMITS, RULE, SCHEDULING, TRACE, WORKER, reference
@@ -21,7 +24,8 @@ from zsched.core.values.fleet import (
 from zsched.core.values.model import Tuning
 from zsched.core.values.plan import StreamSettings
 
-DOC = (Path(__file__).parents[3] / "docs" / "guide" / "fleet-file.md").read_text()
+GUIDE = Path(__file__).parents[3] / "docs" / "guide"
+DOC = (GUIDE / "fleet-file.md").read_text()
 
 
 def test_reference_is_the_schemas() -> None:
@@ -80,3 +84,11 @@ def test_the_shown_report_is_what_the_checker_prints() -> None:
     result = check_bytes(text.encode(), "fleet.yaml")
     report = "\n".join(fault.render("fleet.yaml") for fault in result.faults)
     assert report == shown
+
+
+@pytest.mark.parametrize("page", ["fleet-file.md", "first-fleet.md"])
+def test_whole_fleet_files_of_the_guide_have_no_fault_and_no_warning(page: str) -> None:
+    examples = re.findall(r"^```yaml\n(fleet: .*?)^```", (GUIDE / page).read_text(), re.MULTILINE | re.DOTALL)
+    assert examples
+    for text in examples:
+        assert check_bytes(text.encode(), page).report() == ""
