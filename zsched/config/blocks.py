@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from collections.abc import Mapping as Lookup
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from typing import Any, Final, Generic, Protocol, TypeVar
 
@@ -67,19 +67,16 @@ class Number:
             return None
         value = float(node.text)
         if not self.low <= value <= self.high:
-            out.error(
-                node.place,
-                f"{node.text} is not in the allowed range {_plain(self.low)}..{_plain(self.high)}{self._unit()}",
-            )
+            out.error(node.place, f"{node.text} is not in the allowed range {self._range()}")
             return None
         return value
 
     def says(self) -> str:
         """Range and unit."""
-        return f"a number {_plain(self.low)}..{_plain(self.high)}{self._unit()}"
+        return f"a number {self._range()}"
 
-    def _unit(self) -> str:
-        return f" {self.unit}" if self.unit else ""
+    def _range(self) -> str:
+        return f"{plain_number(self.low)}..{plain_number(self.high)}{f' {self.unit}' if self.unit else ''}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -273,7 +270,7 @@ class MapOf(Generic[T]):
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """One key of a record. ``default`` is only for the reference; where it is empty the record's class has it."""
+    """One key of a record. ``default`` is only for the reference."""
 
     block: Block[Any]
     doc: str
@@ -314,11 +311,10 @@ class Section:
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """A mapping with known keys. ``kind`` is the class whose defaults hold (for the reference)."""
+    """A mapping with known keys."""
 
     what: str
     items: Lookup[str, Field]
-    kind: type | None = None
     removed: Lookup[str, Removed] = field(default_factory=dict)
     """Keys that it had once."""
 
@@ -354,16 +350,6 @@ class Record:
     def says(self) -> str:
         """Its keys."""
         return f"a mapping {{{', '.join(self.items)}}}"
-
-    def default_text(self, name: str) -> str:
-        """The default of a key as the reference shows it."""
-        item = self.items[name]
-        if item.required or item.default:
-            return "required" if item.required else item.default
-        defaults = {one.name: one.default for one in fields(self.kind)} if self.kind is not None else {}
-        value = defaults.get(name, MISSING)
-        is_silent = value is MISSING or value in (None, "", ()) or is_dataclass(value)
-        return "" if is_silent else f"`{_shown(value)}`"
 
 
 @dataclass(frozen=True, slots=True)
@@ -401,11 +387,6 @@ def _distinct(node: Mapping, out: Collector) -> list[tuple[Scalar, Node]]:
     return list(first.values())
 
 
-def _shown(value: object) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    return _plain(value) if isinstance(value, float) else str(value)
-
-
-def _plain(value: float) -> str:
+def plain_number(value: float) -> str:
+    """As one writes it."""
     return f"{value:g}" if abs(value) < 1e5 else f"{value:.0f}"

@@ -56,7 +56,6 @@ def _entry(what: str, word: str, plain: Record) -> Record:
             "worker_key": Field(Here(_KEY), "Or its key, when it is a plain zenoh program; a template."),
             **rest,
         },
-        plain.kind,
     )
 
 

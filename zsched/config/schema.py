@@ -1,7 +1,7 @@
 """Decides which keys a fleet file has, what each takes, and says so in the reference table.
 
-Knows: every key with its kind, range and one sentence. Does not know: how the values relate (`zsched.config.load`), and
-the defaults, which live in `zsched.core.values.fleet`, `zsched.core.values.plan` and `zsched.core.values.model`.
+Knows: every key with its kind, range and one sentence. Those of a field stand beside the field, with its default
+(`zsched.core.values.limits`); the others stand here. Does not know: how the values relate (`zsched.config.load`).
 """
 
 from __future__ import annotations
@@ -25,13 +25,12 @@ from zsched.config.blocks import (
     Record,
     Removed,
     Text,
-    Whole,
 )
+from zsched.config.keys import keys
 from zsched.config.ros2 import ros2_record
 from zsched.config.timing import PROFILES
 from zsched.core.scheduler.patience import CHOICES
 from zsched.core.values.fleet import (
-    DEFAULT_FORESEE_S,
     DEFAULT_SCORE,
     PAPER_PATIENCE,
     PATIENT_BONUS,
@@ -40,16 +39,11 @@ from zsched.core.values.fleet import (
     Demand,
     Fleet,
     LinkLimits,
-    LocalMode,
+    LinkSpec,
     LocalSide,
-    OnIsolation,
     PairReading,
-    Reach,
-    SharedMemory,
-    Standby,
     TaskSpec,
     Timing,
-    WorkerLink,
     WorkerSpec,
 )
 from zsched.core.values.model import (
@@ -61,9 +55,8 @@ from zsched.core.values.model import (
     NodeKind,
     Objective,
     ScoreForm,
-    Tuning,
 )
-from zsched.core.values.plan import HandoverRule, OnCrash, ReadyWhen, ServiceSettings, StreamClass, StreamSettings
+from zsched.core.values.plan import ServiceSettings, StreamSettings
 
 _HOST_PORT: Final = ("tcp", "udp", "tls", "quic", "ws")
 _WITH_PATH: Final = ("unixsock-stream", "unixpipe", "serial", "vsock")
@@ -111,8 +104,6 @@ def _text_fault(text: str) -> str | None:
     return None
 
 
-_SECONDS: Final = Number(0.01, 3600, "s")
-_DBM: Final = Number(RSSI_MIN_DBM, RSSI_MAX_DBM, "dBm")
 _TEXT: Final = Text("text", _text_fault)
 _FILE: Final = Text("a file name", lambda text: "it is empty" if not text else _text_fault(text))
 _ENDPOINT: Final = Text("a zenoh endpoint", endpoint_fault, 'for example "tcp/0.0.0.0:7457"')
@@ -127,15 +118,16 @@ TRACE: Final = Record(
     "a trace",
     {
         "file": Field(_FILE, "CSV (or .csv.gz) of a recorded drive, relative to the fleet file.", required=True),
-        "column": Field(_TEXT, "The column that holds dBm.", default="`c_rssi`"),
-        "offset_s": Field(Number(0, 1e6, "s"), "Where in the drive to start.", default="`0`"),
+        **keys(LinkSpec, column=_TEXT),
     },
 )
 
 _LINK_FIELDS: Final = {
     "wifi": Field(_INTERFACE_NAME, "Read this interface's signal (nl80211, else /proc/net/wireless)."),
     "wired": Field(Flag(only=True), "A cable: the link counts 1."),
-    "fixed": Field(_DBM, "A constant, for tests and for links that cannot be measured."),
+    "fixed": Field(
+        Number(RSSI_MIN_DBM, RSSI_MAX_DBM, "dBm"), "A constant, for tests and for links that cannot be measured."
+    ),
     "trace": Field(TRACE, "Replay a recorded drive (lab and tests)."),
 }
 
@@ -150,15 +142,8 @@ PEER_LINK: Final = Record(
     },
 )
 
-LOCAL: Final = Record(
-    "a local side",
-    {
-        "mode": Field(Choice.of(LocalMode), "`client`: of the host's router; `peer`: among the host's peers."),
-        "connect": Field(ListOf(Here(_ENDPOINT), least=1), "Whom to dial, such as the host's `rmw_zenohd`."),
-        "listen": Field(ListOf(Here(_ENDPOINT), least=1), "Where the host's applications dial us (`peer` only)."),
-    },
-    LocalSide,
-)
+_ENDPOINTS: Final = ListOf(Here(_ENDPOINT), least=1)
+LOCAL: Final = Record("a local side", keys(LocalSide, connect=_ENDPOINTS, listen=_ENDPOINTS))
 
 NODE: Final = Record(
     "a node",
@@ -201,14 +186,7 @@ WEIGHTS: Final = Record(
     },
 )
 
-DEMAND: Final = Record(
-    "a demand",
-    {
-        "cpu_cores": Field(Number(0, 4096, "cores"), "CPU that the task needs at least."),
-        "memory_mb": Field(Number(0, 1e8, "MiB"), "Memory that the task needs at least."),
-    },
-    Demand,
-)
+DEMAND: Final = Record("a demand", keys(Demand))
 
 SCHEDULING: Final = Record(
     "a scheduling section",
@@ -244,17 +222,12 @@ SCHEDULING: Final = Record(
             "comes too late.",
             default="none",
         ),
-        "aggregate": Field(Choice.of(Aggregate), "How the robots' utilities become one; `median` resists a liar."),
-        "reach": Field(Choice.of(Reach), "Who must reach a candidate.", default=f"`{Reach.MAJORITY}`"),
-        "memory_floor_ratio": Field(
-            Number(0, 0.9),
-            "Where a task leaves less memory free than this share, its memory counts up to 15 % less "
-            "(`score: paper`: an owner that has less is left).",
-            default="`0.05`",
+        "aggregate": Field(
+            Choice.of(Aggregate),
+            "How the robots' utilities become one; `median` resists a liar.",
+            default=f"`{Aggregate.MEAN}`",
         ),
-        "max_moves_per_minute": Field(
-            Whole(1, 100_000), "Hard cap of planned moves; escapes are bounded too, at 60.", default="`6`"
-        ),
+        **keys(TaskSpec, "reach", "memory_floor_ratio", "max_moves_per_minute"),
         "patience": Field(
             Number(0.001, 1000),
             "Move once staying has cost so much, lead times seconds (`time_to_trigger_s` does not count then): "
@@ -263,7 +236,6 @@ SCHEDULING: Final = Record(
             f"`{PAPER_PATIENCE:g}` with `score: paper`; none with `time_to_trigger_s` alone",
         ),
     },
-    Tuning,
     removed={
         "pays_off_in_s": Removed(
             why="it gained only where a move costs ten seconds and more, and no more than a larger bonus does there",
@@ -272,30 +244,18 @@ SCHEDULING: Final = Record(
     },
 )
 
+_PAIR: Final = Choice.of(
+    PairReading,
+    {
+        "mean": Removed(
+            why="its leads were a quarter of candidate's, less than the bonus that noise asks for",
+            instead="pair: candidate, which ranks three robots and more as mean did; of two: pair: weaker",
+        )
+    },
+)
 LINK_LIMITS: Final = Record(
     "a link section",
-    {
-        "nu_dbm": Field(_DBM, "Least usable signal (Eq. 3): below it the candidate's utility is 0."),
-        "rho_dbm": Field(_DBM, "Best achievable signal (Eq. 3); above `nu_dbm`."),
-        "pair": Field(
-            Choice.of(
-                PairReading,
-                {
-                    "mean": Removed(
-                        why="its leads were a quarter of candidate's, less than the bonus that noise asks for",
-                        instead="pair: candidate, which ranks three robots and more as mean did; of two: pair: weaker",
-                    )
-                },
-            ),
-            "Worth of a link through an access point: by the candidate's way (as printed), or by the weaker one.",
-        ),
-        "foresee_s": Field(
-            Number(0, 30, "s"),
-            "Signals count as they will be so far ahead along their trend (at most 6 dB); `0`: as they are.",
-            default=f"`{DEFAULT_FORESEE_S:g}`",
-        ),
-    },
-    LinkLimits,
+    keys(LinkLimits, pair=_PAIR),
     removed={
         "knee_dbm": Removed(
             why="a knee gained nothing, and which signal it is depends on the radio",
@@ -306,35 +266,11 @@ LINK_LIMITS: Final = Record(
 
 WORKER: Final = Record(
     "a worker",
-    {
-        "command": Field(
-            ListOf(Text("a word", _text_fault), least=1),
-            "Program and arguments, no shell. A first word `python` is the daemon's own interpreter. "
-            "Absent: the worker is started by somebody else.",
-        ),
-        "standby": Field(
-            Choice.of(Standby), "`warm`: runs on every candidate; `cold`: started on the move, by its `command`."
-        ),
-        "ready": Field(
-            Choice.of(ReadyWhen),
-            "`token`: zsched.worker says so; `matching`: any zenoh program, while it takes every input and service.",
-            default="`token`",
-        ),
-        "link": Field(Choice.of(WorkerLink), "How workers join the data network."),
-        "env": Field(MapOf(Text("a variable", _matches(_ENV_NAME, "letters, digits and '_'")), _TEXT), "Environment."),
-        "start_deadline_s": Field(
-            _SECONDS, "Ready within this time, or the start has failed. So long may the owner's be away."
-        ),
-        "stop_grace_s": Field(_SECONDS, "Between SIGINT, SIGTERM and SIGKILL."),
-        "output_deadline_s": Field(
-            _SECONDS, "No output for so long while inputs flow counts as hung.", default="not watched"
-        ),
-        "max_failures": Field(Whole(1, 100), "So many failures in the window make the node ineligible."),
-        "failure_window_s": Field(
-            Number(1, 86400, "s"), "The window; failures since it was last ready count however old."
-        ),
-    },
-    WorkerSpec,
+    keys(
+        WorkerSpec,
+        command=ListOf(Text("a word", _text_fault), least=1),
+        env=MapOf(Text("a variable", _matches(_ENV_NAME, "letters, digits and '_'")), _TEXT),
+    ),
 )
 
 RULE: Final = Record(
@@ -342,19 +278,8 @@ RULE: Final = Record(
     {
         "from": Field(Here(_TEMPLATE), "Key that is subscribed to; a template.", required=True),
         "to": Field(Here(_TEMPLATE), "Key that is published; a template.", required=True),
-        "class": Field(Choice.of(StreamClass), "What the stream needs.", default=f"`{StreamClass.BEST_EFFORT}`"),
-        "keep_last": Field(Whole(0, 1000), "Samples per key that a new owner gets at once (class `latest`)."),
-        "depth": Field(Whole(1, 100_000), "Samples that may wait between subscriber and publisher."),
-        "handover": Field(Choice.of(HandoverRule), "Outputs: switch at the new owner's first sample, or lose nothing."),
-        "max_hz": Field(Number(0.01, 10_000, "Hz"), "Highest rate per key; not for `reliable`.", default="no limit"),
-        "mirror": Field(Flag(), "Inputs: feed both owners during a move (outputs with handover `latest` only)."),
-        "on_crash": Field(
-            Choice.of(OnCrash),
-            "Inputs of class `reliable`: what a dead owner had not acknowledged is reported (done at most once), "
-            "or replayed to the next owner (at least once).",
-        ),
+        **keys(StreamSettings),
     },
-    StreamSettings,
 )
 
 SERVICE: Final = Record(
@@ -362,12 +287,8 @@ SERVICE: Final = Record(
     {
         "from": Field(Here(_TEMPLATE), "Key under which the robot's applications ask; a template.", required=True),
         "to": Field(Here(_TEMPLATE), "Key under which the owner's worker answers; a template.", required=True),
-        "retry": Field(Flag(), "Ask the next owner when the old one did not answer: it may be done twice."),
-        "timeout_s": Field(Number(0.05, 3600, "s"), "Every request is answered within this time."),
-        "hold_s": Field(Number(0, 3600, "s"), "How long a request waits for an owner while there is none."),
-        "max_pending": Field(Whole(1, 256), "Requests at the owner at one time; the next one is answered `busy`."),
+        **keys(ServiceSettings),
     },
-    ServiceSettings,
 )
 
 TASK: Final = Record(
@@ -383,36 +304,16 @@ TASK: Final = Record(
         "outputs": Field(ListOf(RULE), "Streams from the owner's worker to the robots' applications."),
         "services": Field(ListOf(SERVICE), "Requests of the robots' applications that the owner's worker answers."),
         "ros2": Field(ros2_record(RULE, SERVICE), "The same three by ROS 2 names; they become rules like the others."),
-        "on_isolation": Field(Choice.of(OnIsolation), "What a robot does that is cut off from the owner."),
-        "exclusive": Field(
-            Flag(),
-            "The work must never run twice; needs `{epoch}` in every output's `from`. "
-            "A task that has worked without it rests until all its candidates have answered by this file.",
-        ),
-        "drain_s": Field(Number(0, 600, "s"), "How long the old owner may finish what it has in work."),
+        **keys(TaskSpec, "on_isolation", "exclusive", "drain_s"),
     },
-    TaskSpec,
 )
 
 TIMING: Final = Record(
     "a timing section",
     {
         "profile": Field(Choice(PROFILES), "The profile from which the others differ.", default="`wifi`"),
-        "beat_s": Field(_SECONDS, "Period of the heartbeat."),
-        "suspect_s": Field(_SECONDS, "Silence after which a peer is suspect."),
-        "confirm_s": Field(_SECONDS, "How long a suspect may refute before it is gone."),
-        "zenoh_lease_s": Field(_SECONDS, "zenoh's own lease."),
-        "sample_s": Field(_SECONDS, "Period of the profilers."),
-        "smoothing_s": Field(_SECONDS, "Time constant of CPU and memory, and of dBm where it is over 0.5 s."),
-        "publish_s": Field(_SECONDS, "A profile at least so often."),
-        "profile_ttl_s": Field(_SECONDS, "An older profile does not count."),
-        "decide_s": Field(_SECONDS, "A robot's own round at least so often."),
-        "gather_s": Field(_SECONDS, "Deadline for the peers' utilities."),
-        "ballot_s": Field(_SECONDS, "Deadline of one prepare or accept phase."),
-        "stagger_s": Field(Number(0, 10, "s"), "Wait per rank before a proposer starts."),
-        "lease_s": Field(_SECONDS, "Exclusive tasks: how long an owner may work on the echoes of one beat."),
+        **keys(Timing),
     },
-    Timing,
 )
 
 FLEET: Final = Record(
@@ -433,14 +334,8 @@ FLEET: Final = Record(
             ),
             "Settings of zenoh itself.",
         ),
-        "relay_orphan_s": Field(
-            Number(0, 600, "s"), "How long a relay carries the streams on when its daemon is gone; 0: not at all."
-        ),
-        "shared_memory": Field(
-            Choice.of(SharedMemory), "Large payloads within a machine; `auto`: where the node finds it fit."
-        ),
+        **keys(Fleet),
     },
-    Fleet,
 )
 
 
@@ -478,7 +373,7 @@ def _records(block: Block[Any]) -> Iterator[tuple[str, Record]]:
 def _section(record: Record, paths: list[str]) -> str:
     heading = ", ".join(f"`{path}`" for path in paths) if paths != [""] else "The file"
     rows = (
-        f"| `{name}` | {item.block.says()} | {record.default_text(name)} | {item.doc} |"
+        f"| `{name}` | {item.block.says()} | {'required' if item.required else item.default} | {item.doc} |"
         for name, item in record.items.items()
     )
     return "\n".join(

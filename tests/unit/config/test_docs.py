@@ -1,13 +1,13 @@
 """docs/guide/fleet-file.md says what the schema says, and its examples are real."""
 
 import re
-from dataclasses import MISSING, fields
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
 from zsched.config.load import check_bytes
-from zsched.config.schema import LINK_LIMITS, RULE, SCHEDULING, TRACE, WORKER, reference
+from zsched.config.schema import LINK_LIMITS, SCHEDULING, reference
 from zsched.config.timing import _RELATIONS, PROFILES
 from zsched.core.values.fleet import (
     DEFAULT_FORESEE_S,
@@ -16,13 +16,9 @@ from zsched.core.values.fleet import (
     PATIENT_BONUS,
     PATIENT_COOL_DOWN_S,
     RADIO_PATIENCE,
-    LinkSpec,
-    TaskSpec,
     Timing,
-    WorkerSpec,
 )
 from zsched.core.values.model import Tuning
-from zsched.core.values.plan import StreamSettings
 
 GUIDE = Path(__file__).parents[3] / "docs" / "guide"
 DOC = (GUIDE / "fleet-file.md").read_text()
@@ -33,33 +29,17 @@ def test_reference_is_the_schemas() -> None:
     assert written == reference(), "paste the output of zsched.config.schema.reference() between the two marks"
 
 
-def test_defaults_told_by_hand_are_the_classes_own() -> None:
-    told = [
-        (TRACE, "column", LinkSpec, "column"),
-        (TRACE, "offset_s", LinkSpec, "offset_s"),
-        (SCHEDULING, "reach", TaskSpec, "reach"),
-        (SCHEDULING, "memory_floor_ratio", TaskSpec, "memory_floor_ratio"),
-        (SCHEDULING, "max_moves_per_minute", TaskSpec, "max_moves_per_minute"),
-        (WORKER, "ready", WorkerSpec, "ready_when"),
-        (RULE, "class", StreamSettings, "stream_class"),
-    ]
-    for record, key, kind, name in told:
-        default = next(field.default for field in fields(kind) if field.name == name)
-        assert default is not MISSING
-        shown = f"{default:g}" if isinstance(default, float) else str(default)
-        assert record.default_text(key) == f"`{shown}`", key
-
-
 def test_defaults_that_hang_on_each_other_are_the_codes() -> None:
     timers = {field.name: field.default for field in fields(Tuning)}
     alone = "with `time_to_trigger_s` alone"
-    assert SCHEDULING.default_text("bonus") == f"`{PATIENT_BONUS:g}`; `{timers['bonus']:g}` {alone}"
+    assert SCHEDULING.items["bonus"].default == f"`{PATIENT_BONUS:g}`; `{timers['bonus']:g}` {alone}"
     kept = f"`{PATIENT_COOL_DOWN_S:g}`; `{timers['cool_down_s']:g}` {alone}"
-    assert SCHEDULING.default_text("cool_down_s") == kept
-    assert SCHEDULING.default_text("score") == f"`{DEFAULT_SCORE}`"
+    assert SCHEDULING.items["cool_down_s"].default == kept
+    assert SCHEDULING.items["aggregate"].default == f"`{timers['aggregate']}`"
+    assert SCHEDULING.items["score"].default == f"`{DEFAULT_SCORE}`"
     radio, paper = f"`{RADIO_PATIENCE:g}` with a weight for the network", f"`{PAPER_PATIENCE:g}` with `score: paper`"
-    assert SCHEDULING.default_text("patience") == f"learnt, 0.05 to 1.5; {radio}; {paper}; none {alone}"
-    assert LINK_LIMITS.default_text("foresee_s") == f"`{DEFAULT_FORESEE_S:g}`"
+    assert SCHEDULING.items["patience"].default == f"learnt, 0.05 to 1.5; {radio}; {paper}; none {alone}"
+    assert LINK_LIMITS.items["foresee_s"].default == f"`{DEFAULT_FORESEE_S:g}`"
 
 
 def test_timing_table_and_relations_are_the_codes() -> None:

@@ -14,7 +14,20 @@ from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
 from functools import lru_cache
 
-from zsched.core.values.model import Allocation, LinkSource, NodeId, NodeKind, ScoreForm, TaskId, Tuning, check_range
+from zsched.core.values.limits import Range, check_ranges, key
+from zsched.core.values.model import (
+    MAX_CPU_CORES,
+    MAX_MEMORY_MB,
+    RSSI_MAX_DBM,
+    RSSI_MIN_DBM,
+    Allocation,
+    LinkSource,
+    NodeId,
+    NodeKind,
+    ScoreForm,
+    TaskId,
+    Tuning,
+)
 from zsched.core.values.plan import Direction, ReadyWhen, ServiceSettings, StreamSettings
 
 DEFAULT_SCORE = ScoreForm.SERVICE
@@ -29,6 +42,8 @@ PATIENT_COOL_DOWN_S = 2.0
 """The cool-down of a task with a patience, likewise (docs/decisions/0033)."""
 DEFAULT_FORESEE_S = 3.0
 """How far ahead the signals of a task count when its fleet file does not say."""
+SECONDS = Range(0.01, 3600, "s")
+DBM = Range(RSSI_MIN_DBM, RSSI_MAX_DBM, "dBm")
 
 
 class Standby(StrEnum):
@@ -69,10 +84,8 @@ class LinkSpec:
     source: LinkSource
     peer: NodeId | None = None
     value: str = ""
-    column: str = "c_rssi"
-    """Trace: the CSV column that holds dBm."""
-    offset_s: float = 0.0
-    """Trace: where in the drive to start."""
+    column: str = key("c_rssi", "The column that holds dBm.")
+    offset_s: float = key(0.0, "Where in the drive to start.", Range(0, 1e6, "s"))
     mac: str = ""
     """nl80211: the station that ``peer`` is (empty: the access point)."""
 
@@ -88,10 +101,9 @@ class LocalMode(StrEnum):
 class LocalSide:
     """A network of the host's applications apart from the fleet's: inputs come from it, outputs go to it."""
 
-    mode: LocalMode = LocalMode.CLIENT
-    connect: tuple[str, ...] = ()
-    """zenoh endpoints, e.g. that of the host's `rmw_zenohd`."""
-    listen: tuple[str, ...] = ()
+    mode: LocalMode = key(LocalMode.CLIENT, "`client`: of the host's router; `peer`: among the host's peers.")
+    connect: tuple[str, ...] = key((), "Whom to dial, such as the host's `rmw_zenohd`.")
+    listen: tuple[str, ...] = key((), "Where the host's applications dial us (`peer` only).")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -114,30 +126,43 @@ class NodeSpec:
 class Demand:
     """What the task needs at least, known before it was ever measured (cores, MiB)."""
 
-    cpu_cores: float = 0.0
-    memory_mb: float = 0.0
+    cpu_cores: float = key(0.0, "CPU that the task needs at least.", Range(0, MAX_CPU_CORES, "cores"))
+    memory_mb: float = key(0.0, "Memory that the task needs at least.", Range(0, MAX_MEMORY_MB, "MiB"))
 
     def __post_init__(self) -> None:
-        check_range("demand.cpu_cores", self.cpu_cores, 0.0, 4096.0)
-        check_range("demand.memory_mb", self.memory_mb, 0.0, 1e8)
+        check_ranges(self, "demand.")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorkerSpec:
     """How a task's worker is run."""
 
-    command: tuple[str, ...] = ()
-    """Empty: nothing is started, the worker is somebody else's process."""
-    standby: Standby = Standby.WARM
-    ready_when: ReadyWhen = ReadyWhen.TOKEN
-    link: WorkerLink = WorkerLink.PEER
-    env: tuple[tuple[str, str], ...] = ()
-    start_deadline_s: float = 20.0
-    stop_grace_s: float = 2.0
-    output_deadline_s: float | None = None
-    """No output for so long while inputs flow counts as hung; ``None``: not watched."""
-    max_failures: int = 3
-    failure_window_s: float = 60.0
+    command: tuple[str, ...] = key(
+        (),
+        "Program and arguments, no shell. A first word `python` is the daemon's own interpreter. "
+        "Absent: the worker is started by somebody else.",
+    )
+    standby: Standby = key(
+        Standby.WARM, "`warm`: runs on every candidate; `cold`: started on the move, by its `command`."
+    )
+    ready_when: ReadyWhen = key(
+        ReadyWhen.TOKEN,
+        "`token`: zsched.worker says so; `matching`: any zenoh program, while it takes every input and service.",
+        name="ready",
+    )
+    link: WorkerLink = key(WorkerLink.PEER, "How workers join the data network.")
+    env: tuple[tuple[str, str], ...] = key((), "Environment.")
+    start_deadline_s: float = key(
+        20.0, "Ready within this time, or the start has failed. So long may the owner's be away.", SECONDS
+    )
+    stop_grace_s: float = key(2.0, "Between SIGINT, SIGTERM and SIGKILL.", SECONDS)
+    output_deadline_s: float | None = key(
+        None, "No output for so long while inputs flow counts as hung.", SECONDS, shown="not watched"
+    )
+    max_failures: int = key(3, "So many failures in the window make the node ineligible.", Range(1, 100))
+    failure_window_s: float = key(
+        60.0, "The window; failures since it was last ready count however old.", Range(1, 86400, "s")
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -165,11 +190,18 @@ class PairReading(StrEnum):
 class LinkLimits:
     """Eq. 3: nu (least usable) and rho (best achievable) in dBm, and how links are read."""
 
-    nu_dbm: float = -80.0
-    rho_dbm: float = -40.0
-    pair: PairReading = PairReading.CANDIDATE
-    foresee_s: float = 0.0
-    """Signals count as they will be so many seconds ahead along their trend; 0: as they are."""
+    nu_dbm: float = key(-80.0, "Least usable signal (Eq. 3): below it the candidate's utility is 0.", DBM)
+    rho_dbm: float = key(-40.0, "Best achievable signal (Eq. 3); above `nu_dbm`.", DBM)
+    pair: PairReading = key(
+        PairReading.CANDIDATE,
+        "Worth of a link through an access point: by the candidate's way (as printed), or by the weaker one.",
+    )
+    foresee_s: float = key(
+        0.0,
+        "Signals count as they will be so far ahead along their trend (at most 6 dB); `0`: as they are.",
+        Range(0, 30, "s"),
+        shown=f"`{DEFAULT_FORESEE_S:g}`",
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -182,18 +214,26 @@ class TaskSpec:
     tuning: Tuning
     demand: Demand = Demand()
     limits: LinkLimits = LinkLimits()
-    reach: Reach = Reach.MAJORITY
-    memory_floor_ratio: float = 0.05
-    """Escape: the owner's free memory under this fraction."""
-    max_moves_per_minute: int = 6
-    """Hard cap of planned moves; escapes have their own (`zsched.core.scheduler.damping`)."""
+    reach: Reach = key(Reach.MAJORITY, "Who must reach a candidate.")
+    memory_floor_ratio: float = key(
+        0.05,
+        "Where a task leaves less memory free than this share, its memory counts up to 15 % less "
+        "(`score: paper`: an owner that has less is left).",
+        Range(0, 0.9),
+    )
+    max_moves_per_minute: int = key(6, "Hard cap of planned moves; escapes are bounded too, at 60.", Range(1, 100_000))
+    """Escapes: `zsched.core.scheduler.damping`."""
     patience: float | None = None
     """Utility seconds that staying may cost before the task moves, in place of the time-to-trigger; ``None``: that."""
     learns_patience: bool = False
     """Its patience is learnt (`zsched.core.scheduler.patience`); ``patience`` is what it begins with."""
-    on_isolation: OnIsolation = OnIsolation.HOLD
-    exclusive: bool = False
-    drain_s: float = 2.0
+    on_isolation: OnIsolation = key(OnIsolation.HOLD, "What a robot does that is cut off from the owner.")
+    exclusive: bool = key(
+        False,
+        "The work must never run twice; needs `{epoch}` in every output's `from`. "
+        "A task that has worked without it rests until all its candidates have answered by this file.",
+    )
+    drain_s: float = key(2.0, "How long the old owner may finish what it has in work.", Range(0, 600, "s"))
     worker: WorkerSpec = WorkerSpec()
     rules: tuple[StreamRule, ...] = ()
 
@@ -208,27 +248,21 @@ class Timing:
     """The clocks of the protocol; profiles `wired`, `wifi`, `wan` are differences from it (`docs/design/timing.md`)."""
 
     name: str = "wifi"
-    beat_s: float = 0.2
-    suspect_s: float = 1.2
-    """Silence of the beats after which a peer is suspect."""
-    confirm_s: float = 0.3
-    """How long a suspect may refute, or a second observer confirm, before it is gone."""
-    zenoh_lease_s: float = 1.5
-    sample_s: float = 0.2
-    smoothing_s: float = 0.3
-    """EWMA time constant of CPU, memory and dBm."""
-    publish_s: float = 1.0
-    """Profiles at least so often (sooner on change)."""
-    profile_ttl_s: float = 3.0
-    decide_s: float = 0.5
-    """A robot's own round at least so often."""
-    gather_s: float = 0.15
-    ballot_s: float = 0.3
-    """Deadline of one prepare or accept phase."""
-    stagger_s: float = 0.03
-    """Wait per rank before a proposer starts."""
-    lease_s: float = 1.0
-    """Exclusive tasks: how long an owner may work on the echoes of one beat."""
+    beat_s: float = key(0.2, "Period of the heartbeat.", SECONDS)
+    suspect_s: float = key(1.2, "Silence after which a peer is suspect.", SECONDS)
+    confirm_s: float = key(0.3, "How long a suspect may refute before it is gone.", SECONDS)
+    """In which a second observer may confirm, too."""
+    zenoh_lease_s: float = key(1.5, "zenoh's own lease.", SECONDS)
+    sample_s: float = key(0.2, "Period of the profilers.", SECONDS)
+    smoothing_s: float = key(0.3, "Time constant of CPU and memory, and of dBm where it is over 0.5 s.", SECONDS)
+    publish_s: float = key(1.0, "A profile at least so often.", SECONDS)
+    """Sooner on change."""
+    profile_ttl_s: float = key(3.0, "An older profile does not count.", SECONDS)
+    decide_s: float = key(0.5, "A robot's own round at least so often.", SECONDS)
+    gather_s: float = key(0.15, "Deadline for the peers' utilities.", SECONDS)
+    ballot_s: float = key(0.3, "Deadline of one prepare or accept phase.", SECONDS)
+    stagger_s: float = key(0.03, "Wait per rank before a proposer starts.", Range(0, 10, "s"))
+    lease_s: float = key(1.0, "Exclusive tasks: how long an owner may work on the echoes of one beat.", SECONDS)
 
 
 class SharedMemory(StrEnum):
@@ -253,10 +287,14 @@ class Fleet:
     seeds: tuple[NodeId, ...] = ()
     zenoh_config: str = ""
     """Path of a zenoh JSON5 file, passed through untouched; empty: none."""
-    relay_orphan_s: float = 10.0
-    """A relay carries on for so long when its daemon is gone, and the next daemon takes it over; 0: it ends with it."""
-    shared_memory: SharedMemory = SharedMemory.OFF
-    """``auto``: where the node finds /dev/shm fit for it."""
+    relay_orphan_s: float = key(
+        10.0, "How long a relay carries the streams on when its daemon is gone; 0: not at all.", Range(0, 600, "s")
+    )
+    """The next daemon takes the relay over."""
+    shared_memory: SharedMemory = key(
+        SharedMemory.OFF, "Large payloads within a machine; `auto`: where the node finds it fit."
+    )
+    """Fit is its /dev/shm (`zsched.adapters.machine.shared_memory`)."""
 
     @property
     def voters(self) -> tuple[NodeId, ...]:

@@ -8,7 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
-from zsched.core.values.model import NodeId, TaskId, check_range
+from zsched.core.values.limits import Range, check_ranges, key
+from zsched.core.values.model import NodeId, TaskId
 
 
 class Direction(StrEnum):
@@ -60,48 +61,46 @@ class ReadyWhen(StrEnum):
 class StreamSettings:
     """How one stream is carried."""
 
-    stream_class: StreamClass = StreamClass.BEST_EFFORT
-    keep_last: int = 1
-    """Samples kept per key and replayed to a new owner (class ``latest``), 0..1000."""
-    depth: int = 16
-    """Bounded queue between subscriber and publisher, 1..100000 samples."""
-    handover: HandoverRule = HandoverRule.LATEST
-    max_hz: float | None = None
-    """Highest rate per key that goes on, Hz, 0.01..10000; the rest is dropped, the newest of class ``latest`` never."""
-    mirror: bool = False
-    """Inputs: until the old slot closes, both owners are fed (outputs with handover ``latest`` only)."""
+    stream_class: StreamClass = key(StreamClass.BEST_EFFORT, "What the stream needs.", name="class")
+    keep_last: int = key(1, "Samples per key that a new owner gets at once (class `latest`).", Range(0, 1000))
+    depth: int = key(16, "Samples that may wait between subscriber and publisher.", Range(1, 100_000))
+    handover: HandoverRule = key(
+        HandoverRule.LATEST, "Outputs: switch at the new owner's first sample, or lose nothing."
+    )
+    max_hz: float | None = key(
+        None, "Highest rate per key; not for `reliable`.", Range(0.01, 10_000, "Hz"), shown="no limit"
+    )
+    """The rest is dropped, the newest of class ``latest`` never."""
+    mirror: bool = key(False, "Inputs: feed both owners during a move (outputs with handover `latest` only).")
     graph: RosGraph = RosGraph.NONE
     """Set by the fleet file's `ros2:` sections."""
-    on_crash: OnCrash = OnCrash.REPORT
+    on_crash: OnCrash = key(
+        OnCrash.REPORT,
+        "Inputs of class `reliable`: what a dead owner had not acknowledged is reported (done at most once), "
+        "or replayed to the next owner (at least once).",
+    )
 
     def __post_init__(self) -> None:
-        check_range("keep_last", self.keep_last, 0, 1000)
-        check_range("depth", self.depth, 1, 100_000)
-        if self.max_hz is not None:
-            check_range("max_hz", self.max_hz, 0.01, 10_000)
+        check_ranges(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServiceSettings:
     """How the requests of one service are carried."""
 
-    retry: bool = False
-    """Ask the next owner when the old one did not answer: the work may then be done twice."""
-    timeout_s: float = 10.0
-    """A request is answered within this time, with an error if need be; 0.05..3600."""
-    hold_s: float = 3.0
-    """A request that nobody has taken waits so long for an owner, 0..3600 (with `retry`: as long as its time lasts).
+    retry: bool = key(False, "Ask the next owner when the old one did not answer: it may be done twice.")
+    timeout_s: float = key(10.0, "Every request is answered within this time.", Range(0.05, 3600, "s"))
+    """With an error if need be."""
+    hold_s: float = key(3.0, "How long a request waits for an owner while there is none.", Range(0, 3600, "s"))
+    """With `retry`: as long as the request's time lasts.
 
     The default is what a killed owner's takeover may take at most with the profile ``wifi``, 1.8 s, and an exclusive
     task's lease on top (docs/design/timing.md).
     """
-    max_pending: int = 16
-    """Requests at the owner at one time, 1..256; the next one is answered "busy"."""
+    max_pending: int = key(16, "Requests at the owner at one time; the next one is answered `busy`.", Range(1, 256))
 
     def __post_init__(self) -> None:
-        check_range("timeout_s", self.timeout_s, 0.05, 3600.0)
-        check_range("hold_s", self.hold_s, 0.0, 3600.0)
-        check_range("max_pending", self.max_pending, 1, 256)
+        check_ranges(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

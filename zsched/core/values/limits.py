@@ -1,0 +1,48 @@
+"""Says what a field may hold, beside the field: its range, and the key of the fleet file that gives it.
+
+As ``beat_s: float = key(0.2, "Period of the heartbeat.", Range(0.01, 3600, "s"))``. The default, the sentence and the
+range stand there only: `zsched.config.keys` makes the fleet file's schema of them. Does not know: who checks what.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Any, TypeVar
+
+from zsched.core.values.model import check_range
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class Range:
+    """A number in [low, high]; ``unit`` is for the reader only."""
+
+    low: float
+    high: float
+    unit: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Key:
+    """What the fleet file's reference says of a field, and its range if it has one."""
+
+    doc: str
+    range: Range | None
+    name: str
+    """The key, where it is not the field's name."""
+    shown: str
+    """The default in words, where the field's own is another one or says nothing."""
+
+
+def key(default: T, doc: str, bounds: Range | None = None, *, name: str = "", shown: str = "") -> T:
+    """A field of a dataclass that the fleet file has a key for."""
+    return field(default=default, metadata={"key": Key(doc, bounds, name, shown)})
+
+
+def check_ranges(value: Any, prefix: str = "") -> None:
+    """Raise `ValueError` unless every field of a dataclass is in its range (``None``, "not given", passes)."""
+    for one in fields(value):
+        held: Key | None = one.metadata.get("key")
+        if held is not None and held.range is not None:
+            check_range(f"{prefix}{one.name}", getattr(value, one.name), held.range.low, held.range.high)
