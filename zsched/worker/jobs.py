@@ -10,7 +10,6 @@ that writes it.
 from __future__ import annotations
 
 import contextlib
-import os
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -20,6 +19,7 @@ from typing import Final, Self
 
 from zsched.core.events import WorkerJobs
 from zsched.guard import guarded
+from zsched.procfs import parse_schedstat, read_file
 
 TELL_S: Final = 0.2
 """The node is told no more often: as often as it measures itself."""
@@ -118,17 +118,9 @@ class JobTimer:
 
 
 def _waited_s(thread_id: int) -> float | None:
-    """The run-queue delay of a thread of this process (/proc/PID/task/TID/schedstat, second figure)."""
-    try:
-        fd = os.open(f"/proc/self/task/{thread_id}/schedstat", os.O_RDONLY | os.O_CLOEXEC)
-    except OSError:
-        return None
-    try:
-        return int(os.read(fd, 128).split()[1]) / 1e9
-    except (OSError, ValueError, IndexError):
-        return None
-    finally:
-        os.close(fd)
+    """The run-queue delay of a thread of this process."""
+    times = parse_schedstat(read_file(f"/proc/self/task/{thread_id}/schedstat"))
+    return None if times is None else times[1]
 
 
 class Job:

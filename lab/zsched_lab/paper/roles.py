@@ -9,12 +9,12 @@ readings loses what it took since the last one.
 from __future__ import annotations
 
 import itertools
-import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from zsched.core.values.model import NodeId
+from zsched.procfs import parse_process_stat, read_file
 
 ROLES = (
     ("zsched_lab.explore.slam", "slam"),
@@ -25,7 +25,6 @@ ROLES = (
 """(what a command line holds, what such a process is)."""
 REST = "zsched"
 """Everything else in a node's group: the daemon, its relay."""
-TICKS_S = 1.0 / os.sysconf("SC_CLK_TCK")
 Json = Mapping[str, Any]
 
 
@@ -78,11 +77,8 @@ class RoleMeter:
 
 def cpu_s(stat: Path) -> float | None:
     """CPU seconds of a process by its ``/proc/PID/stat`` (proc(5)), of all its threads; ``None``: it has ended."""
-    try:
-        fields = stat.read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()
-        return (int(fields[11]) + int(fields[12])) * TICKS_S
-    except (OSError, ValueError, IndexError):
-        return None
+    times = parse_process_stat(read_file(str(stat)))
+    return None if times is None else times.own_s
 
 
 def role_figures(

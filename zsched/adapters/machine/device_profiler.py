@@ -26,28 +26,12 @@ from zsched.adapters.machine.cgroup import CgroupTree, CpuQuota, MemoryQuota, pa
 from zsched.clock import monotonic_s
 from zsched.core.profile.appetite import Appetite, Thread
 from zsched.core.values.model import DeviceSample, TaskId, WorkerLoad, WorkerState
+from zsched.procfs import PAGE_MB, TICKS_PER_S, ProcessTimes, names, parse_process_stat, parse_schedstat, read_file
 
 LIMITS_EVERY_S = 5.0
 """How often quotas, limits and the set of CPUs are looked up again; they change by an operator's hand only."""
 MIN_INTERVAL_S = 0.02
 """Two samples closer than this would divide one tick by nothing: the previous figure stands."""
-TICKS_PER_S = float(os.sysconf("SC_CLK_TCK"))
-PAGE_MB = os.sysconf("SC_PAGE_SIZE") / 1048576.0
-READ_BYTES = 65536
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ProcessTimes:
-    """One line of /proc/PID/stat, as far as it is needed here (times in seconds, memory in MiB)."""
-
-    parent: int
-    own_s: float
-    waited_s: float
-    """User and system time of children that ended and were waited for."""
-    threads: int
-    start_s: float
-    """After boot: with the id, the process's identity."""
-    rss_mb: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,23 +41,6 @@ class CpuTimes:
     busy_s: float
     total_s: float
     cpus: int
-
-
-def parse_process_stat(content: bytes) -> ProcessTimes | None:
-    """Read /proc/PID/stat; the name in it may hold blanks and brackets. ``None`` when it is malformed."""
-    fields = content[content.rfind(b")") + 2 :].split()
-    try:
-        user, system, waited_user, waited_system = (int(field) for field in fields[11:15])
-        return ProcessTimes(
-            parent=int(fields[1]),
-            own_s=(user + system) / TICKS_PER_S,
-            waited_s=(waited_user + waited_system) / TICKS_PER_S,
-            threads=int(fields[17]),
-            start_s=int(fields[19]) / TICKS_PER_S,
-            rss_mb=max(0, int(fields[21])) * PAGE_MB,
-        )
-    except (ValueError, IndexError):
-        return None
 
 
 def parse_cpu_stat(content: bytes, allowed: frozenset[int] | None) -> CpuTimes | None:
@@ -99,15 +66,6 @@ def parse_running(content: bytes) -> int | None:
     _, found, rest = content.partition(b"\nprocs_running ")
     count = rest.partition(b"\n")[0].strip()
     return int(count) if found and count.isdigit() else None
-
-
-def parse_schedstat(content: bytes) -> tuple[float, float] | None:
-    """Seconds a thread has run, and has waited to run, of /proc/PID/task/TID/schedstat; ``None`` when malformed."""
-    try:
-        run_ns, wait_ns = (int(field) for field in content.split()[:2])
-    except ValueError:
-        return None
-    return run_ns / 1e9, wait_ns / 1e9
 
 
 def parse_pressure(content: bytes) -> float | None:
@@ -155,7 +113,7 @@ class DeviceProfiler:
         now = monotonic_s()
         if self._limits_at_s is None or now - self._limits_at_s >= LIMITS_EVERY_S:
             self._look_up_limits(now)
-        stat = _read(f"{self._proc}/stat")
+        stat = read_file(f"{self._proc}/stat")
         times = parse_cpu_stat(stat, self._allowed)
         memory_mb, memory_used_mb = self._memory()
         return DeviceSample(
@@ -175,7 +133,7 @@ class DeviceProfiler:
         ``None`` on the first sample, and where the kernel has no pressure stall information.
         """
         path = f"{self._proc}/pressure/cpu" if self._cpu_quota is None else self._cpu_quota.pressure_file()
-        stalled_s = None if path is None else parse_pressure(_read(path))
+        stalled_s = None if path is None else parse_pressure(read_file(path))
         before, self._stalled = self._stalled, None if stalled_s is None else (now, stalled_s)
         if stalled_s is None or before is None:
             self._pressure = None
@@ -194,10 +152,10 @@ class DeviceProfiler:
         self._limits_at_s = now
         tree = CgroupTree(self._root, self._pid)
         self._memory_quota = tree.memory_quota()
-        quota, status = tree.cpu_quota(), _read(f"{self._proc}/{self._pid}/status").decode(errors="replace")
+        quota, status = tree.cpu_quota(), read_file(f"{self._proc}/{self._pid}/status").decode(errors="replace")
         _, _, allowed = status.partition("Cpus_allowed_list:")
         self._allowed = parse_cpu_list(allowed.partition("\n")[0]) or None
-        stat = _read(f"{self._proc}/stat")
+        stat = read_file(f"{self._proc}/stat")
         times, every = parse_cpu_stat(stat, self._allowed), parse_cpu_stat(stat, None)
         self._has_all_cpus = times is not None and every is not None and times.cpus == every.cpus
         if quota is not None and times is not None and quota.cores >= times.cpus:
@@ -232,7 +190,7 @@ class DeviceProfiler:
 
     def _memory(self) -> tuple[float, float | None]:
         figures = parse_flat(
-            _read(f"{self._proc}/meminfo").decode(errors="replace").replace(":", "").replace(" kB", "")
+            read_file(f"{self._proc}/meminfo").decode(errors="replace").replace(":", "").replace(" kB", "")
         )
         total_mb = figures.get("MemTotal", 0) / 1024.0 or os.sysconf("SC_PHYS_PAGES") * PAGE_MB
         available_kb = figures.get("MemAvailable")
@@ -285,8 +243,8 @@ class _ProcessTrees:
         found = {}
         for pid in tree:
             folder = f"{self._proc}/{pid}/task"
-            for thread in _names(folder):
-                times = parse_schedstat(_read(f"{folder}/{thread}/schedstat"))
+            for thread in names(folder):
+                times = parse_schedstat(read_file(f"{folder}/{thread}/schedstat"))
                 if times is not None:
                     found[pid, thread] = times
         return found
@@ -296,7 +254,7 @@ class _ProcessTrees:
         waiting = [pid]
         while waiting:
             process = waiting.pop()
-            times = parse_process_stat(_read(f"{self._proc}/{process}/stat"))
+            times = parse_process_stat(read_file(f"{self._proc}/{process}/stat"))
             if times is None or process in tree:
                 continue
             tree[process] = times
@@ -305,13 +263,13 @@ class _ProcessTrees:
 
     def _children(self, pid: int) -> list[int]:
         folder = f"{self._proc}/{pid}/task"
-        return [int(child) for thread in _names(folder) for child in _read(f"{folder}/{thread}/children").split()]
+        return [int(child) for thread in names(folder) for child in read_file(f"{folder}/{thread}/children").split()]
 
     def _scan_children(self) -> dict[int, list[int]]:
         """``{parent: [child]}`` of the whole machine, for kernels without CONFIG_PROC_CHILDREN."""
         children: dict[int, list[int]] = {}
-        for name in _names(self._proc):
-            if name.isdecimal() and (times := parse_process_stat(_read(f"{self._proc}/{name}/stat"))) is not None:
+        for name in names(self._proc):
+            if name.isdecimal() and (times := parse_process_stat(read_file(f"{self._proc}/{name}/stat"))) is not None:
                 children.setdefault(times.parent, []).append(int(name))
         return children
 
@@ -340,25 +298,3 @@ def _share(times: ProcessTimes, elapsed_s: float, now: float) -> float:
     """What a newly seen process probably used in the last ``elapsed_s``: all if it is younger, else in proportion."""
     age_s = max(now - times.start_s, elapsed_s)
     return (times.own_s + times.waited_s) * elapsed_s / age_s
-
-
-def _names(folder: str) -> list[str]:
-    """The names in a folder; empty when it cannot be read."""
-    try:
-        return os.listdir(folder)  # noqa: PTH208 - names are all we need, 5 times a second
-    except OSError:
-        return []
-
-
-def _read(path: str) -> bytes:
-    """A small kernel file, with three system calls; empty when it cannot be read."""
-    try:
-        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    except OSError:
-        return b""
-    try:
-        return os.read(fd, READ_BYTES)
-    except OSError:
-        return b""
-    finally:
-        os.close(fd)

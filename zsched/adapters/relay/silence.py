@@ -11,19 +11,17 @@ that works for `WORK_S` and says nothing all the same is.
 
 from __future__ import annotations
 
-import contextlib
-import os
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final
+
+from zsched.procfs import names, parse_process_stat, parse_schedstat, read_file
 
 WORK_S: Final = 10.0
 """Processor time in which any relay would have said something; starting one takes 0.2 to 2 s."""
 LOOK_S: Final = 0.25
 LOOKS, LOOK_APART_S = 5, 0.02
-_TICK_S: Final = 1.0 / os.sysconf("SC_CLK_TCK")
 
 
 class Silence:
@@ -94,21 +92,15 @@ def use_of(pid: int) -> _Use | None:
 
 
 def waited_s(pid: int) -> float:
-    """How long the threads that a process has now have waited for a processor (Documentation/scheduler/sched-stats)."""
-    waited_ns = 0
-    for text in _of_threads(pid, "schedstat"):
-        with contextlib.suppress(IndexError, ValueError):
-            waited_ns += int(text.split()[1])
-    return waited_ns / 1e9
+    """How long the threads that a process has now have waited for a processor."""
+    found = (parse_schedstat(content) for content in _of_threads(pid, "schedstat"))
+    return sum(times[1] for times in found if times is not None)
 
 
 def processor_s(pid: int) -> float | None:
     """Processor time that a process has had so far, with all its threads; ``None`` when there is no such process."""
-    try:
-        fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
-        return (int(fields[11]) + int(fields[12])) * _TICK_S
-    except (OSError, IndexError, ValueError):
-        return None
+    times = parse_process_stat(read_file(f"/proc/{pid}/stat"))
+    return None if times is None else times.own_s
 
 
 def is_idle(pid: int) -> bool:
@@ -128,16 +120,11 @@ def is_idle(pid: int) -> bool:
 
 
 def _thread_states(pid: int) -> set[str]:
-    states = set()
-    for text in _of_threads(pid, "stat"):
-        with contextlib.suppress(IndexError):
-            states.add(text.rsplit(")", 1)[1].split()[0])
-    return states
+    found = (parse_process_stat(content) for content in _of_threads(pid, "stat"))
+    return {times.state for times in found if times is not None}
 
 
-def _of_threads(pid: int, file: str) -> Iterator[str]:
-    """What /proc says under that name of each thread there is; one that ends meanwhile is left out."""
-    with contextlib.suppress(OSError):
-        for thread in Path(f"/proc/{pid}/task").iterdir():
-            with contextlib.suppress(OSError):
-                yield (thread / file).read_text()
+def _of_threads(pid: int, file: str) -> Iterator[bytes]:
+    """What /proc says under that name of each thread there is; nothing of one that ends meanwhile."""
+    folder = f"/proc/{pid}/task"
+    return (read_file(f"{folder}/{thread}/{file}") for thread in names(folder))

@@ -19,11 +19,10 @@ from zsched.adapters.machine.device_profiler import (
     parse_cpu_list,
     parse_cpu_stat,
     parse_pressure,
-    parse_process_stat,
     parse_running,
-    parse_schedstat,
 )
 from zsched.core.values.model import WorkerState
+from zsched.procfs import parse_process_stat, parse_schedstat
 
 MEMINFO = "MemTotal:        4096000 kB\nMemFree: 100 kB\nMemAvailable:    3072000 kB\nHugePages_Total: 0\n"
 V2 = "30 25 0:26 / /sys/fs/cgroup rw - cgroup2 cgroup2 rw\n"
