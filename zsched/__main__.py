@@ -7,9 +7,6 @@ from __future__ import annotations
 
 import sys
 
-EXIT_INTERRUPTED = 130
-"""As a shell counts SIGINT."""
-
 
 def main() -> None:
     """Run the command line."""
@@ -18,4 +15,6 @@ def main() -> None:
 
         run()
     except KeyboardInterrupt:
+        from zsched.exits import EXIT_INTERRUPTED  # noqa: PLC0415 - nothing is imported outside of the `try`
+
         sys.exit(EXIT_INTERRUPTED)

@@ -20,9 +20,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from zsched.commands.common import EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, CliError, Json, Verb, print_json
+from zsched.commands.common import CliError, Json, Verb, print_json
 from zsched.commands.program import Program
 from zsched.commands.stream_verbs import stream_app
+from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE
 
 if TYPE_CHECKING:
     from zsched.runtime.init import Heard  # imports zenoh

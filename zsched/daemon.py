@@ -39,6 +39,7 @@ from zsched.core.status import status_line
 from zsched.core.values.fleet import electorate_hash, fleet_hash, runs_worker
 from zsched.core.values.model import DurableState, NodeId, NodeKind, TaskId
 from zsched.errors import AdapterError, ConfigError, NameTakenError
+from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_NAME_TAKEN, EXIT_OK
 from zsched.files import write_regular
 from zsched.guard import on_failure
 from zsched.ipc.takeover import Door
@@ -54,7 +55,6 @@ from zsched.runtime.sessions import SessionsRead
 from zsched.runtime.shell import Desk, Inbox, Shell
 from zsched.sessions import config as zenoh_config
 
-EXIT_OK, EXIT_FAILED, EXIT_NAME_TAKEN, EXIT_CONFIG = 0, 1, 75, 78
 NAME_TAKEN_WAIT_S = 5.0
 CLOSE_WORKERS_S = 0.7
 LOOP_MAX_WAIT_S = 1.0

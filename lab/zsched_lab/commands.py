@@ -12,7 +12,8 @@ from typing import Annotated
 
 import typer
 
-from zsched.commands.common import EXIT_USAGE, CliError, Verb, Verbs
+from zsched.commands.common import CliError, Verb, Verbs
+from zsched.exits import EXIT_USAGE
 
 
 class MergeMode(StrEnum):

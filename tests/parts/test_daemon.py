@@ -30,8 +30,8 @@ from zsched.core import events as ev
 from zsched.core.values.fleet import Fleet, NodeSpec, Timing
 from zsched.core.values.model import NodeKind
 from zsched.core.vote.clocks import is_bad
-from zsched.daemon import EXIT_CONFIG, EXIT_FAILED, EXIT_OK
 from zsched.errors import AdapterError
+from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_OK
 from zsched.log_limit import BURST, RATE_HZ
 from zsched.paths import socket_path
 from zsched.runtime.endpoints import MAX_PORT, MIN_PORT, PORT_RANGE, Endpoints, endpoints_for, free_port, is_here

@@ -12,6 +12,7 @@ import pytest
 from zsched.core.membership.beat_room import MAX_BEAT_BYTES, most_bytes
 from zsched.core.todo import ToDo
 from zsched.core.values.messages import Prepare, Promise, Refused
+from zsched.core.vote.belief import GENERATION_STEP
 from zsched.core.vote.register import Register
 from zsched.errors import InvariantError
 from zsched_lab.sim import simulate
@@ -19,7 +20,7 @@ from zsched_lab.sim.checks import DisagreementError
 from zsched_lab.sim.faults import BEYOND, Stage, play
 from zsched_lab.sim.files import CHANGES
 from zsched_lab.sim.links import Held
-from zsched_lab.sim.parts import GENERATION_STEP, Clock, Disk
+from zsched_lab.sim.parts import Clock, Disk
 from zsched_lab.sim.rest import AT_MOST_S
 from zsched_lab.sim.simulate import Job, main, shrink
 from zsched_lab.sim.simulator import Simulator

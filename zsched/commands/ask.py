@@ -12,8 +12,9 @@ from pathlib import Path
 
 from zsched import paths as places
 from zsched.adapters.host.operator_socket import ask
-from zsched.commands.common import EXIT_FAILED, EXIT_TIMED_OUT, EXIT_UNREACHABLE, EXIT_USAGE, CliError, Json, nearest
+from zsched.commands.common import CliError, Json, nearest
 from zsched.errors import AdapterError
+from zsched.exits import EXIT_FAILED, EXIT_TIMED_OUT, EXIT_UNREACHABLE, EXIT_USAGE
 
 ASK_TIMEOUT_S = 5.0
 """Above the daemon's own limits (3 s for its loop, 3 s for another node), so that their reasons arrive."""

@@ -11,7 +11,8 @@ from typing import Any, Final
 
 import typer
 
-from zsched.commands.common import EXIT_FAILED, CliError, Verb, Verbs
+from zsched.commands.common import CliError, Verb, Verbs
+from zsched.exits import EXIT_FAILED
 
 GROUP: Final = "zsched.commands"
 LAB_VERBS: Final = frozenset({"bench", "demo"})

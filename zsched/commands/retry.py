@@ -10,8 +10,9 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 from zsched.commands.ask import Door, ask_door
-from zsched.commands.common import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE, CliError, Json, nearest, print_json
+from zsched.commands.common import CliError, Json, nearest, print_json
 from zsched.commands.page import harmless
+from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE
 
 SCHEMA = "zsched.retry/1"
 AT_ONCE = 8

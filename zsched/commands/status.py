@@ -12,9 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from zsched.commands.ask import Door, ask_door, find_door
-from zsched.commands.common import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK, CliError, Json, print_json, wants_color
+from zsched.commands.common import CliError, Json, print_json, wants_color
 from zsched.commands.page import harmless
 from zsched.commands.report import TROUBLES, degradations, render_status
+from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK
 
 MIN_WIDTH, DEFAULT_WIDTH, MAX_WIDTH = 60, 100, 160
 MAJOR = "1"

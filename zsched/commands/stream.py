@@ -15,19 +15,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door, find_door
-from zsched.commands.common import (
-    EXIT_FAILED,
-    EXIT_OK,
-    EXIT_UNREACHABLE,
-    EXIT_USAGE,
-    CliError,
-    Json,
-    nearest,
-    print_json,
-)
+from zsched.commands.common import CliError, Json, nearest, print_json
 from zsched.commands.page import Page, harmless, size, span
 from zsched.core.route import keyexpr
 from zsched.errors import AdapterError
+from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_UNREACHABLE, EXIT_USAGE
 
 if TYPE_CHECKING:
     from zsched.adapters.network.stream_tap import StreamTap, Tapped

@@ -10,17 +10,8 @@ import sys
 from collections.abc import Iterable
 
 from zsched.commands.ask import Door, ask_door
-from zsched.commands.common import (
-    EXIT_DEGRADED,
-    EXIT_FAILED,
-    EXIT_OK,
-    EXIT_TIMED_OUT,
-    EXIT_USAGE,
-    CliError,
-    Json,
-    nearest,
-    print_json,
-)
+from zsched.commands.common import CliError, Json, nearest, print_json
+from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE
 
 SCHEMA = "zsched.weights/1"
 NAMES = ("cpu", "memory", "network")

@@ -19,11 +19,11 @@ from pathlib import Path
 from typing import Final
 
 from zsched.clock import monotonic_s
+from zsched.exits import EXIT_CONFIG
 from zsched.ipc.takeover import relays_in
 
 DEADLINE_S: Final = 1.0
 POLL_S: Final = 0.01
-EXIT_CONFIG: Final = "78"
 GROUPS: Final = Path("/sys/fs/cgroup")
 
 
@@ -32,7 +32,7 @@ def spares_relay(environment: Mapping[str, str]) -> bool:
 
     Not after a stop that had to be forced ("timeout"), nor after an exit that systemd does not answer with a restart.
     """
-    return environment.get("SERVICE_RESULT") != "timeout" and environment.get("EXIT_STATUS") != EXIT_CONFIG
+    return environment.get("SERVICE_RESULT") != "timeout" and environment.get("EXIT_STATUS") != str(EXIT_CONFIG)
 
 
 def own_group(text: str, root: Path = GROUPS) -> Path | None:

@@ -23,9 +23,8 @@ import sys
 import time
 
 from zsched.errors import ConfigError
+from zsched.exits import EXIT_CONFIG
 from zsched.worker import Answer, Output, Received, Request, Worker
-
-EXIT_CONFIG = 78
 
 
 def main(arguments: list[str] | None = None) -> int:

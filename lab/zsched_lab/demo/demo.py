@@ -12,6 +12,7 @@ from datetime import datetime
 from pathlib import Path
 
 from zsched.errors import ConfigError, ZschedError
+from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_SIGNAL, EXIT_USAGE
 from zsched_lab.demo.evaluate import evaluate, print_summary
 from zsched_lab.demo.live_view import make_view
 from zsched_lab.demo.run import DemoRun, RunPlan
@@ -22,7 +23,6 @@ from zsched_lab.robots.laser_log import load_log, malaga_path
 
 MODES = ("known", "track", "estimate")
 MIN_DURATION_S, MAX_DURATION_S = 20.0, 3600.0
-EXIT_FAILED, EXIT_USAGE, EXIT_CONFIG, EXIT_SIGNAL = 1, 2, 78, 128
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

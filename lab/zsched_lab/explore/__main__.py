@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 
 from zsched.errors import ConfigError
+from zsched.exits import EXIT_CONFIG
 from zsched_lab.explore.body import Limits
 from zsched_lab.explore.picture import Picture, save_pictures
 from zsched_lab.explore.virtual import VirtualResult, VirtualRun, run_virtual
@@ -26,7 +27,6 @@ from zsched_lab.explore.worlds import load_world
 from zsched_lab.maps.metrics import score_map
 
 RESAMPLES = 10_000
-EXIT_CONFIG = 78
 
 Times = dict[float, list[float]]
 """{delay_s: time to the target (s), one per seed; the whole duration where it was not reached}."""

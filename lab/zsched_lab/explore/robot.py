@@ -44,6 +44,7 @@ import zenoh
 
 from zsched.clock import monotonic_s
 from zsched.errors import ConfigError, WireError
+from zsched.exits import EXIT_CONFIG
 from zsched.tasks.map_merge.__main__ import metres_per_cell
 from zsched.tasks.map_merge.cdr import CdrError, decode_grid, encode_grid
 from zsched.tasks.map_merge.geometry import Pose2
@@ -68,7 +69,6 @@ from zsched_lab.maps.mapping import RESOLUTION_M
 TICK_S = 0.1
 PATH_PERIOD_S = 0.5
 PROGRESS_PERIOD_S = 1.0
-EXIT_CONFIG = 78
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -16,7 +16,7 @@ from typing import Any
 
 from zsched import __version__
 from zsched.errors import ConfigError, ZschedError
-from zsched_lab.demo.demo import EXIT_CONFIG, EXIT_FAILED, EXIT_SIGNAL, EXIT_USAGE
+from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_SIGNAL, EXIT_USAGE
 from zsched_lab.fleet.netns import why_not
 from zsched_lab.fleet.runner import read_tree
 from zsched_lab.fleet.signals import Interrupted, interruptible

@@ -27,9 +27,10 @@ from zsched.core.values.model import (
     WorkerState,
 )
 from zsched.core.values.plan import Role, RoutePlan, WorkerRole
+from zsched.core.vote.belief import GENERATION_STEP
 from zsched.errors import InvariantError
 from zsched_lab.sim.history import Checker, Learnt, Record, Routed, Started, Stored, Worked
-from zsched_lab.sim.parts import GENERATION_STEP, Machine
+from zsched_lab.sim.parts import Machine
 
 FORGED = -1
 """The number of a question that a stranger asks, or in another one's name: a yes to it is a violation."""

@@ -18,8 +18,6 @@ from zsched.core.values.plan import Role
 from zsched.errors import WireError
 from zsched.wire import codec as wire
 
-GENERATION_STEP = 2**32
-"""Revision and epoch of generation G start at G times this."""
 PAST_KEPT = 64
 
 

@@ -15,8 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from zsched.errors import ConfigError
-
-EXIT_CONFIG = 78
+from zsched.exits import EXIT_CONFIG
 
 
 def _positive(text: str) -> float:
