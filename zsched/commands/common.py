@@ -1,4 +1,4 @@
-"""What every verb of the command line shares: exit codes, errors as text, output as JSON, when to use colour.
+"""What every verb of the command line shares: how options are read, errors as text, output as JSON, when to use colour.
 
 Knows: the contract (stdout is data, stderr everything else). Does not know: any verb.
 """
@@ -17,8 +17,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from zsched.commands.page import harmless
 from zsched.errors import AdapterError, ConfigError, ZschedError
-
-EXIT_OK, EXIT_FAILED, EXIT_USAGE, EXIT_UNREACHABLE, EXIT_DEGRADED, EXIT_TIMED_OUT, EXIT_CONFIG = 0, 1, 2, 3, 4, 5, 78
+from zsched.exits import EXIT_CONFIG, EXIT_FAILED
 
 Json = dict[str, Any]
 
@@ -31,51 +30,58 @@ class CliError(ZschedError):
         self.code = code
 
 
-class PlainValue:
-    """Reads one option's text without pydantic, whose import takes longer than all the rest of `zsched status`.
+def plain_value(param: Any, value: Any) -> tuple[Any, ...]:
+    """(``value`` as the verb wants it,) where that takes no coercion; ``()`` where it does, or where one is missing.
 
-    A value that has its type already, words and a path need no coercion; all others still go typer's own way.
+    Words, paths and what has its type already take none. ``param`` is typer's; one that does not tell its type is of a
+    typer without pydantic, and takes one.
     """
-
-    def __init__(self, param: Any) -> None:
-        self._annotation = param.type_descriptor.annotation
-
-    def coerce(self, value: Any, param: Any, ctx: Any) -> Any:
-        """The value as the verb wants it, as typer's own coercion does it."""
-        annotation = self._annotation
-        if annotation == list[str] and (value is None or isinstance(value, tuple)):
-            return list(value or ())
-        if param.nargs == 1 and not param.multiple and isinstance(annotation, type):
-            if value is None or isinstance(value, annotation):
-                return value
-            if annotation is Path:
-                return Path(value)
-        param._runtime_param = None  # noqa: SLF001 - makes typer build its own
-        return param.get_runtime_param().coerce(value, param=param, ctx=ctx)
+    annotation = getattr(getattr(param, "type_descriptor", None), "annotation", None)
+    if annotation is None or param.callback is not None or (param.required and param.value_is_missing(value)):
+        return ()
+    if annotation == list[str] and (value is None or isinstance(value, tuple)):
+        return (list(value or ()),)
+    if param.nargs != 1 or param.multiple or not isinstance(annotation, type):
+        return ()
+    if value is None or isinstance(value, annotation):
+        return (value,)
+    return (Path(value),) if annotation is Path else ()
 
 
-def _read_plainly(params: list[Any]) -> list[Any]:
-    """Give each parameter a `PlainValue`, where this typer has that seam (a test tells when it has not)."""
-    for param in params:
-        if getattr(param, "_runtime_param", 0) is None and hasattr(param, "type_descriptor"):
-            param._runtime_param = PlainValue(param)  # noqa: SLF001 - typer has no public seam for it
-    return params
+def no_help_yet(option: Any) -> Any:
+    """The option --help with a default that has its type: typer's own is ``None``, and ``None`` is coerced."""
+    if option is not None:
+        option.default = False
+    return option
 
 
 class Verb(TyperCommand):
     """One verb of the command line."""
 
-    def get_params(self, ctx: Any) -> Any:
-        """Its options and arguments."""
-        return _read_plainly(super().get_params(ctx))
+    def get_help_option(self, ctx: Any) -> Any:
+        """As typer's."""
+        return no_help_yet(super().get_help_option(ctx))
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Read its options and arguments, without pydantic if possible: its import takes as long as all of `status`.
+
+        If one of them is no `plain_value`, or something is wrong, all go typer's own way.
+        """
+        opts, rest, _ = self.make_parser(ctx).parse_args(args=list(args))
+        params = [param for param in self.get_params(ctx) if param.expose_value or opts.get(param.name)]
+        found = {param.name: plain_value(param, param.consume_value(ctx, opts)[0]) for param in params}
+        if rest or not all(found.values()):
+            return super().parse_args(ctx, args)
+        ctx.params.update({name: value for name, (value,) in found.items()})
+        return rest
 
 
 class Verbs(TyperGroup):
     """Turns the errors we raise on purpose into one message on stderr and an exit code; bugs keep their traceback."""
 
-    def get_params(self, ctx: Any) -> Any:
-        """The options in front of a verb."""
-        return _read_plainly(super().get_params(ctx))
+    def get_help_option(self, ctx: Any) -> Any:
+        """As typer's."""
+        return no_help_yet(super().get_help_option(ctx))
 
     def invoke(self, ctx: Any) -> Any:
         """Run the verb."""
