@@ -21,6 +21,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO
 
+import psutil
+
 from zsched.adapters.host.operator_socket import ask
 from zsched.clock import monotonic_s
 from zsched.core.values.fleet import Timing
@@ -343,12 +345,9 @@ def stop_group(pid: int, number: signal.Signals) -> None:
 
 def descendants(pid: int) -> list[int]:
     """Every living process below ``pid``."""
-    found: list[int] = []
-    with contextlib.suppress(OSError):
-        for task in Path(f"/proc/{pid}/task").iterdir():
-            for child in (task / "children").read_text().split():
-                found += [int(child), *descendants(int(child))]
-    return found
+    with contextlib.suppress(psutil.Error):
+        return [one.pid for one in psutil.Process(pid).children(recursive=True)]
+    return []
 
 
 def descendants_running(pid: int, word: str) -> list[int]:
@@ -358,6 +357,6 @@ def descendants_running(pid: int, word: str) -> list[int]:
 
 def _words(pid: int) -> list[str]:
     """A process's command line; none when it has ended meanwhile."""
-    with contextlib.suppress(OSError):
-        return Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").split("\0")
+    with contextlib.suppress(psutil.Error):
+        return list(psutil.Process(pid).cmdline())
     return []

@@ -21,6 +21,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
+import psutil
 import zenoh
 
 from zsched import paths as places
@@ -38,6 +39,7 @@ from zsched_lab.fleet.loopback import free_endpoint, own_address
 
 DAEMON = (sys.executable, "-m", "zsched.daemon")
 ECHO = ("python", "-m", "zsched.tasks.echo")
+ASLEEP = (psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP, psutil.STATUS_ZOMBIE)
 TASK = "echo"
 SCHEDULING: Mapping[str, float | str] = {
     "score": "paper",
@@ -251,8 +253,8 @@ class Testbed:
     def _is_awake(self, node: NodeId) -> bool:
         if self._processes[node].poll() is not None:
             return False
-        with contextlib.suppress(OSError):
-            return Path(f"/proc/{self.pid(node)}/stat").read_text().rpartition(")")[2].split()[0] not in "TtZ"
+        with contextlib.suppress(psutil.Error):
+            return psutil.Process(self.pid(node)).status() not in ASLEEP
         return False
 
     def owner(self, *nodes: NodeId) -> NodeId | None:
