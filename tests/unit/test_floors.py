@@ -50,11 +50,15 @@ CORE_MAY: Final = frozenset(
 """Pure parts of the standard library; ``random`` only for the type `Random` (generators come in seeded)."""
 IMPURE_CALLS: Final = frozenset({"open", "print", "input", "exec", "eval", "compile", "__import__", "Random"})
 
-HEAVY: Final = frozenset({"numpy", "cv2", "matplotlib", "onnxruntime", "rich", "pydantic", "asyncio"})
+HEAVY: Final = frozenset(
+    {
+        *("numpy", "cv2", "matplotlib", "onnxruntime", "rich", "pydantic", "asyncio"),
+        *("psutil", "pyroute2", "rosbags", "scipy", "skimage"),  # decisions 0010 and 0042
+    }
+)
 OUTSIDE: Final[dict[str, str]] = {
     # library: who alone may import it, besides lab and tasks
     "zenoh": r"(adapters\.network|relay|worker|sessions)(\..+)?",
-    "psutil": r"adapters\..+",
     "msgpack": r"wire\.codec",
     "ruamel": r"config\.reader",
     "typer": r"cli|commands\..+",

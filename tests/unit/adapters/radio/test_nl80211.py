@@ -56,6 +56,36 @@ def test_station_is_read_with_the_wide_bitrate() -> None:
     )
 
 
+def test_pyroute2_reads_the_same_of_a_station() -> None:
+    reference = pytest.importorskip("pyroute2.netlink.nl80211", reason="a development dependency: make test brings it")
+    theirs = reference.nl80211cmd(message(30, station_payload()))
+    theirs.decode()
+    info = theirs.get_attr("NL80211_ATTR_STA_INFO")
+    rates = [info.get_attr(f"NL80211_STA_INFO_{way}_BITRATE") for way in ("TX", "RX")]
+    assert nl80211.parse_station(station_payload()) == Station(
+        mac=theirs.get_attr("NL80211_ATTR_MAC"),
+        signal_dbm=info.get_attr("NL80211_STA_INFO_SIGNAL"),
+        tx_mbps=rates[0].get_attr("NL80211_RATE_INFO_BITRATE32") / 10,
+        rx_mbps=rates[1].get_attr("NL80211_RATE_INFO_BITRATE") / 10,
+        tx_packets=info.get_attr("NL80211_STA_INFO_TX_PACKETS"),
+        tx_retries=info.get_attr("NL80211_STA_INFO_TX_RETRIES"),
+        tx_failed=info.get_attr("NL80211_STA_INFO_TX_FAILED"),
+    )
+
+
+def test_pyroute2_asks_for_stations_in_the_same_bytes() -> None:
+    reference = pytest.importorskip("pyroute2.netlink.nl80211", reason="a development dependency: make test brings it")
+    theirs = reference.nl80211cmd()
+    theirs["cmd"], theirs["version"] = reference.NL80211_NAMES["NL80211_CMD_GET_STATION"], 1
+    theirs["attrs"] = [("NL80211_ATTR_IFINDEX", 4)]
+    theirs["header"]["type"], theirs["header"]["sequence_number"] = 30, 7
+    theirs["header"]["flags"] = nl80211.NLM_F_REQUEST | nl80211.NLM_F_DUMP
+    theirs.encode()
+    ours = {int(nl80211.Attr.IFINDEX): struct.pack("=I", 4)}
+    asked = nl80211.request(30, nl80211.Command.GET_STATION, ours, flags=nl80211.NLM_F_DUMP, sequence=7)
+    assert asked == bytes(theirs.data)
+
+
 def test_station_with_little_information_is_read_with_what_it_has() -> None:
     generic, mac = struct.pack("=BBH", 19, 1, 0), attribute(6, bytes(6))
     assert nl80211.parse_station(generic + mac) == Station(mac="00:00:00:00:00:00")
