@@ -1,6 +1,7 @@
 """The exit codes of every program here: zsched's verbs, its daemon, the reference tasks, the lab.
 
-Knows: numbers. Does not know: who ends with which. `zsched.adapters.workers.launch` says 78 itself: it imports nothing.
+Knows: numbers. Does not know: which program ends with which. Only `zsched.adapters.workers.launch` says its 78 itself:
+it is run by path and imports nothing of zsched.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Reads what the kernel says of processes and threads (proc(5)); what cannot be read, or is malformed, is ``None``.
 
-Knows: the formats of /proc/PID/stat and schedstat. Does not know: whose processes they are, or what for.
+Knows: the formats of /proc/PID/stat and schedstat. Does not know: which processes are ours.
 """
 
 from __future__ import annotations

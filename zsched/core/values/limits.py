@@ -1,7 +1,7 @@
 """Says what a field may hold, beside the field: its range, and the key of the fleet file that gives it.
 
 As ``beat_s: float = key(0.2, "Period of the heartbeat.", Range(0.01, 3600, "s"))``. The default, the sentence and the
-range stand there only: `zsched.config.keys` makes the fleet file's schema of them. Does not know: who checks what.
+range stand there only: `zsched.config.keys` makes the fleet file's schema of them. Does not know: YAML.
 """
 
 from __future__ import annotations
