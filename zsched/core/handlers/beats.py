@@ -26,7 +26,7 @@ def send_beat(node: Stages, todo: ToDo, now: float) -> None:
     node.beat_sequence += 1
     if "membership" in node.problems:
         _complain(node, now)
-    node.membership.fade_doubt()
+    node.membership.fade_stretch()
     parts = node.agreement.leases.on_sent(node.beat_sequence, now)
     beat = Beat(
         node=node.me,

@@ -26,7 +26,7 @@ from zsched.core.values.model import Beat, NodeId, PeerState
 
 SMALL_FLEET = 3
 """Up to so many nodes no second observer is waited for: there is one at most, and it may be the next to go."""
-MAX_DOUBT = 3.0
+MAX_STRETCH = 3.0
 IN_FLIGHT_S = 0.03
 """A beat that arrives so soon after its sender's token went was on its way before: it refutes nothing."""
 
@@ -70,7 +70,7 @@ class Membership:
         self._timing = timing
         self._peers = {name: _Peer() for name in sorted(nodes) if name != me}
         self._size = len(nodes)
-        self._doubt = 1.0
+        self._stretch = 1.0
         self._started_at = math.inf
         self._deadline: float | None = None
         """`next_deadline`, until something changes it."""
@@ -136,13 +136,13 @@ class Membership:
     def note_lag(self, lag_s: float) -> None:
         """Take in how late this node's own loop woke up (seconds, >= 0), before it judges anybody."""
         if lag_s > 0.0:
-            self._doubt = max(self._doubt, min(1.0 + lag_s / self._timing.beat_s, MAX_DOUBT))
+            self._stretch = max(self._stretch, min(1.0 + lag_s / self._timing.beat_s, MAX_STRETCH))
             self._deadline = None
 
-    def fade_doubt(self) -> None:
+    def fade_stretch(self) -> None:
         """A beat was sent: doubt fades by halves."""
-        if self._doubt > 1.0:
-            self._doubt = 1.0 + (self._doubt - 1.0) / 2
+        if self._stretch > 1.0:
+            self._stretch = 1.0 + (self._stretch - 1.0) / 2
             self._deadline = None
 
     def absorb_beat(self, beat: Beat, now: float) -> tuple[Transition, ...]:
@@ -181,7 +181,7 @@ class Membership:
         for name, peer in self._peers.items():
             if peer.state is PeerState.GONE and name not in accused:
                 changes.append(self._change(name, PeerState.SUSPECT, f"{beat.node} is back and hears it", now))
-                peer.vouched_until = now + self._timing.suspect_s * self._doubt
+                peer.vouched_until = now + self._timing.suspect_s * self._stretch
         return changes
 
     def _may_begin(self, peer: _Peer, incarnation: int, now: float) -> bool:
@@ -212,7 +212,7 @@ class Membership:
     def tick(self, now: float) -> tuple[Transition, ...]:
         """Time has passed."""
         changes = []
-        limit = self._timing.suspect_s * self._doubt
+        limit = self._timing.suspect_s * self._stretch
         self._started_at = min(self._started_at, now)
         self._has_watched = self._has_watched or now >= self._started_at + limit
         if now < self.next_deadline():
@@ -227,7 +227,7 @@ class Membership:
     def next_deadline(self) -> float:
         """When `tick` may have something to say; infinity when never."""
         if self._deadline is None:
-            limit, due = self._timing.suspect_s * self._doubt, math.inf
+            limit, due = self._timing.suspect_s * self._stretch, math.inf
             for peer in self._peers.values():
                 due = min(due, self._peer_deadline(peer, limit))
             self._deadline = due
@@ -246,8 +246,8 @@ class Membership:
     def _grace(self, peer: _Peer) -> float:
         """How long a suspect has before it is gone without anybody's confirmation."""
         if self._size <= SMALL_FLEET:
-            return 1.5 * self._timing.beat_s * self._doubt if peer.token_lost else 0.0
-        return self._timing.confirm_s * self._doubt
+            return 1.5 * self._timing.beat_s * self._stretch if peer.token_lost else 0.0
+        return self._timing.confirm_s * self._stretch
 
     def _review(self, now: float) -> list[Transition]:
         """Turn suspects into gone where that is confirmed."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-PATIENCE_S = 1.0
+LINK_WAIT_S = 1.0
 """So long a link has to come back by itself: who has an address is redialled within a second."""
 FIRST_PAUSE_S, MAX_PAUSE_S = 2.0, 60.0
 
@@ -30,7 +30,7 @@ class Introductions:
             self._due_at = math.inf
             return False
         if self._due_at == math.inf:
-            self._due_at, self._pause_s = now + PATIENCE_S, FIRST_PAUSE_S
+            self._due_at, self._pause_s = now + LINK_WAIT_S, FIRST_PAUSE_S
         if now < self._due_at:
             return False
         self._due_at = now + self._pause_s

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-from zsched.core.membership.relink import FIRST_PAUSE_S, MAX_PAUSE_S, PATIENCE_S, Introductions
+from zsched.core.membership.relink import FIRST_PAUSE_S, MAX_PAUSE_S, LINK_WAIT_S, Introductions
 
 
 def times(introductions: Introductions, begin: float, end: float) -> list[float]:
@@ -15,16 +15,16 @@ def times(introductions: Introductions, begin: float, end: float) -> list[float]
 def test_a_link_that_comes_back_by_itself_needs_none() -> None:
     introductions = Introductions()
 
-    assert times(introductions, 0.0, PATIENCE_S) == []
-    assert not introductions.is_due(PATIENCE_S, is_missing=False)
-    assert not introductions.is_due(PATIENCE_S + 0.1, is_missing=True)
+    assert times(introductions, 0.0, LINK_WAIT_S) == []
+    assert not introductions.is_due(LINK_WAIT_S, is_missing=False)
+    assert not introductions.is_due(LINK_WAIT_S + 0.1, is_missing=True)
 
 
 def test_who_stays_away_costs_ever_less() -> None:
     found = times(Introductions(), 0.0, 600.0)
 
     pauses = [later - earlier for earlier, later in pairwise(found)]
-    assert PATIENCE_S <= found[0] < PATIENCE_S + 0.15
+    assert LINK_WAIT_S <= found[0] < LINK_WAIT_S + 0.15
     assert FIRST_PAUSE_S <= pauses[0] < FIRST_PAUSE_S + 0.15
     assert pauses == sorted(pauses)
     assert MAX_PAUSE_S <= pauses[-1] < MAX_PAUSE_S + 0.15
@@ -37,5 +37,5 @@ def test_the_next_absence_begins_from_the_start() -> None:
 
     first, second, *_ = times(introductions, 301.0, 320.0)
 
-    assert first < 301.0 + PATIENCE_S + 0.15
+    assert first < 301.0 + LINK_WAIT_S + 0.15
     assert second - first < FIRST_PAUSE_S + 0.15
