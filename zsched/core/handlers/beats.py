@@ -1,4 +1,4 @@
-"""Membership at the door: the beats that are sent and heard, tokens, and who has come, gone or taken our name.
+"""Membership at the door: beats that are sent and heard, tokens, and peers that come, go or use our name.
 
 Knows: which stage each part of a beat comes from and goes to. Does not know: the rules of each (membership, witness,
 leases, sealing), the scheduler's and the executor's own events.
@@ -21,12 +21,12 @@ from zsched.core.values.model import Beat, NodeId, PeerState
 
 
 def send_beat(node: Stages, todo: ToDo, now: float) -> None:
-    """Send the beat that is due, or that somebody waits for."""
+    """Send the beat that is due or urgent."""
     is_news, todo.must_beat = todo.must_beat, False
     node.beat_sequence += 1
     if "membership" in node.problems:
         _complain(node, now)
-    node.membership.fade_stretch()
+    node.membership.fade_lag_factor()
     parts = node.agreement.leases.on_sent(node.beat_sequence, now)
     beat = Beat(
         node=node.me,
@@ -68,7 +68,7 @@ def _fitting(node: Stages, beat: Beat) -> Beat:
 
 
 def _seal(node: Stages, todo: ToDo, now: float) -> None:
-    """As an owner: what our file says of exclusive tasks shall hold for everybody."""
+    """As an owner, propose what our file says of exclusive tasks, for all nodes."""
     for task, change in node.sealing.due(node.values(), now):
         if not node.registers[task].is_busy:
             node.agreement.propose(task, change, todo, now)
@@ -129,7 +129,7 @@ def _hear_leases(node: Stages, beat: Beat, todo: ToDo, now: float, *, is_newest:
 
 
 def on_twins(node: Stages, event: ev.LearntReceived, todo: ToDo, now: float) -> None:
-    """A peer's answer says where it is, and whether it hears our name twice."""
+    """A peer's answer holds its address, and whether it hears our name twice."""
     learnt = event.learnt
     node.namesakes.on_answer(learnt.node, learnt.daemon, event.where)
     lives = {incarnation: sequence for name, incarnation, sequence in learnt.twins if name == node.me}
@@ -138,7 +138,7 @@ def on_twins(node: Stages, event: ev.LearntReceived, todo: ToDo, now: float) -> 
 
 
 def _heed(node: Stages, verdict: Verdict, todo: ToDo, now: float) -> None:
-    """Do what another daemon of our name means for this one."""
+    """Act on another daemon of our name: complain, and stand down or stop electing."""
     if verdict is Verdict.OURS:
         return
     complaint = _complain(node, now)
@@ -149,7 +149,7 @@ def _heed(node: Stages, verdict: Verdict, todo: ToDo, now: float) -> None:
 
 
 def _complain(node: Stages, now: float) -> str:
-    """Show whether somebody else uses our name."""
+    """Show or end the complaint that another daemon uses our name."""
     complaint = node.identity.complaint(now)
     node.set_problem("membership", complaint)
     return complaint or ""
@@ -178,7 +178,7 @@ def _note_token(node: Stages, of: NodeId, incarnation: int, now: float, *, is_pr
 
 
 def on_transition(node: Stages, change: Transition, todo: ToDo, now: float) -> None:
-    """A peer has come, is suspected or has gone: every stage that goes by that hears of it."""
+    """A peer has come, is suspected or has gone: tell every stage that depends on it."""
     text = f"{change.node} {change.before} -> {change.after}: {change.reason}"
     todo.add(do.RecordStory(stage="membership", text=text))
     todo.must_beat = True  # tell the others at once: they wait for a second observer

@@ -1,18 +1,20 @@
-"""Membership: who is alive, suspect or gone, by beats, tokens and second observers.
+"""Membership: which peers are alive, suspect or gone, by beats, tokens and second observers.
 
-Knows: deadlines, confirmation, incarnations, self-doubt. Does not know: what follows from a peer being gone.
+Knows: deadlines, confirmation, incarnations, its own lag. Does not know: what follows when a peer is gone.
 
-A beat comes out of the peer's decision loop and is the only proof of life; the liveliness token goes within
-milliseconds of a kill, but stays while a wedged process keeps its link, so it can only accuse. Silence or a lost token
-make a peer *suspect*. It is *gone* when a second, living observer suspects it too, or when nobody speaks for it during
-the confirmation time; in fleets of more than three nodes a living observer that still hears it keeps it suspect (a
-partial cut). Any beat refutes. A node whose own loop lags doubts itself first: its deadlines lengthen, at most
-threefold, and never stop (after Lifeguard, arXiv 1707.00788). An observer that has watched for a while without ever
-hearing a peer accuses it as well: it must not vouch for what it does not know.
+A beat comes out of the peer's decision loop and is the only proof of life. The liveliness token goes within
+milliseconds of a kill, but it stays while a wedged process keeps its link, so it can only accuse. Silence or a lost
+token make a peer *suspect*. It is *gone* when a second, living observer suspects it too, or when no node speaks for it
+during the confirmation time. In fleets of more than three nodes a living observer that still hears it keeps it suspect
+(a partial cut). Any beat refutes.
 
-Whoever comes back after a cut is heard before the others behind the same cut. As long as its beats do not accuse them,
-they are not gone but *suspect*: else a robot that hears a healed network's first node would flee from an owner that
-everybody else hears.
+A node whose own loop lags mistrusts itself first: the lag factor lengthens its deadlines, at most threefold (after
+Lifeguard, arXiv 1707.00788). An observer that has watched for a while without ever hearing a peer accuses it as well:
+it must not speak for a peer that it does not know.
+
+The first peer that is heard after a cut is heard before the others behind the same cut. While its beats do not accuse
+them, they are *suspect*, not gone. Otherwise a robot that hears the first node of a healed network would flee from an
+owner that all others hear.
 """
 
 from __future__ import annotations
@@ -25,10 +27,10 @@ from zsched.core.values.fleet import Timing
 from zsched.core.values.model import Beat, NodeId, PeerState
 
 SMALL_FLEET = 3
-"""Up to so many nodes no second observer is waited for: there is one at most, and it may be the next to go."""
-MAX_STRETCH = 3.0
+"""Up to this size nobody waits for a second observer: there is at most one, and it may be the next to go."""
+MAX_LAG_FACTOR = 3.0
 IN_FLIGHT_S = 0.03
-"""A beat that arrives so soon after its sender's token went was on its way before: it refutes nothing."""
+"""A beat this soon after its sender's token went was sent before that: it refutes nothing."""
 
 _NOBODY: frozenset[NodeId] = frozenset()
 
@@ -48,29 +50,29 @@ class _Peer:
     state: PeerState = PeerState.UNKNOWN
     track: Track = field(default_factory=Track)
     order: Order = Order.NEW
-    """Of the beat that came last."""
+    """Order of the last beat."""
     beat_at: float = -math.inf
     suspect_since: float = math.inf
     vouched_until: float = -math.inf
-    """A suspect for whom somebody speaks is looked at again then."""
+    """When to judge a suspect again for which another node speaks."""
     token_lost: bool = False
     token_lost_at: float = -math.inf
     has_been_gone: bool = False
-    """Gone since it was last alive, even if somebody's word has made it a suspect again."""
+    """Gone since it was last alive, even if another node's word has made it suspect again."""
     back_at: float = -math.inf
     """When it last came back from gone in the same life."""
     suspects: tuple[NodeId, ...] = ()
 
 
 class Membership:
-    """Every other configured node's state, as this node sees it."""
+    """This node's view of every other configured node's state."""
 
     def __init__(self, me: NodeId, nodes: tuple[NodeId, ...], timing: Timing) -> None:
         self._me = me
         self._timing = timing
         self._peers = {name: _Peer() for name in sorted(nodes) if name != me}
         self._size = len(nodes)
-        self._stretch = 1.0
+        self._lag_factor = 1.0
         self._started_at = math.inf
         self._deadline: float | None = None
         """`next_deadline`, until something changes it."""
@@ -103,11 +105,11 @@ class Membership:
         return None if peer is None or peer.track.incarnation < 0 else peer.track.incarnation
 
     def is_doubtful(self, node: NodeId) -> bool:
-        """Whether the beat that came last in this peer's name is not to be believed, whatever it says."""
+        """Whether the peer's last beat is not believed."""
         return self._peers[node].order is Order.DOUBTFUL
 
     def is_newest(self, node: NodeId) -> bool:
-        """Whether the beat that came last in this peer's name is no repeat and no late one, and is believed."""
+        """Whether the peer's last beat is believed, and is no repeat and no late one."""
         return self._peers[node].order is Order.NEW
 
     def alive(self) -> tuple[NodeId, ...]:
@@ -115,14 +117,14 @@ class Membership:
         return tuple(name for name, peer in self._peers.items() if peer.state is PeerState.ALIVE)
 
     def in_grace(self) -> frozenset[NodeId]:
-        """The suspects whose confirmation time still runs: by then they have beaten again, are gone, or are cut off."""
+        """The suspects within their confirmation time: at its end they have beaten again, are gone, or are cut off."""
         if not self._has_suspect:
             return _NOBODY
         suspects = ((name, peer) for name, peer in self._peers.items() if peer.state is PeerState.SUSPECT)
         return frozenset(name for name, peer in suspects if peer.vouched_until == -math.inf)
 
     def suspects(self) -> tuple[NodeId, ...]:
-        """Whom this node accuses: suspect, gone, or never heard although it has listened for long enough."""
+        """The nodes that this node accuses: suspect, gone, or never heard after it has listened for long enough."""
         excused = (PeerState.ALIVE,) if self._has_watched else (PeerState.ALIVE, PeerState.UNKNOWN)
         return tuple(name for name, peer in self._peers.items() if peer.state not in excused)
 
@@ -134,19 +136,19 @@ class Membership:
     # --- what changes it ---------------------------------------------------------------------------------------
 
     def note_lag(self, lag_s: float) -> None:
-        """Take in how late this node's own loop woke up (seconds, >= 0), before it judges anybody."""
+        """Note how late this node's own loop woke up (seconds, >= 0), before it judges any peer."""
         if lag_s > 0.0:
-            self._stretch = max(self._stretch, min(1.0 + lag_s / self._timing.beat_s, MAX_STRETCH))
+            self._lag_factor = max(self._lag_factor, min(1.0 + lag_s / self._timing.beat_s, MAX_LAG_FACTOR))
             self._deadline = None
 
-    def fade_stretch(self) -> None:
-        """A beat was sent: doubt fades by halves."""
-        if self._stretch > 1.0:
-            self._stretch = 1.0 + (self._stretch - 1.0) / 2
+    def fade_lag_factor(self) -> None:
+        """A beat was sent: the excess of the lag factor over 1 halves."""
+        if self._lag_factor > 1.0:
+            self._lag_factor = 1.0 + (self._lag_factor - 1.0) / 2
             self._deadline = None
 
     def absorb_beat(self, beat: Beat, now: float) -> tuple[Transition, ...]:
-        """A peer's loop is alive: it refutes every accusation. Old and doubtful ones (`Track`) are ignored."""
+        """A peer's loop is alive: the beat refutes every accusation. Old and doubtful beats (`Track`) are ignored."""
         peer = self._peers.get(beat.node)
         if peer is None:
             return ()
@@ -175,20 +177,20 @@ class Membership:
         return (*changes, *self._review(now)) if self._has_suspect else tuple(changes)
 
     def _take_word(self, beat: Beat, now: float) -> list[Transition]:
-        """A peer that we had lost is back: whom it does not accuse we had lost with it, and should hear soon."""
+        """A lost peer is back. Lost peers that it does not accuse should be heard soon."""
         changes = []
         accused = {name for peer in self._peers.values() if peer.state is PeerState.ALIVE for name in peer.suspects}
         for name, peer in self._peers.items():
             if peer.state is PeerState.GONE and name not in accused:
                 changes.append(self._change(name, PeerState.SUSPECT, f"{beat.node} is back and hears it", now))
-                peer.vouched_until = now + self._timing.suspect_s * self._stretch
+                peer.vouched_until = now + self._timing.suspect_s * self._lag_factor
         return changes
 
     def _may_begin(self, peer: _Peer, incarnation: int, now: float) -> bool:
         """Whether another life may begin with its first beat.
 
-        The next one when the known one misses its beats; of a peer that is silent also one with a lower count (its
-        state was made anew).
+        It may when the known life misses its beats. For a silent peer a lower incarnation may also begin (its state was
+        made anew).
         """
         if incarnation > peer.track.incarnation:
             return peer.state is not PeerState.ALIVE or now >= peer.beat_at + 2 * self._timing.beat_s
@@ -198,8 +200,8 @@ class Membership:
     def absorb_token_lost(self, node: NodeId, incarnation: int, now: float) -> tuple[Transition, ...]:
         """A peer's token went: suspect at once, if it is the token of the life we know.
 
-        Of a peer that has just come back it is most likely the old link's: the beats came by a new one, and zenoh ends
-        the token of the other when it notices. So for a lease only silence counts.
+        Just after a peer has come back this is most likely the old link's token: the beats come by a new link, and
+        zenoh ends the old token when it notices. So for one lease only silence counts.
         """
         peer = self._peers.get(node)
         if peer is None or peer.track.incarnation != incarnation or peer.state is not PeerState.ALIVE:
@@ -212,7 +214,7 @@ class Membership:
     def tick(self, now: float) -> tuple[Transition, ...]:
         """Time has passed."""
         changes = []
-        limit = self._timing.suspect_s * self._stretch
+        limit = self._timing.suspect_s * self._lag_factor
         self._started_at = min(self._started_at, now)
         self._has_watched = self._has_watched or now >= self._started_at + limit
         if now < self.next_deadline():
@@ -227,7 +229,7 @@ class Membership:
     def next_deadline(self) -> float:
         """When `tick` may have something to say; infinity when never."""
         if self._deadline is None:
-            limit, due = self._timing.suspect_s * self._stretch, math.inf
+            limit, due = self._timing.suspect_s * self._lag_factor, math.inf
             for peer in self._peers.values():
                 due = min(due, self._peer_deadline(peer, limit))
             self._deadline = due
@@ -244,10 +246,10 @@ class Membership:
         return max(peer.suspect_since + self._grace(peer), peer.vouched_until)
 
     def _grace(self, peer: _Peer) -> float:
-        """How long a suspect has before it is gone without anybody's confirmation."""
+        """How long a suspect stays so before it is gone without another observer."""
         if self._size <= SMALL_FLEET:
-            return 1.5 * self._timing.beat_s * self._stretch if peer.token_lost else 0.0
-        return self._timing.confirm_s * self._stretch
+            return 1.5 * self._timing.beat_s * self._lag_factor if peer.token_lost else 0.0
+        return self._timing.confirm_s * self._lag_factor
 
     def _review(self, now: float) -> list[Transition]:
         """Turn suspects into gone where that is confirmed."""
@@ -268,7 +270,7 @@ class Membership:
         if now < self._review_at(peer):
             return ""
         if self._size > SMALL_FLEET and any(at.beat_at > peer.suspect_since for _, at in observers):
-            # Somebody alive still hears it: a cut between it and us, not its end. Whoever falls silent vouches no more.
+            # A living node still hears it: a cut between it and us, not its end. A silent node speaks for no peer.
             peer.vouched_until = now + self._timing.beat_s
             return ""
         return "nobody speaks for it"

@@ -9,7 +9,7 @@ from random import Random
 import pytest
 
 from zsched.config.timing import WAN, WIFI, WIRED
-from zsched.core.membership.peers import MAX_STRETCH, Membership
+from zsched.core.membership.peers import MAX_LAG_FACTOR, Membership
 from zsched.core.values.fleet import Timing
 from zsched.core.values.model import Beat, NodeId, PeerState
 
@@ -407,7 +407,7 @@ def test_token_of_a_suspect_or_gone_peer_changes_nothing_more() -> None:
 # --- self-doubt ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("lag", "factor"), [(0.0, 1.0), (0.1, 1.5), (0.2, 2.0), (0.4, MAX_STRETCH), (1000.0, MAX_STRETCH)])
+@pytest.mark.parametrize(("lag", "factor"), [(0.0, 1.0), (0.1, 1.5), (0.2, 2.0), (0.4, MAX_LAG_FACTOR), (1000.0, MAX_LAG_FACTOR)])
 def test_lagging_node_doubts_itself_up_to_threefold(lag: float, factor: float) -> None:
     ear = heard(LARGE)
     ear.members.note_lag(lag)
@@ -422,7 +422,7 @@ def test_doubt_fades_by_halves_and_never_below_trust() -> None:
     ear.members.note_lag(0.4)
     limits = []
     for _ in range(12):
-        ear.members.fade_stretch()
+        ear.members.fade_lag_factor()
         limits.append(ear.members.next_deadline() / WIFI.suspect_s)
     assert limits[:2] == [pytest.approx(2.0), pytest.approx(1.5)]
     assert limits[-1] == pytest.approx(1.0, abs=1e-3)
@@ -459,7 +459,7 @@ def test_random_beats_cuts_and_kills_end_where_the_truth_is(nodes: tuple[NodeId,
             ear.members.tick(now)
         dead = set(nodes[1 + len(nodes) // 2 :]) | {nodes[1]}
         living = tuple(n for n in nodes[1:] if n not in dead)
-        ear.members.fade_stretch()
+        ear.members.fade_lag_factor()
         ear.run(now, now + 6 * ear.timing.suspect_s, living, suspects=tuple(sorted(dead)))
         states = ear.members.states()
         assert all(states[n] in (GONE, UNKNOWN) for n in dead), f"seed {seed}: {states}"
