@@ -45,14 +45,14 @@ class DeadlineReached:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClockCompared:
-    """This machine's clock that may be slewed was held against the one that is not (`zsched.clock.ClockWatch`)."""
+    """This machine's clock that a time service slews was compared with the raw one (`zsched.clock.ClockWatch`)."""
 
     error_ratio: float
-    """How much faster it ran over the last second or less; negative: slower."""
+    """How much faster the clock ran over the last second or less; negative: slower."""
     jump_s: float = 0.0
-    """How far they moved apart since the comparison before: after a suspend as long as it took."""
+    """How far the clocks moved apart since the comparison before; after a suspend, its length."""
     since_s: float = 0.0
-    """How long ago that was."""
+    """How long ago that comparison was."""
 
 
 # --- PROFILE, GATEWAY ------------------------------------------------------------------------------------------------
@@ -129,7 +129,7 @@ class ElectorAnswered:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LearntReceived:
-    """A peer told what it has learnt: unasked, after a commit, or in answer to our own question (`AskLearnt`)."""
+    """A peer sent its learnt values: unasked, after a commit, or in answer to our question (`AskLearnt`)."""
 
     learnt: Learnt
     is_answer: bool = False
@@ -146,7 +146,7 @@ class LearntAsked:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PersistFailed:
-    """The durable state could not be written; nothing that hung on it was sent."""
+    """The durable state could not be written; nothing that depended on it was sent."""
 
     reason: str
 
@@ -200,7 +200,7 @@ class WorkerTroubled:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorkerOutdated:
-    """A worker of this node that somebody else started should be started again, and why; empty: no more."""
+    """A worker that somebody else started on this node should be started again; ``reason`` empty: no longer."""
 
     task: TaskId
     reason: str
@@ -208,33 +208,33 @@ class WorkerOutdated:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorkerJobs:
-    """A worker of this node says what it has done in this life: to the relay, which hands it on.
+    """A worker of this node reports its jobs of this life to the relay, which forwards them.
 
-    Counts and sums only rise, so a word that is lost costs nothing; means and rates are made of the differences
+    Counts and sums only rise, so a lost report costs nothing: means and rates are made of the differences
     (`zsched.core.profile.jobs`).
     """
 
     task: TaskId
     incarnation: str
     at_s: float
-    """When this was so: seconds since this life of the worker began, by its own clock."""
+    """Time of the report: seconds since this life of the worker began, by its own clock."""
     done: int
     skipped: int = 0
-    """Gave way to something newer, undone."""
+    """Jobs that gave way to newer ones, undone."""
     waiting: int = 0
-    """The fewest that have waited for their turn since the word before."""
+    """The fewest jobs that were waiting at any time since the report before."""
     time_s: float = 0.0
-    """Of all that are done: from beginning to end..."""
+    """Sums over all done jobs: time from beginning to end..."""
     cpu_s: float = 0.0
     """...CPU time..."""
     wait_s: float | None = None
-    """...waiting for a CPU; ``None``: not known..."""
+    """...time waiting for a CPU; ``None``: not known..."""
     age_s: float | None = None
-    """...and from arrival to end; ``None``: not known."""
+    """...and time from arrival to end; ``None``: not known."""
     late: int | None = None
-    """So many took longer from arrival to end than the task's deadline; ``None``: it has none."""
+    """Jobs that took longer from arrival to end than the task's deadline; ``None``: it has none."""
     is_idle: bool = False
-    """It has nothing to do just now: nothing in hand, and nothing that waits."""
+    """The worker is idle: no job in hand, and none waiting."""
 
     def __post_init__(self) -> None:
         check_name("jobs.task", self.task)
@@ -279,7 +279,7 @@ class SlotFlipped:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SlotDrained:
-    """The old slot's end markers have come back."""
+    """The end markers of the old slot have come back."""
 
     task: TaskId
     epoch: int
@@ -288,10 +288,10 @@ class SlotDrained:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RoleEnded:
-    """This node's worker says that it does not work in ``epoch`` any more, or it is dead.
+    """This node's worker reports that it no longer works in ``epoch``, or it is dead.
 
-    It names no stop: where it might be an earlier one's, `zsched.core.vote.lease.Leases.on_stopped` does not believe
-    it.
+    The report does not say to which stop order it belongs. Where it might belong to an earlier one,
+    `zsched.core.vote.lease.Leases.on_stopped` does not believe it.
     """
 
     task: TaskId
@@ -307,7 +307,7 @@ class StreamsCounted:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RelayChanged:
-    """The relay process started or went; after a restart it has been given the newest plans again."""
+    """The relay process started or ended; a new one gets the newest plans again."""
 
     is_running: bool
     reason: str = ""
@@ -333,7 +333,7 @@ class WeightsCommanded:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RetryCommanded:
-    """An operator wants failures to be forgotten."""
+    """An operator orders that failures are forgotten."""
 
     request: int
     command: RetryTask
@@ -341,7 +341,7 @@ class RetryCommanded:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameDropped:
-    """Bytes came that are no valid frame, or not for us: only a counter moves."""
+    """A frame came that is invalid or not for us: only a counter rises."""
 
     kind: str
     reason: str
@@ -349,7 +349,7 @@ class FrameDropped:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProblemReported:
-    """An adapter has trouble (``problem``), or no longer (``None``); ``source`` names it. Shown in status."""
+    """An adapter has trouble (``problem``), or no longer has (``None``); ``source`` names it for the status."""
 
     source: str
     problem: str | None
@@ -357,7 +357,7 @@ class ProblemReported:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StopRequested:
-    """The daemon is told to stop: hand nothing new to this node, say goodbye."""
+    """The daemon must stop: this node takes no new task and hands its tasks over."""
 
 
 Event = (

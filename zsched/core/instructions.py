@@ -1,10 +1,10 @@
-"""What to do: everything a node asks of its adapters, in the imperative.
+"""What to do: every instruction of a node to its adapters, in the imperative.
 
-Knows: the wish. Does not know: how it is carried out, or whether it worked (that comes back as an event).
+Knows: the order. Does not know: how an adapter carries it out, or whether it worked (that comes back as an event).
 
-The order of a batch is meaning: *persist, then send, then apply*. The shell carries a batch out in order; when the
-state cannot be written it drops the rest of the batch, any other failure it only reports as an event. Every batch is
-safe when cut after any prefix.
+The order of a batch is a contract: *persist, then send, then apply*. The shell carries a batch out in order. When the
+state cannot be written, it drops the rest of the batch; any other failure it only reports as an event. Every batch is
+safe when it is cut after any prefix.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from zsched.core.values.snapshot import Snapshot
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PersistState:
-    """Write the durable state; what follows in this batch must not happen unless it is on disk."""
+    """Write the durable state; the rest of the batch must not happen unless it is on disk."""
 
     state: DurableState
 
@@ -28,7 +28,7 @@ class PersistState:
 class PublishBeat:
     """Send the heartbeat to everybody, best effort.
 
-    Out of turn (``is_news``) it wakes its receivers up; in turn it waits until they are awake anyway.
+    An urgent beat (``is_news``) wakes its receivers up; a periodic one waits until they are awake anyway.
     """
 
     beat: Beat
@@ -37,7 +37,7 @@ class PublishBeat:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PublishProfile:
-    """Send our profile to every gateway; with news (more than figures) it wakes its receivers up."""
+    """Send our profile to every gateway; an urgent one (news other than figures) wakes its receivers up."""
 
     profile: Profile
     is_news: bool = True
@@ -92,14 +92,14 @@ class AnswerElection:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PublishLearnt:
-    """Tell everybody what we have learnt."""
+    """Send our learnt values to everybody."""
 
     learnt: Learnt
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AskLearnt:
-    """Ask one peer what it has learnt; the answer comes back as `LearntReceived`."""
+    """Ask one peer for its learnt values; the answer comes back as `LearntReceived`."""
 
     peer: NodeId
     deadline_s: float
@@ -107,7 +107,7 @@ class AskLearnt:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IntroducePeers:
-    """Somebody is missing on the control network: see that everybody hears of everybody's addresses again."""
+    """A node is missing on the control network: tell every node all addresses again."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -120,7 +120,7 @@ class AnswerLearnt:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StartWorker:
-    """Let this node's worker for the task run (again, if it runs already: nothing happens)."""
+    """Start this node's worker for the task; nothing happens if it runs."""
 
     task: TaskId
 
@@ -149,7 +149,7 @@ class RestartWorker:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SetRole:
-    """Tell this node's worker what it is now."""
+    """Tell this node's worker its role."""
 
     role: Role
 

@@ -1,7 +1,7 @@
 """The frozen values that only the relay's pipe and the streams themselves carry.
 
-Knows: what the daemon and its relay tell each other beside plans, roles and the events of `zsched.core.events`; what an
-end marker says. Does not know: pipes, frames, zenoh.
+Knows: the messages between the daemon and its relay beside plans, roles and the events of `zsched.core.events`; the
+content of end markers. Does not know: pipes, frames, zenoh.
 
 Commands (daemon to relay): `RoutePlan`, `Role`, `WorkerWatch`, `RelayStop`. Reports (relay to daemon): `RelayStarted`,
 `WorkerSeen`, `WorkerMatched`, `WorkerTrouble`, `WorkerJobs`, `SlotLost` and the events `SlotReady`, `SlotFlipped`,
@@ -66,11 +66,11 @@ class WorkerWatch:
 
     task: TaskId
     inputs: tuple[str, ...] = ()
-    """What goes to the worker here, over all robots: one key expression per rule."""
+    """The inputs of the worker here, over all robots: one key expression per rule."""
     strangers: tuple[str, ...] = ()
-    """The same for a node that cannot be: who subscribes to these as well is not the worker alone."""
+    """The same for a node that cannot exist: a subscriber to these as well is not (only) the worker."""
     services: tuple[tuple[str, ...], ...] = ()
-    """What the worker here is asked: per rule the key of every robot."""
+    """The services of the worker here: per rule the key of every robot."""
     standbys: tuple[Route, ...] = ()
     """Robots: the inputs towards every candidate, to be announced in the ROS graph for warm workers to find."""
     unowned: tuple[Route, ...] = ()
@@ -79,19 +79,19 @@ class WorkerWatch:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorkerMatched:
-    """Whether somebody takes all that goes to this node's worker of the task, as far as zenoh tells."""
+    """Whether zenoh reports subscribers for all inputs of this node's worker of the task."""
 
     task: TaskId
     is_matched: bool
     is_certain: bool = True
-    """False: somebody else, who listens to everything, may be all that matches."""
+    """False: the only match may be another program that subscribes to everything."""
     missing: str = ""
-    """What nobody takes, in words."""
+    """The inputs without a subscriber, in words."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorkerTrouble:
-    """The worker's own callbacks raise: a worker's word to its node's relay, and the relay's to the daemon."""
+    """The worker's callbacks raise: the worker's report to its relay, and the relay's to the daemon."""
 
     task: TaskId
     incarnation: str
@@ -117,14 +117,14 @@ class EndMarker:
     epoch: int
     count: int
     replayed: int = 0
-    """Start markers: so many samples from ``count`` on may have gone to an earlier owner, which died."""
+    """Start markers: this many samples from ``count`` on may have gone to an earlier owner, which died."""
     is_whole: bool = False
     """Start markers: the stream is of class ``reliable``, every sample is wanted."""
     had: int | None = None
     """Start markers among answers: the numbers below this one an earlier life of the same relay has acknowledged;
     ``None``: no other life of it is known."""
     age_s: float | None = None
-    """Start markers among answers: number 0 was put so long ago."""
+    """Start markers among answers: seconds since number 0 was put."""
     slot: int = 0
     """Start markers of inputs: the epoch of the slot that this publisher feeds; 0: it does not say. Of class ``latest``
     that is all such a marker says."""
@@ -142,7 +142,7 @@ class EndMarker:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SnapshotChunk:
-    """Beside each piece of a worker's snapshot: its place, and by what the whole is known (blake2s, 16 bytes, hex)."""
+    """Beside each piece of a worker's snapshot: its place, and the checksum of the whole (blake2s, 16 bytes, hex)."""
 
     index: int
     count: int
@@ -176,7 +176,7 @@ class ServiceProblem(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StreamAck:
-    """What a worker has had of one publisher of a relay, or a relay of a worker's; the hop's numbers are 0, 1, 2..."""
+    """A worker's progress on one publisher of a relay, or a relay's on one of a worker; a hop's numbers start at 0."""
 
     eid: int
     """The publisher's entity id in the sender's session."""
@@ -185,7 +185,7 @@ class StreamAck:
     arrived: int
     """The number it waits for: everything from `first` up to it has come, or is given up."""
     processed: int
-    """Everything below this number is processed (or gave way to something newer)."""
+    """Everything below this number is processed (or gave way to newer samples)."""
     lost: int = 0
     doubled: int = 0
     reordered: int = 0
@@ -200,7 +200,7 @@ class StreamAck:
     is_whole: bool | None = None
     """A worker's: what a start marker has told it of the stream's class (`EndMarker.is_whole`); ``None``: nothing."""
     replays: int = 0
-    """A worker's: so many numbers from `arrived` on it takes for replays, by a start marker."""
+    """A worker's: this many numbers from `arrived` on count as replays, by a start marker."""
 
     def __post_init__(self) -> None:
         for name in ("eid", "first", "arrived", "processed", "lost", "doubled", "reordered", "until", "replays"):
@@ -216,7 +216,7 @@ class StreamAcks:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SlotLost:
-    """A slot closed, or its worker restarted, with samples not acknowledged: at most so many had no result."""
+    """A slot closed, or its worker restarted, with unacknowledged samples: at most that many had no result."""
 
     task: TaskId
     epoch: int

@@ -1,7 +1,7 @@
-"""A status snapshot as JSON values (pure).
+"""The status as JSON values (pure).
 
 Knows: the schema ``zsched.status/1`` as JSON. Does not know: text for people (`zsched.commands.report`), sockets, where
-the snapshot came from.
+the status came from.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Json = dict[str, Any]
 
 
 def snapshot_json(snapshot: Snapshot) -> Json:
-    """The snapshot as JSON values; pairs become objects, ``None`` becomes null, times are ages in seconds."""
+    """The status as JSON values; pairs become objects, ``None`` becomes null, times are ages in seconds."""
     body = _plain(snapshot)
     body["counters"] = dict(snapshot.counters)
     for task, status in zip(body["tasks"], snapshot.tasks, strict=True):

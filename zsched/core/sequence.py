@@ -1,11 +1,11 @@
-"""Membership's and the gateway's question about one sender: is a numbered message news, old, or not to be believed?
+"""Numbered messages of one sender: is a message news, old, or doubtful?
 
-Knows: lives (incarnations), sequence numbers, how far ahead one can honestly be, the way back from a wrong one. Does
-not know: what the messages say, what silence means.
+Knows: lives (incarnations), sequence numbers, how far ahead an honest one can be, the way back from a wrong one. Does
+not know: the messages' content, what silence means.
 
-Whoever can put a frame can put one number, and the highest number wins. So a number far ahead of the last one, or of
-another life than that which is heard, is *doubtful*: it counts only once `RUN` messages in a row have gone on from it
-while nothing more came of the known course. That way, too, a sender is heard again whose number somebody has overtaken.
+Anybody who can send a frame can send one number, and the highest number wins. So a number far ahead of the last one, or
+of an unknown life, is *doubtful*. It counts only after `RUN` messages in a row have continued it while nothing more
+came of the known course. In the same way a sender is heard again whose number a forged one has overtaken.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 WINDOW = 16
-"""No honest message is so many numbers ahead of the one before..."""
+"""No honest message is further ahead of the one before..."""
 RATE_HZ = 50.0
-"""...beside so many for each second between the two (a cut)."""
+"""...plus this many numbers for each second between the two (a cut)."""
 RUN = 3
-"""So many messages in a row make another course believed."""
+"""This many messages in a row make another course believed."""
 STEP = 8
-"""Messages that are so many numbers apart at most are in a row."""
+"""Messages are in a row when they are at most this many numbers apart."""
 
 
 class Order(StrEnum):
@@ -44,18 +44,18 @@ class _Course:
 
 @dataclass(slots=True)
 class Track:
-    """The newest believed (incarnation, sequence) of one sender, and another course that may take its place."""
+    """The newest believed (incarnation, sequence) of one sender, and another course that may replace it."""
 
     incarnation: int = -1
     sequence: int = -1
     at: float = -math.inf
-    """When something of it last came (monotonic seconds)."""
+    """When its last message came (monotonic seconds)."""
     _other: _Course | None = None
 
     def judge(self, incarnation: int, sequence: int, now: float, *, may_begin: bool) -> Order:
         """Take a number in; `Order.NEW` makes it the newest.
 
-        ``may_begin``: another life may begin with its first message, for the known one is over or was never heard.
+        ``may_begin``: another life may begin with its first message, since the known one is over or was never heard.
         """
         if self.incarnation < 0 or (may_begin and incarnation != self.incarnation):
             return self._take(incarnation, sequence, now)
@@ -71,7 +71,7 @@ class Track:
         return Order.NEW
 
     def _is_believed(self, incarnation: int, sequence: int, now: float) -> bool:
-        """Whether this goes on from a course that has run for long enough by now."""
+        """Whether this continues a course that has now run for long enough."""
         other = self._other
         if other is None or other.incarnation != incarnation or not 0 < sequence - other.sequence <= STEP:
             if (incarnation, sequence) != (self.incarnation, self.sequence):  # a mere repeat begins nothing

@@ -1,4 +1,4 @@
-"""Builds the status snapshot out of a node's state.
+"""Builds the status out of a node's state.
 
 Knows: which figure stands where. Does not know: how it is shown.
 """
@@ -45,7 +45,7 @@ STARTED_BEFORE = (
     "there: the session {owner}-{task}.zenoh.json5 has this robot's address since"
 )
 UNREADY_SHOWN_S = 2.0
-"""A handover takes less; a slot that nobody takes for longer is a problem."""
+"""A slot that no worker takes for longer is a problem: a handover takes less."""
 
 
 def build_snapshot(node: Stages, now: float) -> Snapshot:
@@ -121,7 +121,7 @@ def _problems(node: Stages, quorum: QuorumStatus) -> tuple[str, ...]:
 
 
 def _is_never_initialised(node: Stages, quorum: QuorumStatus) -> bool:
-    """Whether too many electors have no state, none is known to have one, and nobody remembers that one ever had."""
+    """Whether too many electors lack a state, none is known to have one, and no node remembers that one ever had."""
     agreement, electors = node.agreement, node.fleet.electors
     if node.me in electors and not node.lacks_state_file:
         return False
@@ -132,7 +132,7 @@ def _is_never_initialised(node: Stages, quorum: QuorumStatus) -> bool:
 
 
 def _relay_problems(node: Stages, now: float) -> Iterator[str]:
-    """Relays that do not stay: their robots' streams pause each time, whatever the tasks look like from here."""
+    """Relays that do not stay: their robots' streams pause each time, although the tasks look well from here."""
     for name in node.membership.states():
         told = _relay_told(node, name, now)
         if told and not (name == node.me and "relay" in node.problems):
@@ -276,13 +276,13 @@ def _task_problems(node: Stages, task: TaskSpec, value: Allocation, now: float) 
 
 
 def _is_in_the_way(task: TaskSpec, load: WorkerLoad) -> bool:
-    """Whether a task may be without an owner for its sake: somebody else has to start it, or it has failed before."""
+    """Whether this worker may be why a task has no owner: somebody else has to start it, or it has failed before."""
     is_missed = not task.worker.command and load.state is WorkerState.STOPPED and bool(load.reason)
     return is_missed or (load.state is not WorkerState.READY and load.reason.startswith(RESTARTING))
 
 
 def _unready_since(node: Stages, executor: Executor) -> float:
-    """Since when our relay has not seen that the newest slot is taken; infinity when it does."""
+    """Since when our relay has missed a worker for the newest slot; infinity when it has one."""
     if executor.phase is Phase.PREPARING:
         return executor.started_at
     epoch, since = node.unready.get(executor.spec.name, (-1, math.inf))
@@ -290,7 +290,7 @@ def _unready_since(node: Stages, executor: Executor) -> float:
 
 
 def _untaken(task: TaskSpec, executor: Executor, lack: SlotReady | None) -> str:
-    """What our relay misses, as far as it has said."""
+    """What our relay misses, as far as it has reported."""
     newer = "" if task.worker.command else f"; {STARTED_BEFORE.format(owner=executor.owner, task=task.name)}"
     told = lack if lack is not None and lack.epoch == executor.epoch else None
     untaken = () if told is None else told.untaken

@@ -1,10 +1,10 @@
-"""The one answer of every stage: what one event, and the time that has passed, lead to.
+"""The one answer of every stage: the result of one event and of the time that has passed.
 
 Knows: what there is to do, and its order: *persist, then send, then apply*, so that every prefix of it is safe. Does
-not know: why it is to be done.
+not know: the reasons.
 
-A stage writes into the `ToDo` that it is handed and returns nothing of the kind. `Node` hands the same one from stage
-to stage and turns it into a batch of instructions at the end.
+A stage writes into the `ToDo` that it gets and returns nothing of the kind. `Node` passes the same one from stage to
+stage and makes a batch of instructions of it at the end.
 """
 
 from __future__ import annotations
@@ -31,29 +31,29 @@ _LOCAL = frozenset(
 
 @dataclass(slots=True)
 class ToDo:
-    """What is to be done, by whom it concerns."""
+    """What there is to do, by receiver."""
 
     must_persist: bool = False
     """The durable state has changed: it is on disk before anything is sent."""
     must_beat: bool = False
-    """The others must hear at once what the next beat says."""
+    """The other nodes must hear the next beat at once."""
     must_decide: bool = False
     """Something happened that may need a decision: a round now."""
     called: list[tuple[TaskId, bool]] = field(default_factory=list)
     """(task, whether its owner is to be left at once) of the votes to which another robot has called this one."""
     stayed: list[TaskId] = field(default_factory=list)
-    """Tasks of which a vote has ended with: stay."""
+    """Tasks whose vote has ended with: stay."""
     ended: list[Ended] = field(default_factory=list)
     """Changes of this node's that were committed, overtaken or given up."""
     learnt: list[tuple[Allocation, str]] = field(default_factory=list)
     """(a newer value, why it came about)."""
     send: list[do.Instruction] = field(default_factory=list)
-    """What other nodes or whoever asks will see."""
+    """Instructions whose effect other nodes, or an asking operator, will see."""
     apply: list[do.Instruction] = field(default_factory=list)
-    """What only this machine does."""
+    """Instructions whose effect stays on this machine."""
 
     stand_down: do.StandDown | None = None
-    """This daemon ends: the last thing that it does, whatever else the same event leads to."""
+    """This daemon ends: the last instruction, behind all others of the same event."""
 
     def add(self, *instructions: do.Instruction) -> None:
         """Sort instructions into sending and applying."""
@@ -66,11 +66,11 @@ class ToDo:
 
     @property
     def is_settled(self) -> bool:
-        """Whether no stage has left anything for another stage to look at."""
+        """Whether no stage has left anything for another stage."""
         return not (self.called or self.stayed or self.ended or self.learnt)
 
     @property
     def is_only_sent(self) -> bool:
-        """Whether it is nothing but what is sent at once: answers, most of all."""
+        """Whether it holds only messages that can leave at once, mostly answers."""
         is_called_on = self.must_persist or self.must_beat or self.must_decide or self.stand_down is not None
         return not (is_called_on or self.apply) and self.is_settled

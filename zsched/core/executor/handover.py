@@ -46,9 +46,9 @@ from zsched.core.values.plan import Role, Route, RoutePhase, RoutePlan, Slot, Wo
 ROLE_DRAIN_MARGIN_S = 1.0
 """The old owner's worker goes idle this much after the robots' drain time (a cold standby's start comes on top)."""
 MAX_OLD = 3
-"""So many predecessors are kept; a plan has to fit a frame (`zsched.wire.codec`)."""
+"""Predecessors that are kept: a plan has to fit into a frame (`zsched.wire.codec`)."""
 LEAVES_S = 1.0
-"""A worker whose draining is over hears so within this time (it says nothing more)."""
+"""A worker that has drained learns within this time that it is idle."""
 
 
 class Phase(StrEnum):
@@ -71,7 +71,7 @@ class _Old:
 
     @property
     def is_left(self) -> bool:
-        """Whether the relay has flipped to another slot."""
+        """Whether the relay has flipped to a newer slot."""
         return self.until < math.inf
 
 
@@ -90,13 +90,13 @@ class Executor:
     is_leased: bool = False
     """The worker here may work only under a lease: the task is exclusive by this node's file, or for everybody."""
     is_local: bool = False
-    """Cut off from the owner and from a quorum, this robot works alone; its output is degraded."""
+    """This robot is cut off from owner and quorum and works alone; its output is degraded."""
     _unleased_epoch: int | None = None
-    """In which epoch the worker here was let work without a lease; ``None`` once it has said that it ended that."""
+    """The epoch in which the worker here worked without a lease; ``None`` once it has confirmed its end."""
     _leaves_until: float = -math.inf
-    """Until when a worker that drained, and so had said already that it left its epoch, hears that it is idle."""
+    """Until when a worker that has drained, and so has left its epoch, learns that it is idle."""
     _is_owner_gone: bool = False
-    """The owner went during its epoch: its worker's state is not asked for."""
+    """The owner went during its epoch: nobody asks for its worker's snapshot."""
     _current: Slot | None = None
     _old: tuple[_Old, ...] = ()
     """The predecessors, the oldest first."""
@@ -123,7 +123,7 @@ class Executor:
         return () if self._current is None else self._current.routes
 
     def again(self, todo: ToDo) -> None:
-        """The newest worker's state, role and plan once more, after a batch that carried them was cut off."""
+        """Repeat the newest worker state, role and plan after a batch that carried them was cut off."""
         if self.runs_worker:
             self.start(todo)
             self._wake_worker(self.role, todo)
@@ -144,7 +144,7 @@ class Executor:
             todo.add(StartWorker(task=self.spec.name))
 
     def execute(self, allocation: Allocation, todo: ToDo, now: float) -> None:
-        """A learnt allocation: act if its epoch is newer than what is carried out."""
+        """Carry out a learnt allocation if its epoch is newer than the present one."""
         if allocation.owner is None or allocation.epoch < self.epoch:
             return
         was_leased, self.is_leased = self.is_leased, self.spec.exclusive or allocation.leased
@@ -174,7 +174,7 @@ class Executor:
             self._wake_worker(role, todo)
             self._become(role, todo)
         elif self.role.role is WorkerRole.ACTIVE and self.is_leased:
-            # Whoever owns it now may be working already: nothing of the old epoch may leave any more.
+            # The new owner may be working already: nothing of the old epoch may leave any more.
             self._role_deadline = now
             self.leave(todo)
         elif self.role.role is WorkerRole.ACTIVE:
@@ -185,14 +185,14 @@ class Executor:
             self._become(Role(task=self.spec.name, role=WorkerRole.DRAINING, epoch=self.role.epoch), todo)
 
     def _become(self, role: Role, todo: ToDo) -> None:
-        """Another role; one that lets the worker work without a lease is remembered until it has stopped."""
+        """Change the role; remember a role without a lease until the worker has stopped."""
         self.role = role
         if role.role is WorkerRole.ACTIVE and role.lease_until_s is None:
             self._unleased_epoch = role.epoch
         todo.add(SetRole(role=role))
 
     def _change_terms(self, todo: ToDo) -> None:
-        """The owner stays, and its worker needs a lease from now on, or none any more."""
+        """The owner stays, but its worker needs a lease from now on, or no longer needs one."""
         if self.is_local:
             self.rejoin(todo)  # whoever works alone needed no lease until now
         elif self.owner == self.me and self.runs_worker:
@@ -204,22 +204,22 @@ class Executor:
                 self._become(role, todo)
 
     def on_role_ended(self, epoch: int) -> None:
-        """The worker says that it has left ``epoch``: believed once it was told to."""
+        """The worker says that it has left ``epoch``; this counts only after the order to leave."""
         if epoch == self._unleased_epoch and self.role.role is not WorkerRole.ACTIVE:
             self._unleased_epoch = None
 
     def on_worker_ended(self) -> None:
-        """The worker's process is no more: what it was told before is over."""
+        """The worker's process has ended, and its former role with it."""
         if self.role.role is not WorkerRole.ACTIVE:
             self._unleased_epoch = None
 
     def may_work_unleased(self, now: float) -> bool:
-        """Whether the worker here may be working without a lease: it may, or has not said that it has stopped."""
+        """Whether the worker here may be working without a lease: it may, or it has not confirmed its stop."""
         is_let = self.role.role is not WorkerRole.IDLE and self.role.lease_until_s is None
         return is_let or self._unleased_epoch is not None or now < self._leaves_until
 
     def isolate(self, todo: ToDo) -> None:
-        """Nobody can be asked and the owner is not heard: this robot's own worker serves its own streams."""
+        """Owner and quorum are out of reach: this robot's own worker serves its streams."""
         may_work = self.spec.on_isolation is OnIsolation.LOCAL and not self.is_leased
         can = self.has_streams and may_work and self.epoch > 0
         if self.is_local or not can or self.owner == self.me:
@@ -232,7 +232,7 @@ class Executor:
         self._go(Phase.PREPARING, RoutePhase.PREPARE, f"cut off from {self.owner}: works alone (degraded)", todo)
 
     def rejoin(self, todo: ToDo) -> None:
-        """The committed owner is heard again: back to its slot."""
+        """The committed owner is heard again: go back to its slot."""
         if not self.is_local or self.owner is None:
             return
         self._end_local(todo)
@@ -260,14 +260,14 @@ class Executor:
         self._become(role, todo)
 
     def leave(self, todo: ToDo) -> None:
-        """Exclusive tasks: another owner waits; the worker stops now, before the move is committed."""
+        """Exclusive tasks: another owner waits, so the worker stops now, before the commit."""
         if self.role.role is WorkerRole.IDLE:
             return
         self._become(Role(task=self.spec.name, role=WorkerRole.IDLE), todo)
         todo.add(RecordStory(stage="executor", text="the worker stops", task=self.spec.name, epoch=self.epoch))
 
     def _wake_worker(self, role: Role, todo: ToDo) -> None:
-        """An owner's worker must run, cold standby or not."""
+        """An owner's worker must run, also a cold standby."""
         if role.role is WorkerRole.ACTIVE and self.spec.worker.command:
             todo.add(StartWorker(task=self.spec.name))
 
@@ -306,7 +306,7 @@ class Executor:
         self._go(Phase.DRAINING, None, f"{done}; {', '.join(self.predecessors)} drains", todo)
 
     def on_drained(self, epoch: int, todo: ToDo) -> None:
-        """The old slot of ``epoch`` has given back all it had."""
+        """The old slot of ``epoch`` has given back everything."""
         drained = tuple(old for old in self._old if old.slot.epoch == epoch and old.is_left)
         if not drained:
             return
@@ -317,7 +317,7 @@ class Executor:
             self._go(self.phase, None, text, todo)
 
     def on_gone(self, node: NodeId, todo: ToDo) -> None:
-        """A peer is gone: nothing will come from its slots any more."""
+        """A peer is gone: nothing more comes from its slots."""
         self._is_owner_gone = self._is_owner_gone or node == self.owner
         self._drop(tuple(old for old in self._old if old.slot.owner == node), f"{node} is gone", todo)
 
@@ -332,7 +332,7 @@ class Executor:
         self._go(self.phase, plan, f"drops the slot of epoch {epochs}: {why}", todo)
 
     def _forget(self, gone: tuple[_Old, ...]) -> bool:
-        """Let go of predecessors; answers whether the handover has nothing to wait for any more."""
+        """Drop predecessors; whether the handover then waits for nothing more."""
         self._old = tuple(old for old in self._old if old not in gone)
         return self.phase is Phase.DRAINING and not self._old
 

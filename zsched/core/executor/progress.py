@@ -1,16 +1,16 @@
-"""EXECUTOR, beside the handover: which workers hang although inputs flow (`output_deadline_s`).
+"""EXECUTOR, beside the handover: finds workers that hang although inputs flow (`output_deadline_s`).
 
-Knows: what every robot's relay counts, when a worker was last given time. Does not know: processes, streams, zenoh.
+Knows: the counters of every robot's relay, when a worker was last given time. Does not know: processes, streams, zenoh.
 
-Inputs and outputs pass through the robots' relays, never through the owner's, and they are the same for a worker that
-uses our library and for any other zenoh program. So a robot says in its profile whether a task answers it
-(`Progress`), and the owner's daemon puts what the robots say together (`HangJudge`).
+Inputs and outputs pass through the robots' relays, never through the owner's. They look the same for a worker with our
+library and for any other zenoh program. So each robot reports in its profile whether a task answers it (`Progress`),
+and the owner's daemon combines these reports (`HangJudge`).
 
-A robot that was not heard and is back has waited for a link, not for the worker: its complaints count again once links
-have had the time to heal (`zsched.core.scheduler.probation`) and the worker the time to answer.
+A robot that was out of reach and is back has waited for a link, not for the worker. Its complaints count again after
+links have had time to heal (`zsched.core.scheduler.probation`) and the worker has had time to answer.
 
-A node that did not run for a while (its machine was suspended, its daemon stopped) begins to count again, on both
-sides: time counts on while it sleeps, and a worker that slept with it owes nothing for that.
+A node that stood still (suspended machine, stopped daemon) starts all waits again, as a robot and as an owner: its
+clock went on while neither it nor its worker could run.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from zsched.core.values.model import NodeId, Profile, TaskId, TaskProgress, Work
 from zsched.core.values.plan import Direction, StreamCount
 
 COUNT_S = 1.0
-"""Relays count so often: what they say is at most so old."""
+"""Period of the relays' counters, so a report is at most this old."""
 MARGIN_S = 1.5
-"""A complaint may be older than the answer that ends it by the relay's period and the way of a profile."""
+"""A complaint may be this much older than the answer that ends it: `COUNT_S` and a profile's way."""
 _INPUTS, _OUTPUTS = "in", "out"
-"""How streams' names call their direction (`zsched.core.route.templates`)."""
+"""The directions in stream names (`zsched.core.route.templates`)."""
 
 
 @dataclass(slots=True)
@@ -51,7 +51,7 @@ class _Seen:
 
 
 class Progress:
-    """A robot's view: does the owner's worker give back anything for what it is given?"""
+    """A robot's view: does the owner's worker return anything for its inputs?"""
 
     def __init__(self, specs: Iterable[TaskSpec]) -> None:
         self._deadlines = {spec.name: spec.worker.output_deadline_s for spec in specs}
@@ -87,7 +87,7 @@ class Progress:
         seen.taken, seen.given = taken, given
 
     def _sums(self, task: TaskId, counts: tuple[StreamCount, ...]) -> tuple[int, int]:
-        """(inputs, outputs) so far; a task without outputs gives back acknowledgements, if its worker sends any."""
+        """(inputs, outputs) so far; a task without outputs counts its worker's acknowledgements, if there are any."""
         inputs = [count for count in counts if count.stream.startswith(f"{task}/{_INPUTS}/")]
         outputs = [count for count in counts if count.stream.startswith(f"{task}/{_OUTPUTS}/")]
         taken = sum(count.messages for count in inputs)
@@ -98,13 +98,13 @@ class Progress:
         return taken, sum(count.acknowledged or 0 for count in inputs)
 
     def begin_again(self, task: TaskId, now: float) -> None:
-        """What waits has waited since now only."""
+        """Start the wait of every open input again, now."""
         seen = self._seen.get(task)
         if seen is not None and seen.waits_since is not None:
             seen.waits_since = now
 
     def reports(self, now: float) -> tuple[TaskProgress, ...]:
-        """What this robot can say now: served, or waiting for longer than the deadline while inputs go on."""
+        """This robot's reports: served, or waiting for longer than the deadline while inputs flow."""
         found = []
         for task, seen in sorted(self._seen.items()):
             limit_s = max(self._deadlines[task] or 0.0, 2 * COUNT_S)
@@ -126,14 +126,14 @@ class HangJudge:
         """Since when a worker owes an answer: it became ready, or was ended by us."""
 
     def note_worker(self, task: TaskId, state: WorkerState, now: float) -> None:
-        """A worker's state has changed; one that only lost its token still owes."""
+        """A worker's state has changed; one that only lost its token still owes an answer."""
         if state is WorkerState.READY:
             self._given_time_at[task] = now
         elif state is not WorkerState.STARTING:
             self._given_time_at.pop(task, None)
 
     def begin_again(self, task: TaskId, now: float) -> None:
-        """A worker that owes an answer has its whole time again."""
+        """A worker that owes an answer gets its whole time again."""
         if task in self._given_time_at:
             self._given_time_at[task] = now
 
@@ -150,9 +150,9 @@ class HangJudge:
         Args:
             spec: the task, owned by this node.
             executor: carries it out here.
-            profiles: the robots' fresh ones.
+            profiles: fresh profiles of the robots.
             now: monotonic seconds.
-            unproven: the robots whose complaints may be about their links; that one is served counts all the same.
+            unproven: robots whose complaints may come from their links. A report of being served counts all the same.
         """
         deadline_s = spec.worker.output_deadline_s
         ready_at = self._given_time_at.get(spec.name)
@@ -181,7 +181,7 @@ class HangWatch:
         self._progress = Progress(self._specs.values())
         self._judge = HangJudge()
         self._back_at: dict[NodeId, float] = {}
-        """{robot: when it was heard again after it had not been}."""
+        """{robot: when it was heard again after a silence}."""
 
     def absorb(self, counts: tuple[StreamCount, ...], executors: Mapping[TaskId, Executor], now: float) -> None:
         """Our relay has counted."""
@@ -194,7 +194,7 @@ class HangWatch:
             self._judge.note_worker(task, state, now)
 
     def note_lag(self, lag_s: float, now: float) -> None:
-        """This node did not run for so long (seconds); what is half a deadline or more is nobody's fault."""
+        """This node stood still for this many seconds; a pause of half a deadline or more starts all waits again."""
         for task, spec in self._specs.items():
             if lag_s >= max(spec.worker.output_deadline_s or 0.0, COUNT_S) / 2:
                 self._progress.begin_again(task, now)
@@ -210,7 +210,7 @@ class HangWatch:
         return frozenset(node for node, at in self._back_at.items() if now < at + excused_s)
 
     def reports(self, now: float) -> tuple[TaskProgress, ...]:
-        """What our profile shall say."""
+        """The reports for our profile."""
         return self._progress.reports(now)
 
     def look(
@@ -221,7 +221,7 @@ class HangWatch:
         todo: ToDo,
         now: float,
     ) -> None:
-        """A robot's profile came: end the workers here that hang; those of somebody else are only told of."""
+        """A robot's profile came: restart our workers that hang; of a foreign worker only report it."""
         for spec in [self._specs[task] for task in owned if task in self._specs]:
             profiles = [profile for robot in self._voters if (profile := gateway.fresh(robot, now)) is not None]
             reason = self._judge.hangs(spec, executors[spec.name], profiles, now, self._unproven(spec, now))

@@ -1,19 +1,17 @@
-"""EXECUTOR, beside the handover: since when a task is *leased*, that is exclusive for everybody.
+"""EXECUTOR, beside the handover: when a task becomes *leased*, which means exclusive for every node.
 
-A fleet file is brought to the machines one by one, so `exclusive: true` holds here and not yet there. Until the last
-candidate goes by it, one may work without a lease, for as long as it likes if it is cut off. So it is agreed through
-the task's register whether the task is leased (`Allocation.leased`), and everybody obeys the value, whatever its own
-file says:
+An operator brings a new fleet file to one machine after the other, so `exclusive: true` holds on some nodes first. A
+candidate with the old file may work without a lease, and for any time while it is cut off. So the nodes agree through
+the task's register whether the task is leased (`Allocation.leased`). Every node obeys that value, whatever its own file
+says:
 
-* A task that nobody has ever owned is leased from its first owner on, if the file of whoever proposes that one says
-  that it is exclusive.
-* Else its owner, if its file says so, has the value changed once nobody else works without a lease: every candidate
-  and whoever else is heard was asked, has learnt this epoch, and answered that no worker there works without one.
-  Until then nothing is granted: an owner whose file says that the task is exclusive waits, and says for whom.
-* It ends being leased when the owner's file does not say so and everybody who is heard has the same file.
+* A task without an owner so far is leased from its first owner on, if the proposer's file says exclusive.
+* Otherwise an owner whose file says exclusive proposes the change once no other node works without a lease. It asks
+  every candidate and every node that it hears. Each must have learnt this epoch and answer that no worker there works
+  without a lease. Until then no elector grants a lease: the owner waits, and its status says for which nodes.
+* The task stops being leased when the owner's file does not say exclusive and all nodes that it hears have its file.
 
-Knows: what peers answered, which file they go by. Does not know: grants (`zsched.core.vote.lease`), how a value is
-agreed.
+Knows: peers' answers and fleet files. Does not know: grants (`zsched.core.vote.lease`), how a value is agreed.
 """
 
 from __future__ import annotations
@@ -33,7 +31,7 @@ ASK_EVERY_S = 0.2
 
 @dataclass(slots=True)
 class Sealing:
-    """What one node knows of those who may work without a lease."""
+    """Decides for one node which changes of *leased* to propose and which peers to ask first."""
 
     fleet: Fleet
     me: NodeId
@@ -46,22 +44,22 @@ class Sealing:
     _asked_at: float = -math.inf
 
     def hear(self, beat: Beat) -> None:
-        """A peer's beat came."""
+        """Note the fleet file that a peer's beat names."""
         self._files[beat.node] = beat.fleet_file
 
     def on_answer(self, learnt: Learnt) -> None:
-        """A peer answered a question; those that this node asks for another reason are none of this one's."""
+        """A peer answered a question. Answers count from this part's own first question on."""
         if self._asked_at > -math.inf:
             self._answers[learnt.node] = learnt
 
     def unleased(self, now: float) -> tuple[TaskId, ...]:
-        """The tasks whose worker here may be working without a lease: our answers say so."""
+        """The tasks whose worker here may be working without a lease, for our answers."""
         return tuple(name for name, executor in self.executors.items() if executor.may_work_unleased(now))
 
     def due(self, values: Mapping[TaskId, Allocation], now: float) -> list[tuple[TaskId, SetLeased]]:
-        """What this node proposes as an owner.
+        """The changes that this node proposes as an owner.
 
-        What an earlier life of its own was granted is over before it lets its worker do without a lease.
+        It waits until every lease of its own earlier life is over before it lets its worker do without one.
         """
         is_young = now < self.over_at
         return [
@@ -71,7 +69,7 @@ class Sealing:
         ]
 
     def to_ask(self, values: Mapping[TaskId, Allocation], now: float) -> tuple[NodeId, ...]:
-        """Whom to ask now for what it has learnt and who works there."""
+        """The peers to ask now for their learnt values and unleased workers."""
         tasks = [spec for spec in self._open(values) if spec.exclusive]
         if not tasks or now - self._asked_at < ASK_EVERY_S:
             return ()
@@ -91,7 +89,7 @@ class Sealing:
         return any(file != mine for file in self._files.values())
 
     def _waits_for(self, spec: TaskSpec, value: Allocation) -> dict[NodeId, str]:
-        """{who must be heard, or must stop, before the task is leased: why}."""
+        """{node that must be heard, or whose worker must stop, before the task is leased: reason}."""
         others = sorted({*self._files, *spec.candidates} - {self.me})
         reasons = {name: self._doubt(spec, value, name) for name in others}
         return {name: reason for name, reason in reasons.items() if reason}
@@ -108,7 +106,7 @@ class Sealing:
         return "" if epoch >= value.epoch else f"has not learnt epoch {value.epoch}"
 
     def problem(self, spec: TaskSpec, value: Allocation) -> str:
-        """How this node's file and what is agreed differ; empty when they do not."""
+        """How this node's file and the agreed value differ; empty when they do not."""
         if value.owner is None or value.leased is spec.exclusive:
             return ""
         if not spec.exclusive:

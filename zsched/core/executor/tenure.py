@@ -1,7 +1,7 @@
-"""EXECUTOR, beside the handover: who may work right now. Leases of exclusive tasks, and robots that are cut off.
+"""EXECUTOR, beside the handover: decides whether a worker may work now. Leases, and robots that are cut off.
 
 Knows: when a worker here must stop, may go on, or works alone. Does not know: grants and echoes
-(`zsched.core.vote.lease`), the handover's table (`zsched.core.executor.handover`), how a worker is told.
+(`zsched.core.vote.lease`), the handover's table (`zsched.core.executor.handover`), how a role reaches a worker.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from zsched.core.vote.clocks import ClockDoubt
 from zsched.core.vote.lease import Leases
 
 ALONE_AFTER_S = 0.5
-"""So long cut off from the owner and from a quorum, a robot with `on_isolation: local` works alone."""
+"""With `on_isolation: local` a robot works alone after this time without the owner and without a quorum."""
 
 
 @dataclass(slots=True)
@@ -43,7 +43,7 @@ class Tenure:
 
     @property
     def is_busy(self) -> bool:
-        """Whether a worker here may have to be given a lease or stopped with any beat."""
+        """Whether any beat may give a worker here a lease, or stop it."""
         return self.leases.is_holding
 
     def next_deadline(self, now: float) -> float:
@@ -60,7 +60,7 @@ class Tenure:
     # --- exclusive tasks ---------------------------------------------------------------------------------------------
 
     def hold(self, value: Allocation, next_number: int) -> None:
-        """A newer value was learnt: begin or end this node's side of an exclusive task's lease."""
+        """A newer value was learnt: begin or end this node's side of the task's lease."""
         self._note_leased()
         if value.task in self.exclusive and value.owner == self.me:
             self.leases.begin(value.task, value.epoch, next_number)
@@ -82,7 +82,7 @@ class Tenure:
     def on_clock(
         self, event: ClockCompared, standing: Mapping[TaskId, Allocation | None], number: int, now: float
     ) -> bool:
-        """The clock was compared. Whether that has begun or ended a doubt about it."""
+        """Take a comparison of clocks in. Whether it began or ended a doubt."""
         is_unsure = self.clock.absorb(event, now)
         if not self.exclusive or is_unsure == self.leases.is_unsure:
             return False
@@ -93,9 +93,9 @@ class Tenure:
         return True
 
     def tend_leases(self, number: int, todo: ToDo, now: float) -> None:
-        """Prolong our workers' leases; stop who is asked to leave, and give back what has stopped or run out.
+        """Prolong our workers' leases, stop workers that must leave, and give back leases that ended.
 
-        ``number`` is our newest beat's.
+        ``number`` is that of our newest beat.
         """
         if not self.leases.is_holding:
             return  # nobody works here
@@ -123,7 +123,7 @@ class Tenure:
     # --- isolation ---------------------------------------------------------------------------------------------------
 
     def tend_isolation(self, membership: Membership, todo: ToDo, now: float) -> None:
-        """Work alone while cut off from the owner and from a quorum, and not a moment longer."""
+        """Work alone exactly while cut off from the owner and from a quorum."""
         if not self._local:
             return
         voters = self.fleet.voters

@@ -14,7 +14,7 @@ from zsched.core.values.fleet import Fleet, runs_worker
 from zsched.core.values.model import NodeId, Profile, TaskId, WorkerState, as_reason, told_of_worker
 
 TROUBLE_S = 60.0
-"""A callback that has raised is shown for so long behind the last time."""
+"""Status shows a callback's error for this long after the last one."""
 
 
 def failed_workers(profile: Profile) -> set[TaskId]:
@@ -29,9 +29,9 @@ class Workers:
     states: dict[TaskId, WorkerState]
     reasons: dict[TaskId, str] = field(default_factory=dict)
     _troubles: dict[TaskId, tuple[str, float]] = field(default_factory=dict)
-    """{task: (what a worker that is ready complains of, since when it has not again)}."""
+    """{task: (the newest error of a ready worker, when it came)}."""
     _outdated: dict[TaskId, str] = field(default_factory=dict)
-    """{task: why a worker that is ready should be started again}."""
+    """{task: why a ready worker should be started again}."""
 
     @classmethod
     def of(cls, fleet: Fleet, me: NodeId) -> Workers:
@@ -40,7 +40,7 @@ class Workers:
         return cls({task.name: WorkerState.STOPPED for task in fleet.tasks if runs_worker(task, me, kind)})
 
     def on_changed(self, event: ev.WorkerChanged) -> RecordStory | None:
-        """Note a worker's new state; ``None`` when it is no news, or no worker of ours."""
+        """Note a worker's new state; ``None`` when nothing changed or the worker is not ours."""
         if event.task not in self.states:
             return None
         if event.state is not WorkerState.READY:
@@ -69,7 +69,7 @@ class Workers:
             self._outdated.pop(event.task, None)
 
     def told(self, now: float) -> Mapping[TaskId, str]:
-        """{task: why its worker is not ready, or what is wrong with it though it is}."""
+        """{task: why its worker is not ready, or what is wrong with a ready one}."""
         if not self._troubles and not self._outdated:
             return self.reasons
         self._troubles = {task: one for task, one in self._troubles.items() if now - one[1] <= TROUBLE_S}

@@ -1,11 +1,11 @@
-"""GATEWAY, what a task needs where: learnt where it runs, scaled by speed to where it does not.
+"""GATEWAY: what a task needs on each node. Learnt where it runs, scaled by speed for the others.
 
-Knows: the difference between what a task uses and what it wants, by its own word where there is one (`Jobs`). Does not
-know: profiles' age, who is better.
+Knows: the difference between a task's use and its need, also by the task's own word (`Jobs`). Does not know: profiles'
+age, which node is better.
 
-A task's need is kept as *work*: cores of a machine of speed 1. Without it a task that was measured on a slow machine
-seems too large for the fast ones, and the other way round; with one figure for all of them the view from every owner is
-the same but for a common factor, so a constant fleet has no limit cycle.
+A need is kept as *work*: cores of a machine of speed 1. Otherwise a task that was measured on a slow machine would seem
+too large for fast ones, and the other way round. With one figure for all machines the view from every owner is the same
+but for a common factor, so an unchanging fleet has no limit cycle.
 """
 
 from __future__ import annotations
@@ -16,37 +16,37 @@ from zsched.core.values.fleet import Demand, TaskSpec
 from zsched.core.values.model import Jobs, NodeId, Profile, TaskId, WorkerLoad, WorkerState
 
 STARVED_CPU_RATIO = 0.9
-"""On an owner busier than this a task may get less than it wants: what it uses is the least that it needs."""
+"""On a busier owner a task may get less than it wants: its use is only a lower bound of its need."""
 UNSURE = 1.5
-"""A worker that always wants to run and never had enough counts as needing so many times what it gets."""
+"""Need of a worker that always wants to run and never had enough: this many times its use."""
 SETTLE_S = 4.0
-"""What a task uses still rises for so long after it has come, for the figures are smoothed: the least that it needs."""
+"""After a move the smoothed use still rises for this long: it is only a lower bound of the need."""
 
 
 CALM_WAIT_RATIO = 0.1
-"""Jobs that wait for a CPU for no more of their time show how long they wait for their turn where nothing is short."""
+"""Jobs that wait for a CPU for a smaller part of their time show their usual wait in the queue."""
 QUEUE_RATIO = 2.0
-"""Until that was seen, a job's age counts as at most so many times the time that it takes."""
+"""Until that was seen, a job's age counts as at most this many times its own time."""
 SHORT_RATIO = 0.9
-"""A task that gets less than this part of what was foreseen for its owner does so for a reason of that machine."""
+"""A task that gets a smaller part of its forecast has a shortfall on that machine."""
 SAME_RATIO = 0.1
-"""That reason is believed in until what others use there has changed by this share of the machine."""
+"""A shortfall is remembered until others' use there changes by this share of the machine."""
 LEAST_FREE_CORES = 0.05
-"""A job on a full machine gets this much at least, so that its time can be told."""
+"""A job on a full machine gets at least this much, so that its time is finite."""
 
 
 @dataclass(frozen=True, slots=True)
 class JobNeed:
-    """What one job of a task takes, as its worker said where it ran."""
+    """One job's need, as the worker reported it where it ran."""
 
     work_s: float
     """CPU time at speed 1."""
     other_s: float
-    """What it waits for beside a CPU: it takes as long on every machine."""
+    """Its wait for things other than a CPU, the same on every machine."""
     queue_ratio: float
-    """From arrival to end, over what it takes itself, where nothing is short; at least 1."""
+    """Time from arrival to end over its own time where nothing is short; at least 1."""
     is_serial: bool
-    """One thread works on it: it cannot use more than a core at a time."""
+    """One thread does it, so it uses at most one core at a time."""
 
     def most_cores(self, speed: float) -> float | None:
         """What the worker can use at a time on a machine of ``speed``; ``None``: any amount."""
@@ -54,30 +54,30 @@ class JobNeed:
         return cpu_s / (cpu_s + self.other_s) if self.is_serial and cpu_s > 0.0 else None
 
     def age_s(self, speed: float, free_cores: float) -> float:
-        """How long it would take there from arrival to end, with so much not in use by others."""
+        """Expected seconds from arrival to end on a machine with this many free cores."""
         stretch = 1.0 / min(max(free_cores, LEAST_FREE_CORES), 1.0)
         return self.queue_ratio * (self.other_s + stretch * self.work_s / speed)
 
 
 @dataclass(frozen=True, slots=True)
 class _Shortfall:
-    """What a task got on a machine beside what was foreseen for it there."""
+    """What a task got on a machine, compared with the forecast for that machine."""
 
     share: float
-    """Of the share of its work, at most 1."""
+    """The part of the forecast work that it got, at most 1."""
     stretch: float
     """How many times as long its jobs took, at least 1."""
     others_cores: float
-    """What others used there."""
+    """Cores that others used there."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Known:
-    """What was learnt of a task; ``None``: nothing yet."""
+    """What is known of a task's need; ``None``: nothing yet."""
 
     work: float | None = None
     is_sure: bool = False
-    """It was measured where the task had all that it needs; otherwise the need may be larger."""
+    """It was measured with enough CPU; otherwise the need may be larger."""
     memory_mb: float | None = None
     job: JobNeed | None = None
     owner: NodeId | None = None
@@ -93,14 +93,14 @@ class Demands:
         self._shortfalls: dict[tuple[TaskId, NodeId], _Shortfall] = {}
 
     def learn(self, task: TaskId, profile: Profile, now: float, fastest: float | None = None) -> bool:
-        """Note what the task's worker wants on its owner; whether that is news.
+        """Learn the task's need from its owner's profile; whether the need has changed.
 
-        What it uses is its need where CPU is left, and the least of it where none is. Where threads of it always want
-        to run (`WorkerLoad.wanted_cores`), its need is what was measured when it had enough, if they would take that
-        much; else a guess above what it gets, so that a machine that would give it more is seen to. Where the worker
-        tells what it left undone (`WorkerLoad.jobs`), nothing is guessed: that is less exact than what was measured,
-        for jobs are whole, but known at once. A worker that is not ready, or a figure that nobody measured, changes
-        nothing: the task does not cost less because its worker restarts.
+        With free CPU the use is the need; without, it is a lower bound. For threads that always want to run
+        (`WorkerLoad.wanted_cores`) the need is the last one measured with enough CPU, if they would take that much.
+        Otherwise it is a guess above the use, so that a better machine is seen. A worker's report of work left undone
+        (`WorkerLoad.jobs`) replaces the guess: jobs are whole, so it is less exact than a measurement, but it is known
+        at once. A worker that is not ready, or a figure without a measurement, changes nothing: a task does not get
+        cheaper because its worker restarts.
 
         ``fastest``: the highest speed among the candidates (``None``: the owner's).
         """
@@ -134,7 +134,7 @@ class Demands:
         return is_seen or (found.work, found.memory_mb, found.job) != (known.work, known.memory_mb, known.job)
 
     def _note_shortfall(self, task: TaskId, profile: Profile, load: WorkerLoad, found: _Known) -> bool:
-        """Remember of a machine that the task gets less there than its figures say, if it does; is that news?"""
+        """Remember that the task gets less on a machine than forecast, or no longer does; whether that has changed."""
         jobs, job, used = load.jobs, found.job, profile.cpu_used_cores
         if jobs is None or job is None or used is None or load.cpu_cores is None or not found.work:
             return False
@@ -153,14 +153,14 @@ class Demands:
         return before != self._shortfalls[task, profile.node]
 
     def job(self, task: TaskId) -> JobNeed | None:
-        """What one of its jobs takes; ``None``: its worker has never told."""
+        """One job's need; ``None``: its worker has never reported any."""
         return self._known.get(task, _Known()).job
 
     def experience(self, task: TaskId, profile: Profile) -> tuple[float, float]:
-        """What the task got on that machine beside what is foreseen: (part of the work, at most 1; times as long).
+        """(part of the forecast work that the task got there, at most 1; how many times as long its jobs took).
 
-        What was seen there counts as long as others use about as much there, whoever has the task: the owner's term is
-        what is measured, and it does not look better as soon as the task has left.
+        This counts while others use about as much there, whoever owns the task now. The owner's term is measured, so a
+        machine must not look better as soon as the task has left.
         """
         seen, used = self._shortfalls.get((task, profile.node)), profile.cpu_used_cores
         if seen is None or used is None:
@@ -169,7 +169,7 @@ class Demands:
         return (seen.share, seen.stretch) if is_same else (1.0, 1.0)
 
     def at(self, spec: TaskSpec, profile: Profile) -> Demand:
-        """What the task will use on a node: the larger of the fleet file's figure and what was learnt."""
+        """The task's demand on a node: the larger of the fleet file's figure and the learnt one."""
         known = self._known.get(spec.name, _Known())
         return Demand(
             cpu_cores=max(spec.demand.cpu_cores, (known.work or 0.0) / speed_of(profile)),
@@ -182,9 +182,9 @@ def _others_cores(task: TaskId, profile: Profile, used_cores: float) -> float:
 
 
 def is_short(load: WorkerLoad) -> bool:
-    """Whether the worker is seen to want more than it gets; one that has nothing to do uses little and lacks nothing.
+    """Whether the worker visibly wants more than it gets; an idle worker lacks nothing.
 
-    Its threads always want to run and run for less, or it leaves work undone.
+    Either its threads always want to run and run for less, or it leaves work undone.
     """
     jobs, use = load.jobs, load.cpu_cores or 0.0
     is_hungry = load.wanted_cores is not None and use < SHORT_RATIO * load.wanted_cores
@@ -192,17 +192,17 @@ def is_short(load: WorkerLoad) -> bool:
 
 
 def _is_told(load: WorkerLoad) -> bool:
-    """Whether the worker's own word says what it lacks of a CPU, and not only what it leaves undone."""
+    """Whether the worker's report shows its lack of CPU, and not only its undone work."""
     jobs = load.jobs
     return jobs is not None and (jobs.wait_s is not None or load.wanted_cores is not None)
 
 
 def _told(load: WorkerLoad, speed: float, fastest: float) -> float | None:
-    """The work that the task needs, of what it uses and what its worker says that it left undone; ``None``: not told.
+    """The work that the task needs, from its use and its worker's report of undone work; ``None``: no report.
 
-    What is left undone counts only as far as a CPU would have done it. A serial worker that skips four of five samples
-    of a camera, and would skip three of five on the fastest candidate, lacks one of five. Where the kernel tells how
-    long jobs have waited for a CPU, that bound is known; else only threads that always want to run show a lack.
+    Undone work counts only as far as a CPU would have done it. A serial worker that skips four of five camera samples,
+    and would skip three of five on the fastest candidate, lacks one of five. Where the kernel reports how long jobs
+    waited for a CPU, that bound is known. Elsewhere only threads that always want to run show a lack.
     """
     jobs, use = load.jobs, load.cpu_cores
     if jobs is None or use is None or not _is_told(load):
@@ -217,7 +217,7 @@ def _told(load: WorkerLoad, speed: float, fastest: float) -> float | None:
 
 
 def _other_s(jobs: Jobs) -> float:
-    """What a job waits for beside a CPU, on whatever machine; nothing where the kernel does not tell it apart."""
+    """A job's wait for things other than a CPU, the same on every machine; 0 where the kernel does not report it."""
     return 0.0 if jobs.wait_s is None else max(jobs.time_s - jobs.wait_s - jobs.cpu_s, 0.0)
 
 
@@ -232,5 +232,5 @@ def _job(jobs: Jobs, speed: float, known: JobNeed | None) -> JobNeed:
 
 
 def speed_of(profile: Profile) -> float:
-    """How fast one of the node's cores is; 1 where nobody has measured it."""
+    """Speed of the node's cores; 1 where nobody has measured it."""
     return 1.0 if profile.speed is None else profile.speed

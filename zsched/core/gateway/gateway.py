@@ -1,6 +1,6 @@
 """GATEWAY: the newest profile of every node, with its age (the paper's ``edge_data``, Alg. 1).
 
-Knows: which report is newer, how old is too old, what the task costs where it runs. Does not know: who is better.
+Knows: which profile is newer, how old is too old, the task's demand. Does not know: which node is better.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class EdgeData:
 
 
 class Gateway:
-    """What this node knows of every node's state, itself included."""
+    """This node's knowledge of every node, itself included."""
 
     def __init__(self, fleet: Fleet) -> None:
         self._names = frozenset(node.name for node in fleet.nodes)
@@ -65,12 +65,12 @@ class Gateway:
         return known[0] if known is not None and now - known[1] <= self._ttl_s else None
 
     def fresh_until(self, now: float) -> float:
-        """Up to when (inclusive) the same profiles as now are fresh, if none comes."""
+        """The time until which (inclusive) the same profiles as now stay fresh, if none comes."""
         ends = (at + self._ttl_s for _, at in self._profiles.values() if now - at <= self._ttl_s)
         return min(ends, default=math.inf)
 
     def learn_demand(self, task: TaskId, owner: NodeId, now: float) -> None:
-        """Note what the task's worker wants on its owner, and gets (`zsched.core.gateway.demand` and `sharing`)."""
+        """Learn the task's need and share from its owner's profile (`zsched.core.gateway.demand` and `sharing`)."""
         profile = self.fresh(owner, now)
         if profile is None:
             return
@@ -82,7 +82,7 @@ class Gateway:
         self.version += any(news)
 
     def demand(self, spec: TaskSpec, profile: Profile) -> Demand:
-        """What the task will use on the node of ``profile``."""
+        """The task's demand on the node of ``profile``."""
         return self.demands.at(spec, profile)
 
     def share(self, spec: TaskSpec, profile: Profile, need_cores: float, coming_cores: float) -> float:

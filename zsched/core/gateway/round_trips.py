@@ -1,11 +1,10 @@
-"""GATEWAY, how far away nodes are: seconds from this node to each other one and back, by what profiles echo.
+"""GATEWAY: the round trip from this node to every other one, in seconds, from the echoes in profiles.
 
-Knows: which of our profiles another node has heard, and how long it has kept it. Does not know: links, signals, what a
-delay is worth.
+Knows: which of our profiles another node has, and for how long. Does not know: links, signals, the price of a delay.
 
-Every node's profile names the newest profile that it has of each node, and how long it has held it (as NTP does, and
-RTCP's DLSR, RFC 3550): what is left of the time since we sent that is the way there and back, whatever the clocks. A
-busy daemon takes a frame late, so the least of the last few counts.
+Every node's profile names the newest profile that it has of each other node, and for how long it has held it (as NTP
+does, and RTCP's DLSR, RFC 3550). The time since we sent that profile, less the hold, is the round trip, whatever the
+clocks show. A busy daemon takes a frame late, so the least of the last few counts.
 """
 
 from __future__ import annotations
@@ -16,15 +15,15 @@ from collections.abc import Mapping
 from zsched.core.values.model import Echo, NodeId, Profile
 
 KEPT = 8
-"""The least of so many round trips counts."""
+"""The least of this many round trips counts."""
 SENT = 64
-"""So many of our own profiles may be echoed; one of before is too old to mean anything."""
+"""Number of our own profiles that may be echoed; an older one says nothing."""
 ECHO_S = 10.0
-"""A profile that has been held for longer is not echoed."""
+"""A profile that was held for longer is not echoed."""
 
 
 class RoundTrips:
-    """This node's round trips, and what it echoes."""
+    """This node's round trips, and its echoes for others."""
 
     def __init__(self, me: NodeId) -> None:
         self._me = me
@@ -41,7 +40,7 @@ class RoundTrips:
             del self._sent[next(iter(self._sent))]
 
     def note_heard(self, profile: Profile, incarnation: int, now: float) -> None:
-        """Another node's profile, which the gateway has believed; ``incarnation``: our own."""
+        """Another node's profile that the gateway has believed; ``incarnation``: our own."""
         self._heard[profile.node] = (profile.incarnation, profile.sequence, now)
         for echo in profile.echoes:
             sent_at = self._sent.get(echo.sequence)
@@ -52,7 +51,7 @@ class RoundTrips:
                 self._known.setdefault(profile.node, deque(maxlen=KEPT)).append(round_trip_s)
 
     def echoes(self, now: float) -> tuple[Echo, ...]:
-        """What our next profile says of the others'."""
+        """The echoes for our next profile."""
         return tuple(
             Echo(node=node, incarnation=incarnation, sequence=sequence, held_s=now - at)
             for node, (incarnation, sequence, at) in sorted(self._heard.items())
@@ -60,5 +59,5 @@ class RoundTrips:
         )
 
     def seconds(self) -> Mapping[NodeId, float]:
-        """{node: there and back}, of those that are known."""
+        """{node: round trip}, where it is known."""
         return {node: min(known) for node, known in sorted(self._known.items())}

@@ -1,11 +1,11 @@
-"""GATEWAY, what a task would get on a machine that is full: the fair share of its threads, corrected where it was.
+"""GATEWAY: what a task would get on a full machine: the fair share of its threads, corrected by experience.
 
-Knows: run queues, what a task got beside how many others. Does not know: what it needs, who is better.
+Knows: run queues, what a task got beside how many others. Does not know: the task's need, which node is better.
 
-A fair scheduler (CFS, EEVDF) gives every thread that wants to run the same. Groups with weights of their own (services,
-sessions) share otherwise, and nobody can tell from outside. So a share is believed until the task has been there: what
-it then got, as a part of the fair share, counts for that machine from then on. Without that, two machines that both
-promise more than they give would hand the task to each other for ever.
+A fair scheduler (CFS, EEVDF) gives the same to every thread that wants to run. Groups with weights of their own
+(services, sessions) share differently, and nobody can see that from outside. So a share is believed until the task has
+been there. From then on the ratio of what it got to its fair share counts for that machine. Otherwise two machines that
+both promise more than they give would pass the task back and forth for ever.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def fair_share(capacity: float, threads: float, others: float) -> float:
 
 
 class Shares:
-    """What tasks get of full machines, as one node has seen it."""
+    """One node's experience of what tasks get of full machines."""
 
     def __init__(self) -> None:
         self._threads: dict[TaskId, float] = {}
@@ -36,7 +36,7 @@ class Shares:
         """What a task got on a machine as a part of its fair share there, at most 1; the newest figure."""
 
     def learn(self, task: TaskId, profile: Profile) -> bool:
-        """Note by how many threads the task wants to run on its owner, and what they get; whether that is news."""
+        """Note how many threads of the task want to run on its owner, and what they get; whether that has changed."""
         load = profile.worker(task)
         if load is None or load.wanted_cores is None or load.cpu_cores is None or profile.runnable is None:
             return False
@@ -48,13 +48,13 @@ class Shares:
         return before != (threads, kept)
 
     def at(self, task: TaskId, profile: Profile, need_cores: float, coming_cores: float = 0.0) -> float:
-        """Cores that the task would get on the node of ``profile``, were it full; 0 where nobody counts its threads.
+        """Cores that the task would get on the node of ``profile`` if it were full; 0 where threads are not counted.
 
         Args:
             task: which one.
-            profile: of a node that has not the task.
-            need_cores: of the task there; by as many threads it runs that was never seen to lack CPU, by one at least.
-            coming_cores: of other tasks that have just come there, and do not show yet.
+            profile: of a node that does not have the task.
+            need_cores: of the task there. A task without a known lack of CPU runs this many threads, at least one.
+            coming_cores: of other tasks that have just moved there and do not show yet.
         """
         if profile.runnable is None:
             return 0.0

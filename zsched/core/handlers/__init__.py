@@ -1,1 +1,1 @@
-"""What each event means to the stages: a file for what it is about."""
+"""The handlers of events: one file per subject."""

@@ -1,6 +1,6 @@
-"""PROFILE, GATEWAY, SCHEDULER and VOTE at the door: figures, utilities, proposals, ballots and what is learnt of them.
+"""PROFILE, GATEWAY, SCHEDULER and VOTE at the door: figures, utilities, proposals, ballots and learnt values.
 
-Knows: which stage takes each in, and when it may need a decision. Does not know: how any of them judges.
+Knows: which stage takes each of them, and when a decision may be needed. Does not know: how a stage judges.
 """
 
 from __future__ import annotations

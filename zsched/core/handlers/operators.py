@@ -1,7 +1,7 @@
-"""Operators at the door: status, a task's weights, failures that are to be forgotten, and the order to stop.
+"""Operators at the door: status, a task's weights, failures to forget, and the order to stop.
 
-Knows: what each command asks of which stage. Does not know: how the snapshot is put together (`zsched.core.status`),
-how a change is agreed.
+Knows: which stage each command concerns. Does not know: how the status is put together (`zsched.core.status`), how a
+change is agreed.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def _on_weights(node: Stages, event: ev.WeightsCommanded, todo: ToDo, now: float
 
 
 def _on_retry(node: Stages, event: ev.RetryCommanded, todo: ToDo, now: float) -> None:
-    """Forget failures: of our own worker if it is meant, and what we hold against nodes."""
+    """Forget failures: of our own worker if the command means it, and our penalties against nodes."""
     task, whose = event.command.task, event.command.node
     if task not in node.executors or (whose and not _may_work(node, task, whose)):
         detail = f"no task {task!r}" if task not in node.executors else f"{whose!r} is no candidate of {task}"
@@ -49,7 +49,7 @@ def _may_work(node: Stages, task: TaskId, whose: NodeId) -> bool:
 
 
 def _forgiven(node: Stages, whose: NodeId) -> str:
-    """What a node forgets that has no worker that is meant: robots take penalties off candidates."""
+    """The part for a node whose worker is not meant: robots take penalties off candidates."""
     if not node.rounds.is_voter:
         return "nothing to forget here"
     return f"takes no penalty off {whose or 'any candidate'} any more"

@@ -1,4 +1,4 @@
-"""EXECUTOR and ROUTE at the door: what is learnt is carried out, and what workers and the relay report is taken in.
+"""EXECUTOR and ROUTE at the door: learnt values are carried out; reports of workers and the relay are taken in.
 
 Knows: which stages a learnt value, a worker's state and a slot's progress concern. Does not know: the handover's table
 (`zsched.core.executor.handover`), how a value is agreed.
@@ -20,7 +20,7 @@ from zsched.core.values.model import Allocation, NodeId, PeerState, TaskId, Weig
 
 
 def carry_out(node: Stages, value: Allocation, reason: str, todo: ToDo, now: float) -> None:
-    """A newer value is learnt (and will be on disk before this batch does anything)."""
+    """Carry out a newly learnt value; this batch writes it to disk before anything else."""
     task, executor = value.task, node.executors[value.task]
     is_new_epoch = value.epoch > executor.epoch
     node.history[task].append(PastValue(value=value, at=now, reason=reason))
@@ -41,7 +41,7 @@ def carry_out(node: Stages, value: Allocation, reason: str, todo: ToDo, now: flo
 
 
 def _has_failed(node: Stages, task: TaskId, owner: NodeId | None, now: float) -> bool:
-    """Whether an owner was fled from: it is not there, or its worker has failed."""
+    """Whether the task fled from this owner: the owner is not there, or its worker has failed."""
     if owner is None or owner == node.me:
         return False
     if node.membership.state(owner) in (PeerState.SUSPECT, PeerState.GONE):
@@ -143,7 +143,7 @@ def _on_relay(node: Stages, event: ev.RelayChanged, _todo: ToDo, now: float) -> 
 
 
 def _on_persist_failed(node: Stages, event: ev.PersistFailed, todo: ToDo, _now: float) -> None:
-    """The disk refused: routes and workers go on (what was cut off is given again)."""
+    """The disk refused. Routes and workers go on: the cut-off instructions are given again."""
     node.agreement.on_persist_failed(event.reason)
     for executor in node.executors.values():
         executor.again(todo)

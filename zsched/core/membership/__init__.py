@@ -1,1 +1,1 @@
-"""Who belongs to the fleet, who is there, and who is who."""
+"""Which nodes belong to the fleet, which are there, and whether a name is one node's alone."""

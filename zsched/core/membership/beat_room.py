@@ -1,7 +1,7 @@
-"""Membership: a beat is sent whatever it holds. What has no room in one beat is in the next, in turn.
+"""Membership: makes every beat fit into a frame. Parts without room in one beat are in the next, one after another.
 
-A beat that is too large would not be sent at all, and a healthy node would look dead. `zsched check` refuses fleet
-files whose beats could be too large in the long run (`most_bytes`); a moment in which many tasks move may still be.
+A beat that is too large would not be sent, and a healthy node would look dead. `zsched check` refuses fleet files whose
+beats could be too large in the long run (`most_bytes`). A moment in which many tasks move may still exceed it.
 
 Knows: how many bytes a beat's parts take at most. Does not know: the bytes themselves, what a part means.
 """
@@ -15,7 +15,7 @@ from zsched.core.values.model import Beat, Grant
 
 MAX_BEAT_BYTES = 16 * 1024
 FRAME_BYTES = 640
-"""What is left for the frame, the names of the fields and the fields of one value."""
+"""Room for the frame, the names of the fields and the fields with one value."""
 _NUMBER = 9
 _GRANT = 1 + sum(1 + len(name) for name in ("task", "owner", "incarnation", "epoch", "number")) + 3 * _NUMBER
 _PARTS = ("learnt", "released", "asked_to_leave", "echoes")
@@ -45,8 +45,8 @@ def _names_bytes(beat: Beat) -> int:
 def most_bytes(fleet: Fleet) -> int:
     """How many bytes a beat of this fleet takes at most in the long run.
 
-    All tasks are learnt, an elector echoes every exclusive one and has given all back itself, and misses everybody (or
-    hears some twice).
+    The worst case: all tasks are learnt, an elector echoes every exclusive one and has released all itself, and every
+    peer is suspect (or some names live twice).
     """
     longest = max((len(node.name) for node in fleet.nodes), default=0)
     learnt = sum(1 + _text(task.name) + 2 * _NUMBER for task in fleet.tasks)
@@ -56,14 +56,14 @@ def most_bytes(fleet: Fleet) -> int:
 
 @dataclass(slots=True)
 class BeatRoom:
-    """Makes one node's beats fit, and remembers whose turn it is."""
+    """Makes one node's beats fit, and remembers which parts come next."""
 
     _next: int = 0
 
     def fit(self, beat: Beat) -> tuple[Beat, int]:
         """The beat as it is sent, and how many of its parts wait for the next ones.
 
-        Whom it suspects is always in it: who is not named there is vouched for.
+        The suspects are always in it: a node that is missing there counts as heard.
         """
         if beat_bytes(beat) <= MAX_BEAT_BYTES:
             return beat, 0

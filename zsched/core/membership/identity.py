@@ -1,13 +1,13 @@
-"""Membership's question about ourselves: is our name ours alone, and do all go by the same fleet file?
+"""Membership, this node's own name: is it ours alone, and do all nodes have the same fleet file?
 
-Knows: beats in our own name, what peers answer about it, hashes of fleet files. Does not know: what follows (the node
-stands down, or says so).
+Knows: beats in our own name, peers' answers about it, hashes of fleet files. Does not know: what follows (the node
+stands down, or reports it).
 
-Two machines with one name must not both vote as one elector. The younger daemon (it has beaten less often) leaves
-again at its start; if both stay, both stop being electors, on disk, until the operator settles it. Beats alone prove no
-second machine: anybody can put one. Without that life's liveliness token they are a complaint, and nothing else.
-Twins without a link between them learn it from whoever hears both (`zsched.core.membership.namesakes`): a peer's beat
-makes them ask it, and only answers count, over `TOLD_FOR_S`.
+Two machines with one name must not both vote as one elector. The younger daemon (with fewer beats) leaves at its start.
+If both stay, both stop being electors, on disk, until the operator settles the dispute. Beats alone prove no second
+machine, since anybody can send one: without a liveliness token of that life they are only a complaint. Twins without a
+link between them learn of each other from a node that hears both (`zsched.core.membership.namesakes`). A peer's beat
+only makes them ask, and only answers count, over `TOLD_FOR_S`.
 """
 
 from __future__ import annotations
@@ -20,28 +20,28 @@ from enum import StrEnum
 from zsched.core.values.model import Beat, NodeId
 
 YOUNG_S = 3.0
-"""A daemon that finds its own name alive so soon after its start leaves again."""
+"""A daemon that finds its own name alive within this time after its start leaves again."""
 TOLD_YOUNG_S = 10.0
-"""...or that is told so by a peer, who must hear both for a while first."""
+"""The same when a peer reports it: the peer must hear both for a while first."""
 TOLD_FOR_S = 1.0
-"""What peers answer about a twin must have held for so long: time for all of them to see it, too."""
+"""Peers' answers about a twin must hold for this long, so that all peers have seen it."""
 ASK_TWINS_S = 0.5
-"""A peer that says that our name lives twice is asked about it so often at most."""
+"""A peer whose beats say that our name lives twice is asked at most this often."""
 STAYS_S = 5.0
-"""A twin that stays so long disputes the name."""
+"""A twin that stays for this long disputes the name."""
 
 
 QUIET_S = 10.0
-"""Beats in our name that were heard so long ago are no complaint any more."""
+"""Older beats in our name are no complaint any more."""
 
 
 def here(fleet_file: str, path: str) -> str:
-    """Our own fleet file, to be found and compared: its hash, and its path where that is known."""
+    """Our own fleet file in words: its hash, and its path where that is known."""
     return f"here {fleet_file}{' of ' if path else ''}{path}"
 
 
 ONE_FILE = "compare them (`zsched check` tells a file's hash), give all nodes the same one, restart who had another"
-"""What to do about two fleet files."""
+"""The advice for two different fleet files."""
 
 
 class Verdict(StrEnum):
@@ -55,25 +55,25 @@ class Verdict(StrEnum):
 
 @dataclass(slots=True)
 class Identity:
-    """What this node knows about its own name and file."""
+    """This node's knowledge about its own name and file."""
 
     me: NodeId
     incarnation: int
     fleet_file: str
     started_at: float
     beat_s: float
-    """Between two beats: how long another daemon has stayed is counted by its own beats, too."""
+    """Period of beats: they also count how long another daemon has stayed."""
     _twin: tuple[int, int, float] | None = field(default=None)
     """(incarnation, first sequence, since when) of another daemon with our name."""
     _tokens: set[int] = field(default_factory=set)
-    """Incarnations of other daemons with our name whose tokens are there."""
+    """Incarnations of other daemons with our name that have a token."""
     _heard_at: float = -math.inf
     _told: tuple[NodeId, float] = ("", -math.inf)
     """(peer that last answered that it hears another daemon of our name, when)."""
     _asked_at: dict[NodeId, float] = field(default_factory=dict)
 
     def complaint(self, now: float) -> str | None:
-        """How status says that the name is not ours alone; ``None``: nobody else uses it."""
+        """The complaint that status shows; ``None``: nobody else uses the name."""
         if self._tokens:
             return f"another daemon calls itself {self.me!r}"
         peer, told_at = self._told
@@ -104,7 +104,7 @@ class Identity:
         return verdict if beat.incarnation in self._tokens else Verdict.TWIN
 
     def must_ask(self, peer: NodeId, now: float) -> bool:
-        """A peer's beat says that our name lives twice: whether to ask it; then it is taken as asked."""
+        """Whether to ask a peer whose beat says that our name lives twice; a yes counts as asked."""
         if now - self._asked_at.get(peer, -math.inf) < ASK_TWINS_S:
             return False
         self._asked_at[peer] = now
@@ -129,7 +129,7 @@ class Identity:
         return verdict if is_lasting else Verdict.TWIN
 
     def _judge(self, incarnation: int, sequence: int, my_sequence: int, now: float, young_s: float) -> Verdict:
-        """What another life of our name means whose newest beat is ``sequence``."""
+        """The verdict on another life of our name whose newest beat is ``sequence``."""
         if self._twin is None or self._twin[0] != incarnation:
             self._twin = (incarnation, sequence, now)
             return Verdict.TWIN
@@ -144,7 +144,7 @@ class Identity:
         return Verdict.DISPUTE if min(now - self._twin[2], lived_s) >= STAYS_S else Verdict.TWIN
 
     def file_complaint(self, beat: Beat, path: str = "") -> str | None:
-        """How a peer's fleet file differs from ours, at ``path``; ``None``: it does not, or the peer does not say."""
+        """How a peer's fleet file differs from ours, at ``path``; ``None``: it is the same, or the peer names none."""
         if beat.fleet_file in ("", self.fleet_file):
             return None
         ours = here(self.fleet_file, path)

@@ -1,9 +1,9 @@
-"""Membership's question about nobody it knows: who beats in this fleet and is in no line of its file?
+"""Membership, unknown nodes: which names beat in this fleet but are not in its file?
 
-A fleet file that has grown by a node is not everywhere at once. The new node hears another hash and says so; the others
-know no such node, and would say nothing. Nothing follows from such beats but a line in the status.
+A fleet file with a new node does not reach all machines at once. The new node sees another hash and reports it; the
+others do not know the node and would report nothing. Such beats only lead to a line in the status.
 
-Knows: names and beats of unknown nodes. Does not know: anything else that they say.
+Knows: names and beats of unknown nodes. Does not know: the other content of their beats.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from zsched.core.membership.identity import ONE_FILE, QUIET_S, here
 from zsched.core.values.model import Beat, NodeId
 
 KNOCKERS_KEPT = 4
-"""So many unknown names are told of; a stranger may use any number."""
+"""Unknown names that status shows; a stranger may invent any number."""
 
 
 @dataclass(slots=True)
 class Knocking:
-    """The unknown nodes that one node hears, by its own fleet file's hash."""
+    """The unknown nodes that one node hears, with its own fleet file's hash."""
 
     fleet_file: str
     _heard: dict[NodeId, tuple[Beat, float]] = field(default_factory=dict)
@@ -32,7 +32,7 @@ class Knocking:
             self._heard[beat.node] = (beat, now)
 
     def problems(self, now: float, path: str = "") -> tuple[str, ...]:
-        """What status says of those that were heard lately; our own fleet file is at ``path``."""
+        """The status lines about unknown nodes that were heard lately; our own fleet file is at ``path``."""
         ours = here(self.fleet_file, path)
         return tuple(
             f"fleet/{name}: {name} beats in this fleet, goes by another fleet file ({beat.fleet_file or 'not told'}, "

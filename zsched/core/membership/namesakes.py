@@ -1,10 +1,10 @@
-"""Membership's question about the others: does a peer's name live twice?
+"""Membership, peers' names: does a peer's name live twice?
 
-Twins that hear each other settle it themselves (`zsched.core.membership.identity`). Those without a link between them
-never would, so whoever hears both says so: to the operator, and to the two of them, in its beats and in its answers.
+Twins that hear each other find it out themselves (`zsched.core.membership.identity`). Twins without a link between them
+never would. So a node that hears both reports it to the operator, and to the twins in its beats and answers.
 
-One frame proves nothing: both lives must have a token here, and beats of both must rise side by side for a while. A
-node that is restarted shows two tokens for a moment, too, and what its old link still held comes at one time.
+One frame proves nothing: both lives must have a token here, and the beats of both must rise side by side for a while. A
+restarted node also shows two tokens for a moment, and its old link delivers the rest of its beats at once.
 
 Knows: tokens and beats of every life of a name. Does not know: which of the two is right, what the twins do.
 """
@@ -18,15 +18,15 @@ from zsched.core.membership.identity import QUIET_S
 from zsched.core.values.model import Beat, NodeId
 
 BESIDE_S = 1.0
-"""Two lives that have both beaten for so long beside each other are twins..."""
+"""Two lives are twins when both have beaten side by side for this long..."""
 BESIDE_BEATS = 3
-"""...and for so many beats' time."""
+"""...and for this many beats."""
 LIVES_KEPT = 8
 """Tokens of one name that are kept; a stranger may show any number."""
 TWINS_TOLD = 4
 """Names of twins in one beat."""
 WHERE_EVERY_S = 2.0
-"""A name that lives twice is asked so often at most where its daemons are."""
+"""A name that lives twice is asked for its addresses at most this often."""
 
 
 @dataclass(slots=True)
@@ -49,18 +49,18 @@ class _Name:
     twins_at: float = -math.inf
     """When two lives were last seen beside each other."""
     told: str = ""
-    """Of the two that were last seen so."""
+    """Those two lives."""
     asked_at: float = -math.inf
 
 
 class Namesakes:
-    """What one node has heard of daemons that share a name."""
+    """The daemons with a shared name that one node hears."""
 
     def __init__(self, beat_s: float) -> None:
         self._beside_s = max(BESIDE_S, BESIDE_BEATS * beat_s)
         self._names: dict[NodeId, _Name] = {}
         self._watched: dict[NodeId, _Name] = {}
-        """Names with two tokens: hardly ever one, and thirty beats a second come by."""
+        """Names with two tokens: usually none. The set is kept because thirty beats a second are looked up."""
 
     def on_token(self, node: NodeId, incarnation: int, *, is_present: bool) -> None:
         """A peer's token came or went."""
@@ -80,7 +80,7 @@ class Namesakes:
             name.lives.clear()
 
     def on_beat(self, beat: Beat, now: float) -> bool:
-        """A beat came, believed or not; whether its name has just turned out to live twice."""
+        """A beat came, believed or not; whether this showed that its name lives twice."""
         if beat.node not in self._watched:
             return False
         name = self._watched[beat.node]
@@ -102,18 +102,18 @@ class Namesakes:
         return not was_known
 
     def _beside(self, name: _Name, now: float) -> list[int]:
-        """The lives that have all beaten for long enough beside another one, and still do."""
+        """The lives that have beaten side by side for long enough, and still do."""
         lives = name.lives.items()
         return sorted(one for one, life in lives if life.stays_s() >= self._beside_s > now - life.at)
 
     def on_answer(self, node: NodeId, incarnation: int, where: str) -> None:
-        """A daemon has answered: where it is."""
+        """A daemon has answered with its address."""
         name = self._watched.get(node)
         if name is not None and where and incarnation in name.lives:
             name.lives[incarnation].where = where
 
     def must_ask(self, node: NodeId, now: float) -> bool:
-        """Whether to ask a name's daemons where they are; then it is taken as asked."""
+        """Whether to ask a name's daemons for their addresses; a yes counts as asked."""
         name = self._watched.get(node)
         if name is None or now - name.asked_at < WHERE_EVERY_S:
             return False
@@ -140,7 +140,7 @@ class Namesakes:
         )
 
     def problems(self, now: float) -> tuple[str, ...]:
-        """What status says; a twin that a service manager starts again and again comes back before it is forgotten."""
+        """The status lines; a twin that a service manager restarts returns before it is forgotten."""
         return tuple(name.told for _, name in sorted(self._names.items()) if now < name.twins_at + QUIET_S)
 
     def _text(self, node: NodeId, name: _Name, twins: list[int]) -> str:

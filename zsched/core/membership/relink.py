@@ -1,6 +1,6 @@
-"""Decides when peers that miss each other are introduced again: soon, and ever more rarely while it does not help.
+"""Decides when peers that miss each other are introduced again: soon, then more rarely while it does not help.
 
-Knows: how long somebody has been missing. Does not know: who it is, which links there are, how an introduction is made.
+Knows: how long a node has been missing. Does not know: which one, which links there are, how an introduction works.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 
 LINK_WAIT_S = 1.0
-"""So long a link has to come back by itself: who has an address is redialled within a second."""
+"""A link has this long to come back by itself: zenoh redials known addresses within a second."""
 FIRST_PAUSE_S, MAX_PAUSE_S = 2.0, 60.0
 
 
@@ -20,11 +20,11 @@ class Introductions:
         self._pause_s = FIRST_PAUSE_S
 
     def is_due(self, now: float, *, is_missing: bool) -> bool:
-        """Whether to introduce everybody to everybody now; ask often.
+        """Whether to introduce all nodes to each other now; ask often.
 
         Args:
             now: monotonic seconds.
-            is_missing: whether somebody is missing at this moment. Nobody: the next time begins from the start.
+            is_missing: whether a node is missing at this moment. If not, the pauses begin from the start.
         """
         if not is_missing:
             self._due_at = math.inf

@@ -1,6 +1,6 @@
-"""PROFILE, what a worker wants: which of its threads would use a whole core if they never had to wait.
+"""PROFILE, a worker's threads: which of them would use a whole core if they never had to wait?
 
-Knows: shares of time, smoothing. Does not know: where the kernel tells them
+Knows: shares of time, smoothing. Does not know: where the kernel reports them
 (`zsched.adapters.machine.device_profiler`), needs.
 """
 
@@ -11,9 +11,9 @@ from collections.abc import Mapping
 from zsched.core.profile.means import Ewma
 
 ALWAYS = 0.9
-"""A thread that runs or waits to run for so much of the time always wants to run."""
+"""A thread that runs or waits to run for this share of the time always wants to run."""
 APPETITE_S = 1.5
-"""Time constant of that share: a job that comes once a second and leaves pauses is no such thread."""
+"""Time constant of that share: a job once a second, with pauses between, must not look like such a thread."""
 
 Thread = tuple[int, str]
 """(process, thread)."""
@@ -31,7 +31,8 @@ class Appetite:
     def look(self, times: Mapping[Thread, tuple[float, float]], now: float) -> None:
         """Take in how long every thread has run, and has waited to run, in seconds since it began.
 
-        A wait is told when it ends, so one look may show more than the time since the last: only the mean is bounded.
+        The kernel reports a wait at its end, so one look may show more than the time since the last. Only the mean is
+        bounded.
         """
         elapsed_s = now - self._at
         if elapsed_s <= 0.0:
@@ -48,7 +49,7 @@ class Appetite:
         self._at, self._times, self._shares = now, times, shares
 
     def wanted_cores(self) -> float | None:
-        """What they would use; ``None`` when no thread always wants to run."""
+        """Cores that its threads would use; ``None`` when no thread always wants to run."""
         shares = [(ran.value or 0.0, wanted.value or 0.0) for ran, wanted in self._shares.values()]
         if all(wanted < ALWAYS for _, wanted in shares):
             return None

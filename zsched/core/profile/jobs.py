@@ -1,16 +1,16 @@
-"""PROFILE, the task's own word: what a worker says of its jobs, as smoothed means and rates.
+"""PROFILE, the task's own word: a worker's reports of its jobs, as smoothed means and rates.
 
 Knows: sums that only rise, smoothing. Does not know: how a job is timed (`zsched.worker.jobs`), what follows from it.
 
-Rates are smoothed as the CPU in use is, and a mean per job is the quotient of two such rates: so ``done_hz`` times
-``cpu_s`` is what the jobs use, in step with what the worker's processes are seen to use.
+Rates are smoothed like the CPU in use, and a mean per job is the quotient of two such rates. So ``done_hz`` times
+``cpu_s`` is the CPU use of the jobs, in step with the measured use of the worker's processes.
 
-A worker that has nothing to do, and has left nothing undone since it was last looked at, lacks nothing from then on:
-what it left undone before does not fade as means do. Its use of the CPU is gone in a moment, and beside a lack that
-fades slowly that would look like a worker that is given nothing.
+A worker that is idle, and has left nothing undone since the last look, lacks nothing from then on: its earlier undone
+work does not fade like a mean. Its CPU use drops at once, and a lack that fades slowly beside it would look like a
+worker that gets no CPU.
 
-A job that waits for its turn is not lost. It is *left undone* when it gives way to a newer one, or by as much as more
-and more wait: the fewest in `QUEUE_S`, so that three maps which come at once, and are merged one by one, are no loss.
+A waiting job is not lost. Jobs are *left undone* when they give way to newer ones, or when more and more wait: the
+fewest of the last `QUEUE_S` count, so three maps that come at once and are merged one by one are no loss.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from zsched.core.profile.means import STALE_S, Ewma
 from zsched.core.values.model import MAX_JOB_S, MAX_JOBS_HZ, Jobs
 
 QUEUE_S = 2.0
-"""Whoever has waited for so long waits because the worker is behind, and not because several came at once."""
+"""A longer wait shows that the worker is behind, and not that several jobs came at once."""
 MAX_AT_ONCE = 64.0
 """No worker runs more jobs at a time: a sum of times that rises faster was made up."""
 LEAST_HZ = 1e-3
-"""Below this rate a mean per job is made of nothing: the last one stands."""
+"""At a lower rate there are too few jobs for a mean: the last one stands."""
 
 
 class JobMeter:
@@ -37,7 +37,7 @@ class JobMeter:
     def __init__(self, tau_s: float) -> None:
         """``tau_s``: the time constant of all means."""
         self.value: Jobs | None = None
-        """As of the last look."""
+        """Result of the last look."""
         self._tau_s = tau_s
         self._newest: WorkerJobs | None = None
         self._heard_at = -math.inf
@@ -49,7 +49,7 @@ class JobMeter:
         self._means: dict[str, Ewma] = {}
 
     def absorb(self, report: WorkerJobs, now: float) -> bool:
-        """Take a worker's word in; whether it is one that can be true behind the one before."""
+        """Take a worker's report in; whether it is possible after the one before."""
         newest = self._newest
         is_same_life = newest is not None and report.incarnation == newest.incarnation
         if not _is_possible(report) or (newest is not None and is_same_life and not _follows(report, newest)):
@@ -61,7 +61,7 @@ class JobMeter:
         return True
 
     def look(self, now: float) -> None:
-        """Smooth what was heard since the last look, at the moment when the machine was read."""
+        """Smooth the reports since the last look, at the moment of the machine's sample."""
         newest, before, since = self._newest, self._looked, self._looked_at
         self._looked_at = now
         if newest is None or before is None:
@@ -76,7 +76,7 @@ class JobMeter:
             self._evaluate(newest)
 
     def _begin(self, report: WorkerJobs, now: float) -> None:
-        """Another life of the worker; what it had done before it was first heard is no rate of now."""
+        """The worker has another life; its work before the first report is no rate of now."""
         waited = report.waiting if report.done else 0
         self._looked, self._undone = report, report.skipped + waited
         self._queue = deque([(now, waited)])
@@ -135,7 +135,7 @@ _SUMS: Final = ("time_s", "cpu_s", "wait_s", "age_s", "late")
 
 
 def _is_possible(report: WorkerJobs) -> bool:
-    """Whether a worker can have done so much since its life began."""
+    """Whether a worker can have done this much since its life began."""
     most_s = MAX_AT_ONCE * (report.at_s + 1.0)
     return max(report.time_s, report.cpu_s, report.wait_s or 0.0) <= most_s and report.done <= MAX_JOBS_HZ * most_s
 

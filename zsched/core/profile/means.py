@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 
 STALE_S = 5.0
-"""What gave no valid reading for so long (a radio, a worker, the whole sampler) counts as not measured."""
+"""A radio, a worker or a sampler without a valid reading for this long counts as not measured."""
 
 
 class Ewma:
@@ -35,7 +35,7 @@ class Ewma:
         return self.value
 
     def share(self) -> Ewma:
-        """The mean of a part of what this one smooths, which was nothing so far."""
+        """The mean of a part of this figure; the part was 0 until now."""
         part = Ewma(self.tau_s)
         if self.value is not None:
             part.update(0.0, self._at)

@@ -1,10 +1,10 @@
-"""PROFILE: turns this machine's raw readings into the smoothed profile that robots decide by (Alg. 1).
+"""PROFILE: turns this machine's raw readings into the smoothed profile by which robots decide (Alg. 1).
 
-Knows: outlier rules, smoothing by elapsed time, when a profile is worth sending. Does not know: how anything is read,
-who receives it, or what it is worth.
+Knows: outlier rules, smoothing by elapsed time, when a profile should be sent. Does not know: how a figure is read, who
+receives it, what it is worth.
 
-Smoothing stands here, at the source, and not at the receivers: samples come at 5 Hz, profiles leave at 1 Hz, and
-smoothing what was already thinned out would alias (docs/decisions/0003).
+Smoothing happens here, at the source, and not at the receivers: samples come at 5 Hz and profiles leave at 1 Hz.
+Smoothing the thinned values would alias (docs/decisions/0003).
 """
 
 from __future__ import annotations
@@ -39,17 +39,17 @@ from zsched.core.values.model import (
 )
 
 RATIO_CHANGE = 0.02
-"""A CPU or memory ratio that moved by this much is worth a profile before its time."""
+"""This change of a CPU or memory ratio sends a profile at once."""
 JOB_SMOOTHING_S = 1.0
-"""Least time constant of what workers say of their jobs: a job or two in a sample is no rate."""
+"""Least time constant for jobs: one or two in a sample are no rate."""
 JOB_CHANGE = 0.2
-"""So is a worker's share of done jobs that moved by this much, or its time per job by this part."""
+"""This change of the share of done jobs, or this relative change of time per job, sends a profile at once."""
 RSSI_CHANGE_DB = 1.0
 RSSI_IMPOSSIBLE_ABOVE_DBM = -10.0
 RSSI_IMPOSSIBLE_BELOW_DBM = -100.0
 RSSI_OUTLIER_DB = 25.0
 SIGNAL_SMOOTHING_S = 0.5
-"""A radio is smoothed over this at least: its readings scatter by 2.5 to 2.9 dB, and trends are seen in them."""
+"""Least time constant of a signal: readings scatter by 2.5 to 2.9 dB, and trends are taken from them."""
 RSSI_WINDOW = 5
 """A reading further than 25 dB from the median of the last 5 is dropped (measured on real drives)."""
 NO_REASONS: Mapping[TaskId, str] = {}
@@ -68,7 +68,7 @@ class SignalFilter:
         self.dropped = 0
 
     def update(self, rssi_dbm: float | None, now: float) -> float | None:
-        """Take one reading in; the smoothed signal in dBm, or ``None`` when there was none for `STALE_S`."""
+        """Take one reading in; the smoothed signal in dBm, or ``None`` without a reading for `STALE_S`."""
         if rssi_dbm is not None and self._is_plausible(rssi_dbm):
             self._valid_at = now
             self._mean_of_means.update(self._mean.update(rssi_dbm, now), now)
@@ -118,7 +118,7 @@ class Profiler:
         self._is_new = False
         self._flags: tuple[object, ...] = ()
         self.has_news = True
-        """The profile that was last sent says more than figures that differ."""
+        """The profile that was last sent has news other than figures."""
         self._links: tuple[Link, ...] = ()
         self._workers: tuple[WorkerLoad, ...] = ()
         self._sent: Profile | None = None
@@ -140,7 +140,7 @@ class Profiler:
         self._workers = tuple(self._worker(load) for load in device.workers)
 
     def note_jobs(self, report: WorkerJobs, now: float) -> bool:
-        """Take in what a worker of this node says of its jobs; whether it can be true."""
+        """Take a worker's report of its jobs in; whether it is possible."""
         meter = self._jobs.setdefault(report.task, JobMeter(max(self._timing.smoothing_s, JOB_SMOOTHING_S)))
         return meter.absorb(report, now)
 
@@ -248,7 +248,7 @@ class Profiler:
 
 
 def _signal_tau_s(timing: Timing) -> float:
-    """Less than the period of samples is no smoothing, neither of signals (no fleet file can say that)."""
+    """The time constant of signals; 0 or close to it, below the samples' period, switches their smoothing off, too."""
     is_smoothed = timing.smoothing_s >= timing.sample_s
     return max(timing.smoothing_s, SIGNAL_SMOOTHING_S) if is_smoothed else timing.smoothing_s
 
@@ -261,11 +261,11 @@ def _absorb_use(
     high: float,
     now: float,
 ) -> None:
-    """Smooth what is in use on the machine, and each worker's share of it, in step.
+    """Smooth the machine's use, and each worker's share of it, in step.
 
-    What is subtracted must be as slow as what it is subtracted from, and see the same samples: a worker without a
-    figure (stopped, just started) uses nothing for that sample. So whole minus share is the smoothed rest, and a
-    worker's start or end makes its node look neither better nor worse.
+    A share must be as slow as the whole from which it is subtracted, and see the same samples. A worker without a
+    figure (stopped, just started) uses nothing in that sample. So whole minus share is the smoothed rest, and the start
+    or end of a worker makes its node look neither better nor worse.
     """
     used = _possible(used, high)
     if used is None:
@@ -280,7 +280,7 @@ def _absorb_use(
 
 
 def _absorb_known(mean: Ewma, figure: float | None, high: float, now: float) -> None:
-    """Smooth a figure; where it is not measured, there is no mean either."""
+    """Smooth a figure; without a measurement the mean is absent, too."""
     known = _possible(figure, high)
     if known is None:
         mean.value = None
@@ -289,12 +289,12 @@ def _absorb_known(mean: Ewma, figure: float | None, high: float, now: float) -> 
 
 
 def _possible(value: float | None, high: float) -> float | None:
-    """``value`` when it is in [0, ``high``], else ``None``: what a driver makes up is not measured (NaN included)."""
+    """``value`` when it is in [0, ``high``], else ``None`` (NaN included): drivers may invent figures."""
     return value if value is not None and 0.0 <= value <= high else None
 
 
 def _differs(new: Profile, old: Profile) -> bool:
-    """Whether a robot might decide otherwise by ``new`` than by ``old``."""
+    """Whether ``new`` could lead a robot to another decision than ``old``."""
     if _kinds(new) != _kinds(old):
         return True
     if _moved(new.cpu_used_cores, old.cpu_used_cores, RATIO_CHANGE * new.cpu_cores):
@@ -308,7 +308,7 @@ def _differs(new: Profile, old: Profile) -> bool:
 
 
 def _lost_or_won(new: WorkerLoad | None, old: WorkerLoad) -> bool:
-    """Whether a worker's jobs take another time, or another share of them is done."""
+    """Whether a worker's time per job, or its share of done jobs, has changed."""
     if new is None or new.jobs is None or old.jobs is None:
         return (None if new is None else new.jobs) is not old.jobs
     if _moved(new.jobs.done_ratio, old.jobs.done_ratio, JOB_CHANGE):
@@ -317,7 +317,7 @@ def _lost_or_won(new: WorkerLoad | None, old: WorkerLoad) -> bool:
 
 
 def _kinds(profile: Profile) -> tuple[object, ...]:
-    """What is no figure: every change of it counts."""
+    """The parts of a profile that are no figures: every change of them counts."""
     workers = [
         # what a worker that is ready complains of is a count: it goes along with the figures
         (load.task, load.state, bool(load.reason) if load.state is WorkerState.READY else load.reason)

@@ -1,9 +1,9 @@
-"""ROUTE: whether this node's relay stays, to be told to the whole fleet.
+"""ROUTE: does this node's relay stay? Reported to the whole fleet.
 
-One end is no news to others: the next relay has its plans within a second. One that ends again and again, or does not
-come back, means that this node's streams do not flow, and whoever asks another node's status has to see that, too.
+One end is no news to others: the next relay has its plans within a second. A relay that ends again and again, or does
+not come back, means that this node's streams do not flow. An operator must see that in any node's status.
 
-Knows: when the relay ended and why. Does not know: processes, what it carries.
+Knows: when the relay ended and why. Does not know: processes, the relay's streams.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from zsched.core.values.model import as_reason
 
 WINDOW_S = 60.0
 OFTEN = 3
-"""So many ends within the window are a problem, until fewer of them are younger than that."""
+"""This many ends within the window are a problem, until fewer of them are that young."""
 DOWN_TOLD_S = 2.0
-"""Another one takes less to start; a node without a relay for longer is a problem."""
+"""A node without a relay for longer is a problem: a new one starts faster."""
 
 
 @dataclass(slots=True)
@@ -39,7 +39,7 @@ class RelayEnds:
         self._down_since, self._reason = min(self._down_since, now), event.reason
 
     def told(self, now: float) -> str:
-        """What is wrong, to be said behind "the relay"; empty: nothing that lasts."""
+        """The problem, as text that follows "the relay"; empty: nothing lasting."""
         while self._ended_at and now - self._ended_at[0] > WINDOW_S:
             self._ended_at.popleft()
         if len(self._ended_at) >= OFTEN:

@@ -1,9 +1,9 @@
-"""Finds which of many key expressions share a key with one, without comparing it with each of them.
+"""Finds the key expressions that share a key with a given one, without a comparison with each of them.
 
-Knows: chunks, wildcards. Does not know: rules, what the expressions are for.
+Knows: chunks, wildcards. Does not know: rules, the purpose of the expressions.
 
-A tree by chunks gives a few that may meet (where one has ``**``, all that lie behind it), and `keyexpr.intersects`
-decides. With expressions that differ in a plain chunk a question costs about as many steps as it has chunks.
+A tree by chunks gives the few candidates (below a ``**``, all of them), and `keyexpr.intersects` decides. If the
+expressions differ in a plain chunk, a question costs about as many steps as it has chunks.
 """
 
 from __future__ import annotations

@@ -213,7 +213,7 @@ _BYTES: Final = 8 + 8 + 1 + GID_BYTES
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Attachment:
-    """What rmw_zenoh (0.2.4 and later) hangs on every message, request and reply."""
+    """The attachment of rmw_zenoh (0.2.4 and later) on every message, request and reply."""
 
     sequence: int
     """From 1, gapless per publisher or client."""

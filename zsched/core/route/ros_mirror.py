@@ -1,12 +1,12 @@
-"""Decides which endpoints a relay announces in the ROS graph, so that graph tools see what the streams really join.
+"""Decides which endpoints a relay announces in the ROS graph, so that graph tools see the real ends of a stream.
 
 Knows: routes, endpoints seen on either side, capture. Does not know: tokens' spelling, zenoh, when routes change.
 
-A stream joins publishers on its ``from`` side with subscriptions on its ``to`` side, which ROS nodes count: some
-publish only while a subscription matches, a client waits for its service. So each side is shown the other's endpoints
-under its own names: publishers forwards, subscriptions backwards, servers backwards, clients forwards. Where the far
-end is no ROS node (a plain key), the relay stands in for it: it subscribes to every publisher that it forwards, and
-publishes (or serves) from the moment the route is there.
+A stream joins publishers on its ``from`` side with subscriptions on its ``to`` side. ROS nodes count these: some
+publish only while a subscription matches, and a client waits for its service. So each side is shown the other side's
+endpoints under its own names: publishers forwards, subscriptions backwards, servers backwards, clients forwards. Where
+the far end is no ROS node (a plain key), the relay stands in for it: it subscribes to every publisher that it forwards,
+and publishes (or serves) as soon as the route exists.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Sides:
 
 
 def mirrored(routes: Iterable[Route], seen: Sides) -> Sides:
-    """What the relay shall announce on each side for ``routes``, given what others announce there (``seen``)."""
+    """The endpoints to announce on each side for ``routes``, given the others' endpoints there (``seen``)."""
     local: dict[Endpoint, None] = {}
     fleet: dict[Endpoint, None] = {}
     for route in routes:
@@ -72,7 +72,7 @@ def _of_route(
 
 
 def _stand_in_for_reader(route: Route, before: list[Endpoint]) -> Iterator[Endpoint]:
-    """The far end takes plain keys: whoever publishes here has us as its subscriber, whoever asks as its server."""
+    """The far end takes plain keys: our relay subscribes to every publisher here and serves every client."""
     if route.direction is Direction.SERVICE:
         if not keyexpr.is_wild(route.from_expr):
             yield _announced(route, EndpointKind.SERVICE, route.from_expr)

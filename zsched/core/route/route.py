@@ -1,4 +1,4 @@
-"""ROUTE: the plan that this robot's relay shall carry out for one task, and what it shall look after beside that.
+"""ROUTE: the plan of one task for this robot's relay, and its other duties for the task.
 
 Knows: slots, plans, watches. Does not know: when a handover may go on (`zsched.core.executor.handover`), zenoh,
 processes.
@@ -14,7 +14,7 @@ from zsched.core.values.model import NodeId, NodeKind
 from zsched.core.values.plan import Direction, ReadyWhen, RosGraph, Route, RoutePhase, RoutePlan, Slot
 
 NOBODY = "Nobody"
-"""No node is called so (names have no capitals): what is sent to it nobody takes but who takes everything."""
+"""No node has this name (names have no capitals): only a subscriber to everything takes its samples."""
 
 
 def slot_for(spec: TaskSpec, robot: NodeId, owner: NodeId, epoch: int) -> Slot:
@@ -39,7 +39,7 @@ def plan_for(spec: TaskSpec, phase: RoutePhase, current: Slot, predecessors: tup
 
 
 def watch_for(fleet: Fleet, spec: TaskSpec, me: NodeId) -> WorkerWatch | None:
-    """What this node's relay shall look after for the task whoever owns it; ``None``: nothing."""
+    """The relay's duties for the task that do not depend on its owner; ``None``: none."""
     kind = fleet.node(me).kind
     inputs: tuple[str, ...] = ()
     strangers: tuple[str, ...] = ()
@@ -64,13 +64,13 @@ def watch_for(fleet: Fleet, spec: TaskSpec, me: NodeId) -> WorkerWatch | None:
 
 
 def _taken(spec: TaskSpec, target: NodeId) -> tuple[str, ...]:
-    """What the worker on ``target`` subscribes to, over all robots, one key expression per rule."""
+    """The inputs of the worker on ``target``, over all robots, one key expression per rule."""
     rules = (rule for rule in spec.rules if rule.direction is Direction.INPUT)
     return tuple(dict.fromkeys(widened(rule.to_template, target=target, task=spec.name) for rule in rules))
 
 
 def _served(spec: TaskSpec, target: NodeId, robots: tuple[NodeId, ...]) -> tuple[tuple[str, ...], ...]:
-    """What the worker on ``target`` is asked, per rule; of keys with wildcards zenoh cannot tell who serves them."""
+    """The services of the worker on ``target``, per rule; zenoh cannot tell who serves a key with wildcards."""
     result = []
     for rule in spec.rules:
         if rule.direction is not Direction.SERVICE:

@@ -106,7 +106,7 @@ def rule_fault(rule: StreamRule) -> str | None:
 
 
 def merges_keys(rule: StreamRule) -> bool:
-    """True when several keys of ``from`` become one key of ``to``: a receiver cannot tell them apart any more."""
+    """True when several keys of ``from`` become one key of ``to``, so that a receiver cannot tell them apart."""
     return len(capture.wildcards(rule.to_template)) < len(capture.wildcards(rule.from_template))
 
 
@@ -182,7 +182,7 @@ def _missing_fault(template: str, direction: Direction, side: str) -> str | None
 def shared_key_fault(rule: StreamRule) -> str | None:
     """Why ``rule`` needs a local side on every robot (its applications' key has no ``{robot}``); ``None``: it does not.
 
-    An input may do without: it is then one stream that every robot forwards.
+    An input needs none: it is then one stream that every robot forwards.
     """
     if rule.direction is Direction.INPUT:
         return None

@@ -1,11 +1,11 @@
-"""Decides under which key a sample goes on when a rule's expressions hold wildcards, and which wildcards go together.
+"""Decides a sample's new key when a rule's expressions hold wildcards, and which wildcards go together.
 
-Knows: key expressions as text. Does not know: zenoh, streams, templates, who asks.
+Knows: key expressions as text. Does not know: zenoh, streams, templates, its callers.
 
-The n-th wildcard of ``to`` stands for what the n-th wildcard of ``from`` matched. Both are of one kind, so that what
-was captured always fits. A ``to`` with as many wildcards as ``from`` can be turned round: `rewriter` with the two
-expressions swapped gives every key back (that is why a side may hold only one ``**``: with two it could not be told
-where the first ends). A ``to`` with fewer drops the last ones: several keys become one.
+The n-th wildcard of ``to`` stands for the match of the n-th wildcard of ``from``. Both are of one kind, so the match
+always fits. A ``to`` with as many wildcards as ``from`` can be inverted: `rewriter` with the two expressions swapped
+gives every key back. (That is why a side may hold only one ``**``: with two, the end of the first would be unknown.) A
+``to`` with fewer wildcards drops the last ones, and several keys become one.
 """
 
 from __future__ import annotations
@@ -31,11 +31,7 @@ def wildcards(expr: str) -> tuple[str, ...]:
 
 
 def ambiguity(expr: str) -> str | None:
-    """Why it could not be told what each wildcard of ``expr`` stands for; ``None`` when it can.
-
-    >>> ambiguity("a/**/b/**")
-    "it has more than one '**': where the first one ends could not be told"
-    """
+    """Why the meaning of each wildcard of ``expr`` would be unclear; ``None`` when it is clear."""
     if wildcards(expr).count(DOUBLE) > 1:
         return "it has more than one '**': where the first one ends could not be told"
     if any(chunk.count(ANY_RUN) > 1 for chunk in expr.split("/")):
@@ -44,7 +40,7 @@ def ambiguity(expr: str) -> str | None:
 
 
 def capture_fault(from_expr: str, to_expr: str) -> str | None:
-    """Why ``to_expr`` cannot be filled from what ``from_expr`` captures; ``None`` when it can."""
+    """Why the matches of ``from_expr`` cannot fill ``to_expr``; ``None`` when they can."""
     sources, places = wildcards(from_expr), wildcards(to_expr)
     if len(places) > len(sources):
         return f"{to_expr!r} has more wildcards than {from_expr!r} can fill"

@@ -1,7 +1,7 @@
-"""What a node wants changed in a task's register, and how that ends.
+"""Changes of a task's register that a node proposes, and how they end.
 
 Knows: which fields of an allocation each change touches. Does not know: ballots and rounds
-(`zsched.core.vote.register`), who wants it and why.
+(`zsched.core.vote.register`), who wants a change and why.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class MoveOwner:
     reason: str
 
     def apply(self, read: Allocation) -> Allocation:
-        """The new value; touches owner, epoch and revision only. For the owner that is there already: what was read."""
+        """The new value, with another owner, epoch and revision; for the present owner the value as read."""
         if self.owner == read.owner:
             return read
         return replace(read, revision=read.revision + 1, epoch=read.epoch + 1, owner=self.owner)
@@ -34,7 +34,7 @@ class Retune:
     base_revision: int
     tuning: Tuning
     request: int | None = None
-    """The operator's question that waits for this change."""
+    """The operator's open question about this change."""
 
     @property
     def reason(self) -> str:
@@ -42,7 +42,7 @@ class Retune:
         return "retuned by an operator"
 
     def apply(self, read: Allocation) -> Allocation:
-        """The new value; touches tuning and revision only. For the tuning in force: what was read."""
+        """The new value, with another tuning and revision; for the present tuning the value as read."""
         if self.tuning == read.tuning:
             return read
         return replace(read, revision=read.revision + 1, tuning=self.tuning)
@@ -50,7 +50,7 @@ class Retune:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SetLeased:
-    """Change: from now on nobody works without a lease, or everybody may (`zsched.core.executor.sealing`)."""
+    """Change: from now on no node works without a lease, or every node may (`zsched.core.executor.sealing`)."""
 
     base_revision: int
     leased: bool
@@ -61,7 +61,7 @@ class SetLeased:
         return "nobody works without a lease any more" if self.leased else "not exclusive any more"
 
     def apply(self, read: Allocation) -> Allocation:
-        """The new value; touches that and the revision only."""
+        """The new value; touches this field and the revision only."""
         return read if read.leased is self.leased else replace(read, revision=read.revision + 1, leased=self.leased)
 
 
@@ -80,7 +80,7 @@ class RoundOutcome(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ended:
-    """A change that this node proposed has ended."""
+    """A change of this node has ended."""
 
     task: TaskId
     change: Change

@@ -31,7 +31,7 @@ from zsched.core.values.model import (
 from zsched.core.values.plan import Direction, ReadyWhen, ServiceSettings, StreamSettings
 
 DEFAULT_SCORE = ScoreForm.SERVICE
-"""What a machine is worth to a task whose fleet file does not say how to score (docs/decisions/0031)."""
+"""How to score a machine when the fleet file does not say (docs/decisions/0031)."""
 PAPER_PATIENCE = 0.55
 """Utility seconds, of a task with `ScoreForm.PAPER` whose fleet file gives neither a patience nor a time-to-trigger."""
 RADIO_PATIENCE = 0.3
@@ -54,14 +54,14 @@ class Standby(StrEnum):
 
 
 class OnIsolation(StrEnum):
-    """What a robot does that is cut off from the owner without a quorum."""
+    """What a robot does when it is cut off from the owner and has no quorum."""
 
     HOLD = "hold"
     LOCAL = "local"
 
 
 class Reach(StrEnum):
-    """Who must reach a candidate: a majority of the fresh voters, or all of them."""
+    """How many robots must reach a candidate: a majority of the fresh voters, or all of them."""
 
     MAJORITY = "majority"
     ALL = "all"
@@ -99,7 +99,7 @@ class LocalMode(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LocalSide:
-    """A network of the host's applications apart from the fleet's: inputs come from it, outputs go to it."""
+    """A network of the host's applications, apart from the fleet's: inputs come from it, outputs go to it."""
 
     mode: LocalMode = key(LocalMode.CLIENT, "`client`: of the host's router; `peer`: among the host's peers.")
     connect: tuple[str, ...] = key((), "Whom to dial, such as the host's `rmw_zenohd`.")
@@ -124,7 +124,7 @@ class NodeSpec:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Demand:
-    """What the task needs at least, known before it was ever measured (cores, MiB)."""
+    """The task's least need, known before it was ever measured (cores, MiB)."""
 
     cpu_cores: float = key(0.0, "CPU that the task needs at least.", Range(0, MAX_CPU_CORES, "cores"))
     memory_mb: float = key(0.0, "Memory that the task needs at least.", Range(0, MAX_MEMORY_MB, "MiB"))
@@ -178,7 +178,7 @@ class StreamRule:
 
 
 class PairReading(StrEnum):
-    """What a link is worth whose two ends reach each other through one access point (docs/decisions/0018)."""
+    """How to value a link whose two ends reach each other through one access point (docs/decisions/0018)."""
 
     CANDIDATE = "candidate"
     """The candidate's own way, as the paper prints Eq. 3: the robot's is part of every path, and decides nothing."""
@@ -238,7 +238,7 @@ class TaskSpec:
     rules: tuple[StreamRule, ...] = ()
 
     def first_value(self, start: int, *, is_new: bool = True) -> Allocation:
-        """What a generation begins with, by this file; ``is_new`` unless somebody may work at the task by another."""
+        """The first value of a generation, by this file; ``is_new``: no worker may still run by an earlier one."""
         leased = self.exclusive and is_new
         return Allocation(task=self.name, revision=start, epoch=start, owner=None, tuning=self.tuning, leased=leased)
 
@@ -337,10 +337,10 @@ def dial_endpoint(endpoint: str, host: str) -> str:
 
 @lru_cache(maxsize=8)
 def fleet_hash(fleet: Fleet) -> str:
-    """16 hex digits over all that every machine of the fleet must agree on.
+    """16 hex digits over everything on which all machines of the fleet must agree.
 
-    Left out is what a machine may have to itself: folders (of two paths only the file's name counts). Two nodes with
-    different hashes run different fleet files; they say so in their status and go on.
+    A machine's own folders are left out (of two paths only the file's name counts). Two nodes with different hashes
+    have different fleet files; their status says so, and they go on.
     """
     return _digest("fleet", fleet)
 
@@ -351,10 +351,10 @@ def electorate_hash(fleet: Fleet) -> str:
 
 
 def lease_terms(fleet: Fleet) -> str:
-    """16 hex digits over all that a lease of an exclusive task hangs on and files may say: the electors and its length.
+    """16 hex digits over everything in a fleet file that a lease depends on: the electors and the lease's length.
 
-    A majority of other electors need not meet the majority that has granted, and an elector that waits for a shorter
-    lease than the owner counts on waits for nothing. Which tasks are leased is agreed (`Allocation.leased`).
+    A majority of other electors need not meet the one that has granted. An elector that waits for a shorter lease than
+    the owner's waits too briefly. Which tasks are leased is agreed (`Allocation.leased`).
     """
     return _digest("lease/2", (fleet.name, fleet.electors, fleet.timing.lease_s))
 
@@ -392,6 +392,6 @@ def _canonical(value: object) -> Iterable[bytes]:
 
 
 def runs_worker(task: TaskSpec, node: NodeId, kind: NodeKind) -> bool:
-    """Whether ``node`` keeps a worker of the task: candidates do, and robots that work alone when they are cut off."""
+    """Whether ``node`` keeps a worker of the task: candidates do, and robots that may work alone when cut off."""
     is_alone = kind is NodeKind.ROBOT and task.on_isolation is OnIsolation.LOCAL
     return node in task.candidates or is_alone

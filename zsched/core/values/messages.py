@@ -1,6 +1,6 @@
-"""What nodes say to each other beyond the stages' own values: ballots of the register, answers, commands.
+"""Messages between nodes beyond the stages' own values: ballots of the register, answers, commands.
 
-Knows: the fields of each message and their ranges. Does not know: keys, bytes, or who may send what.
+Knows: the fields of each message and their ranges. Does not know: keys, bytes, or who may send which.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Prepare:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Promise:
-    """An elector's yes to a `Prepare`: persisted, with what it had accepted before (Synod, phase 1b)."""
+    """An elector's yes to a `Prepare`: persisted, with its earlier acceptance (Synod, phase 1b)."""
 
     elector: NodeId
     task: TaskId
@@ -112,19 +112,19 @@ class Learnt:
     has_voted: bool = False
     """Whether ``node`` has ever promised anything as an elector."""
     lease_terms: str = ""
-    """What its leases hang on."""
+    """The terms of its leases (`zsched.core.values.fleet.lease_terms`)."""
     unleased: tuple[TaskId, ...] = ()
     """Tasks whose worker there may be working without a lease."""
     incarnation: int = 0
-    """Of its state; 0: it has none."""
+    """Generation of its state; 0: it has none."""
     votes: int = 0
     """How many promises and acceptances it has ever given."""
     seen: tuple[tuple[NodeId, int, int], ...] = ()
-    """(elector, incarnation, votes): what it remembers of others (`zsched.core.vote.witness`)."""
+    """(elector, incarnation, votes) that it remembers of others (`zsched.core.vote.witness`)."""
     daemon: int = 0
     """Incarnation of the daemon that answers, whether it has a state or not."""
     twins: tuple[tuple[NodeId, int, int], ...] = ()
-    """(name, incarnation, newest beat) of daemons whose name it hears twice (`zsched.core.membership.namesakes`)."""
+    """(name, incarnation, newest beat) of daemons that share a name (`zsched.core.membership.namesakes`)."""
 
     def __post_init__(self) -> None:
         check_name("learnt.node", self.node)
@@ -161,9 +161,9 @@ class SetWeights:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RetryTask:
-    """Operator command to one node: forget what failures of the task's workers have led to there.
+    """Operator command to one node: forget the consequences of failures of the task's workers.
 
-    Given to every node: each remembers something else. ``node`` is whose failures; empty means everybody's.
+    Sent to every node, since each remembers others. ``node`` is the node whose failures are meant; empty means all.
     """
 
     task: TaskId
@@ -191,7 +191,7 @@ class CommandOutcome(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CommandResult:
-    """What the operator is told."""
+    """The answer to an operator's command."""
 
     outcome: CommandOutcome
     detail: str

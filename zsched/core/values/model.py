@@ -28,7 +28,7 @@ MIN_SPEED, MAX_SPEED = 0.001, 1000.0
 MAX_RUNNABLE = 1e6
 MAX_TREND_DB_S = 100.0
 MAX_JOBS_HZ, MAX_JOB_S = 1e6, 1e6
-"""What no machine or link exceeds: a larger figure is a fault of whoever measured or sent it."""
+"""Bounds that no machine or link exceeds: a larger figure is a fault of its sender."""
 MAX_REASON = 400
 """Characters of a worker's reason: it travels with every profile."""
 
@@ -78,7 +78,7 @@ class ScoreForm(StrEnum):
 
 
 class Objective(StrEnum):
-    """What a task wants of its machine (`ScoreForm.SERVICE`)."""
+    """The figure by which a task judges its machine (`ScoreForm.SERVICE`)."""
 
     SERVICE = "service"  # as many of its jobs done as possible
     LATENCY = "latency"  # as many of them as possible done within a deadline
@@ -108,10 +108,10 @@ MIN_DEADLINE_MS, MAX_DEADLINE_MS = 1.0, 3.6e6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tuning:
-    """What may be changed on the running fleet: agreed through the register like an allocation.
+    """The settings that may change on the running fleet, agreed through the register like an allocation.
 
-    ``bonus`` is added to the owner's aggregate (APPLY_COST of Alg. 2), in utility units [0, 1];
-    ``time_to_trigger_s`` is how long another candidate must lead; ``cool_down_s`` the least stay after a move.
+    ``bonus`` is added to the owner's aggregate (APPLY_COST of Alg. 2), in utility units [0, 1]; ``time_to_trigger_s``
+    is how long another candidate must lead; ``cool_down_s`` the least stay after a move.
     """
 
     weights: Weights
@@ -126,7 +126,7 @@ class Tuning:
 
     @property
     def objective(self) -> Objective:
-        """What a machine is judged by."""
+        """The figure by which a machine is judged."""
         return Objective.SERVICE if self.deadline_ms is None else Objective.LATENCY
 
     def __post_init__(self) -> None:
@@ -187,16 +187,16 @@ class WorkerState(StrEnum):
 
 
 NEVER_INITIALISED = "never initialised"
-"""How the problem begins of a fleet in which no elector has a state, and nobody remembers one."""
+"""First words of the problem that no elector has a state, and no node remembers one."""
 WAS_READY = "was ready until "
-"""So a reason begins that is one of a worker which is not ready any more: it is starting only for its supervisor."""
+"""First words of the reason of a worker that was ready and no longer is; its supervisor calls that starting."""
 
 RESTARTING = "restarting"
-"""So a reason begins that is one of a worker which has failed, and is or will be started again."""
+"""First words of the reason of a worker that has failed and is, or will be, started again."""
 
 
 def told_of_worker(state: WorkerState, reason: str) -> str:
-    """How a worker is, to be said behind its name."""
+    """A worker's state in words, to follow its name."""
     if state is not WorkerState.READY and reason.startswith(WAS_READY):
         return reason
     if state is not WorkerState.READY and reason.startswith(RESTARTING):
@@ -206,10 +206,10 @@ def told_of_worker(state: WorkerState, reason: str) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Jobs:
-    """What a worker says of its own jobs, smoothed (`zsched.core.profile.jobs`).
+    """A worker's report of its jobs, smoothed (`zsched.core.profile.jobs`).
 
-    A job is one input sample, and its callback. Times are seconds per job, means over the jobs that were done; rates
-    are jobs per second.
+    A job is one input sample and its callback. Times are seconds per job, means over the done jobs; rates are jobs per
+    second.
     """
 
     time_s: float
@@ -222,9 +222,9 @@ class Jobs:
     """From a job's arrival to its end, the wait for its turn included; ``None``: not told."""
     done_hz: float = 0.0
     wanted_hz: float = 0.0
-    """Done, and left undone: skipped for something newer, or added to those that wait."""
+    """Done and undone jobs: skipped for newer ones, or added to the waiting ones."""
     backlog: int = 0
-    """So many wait for their turn."""
+    """Jobs that wait."""
     late_ratio: float | None = None
     """Share of the done ones that took longer than the task's deadline from arrival to end; ``None``: it has none."""
 
@@ -251,11 +251,11 @@ class WorkerLoad:
     cpu_cores: float | None = None
     memory_mb: float | None = None
     wanted_cores: float | None = None
-    """The most that it would use alone, where threads of it always want to run; ``None``: none does, or unknown."""
+    """Cores that it would use alone if some of its threads always want to run; ``None``: none does, or unknown."""
     reason: str = ""
     """Why it is not ready, or what is wrong with it though it is; at most `MAX_REASON` characters."""
     jobs: Jobs | None = None
-    """What it says of its jobs; ``None``: nothing, or it has none."""
+    """Its report of its jobs; ``None``: none."""
 
     def __post_init__(self) -> None:
         check_name("worker.task", self.task)
@@ -268,7 +268,7 @@ class WorkerLoad:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TaskProgress:
-    """What a robot sees of a task with `output_deadline_s`: do its inputs of ``epoch`` lead to outputs?"""
+    """A robot's view of a task with `output_deadline_s`: do its inputs of ``epoch`` lead to outputs?"""
 
     task: TaskId
     epoch: int
@@ -299,12 +299,12 @@ class DeviceSample:
     cpu_pressure: float | None = None
     """Share of the time since the last sample in which some process wanted a CPU and had none; ``None``: not known."""
     runnable: float | None = None
-    """Threads that run or wait to run just now, the profiler's own left out; ``None``: not to be told."""
+    """Threads that run or wait to run now, without the profiler's own; ``None``: not known."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkSample:
-    """One raw reading of one link by a network profiler: what was read, before outliers are dropped and smoothed."""
+    """One raw reading of one link by a network profiler, with outliers and without smoothing."""
 
     source: LinkSource
     peer: NodeId | None = None
@@ -351,7 +351,7 @@ class Profile:
     workers: tuple[WorkerLoad, ...] = ()
     draining: bool = False
     progress: tuple[TaskProgress, ...] = ()
-    """Robots: the watched tasks that answer here, or do not although inputs flow."""
+    """Robots: the watched tasks that answer here, or fail to although inputs flow."""
     speed: float | None = None
     """How fast one of its cores is (`zsched.adapters.machine.core_speed`); ``None``: not measured."""
     cpu_pressure: float | None = None
@@ -359,7 +359,7 @@ class Profile:
     echoes: tuple[Echo, ...] = ()
     """Which profiles of others the node has, where a task has a deadline (`zsched.core.gateway.round_trips`)."""
     runnable: float | None = None
-    """Threads that run or wait to run, on the mean: what a task would share a full machine with; ``None``: unknown."""
+    """Mean number of threads that run or wait to run: a full machine is shared with them; ``None``: unknown."""
     relay: str = ""
     """What is wrong with its relay (`zsched.core.profile.relay_ends`); at most `MAX_REASON` long; empty: nothing."""
 
@@ -385,7 +385,7 @@ class Profile:
         return None
 
     def cores_of(self, task: TaskId) -> float:
-        """What ``task``'s worker uses on this node; 0 where the node runs none, or has not measured it."""
+        """Cores that ``task``'s worker uses on this node; 0 without a worker or a measurement."""
         load = self.worker(task)
         return 0.0 if load is None else load.cpu_cores or 0.0
 
@@ -395,7 +395,7 @@ class Profile:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Utility:
-    """What one robot thinks of one candidate: Eq. 4 and its terms, each in [0, 1] or absent (nobody measured it)."""
+    """One robot's score of one candidate: Eq. 4 and its terms, each in [0, 1] or absent (nobody measured it)."""
 
     candidate: NodeId
     value: float
@@ -423,7 +423,7 @@ class UtilityVector:
     refused: tuple[tuple[NodeId, str], ...] = ()
     """Candidates this voter did not score, each with its reason."""
     penalties: tuple[tuple[NodeId, float], ...] = ()
-    """What this voter remembers against nodes, each in [0, 1] (`zsched.core.scheduler.damping`)."""
+    """This voter's penalties against nodes, each in [0, 1] (`zsched.core.scheduler.damping`)."""
 
     def __post_init__(self) -> None:
         check_name("vector.voter", self.voter)
@@ -476,7 +476,7 @@ class Allocation:
     pinned: bool = False
     paused: bool = False
     leased: bool = False
-    """The task is exclusive for everybody, whatever their files say: nobody works without a lease any more."""
+    """The task is exclusive for every node, whatever its file says: none works without a lease."""
 
     def __post_init__(self) -> None:
         check_name("allocation.task", self.task)
@@ -525,7 +525,7 @@ class RegisterState:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DurableState:
-    """Everything a node keeps across restarts (one file, `zsched.adapters.host.state_file`)."""
+    """Everything that a node keeps across restarts (one file, `zsched.adapters.host.state_file`)."""
 
     fleet: str
     node: NodeId
@@ -592,13 +592,13 @@ class Beat:
     learnt: tuple[tuple[TaskId, int, int], ...] = ()
     """(task, revision, epoch) of every value this node has learnt."""
     suspects: tuple[NodeId, ...] = ()
-    """Whom this node suspects or holds for gone: the second observer's word."""
+    """Nodes that this node suspects or takes for gone: the second observer's word."""
     echoes: tuple[Grant, ...] = ()
     """Exclusive tasks: what this elector grants."""
     released: tuple[Grant, ...] = ()
     """Exclusive tasks: what this owner has given back."""
     asked_to_leave: tuple[tuple[TaskId, NodeId, int], ...] = ()
-    """(task, owner, epoch): this elector has refused another owner for their sake."""
+    """(task, owner, epoch): this elector has refused another owner because of them."""
     fleet_file: str = ""
     """Hash of the fleet file that this node goes by."""
     has_voted: bool = False
@@ -606,7 +606,7 @@ class Beat:
     generation: int = 0
     """Of this node's state; what nodes of another generation have learnt means nothing here."""
     lease_terms: str = ""
-    """What this node's leases hang on; an echo under other terms is none."""
+    """The terms of this node's leases; an echo under other terms does not count."""
     has_lost_state: bool = False
     """This node is in the electorate and answers no proposer: its state is lost, disputed or cannot be written."""
 
@@ -616,7 +616,7 @@ class Beat:
     electorate: str = ""
     """Hash of the electors that this elector counts with, and its generation; empty: it answers no proposer."""
     twins: tuple[NodeId, ...] = ()
-    """Names that this node hears two daemons of; who is one of them asks."""
+    """Names with two daemons, as this node hears them; the daemons themselves ask about it."""
 
     def __post_init__(self) -> None:
         check_name("beat.node", self.node)

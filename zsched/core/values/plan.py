@@ -21,7 +21,7 @@ class Direction(StrEnum):
 
 
 class StreamClass(StrEnum):
-    """What a stream needs (design: classes of streams)."""
+    """The needs of a stream (classes of streams in docs/guide/streams.md)."""
 
     BEST_EFFORT = "best_effort"
     LATEST = "latest"
@@ -36,7 +36,7 @@ class HandoverRule(StrEnum):
 
 
 class OnCrash(StrEnum):
-    """Inputs of class ``reliable``: what becomes of samples that an owner had not acknowledged when it died."""
+    """Inputs of class ``reliable``: the fate of samples that an owner had not acknowledged when it died."""
 
     REPORT = "report"  # they are counted: each is done at most once
     REPLAY = "replay"  # the next owner gets them: each is done at least once
@@ -108,7 +108,7 @@ class Route:
     """One stream of one robot for one owner, with every placeholder filled in (concrete key expressions)."""
 
     stream: str
-    """Stable name of the rule on this node, e.g. ``map_merge/in/0``: counters and kept values hang on it."""
+    """Stable name of the rule on this node, e.g. ``map_merge/in/0``: counters and kept values belong to it."""
     direction: Direction
     from_expr: str
     to_expr: str
@@ -148,11 +148,11 @@ class RoutePlan:
     current: Slot | None
     predecessors: tuple[Slot, ...] = ()
     exclusive: bool = False
-    """What the owner puts out must not pass while nobody here would hear of another owner."""
+    """The owner's outputs must not pass while this node could not hear of another owner."""
 
 
 class WorkerRole(StrEnum):
-    """What a worker is told to be."""
+    """The role that a worker is told."""
 
     IDLE = "idle"
     ACTIVE = "active"
@@ -195,7 +195,7 @@ class StreamCount:
     in_flight: int | None = None
     """Inputs: samples taken and not processed yet: they wait here, or were sent and are not acknowledged."""
     lost: int = 0
-    """Numbers that never came over the numbered hop."""
+    """Numbers that never came over the hop."""
     doubled: int = 0
     """Numbers that came twice and were dropped."""
     reordered: int = 0
@@ -204,7 +204,7 @@ class StreamCount:
     """Kept values sent once more to a new owner, and samples sent again for want of an acknowledgement, or after a
     crash (`OnCrash.REPLAY`)."""
     at_most_lost: int = 0
-    """Inputs: in flight to workers that died, so at most so many had no result."""
+    """Inputs: in flight to workers that died: at most this many had no result."""
     repeated: int = 0
     """Inputs: samples that were given to one more receiver: kept values and mirrors."""
     unsent: int = 0
@@ -213,7 +213,7 @@ class StreamCount:
     """Inputs: sent to a worker that acknowledges nothing (a foreign one): nobody knows what came of them."""
     answer_s: float | None = None
     """Outputs: mean seconds from inputs to their answers since the count before, network included. An answer without
-    its input's timestamp counts since the newest input before it, so it took at least so long."""
+    its input's timestamp counts since the newest input before it: a lower bound."""
     from_expr: str = ""
     """Filled in by the status: the keys of the newest slot, empty while the task has no owner."""
     to_expr: str = ""

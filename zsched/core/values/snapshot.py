@@ -1,4 +1,4 @@
-"""The status of a node as frozen values: what `zsched status` shows, and nothing that it does not.
+"""The status of a node as frozen values: exactly the content of `zsched status`.
 
 Knows: the fields of the schema ``zsched.status/1``. Does not know: tables, colours, JSON.
 
@@ -63,7 +63,7 @@ class DecisionStatus:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VoteStatus:
-    """The last vote of one task that this node heard: who proposed whom, and what came out."""
+    """The last vote of one task that this node heard: who proposed whom, and the outcome."""
 
     base_revision: int
     votes: tuple[tuple[NodeId, NodeId], ...]

@@ -1,7 +1,7 @@
-"""VOTE, where the registers meet the node: one register per task, the durable state they share, and who is told.
+"""VOTE, between the registers and the node: one register per task, the durable state they share, the messages.
 
-Knows: which messages a register's step becomes, what an operator's change is, what goes to disk. Does not know: the
-rules of a round (`zsched.core.vote.register`), what a learnt allocation leads to (the node applies it).
+Knows: which messages a register's step becomes, how an operator's change is made, what goes to disk. Does not know: the
+rules of a round (`zsched.core.vote.register`), the effect of a learnt allocation (the node applies it).
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ SETTLE_AFTER_START_S = 0.3
 """A starting elector learns first what was accepted before (an identity round), once its peers are connected."""
 ASK_LEARNT_EVERY_S = 0.3
 ASK_AT_ONCE_S = 0.05
-"""One peer is asked so often at most: because of its beats, and because it says that it has just learnt something."""
+"""A peer whose beats, or word of a new value, tell of news is asked at most this often."""
 READ_EVERY_S = 2.0
-"""A value that no single node's word is enough for is read from a majority so often at most."""
+"""A value that one node's word does not prove is read from a majority at most this often."""
 PREPARES_PER_S = 20.0
 PREPARE_BURST = 40.0
-"""What one peer may cost an elector: proposers back off to far less, only a broken one comes near."""
+"""Prepares of one peer: honest proposers back off far below this, only a broken one comes near."""
 PARK_SHARE = 0.8
-"""An accept that a lease forbids waits for the release so long (of a ballot's deadline) before it is refused."""
+"""An accept that a lease forbids waits for this part of a ballot's deadline for the release; then it is refused."""
 
 _RETUNED = {
     RoundOutcome.COMMITTED: (CommandOutcome.OK, "committed by a majority of the electors"),
@@ -134,7 +134,7 @@ class Agreement:
         self._foreign = tuple(stored[name] for name in sorted(stored) if name not in self.registers)
         self._settle_at = now + SETTLE_AFTER_START_S if self.is_elector else math.inf
         self._asked_at: dict[tuple[NodeId, bool], float] = {}
-        """{(peer, whether for a newer revision): when}: a vote that was heard of delays nobody who is behind."""
+        """{(peer, whether for a newer revision): when}: news of votes must not delay a question about revisions."""
         self._read_at: dict[TaskId, float] = {}
         self.leases = Leases(
             fleet=fleet,
@@ -146,7 +146,7 @@ class Agreement:
         )
         self._parked: dict[tuple[TaskId, NodeId], tuple[ev.AcceptAsked, float]] = {}
         self._seen: list[RegisterState] = []
-        """The registers' states of which `values` and `accepted` are told."""
+        """The registers' states from which `values` and `accepted` were made."""
         self._values: dict[TaskId, Allocation] = {}
         self._accepted: dict[TaskId, tuple[NodeId, int]] = {}
 
@@ -159,7 +159,7 @@ class Agreement:
 
     @property
     def problems(self) -> dict[str, str]:
-        """{what: why agreement does not work here as it should}."""
+        """{subject: why agreement does not work here as it should}."""
         stuck = {f"register/{name}": register.problem for name, register in self.registers.items() if register.problem}
         return {**self._problems, **stuck}
 
@@ -169,7 +169,7 @@ class Agreement:
         return self._values
 
     def _look(self) -> None:
-        """See whether a register has changed: beats ask thirty times a second, and it hardly ever has."""
+        """See whether a register has changed: thirty beats a second ask, and it seldom has."""
         states = [register.state for register in self.registers.values()]
         if states == self._seen:
             return
@@ -183,12 +183,12 @@ class Agreement:
         }
 
     def learnt(self) -> Learnt:
-        """What this node tells others: learnt values only, never accepted ones."""
+        """This node's learnt values for others, never accepted ones."""
         values = tuple(value for value in self.values().values() if value.revision > 0)
         return Learnt(node=self._me, values=values, generation=self.generation or 0, has_voted=self.has_voted)
 
     def answer(self) -> Learnt:
-        """What this node answers a peer: what it has learnt, and what it remembers of electors and of itself."""
+        """This node's answer to a peer: its learnt values, and its memory of electors and of itself."""
         return replace(
             self.learnt(),
             incarnation=0 if self._durable is None else self.witness.incarnation,
@@ -205,17 +205,17 @@ class Agreement:
         return min(due, *(deadline for _, deadline in self._parked.values())) if self._parked else due
 
     def accepted(self) -> Mapping[TaskId, tuple[NodeId, int]]:
-        """{leased task: (owner, epoch)} that this elector echoes: of the newest value that it has accepted or learnt.
+        """{leased task: (owner, epoch)} that this elector echoes: from the newest value that it has accepted or learnt.
 
-        Learnt counts too: what was committed without this elector would else never be echoed by it, and with another
-        elector away no majority could be. An accepted value that is newer than what is learnt comes first, so nobody
-        is echoed any more whom a newer acceptance replaces.
+        Learnt values count too. Otherwise this elector would never echo a value that was committed without it, and with
+        another elector away no majority could. An accepted value that is newer than the learnt one comes first, so an
+        owner that a newer acceptance replaces is no longer echoed.
         """
         self._look()
         return self._accepted
 
     def standing(self) -> dict[TaskId, Allocation | None]:
-        """{task: the newest value here}: an elector that does not know when it granted accepts its owner only."""
+        """{task: the newest value here}: an elector that does not know when it granted accepts only this owner."""
         return {name: _newest(register) for name, register in self.registers.items()}
 
     def to_persist(self, now: float) -> DurableState | None:
@@ -248,7 +248,7 @@ class Agreement:
     # --- electors ----------------------------------------------------------------------------------------------------
 
     def on_prepare(self, event: ev.PrepareAsked, todo: ToDo, now: float) -> None:
-        """A proposer asks for a promise; only for its own ballots, and not too often (each promise costs an fsync)."""
+        """A proposer asks for a promise: only for its own ballots, at a bounded rate (each promise costs an fsync)."""
         register = self.registers.get(event.prepare.task)
         if register is None or not self._is_its_own(event.prepare.ballot, event.asker):
             self.counters["prepare_foreign"] += 1
@@ -266,7 +266,7 @@ class Agreement:
         todo.add(do.AnswerElection(request=event.request, answer=answer))
 
     def _may_ask(self, asker: NodeId, now: float) -> bool:
-        """One token of the asker's bucket (`PREPARES_PER_S`, at most `PREPARE_BURST` saved); a no costs none."""
+        """Take one token of the asker's bucket (`PREPARES_PER_S`, at most `PREPARE_BURST` saved); a no costs none."""
         tokens, at = self._buckets.get(asker, (PREPARE_BURST, now))
         tokens = min(tokens + (now - at) * PREPARES_PER_S, PREPARE_BURST)
         may_ask = tokens >= 1.0
@@ -274,7 +274,7 @@ class Agreement:
         return may_ask
 
     def on_accept(self, event: ev.AcceptAsked, todo: ToDo, now: float) -> None:
-        """A proposer asks to accept a value; only under its own ballots."""
+        """A proposer asks this elector to accept a value: only under its own ballots."""
         acceptance = event.accept.acceptance
         register = self.registers.get(event.accept.task)
         if register is None or not self._is_its_own(acceptance.ballot, event.asker):
@@ -340,7 +340,7 @@ class Agreement:
         return ballot.node == asker and asker in self._nodes
 
     def note_asked(self, beat: Beat, now: float) -> None:
-        """An elector (maybe this one) asks owners to leave: somebody's accept waits for that."""
+        """An elector (maybe this one) asks owners to leave, because another owner's accept waits."""
         if beat.node not in self._fleet.electors:
             return
         for task, _, epoch in beat.asked_to_leave:
@@ -351,7 +351,7 @@ class Agreement:
     # --- learners ----------------------------------------------------------------------------------------------------
 
     def on_learnt(self, event: ev.LearntReceived, todo: ToDo, now: float) -> None:
-        """A peer told what it has learnt: unasked, that is a reason to ask it; its answer may be believed."""
+        """A peer sent learnt values. Unasked they only lead to a question; an answer may be believed."""
         learnt = event.learnt
         if learnt.node == self._me:
             return
@@ -374,7 +374,7 @@ class Agreement:
             self._learn(learnt, value, todo, now)
 
     def _learn(self, learnt: Learnt, value: Allocation, todo: ToDo, now: float) -> None:
-        """A peer has answered that it has learnt ``value``."""
+        """A peer has answered a question with the learnt ``value``."""
         register = self.registers.get(value.task)
         if register is None:
             self.counters["learnt_foreign"] += 1
@@ -387,14 +387,14 @@ class Agreement:
             self._read(value.task, register, todo, now)
 
     def _read(self, task: TaskId, register: Register, todo: ToDo, now: float) -> None:
-        """Ask a majority what is in force (an identity round), for one peer's word is not enough."""
+        """Ask a majority for the value in force (an identity round): one peer's word is not enough."""
         self.counters["learnt_unproven"] += 1
         if now - self._read_at.get(task, -math.inf) >= READ_EVERY_S:
             self._read_at[task] = now
             register.settle(todo, now)
 
     def _hear_electorate(self, beat: Beat) -> None:
-        """Keep whether an elector refuses our ballots, and we its: it has other electors, or another generation."""
+        """Note whether an elector and this node refuse each other's ballots (other electors, or another generation)."""
         is_apart = beat.generation != self.generation or beat.electorate not in ("", self.electorate)
         is_apart |= self._is_no_elector_there(beat)
         if is_apart and not self._is_guest_of(beat.generation) and beat.node in self._fleet.electors:
@@ -403,10 +403,10 @@ class Agreement:
             self.apart.discard(beat.node)
 
     def _is_no_elector_there(self, beat: Beat) -> bool:
-        """Whether a node that this file has as an elector counts with others, and does not have itself among them.
+        """Whether a node that is an elector by this file counts with other electors and is none by its own file.
 
-        It tells no electorate then, and no lost state either: who has lost one is an elector by its own file. The terms
-        tell such a node from one that is too old to tell its electorate.
+        Such a node names no electorate and no lost state (a node with a lost state is an elector by its own file). The
+        terms tell it from a node that is too old to name its electorate.
         """
         terms = beat.lease_terms.partition(",")[0]  # behind it a clock is in doubt
         return not beat.electorate and not beat.has_lost_state and terms not in ("", self.leases.terms)
@@ -429,11 +429,11 @@ class Agreement:
         return False
 
     def _is_guest_of(self, generation: int) -> bool:
-        """Whether this node, without a state, goes by what a newer generation says."""
+        """Whether this node, without a state, follows a newer generation."""
         return not self._has_state and (self.generation is None or generation > self.generation)
 
     def _follow(self, learnt: Learnt) -> None:
-        """An elector that keeps a state has answered: without one this node is of the newest generation it hears of."""
+        """An elector with a state has answered: a node without one joins the newest generation that it hears of."""
         is_elector = learnt.node in self._fleet.electors and (learnt.incarnation > 0 or learnt.has_voted)
         if not is_elector or learnt.generation > MAX_GENERATION or not self._is_guest_of(learnt.generation):
             return
@@ -445,7 +445,7 @@ class Agreement:
             self.registers[task.name].follow(self.electorate, initial)
 
     def dispute(self, reason: str, todo: ToDo) -> None:
-        """Our name is used by somebody else too: no elector any more, on disk, until the operator settles it."""
+        """Another daemon uses our name, too: no elector any more, on disk, until the operator settles the dispute."""
         if self._disputed:
             return
         self._disputed = reason
@@ -454,7 +454,7 @@ class Agreement:
         todo.must_persist |= self._durable is not None
 
     def _lose(self, why: str, todo: ToDo) -> None:
-        """Our state has forgotten what others have seen of it: no elector any more, on disk."""
+        """Peers have seen more of our state than it holds: no elector any more, on disk."""
         if not why or self._lost or not self.is_elector:
             return
         self._lost = why
@@ -463,7 +463,7 @@ class Agreement:
         todo.must_persist = True
 
     def compare(self, beat: Beat, todo: ToDo, now: float) -> None:
-        """A peer's beat may show that it has learnt more than we, or has voted: then ask it."""
+        """A peer's beat may show that it has learnt more than we have, or has voted: then ask it."""
         self.newest_generation = max(self.newest_generation, min(beat.generation, MAX_GENERATION))
         self._hear_electorate(beat)
         if not self._is_our_generation(beat.node, beat.generation):
@@ -484,7 +484,7 @@ class Agreement:
         *,
         is_news: bool = False,
     ) -> None:
-        """Ask a peer for what it has learnt, when it tells of a newer revision (or of other news)."""
+        """Ask a peer for its learnt values, because of a newer revision (or of other news)."""
         is_behind = False
         for task, revision in told:
             register = self.registers.get(task)
@@ -540,7 +540,7 @@ class Agreement:
             self._settle_at = math.inf
 
     def on_ended(self, ended: Ended, todo: ToDo) -> None:
-        """A change that this node proposed has ended: tell the others, and whoever waits for it."""
+        """A change of this node has ended: tell the other nodes, and the operator that waits for it."""
         task, change, outcome = ended.task, ended.change, ended.outcome
         value = self.registers[task].value
         if outcome is RoundOutcome.COMMITTED:

@@ -1,10 +1,10 @@
-"""VOTE, what is believed: whether a peer's word is enough for a value to be learnt, or to be accepted.
+"""VOTE, belief: is a peer's word enough to learn a value, or to accept it?
 
-Knows: nodes, electors, how far a counter can honestly be ahead. Does not know: who asked what, what follows when
-it is not enough (`zsched.core.vote.agreement` asks a majority).
+Knows: nodes, electors, how far ahead a counter can honestly be. Does not know: who asked, what follows when the word is
+not enough (`zsched.core.vote.agreement` asks a majority).
 
-Nobody is authenticated here. Whoever can put a frame on the network can say anything once; so what is said unasked only
-leads to a question, and an answer is believed only where it could be true.
+No message is authenticated here, and anybody on the network can say anything once. So an unasked word only leads to a
+question, and an answer is believed only if it could be true.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ GENERATION_STEP = 2**32
 MAX_GENERATION = MAX_REVISION // GENERATION_STEP - 1
 """The last one that leaves room to count: above `MAX_REVISION` nothing can follow (`Register`)."""
 MAX_AHEAD = 2**20
-"""No honest revision is so far ahead of what a node knows: at one move a second that is a cut of twelve days."""
+"""No honest revision is further ahead: at one move a second that would be a cut of twelve days."""
 
 
 def is_fit(fleet: Fleet, value: Allocation, register: Register, start: int = 0) -> bool:
-    """Whether a value that is new here could be one: its owner is a node of the fleet, and it is not far ahead.
+    """Whether a value that is new here could be true: its owner is a node of the fleet, and it is not far ahead.
 
-    The owner need not be a candidate: it may have been one by the file of before, and a node that could not learn that
-    could not take part in moving the task away from it. ``start`` is the first revision of the value's generation.
+    The owner need not be a candidate. It may have been one by an earlier file, and a node that could not learn that
+    value could not help to move the task away from it. ``start`` is the first revision of the value's generation.
     """
     state = register.state
     accepted = None if state.accepted is None else state.accepted.value
@@ -39,10 +39,10 @@ def is_fit(fleet: Fleet, value: Allocation, register: Register, start: int = 0) 
 
 
 def is_proven(fleet: Fleet, learnt: Learnt, value: Allocation, register: Register, *, has_generation: bool) -> bool:
-    """Whether a peer's answer to our own question is enough for a value to be learnt.
+    """Whether a peer's answer to our own question is enough to learn a value.
 
-    It is an elector's, or of what this elector has accepted itself (whoever committed it may be no elector). A node
-    without a state has no generation: it goes by that of whom it asked.
+    It is when the peer is an elector, or when this elector has accepted the same value (whoever committed it need not
+    be an elector). A node without a state has no generation and takes that of the node that it asked.
     """
     accepted = register.state.accepted
     if accepted is not None and accepted.value == value:

@@ -1,11 +1,12 @@
-"""Membership's question about time: does a second here take as long as elsewhere? Leases hang on it.
+"""VOTE, this machine's clock: does a second last as long here as elsewhere? Leases depend on it.
 
-Knows: how far two clocks of one machine may run apart before one of them is wrong. Does not know: clocks
+Knows: how far two clocks of one machine may drift apart before one of them is wrong. Does not know: clocks
 (`zsched.clock` reads and compares them), which of the two is wrong, what follows for leases (`zsched.core.vote.lease`).
 
-One is slewed by the machine's time service, the other is not. When they differ by more than the bound that leases
-allow for, or move apart at once (a suspend; its length is known to a second only on some machines), no time that was
-measured here can be trusted by others. A clock that stands still together with all others of its machine is not seen.
+The machine's time service slews one clock and not the other. When their rates differ by more than the bound of the
+leases, or when they jump apart (a suspend, whose length some machines know only to a second), other nodes cannot trust
+a time that was measured here: the clock is *in doubt*. A clock that stands still together with all others of its
+machine is not noticed.
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ from zsched.core.events import ClockCompared
 from zsched.core.vote.lease import RHO
 
 JUMP_S = 1e-3
-"""What two clocks may move apart at once, beyond their rates; reading them both takes a fiftieth of it."""
+"""Two clocks may move apart by this at once, beyond their rates; reading both takes a fiftieth of it."""
 DOUBT_S = 2.0
-"""So long after the last bad comparison the clock is in doubt."""
+"""The clock is in doubt for this long after the last bad comparison."""
 
 
 def is_bad(event: ClockCompared) -> bool:
@@ -29,10 +30,10 @@ def is_bad(event: ClockCompared) -> bool:
 
 @dataclass(slots=True)
 class ClockDoubt:
-    """Whether this machine's clock may be believed."""
+    """Decides whether this machine's clock is in doubt."""
 
     complaint: str | None = None
-    """How status says that it may not."""
+    """The status's problem while it is in doubt."""
     _until: float = -math.inf
 
     def absorb(self, event: ClockCompared, now: float) -> bool:

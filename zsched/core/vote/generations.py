@@ -1,6 +1,6 @@
-"""VOTE, a node's blank state: what speaks against it, and what it holds of each task in a new generation.
+"""VOTE, a node's blank state: objections to it, and its values in a new generation.
 
-Knows: what the state before says, and what the fleet answers. Does not know: disks, how anybody is asked.
+Knows: the content of the state before, the fleet's answers. Does not know: disks, how a node is asked.
 """
 
 from __future__ import annotations
@@ -16,8 +16,9 @@ from zsched.core.vote.belief import GENERATION_STEP
 def first_registers(fleet: Fleet, generation: int, before: Iterable[RegisterState]) -> tuple[RegisterState, ...]:
     """The registers of a blank state of ``generation``; none for generation 0.
 
-    Accepted everywhere, too: a majority that had learnt a value and accepted none would count as one that forgot.
-    A task whose last owner, by the state ``before``, needed no lease is not leased from the start: it may still work.
+    The values are accepted everywhere, too: a majority that had learnt a value without an acceptance would look like
+    one that forgot. A task whose last owner, by the state ``before``, needed no lease does not start leased: that owner
+    may still work.
     """
     if not generation:
         return ()
@@ -39,10 +40,10 @@ def _is_unleased(state: RegisterState) -> bool:
 def blank_state(
     fleet: Fleet, node: NodeId, generation: int, before: DurableState | None, *, incarnation: int, hardware: str
 ) -> DurableState:
-    """What `zsched init` writes: this name has never voted, in ``generation``.
+    """The state that `zsched init` writes: this name has never voted, in ``generation``.
 
-    How long the leases were that the state ``before`` granted is kept: who was granted one may still work by it, and by
-    a file that says another length.
+    The length of the leases that the state ``before`` granted is kept. Their holder may still work by one, under a file
+    with another length.
     """
     return DurableState(
         fleet=fleet.name,
@@ -57,7 +58,7 @@ def blank_state(
 
 
 def way_out(generation: int) -> str:
-    """The steps that lead from any mix of states to a fleet of one generation, which agrees."""
+    """The operator's steps from any mix of states to a fleet of one generation that agrees."""
     return (
         f"stop every daemon, run `zsched init --generation {generation} --force` on every node, "
         "and start them when all have it"
@@ -68,7 +69,7 @@ def way_out(generation: int) -> str:
 
 
 def generation_of(answer: Snapshot) -> int:
-    """The generation that a node goes by, as its status shows it: revisions of generation G start at G * 2^32."""
+    """The generation of a node, from the revision in its status: generation G starts at G * 2^32."""
     return max((task.revision for task in answer.tasks), default=0) // GENERATION_STEP
 
 
@@ -81,16 +82,16 @@ def objection(
     is_elector: bool,
     is_forced: bool,
 ) -> str | None:
-    """Why ``node`` must not get a blank state of ``generation``, and what to do instead; ``None``: nothing is known.
+    """Why ``node`` must not get a blank state of ``generation``, and the remedy; ``None``: no objection known.
 
     Args:
         node: whose state it would be.
         generation: 0, or a new one for a fleet that cannot agree any more.
-        good: its valid state of an older generation, which would be lost with it.
-        answers: what the other nodes say.
+        good: its valid state of an older generation, which would be lost.
+        answers: the other nodes' answers.
         is_elector: whether ``node`` is one.
-        is_forced: the operator knows better whether the fleet needs a new generation. That a node has voted in this
-            one, or that the fleet is ahead of it, no operator can change.
+        is_forced: the operator insists that the fleet needs a new generation. No operator can overrule that a node has
+            voted in this one, or that the fleet is ahead of it.
     """
     newest = max(map(generation_of, answers), default=0)
     current = [answer for answer in answers if generation_of(answer) == newest]

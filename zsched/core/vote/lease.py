@@ -1,30 +1,32 @@
-"""Exclusive tasks: the lease that makes two active owners impossible, held by a majority's echoes of the owner's beats.
+"""Exclusive tasks: a lease excludes two active owners. A majority grants it by echoes of the owner's beats.
 
 Knows: grants, echoes, releases and their clocks. Does not know: how a worker is stopped, ballots, bytes.
 
-L is the lease, rho the bound on how far two clocks' rates differ. Nobody compares clocks: each side counts on its own.
+L is the lease, rho the bound on the difference of two clocks' rates. Nodes do not compare clocks: each counts on its
+own.
 
 * The owner's beats are numbered. An elector echoes a number, per task, only to the owner and epoch of the value that it
   last *accepted*; the echo is the grant.
-* The owner is active only while a majority has echoed a number that it sent *after learning this epoch*; the lease ends
-  L after the *sending* of the largest number that a majority has echoed or exceeded. An elector that echoes what was
-  not sent yet, for somebody else beats in the owner's name, counts from an earlier moment than the owner would: its
-  echo of that number never counts. It grants the real, lower numbers again once they are believed
+* The owner is active only while a majority has echoed a number that it sent *after learning this epoch*. The lease ends
+  L after the *sending* of the largest number that a majority has echoed or exceeded. An elector may echo a number that
+  the owner has not sent yet, because of a forged beat. It then counts from an earlier moment than the owner would, so
+  its echo of that number never counts. It grants the real, lower numbers again once they are believed
   (`zsched.core.sequence`).
-* Only a task that is *leased* for everybody (`Allocation.leased`, `zsched.core.executor.sealing`) is granted.
-* An elector never grants to two owners, or two lives of one, at once: to another only after the hold, or a release.
+* Electors grant only a task that is *leased* for everybody (`Allocation.leased`, `zsched.core.executor.sealing`).
+* An elector never grants to two owners, or to two lives of one, at once: to another only after the hold or a release.
 * An elector that granted refuses an accept for another owner until L(1+rho)/(1-rho) after its last grant on its own
-  clock, or until the owner released; one that has just started refuses every owner but that of its own persisted
-  accepted value for as long, and echoes nobody: that owner's life may be another one than it granted to before.
-* When it refuses, it stops echoing the owner for whose sake it refused (at most twice that time, or until it accepts or
-  learns a newer revision), and its beats ask that owner to leave; the owner drains and releases all numbers up to now,
-  which are never granted again. Without this a planned move would never happen.
+  clock, or until the owner released. An elector that has just started does so for the same time with every owner but
+  that of its persisted accepted value, and echoes no owner: it may have granted to an earlier life of that owner.
+* An elector that refuses stops echoing the present owner (for at most twice that time, or until it accepts or learns a
+  newer revision), and its beats ask that owner to leave. The owner drains and releases all numbers up to now, which are
+  never granted again. Without this a planned move would never happen.
 * An echo counts only under the same terms (`lease_terms`): the electors and L of both fleet files. The majority of
-  another electorate need not meet the one that granted to this owner's earlier life. Such a node gets no such task.
-* A node whose clock's rate is in doubt (`zsched.core.vote.clocks`) neither works nor grants, and its beats name other
-  terms; afterwards it begins like an elector, and an owner, that has just started.
-* The worker's own word that it has stopped ends the owner's wait before the lease does, but only while no earlier word
-  of the same epoch is missing: a late one would give back a lease that the worker has been given since.
+  another electorate need not meet the one that granted to this owner's earlier life. A node with other terms gets no
+  leased task.
+* A node whose clock is in doubt (`zsched.core.vote.clocks`) neither works nor grants, and its beats name other terms.
+  Afterwards it begins like an elector, and an owner, that has just started.
+* The worker's own report that it has stopped ends the owner's wait before the lease does, but only while no earlier
+  report of the same epoch is missing: a late one would give back a lease that the worker has been given since.
 
 Source: Gray & Cheriton 1989 (leases), with the epoch as fencing token.
 """
@@ -43,9 +45,9 @@ from zsched.core.values.quorum import majority
 RHO = 1e-3
 """Bound on the relative difference of two clocks' rates (a crystal is within 1e-4)."""
 SENT_KEPT = 128
-"""An owner knows when it sent so many of its newest numbers; of older ones there is no lease."""
+"""Newest numbers whose sending time an owner keeps; an echo of an older one gives no lease."""
 HURRY_S = 0.05
-"""A release of nothing that was used is worth a beat of its own at most so often."""
+"""An empty release (nothing was used) causes a beat of its own at most this often."""
 
 
 def hold_s(lease_s: float) -> float:
@@ -81,7 +83,7 @@ class Granter:
     _silent_until: float = -math.inf
 
     def on_beat(self, beat: Beat, accepted: tuple[NodeId, int] | None, now: float, *, is_newest: bool = True) -> bool:
-        """Take a beat in: grant it if its sender is the accepted owner. Whether this begins a new grant.
+        """Take a beat in and grant it if its sender is the accepted owner. Whether this begins a new grant.
 
         Args:
             beat: of any node.
@@ -134,13 +136,13 @@ class Granter:
         return self._silent_for == (owner, epoch) and now < self._silent_until
 
     def restart(self, standing: Allocation | None, until: float) -> None:
-        """It is not known when this elector granted, only to whom: as after a start."""
+        """This elector knows to whom it granted, but not when: as after a start."""
         self.standing, self.until = None if standing is None else standing.owner, until
         self._last, self._granted_at = None, -math.inf
         self.on_newer_value()
 
     def may_accept(self, owner: NodeId | None, now: float) -> bool:
-        """Whether a value with this owner may be accepted now; a no begins the silence towards the present owner."""
+        """Whether a value with this owner may be accepted now; a no starts the silence towards the present owner."""
         hold = hold_s(self.lease_s)
         if now < self.until and owner != self.standing:
             return False
@@ -153,11 +155,11 @@ class Granter:
         return False
 
     def on_newer_value(self) -> None:
-        """A newer revision was accepted or learnt: nobody is waited for any more."""
+        """A newer revision was accepted or learnt: no other owner waits any more."""
         self._silent_for, self._silent_until = None, -math.inf
 
     def echo(self, now: float) -> Grant | None:
-        """What this elector's beat echoes, or ``None``."""
+        """This elector's echo for its beat, or ``None``."""
         last = self._last
         if last is None or self._is_silenced(last.owner, last.epoch, now) or now >= self._granted_at + self.lease_s:
             return None
@@ -200,24 +202,24 @@ class Holder:
     released: int = -1
     """The largest number that was given back."""
     given_until: float = -math.inf
-    """Until when the worker was told that it may work; minus infinity once it has stopped."""
+    """The end of the worker's permission to work; minus infinity once it has stopped."""
     awaits_report: bool = False
     """The worker was told to stop and has not said yet that it has."""
     is_doubtful: bool = False
-    """A word of an earlier stop in this epoch may still come: from now on only the end of what was given counts."""
+    """A report of an earlier stop in this epoch may still come: from now on only the permission's end counts."""
     hurried_at: float = -math.inf
-    """When a release of nothing that was used last had a beat of its own."""
+    """When an empty release last had a beat of its own."""
     _sent: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=SENT_KEPT))
     _echoed: dict[NodeId, int] = field(default_factory=dict)
     _ahead: dict[NodeId, list[int]] = field(default_factory=dict)
-    """{elector: the numbers that it echoed before we sent them, the lowest first}: of somebody else's beats."""
+    """{elector: the numbers that it echoed before we sent them, lowest first}: from forged beats."""
 
     def on_sent(self, number: int, now: float) -> None:
         """A beat leaves."""
         self._sent.append((number, now))
 
     def on_echo(self, elector: NodeId, grant: Grant) -> None:
-        """An elector echoed one of our numbers; of another life or epoch, or from a stranger, it counts nothing."""
+        """An elector echoed one of our numbers; another life or epoch, or a stranger's echo, does not count."""
         if elector not in self.electors or (grant.task, grant.owner) != (self.task, self.me):
             return
         if (grant.incarnation, grant.epoch) != (self.incarnation, self.epoch):
@@ -230,7 +232,7 @@ class Holder:
             self._echoed[elector] = max(self._echoed.get(elector, -1), grant.number)
 
     def _note_ahead(self, elector: NodeId, number: int) -> None:
-        """Keep the lowest: what is `SENT_KEPT` numbers behind those was echoed long before we could send it."""
+        """Keep the lowest of these numbers: those `SENT_KEPT` behind were echoed long before we could send them."""
         known = {*self._ahead.get(elector, ()), number}
         echoed = self._echoed.get(elector, -1)
         self._ahead[elector] = sorted(one for one in known if one > echoed)[:SENT_KEPT]
@@ -246,7 +248,7 @@ class Holder:
         return -math.inf if at is None else at + self.lease_s
 
     def ask(self) -> None:
-        """Another owner waits. Electors may have granted what they do not echo, so whatever was sent is asked for."""
+        """Another owner waits. Electors may have granted more than they echo, so every number sent so far is meant."""
         if self._sent and self._sent[-1][0] > self.released:
             self.is_leaving = True
 
@@ -261,7 +263,7 @@ class Holder:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BeatParts:
-    """What this node's beat says about leases."""
+    """The parts of this node's beat about leases."""
 
     echoes: tuple[Grant, ...]
     released: tuple[Grant, ...]
@@ -289,9 +291,9 @@ class Leases:
     granted_s: float = 0.0
     terms: str = field(init=False)
     is_unsure: bool = False
-    """How long anything takes on this node's clock is not known: it holds and grants nothing."""
+    """This node's clock is in doubt: it holds and grants nothing."""
     _others: dict[NodeId, str] = field(default_factory=dict)
-    """{node: its terms} of those that go by other terms than this node."""
+    """{node: its terms} of the nodes whose terms differ from ours."""
     _granters: dict[TaskId, Granter] = field(init=False)
     _holders: dict[TaskId, Holder] = field(default_factory=dict)
     _releases: dict[TaskId, Grant] = field(default_factory=dict)
@@ -310,22 +312,22 @@ class Leases:
 
     @property
     def over_at(self) -> float:
-        """When whatever was granted, to or by a life of this node before, is over."""
+        """When every grant to, or by, an earlier life of this node is over."""
         return self.now + hold_s(max(self.fleet.timing.lease_s, self.granted_s))
 
     @property
     def terms_told(self) -> str:
-        """What this node's beats say that its leases hang on; not the others' terms while it is unsure."""
+        """The terms of this node's leases for its beats; in doubt, terms that no other node has."""
         return f"{self.terms}, clock in doubt" if self.is_unsure and self.terms else self.terms
 
     def doubt(self, standing: Mapping[TaskId, Allocation | None]) -> None:
-        """The clock's rate is in doubt: hold and grant nothing from now on."""
+        """The clock is in doubt: hold and grant nothing from now on."""
         self.is_unsure = True
         for task, granter in self._granters.items():
             granter.restart(standing[task], math.inf)
 
     def trust(self, standing: Mapping[TaskId, Allocation | None], number: int, now: float) -> None:
-        """The clock runs right again: begin anew, with beats behind ``number``."""
+        """The clock is right again: begin anew, with beats after ``number``."""
         self.is_unsure = False
         for task, granter in self._granters.items():
             granter.restart(standing[task], now + hold_s(self.fleet.timing.lease_s))
@@ -351,16 +353,16 @@ class Leases:
             self._watch(value.task, None, math.inf if self.is_unsure else -math.inf)
 
     def is_news(self, remembered_s: float) -> bool:
-        """Whether this elector may grant for longer than its state file says: it must be there before the first one."""
+        """Whether this elector's grants may be longer than its state file says: the file must be written first."""
         return bool(self._granters) and remembered_s < self.fleet.timing.lease_s
 
     def to_remember_s(self, now: float) -> float:
-        """How long a lease may last that this elector has granted, or its life before: for its next life."""
+        """The longest lease of a grant of this elector, or of its life before, for its next life."""
         own_s = self.fleet.timing.lease_s
         return own_s if now >= self.now + hold_s(self.granted_s) else max(own_s, self.granted_s)
 
     def stop_granting(self) -> None:
-        """This node is no elector any more: what it granted runs out."""
+        """This node is no elector any more: its grants run out."""
         self._granters.clear()
         self.standing = {}
 
@@ -382,7 +384,7 @@ class Leases:
         self._releases.pop(task, None)
 
     def end(self, task: TaskId, number: int) -> None:
-        """Another owner was learnt: whatever this node still holds is given back."""
+        """Another owner was learnt: give back everything that this node still holds."""
         holder = self._holders.pop(task, None)
         if holder is not None:
             self._releases[task] = holder.release(number)
@@ -398,32 +400,32 @@ class Leases:
         return bool(self._holders)
 
     def leaving(self) -> tuple[TaskId, ...]:
-        """Tasks whose worker here is asked to stop and has not yet."""
+        """Tasks whose worker here must stop and has not yet."""
         return tuple(task for task, holder in self._holders.items() if holder.is_leaving)
 
     def on_given(self, task: TaskId, until: float) -> None:
-        """The worker here, of a task that this node holds, is told that it may work ``until`` then."""
+        """The worker of a task that this node holds is told that it may work until ``until``."""
         self._holders[task].given_until = until
 
     def given_until(self, task: TaskId) -> float:
-        """Until when the worker here may be working; minus infinity when it is not."""
+        """The end of the worker's permission to work; minus infinity without one."""
         holder = self._holders.get(task)
         return -math.inf if holder is None else holder.given_until
 
     def on_told_to_stop(self, task: TaskId) -> None:
-        """The worker here, of a task that this node holds, is told to stop: it will say when it has."""
+        """The worker of a task that this node holds is told to stop; it will report its stop."""
         self._holders[task].awaits_report = True
 
     def on_worker_lost(self, task: TaskId) -> None:
-        """The worker's process here has ended; another one may be given leases before its end is told."""
+        """The worker's process has ended; the next one may get leases before that end is reported."""
         if task in self._holders:
             self._holders[task].is_doubtful = True
 
     def on_stopped(self, task: TaskId, epoch: int, number: int) -> bool:
-        """The worker says that it has stopped: give everything back; false when nobody asked.
+        """The worker reports that it has stopped: give everything back; false when no electors asked for it.
 
-        False, too, when this may be the late word of an earlier stop in this epoch, or of a process that is dead: the
-        worker may be at it again, so `on_run_out` decides.
+        False, too, when this may be the late report of an earlier stop in this epoch, or of a dead process. The worker
+        may be working again, so `on_run_out` decides.
         """
         holder = self._holders.get(task)
         if holder is None or holder.epoch != epoch or not holder.is_leaving or holder.is_doubtful:
@@ -433,10 +435,10 @@ class Leases:
         return True
 
     def on_run_out(self, task: TaskId, number: int, now: float) -> bool:
-        """All that a leaving worker was ever given is over: give everything back. Whether that is worth a beat at once.
+        """A leaving worker's last permission is over: give everything back. Whether that needs a beat at once.
 
-        It is when the worker was given something since the last time, and now and then when it was not. Two owners,
-        each an elector that asks the other one to leave, would otherwise answer every beat with a beat.
+        It does when the worker was given something since the last time; otherwise only now and then. Two owners, each
+        an elector that asks the other one to leave, would otherwise answer every beat with a beat.
         """
         holder = self._holders.get(task)
         if holder is None or not holder.is_leaving:
@@ -455,7 +457,7 @@ class Leases:
     # --- beats -------------------------------------------------------------------------------------------------------
 
     def on_sent(self, number: int, now: float) -> BeatParts:
-        """This node's beat ``number`` leaves: what it says."""
+        """This node's beat ``number`` leaves: its parts about leases."""
         for holder in self._holders.values():
             holder.on_sent(number, now)
         echoes = [granter.echo(now) for granter in self._granters.values()]
@@ -469,7 +471,7 @@ class Leases:
     def on_beat(
         self, beat: Beat, accepted: Mapping[TaskId, tuple[NodeId, int]], now: float, *, is_newest: bool = True
     ) -> bool:
-        """A beat came, or our own left: grant, count echoes, hear who must leave. Whether to beat at once."""
+        """A beat came, or our own left: grant, count echoes, note who must leave. Whether to beat at once."""
         is_new = False
         for task, granter in self._granters.items():
             is_new |= granter.on_beat(beat, accepted.get(task), now, is_newest=is_newest)
@@ -487,14 +489,14 @@ class Leases:
         return is_new
 
     def unfit(self) -> dict[NodeId, str]:
-        """{node: why it could never hold a lease that counts here}."""
+        """{node: why it could never hold a valid lease}."""
         return {
             node: f"goes by other leases ({terms or 'it does not say'}, here {self.terms})"
             for node, terms in self._others.items()
         }
 
     def next_deadline(self, now: float) -> float:
-        """When an elector may accept what it refused, or a leaving owner's lease ends."""
+        """When an elector may accept a refused value, or a leaving owner's lease ends."""
         due = math.inf
         for granter in self._granters.values():
             due = min(due, granter.next_deadline(now))

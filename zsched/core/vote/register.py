@@ -59,7 +59,7 @@ class _Round:
     sent: Allocation | None = None
     """Our own new value once an accept for it left: from then on the outcome may be unknown."""
     unfit: Allocation | None = None
-    """A value of somebody else's that no majority will accept, for too many electors do not take it for a true one."""
+    """Another node's value that no majority will accept, since too many electors take it for false."""
     attempt: int = 0
 
 
@@ -87,14 +87,14 @@ class Register:
         self._ballot_s, self._stagger_s, self._rng = ballot_s, stagger_s, rng
         self.state = state
         self.problem = ""
-        """Why agreement stands still; a value that is learnt ends it."""
+        """Why agreement stands still; the next learnt value ends it."""
         self._counter = state.promised.counter
         self._round: _Round | None = None
         self._queue: list[Change] = []
         self._settle_at = math.inf
         self._settle_tries = 0
         self._lease_over_at = -math.inf
-        """The owner is asked to leave, for somebody's accept: when its lease must be over."""
+        """An accept waits for the owner to leave: when its lease must be over."""
 
     @property
     def value(self) -> Allocation:
@@ -111,11 +111,11 @@ class Register:
         return self._settle_at if self._round is None else self._round.deadline
 
     def stop_electing(self) -> None:
-        """This node lost its right to be an elector (disk, duplicate name): it answers no more."""
+        """This node lost its right to be an elector (disk, duplicate name) and answers no more."""
         self._is_elector = False
 
     def follow(self, electorate: str, initial: Allocation) -> None:
-        """A node without a state has been told which generation the fleet is of: count, and begin, with that one's."""
+        """A node without a state has heard the fleet's generation: continue with its first value and counters."""
         self._electorate, self._initial = electorate, initial
         learnt = self.state.learnt
         if learnt is not None and learnt.revision < initial.revision:
@@ -140,7 +140,7 @@ class Register:
         return self._refusal(accept.electorate, ballot) is None and ballot >= self.state.promised
 
     def refuse(self, ballot: Ballot, refusal: Refusal) -> Refused:
-        """A no for a reason that lies outside the register (an exclusive task's lease)."""
+        """A no for a reason outside the register (an exclusive task's lease)."""
         return self._no(ballot, refusal)
 
     def on_accept(self, accept: Accept, todo: ToDo, now: float) -> Accepted | Refused:
@@ -209,12 +209,12 @@ class Register:
             self._finish(todo, outcome, now)
 
     def _why(self, outcome: RoundOutcome | None) -> str:
-        """Why a value that is learnt is what it is: by our own change, or somebody else's."""
+        """Why a learnt value came about: by our own change, or by another node's."""
         change = None if self._round is None else self._round.change
         return "learnt from a peer" if change is None or outcome is not RoundOutcome.COMMITTED else change.reason
 
     def _outcome_by(self, value: Allocation) -> RoundOutcome | None:
-        """How our change under way has ended, now that ``value`` is learnt; ``None``: it has not."""
+        """The end of our change under way, given the learnt ``value``; ``None``: it goes on."""
         running = self._round
         if running is None or running.change is None:
             return None
@@ -227,18 +227,18 @@ class Register:
     # --- proposer ----------------------------------------------------------------------------------------------
 
     def expect_release(self, now: float, at_most: float) -> None:
-        """An exclusive task's owner is asked to leave, for an accept that waits; its lease is over ``at_most`` then."""
+        """An accept waits for an exclusive task's owner to leave; its lease ends at ``at_most``."""
         if now >= self._lease_over_at:
             self._lease_over_at = at_most
 
     def propose(self, change: Change, todo: ToDo, now: float) -> None:
-        """Try to commit a change; its end is one of `ToDo.ended`, of this or a later call."""
+        """Try to commit a change; its end appears in `ToDo.ended`, of this or a later call."""
         self._queue.append(change)
         if self._round is None:
             self._start_next(todo, now)
 
     def settle(self, todo: ToDo, now: float) -> None:
-        """Run an identity round, unless a round is under way: learn whatever was accepted before."""
+        """Run an identity round, unless a round is under way: learn the earlier acceptances."""
         if self._round is None:
             self._round = _Round(change=None, give_up_at=now + 3 * self._ballot_s)
             if self._is_unlearnt() and self._settle_at == math.inf:
@@ -253,7 +253,7 @@ class Register:
         self._begin(todo, now)
 
     def _begin(self, todo: ToDo, now: float) -> None:
-        """Prepare, unless the change is outdated; a base that is newer than what we know is read first."""
+        """Prepare, unless the change is outdated; read a newer base than ours first."""
         if self._outcome_by(self.value) is None:
             self._prepare(todo, now)
         else:
@@ -274,7 +274,7 @@ class Register:
         return self._round
 
     def on_answer(self, answer: Promise | Accepted | Refused, todo: ToDo, now: float) -> None:
-        """An elector answered; answers to older ballots and from strangers change nothing."""
+        """An elector answered; answers to older ballots, and from strangers, change nothing."""
         running = self._round
         if running is None or answer.ballot != running.ballot or answer.elector not in self._electors:
             return
@@ -290,7 +290,7 @@ class Register:
                 self._commit(running, todo, now)
 
     def _read(self, running: _Round, todo: ToDo, now: float) -> None:
-        """A majority promised: decide what this ballot carries."""
+        """A majority promised: decide the value of this ballot."""
         accepted = [acceptance for acceptance in running.promises.values() if acceptance is not None]
         # First values of a generation are equal but for their leases: what is not leased for one is so for nobody.
         newest = max(accepted, key=lambda acceptance: (acceptance.ballot, not acceptance.value.leased), default=None)
@@ -322,7 +322,7 @@ class Register:
         self._accept(running, running.ballot, running.value, todo, now)
 
     def _moved_on(self, running: _Round, read: Allocation) -> Allocation | None:
-        """Our move applied to a value that was read and cannot be settled; ``None``: it is not that, or no move."""
+        """Our move applied to a read value that no majority will accept; ``None``: not that case, or no move."""
         if read != running.unfit or running.sent is not None or not isinstance(running.change, MoveOwner):
             return None
         moved = running.change.apply(read)
@@ -356,11 +356,11 @@ class Register:
 
     @staticmethod
     def _waits_for_leases(running: _Round) -> bool:
-        """Whether nothing but an exclusive task's lease stands against our accept: it will end, the ballot is good."""
+        """Whether only an exclusive task's lease stands against our accept: it will end, and the ballot is good."""
         return running.phase is _Phase.ACCEPT and set(running.no.values()) == {Refusal.LEASE}
 
     def _ask_again(self, running: _Round, todo: ToDo, now: float) -> None:
-        """Send the same accept once more: a new ballot could only find out what became of it, without a move."""
+        """Send the same accept again: a new ballot could only find out the outcome, without a move."""
         if now >= running.give_up_at:
             self._give_up(running, todo, now)
             return
@@ -375,7 +375,10 @@ class Register:
         todo.add(SendAccept(accept=accept, deadline_s=self._ballot_s))
 
     def _again(self, running: _Round, todo: ToDo, now: float) -> None:
-        """This ballot cannot win: wait a little and try a higher one (only to find out, once ours was sent), or end."""
+        """This ballot cannot win: wait a little and try a higher one, or end.
+
+        Once our own accept has left, the higher ballot only finds out its outcome.
+        """
         wait = self._jitter(running.attempt)
         if now + wait >= running.give_up_at:
             self._give_up(running, todo, now)

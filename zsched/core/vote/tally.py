@@ -1,12 +1,11 @@
 """VOTE: plurality of the robots' proposals, with the tie rules (Alg. 3, Consensus).
 
-Knows: counting fresh proposals on one base. Does not know: why a robot proposes what it does, how the winner is
+Knows: counting fresh proposals on one base. Does not know: the reason of a robot's proposal, how the winner is
 committed (`zsched.core.vote.register`).
 
-There is an outcome only with fresh proposals on the same base revision from a majority of the robots (for an escape: of
-the robots that are not gone; the electors' majority alone guards uniqueness). Then the most proposed candidate wins;
-ties go to the owner, then to the higher aggregate (to 1/256), then to the lowest name. Staying is a proposal for the
-owner.
+An outcome needs fresh proposals on the same base revision from a majority of the robots. (For an escape: of the robots
+that are not gone; the electors' majority alone guards uniqueness.) Then the most proposed candidate wins. Ties go to
+the owner, then to the higher aggregate (to 1/256), then to the lowest name. A proposal for the owner means staying.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""VOTE in motion at one robot, all tasks: proposals are taken in, votes counted, winners handed on to be committed.
+"""VOTE in motion at one robot, all tasks: takes proposals in, counts votes, hands winners on to be committed.
 
-Knows: every task's voting, and what a vote's end is told as. Does not know: why a robot proposes what it does
+Knows: every task's voting, the outcome of a vote in words. Does not know: the reason of a robot's proposal
 (`zsched.core.scheduler.rounds`), when a vote is open and how it ends (`zsched.core.vote.voting`), the register.
 """
 
@@ -36,7 +36,7 @@ class Votes:
     def propose(
         self, proposal: Proposal, allocation: Allocation, states: Mapping[NodeId, PeerState], todo: ToDo, now: float
     ) -> None:
-        """This robot's own proposal: to everybody, and into its own box."""
+        """This robot's own proposal: send it to everybody, and count it here."""
         if not proposal.is_escape:
             self.tasks[proposal.task].call(now)
         todo.add(PublishProposal(proposal=proposal))
@@ -45,7 +45,7 @@ class Votes:
     def absorb(
         self, proposal: Proposal, allocation: Allocation, states: Mapping[NodeId, PeerState], todo: ToDo, now: float
     ) -> None:
-        """Any robot's proposal. On an older or newer base than ``allocation``, today's value, it does not count."""
+        """Any robot's proposal. It does not count on another base than ``allocation``, the present value."""
         voting = self.tasks[proposal.task]
         if voting.absorb(proposal, allocation, now):
             todo.called.append((proposal.task, proposal.is_escape))
@@ -76,7 +76,7 @@ class Votes:
         todo.add(RecordStory(stage="vote", text=text, task=allocation.task, epoch=allocation.epoch))
 
     def due_commits(self, now: float) -> list[tuple[TaskId, MoveOwner]]:
-        """Changes whose turn has come; each is handed out once."""
+        """Changes that are due now; each is handed out once."""
         due = ((name, voting.take_commit(now)) for name, voting in self.tasks.items())
         return [(name, change) for name, change in due if change is not None]
 
@@ -85,5 +85,5 @@ class Votes:
         self.tasks[task].end_commit()
 
     def on_learnt(self, task: TaskId) -> None:
-        """A newer revision is known: proposals on older bases are worthless."""
+        """A newer revision is known: drop proposals on older bases."""
         self.tasks[task].on_learnt()

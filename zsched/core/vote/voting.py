@@ -1,11 +1,12 @@
-"""VOTE in motion: one task's proposals at one robot, whether a vote is open, what it gave, when to commit the winner.
+"""VOTE in motion: one task's proposals at one robot. Is a vote open, what is its outcome, when to commit the winner?
 
-Knows: which proposals are fresh, who answers a call, who commits and when. Does not know: why a robot proposes what it
-does (`zsched.core.scheduler.rounds`), the count's rules (`tally`), how a winner is committed (`register`).
+Knows: which proposals are fresh, which robots answer a call, which of them commits and when. Does not know: the reason
+of a robot's proposal (`zsched.core.scheduler.rounds`), the count's rules (`tally`), how a winner is committed
+(`register`).
 
-The first proposal for a move *opens* a vote, and so calls all others to it; whoever has proposed within `vote_time` has
-answered already. A proposal counts as fresh for as long: twice a gather, since answering one may take a whole gather
-when a peer is frozen. The winner's voters commit it, staggered by rank so that one usually suffices.
+The first proposal for a move *opens* a vote and so calls all other robots to it. A robot that has proposed within
+`vote_time` has already answered. A proposal is fresh for the same time: twice a gather, since an answer may take a
+whole gather when a peer is frozen. The winner's voters commit it, staggered by rank, so that usually one suffices.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ class Voting:
     def absorb(self, proposal: Proposal, allocation: Allocation, now: float) -> bool:
         """Take in a proposal, our own too; whether it calls this robot to propose as well.
 
-        On an older or newer base than today's value, ``allocation``, it does not count.
+        On another base than ``allocation``, the present value, it does not count.
         """
         if proposal.base_revision != allocation.revision:
             return False
@@ -88,11 +89,11 @@ class Voting:
     # --- the count -----------------------------------------------------------------------------------------------
 
     def count(self, allocation: Allocation, states: Mapping[NodeId, PeerState], now: float) -> Tally | None:
-        """Count the open vote; its tally when it has ended by that, ``None`` while it goes on or none is open.
+        """Count the open vote; its tally when the vote has ended, ``None`` while it goes on or none is open.
 
         Args:
-            allocation: today's value: whose revision proposals must name, and who the owner is.
-            states: what this node holds every node for.
+            allocation: the present value: proposals must name its revision, and it names the owner.
+            states: this node's view of every node.
             now: monotonic seconds.
         """
         if self.opened_at is None:
@@ -131,7 +132,7 @@ class Voting:
     # --- the commit ----------------------------------------------------------------------------------------------
 
     def take_commit(self, now: float) -> MoveOwner | None:
-        """The change whose turn has come; it is handed out once."""
+        """The change that is due now; it is handed out once."""
         if self.commit is None or now < self.commit_at:
             return None
         self.commit_at = math.inf
@@ -142,7 +143,7 @@ class Voting:
         self.commit, self.commit_at, self.awaited_until = None, math.inf, -math.inf
 
     def on_learnt(self) -> None:
-        """A newer revision is known: proposals on older bases are worthless, and so is a commit not yet handed out."""
+        """A newer revision is known: drop proposals on older bases, and a commit that is not handed out yet."""
         self.proposals.clear()
         self.opened_at, self.awaited_until = None, -math.inf
         if self._first_call_at is not None:

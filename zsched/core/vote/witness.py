@@ -1,15 +1,14 @@
-"""VOTE, what peers remember of an elector's state: one that is older than that was lost, and is not voted with.
+"""VOTE, peers' memory of an elector: a state that is older than peers have seen was lost, and must not vote.
 
-A state folder that is brought back from a backup, or a disk that says it has synced what it has not, forgets promises,
-and nothing on that disk shows it. Others have seen more of it. So every elector counts its promises and acceptances;
-all nodes ask it, whenever its beats say that the count has risen, and keep what they are answered. An elector that
-starts asks them before it votes: who remembers a higher count, or a later life, than its state knows has seen what that
-state forgot.
+A folder that comes back from a backup, or a disk that lies about its sync, forgets promises, and nothing on that disk
+shows it. But other nodes have seen more of that state. So every elector counts its promises and acceptances. All nodes
+ask it whenever its beats show a higher count, and keep its answers. A starting elector asks them before it votes. A
+node that remembers a higher count, or a later life, has seen what this state forgot.
 
-Nothing here rests on a beat: a beat leads to a question at most, and only the answer of whom it was asked is kept, or
-believed. What nobody living has seen is not found out (docs/design/failures.md).
+A beat leads to a question at most. Only the answer of the node that was asked is kept, or believed. Votes that no
+living node has seen are not found out (docs/design/failures.md).
 
-Knows: counts, incarnations, who has answered. Does not know: what was voted, how anything is asked.
+Knows: counts, incarnations, which peers have answered. Does not know: the votes' content, how a node is asked.
 """
 
 from __future__ import annotations
@@ -22,21 +21,21 @@ from zsched.core.values.model import Beat, NodeId
 from zsched.core.values.quorum import majority
 
 ASK_ALL_S = 0.5
-"""A starting elector waits so long for the answers of all others, and longer only for those of a majority."""
+"""A starting elector waits this long for the answers of all others, and longer only for those of a majority."""
 
 
 @dataclass(slots=True)
 class Witness:
-    """What one node has seen of the electors, and whether others have seen more of it than its state knows.
+    """One node's memory of the electors, and the others' memory of this elector.
 
     Args:
         me: this node.
         electors: the configured electors.
         nodes: all nodes of the fleet file.
         incarnation: of this daemon.
-        votes: how many promises and acceptances the state knows at the start.
+        votes: the state's count of promises and acceptances at the start.
         started_at: monotonic seconds.
-        seen: {elector: (incarnation, votes)}, as its own answers said.
+        seen: {elector: (incarnation, votes)}, from their own answers.
     """
 
     me: NodeId
@@ -60,20 +59,20 @@ class Witness:
         return is_enough and (known == self.nodes or now >= self.started_at + ASK_ALL_S)
 
     def must_ask(self, beat: Beat) -> bool:
-        """Whether a peer has something to answer: it has not been asked in this life, or its count has risen."""
+        """Whether to ask a peer: it was not asked in this life, or its count has risen."""
         if self.me in self.electors and beat.node not in self._answered:
             return True
         return beat.node in self.electors and beat.votes > self.seen.get(beat.node, (0, 0))[1]
 
     def on_twin(self) -> None:
-        """Our name lives twice, or did: a later life that a peer remembers may be the other one's.
+        """Our name lives twice, or did: a later life in a peer's memory may be the other one's.
 
-        One that has cast no vote beyond those of our state forgets nothing of ours.
+        If that life has no more votes than our state knows, our state has forgotten nothing.
         """
         self._has_twin = True
 
     def on_answer(self, learnt: Learnt) -> str:
-        """A peer answered our question: keep what it says of itself. Why our state was lost; empty: it was not."""
+        """A peer answered: keep its word about itself. Why our state was lost; empty: it was not."""
         self._has_twin |= learnt.node in self._answered and self._is_later(learnt)  # it began after our own start
         self._answered.add(learnt.node)
         if learnt.node in self.electors:
@@ -83,11 +82,11 @@ class Witness:
         return next((f"{learnt.node} remembers {why}" for why in map(self._excess, mine) if why), "")
 
     def _is_later(self, learnt: Learnt) -> bool:
-        """Whether a peer remembers a life of this elector behind this one."""
+        """Whether a peer remembers a later life of this elector."""
         return any(name == self.me and incarnation > self.incarnation for name, incarnation, _ in learnt.seen)
 
     def _excess(self, mark: tuple[int, int]) -> str:
-        """What a peer remembers of this elector that its state does not know; empty: nothing."""
+        """What a peer remembers beyond our state, in words; empty: nothing."""
         incarnation, votes = mark
         if incarnation > self.incarnation and not self._has_twin:
             return f"a later life of this elector ({incarnation}, this is {self.incarnation})"
@@ -97,7 +96,7 @@ class Witness:
 
 
 def as_tuple(seen: dict[NodeId, tuple[int, int]]) -> tuple[tuple[NodeId, int, int], ...]:
-    """As it is told and written.
+    """The memory in the form of messages and of the state file.
 
     >>> as_tuple({"robot2": (8, 120), "robot1": (7, 3)})
     (('robot1', 7, 3), ('robot2', 8, 120))
