@@ -191,9 +191,9 @@ class Daemon:
         )
         access = StreamAccess(fleet, me, points.worker_connect[:1], operator_json5)
         desk = Desk(me, self._inbox, bus, access.answer)
-        door = OperatorSocket(places.socket_path(self._options.runtime_dir, me), desk.answer)
-        door.open()
-        stack.callback(door.close)
+        operators = OperatorSocket(places.socket_path(self._options.runtime_dir, me), desk.answer)
+        operators.open()
+        stack.callback(operators.close)
         bus.open()
         stack.callback(bus.close)
         shell = Shell(node=me, inbox=self._inbox, bus=bus, state_file=state_file, desk=desk, fleet=fleet)
@@ -345,7 +345,7 @@ class Daemon:
         return now
 
     def _absorb_waiting(self, node: Node, shell: Shell) -> None:
-        """Let the node have what has come without waking the loop: our own samples, and frames in turn."""
+        """Let the node absorb what has come without waking the loop: our own samples, and periodic frames."""
         for waiting in (*self._inbox.waiting(), *shell.waiting_frames()):
             node.absorb(waiting, monotonic_s())
             self._note_ready(node, waiting)

@@ -68,7 +68,7 @@ class Keyspace:
         return self._key("alive", node, str(incarnation))
 
     def beat(self, node: NodeId) -> str:
-        """Put, best effort: a heartbeat out of turn, for it has news; receivers wake up for it."""
+        """Put, best effort: an urgent heartbeat: receivers wake up for it."""
         return self._key("beat", node)
 
     def beat_in_turn(self, node: NodeId) -> str:

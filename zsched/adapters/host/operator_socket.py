@@ -1,4 +1,4 @@
-"""The local door for operators: a unix socket that speaks one JSON object per line.
+"""The operators' unix socket on this machine: one JSON object per line.
 
 Knows: sockets, lines, size and time limits. Does not know: what a request means (`serve` is given a function).
 

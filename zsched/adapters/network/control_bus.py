@@ -44,7 +44,7 @@ from zsched.wire.keyspace import Keyspace, counter, parse
 OPERATOR_TIMEOUT_S = 3.0
 CLOSE_S = 0.5
 RING = 1024
-"""Frames in turn that wait for the loop; when it does not come the oldest go, and zenoh waits for nobody."""
+"""Periodic frames that wait for the loop; if it does not come, the oldest go, and zenoh need not wait."""
 
 Post = Callable[[ev.Event], None]
 log = logging.getLogger("zsched.bus")
@@ -83,7 +83,7 @@ class ControlBus:
         is_voter: bool = True,
         hears_all_beats_at_once: bool = True,
     ) -> None:
-        """``is_voter``: peers gather utilities here. What comes in turn is posted at once, or waits for `waiting`."""
+        """``is_voter``: peers gather utilities here. Periodic frames are posted at once, or wait for `waiting`."""
         self._is_voter, self._hears_all_at_once = is_voter, hears_all_beats_at_once
         self._ring: zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]] | None = None
         self._keys = Keyspace(fleet)
@@ -132,7 +132,7 @@ class ControlBus:
         ]
 
     def _hear_in_turn(self, session: zenoh.Session) -> list[Any]:
-        """Subscribe to what comes in turn: thirty frames a second in a small fleet, not worth waking up for each."""
+        """Subscribe to periodic frames: thirty a second in a small fleet, too many to wake up for each."""
         key = self._keys.all_in_turn()
         if self._hears_all_at_once:
             return [session.declare_subscriber(key, tolerant(self._on_sample, "put"))]
@@ -147,7 +147,7 @@ class ControlBus:
         return [keys.register(node, "*"), keys.learnt(node, "*"), keys.status(node, "*"), keys.command(node, "*")]
 
     def waiting(self) -> Iterator[ev.Event]:
-        """The beats and profiles in turn that have come since the last call (the loop)."""
+        """The periodic beats and profiles that have come since the last call (the loop)."""
         ring = self._ring
         while ring is not None and (sample := ring.handler.try_recv()) is not None:
             yield self._event(sample)

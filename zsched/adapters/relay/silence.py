@@ -4,7 +4,7 @@ Knows: what /proc says of a process: its threads' states, the processor time it 
 not know: what a relay says, how it is replaced.
 
 Only time in which the daemon itself was there to listen counts: not a suspended machine's, nor a stopped daemon's. Of
-that, only what the relay slept through uses up the patience. A relay that wants a processor and gets none is never
+that, only the time in which the relay slept counts against it. A relay that wants a processor and gets none is never
 wedged, however long that takes: another one would have to begin from the start, and make the machine busier still. One
 that works for `WORK_S` and says nothing all the same is.
 """
