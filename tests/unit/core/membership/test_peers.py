@@ -407,7 +407,9 @@ def test_token_of_a_suspect_or_gone_peer_changes_nothing_more() -> None:
 # --- self-doubt ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("lag", "factor"), [(0.0, 1.0), (0.1, 1.5), (0.2, 2.0), (0.4, MAX_LAG_FACTOR), (1000.0, MAX_LAG_FACTOR)])
+@pytest.mark.parametrize(
+    ("lag", "factor"), [(0.0, 1.0), (0.1, 1.5), (0.2, 2.0), (0.4, MAX_LAG_FACTOR), (1000.0, MAX_LAG_FACTOR)]
+)
 def test_lagging_node_doubts_itself_up_to_threefold(lag: float, factor: float) -> None:
     ear = heard(LARGE)
     ear.members.note_lag(lag)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-from zsched.core.membership.relink import FIRST_PAUSE_S, MAX_PAUSE_S, LINK_WAIT_S, Introductions
+from zsched.core.membership.relink import FIRST_PAUSE_S, LINK_WAIT_S, MAX_PAUSE_S, Introductions
 
 
 def times(introductions: Introductions, begin: float, end: float) -> list[float]:
