@@ -56,7 +56,7 @@ def slewed(sim: Simulator, name: str, seconds: float, size: float = 0.083) -> No
 
 
 @pytest.mark.parametrize(
-    ("event", "is_unsure"),
+    ("event", "is_in_doubt"),
     [
         (WELL, False),
         (replace(WELL, error_ratio=RHO), False),
@@ -72,10 +72,10 @@ def slewed(sim: Simulator, name: str, seconds: float, size: float = 0.083) -> No
         (ClockCompared(error_ratio=-RHO), False),
     ],
 )
-def test_a_rate_beyond_the_lease_s_bound_and_a_jump_are_doubts(event: ClockCompared, is_unsure: bool) -> None:
+def test_a_rate_beyond_the_lease_s_bound_and_a_jump_are_doubts(event: ClockCompared, is_in_doubt: bool) -> None:
     doubt = ClockDoubt()
-    assert doubt.absorb(event, 10.0) is is_unsure
-    assert (doubt.complaint is not None) is is_unsure
+    assert doubt.absorb(event, 10.0) is is_in_doubt
+    assert (doubt.complaint is not None) is is_in_doubt
 
 
 def test_a_doubt_ends_some_time_after_the_last_bad_comparison() -> None:

@@ -451,7 +451,7 @@ LEASE_BUGS = (
     _bug(
         "late word of an earlier stop gives a newer lease back",
         LEASE,
-        "not holder.is_leaving or holder.is_doubtful:",
+        "not holder.is_leaving or holder.expects_late_report:",
         "not holder.is_leaving:",
         _LEASE,
     ),

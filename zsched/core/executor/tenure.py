@@ -83,10 +83,10 @@ class Tenure:
         self, event: ClockCompared, standing: Mapping[TaskId, Allocation | None], number: int, now: float
     ) -> bool:
         """Take a comparison of clocks in. Whether it began or ended a doubt."""
-        is_unsure = self.clock.absorb(event, now)
-        if not self.exclusive or is_unsure == self.leases.is_unsure:
+        is_in_doubt = self.clock.absorb(event, now)
+        if not self.exclusive or is_in_doubt == self.leases.is_in_doubt:
             return False
-        if is_unsure:
+        if is_in_doubt:
             self.leases.doubt(standing)
         else:
             self.leases.trust(standing, number, now)
@@ -102,7 +102,7 @@ class Tenure:
         leaving = self.leases.leaving()
         for task in self.exclusive:
             executor = self.executors[task]
-            if self.leases.is_unsure:
+            if self.leases.is_in_doubt:
                 executor.leave(todo)
                 continue
             if task not in leaving:

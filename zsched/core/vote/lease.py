@@ -205,7 +205,7 @@ class Holder:
     """The end of the worker's permission to work; minus infinity once it has stopped."""
     awaits_report: bool = False
     """The worker was told to stop and has not said yet that it has."""
-    is_doubtful: bool = False
+    expects_late_report: bool = False
     """A report of an earlier stop in this epoch may still come: from now on only the permission's end counts."""
     hurried_at: float = -math.inf
     """When an empty release last had a beat of its own."""
@@ -290,7 +290,7 @@ class Leases:
     now: float
     granted_s: float = 0.0
     terms: str = field(init=False)
-    is_unsure: bool = False
+    is_in_doubt: bool = False
     """This node's clock is in doubt: it holds and grants nothing."""
     _others: dict[NodeId, str] = field(default_factory=dict)
     """{node: its terms} of the nodes whose terms differ from ours."""
@@ -318,24 +318,24 @@ class Leases:
     @property
     def terms_told(self) -> str:
         """The terms of this node's leases for its beats; in doubt, terms that no other node has."""
-        return f"{self.terms}, clock in doubt" if self.is_unsure and self.terms else self.terms
+        return f"{self.terms}, clock in doubt" if self.is_in_doubt and self.terms else self.terms
 
     def doubt(self, standing: Mapping[TaskId, Allocation | None]) -> None:
         """The clock is in doubt: hold and grant nothing from now on."""
-        self.is_unsure = True
+        self.is_in_doubt = True
         for task, granter in self._granters.items():
             granter.restart(standing[task], math.inf)
 
     def trust(self, standing: Mapping[TaskId, Allocation | None], number: int, now: float) -> None:
         """The clock is right again: begin anew, with beats after ``number``."""
-        self.is_unsure = False
+        self.is_in_doubt = False
         for task, granter in self._granters.items():
             granter.restart(standing[task], now + hold_s(self.fleet.timing.lease_s))
         for task in tuple(self._holders):
             holder = self._holders.pop(task)
             self.begin(task, holder.epoch, number + 1)
             # The worker was told to stop: its word may still come, and until then it may be at work.
-            self._holders[task].is_doubtful, self._holders[task].given_until = True, holder.given_until
+            self._holders[task].expects_late_report, self._holders[task].given_until = True, holder.given_until
 
     # --- electors ----------------------------------------------------------------------------------------------------
 
@@ -350,7 +350,7 @@ class Leases:
             self._granters[value.task].on_newer_value()
         elif value.leased and value.task in self.standing:
             # Not leased until now: nothing was granted.
-            self._watch(value.task, None, math.inf if self.is_unsure else -math.inf)
+            self._watch(value.task, None, math.inf if self.is_in_doubt else -math.inf)
 
     def is_news(self, remembered_s: float) -> bool:
         """Whether this elector's grants may be longer than its state file says: the file must be written first."""
@@ -392,7 +392,7 @@ class Leases:
     def until(self, task: TaskId) -> float:
         """When this node's lease of the task ends; minus infinity without one."""
         holder = self._holders.get(task)
-        return -math.inf if holder is None or self.is_unsure else holder.lease_until()
+        return -math.inf if holder is None or self.is_in_doubt else holder.lease_until()
 
     @property
     def is_holding(self) -> bool:
@@ -419,7 +419,7 @@ class Leases:
     def on_worker_lost(self, task: TaskId) -> None:
         """The worker's process has ended; the next one may get leases before that end is reported."""
         if task in self._holders:
-            self._holders[task].is_doubtful = True
+            self._holders[task].expects_late_report = True
 
     def on_stopped(self, task: TaskId, epoch: int, number: int) -> bool:
         """The worker reports that it has stopped: give everything back; false when no electors asked for it.
@@ -428,7 +428,7 @@ class Leases:
         may be working again, so `on_run_out` decides.
         """
         holder = self._holders.get(task)
-        if holder is None or holder.epoch != epoch or not holder.is_leaving or holder.is_doubtful:
+        if holder is None or holder.epoch != epoch or not holder.is_leaving or holder.expects_late_report:
             return False
         holder.awaits_report = False
         self._releases[task] = holder.release(number)
@@ -444,7 +444,7 @@ class Leases:
         if holder is None or not holder.is_leaving:
             return False
         was_given = holder.given_until > -math.inf or holder.awaits_report
-        holder.is_doubtful |= holder.awaits_report
+        holder.expects_late_report |= holder.awaits_report
         holder.awaits_report = False  # when it comes, it is of a stop that is over
         self._releases[task] = holder.release(number)
         if was_given:
