@@ -139,7 +139,7 @@ class LearntReceived:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LearntAsked:
-    """A peer wants to know what we have learnt."""
+    """A peer asks for our learnt values."""
 
     request: int
 

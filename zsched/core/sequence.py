@@ -25,7 +25,7 @@ STEP = 8
 
 
 class Order(StrEnum):
-    """What a number means."""
+    """The verdict on a number."""
 
     NEW = "new"
     OLD = "old"

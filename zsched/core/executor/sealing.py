@@ -77,7 +77,7 @@ class Sealing:
         return tuple(sorted({name for spec in tasks for name in self._waits_for(spec, values[spec.name])}))
 
     def _open(self, values: Mapping[TaskId, Allocation]) -> list[TaskSpec]:
-        """The tasks owned here for which the fleet has not agreed to what this node's file says."""
+        """The tasks owned here whose agreed value differs from this node's file."""
         return [
             spec
             for spec in self.fleet.tasks
@@ -91,10 +91,10 @@ class Sealing:
     def _waits_for(self, spec: TaskSpec, value: Allocation) -> dict[NodeId, str]:
         """{node that must be heard, or whose worker must stop, before the task is leased: reason}."""
         others = sorted({*self._files, *spec.candidates} - {self.me})
-        reasons = {name: self._doubt(spec, value, name) for name in others}
+        reasons = {name: self._obstacle(spec, value, name) for name in others}
         return {name: reason for name, reason in reasons.items() if reason}
 
-    def _doubt(self, spec: TaskSpec, value: Allocation, node: NodeId) -> str:
+    def _obstacle(self, spec: TaskSpec, value: Allocation, node: NodeId) -> str:
         answer = self._answers.get(node)
         if answer is None:
             return "has not answered yet"

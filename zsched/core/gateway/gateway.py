@@ -36,7 +36,7 @@ class Gateway:
         self._shares = Shares()
         self._candidates = {task.name: task.candidates for task in fleet.tasks}
         self.version = 0
-        """Rises with every change; what was computed from an older version may be wrong."""
+        """Rises with every change; a result from an older version may be wrong."""
 
     def absorb(self, profile: Profile, now: float, life: int | None = None) -> str | None:
         """Take a profile in; returns why it was refused (one word for a counter), or ``None``.

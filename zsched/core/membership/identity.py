@@ -45,7 +45,7 @@ ONE_FILE = "compare them (`zsched check` tells a file's hash), give all nodes th
 
 
 class Verdict(StrEnum):
-    """What a beat in our own name means."""
+    """The verdict on a beat in our own name."""
 
     OURS = "ours"  # our own, or the echo of an earlier life
     TWIN = "twin"  # somebody else, wait and see

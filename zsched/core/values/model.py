@@ -545,7 +545,7 @@ class DurableState:
     seen: tuple[tuple[NodeId, int, int], ...] = ()
     """(elector, incarnation, votes), as others answered: they may lose their state (`zsched.core.vote.witness`)."""
     lost: str = ""
-    """Why this state is older than what others have seen of it; empty: it is not."""
+    """Why peers have seen a newer state of this node than this one; empty: they have not."""
 
 
 # --- membership ------------------------------------------------------------------------------------------------------
@@ -594,9 +594,9 @@ class Beat:
     suspects: tuple[NodeId, ...] = ()
     """Nodes that this node suspects or takes for gone: the second observer's word."""
     echoes: tuple[Grant, ...] = ()
-    """Exclusive tasks: what this elector grants."""
+    """Exclusive tasks: this elector's grants."""
     released: tuple[Grant, ...] = ()
-    """Exclusive tasks: what this owner has given back."""
+    """Exclusive tasks: this owner's releases."""
     asked_to_leave: tuple[tuple[TaskId, NodeId, int], ...] = ()
     """(task, owner, epoch): this elector has refused another owner because of them."""
     fleet_file: str = ""

@@ -87,10 +87,12 @@ class Agreement:
         self.generation = None if durable is None else durable.generation
         """``None``: this node has no state, and has not been told yet which one the fleet is of."""
         self.newest_generation = self.generation or 0
-        """That any beat has named: what the operator's next one must exceed."""
+        """The highest generation of any beat; the operator's next one must exceed it."""
         self.apart: set[NodeId] = set()
-        """Electors whose newest beat says that they are of another generation, or count with other electors (who may
-        leave them out: then they are none by their own file)."""
+        """Electors of another generation, or with other electors in their file, by their newest beat.
+
+        That file may leave them out: then they call themselves no electors.
+        """
         self._has_state, self._electorate = durable is not None, electorate
         self._disputed = "" if durable is None else durable.disputed
         self._lost = "" if durable is None else durable.lost

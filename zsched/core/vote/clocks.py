@@ -47,7 +47,7 @@ class ClockDoubt:
 
 
 def _complaint(event: ClockCompared) -> str:
-    """What the operator reads."""
+    """The problem for the status."""
     if abs(event.error_ratio) > RHO:
         found = f"this machine's clock is slewed by {event.error_ratio:+.2%}, leases allow for {RHO:.2%}"
     else:
