@@ -11,9 +11,7 @@ methods as a peer's. What there is to do stands in one `ToDo`, which goes from s
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from random import Random
 from typing import Any, Final
 
 from zsched.core import events as ev
@@ -22,8 +20,6 @@ from zsched.core.handlers import beats, choice, operators, work
 from zsched.core.stages import Handler, Stages
 from zsched.core.todo import ToDo
 from zsched.core.values.change import MoveOwner
-from zsched.core.values.fleet import Fleet
-from zsched.core.values.model import DurableState, NodeId
 
 _HANDLERS: Final[Mapping[type[Any], Handler]] = {
     ev.DeadlineReached: lambda _node, _event, _todo, _now: None,
@@ -50,32 +46,7 @@ _OFTEN_QUIET: Final = frozenset(
 
 
 class Node(Stages):
-    """One daemon's decision state, and its only door. The arguments are those of `Stages`."""
-
-    def __init__(
-        self,
-        *,
-        fleet: Fleet,
-        me: NodeId,
-        durable: DurableState | None,
-        incarnation: int,
-        electorate: str,
-        rng: Random,
-        now: float,
-        version: str = "",
-    ) -> None:
-        super().__init__(
-            fleet=fleet,
-            me=me,
-            durable=durable,
-            incarnation=incarnation,
-            electorate=electorate,
-            rng=rng,
-            now=now,
-            version=version,
-        )
-        self._promised = math.inf
-        self._todo = ToDo()
+    """One daemon's decision state, and its only door. It is made as `Stages` are."""
 
     # --- the door ----------------------------------------------------------------------------------------------------
 

@@ -6,6 +6,7 @@ Knows: which parts there are, and what is asked of several of them together. Doe
 
 from __future__ import annotations
 
+import math
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -48,6 +49,14 @@ class PastValue:
     value: Allocation
     at: float
     reason: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Unready:
+    """A slot whose worker our relay does not see: what it misses there, and since when."""
+
+    slot: SlotReady
+    since: float
 
 
 class Stages:
@@ -129,10 +138,8 @@ class Stages:
         self.stream_counts: tuple[StreamCount, ...] = ()
         self.dropped: dict[str, tuple[int, float]] = {}
         """{stream: (how many samples it has dropped, when that last rose)}."""
-        self.unready: dict[TaskId, tuple[int, float]] = {}
-        """{task: (epoch, since when)} of the slots whose worker our relay does not see any more."""
-        self.lacks: dict[TaskId, SlotReady] = {}
-        """{task: what our relay misses of such a worker}."""
+        self.unready: dict[TaskId, Unready] = {}
+        """The slots whose worker our relay does not see, or not any more."""
         # membership
         self.membership = Membership(me, tuple(node.name for node in fleet.nodes), fleet.timing)
         self.identity = Identity(me, incarnation, self.fleet_file, now, fleet.timing.beat_s)
@@ -145,6 +152,10 @@ class Stages:
         self.beat_at = now
         """When the next beat is due that nothing brings forward."""
         self.beat_sequence = 0
+        # what the door (`zsched.core.node`) keeps from one event to the next
+        self._promised = math.inf
+        """The deadline that the last batch was given out with."""
+        self._todo = ToDo()
 
     # --- queries -----------------------------------------------------------------------------------------------------
 

@@ -9,11 +9,10 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 
-from zsched.core.events import SlotReady
 from zsched.core.executor.handover import Executor, Phase
 from zsched.core.scheduler.rounds import TaskRound
 from zsched.core.scheduler.scoring import joined
-from zsched.core.stages import Stages
+from zsched.core.stages import Stages, Unready
 from zsched.core.values.fleet import NodeSpec, TaskSpec
 from zsched.core.values.model import (
     NEVER_INITIALISED,
@@ -272,7 +271,7 @@ def _task_problems(node: Stages, task: TaskSpec, value: Allocation, now: float) 
     since = _unready_since(node, executor)
     if is_owner_ready and now - since >= UNREADY_SHOWN_S:
         waited = f"this robot's streams have waited for {executor.owner} for {now - since:.0f} s"
-        yield f"{waited}: {_untaken(task, executor, node.lacks.get(task.name))}"
+        yield f"{waited}: {_untaken(task, executor, node.unready.get(task.name))}"
 
 
 def _is_in_the_way(task: TaskSpec, load: WorkerLoad) -> bool:
@@ -285,14 +284,14 @@ def _unready_since(node: Stages, executor: Executor) -> float:
     """Since when our relay has missed a worker for the newest slot; infinity when it has one."""
     if executor.phase is Phase.PREPARING:
         return executor.started_at
-    epoch, since = node.unready.get(executor.spec.name, (-1, math.inf))
-    return since if epoch == executor.epoch else math.inf
+    known = node.unready.get(executor.spec.name)
+    return known.since if known is not None and known.slot.epoch == executor.epoch else math.inf
 
 
-def _untaken(task: TaskSpec, executor: Executor, lack: SlotReady | None) -> str:
+def _untaken(task: TaskSpec, executor: Executor, known: Unready | None) -> str:
     """What our relay misses, as far as it has reported."""
     newer = "" if task.worker.command else f"; {STARTED_BEFORE.format(owner=executor.owner, task=task.name)}"
-    told = lack if lack is not None and lack.epoch == executor.epoch else None
+    told = known.slot if known is not None and known.slot.epoch == executor.epoch else None
     untaken = () if told is None else told.untaken
     if task.worker.ready_when is ReadyWhen.TOKEN:
         if told is None or told.has_token is None:

@@ -12,7 +12,7 @@ from typing import Any, Final
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.executor.workers import failed_workers
-from zsched.core.stages import Handler, PastValue, Stages
+from zsched.core.stages import Handler, PastValue, Stages, Unready
 from zsched.core.todo import ToDo
 from zsched.core.values.model import Allocation, NodeId, PeerState, TaskId, Weights, WorkerState
 
@@ -99,12 +99,11 @@ def _on_slot_ready(node: Stages, event: ev.SlotReady, todo: ToDo, now: float) ->
     if event.task not in node.executors:
         return
     if not event.is_ready:
-        known, since = node.unready.get(event.task, (-1, now))
-        node.unready[event.task] = (event.epoch, since if known == event.epoch else now)
-        node.lacks[event.task] = event
+        known = node.unready.get(event.task)
+        since = known.since if known is not None and known.slot.epoch == event.epoch else now
+        node.unready[event.task] = Unready(slot=event, since=since)
         return
     node.unready.pop(event.task, None)
-    node.lacks.pop(event.task, None)
     node.executors[event.task].on_ready(event.epoch, todo)
 
 
@@ -138,7 +137,10 @@ def _on_relay(node: Stages, event: ev.RelayChanged, _todo: ToDo, now: float) -> 
     node.set_problem("relay", None if event.is_running else f"the relay is down: {event.reason}")
     if not event.is_running:
         node.probation.forget_tokens()
-        node.unready |= {name: (one.epoch, now) for name, one in node.executors.items() if one.routes}
+        for name, executor in node.executors.items():
+            if executor.routes:
+                untold = ev.SlotReady(task=name, epoch=executor.epoch, is_ready=False)
+                node.unready[name] = Unready(slot=untold, since=now)
         node.counters["relay_exits"] += 1
 
 
