@@ -1,7 +1,7 @@
 """Trigger -> committed: from the first robot's proposal for a move to the commit, and until every robot knows.
 
 ``python -m benchmarks.commit [--n 200]``. Three robots and three edges on loopback. Every robot's link to the edges
-follows a synthetic recording in which the best edge changes every second; with time-to-trigger, bonus and cool-down at
+follows a synthetic recording in which the best edge changes every second; with patience, bonus and cool-down at
 0, and nothing foreseen, each change is a vote. Times are read from the daemons' own logs (one host, one clock, whole
 milliseconds).
 """
@@ -41,7 +41,7 @@ def fleet(folder: Path) -> dict[str, Any]:
     trace = folder / "links.csv"
     write_trace(trace)
     tree = echo_fleet(
-        scheduling={"time_to_trigger_s": 0, "bonus": 0, "cool_down_s": 0, "max_moves_per_minute": 1000},
+        scheduling={"patience": 0, "bonus": 0, "cool_down_s": 0, "max_moves_per_minute": 1000},
         weights={"cpu": 0.0, "memory": 0.0, "network": 1.0},
         task={"link": {"foresee_s": 0}},  # a signal that jumps every second has no trend to be foreseen
     )

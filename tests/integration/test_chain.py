@@ -161,7 +161,7 @@ def test_injected_load_moves_the_task_to_a_quiet_edge(tmp_path: Path) -> None:
     reason = LimitedGroup.why_not()
     if reason is not None:
         pytest.skip(f"no cgroups here: {reason}")
-    tree = echo_fleet(scheduling={"time_to_trigger_s": 1}, weights={"cpu": 1.0, "memory": 0.0, "network": 0.0})
+    tree = echo_fleet(weights={"cpu": 1.0, "memory": 0.0, "network": 0.0})
     with contextlib.ExitStack() as stack:
         bed = stack.enter_context(Testbed(tmp_path, tree))
         bed.init()

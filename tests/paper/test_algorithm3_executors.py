@@ -286,10 +286,11 @@ def test_the_task_follows_the_signal_from_robot_to_robot_by_consensus() -> None:
     team.run(20.0)
     assert [owner for _, owner in team.moves] == ["robot1"]
     assert team.value.epoch == 2
-    # -45 dBm falls below -67 dBm, where the lead passes the bonus, after 1.3 time constants; the rest is a round.
+    # -45 dBm falls below -67 dBm, where the lead passes the bonus, after 1.3 time constants. From then on staying
+    # costs the lead at most, and half of it at least; the rest is a round.
     waited = team.moves[0][0] - 20.0
-    timing = team.fleet.timing
-    assert TUNING.time_to_trigger_s <= waited <= TUNING.time_to_trigger_s + 1.3 * timing.smoothing_s + 0.75
+    timing, lead = team.fleet.timing, (NEAR["robot1"] - FAR) / 40.0 - TUNING.bonus
+    assert SPEC.patience / lead <= waited <= 2.0 * SPEC.patience / lead + 1.3 * timing.smoothing_s + 0.75
 
 
 def test_the_first_proposal_makes_every_robot_run_its_round_at_once() -> None:

@@ -22,7 +22,8 @@ WELL = ClockCompared(error_ratio=1e-5, since_s=0.2)
 TASK = TaskSpec(
     name="guard",
     candidates=("edge1", "edge2"),
-    tuning=tuning_of(cpu=1.0, memory=0.0, time_to_trigger_s=0.5, cool_down_s=0.0),
+    tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0),
+    patience=0.1,
     worker=WorkerSpec(command=("true",)),
     exclusive=True,
 )

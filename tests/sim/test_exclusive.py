@@ -31,7 +31,8 @@ def fleet(*, exclusive: bool = True, robots_only: bool = False) -> Fleet:
     task = TaskSpec(
         name=TASK,
         candidates=edges or robots,
-        tuning=tuning_of(cpu=1.0, memory=0.0, time_to_trigger_s=0.5, cool_down_s=0.0),
+        tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0),
+        patience=0.1,
         worker=WorkerSpec(command=("true",)),
         exclusive=exclusive,
         max_moves_per_minute=1000,

@@ -21,7 +21,8 @@ OLD = fleet_of(
     TaskSpec(
         name=TASK,
         candidates=EDGES,
-        tuning=tuning_of(cpu=1.0, memory=0.0, time_to_trigger_s=0.5, cool_down_s=0.0),
+        tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0),
+        patience=0.1,
         worker=WorkerSpec(command=("true",)),
     ),
     of=sorted(EDGES + ROBOTS),

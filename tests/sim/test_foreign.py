@@ -18,7 +18,8 @@ def fleet() -> Simulator:
     task = TaskSpec(
         name="merge",
         candidates=EDGES,
-        tuning=tuning_of(cpu=1.0, memory=0.0, time_to_trigger_s=0.0, cool_down_s=0.0),
+        tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0),
+        patience=0.0,
         worker=WorkerSpec(ready_when=ReadyWhen.MATCHING, start_deadline_s=DEADLINE_S),
     )
     kinds = {**dict.fromkeys(EDGES, NodeKind.EDGE), **dict.fromkeys(ROBOTS, NodeKind.ROBOT)}

@@ -21,7 +21,8 @@ FLEET = fleet_of(
     TaskSpec(
         name=TASK,
         candidates=EDGES,
-        tuning=tuning_of(cpu=1.0, memory=0.0, time_to_trigger_s=0.2, cool_down_s=0.0),
+        tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0),
+        patience=0.05,
         worker=WorkerSpec(command=("true",)),
         exclusive=True,
         max_moves_per_minute=1000,

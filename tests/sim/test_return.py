@@ -17,7 +17,8 @@ def settled_on_edge1() -> Simulator:
     task = TaskSpec(
         name="merge",
         candidates=EDGES,
-        tuning=tuning_of(cpu=1.0, memory=0.0, time_to_trigger_s=0.0, cool_down_s=0.0),
+        tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0),
+        patience=0.0,
         worker=WorkerSpec(command=("true",)),
     )
     kinds = {**dict.fromkeys(EDGES, NodeKind.EDGE), **dict.fromkeys(ROBOTS, NodeKind.ROBOT)}

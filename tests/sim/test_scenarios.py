@@ -38,7 +38,8 @@ def fleet_of(words: list[str]) -> Fleet:
     task = TaskSpec(
         name=TASK,
         candidates=edges,
-        tuning=tuning_of(cpu=1.0, memory=0.0, time_to_trigger_s=0.5, cool_down_s=0.0),
+        tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0),
+        patience=0.1,
         worker=WorkerSpec(command=("work",)),
         exclusive="exclusive" in words,
         drain_s=0.2,

@@ -59,7 +59,8 @@ def reaching_all(robots: int) -> Simulator:
     task = TaskSpec(
         name="merge",
         candidates=edges,
-        tuning=tuning_of(cpu=1.0, memory=0.0, time_to_trigger_s=0.0, cool_down_s=0.0),
+        tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0),
+        patience=0.0,
         worker=WorkerSpec(command=("true",)),
         reach=Reach.ALL,
     )

@@ -288,7 +288,7 @@ def _scheduler(page: Page, status: Json, task: Json) -> None:
         "SCHEDULER",
         (weights, ""),
         (f"bonus {tuning['bonus']:g}", ""),
-        (f"trigger {tuning['time_to_trigger_s']:g}s" if patience is None else f"patience {patience:g}", ""),
+        *([(f"patience {patience:g}", "")] if patience is not None else []),
         (f"cool-down {tuning['cool_down_s']:g}s", ""),
         *([(f"deadline {tuning['deadline_ms']:g} ms", "")] if tuning.get("deadline_ms") is not None else []),
         *([("by the paper's score", "")] if tuning.get("score") == "paper" else []),

@@ -36,10 +36,8 @@ def told(spec: TaskSpec) -> list[str]:
     lines = [f"a machine is worth {worth}; weights: {shares}"]
     if spec.learns_patience:
         when = f"staying has cost its patience, which it learns ({CHOICES[0]:g} to {CHOICES[-1]:g} {seconds})"
-    elif spec.patience is not None:
-        when = f"staying has cost {spec.patience:g} {seconds} (patience)"
     else:
-        when = f"that has lasted {tuning.time_to_trigger_s:g} s (time_to_trigger_s)"
+        when = f"staying has cost {spec.patience:g} {seconds} (patience)"
     lines.append(f"it moves when another candidate leads by more than {tuning.bonus:g} (bonus) and {when}")
     lines.append(f"after a move it stays {tuning.cool_down_s:g} s at least (cool_down_s), unless its owner fails")
     lines.append(f"it moves {spec.max_moves_per_minute} times a minute at most (max_moves_per_minute), failures aside")

@@ -31,10 +31,10 @@ from zsched.config.ros2 import ros2_record
 from zsched.config.timing import PROFILES
 from zsched.core.scheduler.patience import CHOICES
 from zsched.core.values.fleet import (
+    DEFAULT_BONUS,
+    DEFAULT_COOL_DOWN_S,
     DEFAULT_SCORE,
     PAPER_PATIENCE,
-    PATIENT_BONUS,
-    PATIENT_COOL_DOWN_S,
     RADIO_PATIENCE,
     Demand,
     Fleet,
@@ -194,15 +194,12 @@ SCHEDULING: Final = Record(
         "bonus": Field(
             _SHARE,
             "Added to the owner's joint utility: what a move must gain.",
-            default=f"`{PATIENT_BONUS:g}`; `0.1` with `time_to_trigger_s` alone",
-        ),
-        "time_to_trigger_s": Field(
-            Number(0, 3600, "s"), "How long another candidate must lead, for tasks without `patience`.", default="none"
+            default=f"`{DEFAULT_BONUS:g}`",
         ),
         "cool_down_s": Field(
             Number(0, 86400, "s"),
             "Least stay after a move.",
-            default=f"`{PATIENT_COOL_DOWN_S:g}`; `10` with `time_to_trigger_s` alone",
+            default=f"`{DEFAULT_COOL_DOWN_S:g}`",
         ),
         "score": Field(
             Choice.of(ScoreForm),
@@ -229,14 +226,18 @@ SCHEDULING: Final = Record(
         ),
         **keys(TaskSpec, "reach", "memory_floor_ratio", "max_moves_per_minute"),
         "patience": Field(
-            Number(0.001, 1000),
-            "Move once staying has cost so much, lead times seconds (`time_to_trigger_s` does not count then): "
-            "a big lead is followed sooner than a small one.",
+            Number(0, 1000),
+            "Move once staying has cost so much, lead times seconds: a big lead is followed sooner than a small one. "
+            "`0`: the first lead that is seen is followed.",
             default=f"learnt, {CHOICES[0]:g} to {CHOICES[-1]:g}; `{RADIO_PATIENCE:g}` with a weight for the network; "
-            f"`{PAPER_PATIENCE:g}` with `score: paper`; none with `time_to_trigger_s` alone",
+            f"`{PAPER_PATIENCE:g}` with `score: paper`",
         ),
     },
     removed={
+        "time_to_trigger_s": Removed(
+            why="a timer follows a big lead as late as a small one, and patience loses less under every load",
+            instead="delete it: the task learns its patience; or patience: 0.3, lead times seconds",
+        ),
         "pays_off_in_s": Removed(
             why="it gained only where a move costs ten seconds and more, and no more than a larger bonus does there",
             instead="delete it; where moves are that dear: bonus: 0.2",

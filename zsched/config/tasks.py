@@ -25,11 +25,11 @@ from zsched.core.route.templates import (
 )
 from zsched.core.scheduler.patience import FIRST_PATIENCE
 from zsched.core.values.fleet import (
+    DEFAULT_BONUS,
+    DEFAULT_COOL_DOWN_S,
     DEFAULT_FORESEE_S,
     DEFAULT_SCORE,
     PAPER_PATIENCE,
-    PATIENT_BONUS,
-    PATIENT_COOL_DOWN_S,
     RADIO_PATIENCE,
     Demand,
     LinkLimits,
@@ -145,11 +145,10 @@ def _tuning(given: Section, out: Collector) -> Tuning | None:
     scheduling: Section | None = given.get("scheduling")
     score = _score(scheduling)
     deadline = {} if scheduling is None else _deadline(scheduling, score, weights, out)
-    patient: dict[str, Any] = {"bonus": PATIENT_BONUS, "cool_down_s": PATIENT_COOL_DOWN_S}
+    default: dict[str, Any] = {"bonus": DEFAULT_BONUS, "cool_down_s": DEFAULT_COOL_DOWN_S}
     if scheduling is None:
-        return Tuning(weights=weights, score=score, **patient)
-    default = patient if _patience(scheduling, weights) is not None else {}
-    more = {"score": score, **default, **_of(scheduling, *patient), **deadline}
+        return Tuning(weights=weights, score=score, **default)
+    more = {"score": score, **default, **_of(scheduling, *default), **deadline}
     return scheduling.build(Tuning, out, weights=weights, **more)
 
 
@@ -174,21 +173,20 @@ def _deadline(scheduling: Section, score: ScoreForm, weights: Weights, out: Coll
     return {"deadline_ms": None}
 
 
-def _patience(scheduling: Section | None, weights: Weights) -> float | None:
-    """As given; none where only a time-to-trigger is given; else the default."""
+def _patience(scheduling: Section | None, weights: Weights) -> float:
+    """As given, or what the task begins with."""
     if _learns(scheduling, weights):
         return FIRST_PATIENCE
     values = {} if scheduling is None else scheduling.values
     default = PAPER_PATIENCE if _score(scheduling) is ScoreForm.PAPER else RADIO_PATIENCE
-    patience: float | None = values.get("patience", None if "time_to_trigger_s" in values else default)
+    patience: float = values.get("patience", default)
     return patience
 
 
 def _learns(scheduling: Section | None, weights: Weights) -> bool:
     """Whether the task learns its patience: not where a radio counts, whose noise costs as much as it (0033)."""
     values = {} if scheduling is None else scheduling.values
-    is_given = "patience" in values or "time_to_trigger_s" in values
-    return not is_given and _score(scheduling) is ScoreForm.SERVICE and not weights.network
+    return "patience" not in values and _score(scheduling) is ScoreForm.SERVICE and not weights.network
 
 
 def _score(scheduling: Section | None) -> ScoreForm:

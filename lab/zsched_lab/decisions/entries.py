@@ -10,14 +10,15 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from dataclasses import replace
 from random import Random
 from typing import Any, Final
 
 from zsched.core.values.fleet import (
+    DEFAULT_BONUS,
+    DEFAULT_COOL_DOWN_S,
     DEFAULT_FORESEE_S,
     PAPER_PATIENCE,
-    PATIENT_BONUS,
-    PATIENT_COOL_DOWN_S,
     LinkLimits,
     PairReading,
 )
@@ -55,17 +56,16 @@ def core(
     """The production's decision; what is ``None`` is what a fleet file with ``score: paper`` gets that leaves it out.
 
     These histories are judged by the paper's utility, so the product decides by that, too (docs/decisions/0024).
-    Neither a patience nor a time-to-trigger: the default patience. Signals are `foreseeing`'s affair.
+    With a time-to-trigger it is the rule before patience, with the bonus and the cool-down that it had: those of
+    `Tuning`. Signals are `foreseeing`'s affair.
     """
-    if patience is None and time_to_trigger_s is None:
-        patience = PAPER_PATIENCE
-    if patience is not None:
-        bonus = PATIENT_BONUS if bonus is None else bonus
-        cool_down_s = PATIENT_COOL_DOWN_S if cool_down_s is None else cool_down_s
-    given = {"bonus": bonus, "time_to_trigger_s": time_to_trigger_s, "cool_down_s": cool_down_s}
-    settings: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-    tuning = Tuning(weights=world.spec.tuning.weights, **settings)
-    return lambda view: CoreRule(view, tuning, patience=patience)
+    tuning = Tuning(weights=world.spec.tuning.weights)
+    if time_to_trigger_s is None:
+        tuning = replace(tuning, bonus=DEFAULT_BONUS, cool_down_s=DEFAULT_COOL_DOWN_S)
+    tuning = tuning if bonus is None else replace(tuning, bonus=bonus)
+    tuning = tuning if cool_down_s is None else replace(tuning, cool_down_s=cool_down_s)
+    held = PAPER_PATIENCE if patience is None else patience
+    return lambda view: CoreRule(view, tuning, patience=held, time_to_trigger_s=time_to_trigger_s)
 
 
 def foreseeing(world: World, lead_s: float = DEFAULT_FORESEE_S, **more: Any) -> LinkLimits | None:

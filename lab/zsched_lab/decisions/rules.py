@@ -4,7 +4,7 @@ Knows: when each rule looks, and whom it then chooses. Does not know: the truth,
 
 `CoreRule` is the production's decision: one `Judge` per robot, a called vote, the tally, flap damping. It does what
 `zsched.core.scheduler.rounds` does when no message is lost; `tests/unit/lab/decisions/test_same_as_nodes.py` holds the
-two together.
+two together. `TimedJudge` is what the production decided by before patience: a yardstick.
 """
 
 from __future__ import annotations
@@ -13,19 +13,20 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from random import Random
-from typing import Protocol
+from typing import Any, Protocol
 
 from zsched.core.scheduler.damping import Damping
 from zsched.core.scheduler.judge import Judge, Judgement, Outcome, escape_reason
-from zsched.core.scheduler.rounds import TIMER_MARGIN_S
 from zsched.core.scheduler.scoring import Standing, pick
-from zsched.core.values.fleet import TaskSpec
+from zsched.core.values.fleet import PAPER_PATIENCE, TaskSpec
 from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, Tuning
 from zsched.core.vote.tally import VoteOutcome, tally
 from zsched_lab.decisions.view import Sight
 
 COMMIT_S = 0.03
 """From the vote to the commit; measured on loopback (`benchmarks.commit`)."""
+TIMER_MARGIN_S = 0.001
+"""Sums of floats: a timer has certainly ended this much later."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,26 +49,78 @@ class Rule(Protocol):
         ...
 
 
+class Unpunished(Damping):
+    """The production's record of moves, which holds nothing against any node; the cap of moves counts by it."""
+
+    __slots__ = ()
+
+    def penalties(self, now: float) -> dict[NodeId, float]:
+        """None."""
+        del now
+        return {}
+
+
+class TimedJudge(Judge):
+    """The production's judge with a time-to-trigger in place of patience: another candidate must lead for that long.
+
+    A time-to-trigger is counted from the first judgement at which the owner is beaten, by whomever, without a break
+    (docs/decisions/0017; patience took its place by docs/decisions/0021).
+    """
+
+    __slots__ = ("beaten_since", "trigger_s")
+
+    def __init__(self, spec: TaskSpec, trigger_s: float) -> None:
+        super().__init__(spec=replace(spec, patience=0.0, learns_patience=False))
+        self.trigger_s = trigger_s
+        self.beaten_since: float | None = None
+
+    def reset(self, *, is_new_owner: bool = False) -> None:
+        """As `Judge.reset`; the whole time counts again."""
+        super().reset(is_new_owner=is_new_owner)
+        self.beaten_since = None
+
+    def judge(self, standing: Standing, allocation: Allocation, **given: Any) -> Judgement:
+        """As `Judge.judge`, but that a planned move waits for its time."""
+        judgement, owner, now = super().judge(standing, allocation, **given), allocation.owner, float(given["now"])
+        if owner is None or pick(judgement.aggregates, owner) in (None, owner):
+            self.beaten_since = None
+            return judgement
+        self.beaten_since = now if self.beaten_since is None else self.beaten_since
+        is_planned = judgement.outcome is Outcome.PROPOSE and not (judgement.is_escape or given["is_called"])
+        if not is_planned or now - self.beaten_since >= self.trigger_s:
+            return judgement
+        aggregate = judgement.aggregates.get(owner, 0.0)
+        return replace(judgement, outcome=Outcome.WAIT, candidate=owner, aggregate=aggregate)
+
+
 @dataclass(slots=True)
 class CoreRule:
-    """The production's decision under some tuning."""
+    """The production's decision under some tuning; with a ``time_to_trigger_s`` as it was before it had patience."""
 
     view: Sight
     tuning: Tuning
-    patience: float | None = None
+    patience: float = PAPER_PATIENCE
     learns_patience: bool = False
+    time_to_trigger_s: float | None = None
+    is_damped: bool = True
+    """``False``: a node to which the task came back for nothing does not pay for it."""
     moves: list[Move] = field(default_factory=list)
     _judges: list[Judge] = field(init=False)
     _allocation: Allocation = field(init=False)
-    _damping: Damping = field(default_factory=Damping)
+    _damping: Damping = field(init=False)
     _settled_at: float = -math.inf
     _due: float = math.inf
     _spec: TaskSpec = field(init=False)
 
     def __post_init__(self) -> None:
         self._spec = replace(self.view.spec, patience=self.patience, learns_patience=self.learns_patience)
-        self._judges = [Judge(spec=self._spec) for _ in self.view.fleet.voters]
+        self._damping = Damping() if self.is_damped else Unpunished()
+        self._judges = [self._new_judge() for _ in self.view.fleet.voters]
         self._allocation = Allocation(task=self._spec.name, revision=0, epoch=0, owner=None, tuning=self.tuning)
+
+    def _new_judge(self) -> Judge:
+        timer_s = self.time_to_trigger_s
+        return Judge(spec=self._spec) if timer_s is None else TimedJudge(self._spec, timer_s)
 
     def round(self, seats: tuple[int, ...], at_s: float, now: float) -> None:
         """Judge at every robot whose turn it is; the first that proposes a move calls the vote."""
@@ -100,11 +153,11 @@ class CoreRule:
         )
 
     def _wake_when_due(self, seat: int, judgement: Judgement, now: float) -> None:
-        """As `Rounds._wake_when_due`: a lead that only waits for its timers is judged when they end."""
-        since = self._judges[seat].beaten_since
-        if judgement.outcome is not Outcome.WAIT or since is None:
+        """A lead that only waits for a time-to-trigger and the cool-down is judged when they end."""
+        judge = self._judges[seat]
+        if judgement.outcome is not Outcome.WAIT or not isinstance(judge, TimedJudge) or judge.beaten_since is None:
             return
-        ends = max(since + self.tuning.time_to_trigger_s, self._settled_at + self.tuning.cool_down_s)
+        ends = max(judge.beaten_since + judge.trigger_s, self._settled_at + self.tuning.cool_down_s)
         if ends + TIMER_MARGIN_S > now:
             self._due = min(self._due, ends + TIMER_MARGIN_S)
 

@@ -38,7 +38,7 @@ PUSH_START_RATIO = 0.14
 PUSH_END_RATIO = 0.92
 """No push begins so late that its move would not be seen."""
 PUSH_PERIOD_S = 15.0
-"""From push to push at least: smoothing + time-to-trigger + the default cool-down, and a second to look at it."""
+"""From push to push at least: smoothing + patience + the default cool-down, and a second to look at it."""
 PUSH_LENGTH_S = 12.0
 JITTER_S = 1.0
 

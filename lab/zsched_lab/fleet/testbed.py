@@ -44,7 +44,7 @@ TASK = "echo"
 SCHEDULING: Mapping[str, float | str] = {
     "score": "paper",
     "bonus": 0.1,
-    "time_to_trigger_s": 1,
+    "patience": 0.2,
     "cool_down_s": 0,
     "max_moves_per_minute": 1000,
 }

@@ -5,8 +5,8 @@ Does not know: runs, figures.
 
 What the paper does not give is fixed here, once, and told in the report: the "predefined cost" is `PAPER_BONUS`, a
 decision is taken every `PAPER_PERIOD_S`, its profilers average over one second; nothing else restrains a move (no
-time-to-trigger, no patience, no cool-down, no damping), and no signal is foreseen. `zsched` is the product as it comes:
-no setting of it is touched.
+patience, no cool-down, no damping), and no signal is foreseen. `zsched` is the product as it comes: no setting of it is
+touched.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class Scheme:
 
 
 CPU, MEMORY, BOTH, NETWORK = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.5, 0.5, 0.0), (0.0, 0.0, 1.0)
-_FREE: Mapping[str, float | str] = {"score": "paper", "bonus": 0.0, "time_to_trigger_s": 0.0, "cool_down_s": 0.0}
+_FREE: Mapping[str, float | str] = {"score": "paper", "bonus": 0.0, "patience": 0.0, "cool_down_s": 0.0}
 _AS_MEASURED = {"foresee_s": 0.0}
 _TIMING = {"smoothing_s": PAPER_SMOOTHING_S, "decide_s": PAPER_PERIOD_S}
 

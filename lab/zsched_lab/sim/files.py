@@ -88,13 +88,13 @@ def _other_worker(rng: Random, fleet: Fleet) -> Fleet:
 
 
 def _other_score(rng: Random, fleet: Fleet) -> Fleet:
-    """Another form, with or without a deadline; learnt patience or the timer."""
+    """Another form, with or without a deadline; a patience that is learnt or given."""
     score, deadline_ms = rng.choice(((ScoreForm.PAPER, None), (ScoreForm.SERVICE, None), (ScoreForm.SERVICE, 500.0)))
-    patience = rng.choice((None, 0.3))
+    learns = rng.choice((False, True))
 
     def changed(task: TaskSpec) -> TaskSpec:
         tuning = replace(task.tuning, score=score, deadline_ms=deadline_ms)
-        return replace(task, tuning=tuning, patience=patience, learns_patience=patience is not None)
+        return replace(task, tuning=tuning, patience=0.3 if learns else task.patience, learns_patience=learns)
 
     return _with_task(fleet, changed)
 

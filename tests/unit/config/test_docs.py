@@ -10,11 +10,11 @@ from zsched.config.load import check_bytes
 from zsched.config.schema import LINK_LIMITS, SCHEDULING, reference
 from zsched.config.timing import _RELATIONS, PROFILES
 from zsched.core.values.fleet import (
+    DEFAULT_BONUS,
+    DEFAULT_COOL_DOWN_S,
     DEFAULT_FORESEE_S,
     DEFAULT_SCORE,
     PAPER_PATIENCE,
-    PATIENT_BONUS,
-    PATIENT_COOL_DOWN_S,
     RADIO_PATIENCE,
     Timing,
 )
@@ -30,15 +30,13 @@ def test_reference_is_the_schemas() -> None:
 
 
 def test_defaults_that_hang_on_each_other_are_the_codes() -> None:
-    timers = {field.name: field.default for field in fields(Tuning)}
-    alone = "with `time_to_trigger_s` alone"
-    assert SCHEDULING.items["bonus"].default == f"`{PATIENT_BONUS:g}`; `{timers['bonus']:g}` {alone}"
-    kept = f"`{PATIENT_COOL_DOWN_S:g}`; `{timers['cool_down_s']:g}` {alone}"
-    assert SCHEDULING.items["cool_down_s"].default == kept
-    assert SCHEDULING.items["aggregate"].default == f"`{timers['aggregate']}`"
+    assert SCHEDULING.items["bonus"].default == f"`{DEFAULT_BONUS:g}`"
+    assert SCHEDULING.items["cool_down_s"].default == f"`{DEFAULT_COOL_DOWN_S:g}`"
+    aggregate = next(field.default for field in fields(Tuning) if field.name == "aggregate")
+    assert SCHEDULING.items["aggregate"].default == f"`{aggregate}`"
     assert SCHEDULING.items["score"].default == f"`{DEFAULT_SCORE}`"
     radio, paper = f"`{RADIO_PATIENCE:g}` with a weight for the network", f"`{PAPER_PATIENCE:g}` with `score: paper`"
-    assert SCHEDULING.items["patience"].default == f"learnt, 0.05 to 1.5; {radio}; {paper}; none {alone}"
+    assert SCHEDULING.items["patience"].default == f"learnt, 0.05 to 1.5; {radio}; {paper}"
     assert LINK_LIMITS.items["foresee_s"].default == f"`{DEFAULT_FORESEE_S:g}`"
 
 

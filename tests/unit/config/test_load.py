@@ -11,10 +11,10 @@ import pytest
 from zsched.config.load import CheckResult, check_bytes, check_file, load_fleet
 from zsched.core.scheduler.patience import FIRST_PATIENCE
 from zsched.core.values.fleet import (
+    DEFAULT_BONUS,
+    DEFAULT_COOL_DOWN_S,
     DEFAULT_FORESEE_S,
     PAPER_PATIENCE,
-    PATIENT_BONUS,
-    PATIENT_COOL_DOWN_S,
     RADIO_PATIENCE,
     Fleet,
     LinkSpec,
@@ -50,7 +50,7 @@ tasks:
     candidates: {kind: edge}
     weights: {cpu: 0.5, memory: 0.5, network: 0.0}
     demand: {cpu_cores: 0.4, memory_mb: 250}
-    scheduling: {bonus: 0.10, time_to_trigger_s: 2, cool_down_s: 10}
+    scheduling: {bonus: 0.10, patience: 0.4, cool_down_s: 10}
     worker: {command: [python, -m, zsched.tasks.map_merge], standby: warm}
     inputs:   [{from: "{robot}/map", to: "{target}/map_merge/{robot}/map", class: latest, keep_last: 1}]
     outputs:  [{from: "{target}/map_merge/global_map", to: "{robot}/global_map", class: latest}]
@@ -144,53 +144,46 @@ def test_links_of_every_source() -> None:
 
 
 @pytest.mark.parametrize(
-    ("scheduling", "patience", "bonus", "cool_down_s", "trigger_s"),
+    ("scheduling", "patience", "bonus", "cool_down_s"),
     [
-        ("", FIRST_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S, None),
-        ("{}", FIRST_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S, None),
-        ("{cool_down_s: 7}", FIRST_PATIENCE, PATIENT_BONUS, 7.0, None),
-        ("{cool_down_s: 0}", FIRST_PATIENCE, PATIENT_BONUS, 0.0, None),
-        ("{bonus: 0.2}", FIRST_PATIENCE, 0.2, PATIENT_COOL_DOWN_S, None),
-        ("{bonus: 0}", FIRST_PATIENCE, 0.0, PATIENT_COOL_DOWN_S, None),
-        ("{patience: 0.3}", 0.3, PATIENT_BONUS, PATIENT_COOL_DOWN_S, None),
-        ("{patience: 0.3, bonus: 0.2}", 0.3, 0.2, PATIENT_COOL_DOWN_S, None),
-        ("{time_to_trigger_s: 2}", None, 0.1, 10.0, 2.0),
-        ("{time_to_trigger_s: 0}", None, 0.1, 10.0, 0.0),
-        ("{time_to_trigger_s: 3, bonus: 0.05, cool_down_s: 4}", None, 0.05, 4.0, 3.0),
-        ("{time_to_trigger_s: 3, patience: 0.3}", 0.3, PATIENT_BONUS, PATIENT_COOL_DOWN_S, 3.0),
-        ("{time_to_trigger_s: 3, patience: 0.3, bonus: 0.2}", 0.3, 0.2, PATIENT_COOL_DOWN_S, 3.0),
+        ("", FIRST_PATIENCE, DEFAULT_BONUS, DEFAULT_COOL_DOWN_S),
+        ("{}", FIRST_PATIENCE, DEFAULT_BONUS, DEFAULT_COOL_DOWN_S),
+        ("{cool_down_s: 7}", FIRST_PATIENCE, DEFAULT_BONUS, 7.0),
+        ("{cool_down_s: 0}", FIRST_PATIENCE, DEFAULT_BONUS, 0.0),
+        ("{bonus: 0.2}", FIRST_PATIENCE, 0.2, DEFAULT_COOL_DOWN_S),
+        ("{bonus: 0}", FIRST_PATIENCE, 0.0, DEFAULT_COOL_DOWN_S),
+        ("{patience: 0.3}", 0.3, DEFAULT_BONUS, DEFAULT_COOL_DOWN_S),
+        ("{patience: 0}", 0.0, DEFAULT_BONUS, DEFAULT_COOL_DOWN_S),
+        ("{patience: 0.3, bonus: 0.2}", 0.3, 0.2, DEFAULT_COOL_DOWN_S),
     ],
 )
-def test_patience_is_the_default_and_a_time_to_trigger_alone_takes_its_place(
-    scheduling: str, patience: float | None, bonus: float, cool_down_s: float, trigger_s: float | None
+def test_what_a_file_does_not_say_of_patience_bonus_and_cool_down_is_the_default(
+    scheduling: str, patience: float, bonus: float, cool_down_s: float
 ) -> None:
-    """docs/decisions/0021 and 0023."""
+    """docs/decisions/0021 and 0033."""
     given = f"    scheduling: {scheduling}\n" if scheduling else ""
-    task = fleet_of(swapped("    scheduling: {bonus: 0.10, time_to_trigger_s: 2, cool_down_s: 10}\n", given)).tasks[0]
+    task = fleet_of(swapped("    scheduling: {bonus: 0.10, patience: 0.4, cool_down_s: 10}\n", given)).tasks[0]
     assert task.patience == patience
     assert (task.tuning.bonus, task.tuning.cool_down_s) == (bonus, cool_down_s)
-    if trigger_s is not None:
-        assert task.tuning.time_to_trigger_s == trigger_s
 
 
 @pytest.mark.parametrize(
     ("given", "patience", "cool_down_s"),
     [
-        ("{bonus: 0.05}", FIRST_PATIENCE, PATIENT_COOL_DOWN_S),
-        ("{score: service}", FIRST_PATIENCE, PATIENT_COOL_DOWN_S),
+        ("{bonus: 0.05}", FIRST_PATIENCE, DEFAULT_COOL_DOWN_S),
+        ("{score: service}", FIRST_PATIENCE, DEFAULT_COOL_DOWN_S),
         ("{score: service, patience: 0.7, cool_down_s: 9}", 0.7, 9.0),
-        ("{score: service, time_to_trigger_s: 2}", None, 10.0),
-        ("{score: paper}", PAPER_PATIENCE, PATIENT_COOL_DOWN_S),
+        ("{score: paper}", PAPER_PATIENCE, DEFAULT_COOL_DOWN_S),
     ],
 )
-def test_a_task_scored_by_service_has_its_own_defaults(given: str, patience: float | None, cool_down_s: float) -> None:
-    scheduling = "    scheduling: {bonus: 0.10, time_to_trigger_s: 2, cool_down_s: 10}\n"
+def test_a_task_scored_by_service_has_its_own_defaults(given: str, patience: float, cool_down_s: float) -> None:
+    scheduling = "    scheduling: {bonus: 0.10, patience: 0.4, cool_down_s: 10}\n"
     task = fleet_of(swapped(scheduling, f"    scheduling: {given}\n")).tasks[0]
     assert (task.patience, task.tuning.cool_down_s) == (patience, cool_down_s)
     assert task.tuning.score is (ScoreForm.PAPER if "paper" in given else ScoreForm.SERVICE)
 
 
-SCHEDULED = "    scheduling: {bonus: 0.10, time_to_trigger_s: 2, cool_down_s: 10}\n"
+SCHEDULED = "    scheduling: {bonus: 0.10, patience: 0.4, cool_down_s: 10}\n"
 
 
 @pytest.mark.parametrize(
@@ -244,11 +237,11 @@ def test_a_deadline_of_a_worker_that_tells_nothing_is_worth_a_word() -> None:
 @pytest.mark.parametrize("given", ["", "    scheduling: {score: service}\n"])
 def test_a_task_that_weighs_the_network_has_a_patience_that_is_not_learnt(given: str) -> None:
     """A radio comes and goes: twice as many moves otherwise (docs/decisions/0033)."""
-    scheduling = "    scheduling: {bonus: 0.10, time_to_trigger_s: 2, cool_down_s: 10}\n"
+    scheduling = "    scheduling: {bonus: 0.10, patience: 0.4, cool_down_s: 10}\n"
     text = swapped(scheduling, given).replace("network: 0.0", "network: 0.2").replace("cpu: 0.5", "cpu: 0.3")
     task = fleet_of(text).tasks[0]
     assert task.tuning.weights.network > 0
-    assert (task.patience, task.tuning.cool_down_s) == (RADIO_PATIENCE, PATIENT_COOL_DOWN_S)
+    assert (task.patience, task.tuning.cool_down_s) == (RADIO_PATIENCE, DEFAULT_COOL_DOWN_S)
     assert not task.learns_patience
     assert task.tuning.score is ScoreForm.SERVICE
 
@@ -258,7 +251,7 @@ def test_a_task_that_weighs_the_network_has_a_patience_that_is_not_learnt(given:
     [("", DEFAULT_FORESEE_S), ("{nu_dbm: -75}", DEFAULT_FORESEE_S), ("{foresee_s: 0}", 0.0), ("{foresee_s: 1}", 1.0)],
 )
 def test_signals_are_foreseen_unless_the_file_says_otherwise(link: str, foresee_s: float) -> None:
-    scheduling = "    scheduling: {bonus: 0.10, time_to_trigger_s: 2, cool_down_s: 10}\n"
+    scheduling = "    scheduling: {bonus: 0.10, patience: 0.4, cool_down_s: 10}\n"
     given = f"{scheduling}    link: {link}\n" if link else scheduling
     limits = fleet_of(swapped(scheduling, given)).tasks[0].limits
     assert limits.foresee_s == foresee_s
@@ -266,7 +259,7 @@ def test_signals_are_foreseen_unless_the_file_says_otherwise(link: str, foresee_
 
 
 def test_the_defaults_of_a_fleet_file_are_those_of_decisions_0021_and_0033() -> None:
-    assert (PAPER_PATIENCE, RADIO_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S) == (0.55, 0.3, 0.05, 2.0)
+    assert (PAPER_PATIENCE, RADIO_PATIENCE, DEFAULT_BONUS, DEFAULT_COOL_DOWN_S) == (0.55, 0.3, 0.05, 2.0)
     assert (DEFAULT_FORESEE_S, Timing().smoothing_s) == (3.0, 0.3)
 
 
@@ -276,22 +269,21 @@ def test_the_defaults_of_a_fleet_file_are_those_of_decisions_0021_and_0033() -> 
         ("{}", True),
         ("{score: service, bonus: 0.1}", True),
         ("{patience: 0.3}", False),
-        ("{time_to_trigger_s: 2}", False),
         ("{score: paper}", False),
     ],
 )
-def test_a_patience_is_learnt_where_the_file_gives_neither_one_nor_a_time_to_trigger(given: str, learns: bool) -> None:
-    scheduling = "    scheduling: {bonus: 0.10, time_to_trigger_s: 2, cool_down_s: 10}\n"
+def test_a_patience_is_learnt_where_the_file_gives_none(given: str, learns: bool) -> None:
+    scheduling = "    scheduling: {bonus: 0.10, patience: 0.4, cool_down_s: 10}\n"
     assert fleet_of(swapped(scheduling, f"    scheduling: {given}\n")).tasks[0].learns_patience is learns
 
 
 def test_every_setting_of_a_task_arrives() -> None:
     text = swapped(
-        "    scheduling: {bonus: 0.10, time_to_trigger_s: 2, cool_down_s: 10}\n    worker: {command: "
+        "    scheduling: {bonus: 0.10, patience: 0.4, cool_down_s: 10}\n    worker: {command: "
         "[python, -m, zsched.tasks.map_merge], standby: warm}\n",
         """\
     scheduling:
-      {bonus: 0.2, time_to_trigger_s: 3, cool_down_s: 4, aggregate: median, reach: all, memory_floor_ratio: 0.1,
+      {bonus: 0.2, cool_down_s: 4, aggregate: median, reach: all, memory_floor_ratio: 0.1,
        patience: 0.3}
     link: {nu_dbm: -75, rho_dbm: -45, pair: weaker, foresee_s: 2}
     on_isolation: local
@@ -310,7 +302,7 @@ def test_every_setting_of_a_task_arrives() -> None:
 """,
     ).replace("class: latest}]", "class: reliable, depth: 99, handover: all}]")
     task = fleet_of(text).task("map_merge")
-    assert (task.tuning.bonus, task.tuning.time_to_trigger_s, task.tuning.cool_down_s) == (0.2, 3, 4)
+    assert (task.tuning.bonus, task.tuning.cool_down_s) == (0.2, 4)
     assert (task.tuning.aggregate, task.reach, task.memory_floor_ratio) == (Aggregate.MEDIAN, Reach.ALL, 0.1)
     assert (task.patience, task.limits.pair, task.limits.foresee_s) == (0.3, PairReading.WEAKER, 2)
     assert (task.limits.nu_dbm, task.limits.rho_dbm) == (-75, -45)
@@ -639,6 +631,7 @@ def test_one_fault_is_reported_once_at_its_place(old: str, new: str, said: str |
     [
         ("    outputs:", "    link: {knee_dbm: -60}\n    outputs:", "any more: a knee gained", "knee_dbm", "delete it"),
         ("    outputs:", "    link: {pair: mean}\n    outputs:", "any more: its leads", "mean}", "pair: candidate"),
+        ("patience: 0.4,", "time_to_trigger_s: 2,", "any more: a timer follows", "time_to_trigger_s", "patience: 0.3"),
         ("bonus: 0.10,", "pays_off_in_s: 60,", "any more: it gained only where", "pays_off_in_s", "bonus: 0.2"),
     ],
 )

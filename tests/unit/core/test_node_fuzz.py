@@ -52,8 +52,7 @@ ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
 NAMES = (*ROBOTS, *EDGES, "ghost")
 TASKS = ("alone", "cold", "merge", "other")
 TUNINGS = tuple(
-    Tuning(weights=Weights(cpu=cpu, memory=1.0 - cpu, network=0.0), time_to_trigger_s=0.1, cool_down_s=0.0)
-    for cpu in (0.25, 0.75)
+    Tuning(weights=Weights(cpu=cpu, memory=1.0 - cpu, network=0.0), cool_down_s=0.0) for cpu in (0.25, 0.75)
 )
 RULE = StreamRule(direction=Direction.INPUT, from_template="{robot}/{task}", to_template="{target}/{task}/{robot}/map")
 
@@ -63,6 +62,7 @@ def task(name: str, candidates: tuple[str, ...], *, standby: Standby, exclusive:
         name=name,
         candidates=candidates,
         tuning=TUNINGS[0],
+        patience=0.02,
         worker=WorkerSpec(command=("work",), standby=standby, start_deadline_s=1.0, output_deadline_s=0.1),
         rules=(RULE,),
         exclusive=exclusive,

@@ -45,11 +45,12 @@ def fleet(*, exclusive: bool = False) -> Fleet:
         NodeSpec(name=name, kind=NodeKind.ROBOT if name in ROBOTS else NodeKind.EDGE)
         for name in sorted((*ROBOTS, *EDGES))
     )
-    tuning = tuning_of(time_to_trigger_s=0.2, cool_down_s=0.0)
+    tuning = tuning_of(cool_down_s=0.0)
     task = TaskSpec(
         name=TASK,
         candidates=EDGES,
         tuning=tuning,
+        patience=0.05,
         worker=WorkerSpec(command=("true",)),
         drain_s=0.2,
         exclusive=exclusive,

@@ -1,6 +1,6 @@
 """SCHEDULER, second half: from a standing to a proposal, with stickiness.
 
-Knows: bonus, time-to-trigger, cool-down, escapes. Does not know: how utilities were computed or travel, who else
+Knows: bonus, patience, cool-down, escapes. Does not know: how utilities were computed or travel, who else
 proposes what, how anything is committed.
 
 `Judge` keeps the little memory that stickiness needs, per task, and turns a `Standing` into a `Judgement`: a candidate
@@ -22,13 +22,15 @@ from zsched.core.values.model import Allocation, NodeId, PeerState, Profile, Sco
 
 INITIAL_SETTLE_S = 3.0
 """A task that nobody owns yet waits so long for candidates that are still starting."""
+UNSCORED_S = 2.0
+"""An owner that cannot be scored is left after so long: nobody knows what staying costs there."""
 
 
 class Outcome(StrEnum):
     """What a robot makes of a standing."""
 
     STAY = "stay"
-    WAIT = "wait"  # another one leads, but not for long enough
+    WAIT = "wait"  # another one leads, but something holds the task back
     PROPOSE = "propose"
     NONE = "none"  # nobody to propose
 
@@ -51,11 +53,11 @@ class Judge:
     """The memory of one task's stickiness at one robot."""
 
     spec: TaskSpec
-    beaten_since: float | None = None
-    """Since when the owner has been beaten by somebody, without a break."""
+    unscored_since: float | None = None
+    """Since when the owner could not be scored, while somebody else could."""
     not_ready_since: float | None = None
     spent: float = 0.0
-    """What staying has cost so far, in utility seconds (tasks with a ``patience``)."""
+    """What staying has cost so far, in utility seconds."""
     spent_at: float | None = None
     learnt: LearntPatience = field(default_factory=LearntPatience)
     """Of a task that learns its patience."""
@@ -66,13 +68,13 @@ class Judge:
     """The candidates that a first placement does not wait for: they cannot have the task."""
 
     @property
-    def patience(self) -> float | None:
-        """What staying may cost now, in utility seconds; ``None``: the time-to-trigger counts."""
+    def patience(self) -> float:
+        """What staying may cost now, in utility seconds."""
         return self.learnt.value if self.spec.learns_patience else self.spec.patience
 
     def reset(self, *, is_new_owner: bool = False) -> None:
-        """A vote was lost or the value changed: wait the whole time-to-trigger again."""
-        self.beaten_since, self.spent = None, 0.0
+        """A vote was lost or the value changed: what staying has cost counts from nothing again."""
+        self.unscored_since, self.spent = None, 0.0
         if is_new_owner:
             self.not_ready_since = None
 
@@ -112,7 +114,7 @@ class Judge:
         }
         winner = pick(scored, owner)
         if winner is None:
-            self.beaten_since = None
+            self.unscored_since = None
             return Judgement(outcome=Outcome.NONE, candidate=owner, aggregate=0.0, reason="no candidate can have it")
         self._spend(scored, owner, now)
         outcome, reason = self._outcome(winner, scored, allocation, settled_for_s, escape, is_called, now)
@@ -131,12 +133,13 @@ class Judge:
 
     def _spend(self, scored: Mapping[NodeId, float], owner: NodeId | None, now: float) -> None:
         """Add up the lead over the owner with its bonus, over time (`zsched.core.scheduler.patience.spend`)."""
-        patience = self.patience
-        if patience is None or owner is None or owner not in scored:
+        if owner is None or owner not in scored:
             self.spent, self.spent_at = 0.0, None
+            self.unscored_since = now if self.unscored_since is None else self.unscored_since
             return
+        self.unscored_since = None
         elapsed_s = 0.0 if self.spent_at is None else min(now - self.spent_at, LONGEST_GAP_S)
-        self.spent = spend(self.spent, max(scored.values()) - scored[owner], patience, elapsed_s)
+        self.spent = spend(self.spent, max(scored.values()) - scored[owner], self.patience, elapsed_s)
         self.spent_at = now
 
     def _cap(self, damping: Damping, *, is_escape: bool, now: float) -> str | None:
@@ -157,31 +160,27 @@ class Judge:
     ) -> tuple[Outcome, str]:
         owner, tuning = allocation.owner, allocation.tuning
         if allocation.paused or allocation.pinned:
-            self.beaten_since = None  # nobody looked meanwhile: afterwards the whole time-to-trigger counts again
             return Outcome.STAY, "paused by the operator" if allocation.paused else "pinned by the operator"
         if owner is None:
             return self._initial(winner, scored, is_called=is_called, now=now)
         if escape is not None:
             return Outcome.PROPOSE, escape
         if winner == owner:
-            self.beaten_since = None
             return Outcome.STAY, "nobody better"
-        if self.beaten_since is None:
-            self.beaten_since = now
         lead = scored[winner] - scored.get(owner, 0.0)
-        led_for = now - self.beaten_since
         why = f"{winner} leads by {lead:.3f} over {owner} with its bonus"
         if is_called:
             return Outcome.PROPOSE, f"vote called; {why}"
         if settled_for_s < tuning.cool_down_s:
             return Outcome.WAIT, f"{why}; cool-down {settled_for_s:.1f} of {tuning.cool_down_s:g} s"
-        # What an owner that may not be scored is worth, nobody knows: it is left by the time alone.
-        patience = self.patience if owner in scored else None
-        if patience is not None and self.spent < patience:
-            return Outcome.WAIT, f"{why}; staying has cost {self.spent:.3f} of {patience:g}"
-        if patience is None and led_for < tuning.time_to_trigger_s:
-            return Outcome.WAIT, f"{why}; for {led_for:.1f} of {tuning.time_to_trigger_s:g} s"
-        return Outcome.PROPOSE, f"{why} for {led_for:.1f} s"
+        if owner not in scored:
+            assert self.unscored_since is not None
+            unscored_s = now - self.unscored_since
+            for_long = f"{owner} cannot be scored, for {unscored_s:.1f} of {UNSCORED_S:g} s"
+            return (Outcome.PROPOSE if unscored_s >= UNSCORED_S else Outcome.WAIT), for_long
+        if self.spent < self.patience:
+            return Outcome.WAIT, f"{why}; staying has cost {self.spent:.3f} of {self.patience:g}"
+        return Outcome.PROPOSE, f"{why}; staying has cost {self.patience:g}"
 
     def _initial(
         self, winner: NodeId, scored: Mapping[NodeId, float], *, is_called: bool, now: float
@@ -203,7 +202,7 @@ def escape_reason(
     standing: Standing,
     not_ready_for_s: float,
 ) -> str | None:
-    """Why the owner must be left now, without time-to-trigger or cool-down (but never without the quorum).
+    """Why the owner must be left now, without patience or cool-down (but never without the quorum).
 
     Short memory is such a reason under the paper's score, which does not tell it from enough; `ScoreForm.SERVICE` does.
 

@@ -5,7 +5,7 @@ becomes of a proposal (`zsched.core.vote.votes`), bytes.
 
 A robot gathers the others' utilities every ``decide_s``, and at once when an owner is gone or another robot's proposal
 for a move arrives: the first proposal *calls* the vote, so rounds need no synchronised clocks. In a called vote every
-robot answers with today's winner, or with the owner: its own time-to-trigger and cool-down do not count, the caller's
+robot answers with today's winner, or with the owner: its own patience and cool-down do not count, the caller's
 did (docs/decisions/0004).
 """
 
@@ -29,8 +29,8 @@ from zsched.core.values.messages import Utilities
 from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, TaskId, UtilityVector, WorkerState
 from zsched.core.values.quorum import majority, present_voters
 
-TIMER_MARGIN_S = 0.001
-"""Sums of floats: a timer has certainly ended this much later."""
+FRESH_MARGIN_S = 0.001
+"""Sums of floats: a profile is certainly fresh until so long before its end."""
 
 
 @dataclass(slots=True)
@@ -131,8 +131,7 @@ class Rounds:
                 for name, task in self.tasks.items()
             ),
         )
-        # A hair less than the profiles' time: sums of floats.
-        until = self._gateway.fresh_until(now) - TIMER_MARGIN_S
+        until = self._gateway.fresh_until(now) - FRESH_MARGIN_S
         self._answer = (self._gateway.version, until, (states, values, doubts), answer)
         return answer
 
@@ -242,7 +241,6 @@ class Rounds:
         if not is_called:
             judgement = self._spare(judgement, allocation, states)
         task.judgement, task.judged_at = judgement, now
-        self._wake_when_due(task, judgement, allocation, now)
         self._tell(task, judgement, allocation, todo)
         if self._turns[task.spec.name].commit is not None:
             return None
@@ -322,17 +320,6 @@ class Rounds:
         self._gateway.learn_demand(task.spec.name, owner, now)
         not_ready_for = self._not_ready_for(task, owner, now)
         return escape_reason(task.spec, allocation, state, profile, standing, not_ready_for)
-
-    def _wake_when_due(self, task: TaskRound, judgement: Judgement, allocation: Allocation, now: float) -> None:
-        """A lead that only waits for its timers is judged again when they end, not up to a whole round later."""
-        if judgement.outcome is not Outcome.WAIT or task.judge.beaten_since is None:
-            return
-        tuning = allocation.tuning
-        due = TIMER_MARGIN_S + max(
-            task.judge.beaten_since + tuning.time_to_trigger_s, task.settled_at + tuning.cool_down_s
-        )
-        if due > now:
-            self._round_at = min(self._round_at, due)
 
     def _not_ready_for(self, task: TaskRound, owner: NodeId, now: float) -> float:
         """For how long the owner's worker was heard not to be ready; who is not heard says nothing about it."""

@@ -2,7 +2,7 @@
 
 Knows: what an operator may say, with the defaults (they live here only). Does not know: YAML, files, positions.
 
-A class's defaults are the plain rule: a time-to-trigger, signals as they are. The constants below are what a task of a
+A class's defaults are the plain rule: the paper's score, signals as they are. The constants below are what a task of a
 fleet file gets that says nothing else.
 """
 
@@ -33,13 +33,13 @@ from zsched.core.values.plan import Direction, ReadyWhen, ServiceSettings, Strea
 DEFAULT_SCORE = ScoreForm.SERVICE
 """How to score a machine when the fleet file does not say (docs/decisions/0031)."""
 PAPER_PATIENCE = 0.55
-"""Utility seconds, of a task with `ScoreForm.PAPER` whose fleet file gives neither a patience nor a time-to-trigger."""
+"""Utility seconds, of a task with `ScoreForm.PAPER` whose fleet file gives no patience."""
 RADIO_PATIENCE = 0.3
 """Likewise, of a task scored by service that weighs the network. All others learn theirs (docs/decisions/0033)."""
-PATIENT_BONUS = 0.05
-"""The bonus of a task with a patience, when its fleet file gives none; with a time-to-trigger it is `Tuning`'s."""
-PATIENT_COOL_DOWN_S = 2.0
-"""The cool-down of a task with a patience, likewise (docs/decisions/0033)."""
+DEFAULT_BONUS = 0.05
+"""The bonus of a task whose fleet file gives none (docs/decisions/0021)."""
+DEFAULT_COOL_DOWN_S = 2.0
+"""The cool-down, likewise (docs/decisions/0033)."""
 DEFAULT_FORESEE_S = 3.0
 """How far ahead the signals of a task count when its fleet file does not say."""
 SECONDS = Range(0.01, 3600, "s")
@@ -223,8 +223,8 @@ class TaskSpec:
     )
     max_moves_per_minute: int = key(6, "Hard cap of planned moves; escapes are bounded too, at 60.", Range(1, 100_000))
     """Escapes: `zsched.core.scheduler.damping`."""
-    patience: float | None = None
-    """Utility seconds that staying may cost before the task moves, in place of the time-to-trigger; ``None``: that."""
+    patience: float = PAPER_PATIENCE
+    """Utility seconds that staying may cost before the task moves; 0: none, the first judgement of a lead moves it."""
     learns_patience: bool = False
     """Its patience is learnt (`zsched.core.scheduler.patience`); ``patience`` is what it begins with."""
     on_isolation: OnIsolation = key(OnIsolation.HOLD, "What a robot does that is cut off from the owner.")

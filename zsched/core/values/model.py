@@ -110,13 +110,12 @@ MIN_DEADLINE_MS, MAX_DEADLINE_MS = 1.0, 3.6e6
 class Tuning:
     """The settings that may change on the running fleet, agreed through the register like an allocation.
 
-    ``bonus`` is added to the owner's aggregate (APPLY_COST of Alg. 2), in utility units [0, 1]; ``time_to_trigger_s``
-    is how long another candidate must lead; ``cool_down_s`` the least stay after a move.
+    ``bonus`` is added to the owner's aggregate (APPLY_COST of Alg. 2), in utility units [0, 1]; ``cool_down_s`` is the
+    least stay after a move.
     """
 
     weights: Weights
     bonus: float = 0.10
-    time_to_trigger_s: float = 2.0
     cool_down_s: float = 10.0
     aggregate: Aggregate = Aggregate.MEAN
     score: ScoreForm = ScoreForm.PAPER
@@ -132,7 +131,6 @@ class Tuning:
     def __post_init__(self) -> None:
         check_range("deadline_ms", self.deadline_ms, MIN_DEADLINE_MS, MAX_DEADLINE_MS)
         check_range("bonus", self.bonus, 0.0, 1.0)
-        check_range("time_to_trigger_s", self.time_to_trigger_s, 0.0, 3600.0)
         check_range("cool_down_s", self.cool_down_s, 0.0, 86400.0)
 
 

@@ -103,8 +103,8 @@ class TaskStatus:
     streams: tuple[StreamCount, ...] = ()
     history: tuple[PastAllocation, ...] = ()
     problems: tuple[str, ...] = ()
-    patience: float | None = None
-    """Utility seconds that staying may cost; ``None``: the tuning's time-to-trigger counts."""
+    patience: float = 0.0
+    """Utility seconds that staying may cost."""
     round_trips: tuple[tuple[NodeId, float], ...] = ()
     """(node, seconds from the answering node to it and back), of a task with a deadline."""
 

@@ -13,10 +13,10 @@ from typing import Any, Final, Literal, get_args, get_origin, get_type_hints
 
 from zsched.core.scheduler.patience import FIRST_PATIENCE
 from zsched.core.values.fleet import (
+    DEFAULT_BONUS,
+    DEFAULT_COOL_DOWN_S,
     DEFAULT_SCORE,
     PAPER_PATIENCE,
-    PATIENT_BONUS,
-    PATIENT_COOL_DOWN_S,
     TaskSpec,
 )
 from zsched.core.values.model import ScoreForm, Tuning, Weights
@@ -26,9 +26,10 @@ from zsched_lab.decisions.service.replay import Player, is_of_task
 from zsched_lab.decisions.view import Look, Sight
 from zsched_lab.decisions.world import EVEN, RADIO_ONLY
 
-OWN: Final = ("smoothing_s", "is_told", "tells_jobs")
+OWN: Final = ("smoothing_s", "is_told", "tells_jobs", "is_damped", "time_to_trigger_s")
 """Settings of a rule that are neither of `Tuning` nor of `TaskSpec`; ``is_told=0``: run queues are not read;
-``tells_jobs=0``: the worker says nothing of its jobs."""
+``tells_jobs=0``: the worker says nothing of its jobs; ``is_damped=0``: no node pays for moves that led nowhere;
+``time_to_trigger_s``: in place of patience, as it once was."""
 
 
 def players() -> tuple[Player, ...]:
@@ -52,15 +53,16 @@ def zsched(name: str, **settings: Any) -> Player:
     is_told, tells_jobs = bool(given.pop("is_told", True)), bool(given.pop("tells_jobs", True))
     changes = {key: given.pop(key) for key in tuple(given) if is_of_task(key)}
     is_service = given.setdefault("score", DEFAULT_SCORE) is ScoreForm.SERVICE  # no task here weighs the network
-    if "time_to_trigger_s" not in given and "patience" not in changes:
-        changes.setdefault("learns_patience", is_service)
-        changes["patience"] = FIRST_PATIENCE if is_service else PAPER_PATIENCE
-    if changes.get("patience") is not None:
-        given = {"bonus": PATIENT_BONUS, "cool_down_s": PATIENT_COOL_DOWN_S, **given}
+    trigger_s, is_damped = given.pop("time_to_trigger_s", None), bool(given.pop("is_damped", True))
+    if trigger_s is None:
+        if "patience" not in changes:
+            changes.setdefault("learns_patience", is_service)
+            changes["patience"] = FIRST_PATIENCE if is_service else PAPER_PATIENCE
+        given = {"bonus": DEFAULT_BONUS, "cool_down_s": DEFAULT_COOL_DOWN_S, **given}
     tuning = Tuning(**{"weights": EVEN, **given})
     return Player(
         name=name,
-        make=_core(tuning, changes),
+        make=_core(tuning, changes, trigger_s, is_damped=is_damped),
         tuning=tuning,
         look=Look(smoothing_s=smoothing_s),
         changes=changes,
@@ -69,9 +71,11 @@ def zsched(name: str, **settings: Any) -> Player:
     )
 
 
-def _core(tuning: Tuning, changes: Mapping[str, Any]) -> Callable[[Sight], Rule]:
+def _core(
+    tuning: Tuning, changes: Mapping[str, Any], trigger_s: float | None, *, is_damped: bool
+) -> Callable[[Sight], Rule]:
     own = {name: changes[name] for name in ("patience", "learns_patience") if name in changes}
-    return lambda view: CoreRule(view, tuning, **own)
+    return lambda view: CoreRule(view, tuning, time_to_trigger_s=trigger_s, is_damped=is_damped, **own)
 
 
 def _picks(name: str, weights: Weights, cost: float) -> Player:

@@ -17,7 +17,8 @@ from zsched.core.values.model import Allocation
 SPEC = TaskSpec(
     name="merge",
     candidates=("edge1", "edge2"),
-    tuning=tuning_of(cpu=1.0, memory=0.0, time_to_trigger_s=0.0, cool_down_s=0.0),
+    tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0),
+    patience=0.0,
     max_moves_per_minute=2,
 )
 OWNED = Allocation(task="merge", revision=1, epoch=1, owner="edge1", tuning=SPEC.tuning)

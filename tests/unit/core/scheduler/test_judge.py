@@ -9,6 +9,7 @@ import pytest
 from support.fleets import tuning_of
 from zsched.core.scheduler.judge import (
     INITIAL_SETTLE_S,
+    UNSCORED_S,
     Judge,
     Judgement,
     Outcome,
@@ -28,10 +29,15 @@ from zsched.core.values.model import (
     WorkerState,
 )
 
-TUNING = tuning_of(cpu=1.0, memory=0.0, bonus=0.10, time_to_trigger_s=2.0, cool_down_s=10.0)
+TUNING = tuning_of(cpu=1.0, memory=0.0, bonus=0.10, cool_down_s=10.0)
 SPEC = TaskSpec(
-    name="merge", candidates=("edge1", "edge2", "edge3"), tuning=TUNING, worker=WorkerSpec(command=("worker",))
+    name="merge",
+    candidates=("edge1", "edge2", "edge3"),
+    tuning=TUNING,
+    patience=0.1,
+    worker=WorkerSpec(command=("worker",)),
 )
+"""A lead of 0.05 over the bonus, as in `BETTER`, uses the patience up in 2 s."""
 LONG = 1000.0
 """Settled for so long that no cool-down counts."""
 
@@ -100,29 +106,27 @@ def test_the_bonus_is_added_once_whatever_the_number_of_robots_and_rounds() -> N
             assert judgement.aggregate == pytest.approx(0.6)
 
 
-# --- time-to-trigger -----------------------------------------------------------------------------------------------
+# --- what staying costs --------------------------------------------------------------------------------------------
 
 
-def test_a_lead_is_proposed_after_the_time_to_trigger() -> None:
+def test_a_lead_is_proposed_once_staying_has_cost_the_patience() -> None:
     judge = Judge(spec=SPEC)
-    outcomes = [(now, judged(judge, BETTER, now).outcome) for now in (10.0, 11.0, 11.99, 12.0)]
+    outcomes = [(now, judged(judge, BETTER, now).outcome) for now in (10.0, 11.0, 11.99, 12.01)]
 
-    assert outcomes == [(10.0, Outcome.WAIT), (11.0, Outcome.WAIT), (11.99, Outcome.WAIT), (12.0, Outcome.PROPOSE)]
+    assert outcomes == [(10.0, Outcome.WAIT), (11.0, Outcome.WAIT), (11.99, Outcome.WAIT), (12.01, Outcome.PROPOSE)]
     proposed = judged(judge, BETTER, 12.5)
     assert (proposed.candidate, proposed.is_escape) == ("edge2", False)
     assert proposed.aggregate == 0.65
-    assert "edge2 leads by 0.050" in proposed.reason
+    assert proposed.reason == "edge2 leads by 0.050 over edge1 with its bonus; staying has cost 0.1"
 
 
-@pytest.mark.parametrize("break_", [EQUAL, {"edge1": 0.5}, {}])
-def test_a_break_in_the_lead_starts_the_time_again(break_: Mapping[str, float]) -> None:
-    judge = Judge(spec=SPEC)
-    judged(judge, BETTER, 0.0)
-    judged(judge, break_, 1.0)
+def test_without_patience_the_first_lead_is_followed() -> None:
+    """The paper's schemes play so; what the bonus is for, it still does."""
+    judge = Judge(spec=replace(SPEC, patience=0.0))
 
-    assert judged(judge, BETTER, 2.0).outcome is Outcome.WAIT
-    assert judged(judge, BETTER, 3.9).outcome is Outcome.WAIT
-    assert judged(judge, BETTER, 4.0).outcome is Outcome.PROPOSE
+    assert judged(judge, EQUAL, 0.0).outcome is Outcome.STAY
+    assert judged(judge, BETTER, 0.5).outcome is Outcome.PROPOSE
+    assert judged(Judge(spec=replace(SPEC, patience=0.0)), BETTER, 0.0).outcome is Outcome.PROPOSE
 
 
 def test_challengers_that_take_turns_do_not_save_the_owner() -> None:
@@ -135,13 +139,15 @@ def test_challengers_that_take_turns_do_not_save_the_owner() -> None:
     assert (judgement.outcome, judgement.candidate) == (Outcome.PROPOSE, "edge2")
 
 
-def test_after_a_reset_the_whole_time_counts_again() -> None:
+def test_after_a_reset_staying_has_cost_nothing() -> None:
     judge = Judge(spec=SPEC, not_ready_since=0.0)
     judged(judge, BETTER, 0.0)
+    judged(judge, BETTER, 1.9)
     judge.reset()
 
     assert judge.not_ready_since == 0.0, "a lost vote does not make the owner's worker ready"
-    assert judged(judge, BETTER, 2.0).outcome is Outcome.WAIT
+    assert judged(judge, BETTER, 3.0).outcome is Outcome.WAIT
+    assert judged(judge, BETTER, 3.95).outcome is Outcome.PROPOSE
 
 
 def test_a_new_owner_has_its_own_start_up_time() -> None:
@@ -151,11 +157,34 @@ def test_a_new_owner_has_its_own_start_up_time() -> None:
     assert judge.not_ready_since is None
 
 
-def test_an_owner_that_may_not_be_scored_is_left_by_the_same_timers() -> None:
-    judge = Judge(spec=SPEC)
+@pytest.mark.parametrize("patience", [0.0, 0.1, 1000.0])
+def test_an_owner_that_cannot_be_scored_is_left_after_a_while_whatever_the_patience(patience: float) -> None:
+    """Nobody knows what staying costs there: for an account that never fills it would stay for ever."""
+    judge = Judge(spec=replace(SPEC, patience=patience))
+    waiting = judged(judge, {"edge2": 0.1}, 100.0)
 
-    assert judged(judge, {"edge2": 0.1}, 0.0).outcome is Outcome.WAIT
-    assert judged(judge, {"edge2": 0.1}, 2.0).outcome is Outcome.PROPOSE
+    assert (waiting.outcome, waiting.candidate) == (Outcome.WAIT, "edge1")
+    assert "edge1 cannot be scored" in waiting.reason
+    assert judged(judge, {"edge2": 0.1}, 100.0 + UNSCORED_S - 0.1).outcome is Outcome.WAIT
+    assert judged(judge, {"edge2": 0.1}, 100.0 + UNSCORED_S).outcome is Outcome.PROPOSE
+
+
+@pytest.mark.parametrize("break_", [EQUAL, {}])
+def test_an_owner_that_was_scored_in_between_is_given_the_whole_time_again(break_: Mapping[str, float]) -> None:
+    judge = Judge(spec=SPEC)
+    judged(judge, {"edge2": 0.1}, 0.0)
+    judged(judge, break_, UNSCORED_S - 0.5)
+
+    assert judged(judge, {"edge2": 0.1}, UNSCORED_S).outcome is Outcome.WAIT
+    assert judged(judge, {"edge2": 0.1}, 2 * UNSCORED_S).outcome is Outcome.PROPOSE
+
+
+def test_a_lead_that_came_before_does_not_count_for_an_owner_that_cannot_be_scored() -> None:
+    judge = Judge(spec=replace(SPEC, patience=1000.0))
+    for now in range(5):
+        judged(judge, BETTER, float(now))
+
+    assert judged(judge, {"edge2": 0.65}, 5.0).outcome is Outcome.WAIT
 
 
 # --- cool-down -----------------------------------------------------------------------------------------------------
@@ -174,18 +203,18 @@ def test_after_a_move_the_task_stays_for_the_cool_down() -> None:
     }
 
 
-def test_time_to_trigger_runs_during_the_cool_down_but_is_not_replaced_by_it() -> None:
+def test_staying_costs_during_the_cool_down_as_well_and_the_cool_down_alone_moves_nothing() -> None:
     judge = Judge(spec=SPEC)
     judged(judge, BETTER, 9.0, settled=9.0)
 
     assert judged(judge, BETTER, 10.0, settled=10.0).outcome is Outcome.WAIT
-    assert judged(judge, BETTER, 11.0, settled=11.0).outcome is Outcome.PROPOSE
+    assert judged(judge, BETTER, 11.1, settled=11.1).outcome is Outcome.PROPOSE
 
 
 # --- escape --------------------------------------------------------------------------------------------------------
 
 
-def test_an_escape_skips_both_timers_and_excludes_the_owner() -> None:
+def test_an_escape_skips_patience_and_cool_down_and_excludes_the_owner() -> None:
     judgement = judged(
         Judge(spec=SPEC), {"edge1": 0.9, "edge2": 0.1, "edge3": 0.2}, 0.0, settled=0.0, escape="edge1 is gone"
     )
@@ -258,14 +287,6 @@ def test_paused_or_pinned_tasks_stay_whatever_happens(word: str, escape: str | N
 
     assert (judgement.outcome, judgement.candidate, judgement.is_escape) == (Outcome.STAY, "edge1", False)
     assert judgement.reason == f"{word} by the operator"
-
-
-def test_a_pause_does_not_count_towards_the_time_to_trigger() -> None:
-    judge = Judge(spec=SPEC)
-    judged(judge, BETTER, 0.0)
-    judged(judge, BETTER, 1.0, agreed=allocation(paused=True))
-
-    assert judged(judge, BETTER, 100.0).outcome is Outcome.WAIT
 
 
 # --- escape_reason -------------------------------------------------------------------------------------------------
@@ -397,13 +418,6 @@ def moved_after(aggregates: Mapping[str, float], *, settled: float = LONG) -> fl
 def test_with_patience_a_task_moves_once_staying_has_cost_it(challenger: float, after_s: float) -> None:
     """The owner has 0.5 and a bonus of 0.1; lead times seconds must reach 0.2 (rounded up to the next judgement)."""
     assert moved_after({"edge1": 0.5, "edge2": challenger + 1e-6}) == after_s
-
-
-def test_a_patient_task_leaves_an_owner_that_may_not_be_scored_by_the_time_to_trigger() -> None:
-    """Nobody knows what staying costs there: for an account that never fills it would stay for ever."""
-    judge = Judge(spec=PATIENT)
-    found = [judged(judge, {"edge2": 0.1}, 100.0 + tick / 2).outcome for tick in range(5)]
-    assert found == [*[Outcome.WAIT] * 4, Outcome.PROPOSE]
 
 
 def test_patience_is_given_back_while_nobody_leads() -> None:

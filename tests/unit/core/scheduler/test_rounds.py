@@ -13,7 +13,7 @@ from support.robots import Decider
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.instructions import AskUtilities, Instruction, PublishProposal
 from zsched.core.scheduler.judge import Outcome
-from zsched.core.scheduler.rounds import TIMER_MARGIN_S, TaskRound
+from zsched.core.scheduler.rounds import TaskRound
 from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec
 from zsched.core.values.messages import Utilities
 from zsched.core.values.model import (
@@ -31,9 +31,10 @@ from zsched.core.vote.voting import Voting, vote_time
 
 T = TypeVar("T")
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
-TUNING = tuning_of(cpu=1.0, memory=0.0, time_to_trigger_s=2.0, cool_down_s=0.0)
+TUNING = tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0)
+PATIENCE = 1.0
 FLEET = fleet_of(
-    TaskSpec(name="merge", candidates=EDGES, tuning=TUNING, worker=WorkerSpec(command=("merge",))),
+    TaskSpec(name="merge", candidates=EDGES, tuning=TUNING, patience=PATIENCE, worker=WorkerSpec(command=("merge",))),
     of=sorted((*ROBOTS, *EDGES)),
     electors=ROBOTS,
 )
@@ -225,17 +226,40 @@ def test_hurry_during_a_gather_runs_another_round_after_it() -> None:
     assert of(robot.tick(), AskUtilities)
 
 
-def test_lead_that_waits_for_its_time_to_trigger_is_judged_when_it_ends() -> None:
+def lead_of(robot: Robot) -> float:
+    """Of the best over the owner with its bonus."""
+    assert robot.task.judgement is not None
+    aggregates = robot.task.judgement.aggregates
+    return max(aggregates.values()) - aggregates["edge1"]
+
+
+def test_a_lead_is_followed_in_the_round_by_which_staying_has_cost_the_patience() -> None:
     robot = Robot(owner_cpu=3.9)
     robot.round(edge1=0.02)
     assert robot.outcome() is Outcome.WAIT
-    began = robot.now
+    due = robot.now + PATIENCE / lead_of(robot)
     while robot.outcome() is Outcome.WAIT:
         robot.profiles({"edge1": 3.9})
         out = robot.round(edge1=0.02)
-        assert robot.now <= began + TUNING.time_to_trigger_s + 2 * TIMER_MARGIN_S
-    assert robot.now == pytest.approx(began + TUNING.time_to_trigger_s, abs=2 * TIMER_MARGIN_S)
+    assert due <= robot.now <= due + 1.1 * FLEET.timing.decide_s
     assert proposed(out) == ["edge2"]
+
+
+@pytest.mark.parametrize(("paused", "pinned"), [(True, False), (False, True)])
+def test_what_staying_costs_while_an_operator_holds_a_task_moves_nothing_afterwards(
+    *, paused: bool, pinned: bool
+) -> None:
+    robot = Robot(owner_cpu=3.9)
+    robot.value = replace(robot.value, paused=paused, pinned=pinned)
+    for _ in range(10):
+        robot.profiles({"edge1": 3.9})
+        robot.round(edge1=0.02)
+    assert robot.outcome() is Outcome.STAY
+    robot.value = replace(robot.value, paused=False, pinned=False)
+    robot.decider.on_learnt("merge", is_new_epoch=False, now=robot.now)
+    robot.profiles({"edge1": 3.9})
+    assert proposed(robot.round(edge1=0.02)) == []
+    assert robot.outcome() is Outcome.WAIT
 
 
 def test_gone_owner_is_left_in_one_round_by_whoever_is_there() -> None:
@@ -581,39 +605,44 @@ def test_a_time_in_which_the_owner_was_not_heard_is_no_time_in_which_its_worker_
 # --- what ends a lead ------------------------------------------------------------------------------------------------
 
 
-def test_a_vote_that_stays_starts_the_caller_s_time_to_trigger_again() -> None:
-    """Else a robot with a nervous view would call a vote in every round."""
+def beaten() -> Robot:
+    """A robot at which the owner has been beaten for a round, and has not used up the patience."""
     robot = Robot(owner_cpu=3.9)
-    robot.round(edge1=0.02)
-    began = robot.task.judge.beaten_since
-    assert began is not None
+    for _ in range(2):
+        robot.profiles({"edge1": 3.9})
+        robot.round(edge1=0.02)
+    assert 0.0 < robot.task.judge.spent < PATIENCE
+    return robot
+
+
+def test_a_vote_that_stays_gives_the_caller_all_its_patience_again() -> None:
+    """Else a robot with a nervous view would call a vote in every round."""
+    robot = beaten()
     for voter in ("robot2", "robot3"):
         robot.paper(voter, "edge1")
     robot.paper("robot1", "edge2")
     assert robot.voting.tally is not None
     assert robot.voting.tally.outcome is VoteOutcome.STAY
-    assert robot.task.judge.beaten_since is None
-    robot.now = began + TUNING.time_to_trigger_s
+    assert robot.task.judge.spent == 0.0
+    robot.now += 0.7 * PATIENCE / lead_of(robot)
     robot.profiles({"edge1": 3.9})
     assert proposed(robot.round(edge1=0.02)) == []
     assert robot.outcome() is Outcome.WAIT
 
 
 def test_a_vote_without_a_quorum_does_not() -> None:
-    robot = Robot(owner_cpu=3.9)
-    robot.round(edge1=0.02)
+    robot = beaten()
     robot.paper("robot1", "edge2")
     robot.tick(vote_time(FLEET.timing))
     assert robot.voting.tally is not None
     assert robot.voting.tally.outcome is VoteOutcome.NO_QUORUM
-    assert robot.task.judge.beaten_since is not None
+    assert robot.task.judge.spent > 0.0
 
 
 @pytest.mark.parametrize("is_new_epoch", [True, False])
 def test_a_new_owner_has_all_its_time_to_get_ready_and_new_weights_give_none(is_new_epoch: bool) -> None:
-    robot = Robot(owner_cpu=3.9)
-    robot.round(edge1=0.02)
+    robot = beaten()
     robot.task.judge.not_ready_since = 90.0
     robot.decider.on_learnt("merge", is_new_epoch=is_new_epoch, now=robot.now)
-    assert robot.task.judge.beaten_since is None
+    assert robot.task.judge.spent == 0.0
     assert robot.task.judge.not_ready_since == (None if is_new_epoch else 90.0)

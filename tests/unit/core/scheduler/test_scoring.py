@@ -10,7 +10,7 @@ from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts, compare, score
 from zsched.core.scheduler.utility import NEARLY_FULL, service_utility
 from zsched.core.values.fleet import (
-    PATIENT_BONUS,
+    DEFAULT_BONUS,
     Demand,
     LinkLimits,
     PairReading,
@@ -153,7 +153,7 @@ def test_a_task_that_has_its_memory_counts_a_full_machine_less_and_not_for_nothi
 
     enough, half_way, nothing = term(3400.0), term(3500.0), term(3600.0)
     assert term(3600.0, ScoreForm.PAPER) == 0.0
-    assert enough - PATIENT_BONUS > half_way - PATIENT_BONUS > nothing, (
+    assert enough - DEFAULT_BONUS > half_way - DEFAULT_BONUS > nothing, (
         "a full one is worth a move, a half full one late"
     )
     assert nothing == pytest.approx(enough * (1.0 - NEARLY_FULL), abs=0.01)

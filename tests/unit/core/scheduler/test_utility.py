@@ -19,7 +19,7 @@ from zsched.core.scheduler.utility import (
     total_utility,
 )
 from zsched.core.values import fleet
-from zsched.core.values.fleet import PATIENT_BONUS
+from zsched.core.values.fleet import DEFAULT_BONUS
 from zsched.core.values.model import ScoreForm, Weights
 
 SEEDED = settings(derandomize=True, database=None, deadline=None)
@@ -162,8 +162,8 @@ def test_room_is_worth_more_the_more_there_is_and_less_the_more_is_needed(
 def test_below_the_need_a_term_falls_as_the_work_that_is_done_and_above_it_next_to_nothing_counts() -> None:
     whole = service_utility(2.0, 2.0, 4.0)
     assert service_utility(1.0, 2.0, 4.0) == pytest.approx(whole / 2, rel=0.02)
-    assert whole < service_utility(4.0, 2.0, 4.0) < whole + PATIENT_BONUS
-    assert service_utility(4.0, 0.2, 4.0) <= service_utility(0.2, 0.2, 4.0) + PATIENT_BONUS, "idle beside just enough"
+    assert whole < service_utility(4.0, 2.0, 4.0) < whole + DEFAULT_BONUS
+    assert service_utility(4.0, 0.2, 4.0) <= service_utility(0.2, 0.2, 4.0) + DEFAULT_BONUS, "idle beside just enough"
 
 
 def test_a_tenth_of_a_machine_places_tasks_apart_however_much_room_there_is() -> None:

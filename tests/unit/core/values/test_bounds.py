@@ -137,7 +137,6 @@ NAMES = [
 RATIO = (0.0, 1.0)
 RANGES = [
     (TUNING, "bonus", "bonus", RATIO),
-    (TUNING, "time_to_trigger_s", "time_to_trigger_s", (0.0, 3600.0)),
     (TUNING, "cool_down_s", "cool_down_s", (0.0, 86400.0)),
     (LINK, "rssi_dbm", "link.rssi_dbm", (-120.0, 0.0)),
     (LINK, "trend_db_s", "link.trend_db_s", (-100.0, 100.0)),

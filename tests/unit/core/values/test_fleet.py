@@ -45,7 +45,7 @@ FLEET = Fleet(
 
 
 def test_defaults_are_the_design_s_first_ones() -> None:
-    assert (TUNING.bonus, TUNING.time_to_trigger_s, TUNING.cool_down_s) == (0.10, 2.0, 10.0)
+    assert (TUNING.bonus, TUNING.cool_down_s, TASK.patience) == (0.10, 10.0, 0.55)
     assert TUNING.aggregate is Aggregate.MEAN
     assert LinkLimits() == LinkLimits(nu_dbm=-80.0, rho_dbm=-40.0)
     timing = Timing()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from zsched.core.scheduler.patience import FIRST_PATIENCE
-from zsched.core.values.fleet import PAPER_PATIENCE, PATIENT_BONUS, PATIENT_COOL_DOWN_S, Timing
+from zsched.core.values.fleet import DEFAULT_BONUS, DEFAULT_COOL_DOWN_S, PAPER_PATIENCE, Timing
 from zsched.core.values.model import Tuning
 from zsched_lab.decisions.loads import Array
 from zsched_lab.decisions.replay import Entry, replay
@@ -16,8 +16,8 @@ from zsched_lab.decisions.rules import CoreRule
 from zsched_lab.decisions.world import DT_S, EVEN, World, build_fleet
 from zsched_lab.sim.simulator import CORES, MEMORY_MB, Simulator
 
-TIMER = Tuning(weights=EVEN, cool_down_s=10.0)
-PATIENT = Tuning(weights=EVEN, cool_down_s=PATIENT_COOL_DOWN_S, bonus=PATIENT_BONUS)
+SLOW = Tuning(weights=EVEN, cool_down_s=10.0)
+PATIENT = Tuning(weights=EVEN, cool_down_s=DEFAULT_COOL_DOWN_S, bonus=DEFAULT_BONUS)
 MINUTES = 3
 STARTED_AT_S = 100.0
 """The simulator's clock at its start."""
@@ -49,7 +49,7 @@ def history(seed: int, scatter: float) -> World:
     )
 
 
-def by_nodes(world: World, tuning: Tuning, patience: float | None, *, learns: bool = False) -> list[tuple[float, str]]:
+def by_nodes(world: World, tuning: Tuning, patience: float, *, learns: bool = False) -> list[tuple[float, str]]:
     """(time, owner) of every allocation that a fleet of full nodes learns."""
     column = {name: index for index, name in enumerate(world.candidates)}
     cpu, memory = world.cpu_read, world.memory_read
@@ -82,14 +82,14 @@ def _at(table: Array, step: int, column: int) -> float:
 @pytest.mark.parametrize(
     ("seed", "scatter", "tuning", "patience", "learns"),
     [
-        (1, 0.0, TIMER, None, False),
+        (1, 0.0, SLOW, PAPER_PATIENCE, False),
         (2, 0.03, PATIENT, PAPER_PATIENCE, False),
         (1, 0.0, PATIENT, FIRST_PATIENCE, True),
         (2, 0.03, PATIENT, FIRST_PATIENCE, True),
     ],
 )
 def test_the_replay_makes_the_moves_that_full_nodes_make(
-    seed: int, scatter: float, tuning: Tuning, patience: float | None, *, learns: bool
+    seed: int, scatter: float, tuning: Tuning, patience: float, *, learns: bool
 ) -> None:
     world = history(seed, scatter)
     rule = Entry(name="zsched", make=lambda view: CoreRule(view, tuning, patience=patience, learns_patience=learns))

@@ -10,11 +10,11 @@ import pytest
 
 from zsched.core.scheduler import scoring
 from zsched.core.scheduler.patience import FIRST_PATIENCE
-from zsched.core.values.fleet import PATIENT_BONUS, PATIENT_COOL_DOWN_S, TaskSpec
+from zsched.core.values.fleet import DEFAULT_BONUS, DEFAULT_COOL_DOWN_S, TaskSpec
 from zsched.core.values.model import ScoreForm, Utility, UtilityVector, Weights
 from zsched_lab.decisions import __main__ as package
 from zsched_lab.decisions import entries
-from zsched_lab.decisions.rules import CoreRule
+from zsched_lab.decisions.rules import CoreRule, TimedJudge
 from zsched_lab.decisions.service import cast, command, picture, study, tables
 from zsched_lab.decisions.service import replay as closed
 from zsched_lab.decisions.service.history import MEASURED, History, build
@@ -110,7 +110,7 @@ def test_the_paper_s_score_here_is_zsched_of_the_other_study() -> None:
 
 def test_the_service_rule_is_what_a_fleet_file_gets_that_says_nothing() -> None:
     assert ZSCHED.changes == {"patience": FIRST_PATIENCE, "learns_patience": True}
-    assert (ZSCHED.tuning.bonus, ZSCHED.tuning.cool_down_s) == (PATIENT_BONUS, PATIENT_COOL_DOWN_S)
+    assert (ZSCHED.tuning.bonus, ZSCHED.tuning.cool_down_s) == (DEFAULT_BONUS, DEFAULT_COOL_DOWN_S)
     made = ZSCHED.make(TaskView(scene(build(seed=3, hours=HOURS, load_s=0.0), 1.0, None), spec_of(3)))
     assert isinstance(made, CoreRule)
     assert [judge.spec.learns_patience for judge in made._judges] == [True] * 3
@@ -126,7 +126,10 @@ def test_a_rule_may_be_described() -> None:
     assert (player.tuning.cool_down_s, player.tuning.aggregate, player.changes["patience"]) == (1.5, "median", 0.3)
     assert cast.described("new:score=service").tuning.score is ScoreForm.SERVICE
     timer = cast.described("timer:time_to_trigger_s=2")
-    assert (timer.tuning.time_to_trigger_s, timer.tuning.bonus, timer.changes) == (2.0, 0.1, {})
+    made = timer.make(TaskView(scene(build(seed=3, hours=HOURS, load_s=0.0), 1.0, None), spec_of(3)))
+    assert isinstance(made, CoreRule)
+    assert (made.time_to_trigger_s, timer.tuning.bonus, timer.tuning.cool_down_s) == (2.0, 0.1, 10.0)
+    assert {type(judge) for judge in made._judges} == {TimedJudge}
     for wrong in ("x:speed=3", "x:patience", ":patience=1", "x:bonus=7", "x:demand=1", "x:exclusive=maybe"):
         with pytest.raises(ValueError, match=r"."):
             cast.described(wrong)

@@ -7,7 +7,7 @@ import pytest
 
 from zsched.adapters.radio.network_profiler import parse_trace
 from zsched.config.load import load_fleet
-from zsched.core.values.fleet import DEFAULT_FORESEE_S, PATIENT_BONUS, PATIENT_COOL_DOWN_S
+from zsched.core.values.fleet import DEFAULT_BONUS, DEFAULT_COOL_DOWN_S, DEFAULT_FORESEE_S
 from zsched.core.values.model import ScoreForm
 from zsched.errors import ConfigError
 from zsched_lab.fleet.runner import read_tree, write_fleet
@@ -150,11 +150,11 @@ def test_every_scheme_makes_a_valid_fleet_file(tmp_path: Path, scenario: Scenari
     family = SCHEMES[name].family
     if family is Family.OURS:
         tuned = (spec.learns_patience, spec.tuning.bonus, spec.tuning.cool_down_s, spec.limits.foresee_s)
-        as_it_comes = (True, PATIENT_BONUS, PATIENT_COOL_DOWN_S, DEFAULT_FORESEE_S)
+        as_it_comes = (True, DEFAULT_BONUS, DEFAULT_COOL_DOWN_S, DEFAULT_FORESEE_S)
         assert tuned == as_it_comes, "the product as it comes"
         assert spec.tuning.score is ScoreForm.SERVICE
     elif family is not Family.FIXED:
-        assert (spec.patience, spec.tuning.time_to_trigger_s, spec.limits.foresee_s) == (None, 0.0, 0.0)
+        assert (spec.patience, spec.learns_patience, spec.limits.foresee_s) == (0.0, False, 0.0)
         assert spec.tuning.score is ScoreForm.PAPER, "the paper's schemes score as the paper does"
     if SCHEMES[name].weights is not None:
         assert (spec.tuning.weights.cpu, spec.tuning.weights.memory, spec.tuning.weights.network) == SCHEMES[

@@ -19,9 +19,8 @@ from zsched.wire import codec as wire
 HERE = Path(__file__).parent
 
 _WEIGHTS = model.Weights(cpu=0.5, memory=0.25, network=0.25)
-_TUNING = model.Tuning(
-    weights=_WEIGHTS, bonus=0.125, time_to_trigger_s=1.5, cool_down_s=7.0, aggregate=model.Aggregate.MEDIAN
-)
+_TUNING = model.Tuning(weights=_WEIGHTS, bonus=0.125, cool_down_s=7.0, aggregate=model.Aggregate.MEDIAN)
+"""Its frames hold a ``time_to_trigger_s`` as well, from when there was one: a field that is gone is read over."""
 _VALUE = model.Allocation(
     task="map_merge", revision=7, epoch=4, owner="edge1", tuning=_TUNING, pinned=True, paused=True
 )
