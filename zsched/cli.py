@@ -284,7 +284,7 @@ def check(
     if not json_:
         typer.echo("ok: " + ", ".join(_count(number, noun) for noun, number in counts.items()))
         typer.echo(f"hash: {digest} (nodes whose files have another one say so in `zsched status`)")
-    for first, *more in told_once(fleet.tasks) if fleet is not None and not json_ else ():
+    for first, *more in told_once(fleet.tasks, fleet.timing) if fleet is not None and not json_ else ():
         typer.echo("\n".join((first, *(f"  {line}" for line in more))))
 
 

@@ -1,23 +1,31 @@
-"""Says in words when a task moves: every setting of `scheduling:`, and what it does.
+"""Says in words when a task moves: every setting of `scheduling:` and `link:`, and what it does.
 
-Knows: a task's settings. Does not know: the fleet file, nodes, how anything is printed.
+Knows: a task's settings, the fleet's timing. Does not know: the fleet file, nodes, how anything is printed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Iterator
 
-from zsched.core.scheduler.patience import CHOICES
+from zsched.core.scheduler.damping import ESCAPES_PER_MINUTE
+from zsched.core.scheduler.links import FORESEE_MOST_DB
+from zsched.core.scheduler.patience import CHOICES, FIRST_PATIENCE, spend
 from zsched.core.scheduler.utility import NEARLY_FULL
-from zsched.core.values.fleet import TaskSpec
+from zsched.core.values.fleet import PairReading, TaskSpec, Timing
 from zsched.core.values.model import ScoreForm
 
+LEADS = (0.5, 0.1)
+"""The leads of which it is told how soon they are followed: a machine that is worth half, and a slight one."""
+STEP_S = 0.01
+LONGEST_S = 3600.0
 
-def told_once(specs: Iterable[TaskSpec]) -> list[list[str]]:
+
+def told_once(specs: Iterable[TaskSpec], timing: Timing) -> list[list[str]]:
     """What is told of every task, the names first, and once for all tasks of which the same is told."""
     alike: dict[tuple[str, ...], list[str]] = {}
     for spec in specs:
-        alike.setdefault(tuple(told(spec)), []).append(spec.name)
+        alike.setdefault(tuple(told(spec, timing)), []).append(spec.name)
     return [[f"{_named(names)}: {first}", *more] for (first, *more), names in alike.items()]
 
 
@@ -25,38 +33,94 @@ def _named(names: list[str]) -> str:
     return names[0] if len(names) == 1 else f"tasks {', '.join(names)}"
 
 
-def told(spec: TaskSpec) -> list[str]:
-    """One sentence per setting."""
+def told(spec: TaskSpec, timing: Timing) -> list[str]:
+    """One sentence per setting, each with its key in the fleet file."""
+    return [*_worth(spec), *_when(spec, timing), *_bounds(spec), *_links(spec)]
+
+
+def _worth(spec: TaskSpec) -> Iterator[str]:
+    """What a machine is worth to the task."""
     tuning, weights = spec.tuning, spec.tuning.weights
     is_service = tuning.score is ScoreForm.SERVICE
     shares = ", ".join(f"{name} {getattr(weights, name):g}" for name in ("cpu", "memory", "network"))
     worth = "the share of its work that it gets done there" if is_service else "what is left free there (Eq. 1 and 2)"
+    yield f"a machine is worth {worth} (score: {tuning.score}); weights: {shares}"
+    if tuning.deadline_ms is not None:
+        yield LATENCY.format(deadline=f"{tuning.deadline_ms:g}")
+    elif is_service:
+        yield "it wants as many of its jobs done as possible, late ones too (objective: service)"
     floor = f"{100 * spec.memory_floor_ratio:g} %"
-    seconds = "s of its work" if is_service else "utility seconds"
-    lines = [f"a machine is worth {worth}; weights: {shares}"]
-    if spec.learns_patience:
-        when = f"staying has cost its patience, which it learns ({CHOICES[0]:g} to {CHOICES[-1]:g} {seconds})"
-    else:
-        when = f"staying has cost {spec.patience:g} {seconds} (patience)"
-    lines.append(f"it moves when another candidate leads by more than {tuning.bonus:g} (bonus) and {when}")
-    lines.append(f"after a move it stays {tuning.cool_down_s:g} s at least (cool_down_s), unless its owner fails")
-    lines.append(f"it moves {spec.max_moves_per_minute} times a minute at most (max_moves_per_minute), failures aside")
     if is_service:
         less = f"counts up to {100 * NEARLY_FULL:g} % less"
-        lines.append(f"a machine that it leaves less than {floor} of the memory free {less} (memory_floor_ratio)")
+        yield f"a machine that it leaves less than {floor} of the memory free {less} (memory_floor_ratio)"
     else:
-        lines.append(f"an owner with less than {floor} of its memory free is left at once (memory_floor_ratio)")
-    if tuning.deadline_ms is not None:
-        lines.append(LATENCY.format(deadline=f"{tuning.deadline_ms:g}"))
-    if weights.network > 0.0:
-        lines.append(f"signals count as they will be in {spec.limits.foresee_s:g} s (link.foresee_s)")
-    lines.append(f"a candidate counts that {_REACH[spec.reach.value]} (reach); the robots' {tuning.aggregate} decides")
-    return lines
+        yield f"an owner with less than {floor} of its memory free is left at once (memory_floor_ratio)"
+    reach = f"a candidate counts that {_REACH[spec.reach.value]} (reach)"
+    yield f"{reach}; the robots' {tuning.aggregate} decides (aggregate)"
+
+
+def _when(spec: TaskSpec, timing: Timing) -> Iterator[str]:
+    """When a lead is followed."""
+    tuning = spec.tuning
+    seconds = "s of its work" if tuning.score is ScoreForm.SERVICE else "utility seconds"
+    if spec.learns_patience:
+        when = f"staying has cost its patience, which it learns ({CHOICES[0]:g} to {CHOICES[-1]:g} {seconds})"
+    elif spec.patience > 0.0:
+        when = f"staying has cost {spec.patience:g} {seconds} (patience)"
+    else:
+        when = "that is seen once (patience: 0)"
+    yield f"it moves when another candidate leads by more than {tuning.bonus:g} (bonus) and {when}"
+    followed = "; ".join(f"by {lead:g} {_left(spec, timing, lead)}" for lead in LEADS)
+    yield f"it leaves an owner that a load puts behind another candidate {followed}"
+
+
+def _left(spec: TaskSpec, timing: Timing, lead: float) -> str:
+    """How soon a lead is followed, in words."""
+    bonus = spec.tuning.bonus
+    if lead <= bonus:
+        return "never"
+    if not spec.learns_patience:
+        return f"after about {left_after_s(lead, bonus, spec.patience, timing):.2g} s"
+    first, least, most = (left_after_s(lead, bonus, one, timing) for one in (FIRST_PATIENCE, CHOICES[0], CHOICES[-1]))
+    return f"after about {first:.2g} s at first, {least:.2g} to {most:.2g} s by what it has learnt"
+
+
+def left_after_s(lead: float, bonus: float, patience: float, timing: Timing) -> float:
+    """Seconds from a step in the load to the proposal to leave, by a step that puts the owner behind by ``lead``.
+
+    Smoothing shows the step by and by, and what is seen is added up. That a robot looks once in a round only makes no
+    difference on average: what it sees, it charges for the whole round that has passed. An hour at most.
+    """
+    shown = spent = elapsed_s = 0.0
+    while (shown <= bonus or spent < patience) and elapsed_s < LONGEST_S:
+        elapsed_s += STEP_S
+        shown = lead * (1.0 - math.exp(-elapsed_s / timing.smoothing_s))
+        spent = spend(spent, shown - bonus, patience, STEP_S)
+    return elapsed_s
+
+
+def _bounds(spec: TaskSpec) -> Iterator[str]:
+    """How often it moves at most."""
+    yield f"after a move it stays {spec.tuning.cool_down_s:g} s at least (cool_down_s), unless its owner fails"
+    capped = f"it moves {spec.max_moves_per_minute} times a minute at most (max_moves_per_minute)"
+    yield f"{capped}, failures aside, from which it moves {ESCAPES_PER_MINUTE} times at most"
+
+
+def _links(spec: TaskSpec) -> Iterator[str]:
+    """What a signal is worth; of nodes on cables it says nothing."""
+    limits = spec.limits
+    yield f"a robot does not reach a candidate whose signal is below {limits.nu_dbm:g} dBm (link.nu_dbm)"
+    if spec.tuning.weights.network > 0.0:
+        yield f"a signal is worth 0 at {limits.nu_dbm:g} dBm and 1 from {limits.rho_dbm:g} dBm on (link.rho_dbm)"
+        yield f"through one access point {_PAIR[limits.pair]} counts (link.pair: {limits.pair})"
+        ahead = f"as they will be in {limits.foresee_s:g} s, at most {FORESEE_MOST_DB:g} dB away"
+        yield f"signals count {ahead if limits.foresee_s else 'as they are'} (link.foresee_s)"
 
 
 LATENCY = (
-    "objective latency: a machine is worth the share of jobs that it is expected to do within {deadline} ms, "
-    "by its worker's word of them (CPU per job over the machine's speed and what is free there, and what a job waits "
-    "for otherwise) and the measured way there and back"
+    "objective latency: a machine is worth the share of jobs that it is expected to do within {deadline} ms "
+    "(deadline_ms), by its worker's word of them (CPU per job over the machine's speed and what is free there, and "
+    "what a job waits for otherwise) and the measured way there and back"
 )
 _REACH = {"majority": "most robots reach", "all": "all robots reach"}
+_PAIR = {PairReading.CANDIDATE: "the candidate's way alone", PairReading.WEAKER: "the weaker of the two ways"}

@@ -9,6 +9,7 @@ from random import Random
 import numpy as np
 import pytest
 
+from zsched.commands.rules import left_after_s
 from zsched.config.load import check_bytes
 from zsched.core.values.fleet import DEFAULT_BONUS, DEFAULT_COOL_DOWN_S, PAPER_PATIENCE
 from zsched.core.values.model import Tuning
@@ -76,6 +77,14 @@ def test_patience_follows_a_big_lead_sooner_than_a_small_one() -> None:
         return move.at_s - STEP_AT_S
 
     assert delay(0.05) < delay(0.4) < delay(1.6)
+
+
+@pytest.mark.parametrize("patience", [0.0, 0.05, 0.3, 1.5])
+def test_what_zsched_check_says_of_the_time_to_leave_is_what_the_rule_takes(patience: float) -> None:
+    world = equal_world(seed=1, hours=0.03, half_width=0.0, step_at_s=STEP_AT_S)
+    (move,) = only(world, Entry(name="patient", make=entries.core(world, patience=patience)))
+    told_s = left_after_s(0.3, DEFAULT_BONUS, patience, world.fleet.timing)
+    assert move.at_s - STEP_AT_S == pytest.approx(told_s, abs=0.75 * world.fleet.timing.decide_s)
 
 
 def spiky() -> World:

@@ -1,0 +1,62 @@
+"""What `zsched check` says of a task's settings: all of them, in words, and true."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from support.fleets import task_of, tuning_of
+from zsched.commands.rules import LONGEST_S, left_after_s, told
+from zsched.config.schema import LINK_LIMITS, SCHEDULING
+from zsched.core.values.fleet import LinkLimits, PairReading, TaskSpec, Timing
+from zsched.core.values.model import ScoreForm
+
+TIMING = Timing()
+RADIO = tuning_of(cpu=0.5, memory=0.2, network=0.3, score=ScoreForm.SERVICE, bonus=0.05)
+SPEC = task_of(tuning=RADIO, patience=0.3)
+
+
+def words(spec: TaskSpec) -> str:
+    return "\n".join(told(spec, TIMING))
+
+
+def test_every_setting_is_named_with_its_key() -> None:
+    of_all = words(SPEC) + words(replace(SPEC, tuning=replace(RADIO, deadline_ms=80.0)))
+    keys = [*SCHEDULING.items, *(f"link.{key}" for key in LINK_LIMITS.items)]
+    assert [key for key in keys if f"({key}" not in of_all] == []
+
+
+@pytest.mark.parametrize(
+    ("spec", "said"),
+    [
+        (SPEC, "leads by more than 0.05 (bonus) and staying has cost 0.3 s of its work (patience)"),
+        (replace(SPEC, patience=0.0), "leads by more than 0.05 (bonus) and that is seen once (patience: 0)"),
+        (replace(SPEC, learns_patience=True), "at first, 0.33 to 3.7 s by what it has learnt; by 0.1"),
+        (replace(SPEC, tuning=replace(RADIO, bonus=0.2)), "; by 0.1 never"),
+        (SPEC, "below -80 dBm (link.nu_dbm)"),
+        (SPEC, "signals count as they are (link.foresee_s)"),
+        (replace(SPEC, limits=LinkLimits(foresee_s=3.0)), "as they will be in 3 s, at most 6 dB away (link.foresee_s)"),
+        (replace(SPEC, limits=LinkLimits(pair=PairReading.WEAKER)), "the weaker of the two ways counts"),
+        (SPEC, "(objective: service)"),
+    ],
+)
+def test_a_setting_is_told_by_what_it_does(spec: TaskSpec, said: str) -> None:
+    assert said in words(spec), words(spec)
+
+
+def test_a_task_that_does_not_weigh_the_network_is_told_of_its_reach_alone() -> None:
+    text = words(task_of(patience=0.3))
+    assert "link.nu_dbm" in text
+    assert "link.rho_dbm" not in text
+
+
+def test_the_time_to_leave_grows_with_patience_and_smoothing_and_falls_with_the_lead() -> None:
+    by_patience = [left_after_s(0.5, 0.05, patience, TIMING) for patience in (0.0, 0.15, 0.5)]
+    assert by_patience == sorted(set(by_patience))
+    assert left_after_s(0.5, 0.05, 0.15, replace(TIMING, smoothing_s=3.0)) > by_patience[1]
+    assert left_after_s(0.2, 0.05, 0.15, TIMING) > by_patience[1] > left_after_s(0.9, 0.05, 0.15, TIMING)
+
+
+def test_a_lead_that_is_added_up_for_ever_is_told_as_an_hour() -> None:
+    assert left_after_s(0.0501, 0.05, 1000.0, TIMING) == pytest.approx(LONGEST_S, abs=1.0)
