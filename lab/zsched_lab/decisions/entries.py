@@ -143,10 +143,10 @@ def grid(world: World) -> tuple[Entry, ...]:
 
 
 def cool_downs(world: World) -> tuple[Entry, ...]:
-    """The default with other cool-downs, from shorter than the smoothing to what the timer has."""
+    """The default with other cool-downs, from none to what the timer has."""
     return tuple(
         Entry(name=f"cool-down {cool_s:g} s", limits=foreseeing(world), make=core(world, cool_down_s=cool_s))
-        for cool_s in (1.0, 2.0, 3.0, 5.0, 7.0, 10.0)
+        for cool_s in (0.0, 1.0, 2.0, 3.0, 5.0, 7.0, 10.0)
     )
 
 

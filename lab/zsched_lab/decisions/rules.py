@@ -49,17 +49,6 @@ class Rule(Protocol):
         ...
 
 
-class Unpunished(Damping):
-    """The production's record of moves, which holds nothing against any node; the cap of moves counts by it."""
-
-    __slots__ = ()
-
-    def penalties(self, now: float) -> dict[NodeId, float]:
-        """None."""
-        del now
-        return {}
-
-
 class TimedJudge(Judge):
     """The production's judge with a time-to-trigger in place of patience: another candidate must lead for that long.
 
@@ -102,19 +91,16 @@ class CoreRule:
     patience: float = PAPER_PATIENCE
     learns_patience: bool = False
     time_to_trigger_s: float | None = None
-    is_damped: bool = True
-    """``False``: a node to which the task came back for nothing does not pay for it."""
     moves: list[Move] = field(default_factory=list)
     _judges: list[Judge] = field(init=False)
     _allocation: Allocation = field(init=False)
-    _damping: Damping = field(init=False)
+    _damping: Damping = field(default_factory=Damping)
     _settled_at: float = -math.inf
     _due: float = math.inf
     _spec: TaskSpec = field(init=False)
 
     def __post_init__(self) -> None:
         self._spec = replace(self.view.spec, patience=self.patience, learns_patience=self.learns_patience)
-        self._damping = Damping() if self.is_damped else Unpunished()
         self._judges = [self._new_judge() for _ in self.view.fleet.voters]
         self._allocation = Allocation(task=self._spec.name, revision=0, epoch=0, owner=None, tuning=self.tuning)
 

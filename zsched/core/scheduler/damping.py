@@ -1,12 +1,11 @@
-"""SCHEDULER, restraint under faults: a node that failed or was left often pays for it, and moves are capped.
+"""SCHEDULER, restraint under faults: a node that failed pays for it, and moves are capped.
 
 Knows: what every learnt change of owner says about the node that was left. Does not know: why robots prefer a node.
 
 Route flap damping (RFC 2439) in utility units: a node that failed collects two points, one more when it had just got
-the task; one that is left again soon after it was left before, one point: the task came back for nothing. To leave a
-node for a better one is what moves are for and costs it nothing, nor does a node pay that was told to stop. Points
-decay with a half-life, and the penalty grows as ``STEP * (2**points - 1)``, at most `MAX_PENALTY`. A penalised node
-stays eligible: when it is the only one, it serves.
+the task. To leave a node for a better one is what moves are for and costs it nothing, however soon the task leaves it
+again; nor does a node pay that was told to stop. Points decay with a half-life, and the penalty grows as
+``STEP * (2**points - 1)``, at most `MAX_PENALTY`. A penalised node stays eligible: when it is the only one, it serves.
 Every robot learns the same allocations, so all come to the same penalties; but one that was cut off has missed some,
 and one that was restarted has forgotten them. So robots tell each other (`UtilityVector.penalties`), and what any of
 them remembers counts (`zsched.core.scheduler.scoring.joined`).
@@ -14,7 +13,6 @@ them remembers counts (`zsched.core.scheduler.scoring.joined`).
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from dataclasses import dataclass, field
 
@@ -24,7 +22,7 @@ STEP = 0.03
 MAX_PENALTY = 0.35
 HALF_LIFE_S = 60.0
 PROBATION_S = 30.0
-"""A node that fails so soon after it got the task, or is left so soon after it was left before, had it for nothing."""
+"""A node that fails so soon after it got the task pays more for it."""
 FORGET_BELOW = 0.05
 WINDOW_S = 60.0
 ESCAPES_PER_MINUTE = 60
@@ -37,7 +35,6 @@ class Damping:
 
     _points: dict[NodeId, tuple[float, float]] = field(default_factory=dict)
     _moves: deque[tuple[float, bool]] = field(default_factory=deque)
-    _left_at: dict[NodeId, float] = field(default_factory=dict)
     _owner_since: float = 0.0
 
     def note_move(self, left: NodeId | None, *, has_failed: bool, was_draining: bool = False, now: float) -> None:
@@ -46,11 +43,9 @@ class Damping:
         A node that drained was told to: that says nothing against it, however soon, and though it is gone by now.
         """
         if left is not None:
-            since = self._owner_since if has_failed else self._left_at.get(left, -math.inf)
-            gained = 0.0 if was_draining else 2.0 * float(has_failed) + float(now - since < PROBATION_S)
-            if gained:
+            if has_failed and not was_draining:
+                gained = 2.0 + float(now - self._owner_since < PROBATION_S)
                 self._points[left] = (self.points(left, now) + gained, now)
-            self._left_at[left] = now
             self._moves.append((now, has_failed))
         self._owner_since = now
 

@@ -26,10 +26,9 @@ from zsched_lab.decisions.service.replay import Player, is_of_task
 from zsched_lab.decisions.view import Look, Sight
 from zsched_lab.decisions.world import EVEN, RADIO_ONLY
 
-OWN: Final = ("smoothing_s", "is_told", "tells_jobs", "is_damped", "time_to_trigger_s")
+OWN: Final = ("smoothing_s", "is_told", "tells_jobs", "time_to_trigger_s")
 """Settings of a rule that are neither of `Tuning` nor of `TaskSpec`; ``is_told=0``: run queues are not read;
-``tells_jobs=0``: the worker says nothing of its jobs; ``is_damped=0``: no node pays for moves that led nowhere;
-``time_to_trigger_s``: in place of patience, as it once was."""
+``tells_jobs=0``: the worker says nothing of its jobs; ``time_to_trigger_s``: in place of patience, as it once was."""
 
 
 def players() -> tuple[Player, ...]:
@@ -53,7 +52,7 @@ def zsched(name: str, **settings: Any) -> Player:
     is_told, tells_jobs = bool(given.pop("is_told", True)), bool(given.pop("tells_jobs", True))
     changes = {key: given.pop(key) for key in tuple(given) if is_of_task(key)}
     is_service = given.setdefault("score", DEFAULT_SCORE) is ScoreForm.SERVICE  # no task here weighs the network
-    trigger_s, is_damped = given.pop("time_to_trigger_s", None), bool(given.pop("is_damped", True))
+    trigger_s = given.pop("time_to_trigger_s", None)
     if trigger_s is None:
         if "patience" not in changes:
             changes.setdefault("learns_patience", is_service)
@@ -62,7 +61,7 @@ def zsched(name: str, **settings: Any) -> Player:
     tuning = Tuning(**{"weights": EVEN, **given})
     return Player(
         name=name,
-        make=_core(tuning, changes, trigger_s, is_damped=is_damped),
+        make=_core(tuning, changes, trigger_s),
         tuning=tuning,
         look=Look(smoothing_s=smoothing_s),
         changes=changes,
@@ -71,11 +70,9 @@ def zsched(name: str, **settings: Any) -> Player:
     )
 
 
-def _core(
-    tuning: Tuning, changes: Mapping[str, Any], trigger_s: float | None, *, is_damped: bool
-) -> Callable[[Sight], Rule]:
+def _core(tuning: Tuning, changes: Mapping[str, Any], trigger_s: float | None) -> Callable[[Sight], Rule]:
     own = {name: changes[name] for name in ("patience", "learns_patience") if name in changes}
-    return lambda view: CoreRule(view, tuning, time_to_trigger_s=trigger_s, is_damped=is_damped, **own)
+    return lambda view: CoreRule(view, tuning, time_to_trigger_s=trigger_s, **own)
 
 
 def _picks(name: str, weights: Weights, cost: float) -> Player:
