@@ -279,3 +279,25 @@ def test_unit_tests_open_no_session() -> None:
     assert not [
         str(path.relative_to(ROOT)) for path in tests if path.name != "test_floors.py" and real.search(path.read_text())
     ]
+
+
+def folders_without_code(tests: Path) -> list[str]:
+    """Folders with tests that mirror no folder of the code: ``lab`` is the lab, everything else the package."""
+    found = []
+    for folder in sorted({path.parent.relative_to(tests) for path in tests.rglob("test_*.py")}):
+        code = LAB.joinpath(*folder.parts[1:]) if folder.parts[:1] == ("lab",) else PACKAGE / folder
+        if not code.is_dir():
+            found.append(str(folder))
+    return found
+
+
+@pytest.mark.parametrize("kind", ["unit", "parts"])
+def test_folders_of_tests_are_those_of_the_code(kind: str) -> None:
+    assert folders_without_code(ROOT / "tests" / kind) == []
+
+
+def test_planted_folders_without_code_are_found(tmp_path: Path) -> None:
+    for folder in ("core/vote", "core/absent", "lab/sim", "lab/core"):
+        (tmp_path / folder).mkdir(parents=True)
+        (tmp_path / folder / "test_one.py").touch()
+    assert folders_without_code(tmp_path) == ["core/absent", "lab/core"]

@@ -14,7 +14,7 @@ from zsched_lab.bugs.mutant_tests import KILLED, SURVIVED, TIMEOUT, UNJUDGED, Re
 from zsched_lab.bugs.mutants import Mutant, mutants_of, mutated
 from zsched_lab.bugs.mutate import CORE, Fork, Results, Verdict, choose, score, table
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[4]
 
 
 def changes(source: str) -> set[tuple[str, str]]:

@@ -8,7 +8,7 @@ import pytest
 
 from zsched_lab.sim.coverage import File, merge, reached, table, watch
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[4]
 
 
 def test_table_sums_up_and_names_what_nobody_has_gone() -> None:
