@@ -118,7 +118,7 @@ def _place(mutant: Mutant) -> str:
 def source_hash(root: Path, tests: Sequence[str]) -> str:
     """Of the core and of all tests."""
     files = sorted(
-        {*root.glob("zsched/core/**/*.py"), *root.glob("lab/zsched_lab/sim*.py"), *root.glob("tests/**/*.py")}
+        {*root.glob("zsched/core/**/*.py"), *root.glob("lab/zsched_lab/sim/**/*.py"), *root.glob("tests/**/*.py")}
     )
     digest = hashlib.sha256(" ".join(tests).encode())
     for file in files:
