@@ -7,30 +7,15 @@ import math
 
 import pytest
 
-from support.fleets import tuning_of
+from support.fleets import fleet_of, task_of, tuning_of
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.profile.profile import Profiler
-from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing
-from zsched.core.values.model import DeviceSample, LinkSample, LinkSource, NodeKind, Profile
+from zsched.core.values.fleet import Timing
+from zsched.core.values.model import DeviceSample, LinkSample, LinkSource, Profile
 
 TIMING = Timing()
-FLEET = Fleet(
-    name="lab",
-    timing=TIMING,
-    nodes=(
-        NodeSpec(name="edge1", kind=NodeKind.EDGE),
-        NodeSpec(name="edge2", kind=NodeKind.EDGE),
-        NodeSpec(name="robot1", kind=NodeKind.ROBOT),
-        NodeSpec(name="robot2", kind=NodeKind.ROBOT),
-    ),
-    tasks=(
-        TaskSpec(
-            name="merge",
-            candidates=("edge1", "edge2"),
-            tuning=tuning_of(cpu=0.5, memory=0.25, network=0.25),
-        ),
-    ),
-    electors=("robot1", "robot2"),
+FLEET = fleet_of(
+    task_of(tuning=tuning_of(cpu=0.5, memory=0.25, network=0.25)), of=("edge1", "edge2", "robot1", "robot2")
 )
 
 

@@ -7,27 +7,27 @@ from dataclasses import replace
 
 import pytest
 
+from support.allocations import allocation_of
+from support.fleets import fleet_of
+from support.profiles import load_of, profile_of
+from support.proposals import proposal_of
 from support.robots import Decider
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.instructions import AskUtilities, Instruction, PublishProposal
 from zsched.core.scheduler.judge import Judge, Outcome
 from zsched.core.scheduler.scoring import compare, pick, score
-from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.fleet import TaskSpec, Timing, WorkerSpec
 from zsched.core.values.messages import Utilities
 from zsched.core.values.model import (
     Allocation,
     Link,
     LinkSource,
-    NodeKind,
     PeerState,
-    Profile,
     Proposal,
     Tuning,
     Utility,
     UtilityVector,
     Weights,
-    WorkerLoad,
-    WorkerState,
 )
 
 BOTH = Weights(cpu=0.5, memory=0.5, network=0.0)
@@ -36,23 +36,16 @@ SPEC = TaskSpec(
     name="merge", candidates=("edge1", "edge2", "edge3"), tuning=TUNING, worker=WorkerSpec(command=("merge",))
 )
 ROBOTS = ("robot1", "robot2", "robot3")
-FLEET = Fleet(
-    name="lab",
-    timing=Timing(profile_ttl_s=60.0),  # one set of edge data lasts for a test
-    nodes=(
-        *(NodeSpec(name=name, kind=NodeKind.EDGE) for name in SPEC.candidates),
-        *(NodeSpec(name=name, kind=NodeKind.ROBOT) for name in ROBOTS),
-    ),
-    tasks=(SPEC,),
-    electors=ROBOTS,
-)
+LONG = Timing(profile_ttl_s=60.0)
+"""One set of edge data lasts for a test."""
+FLEET = replace(fleet_of(SPEC, of=(*SPEC.candidates, *ROBOTS)), timing=LONG)
 ALIVE = {node.name: PeerState.ALIVE for node in FLEET.nodes}
 SETTLED_S = 1000.0
 
 
 def allocation(owner: str | None = "edge1", weights: Weights = BOTH, revision: int = 4) -> Allocation:
     tuning = replace(TUNING, weights=weights)
-    return Allocation(task="merge", revision=revision, epoch=revision, owner=owner, tuning=tuning)
+    return allocation_of(revision, owner, tuning=tuning)
 
 
 def gateway_with(now: float = SETTLED_S, **used: tuple[float, float]) -> Gateway:
@@ -60,16 +53,13 @@ def gateway_with(now: float = SETTLED_S, **used: tuple[float, float]) -> Gateway
     gateway = Gateway(FLEET)
     for node in FLEET.nodes:
         cpu, memory = used.get(node.name, (0.5, 0.5))
-        profile = Profile(
-            node=node.name,
-            incarnation=1,
+        profile = profile_of(
+            node.name,
             sequence=0,
-            cpu_cores=4.0,
             cpu_used_cores=4.0 * cpu,
-            memory_mb=4000.0,
             memory_used_mb=4000.0 * memory,
             links=(Link(source=LinkSource.WIRED),),
-            workers=(WorkerLoad(task="merge", state=WorkerState.READY),),
+            workers=(load_of(),),
         )
         gateway.absorb(profile, now)
     return gateway
@@ -324,7 +314,7 @@ def test_no_proposal_with_fewer_fresh_voters_than_a_majority() -> None:
     alone = robot1()
     assert lead_for(alone, 5.0, heard=1) == []
 
-    call = Proposal(voter="robot2", task="merge", base_revision=4, candidate="edge2", aggregate=0.8)
+    call = proposal_of("robot2", "edge2", base_revision=4, aggregate=0.8)
     alone.absorb_proposal(call, allocation(), ALIVE, SETTLED_S + 5.0)
     assert lead_for(alone, 1.0, heard=1, start=SETTLED_S + 5.0) == [], "not even staying is its to propose"
     assert alone.tasks["merge"].judgement is not None

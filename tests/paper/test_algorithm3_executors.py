@@ -6,7 +6,9 @@ import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
+from support.allocations import allocation_of
 from support.fleets import fleet_of, tuning_of
+from support.proposals import proposal_of
 from support.robots import Decider
 from support.todos import done
 from zsched.core.executor.handover import Executor, Phase
@@ -46,9 +48,7 @@ SPEC = TaskSpec(
 
 
 def allocation(owner: str | None, epoch: int, *, revision: int | None = None) -> Allocation:
-    return Allocation(
-        task="merge", revision=epoch if revision is None else revision, epoch=epoch, owner=owner, tuning=TUNING
-    )
+    return allocation_of(epoch if revision is None else revision, owner, epoch=epoch, tuning=TUNING)
 
 
 # --- Consensus -----------------------------------------------------------------------------------------------------
@@ -56,8 +56,7 @@ def allocation(owner: str | None, epoch: int, *, revision: int | None = None) ->
 
 def consensus(votes: Mapping[str, str], *, owner: str = "edge1", is_over: bool = True, best: float = 0.5) -> Tally:
     papers = {
-        robot: Proposal(voter=robot, task="merge", base_revision=1, candidate=candidate, aggregate=best)
-        for robot, candidate in votes.items()
+        robot: proposal_of(robot, candidate, base_revision=1, aggregate=best) for robot, candidate in votes.items()
     }
     return tally(papers, voters=ROBOTS, present=frozenset(ROBOTS), owner=owner, is_over=is_over)
 

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import pytest
 
+from support.allocations import allocation_of
 from support.fleets import tuning_of
 from zsched.core.scheduler.scoring import Standing, compare, pick
 from zsched.core.scheduler.utility import cpu_utility, memory_utility, network_utility, predicted_use, total_utility
 from zsched.core.values.fleet import LinkLimits, Reach, TaskSpec
-from zsched.core.values.model import Aggregate, Allocation, Tuning, Utility, UtilityVector, Weights
+from zsched.core.values.model import Aggregate, Tuning, Utility, UtilityVector, Weights
 
 ALL = frozenset({"cpu", "memory", "network"})
 LIMITS = LinkLimits()
@@ -125,7 +126,7 @@ SPEC = TaskSpec(
 def joint(rows: dict[str, dict[str, float]], aggregate: Aggregate = Aggregate.MEAN) -> Standing:
     """The standing of {robot: {candidate: utility}}; a negative utility stands for unreachable."""
     tuning = Tuning(weights=SPEC.tuning.weights, aggregate=aggregate)
-    allocation = Allocation(task="merge", revision=1, epoch=1, owner="edge1", tuning=tuning)
+    allocation = allocation_of(tuning=tuning)
     vectors = {
         robot: UtilityVector(
             voter=robot,

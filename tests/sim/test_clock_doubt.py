@@ -7,10 +7,12 @@ from dataclasses import replace
 
 import pytest
 
+from support.allocations import allocation_of
+from support.beats import beat_of
 from support.fleets import fleet_of, tuning_of
 from zsched.core.events import ClockCompared
 from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec
-from zsched.core.values.model import Allocation, Beat, Grant, WorkerState
+from zsched.core.values.model import Beat, Grant, WorkerState
 from zsched.core.values.plan import WorkerRole
 from zsched.core.vote.clocks import DOUBT_S, JUMP_S, ClockDoubt
 from zsched.core.vote.lease import RHO, Leases, hold_s
@@ -103,18 +105,10 @@ def test_the_operator_reads_what_is_wrong() -> None:
 
 
 def beat(node: str, number: int, echoes: tuple[Grant, ...] = (), terms: str = "") -> Beat:
-    return Beat(
-        node=node,
-        incarnation=1,
-        sequence=number,
-        loop_lag_s=0.0,
-        learnt=(("guard", 7, 3),),
-        echoes=echoes,
-        lease_terms=terms,
-    )
+    return beat_of(node, number, learnt=(("guard", 7, 3),), echoes=echoes, lease_terms=terms)
 
 
-OF_EDGE1 = Allocation(task="guard", revision=7, epoch=3, owner="edge1", tuning=tuning_of(cpu=1.0, memory=0.0))
+OF_EDGE1 = allocation_of(7, task="guard", epoch=3, tuning=tuning_of(cpu=1.0, memory=0.0))
 
 
 def test_an_elector_in_doubt_grants_nothing_and_afterwards_begins_as_after_a_start() -> None:

@@ -9,10 +9,11 @@ from random import Random
 
 import pytest
 
-from support.fleets import tuning_of
+from support.beats import beat_of
+from support.fleets import fleet_of, tuning_of
 from zsched.core.events import BeatReceived
-from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.values.model import Beat, NodeId, NodeKind
+from zsched.core.values.fleet import Fleet, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.model import NodeId
 from zsched.core.values.plan import WorkerRole
 from zsched.core.vote.lease import hold_s
 from zsched_lab.sim.simulator import CORES, Simulator
@@ -24,10 +25,6 @@ TIMING = Timing()
 def fleet(*, exclusive: bool = True, robots_only: bool = False) -> Fleet:
     robots = ("robot1", "robot2", "robot3")
     edges = () if robots_only else ("edge1", "edge2", "edge3")
-    nodes = tuple(
-        NodeSpec(name=name, kind=NodeKind.EDGE if name.startswith("edge") else NodeKind.ROBOT)
-        for name in sorted(robots + edges)
-    )
     task = TaskSpec(
         name=TASK,
         candidates=edges or robots,
@@ -37,7 +34,7 @@ def fleet(*, exclusive: bool = True, robots_only: bool = False) -> Fleet:
         exclusive=exclusive,
         max_moves_per_minute=1000,
     )
-    return Fleet(name="sim", timing=TIMING, nodes=nodes, tasks=(task,), electors=robots)
+    return fleet_of(task, of=sorted(robots + edges))
 
 
 def is_working(sim: Simulator) -> bool:
@@ -113,7 +110,7 @@ def test_one_forged_number_costs_no_elector_s_grants(seed: int) -> None:
     sim.heal()
     holder = sim.node(owner)
     learnt = tuple((name, value.revision, value.epoch) for name, value in holder.values().items())
-    forged = Beat(node=owner, incarnation=holder.incarnation, sequence=75, loop_lag_s=0.0, learnt=learnt)
+    forged = beat_of(owner, 75, incarnation=holder.incarnation, learnt=learnt)
     sim.deliver(sim.machines["robot2"], BeatReceived(beat=forged))
     assert sim.node("robot2").membership.is_newest(owner), "it looks like the owner's"
     sim.run(1.0)

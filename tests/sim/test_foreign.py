@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from support.fleets import tuning_of
+from support.fleets import fleet_of, tuning_of
 from zsched.core.status import build_snapshot
-from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.values.model import NodeKind
+from zsched.core.values.fleet import TaskSpec, WorkerSpec
 from zsched.core.values.plan import ReadyWhen
 from zsched_lab.sim.simulator import Simulator
 from zsched_lab.sim.swarm import plan
@@ -22,9 +21,7 @@ def fleet() -> Simulator:
         patience=0.0,
         worker=WorkerSpec(ready_when=ReadyWhen.MATCHING, start_deadline_s=DEADLINE_S),
     )
-    kinds = {**dict.fromkeys(EDGES, NodeKind.EDGE), **dict.fromkeys(ROBOTS, NodeKind.ROBOT)}
-    nodes = tuple(NodeSpec(name=name, kind=kind) for name, kind in kinds.items())
-    return Simulator(fleet=Fleet(name="sim", timing=Timing(), nodes=nodes, tasks=(task,), electors=ROBOTS), seed=3)
+    return Simulator(fleet=fleet_of(task, of=EDGES + ROBOTS), seed=3)
 
 
 def problems(sim: Simulator, node: str) -> tuple[str, ...]:

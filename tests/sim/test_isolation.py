@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from support.fleets import tuning_of
+from support.fleets import fleet_of, tuning_of
 from zsched.core.status import build_snapshot
-from zsched.core.values.fleet import Fleet, NodeSpec, OnIsolation, TaskSpec, Timing, WorkerSpec
-from zsched.core.values.model import NodeKind
+from zsched.core.values.fleet import Fleet, OnIsolation, TaskSpec, WorkerSpec
 from zsched.core.values.plan import WorkerRole
 from zsched_lab.sim.simulator import Simulator
 
@@ -17,9 +16,6 @@ EDGES = ("edge1", "edge2")
 
 
 def fleet(on_isolation: OnIsolation) -> Fleet:
-    nodes = tuple(
-        NodeSpec(name=name, kind=NodeKind.EDGE if name in EDGES else NodeKind.ROBOT) for name in sorted(EDGES + ROBOTS)
-    )
     task = TaskSpec(
         name=TASK,
         candidates=EDGES,
@@ -27,7 +23,7 @@ def fleet(on_isolation: OnIsolation) -> Fleet:
         worker=WorkerSpec(command=("true",)),
         on_isolation=on_isolation,
     )
-    return Fleet(name="sim", timing=Timing(), nodes=nodes, tasks=(task,), electors=ROBOTS)
+    return fleet_of(task, of=sorted(EDGES + ROBOTS))
 
 
 def started(on_isolation: OnIsolation, seed: int = 1) -> Simulator:

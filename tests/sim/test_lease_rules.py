@@ -7,6 +7,8 @@ from dataclasses import replace
 
 import pytest
 
+from support.allocations import allocation_of
+from support.beats import beat_of
 from support.fleets import fleet_of, tuning_of
 from support.todos import done, todo_of
 from zsched.core import instructions as do
@@ -14,7 +16,7 @@ from zsched.core.executor.handover import Executor
 from zsched.core.executor.tenure import Tenure
 from zsched.core.instructions import SetRole
 from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec, lease_terms
-from zsched.core.values.model import Allocation, Beat, Grant
+from zsched.core.values.model import Beat, Grant
 from zsched.core.values.plan import WorkerRole
 from zsched.core.vote.lease import RHO, SENT_KEPT, Granter, Holder, Leases, hold_s
 
@@ -23,14 +25,7 @@ ELECTORS = ("r1", "r2", "r3")
 
 
 def beat(node: str = "e1", number: int = 5, *, epoch: int = 3, life: int = 1, released: tuple[Grant, ...] = ()) -> Beat:
-    return Beat(
-        node=node,
-        incarnation=life,
-        sequence=number,
-        loop_lag_s=0.0,
-        learnt=(("guard", 7, epoch),),
-        released=released,
-    )
+    return beat_of(node, number, incarnation=life, learnt=(("guard", 7, epoch),), released=released)
 
 
 def grant(number: int, *, owner: str = "e1", epoch: int = 3, life: int = 1) -> Grant:
@@ -379,7 +374,7 @@ def tended(tenure: Tenure, number: int, now: float) -> tuple[list[do.Instruction
 
 def tenured() -> Tenure:
     executor = Executor(spec=GUARD, me="r1", has_streams=True)
-    done(executor.execute, Allocation(task="guard", revision=7, epoch=3, owner="r1", tuning=GUARD.tuning), 10.0)
+    done(executor.execute, allocation_of(7, "r1", task="guard", epoch=3, tuning=GUARD.tuning), 10.0)
     return Tenure(fleet=FLEET, me="r1", leases=leases(), executors={"guard": executor})
 
 
@@ -427,7 +422,7 @@ def test_an_owner_that_is_asked_again_gives_back_at_once_when_its_worker_has_sto
     """Found by the simulator (seed 60191): it waited for a second stop, and echoes prolonged the wait for ever."""
     held = leases()
     executor = Executor(spec=GUARD, me="r1", has_streams=True)
-    done(executor.execute, Allocation(task="guard", revision=7, epoch=3, owner="r1", tuning=GUARD.tuning), 10.0)
+    done(executor.execute, allocation_of(7, "r1", task="guard", epoch=3, tuning=GUARD.tuning), 10.0)
     tenure = Tenure(fleet=FLEET, me="r1", leases=held, executors={"guard": executor})
     for elector in ("r1", "r2"):
         held.on_beat(echo(elector, 5), {}, 10.01)

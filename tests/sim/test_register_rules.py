@@ -7,6 +7,8 @@ from random import Random
 
 import pytest
 
+from support.allocations import allocation_of
+from support.ballots import ballot_of
 from support.fleets import fleet_of, tuning_of
 from support.registers import Step, did
 from support.todos import agreed
@@ -16,7 +18,6 @@ from zsched.core.values.fleet import TaskSpec, WorkerSpec, electorate_hash
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise
 from zsched.core.values.model import (
     Acceptance,
-    Allocation,
     Ballot,
     DurableState,
     RegisterState,
@@ -25,7 +26,7 @@ from zsched.core.vote.agreement import Agreement
 from zsched.core.vote.register import Register
 
 ELECTORS = ("r1", "r2", "r3")
-INITIAL = Allocation(task="merge", revision=0, epoch=0, owner=None, tuning=tuning_of(cpu=1.0, memory=0.0))
+INITIAL = allocation_of(0, None, tuning=tuning_of(cpu=1.0, memory=0.0))
 
 
 def proposer(incarnation: int = 4) -> Register:
@@ -92,12 +93,12 @@ def test_newer_among_accepted_values_is_the_higher_ballot_not_the_higher_revisio
     register = proposer()
     ballot = proposed(register)
     older = Acceptance(
-        ballot=Ballot(counter=1, node="r2", incarnation=1),
-        value=Allocation(task="merge", revision=2, epoch=2, owner="e2", tuning=INITIAL.tuning),
+        ballot=ballot_of(node="r2"),
+        value=allocation_of(2, "e2", tuning=INITIAL.tuning),
     )
     newer = Acceptance(
-        ballot=Ballot(counter=1, node="r3", incarnation=1),
-        value=Allocation(task="merge", revision=1, epoch=1, owner="e3", tuning=INITIAL.tuning),
+        ballot=ballot_of(node="r3"),
+        value=allocation_of(owner="e3", tuning=INITIAL.tuning),
     )
     did(register.on_answer, promise("r2", ballot, older), 0.01)
     step = did(register.on_answer, promise("r3", ballot, newer), 0.02)
@@ -114,7 +115,7 @@ def test_a_ballot_that_is_not_its_asker_s_or_a_stranger_s_gets_no_answer(node: s
     elector = Agreement(
         fleet=fleet, me="r1", durable=state, incarnation=1, electorate=electorate, rng=Random(1), now=0.0
     )
-    ballot = Ballot(counter=1, node=node, incarnation=1)
+    ballot = ballot_of(node=node)
     prepare = Prepare(task="merge", ballot=ballot, electorate=electorate)
     value = replace(INITIAL, revision=1, epoch=1, owner="r2")
     accept = Accept(task="merge", acceptance=Acceptance(ballot=ballot, value=value), electorate=electorate)

@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import pytest
 
+from support.beats import beat_of
 from support.fleets import fleet_of, tuning_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.values.fleet import TaskSpec, WorkerSpec
 from zsched.core.values.messages import Learnt
-from zsched.core.values.model import Beat, DurableState, NodeId
+from zsched.core.values.model import DurableState, NodeId
 from zsched.core.vote.witness import ASK_ALL_S, Witness
 from zsched_lab.sim.simulator import CORES, Simulator
 
@@ -261,7 +262,7 @@ def test_a_beat_is_a_reason_to_ask_and_nothing_more() -> None:
     """Whoever can forge a beat makes nobody forget anything, or remember it."""
     own = witness()
     own.on_answer(told("robot2", votes=5))
-    beat = Beat(node="robot2", incarnation=3, sequence=1, loop_lag_s=0.0, votes=5)
+    beat = beat_of("robot2", incarnation=3, votes=5)
     assert not own.must_ask(beat)
     assert own.must_ask(replace(beat, votes=10**9))
     assert own.seen == {"robot2": (3, 5)}

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from support.fleets import tuning_of
+from support.fleets import fleet_of, tuning_of
 from zsched.core.scheduler.probation import LEASE_MARGIN_S
-from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.values.model import NodeKind, PeerState
+from zsched.core.values.fleet import TaskSpec, Timing, WorkerSpec
+from zsched.core.values.model import PeerState
 from zsched_lab.sim.simulator import CORES, Simulator
 
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2", "edge3")
@@ -21,9 +21,7 @@ def settled_on_edge1() -> Simulator:
         patience=0.0,
         worker=WorkerSpec(command=("true",)),
     )
-    kinds = {**dict.fromkeys(EDGES, NodeKind.EDGE), **dict.fromkeys(ROBOTS, NodeKind.ROBOT)}
-    nodes = tuple(NodeSpec(name=name, kind=kind) for name, kind in kinds.items())
-    fleet = Fleet(name="sim", timing=TIMING, nodes=nodes, tasks=(task,), electors=ROBOTS)
+    fleet = fleet_of(task, of=EDGES + ROBOTS)
     sim = Simulator(fleet=fleet, seed=5, load=lambda node, _: (CORES * (0.05 if node == "edge1" else 0.9), 1000.0))
     sim.start()
     assert sim.run_until(lambda: sim.agreed("merge") == "edge1" and not sim.unsettled(), 20), sim.unsettled()

@@ -19,11 +19,10 @@ from random import Random
 
 import pytest
 
-from support.fleets import tuning_of
+from support.fleets import fleet_of, tuning_of
 from zsched.core import events as ev
-from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec
 from zsched.core.values.messages import SetWeights
-from zsched.core.values.model import NodeKind
 from zsched_lab.sim.simulator import CORES, Simulator
 
 FOLDER = Path(__file__).parent / "scenarios"
@@ -31,7 +30,7 @@ FILES = sorted(FOLDER.glob("*.txt"))
 TASK = "merge"
 
 
-def fleet_of(words: list[str]) -> Fleet:
+def fleet(words: list[str]) -> Fleet:
     options = dict(word.split("=") for word in words if "=" in word)
     robots = tuple(f"robot{i}" for i in range(1, int(options.get("robots", 3)) + 1))
     edges = tuple(f"edge{i}" for i in range(1, int(options.get("edges", 2)) + 1))
@@ -44,18 +43,14 @@ def fleet_of(words: list[str]) -> Fleet:
         exclusive="exclusive" in words,
         drain_s=0.2,
     )
-    nodes = tuple(
-        NodeSpec(name=name, kind=NodeKind.ROBOT if name in robots else NodeKind.EDGE)
-        for name in sorted((*robots, *edges))
-    )
-    return Fleet(name="sim", timing=Timing(), nodes=nodes, tasks=(task,), electors=robots)
+    return fleet_of(task, of=sorted((*robots, *edges)))
 
 
 class Scene:
     """One scenario on its simulator; `do` returns what was said."""
 
     def __init__(self) -> None:
-        self.sim = Simulator(fleet=fleet_of([]), seed=1)
+        self.sim = Simulator(fleet=fleet([]), seed=1)
         self.busy: dict[str, float] = {}
         self.owner = ""
         self.verbs: dict[str, Callable[[list[str]], list[str] | None]] = {
@@ -89,7 +84,7 @@ class Scene:
     def fleet(self, words: list[str]) -> None:
         seed = next((int(word.partition("=")[2]) for word in words if word.startswith("seed=")), 1)
         self.sim = Simulator(
-            fleet=fleet_of(words), seed=seed, load=lambda node, _: (CORES * self.busy.get(node, 0.25), 1000.0)
+            fleet=fleet(words), seed=seed, load=lambda node, _: (CORES * self.busy.get(node, 0.25), 1000.0)
         )
 
     def settle(self, words: list[str]) -> list[str]:

@@ -7,9 +7,9 @@ from random import Random
 
 import pytest
 
-from support.fleets import tuning_of
-from zsched.core.values.fleet import PAPER_PATIENCE, Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.values.model import NodeId, NodeKind, PeerState
+from support.fleets import fleet_of, tuning_of
+from zsched.core.values.fleet import PAPER_PATIENCE, Fleet, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.model import NodeId, PeerState
 from zsched_lab.sim.simulator import CORES, Simulator
 
 TASK = "merge"
@@ -17,10 +17,6 @@ TASK = "merge"
 
 def fleet(robots: int = 3, edges: int = 3, *, patience: float = PAPER_PATIENCE, cool_down: float = 10.0) -> Fleet:
     names = [f"robot{i}" for i in range(1, robots + 1)] + [f"edge{i}" for i in range(1, edges + 1)]
-    nodes = tuple(
-        NodeSpec(name=name, kind=NodeKind.ROBOT if name.startswith("robot") else NodeKind.EDGE)
-        for name in sorted(names)
-    )
     task = TaskSpec(
         name=TASK,
         candidates=tuple(f"edge{i}" for i in range(1, edges + 1)),
@@ -28,8 +24,7 @@ def fleet(robots: int = 3, edges: int = 3, *, patience: float = PAPER_PATIENCE, 
         patience=patience,
         worker=WorkerSpec(command=("true",)),
     )
-    electors = tuple(f"robot{i}" for i in range(1, robots + 1))
-    return Fleet(name="sim", timing=Timing(), nodes=nodes, tasks=(task,), electors=electors)
+    return fleet_of(task, of=sorted(names))
 
 
 def settled(sim: Simulator) -> bool:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from support.fleets import tuning_of
+from support.allocations import allocation_of
+from support.fleets import fleet_of, tuning_of
+from support.proposals import proposal_of
 from support.robots import Decider
 from zsched.core import events as ev
 from zsched.core.gateway.gateway import Gateway
-from zsched.core.values.fleet import Fleet, NodeSpec, Reach, TaskSpec, Timing, WorkerSpec
-from zsched.core.values.model import Allocation, NodeKind, PeerState, Proposal
+from zsched.core.values.fleet import Reach, TaskSpec, WorkerSpec
+from zsched.core.values.model import PeerState, Proposal
 from zsched.core.vote.tally import VoteOutcome, tally
 from zsched_lab.sim.simulator import Simulator
 from zsched_lab.sim.swarm import plan
@@ -18,9 +20,7 @@ VOTERS = ("robot1", "robot2", "robot3")
 
 
 def proposal(voter: str, candidate: str, *, is_escape: bool = False) -> Proposal:
-    return Proposal(
-        voter=voter, task="merge", base_revision=3, candidate=candidate, aggregate=0.5, is_escape=is_escape, reason="x"
-    )
+    return proposal_of(voter, candidate, base_revision=3, is_escape=is_escape, reason="x")
 
 
 @pytest.mark.parametrize(
@@ -46,7 +46,7 @@ def test_only_a_robot_that_voted_for_the_winner_commits_it(mine: str, commits: i
     fleet = next(one.fleet for one in map(plan, range(1000)) if one.fleet.voters == VOTERS)
     robot = Decider(fleet, "robot1", Gateway(fleet))
     spec = fleet.task("merge")
-    value = Allocation(task="merge", revision=3, epoch=3, owner="edge1", tuning=spec.tuning)
+    value = allocation_of(3, tuning=spec.tuning)
     states = dict.fromkeys((node.name for node in fleet.nodes), PeerState.ALIVE)
     for voter, candidate in (("robot1", mine), ("robot2", "edge2"), ("robot3", "edge2")):
         robot.absorb_proposal(proposal(voter, candidate), value, states, 1.0)
@@ -64,9 +64,7 @@ def reaching_all(robots: int) -> Simulator:
         worker=WorkerSpec(command=("true",)),
         reach=Reach.ALL,
     )
-    kinds = {**dict.fromkeys(edges, NodeKind.EDGE), **dict.fromkeys(voters, NodeKind.ROBOT)}
-    nodes = tuple(NodeSpec(name=name, kind=kind) for name, kind in kinds.items())
-    fleet = Fleet(name="sim", timing=Timing(), nodes=nodes, tasks=(task,), electors=voters)
+    fleet = fleet_of(task, of=edges + voters)
     sim = Simulator(fleet=fleet, seed=3)
     sim.start()
     assert sim.run_until(lambda: not sim.unsettled(), 20), sim.unsettled()

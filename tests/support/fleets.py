@@ -1,4 +1,4 @@
-"""Fleets, tasks, and the values that tests make over and over. What a test is about, it says itself.
+"""Fleets and tasks, as tests make them over and over. What a test is about, it says itself.
 
 A node whose name begins with "r" is a robot, every other one an edge. Robots are the electors, if there are any.
 """
@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing
-from zsched.core.values.model import Allocation, NodeKind, Tuning, Weights
+from zsched.core.values.model import NodeKind, Tuning, Weights
 
 EDGES = ("edge1", "edge2")
 ROBOTS = ("robot1", "robot2", "robot3")
@@ -42,9 +42,3 @@ def fleet_of(*tasks: TaskSpec, of: Iterable[str] = (*EDGES, *ROBOTS), electors: 
     robots = tuple(node.name for node in known if node.kind is NodeKind.ROBOT)
     chosen = robots if electors is None else tuple(electors)
     return Fleet(name="test", timing=Timing(), nodes=known, tasks=tasks or (task_of(),), electors=chosen)
-
-
-def value_of(revision: int = 1, owner: str | None = "edge1", **options: Any) -> Allocation:
-    """What a register holds of the task "merge"; its epoch is its revision."""
-    fields: dict[str, Any] = {"task": "merge", "epoch": revision, "tuning": tuning_of(), **options}
-    return Allocation(revision=revision, owner=owner, **fields)

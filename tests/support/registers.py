@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from random import Random
 from typing import Any
 
+from support.allocations import allocation_of
+from support.ballots import ballot_of
 from support.fleets import tuning_of
 from zsched.core.instructions import SendAccept, SendPrepare
 from zsched.core.todo import ToDo
@@ -17,7 +19,7 @@ from zsched.core.vote.register import Register
 
 ELECTORS = ("r1", "r2", "r3")
 TUNING = tuning_of()
-INITIAL = Allocation(task="merge", revision=0, epoch=0, owner=None, tuning=TUNING)
+INITIAL = allocation_of(0, None)
 BLANK = RegisterState(task="merge")
 FIRST = MoveOwner(base_revision=0, owner="e1", reason="test")
 BALLOT_S, STAGGER_S = 0.3, 0.03
@@ -50,12 +52,12 @@ def make(
 
 def allocation(revision: int, owner: str = "e1") -> Allocation:
     """The value of a revision, its epoch the same number."""
-    return replace(INITIAL, revision=revision, epoch=revision, owner=owner)
+    return allocation_of(revision, owner)
 
 
 def ballot(counter: int, node: str = "r9") -> Ballot:
     """A stranger's ballot."""
-    return Ballot(counter=counter, node=node, incarnation=1)
+    return ballot_of(counter, node)
 
 
 def prepare(counter: int, node: str = "r9", electorate: str = "abc") -> Prepare:

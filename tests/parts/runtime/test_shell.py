@@ -11,7 +11,11 @@ from typing import Any, cast
 
 import pytest
 
-from support.fleets import tuning_of
+from support.allocations import allocation_of
+from support.ballots import ballot_of
+from support.beats import beat_of
+from support.profiles import profile_of
+from support.proposals import proposal_of
 from support.waiting import until
 from zsched.adapters.host.state_file import StateFile
 from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
@@ -31,12 +35,7 @@ from zsched.core.values.messages import (
 )
 from zsched.core.values.model import (
     Acceptance,
-    Allocation,
-    Ballot,
-    Beat,
     DurableState,
-    Profile,
-    Proposal,
     WorkerState,
 )
 from zsched.core.values.plan import Role, RoutePhase, RoutePlan, WorkerRole
@@ -44,14 +43,11 @@ from zsched.errors import AdapterError, WireError
 from zsched.runtime import shell as shell_module
 from zsched.runtime.shell import INBOX_LIMIT, LOCAL_REQUESTS_FROM, PROBLEM_TTL_S, WAITING_LIMIT, Desk, Inbox, Shell
 
-TUNING = tuning_of()
-BALLOT = Ballot(counter=1, node="robot1", incarnation=1)
-VALUE = Allocation(task="merge", revision=1, epoch=1, owner="edge1", tuning=TUNING)
-BEAT = Beat(node="robot1", incarnation=1, sequence=1, loop_lag_s=0.0)
-PROFILE = Profile(
-    node="robot1", incarnation=1, sequence=1, cpu_cores=1, cpu_used_cores=None, memory_mb=10, memory_used_mb=None
-)
-PROPOSAL = Proposal(voter="robot1", task="merge", base_revision=0, candidate="edge1", aggregate=0.5)
+BALLOT = ballot_of()
+VALUE = allocation_of()
+BEAT = beat_of("robot1")
+PROFILE = profile_of("robot1", cpu_cores=1, cpu_used_cores=None, memory_mb=10, memory_used_mb=None)
+PROPOSAL = proposal_of("robot1")
 PREPARE = Prepare(task="merge", ballot=BALLOT, electorate="e")
 ACCEPT = Accept(task="merge", acceptance=Acceptance(ballot=BALLOT, value=VALUE), electorate="e")
 LEARNT = Learnt(node="robot1", values=(VALUE,))

@@ -15,6 +15,9 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from support.allocations import allocation_of
+from support.profiles import load_of
+from support.proposals import proposal_of
 from zsched.core.events import WorkerJobs
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.profile.profile import Profiler
@@ -33,17 +36,14 @@ from zsched.core.values.fleet import (
     WorkerSpec,
 )
 from zsched.core.values.model import (
-    Allocation,
     DeviceSample,
     LinkSample,
     LinkSource,
     NodeKind,
     PeerState,
-    Proposal,
     ScoreForm,
     Tuning,
     Weights,
-    WorkerLoad,
     WorkerState,
 )
 from zsched.core.vote.tally import VoteOutcome, tally
@@ -90,9 +90,7 @@ class Machine:
         needs = self.task_cores / self.speed if is_owner and now < self.works_until else 0.0
         takes = min(needs, max(self.cores - rest, 0.5), self.most_cores)
         holds = self.task_mb if is_owner else 0.0
-        load = WorkerLoad(
-            task="merge",
-            state=WorkerState.READY,
+        load = load_of(
             cpu_cores=takes if self.shows_worker else None,
             memory_mb=holds if self.shows_worker else None,
             wanted_cores=math.ceil(needs) if self.shows_worker and takes < needs else None,
@@ -173,7 +171,7 @@ class Loop:
         fleet = Fleet(
             name="loop", timing=self.timing, nodes=tuple(nodes), tasks=(self.spec,), electors=tuple(self.robots)
         )
-        self.allocation = Allocation(task="merge", revision=1, epoch=1, owner=names[0], tuning=self.spec.tuning)
+        self.allocation = allocation_of(owner=names[0], tuning=self.spec.tuning)
         self.gateways = {robot: Gateway(fleet) for robot in self.robots}
         self.judges = {robot: Judge(spec=self.spec) for robot in self.robots}
         self.profilers = {name: Profiler(name, 1, self.timing) for name in (*names, *self.robots)}
@@ -241,11 +239,10 @@ class Loop:
 
     def _vote(self, judgements: dict[str, Judgement], now: float) -> None:
         proposals = {
-            robot: Proposal(
-                voter=robot,
-                task="merge",
+            robot: proposal_of(
+                robot,
+                judgement.candidate or "",
                 base_revision=self.allocation.revision,
-                candidate=judgement.candidate or "",
                 aggregate=judgement.aggregate,
                 is_escape=judgement.is_escape,
             )

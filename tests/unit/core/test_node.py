@@ -9,7 +9,12 @@ from typing import Any, TypeVar
 
 import pytest
 
+from support.allocations import allocation_of
+from support.ballots import ballot_of
+from support.beats import beat_of
 from support.fleets import fleet_of, tuning_of
+from support.profiles import load_of, profile_of
+from support.proposals import proposal_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.membership.identity import QUIET_S
@@ -37,11 +42,8 @@ from zsched.core.values.model import (
     DurableState,
     Echo,
     PeerState,
-    Profile,
-    Proposal,
     RegisterState,
     UtilityVector,
-    WorkerLoad,
     WorkerState,
 )
 from zsched.core.values.plan import Direction, ReadyWhen, RoutePhase, WorkerRole
@@ -57,12 +59,6 @@ FLEET = fleet_of(
 )
 ELECTORATE = electorate_hash(FLEET)
 SAMPLE = DeviceSample(cpu_cores=4.0, cpu_used_cores=1.0, memory_mb=4000.0, memory_used_mb=1000.0)
-
-
-def value(revision: int, owner: str | None, epoch: int | None = None) -> Allocation:
-    return Allocation(
-        task="merge", revision=revision, epoch=revision if epoch is None else epoch, owner=owner, tuning=TUNING
-    )
 
 
 def durable(me: str, *registers: RegisterState) -> DurableState:
@@ -104,11 +100,11 @@ def started(me: str = "robot1", *, has_state: bool = True, learnt: Allocation | 
 
 def beat(node: str, sequence: int = 1, *, incarnation: int = 3, revision: int = 0) -> Beat:
     learnt = (("merge", revision, revision),) if revision else ()
-    return Beat(node=node, incarnation=incarnation, sequence=sequence, loop_lag_s=0.0, learnt=learnt)
+    return beat_of(node, sequence, incarnation=incarnation, learnt=learnt)
 
 
 def ballot(counter: int, node: str) -> Ballot:
-    return Ballot(counter=counter, node=node, incarnation=1)
+    return ballot_of(counter, node)
 
 
 def prepare(counter: int, node: str, *, task: str = "merge", asker: str | None = None) -> ev.PrepareAsked:
@@ -123,22 +119,11 @@ def accept(counter: int, node: str, allocation: Allocation, *, asker: str | None
 
 
 def profile(node: str, *, draining: bool = False) -> ev.ProfileReceived:
-    return ev.ProfileReceived(
-        profile=Profile(
-            node=node,
-            incarnation=3,
-            sequence=1,
-            cpu_cores=4.0,
-            cpu_used_cores=1.0,
-            memory_mb=4000.0,
-            memory_used_mb=1.0,
-            draining=draining,
-        )
-    )
+    return ev.ProfileReceived(profile=profile_of(node, incarnation=3, memory_used_mb=1.0, draining=draining))
 
 
 def proposal(voter: str, candidate: str, *, task: str = "merge", base: int = 0) -> ev.ProposalReceived:
-    paper = Proposal(voter=voter, task=task, base_revision=base, candidate=candidate, aggregate=0.5)
+    paper = proposal_of(voter, candidate, task=task, base_revision=base)
     return ev.ProposalReceived(proposal=paper)
 
 
@@ -167,7 +152,7 @@ def digest(thing: Any, seen: frozenset[int] = frozenset()) -> Any:
 
 # --- strangers -------------------------------------------------------------------------------------------------------
 
-STRANGER_VALUE = replace(value(9, "edge1"), task="other")
+STRANGER_VALUE = replace(allocation_of(9, "edge1"), task="other")
 STRANGERS: dict[str, ev.Event] = {
     "beat of a node that the file does not name": ev.BeatReceived(beat=beat("ghost", revision=99)),
     "token of it": ev.TokenSeen(node="ghost", incarnation=1),
@@ -175,8 +160,10 @@ STRANGERS: dict[str, ev.Event] = {
     "lost token of a life we do not know": ev.TokenLost(node="edge1", incarnation=99),
     "profile of it": profile("ghost"),
     "prepare of it": prepare(5, "ghost"),
-    "accept of it": accept(5, "ghost", value(1, "edge1")),
-    "learnt value of it": ev.LearntReceived(learnt=Learnt(node="ghost", values=(value(5, "edge2"),)), is_answer=True),
+    "accept of it": accept(5, "ghost", allocation_of(1, "edge1")),
+    "learnt value of it": ev.LearntReceived(
+        learnt=Learnt(node="ghost", values=(allocation_of(5, "edge2"),)), is_answer=True
+    ),
     "its utilities": ev.UtilityReceived(gather=1, utilities=Utilities(voter="ghost", vectors=())),
     "proposal of it": proposal("ghost", "edge1"),
     "proposal of an edge": proposal("edge1", "edge1"),
@@ -186,7 +173,7 @@ STRANGERS: dict[str, ev.Event] = {
     "prepare for an unknown task": prepare(5, "robot2", task="other"),
     "prepare under another's ballot": prepare(5, "robot2", asker="robot3"),
     "accept for an unknown task": accept(5, "robot2", STRANGER_VALUE),
-    "accept under another's ballot": accept(5, "robot2", value(1, "edge1"), asker="robot3"),
+    "accept under another's ballot": accept(5, "robot2", allocation_of(1, "edge1"), asker="robot3"),
     "answer for an unknown task": ev.ElectorAnswered(
         answer=Promise(elector="robot2", task="other", ballot=ballot(1, "robot1"))
     ),
@@ -275,7 +262,7 @@ def test_refused_disk_loses_no_route() -> None:
     """The batch that carried the plan was cut off; the plan comes again with the failure."""
     node = started()
     first = node.handle(
-        ev.LearntReceived(learnt=Learnt(node="robot2", values=(value(1, "edge1"),)), is_answer=True), 100.0
+        ev.LearntReceived(learnt=Learnt(node="robot2", values=(allocation_of(1, "edge1"),)), is_answer=True), 100.0
     )
     again = node.handle(ev.PersistFailed(reason="read-only"), 100.0)
     assert [one.plan for one in of(again, do.ApplyRoutes)] == [one.plan for one in of(first, do.ApplyRoutes)]
@@ -284,7 +271,9 @@ def test_refused_disk_loses_no_route() -> None:
 
 def test_refused_disk_loses_no_role_and_no_worker_start() -> None:
     node = started("edge1")
-    node.handle(ev.LearntReceived(learnt=Learnt(node="robot2", values=(value(1, "edge1"),)), is_answer=True), 100.0)
+    node.handle(
+        ev.LearntReceived(learnt=Learnt(node="robot2", values=(allocation_of(1, "edge1"),)), is_answer=True), 100.0
+    )
     again = node.handle(ev.PersistFailed(reason="read-only"), 100.0)
     assert do.StartWorker(task="merge") in again
     assert [one.role.role for one in of(again, do.SetRole)] == [WorkerRole.ACTIVE]
@@ -293,7 +282,7 @@ def test_refused_disk_loses_no_role_and_no_worker_start() -> None:
 def test_learnt_values_apply_on_a_node_without_state_too() -> None:
     node = started(has_state=False)
     batch = node.handle(
-        ev.LearntReceived(learnt=Learnt(node="robot2", values=(value(1, "edge1"),)), is_answer=True), 100.0
+        ev.LearntReceived(learnt=Learnt(node="robot2", values=(allocation_of(1, "edge1"),)), is_answer=True), 100.0
     )
     assert not of(batch, do.PersistState)
     assert of(batch, do.ApplyRoutes)
@@ -303,10 +292,10 @@ def test_learnt_values_apply_on_a_node_without_state_too() -> None:
 
 
 def test_restart_carries_out_again_what_was_learnt() -> None:
-    batch = make("edge1", learnt=value(4, "edge1", 2)).start(100.0)
+    batch = make("edge1", learnt=allocation_of(4, "edge1", 2)).start(100.0)
     assert of(batch, do.StartWorker)
     assert [one.role.epoch for one in of(batch, do.SetRole)] == [2]
-    (plan,) = of(make("robot1", learnt=value(4, "edge1", 2)).start(100.0), do.ApplyRoutes)
+    (plan,) = of(make("robot1", learnt=allocation_of(4, "edge1", 2)).start(100.0), do.ApplyRoutes)
     assert plan.plan.phase is RoutePhase.PREPARE
 
 
@@ -325,7 +314,7 @@ def test_own_profile_enters_the_gateway_as_it_leaves() -> None:
 
 
 def test_draining_is_told_in_the_same_batch() -> None:
-    node = started("edge1", learnt=value(1, "edge1"))
+    node = started("edge1", learnt=allocation_of(1, "edge1"))
     (published,) = of(node.handle(ev.StopRequested(), 100.1), do.PublishProfile)
     assert published.profile.draining
     assert published.is_news
@@ -338,7 +327,7 @@ def test_a_robot_that_drains_what_it_owns_asks_at_once_who_shall_have_it() -> No
         node = Node(
             fleet=fleet, me="robot1", durable=durable("robot1"), incarnation=7, electorate="e", rng=Random(1), now=100.0
         )
-        learnt = Learnt(node="robot2", values=(value(1, owner),))
+        learnt = Learnt(node="robot2", values=(allocation_of(1, owner),))
         node.handle(ev.LearntReceived(learnt=learnt, is_answer=True), 100.0)
         for name in ("robot2", "robot3"):
             node.handle(ev.BeatReceived(beat=beat(name)), 100.0)
@@ -349,11 +338,11 @@ def test_a_robot_that_drains_what_it_owns_asks_at_once_who_shall_have_it() -> No
 
 
 def test_movable_is_what_a_living_candidate_that_does_not_drain_could_take() -> None:
-    node = started("edge1", learnt=value(1, "edge1"))
+    node = started("edge1", learnt=allocation_of(1, "edge1"))
     assert (node.owned(), node.movable(100.0)) == (("merge",), ("merge",))
     node.handle(profile("edge2", draining=True), 100.0)
     assert node.movable(100.0) == ()
-    alone = make("edge1", learnt=value(1, "edge1"))
+    alone = make("edge1", learnt=allocation_of(1, "edge1"))
     alone.start(100.0)
     assert (alone.owned(), alone.movable(100.0)) == (("merge",), ())
 
@@ -370,7 +359,7 @@ def test_a_newer_profile_in_our_name_is_not_ours_either() -> None:
 
 @pytest.mark.parametrize(("base", "counted"), [(3, "proposal_stale"), (5, "proposal_ahead"), (4, None)])
 def test_proposals_on_another_base_are_counted_by_which_side_is_behind(base: int, counted: str | None) -> None:
-    node = started(learnt=value(4, "edge1"))
+    node = started(learnt=allocation_of(4, "edge1"))
     node.handle(proposal("robot2", "edge2", base=base), 100.0)
     assert [name for name in node.counters if name.startswith("proposal_")] == ([] if counted is None else [counted])
     assert counted is None or node.counters[counted] == 1
@@ -442,7 +431,7 @@ def test_a_problem_of_a_relay_is_sent_at_once_and_not_said_of_a_node_that_is_not
 
 
 def test_a_relay_that_has_gone_leaves_every_slot_to_be_taken_again() -> None:
-    node = started(learnt=value(1, "edge1"))
+    node = started(learnt=allocation_of(1, "edge1"))
     for event in (ev.SlotReady(task="merge", epoch=1), ev.SlotFlipped(task="merge", epoch=1)):
         node.handle(event, 101.0)
     assert build_snapshot(node, 111.0).tasks[0].problems == ()
@@ -465,7 +454,7 @@ def test_a_slot_of_a_foreign_worker_says_which_key_nobody_takes() -> None:
         node = Node(
             fleet=fleet, me="robot1", durable=durable("robot1"), incarnation=7, electorate="e", rng=Random(1), now=100.0
         )
-        learnt = Learnt(node="robot2", values=(value(1, "edge1"),))
+        learnt = Learnt(node="robot2", values=(allocation_of(1, "edge1"),))
         node.handle(ev.LearntReceived(learnt=learnt, is_answer=True), 100.0)
         (problem,) = build_snapshot(node, 105.0).tasks[0].problems
         assert f"our relay sees nobody take {what}" in problem
@@ -726,7 +715,7 @@ def test_a_retry_of_what_there_is_not_is_refused(command: RetryTask) -> None:
 
 @pytest.mark.parametrize("is_draining", [False, True])
 def test_an_owner_that_drains_hurries_the_next_round(*, is_draining: bool) -> None:
-    node = started(learnt=value(1, "edge1"))
+    node = started(learnt=allocation_of(1, "edge1"))
     node.handle(ev.DeadlineReached(), node.rounds.next_deadline())  # the gather that ran is over
     now = node.rounds.next_deadline() - 0.1
     new = replace(profile("edge1", draining=is_draining).profile, sequence=5)
@@ -735,7 +724,7 @@ def test_an_owner_that_drains_hurries_the_next_round(*, is_draining: bool) -> No
 
 
 def test_a_profile_that_comes_late_hurries_no_decision_by_what_it_says() -> None:
-    node = started(learnt=value(1, "edge1"))
+    node = started(learnt=allocation_of(1, "edge1"))
     new = replace(profile("edge1").profile, sequence=5)
     node.handle(ev.ProfileReceived(profile=new), 100.0)
     now = node.rounds.next_deadline()
@@ -759,7 +748,7 @@ def word(done: int, **more: Any) -> ev.WorkerJobs:
 def test_what_a_worker_here_says_of_its_jobs_is_in_the_next_profile_and_in_the_status() -> None:
     node = started("edge1")
     node.handle(ev.WorkerChanged(task="merge", state=WorkerState.READY), 100.0)
-    sample = replace(SAMPLE, workers=(WorkerLoad(task="merge", state=WorkerState.READY, cpu_cores=0.5, memory_mb=9.0),))
+    sample = replace(SAMPLE, workers=(load_of(cpu_cores=0.5, memory_mb=9.0),))
     published: list[do.PublishProfile] = []
     for number in range(1, 11):
         now = 100.0 + number

@@ -8,7 +8,12 @@ from random import Random
 
 import pytest
 
+from support.allocations import allocation_of
+from support.ballots import ballot_of
+from support.beats import beat_of
 from support.fleets import fleet_of
+from support.profiles import load_of, profile_of
+from support.proposals import proposal_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.node import Node
@@ -31,18 +36,14 @@ from zsched.core.values.model import (
     Acceptance,
     Allocation,
     Ballot,
-    Beat,
     DeviceSample,
     DurableState,
     Grant,
-    Profile,
-    Proposal,
     TaskProgress,
     Tuning,
     Utility,
     UtilityVector,
     Weights,
-    WorkerLoad,
     WorkerState,
 )
 from zsched.core.values.plan import Direction, StreamCount
@@ -134,14 +135,12 @@ class Storm:
         return self.sent if self.rng.random() < 0.9 else self.rng.randrange(10**6)
 
     def ballot(self, node: str) -> Ballot:
-        return Ballot(counter=self.rng.randrange(60), node=node, incarnation=self.rng.randrange(9))
+        return ballot_of(self.rng.randrange(60), node, self.rng.randrange(9))
 
     def value(self, task: str) -> Allocation:
         revision = self.rng.randrange(40)
         owner = self.rng.choice((None, *NAMES)) if revision else None
-        return Allocation(
-            task=task, revision=revision, epoch=revision // 2, owner=owner, tuning=self.rng.choice(TUNINGS)
-        )
+        return allocation_of(revision, owner, task=task, epoch=revision // 2, tuning=self.rng.choice(TUNINGS))
 
     def sampled(self) -> ev.Event:
         used = self.rng.choice((None, self.rng.uniform(0, 5)))
@@ -150,19 +149,17 @@ class Storm:
         )
 
     def profile(self) -> ev.Event:
-        loads = [WorkerLoad(task=name, state=self.rng.choice(list(WorkerState))) for name in TASKS]
+        loads = [load_of(name, self.rng.choice(list(WorkerState))) for name in TASKS]
         said = [
             TaskProgress(task=name, epoch=self.epochs[name], is_served=self.rng.random() < 0.1)
             for name in self.rng.sample(TASKS, self.rng.randrange(len(TASKS)))
         ]
         return ev.ProfileReceived(
-            profile=Profile(
-                node=self.name(),
+            profile=profile_of(
+                self.name(),
                 incarnation=3,
                 sequence=self.sequence(),
-                cpu_cores=4.0,
                 cpu_used_cores=self.rng.uniform(0, 4),
-                memory_mb=4000.0,
                 memory_used_mb=self.rng.uniform(0, 4000),
                 workers=tuple(loads),
                 draining=self.rng.random() < 0.1,
@@ -185,11 +182,11 @@ class Storm:
 
     def proposal(self) -> ev.Event:
         return ev.ProposalReceived(
-            proposal=Proposal(
-                voter=self.name(),
+            proposal=proposal_of(
+                self.name(),
+                self.name(),
                 task=self.task(),
                 base_revision=self.rng.randrange(4),
-                candidate=self.name(),
                 aggregate=self.rng.random(),
                 is_escape=self.rng.random() < 0.5,
             )
@@ -251,10 +248,10 @@ class Storm:
             for name in ("alone", "alone", "other")
         )
         return ev.BeatReceived(
-            beat=Beat(
-                node=self.name(),
+            beat=beat_of(
+                self.name(),
+                self.sequence(),
                 incarnation=self.rng.choice((*[3] * 20, 7, 8)),
-                sequence=self.sequence(),
                 loop_lag_s=self.rng.random(),
                 learnt=learnt,
                 suspects=suspects,
@@ -420,8 +417,8 @@ def test_fading_doubt_is_no_lag() -> None:
     node.start(100.0)
     peers = [name for name in (*ROBOTS, *EDGES) if name != "robot1"]
     for name in peers:
-        node.handle(ev.BeatReceived(beat=Beat(node=name, incarnation=1, sequence=1, loop_lag_s=0.0)), 100.0)
-    alive = Beat(node="robot2", incarnation=1, sequence=2, loop_lag_s=0.0)
+        node.handle(ev.BeatReceived(beat=beat_of(name)), 100.0)
+    alive = beat_of("robot2", 2)
     now, sequence = 101.25, 2
     node.handle(ev.DeadlineReached(), now)  # one lag of a second
     told = []

@@ -7,6 +7,8 @@ from random import Random
 
 import pytest
 
+from support.allocations import allocation_of
+from support.beats import beat_of
 from support.fleets import fleet_of, tuning_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
@@ -15,7 +17,6 @@ from zsched.core.values.fleet import TaskSpec, WorkerSpec, lease_terms
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import (
     Allocation,
-    Beat,
     DurableState,
     Grant,
     RegisterState,
@@ -31,7 +32,7 @@ FLEET = fleet_of(
 
 
 def value(revision: int, owner: str = "robot1") -> Allocation:
-    return Allocation(task="guard", revision=revision, epoch=revision, owner=owner, tuning=TUNING, leased=True)
+    return allocation_of(revision, owner, task="guard", leased=True)
 
 
 class Owner:
@@ -92,11 +93,9 @@ class Owner:
     def heard(self, name: str, *, echoes: tuple[Grant, ...] = (), is_asked: bool = False) -> tuple[do.Instruction, ...]:
         """A peer's beat, which may ask this owner to leave."""
         self.sequence += 1
-        beat = Beat(
-            node=name,
-            incarnation=1,
-            sequence=self.sequence,
-            loop_lag_s=0.0,
+        beat = beat_of(
+            name,
+            self.sequence,
             learnt=(("guard", 4, 4),),
             echoes=echoes,
             asked_to_leave=(("guard", "robot1", 4),) if is_asked else (),

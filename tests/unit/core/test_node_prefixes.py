@@ -12,21 +12,20 @@ from random import Random
 
 import pytest
 
-from support.fleets import tuning_of
+from support.allocations import allocation_of
+from support.ballots import ballot_of
+from support.fleets import fleet_of, tuning_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.executor.handover import Phase
 from zsched.core.node import Node
-from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, electorate_hash
+from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec, electorate_hash
 from zsched.core.values.messages import Accept, Accepted, Learnt, Promise
 from zsched.core.values.model import (
     NO_BALLOT,
     Acceptance,
-    Allocation,
-    Ballot,
     DurableState,
     NodeId,
-    NodeKind,
     RegisterState,
     TaskId,
 )
@@ -41,10 +40,6 @@ SLICES = range(9)
 
 
 def fleet(*, exclusive: bool = False) -> Fleet:
-    nodes = tuple(
-        NodeSpec(name=name, kind=NodeKind.ROBOT if name in ROBOTS else NodeKind.EDGE)
-        for name in sorted((*ROBOTS, *EDGES))
-    )
     tuning = tuning_of(cool_down_s=0.0)
     task = TaskSpec(
         name=TASK,
@@ -56,7 +51,7 @@ def fleet(*, exclusive: bool = False) -> Fleet:
         exclusive=exclusive,
         max_moves_per_minute=1000,
     )
-    return Fleet(name="sim", timing=Timing(), nodes=nodes, tasks=(task,), electors=ROBOTS)
+    return fleet_of(task, of=sorted((*ROBOTS, *EDGES)))
 
 
 FLEET, EXCLUSIVE = fleet(), fleet(exclusive=True)
@@ -262,8 +257,8 @@ def test_elector_that_has_just_started_grants_nobody_new_before_its_old_grant_ha
     owner: NodeId, is_free_at_once: bool
 ) -> None:
     """Grants live in memory: a crash forgets when the last one was, so the whole lease is waited for."""
-    old = Allocation(task=TASK, revision=1, epoch=1, owner="edge1", tuning=EXCLUSIVE.tasks[0].tuning)
-    accepted = Acceptance(ballot=Ballot(counter=5, node="robot2", incarnation=1), value=old)
+    old = allocation_of(task=TASK, tuning=EXCLUSIVE.tasks[0].tuning)
+    accepted = Acceptance(ballot=ballot_of(5, "robot2"), value=old)
     held = RegisterState(task=TASK, promised=accepted.ballot, accepted=accepted, learnt=old)
     electorate = electorate_hash(EXCLUSIVE)
 
@@ -289,7 +284,7 @@ def test_elector_that_has_just_started_grants_nobody_new_before_its_old_grant_ha
         node.start(100.0)
         for name in {one.name for one in EXCLUSIVE.nodes} - {"robot1"}:  # who starts asks all what they remember of it
             node.handle(ev.LearntReceived(learnt=Learnt(node=name, values=()), is_answer=True), 100.0)
-        ballot = Ballot(counter=6, node="robot2", incarnation=1)
+        ballot = ballot_of(6, "robot2")
         value = replace(old, revision=2, epoch=2 if owner != "edge1" else 1, owner=owner)
         asked = Accept(task=TASK, acceptance=Acceptance(ballot=ballot, value=value), electorate=electorate)
         batch = node.handle(ev.AcceptAsked(request=1, asker="robot2", accept=asked), 100.0 + after_s)

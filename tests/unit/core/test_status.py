@@ -8,7 +8,11 @@ from typing import Any
 
 import pytest
 
+from support.allocations import allocation_of
+from support.beats import beat_of
 from support.fleets import fleet_of, tuning_of
+from support.profiles import load_of, profile_of
+from support.proposals import proposal_of
 from zsched.commands.report import degradations, render_status
 from zsched.core import events as ev
 from zsched.core import instructions as do
@@ -21,17 +25,12 @@ from zsched.core.values.messages import Learnt
 from zsched.core.values.model import (
     RESTARTING,
     WAS_READY,
-    Allocation,
-    Beat,
     DeviceSample,
     DurableState,
     Echo,
     LinkSample,
     LinkSource,
-    Profile,
-    Proposal,
     ScoreForm,
-    WorkerLoad,
     WorkerState,
 )
 from zsched.core.values.plan import StreamCount
@@ -66,15 +65,13 @@ def make(me: str = "robot1", *, has_state: bool = True, alive: tuple[str, ...] =
     )
     for name in alive:
         if name != me:
-            beat = Beat(node=name, incarnation=3, sequence=1, loop_lag_s=0.0)
+            beat = beat_of(name, incarnation=3)
             node.handle(ev.BeatReceived(beat=beat), 100.0)
     return node
 
 
 def learn(node: Node, revision: int, owner: str | None, now: float = 100.0, *, epoch: int | None = None) -> None:
-    value = Allocation(
-        task="merge", revision=revision, epoch=revision if epoch is None else epoch, owner=owner, tuning=TUNING
-    )
+    value = allocation_of(revision, owner, epoch)
     node.handle(ev.LearntReceived(learnt=Learnt(node="robot2", values=(value,)), is_answer=True), now)
 
 
@@ -106,7 +103,7 @@ def test_quorum_counts_the_living_electors_and_says_what_this_node_is(
 def test_electors_that_have_lost_their_state_are_named_and_count_for_nothing() -> None:
     node = make()
     for sequence, name in enumerate(("robot2", "robot3"), 2):
-        beat = Beat(node=name, incarnation=3, sequence=sequence, loop_lag_s=0.0, has_lost_state=True)
+        beat = beat_of(name, sequence, incarnation=3, has_lost_state=True)
         node.handle(ev.BeatReceived(beat=beat), 100.0)
     quorum = build_snapshot(node, 100.0).quorum
     assert (quorum.alive, quorum.ok, quorum.stateless) == (1, False, ("robot2", "robot3"))
@@ -119,7 +116,7 @@ def test_electors_that_have_lost_their_state_are_named_and_count_for_nothing() -
             "and start them when all have it"
         ),
     )
-    again = Beat(node="robot2", incarnation=4, sequence=1, loop_lag_s=0.0)
+    again = beat_of("robot2", incarnation=4)
     node.handle(ev.BeatReceived(beat=again), 100.5)
     quorum = build_snapshot(node, 100.5).quorum
     assert (quorum.alive, quorum.ok, quorum.stateless) == (2, True, ("robot3",))
@@ -132,7 +129,7 @@ def forgotten(me: str = "robot1", *, lacks_file: bool = True, stateless: tuple[s
     node.problems["state"] = "/x/state does not exist"
     for name in stateless:
         if name != me:
-            beat = Beat(node=name, incarnation=3, sequence=2, loop_lag_s=0.0, has_lost_state=True)
+            beat = beat_of(name, 2, incarnation=3, has_lost_state=True)
             node.handle(ev.BeatReceived(beat=beat), 100.0)
     return node
 
@@ -180,7 +177,7 @@ def test_one_node_without_a_state_is_not_the_fleet() -> None:
 def test_electors_of_another_generation_or_electorate_count_for_nothing(strange: dict[str, Any]) -> None:
     node = make()
     mine = electorate_hash(FLEET)
-    apart = replace(Beat(node="robot2", incarnation=3, sequence=2, loop_lag_s=0.0), **strange)
+    apart = replace(beat_of("robot2", 2, incarnation=3), **strange)
     node.handle(ev.BeatReceived(beat=apart), 100.0)
     snapshot = build_snapshot(node, 100.0)
     assert (snapshot.quorum.alive, snapshot.quorum.ok, snapshot.quorum.apart) == (2, True, ("robot2",))
@@ -190,7 +187,7 @@ def test_electors_of_another_generation_or_electorate_count_for_nothing(strange:
     node.handle(ev.BeatReceived(beat=replace(apart, node="robot3")), 100.0)
     assert not build_snapshot(node, 100.0).quorum.ok
     for name in ("robot2", "robot3"):
-        again = Beat(node=name, incarnation=3, sequence=3, loop_lag_s=0.0, electorate=mine)
+        again = beat_of(name, 3, incarnation=3, electorate=mine)
         node.handle(ev.BeatReceived(beat=again), 100.2)
     assert build_snapshot(node, 100.2).problems == ()
 
@@ -232,16 +229,14 @@ def test_an_elector_that_is_none_by_its_own_file_counts_for_nothing() -> None:
 )
 def test_an_elector_with_another_file_and_the_same_electors_counts(compatible: dict[str, Any]) -> None:
     node = make()
-    beat = replace(Beat(node="robot2", incarnation=3, sequence=2, loop_lag_s=0.0), **compatible)
+    beat = replace(beat_of("robot2", 2, incarnation=3), **compatible)
     node.handle(ev.BeatReceived(beat=beat), 100.0)
     assert (build_snapshot(node, 100.0).quorum.alive, build_snapshot(node, 100.0).quorum.apart) == (3, ())
 
 
 def test_a_node_of_another_generation_is_told_with_the_command_that_mends_it() -> None:
     node = make()
-    node.handle(
-        ev.BeatReceived(beat=Beat(node="robot2", incarnation=3, sequence=2, loop_lag_s=0.0, generation=2)), 100.0
-    )
+    node.handle(ev.BeatReceived(beat=beat_of("robot2", 2, incarnation=3, generation=2)), 100.0)
     ahead = "robot2 is of generation 2, this node of 0; stop this daemon, `zsched init --generation 2` here, start it"
     assert any(ahead in one for one in build_snapshot(node, 100.0).problems)
 
@@ -275,17 +270,9 @@ def test_a_task_says_what_staying_may_cost(patience: float, *, learns: bool) -> 
 def test_the_way_there_and_back_is_told_of_a_task_with_a_deadline(deadline_ms: float | None) -> None:
     node = make()
     tuning = replace(TUNING, deadline_ms=deadline_ms, score=ScoreForm.SERVICE)
-    value = Allocation(task="merge", revision=1, epoch=1, owner="edge1", tuning=tuning)
+    value = allocation_of(tuning=tuning)
     node.handle(ev.LearntReceived(learnt=Learnt(node="robot2", values=(value,)), is_answer=True), 100.0)
-    ours = Profile(
-        node="robot1",
-        incarnation=7,
-        sequence=1,
-        cpu_cores=4.0,
-        cpu_used_cores=1.0,
-        memory_mb=100.0,
-        memory_used_mb=1.0,
-    )
+    ours = profile_of("robot1", incarnation=7, memory_mb=100.0, memory_used_mb=1.0)
     node.round_trips.note_sent(ours, 100.0)
     echo = Echo(node="robot1", incarnation=7, sequence=1, held_s=0.5)
     for name in ("edge1", "robot2"):
@@ -332,29 +319,20 @@ def test_robots_that_cannot_make_a_majority_are_a_problem_while_electors_can() -
         "no planned moves: 1 of 3 robots can vote, 2 needed; not robot2, robot3. "
         "An owner that is gone, drains or fails is still replaced"
     )
-    node.handle(ev.BeatReceived(beat=Beat(node="robot2", incarnation=3, sequence=1, loop_lag_s=0.0)), 100.0)
+    node.handle(ev.BeatReceived(beat=beat_of("robot2", incarnation=3)), 100.0)
     assert build_snapshot(node, 100.0).problems == ()
 
 
 def test_a_worker_that_failed_or_is_missed_is_told_with_its_reason() -> None:
     node = make()
     for name in EDGES:
-        node.handle(ev.BeatReceived(beat=Beat(node=name, incarnation=3, sequence=1, loop_lag_s=0.0)), 100.0)
+        node.handle(ev.BeatReceived(beat=beat_of(name, incarnation=3)), 100.0)
     learn(node, 1, "edge1")
     for name, state, reason in (
         ("edge1", WorkerState.STOPPED, "nobody subscribes to a/key"),
         ("edge2", WorkerState.FAILED, "exited with status 1: no such map"),
     ):
-        profile = Profile(
-            node=name,
-            incarnation=3,
-            sequence=1,
-            cpu_cores=4.0,
-            cpu_used_cores=1.0,
-            memory_mb=4000.0,
-            memory_used_mb=100.0,
-            workers=(WorkerLoad(task="merge", state=state, reason=reason),),
-        )
+        profile = profile_of(name, incarnation=3, memory_used_mb=100.0, workers=(load_of(state=state, reason=reason),))
         node.handle(ev.ProfileReceived(profile=profile), 100.0)
     assert build_snapshot(node, 100.0).tasks[0].problems == (
         "the worker on edge1 is stopped: nobody subscribes to a/key",
@@ -364,7 +342,7 @@ def test_a_worker_that_failed_or_is_missed_is_told_with_its_reason() -> None:
 
 def test_a_task_without_an_owner_says_which_workers_somebody_else_has_to_start() -> None:
     node = make()
-    node.handle(ev.BeatReceived(beat=Beat(node="edge1", incarnation=3, sequence=1, loop_lag_s=0.0)), 100.0)
+    node.handle(ev.BeatReceived(beat=beat_of("edge1", incarnation=3)), 100.0)
     told_by(node, "edge1", 1, WorkerState.STOPPED, "no token")
     assert build_snapshot(node, 100.0).tasks[0].problems == (), "our own standby, which a move starts"
     node.fleet = replace(FLEET, tasks=tuple(replace(task, worker=WorkerSpec()) for task in FLEET.tasks))
@@ -373,7 +351,7 @@ def test_a_task_without_an_owner_says_which_workers_somebody_else_has_to_start()
 
 def test_a_task_without_an_owner_says_which_workers_have_failed_before() -> None:
     node = make()
-    node.handle(ev.BeatReceived(beat=Beat(node="edge1", incarnation=3, sequence=1, loop_lag_s=0.0)), 100.0)
+    node.handle(ev.BeatReceived(beat=beat_of("edge1", incarnation=3)), 100.0)
     told_by(node, "edge1", 1, WorkerState.STARTING, "pid 7")
     assert build_snapshot(node, 100.0).tasks[0].problems == (), "it starts"
     told_by(node, "edge1", 2, WorkerState.STARTING, f"{RESTARTING} (failure 1 of 3): not ready within 20 s")
@@ -383,7 +361,7 @@ def test_a_task_without_an_owner_says_which_workers_have_failed_before() -> None
 
 def test_an_owner_s_worker_that_was_ready_is_not_said_to_be_starting() -> None:
     node = make()
-    node.handle(ev.BeatReceived(beat=Beat(node="edge1", incarnation=3, sequence=1, loop_lag_s=0.0)), 100.0)
+    node.handle(ev.BeatReceived(beat=beat_of("edge1", incarnation=3)), 100.0)
     learn(node, 1, "edge1")
     told_by(node, "edge1", 1, WorkerState.STARTING, f"{WAS_READY}12:00:00 UTC, its token went: it may hang")
     said = "the worker on edge1 was ready until 12:00:00 UTC, its token went: it may hang"
@@ -404,15 +382,8 @@ def test_a_slot_that_somebody_else_s_worker_does_not_take_is_told_with_what_mend
 
 def told_by(node: Node, name: str, sequence: int, state: WorkerState, reason: str = "") -> None:
     """A node's profile says how its worker is."""
-    profile = Profile(
-        node=name,
-        incarnation=3,
-        sequence=sequence,
-        cpu_cores=4.0,
-        cpu_used_cores=1.0,
-        memory_mb=4000.0,
-        memory_used_mb=100.0,
-        workers=(WorkerLoad(task="merge", state=state, reason=reason),),
+    profile = profile_of(
+        name, incarnation=3, sequence=sequence, memory_used_mb=100.0, workers=(load_of(state=state, reason=reason),)
     )
     node.handle(ev.ProfileReceived(profile=profile), 100.0)
 
@@ -421,7 +392,7 @@ def test_a_slot_that_is_not_taken_is_told_of_only_once_the_owner_s_own_worker_is
     """Else the worker is what is told of; another node's worker excuses nothing."""
     node = make()
     for name in EDGES:
-        node.handle(ev.BeatReceived(beat=Beat(node=name, incarnation=3, sequence=1, loop_lag_s=0.0)), 100.0)
+        node.handle(ev.BeatReceived(beat=beat_of(name, incarnation=3)), 100.0)
     learn(node, 1, "edge1")
     told_by(node, "edge1", 1, WorkerState.READY)
     told_by(node, "edge2", 1, WorkerState.STARTING)
@@ -561,7 +532,7 @@ def test_streams_stand_under_their_own_task_only() -> None:
 
 def test_vote_shows_who_proposed_whom() -> None:
     node = make()
-    paper = Proposal(voter="robot2", task="merge", base_revision=0, candidate="edge1", aggregate=0.5)
+    paper = proposal_of("robot2")
     node.handle(ev.ProposalReceived(proposal=paper), 100.0)
     vote = build_snapshot(node, 100.5).tasks[0].vote
     assert vote is not None
@@ -575,7 +546,7 @@ def test_vote_shows_who_proposed_whom() -> None:
 def test_a_decision_and_a_vote_have_an_age() -> None:
     node = make()
     learn(node, 1, "edge1")
-    paper = Proposal(voter="robot2", task="merge", base_revision=1, candidate="edge1", aggregate=0.5)
+    paper = proposal_of("robot2", base_revision=1)
     assert not paper.is_escape, "unless it says so"
     for _ in range(2):
         node.handle(ev.DeadlineReached(), node.rounds.next_deadline())
@@ -597,9 +568,7 @@ def test_nodes_never_heard_are_listed_without_figures() -> None:
 
 def test_ratios_are_bounded_and_none_when_not_measured() -> None:
     node = make()
-    profile = Profile(
-        node="edge1", incarnation=3, sequence=1, cpu_cores=2.0, cpu_used_cores=2.5, memory_mb=1000, memory_used_mb=None
-    )
+    profile = profile_of(incarnation=3, cpu_cores=2.0, cpu_used_cores=2.5, memory_mb=1000, memory_used_mb=None)
     node.handle(ev.ProfileReceived(profile=profile), 100.0)
     edge = build_snapshot(node, 100.25).nodes[0]
     assert (edge.cpu_ratio, edge.memory_ratio, edge.age_s) == (1.0, None, 0.25)
@@ -629,7 +598,7 @@ def full() -> Snapshot:
     node = sim.node("robot1")
     count = StreamCount(stream="merge/in/0", messages=1, bytes=2, drops=(("loop", 1),), last_seen_s=0.1)
     node.handle(ev.StreamsCounted(counts=(count,)), sim.now)
-    load = WorkerLoad(task="merge", state=WorkerState.READY, cpu_cores=0.1, memory_mb=10.0)
+    load = load_of(cpu_cores=0.1, memory_mb=10.0)
     device = DeviceSample(cpu_cores=4, cpu_used_cores=1, memory_mb=4000, memory_used_mb=100, workers=(load,))
     link = LinkSample(source=LinkSource.WIRELESS, rssi_dbm=-50.0)
     node.handle(ev.ProfileSampled(device=device, links=(link,)), sim.now + 2)

@@ -11,7 +11,11 @@ from typing import Any, TypeVar
 import pytest
 import zenoh
 
-from support.fleets import tuning_of
+from support.allocations import allocation_of
+from support.ballots import ballot_of
+from support.beats import beat_of
+from support.profiles import profile_of
+from support.proposals import proposal_of
 from support.waiting import free_endpoint, until
 from zsched.adapters.network import control_bus, open_questions
 from zsched.adapters.network.control_bus import RING, ControlBus
@@ -31,7 +35,7 @@ from zsched.core.values.messages import (
     SetWeights,
     Utilities,
 )
-from zsched.core.values.model import Acceptance, Allocation, Ballot, Beat, Profile, Proposal
+from zsched.core.values.model import Acceptance
 from zsched.core.values.snapshot import QuorumStatus, Snapshot
 from zsched.errors import AdapterError
 from zsched.sessions.config import control_config
@@ -39,16 +43,13 @@ from zsched.wire import codec as wire
 
 T = TypeVar("T")
 TIMING = Timing()
-TUNING = tuning_of()
-VALUE = Allocation(task="merge", revision=1, epoch=1, owner="edge1", tuning=TUNING)
-BALLOT = Ballot(counter=1, node="a", incarnation=1)
+VALUE = allocation_of()
+BALLOT = ballot_of(node="a")
 PREPARE = Prepare(task="merge", ballot=BALLOT, electorate="e")
 ACCEPT = Accept(task="merge", acceptance=Acceptance(ballot=BALLOT, value=VALUE), electorate="e")
-BEAT = Beat(node="a", incarnation=1, sequence=1, loop_lag_s=0.0)
-PROFILE = Profile(
-    node="a", incarnation=1, sequence=1, cpu_cores=1, cpu_used_cores=None, memory_mb=10, memory_used_mb=None
-)
-PROPOSAL = Proposal(voter="a", task="merge", base_revision=0, candidate="edge1", aggregate=0.5)
+BEAT = beat_of("a")
+PROFILE = profile_of("a", cpu_cores=1, cpu_used_cores=None, memory_mb=10, memory_used_mb=None)
+PROPOSAL = proposal_of("a")
 LEARNT = Learnt(node="a", values=(VALUE,))
 SNAPSHOT = Snapshot(
     schema="zsched.status/1",

@@ -11,11 +11,12 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
+from support.beats import beat_of
+from support.profiles import load_of, profile_of
 from support.waiting import free_endpoint, until, within
 from zsched.adapters.network.control_bus import ControlBus
 from zsched.core import events as ev
 from zsched.core.values.fleet import Timing
-from zsched.core.values.model import Beat, Profile, WorkerLoad, WorkerState
 from zsched.errors import AdapterError
 from zsched.sessions.config import control_config
 
@@ -149,16 +150,9 @@ def test_close_towards_a_stopped_peer_takes_less_than_a_second(spawn: Spawn, par
     """zenoh itself waits for a peer that does not read; a daemon that is told to stop must not."""
     child = spawn(5)
     child.send_signal(signal.SIGSTOP)
-    load = WorkerLoad(task="x" * 60, state=WorkerState.READY)
-    large = Profile(
-        node="parent",
-        incarnation=1,
-        sequence=1,
-        cpu_cores=1,
-        cpu_used_cores=None,
-        memory_mb=10,
-        memory_used_mb=None,
-        workers=(load,) * 250,
+    load = load_of("x" * 60)
+    large = profile_of(
+        "parent", cpu_cores=1, cpu_used_cores=None, memory_mb=10, memory_used_mb=None, workers=(load,) * 250
     )
     for _ in range(500):  # more than the socket and zenoh's queue take
         parent.bus.publish("profile", large)
@@ -167,10 +161,10 @@ def test_close_towards_a_stopped_peer_takes_less_than_a_second(spawn: Spawn, par
 
 def test_closed_bus_takes_calls_and_does_nothing() -> None:
     bus = Parent().bus
-    bus.publish("beat", Beat(node="parent", incarnation=1, sequence=1, loop_lag_s=0.0))
+    bus.publish("beat", beat_of("parent"))
     bus.ask_utilities(1, 0.1)
     bus.ask_learnt("child", 0.1)
-    bus.answer(1, Beat(node="parent", incarnation=1, sequence=1, loop_lag_s=0.0))
+    bus.answer(1, beat_of("parent"))
     assert bus.peers() == 0
     with pytest.raises(AdapterError, match="closed"):
         bus.ask_node("child", None)

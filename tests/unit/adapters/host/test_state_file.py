@@ -10,13 +10,15 @@ from pathlib import Path
 
 import pytest
 
+from support.allocations import allocation_of
+from support.ballots import ballot_of
 from support.fleets import tuning_of
 from zsched.adapters.host.state_file import NEW_NAME, StateFile, hardware_id, is_same_hardware
-from zsched.core.values.model import Acceptance, Allocation, Ballot, DurableState, RegisterState
+from zsched.core.values.model import Acceptance, DurableState, RegisterState
 from zsched.errors import AdapterError
 
-BALLOT = Ballot(counter=3, node="robot1", incarnation=2)
-VALUE = Allocation(task="merge", revision=9, epoch=4, owner="edge1", tuning=tuning_of())
+BALLOT = ballot_of(3, incarnation=2)
+VALUE = allocation_of(9, epoch=4, tuning=tuning_of())
 REGISTER = RegisterState(task="merge", promised=BALLOT, accepted=Acceptance(ballot=BALLOT, value=VALUE), learnt=VALUE)
 STATE = DurableState(
     fleet="hall",

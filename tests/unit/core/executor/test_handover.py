@@ -9,6 +9,7 @@ from typing import TypeVar
 
 import pytest
 
+from support.allocations import allocation_of
 from support.fleets import tuning_of
 from support.todos import done
 from zsched.core.executor.handover import LEAVES_S, MAX_OLD, ROLE_DRAIN_MARGIN_S, Executor, Phase
@@ -31,10 +32,6 @@ SPEC = TaskSpec(
 )
 COLD = replace(SPEC, worker=replace(SPEC.worker, standby=Standby.COLD))
 FOREIGN = replace(SPEC, worker=WorkerSpec())
-
-
-def allocation(owner: str | None, epoch: int) -> Allocation:
-    return Allocation(task="merge", revision=epoch, epoch=epoch, owner=owner, tuning=TUNING)
 
 
 def robot() -> Executor:
@@ -69,12 +66,12 @@ def of(out: tuple[Instruction, ...], kind: type[T]) -> list[T]:
 def at(phase: Phase) -> Executor:
     """A robot's executor in a phase of its second handover: edge1 (epoch 1) to edge2 (epoch 2), at 10 s."""
     one = robot()
-    done(one.execute, allocation("edge1", 1), 0.0)
+    done(one.execute, allocation_of(1, "edge1"), 0.0)
     done(one.on_ready, 1)
     done(one.on_flipped, 1, 0, 0.0)
     if phase is Phase.SETTLED:
         return one
-    done(one.execute, allocation("edge2", 2), 10.0)
+    done(one.execute, allocation_of(2, "edge2"), 10.0)
     if phase is Phase.PREPARING:
         return one
     done(one.on_ready, 2)
@@ -90,7 +87,7 @@ def at(phase: Phase) -> Executor:
 
 def test_first_owner_is_prepared_flipped_and_closed_without_a_predecessor() -> None:
     one = robot()
-    assert plan(done(one.execute, allocation("edge1", 1), 0.0)) == ("prepare", 1, None)
+    assert plan(done(one.execute, allocation_of(1, "edge1"), 0.0)) == ("prepare", 1, None)
     phases = [one.phase]
     assert plan(done(one.on_ready, 1)) == ("flip", 1, None)
     phases.append(one.phase)
@@ -100,7 +97,7 @@ def test_first_owner_is_prepared_flipped_and_closed_without_a_predecessor() -> N
 
 def test_move_goes_through_every_phase_and_keeps_the_old_slot_until_it_is_drained() -> None:
     one = at(Phase.SETTLED)
-    assert plan(done(one.execute, allocation("edge2", 2), 1.0)) == ("prepare", 2, 1)
+    assert plan(done(one.execute, allocation_of(2, "edge2"), 1.0)) == ("prepare", 2, 1)
     assert plan(done(one.on_ready, 2)) == ("flip", 2, 1)
     assert plan(done(one.on_flipped, 2, 1, 1.1)) is None, "the flip's plan stands while the old slot drains"
     assert (one.phase, one.predecessors) == (Phase.DRAINING, ("edge1",))
@@ -154,7 +151,7 @@ def test_newer_epoch_in_any_phase_prepares_and_keeps_the_slots_that_carry_or_dra
     phase: Phase, expected: tuple[str, int, int], deadline: float
 ) -> None:
     one = at(phase)
-    assert plan(done(one.execute, allocation("edge3", 3), 11.0)) == expected
+    assert plan(done(one.execute, allocation_of(3, "edge3"), 11.0)) == expected
     assert one.phase is Phase.PREPARING
     assert one.next_deadline() == deadline
 
@@ -162,7 +159,7 @@ def test_newer_epoch_in_any_phase_prepares_and_keeps_the_slots_that_carry_or_dra
 def moved_twice() -> Executor:
     """Epoch 1 (edge1) drains since 10 s, epoch 2 (edge2) carries, epoch 3 (edge1) is prepared at 11 s."""
     one = at(Phase.DRAINING)
-    done(one.execute, allocation("edge1", 3), 11.0)
+    done(one.execute, allocation_of(3, "edge1"), 11.0)
     return one
 
 
@@ -210,7 +207,7 @@ def test_every_slot_of_an_owner_that_is_gone_is_dropped() -> None:
 def test_only_so_many_slots_drain_at_once() -> None:
     one = at(Phase.SETTLED)
     for epoch in range(2, 9):
-        done(one.execute, allocation(f"edge{1 + epoch % 2}", epoch), 0.0)
+        done(one.execute, allocation_of(epoch, f"edge{1 + epoch % 2}"), 0.0)
         done(one.on_ready, epoch)
         out = done(one.on_flipped, epoch, 0, 0.0)
     assert plan(out) is None
@@ -220,7 +217,7 @@ def test_only_so_many_slots_drain_at_once() -> None:
 def test_there_and_back_ends_on_the_first_owner_with_its_own_old_slot_to_drain() -> None:
     """A -> B -> A before B was ready: the old slot of A stays open beside A's new one."""
     one = at(Phase.PREPARING)
-    assert plan(done(one.execute, allocation("edge1", 3), 11.0)) == ("prepare", 3, 1)
+    assert plan(done(one.execute, allocation_of(3, "edge1"), 11.0)) == ("prepare", 3, 1)
     assert (one.predecessors, one.owner) == (("edge1",), "edge1")
     assert plan(done(one.on_ready, 3)) == ("flip", 3, 1)
     done(one.on_flipped, 3, 0, 11.1)
@@ -258,7 +255,7 @@ def test_idle_executor_ignores_reports_and_needs_no_time() -> None:
     assert (one.phase, one.next_deadline(), done(one.again)) == (Phase.IDLE, math.inf, ())
 
 
-@pytest.mark.parametrize("late", [allocation("edge3", 1), allocation("edge3", 2), allocation(None, 3)])
+@pytest.mark.parametrize("late", [allocation_of(1, "edge3"), allocation_of(2, "edge3"), allocation_of(3, None)])
 def test_older_equal_and_empty_allocations_are_not_carried_out(late: Allocation) -> None:
     one = at(Phase.DRAINING)
     assert done(one.execute, late, 11.0) == ()
@@ -283,7 +280,7 @@ def test_again_repeats_the_plan_that_stands(phase: Phase, expected: tuple[str, i
 def test_every_step_says_what_it_did() -> None:
     one = at(Phase.SETTLED)
     steps = (
-        done(one.execute, allocation("edge2", 2), 10.0),
+        done(one.execute, allocation_of(2, "edge2"), 10.0),
         done(one.on_ready, 2),
         done(one.on_flipped, 2, 7, 10.25),
         done(one.on_drained, 1),
@@ -321,8 +318,8 @@ def test_only_warm_candidates_with_a_command_start_their_worker_at_once(
 def test_role_goes_from_idle_over_active_and_draining_to_idle() -> None:
     one = edge()
     assert one.role.role is WorkerRole.IDLE
-    assert roles(done(one.execute, allocation("edge1", 1), 0.0)) == [(WorkerRole.ACTIVE, 1)]
-    assert roles(done(one.execute, allocation("edge2", 2), 10.0)) == [(WorkerRole.DRAINING, 1)]
+    assert roles(done(one.execute, allocation_of(1, "edge1"), 0.0)) == [(WorkerRole.ACTIVE, 1)]
+    assert roles(done(one.execute, allocation_of(2, "edge2"), 10.0)) == [(WorkerRole.DRAINING, 1)]
     assert one.next_deadline() == 10.0 + SPEC.drain_s + ROLE_DRAIN_MARGIN_S
     out = done(one.tick, one.next_deadline())
     assert roles(out) == [(WorkerRole.IDLE, 0)]
@@ -332,29 +329,29 @@ def test_role_goes_from_idle_over_active_and_draining_to_idle() -> None:
 
 def test_owner_that_is_chosen_again_while_it_drains_stays_active() -> None:
     one = edge()
-    done(one.execute, allocation("edge1", 1), 0.0)
-    done(one.execute, allocation("edge2", 2), 1.0)
-    assert roles(done(one.execute, allocation("edge1", 3), 1.5)) == [(WorkerRole.ACTIVE, 3)]
+    done(one.execute, allocation_of(1, "edge1"), 0.0)
+    done(one.execute, allocation_of(2, "edge2"), 1.0)
+    assert roles(done(one.execute, allocation_of(3, "edge1"), 1.5)) == [(WorkerRole.ACTIVE, 3)]
     assert one.next_deadline() == math.inf
     assert done(one.tick, 100.0) == ()
 
 
 def test_moves_between_others_do_not_touch_the_role() -> None:
     one = edge("edge3")
-    assert done(one.execute, allocation("edge1", 1), 0.0) == ()
-    assert done(one.execute, allocation("edge2", 2), 0.0) == ()
+    assert done(one.execute, allocation_of(1, "edge1"), 0.0) == ()
+    assert done(one.execute, allocation_of(2, "edge2"), 0.0) == ()
     drained = edge()
-    done(drained.execute, allocation("edge1", 1), 0.0)
-    done(drained.execute, allocation("edge2", 2), 10.0)
+    done(drained.execute, allocation_of(1, "edge1"), 0.0)
+    done(drained.execute, allocation_of(2, "edge2"), 10.0)
     deadline = drained.next_deadline()
-    assert done(drained.execute, allocation("edge3", 3), 11.0) == ()
+    assert done(drained.execute, allocation_of(3, "edge3"), 11.0) == ()
     assert drained.next_deadline() == deadline
 
 
 def test_cold_standby_is_started_by_its_allocation_and_stopped_after_its_drain() -> None:
     one = edge(spec=COLD)
-    assert of(done(one.execute, allocation("edge1", 1), 0.0), StartWorker)
-    assert not of(done(one.execute, allocation("edge2", 2), 10.0), StopWorker)
+    assert of(done(one.execute, allocation_of(1, "edge1"), 0.0), StartWorker)
+    assert not of(done(one.execute, allocation_of(2, "edge2"), 10.0), StopWorker)
     out = done(one.tick, one.next_deadline())
     assert out[-1] == StopWorker(task="merge")
     assert roles(out) == [(WorkerRole.IDLE, 0)]
@@ -363,15 +360,15 @@ def test_cold_standby_is_started_by_its_allocation_and_stopped_after_its_drain()
 def test_cold_standbys_old_owner_works_until_the_new_one_can_have_started() -> None:
     """Make before break: the robots stay with the old owner while the new one's worker starts."""
     one = edge(spec=COLD)
-    done(one.execute, allocation("edge1", 1), 0.0)
-    done(one.execute, allocation("edge2", 2), 10.0)
+    done(one.execute, allocation_of(1, "edge1"), 0.0)
+    done(one.execute, allocation_of(2, "edge2"), 10.0)
     assert done(one.tick, 10.0 + COLD.worker.start_deadline_s + COLD.drain_s) == ()
     assert one.role.role is WorkerRole.DRAINING
 
 
 def test_foreign_worker_is_told_its_role_and_never_started() -> None:
     one = edge(spec=FOREIGN)
-    out = done(one.execute, allocation("edge1", 1), 0.0)
+    out = done(one.execute, allocation_of(1, "edge1"), 0.0)
     assert roles(out) == [(WorkerRole.ACTIVE, 1)]
     assert not of(out, StartWorker)
 
@@ -379,7 +376,7 @@ def test_foreign_worker_is_told_its_role_and_never_started() -> None:
 def test_robot_that_is_candidate_and_has_streams_gets_both() -> None:
     spec = replace(SPEC, candidates=("robot1",))
     one = Executor(spec=spec, me="robot1", has_streams=True)
-    out = done(one.execute, allocation("robot1", 1), 0.0)
+    out = done(one.execute, allocation_of(1, "robot1"), 0.0)
     assert [type(step) for step in out] == [StartWorker, SetRole, ApplyRoutes, RecordStory]
 
 
@@ -401,7 +398,7 @@ def test_again_repeats_the_workers_wish_and_role(
     """A batch that was cut off may have held any of them; each may be given twice."""
     one = edge(spec=spec)
     for epoch, owner in enumerate(moves, 1):
-        done(one.execute, allocation(owner, epoch), 0.0)
+        done(one.execute, allocation_of(epoch, owner), 0.0)
     out = done(one.again)
     assert [type(step) for step in out] == expected
     assert roles(out) == [(one.role.role, one.role.epoch)]
@@ -411,10 +408,10 @@ def test_an_owner_that_went_stays_gone_whoever_goes_next() -> None:
     """Its worker's state is not asked for by the next owner."""
     for gone in ((), ("edge1",), ("edge1", "edge3"), ("edge3",)):
         one = edge("edge2")
-        done(one.execute, allocation("edge1", 1), 0.0)
+        done(one.execute, allocation_of(1, "edge1"), 0.0)
         for node in gone:
             done(one.on_gone, node)
-        (told,) = [out.role for out in done(one.execute, allocation("edge2", 2), 1.0) if isinstance(out, SetRole)]
+        (told,) = [out.role for out in done(one.execute, allocation_of(2, "edge2"), 1.0) if isinstance(out, SetRole)]
         assert told.predecessor == (None if "edge1" in gone else "edge1")
 
 
@@ -424,10 +421,10 @@ def test_an_owner_that_went_stays_gone_whoever_goes_next() -> None:
 def test_a_worker_may_work_without_a_lease_until_it_has_said_that_it_has_stopped() -> None:
     one = edge()
     assert not one.may_work_unleased(0.0)
-    done(one.execute, allocation("edge1", 1), 0.0)
+    done(one.execute, allocation_of(1, "edge1"), 0.0)
     one.on_role_ended(1)
     assert one.may_work_unleased(0.0), "nobody told it to stop"
-    done(one.execute, replace(allocation("edge1", 1), leased=True), 1.0)
+    done(one.execute, replace(allocation_of(1, "edge1"), leased=True), 1.0)
     assert one.role.role is WorkerRole.IDLE
     assert one.may_work_unleased(100.0), "it has not said that it has"
     one.on_role_ended(0)
@@ -438,18 +435,18 @@ def test_a_worker_may_work_without_a_lease_until_it_has_said_that_it_has_stopped
 
 def test_a_worker_whose_process_ended_works_no_more_unless_the_next_one_may() -> None:
     one = edge()
-    done(one.execute, allocation("edge1", 1), 0.0)
+    done(one.execute, allocation_of(1, "edge1"), 0.0)
     one.on_worker_ended()
     assert one.may_work_unleased(0.0), "the next process may work at once"
-    done(one.execute, replace(allocation("edge1", 1), leased=True), 1.0)
+    done(one.execute, replace(allocation_of(1, "edge1"), leased=True), 1.0)
     one.on_worker_ended()
     assert not one.may_work_unleased(1.0)
 
 
 def test_a_worker_that_has_drained_hears_of_its_end_a_little_later() -> None:
     one = edge()
-    done(one.execute, allocation("edge1", 1), 0.0)
-    done(one.execute, allocation("edge2", 2), 1.0)
+    done(one.execute, allocation_of(1, "edge1"), 0.0)
+    done(one.execute, allocation_of(2, "edge2"), 1.0)
     assert one.role.role is WorkerRole.DRAINING
     ends_at = one.next_deadline()
     (told,) = [out.role.role for out in done(one.tick, ends_at) if isinstance(out, SetRole)]
@@ -461,8 +458,8 @@ def test_a_worker_that_has_drained_hears_of_its_end_a_little_later() -> None:
 
 def test_a_worker_that_was_told_to_stop_at_once_has_nothing_to_hear() -> None:
     one = edge(spec=replace(SPEC, exclusive=True))
-    done(one.execute, replace(allocation("edge1", 1), leased=True), 0.0)
+    done(one.execute, replace(allocation_of(1, "edge1"), leased=True), 0.0)
     done(one.set_lease, 2.0, 0.0)
-    done(one.execute, replace(allocation("edge2", 2), leased=True), 1.0)
+    done(one.execute, replace(allocation_of(2, "edge2"), leased=True), 1.0)
     done(one.tick, one.next_deadline())
     assert not one.may_work_unleased(1.0)

@@ -1,11 +1,11 @@
 """Who is asked for the state of an epoch: the owner of the one before, while it is there."""
 
+from support.allocations import allocation_of
 from support.fleets import tuning_of
 from support.todos import done
 from zsched.core.executor.handover import Executor
 from zsched.core.instructions import Instruction, SetRole
 from zsched.core.values.fleet import TaskSpec, WorkerSpec
-from zsched.core.values.model import Allocation
 from zsched.core.values.plan import Role, WorkerRole
 
 TUNING = tuning_of()
@@ -23,7 +23,7 @@ def edge(*, exclusive: bool = False) -> Executor:
 
 
 def execute(one: Executor, owner: str, epoch: int) -> tuple[Instruction, ...]:
-    return done(one.execute, Allocation(task="merge", revision=epoch, epoch=epoch, owner=owner, tuning=TUNING), 0.0)
+    return done(one.execute, allocation_of(epoch, owner), 0.0)
 
 
 def role(out: tuple[Instruction, ...]) -> Role:

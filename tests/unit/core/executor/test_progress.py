@@ -7,7 +7,10 @@ from random import Random
 
 import pytest
 
-from support.fleets import tuning_of
+from support.allocations import allocation_of
+from support.beats import beat_of
+from support.fleets import fleet_of, tuning_of
+from support.profiles import profile_of
 from support.todos import todo_of
 from zsched.core import events as ev
 from zsched.core.executor.handover import Executor, Phase
@@ -16,12 +19,9 @@ from zsched.core.gateway.gateway import Gateway
 from zsched.core.instructions import Instruction, RecordStory, RestartWorker
 from zsched.core.node import Node
 from zsched.core.scheduler.probation import LIMIT_S
-from zsched.core.values.fleet import Fleet, NodeSpec, StreamRule, TaskSpec, Timing, WorkerSpec, electorate_hash
+from zsched.core.values.fleet import StreamRule, TaskSpec, WorkerSpec, electorate_hash
 from zsched.core.values.model import (
-    Allocation,
-    Beat,
     DurableState,
-    NodeKind,
     Profile,
     RegisterState,
     TaskProgress,
@@ -144,9 +144,8 @@ def test_only_robots_watch_and_only_tasks_that_say_so(worker: WorkerSpec) -> Non
 
 
 def profile(robot: str, sequence: int, *progress: TaskProgress) -> Profile:
-    return Profile(
-        node=robot,
-        incarnation=1,
+    return profile_of(
+        robot,
         sequence=sequence,
         cpu_cores=1.0,
         cpu_used_cores=0.1,
@@ -160,14 +159,7 @@ class Owner:
     """The daemon whose worker is judged; its worker became ready at 100 s."""
 
     def __init__(self, spec: TaskSpec = SPEC) -> None:
-        kinds = {"robot1": NodeKind.ROBOT, "robot2": NodeKind.ROBOT, "edge1": NodeKind.EDGE}
-        self.fleet = Fleet(
-            name="test",
-            timing=Timing(),
-            nodes=tuple(NodeSpec(name=name, kind=kind) for name, kind in sorted(kinds.items())),
-            tasks=(spec,),
-            electors=ROBOTS,
-        )
+        self.fleet = fleet_of(spec, of=("edge1", *ROBOTS))
         self.watch, self.gateway = HangWatch(self.fleet), Gateway(self.fleet)
         self.executor = settled(spec, has_streams=False)
         self.watch.note_worker("merge", WorkerState.READY, 100.0)
@@ -274,7 +266,7 @@ def test_a_suspended_owner_takes_no_complaint_about_its_sleep(*, is_suspended: b
 def owner_node() -> Node:
     """The whole daemon of the only candidate, which owns the task and whose worker became ready at 100 s."""
     fleet = Owner().fleet
-    learnt = Allocation(task="merge", revision=3, epoch=3, owner="edge1", tuning=SPEC.tuning)
+    learnt = allocation_of(3, tuning=SPEC.tuning)
     electorate = electorate_hash(fleet)
     state = DurableState(
         fleet="test",
@@ -305,7 +297,7 @@ class Fates:
             batch += self.node.handle(ev.DeadlineReached(), self.now)
             self.sequence += 1
             for robot in ROBOTS if said is not None else ():
-                beat = Beat(node=robot, incarnation=1, sequence=self.sequence, loop_lag_s=0.0)
+                beat = beat_of(robot, self.sequence)
                 batch += self.node.handle(ev.BeatReceived(beat=beat), self.now)
                 if said is not None and self.sequence % 5 == 0:
                     told = profile(robot, self.sequence, said)

@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import pytest
 
+from support.allocations import allocation_of
+from support.beats import beat_of
 from support.fleets import fleet_of, tuning_of
 from support.todos import done
 from zsched.core.executor.handover import Executor
@@ -35,7 +37,7 @@ def sealing(of: Fleet = NEW, me: str = "e1") -> Sealing:
 
 
 def value(task: str = "guard", *, leased: bool = False, owner: str | None = "e1", epoch: int = 3) -> Allocation:
-    return Allocation(task=task, revision=7, epoch=epoch, owner=owner, tuning=TUNING, leased=leased)
+    return allocation_of(7, owner, task=task, epoch=epoch, tuning=TUNING, leased=leased)
 
 
 def values(*known: Allocation) -> dict[str, Allocation]:
@@ -43,7 +45,7 @@ def values(*known: Allocation) -> dict[str, Allocation]:
 
 
 def beat(node: str, of: Fleet = NEW) -> Beat:
-    return Beat(node=node, incarnation=1, sequence=1, loop_lag_s=0.0, fleet_file=fleet_hash(of))
+    return beat_of(node, fleet_file=fleet_hash(of))
 
 
 def answer(

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from support.fleets import tuning_of
+from support.profiles import load_of, profile_of
 from zsched.core.gateway.demand import QUEUE_RATIO, SETTLE_S, SHORT_RATIO, STARVED_CPU_RATIO, UNSURE, Demands, is_short
 from zsched.core.values.fleet import Demand, TaskSpec
 from zsched.core.values.model import Jobs, Profile, WorkerLoad, WorkerState
@@ -33,15 +34,10 @@ def profile(
     speed: float | None = None,
     jobs: Jobs | None = None,
 ) -> Profile:
-    return Profile(
-        node=node,
-        incarnation=1,
-        sequence=1,
-        cpu_cores=4.0,
+    return profile_of(
+        node,
         cpu_used_cores=cpu,
-        memory_mb=4000.0,
-        memory_used_mb=1000.0,
-        workers=(WorkerLoad(task="merge", state=state, cpu_cores=cores, memory_mb=mb, wanted_cores=wanted, jobs=jobs),),
+        workers=(load_of(state=state, cpu_cores=cores, memory_mb=mb, wanted_cores=wanted, jobs=jobs),),
         speed=speed,
     )
 
@@ -287,7 +283,7 @@ def test_the_same_word_again_is_no_news() -> None:
 
 def test_who_gets_less_than_its_threads_want_is_short() -> None:
     def load(cores: float | None, wanted: float | None) -> WorkerLoad:
-        return WorkerLoad(task="merge", state=WorkerState.READY, cpu_cores=cores, wanted_cores=wanted)
+        return load_of(cpu_cores=cores, wanted_cores=wanted)
 
     assert is_short(load(1.0, 4.0))
     assert is_short(load(0.8 * SHORT_RATIO, 0.9)), "whatever it wants"

@@ -5,9 +5,10 @@ import math
 import pytest
 
 from support.fleets import fleet_of, tuning_of
+from support.profiles import load_of, profile_of
 from zsched.core.gateway.gateway import EdgeData, Gateway
 from zsched.core.values.fleet import Demand, TaskSpec
-from zsched.core.values.model import Profile, WorkerLoad, WorkerState
+from zsched.core.values.model import Profile, WorkerState
 
 TASK = TaskSpec(
     name="merge",
@@ -28,15 +29,12 @@ def profile(
     state: WorkerState = WorkerState.READY,
     used: tuple[float | None, float | None] = (0.5, 300.0),
 ) -> Profile:
-    return Profile(
-        node=node,
+    return profile_of(
+        node,
         incarnation=incarnation,
         sequence=sequence,
-        cpu_cores=4.0,
         cpu_used_cores=cpu,
-        memory_mb=4000.0,
-        memory_used_mb=1000.0,
-        workers=(WorkerLoad(task="merge", state=state, cpu_cores=used[0], memory_mb=used[1]),),
+        workers=(load_of(state=state, cpu_cores=used[0], memory_mb=used[1]),),
     )
 
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from support.profiles import profile_of
 from zsched.core.gateway.round_trips import ECHO_S, KEPT, SENT, RoundTrips
-from zsched.core.values.model import Echo, Profile
+from zsched.core.values.model import Echo
 
-MINE = Profile(
-    node="robot1", incarnation=7, sequence=0, cpu_cores=4.0, cpu_used_cores=1.0, memory_mb=100.0, memory_used_mb=1.0
-)
+MINE = profile_of("robot1", incarnation=7, sequence=0, memory_mb=100.0, memory_used_mb=1.0)
 EDGE = replace(MINE, node="edge1", incarnation=3)
 
 

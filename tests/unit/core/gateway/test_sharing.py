@@ -6,23 +6,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from support.profiles import load_of, profile_of
 from zsched.core.gateway.sharing import Shares, fair_share
-from zsched.core.values.model import Profile, WorkerLoad, WorkerState
+from zsched.core.values.model import Profile
 
 
 def profile(
     *, runnable: float | None = 8.0, got: float | None = 1.0, wanted: float | None = None, node: str = "edge1"
 ) -> Profile:
-    return Profile(
-        node=node,
-        incarnation=1,
-        sequence=1,
-        cpu_cores=4.0,
-        cpu_used_cores=4.0,
-        memory_mb=4000.0,
-        memory_used_mb=1000.0,
-        workers=(WorkerLoad(task="merge", state=WorkerState.READY, cpu_cores=got, wanted_cores=wanted),),
-        runnable=runnable,
+    return profile_of(
+        node, cpu_used_cores=4.0, workers=(load_of(cpu_cores=got, wanted_cores=wanted),), runnable=runnable
     )
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from support.beats import beat_of
 from zsched.config.load import check_bytes
 from zsched.core.membership.beat_room import FRAME_BYTES, MAX_BEAT_BYTES, BeatRoom, beat_bytes, most_bytes
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
@@ -28,10 +29,10 @@ def full(tasks: int, length: int = 63) -> Beat:
     def grant(number: int) -> Grant:
         return Grant(task=name(number, length), owner=ROBOTS[0], incarnation=most, epoch=most, number=most)
 
-    return Beat(
-        node=ROBOTS[0],
+    return beat_of(
+        ROBOTS[0],
+        most,
         incarnation=most,
-        sequence=most,
         loop_lag_s=1.1,
         learnt=tuple((name(number, length), most, most) for number in range(tasks)),
         suspects=ROBOTS,

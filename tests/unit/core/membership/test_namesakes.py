@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from support.beats import beat_of
 from zsched.core.membership.identity import QUIET_S
 from zsched.core.membership.namesakes import BESIDE_BEATS, BESIDE_S, LIVES_KEPT, TWINS_TOLD, WHERE_EVERY_S, Namesakes
 from zsched.core.values.model import Beat
@@ -10,7 +11,7 @@ BEAT_S = 0.2
 
 
 def beat(incarnation: int, sequence: int, node: str = "edge2") -> Beat:
-    return Beat(node=node, incarnation=incarnation, sequence=sequence, loop_lag_s=0.0)
+    return beat_of(node, sequence, incarnation=incarnation)
 
 
 def two(*, tokens: tuple[int, ...] = (7, 8), node: str = "edge2") -> Namesakes:

@@ -8,10 +8,11 @@ from random import Random
 
 import pytest
 
+from support.beats import beat_of
 from zsched.config.timing import WAN, WIFI, WIRED
 from zsched.core.membership.peers import MAX_LAG_FACTOR, Membership
 from zsched.core.values.fleet import Timing
-from zsched.core.values.model import Beat, NodeId, PeerState
+from zsched.core.values.model import NodeId, PeerState
 
 SMALL = ("me", "a", "b")
 LARGE = ("me", "a", "b", "c")
@@ -30,13 +31,7 @@ class Ear:
         self, node: NodeId, now: float, *, incarnation: int = 1, suspects: tuple[NodeId, ...] = (), sequence: int = -1
     ) -> list[PeerState]:
         self.sequence += 1
-        beat = Beat(
-            node=node,
-            incarnation=incarnation,
-            sequence=self.sequence if sequence < 0 else sequence,
-            loop_lag_s=0.0,
-            suspects=suspects,
-        )
+        beat = beat_of(node, self.sequence if sequence < 0 else sequence, incarnation=incarnation, suspects=suspects)
         return [change.after for change in self.members.absorb_beat(beat, now)]
 
     def run(

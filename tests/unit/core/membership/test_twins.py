@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from support.beats import beat_of
 from zsched.core.membership.identity import (
     ASK_TWINS_S,
     QUIET_S,
@@ -20,7 +21,7 @@ STAYS = int(STAYS_S / BEAT_S)
 
 
 def beat(incarnation: int, sequence: int) -> Beat:
-    return Beat(node="robot1", incarnation=incarnation, sequence=sequence, loop_lag_s=0.0)
+    return beat_of("robot1", sequence, incarnation=incarnation)
 
 
 def old() -> Identity:

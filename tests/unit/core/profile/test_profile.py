@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 
+from support.profiles import load_of
 from zsched.core.events import WorkerJobs
 from zsched.core.profile.means import STALE_S, Ewma
 from zsched.core.profile.profile import (
@@ -23,7 +24,7 @@ READY = {"merge": WorkerState.READY}
 
 
 def load(cpu: float | None, memory: float | None = None, state: WorkerState = WorkerState.READY) -> WorkerLoad:
-    return WorkerLoad(task="merge", state=state, cpu_cores=cpu, memory_mb=memory)
+    return load_of(state=state, cpu_cores=cpu, memory_mb=memory)
 
 
 def device(cpu: float | None = 1.0, memory: float | None = 1000.0, *workers: WorkerLoad) -> DeviceSample:

@@ -6,11 +6,10 @@ from dataclasses import replace
 
 import pytest
 
-from support.fleets import tuning_of
+from support.fleets import fleet_of, tuning_of
 from zsched.core.relay_protocol import WorkerWatch
 from zsched.core.route.route import plan_for, slot_for, watch_for
-from zsched.core.values.fleet import Fleet, NodeSpec, Standby, StreamRule, TaskSpec, Timing, WorkerSpec
-from zsched.core.values.model import NodeKind
+from zsched.core.values.fleet import Fleet, Standby, StreamRule, TaskSpec, WorkerSpec
 from zsched.core.values.plan import (
     Direction,
     HandoverRule,
@@ -72,10 +71,8 @@ def test_only_a_closing_plan_drops_the_predecessors(phase: RoutePhase) -> None:
 # --- what the relay looks after, whoever owns the task ---------------------------------------------------------------
 
 
-def fleet_of(spec: TaskSpec) -> Fleet:
-    kinds = {"edge1": NodeKind.EDGE, "edge2": NodeKind.EDGE, "robot1": NodeKind.ROBOT, "robot2": NodeKind.ROBOT}
-    nodes = tuple(NodeSpec(name=name, kind=kind) for name, kind in kinds.items())
-    return Fleet(name="test", timing=Timing(), nodes=nodes, tasks=(spec,), electors=("robot1", "robot2"))
+def fleet(spec: TaskSpec) -> Fleet:
+    return fleet_of(spec, of=("edge1", "edge2", "robot1", "robot2"))
 
 
 def test_a_worker_without_a_token_is_watched_where_it_may_run_over_all_robots() -> None:
@@ -84,21 +81,21 @@ def test_a_worker_without_a_token_is_watched_where_it_may_run_over_all_robots() 
     )
     wild = StreamRule(direction=Direction.SERVICE, from_template="{robot}/x/*", to_template="{target}/{robot}/x/*")
     spec = replace(SPEC, rules=(*SPEC.rules, ask, wild))
-    assert watch_for(fleet_of(spec), spec, "edge2") == WorkerWatch(
+    assert watch_for(fleet(spec), spec, "edge2") == WorkerWatch(
         task="merge",
         inputs=("edge2/merge/*/map",),
         strangers=("Nobody/merge/*/map",),
         services=(("edge2/merge/robot1/now", "edge2/merge/robot2/now"),),
     )
-    robot = watch_for(fleet_of(spec), spec, "robot1")
+    robot = watch_for(fleet(spec), spec, "robot1")
     assert robot is not None
     assert (robot.inputs, robot.services) == ((), ()), "no candidate"
 
 
 def test_a_worker_with_a_token_is_not_watched() -> None:
     spec = replace(SPEC, worker=WorkerSpec())
-    assert watch_for(fleet_of(spec), spec, "edge1") is None
-    robot = watch_for(fleet_of(spec), spec, "robot1")
+    assert watch_for(fleet(spec), spec, "edge1") is None
+    robot = watch_for(fleet(spec), spec, "robot1")
     assert robot is not None
     assert (robot.inputs, robot.services) == ((), ())
 
@@ -109,7 +106,7 @@ def test_a_robot_takes_its_own_inputs_before_there_is_an_owner(ready: ReadyWhen)
     spec = replace(SPEC, worker=WorkerSpec(ready_when=ready))
     taken = {}
     for node in ("robot1", "robot2", "edge1"):
-        watch = watch_for(fleet_of(spec), spec, node)
+        watch = watch_for(fleet(spec), spec, node)
         taken[node] = () if watch is None else watch.unowned
     of_a_slot = slot_for(spec, "robot1", "edge1", 1).routes[0]
     assert [(one.stream, one.from_expr) for one in taken["robot1"]] == [(of_a_slot.stream, "robot1/map")]
@@ -117,7 +114,7 @@ def test_a_robot_takes_its_own_inputs_before_there_is_an_owner(ready: ReadyWhen)
     assert [one.from_expr for one in taken["robot2"]] == ["robot2/map"]
     assert taken["edge1"] == ()
     without = replace(spec, rules=spec.rules[1:])
-    robot = watch_for(fleet_of(without), without, "robot1")
+    robot = watch_for(fleet(without), without, "robot1")
     assert robot is None or robot.unowned == ()
 
 
@@ -127,6 +124,6 @@ def test_robots_announce_a_ros_node_s_inputs_at_every_candidate_that_runs_one(st
     rules = tuple(replace(rule, settings=replace(SETTINGS, graph=RosGraph.RMW_ZENOH)) for rule in SPEC.rules)
     worker = replace(SPEC.worker, command=("node",), standby=standby)
     spec = replace(SPEC, rules=rules, worker=worker)
-    watch = watch_for(fleet_of(spec), spec, "robot1")
+    watch = watch_for(fleet(spec), spec, "robot1")
     shown = [] if watch is None else [route.to_expr for route in watch.standbys]
     assert shown == (["edge1/merge/robot1/map", "edge2/merge/robot1/map"] if standby is Standby.WARM else [])

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import pytest
 
+from support.allocations import allocation_of
 from support.fleets import fleet_of, tuning_of
+from support.profiles import load_of, profile_of
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.scoring import score
 from zsched.core.values.fleet import Demand, TaskSpec, WorkerSpec
 from zsched.core.values.model import (
-    Allocation,
     PeerState,
-    Profile,
     Utility,
     WorkerLoad,
     WorkerState,
@@ -32,24 +32,19 @@ TASKS = tuple(
 )
 MAP, PLAN, WATCH = TASKS
 FLEET = fleet_of(*TASKS, of=("edge1", "robot1"), electors=("robot1",))
-NOBODY = Allocation(task="map", revision=1, epoch=1, owner=None, tuning=TUNING)
+NOBODY = allocation_of(owner=None, task="map")
 READY = WorkerState.READY
 
 
 def load(task: str, cpu: float | None = None, memory: float | None = None) -> WorkerLoad:
-    return WorkerLoad(task=task, state=READY, cpu_cores=cpu, memory_mb=memory)
+    return load_of(task, READY, cpu_cores=cpu, memory_mb=memory)
 
 
 def seen(*workers: WorkerLoad, cpu: float = 1.0, memory: float = 1000.0, booked: tuple[TaskSpec, ...] = ()) -> Utility:
     """How robot1 scores edge1 for the task ``map``."""
     gateway = Gateway(FLEET)
-    profile = Profile(
-        node="edge1",
-        incarnation=1,
-        sequence=1,
-        cpu_cores=4.0,
+    profile = profile_of(
         cpu_used_cores=cpu,
-        memory_mb=4000.0,
         memory_used_mb=memory,
         workers=(load("map"), *workers) if not any(one.task == "map" for one in workers) else workers,
     )
@@ -98,19 +93,7 @@ def test_several_tasks_add_up_and_our_own_and_a_stranger_s_do_not_count() -> Non
 
 def test_where_somebody_else_starts_the_worker_its_whole_demand_is_added() -> None:
     """No load of the task is in the profile: nothing of what is used is its own."""
-    unseen, seen_idle = (
-        Profile(
-            node="edge1",
-            incarnation=1,
-            sequence=1,
-            cpu_cores=4.0,
-            cpu_used_cores=1.0,
-            memory_mb=4000.0,
-            memory_used_mb=1000.0,
-            workers=workers,
-        )
-        for workers in ((), (load("map", 0.0, 0.0),))
-    )
+    unseen, seen_idle = (profile_of(workers=workers) for workers in ((), (load("map", 0.0, 0.0),)))
     terms = []
     for profile in (unseen, seen_idle):
         gateway = Gateway(FLEET)

@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import pytest
 
+from support.allocations import allocation_of
 from support.fleets import tuning_of
 from zsched.core.scheduler.scoring import Standing, compare, pick, rounded
 from zsched.core.values.fleet import Reach, TaskSpec
-from zsched.core.values.model import Aggregate, Allocation, Utility, UtilityVector
+from zsched.core.values.model import Aggregate, Utility, UtilityVector
 from zsched.core.values.quorum import majority
 
 SPEC = TaskSpec(
@@ -36,7 +37,7 @@ def vote(
 
 def joined(*vectors: UtilityVector, spec: TaskSpec = SPEC, aggregate: Aggregate = Aggregate.MEAN) -> Standing:
     tuning = replace(SPEC.tuning, aggregate=aggregate)
-    allocation = Allocation(task="merge", revision=7, epoch=3, owner="edge1", tuning=tuning)
+    allocation = allocation_of(7, epoch=3, tuning=tuning)
     return compare(spec, allocation, {vector.voter: vector for vector in vectors})
 
 

@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 
+from support.allocations import allocation_of
 from support.fleets import tuning_of
 from zsched.core.scheduler.damping import MAX_PENALTY, PROBATION_S, STEP, WINDOW_S, Damping
 from zsched.core.scheduler.judge import Judge, Outcome
 from zsched.core.scheduler.scoring import Standing
 from zsched.core.values.fleet import TaskSpec
-from zsched.core.values.model import Allocation
 
 SPEC = TaskSpec(
     name="merge",
@@ -21,7 +21,7 @@ SPEC = TaskSpec(
     patience=0.0,
     max_moves_per_minute=2,
 )
-OWNED = Allocation(task="merge", revision=1, epoch=1, owner="edge1", tuning=SPEC.tuning)
+OWNED = allocation_of(tuning=SPEC.tuning)
 
 
 def standing(**aggregates: float) -> Standing:

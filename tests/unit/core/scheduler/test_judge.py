@@ -6,7 +6,9 @@ from dataclasses import replace
 
 import pytest
 
+from support.allocations import allocation_of
 from support.fleets import tuning_of
+from support.profiles import load_of, profile_of
 from zsched.core.scheduler.judge import (
     INITIAL_SETTLE_S,
     UNSCORED_S,
@@ -25,7 +27,6 @@ from zsched.core.values.model import (
     Profile,
     Utility,
     UtilityVector,
-    WorkerLoad,
     WorkerState,
 )
 
@@ -48,9 +49,7 @@ def standing(aggregates: Mapping[str, float], vetoed: Mapping[str, str] | None =
 
 def allocation(owner: str | None = "edge1", *, paused: bool = False, pinned: bool = False) -> Allocation:
     revision = 0 if owner is None else 5
-    return Allocation(
-        task="merge", revision=revision, epoch=revision, owner=owner, tuning=TUNING, paused=paused, pinned=pinned
-    )
+    return allocation_of(revision, owner, tuning=TUNING, paused=paused, pinned=pinned)
 
 
 def judged(
@@ -295,15 +294,11 @@ def test_paused_or_pinned_tasks_stay_whatever_happens(word: str, escape: str | N
 def profile(
     *, state: WorkerState | None = WorkerState.READY, memory: float | None = 1000.0, draining: bool = False
 ) -> Profile:
-    return Profile(
-        node="edge1",
-        incarnation=1,
+    return profile_of(
         sequence=0,
-        cpu_cores=4.0,
         cpu_used_cores=4.0,
-        memory_mb=4000.0,
         memory_used_mb=memory,
-        workers=() if state is None else (WorkerLoad(task="merge", state=state),),
+        workers=() if state is None else (load_of(state=state),),
         draining=draining,
     )
 

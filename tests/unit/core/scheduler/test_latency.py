@@ -8,21 +8,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from support.fleets import tuning_of
+from support.allocations import allocation_of
+from support.fleets import fleet_of, tuning_of
+from support.profiles import load_of, profile_of
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.scoring import score
 from zsched.core.scheduler.utility import on_time, service_utility
-from zsched.core.values.fleet import Demand, Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.fleet import Demand, TaskSpec, WorkerSpec
 from zsched.core.values.model import (
-    Allocation,
     Jobs,
-    NodeKind,
     PeerState,
-    Profile,
     ScoreForm,
     Tuning,
-    WorkerLoad,
-    WorkerState,
 )
 
 TUNING = tuning_of(cpu=1.0, memory=0.0, score=ScoreForm.SERVICE, deadline_ms=100.0)
@@ -40,24 +37,14 @@ def worth(
 ) -> tuple[float, float]:
     """What the owner edge1 and the candidate edge2 are worth, behind the owner's settling."""
     spec = TaskSpec(name="merge", candidates=EDGES, tuning=tuning, worker=WorkerSpec(command=("x",)), demand=Demand())
-    nodes = tuple(NodeSpec(name=name, kind=NodeKind.EDGE) for name in EDGES)
-    nodes += (NodeSpec(name="robot1", kind=NodeKind.ROBOT),)
-    gateway = Gateway(Fleet(name="f", timing=Timing(), nodes=nodes, tasks=(spec,), electors=("robot1",)))
+    gateway = Gateway(fleet_of(spec, of=(*EDGES, "robot1")))
     for sequence, now in ((1, 0.0), (2, 10.0)):
         for name, speed, cores in zip(EDGES, speeds, used, strict=True):
             own = JOBS.done_hz * JOBS.cpu_s if name == "edge1" else 0.0
-            load = WorkerLoad(
-                task="merge",
-                state=WorkerState.READY,
-                cpu_cores=own,
-                memory_mb=1.0,
-                jobs=jobs if name == "edge1" else None,
-            )
-            profile = Profile(
-                node=name,
-                incarnation=1,
+            load = load_of(cpu_cores=own, memory_mb=1.0, jobs=jobs if name == "edge1" else None)
+            profile = profile_of(
+                name,
                 sequence=sequence,
-                cpu_cores=4.0,
                 cpu_used_cores=cores,
                 memory_mb=1000.0,
                 memory_used_mb=100.0,
@@ -66,7 +53,7 @@ def worth(
             )
             assert gateway.absorb(profile, now) is None
         gateway.learn_demand("merge", "edge1", now)
-    allocation = Allocation(task="merge", revision=1, epoch=1, owner="edge1", tuning=tuning)
+    allocation = allocation_of(tuning=tuning)
     states = dict.fromkeys((*EDGES, "robot1"), PeerState.ALIVE)
     trips = {name: trip_s for name, trip_s in zip(EDGES, away_s, strict=True) if trip_s is not None}
     vector = score(spec, allocation, "robot1", gateway, states, 10.0, round_trips=trips)

@@ -8,7 +8,10 @@ from typing import TypeVar
 
 import pytest
 
+from support.allocations import allocation_of
 from support.fleets import fleet_of, tuning_of
+from support.profiles import load_of, profile_of
+from support.proposals import proposal_of
 from support.robots import Decider
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.instructions import AskUtilities, Instruction, PublishProposal
@@ -19,11 +22,8 @@ from zsched.core.values.messages import Utilities
 from zsched.core.values.model import (
     Allocation,
     PeerState,
-    Profile,
-    Proposal,
     Utility,
     UtilityVector,
-    WorkerLoad,
     WorkerState,
 )
 from zsched.core.vote.tally import VoteOutcome
@@ -53,7 +53,7 @@ class Robot:
         self.decider = Decider(fleet, me, self.gateway, now=self.now)
         self.rounds, self.votes = self.decider.rounds, self.decider.votes
         revision = 0 if owner is None else 5
-        self.value = Allocation(task="merge", revision=revision, epoch=revision, owner=owner, tuning=TUNING)
+        self.value = allocation_of(revision, owner, tuning=TUNING)
         self.sequence = 0
         self.profiles({"edge1": owner_cpu})
 
@@ -72,16 +72,7 @@ class Robot:
         """Fresh profiles of everybody; ``cpu`` in cores, 1 of 4 by default."""
         self.sequence += 1
         for name in (*ROBOTS, *EDGES):
-            profile = Profile(
-                node=name,
-                incarnation=1,
-                sequence=self.sequence,
-                cpu_cores=4.0,
-                cpu_used_cores=cpu.get(name, 1.0),
-                memory_mb=4000.0,
-                memory_used_mb=1000.0,
-                workers=(WorkerLoad(task="merge", state=WorkerState.READY),),
-            )
+            profile = profile_of(name, sequence=self.sequence, cpu_used_cores=cpu.get(name, 1.0), workers=(load_of(),))
             self.gateway.absorb(replace(profile, **changes) if name == "edge1" else profile, self.now)  # type: ignore[arg-type]
 
     def values(self) -> dict[str, Allocation]:
@@ -115,13 +106,8 @@ class Robot:
         self, voter: str, candidate: str, *, base: int | None = None, is_escape: bool = False, task: str = "merge"
     ) -> list[Instruction]:
         value = self.values()[task]
-        proposal = Proposal(
-            voter=voter,
-            task=task,
-            base_revision=value.revision if base is None else base,
-            candidate=candidate,
-            aggregate=0.5,
-            is_escape=is_escape,
+        proposal = proposal_of(
+            voter, candidate, task=task, base_revision=value.revision if base is None else base, is_escape=is_escape
         )
         return self.decider.absorb_proposal(proposal, value, self.states, self.now)
 
@@ -536,7 +522,7 @@ def test_while_an_owner_s_worker_is_not_ready_the_decision_says_when_it_will_be_
     robot.round()
     assert robot.task.judgement is not None
     assert robot.task.judgement.reason == "nobody better"
-    load = WorkerLoad(task="merge", state=WorkerState.STARTING, reason="no token yet")
+    load = load_of(state=WorkerState.STARTING, reason="no token yet")
     robot.profiles({}, workers=(load,))
     robot.round()
     since = robot.task.judge.not_ready_since
@@ -569,7 +555,7 @@ def test_a_first_placement_does_not_wait_for_a_node_that_cannot_have_the_task(
     state: WorkerState, is_draining: bool, votes: list[str]
 ) -> None:
     robot = Robot(owner=None)
-    robot.profiles({}, workers=(WorkerLoad(task="merge", state=state),), draining=is_draining)
+    robot.profiles({}, workers=(load_of(state=state),), draining=is_draining)
     robot.now = robot.decider.next_deadline()
     (ask,) = of(robot.tick(), AskUtilities)
     for voter in ("robot2", "robot3"):
@@ -584,7 +570,7 @@ def test_a_first_placement_does_not_wait_for_a_node_that_cannot_have_the_task(
 def test_a_time_in_which_the_owner_was_not_heard_is_no_time_in_which_its_worker_was_not_ready() -> None:
     """After a minute of silence "not ready for 64 s" would be a reason to flee from a worker that starts again."""
     robot = Robot()
-    starting = (WorkerLoad(task="merge", state=WorkerState.STARTING),)
+    starting = (load_of(state=WorkerState.STARTING),)
     robot.profiles({}, workers=starting)
     robot.round()
     robot.now += 64.0  # its profile is stale now

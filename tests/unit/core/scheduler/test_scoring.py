@@ -5,7 +5,9 @@ from dataclasses import replace
 
 import pytest
 
+from support.allocations import allocation_of
 from support.fleets import fleet_of
+from support.profiles import load_of, profile_of
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts, compare, score
 from zsched.core.scheduler.utility import NEARLY_FULL, service_utility
@@ -30,7 +32,6 @@ from zsched.core.values.model import (
     Utility,
     UtilityVector,
     Weights,
-    WorkerLoad,
     WorkerState,
 )
 
@@ -59,23 +60,14 @@ def profile(
     own: tuple[float, float] = (0.0, 0.0),
     draining: bool = False,
 ) -> Profile:
-    load = () if state is None else (WorkerLoad(task="merge", state=state, cpu_cores=own[0], memory_mb=own[1]),)
-    return Profile(
-        node=node,
-        incarnation=1,
-        sequence=0,
-        cpu_cores=4.0,
-        cpu_used_cores=cpu,
-        memory_mb=4000.0,
-        memory_used_mb=memory,
-        links=links,
-        workers=load,
-        draining=draining,
+    load = () if state is None else (load_of(state=state, cpu_cores=own[0], memory_mb=own[1]),)
+    return profile_of(
+        node, sequence=0, cpu_used_cores=cpu, memory_used_mb=memory, links=links, workers=load, draining=draining
     )
 
 
 def allocation(weights: Weights = CPU, owner: str | None = "edge1") -> Allocation:
-    return Allocation(task="merge", revision=7, epoch=3, owner=owner, tuning=Tuning(weights=weights))
+    return allocation_of(7, owner, epoch=3, tuning=Tuning(weights=weights))
 
 
 def scored(
@@ -124,9 +116,7 @@ def test_machines_that_lack_what_the_task_needs_are_told_apart_by_the_service_fo
 def test_a_full_machine_is_worth_the_fair_share_of_it_to_all_but_an_owner_that_lacks_cpu() -> None:
     """Four threads wait beside the task's two; what such an owner gives is measured, and was not much."""
     spec = replace(SPEC, candidates=("edge1", "edge2"), demand=Demand(cpu_cores=2.0))
-    agreed = Allocation(
-        task="merge", revision=7, epoch=3, owner="edge1", tuning=Tuning(weights=CPU, score=ScoreForm.SERVICE)
-    )
+    agreed = allocation_of(7, epoch=3, tuning=Tuning(weights=CPU, score=ScoreForm.SERVICE))
     full = [
         replace(profile(name, cpu=4.0, own=(0.2 if name == "edge1" else 0.0, 0.0)), runnable=runnable)
         for name, runnable in (("edge1", 4.0), ("edge2", 4.0))

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 import pytest
 
+from support.allocations import allocation_of
 from support.fleets import fleet_of, tuning_of
+from support.profiles import load_of, profile_of
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.scoring import book, score
 from zsched.core.scheduler.turns import in_turn, who_moves_first
@@ -15,10 +17,8 @@ from zsched.core.values.fleet import Demand, TaskSpec
 from zsched.core.values.model import (
     Allocation,
     PeerState,
-    Profile,
     UtilityVector,
     WorkerLoad,
-    WorkerState,
 )
 from zsched.core.vote.voting import Voting
 
@@ -87,7 +87,7 @@ ALIVE = dict.fromkeys(("edge1", "edge2"), PeerState.ALIVE)
 
 def values(owner_of_a: str | None, owner_of_b: str | None = None) -> dict[str, Allocation]:
     owners = {"a": owner_of_a, "b": owner_of_b}
-    return {name: Allocation(task=name, revision=1, epoch=1, owner=o, tuning=TUNING) for name, o in owners.items()}
+    return {name: allocation_of(owner=o, task=name) for name, o in owners.items()}
 
 
 def scored_b(gateway: Gateway, agreed: dict[str, Allocation]) -> UtilityVector:
@@ -99,22 +99,13 @@ def gateway_with(*workers_on_edge1: WorkerLoad, memory_mb: float = 1000.0) -> Ga
     for node, workers in (("edge1", workers_on_edge1), ("edge2", ())):
         seen_cores = sum(load.cpu_cores or 0.0 for load in workers)
         seen_mb = sum(load.memory_mb or 0.0 for load in workers)
-        profile = Profile(
-            node=node,
-            incarnation=1,
-            sequence=1,
-            cpu_cores=4.0,
-            cpu_used_cores=1.0 + seen_cores,
-            memory_mb=4000.0,
-            memory_used_mb=memory_mb + seen_mb,
-            workers=workers,
-        )
+        profile = profile_of(node, cpu_used_cores=1.0 + seen_cores, memory_used_mb=memory_mb + seen_mb, workers=workers)
         assert gateway.absorb(profile, 0.0) is None
     return gateway
 
 
 def of_a(cpu: float | None, memory: float | None) -> WorkerLoad:
-    return WorkerLoad(task="a", state=WorkerState.READY, cpu_cores=cpu, memory_mb=memory)
+    return load_of("a", cpu_cores=cpu, memory_mb=memory)
 
 
 def value(vector: UtilityVector, node: str) -> float:
@@ -134,7 +125,7 @@ def test_nothing_is_booked_for_a_task_elsewhere_for_oneself_and_for_a_foreign_wo
     for agreed, workers in ((values("edge2"), (of_a(0.0, 0.0),)), (values("edge1"), ())):
         vector = scored_b(gateway_with(*workers), agreed)
         assert value(vector, "edge1") == pytest.approx(0.5 * 0.5 + 0.5 * 2200 / 4000)
-    own = WorkerLoad(task="b", state=WorkerState.READY, cpu_cores=0.0, memory_mb=0.0)
+    own = load_of("b", cpu_cores=0.0, memory_mb=0.0)
     assert value(scored_b(gateway_with(own), values(None, "edge1")), "edge1") == pytest.approx(0.525)
 
 

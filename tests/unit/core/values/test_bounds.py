@@ -7,13 +7,17 @@ from typing import Any
 
 import pytest
 
+from support.allocations import allocation_of
+from support.ballots import ballot_of
+from support.beats import beat_of
 from support.fleets import tuning_of
+from support.profiles import load_of, profile_of
+from support.proposals import proposal_of
 from zsched.core.events import RetryCommanded, WeightsCommanded, WorkerJobs, commanded
 from zsched.core.relay_protocol import EndMarker, SnapshotChunk, StreamAck, WorkerTrouble
 from zsched.core.values import model
 from zsched.core.values.fleet import Demand
 from zsched.core.values.messages import (
-    Accept,
     Accepted,
     Learnt,
     Prepare,
@@ -25,40 +29,29 @@ from zsched.core.values.messages import (
 )
 from zsched.core.values.model import (
     MAX_COUNTER,
-    Acceptance,
-    Allocation,
-    Ballot,
-    Beat,
     Echo,
     Grant,
     Jobs,
     Link,
     LinkSource,
-    Profile,
-    Proposal,
     ScoreForm,
     TaskProgress,
     Utility,
     UtilityVector,
-    WorkerLoad,
-    WorkerState,
 )
 from zsched.core.values.plan import ServiceSettings, StreamSettings
 
 TUNING = tuning_of(score=ScoreForm.SERVICE)
-BALLOT = Ballot(counter=1, node="r1", incarnation=1)
-VALUE = Allocation(task="merge", revision=1, epoch=1, owner="e1", tuning=TUNING)
-ACCEPT = Accept(task="merge", acceptance=Acceptance(ballot=BALLOT, value=VALUE), electorate="x")
+BALLOT = ballot_of(node="r1")
+VALUE = allocation_of(owner="e1", tuning=TUNING)
 LINK = Link(source=LinkSource.FIXED)
-LOAD = WorkerLoad(task="merge", state=WorkerState.READY)
-PROFILE = Profile(
-    node="e1", incarnation=1, sequence=1, cpu_cores=4.0, cpu_used_cores=1.0, memory_mb=100.0, memory_used_mb=1.0
-)
+LOAD = load_of()
+PROFILE = profile_of("e1", memory_mb=100.0, memory_used_mb=1.0)
 UTILITY = Utility(candidate="e1", value=0.5)
 VECTOR = UtilityVector(voter="r1", task="merge", revision=1, utilities=())
-PROPOSAL = Proposal(voter="r1", task="merge", base_revision=1, candidate="e1", aggregate=0.5)
+PROPOSAL = proposal_of("r1", "e1", base_revision=1)
 GRANT = Grant(task="merge", owner="e1", incarnation=1, epoch=1, number=1)
-BEAT = Beat(node="e1", incarnation=1, sequence=1, loop_lag_s=0.0)
+BEAT = beat_of("e1")
 PROGRESS = TaskProgress(task="merge", epoch=1, is_served=True)
 PROMISE = Promise(elector="r1", task="merge", ballot=BALLOT)
 ACCEPTED = Accepted(elector="r1", task="merge", ballot=BALLOT)

@@ -7,7 +7,7 @@ from dataclasses import FrozenInstanceError, fields, is_dataclass, replace
 
 import pytest
 
-from support.fleets import tuning_of
+from support.allocations import allocation_of
 from zsched.core.relay_protocol import EndMarker
 from zsched.core.values import messages
 from zsched.core.values.messages import (
@@ -21,11 +21,10 @@ from zsched.core.values.messages import (
     SetWeights,
     Utilities,
 )
-from zsched.core.values.model import NO_BALLOT, Acceptance, Allocation, Ballot
+from zsched.core.values.model import NO_BALLOT, Acceptance, Ballot
 
-TUNING = tuning_of()
 BALLOT = Ballot(counter=1, node="r1", incarnation=1)
-VALUE = Allocation(task="merge", revision=1, epoch=1, owner="e1", tuning=TUNING)
+VALUE = allocation_of(owner="e1")
 ACCEPTANCE = Acceptance(ballot=BALLOT, value=VALUE)
 BAD_NAMES = ("", "Robot", "a/b", "-a", "é", "a" * 64, "*", "a\n")
 

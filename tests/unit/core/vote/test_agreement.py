@@ -8,6 +8,9 @@ from typing import TypeVar
 
 import pytest
 
+from support.allocations import allocation_of
+from support.ballots import ballot_of
+from support.beats import beat_of
 from support.fleets import fleet_of, tuning_of
 from support.todos import agreed
 from zsched.core import events as ev
@@ -31,7 +34,6 @@ from zsched.core.values.model import (
     NO_BALLOT,
     Acceptance,
     Allocation,
-    Ballot,
     Beat,
     DurableState,
     RegisterState,
@@ -53,10 +55,6 @@ FLEET = fleet_of(
     of=("edge1", *ROBOTS),
     electors=ROBOTS,
 )
-
-
-def value(revision: int, owner: str | None = "edge1", *, task: str = "merge") -> Allocation:
-    return Allocation(task=task, revision=revision, epoch=revision, owner=owner, tuning=TUNING)
 
 
 def make(*registers: RegisterState, me: str = "robot1", has_state: bool = True) -> Agreement:
@@ -192,7 +190,7 @@ def test_command_on_the_revision_that_is_current_starts_a_round() -> None:
 def test_command_that_another_change_overtakes_is_a_conflict() -> None:
     agreement = make()
     agreed(agreement.retune, command(), 100.0)
-    result = told(agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(value(1),))), 100.1))
+    result = told(agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(allocation_of(1),))), 100.1))
     assert result is not None
     assert (result.outcome, result.revision) == (CommandOutcome.CONFLICT, 1)
 
@@ -226,7 +224,7 @@ def test_answers_of_strangers_are_counted_and_complete_no_majority() -> None:
 
 
 def beat(node: str, revision: int, *, task: str = "merge") -> Beat:
-    return Beat(node=node, incarnation=1, sequence=1, loop_lag_s=0.0, learnt=((task, revision, revision),))
+    return beat_of(node, learnt=((task, revision, revision),))
 
 
 def test_peer_that_knows_more_is_asked_at_most_every_so_often() -> None:
@@ -239,20 +237,22 @@ def test_peer_that_knows_more_is_asked_at_most_every_so_often() -> None:
 
 @pytest.mark.parametrize("heard", [beat("robot2", 3), beat("robot2", 2), beat("robot2", 9, task="other")])
 def test_peer_that_knows_no_more_is_not_asked(heard: Beat) -> None:
-    agreement = make(RegisterState(task="merge", learnt=value(3)))
+    agreement = make(RegisterState(task="merge", learnt=allocation_of(3)))
     assert agreed(agreement.compare, heard, 100.0) == ToDo()
 
 
 def test_only_learnt_values_are_told_never_accepted_ones() -> None:
-    held = Acceptance(ballot=Ballot(counter=5, node="robot2", incarnation=1), value=value(4))
-    agreement = make(RegisterState(task="merge", promised=held.ballot, accepted=held, learnt=value(3)))
-    assert agreement.learnt() == Learnt(node="robot1", values=(value(3),), has_voted=True)
+    held = Acceptance(ballot=ballot_of(5, "robot2"), value=allocation_of(4))
+    agreement = make(RegisterState(task="merge", promised=held.ballot, accepted=held, learnt=allocation_of(3)))
+    assert agreement.learnt() == Learnt(node="robot1", values=(allocation_of(3),), has_voted=True)
     assert make().learnt().values == (), "the fleet file's tuning is not agreed"
 
 
 def test_values_of_several_tasks_are_learnt_from_one_message() -> None:
     agreement = make()
-    both = Learnt(node="robot2", values=(value(2), value(5, task="plan"), value(1, task="gone")))
+    both = Learnt(
+        node="robot2", values=(allocation_of(2), allocation_of(5, task="plan"), allocation_of(1, task="gone"))
+    )
     effects = agreed(agreement.on_learnt, answer(both), 100.0)
     assert [one.task for one, _ in effects.learnt] == ["merge", "plan"]
     assert {reason for _, reason in effects.learnt} == {"learnt from a peer"}
@@ -264,10 +264,16 @@ def test_values_of_several_tasks_are_learnt_from_one_message() -> None:
 
 
 def test_two_values_for_one_revision_are_a_problem_that_is_shown() -> None:
-    agreement = make(RegisterState(task="merge", learnt=value(3)))
-    assert agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(value(3, "robot2"),))), 100.0).learnt == []
+    agreement = make(RegisterState(task="merge", learnt=allocation_of(3)))
+    assert (
+        agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(allocation_of(3, "robot2"),))), 100.0).learnt
+        == []
+    )
     assert "two values for revision 3" in agreement.problems["register/merge"]
-    assert agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(value(4, "robot2"),))), 100.1).learnt != []
+    assert (
+        agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(allocation_of(4, "robot2"),))), 100.1).learnt
+        != []
+    )
     assert agreement.problems == {}, "agreement goes on"
 
 
@@ -277,7 +283,7 @@ def test_two_values_for_one_revision_are_a_problem_that_is_shown() -> None:
 def test_what_is_said_unasked_is_not_learnt_but_asked_about() -> None:
     """One put from anybody who can reach the network must not end a task."""
     agreement = make()
-    said = Learnt(node="robot2", values=(value(3),))
+    said = Learnt(node="robot2", values=(allocation_of(3),))
     effects = agreed(agreement.on_learnt, ev.LearntReceived(learnt=said), 100.0)
     assert (effects.learnt, effects.must_persist) == ([], False)
     assert [one.peer for one in of(effects, do.AskLearnt)] == ["robot2"]
@@ -288,17 +294,17 @@ def test_what_is_said_unasked_is_not_learnt_but_asked_about() -> None:
 
 
 ABSURD = [
-    value(2**52 - 1, "nobody"),
-    value(3, "nobody"),
-    value(3, "edge9"),
-    value(MAX_AHEAD + 4),
-    replace(value(3), epoch=4),
+    allocation_of(2**52 - 1, "nobody"),
+    allocation_of(3, "nobody"),
+    allocation_of(3, "edge9"),
+    allocation_of(MAX_AHEAD + 4),
+    replace(allocation_of(3), epoch=4),
 ]
 
 
 @pytest.mark.parametrize("absurd", ABSURD)
 def test_an_absurd_answer_is_not_learnt_and_a_majority_is_asked_now_and_then(absurd: Allocation) -> None:
-    agreement = make(RegisterState(task="merge", learnt=value(2)))
+    agreement = make(RegisterState(task="merge", learnt=allocation_of(2)))
     effects = agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(absurd,))), 200.0)
     assert (effects.learnt, effects.must_persist) == ([], False)
     assert [one.prepare.task for one in of(effects, do.SendPrepare)] == ["merge"]
@@ -306,20 +312,20 @@ def test_an_absurd_answer_is_not_learnt_and_a_majority_is_asked_now_and_then(abs
         agreed(agreement.tick, 200.0 + number / 10)
     again = agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(absurd,))), 200.0 + READ_EVERY_S / 2)
     assert again.send == []
-    assert agreement.registers["merge"].value == value(2)
+    assert agreement.registers["merge"].value == allocation_of(2)
     assert agreement.counters["learnt_unproven"] == 2
 
 
 def test_an_owner_that_is_no_candidate_any_more_can_be_learnt_and_accepted() -> None:
     """Found by the simulator (seed 8008456): a node that could not learn it had no voice in moving the task away."""
-    before = value(3, "robot3")
-    agreement = make(RegisterState(task="merge", learnt=value(2)))
+    before = allocation_of(3, "robot3")
+    agreement = make(RegisterState(task="merge", learnt=allocation_of(2)))
     effects = agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(before,))), 200.0)
     assert [one for one, _ in effects.learnt] == [before]
-    elector = make(RegisterState(task="merge", learnt=value(2)))
+    elector = make(RegisterState(task="merge", learnt=allocation_of(2)))
     asked = Accept(
         task="merge",
-        acceptance=Acceptance(ballot=Ballot(counter=5, node="robot2", incarnation=1), value=before),
+        acceptance=Acceptance(ballot=ballot_of(5, "robot2"), value=before),
         electorate="e",
     )
     agreed(elector.on_accept, ev.AcceptAsked(request=1, asker="robot2", accept=asked), 200.0)
@@ -330,7 +336,7 @@ def test_an_owner_that_is_no_candidate_any_more_can_be_learnt_and_accepted() -> 
 
 def test_what_no_single_answer_proves_is_learnt_from_a_majority() -> None:
     """A candidate left the fleet file here and owns the task: the electors' own word is enough."""
-    held = Acceptance(ballot=Ballot(counter=5, node="robot2", incarnation=1), value=value(4, "edge9"))
+    held = Acceptance(ballot=ballot_of(5, "robot2"), value=allocation_of(4, "edge9"))
     agreement = make()
     asked = agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(held.value,))), 100.0)
     effects = accepts(agreement, promises(agreement, asked, held=held))
@@ -340,28 +346,28 @@ def test_what_no_single_answer_proves_is_learnt_from_a_majority() -> None:
 def test_only_an_elector_s_answer_is_believed_or_one_about_what_was_accepted_here() -> None:
     """edge1 is no elector; if it had committed something, electors would have accepted it."""
     agreement = make()
-    said = answer(Learnt(node="edge1", values=(value(3),)))
+    said = answer(Learnt(node="edge1", values=(allocation_of(3),)))
     assert agreed(agreement.on_learnt, said, 100.0).learnt == []
-    held = Acceptance(ballot=Ballot(counter=5, node="edge1", incarnation=1), value=value(3))
+    held = Acceptance(ballot=ballot_of(5, "edge1"), value=allocation_of(3))
     agreement = make(RegisterState(task="merge", promised=held.ballot, accepted=held))
-    assert [one for one, _ in agreed(agreement.on_learnt, said, 100.0).learnt] == [value(3)]
+    assert [one for one, _ in agreed(agreement.on_learnt, said, 100.0).learnt] == [allocation_of(3)]
 
 
 def test_a_node_without_a_state_goes_by_the_generation_of_whom_it_asked() -> None:
     agreement = make(has_state=False)
     start = 3 * GENERATION_STEP
-    old = answer(Learnt(node="robot2", values=(value(start + 5),), generation=2))
+    old = answer(Learnt(node="robot2", values=(allocation_of(start + 5),), generation=2))
     assert agreed(agreement.on_learnt, old, 100.0).learnt == []
-    new = answer(Learnt(node="robot2", values=(value(start + 5),), generation=3))
-    assert [one for one, _ in agreed(agreement.on_learnt, new, 110.0).learnt] == [value(start + 5)]
+    new = answer(Learnt(node="robot2", values=(allocation_of(start + 5),), generation=3))
+    assert [one for one, _ in agreed(agreement.on_learnt, new, 110.0).learnt] == [allocation_of(start + 5)]
 
 
 @pytest.mark.parametrize("absurd", ABSURD)
 def test_an_absurd_value_is_not_accepted(absurd: Allocation) -> None:
-    agreement = make(RegisterState(task="merge", learnt=value(2)))
+    agreement = make(RegisterState(task="merge", learnt=allocation_of(2)))
     asked = Accept(
         task="merge",
-        acceptance=Acceptance(ballot=Ballot(counter=5, node="robot2", incarnation=1), value=absurd),
+        acceptance=Acceptance(ballot=ballot_of(5, "robot2"), value=absurd),
         electorate="e",
     )
     effects = agreed(agreement.on_accept, ev.AcceptAsked(request=1, asker="robot2", accept=asked), 100.0)
@@ -385,12 +391,12 @@ def test_starting_elector_asks_what_was_accepted_once_per_task() -> None:
 
 
 def test_starting_elector_learns_what_a_majority_had_accepted() -> None:
-    held = Acceptance(ballot=Ballot(counter=5, node="robot2", incarnation=1), value=value(4))
+    held = Acceptance(ballot=ballot_of(5, "robot2"), value=allocation_of(4))
     agreement = make()
     asked = agreed(agreement.tick, 100.0 + SETTLE_AFTER_START_S)
     merge = ToDo(send=[one for one in of(asked, do.SendPrepare) if one.prepare.task == "merge"])
     effects = accepts(agreement, promises(agreement, merge, held=held))
-    assert [one for one, _ in effects.learnt] == [value(4)]
+    assert [one for one, _ in effects.learnt] == [allocation_of(4)]
 
 
 @pytest.mark.parametrize(("me", "has_state"), [("edge1", True), ("robot1", False)])
@@ -405,21 +411,21 @@ def test_who_is_no_elector_does_not_ask_at_its_start(me: str, has_state: bool) -
 
 def test_registers_of_tasks_that_left_the_file_stay_on_disk() -> None:
     """The task may come back: its promises must not be forgotten."""
-    gone = RegisterState(task="gone", promised=Ballot(counter=9, node="robot2", incarnation=1), learnt=value(3))
-    agreement = make(gone, RegisterState(task="merge", learnt=value(2)))
-    agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(value(3),))), 100.0)
+    gone = RegisterState(task="gone", promised=ballot_of(9, "robot2"), learnt=allocation_of(3))
+    agreement = make(gone, RegisterState(task="merge", learnt=allocation_of(2)))
+    agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(allocation_of(3),))), 100.0)
     state = agreement.to_persist(100.0)
     assert state is not None
     by_task = {one.task: one for one in state.registers}
     assert sorted(by_task) == ["gone", "merge", "plan"]
     assert by_task["gone"] == gone
-    assert by_task["merge"].learnt == value(3)
+    assert by_task["merge"].learnt == allocation_of(3)
     assert (state.incarnation, state.hardware, state.electorate) == (7, "h", "e")
 
 
 def test_without_a_state_nothing_is_written() -> None:
     agreement = make(has_state=False)
-    assert agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(value(1),))), 100.0).must_persist
+    assert agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(allocation_of(1),))), 100.0).must_persist
     assert agreement.to_persist(100.0) is None
 
 
@@ -429,7 +435,7 @@ def test_refused_write_ends_the_electorship_and_the_writing() -> None:
     assert not agreement.is_elector
     assert agreement.to_persist(100.0) is None
     assert agreement.problems == {"state": "disk full; this node is no elector until it is restarted"}
-    ballot = Ballot(counter=1, node="robot2", incarnation=1)
+    ballot = ballot_of(node="robot2")
     effects = agreed(
         agreement.on_prepare,
         ev.PrepareAsked(request=1, asker="robot2", prepare=replace(_prepare(agreement), ballot=ballot)),
@@ -456,14 +462,14 @@ def test_end_of_a_move_is_told_to_the_rounds_and_to_the_journal() -> None:
     move = MoveOwner(base_revision=0, owner="edge1", reason="edge1 leads")
     effects = accepts(agreement, promises(agreement, agreed(agreement.propose, "merge", move, 100.0)))
     assert [one.task for one in effects.ended] == ["merge"]
-    assert effects.learnt == [(value(1), "edge1 leads")]
+    assert effects.learnt == [(allocation_of(1), "edge1 leads")]
     (story,) = of(effects, do.RecordStory)
     assert story.text == "move to edge1 on revision 0: committed"
     assert told(effects) is None
 
 
 def test_move_on_an_outdated_revision_ends_as_a_conflict_without_a_message() -> None:
-    agreement = make(RegisterState(task="merge", learnt=value(3)))
+    agreement = make(RegisterState(task="merge", learnt=allocation_of(3)))
     effects = agreed(agreement.propose, "merge", MoveOwner(base_revision=2, owner="edge1", reason=""), 100.0)
     assert [one.task for one in effects.ended] == ["merge"]
     assert (effects.send, [type(one) for one in effects.apply]) == ([], [do.RecordStory])
@@ -477,20 +483,20 @@ def test_prepares_of_one_peer_are_rate_limited_and_others_are_not() -> None:
     agreement = make()
     answers = []
     for number in range(60):
-        prepare = Prepare(task="merge", ballot=Ballot(counter=number + 1, node="robot2", incarnation=1), electorate="e")
+        prepare = Prepare(task="merge", ballot=ballot_of(number + 1, "robot2"), electorate="e")
         effects = agreed(agreement.on_prepare, ev.PrepareAsked(request=number, asker="robot2", prepare=prepare), 100.0)
         answers += [i.answer for i in of(effects, do.AnswerElection)]
     refused = [answer for answer in answers if isinstance(answer, Refused)]
     assert len(answers) == 60
     assert len(refused) == agreement.counters["prepare_rate"] == 20
     assert {answer.refusal for answer in refused} == {Refusal.RATE}
-    other = Prepare(task="merge", ballot=Ballot(counter=99, node="robot3", incarnation=1), electorate="e")
+    other = Prepare(task="merge", ballot=ballot_of(99, "robot3"), electorate="e")
     (answer,) = of(
         agreed(agreement.on_prepare, ev.PrepareAsked(request=1, asker="robot3", prepare=other), 100.0),
         do.AnswerElection,
     )
     assert isinstance(answer.answer, Promise)
-    again = Prepare(task="merge", ballot=Ballot(counter=100, node="robot2", incarnation=1), electorate="e")
+    again = Prepare(task="merge", ballot=ballot_of(100, "robot2"), electorate="e")
     (soon,) = of(
         agreed(agreement.on_prepare, ev.PrepareAsked(request=1, asker="robot2", prepare=again), 100.04),
         do.AnswerElection,
@@ -508,7 +514,7 @@ def test_a_broken_proposer_costs_an_elector_twenty_promises_a_second_and_an_hone
     for per_s, promised in ((100, range(235, 246)), (19, range(190, 191))):
         agreement, count = make(), 0
         for number in range(10 * per_s):
-            ballot = Ballot(counter=number + 1, node="robot2", incarnation=1)
+            ballot = ballot_of(number + 1, "robot2")
             asked = ev.PrepareAsked(
                 request=number, asker="robot2", prepare=Prepare(task="merge", ballot=ballot, electorate="e")
             )
@@ -560,18 +566,18 @@ def test_a_state_that_was_brought_back_says_so_in_this_life_and_the_next() -> No
 
 def test_another_generation_teaches_nothing_and_is_shown_until_it_is_gone() -> None:
     agreement = make()
-    told_by = Learnt(node="robot2", values=(value(2**32, None),), generation=1)
+    told_by = Learnt(node="robot2", values=(allocation_of(2**32, None),), generation=1)
     assert agreed(agreement.on_learnt, answer(told_by), 100.0) == ToDo()
     assert agreement.registers["merge"].value.revision == 0
     assert "generation 1" in agreement.problems["generation/robot2"]
-    agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(value(3),))), 100.0)
+    agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(allocation_of(3),))), 100.0)
     assert "generation/robot2" not in agreement.problems
     assert agreement.registers["merge"].value.revision == 3
 
 
 def test_generations_refuse_each_others_ballots() -> None:
     agreement = make()
-    stranger = Prepare(task="merge", ballot=Ballot(counter=1, node="robot2", incarnation=1), electorate="e/1")
+    stranger = Prepare(task="merge", ballot=ballot_of(node="robot2"), electorate="e/1")
     (said,) = of(
         agreed(agreement.on_prepare, ev.PrepareAsked(request=1, asker="robot2", prepare=stranger), 0.0),
         do.AnswerElection,
@@ -582,7 +588,7 @@ def test_generations_refuse_each_others_ballots() -> None:
 
 def test_node_without_state_believes_whatever_generation_it_is_told() -> None:
     agreement = make(has_state=False)
-    agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(value(2**32 + 1),), generation=1)), 100.0)
+    agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(allocation_of(2**32 + 1),), generation=1)), 100.0)
     assert agreement.registers["merge"].value.revision == 2**32 + 1
 
 
@@ -630,6 +636,6 @@ def test_a_node_with_a_state_follows_nobody() -> None:
 
 def test_revision_that_nothing_could_follow_is_refused_and_shown() -> None:
     agreement = make()
-    agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(value(2**53 - 1),))), 100.0)
+    agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(allocation_of(2**53 - 1),))), 100.0)
     assert agreement.registers["merge"].value.revision == 0
     assert agreement.counters["learnt_unproven"] == 1

@@ -7,10 +7,12 @@ from random import Random
 
 import pytest
 
+from support.allocations import allocation_of
+from support.ballots import ballot_of
 from support.fleets import fleet_of, tuning_of
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.messages import Learnt
-from zsched.core.values.model import Acceptance, Allocation, Ballot, RegisterState
+from zsched.core.values.model import Acceptance, Allocation, RegisterState
 from zsched.core.vote.belief import GENERATION_STEP, MAX_AHEAD, MAX_GENERATION, is_fit, is_proven
 from zsched.core.vote.register import MAX_REVISION, Register
 
@@ -21,14 +23,8 @@ FLEET = fleet_of(TASK, of=NAMES, electors=("robot1", "robot2"))
 STRAY = MAX_AHEAD * 3
 
 
-def value(revision: int, owner: str | None = "edge1", epoch: int | None = None) -> Allocation:
-    return Allocation(
-        task="merge", revision=revision, epoch=revision if epoch is None else epoch, owner=owner, tuning=TUNING
-    )
-
-
 def register(learnt: Allocation | None = None, accepted: Allocation | None = None) -> Register:
-    ballot = Ballot(counter=5, node="robot1", incarnation=1)
+    ballot = ballot_of(5)
     held = None if accepted is None else Acceptance(ballot=ballot, value=accepted)
     return Register(
         me="robot1",
@@ -47,46 +43,46 @@ def register(learnt: Allocation | None = None, accepted: Allocation | None = Non
 @pytest.mark.parametrize(
     ("new", "fits"),
     [
-        (value(11), True),
-        (value(11, None), True),
-        (value(11, "robot1"), True),
-        (value(11, "robot9"), False),
-        (value(11, epoch=11), True),
-        (value(11, epoch=12), False),
-        (value(10 + MAX_AHEAD), True),
-        (value(10 + MAX_AHEAD + 1), False),
+        (allocation_of(11), True),
+        (allocation_of(11, None), True),
+        (allocation_of(11, "robot1"), True),
+        (allocation_of(11, "robot9"), False),
+        (allocation_of(11, epoch=11), True),
+        (allocation_of(11, epoch=12), False),
+        (allocation_of(10 + MAX_AHEAD), True),
+        (allocation_of(10 + MAX_AHEAD + 1), False),
     ],
 )
 def test_a_value_names_a_node_of_the_fleet_and_is_not_absurdly_far_ahead(new: Allocation, fits: bool) -> None:
-    assert is_fit(FLEET, new, register(learnt=value(10))) is fits
+    assert is_fit(FLEET, new, register(learnt=allocation_of(10))) is fits
 
 
 def test_ahead_is_counted_from_whatever_is_newest() -> None:
-    assert is_fit(FLEET, value(20 + MAX_AHEAD), register(learnt=value(10), accepted=value(20)))
-    assert is_fit(FLEET, value(20 + MAX_AHEAD), register(learnt=value(20), accepted=value(10)))
-    assert is_fit(FLEET, value(30 + MAX_AHEAD), register(learnt=value(20)), start=30)
-    assert not is_fit(FLEET, value(31 + MAX_AHEAD), register(learnt=value(20)), start=30)
-    assert is_fit(FLEET, value(MAX_AHEAD), register())
-    assert not is_fit(FLEET, value(MAX_AHEAD + 1), register())
+    assert is_fit(FLEET, allocation_of(20 + MAX_AHEAD), register(learnt=allocation_of(10), accepted=allocation_of(20)))
+    assert is_fit(FLEET, allocation_of(20 + MAX_AHEAD), register(learnt=allocation_of(20), accepted=allocation_of(10)))
+    assert is_fit(FLEET, allocation_of(30 + MAX_AHEAD), register(learnt=allocation_of(20)), start=30)
+    assert not is_fit(FLEET, allocation_of(31 + MAX_AHEAD), register(learnt=allocation_of(20)), start=30)
+    assert is_fit(FLEET, allocation_of(MAX_AHEAD), register())
+    assert not is_fit(FLEET, allocation_of(MAX_AHEAD + 1), register())
 
 
 def test_what_is_known_here_already_fits_whatever_it_is() -> None:
     """A fleet file that names other nodes must not make a node refuse what it has agreed to."""
-    old = value(7, "robot9")
+    old = allocation_of(7, "robot9")
     assert is_fit(FLEET, old, register(learnt=old))
-    assert is_fit(FLEET, old, register(learnt=value(8), accepted=old))
-    assert not is_fit(FLEET, old, register(learnt=value(8)))
+    assert is_fit(FLEET, old, register(learnt=allocation_of(8), accepted=old))
+    assert not is_fit(FLEET, old, register(learnt=allocation_of(8)))
 
 
 @pytest.mark.parametrize(
     ("by", "new", "accepted", "is_enough"),
     [
-        ("robot2", value(3), None, True),
-        ("edge1", value(3), None, False),
-        ("edge1", value(3), value(3), True),
-        ("edge1", value(3), value(4), False),
-        ("robot2", value(STRAY), None, False),
-        ("robot2", value(STRAY), value(STRAY), True),
+        ("robot2", allocation_of(3), None, True),
+        ("edge1", allocation_of(3), None, False),
+        ("edge1", allocation_of(3), allocation_of(3), True),
+        ("edge1", allocation_of(3), allocation_of(4), False),
+        ("robot2", allocation_of(STRAY), None, False),
+        ("robot2", allocation_of(STRAY), allocation_of(STRAY), True),
     ],
 )
 def test_an_elector_s_answer_is_enough_or_what_was_accepted_here(
@@ -97,17 +93,17 @@ def test_an_elector_s_answer_is_enough_or_what_was_accepted_here(
 
 
 def test_only_a_node_without_a_state_counts_from_the_generation_that_it_is_told() -> None:
-    new = value(3 * GENERATION_STEP + 5)
+    new = allocation_of(3 * GENERATION_STEP + 5)
     said = Learnt(node="robot2", values=(new,), generation=3)
     assert is_proven(FLEET, said, new, register(), has_generation=False)
     assert not is_proven(FLEET, said, new, register(), has_generation=True)
-    ahead = value(MAX_AHEAD + 1)
+    ahead = allocation_of(MAX_AHEAD + 1)
     assert not is_proven(FLEET, replace(said, values=(ahead,)), ahead, register(), has_generation=True)
     assert not is_proven(FLEET, replace(said, generation=2), new, register(), has_generation=False)
 
 
 def test_a_node_that_was_cut_off_for_twelve_days_of_a_move_a_second_believes_what_it_hears_then() -> None:
-    assert is_fit(FLEET, value(10 + 12 * 86400), register(learnt=value(10)))
+    assert is_fit(FLEET, allocation_of(10 + 12 * 86400), register(learnt=allocation_of(10)))
 
 
 def test_the_last_generation_has_room_to_count_like_any_other() -> None:

@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 
 from support.fleets import fleet_of
+from support.proposals import proposal_of
 from support.registers import (
     BLANK,
     ELECTORS,
@@ -22,7 +23,7 @@ from support.registers import (
 )
 from zsched.core.values.change import Change, MoveOwner, Retune, RoundOutcome
 from zsched.core.values.fleet import TaskSpec
-from zsched.core.values.model import PeerState, Proposal
+from zsched.core.values.model import PeerState
 from zsched.core.vote.register import Register
 from zsched.core.vote.tally import VoteOutcome
 from zsched.core.vote.voting import Voting
@@ -70,7 +71,7 @@ def test_the_first_placement_is_a_change() -> None:
 def test_a_vote_that_ends_in_stay_commits_nothing_and_awaits_nothing() -> None:
     voting = Voting(FLEET, "r1")
     for voter, candidate in (("r2", "e2"), ("r1", "e1"), ("r3", "e1")):
-        paper = Proposal(voter=voter, task="merge", base_revision=3, candidate=candidate, aggregate=1.0)
+        paper = proposal_of(voter, candidate, base_revision=3, aggregate=1.0)
         voting.absorb(paper, TODAY, 10.0)
     ended = voting.count(TODAY, dict.fromkeys(ROBOTS, PeerState.ALIVE), 10.0)
     assert ended is not None

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import pytest
 
+from support.allocations import allocation_of
+from support.ballots import ballot_of
 from support.fleets import fleet_of, tuning_of
 from zsched.core.values.fleet import TaskSpec
-from zsched.core.values.model import NO_BALLOT, Acceptance, Allocation, Ballot, RegisterState
+from zsched.core.values.model import NO_BALLOT, Acceptance, Allocation, RegisterState
 from zsched.core.vote.belief import GENERATION_STEP
 from zsched.core.vote.generations import first_registers
 
@@ -20,11 +22,11 @@ FLEET = fleet_of(
 
 
 def value(revision: int, owner: str | None = "robot1", *, leased: bool = False) -> Allocation:
-    return Allocation(task="guard", revision=revision, epoch=revision, owner=owner, tuning=TUNING, leased=leased)
+    return allocation_of(revision, owner, task="guard", leased=leased)
 
 
 def state(learnt: Allocation | None = None, accepted: Allocation | None = None) -> RegisterState:
-    ballot = Ballot(counter=5, node="robot1", incarnation=1)
+    ballot = ballot_of(5)
     held = None if accepted is None else Acceptance(ballot=ballot, value=accepted)
     return RegisterState(task="guard", promised=ballot, accepted=held, learnt=learnt)
 

@@ -7,6 +7,8 @@ from dataclasses import replace
 
 import pytest
 
+from support.allocations import allocation_of
+from support.beats import beat_of
 from support.fleets import fleet_of, tuning_of
 from zsched.core.values.fleet import Fleet, TaskSpec, lease_terms
 from zsched.core.values.model import Allocation, Beat, Grant
@@ -22,11 +24,11 @@ ACCEPTED = {"guard": ("r2", 3)}
 
 
 def value(owner: str | None = "r2", *, leased: bool = True) -> Allocation:
-    return Allocation(task="guard", revision=7, epoch=3, owner=owner, tuning=TUNING, leased=leased)
+    return allocation_of(7, owner, task="guard", epoch=3, tuning=TUNING, leased=leased)
 
 
 def beat(node: str = "r2", number: int = 5, released: tuple[Grant, ...] = ()) -> Beat:
-    return Beat(node=node, incarnation=1, sequence=number, loop_lag_s=0.0, learnt=(("guard", 7, 3),), released=released)
+    return beat_of(node, number, learnt=(("guard", 7, 3),), released=released)
 
 
 def grant(number: int, owner: str = "r2", epoch: int = 3) -> Grant:

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from support.allocations import allocation_of
 from support.fleets import tuning_of
 from support.todos import done
 from zsched.core.executor.handover import Executor
 from zsched.core.instructions import ApplyRoutes, SetRole, StartWorker
 from zsched.core.values.fleet import OnIsolation, TaskSpec, WorkerSpec
-from zsched.core.values.model import Allocation
 from zsched.core.values.plan import Role, WorkerRole
 
 TUNING = tuning_of(cpu=1.0, memory=0.0)
 SPEC = TaskSpec(name="guard", candidates=("edge1", "edge2"), tuning=TUNING, worker=WorkerSpec(command=("work",)))
-FIRST = Allocation(task="guard", revision=1, epoch=1, owner="edge1", tuning=TUNING)
+FIRST = allocation_of(task="guard", tuning=TUNING)
 
 
 def roles(instructions: tuple[object, ...]) -> list[Role]:

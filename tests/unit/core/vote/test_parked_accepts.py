@@ -6,6 +6,9 @@ from random import Random
 
 import pytest
 
+from support.allocations import allocation_of
+from support.ballots import ballot_of
+from support.beats import beat_of
 from support.fleets import fleet_of, tuning_of
 from support.todos import agreed
 from zsched.core import events as ev
@@ -18,8 +21,6 @@ from zsched.core.values.messages import Accept, Accepted, Learnt, Refusal, Refus
 from zsched.core.values.model import (
     Acceptance,
     Allocation,
-    Ballot,
-    Beat,
     DurableState,
     RegisterState,
 )
@@ -34,7 +35,7 @@ PARKED_S = PARK_SHARE * FLEET.timing.ballot_s
 
 
 def value(revision: int, owner: str) -> Allocation:
-    return Allocation(task="guard", revision=revision, epoch=revision, owner=owner, tuning=TUNING)
+    return allocation_of(revision, owner, task="guard")
 
 
 def disk() -> DurableState:
@@ -82,16 +83,16 @@ def overtaken(agreement: Agreement) -> None:
             task="guard",
             ballot=sent.prepare.ballot,
             refusal=Refusal.BALLOT,
-            promised=Ballot(counter=9, node="robot3", incarnation=1),
+            promised=ballot_of(9, "robot3"),
         )
         agreed(agreement.on_answer, ev.ElectorAnswered(answer=no), 101.0)
 
 
-ASKS_TO_LEAVE = Beat(node="robot2", incarnation=1, sequence=9, loop_lag_s=0.0, asked_to_leave=(("guard", "robot2", 3),))
+ASKS_TO_LEAVE = beat_of("robot2", 9, asked_to_leave=(("guard", "robot2", 3),))
 
 
 def asks(agreement: Agreement, request: int, counter: int, now: float, asker: str = "robot3") -> ToDo:
-    ballot = Ballot(counter=counter, node=asker, incarnation=1)
+    ballot = ballot_of(counter, asker)
     accept = Accept(task="guard", acceptance=Acceptance(ballot=ballot, value=value(4, "robot3")), electorate="e")
     return agreed(agreement.on_accept, ev.AcceptAsked(request=request, asker=asker, accept=accept), now)
 
@@ -163,7 +164,7 @@ def test_a_question_that_would_be_refused_anyway_does_not_wait() -> None:
             asker="robot3",
             accept=Accept(
                 task="guard",
-                acceptance=Acceptance(ballot=Ballot(counter=7, node="robot3", incarnation=1), value=value(4, "robot3")),
+                acceptance=Acceptance(ballot=ballot_of(7, "robot3"), value=value(4, "robot3")),
                 electorate="another",
             ),
         ),
@@ -175,7 +176,7 @@ def test_a_question_that_would_be_refused_anyway_does_not_wait() -> None:
 def test_a_question_that_waits_is_answered_though_no_task_is_exclusive_any_more() -> None:
     """The task may cease to be leased meanwhile. Its deadline must not lie behind us for ever: the loop would spin."""
     node = elector_node()
-    ballot = Ballot(counter=5, node="robot3", incarnation=1)
+    ballot = ballot_of(5, "robot3")
     accept = Accept(task="guard", acceptance=Acceptance(ballot=ballot, value=value(4, "robot3")), electorate="e")
     node.handle(ev.AcceptAsked(request=1, asker="robot3", accept=accept), 100.1)
     assert node.agreement.has_parked
@@ -197,9 +198,7 @@ def test_who_is_overtaken_while_an_elector_asks_this_owner_to_leave_waits_for_a_
     agreement = elector()
     overtaken(agreement)
     asks_to_leave = (("guard", "robot2", epoch), ("stranger", "robot2", 3))
-    agreement.note_asked(
-        Beat(node=node, incarnation=1, sequence=9, loop_lag_s=0.0, asked_to_leave=asks_to_leave), 101.0
-    )
+    agreement.note_asked(beat_of(node, 9, asked_to_leave=asks_to_leave), 101.0)
     at = agreement.registers["guard"].next_deadline()
     assert (agreed(agreement.tick, at).send == []) is waits
     if waits:
@@ -210,10 +209,10 @@ def test_who_is_overtaken_while_an_elector_asks_this_owner_to_leave_waits_for_a_
 def test_an_identity_round_does_not_end_the_silence_towards_an_owner_that_is_asked_to_leave() -> None:
     """It is no newer revision, and the next owner may still wait: the present one must not work again before it."""
     agreement, now = elector(), 100.0 + 2 * HOLD_S
-    beat = Beat(node="robot2", incarnation=1, sequence=9, loop_lag_s=0.0, learnt=(("guard", 3, 3),))
+    beat = beat_of("robot2", 9, learnt=(("guard", 3, 3),))
     assert agreement.leases.on_beat(beat, {"guard": ("robot2", 3)}, now)
     asks(agreement, 1, 5, now)
-    acceptance = Acceptance(ballot=Ballot(counter=6, node="robot2", incarnation=1), value=value(3, "robot2"))
+    acceptance = Acceptance(ballot=ballot_of(6, "robot2"), value=value(3, "robot2"))
     identity = Accept(task="guard", acceptance=acceptance, electorate="e")
     effects = agreed(agreement.on_accept, ev.AcceptAsked(request=2, asker="robot2", accept=identity), now)
     assert answers(effects) == [(2, "accepted")]

@@ -13,11 +13,12 @@ from random import Random
 
 import pytest
 
+from support.ballots import ballot_of
 from support.registers import BALLOT_S, INITIAL, TUNING, Step, accepted, did, promised
 from zsched.core.todo import ToDo
 from zsched.core.values.change import Change, MoveOwner, Retune, RoundOutcome
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refused
-from zsched.core.values.model import Acceptance, Allocation, Ballot, RegisterState
+from zsched.core.values.model import Acceptance, Allocation, RegisterState
 from zsched.core.values.quorum import majority
 from zsched.core.vote.register import Register
 
@@ -282,7 +283,7 @@ def test_register_unlearnt_majority_after_power_loss_is_learnt_without_a_new_pro
     world.electors = ("r0", "r1", "r2")
     world.crash_rate = world.loss = 0.0
     world.calls.clear()
-    ballot = Ballot(counter=1, node="edge", incarnation=1)
+    ballot = ballot_of(node="edge")
     acceptance = Acceptance(ballot=ballot, value=replace(INITIAL, revision=1, epoch=1, owner="e1"))
     disk = RegisterState(task="merge", promised=ballot, accepted=acceptance)
     world.hosts = {name: Host(name, 1, disk) for name in world.electors}

@@ -4,6 +4,7 @@ import itertools
 
 import pytest
 
+from support.proposals import proposal_of
 from zsched.core.values.model import Proposal
 from zsched.core.values.quorum import majority
 from zsched.core.vote.tally import Tally, VoteOutcome, tally
@@ -13,9 +14,7 @@ FIVE = (*THREE, "r4", "r5")
 
 
 def paper(voter: str, candidate: str, aggregate: float = 0.5, *, escape: bool = False) -> Proposal:
-    return Proposal(
-        voter=voter, task="merge", base_revision=4, candidate=candidate, aggregate=aggregate, is_escape=escape
-    )
+    return proposal_of(voter, candidate, base_revision=4, aggregate=aggregate, is_escape=escape)
 
 
 def counted(

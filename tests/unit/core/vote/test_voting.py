@@ -6,9 +6,11 @@ import math
 
 import pytest
 
+from support.allocations import allocation_of
 from support.fleets import fleet_of, tuning_of
+from support.proposals import proposal_of
 from zsched.core.values.fleet import TaskSpec
-from zsched.core.values.model import Allocation, PeerState, Proposal
+from zsched.core.values.model import PeerState, Proposal
 from zsched.core.vote.tally import VoteOutcome
 from zsched.core.vote.voting import Voting, vote_time
 
@@ -16,14 +18,12 @@ ROBOTS = ("robot1", "robot2", "robot3")
 ALL = dict.fromkeys(ROBOTS, PeerState.ALIVE)
 TUNING = tuning_of(cpu=1.0, memory=0.0)
 FLEET = fleet_of(TaskSpec(name="merge", candidates=("edge1", "edge2"), tuning=TUNING), of=ROBOTS, electors=ROBOTS)
-VALUE = Allocation(task="merge", revision=5, epoch=5, owner="edge1", tuning=TUNING)
+VALUE = allocation_of(5, tuning=TUNING)
 VOTE_S = vote_time(FLEET.timing)
 
 
 def paper(voter: str, candidate: str = "edge2", base: int = 5) -> Proposal:
-    return Proposal(
-        voter=voter, task="merge", base_revision=base, candidate=candidate, aggregate=2.0, is_escape=False, reason=voter
-    )
+    return proposal_of(voter, candidate, base_revision=base, aggregate=2.0, is_escape=False, reason=voter)
 
 
 def test_a_move_opens_a_vote_and_calls_who_has_not_proposed_lately() -> None:

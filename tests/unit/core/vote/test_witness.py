@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from support.beats import beat_of
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import Beat
 from zsched.core.vote.witness import ASK_ALL_S, Witness, as_seen, as_tuple
@@ -21,7 +22,7 @@ def said(by: str, incarnation: int = 3, votes: int = 0, *seen: tuple[str, int, i
 
 
 def beat(node: str, votes: int) -> Beat:
-    return Beat(node=node, incarnation=3, sequence=1, loop_lag_s=0.0, votes=votes)
+    return beat_of(node, incarnation=3, votes=votes)
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,9 @@ from collections.abc import Callable
 
 import pytest
 
-from zsched.core.values.fleet import Demand, Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
-from zsched.core.values.model import NodeId, NodeKind, Tuning
+from support.fleets import fleet_of
+from zsched.core.values.fleet import Demand, Fleet, TaskSpec, WorkerSpec
+from zsched.core.values.model import NodeId, Tuning
 from zsched_lab.decisions.world import EVEN
 from zsched_lab.sim.simulator import CORES, MEMORY_MB, Simulator
 
@@ -19,8 +20,6 @@ Load = Callable[[NodeId, float], tuple[float, float]]
 
 def fleet(tasks: int, edges: int) -> Fleet:
     names = tuple(f"edge{index}" for index in range(1, edges + 1))
-    nodes = [NodeSpec(name=name, kind=NodeKind.EDGE) for name in names]
-    nodes += [NodeSpec(name=name, kind=NodeKind.ROBOT) for name in ROBOTS]
     specs = tuple(
         TaskSpec(
             name=f"task{index}",
@@ -31,7 +30,7 @@ def fleet(tasks: int, edges: int) -> Fleet:
         )
         for index in range(1, tasks + 1)
     )
-    return Fleet(name="several", timing=Timing(), nodes=tuple(nodes), tasks=specs, electors=ROBOTS)
+    return fleet_of(*specs, of=(*names, *ROBOTS))
 
 
 def busy(shares: dict[NodeId, float]) -> Load:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 
+from support.allocations import allocation_of
 from support.fleets import fleet_of, tuning_of
 from zsched.core import instructions as do
 from zsched.core.values.fleet import StreamRule, TaskSpec, WorkerSpec
@@ -41,10 +42,6 @@ def settled(seed: int = 1) -> Simulator:
     assert sim.run_until(lambda: sim.agreed("merge") is not None, 10)
     sim.run(1)
     return sim
-
-
-def value(owner: str, revision: int = 1, epoch: int = 1) -> Allocation:
-    return Allocation(task="merge", revision=revision, epoch=epoch, owner=owner, tuning=TUNING)
 
 
 # --- time and delivery -----------------------------------------------------------------------------------------------
@@ -189,7 +186,9 @@ def test_promise_that_tells_another_acceptance_than_the_disk_holds_is_found() ->
     before = state.accepted
     assert before is not None
     ballot = replace(state.promised, counter=state.promised.counter + 1)
-    later = replace(before, ballot=ballot, value=value("edge2", before.value.revision + 1, before.value.epoch + 1))
+    later = replace(
+        before, ballot=ballot, value=allocation_of(before.value.revision + 1, "edge2", before.value.epoch + 1)
+    )
     promise = Promise(elector="robot1", task="merge", ballot=ballot, accepted=before)
 
     machine.disk.registers["merge"] = replace(state, promised=ballot, accepted=later)
@@ -209,7 +208,7 @@ def test_two_acceptances_in_one_write_are_two_and_an_older_one_after_that_is_fou
     assert state.accepted is not None
     first = replace(state.promised, counter=state.promised.counter + 1)
     second = replace(first, counter=first.counter + 1)
-    accepted = Acceptance(ballot=first, value=value("edge2", state.accepted.value.revision + 1, 2))
+    accepted = Acceptance(ballot=first, value=allocation_of(state.accepted.value.revision + 1, "edge2", 2))
     sim.invariants.ballots["merge", first] = ("robot2 life 1", accepted.value)
 
     def answer(ballot: Ballot) -> None:

@@ -1,0 +1,12 @@
+"""Beats, with what a test does not care about filled in."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from zsched.core.values.model import Beat, NodeId
+
+
+def beat_of(node: NodeId, sequence: int = 1, **options: Any) -> Beat:
+    """A beat of a node's first life whose loop does not lag; it tells nothing else."""
+    return Beat(node=node, sequence=sequence, **{"incarnation": 1, "loop_lag_s": 0.0, **options})
