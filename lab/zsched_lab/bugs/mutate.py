@@ -11,6 +11,7 @@ then a few schedules of the simulator, and ends with the first that fails. The l
 from __future__ import annotations
 
 import argparse
+import functools
 import gc
 import hashlib
 import json
@@ -106,6 +107,11 @@ class Results:
 # --- the choice ------------------------------------------------------------------------------------------------------
 
 
+@functools.cache
+def _mutants(module: str, source: str) -> tuple[Mutant, ...]:
+    return tuple(mutants_of(module, source))
+
+
 def choose(seed: int, count: int, only: Sequence[str] = ()) -> list[Mutant]:
     """Mutants of the core, all equally likely; the same ones for the same seed and source.
 
@@ -125,7 +131,7 @@ def choose(seed: int, count: int, only: Sequence[str] = ()) -> list[Mutant]:
     found = [
         mutant
         for path, source in sources.items()
-        for mutant in mutants_of(module_of(path, CORE), source)
+        for mutant in _mutants(module_of(path, CORE), source)
         if not only or mutant.path in only or f"{mutant.path}:{mutant.line}" in only
     ]
     found.sort(key=lambda mutant: hashlib.sha256(f"{seed} {mutant.key}".encode()).digest())
