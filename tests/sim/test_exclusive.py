@@ -51,7 +51,7 @@ def started(seed: int, **options: bool) -> Simulator:
 
 
 @pytest.mark.parametrize("robots_only", [False, True])
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_owner_works_only_under_a_lease_and_keeps_it(seed: int, robots_only: bool) -> None:
     sim = started(seed, robots_only=robots_only)
     owner = sim.agreed(TASK)
@@ -61,7 +61,7 @@ def test_owner_works_only_under_a_lease_and_keeps_it(seed: int, robots_only: boo
     assert sim.agreed(TASK) == owner
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(4))
 def test_crashed_owner_is_replaced_only_after_its_lease(seed: int) -> None:
     sim = started(seed)
     sim.run(5)
@@ -73,7 +73,7 @@ def test_crashed_owner_is_replaced_only_after_its_lease(seed: int) -> None:
     assert TIMING.lease_s - 2 * TIMING.beat_s < sim.now - at < hold_s(TIMING.lease_s) + 1.5
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(4))
 def test_owner_that_is_cut_off_stops_before_the_next_one_starts(seed: int) -> None:
     sim = started(seed)
     sim.run(5)
@@ -86,7 +86,7 @@ def test_owner_that_is_cut_off_stops_before_the_next_one_starts(seed: int) -> No
     assert sim.run_until(lambda: is_working(sim), 5)
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("towards_owner", [True, False])
 def test_one_way_cuts_never_make_two_owners(seed: int, towards_owner: bool) -> None:
     sim = started(seed)
@@ -100,7 +100,7 @@ def test_one_way_cuts_never_make_two_owners(seed: int, towards_owner: bool) -> N
     assert sim.run_until(lambda: is_working(sim), 10), "\n".join(sim.stories[-40:])
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_one_forged_number_costs_no_elector_s_grants(seed: int) -> None:
     """After a cut of a second a beat may be 60 numbers ahead, and the first one that comes may be anybody's."""
     sim = started(seed)
@@ -140,7 +140,7 @@ def _planned_move_s(*, exclusive: bool, seed: int) -> tuple[float, float]:
     return sim.now - voted, 0.010
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_planned_move_costs_less_than_two_round_trips_more_than_an_idempotent_one(seed: int) -> None:
     plain, trip = _planned_move_s(exclusive=False, seed=seed)
     leased, _ = _planned_move_s(exclusive=True, seed=seed)
@@ -148,7 +148,7 @@ def test_planned_move_costs_less_than_two_round_trips_more_than_an_idempotent_on
 
 
 @pytest.mark.parametrize("stop_s", [0.05, 0.1, 0.4])
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_planned_move_takes_one_vote_and_as_long_as_its_worker_takes_to_stop(seed: int, stop_s: float) -> None:
     """Proposers overtake each other meanwhile: the one that was overtaken must not end the accept that waits."""
     busy: set[NodeId] = set()
@@ -164,7 +164,7 @@ def test_a_planned_move_takes_one_vote_and_as_long_as_its_worker_takes_to_stop(s
 
 
 @pytest.mark.parametrize("stop_s", [0.05, 0.1, 0.4])
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_owner_whose_worker_is_slow_to_stop_is_left_by_the_next_vote(seed: int, stop_s: float) -> None:
     """Proposers that take turns refuse each other meanwhile; what they settle on is no reason to let it work again.
 
@@ -201,7 +201,7 @@ def test_owner_that_released_for_a_move_that_failed_works_again() -> None:
     assert sim.node(owner).registers[TASK].value.epoch >= epoch
 
 
-@pytest.mark.parametrize("seed", range(15))
+@pytest.mark.parametrize("seed", range(6))
 def test_random_faults_never_overlap_and_end_with_a_working_owner(seed: int) -> None:
     rng = Random(seed)
     sim = Simulator(

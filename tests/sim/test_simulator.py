@@ -39,7 +39,7 @@ def started(seed: int = 1, **options: float) -> Simulator:
     return sim
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(4))
 def test_fleet_agrees_on_a_first_owner(seed: int) -> None:
     sim = started(seed)
     assert sim.agreed(TASK) in {"edge1", "edge2", "edge3"}
@@ -55,7 +55,7 @@ def test_same_seed_same_story() -> None:
     assert first.stories == second.stories
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(8))
 def test_killed_owner_is_replaced_within_200_ms_and_epochs_rise_by_one(seed: int) -> None:
     sim = started(seed)
     owner = sim.agreed(TASK)
@@ -87,17 +87,17 @@ def test_busy_owner_is_left_once_staying_has_cost_the_patience_and_not_before() 
     assert due_s - timing.decide_s < sim.now - at < due_s + 2 * timing.smoothing_s + timing.decide_s
 
 
-def test_equal_noisy_nodes_do_not_flap_for_ten_minutes() -> None:
+def test_equal_noisy_nodes_do_not_flap_for_three_minutes() -> None:
     rng = Random(11)
     sim = Simulator(
         fleet=fleet(), seed=4, load=lambda _node, _now: (CORES * rng.uniform(0.1, 0.4), rng.uniform(600, 1800))
     )
     sim.start()
-    sim.run(600)
+    sim.run(180)
     assert max(epoch for _, epoch in sim.owners) <= 2
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(4))
 def test_minority_does_not_move_anything_and_heals(seed: int) -> None:
     """Two robots cut off from the third and from every edge: the majority side decides, the other one learns later."""
     sim = started(seed)
@@ -159,7 +159,7 @@ def test_robot_that_reaches_no_edge_moves_nothing() -> None:
     assert sim.agreed(TASK) == owner
 
 
-@pytest.mark.parametrize("seed", range(15))
+@pytest.mark.parametrize("seed", range(6))
 def test_random_faults_never_break_agreement_and_end_in_an_owner(seed: int) -> None:
     """Loss, crashes, restarts, cuts, then quiet: one value per revision all along, a living owner at the end."""
     rng = Random(1000 + seed)

@@ -27,7 +27,7 @@ from zsched_lab.sim.simulator import Simulator
 from zsched_lab.sim.swarm import KINDS, LATER, MAKERS, MAX_NODES, MIN_NODES, PENDING, Fault, Plan, plan
 
 
-@pytest.mark.parametrize("seed", range(25))
+@pytest.mark.parametrize("seed", range(10))
 def test_a_schedule_of_faults_violates_nothing_and_ends_at_rest(seed: int) -> None:
     result = play(plan(seed))
     assert result.violation == "", f"{Job(seed=seed).command}\n" + "\n".join(result.stories[-40:])
@@ -60,10 +60,9 @@ def test_plans_have_every_fault_every_size_and_every_kind_of_task() -> None:
     assert any(not one.faults for one in plans), "and some in which nothing goes wrong"
 
 
-@pytest.mark.parametrize("seed", [598, 400778])
-def test_many_tasks_with_slow_workers_all_leave_a_busy_owner_in_the_end(seed: int) -> None:
+def test_many_tasks_with_slow_workers_all_leave_a_busy_owner_in_the_end() -> None:
     """Found by the simulator: each vote asked an owner to leave, and the next on that task came when it had stayed."""
-    one = plan(seed)
+    one = plan(598)
     assert len(one.fleet.tasks) == 41
     assert play(one).violation == ""
 
@@ -100,10 +99,12 @@ def test_a_daemon_that_leaves_its_name_does_so_behind_all_else() -> None:
 def test_every_fault_that_is_planned_is_carried_out() -> None:
     done: set[str] = set()
     planned: set[str] = set()
-    for seed in range(20):
+    for seed in range(60):
         one = plan(seed, kinds=frozenset(LATER))
-        done |= set(play(one).faults)
-        planned |= {fault.kind for fault in one.faults}
+        kinds = {fault.kind for fault in one.faults}
+        if kinds - planned:
+            done |= set(play(one).faults)
+            planned |= kinds
     assert planned <= done
 
 
@@ -202,7 +203,7 @@ def test_runs_are_resumed_behind_the_last_seed(tmp_path: Path, capsys: pytest.Ca
 def test_two_processes_play_the_same_schedules(capsys: pytest.CaptureFixture[str]) -> None:
     outs = []
     for jobs in ("1", "2"):
-        assert main(["--seed", "5", "--runs", "12", "--seconds", "2", "--jobs", jobs]) == 0
+        assert main(["--seed", "5", "--runs", "6", "--seconds", "2", "--jobs", jobs]) == 0
         outs.append(next(line for line in capsys.readouterr().out.splitlines() if line.startswith("faults: ")))
     assert outs[0] == outs[1]
 

@@ -137,7 +137,7 @@ def dataclass_strategy(cls: type[Any]) -> st.SearchStrategy[Any]:
 def test_round_trip_of_any_value(kind: str) -> None:
     cls, bound = wire.KINDS[kind]
 
-    @settings(max_examples=40, deadline=None, derandomize=True, database=None)
+    @settings(max_examples=20, deadline=None, derandomize=True, database=None)
     @given(strategy(cls))
     def check(value: Any) -> None:
         frame = wire.encode(value)
@@ -346,12 +346,12 @@ def check_hostile(frame: bytes) -> bool:
     return not reason
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_fuzz_mutated_bytes_raise_wire_errors_only(seed: int) -> None:
     rng = Random(seed)
     frames = [wire.encode(sample) for sample in SAMPLES.values()]
     read = 0
-    for number in range(45_000):
+    for number in range(30_000):
         frame = mutated(frames[number % len(frames)], rng.choice(frames), rng)
         while rng.random() < 0.3 and frame:
             frame = mutated(frame, rng.choice(frames), rng)

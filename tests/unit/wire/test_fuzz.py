@@ -16,7 +16,7 @@ from zsched.errors import WireError
 from zsched.wire import codec as wire
 from zsched_lab.bugs.fuzz_wire import CLASSES, LAG_S, REASONS, Fuzz, damaged, main, sample
 
-FRAMES, PARTS = 200_000, 8
+FRAMES, PARTS = 75_000, 3
 
 
 @pytest.mark.parametrize("part", range(PARTS))

@@ -15,14 +15,14 @@ from zsched.wire import keyspace
 from zsched_lab.bugs.fuzz_keys import KeyFuzz, main
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_no_hostile_key_token_number_or_marker_raises_or_ends_anything(seed: int) -> None:
     fuzz = KeyFuzz(seed)
     fuzz.run(500)
     assert fuzz.violations == []
 
 
-def found(rounds: int = 300) -> str:
+def found(rounds: int = 120) -> str:
     """What a run finds."""
     fuzz = KeyFuzz(1)
     fuzz.run(rounds)

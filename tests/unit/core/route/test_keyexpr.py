@@ -33,13 +33,13 @@ def reference(text: str) -> zenoh.KeyExpr | None:
 valid_texts = texts.filter(lambda text: reference(text) is not None)
 
 
-@settings(max_examples=700, deadline=None)
+@settings(max_examples=250, deadline=None)
 @given(any_text)
 def test_validity_is_zenohs(text: str) -> None:
     assert keyexpr.is_valid(text) == (reference(text) is not None), keyexpr.fault(text)
 
 
-@settings(max_examples=700, deadline=None)
+@settings(max_examples=250, deadline=None)
 @given(valid_texts, valid_texts)
 def test_intersects_is_zenohs(first: str, second: str) -> None:
     expected = zenoh.KeyExpr(first).intersects(zenoh.KeyExpr(second))
@@ -47,7 +47,7 @@ def test_intersects_is_zenohs(first: str, second: str) -> None:
     assert keyexpr.intersects(second, first) == expected
 
 
-@settings(max_examples=700, deadline=None)
+@settings(max_examples=250, deadline=None)
 @given(valid_texts, valid_texts)
 def test_includes_is_zenohs(outer: str, inner: str) -> None:
     assert keyexpr.includes(outer, inner) == zenoh.KeyExpr(outer).includes(zenoh.KeyExpr(inner))
@@ -61,7 +61,7 @@ def related_pair(draw: st.DrawFn) -> tuple[str, str]:
     return "/".join(parts), "/".join(opened)
 
 
-@settings(max_examples=700, deadline=None)
+@settings(max_examples=250, deadline=None)
 @given(related_pair(), related_pair())
 def test_relations_of_related_expressions_are_zenohs(left: tuple[str, str], right: tuple[str, str]) -> None:
     pool = [text for text in (*left, *right) if reference(text) is not None]

@@ -49,7 +49,7 @@ def test_equal_nodes_under_noise_are_not_moved_between_and_the_penalty_never_res
     assert 10 < len(argmax) < len(penalty)
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_a_step_of_thirty_percent_is_followed_in_time(seed: int) -> None:
     """The goal is the timer's; patience is held to it, too, within a round."""
     world = equal_world(seed=seed, hours=0.03, step_at_s=STEP_AT_S)
@@ -62,7 +62,7 @@ def test_a_step_of_thirty_percent_is_followed_in_time(seed: int) -> None:
 
 
 def test_after_a_move_the_cool_down_holds() -> None:
-    world = loaded_world(seed=1, hours=0.3)
+    world = loaded_world(seed=1, hours=0.2)
     tuning = Tuning(weights=EVEN, bonus=0.0, cool_down_s=20.0)
     moves = only(world, Entry(name="eager", make=lambda view: CoreRule(view, tuning, patience=0.0)))
     planned = [after.at_s - before.at_s for before, after in itertools.pairwise(moves) if not after.is_escape]
@@ -106,7 +106,7 @@ def test_short_spikes_move_nothing_by_default_nor_with_the_timer_and_half_the_pa
 
 def test_patience_keeps_equal_nodes_apart_as_well_and_follows_a_step_sooner() -> None:
     patient = Entry(name="patient", make=lambda view: CoreRule(view, Tuning(weights=EVEN, bonus=0.05), patience=0.2))
-    assert only(equal_world(seed=1, hours=0.2), patient) == []
+    assert only(equal_world(seed=1, hours=0.1), patient) == []
     world = equal_world(seed=1, hours=0.03, step_at_s=STEP_AT_S)
     (move,) = only(world, patient)
     (by_timer,) = only(world, Entry(name="timer", make=entries.timed(world)))

@@ -84,7 +84,6 @@ def _at(table: Array, step: int, column: int) -> float:
     [
         (1, 0.0, SLOW, PAPER_PATIENCE, False),
         (2, 0.03, PATIENT, PAPER_PATIENCE, False),
-        (1, 0.0, PATIENT, FIRST_PATIENCE, True),
         (2, 0.03, PATIENT, FIRST_PATIENCE, True),
     ],
 )

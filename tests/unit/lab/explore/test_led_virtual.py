@@ -16,7 +16,7 @@ def test_led_robots_find_each_other_and_cover_a_world_with_odometry_that_drifts(
         world=load_world("office:2:12"),
         seed=2,
         robots=2,
-        duration_s=45.0,
+        duration_s=25.0,
         warm_up_s=4.0,
         min_agreeing=150,
         limits=Limits(speed=0.5),
@@ -32,8 +32,8 @@ def test_led_robots_find_each_other_and_cover_a_world_with_odometry_that_drifts(
     assert shares[0] < found.mean < shares[-1]
     held = [share for t_s, share in found.coverage if t_s <= 0.0]
     assert max(held) - min(held) < 0.05, "in the warm-up they stand"
-    short = replace(plan, duration_s=4.0)
-    assert run_led(short).coverage == run_led(short).coverage, "the same plan is the same run"
+    short = run_led(replace(plan, duration_s=4.0)).coverage
+    assert short == found.coverage[: len(short)], "the same plan is the same run"
 
 
 def test_the_mean_holds_each_map_until_the_next() -> None:
