@@ -24,7 +24,7 @@ from zsched.core.values.plan import RoutePlan
 from zsched.core.vote.generations import blank_state
 from zsched.errors import InvariantError, WireError
 from zsched.wire import codec as wire
-from zsched_lab.sim.checks import Invariants, unsettled
+from zsched_lab.sim.checks import Invariants, are_same, unsettled
 from zsched_lab.sim.clocks import LOOK_S, awake
 from zsched_lab.sim.links import Links
 from zsched_lab.sim.loops import TICK_S
@@ -169,8 +169,8 @@ class Simulator(Links):
 
     def agreed(self, task: TaskId, *names: NodeId) -> NodeId | None:
         """The owner that ``names`` (default: all running) have learnt, when it is one and the same; else ``None``."""
-        values = {self.node(name).registers[task].value for name in names or self.running()}
-        return values.pop().owner if len(values) == 1 else None
+        values = [self.node(name).registers[task].value for name in names or self.running()]
+        return values[0].owner if values and are_same(values) else None
 
     def disk(self, name: NodeId) -> DurableState | None:
         """What a node would find if it started now."""
