@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from zsched_lab.decisions import __main__ as package
 from zsched_lab.decisions import report, study
 from zsched_lab.decisions.drives import DriveFigures
 from zsched_lab.decisions.figures import grid as grid_picture
@@ -93,11 +93,14 @@ def test_the_spread_is_two_standard_errors_of_the_mean() -> None:
     assert spread == pytest.approx(1.96 / 3**0.5)
 
 
-def test_the_command_refuses_to_mix_results_unless_told_to_resume(tmp_path: Path) -> None:
+def test_the_command_refuses_to_mix_results_unless_told_to_resume(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "results-test.ndjson").write_text("")
-    command = [sys.executable, "-m", "zsched_lab.decisions", "--out", str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 1
-    assert "--resume" in done.stderr
-    done = subprocess.run([*command, "--parts", "nonsense"], capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 2
+    command = ["zsched_lab.decisions", "--out", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", command)
+    with pytest.raises(SystemExit, match="--resume"):
+        package.main()
+    monkeypatch.setattr(sys, "argv", [*command, "--parts", "nonsense"])
+    with pytest.raises(SystemExit, match="2"):
+        package.main()

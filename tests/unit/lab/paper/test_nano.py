@@ -479,7 +479,7 @@ def test_the_floor_stands_below_the_goals_for_the_latency(block: str, told: str)
 
 
 def test_the_ceiling_of_coverage_is_told_before_and_after_runs(capsys: pytest.CaptureFixture[str]) -> None:
-    loop = {"world": "turtlebot3", "speed": 0.5, "duration_s": 6.0, "map_period_s": 2.0}
+    loop = {"world": "turtlebot3", "speed": 0.5, "duration_s": 4.0, "map_period_s": 2.0}
     merge = {"rate_hz": 0.5, "min_agreeing": 150}
     scenario = {"seed": 1, "warm_up_s": 1.0, "explore": loop, "merge": merge, "blocks": {}}
     runs = [{"scheme": name, "run": 0, "coverage_mean": 0.1} for name in FIXED_SCHEMES]
