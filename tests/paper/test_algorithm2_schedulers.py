@@ -10,7 +10,7 @@ import pytest
 from support.allocations import allocation_of
 from support.fleets import fleet_of
 from support.profiles import load_of, profile_of
-from support.proposals import proposal_of
+from support.proposals import proposal_of, vector_of
 from support.robots import Decider
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.instructions import AskUtilities, Instruction, PublishProposal
@@ -25,7 +25,6 @@ from zsched.core.values.model import (
     PeerState,
     Proposal,
     Tuning,
-    Utility,
     UtilityVector,
     Weights,
 )
@@ -66,8 +65,7 @@ def gateway_with(now: float = SETTLED_S, **used: tuple[float, float]) -> Gateway
 
 
 def row(robot: str, revision: int = 4, **utilities: float) -> UtilityVector:
-    scored = tuple(Utility(candidate=name, value=value) for name, value in utilities.items())
-    return UtilityVector(voter=robot, task="merge", revision=revision, utilities=scored)
+    return vector_of(robot, utilities, revision)
 
 
 def answer(robot: str, **utilities: float) -> Utilities:

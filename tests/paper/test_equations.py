@@ -9,10 +9,11 @@ import pytest
 
 from support.allocations import allocation_of
 from support.fleets import tuning_of
+from support.proposals import vector_of
 from zsched.core.scheduler.scoring import Standing, compare, pick
 from zsched.core.scheduler.utility import cpu_utility, memory_utility, network_utility, predicted_use, total_utility
 from zsched.core.values.fleet import LinkLimits, Reach, TaskSpec
-from zsched.core.values.model import Aggregate, Tuning, Utility, UtilityVector, Weights
+from zsched.core.values.model import Aggregate, Tuning, Weights
 
 ALL = frozenset({"cpu", "memory", "network"})
 LIMITS = LinkLimits()
@@ -127,17 +128,7 @@ def joint(rows: dict[str, dict[str, float]], aggregate: Aggregate = Aggregate.ME
     """The standing of {robot: {candidate: utility}}; a negative utility stands for unreachable."""
     tuning = Tuning(weights=SPEC.tuning.weights, aggregate=aggregate)
     allocation = allocation_of(tuning=tuning)
-    vectors = {
-        robot: UtilityVector(
-            voter=robot,
-            task="merge",
-            revision=1,
-            utilities=tuple(
-                Utility(candidate=name, value=max(value, 0.0), reachable=value >= 0.0) for name, value in row.items()
-            ),
-        )
-        for robot, row in rows.items()
-    }
+    vectors = {robot: vector_of(robot, row, 1) for robot, row in rows.items()}
     return compare(SPEC, allocation, vectors)
 
 

@@ -11,6 +11,7 @@ from support.allocations import allocation_of
 from support.ballots import ballot_of
 from support.fleets import fleet_of, tuning_of
 from support.registers import Step, did
+from support.states import state_of
 from support.todos import agreed
 from zsched.core.events import AcceptAsked, PrepareAsked
 from zsched.core.values.change import MoveOwner
@@ -19,7 +20,6 @@ from zsched.core.values.messages import Accept, Accepted, Prepare, Promise
 from zsched.core.values.model import (
     Acceptance,
     Ballot,
-    DurableState,
     RegisterState,
 )
 from zsched.core.vote.agreement import Agreement
@@ -111,7 +111,7 @@ def test_a_ballot_that_is_not_its_asker_s_or_a_stranger_s_gets_no_answer(node: s
     spec = TaskSpec(name="merge", candidates=ELECTORS, tuning=INITIAL.tuning, worker=WorkerSpec(command=("true",)))
     fleet = fleet_of(spec, of=ELECTORS, electors=ELECTORS)
     electorate = electorate_hash(fleet)
-    state = DurableState(fleet=fleet.name, node="r1", incarnation=1, generation=0, hardware="", electorate=electorate)
+    state = state_of("r1", incarnation=1, electorate=electorate)
     elector = Agreement(
         fleet=fleet, me="r1", durable=state, incarnation=1, electorate=electorate, rng=Random(1), now=0.0
     )

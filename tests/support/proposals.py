@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
-from zsched.core.values.model import NodeId, Proposal
+from zsched.core.values.model import NodeId, Proposal, Utility, UtilityVector
 
 
 def proposal_of(voter: NodeId, candidate: NodeId = "edge1", **options: Any) -> Proposal:
@@ -12,3 +13,11 @@ def proposal_of(voter: NodeId, candidate: NodeId = "edge1", **options: Any) -> P
     return Proposal(
         voter=voter, candidate=candidate, **{"task": "merge", "base_revision": 0, "aggregate": 0.5, **options}
     )
+
+
+def vector_of(voter: NodeId, utilities: Mapping[NodeId, float], revision: int = 0, **options: Any) -> UtilityVector:
+    """A robot's {candidate: utility} of the task "merge"; of a candidate below 0 it says that it does not reach it."""
+    column = tuple(
+        Utility(candidate=name, value=max(value, 0.0), reachable=value >= 0.0) for name, value in utilities.items()
+    )
+    return UtilityVector(voter=voter, revision=revision, utilities=column, **{"task": "merge", **options})

@@ -16,6 +16,7 @@ from support.ballots import ballot_of
 from support.beats import beat_of
 from support.profiles import profile_of
 from support.proposals import proposal_of
+from support.states import state_of
 from support.waiting import until
 from zsched.adapters.host.state_file import StateFile
 from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
@@ -56,7 +57,7 @@ ANSWER = Accepted(elector="robot1", task="merge", ballot=BALLOT)
 RESULT = CommandResult(outcome=CommandOutcome.OK, detail="done", revision=4)
 PLAN = RoutePlan(task="merge", phase=RoutePhase.CLOSE, current=None)
 ROLE = Role(task="merge", role=WorkerRole.IDLE)
-STATE = DurableState(fleet="f", node="robot1", incarnation=3, generation=0, hardware="", electorate="e")
+STATE = state_of("robot1", fleet="f", incarnation=3)
 
 
 class Adapter:

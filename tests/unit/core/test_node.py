@@ -14,7 +14,8 @@ from support.ballots import ballot_of
 from support.beats import beat_of
 from support.fleets import fleet_of, tuning_of
 from support.profiles import load_of, profile_of
-from support.proposals import proposal_of
+from support.proposals import proposal_of, vector_of
+from support.states import state_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.membership.identity import QUIET_S
@@ -43,7 +44,6 @@ from zsched.core.values.model import (
     Echo,
     PeerState,
     RegisterState,
-    UtilityVector,
     WorkerState,
 )
 from zsched.core.values.plan import Direction, ReadyWhen, RoutePhase, WorkerRole
@@ -62,15 +62,7 @@ SAMPLE = DeviceSample(cpu_cores=4.0, cpu_used_cores=1.0, memory_mb=4000.0, memor
 
 
 def durable(me: str, *registers: RegisterState) -> DurableState:
-    return DurableState(
-        fleet="test",
-        node=me,
-        incarnation=7,
-        generation=0,
-        hardware="",
-        electorate=ELECTORATE,
-        registers=registers,
-    )
+    return state_of(me, *registers, electorate=ELECTORATE)
 
 
 def make(me: str = "robot1", *, has_state: bool = True, learnt: Allocation | None = None, now: float = 100.0) -> Node:
@@ -185,9 +177,7 @@ STRANGERS: dict[str, ev.Event] = {
     ),
     "vectors that are another's": ev.UtilityReceived(
         gather=1,
-        utilities=Utilities(
-            voter="robot2", vectors=(UtilityVector(voter="robot3", task="merge", revision=0, utilities=()),)
-        ),
+        utilities=Utilities(voter="robot2", vectors=(vector_of("robot3", {}),)),
     ),
     "late utilities": ev.UtilityReceived(gather=77, utilities=Utilities(voter="robot2", vectors=())),
     "frame that the bus dropped": ev.FrameDropped(kind="beat", reason="size"),

@@ -15,6 +15,7 @@ from support.beats import beat_of
 from support.fleets import fleet_of
 from support.profiles import load_of, profile_of
 from support.proposals import proposal_of
+from support.states import state_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.node import Node
@@ -38,7 +39,6 @@ from zsched.core.values.model import (
     Allocation,
     Ballot,
     DeviceSample,
-    DurableState,
     Grant,
     TaskProgress,
     Tuning,
@@ -82,7 +82,7 @@ ELECTORATE = electorate_hash(FLEET)
 
 
 def make(me: str, *, has_state: bool = True) -> Node:
-    state = DurableState(fleet="test", node=me, incarnation=7, generation=0, hardware="", electorate=ELECTORATE)
+    state = state_of(me, electorate=ELECTORATE)
     return Node(
         fleet=FLEET,
         me=me,

@@ -10,6 +10,7 @@ import pytest
 from support.allocations import allocation_of
 from support.beats import beat_of
 from support.fleets import fleet_of, tuning_of
+from support.states import state_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.node import Node
@@ -17,7 +18,6 @@ from zsched.core.values.fleet import TaskSpec, WorkerSpec, lease_terms
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import (
     Allocation,
-    DurableState,
     Grant,
     RegisterState,
     WorkerState,
@@ -39,15 +39,7 @@ class Owner:
     """A node that has sent some beats and then learns that it owns the task in epoch 4."""
 
     def __init__(self) -> None:
-        state = DurableState(
-            fleet=FLEET.name,
-            node="robot1",
-            incarnation=7,
-            generation=0,
-            hardware="h",
-            electorate="e",
-            registers=(RegisterState(task="guard"),),
-        )
+        state = state_of("robot1", RegisterState(task="guard"))
         self.node = Node(
             fleet=FLEET, me="robot1", durable=state, incarnation=7, electorate="e", rng=Random(1), now=100.0
         )

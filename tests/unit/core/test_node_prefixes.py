@@ -15,6 +15,7 @@ import pytest
 from support.allocations import allocation_of
 from support.ballots import ballot_of
 from support.fleets import fleet_of, tuning_of
+from support.states import state_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.executor.handover import Phase
@@ -263,15 +264,7 @@ def test_elector_that_has_just_started_grants_nobody_new_before_its_old_grant_ha
     electorate = electorate_hash(EXCLUSIVE)
 
     def is_accepted(after_s: float) -> bool:
-        state = DurableState(
-            fleet="sim",
-            node="robot1",
-            incarnation=2,
-            generation=0,
-            hardware="",
-            electorate=electorate,
-            registers=(held,),
-        )
+        state = state_of("robot1", held, incarnation=2, electorate=electorate)
         node = Node(
             fleet=EXCLUSIVE,
             me="robot1",

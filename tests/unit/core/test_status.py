@@ -13,6 +13,7 @@ from support.beats import beat_of
 from support.fleets import fleet_of, tuning_of
 from support.profiles import load_of, profile_of
 from support.proposals import proposal_of
+from support.states import state_of
 from zsched.commands.report import degradations, render_status
 from zsched.core import events as ev
 from zsched.core import instructions as do
@@ -26,7 +27,6 @@ from zsched.core.values.model import (
     RESTARTING,
     WAS_READY,
     DeviceSample,
-    DurableState,
     Echo,
     LinkSample,
     LinkSource,
@@ -52,7 +52,7 @@ FLEET = fleet_of(
 def make(me: str = "robot1", *, has_state: bool = True, alive: tuple[str, ...] = ROBOTS) -> Node:
     """A node at 100 s that has heard the beats of ``alive``."""
     hashed = electorate_hash(FLEET)
-    state = DurableState(fleet="test", node=me, incarnation=7, generation=0, hardware="", electorate=hashed)
+    state = state_of(me, electorate=hashed)
     node = Node(
         fleet=FLEET,
         me=me,

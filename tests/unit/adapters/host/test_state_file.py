@@ -13,22 +13,15 @@ import pytest
 from support.allocations import allocation_of
 from support.ballots import ballot_of
 from support.fleets import tuning_of
+from support.states import state_of
 from zsched.adapters.host.state_file import NEW_NAME, StateFile, hardware_id, is_same_hardware
-from zsched.core.values.model import Acceptance, DurableState, RegisterState
+from zsched.core.values.model import Acceptance, RegisterState
 from zsched.errors import AdapterError
 
 BALLOT = ballot_of(3, incarnation=2)
 VALUE = allocation_of(9, epoch=4, tuning=tuning_of())
 REGISTER = RegisterState(task="merge", promised=BALLOT, accepted=Acceptance(ballot=BALLOT, value=VALUE), learnt=VALUE)
-STATE = DurableState(
-    fleet="hall",
-    node="robot1",
-    incarnation=2,
-    generation=0,
-    hardware="machine:aa,serial:bb",
-    electorate="0123",
-    registers=(REGISTER,),
-)
+STATE = state_of("robot1", REGISTER, fleet="hall", incarnation=2, hardware="machine:aa,serial:bb", electorate="0123")
 
 
 def state_file(folder: Path, node: str = "robot1", fleet: str = "hall", hardware: str = "machine:aa") -> StateFile:

@@ -11,6 +11,7 @@ from support.allocations import allocation_of
 from support.beats import beat_of
 from support.fleets import fleet_of, tuning_of
 from support.profiles import profile_of
+from support.states import state_of
 from support.todos import todo_of
 from zsched.core import events as ev
 from zsched.core.executor.handover import Executor, Phase
@@ -21,7 +22,6 @@ from zsched.core.node import Node
 from zsched.core.scheduler.probation import LIMIT_S
 from zsched.core.values.fleet import StreamRule, TaskSpec, WorkerSpec, electorate_hash
 from zsched.core.values.model import (
-    DurableState,
     Profile,
     RegisterState,
     TaskProgress,
@@ -268,15 +268,7 @@ def owner_node() -> Node:
     fleet = Owner().fleet
     learnt = allocation_of(3, tuning=SPEC.tuning)
     electorate = electorate_hash(fleet)
-    state = DurableState(
-        fleet="test",
-        node="edge1",
-        incarnation=7,
-        generation=0,
-        hardware="",
-        electorate=electorate,
-        registers=(RegisterState(task="merge", learnt=learnt),),
-    )
+    state = state_of("edge1", RegisterState(task="merge", learnt=learnt), electorate=electorate)
     node = Node(fleet=fleet, me="edge1", durable=state, incarnation=7, electorate=electorate, rng=Random(1), now=100.0)
     node.start(100.0)
     node.handle(ev.WorkerChanged(task="merge", state=WorkerState.READY), 100.0)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import pytest
 
 from support.fleets import tuning_of
+from support.states import state_of
 from zsched.core.values.model import DurableState
 from zsched.core.values.snapshot import QuorumStatus, Snapshot, TaskStatus
 from zsched.core.vote.belief import GENERATION_STEP
 from zsched.core.vote.generations import generation_of, objection
 
 TUNING = tuning_of(cpu=1.0, memory=0.0)
-GOOD = DurableState(fleet="hall", node="robot3", incarnation=1, generation=0, hardware="", electorate="")
+GOOD = state_of("robot3", fleet="hall", incarnation=1, electorate="")
 LOST = ("robot1", "robot2")
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from support.allocations import allocation_of
 from support.fleets import tuning_of
+from support.proposals import vector_of
 from zsched.core.scheduler.scoring import Standing, compare, pick, rounded
 from zsched.core.values.fleet import Reach, TaskSpec
 from zsched.core.values.model import Aggregate, Utility, UtilityVector
@@ -24,15 +25,7 @@ GONE = -1.0
 def vote(
     voter: str, *, revision: int = 7, refused: Mapping[str, str] | None = None, **utilities: float
 ) -> UtilityVector:
-    return UtilityVector(
-        voter=voter,
-        task="merge",
-        revision=revision,
-        utilities=tuple(
-            Utility(candidate=name, value=max(value, 0.0), reachable=value >= 0.0) for name, value in utilities.items()
-        ),
-        refused=tuple(sorted((refused or {}).items())),
-    )
+    return vector_of(voter, utilities, revision, refused=tuple(sorted((refused or {}).items())))
 
 
 def joined(*vectors: UtilityVector, spec: TaskSpec = SPEC, aggregate: Aggregate = Aggregate.MEAN) -> Standing:

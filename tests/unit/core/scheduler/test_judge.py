@@ -9,6 +9,7 @@ import pytest
 from support.allocations import allocation_of
 from support.fleets import tuning_of
 from support.profiles import load_of, profile_of
+from support.proposals import vector_of
 from zsched.core.scheduler.judge import (
     INITIAL_SETTLE_S,
     UNSCORED_S,
@@ -25,8 +26,6 @@ from zsched.core.values.model import (
     Allocation,
     PeerState,
     Profile,
-    Utility,
-    UtilityVector,
     WorkerState,
 )
 
@@ -93,12 +92,7 @@ def test_a_challenger_must_beat_the_owner_with_its_bonus(challenger: float, *, l
 def test_the_bonus_is_added_once_whatever_the_number_of_robots_and_rounds() -> None:
     judge = Judge(spec=SPEC)
     for voters in (1, 3, 9):
-        vectors = {
-            f"r{i}": UtilityVector(
-                voter=f"r{i}", task="merge", revision=5, utilities=(Utility(candidate="edge1", value=0.5),)
-            )
-            for i in range(voters)
-        }
+        vectors = {f"r{i}": vector_of(f"r{i}", {"edge1": 0.5}, 5) for i in range(voters)}
         joint = compare(SPEC, allocation(), vectors)
         for now in (0.0, 1.0, 2.0):
             judgement = judge.judge(joint, allocation(), settled_for_s=LONG, escape=None, is_called=False, now=now)

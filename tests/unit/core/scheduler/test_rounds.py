@@ -11,7 +11,7 @@ import pytest
 from support.allocations import allocation_of
 from support.fleets import fleet_of, tuning_of
 from support.profiles import load_of, profile_of
-from support.proposals import proposal_of
+from support.proposals import proposal_of, vector_of
 from support.robots import Decider
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.instructions import AskUtilities, Instruction, PublishProposal
@@ -22,8 +22,6 @@ from zsched.core.values.messages import Utilities
 from zsched.core.values.model import (
     Allocation,
     PeerState,
-    Utility,
-    UtilityVector,
     WorkerState,
 )
 from zsched.core.vote.tally import VoteOutcome
@@ -86,11 +84,9 @@ class Robot:
         return self.rounds.absorb_utilities(gather, self.answer(voter, revision, **values))
 
     def answer(self, voter: str, revision: int | None = None, /, **values: float) -> Utilities:
-        column = tuple(Utility(candidate=name, value=values.get(name, 0.75)) for name in EDGES)
+        column = {name: values.get(name, 0.75) for name in EDGES}
         base = self.value.revision if revision is None else revision
-        return Utilities(
-            voter=voter, vectors=(UtilityVector(voter=voter, task="merge", revision=base, utilities=column),)
-        )
+        return Utilities(voter=voter, vectors=(vector_of(voter, column, base),))
 
     def round(self, seconds: float = 0.0, **values: float) -> list[Instruction]:
         """A whole gather in which everybody answers with ``values``."""
@@ -559,9 +555,7 @@ def test_a_first_placement_does_not_wait_for_a_node_that_cannot_have_the_task(
     robot.now = robot.decider.next_deadline()
     (ask,) = of(robot.tick(), AskUtilities)
     for voter in ("robot2", "robot3"):
-        seen = (
-            UtilityVector(voter=voter, task="merge", revision=0, utilities=(Utility(candidate="edge2", value=0.5),)),
-        )
+        seen = (vector_of(voter, {"edge2": 0.5}),)
         assert robot.rounds.absorb_utilities(ask.gather, Utilities(voter=voter, vectors=seen))
     assert proposed(robot.tick()) == votes
     assert robot.outcome() is (Outcome.PROPOSE if votes else Outcome.WAIT)

@@ -12,6 +12,7 @@ from support.allocations import allocation_of
 from support.ballots import ballot_of
 from support.beats import beat_of
 from support.fleets import fleet_of, tuning_of
+from support.states import state_of
 from support.todos import agreed
 from zsched.core import events as ev
 from zsched.core import instructions as do
@@ -35,7 +36,6 @@ from zsched.core.values.model import (
     Acceptance,
     Allocation,
     Beat,
-    DurableState,
     RegisterState,
 )
 from zsched.core.vote.agreement import (
@@ -58,15 +58,7 @@ FLEET = fleet_of(
 
 
 def make(*registers: RegisterState, me: str = "robot1", has_state: bool = True) -> Agreement:
-    state = DurableState(
-        fleet="test",
-        node=me,
-        incarnation=7,
-        generation=0,
-        hardware="h",
-        electorate="e",
-        registers=registers,
-    )
+    state = state_of(me, *registers, hardware="h")
     agreement = Agreement(
         fleet=FLEET,
         me=me,

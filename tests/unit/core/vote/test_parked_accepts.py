@@ -10,6 +10,7 @@ from support.allocations import allocation_of
 from support.ballots import ballot_of
 from support.beats import beat_of
 from support.fleets import fleet_of, tuning_of
+from support.states import state_of
 from support.todos import agreed
 from zsched.core import events as ev
 from zsched.core import instructions as do
@@ -40,15 +41,7 @@ def value(revision: int, owner: str) -> Allocation:
 
 def disk() -> DurableState:
     """With robot2 as owner."""
-    return DurableState(
-        fleet=FLEET.name,
-        node="robot1",
-        incarnation=7,
-        generation=0,
-        hardware="h",
-        electorate="e",
-        registers=(RegisterState(task="guard", learnt=value(3, "robot2")),),
-    )
+    return state_of("robot1", RegisterState(task="guard", learnt=value(3, "robot2")))
 
 
 def elector() -> Agreement:
