@@ -25,7 +25,7 @@ from zenoh import SampleKind
 from zsched.adapters.network.control_bus import ControlBus
 from zsched.core import events as ev
 from zsched.core.hop.receiver import MAX_REPLAYED, RETURN
-from zsched.core.hop.sender import Sender, Sent, near
+from zsched.core.hop.sender import Sender, near
 from zsched.core.hop.serial import serial_of
 from zsched.core.relay_protocol import EndMarker, SnapshotChunk, StreamAck, StreamAcks
 from zsched.core.route.ros2 import parse_token
@@ -211,11 +211,10 @@ class KeyFuzz:
 
     def _lane(self) -> None:
         """A relay's book of one publisher: whatever is acknowledged, it stays within what was sent."""
-        lane = Sender()
+        lane = Sender(kept_samples=16, kept_limit=1000)
         for _ in range(30):
             if self._rng.random() < 0.5:
-                lane.count += 1
-                lane.keep(Sent(lane.count - 1, cast("Any", None), None, 10, 1.0, 0.0), samples=16, least=1, size=1000)
+                lane.note_put(None, None, 10, at=1.0)
             elif self._rng.random() < 0.2:
                 done = self._rng.randrange(lane.processed, lane.count + 1)
                 lane.acknowledge(StreamAck(eid=1, first=0, arrived=done, processed=done), "1", 2.0)

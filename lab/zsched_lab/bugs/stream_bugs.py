@@ -95,9 +95,9 @@ STREAM_BUGS = (
     ),
     _bug(
         "a replay skips what is on its way",
-        OUTLET,
-        "lane.replay_end, lowest = lane.count + count, lane.lowest",
-        "lane.replay_end, lowest = lane.count + count, lane.count",
+        SENDER,
+        "self.replay_end = self.count + count\n        return self.lowest",
+        "self.replay_end = self.count + count\n        return self.count",
         _GREETINGS,
     ),
     _bug(
@@ -372,8 +372,8 @@ STREAM_BUGS = (
     _bug(
         "a start marker skips what one forged acknowledgement has let go of",
         SENDER,
-        "first = self.spare[0] if self.spare else self.kept[0] if self.kept else None",
-        "first = self.kept[0] if self.kept else None",
+        "first = self.spare[0].number if self.spare else self.kept.first(self.count)",
+        "first = self.kept.first(self.count)",
         (*_SENDER, *_GREETINGS),
     ),
     _bug(

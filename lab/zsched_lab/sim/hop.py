@@ -21,17 +21,16 @@ from random import Random
 from typing import Final
 
 from zsched.core.hop.receiver import RunningTime, Source
-from zsched.core.hop.sender import KEPT_BYTES, KEPT_SAMPLES, Sender, Sent
+from zsched.core.hop.sender import Sender
 from zsched.core.hop.serial import SPAN, serial_of
 from zsched.core.relay_protocol import StreamAck
+from zsched.hop.acknowledger import ACK_S
 from zsched.relay.streams.tally import Tally
+from zsched.relay.task import CARE_S
 
 FAULTS_END_S: Final = 12.0
 REST_S: Final = 60.0
 """Longer than any pause between two tries."""
-LOOK_S: Final = 0.1
-ACK_S: Final = 0.05
-GREET_AGAIN_S: Final = 0.1
 SIZE: Final = 100
 
 
@@ -46,7 +45,6 @@ class Life:
     name: str
     source: Source | None = None
     time: RunningTime = field(default_factory=RunningTime)
-    began_with: int = 0
     frozen_until: float = 0.0
     waiting: list[Callable[[], None]] = field(default_factory=list)
     processed: set[int] = field(default_factory=set)
@@ -66,7 +64,6 @@ class Hop:
     queue: list[int] = field(default_factory=list)
     """Taken, and not sent yet."""
     taken: int = 0
-    first: int = 0
     lives: int = 0
     link: int = 0
     """Its number: what was put on an earlier one is gone."""
@@ -77,13 +74,13 @@ class Hop:
     """{direction: when its newest frame arrives}: a link keeps the order."""
     events: list[tuple[float, int, Callable[[], None]]] = field(default_factory=list)
     order: int = 0
-    processed: dict[int, int] = field(default_factory=dict)
-    """{number: by how many lives}."""
+    processed: set[int] = field(default_factory=set)
+    """By any life."""
 
     def __post_init__(self) -> None:
         self.rng = Random(self.seed)
-        self.first = self.rng.choice((0, 0, SPAN - 40))
-        self.sender = Sender(is_whole=True, count=self.first, base=self.first)
+        first = self.rng.choice((0, 0, SPAN - 40))
+        self.sender = Sender(is_whole=True, count=first, base=first)
         self.life = self._new_life()
 
     # --- the way -----------------------------------------------------------------------------------------------------
@@ -154,40 +151,30 @@ class Hop:
         self._resend()
         while self.queue and not sender.is_full():
             self.queue.pop(0)
-            number = sender.count
-            self.carry("out", partial(self._arrive, number))
-            sender.count += 1
-            sent = Sent(number, None, None, SIZE, self.now, 0.0)
-            sender.keep(sent, samples=KEPT_SAMPLES, least=1, size=KEPT_BYTES + SIZE)
+            self.carry("out", partial(self._arrive, sender.count))
+            sender.note_put(None, None, SIZE, at=self.now)
 
     def _greet(self) -> None:
-        sender = self.sender
-        if sender.greeted_at is None or self.now - sender.greeted_at > GREET_AGAIN_S:
-            sender.greeted_at = self.now
-            self._put_start(sender.lowest)
+        lowest = self.sender.take_greeting(self.now)
+        if lowest is not None:
+            self._put_start(lowest)
 
     def _put_start(self, lowest: int) -> None:
         self.carry("out", lambda: self._start(lowest))
 
     def _resend(self) -> None:
-        sender = self.sender
-        start, sender.resend_from = sender.resend_from, None
-        if sender.is_misheard:
-            sender.is_misheard = False
-            self._put_start(sender.lowest)
-        if start is None:
-            return
-        wanted = [sent.number for sent in sender.kept if sent.number >= start]
-        if (first := wanted[0] if wanted else sender.count) > start:
-            self._put_start(first)
-        for number in wanted:
-            self.carry("out", partial(self._arrive, number))
-        sender.resent(self.now)
+        owed = self.sender.take_owed()
+        for lowest in (owed.start, owed.skip):
+            if lowest is not None:
+                self._put_start(lowest)
+        for sent in owed.again:
+            self.carry("out", partial(self._arrive, sent.number))
+        if owed.again or owed.skip is not None:
+            self.sender.resent(self.now)
 
     def look_after(self) -> None:
         """Now and then: put again what is late."""
-        if self.sender.is_late(self.now) and self.sender.may_resend:
-            self.sender.ask_again(self.sender.arrived, self.now)
+        self.sender.look_after(self.now)
         self.work()
 
     def _acknowledged(self, ack: StreamAck, life: str) -> None:
@@ -216,7 +203,7 @@ class Hop:
         def take() -> None:
             life = self.life
             if life.source is None:
-                life.source, life.began_with = Source.at(lowest), lowest
+                life.source = Source.at(lowest)
             life.source.skip(lowest)
             life.source.note_start(lowest, is_whole=True, replayed=0)
             life.is_changed = True
@@ -237,7 +224,7 @@ class Hop:
             if number in life.processed:
                 raise HopError(f"number {number} is processed twice in life {life.name}")
             life.processed.add(number)
-            self.processed[number] = self.processed.get(number, 0) + 1
+            self.processed.add(number)
             life.source.done(whole)
 
         self._hear(take)
@@ -261,7 +248,7 @@ class Hop:
         Raises:
             HopError: what must hold does not.
         """
-        self._every(LOOK_S, self.look_after)
+        self._every(CARE_S, self.look_after)
         self._every(ACK_S, self.acknowledge)
         at, rate_hz = 0.0, self.rng.choice((2.0, 50.0, 300.0))
         while at < FAULTS_END_S:

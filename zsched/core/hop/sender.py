@@ -1,7 +1,7 @@
 """The sending side of a numbered hop: what was sent under which number, and what the receiver has said of it.
 
-Knows: the numbers of one publisher, what is kept to be sent again and when. Does not know: what a sample is, how it is
-put, threads. The time is passed in (monotonic seconds).
+Knows: the numbers of one publisher towards one receiver, what is put again and when. Does not know: what a sample is,
+how it is put, threads, several receivers (`zsched.core.hop.shared`). The time is passed in (monotonic seconds).
 
 Class ``reliable`` greets its receiver before the first sample: a start marker says the lowest number that may come, and
 the receiver's acknowledgement of it says who it is and what it waits for. Only then samples go out (the receiver is
@@ -11,35 +11,23 @@ stands still, has no link or has just begun another life.
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, NamedTuple
 
+from zsched.core.hop.kept import NOTHING, RESEND_S, Kept, Owed, Sent
 from zsched.core.hop.serial import number_near, serial_of
 from zsched.core.relay_protocol import StreamAck
 
 KEPT_SAMPLES: Final = 2048
 KEPT_BYTES: Final = 16 << 20
-"""Bounds of what one publisher keeps until it is acknowledged."""
-GREET_S: Final = 0.1
-"""An unanswered start marker is put again after this time, and then after twice as long each time."""
-RESEND_S: Final = 0.3
+"""Bounds of what one publisher of class ``reliable`` keeps until it is acknowledged."""
+KEPT_BYTES_LATEST: Final = 256 << 10
+"""Class ``latest``: so much besides the newest ``keep_last`` samples; large ones are not worth a radio's time again."""
+GREET_S: Final = 0.2
+MAX_GREET_S: Final = 1.0
+"""An unanswered start marker is put again after this time, and then after twice as long each time; bounds of that."""
 MAX_RESEND_S: Final = 10.0
-"""Bounds of the time without progress after which what is not acknowledged is put again."""
-
-
-class Sent(NamedTuple):
-    """A sample that went out under ``number`` and is kept (a tuple: one is made for every sample)."""
-
-    number: int
-    sample: Any
-    """Whatever its publisher needs to put it again."""
-    stamp: Any
-    size: int
-    at: float
-    """When its put had returned (monotonic seconds)."""
-    took_s: float
-    """How long the put waited for the link."""
+"""What is not acknowledged is put again after so long without progress at the latest."""
 
 
 class Sums(NamedTuple):
@@ -59,6 +47,10 @@ class Sender:
 
     is_whole: bool = False
     """Every sample is wanted (class ``reliable``), so the receiver is greeted first."""
+    kept_samples: int = KEPT_SAMPLES
+    kept_least: int = 1
+    kept_limit: int = KEPT_BYTES
+    """Bounds of what is kept: samples, those of them whatever they weigh, and bytes."""
     count: int = 0
     """Samples put so far, and the number of the next one."""
     base: int = 0
@@ -79,8 +71,7 @@ class Sender:
     greet_pause_s: float = GREET_S
     ack: StreamAck | None = None
     incarnation: str = ""
-    kept: deque[Sent] = field(default_factory=deque)
-    kept_bytes: int = 0
+    kept: Kept = field(default_factory=Kept)
     spare: list[Sent] = field(default_factory=list)
     """What the newest acknowledgement has let go of: until one that goes further, it may be taken back."""
     resend_from: int | None = None
@@ -94,13 +85,54 @@ class Sender:
     """How long nothing may move before it is put again: twice what acknowledgements take here, or as long as a put
     takes; doubled each time."""
 
-    def keep(self, sent: Sent, *, samples: int, least: int, size: int) -> None:
-        """Keep what was just put: at most so many ``samples`` and ``size`` bytes, but ``least`` of them; oldest go."""
-        self.kept.append(sent)
-        self.kept_bytes += sent.size
-        self.moved_at, self.pause_s = sent.at, max(self.pause_s, min(sent.took_s, MAX_RESEND_S))
-        while len(self.kept) > samples or (self.kept_bytes > size and len(self.kept) > least):
-            self.kept_bytes -= self.kept.popleft().size
+    # --- what goes out -----------------------------------------------------------------------------------------------
+
+    def note_put(self, sample: Any, stamp: Any, size: int, *, at: float, took_s: float = 0.0) -> Sums | None:
+        """A sample was put under the next number: its put returned at a time, having waited for so long.
+
+        Answers the sums of whoever acknowledged before, when nobody acknowledges this one.
+        """
+        if self.is_foreign:
+            return self.pass_on()
+        sent = Sent(self.count, sample, stamp, size, at, took_s)
+        self.count += 1
+        bound = self.kept_limit + size if self.is_whole else self.kept_limit  # one that is full puts no more
+        self.kept.keep(sent, samples=self.kept_samples, least=self.kept_least, size=bound)
+        self.moved_at, self.pause_s = at, max(self.pause_s, min(took_s, MAX_RESEND_S))
+        return None
+
+    def take_greeting(self, now: float) -> int | None:
+        """The lowest number that may come, when the receiver is to be told it now by a start marker."""
+        if self.greeted_at is not None:
+            if now - self.greeted_at <= self.greet_pause_s:
+                return None
+            self.greet_pause_s = min(2 * self.greet_pause_s, MAX_GREET_S)
+        self.greeted_at = now
+        return self.lowest
+
+    def take_owed(self) -> Owed:
+        """What is to be put now besides new samples; whoever has put it again says so (`resent`)."""
+        if not self.may_resend:
+            return NOTHING
+        start = self.lowest if self.is_misheard else None
+        self.is_misheard = False
+        if self.resend_from is None:
+            return NOTHING if start is None else Owed(start=start)
+        owed = self.kept.owed(self.resend_from, self.count, self.resend_from)
+        self.resend_from = None
+        return owed._replace(start=start)
+
+    def look_after(self, now: float) -> bool:
+        """Have put again what is late; ``False``: nothing is."""
+        is_late = self.may_resend and self.is_late(now)
+        if is_late:
+            self.ask_again(self.arrived, now)
+        return is_late
+
+    def announce(self, count: int) -> int:
+        """So many numbers from the next one on will be replays; answers the lowest that may come before them."""
+        self.replay_end = self.count + count
+        return self.lowest
 
     def is_late(self, now: float) -> bool:
         """Whether what is not acknowledged should be put again.
@@ -119,6 +151,8 @@ class Sender:
     def resent(self, now: float) -> None:
         """What was asked for has been put again."""
         self.moved_at = self.asked_at = now
+
+    # --- what the receiver says --------------------------------------------------------------------------------------
 
     def hear(self, ack: StreamAck, incarnation: str, now: float) -> Sums | None:
         """Take an acknowledgement; answers the sums of the receiver's life before, when another one has said it."""
@@ -144,7 +178,7 @@ class Sender:
         """Another life answers: what the former one left open may be lost; who has not been greeted had nothing."""
         start = self.count if self.is_whole else min(max(ack.first, self.processed), self.count)
         if self.keeps_work and self.kept:
-            start = max(self.kept[0].number, self.processed)
+            start = max(self.kept.first(self.count), self.processed)
         ended = self.begin_life(incarnation, start)
         self.acknowledge(ack, incarnation, now)
         if self.is_whole:
@@ -161,12 +195,9 @@ class Sender:
         limit = ack.processed if self.keeps_work else ack.arrived
         self.ack = ack
         self._take_back(limit)
-        gone: list[Sent] = []
-        while self.kept and self.kept[0].number < limit:
-            gone.append(self.kept.popleft())
+        gone = self.kept.let_go(limit)
         if gone:
             newest, self.spare = gone[-1], gone
-            self.kept_bytes -= sum(sent.size for sent in gone)
             self.pause_s = min(max(2 * (now - newest.at), newest.took_s, RESEND_S), MAX_RESEND_S)
         return True
 
@@ -176,9 +207,7 @@ class Sender:
         Anybody can put one under the worker's key. What it let go of is kept again.
         """
         while self.spare and self.spare[-1].number >= limit:
-            sent = self.spare.pop()
-            self.kept.appendleft(sent)
-            self.kept_bytes += sent.size
+            self.kept.take_back(self.spare.pop())
 
     def _mishears(self, ack: StreamAck) -> bool:
         """Whether the receiver believes of this stream what is not so."""
@@ -212,8 +241,7 @@ class Sender:
         self.replay_end = self.count if self.keeps_work else 0
         self.ack, self.resend_from = None, None
         self.spare.clear()
-        while self.kept and self.kept[0].number < start:
-            self.kept_bytes -= self.kept.popleft().size
+        self.kept.let_go(start)
         return ended
 
     def pass_on(self) -> Sums:
@@ -223,6 +251,8 @@ class Sender:
         self.begin_life("", self.count, is_foreign=True)
         return ended
 
+    # --- how far it is -----------------------------------------------------------------------------------------------
+
     def sums(self) -> Sums:
         """What this life of the receiver has said."""
         doubled, reordered = (0, 0) if self.ack is None else (self.ack.doubled, self.ack.reordered)
@@ -231,8 +261,8 @@ class Sender:
     @property
     def lowest(self) -> int:
         """The lowest number that may still be sent: what a start marker says."""
-        first = self.spare[0] if self.spare else self.kept[0] if self.kept else None
-        return self.count if first is None else max(self.base, first.number)
+        first = self.spare[0].number if self.spare else self.kept.first(self.count)
+        return max(self.base, first)
 
     def unprocessed(self) -> list[Sent]:
         """What is kept of the samples that the receiver has not acknowledged as processed."""
@@ -272,7 +302,7 @@ class Sender:
         """True when nothing more may be sent before an acknowledgement (class ``reliable``)."""
         if self.ack is None:
             return False
-        return self.count - self.processed >= KEPT_SAMPLES or self.kept_bytes >= KEPT_BYTES
+        return self.in_flight >= self.kept_samples or self.kept.size >= self.kept_limit
 
 
 def near(ack: StreamAck, count: int) -> StreamAck:

@@ -18,7 +18,6 @@ from typing import Any, Final
 from zsched.clock import monotonic_s
 from zsched.relay.streams.lanes import Lane
 
-MAX_GREET_PAUSE_S: Final = 1.0
 STRANGE_S: Final = 1.0
 FOREIGN_S: Final = 10.0
 
@@ -78,10 +77,9 @@ class Greetings:
             unmet = tuple(self._unmet.values())
         has_others = len(unmet) < lane_count
         for lane in unmet:
-            if lane.greeted_at is None or now - lane.greeted_at > lane.greet_pause_s:
-                lane.greeted_at, lane.greet_pause_s = now, min(2 * lane.greet_pause_s, MAX_GREET_PAUSE_S)
-                with self._lock:
-                    lowest = lane.lowest
+            with self._lock:
+                lowest = lane.take_greeting(now)
+            if lowest is not None:
                 self._put_start(lane, lowest)
             if _is_foreign(lane, now, has_others=has_others):
                 with self._lock:

@@ -26,7 +26,7 @@ from zsched.core.values.plan import OnCrash, Route, StreamClass, StreamCount
 from zsched.relay.streams.acks import WorkerAcks
 from zsched.relay.streams.answer_times import AnswerTimes
 from zsched.relay.streams.counter import StreamCounter
-from zsched.relay.streams.outlet import MAX_OWED, Outlet, Owed
+from zsched.relay.streams.outlet import MAX_OWED, Outlet, Unsent
 from zsched.relay.streams.pace import Pace
 from zsched.relay.streams.proofs import LeftOpen, Stamps, unproven
 from zsched.relay.streams.receive import Receiver
@@ -90,7 +90,7 @@ class InputStream:
         """Flipped to, and waits until..."""
         self._waits_for: _InputSlot | None = None
         """...this slot, which carried, has ended."""
-        self._held: list[Owed] = []
+        self._held: list[Unsent] = []
         self._held_bytes = 0
         self._hold_until = 0.0
         self._is_patient = route.settings.stream_class is StreamClass.RELIABLE

@@ -12,11 +12,9 @@ from typing import Final
 import zenoh
 from zenoh import CongestionControl, Sample, SampleKind, Session, Timestamp, ext
 
-from zsched.core.hop.sender import Sender, Sent
+from zsched.core.hop.kept import Sent
+from zsched.core.hop.sender import Sender
 from zsched.core.hop.serial import serial_of
-
-KEPT_BYTES_LATEST: Final = 256 << 10
-"""Class ``latest``: so much besides the newest ``keep_last`` samples; large ones are not worth a radio's time again."""
 
 _DELETE: Final = SampleKind.DELETE
 _Plain = zenoh.Publisher

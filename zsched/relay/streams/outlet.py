@@ -28,13 +28,14 @@ import zenoh
 from zenoh import Priority, Sample, Session, Timestamp
 
 from zsched.clock import monotonic_s
-from zsched.core.hop.sender import KEPT_BYTES, KEPT_SAMPLES, Sent
+from zsched.core.hop.kept import NOTHING, Owed
+from zsched.core.hop.sender import KEPT_BYTES, KEPT_BYTES_LATEST, KEPT_SAMPLES
 from zsched.core.relay_protocol import EndMarker, StreamAck
 from zsched.core.values.plan import OnCrash, StreamClass, StreamSettings
 from zsched.relay.streams.acks import WorkerAcks
 from zsched.relay.streams.crowd import Crowd
 from zsched.relay.streams.greetings import Greetings
-from zsched.relay.streams.lanes import KEPT_BYTES_LATEST, Lane
+from zsched.relay.streams.lanes import Lane
 from zsched.relay.streams.proofs import LeftOpen
 from zsched.relay.streams.publishers import declare_publisher, put_marker
 from zsched.relay.streams.receive import undeclare
@@ -57,7 +58,7 @@ MAX_PATIENT: Final = 3
 _log = logging.getLogger("zsched.relay")
 _patient = threading.BoundedSemaphore(MAX_PATIENT)
 
-Owed = tuple[Sample, Timestamp | None]
+Unsent = tuple[Sample, Timestamp | None]
 """A sample that waits to be sent, with its timestamp."""
 
 _ALL_WENT: Final = ("", 0)
@@ -93,9 +94,6 @@ class Outlet:
         self._stalled: contextlib.AbstractContextManager[None] = acks.stalled if acks else contextlib.nullcontext()
         self._rewriting = Rewriting(from_expr, to_expr)
         self._is_reliable = settings.stream_class is StreamClass.RELIABLE
-        self._kept_limit = KEPT_SAMPLES if self._is_reliable else max(settings.depth, settings.keep_last)
-        self._kept_least = 1 if self._is_reliable else settings.keep_last
-        self._kept_bytes = KEPT_BYTES if self._is_reliable else KEPT_BYTES_LATEST
         self._to = to_expr
         self._epoch = epoch
         self._lock = threading.Lock()
@@ -187,7 +185,7 @@ class Outlet:
             finally:
                 _patient.release()
 
-    def take_back(self) -> list[Owed]:
+    def take_back(self) -> list[Unsent]:
         """What class ``reliable`` still holds in its queue, never sent: it may go to another owner instead."""
         taken = self._queue.take_back() if self._queue is not None and self._is_reliable else []
         self._handed -= len(taken)
@@ -217,7 +215,7 @@ class Outlet:
         """The marker may be seen before samples that were put before it: what may still come is not skipped by it."""
         for lane, count in lanes:
             with self._lock:
-                lane.replay_end, lowest = lane.count + count, lane.lowest
+                lowest = lane.announce(count)
             self._put_start(lane, lowest)
 
     def abandon(self) -> tuple[Tally, list[LeftOpen]]:
@@ -262,9 +260,7 @@ class Outlet:
             return  # what a put waits for now, one more would wait for behind it
         now = monotonic_s()
         with self._lock:
-            late = [lane for lane in self._lanes.values() if lane.is_late(now) and lane.may_resend]
-            for lane in late:
-                lane.ask_again(lane.arrived, now)
+            late = [lane for lane in self._lanes.values() if lane.look_after(now)]
         if late or (greetings is not None and greetings.is_waiting):
             self._queue.kick()
 
@@ -321,15 +317,18 @@ class Outlet:
         return lane
 
     def _declare(self, key: str, priority: Priority, *, is_express: bool) -> Lane:
-        publisher = declare_publisher(self._session, key, self._settings, priority, is_express=is_express)
-        eid = publisher.id.eid
+        settings, is_reliable = self._settings, self._is_reliable
+        publisher = declare_publisher(self._session, key, settings, priority, is_express=is_express)
         lane = Lane(
             key=key,
             publisher=publisher,
             source_id=publisher.id,
-            eid=eid,
+            eid=publisher.id.eid,
             is_whole=self._greetings is not None,
             keeps_work=self._replays,
+            kept_samples=KEPT_SAMPLES if is_reliable else max(settings.depth, settings.keep_last),
+            kept_least=1 if is_reliable else settings.keep_last,
+            kept_limit=KEPT_BYTES if is_reliable else KEPT_BYTES_LATEST,
         )
         with self._lock:
             self._lanes[key, f"{priority}{is_express}"] = lane
@@ -413,15 +412,11 @@ class Outlet:
                 lane.count += 1
                 self._leave_unconfirmed(lane)
                 return
-            if lane.is_foreign:
-                self.tally.take(lane.pass_on())
-                self.tally.uncounted += 1
-                return
-            lane.count += 1
             now = monotonic_s()
-            sent = Sent(lane.count - 1, sample, stamp, size, now, now - began)
-            bound = self._kept_bytes + size if self._is_reliable else self._kept_bytes  # full lanes put no more
-            lane.keep(sent, samples=self._kept_limit, least=self._kept_least, size=bound)
+            ended = lane.note_put(sample, stamp, size, at=now, took_s=now - began)
+            if ended is not None:
+                self.tally.take(ended)
+                self.tally.uncounted += 1
 
     def _leave_unconfirmed(self, lane: Lane) -> None:
         """What was just put is in flight no more: its receiver will say nothing of it."""
@@ -452,26 +447,21 @@ class Outlet:
     def _resend(self) -> None:
         for lane in tuple(self._lanes.values()):
             with self._lock:
-                if not lane.may_resend:
-                    continue
-                start, lane.resend_from = lane.resend_from, None
-                is_misheard, lane.is_misheard, lowest = lane.is_misheard, False, lane.lowest
-                wanted = tuple(sent for sent in lane.kept if start is not None and sent.number >= start)
-            if is_misheard:
-                self._put_start(lane, lowest)
-            if start is not None:
-                self._send_again(lane, start, wanted)
+                owed = lane.take_owed()
+            if owed is not NOTHING:
+                self._put_owed(lane, owed)
 
-    def _send_again(self, lane: Lane, start: int, wanted: tuple[Sent, ...]) -> None:
-        first = wanted[0].number if wanted else lane.count
-        if first > start:  # older ones are kept no more: the receiver must not wait for them
-            self._put_marker(lane, SKIP_EPOCH, first)
-        for sent in wanted:
+    def _put_owed(self, lane: Lane, owed: Owed) -> None:
+        for lowest in (owed.start, owed.skip):
+            if lowest is not None:
+                self._put_start(lane, lowest)
+        for sent in owed.again:
             with self._stalled:
                 lane.put_again(self._session, sent)
-        with self._lock:
-            lane.resent(monotonic_s())
-            self.tally.resent += len(wanted)
+        if owed.again or owed.skip is not None:
+            with self._lock:
+                lane.resent(monotonic_s())
+                self.tally.resent += len(owed.again)
 
     # --- acknowledgements (their thread) -----------------------------------------------------------------------------
 

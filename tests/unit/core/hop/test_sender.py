@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
+import itertools
 
 import pytest
 
-from zsched.core.hop.sender import MAX_RESEND_S, RESEND_S, Sender, Sent, near
+from zsched.core.hop.kept import NOTHING, RESEND_S, Owed
+from zsched.core.hop.sender import GREET_S, KEPT_BYTES_LATEST, MAX_GREET_S, MAX_RESEND_S, Sender, near
 from zsched.core.hop.serial import SPAN, serial_of
 from zsched.core.relay_protocol import StreamAck
-from zsched.relay.streams.lanes import KEPT_BYTES_LATEST
 from zsched.relay.streams.tally import Tally
 
 
 def lane() -> Sender:
-    """One that nothing is put on: only its books."""
-    return Sender()
+    """One that nothing is put on: only its books; class ``latest`` with ``depth`` 16 and ``keep_last`` 1."""
+    return Sender(kept_samples=16, kept_limit=KEPT_BYTES_LATEST)
 
 
 def sent(books: Sender, *, at: float, size: int = 100, took_s: float = 0.0) -> None:
-    """A sample went out; class ``latest`` with ``depth`` 16 and ``keep_last`` 1."""
-    books.count += 1
-    one = Sent(books.count - 1, cast("Any", None), None, size, at, took_s)
-    books.keep(one, samples=16, least=1, size=KEPT_BYTES_LATEST)
+    """A sample went out."""
+    assert books.note_put(None, None, size, at=at, took_s=took_s) is None
 
 
 def acknowledged(books: Sender, arrived: int, now: float) -> None:
@@ -75,7 +73,7 @@ def test_of_large_latest_samples_only_the_newest_are_kept_to_be_put_again(size: 
     for number in range(20):
         sent(books, at=10.0 + number, size=size)
     assert [one.number for one in books.kept] == list(range(20 - kept, 20))
-    assert books.kept_bytes == kept * size
+    assert books.kept.size == kept * size
 
 
 def ack(first: int, arrived: int, lost: int = 0, processed: int | None = None) -> StreamAck:
@@ -137,9 +135,9 @@ def test_what_an_acknowledgement_says_is_taken_back_by_one_that_says_less(*, kee
     books.acknowledge(ack(0, 4), "1", 10.3)
     assert (books.acknowledged, books.in_flight, books.lowest) == (4, 4, 3)
     assert [one.number for one in books.kept] == [4, 5, 6, 7]
-    assert books.kept_bytes == sum(one.size for one in books.kept)
+    assert books.kept.size == sum(one.size for one in books.kept)
     books.acknowledge(ack(0, 8), "1", 10.4)
-    assert (books.acknowledged, books.in_flight, books.kept_bytes, len(books.kept)) == (8, 0, 0, 0)
+    assert (books.acknowledged, books.in_flight, books.kept.size, len(books.kept)) == (8, 0, 0, 0)
 
 
 def test_one_acknowledgement_further_on_lets_go_for_good() -> None:
@@ -187,17 +185,52 @@ def test_an_acknowledgement_of_what_was_never_sent_is_nobody_s(forged: StreamAck
 
 def test_a_gap_is_asked_for_again_while_newer_samples_flow() -> None:
     """Found by the simulated hop: what was put again was lost as well, and new samples passed for progress."""
-    books = lane()
+    books = Sender()
     for number in range(4):
         sent(books, at=10.0 + number / 100)
     gap = StreamAck(eid=1, first=0, arrived=2, processed=2, has_gap=True)
     books.hear(gap, "1", 10.05)
-    asked: list[int | None] = [books.resend_from]
-    books.resend_from = None
+    assert [one.number for one in books.take_owed().again] == [2, 3]
+    assert books.take_owed() is NOTHING, "it is asked for once"
     books.resent(now := 10.06)
     while now < 10.06 + 2 * RESEND_S and books.resend_from is None:
         now += 0.01  # a new sample, and the receiver says the same again
         sent(books, at=now)
         books.hear(gap, "1", now)
-    assert [*asked, books.resend_from] == [2, 2]
+    assert books.take_owed().again[0].number == 2
     assert now > 10.06 + 2 * RESEND_S / 3
+
+
+def test_what_is_kept_no_more_is_given_up_by_a_skip() -> None:
+    books = lane()
+    for _ in range(20):
+        sent(books, at=10.0)
+    books.hear(StreamAck(eid=1, first=0, arrived=1, processed=1, has_gap=True), "1", 10.1)
+    owed = books.take_owed()
+    assert (owed.start, owed.skip, [one.number for one in owed.again]) == (None, 4, list(range(4, 20)))
+    books.kept.let_go(20)
+    books.ask_again(1, 10.5)
+    assert books.take_owed() == Owed(skip=20)
+
+
+def test_who_was_not_greeted_is_owed_nothing_and_a_misheard_start_is_said_again() -> None:
+    books = Sender(is_whole=True)
+    sent(books, at=10.0)
+    books.ask_again(0, 10.0)
+    assert books.take_owed() is NOTHING
+    assert books.take_greeting(10.1) == 0
+    books.hear(StreamAck(eid=1, first=0, arrived=0, processed=0, is_whole=False), "1", 10.2)
+    owed = books.take_owed()
+    assert (owed.start, owed.skip, [one.number for one in owed.again]) == (0, None, [0])
+    assert books.take_owed() is NOTHING
+
+
+def test_a_greeting_is_put_again_with_twice_the_pause_each_time() -> None:
+    books, now, greeted = Sender(is_whole=True), 10.0, []
+    books.part(now)
+    while now < 13.9:
+        if books.take_greeting(now) is not None:
+            greeted.append(now)
+        now += 0.01
+    pauses = [after - before for before, after in itertools.pairwise(greeted)]
+    assert pauses == pytest.approx([GREET_S, 2 * GREET_S, 4 * GREET_S, MAX_GREET_S, MAX_GREET_S], abs=0.02)
