@@ -23,6 +23,7 @@ from support.waiting import free_endpoint, until
 from zsched.core.events import SlotDrained, SlotFlipped, SlotReady
 from zsched.core.hop.books import unaccounted
 from zsched.core.hop.serial import SPAN
+from zsched.core.hop.shared import SharedSender
 from zsched.core.values.plan import Role, RoutePhase, RoutePlan, Slot, StreamClass, StreamCount, WorkerRole
 from zsched.relay.process import RelayProcess
 from zsched.relay.streams import outlet
@@ -31,7 +32,7 @@ from zsched.relay.streams.outputs import OutputStream
 from zsched.sessions.config import data_config, worker_config
 from zsched.tasks.echo import Echo
 from zsched.worker import Worker
-from zsched.worker import outputs as worker_outputs
+from zsched.worker import keep as worker_keep
 from zsched.worker.inputs import Dispatcher
 
 BEFORE = 60
@@ -123,7 +124,7 @@ def losing(cls: type, method: str, serials: set[int]) -> Counter[int]:
 def across() -> None:
     """Gaps on both sides and across, resends both ways, end markers behind and before it."""
     vars(outlet)["Lane"] = partial(Lane, count=START, base=START)
-    vars(worker_outputs)["_Stamped"] = partial(worker_outputs._Stamped, count=START)
+    vars(worker_keep)["SharedSender"] = partial(SharedSender, count=START)
     gaps = {SPAN - 20, SPAN - 2, SPAN - 1, 0, 1, 30}
     there = losing(Dispatcher, "put", gaps)
     back = losing(OutputStream, "_carry", {serial + 3 for serial in gaps if serial < SPAN - 3})

@@ -8,8 +8,7 @@ from pathlib import Path
 import zenoh
 
 from support.sessions import matches
-from zsched.worker.keep import TICK_S
-from zsched.worker.lanes import NEWCOMERS_S
+from zsched.core.hop.shared import NEWCOMERS_S, TICK_S
 from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 
 COUNT = 60

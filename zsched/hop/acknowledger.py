@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable
 from typing import Final
 
 from zsched.clock import monotonic_s
-from zsched.core.hop.receiver import RunningTime, Source
+from zsched.core.hop.receiver import MAX_SOURCES, RunningTime, Source, SourceName
 from zsched.core.relay_protocol import StreamAck, StreamAcks
 from zsched.guard import guarded
 
@@ -24,11 +24,7 @@ ACK_S: Final = 0.05
 ACK_SAMPLES: Final = 256
 ACK_BYTES: Final = 1 << 20
 """...or when so much was processed."""
-MAX_SOURCES: Final = 8192
 MAX_PER_FRAME: Final = 500
-
-SourceName = tuple[str, str, int]
-"""(key, session id, entity id) of a publisher as zenoh names it."""
 
 _log = logging.getLogger("zsched.streams")
 

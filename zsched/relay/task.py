@@ -46,7 +46,7 @@ GONE_GRACE_S: Final = 0.05
 """An old owner whose token went has sent its last; what is still in our queues gets so long."""
 SETTLE_S: Final = 1.5
 """An old owner that has ended has acknowledged all by then, also when one acknowledgement was dropped on the way, or a
-robot has just stalled that gets the same answers (`zsched.worker.lanes.STALLED_S`)."""
+robot has just stalled that gets the same answers (`zsched.core.hop.shared.STALLED_S`)."""
 GATHER_S: Final = 0.5
 """What a worker left that restarted in place is told of once, when each of its streams has met the new life."""
 MAX_UNTAKEN: Final = 4

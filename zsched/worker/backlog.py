@@ -25,7 +25,7 @@ from typing import Final, Generic, NamedTuple, Protocol, TypeVar
 
 import zenoh
 
-from zsched.hop.acknowledger import SourceName
+from zsched.core.hop.receiver import SourceName
 from zsched.worker.debts import Held
 
 MAX_WITHHELD: Final = 256

@@ -23,10 +23,10 @@ from typing import Final
 import zenoh
 
 from zsched.clock import monotonic_s
-from zsched.core.hop.receiver import GIVE_UP_S
+from zsched.core.hop.receiver import GIVE_UP_S, MAX_SOURCES, SourceName
 from zsched.core.hop.serial import number_near, serial_of
 from zsched.guard import guarded
-from zsched.hop.acknowledger import MAX_SOURCES, Acknowledger, SourceName
+from zsched.hop.acknowledger import Acknowledger
 from zsched.worker.backlog import Backlog, Done
 from zsched.worker.debts import Debts, Held
 from zsched.worker.jobs import JobBook

@@ -38,7 +38,13 @@ class _Stamped:
     publisher: zenoh.Publisher | ext.AdvancedPublisher
     lane: KeptLane | None
     """Of what is kept until the robots' relays have it (classes ``latest`` and ``reliable``)."""
-    count: int = 0
+    unkept: int = 0
+    """Samples put so far that are not kept."""
+
+    @property
+    def count(self) -> int:
+        """Samples put so far, and the number of the next one."""
+        return self.unkept if self.lane is None else self.lane.state.count
 
 
 class Output:
@@ -150,12 +156,13 @@ class Output:
         return stamped
 
     def _put(self, stamped: _Stamped, payload: Any, attachment: Any, encoding: Any, timestamp: Any) -> None:
-        publisher, number = stamped.publisher, stamped.count
-        stamped.count += 1
-        if stamped.lane is not None:
+        publisher, number = stamped.publisher, stamped.unkept
+        if stamped.lane is None:
+            stamped.unkept += 1
+        else:
             payload, attachment = _own(payload), _own(attachment)
             size = len(payload) if hasattr(payload, "__len__") else 0
-            stamped.lane.keep(number, payload, attachment, encoding, timestamp, size)
+            number = stamped.lane.keep((payload, attachment, encoding), timestamp, size)
             if not self.is_latest:
                 self._owe(stamped.lane, number)
         more = {"attachment": attachment, "encoding": encoding, "timestamp": timestamp}

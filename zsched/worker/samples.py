@@ -14,8 +14,8 @@ from typing import Final, Literal
 
 import zenoh
 
+from zsched.core.hop.receiver import SourceName
 from zsched.core.relay_protocol import EndMarker
-from zsched.hop.acknowledger import SourceName
 from zsched.worker.backlog import Done
 
 BY_CLASS: Final = "by_class"

@@ -34,6 +34,7 @@ import zenoh
 
 from zsched.clock import monotonic_s
 from zsched.core.events import WorkerJobs
+from zsched.core.hop.shared import STALLED_S
 from zsched.core.relay_protocol import StreamAcks, WorkerTrouble
 from zsched.core.values.plan import Role, WorkerRole
 from zsched.guard import guarded, tolerant
@@ -50,7 +51,6 @@ from zsched.worker.errands import Errands
 from zsched.worker.inputs import Dispatcher
 from zsched.worker.jobs import Job, JobBook
 from zsched.worker.keep import Keeper
-from zsched.worker.lanes import STALLED_S
 from zsched.worker.outputs import OUTPUT_DEPTH, Output
 from zsched.worker.roles import RoleWatch
 from zsched.worker.samples import BY_CLASS, Input, KeepLast, Marker, Received
@@ -205,8 +205,8 @@ class Worker:
 
         ``latest``: the last ``keep_last`` values are cached for who comes late; a put never waits, behind a stalled
         receiver the newest wait. ``reliable``: a put waits for a slow receiver (up to a lease) instead of dropping, and
-        the last ``depth`` answers (at most `zsched.worker.lanes.KEPT_BYTES`) are kept until the robots' relays have
-        acknowledged them: what a broken link lost is sent again.
+        the last ``depth`` answers (at most `zsched.core.hop.shared.SHARED_BYTES`) are kept until the robots' relays
+        have acknowledged them: what a broken link lost is sent again.
         """
         output = Output(
             self._session,

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from random import Random
@@ -27,6 +26,7 @@ from zsched.core import events as ev
 from zsched.core.hop.receiver import MAX_REPLAYED, RETURN
 from zsched.core.hop.sender import Sender, near
 from zsched.core.hop.serial import serial_of
+from zsched.core.hop.shared import MAX_RECEIVERS, SharedSender
 from zsched.core.relay_protocol import EndMarker, SnapshotChunk, StreamAck, StreamAcks
 from zsched.core.route.ros2 import parse_token
 from zsched.core.sequence import RUN, Order, Track
@@ -37,7 +37,6 @@ from zsched.relay.streams.slots import KeyState
 from zsched.relay.tokens import Tokens
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import Keyspace, counter, parse
-from zsched.worker.lanes import MAX_RECEIVERS, KeptLane
 from zsched.worker.snapshot import CHUNK, MAX_OFFERS, MAX_SNAPSHOT, Assembly
 from zsched_lab.bugs.fuzz_wire import NAMES
 
@@ -230,17 +229,19 @@ class KeyFuzz:
 
     def _kept(self) -> None:
         """A worker's answers: a relay's word lets go of nothing that was not sent, and never of more than there is."""
-        lane = KeptLane(key="k", source_id=cast("Any", None), limit=8, wake=threading.Event())
-        for number in range(20):
-            lane.keep(number, b"", None, None, None, 1)
+        lane = SharedSender(limit=8)
+        for _ in range(20):
+            lane.note_put(None, None, 1, 1.0)
             name = str(self._rng.randrange(3 * MAX_RECEIVERS))
-            receiver, _ = lane.acknowledge(f"a{name}", f"robot{name}", self._ack(), 1.0)
+            receiver = lane.hear(f"a{name}", f"robot{name}", self._ack(), 1.0)
             assert receiver.arrived <= lane.count
-            lane.wanted(receiver.arrived, self._number())
+            owed = lane.take_owed(f"a{name}", 1.0, is_reached=self._rng.random() < 0.5)
+            assert len(owed.again) <= lane.limit
+            assert (owed.skip or 0) <= lane.count
         assert len(lane.kept) <= lane.limit
         if self._rng.random() < 0.05:
             for number in range(MAX_RECEIVERS + 9):
-                lane.acknowledge(f"b{number}", f"robot{number}", self._ack(), 2.0)
+                lane.hear(f"b{number}", f"robot{number}", self._ack(), 2.0)
         assert len(lane.receivers) <= MAX_RECEIVERS
 
     def _hop(self) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from zsched_lab.bugs.core_bugs import Bug
 
 ACKS, RECEIVER, SERIAL = "zsched.hop.acknowledger", "zsched.core.hop.receiver", "zsched.core.hop.serial"
-INPUTS, WORKER_LANES = "zsched.worker.inputs", "zsched.worker.lanes"
+INPUTS, SHARED = "zsched.worker.inputs", "zsched.core.hop.shared"
 GREETINGS, SENDER, OUTLET = "zsched.relay.streams.greetings", "zsched.core.hop.sender", "zsched.relay.streams.outlet"
 
 _GREETINGS = ("tests/parts/relay/streams/test_greetings.py",)
@@ -214,7 +214,7 @@ STREAM_BUGS = (
     ),
     _bug(
         "a relay's next life is sent what the former one has had",
-        WORKER_LANES,
+        SHARED,
         "arrived = max(receiver.waits_for, receiver.had or 0)",
         "arrived = receiver.waits_for",
         ("tests/parts/worker/test_keep.py",),
@@ -235,21 +235,21 @@ STREAM_BUGS = (
     ),
     _bug(
         "an input does not wait for its robot's first word",
-        WORKER_LANES,
-        "low = self.count if is_known or not self._is_expected(relay, now) else 0",
+        SHARED,
+        "low = self.count if is_known or not self._is_expected(name, now) else 0",
         "low = self.count",
         ("tests/unit/worker/test_debts.py",),
     ),
     _bug(
         "a robot that takes long over a large answer has it",
-        WORKER_LANES,
+        SHARED,
         "return not self.has_left and (is_own or is_moving)",
         "return not self.has_left and is_moving",
         ("tests/unit/worker/test_debts.py",),
     ),
     _bug(
         "a frozen robot stalls the inputs of the others",
-        WORKER_LANES,
+        SHARED,
         "return not self.has_left and (is_own or is_moving)",
         "return not self.has_left",
         ("tests/unit/worker/test_debts.py",),
@@ -342,7 +342,7 @@ STREAM_BUGS = (
         "a lane waits for an answer to a greeting that was not put",
         GREETINGS,
         "                self._put_start(lane, lowest)\n",
-        "",
+        "                pass\n",
         (f"{_FROZEN}::test_an_owner_that_is_frozen_before_it_is_greeted_misses_nothing",),
     ),
     _bug(

@@ -11,6 +11,7 @@ import zenoh
 
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import until
+from zsched.core.hop import shared
 from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks
 from zsched.hop.acknowledger import Acknowledger
 from zsched.ipc.pipe import decode_end
@@ -18,7 +19,6 @@ from zsched.sessions.stalled_links import StalledLinks
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import AGAIN_CHUNK, END_CHUNK, Keyspace
 from zsched.worker import keep as worker_keep
-from zsched.worker import lanes as worker_lanes
 from zsched.worker.debts import Debts
 from zsched.worker.keep import Keeper
 from zsched.worker.lanes import KeptLane
@@ -86,7 +86,7 @@ class Bench:
 
 def keep(lane: KeptLane, *numbers: int) -> None:
     for number in numbers:
-        lane.keep(number, f"answer {number}".encode(), None, None, None, 10)
+        assert lane.keep((f"answer {number}".encode(), None, None), None, 10) == number
 
 
 @pytest.fixture
@@ -99,15 +99,15 @@ def bench() -> Iterator[Bench]:
 
 
 def test_what_every_robot_has_acknowledged_is_kept_no_more(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(worker_lanes, "NEWCOMERS_S", 0.0)
+    monkeypatch.setattr(shared, "NEWCOMERS_S", 0.0)
     lane = bench.lane()
     first, second = bench.robot("robot1", "aa1"), bench.robot("robot2", "aa2")
     keep(lane, 0, 1, 2, 3)
     second.ack(bench.eid, 1)
-    until(lambda: len(lane.kept) == 3, "the slower one counts")
+    until(lambda: len(lane.state.kept) == 3, "the slower one counts")
     first.ack(bench.eid, 4)
     second.ack(bench.eid, 4)
-    until(lambda: not lane.kept and lane.size == 0, "nothing is kept")
+    until(lambda: not lane.state.kept and lane.state.kept.size == 0, "nothing is kept")
 
 
 def test_a_robot_that_follows_the_move_last_is_given_what_the_first_has_acknowledged_already(bench: Bench) -> None:
@@ -116,7 +116,7 @@ def test_a_robot_that_follows_the_move_last_is_given_what_the_first_has_acknowle
     first, second = bench.robot("robot1", "aa1"), bench.robot("robot2", "aa2")
     keep(lane, *range(10))
     first.ack(bench.eid, 10)
-    until(lambda: lane.receivers and lane.receivers["aa1"].arrived == 10, "the first robot's word")
+    until(lambda: lane.state.receivers and lane.state.receivers["aa1"].arrived == 10, "the first robot's word")
     keep(lane, 10)
     second.ack(bench.eid, 0, has_gap=True, until=10)
     until(lambda: second.got == list(range(10)), "the beginning")
@@ -125,13 +125,13 @@ def test_a_robot_that_follows_the_move_last_is_given_what_the_first_has_acknowle
 
 def test_the_first_answers_of_an_epoch_do_not_stay_for_ever(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also when nobody says anything any more."""
-    monkeypatch.setattr(worker_lanes, "NEWCOMERS_S", 0.3)
+    monkeypatch.setattr(shared, "NEWCOMERS_S", 0.3)
     lane = bench.lane()
     robot = bench.robot("robot1")
     keep(lane, 0, 1, 2)
     robot.ack(bench.eid, 3)
-    until(lambda: lane.receivers, "the robot's only word")
-    until(lambda: not lane.kept and lane.size == 0, "they are let go of")
+    until(lambda: lane.state.receivers, "the robot's only word")
+    until(lambda: not lane.state.kept and lane.state.kept.size == 0, "they are let go of")
     until(lambda: not lane.wake.is_set(), "the keeper is at rest")
 
 
@@ -145,7 +145,7 @@ def test_what_comes_while_nothing_is_kept_stays_in_nobody_s_memory(bench: Bench)
     for _ in range(3):
         bench.outside.put(key, b"no frame")
     robot.ack(bench.eid, 0)
-    until(lambda: "aa1" in lane.receivers, "a word is taken all the same")
+    until(lambda: "aa1" in lane.state.receivers, "a word is taken all the same")
     assert bench.keeper._came.empty()
     assert not lane.wake.is_set()
 
@@ -199,8 +199,8 @@ def test_what_is_kept_no_more_is_skipped(bench: Bench) -> None:
 
 
 def test_much_is_sent_again_in_parts_as_it_arrives(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(worker_lanes, "BATCH", 2)
-    monkeypatch.setattr(worker_lanes, "NEWCOMERS_S", 0.0)
+    monkeypatch.setattr(shared, "BATCH", 2)
+    monkeypatch.setattr(shared, "NEWCOMERS_S", 0.0)
     lane = bench.lane()
     robot = bench.robot("robot1")
     keep(lane, *range(5))
@@ -208,27 +208,27 @@ def test_much_is_sent_again_in_parts_as_it_arrives(bench: Bench, monkeypatch: py
     for count in (2, 4, 5):
         until(lambda count=count: robot.got == list(range(count)), f"{count} of them")  # type: ignore[misc]
         robot.ack(bench.eid, count)
-    until(lambda: not lane.kept, "all acknowledged")
+    until(lambda: not lane.state.kept, "all acknowledged")
 
 
 def test_a_relay_that_restarted_takes_the_place_of_its_former_life(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(worker_lanes, "NEWCOMERS_S", 0.0)
+    monkeypatch.setattr(shared, "NEWCOMERS_S", 0.0)
     lane = bench.lane()
     before, after = bench.robot("robot1", "aa1"), bench.robot("robot1", "aa2")
     keep(lane, 0, 1, 2)
     before.ack(bench.eid, 0)
-    until(lambda: "aa1" in lane.receivers, "the first life")
+    until(lambda: "aa1" in lane.state.receivers, "the first life")
     after.ack(bench.eid, 3)
-    until(lambda: not lane.kept, "nobody waits for the first life")
+    until(lambda: not lane.state.kept, "nobody waits for the first life")
 
 
 def test_another_life_of_a_relay_is_told_what_the_former_one_has_had_and_is_sent_only_the_rest(bench: Bench) -> None:
     lane = bench.lane()
     keep(lane, 0, 1, 2, 3)
     bench.robot("robot1", relay="f0").ack(bench.eid, 3)
-    until(lambda: "f0" in lane.receivers, "the former life's word")
+    until(lambda: "f0" in lane.state.receivers, "the former life's word")
     other = bench.robot("robot2", relay="f2")
     other.ack(bench.eid, 0, has_gap=True, until=3)
     until(lambda: other.got == [0, 1, 2], "another robot has had nothing")
@@ -242,14 +242,14 @@ def test_another_life_of_a_relay_is_told_what_the_former_one_has_had_and_is_sent
 def test_a_strangers_word_about_a_relay_that_lives_keeps_nothing_from_it(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(worker_lanes, "NEWCOMERS_S", 60.0)  # later nothing is kept for who is not known
+    monkeypatch.setattr(shared, "NEWCOMERS_S", 60.0)  # later nothing is kept for who is not known
     lane = bench.lane()
     keep(lane, 0, 1, 2)
     robot = bench.robot("robot1")
     robot.ack(bench.eid, 0)
-    until(lambda: robot.relay in lane.receivers, "the relay is known")
+    until(lambda: robot.relay in lane.state.receivers, "the relay is known")
     bench.robot("robot1", relay="dead").ack(bench.eid, 3)
-    until(lambda: "dead" in lane.receivers, "the stranger has taken its place")
+    until(lambda: "dead" in lane.state.receivers, "the stranger has taken its place")
     robot.ack(bench.eid, 0, has_gap=True, until=3)
     until(lambda: robot.got == [0, 1, 2], "everything")
     assert robot.skipped == []
@@ -258,28 +258,27 @@ def test_a_strangers_word_about_a_relay_that_lives_keeps_nothing_from_it(
 def test_who_cannot_be_reached_is_forgotten_and_what_nobody_acknowledges_too(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (worker_lanes, worker_keep):
-        monkeypatch.setattr(module, "FORGET_S", 0.4)
+    monkeypatch.setattr(shared, "FORGET_S", 0.4)
     lane = bench.lane()
     robot = bench.robot("robot1")
     keep(lane, 0, 1)
     robot.ack(bench.eid, 1)
-    until(lambda: lane.receivers, "the robot")
+    until(lambda: lane.state.receivers, "the robot")
     robot.leave()
-    until(lambda: not lane.receivers and not lane.kept, "nothing is kept for nobody")
+    until(lambda: not lane.state.receivers and not lane.state.kept, "nothing is kept for nobody")
 
 
 def test_bytes_are_bounded_too(monkeypatch: pytest.MonkeyPatch, bench: Bench) -> None:
-    monkeypatch.setattr(worker_lanes, "KEPT_BYTES", 25)
+    monkeypatch.setattr(shared, "SHARED_BYTES", 25)
     lane = bench.lane()
     keep(lane, 0, 1, 2)
-    assert [one.number for one in lane.kept] == [1, 2]
+    assert [one.number for one in lane.state.kept] == [1, 2]
 
 
 def test_strangers_who_acknowledge_are_bounded_and_a_robot_that_was_reached_stays(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(worker_lanes, "MAX_RECEIVERS", 4)
+    monkeypatch.setattr(shared, "MAX_RECEIVERS", 4)
     lane = bench.lane()
     robot = bench.robot("robot1")
     keep(lane, 0, 1, 2)
@@ -288,11 +287,11 @@ def test_strangers_who_acknowledge_are_bounded_and_a_robot_that_was_reached_stay
     word = wire.encode(StreamAcks(acks=(StreamAck(eid=bench.eid, first=0, arrived=0, processed=0, has_gap=True),)))
     for number in range(40):
         bench.outside.put(KEYS.received(f"ghost{number}", f"bad{number}", str(bench.worker.zid())), word)
-    until(lambda: "bad39" in lane.receivers, "the last stranger's word")
-    assert len(lane.receivers) == 4
-    assert robot.relay in lane.receivers
-    assert lane.crowded_out == 40 - 3
-    until(lambda: not lane.gone, "the others' publishers are given back")
+    until(lambda: "bad39" in lane.state.receivers, "the last stranger's word")
+    assert len(lane.state.receivers) == 4
+    assert robot.relay in lane.state.receivers
+    assert lane.state.crowded_out == 40 - 3
+    until(lambda: set(lane.ways) <= set(lane.state.receivers), "the others' publishers are given back")
 
 
 def test_an_acknowledgement_under_a_malformed_key_is_nobody_s(bench: Bench) -> None:
@@ -302,5 +301,5 @@ def test_an_acknowledgement_under_a_malformed_key_is_nobody_s(bench: Bench) -> N
     for node, relay in (("*", "aa1"), ("robot9", "*"), ("robot9", "b" * 500)):
         bench.robot(node, relay).ack(bench.eid, 2)
     robot.ack(bench.eid, 1)
-    until(lambda: lane.receivers, "the robot's word, behind those")
-    assert list(lane.receivers) == [robot.relay]
+    until(lambda: lane.state.receivers, "the robot's word, behind those")
+    assert list(lane.state.receivers) == [robot.relay]

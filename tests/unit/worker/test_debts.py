@@ -5,10 +5,12 @@ from __future__ import annotations
 import threading
 from typing import Any, cast
 
+from zsched.core.hop.held import MAX_HELD
+from zsched.core.hop.shared import STALLED_S, SharedSender
 from zsched.core.relay_protocol import StreamAck
 from zsched.hop.acknowledger import Acknowledger
-from zsched.worker.debts import MAX_HELD, Debts
-from zsched.worker.lanes import STALLED_S, KeptLane
+from zsched.worker.debts import Debts
+from zsched.worker.lanes import KeptLane
 
 OWN, OTHER = "aa1", "bb2"
 NAME = ("edge1/t/robot1/in", OWN, 7)
@@ -26,19 +28,20 @@ class Told:
 
 
 def a_lane(count: int = 0) -> KeptLane:
-    lane = KeptLane(key="k", source_id=cast("Any", None), limit=100_000, wake=threading.Event())
+    state = SharedSender(limit=100_000)
+    lane = KeptLane(key="k", source_id=cast("Any", None), wake=threading.Event(), state=state)
     put(lane, *range(count))
     return lane
 
 
 def put(lane: KeptLane, *numbers: int) -> None:
     for number in numbers:
-        lane.keep(number, b"", None, None, None, 1)
+        assert lane.keep((b"", None, None), None, 1) == number
 
 
 def ack(lane: KeptLane, relay: str, arrived: int, now: float = 0.0, **more: Any) -> None:
     word = StreamAck(eid=1, first=0, arrived=arrived, processed=arrived, **more)
-    lane.acknowledge(relay, f"node-{relay}", word, now)
+    lane.hear(relay, f"node-{relay}", word, now)
 
 
 def test_who_has_answered_nothing_is_done_at_once() -> None:
@@ -93,8 +96,7 @@ def test_its_own_robot_is_waited_for_however_long_one_answer_takes() -> None:
     told.debts.processed(NAME, 0, 1, {lane: 1})
     told.debts.settle(8 * STALLED_S)
     assert told.numbers == []
-    with lane.lock:
-        lane.forget(OWN)
+    lane.state.forget(OWN)
     told.debts.settle(8 * STALLED_S)
     assert told.numbers == [0]
 
@@ -150,7 +152,7 @@ def test_a_frozen_robot_stalls_the_inputs_of_another_once_and_not_for_each() -> 
         now = (1.1 + number / 100) * STALLED_S
         put(lane, number)
         ack(lane, OWN, number + 1, now)
-        lane.note_debts(now)
+        lane.state.look_after(now)
         told.debts.processed(NAME, number, 1, {lane: number + 1})
         told.debts.settle(now)
         assert told.numbers[-1] == number
@@ -166,11 +168,11 @@ def test_who_has_had_everything_for_long_is_not_stalled_when_there_is_something_
     told, lane = Told(), a_lane(1)
     ack(lane, OTHER, 1)
     ack(lane, OWN, 1)
-    lane.note_debts(9 * STALLED_S)
+    lane.state.look_after(9 * STALLED_S)
     put(lane, 1)
     ack(lane, OWN, 2, 9 * STALLED_S)
     told.debts.processed(NAME, 0, 1, {lane: 2})
-    lane.note_debts(9 * STALLED_S)
+    lane.state.look_after(9 * STALLED_S)
     told.debts.settle(9.5 * STALLED_S)
     assert told.numbers == []
 
@@ -181,7 +183,7 @@ def test_what_is_held_is_bounded_and_still_waits() -> None:
     ack(lane, OWN, 0)
     for number in range(count):
         told.debts.processed(NAME, number, 1, {lane: number + 1})
-    assert len(told.debts._held[NAME]) == MAX_HELD
+    assert len(told.debts._held.lines[NAME]) == MAX_HELD
     ack(lane, OWN, count - 1)
     told.debts.settle(0.0)
     assert told.numbers[-1] == MAX_HELD - 2
@@ -194,7 +196,7 @@ def test_an_output_that_nobody_looks_after_any_more_holds_nothing_back() -> None
     told, lane = Told(), a_lane(1)
     ack(lane, OWN, 0)
     told.debts.processed(NAME, 0, 1, {lane: 1})
-    lane.is_over = True
+    lane.give_up()
     told.debts.settle(0.0)
     assert told.numbers == [0]
 

@@ -22,12 +22,17 @@ from typing import Final
 from zsched.core.hop.serial import number_near, serial_of
 from zsched.core.relay_protocol import StreamAck
 
+SourceName = tuple[str, str, int]
+"""(key, session id, entity id) of a publisher as zenoh names it."""
+
 GIVE_UP_S: Final = 1.0
 MAX_MISSING: Final = 256
 MAX_AHEAD: Final = 1 << 30
 """No source is so far ahead: at 1 kHz that is a cut of twelve days. Of what is further nobody knows which way it is."""
 RETURN: Final = 3
 """So many numbers in a row take a jump back that nothing has followed; so many start markers what one has said."""
+MAX_SOURCES: Final = 8192
+"""Publishers that a process remembers on the receiving side."""
 MAX_REPLAYED: Final = 1 << 13
 """No start marker speaks of more replays: a relay keeps fewer."""
 

@@ -19,10 +19,10 @@ import zenoh
 from zenoh import Priority, Sample, SampleKind
 
 from zsched.clock import monotonic_s
-from zsched.core.hop.receiver import GIVE_UP_S
+from zsched.core.hop.receiver import GIVE_UP_S, SourceName
 from zsched.core.hop.serial import serial_of
 from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker
-from zsched.hop.acknowledger import Acknowledger, SourceName
+from zsched.hop.acknowledger import Acknowledger
 from zsched.ipc.pipe import decode_end
 from zsched.relay.streams.counter import StreamCounter
 

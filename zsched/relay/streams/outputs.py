@@ -20,11 +20,11 @@ import zenoh
 from zenoh import CongestionControl, Sample, Session, Timestamp
 
 from zsched.clock import monotonic_s
-from zsched.core.hop.receiver import Jump
+from zsched.core.hop.receiver import Jump, SourceName
 from zsched.core.hop.serial import number_near
 from zsched.core.values.plan import HandoverRule, Route, StreamClass, StreamCount
 from zsched.guard import tolerant
-from zsched.hop.acknowledger import Acknowledger, SourceName
+from zsched.hop.acknowledger import Acknowledger
 from zsched.ipc.pipe import decode_end
 from zsched.relay.streams.acks import WorkerAcks
 from zsched.relay.streams.answer_times import AnswerTimes

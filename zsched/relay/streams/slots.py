@@ -14,11 +14,10 @@ from typing import Final
 
 from zenoh import Sample
 
-from zsched.core.hop.receiver import Jump
+from zsched.core.hop.receiver import Jump, SourceName
 from zsched.core.hop.serial import number_near, serial_of
 from zsched.core.relay_protocol import EndMarker
 from zsched.core.route import keyexpr
-from zsched.hop.acknowledger import SourceName
 from zsched.relay.streams.answers import Answers
 from zsched.relay.streams.receive import Receiver
 
