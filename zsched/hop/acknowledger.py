@@ -32,10 +32,21 @@ _log = logging.getLogger("zsched.streams")
 class Acknowledger:
     """The numbers of every publisher heard, and a thread that sends what changed: ``send(session id, frame)``."""
 
-    def __init__(self, send: Callable[[str, StreamAcks], None], *, born_at: float | None = None) -> None:
-        """``send`` puts a frame for the session with that zenoh id; it must not block long."""
+    def __init__(
+        self,
+        send: Callable[[str, StreamAcks], None],
+        *,
+        born_at: float | None = None,
+        clock: Callable[[], float] | None = None,
+    ) -> None:
+        """``send`` puts a frame for the session with that zenoh id; it must not block long.
+
+        With a ``clock`` of the caller's there is no thread: the caller looks at the gaps and flushes every `ACK_S`.
+        """
         self._send = send
-        self.born_at = monotonic_s() if born_at is None else born_at
+        self.clock = clock or monotonic_s
+        """Monotonic seconds."""
+        self.born_at = self.clock() if born_at is None else born_at
         """When this process began to listen."""
         self._sources: dict[SourceName, Source] = {}
         self._dirty: set[SourceName] = set()
@@ -48,8 +59,8 @@ class Acknowledger:
         self._samples = 0
         self._bytes = 0
         self._is_closed = False
-        self._thread = guarded(self._run, name="zsched acks")
-        self._thread.start()
+        if clock is None:
+            guarded(self._run, name="zsched acks").start()
 
     def close(self) -> None:
         """Send what changed, then end."""
@@ -62,7 +73,7 @@ class Acknowledger:
         with self._wake:
             source = self._sources.get(name) or self._add(name, 0 if in_turn else serial)
             number = source.number(serial)
-            if source.admit(number, self._time.at(monotonic_s()), in_turn=in_turn):
+            if source.admit(number, self._time.at(self.clock()), in_turn=in_turn):
                 return number
             self._note_gap(name, source)
             self._mark(name)
@@ -105,7 +116,7 @@ class Acknowledger:
             source = self._sources.get(name) or self._add(name, until)
             source.until = until
             self._mark(name)
-            waits_s = source.waits_s(self._time.at(monotonic_s()))
+            waits_s = source.waits_s(self._time.at(self.clock()))
             self._note_gap(name, source)
             return waits_s
 
@@ -192,9 +203,10 @@ class Acknowledger:
             self._gaps[name] = source
             self._wake.notify()
 
-    def _look_at_gaps(self) -> None:
+    def look_at_gaps(self) -> None:
+        """Look at the clock while something is missing and waited for (under the lock, where there is a thread)."""
         if self._gaps:
-            now = self._time.at(monotonic_s())
+            now = self._time.at(self.clock())
             self._gaps = {name: source for name, source in self._gaps.items() if source.is_waiting(now)}
 
     def _note_done(self, name: SourceName, size: int) -> None:
@@ -238,12 +250,12 @@ class Acknowledger:
             with self._wake:
                 while not self._dirty and not self._is_closed:
                     self._wake.wait(ACK_S if self._gaps else None)
-                    self._look_at_gaps()
-                rest = due - monotonic_s()
+                    self.look_at_gaps()
+                rest = due - self.clock()
                 if rest > 0 and not self._is_closed and not self._is_urgent():
                     self._wake.wait(rest)
                 is_last = self._is_closed
             self.flush()
             if is_last:
                 return
-            due = monotonic_s() + ACK_S
+            due = self.clock() + ACK_S

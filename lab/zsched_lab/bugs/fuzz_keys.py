@@ -23,7 +23,7 @@ from zenoh import SampleKind
 
 from zsched.adapters.network.control_bus import ControlBus
 from zsched.core import events as ev
-from zsched.core.hop.receiver import MAX_REPLAYED, RETURN
+from zsched.core.hop.receiver import MAX_REPLAYED, RETURN, Source
 from zsched.core.hop.sender import Sender, near
 from zsched.core.hop.serial import serial_of
 from zsched.core.hop.shared import MAX_RECEIVERS, SharedSender
@@ -298,7 +298,8 @@ class KeyFuzz:
                 is_taken = key.take_end(named, self._rng.choice((publisher, ("b2", 7))), 1.0)
                 assert not is_taken or key.end_of == publisher or number == 0
             key.received += 1
-            key.last_number = key.numbers[publisher] = number
+            assert key.sources.setdefault(publisher, Source.at(0)).take(number)
+            key.last_number = number
             key.heard_at = 1.0
             if key.is_past_end(publisher):
                 key.reopen()

@@ -185,6 +185,12 @@ class Source:
         self.gap_since = None
         return True
 
+    @property
+    def proven(self) -> int:
+        """`arrived`, but before the newest jump while nothing has followed it: anybody can have made that."""
+        jump = self._jump
+        return jump.at if jump is not None and jump.to + 1 == self.arrived else self.arrived
+
     def done(self, number: int) -> bool:
         """A sample is done, or gave way to a newer one that is; not one whose jump was taken back meanwhile."""
         if not self.processed <= number < self.arrived:
@@ -241,9 +247,14 @@ class Source:
     def _is_back(self, number: int) -> bool:
         """Whether the source goes on where the newest jump began, so that the jump is taken back."""
         jump = self._jump
-        if jump is None or not jump.is_back(number, self.arrived - 1):
+        return jump is not None and jump.is_back(number, self.arrived - 1) and self.go_back(number)
+
+    def go_back(self, number: int) -> bool:
+        """Take the newest jump back: the source goes on with ``number``; ``False``: that is not within the jump."""
+        jump = self._jump
+        if jump is None or number < jump.at or self.arrived - 1 > jump.to:
             return False
-        self.lost = jump.lost + jump.count - 1
+        self.lost = jump.lost + number - jump.at
         self.first = min(self.first, jump.at)
         if self._gaps and self._gaps[-1] == (jump.at, jump.to):  # what was in work before it still is
             self._gaps[-1] = jump.at, number

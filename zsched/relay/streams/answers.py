@@ -4,9 +4,9 @@ Knows: `zsched.worker`'s numbers and what it keeps of its answers, the acknowled
 
 A link that breaks loses what was on it; the worker keeps its answers until this relay has acknowledged them, and puts
 what is missing once more, for this relay alone. Meanwhile newer answers wait here, bounded. What the worker has no more
-is skipped at its word, what never comes after `GIVE_UP_S`; both count as lost: at the gate, here at the very beginning,
-and behind the last one that came when the slot closes. Where only the newest is
-wanted (class ``latest``) nothing waits. The stream's lock guards it.
+is skipped at its word, what never comes after `GIVE_UP_S`. Both count as lost, once: where the next one passes
+(`zsched.relay.streams.slots`), or when the slot closes. Where only the newest is wanted (class ``latest``) nothing
+waits. The stream's lock guards it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from typing import Final, cast
 import zenoh
 from zenoh import Priority, Sample, SampleKind
 
-from zsched.clock import monotonic_s
 from zsched.core.hop.receiver import GIVE_UP_S, SourceName
 from zsched.core.hop.serial import serial_of
 from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker
@@ -156,10 +155,22 @@ class Answers:
         self._acks.expect(name, 0 if self._is_from_start else until)
         return self._acks.ask_for(name, until) <= GIVE_UP_S
 
-    def missing(self, name: SourceName, until: int) -> int:
-        """How many numbers below ``until`` have not come, of a source that we should have had whole."""
-        start = self._start_of(name)
-        return 0 if start is None else max(0, until - max(start, self._acks.arrived(name)))
+    def missing(self, key: str, passed: Mapping[SourceName, int], ends: Mapping[SourceName, int]) -> int:
+        """How many numbers have not gone on, of the sources of a key that we should have had whole.
+
+        ``passed``: behind the last one of each that went on; ``ends``: behind the last one of all, where that is known.
+        """
+        total = 0
+        for name in self._names:
+            start = self._start_of(name)
+            if start is not None and name[0] == key:
+                until = max(ends.get(name, 0), self._acks.arrived(name))
+                total += max(0, until - max(start, passed.get(name, 0)))
+        return total
+
+    def first_of(self, name: SourceName) -> int | None:
+        """The first number that counts as lost when it does not come; ``None``: the first one that comes."""
+        return self._start_of(name) if self._in_turn else None
 
     def _start_of(self, name: SourceName) -> int | None:
         """The first number that we had to get; ``None``: we came when the stream had begun."""
@@ -203,16 +214,12 @@ class Answers:
         """
         number = self._acks.number(name, serial_of(marker.count))
         if self._start_of(name) == 0 == self._acks.arrived(name):
-            is_late = marker.age_s is not None and monotonic_s() - marker.age_s < self._acks.born_at
+            is_late = marker.age_s is not None and self._acks.clock() - marker.age_s < self._acks.born_at
             before = number if is_late else 0
             self._starts[name] = min(before if marker.had is None else marker.had, number)
         return self._skip(name, number)
 
     def _skip(self, name: SourceName, number: int) -> tuple[Sample, ...]:
-        is_known = self._in_turn and name in self._names
-        start = self._start_of(name)
-        if is_known and start is not None and self._acks.arrived(name) <= start:  # the gate counts what is later
-            self._counter.lost += self.missing(name, number)
         self._acks.skip(name, number)
         early = self._early.get(name)
         if early is not None:

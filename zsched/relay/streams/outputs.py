@@ -20,8 +20,7 @@ import zenoh
 from zenoh import CongestionControl, Sample, Session, Timestamp
 
 from zsched.clock import monotonic_s
-from zsched.core.hop.receiver import Jump, SourceName
-from zsched.core.hop.serial import number_near
+from zsched.core.hop.receiver import SourceName
 from zsched.core.values.plan import HandoverRule, Route, StreamClass, StreamCount
 from zsched.guard import tolerant
 from zsched.hop.acknowledger import Acknowledger
@@ -263,7 +262,7 @@ class OutputStream:
         with self._lock:
             for slot in tuple(self._slots.values()):
                 for (name, zid, eid), sample in slot.answers.overdue() if slot.answers is not None else ():
-                    self._pass(slot, slot.keys.setdefault(name, KeyState()), (zid, eid), sample)
+                    self._pass(slot, slot.keys.setdefault(name, KeyState(name=name)), (zid, eid), sample)
             if self._pace is None or not self._is_latest:
                 return
             for sample in self._pace.overdue(monotonic_s()):
@@ -330,7 +329,9 @@ class OutputStream:
         self._counter.seen(size)
         key.received += 1
         key.heard_at = monotonic_s()
-        if number == UNNUMBERED or self._is_next(key, publisher, number, in_order=slot.answers is not None):
+        if number != UNNUMBERED and publisher not in key.sources:
+            note_feeder(publisher[0])
+        if number == UNNUMBERED or key.take(publisher, number, slot.answers, self._counter):
             if key.end is not None and key.is_past_end(publisher):
                 self._reopen(slot, key)
             self._gate(slot, sample, size)
@@ -339,33 +340,6 @@ class OutputStream:
         if slot.answers is not None and key.ender is not None:
             slot.answers.reopen(key.ender)
         key.reopen()
-
-    def _is_next(self, key: KeyState, publisher: tuple[str, int], serial: int, *, in_order: bool) -> bool:
-        """Count what does not fit the numbers of the hop; an old one is dropped, unless a jump is taken back by it.
-
-        ``in_order``: `Answers` has seen to the order, and to that, already.
-        """
-        last = key.numbers.get(publisher, -1)
-        if last < 0:
-            note_feeder(publisher[0])
-        number = serial if last < 0 else number_near(serial, last)
-        jump = key.jumps.get(publisher)
-        if number < last and jump is not None:
-            is_back = in_order and jump.at <= number and last <= jump.to
-            if is_back or jump.is_back(number, last):
-                self._counter.lost -= jump.to - number
-                key.last_number = key.numbers[publisher] = number
-                del key.jumps[publisher]
-                return True
-        key.last_number = key.numbers[publisher] = max(number, last)
-        if number == last:
-            self._counter.doubled += 1
-        elif number < last:
-            self._counter.reordered += 1
-        elif last >= 0 and number > last + 1:
-            self._counter.lost += number - last - 1
-            key.jumps[publisher] = Jump(at=last + 1, to=number)
-        return number > last
 
     def _gate(self, slot: OutputSlot, sample: Sample, size: int) -> None:
         if self._is_paused:

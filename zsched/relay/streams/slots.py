@@ -14,11 +14,12 @@ from typing import Final
 
 from zenoh import Sample
 
-from zsched.core.hop.receiver import Jump, SourceName
+from zsched.core.hop.receiver import Source, SourceName
 from zsched.core.hop.serial import number_near, serial_of
 from zsched.core.relay_protocol import EndMarker
 from zsched.core.route import keyexpr
 from zsched.relay.streams.answers import Answers
+from zsched.relay.streams.counter import StreamCounter
 from zsched.relay.streams.receive import Receiver
 
 END_GRACE_S: Final = 0.1
@@ -31,6 +32,7 @@ QUIET_S: Final = 1.0
 class KeyState:
     """What came on one concrete key of a slot, and what its end marker said."""
 
+    name: str = ""
     received: int = 0
     heard_at: float = 0.0
     end: EndMarker | None = None
@@ -40,21 +42,44 @@ class KeyState:
     ender: SourceName | None = None
     """The publisher whose end it is, where it keeps what we have not acknowledged."""
     last_number: int = -1
-    numbers: dict[tuple[str, int], int] = field(default_factory=dict)
-    """{publisher: its newest number}; a worker that restarted in place is another publisher."""
-    jumps: dict[tuple[str, int], Jump] = field(default_factory=dict)
-    """{publisher: the newest jump in its numbers}."""
+    sources: dict[tuple[str, int], Source] = field(default_factory=dict)
+    """{publisher: its numbers, as they passed here}; a worker that restarted in place is another publisher."""
+
+    def take(self, publisher: tuple[str, int], serial: int, answers: Answers | None, counter: StreamCounter) -> bool:
+        """Whether a sample passes; counts once what is lost, double or late by the numbers of its publisher.
+
+        An old one does not pass, unless a jump is taken back by it; ``answers`` have seen to that already.
+        """
+        source = self.sources.get(publisher)
+        if source is not None and source.take(serial):  # the usual case
+            self.last_number = source.arrived - 1
+            return True
+        if source is None:
+            first = None if answers is None else answers.first_of((self.name, *publisher))
+            source = self.sources[publisher] = Source.at(serial if first is None else first)
+        return self._admit(source, source.number(serial), counter, in_order=answers is not None)
+
+    def _admit(self, source: Source, number: int, counter: StreamCounter, *, in_order: bool) -> bool:
+        before = source.lost, source.doubled, source.reordered
+        is_next = (in_order and number < source.arrived and source.go_back(number)) or source.admit(
+            number, 0.0, in_turn=False
+        )
+        if is_next:
+            source.done(number)
+        counter.lost += source.lost - before[0]
+        counter.doubled += source.doubled - before[1]
+        is_far = not is_next and number > source.arrived
+        counter.reordered += source.reordered - before[2] + is_far
+        self.last_number = source.arrived - 1
+        return is_next
 
     def take_end(self, marker: EndMarker, publisher: tuple[str, int], now: float) -> bool:
         """An end marker of a publisher came; ``False``: it is none."""
-        if self.numbers and publisher not in self.numbers and now - self.heard_at < QUIET_S:
+        source = self.sources.get(publisher)
+        if self.sources and source is None and now - self.heard_at < QUIET_S:
             return False
         count = number_near(serial_of(marker.count), self.last_number + 1)
-        jump = self.jumps.get(publisher)
-        newest = self.numbers.get(publisher, -1)
-        if jump is not None and jump.to == newest:  # nothing has followed it: it may be a stranger's
-            newest = jump.at - 1
-        if count <= newest:
+        if source is not None and count < source.proven:
             return False
         if self.end is None or (self.end.count, self.end_of) != (count, publisher):
             self.end, self.end_at, self.end_of = replace(marker, count=count), now, publisher
@@ -72,7 +97,7 @@ class KeyState:
         """True when everything up to the end marker has come, or will not come any more."""
         if self.end is None:
             return False
-        is_known = self.end_of in self.numbers or not self.numbers or not self.end.count
+        is_known = self.end_of in self.sources or not self.sources or not self.end.count
         has_come = self.received >= self.end.count or self.last_number + 1 >= self.end.count
         is_complete = is_known and has_come
         if is_complete or now - self.end_at <= END_GRACE_S:
@@ -80,12 +105,14 @@ class KeyState:
         return answers is None or self.ender is None or not answers.ask_for(self.ender, self.end.count)
 
     def missing(self, answers: Answers | None) -> int:
-        """How many samples before the end marker have not come."""
-        if self.end is None:
+        """How many samples behind the last one that passed have not come, as far as anybody has said that they are."""
+        ends = {} if self.end is None or self.ender is None else {self.ender: self.end.count}
+        if answers is not None and (ends or self.end is None):
+            passed = {(self.name, *publisher): source.arrived for publisher, source in self.sources.items()}
+            return answers.missing(self.name, passed, ends)
+        if self.end is None or self.last_number < 0:
             return 0
-        if answers is not None and self.ender is not None:
-            return answers.missing(self.ender, self.end.count)
-        return max(0, self.end.count - self.last_number - 1) if self.last_number >= 0 else 0
+        return max(0, self.end.count - self.last_number - 1)
 
 
 @dataclass(slots=True, eq=False)
@@ -128,5 +155,5 @@ class OutputSlot:
         """What has come on a concrete key; ``None`` when it is none of this slot's."""
         state = self.keys.get(name)
         if state is None and keyexpr.intersects(self.expr, name):
-            state = self.keys[name] = KeyState()
+            state = self.keys[name] = KeyState(name=name)
         return state
