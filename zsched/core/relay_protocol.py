@@ -127,7 +127,7 @@ class EndMarker:
     """Start markers among answers: seconds since number 0 was put."""
     slot: int = 0
     """Start markers of inputs: the epoch of the slot that this publisher feeds; 0: it does not say. Of class ``latest``
-    that is all such a marker says."""
+    that is all that a marker with a slot says; one without asks the worker how far it is."""
     is_given_up: bool = False
     """Start markers of inputs: the slot is closed. What of this publisher has not been acknowledged is counted as lost
     by now, or goes to another owner, and shall not be done any more."""

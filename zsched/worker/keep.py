@@ -6,9 +6,9 @@ relay is owed what (`zsched.core.hop.shared`).
 A link that closes (a freeze, a cut) takes with it what was on it, and a put says nothing about that. So every answer of
 class ``reliable`` is kept, at most ``limit`` of an output and `SHARED_BYTES`, of ``latest`` the newest. A relay that
 sees a gap asks at once; one that makes no progress for `RESEND_S`, longer each time, is sent what it lacks once its
-link is there again. Both go to that relay alone, under `AGAIN_CHUNK`: other robots' radios carry nothing twice. One
-that cannot be reached for `FORGET_S` is forgotten. A plain subscriber never acknowledges; for it nothing is kept longer
-than that.
+link is there again (of ``latest`` it is asked first how far it is). Both go to that relay alone, under `AGAIN_CHUNK`:
+other robots' radios carry nothing twice. One that cannot be reached for `FORGET_S` is forgotten. A plain subscriber
+never acknowledges; for it nothing is kept longer than that.
 
 Anybody can put under the key of acknowledgements. What is too large to be one, or comes while too many wait, is dropped
 and counted; what is dropped of a relay's is mended by its next one.
@@ -78,9 +78,9 @@ class Keeper:
         self._is_closed = False
         self._subscriber: zenoh.Subscriber[None] | None = None
 
-    def lane(self, key: str, source_id: zenoh.EntityGlobalId, limit: int) -> KeptLane:
-        """The lane of a new publisher."""
-        state = SharedSender(limit=max(1, limit))
+    def lane(self, key: str, source_id: zenoh.EntityGlobalId, limit: int, *, is_whole: bool = True) -> KeptLane:
+        """The lane of a new publisher; ``is_whole``: of class ``reliable``."""
+        state = SharedSender(limit=max(1, limit), is_whole=is_whole)
         lane = KeptLane(key=key, source_id=source_id, wake=self._wake, state=state)
         with self._lock:
             self._lanes[source_id.eid] = lane

@@ -146,7 +146,9 @@ class Output:
             )
         else:
             publisher = self._session.declare_publisher(key, congestion_control=self._congestion)
-        lane = None if self._keeper is None else self._keeper.lane(key, publisher.id, self._kept)
+        lane = None
+        if self._keeper is not None:
+            lane = self._keeper.lane(key, publisher.id, self._kept, is_whole=not self.is_latest)
         stamped = self._epochs[epoch] = _Stamped(key=key, publisher=publisher, lane=lane)
         for old in sorted(self._epochs)[:-KEPT_EPOCHS]:
             gone = self._epochs.pop(old)

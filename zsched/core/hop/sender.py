@@ -75,8 +75,10 @@ class Sender:
     spare: list[Sent] = field(default_factory=list)
     """What the newest acknowledgement has let go of: until one that goes further, it may be taken back."""
     resend_from: int | None = None
-    is_misheard: bool = False
-    """The receiver believes a start marker that was not ours: ours goes out again."""
+    question: int | None = None
+    """It has been asked how far it is, when so many samples had been put: its next acknowledgement is the answer."""
+    is_start_due: bool = False
+    """Our start marker goes out again: the receiver believes one that was not ours, or is asked how far it is."""
     moved_at: float = 0.0
     """When something was last sent or newly acknowledged (monotonic seconds)."""
     asked_at: float = 0.0
@@ -114,8 +116,8 @@ class Sender:
         """What is to be put now besides new samples; whoever has put it again says so (`resent`)."""
         if not self.may_resend:
             return NOTHING
-        start = self.lowest if self.is_misheard else None
-        self.is_misheard = False
+        start = self.lowest if self.is_start_due else None
+        self.is_start_due = False
         if self.resend_from is None:
             return NOTHING if start is None else Owed(start=start)
         owed = self.kept.owed(self.resend_from, self.count, self.resend_from)
@@ -123,11 +125,17 @@ class Sender:
         return owed._replace(start=start)
 
     def look_after(self, now: float) -> bool:
-        """Have put again what is late; ``False``: nothing is."""
-        is_late = self.may_resend and self.is_late(now)
-        if is_late:
-            self.ask_again(self.arrived, now)
-        return is_late
+        """Have put again what is late; ``False``: nothing is.
+
+        Where not everything is wanted, the receiver is asked first how far it is: it drops what is older than what it
+        has, but would take old numbers in a row for proof that a stranger made its newest jump.
+        """
+        if not self.may_resend or not self.is_late(now):
+            return False
+        self.ask_again(self.arrived, now)
+        if not self.is_whole:
+            self.resend_from, self.question, self.is_start_due = None, self.count, True
+        return True
 
     def announce(self, count: int) -> int:
         """So many numbers from the next one on will be replays; answers the lowest that may come before them."""
@@ -161,7 +169,10 @@ class Sender:
             ended = self._follow(ack, incarnation, now)
         elif before is None or ack.arrived > before.arrived:
             self.moved_at = self.asked_at = now
-        self.is_misheard |= self._mishears(ack)
+        elif self.question == self.count:  # what has been put since makes what is older needless
+            self.resend_from = self.arrived
+        self.question = None
+        self.is_start_due |= self._mishears(ack)
         if self.is_whole:
             self.meet(now)
         is_still = now - self.asked_at > self.pause_s / 3

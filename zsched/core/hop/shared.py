@@ -50,6 +50,8 @@ class Wanted(NamedTuple):
     until: int
     is_asked: bool = False
     """It has said itself that this is missing, so it must hear what is kept no more."""
+    is_question: bool = False
+    """It is only asked how far it is, by a skip of what it has; its answer says what is put again."""
 
 
 @dataclass(slots=True, eq=False)
@@ -67,6 +69,8 @@ class Receiver:
     pause_s: float = RESEND_S
     wanted: Wanted | None = None
     """What is to be put again, until it is taken."""
+    question: int | None = None
+    """It has been asked how far it is, when so many samples had been put: its next acknowledgement is the answer."""
     batch_end: int | None = None
     unreached_since: float | None = None
     heard_at: float = 0.0
@@ -106,6 +110,9 @@ class SharedSender:
 
     limit: int
     """Samples that are kept at most."""
+    is_whole: bool = True
+    """Every sample is wanted (class ``reliable``). If not, a late receiver is asked first how far it is: it drops what
+    is older than what it has, but would take old numbers in a row for proof that a stranger made its newest jump."""
     count: int = 0
     """Samples put so far, and the number of the next one."""
     kept: Kept = field(default_factory=Kept)
@@ -147,6 +154,9 @@ class SharedSender:
         wanted, receiver.wanted, receiver.moved_at = receiver.wanted, None, now
         if not self._is_reached(name, receiver, now, is_reached=is_reached):
             return NOTHING
+        if wanted.is_question:
+            receiver.question = self.count
+            return Owed(skip=receiver.arrived)
         until = min(wanted.until, self.count)
         owed = self.kept.owed(receiver.arrived, until, receiver.waits_for, samples=BATCH, size=BATCH_BYTES)
         end = owed.again[-1].number + 1 if owed.again else wanted.until
@@ -194,6 +204,9 @@ class SharedSender:
             receiver.batch_end = None
             if receiver.arrived < self.count:
                 receiver.wanted = Wanted(self.count)
+        elif receiver.question == self.count and not has_moved:  # what has been put since makes older ones needless
+            receiver.wanted = Wanted(self.count)
+        receiver.question = None
 
     def _add(self, name: str, node: str) -> Receiver:
         """One that is heard for the first time; one that begins another life has another name on the same node."""
@@ -283,7 +296,9 @@ class SharedSender:
         first = self.kept.first(self.count)
         for one in self.receivers.values():
             if self._is_late(one, first, now):
-                one.wanted, one.pause_s = Wanted(self.count), min(2 * one.pause_s, MAX_PAUSE_S)
+                is_question = not self.is_whole and one.arrived < self.count
+                one.wanted = Wanted(self.count, is_question=is_question)
+                one.pause_s = min(2 * one.pause_s, MAX_PAUSE_S)
             one.note_debt(self.count, now, has_moved=False)
         self._let_go(now)
         if not self.receivers:

@@ -234,3 +234,28 @@ def test_a_greeting_is_put_again_with_twice_the_pause_each_time() -> None:
         now += 0.01
     pauses = [after - before for before, after in itertools.pairwise(greeted)]
     assert pauses == pytest.approx([GREET_S, 2 * GREET_S, 4 * GREET_S, MAX_GREET_S, MAX_GREET_S], abs=0.02)
+
+
+def test_class_latest_asks_how_far_the_receiver_is_before_it_puts_anything_again() -> None:
+    """Found by the simulated hop: old numbers in a row passed for proof that a stranger had made the newest jump."""
+    books = lane()
+    for _ in range(6):
+        sent(books, at=10.0)
+    acknowledged(books, 1, 10.0)
+    now = 10.1 + RESEND_S
+    assert books.look_after(now)
+    assert books.take_owed() == Owed(start=0), "it is asked by a start marker, and only that goes out"
+    assert books.take_owed() is NOTHING
+    books.hear(ack(0, 6, lost=4), "1", now + 0.1)  # it has the newest one, and has given up what is older
+    assert books.take_owed() is NOTHING
+    for _ in range(2):
+        sent(books, at=11.0)
+    assert books.look_after(14.0)
+    assert books.take_owed() == Owed(start=1), "the lowest that may be put again, if a word is taken back"
+    books.hear(ack(0, 6, lost=4), "1", 14.1)
+    assert [one.number for one in books.take_owed().again] == [6, 7]
+    assert books.look_after(20.0)
+    sent(books, at=20.0)
+    books.take_owed()
+    books.hear(ack(0, 6, lost=4), "1", 20.1)
+    assert books.take_owed() is NOTHING, "a newer one is on its way, behind which nothing older is wanted"

@@ -1,0 +1,171 @@
+"""A sender with several receivers, without threads: what each of them is owed, and when."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from zsched.core.hop.kept import NOTHING, RESEND_S, Owed
+from zsched.core.hop.serial import SPAN
+from zsched.core.hop.shared import (
+    ASKED_S,
+    BATCH,
+    FORGET_S,
+    LOOK_S,
+    MAX_PAUSE_S,
+    NEWCOMERS_S,
+    TICK_S,
+    SharedSender,
+)
+from zsched.core.relay_protocol import EndMarker, StreamAck
+
+
+def sender(count: int = 0, limit: int = 100, *, first: int = 0, is_whole: bool = True) -> SharedSender:
+    made = SharedSender(limit=limit, count=first, is_whole=is_whole)
+    for number in range(first, first + count):
+        assert made.note_put(None, None, 10, 0.0) == number
+    return made
+
+
+def ack(books: SharedSender, name: str, arrived: int, now: float, **more: Any) -> None:
+    books.hear(name, f"node-{name}", StreamAck(eid=1, first=0, arrived=arrived, processed=arrived, **more), now)
+
+
+def owed(books: SharedSender, name: str, now: float, *, is_reached: bool = True) -> tuple[int | None, list[int]]:
+    one = books.take_owed(name, now, is_reached=is_reached)
+    return one.skip, [sent.number for sent in one.again]
+
+
+def test_each_receiver_is_owed_what_it_lacks_itself() -> None:
+    books = sender(6)
+    ack(books, "a", 1, 1.0, has_gap=True, until=3)
+    ack(books, "b", 6, 1.0)
+    ack(books, "c", 4, 1.0, has_gap=True)
+    assert books.owing() == ("a", "c")
+    assert owed(books, "a", 1.0) == (None, [1, 2])
+    assert owed(books, "b", 1.0) == (None, [])
+    assert owed(books, "c", 1.0) == (None, [4, 5])
+    assert books.owing() == ()
+
+
+def test_what_is_asked_for_once_more_is_on_its_way_for_a_moment() -> None:
+    books = sender(6)
+    ack(books, "a", 1, 1.0, has_gap=True)
+    owed(books, "a", 1.0)
+    ack(books, "a", 1, 1.0 + ASKED_S / 2, has_gap=True)
+    assert books.owing() == ()
+    ack(books, "a", 1, 1.0 + 2 * ASKED_S, has_gap=True)
+    assert books.owing() == ("a",)
+
+
+def test_who_asks_hears_what_is_kept_no_more_and_who_does_not_ask_is_only_late() -> None:
+    books = sender(6, limit=2)
+    ack(books, "a", 1, 1.0, has_gap=True, until=5)
+    assert owed(books, "a", 1.0) == (4, [4])
+    books.look_after(1.0 + RESEND_S)
+    assert owed(books, "a", 2.0) == (None, [4, 5])
+
+
+def test_late_ones_are_put_again_with_more_patience_each_time_until_there_is_progress() -> None:
+    books, now, at = sender(6), 1.0, []
+    ack(books, "a", 1, now)
+    while now < 9.0:
+        now += 0.01
+        books.look_after(now)
+        if books.owing():
+            at.append(now)
+            assert owed(books, "a", now) == (None, [1, 2, 3, 4, 5])
+    pauses = [round(after - before, 1) for before, after in zip([1.0, *at], at, strict=False)]
+    assert pauses[:4] == [RESEND_S, 2 * RESEND_S, 4 * RESEND_S, MAX_PAUSE_S]
+    ack(books, "a", 2, now)
+    books.look_after(now + RESEND_S + 0.01)
+    assert books.owing() == ("a",)
+
+
+def test_much_goes_in_parts_and_progress_brings_the_next() -> None:
+    books = sender(2 * BATCH + 1, limit=4 * BATCH)
+    ack(books, "a", 0, 1.0, has_gap=True)
+    assert owed(books, "a", 1.0) == (None, list(range(BATCH)))
+    ack(books, "a", BATCH - 1, 1.1)
+    assert books.owing() == ()
+    ack(books, "a", BATCH, 1.2)
+    assert owed(books, "a", 1.2) == (None, list(range(BATCH, 2 * BATCH)))
+
+
+def test_who_is_not_reached_is_owed_nothing_and_forgotten_in_the_end() -> None:
+    books = sender(3)
+    for now in (1.0, 1.0 + FORGET_S, 1.5 + FORGET_S):
+        assert "a" in books.receivers or now == 1.0
+        ack(books, "a", 1, now, has_gap=True)
+        assert owed(books, "a", now, is_reached=False) == (None, [])
+    assert books.receivers == {}
+    assert books.had == {"a": ("node-a", 1)}
+
+
+def test_newcomers_find_the_beginning_for_a_while() -> None:
+    books = sender(3)
+    ack(books, "a", 3, 1.0)
+    books.look_after(NEWCOMERS_S - 0.01)
+    assert len(books.kept) == 3
+    books.look_after(NEWCOMERS_S + 0.01)
+    assert len(books.kept) == 0
+    ack(books, "b", 0, NEWCOMERS_S + 0.02, has_gap=True, until=3)
+    assert owed(books, "b", NEWCOMERS_S + 0.02) == (3, [])
+    assert books.skip_marker("b", 3, 5.0) == EndMarker(epoch=0, count=3, age_s=5.0)
+
+
+def test_of_class_latest_a_late_one_is_asked_first_how_far_it_is() -> None:
+    books = sender(6, is_whole=False)
+    ack(books, "a", 1, 1.0)
+    books.look_after(2.0)
+    assert books.take_owed("a", 2.0, is_reached=True) == Owed(skip=1)
+    ack(books, "a", 1, 2.1)
+    assert owed(books, "a", 2.1) == (None, [1, 2, 3, 4, 5])
+    books.look_after(5.0)
+    assert owed(books, "a", 5.0) == (1, [])
+    books.note_put(None, None, 10, 5.0)
+    ack(books, "a", 1, 5.1)
+    assert books.take_owed("a", 5.1, is_reached=True) is NOTHING, "a newer one is on its way"
+
+
+def test_the_end_marker_is_put_again_for_who_lacks_nothing_else() -> None:
+    books, marker = sender(2), EndMarker(epoch=1, count=2)
+    ack(books, "a", 2, 1.0)
+    books.note_end(marker, 1.0)
+    assert books.needs_way("a")
+    books.look_after(1.1 + RESEND_S)
+    assert books.take_owed("a", 2.0, is_reached=True) == Owed(end=marker)
+    ack(books, "a", 2, 2.1, is_ended=True)
+    assert not books.needs_way("a")
+    books.look_after(NEWCOMERS_S + 1.0)
+    assert books.next_deadline(NEWCOMERS_S + 1.0) is None
+
+
+def test_it_is_looked_after_while_anything_is_kept() -> None:
+    books = sender()
+    assert books.next_deadline(1.0) is None
+    books.note_put(None, None, 10, 1.0)
+    assert books.next_deadline(1.0) == 1.0 + TICK_S
+    books.look_after(1.1 + FORGET_S)
+    assert books.next_deadline(1.1 + FORGET_S) is None
+
+
+def test_who_is_expected_is_looked_for_until_it_is_known_or_not_there() -> None:
+    books = sender(1)
+    for name in ("a", "b", "c"):
+        assert books.settled(name, 1.0) == 0
+    ack(books, "a", 1, 1.0)
+    assert books.in_doubt(1.0) == ()
+    assert books.in_doubt(1.0 + LOOK_S) == ("b", "c")
+    books.decide("b", 1.0 + LOOK_S, is_there=False)
+    books.decide("c", 1.0 + LOOK_S, is_there=True)
+    assert (books.settled("b", 1.2), books.settled("c", 1.2)) == (1, 0)
+    assert books.in_doubt(1.2) == ("c",)
+    assert (books.needs_way("b"), books.needs_way("c")) == (False, True)
+    books.give_up()
+    assert (books.settled("c", 1.2), books.in_doubt(1.2)) == (1, ())
+
+
+def test_numbers_go_on_beyond_what_travels() -> None:
+    books = sender(6, first=SPAN - 3)
+    ack(books, "a", 1, 1.0, has_gap=True, until=2)
+    assert owed(books, "a", 1.0) == (None, [SPAN + 1])
