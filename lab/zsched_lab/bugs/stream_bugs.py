@@ -10,6 +10,7 @@ from zsched_lab.bugs.core_bugs import Bug
 
 ACKS, RECEIVER, SERIAL = "zsched.hop.acknowledger", "zsched.core.hop.receiver", "zsched.core.hop.serial"
 INPUTS, SHARED = "zsched.worker.inputs", "zsched.core.hop.shared"
+KEPT, HELD, SLOTS = "zsched.core.hop.kept", "zsched.core.hop.held", "zsched.relay.streams.slots"
 GREETINGS, SENDER, OUTLET = "zsched.relay.streams.greetings", "zsched.core.hop.sender", "zsched.relay.streams.outlet"
 
 _GREETINGS = ("tests/parts/relay/streams/test_greetings.py",)
@@ -18,6 +19,7 @@ _ACKS = ("tests/unit/hop/test_acknowledger.py",)
 _RECEIVER = ("tests/unit/core/hop/test_receiver.py",)
 _HOP = ("tests/sim/test_hop.py",)
 _SENDER = ("tests/unit/core/hop/test_sender.py",)
+_SHARED = ("tests/unit/core/hop/test_shared.py",)
 _WORKER = "tests/parts/worker/test_worker.py"
 _FROZEN = "tests/integration/test_relay_frozen_moves.py"
 _REPLAY = "tests/integration/test_relay_replay.py"
@@ -410,5 +412,96 @@ STREAM_BUGS = (
         "profile = replace(profile, progress=progress, relay=relay)",
         "profile = replace(profile, progress=progress)",
         ("tests/unit/core/test_node.py",),
+    ),
+    _bug(
+        "what class latest has lost is put again by nobody",
+        SENDER,
+        "if not self.may_resend or not self.is_late(now):",
+        "if not self.is_whole or not self.may_resend or not self.is_late(now):",
+        _HOP,
+    ),
+    _bug(
+        "a late receiver of class latest is sent old values unasked",
+        SENDER,
+        "            self.resend_from, self.question, self.is_start_due = None, self.count, True",
+        "            pass",
+        _SENDER,
+    ),
+    _bug(
+        "a late receiver of class latest is sent old values behind a newer one",
+        SENDER,
+        "elif self.question == self.count:",
+        "elif self.question is not None:",
+        _SENDER,
+    ),
+    _bug(
+        "one old number takes a jump back",
+        RECEIVER,
+        "RETURN: Final = 3",
+        "RETURN: Final = 1",
+        _RECEIVER,
+    ),
+    _bug(
+        "a skip of what is kept no more is not told",
+        KEPT,
+        "skip=first if first > waits_for else None",
+        "skip=None",
+        _SENDER,
+    ),
+    _bug(
+        "a relay that is late is sent nothing",
+        SHARED,
+        "            if self._is_late(one, first, now):",
+        "            if self._is_late(one, self.count, now) and False:",
+        _HOP,
+    ),
+    _bug(
+        "a relay that asks is told to skip what is kept",
+        SHARED,
+        "skip=owed.skip if wanted.is_asked else None",
+        "skip=until if wanted.is_asked else None",
+        _HOP,
+    ),
+    _bug(
+        "what a slower relay lacks is let go of",
+        SHARED,
+        "self.kept.let_go(min(one.arrived for",
+        "self.kept.let_go(max(one.arrived for",
+        _HOP,
+    ),
+    _bug(
+        "a relay that comes late finds no beginning",
+        SHARED,
+        "now - self.began_at < NEWCOMERS_S",
+        "now < self.began_at",
+        _SHARED,
+    ),
+    _bug(
+        "a relay that lacks much is sent the first part only",
+        SHARED,
+        "receiver.batch_end = end if end < wanted.until else None",
+        "receiver.batch_end = None",
+        _SHARED,
+    ),
+    _bug(
+        "a late relay is sent old values of class latest unasked",
+        SHARED,
+        "is_question = not self.is_whole and one.arrived < self.count",
+        "is_question = False",
+        _SHARED,
+    ),
+    _bug(
+        "an input is done before the one in front of it",
+        HELD,
+        "if not owed and not is_unanswered and line is None:",
+        "if not owed and not is_unanswered:",
+        ("tests/unit/worker/test_debts.py",),
+    ),
+    _bug(
+        "a beginning that no relay gets is in no counter",
+        SLOTS,
+        "serial if first is None else first",
+        "serial",
+        ("tests/parts/relay/streams/test_answers.py",),
     ),
 )

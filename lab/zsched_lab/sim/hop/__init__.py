@@ -1,0 +1,1 @@
+"""Numbered hops on a bad way: the real senders and receivers, everything between them simulated, by seed."""
