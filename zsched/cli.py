@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from zsched.commands.common import CliError, Json, Verb, print_json
+from zsched.commands.example import Example, write_example
 from zsched.commands.program import Program
 from zsched.commands.stream_verbs import stream_app
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE
@@ -114,6 +115,12 @@ def up(
 
 @app.command(cls=Verb)
 def init(
+    folder: Annotated[
+        Path | None, typer.Argument(metavar="DIR", help="With --example: where; without it the current folder.")
+    ] = None,
+    example: Annotated[
+        Example | None, typer.Option("--example", help="Write an example into DIR instead; nothing is overwritten.")
+    ] = None,
     config: ConfigOption = None,
     node: NameOption = None,
     state_dir: StateOption = None,
@@ -133,7 +140,16 @@ def init(
     Refuses in another node's folder, and when a node that can be reached knows this name as an elector that has voted.
     If too many states are lost to agree, stop every daemon, and run it on every node with the --generation that
     `zsched status` names. That is refused while the fleet agrees, and where a good state would be lost.
+
+    With --example it writes no state but a small task: a fleet file, a worker, an application (see `zsched dev`).
     """
+    if example is not None:
+        if config or node or state_dir or generation or force or settle:
+            raise CliError(EXIT_USAGE, "--example goes with a folder only")
+        _write_example(example, folder or Path())
+        return
+    if folder is not None:
+        raise CliError(EXIT_USAGE, f"{folder}: a folder goes with --example; name the state folder with --state-dir")
     from zsched import paths as places  # noqa: PLC0415 - each verb imports what it needs
     from zsched.adapters.machine import core_speed  # noqa: PLC0415 - likewise
     from zsched.config.load import load_fleet, require_node  # noqa: PLC0415 - ruamel.yaml is slow to import
@@ -143,23 +159,30 @@ def init(
     fleet = load_fleet(file)
     name = _node_name(node)
     require_node(fleet, name, file)
-    folder = places.state_folder(state_dir, os.environ)
+    state = places.state_folder(state_dir, os.environ)
     if settle:
-        done = settle_dispute(fleet, name, folder)
+        done = settle_dispute(fleet, name, state)
         typer.echo(f"{name}: {'settled; restart its daemon' if done else 'there was no dispute'}")
         return
     if force and not generation:
         raise CliError(EXIT_USAGE, "--force goes with --generation G")
-    standing = standing_state(fleet, name, folder)
+    standing = standing_state(fleet, name, state)
     if standing is not None and generation in (0, standing.generation):
         text = f"{name} has its state in fleet {fleet.name}, generation {standing.generation}: nothing to do"
-        typer.echo(f"{folder}: {text}")
+        typer.echo(f"{state}: {text}")
         return
-    heard = check_blank(fleet, name, folder, generation, standing, is_forced=force)
-    path = init_state(fleet, name, folder, generation)
+    heard = check_blank(fleet, name, state, generation, standing, is_forced=force)
+    path = init_state(fleet, name, state, generation)
     _say(_heard(heard, name, generation, is_elector=name in fleet.electors))
-    typer.echo(f"a core of this machine has speed {core_speed.kept_or_new(folder):.2f}")
+    typer.echo(f"a core of this machine has speed {core_speed.kept_or_new(state):.2f}")
     typer.echo(f"{path}: blank state of {name} in fleet {fleet.name}, generation {generation}")
+
+
+def _write_example(example: Example, folder: Path) -> None:
+    for path in write_example(example, folder):
+        typer.echo(str(path))
+    where = "" if folder == Path() else f"cd {folder} && "
+    _say(f"next: {where}zsched dev; in another terminal the application, as README.md there says")
 
 
 def _heard(heard: Heard, name: str, generation: int, *, is_elector: bool) -> str:

@@ -34,6 +34,7 @@ FLOORS: Final[tuple[tuple[str, int, str], ...]] = (
     (r"(relay|worker)(?:\..+)?", 5, "\\1"),
     (r"runtime(\..+)?", 6, "runtime"),
     (r"tasks(?:\.(\w+))?(?:\..+)?", 7, "tasks: \\1"),
+    (r"examples(?:\.(\w+))?(?:\..+)?", 7, "tasks: example \\1"),  # programs that `zsched init --example` copies
     (r"daemon", 7, "daemon"),
     (r"commands(\..+)?", 8, "commands"),
     (r"(cli|__main__)", 9, "cli"),

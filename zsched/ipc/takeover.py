@@ -34,7 +34,7 @@ from zsched.ipc.protocol import RelayHello, RelayHere, RelayRefused
 from zsched.wire import codec as wire
 
 PACKAGE: Final = Path(__file__).parents[1]
-_NOT_THE_RELAYS: Final = frozenset({"tasks", "commands", "cli.py", "__main__.py"})
+_NOT_THE_RELAYS: Final = frozenset({"tasks", "examples", "dev", "commands", "cli.py", "__main__.py"})
 PROTOCOL: Final = 1
 """Raised whenever an older relay would misunderstand a newer daemon."""
 GREETING_S: Final = 1.0

@@ -1,0 +1,50 @@
+"""`zsched init --example`: writes a small complete example, a fleet file, a worker and an application, into a folder.
+
+Knows: the examples that the package holds, and that nothing is overwritten. Does not know: what is in them.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Final
+
+from zsched.commands.common import CliError
+from zsched.exits import EXIT_FAILED
+from zsched.files import write_regular
+
+EXAMPLES: Final = Path(__file__).parents[1] / "examples"
+
+
+class Example(StrEnum):
+    """Which way the example's worker goes."""
+
+    PYTHON = "python"
+    ROS2 = "ros2"
+    ZENOH = "zenoh"
+
+
+def files_of(example: Example) -> dict[str, bytes]:
+    """{name: content} of an example, by name."""
+    return {path.name: path.read_bytes() for path in sorted((EXAMPLES / example.value).iterdir()) if path.is_file()}
+
+
+def write_example(example: Example, folder: Path) -> tuple[Path, ...]:
+    """Write the example's files into ``folder``, which is made if it is not there; their paths.
+
+    Raises:
+        CliError: a file of that name is there (nothing is written then), or the folder cannot be written.
+    """
+    files = files_of(example)
+    there = [name for name in files if (folder / name).exists() or (folder / name).is_symlink()]
+    if there:
+        raise CliError(
+            EXIT_FAILED, f"{folder} has {', '.join(there)} already, and nothing was written; name another folder"
+        )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, content in files.items():
+            write_regular(folder / name, content)
+    except OSError as error:
+        raise CliError(EXIT_FAILED, f"cannot write {error.filename or folder}: {error.strerror}") from error
+    return tuple(folder / name for name in files)
