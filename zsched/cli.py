@@ -197,6 +197,26 @@ def _heard(heard: Heard, name: str, generation: int, *, is_elector: bool) -> str
     return f"{said}: none remembers a vote of {name}{where}" if is_elector else said
 
 
+@app.command(cls=Verb)
+def dev(
+    file: Annotated[Path | None, typer.Argument(metavar="FILE", help="Fleet file; else ./fleet.yaml.")] = None,
+    task: Annotated[
+        list[str] | None,
+        typer.Option("--task", metavar="[TASK=]FILE", help="This worker in place of the fleet file's."),
+    ] = None,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="All that the daemons log.")] = False,
+) -> None:
+    """Run every node of a fleet file on this machine, to try a task of your own; nothing of it stays.
+
+    It prints where applications join, and starts a worker again when its file is saved. On a terminal keys move the
+    task, kill its machine and load it.
+    """
+    from zsched.commands.dev import DevOptions  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.dev import dev as run  # noqa: PLC0415 - as above
+
+    raise typer.Exit(run(DevOptions(file=file, workers=task or (), is_verbose=verbose)))
+
+
 # --- questions -------------------------------------------------------------------------------------------------------
 
 

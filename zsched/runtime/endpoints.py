@@ -22,6 +22,8 @@ MIN_PORT: Final = 20_000
 """Below it there are more registered services."""
 MAX_PORT: Final = 65_535
 PORT_TRIES: Final = 64
+DATA_PORT: Final = 7458
+"""Where the relay of a node without `listen: {data: ...}` listens: its host's applications need no fleet file."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -128,6 +130,36 @@ def free_port(outgoing: range | None = None) -> int:
             with contextlib.suppress(OSError):
                 return _bound_port(port)
     return _bound_port(0)
+
+
+@dataclass(slots=True)
+class PortClaim:
+    """A port that this process, and no other zsched of this machine, may listen on until it closes the claim."""
+
+    port: int
+    _name: socket.socket
+
+    def close(self) -> None:
+        """Give it back."""
+        self._name.close()
+
+
+def claim_port(port: int) -> PortClaim | None:
+    """Claim a TCP port; ``None`` when another zsched of this network namespace holds it, or somebody listens there.
+
+    Of two daemons that start at once both would find the port free; an abstract socket has one name, lives in the same
+    namespace as the port, and ends with its process, however that ends.
+    """
+    name = socket.socket(socket.AF_UNIX)
+    try:
+        name.bind(f"\0zsched/port/{port}")
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # connections that are over do not count
+            probe.bind(("0.0.0.0", port))  # noqa: S104 - only asks the kernel, never listens
+    except OSError:
+        name.close()
+        return None
+    return PortClaim(port=port, _name=name)
 
 
 def _outgoing_ports() -> range:

@@ -1,0 +1,101 @@
+"""The small parts of a development run: shares of the CPUs, files that were saved, lines of a daemon's log."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from zsched.cli import app
+from zsched.commands.common import CliError
+from zsched.commands.dev import DevOptions, _commands, dev, json5
+from zsched.config.load import load_fleet
+from zsched.dev.nodes import shares
+from zsched.dev.run import _parts
+from zsched.dev.watch import Watched
+
+EXAMPLE = Path(__file__).parents[3] / "zsched" / "examples" / "python" / "fleet.yaml"
+
+
+@pytest.mark.parametrize(
+    ("nodes", "cpus", "expected"),
+    [
+        ("ab", {0, 1}, {"a": {0}, "b": {1}}),
+        ("ab", {3, 5, 7, 8}, {"a": {3, 7}, "b": {5, 8}}),
+        ("abc", {0, 1}, {"a": {0}, "b": {1}, "c": {0}}),
+        ("ab", {0}, {}),
+        ("a", {0, 1}, {}),
+    ],
+)
+def test_each_cpu_is_one_node_s_as_far_as_they_go(nodes: str, cpus: set[int], expected: dict[str, set[int]]) -> None:
+    assert shares(list(nodes), cpus) == expected
+
+
+def test_a_saved_file_is_noticed_once_and_one_that_is_away_is_not(tmp_path: Path) -> None:
+    worker, other = tmp_path / "worker.py", tmp_path / "other.py"
+    worker.write_text("1")
+    other.write_text("1")
+    commands = {"shout": ("python", "worker.py", "--fast"), "sing": ("python", str(other)), "none": ()}
+    watched = Watched(commands, tmp_path)
+    assert watched.files == {"shout": (worker,), "sing": (other,), "none": ()}
+    assert watched.changed() == {}
+    worker.write_text("1 2")
+    assert watched.changed() == {"shout": "worker.py"}
+    assert watched.changed() == {}
+    other.unlink()  # as an editor does for a moment
+    assert watched.changed() == {}
+    other.write_text("3")
+    os.utime(other, ns=(1, 1))
+    assert watched.changed() == {"sing": "other.py"}
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("2026-01-02 03:04:05,678 INFO zsched.worker.shout hello  you", ("INFO", "zsched.worker.shout", "hello  you")),
+        ("Traceback (most recent call last): of the", ("", "", "Traceback (most recent call last): of the")),
+        ("", ("", "", "")),
+    ],
+)
+def test_a_daemons_line_has_level_logger_and_text(line: str, expected: tuple[str, str, str]) -> None:
+    assert _parts(line) == expected
+
+
+def test_a_worker_is_named_alone_or_with_its_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my.py").write_text("")
+    (tmp_path / "binary").write_text("")
+    fleet = load_fleet(EXAMPLE)
+    assert _commands(fleet, EXAMPLE, ["my.py"]) == {"shout": ("python", str(tmp_path / "my.py"))}
+    assert _commands(fleet, EXAMPLE, ["shout=binary"]) == {"shout": (str(tmp_path / "binary"),)}
+    several = replace(fleet, tasks=(*fleet.tasks, replace(fleet.tasks[0], name="sing")))
+    for tasks, given, told in (
+        (fleet, "nowhere.py", r"nowhere\.py is no file"),
+        (fleet, "sout=my.py", "no task 'sout'; did you mean shout"),
+        (several, "my.py", r"several tasks \(shout, sing\).*--task TASK=worker.py"),
+    ):
+        with pytest.raises(CliError, match=told) as error:
+            _commands(tasks, EXAMPLE, [given])
+        assert error.value.code == 2
+
+
+def test_without_a_file_it_says_how_to_begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("ZSCHED_CONFIG", str(tmp_path / "none.yaml"))
+    with pytest.raises(CliError, match="zsched init --example python") as told:
+        dev(DevOptions(file=None, workers=()))
+    assert told.value.code == 78
+
+
+def test_a_faulty_file_is_told_as_check_tells_it(tmp_path: Path) -> None:
+    (tmp_path / "fleet.yaml").write_text("fleet: x\n")
+    result = CliRunner().invoke(app, ["dev", str(tmp_path / "fleet.yaml")])
+    assert result.exit_code == 78
+    assert "fleet.yaml:1:1" in result.stderr
+
+
+def test_the_snippet_is_the_configuration_of_a_client() -> None:
+    assert json5("tcp/127.0.0.1:7458").startswith('{mode: "client", connect: {endpoints: ["tcp/127.0.0.1:7458"]}')

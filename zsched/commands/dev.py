@@ -1,0 +1,185 @@
+"""`zsched dev`: stages a fleet file for this machine, says how applications join, and runs it until somebody ends it.
+
+Knows: options, what is printed. Does not know: how nodes are run (`zsched.dev`).
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from zsched import paths as places
+from zsched.commands.common import CliError, Json, nearest, wants_color
+from zsched.commands.page import harmless
+from zsched.commands.report import render_status
+from zsched.config.load import load_fleet
+from zsched.core.route.templates import routes_for
+from zsched.core.values.fleet import Fleet, TaskSpec
+from zsched.core.values.model import NodeId, NodeKind, TaskId
+from zsched.core.values.plan import Direction
+from zsched.dev.fleet import Place, Staged, stage
+from zsched.dev.nodes import Nodes, shares
+from zsched.dev.run import KEYS, Run, stopped_by_signal
+from zsched.dev.terminal import Keys
+from zsched.dev.watch import Watched
+from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE
+from zsched.runtime.endpoints import DATA_PORT, PortClaim, claim_port, free_port
+
+HERE: Final = Path("fleet.yaml")
+PORT_STEP: Final = 10
+"""From one robot's data port to the next one's."""
+NARROW: Final = 80
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DevOptions:
+    """What the verb was given."""
+
+    file: Path | None
+    workers: Sequence[str]
+    is_verbose: bool = False
+
+
+def dev(options: DevOptions) -> int:
+    """Run the fleet until it is ended; the exit code.
+
+    Raises:
+        CliError: there is no such file or task.
+        ConfigError: the fleet file has faults.
+        AdapterError: a node cannot be prepared.
+    """
+    file = _file(options.file)
+    fleet = load_fleet(file)
+    commands = _commands(fleet, file, options.workers)
+    with ExitStack() as stack:
+        spots = _places(fleet, stack)
+        staged = stage(file, spots, commands)
+        candidates = sorted({node for task in fleet.tasks for node in task.candidates})
+        cpus = shares(candidates, os.sched_getaffinity(0))
+        folder = file.absolute().parent
+        words = {**{task.name: task.worker.command for task in fleet.tasks}, **commands}
+        nodes = Nodes(fleet, staged.text, folder, cpus)
+        stop = stack.enter_context(stopped_by_signal())
+        keys = stack.enter_context(Keys())
+        with nodes:
+            _introduce(fleet, file, nodes, spots, staged)
+            _say(f"keys: {KEYS}" if keys.is_there else "no terminal, no keys: Ctrl-C or SIGTERM ends it")
+            run = Run(nodes, Watched(words, folder), say=_say, show=_show, stop=stop, is_verbose=options.is_verbose)
+            code = run.run(keys)
+            _say("ends")
+    if nodes.left_behind:
+        raise CliError(EXIT_FAILED, f"could not be removed: {', '.join(nodes.left_behind)}")
+    return code
+
+
+def _file(given: Path | None) -> Path:
+    if given is not None:
+        return given
+    file = HERE if HERE.exists() else places.config_path(None, os.environ)
+    if not file.exists():
+        raise CliError(
+            EXIT_CONFIG,
+            f"no {HERE} here, and no {file}; name the fleet file, or begin with `zsched init --example python`",
+        )
+    return file
+
+
+def _commands(fleet: Fleet, file: Path, workers: Sequence[str]) -> dict[TaskId, tuple[str, ...]]:
+    """{task: command} of every ``--task [TASK=]PROGRAM``; a Python file runs by this interpreter."""
+    names = [task.name for task in fleet.tasks]
+    found: dict[TaskId, tuple[str, ...]] = {}
+    for given in workers:
+        task, equals, program = given.partition("=")
+        if not equals and len(names) > 1:
+            text = f"{file} has several tasks ({', '.join(names)}); say whose worker it is: --task TASK=worker.py"
+            raise CliError(EXIT_USAGE, text)
+        if not equals:
+            task, program = names[0], given
+        if task not in names:
+            raise CliError(EXIT_USAGE, f"--task {given}: {file} has no task {task!r}{nearest(task, names)}")
+        path = Path(program).absolute()
+        if not path.is_file():
+            raise CliError(EXIT_USAGE, f"--task {given}: {path} is no file")
+        found[task] = ("python", str(path)) if path.suffix == ".py" else (str(path),)
+    return found
+
+
+def _places(fleet: Fleet, stack: ExitStack) -> dict[NodeId, Place]:
+    """Where each node listens: the first robot where a robot's relay always does, if that port is free."""
+    robots = [node.name for node in fleet.nodes if node.kind is NodeKind.ROBOT]
+    taken: set[int] = set()
+
+    def free() -> str:
+        port = free_port()
+        while port in taken:
+            port = free_port()
+        taken.add(port)
+        return f"tcp/127.0.0.1:{port}"
+
+    def joins(name: NodeId) -> str:
+        claim: PortClaim | None = None
+        if name in robots:
+            claim = claim_port(DATA_PORT + PORT_STEP * robots.index(name))
+        if claim is None:
+            return free()
+        stack.callback(claim.close)
+        return f"tcp/127.0.0.1:{claim.port}"
+
+    return {
+        node.name: Place(control=free(), data=joins(node.name))
+        if node.local is None
+        else Place(control=free(), data=free(), local=joins(node.name))
+        for node in fleet.nodes
+    }
+
+
+# --- what is printed -------------------------------------------------------------------------------------------------
+
+
+def _introduce(fleet: Fleet, file: Path, nodes: Nodes, spots: Mapping[NodeId, Place], staged: Staged) -> None:
+    """Everything that somebody needs who writes an application."""
+    _say(f"{file}: fleet {fleet.name}, {len(nodes.names)} nodes on this machine; nothing of it stays")
+    for text in staged.left_out:
+        _say(f"differs from the field: {text}")
+    width = max(map(len, nodes.names))
+    for name in nodes.names:
+        cpus = nodes.cpus.get(name)
+        share = f", CPU {' '.join(map(str, sorted(cpus)))}" if cpus else ""
+        _say(f"{name:{width}}  {fleet.node(name).kind.value:5}  data endpoint {spots[name].joins}{share}")
+    if not nodes.cpus:
+        _say("one CPU only, or one candidate: all nodes look alike, and load moves nothing")
+    robot = next((name for name in nodes.names if fleet.node(name).kind is NodeKind.ROBOT), nodes.names[0])
+    for task in fleet.tasks:
+        _say_streams(task, robot)
+    config = json5(spots[robot].joins)
+    print(f"\nAn application of {robot} in Python:\n")
+    print(f"    import zenoh\n    session = zenoh.open(zenoh.Config.from_json5('{config}'))")
+    print(f"\nAny other zenoh program, as its JSON5 file:\n\n    {config}\n")
+    _say(f"another terminal: zsched status --runtime-dir {nodes.folder} --node {robot}")
+
+
+def json5(endpoint: str) -> str:
+    """The zenoh configuration of an application that joins at ``endpoint``."""
+    return f'{{mode: "client", connect: {{endpoints: ["{endpoint}"]}}, scouting: {{multicast: {{enabled: false}}}}}}'
+
+
+def _say_streams(task: TaskSpec, robot: NodeId) -> None:
+    routes = routes_for(task, robot, task.candidates[0], 1)
+    keys = {way: [one for one in routes if one.direction is way] for way in Direction}
+    told = [f"publishes {', '.join(one.from_expr for one in keys[Direction.INPUT])}"] if keys[Direction.INPUT] else []
+    told += [f"subscribes to {', '.join(one.to_expr for one in keys[Direction.OUTPUT])}"] * bool(keys[Direction.OUTPUT])
+    told += [f"asks {', '.join(one.from_expr for one in keys[Direction.SERVICE])}"] * bool(keys[Direction.SERVICE])
+    _say(f"{task.name}: an application of {robot} {', '.join(told)}")
+
+
+def _say(text: str) -> None:
+    print(f"dev: {harmless(text)}", flush=True)
+
+
+def _show(status: Json) -> None:
+    print(render_status(status, max(shutil.get_terminal_size().columns, NARROW), color=wants_color(False)), flush=True)
