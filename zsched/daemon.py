@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import faulthandler
+import functools
 import gc
 import logging
 import os
@@ -47,7 +48,7 @@ from zsched.log_limit import limit_handlers
 from zsched.runtime import tls as daemon_tls
 from zsched.runtime.access import StreamAccess, joins_at
 from zsched.runtime.descriptors import take_descriptors
-from zsched.runtime.endpoints import Endpoints, endpoints_for, free_port, is_here
+from zsched.runtime.endpoints import DATA_PORT, Endpoints, claim_port, endpoints_for, free_port, is_here
 from zsched.runtime.leaving import Leaving
 from zsched.runtime.memory import shared_memory_objection
 from zsched.runtime.sampler import Sampler
@@ -108,7 +109,9 @@ class Daemon:
         with state_file, contextlib.ExitStack() as stack:
             durable, problem = self._restore(state_file)
             incarnation = durable.incarnation if durable is not None else wall_tenths()
-            points = endpoints_for(self._fleet, self._spec, self._data_port, is_here, self._protocol)
+            points = endpoints_for(
+                self._fleet, self._spec, functools.partial(self._data_port, stack), is_here, self._protocol
+            )
             self._handle_signals(stack)  # first: a stop that comes while things open is an orderly one, too
             shell = self._build(stack, state_file, incarnation, points)
             node = Node(
@@ -163,11 +166,17 @@ class Daemon:
             return None, str(error)
         return state, None
 
-    def _data_port(self) -> int:
-        """A port for the data session: that of the relay that may be taken over, else any that is free."""
+    def _data_port(self, stack: contextlib.ExitStack) -> int:
+        """A port for the data session: that of the relay that may be taken over, else the default, else a free one."""
         note = self._door.note()
         port = "" if note is None else note.listen.partition("#")[0].rpartition(":")[2]
-        return int(port) if port.isdigit() else free_port()
+        if port.isdigit():
+            return int(port)
+        claim = claim_port(DATA_PORT)
+        if claim is None:
+            return free_port()
+        stack.callback(claim.close)
+        return claim.port
 
     def _build(self, stack: contextlib.ExitStack, state_file: StateFile, incarnation: int, points: Endpoints) -> Shell:
         """Open the adapters; each is closed by ``stack`` in the reverse order."""

@@ -34,7 +34,16 @@ from zsched.errors import AdapterError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_OK
 from zsched.log_limit import BURST, RATE_HZ
 from zsched.paths import socket_path
-from zsched.runtime.endpoints import MAX_PORT, MIN_PORT, PORT_RANGE, Endpoints, endpoints_for, free_port, is_here
+from zsched.runtime.endpoints import (
+    MAX_PORT,
+    MIN_PORT,
+    PORT_RANGE,
+    Endpoints,
+    claim_port,
+    endpoints_for,
+    free_port,
+    is_here,
+)
 from zsched.runtime.sampler import Sampler
 from zsched.runtime.shell import Inbox
 from zsched.sessions.config import worker_config
@@ -192,6 +201,44 @@ def test_free_port_is_any_when_no_other_is_free() -> None:
         with contextlib.suppress(OSError):  # somebody else has it: as good
             taken.bind(("127.0.0.1", MAX_PORT))
         assert free_port(range(1024, MAX_PORT)) not in (0, MAX_PORT)
+
+
+def test_a_port_is_claimed_by_one_of_several_that_find_it_free() -> None:
+    port = free_port()
+    first = claim_port(port)
+    assert first is not None
+    assert (first.port, claim_port(port)) == (port, None)
+    first.close()
+    second = claim_port(port)
+    assert second is not None
+    second.close()
+
+
+def test_a_port_on_which_somebody_listens_is_not_claimed() -> None:
+    port = free_port()
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", port))
+        other.listen()
+        assert claim_port(port) is None
+    after = claim_port(port)
+    assert after is not None, "the refused claim was given back"
+    after.close()
+
+
+def test_a_node_without_a_data_endpoint_takes_the_default_port_and_the_next_one_here_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Applications find a robot's relay without the fleet file; several daemons on one machine are a lab."""
+    default = free_port()
+    monkeypatch.setattr(daemon, "DATA_PORT", default)
+    file = tmp_path / "fleet.yaml"
+    file.write_text(json.dumps(echo_fleet(robots=1, edges=1)))
+    options = daemon.Options(config=file, node="robot1", state_dir=tmp_path / "state", runtime_dir=tmp_path)
+    with contextlib.ExitStack() as first, contextlib.ExitStack() as second:
+        assert daemon.Daemon(options)._data_port(first) == default
+        assert daemon.Daemon(options)._data_port(second) != default
+        first.close()
+        assert daemon.Daemon(options)._data_port(second) == default
 
 
 # --- the sampler -----------------------------------------------------------------------------------------------------

@@ -400,7 +400,7 @@ def _route(page: Page, status: Json, task: Json) -> None:
     prefix, parts = f"{task['name']}/", []
     for stream in task["streams"]:
         name, drops = stream["stream"].removeprefix(prefix), stream["drops"]
-        seen = "nothing yet" if stream["last_seen_s"] is None else f"last {span(stream['last_seen_s'])} ago"
+        seen = _awaited(status, stream) if stream["last_seen_s"] is None else f"last {span(stream['last_seen_s'])} ago"
         text = f"{name} {stream['messages']} msg {size(stream['bytes'])}, {seen}"
         told = {
             "in flight": stream.get("in_flight"),
@@ -427,6 +427,15 @@ def _route(page: Page, status: Json, task: Json) -> None:
         parts.append((f"applications here join at {', '.join(status['joins_at'])} (mode client)", "dim"))
     has_streams = bool(task["streams"])
     page.block("ROUTE", *([] if has_streams else [("no streams here", "dim")]), *parts)
+
+
+def _awaited(status: Json, stream: Json) -> str:
+    """Of a stream that never saw a message: for an input, which key it waits for, and where to publish it."""
+    key = stream.get("from_expr") if "/in/" in stream["stream"] else None  # later fields of the schema's major version
+    if not key:
+        return "nothing yet"
+    where = ", ".join(status.get("joins_at", ()))
+    return f"nothing yet: waits for a message on {key}" + (f" from an application at {where}" if where else "")
 
 
 def _unanswered(task: Json) -> list[str]:

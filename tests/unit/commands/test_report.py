@@ -287,6 +287,36 @@ def test_where_applications_join_is_told_before_anything_is_counted() -> None:
 
 
 @pytest.mark.parametrize(
+    ("from_expr", "joins", "told"),
+    [
+        (
+            "robot1/in",
+            ["tcp/127.0.0.1:7458"],
+            "waits for a message on robot1/in from an application at tcp/127.0.0.1:7458",
+        ),
+        ("robot1/in", [], "nothing yet: waits for a message on robot1/in"),
+        ("", ["tcp/127.0.0.1:7458"], "nothing yet"),
+    ],
+)
+def test_an_input_that_never_saw_a_message_says_what_it_waits_for(from_expr: str, joins: list[str], told: str) -> None:
+    status = recorded("healthy")
+    status["joins_at"] = joins
+    for stream in status["tasks"][0]["streams"]:
+        stream["from_expr"], stream["last_seen_s"] = from_expr, None
+    text = " ".join(render_status(status, 100, color=False).split())
+    assert told in text
+    assert text.count("waits for") == (1 if from_expr else 0), "an output waits for nobody's application"
+
+
+def test_an_input_that_has_seen_messages_waits_for_nothing() -> None:
+    status = recorded("healthy")
+    status["joins_at"] = ["tcp/127.0.0.1:7458"]
+    for stream in status["tasks"][0]["streams"]:
+        stream["from_expr"] = "robot1/in"
+    assert "waits for" not in render_status(status, 100, color=False)
+
+
+@pytest.mark.parametrize(
     ("done", "answers", "phase", "is_told"),
     [(100, 0, "settled", True), (99, 0, "settled", False), (100, 1, "settled", False), (100, 0, "preparing", False)],
 )
