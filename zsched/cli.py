@@ -209,7 +209,7 @@ def dev(
     """Run every node of a fleet file on this machine, to try a task of your own; nothing of it stays.
 
     It prints where applications join, and starts a worker again when its file is saved. On a terminal keys move the
-    task, kill its machine and load it.
+    task, kill its owner and load it.
     """
     from zsched.commands.dev import DevOptions  # noqa: PLC0415 - each verb imports what it needs
     from zsched.commands.dev import dev as run  # noqa: PLC0415 - as above

@@ -1,4 +1,4 @@
-"""`zsched dev`: stages a fleet file for this machine, says how applications join, and runs it until somebody ends it.
+"""`zsched dev`: makes a fleet file fit for this machine, says how applications join, and runs it until it is ended.
 
 Knows: options, what is printed. Does not know: how nodes are run (`zsched.dev`).
 """
@@ -22,7 +22,7 @@ from zsched.core.route.templates import routes_for
 from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.model import NodeId, NodeKind, TaskId
 from zsched.core.values.plan import Direction
-from zsched.dev.fleet import Place, Staged, stage
+from zsched.dev.fleet import Addresses, LoopbackFile, on_loopback
 from zsched.dev.nodes import Nodes, shares
 from zsched.dev.run import KEYS, Run, stopped_by_signal
 from zsched.dev.terminal import Keys
@@ -57,17 +57,17 @@ def dev(options: DevOptions) -> int:
     fleet = load_fleet(file)
     commands = _commands(fleet, file, options.workers)
     with ExitStack() as stack:
-        spots = _places(fleet, stack)
-        staged = stage(file, spots, commands)
+        addresses = _addresses(fleet, stack)
+        here = on_loopback(file, addresses, commands)
         candidates = sorted({node for task in fleet.tasks for node in task.candidates})
         cpus = shares(candidates, os.sched_getaffinity(0))
         folder = file.absolute().parent
         words = {**{task.name: task.worker.command for task in fleet.tasks}, **commands}
-        nodes = Nodes(fleet, staged.text, folder, cpus)
+        nodes = Nodes(fleet, here.text, folder, cpus)
         stop = stack.enter_context(stopped_by_signal())
         keys = stack.enter_context(Keys())
         with nodes:
-            _introduce(fleet, file, nodes, spots, staged)
+            _introduce(fleet, file, nodes, addresses, here)
             _say(f"keys: {KEYS}" if keys.is_there else "no terminal, no keys: Ctrl-C or SIGTERM ends it")
             run = Run(nodes, Watched(words, folder), say=_say, show=_show, stop=stop, is_verbose=options.is_verbose)
             code = run.run(keys)
@@ -109,7 +109,7 @@ def _commands(fleet: Fleet, file: Path, workers: Sequence[str]) -> dict[TaskId, 
     return found
 
 
-def _places(fleet: Fleet, stack: ExitStack) -> dict[NodeId, Place]:
+def _addresses(fleet: Fleet, stack: ExitStack) -> dict[NodeId, Addresses]:
     """Where each node listens: the first robot where a robot's relay always does, if that port is free."""
     robots = [node.name for node in fleet.nodes if node.kind is NodeKind.ROBOT]
     taken: set[int] = set()
@@ -131,9 +131,9 @@ def _places(fleet: Fleet, stack: ExitStack) -> dict[NodeId, Place]:
         return f"tcp/127.0.0.1:{claim.port}"
 
     return {
-        node.name: Place(control=free(), data=joins(node.name))
+        node.name: Addresses(control=free(), data=joins(node.name))
         if node.local is None
-        else Place(control=free(), data=free(), local=joins(node.name))
+        else Addresses(control=free(), data=free(), local=joins(node.name))
         for node in fleet.nodes
     }
 
@@ -141,22 +141,24 @@ def _places(fleet: Fleet, stack: ExitStack) -> dict[NodeId, Place]:
 # --- what is printed -------------------------------------------------------------------------------------------------
 
 
-def _introduce(fleet: Fleet, file: Path, nodes: Nodes, spots: Mapping[NodeId, Place], staged: Staged) -> None:
+def _introduce(
+    fleet: Fleet, file: Path, nodes: Nodes, addresses: Mapping[NodeId, Addresses], here: LoopbackFile
+) -> None:
     """Everything that somebody needs who writes an application."""
     _say(f"{file}: fleet {fleet.name}, {len(nodes.names)} nodes on this machine; nothing of it stays")
-    for text in staged.left_out:
+    for text in here.left_out:
         _say(f"differs from the field: {text}")
     width = max(map(len, nodes.names))
     for name in nodes.names:
         cpus = nodes.cpus.get(name)
         share = f", CPU {' '.join(map(str, sorted(cpus)))}" if cpus else ""
-        _say(f"{name:{width}}  {fleet.node(name).kind.value:5}  data endpoint {spots[name].joins}{share}")
+        _say(f"{name:{width}}  {fleet.node(name).kind.value:5}  data endpoint {addresses[name].joins}{share}")
     if not nodes.cpus:
         _say("one CPU only, or one candidate: all nodes look alike, and load moves nothing")
     robot = next((name for name in nodes.names if fleet.node(name).kind is NodeKind.ROBOT), nodes.names[0])
     for task in fleet.tasks:
         _say_streams(task, robot)
-    config = json5(spots[robot].joins)
+    config = json5(addresses[robot].joins)
     print(f"\nAn application of {robot} in Python:\n")
     print(f"    import zenoh\n    session = zenoh.open(zenoh.Config.from_json5('{config}'))")
     print(f"\nAny other zenoh program, as its JSON5 file:\n\n    {config}\n")

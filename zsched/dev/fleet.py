@@ -30,7 +30,7 @@ NOWHERE: Final = reader.NOWHERE
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Place:
+class Addresses:
     """Where one node listens while its fleet runs here: zenoh endpoints on loopback."""
 
     control: str
@@ -45,7 +45,7 @@ class Place:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Staged:
+class LoopbackFile:
     """A fleet file for this machine."""
 
     text: str
@@ -53,8 +53,10 @@ class Staged:
     """What of the operator's file does not hold here, in words."""
 
 
-def stage(file: Path, places: Mapping[NodeId, Place], commands: Mapping[TaskId, Sequence[str]]) -> Staged:
-    """The fleet of ``file``, which has no fault, with ``places`` for its nodes and other ``commands`` for some tasks.
+def on_loopback(
+    file: Path, addresses: Mapping[NodeId, Addresses], commands: Mapping[TaskId, Sequence[str]]
+) -> LoopbackFile:
+    """The fleet of ``file``, which has no fault, with ``addresses`` for nodes and other ``commands`` for some tasks.
 
     Raises:
         ConfigError: it cannot be run on one machine.
@@ -64,8 +66,8 @@ def stage(file: Path, places: Mapping[NodeId, Place], commands: Mapping[TaskId, 
     nodes = _entry(root, "nodes")
     tasks = _entry(root, "tasks")
     assert isinstance(nodes, reader.Mapping)
-    staged_nodes = _changed(nodes, {name: _staged_node(_entry(nodes, name), place) for name, place in places.items()})
-    changes: dict[str, reader.Node] = {"nodes": staged_nodes, "shared_memory": _node("off")}
+    new_nodes = _changed(nodes, {name: _node_here(_entry(nodes, name), one) for name, one in addresses.items()})
+    changes: dict[str, reader.Node] = {"nodes": new_nodes, "shared_memory": _node("off")}
     if commands:
         assert isinstance(tasks, reader.Mapping)
         new = {task: _with_command(_entry(tasks, task), command) for task, command in commands.items()}
@@ -75,7 +77,7 @@ def stage(file: Path, places: Mapping[NodeId, Place], commands: Mapping[TaskId, 
     if result.fleet is None:
         told = "; ".join(f"{fault.message}; {fault.hint}" for fault in result.faults)
         raise ConfigError(f"{file}: it cannot be run on one machine: {told}")
-    return Staged(text=text, left_out=tuple(left_out))
+    return LoopbackFile(text=text, left_out=tuple(left_out))
 
 
 def _root(file: Path) -> reader.Mapping:
@@ -105,13 +107,13 @@ def _left_out(root: reader.Mapping) -> list[str]:
     return found
 
 
-def _staged_node(given: reader.Node | None, place: Place) -> reader.Mapping:
+def _node_here(given: reader.Node | None, addresses: Addresses) -> reader.Mapping:
     assert isinstance(given, reader.Mapping)
     kept = tuple((key, value) for key, value in given.pairs if key.text in KEPT)
-    host = place.data.partition("/")[2].rpartition(":")[0]
-    new: dict[str, Any] = {"host": host, "listen": {"control": place.control, "data": place.data}}
-    if place.local:
-        new["local"] = {"mode": "peer", "listen": [place.local]}
+    host = addresses.data.partition("/")[2].rpartition(":")[0]
+    new: dict[str, Any] = {"host": host, "listen": {"control": addresses.control, "data": addresses.data}}
+    if addresses.local:
+        new["local"] = {"mode": "peer", "listen": [addresses.local]}
     if not any(key.text == "fixed" for key, _ in kept):
         new["wired"] = True
     own = _node(new)

@@ -59,7 +59,7 @@ class Running:
 
 @dataclass(slots=True)
 class Nodes:
-    """All nodes of one staged fleet; a context that leaves no process and no file."""
+    """All nodes of one fleet on loopback; a context that leaves no process and no file."""
 
     fleet: Fleet
     text: str
@@ -100,7 +100,7 @@ class Nodes:
 
     @property
     def file(self) -> Path:
-        """The staged fleet file."""
+        """The fleet file of this run."""
         return self.folder / "fleet.yaml"
 
     @property

@@ -1,6 +1,7 @@
 """One development run: starts the nodes, tells what happens to the tasks, restarts workers, obeys keys, ends.
 
-Knows: the order of a run, what each key does. Does not know: how a fleet file is staged, how lines are shown.
+Knows: the order of a run, what each key does. Does not know: where the fleet file comes from, how lines
+are shown.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ KEPT_LINES: Final = 8
 READ_BYTES: Final = 65_536
 END_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 WORKER: Final = "zsched.worker"
-KEYS: Final = "m moves the task, k kills its machine, l loads its machine, s shows the status, q ends"
+KEYS: Final = "m moves the task, k kills its owner, l loads its owner, s shows the status, q ends"
 
 
 @dataclass(slots=True, kw_only=True)

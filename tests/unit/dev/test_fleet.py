@@ -1,4 +1,4 @@
-"""A fleet file staged for one machine: what stays, what goes, and that it is said."""
+"""A fleet file made fit for one machine: what stays, what goes, and that it is said."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import pytest
 from zsched.config.load import check_bytes, load_fleet
 from zsched.core.values.fleet import Fleet, SharedMemory
 from zsched.core.values.model import LinkSource
-from zsched.dev.fleet import Place, Staged, stage
+from zsched.dev.fleet import Addresses, LoopbackFile, on_loopback
 
 ROOT = Path(__file__).parents[3]
 FILES = sorted((*(ROOT / "configs").glob("*.yaml"), *(ROOT / "zsched" / "examples").glob("*/fleet.yaml")))
 
 
-def places(fleet: Fleet) -> dict[str, Place]:
+def addresses(fleet: Fleet) -> dict[str, Addresses]:
     return {
-        node.name: Place(
+        node.name: Addresses(
             control=f"tcp/127.0.0.1:{20000 + number}",
             data=f"tcp/127.0.0.1:{30000 + number}",
             local="" if node.local is None else f"tcp/127.0.0.1:{40000 + number}",
@@ -26,8 +26,8 @@ def places(fleet: Fleet) -> dict[str, Place]:
     }
 
 
-def staged(file: Path, **commands: tuple[str, ...]) -> tuple[Staged, Fleet]:
-    found = stage(file, places(load_fleet(file)), commands)
+def brought_here(file: Path, **commands: tuple[str, ...]) -> tuple[LoopbackFile, Fleet]:
+    found = on_loopback(file, addresses(load_fleet(file)), commands)
     result = check_bytes(found.text.encode())
     assert result.fleet is not None, result.report()
     return found, result.fleet
@@ -36,26 +36,26 @@ def staged(file: Path, **commands: tuple[str, ...]) -> tuple[Staged, Fleet]:
 @pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(ROOT)))
 def test_tasks_electors_and_clocks_stay_and_every_address_is_loopback(file: Path) -> None:
     before = load_fleet(file)
-    _, after = staged(file)
+    _, after = brought_here(file)
     assert (after.name, after.tasks, after.electors, after.timing) == (
         before.name,
         before.tasks,
         before.electors,
         before.timing,
     )
-    for node, spot in places(before).items():
+    for node, one in addresses(before).items():
         spec = after.node(node)
-        assert (spec.listen_control, spec.listen_data, spec.host) == (spot.control, spot.data, "127.0.0.1")
+        assert (spec.listen_control, spec.listen_data, spec.host) == (one.control, one.data, "127.0.0.1")
         assert (spec.kind, spec.labels) == (before.node(node).kind, before.node(node).labels)
         assert (spec.local is None) == (before.node(node).local is None)
         if spec.local is not None:
-            assert (spec.local.connect, spec.local.listen) == ((), (spot.local,))
-            assert spot.joins == spot.local
+            assert (spec.local.connect, spec.local.listen) == ((), (one.local,))
+            assert one.joins == one.local
         assert [link.source for link in spec.links] == [LinkSource.WIRED]
 
 
 def test_what_does_not_hold_here_is_said() -> None:
-    found, _ = staged(ROOT / "configs" / "ros2-node.yaml")
+    found, _ = brought_here(ROOT / "configs" / "ros2-node.yaml")
     assert found.left_out == (
         "radio links count as perfect (robot1, robot2, robot3)",
         "local sides listen themselves, with no router beside them (robot1, robot2, robot3)",
@@ -86,7 +86,7 @@ def written(folder: Path, text: str = FILE) -> Path:
 
 def test_quotes_numbers_and_a_fixed_signal_stay_as_they_are_meant(tmp_path: Path) -> None:
     file = written(tmp_path)
-    found, fleet = staged(file)
+    found, fleet = brought_here(file)
     before = load_fleet(file)
     assert fleet.node("robot1").labels == before.node("robot1").labels
     assert fleet.node("robot1").links == before.node("robot1").links
@@ -97,5 +97,5 @@ def test_quotes_numbers_and_a_fixed_signal_stay_as_they_are_meant(tmp_path: Path
 
 
 def test_a_worker_may_be_another_one_also_where_the_file_gives_none(tmp_path: Path) -> None:
-    _, fleet = staged(written(tmp_path), shout=("python", "/home/me/my worker.py"))
+    _, fleet = brought_here(written(tmp_path), shout=("python", "/home/me/my worker.py"))
     assert fleet.tasks[0].worker.command == ("python", "/home/me/my worker.py")
