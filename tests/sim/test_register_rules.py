@@ -23,14 +23,14 @@ from zsched.core.values.model import (
     RegisterState,
 )
 from zsched.core.vote.agreement import Agreement
-from zsched.core.vote.register import Register
+from zsched.core.vote.task_register import TaskRegister
 
 ELECTORS = ("r1", "r2", "r3")
 INITIAL = allocation_of(0, None, tuning=tuning_of(cpu=1.0, memory=0.0))
 
 
-def proposer(incarnation: int = 4) -> Register:
-    return Register(
+def proposer(incarnation: int = 4) -> TaskRegister:
+    return TaskRegister(
         me="r1",
         incarnation=incarnation,
         electors=ELECTORS,
@@ -44,7 +44,7 @@ def proposer(incarnation: int = 4) -> Register:
     )
 
 
-def proposed(register: Register, now: float = 0.0) -> Ballot:
+def proposed(register: TaskRegister, now: float = 0.0) -> Ballot:
     step = did(register.propose, MoveOwner(base_revision=0, owner="e1", reason="test"), now)
     assert step.prepare is not None
     return step.prepare.ballot

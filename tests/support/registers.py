@@ -15,7 +15,7 @@ from zsched.core.todo import ToDo
 from zsched.core.values.change import Change, MoveOwner, RoundOutcome
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refused
 from zsched.core.values.model import Acceptance, Allocation, Ballot, RegisterState
-from zsched.core.vote.register import Register
+from zsched.core.vote.task_register import TaskRegister
 
 ELECTORS = ("r1", "r2", "r3")
 TUNING = tuning_of()
@@ -33,8 +33,8 @@ def make(
     electorate: str = "abc",
     is_elector: bool | None = None,
     electors: tuple[str, ...] = ELECTORS,
-    kind: type[Register] = Register,
-) -> Register:
+    kind: type[TaskRegister] = TaskRegister,
+) -> TaskRegister:
     """A register of one node."""
     return kind(
         me=me,
@@ -89,7 +89,7 @@ class Step:
         return self.ends[0] if self.ends else None
 
 
-def _step(register: Register, problem: str, todo: ToDo) -> Step:
+def _step(register: TaskRegister, problem: str, todo: ToDo) -> Step:
     prepares = [one.prepare for one in todo.send if isinstance(one, SendPrepare)]
     accepts = [one.accept for one in todo.send if isinstance(one, SendAccept)]
     assert len(todo.send) == len(prepares) + len(accepts) <= 1, "a register has one round at a time"
@@ -108,33 +108,33 @@ def _step(register: Register, problem: str, todo: ToDo) -> Step:
 
 def did(call: Callable[..., None], *args: Any) -> Step:
     """One call of a register's method whose last argument is the time."""
-    register: Register = call.__self__  # type: ignore[attr-defined] # a bound method
+    register: TaskRegister = call.__self__  # type: ignore[attr-defined] # a bound method
     todo, problem = ToDo(), register.problem
     call(*args[:-1], todo, args[-1])
     return _step(register, problem, todo)
 
 
-def promised(register: Register, prepare: Prepare) -> tuple[Step, Promise | Refused]:
+def promised(register: TaskRegister, prepare: Prepare) -> tuple[Step, Promise | Refused]:
     """What an elector makes of a prepare, and its answer."""
     todo = ToDo()
     answer = register.on_prepare(prepare, todo)
     return _step(register, register.problem, todo), answer
 
 
-def accepted(register: Register, accept: Accept, now: float) -> tuple[Step, Accepted | Refused]:
+def accepted(register: TaskRegister, accept: Accept, now: float) -> tuple[Step, Accepted | Refused]:
     """What an elector makes of an accept, and its answer."""
     todo = ToDo()
     answer = register.on_accept(accept, todo, now)
     return _step(register, register.problem, todo), answer
 
 
-def promise_all(proposer: Register, asked: Step, acceptors: Iterable[Register], now: float = 0.0) -> Step:
+def promise_all(proposer: TaskRegister, asked: Step, acceptors: Iterable[TaskRegister], now: float = 0.0) -> Step:
     """Hand a prepare to acceptors and their answers back; the last step that wants something."""
     assert asked.prepare is not None
     return last(did(proposer.on_answer, promised(acceptor, asked.prepare)[1], now) for acceptor in acceptors)
 
 
-def accept_all(proposer: Register, asked: Step, acceptors: Iterable[Register], now: float = 0.0) -> Step:
+def accept_all(proposer: TaskRegister, asked: Step, acceptors: Iterable[TaskRegister], now: float = 0.0) -> Step:
     """Hand an accept to acceptors and their answers back; the last step that wants something."""
     assert asked.accept is not None
     return last(did(proposer.on_answer, accepted(acceptor, asked.accept, now)[1], now) for acceptor in acceptors)
@@ -146,6 +146,6 @@ def last(steps: Iterable[Step]) -> Step:
     return wanted[-1] if wanted else Step()
 
 
-def commit(proposer: Register, asked: Step, acceptors: list[Register], now: float = 0.0) -> Step:
+def commit(proposer: TaskRegister, asked: Step, acceptors: list[TaskRegister], now: float = 0.0) -> Step:
     """Both rounds; the last step."""
     return accept_all(proposer, promise_all(proposer, asked, acceptors, now), acceptors, now)

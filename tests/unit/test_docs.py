@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Any, Final, Union, get_args, get_origin, get_type_hints
+from typing import Any, Final, Union, get_args, get_origin
 
 import pytest
 import typer.main
@@ -197,9 +197,9 @@ def parts_of(hint: Any) -> Iterator[type]:
     if get_origin(hint) in (tuple, Union, types.UnionType):
         for inner in get_args(hint):
             yield from parts_of(inner)
-    elif isinstance(hint, type) and is_dataclass(hint):
-        yield hint
-        for inner in get_type_hints(hint).values():
+    elif is_dataclass(get_origin(hint) or hint):
+        yield get_origin(hint) or hint
+        for inner in wire.hints_of(hint).values():
             yield from parts_of(inner)
 
 
@@ -214,11 +214,11 @@ def shown(hint: Any) -> str:
         return " or ".join("nil" if part is type(None) else shown(part) for part in get_args(hint))
     if isinstance(hint, type) and issubclass(hint, Enum):
         return "one of " + " ".join(str(member.value) for member in hint)
-    return hint.__name__ if isinstance(hint, type) else str(hint)
+    return str(hint.__name__) if isinstance(hint, type) or is_dataclass(get_origin(hint)) else str(hint)
 
 
 def fields_of(cls: type) -> str:
-    hints = get_type_hints(cls)
+    hints = wire.hints_of(cls)
     parts = [f"`{f.name}{'' if f.default is MISSING else '?'}` {shown(hints[f.name])}" for f in fields(cls)]
     return "; ".join(parts) or "none"
 
@@ -233,7 +233,7 @@ def kinds_table() -> str:
 
 
 def parts_table() -> str:
-    inner = {part for cls, _ in wire.KINDS.values() for hint in get_type_hints(cls).values() for part in parts_of(hint)}
+    inner = {part for cls, _ in wire.KINDS.values() for hint in wire.hints_of(cls).values() for part in parts_of(hint)}
     lines = ["| value | fields |", "| --- | --- |"]
     lines += [f"| `{cls.__name__}` | {fields_of(cls)} |" for cls in sorted(inner, key=lambda cls: cls.__name__)]
     return "\n".join(lines)

@@ -45,8 +45,18 @@ FLOORS: Final[tuple[tuple[str, int, str], ...]] = (
 
 CORE_MAY: Final = frozenset(
     {
-        *("__future__", "bisect", "collections", "collections.abc", "dataclasses", "enum", "functools", "hashlib"),
-        *("heapq", "itertools", "math", "operator", "random", "re", "statistics", "types", "typing"),
+        *(
+            "__future__",
+            "abc",
+            "bisect",
+            "collections",
+            "collections.abc",
+            "dataclasses",
+            "enum",
+            "functools",
+            "hashlib",
+        ),
+        *("abc", "heapq", "itertools", "math", "operator", "random", "re", "statistics", "types", "typing"),
     }
 )
 """Pure parts of the standard library; ``random`` only for the type `Random` (generators come in seeded)."""

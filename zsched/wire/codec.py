@@ -125,6 +125,22 @@ _AS_IT_IS = {
 _CODECS: dict[type, tuple[Reader, Writer]] = {}
 
 
+def hints_of(cls: Any) -> dict[str, Any]:
+    """{field: its type} of a dataclass; a generic one without a parameter is of a task's register."""
+    origin, arguments = get_origin(cls) or cls, get_args(cls) or (model.Allocation,)
+    hints = get_type_hints(origin)
+    return {name: _filled(hint, arguments) for name, hint in hints.items()}
+
+
+def _filled(hint: Any, arguments: tuple[Any, ...]) -> Any:
+    """A type hint with its type variable replaced."""
+    if isinstance(hint, TypeVar):
+        return arguments[0]
+    if not getattr(hint, "__parameters__", ()):
+        return hint
+    return hint[arguments]
+
+
 def _codec(hint: Any) -> tuple[Reader, Writer]:
     """The (reader, writer) of a type hint."""
     if hint in _SCALARS:
@@ -136,7 +152,7 @@ def _codec(hint: Any) -> tuple[Reader, Writer]:
         return _optional_codec(hint)
     if isinstance(hint, type) and issubclass(hint, Enum):
         return _enum_codec(hint)
-    if isinstance(hint, type) and is_dataclass(hint):
+    if is_dataclass(origin or hint):
         if hint not in _CODECS:
             _CODECS[hint] = _dataclass_codec(hint)
         return _CODECS[hint]
@@ -233,7 +249,8 @@ def _fixed_codec(args: tuple[Any, ...]) -> tuple[Reader, Writer]:
 
 
 def _dataclass_codec(cls: type) -> tuple[Reader, Writer]:
-    hints = get_type_hints(cls)
+    hints = hints_of(cls)
+    cls = get_origin(cls) or cls
     read, write = _Source(cls=cls, fail=_fail, WireError=WireError, ABSENT=MISSING), _Source()
     read.lines = ["def f(value):", " if type(value) is not dict:"]
     read.lines += [f"  raise fail('expected a map ({cls.__name__})', value)", " get = value.get"]

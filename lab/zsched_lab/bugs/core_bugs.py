@@ -129,22 +129,22 @@ REGISTER_BUGS = (
     _bug(
         "accepts below its promise",
         REGISTER,
-        "(ballot < self.state.promised or max(",
-        "(ballot.counter < self.state.promised.counter - 9 or max(",
+        "(ballot < self.state.promised or self._highest(",
+        "(ballot.counter < self.state.promised.counter - 9 or self._highest(",
         _REGISTER + _SCHEDULES,
     ),
     _bug(
         "accepted value not re-accepted",
         REGISTER,
-        "newest = max(accepted, key=lambda acceptance: (acceptance.ballot, not acceptance.value.leased), default=None)",
+        "newest = max(accepted, key=lambda held: (held.ballot, self._prevails(held.value)), default=None)",
         "newest = None",
         _SCHEDULES,
     ),
     _bug(
         "newest by revision instead of ballot",
         REGISTER,
-        "key=lambda acceptance: (acceptance.ballot, not",
-        "key=lambda acceptance: (-acceptance.value.revision, acceptance.ballot, not",
+        "key=lambda held: (held.ballot, self",
+        "key=lambda held: (-held.value.revision, held.ballot, self",
         _REGISTER + _SCHEDULES,
     ),
     Bug(
@@ -198,8 +198,8 @@ REGISTER_BUGS = (
     _bug(
         "learnt value not persisted before routes",
         REGISTER,
-        "        todo.must_persist = True\n        todo.learnt",
-        "        todo.learnt",
+        "        todo.must_persist = True\n        self._hand_on",
+        "        self._hand_on",
         _REGISTER,
     ),
     _bug(

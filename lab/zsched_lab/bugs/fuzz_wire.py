@@ -22,7 +22,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from enum import Enum
 from random import Random
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, Union, get_args, get_origin
 
 import msgpack
 
@@ -88,7 +88,7 @@ def sample(hint: Any, rng: Random, name: str = "") -> Any:
         return None if rng.random() < 0.3 else sample(one, rng, name)
     if isinstance(hint, type) and issubclass(hint, Enum):
         return rng.choice(tuple(hint))
-    return _dataclass(hint, rng)
+    return _dataclass(origin or hint, rng)
 
 
 def _dataclass(cls: Any, rng: Random) -> Any:
@@ -96,7 +96,7 @@ def _dataclass(cls: Any, rng: Random) -> Any:
     if cls is Weights:
         cpu = rng.choice((0.0, 0.25, 1.0))
         return Weights(cpu=cpu, memory=1.0 - cpu, network=0.0)
-    hints = get_type_hints(cls)
+    hints = wire.hints_of(cls)
     values = {one.name: sample(hints[one.name], rng, one.name) for one in fields(cls)}
     if cls is Accept:
         values["task"] = values["acceptance"].value.task

@@ -9,7 +9,7 @@ from dataclasses import MISSING, fields, is_dataclass, make_dataclass, replace
 from enum import Enum
 from pathlib import Path
 from random import Random
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, Union, get_args, get_origin
 
 import msgpack
 import pytest
@@ -105,7 +105,7 @@ def strategy(hint: Any, name: str = "") -> st.SearchStrategy[Any]:
     if get_origin(hint) in (Union, types.UnionType):
         (inner,) = [arg for arg in get_args(hint) if arg is not type(None)]
         return st.none() | strategy(inner, name)
-    if issubclass(hint, Enum):
+    if isinstance(hint, type) and issubclass(hint, Enum):
         return st.sampled_from(hint)
     return dataclass_strategy(hint)
 
@@ -129,8 +129,9 @@ def dataclass_strategy(cls: type[Any]) -> st.SearchStrategy[Any]:
             strategy(model.Acceptance),
             TEXTS,
         )
-    hints = get_type_hints(cls)
-    return st.builds(cls, **{field.name: strategy(hints[field.name], field.name) for field in fields(cls)})
+    hints = wire.hints_of(cls)
+    made = get_origin(cls) or cls
+    return st.builds(made, **{field.name: strategy(hints[field.name], field.name) for field in fields(made)})
 
 
 @pytest.mark.parametrize("kind", sorted(wire.KINDS))

@@ -1,4 +1,4 @@
-"""Changes of a task's register that a node proposes, and how they end.
+"""Changes of a register that a node proposes, and how they end.
 
 Knows: which fields of an allocation each change touches. Does not know: ballots and rounds
 (`zsched.core.vote.register`), who wants a change and why.
@@ -8,8 +8,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import Protocol, TypeVar
 
 from zsched.core.values.model import Allocation, NodeId, TaskId, Tuning
+
+_Value = TypeVar("_Value")
+
+
+class Rewrite(Protocol[_Value]):
+    """A change of what a register holds."""
+
+    @property
+    def base_revision(self) -> int:
+        """The revision that it is based on."""
+
+    @property
+    def reason(self) -> str:
+        """Why the value is what it is, once this is committed."""
+
+    def apply(self, read: _Value) -> _Value:
+        """The new value, of the next revision; what was read when nothing is to change."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Generic
 
 from zsched.core.values.model import (
     Acceptance,
@@ -15,6 +16,7 @@ from zsched.core.values.model import (
     NodeId,
     TaskId,
     UtilityVector,
+    V,
     check_counter,
     check_name,
 )
@@ -34,13 +36,13 @@ class Prepare:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Promise:
+class Promise(Generic[V]):
     """An elector's yes to a `Prepare`: persisted, with its earlier acceptance (Synod, phase 1b)."""
 
     elector: NodeId
     task: TaskId
     ballot: Ballot
-    accepted: Acceptance | None = None
+    accepted: Acceptance[V] | None = None
 
     def __post_init__(self) -> None:
         check_name("promise.elector", self.elector)
@@ -48,11 +50,11 @@ class Promise:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Accept:
+class Accept(Generic[V]):
     """Phase 2 of a round: asks an elector to accept ``acceptance`` (Synod, phase 2a)."""
 
     task: TaskId
-    acceptance: Acceptance
+    acceptance: Acceptance[V]
     electorate: str
 
     def __post_init__(self) -> None:

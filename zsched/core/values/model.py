@@ -14,6 +14,7 @@ import math
 import re
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
 NodeId = str
 """A node's name: ``[a-z0-9][a-z0-9_-]{0,62}``, unique in the fleet."""
@@ -503,22 +504,41 @@ NO_BALLOT = Ballot(counter=0, node="", incarnation=0)
 """Lower than every real ballot."""
 
 
+class Revised(Protocol):
+    """What a register can hold: a value that is agreed and rewritten."""
+
+    @property
+    def task(self) -> TaskId:
+        """The register's name."""
+
+    @property
+    def revision(self) -> int:
+        """Rises with every change."""
+
+
+if TYPE_CHECKING:
+    V = TypeVar("V", bound=Revised, default=Allocation)
+else:
+    V = TypeVar("V")
+"""What a register holds; a generic value that is named without it is of a task's register."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Acceptance:
+class Acceptance(Generic[V]):
     """What an elector has accepted: a value under a ballot."""
 
     ballot: Ballot
-    value: Allocation
+    value: V
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RegisterState:
-    """The durable part of one task's register on one node; written before any answer leaves."""
+class RegisterState(Generic[V]):
+    """The durable part of one register on one node; written before any answer leaves."""
 
     task: TaskId
     promised: Ballot = NO_BALLOT
-    accepted: Acceptance | None = None
-    learnt: Allocation | None = None
+    accepted: Acceptance[V] | None = None
+    learnt: V | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

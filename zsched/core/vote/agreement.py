@@ -32,7 +32,7 @@ from zsched.core.values.model import (
 from zsched.core.vote.belief import GENERATION_STEP, MAX_GENERATION, is_fit, is_proven
 from zsched.core.vote.generations import way_out
 from zsched.core.vote.lease import Leases, hold_s
-from zsched.core.vote.register import Register
+from zsched.core.vote.task_register import TaskRegister
 from zsched.core.vote.witness import Witness, as_seen, as_tuple
 
 SETTLE_AFTER_START_S = 0.3
@@ -118,7 +118,7 @@ class Agreement:
         # What blank electors have agreed on: a generation's first value, which the operator has written everywhere.
         start = (self.generation or 0) * GENERATION_STEP
         self.registers = {
-            task.name: Register(
+            task.name: TaskRegister(
                 me=me,
                 incarnation=incarnation,
                 electors=fleet.electors,
@@ -388,7 +388,7 @@ class Agreement:
         elif value.revision > register.value.revision:
             self._read(value.task, register, todo, now)
 
-    def _read(self, task: TaskId, register: Register, todo: ToDo, now: float) -> None:
+    def _read(self, task: TaskId, register: TaskRegister, todo: ToDo, now: float) -> None:
         """Ask a majority for the value in force (an identity round): one peer's word is not enough."""
         self.counters["learnt_unproven"] += 1
         if now - self._read_at.get(task, -math.inf) >= READ_EVERY_S:
@@ -572,7 +572,7 @@ def _refuse(request: int, outcome: CommandOutcome, detail: str, todo: ToDo) -> N
     todo.add(do.AnswerCommand(request=request, result=CommandResult(outcome=outcome, detail=detail)))
 
 
-def _newest(register: Register) -> Allocation | None:
+def _newest(register: TaskRegister) -> Allocation | None:
     """The value of the higher revision among accepted and learnt; the learnt one when they are of the same."""
     accepted, learnt = register.state.accepted, register.state.learnt
     if accepted is None:

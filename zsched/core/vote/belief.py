@@ -12,7 +12,8 @@ from __future__ import annotations
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import Allocation
-from zsched.core.vote.register import MAX_REVISION, Register
+from zsched.core.vote.register import MAX_REVISION
+from zsched.core.vote.task_register import TaskRegister
 
 GENERATION_STEP = 2**32
 """Revision and epoch of generation G start at G times this (`zsched init --generation G`)."""
@@ -22,7 +23,7 @@ MAX_AHEAD = 2**20
 """No honest revision is further ahead: at one move a second that would be a cut of twelve days."""
 
 
-def is_fit(fleet: Fleet, value: Allocation, register: Register, start: int = 0) -> bool:
+def is_fit(fleet: Fleet, value: Allocation, register: TaskRegister, start: int = 0) -> bool:
     """Whether a value that is new here could be true: its owner is a node of the fleet, and it is not far ahead.
 
     The owner need not be a candidate. It may have been one by an earlier file, and a node that could not learn that
@@ -38,7 +39,7 @@ def is_fit(fleet: Fleet, value: Allocation, register: Register, start: int = 0) 
     return is_known and value.epoch <= value.revision <= newest + MAX_AHEAD
 
 
-def is_proven(fleet: Fleet, learnt: Learnt, value: Allocation, register: Register, *, has_generation: bool) -> bool:
+def is_proven(fleet: Fleet, learnt: Learnt, value: Allocation, register: TaskRegister, *, has_generation: bool) -> bool:
     """Whether a peer's answer to our own question is enough to learn a value.
 
     It is when the peer is an elector, or when this elector has accepted the same value (whoever committed it need not

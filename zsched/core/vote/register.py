@@ -1,34 +1,36 @@
 """VOTE, the agreement under it: one rewritable value, agreed by a majority of electors (CASPaxos).
 
-Knows: ballots, promises, acceptances, rounds, what is learnt. Does not know: tasks' meaning, who won which vote, how
-anything travels or is stored.
+Knows: ballots, promises, acceptances, rounds, what is learnt. Does not know: what the value means (a subclass tells the
+few things that a round needs of it), who won which vote, how anything travels or is stored.
 
 Synod on a register that can be rewritten (Rystsov, arXiv 1802.07000): no leader, no log. The rules that keep it safe:
 
 * an elector's promise and acceptance are persisted before the answer leaves (`ToDo.must_persist`);
 * a ballot carries exactly one value: a proposer that reads an accepted value it has not learnt re-accepts that one, and
   its own change follows under a higher ballot;
-* where too many electors refuse that value for good (their fleet files know no such node), a move is applied to it at
-  once, as CASPaxos has it: else a value that a minority has accepted would stop its task for ever;
+* where too many electors refuse that value for good (their fleet files know no such node), a change that its register
+  lets replace it is applied to it at once, as CASPaxos has it: else a value that a minority has accepted would stand in
+  the way for ever;
 * among accepted values "newer" means the higher ballot;
 * accepted is not learnt: an elector with an acceptance that it has not learnt runs an *identity round* (it re-accepts
   what it reads), and so does a proposer that does not know how its round ended; it never applies its change twice;
-* every change names the revision that it is based on and is a function of the value read; one that leaves owner or
-  tuning as they are writes nothing, so a higher epoch always means another owner.
+* every change names the revision that it is based on and is a function of the value read; one that changes nothing
+  writes nothing.
 """
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from enum import StrEnum
 from random import Random
+from typing import Generic
 
-from zsched.core.instructions import SendAccept, SendPrepare
 from zsched.core.todo import ToDo
-from zsched.core.values.change import Change, MoveOwner, RoundOutcome
+from zsched.core.values.change import Rewrite, RoundOutcome
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refusal, Refused
-from zsched.core.values.model import Acceptance, Allocation, Ballot, NodeId, RegisterState
+from zsched.core.values.model import Acceptance, Ballot, NodeId, RegisterState, V
 from zsched.core.values.quorum import majority
 
 BACKOFF_CAP_S = 5.0
@@ -43,28 +45,28 @@ class _Phase(StrEnum):
 
 
 @dataclass(slots=True)
-class _Round:
+class _Round(Generic[V]):
     """One proposer's attempts at one change (or, without a change, an identity round)."""
 
-    change: Change | None
+    change: Rewrite[V] | None
     give_up_at: float
     phase: _Phase = _Phase.WAIT
     deadline: float = 0.0
     ballot: Ballot | None = None
     known: int = 0  # the revision that was learnt when the prepare left
-    promises: dict[NodeId, Acceptance | None] = field(default_factory=dict)
+    promises: dict[NodeId, Acceptance[V] | None] = field(default_factory=dict)
     yes: dict[NodeId, bool] = field(default_factory=dict)
     no: dict[NodeId, Refusal] = field(default_factory=dict)
-    value: Allocation | None = None
-    sent: Allocation | None = None
+    value: V | None = None
+    sent: V | None = None
     """Our own new value once an accept for it left: from then on the outcome may be unknown."""
-    unfit: Allocation | None = None
+    unfit: V | None = None
     """Another node's value that no majority will accept, since too many electors take it for false."""
     attempt: int = 0
 
 
-class Register:
-    """One task's register on one node: acceptor (if it is an elector), proposer and learner."""
+class Register(ABC, Generic[V]):
+    """One register on one node: acceptor (if it is an elector), proposer and learner."""
 
     def __init__(
         self,
@@ -74,8 +76,8 @@ class Register:
         electors: tuple[NodeId, ...],
         electorate: str,
         is_elector: bool,
-        initial: Allocation,
-        state: RegisterState,
+        initial: V,
+        state: RegisterState[V],
         ballot_s: float,
         stagger_s: float,
         rng: Random,
@@ -89,15 +91,15 @@ class Register:
         self.problem = ""
         """Why agreement stands still; the next learnt value ends it."""
         self._counter = state.promised.counter
-        self._round: _Round | None = None
-        self._queue: list[Change] = []
+        self._round: _Round[V] | None = None
+        self._queue: list[Rewrite[V]] = []
         self._settle_at = math.inf
         self._settle_tries = 0
         self._lease_over_at = -math.inf
         """An accept waits for the owner to leave: when its lease must be over."""
 
     @property
-    def value(self) -> Allocation:
+    def value(self) -> V:
         """The newest learnt value (revision 0 before anything was agreed)."""
         return self.state.learnt or self._initial
 
@@ -114,16 +116,46 @@ class Register:
         """This node lost its right to be an elector (disk, duplicate name) and answers no more."""
         self._is_elector = False
 
-    def follow(self, electorate: str, initial: Allocation) -> None:
+    def follow(self, electorate: str, initial: V) -> None:
         """A node without a state has heard the fleet's generation: continue with its first value and counters."""
         self._electorate, self._initial = electorate, initial
         learnt = self.state.learnt
         if learnt is not None and learnt.revision < initial.revision:
             self.state = RegisterState(task=self.state.task)  # it never promised anything, and this was another fleet's
 
+    # --- what a round must know of the value -------------------------------------------------------------------
+
+    @abstractmethod
+    def _highest(self, value: V) -> int:
+        """The highest counter in ``value``."""
+
+    @abstractmethod
+    def _prevails(self, value: V) -> bool:
+        """Whether ``value`` counts more than another first value, which no ballot has brought."""
+
+    @abstractmethod
+    def _replaces(self, change: Rewrite[V]) -> bool:
+        """Whether ``change`` may be applied to a value that no majority of electors takes."""
+
+    @abstractmethod
+    def _named(self, value: V) -> str:
+        """``value`` in a word, for a problem."""
+
+    @abstractmethod
+    def _ask(self, question: Prepare | Accept[V], todo: ToDo) -> None:
+        """Send a question to every elector; answers are late after ``ballot_s``."""
+
+    @abstractmethod
+    def _hand_on(self, value: V, why: str, todo: ToDo) -> None:
+        """A newer value is learnt."""
+
+    @abstractmethod
+    def _end(self, change: Rewrite[V], outcome: RoundOutcome, todo: ToDo) -> None:
+        """A change of this node's has ended."""
+
     # --- acceptor ----------------------------------------------------------------------------------------------
 
-    def on_prepare(self, prepare: Prepare, todo: ToDo) -> Promise | Refused:
+    def on_prepare(self, prepare: Prepare, todo: ToDo) -> Promise[V] | Refused:
         """Phase 1b. A promise must not leave before it is on disk."""
         refusal = self._refusal(prepare.electorate, prepare.ballot)
         if refusal is None and prepare.ballot <= self.state.promised:
@@ -134,7 +166,7 @@ class Register:
         todo.must_persist = True
         return Promise(elector=self._me, task=self.state.task, ballot=prepare.ballot, accepted=self.state.accepted)
 
-    def would_accept(self, accept: Accept) -> bool:
+    def would_accept(self, accept: Accept[V]) -> bool:
         """Whether `on_accept` would say yes now."""
         ballot = accept.acceptance.ballot
         return self._refusal(accept.electorate, ballot) is None and ballot >= self.state.promised
@@ -143,12 +175,12 @@ class Register:
         """A no for a reason outside the register (an exclusive task's lease)."""
         return self._no(ballot, refusal)
 
-    def on_accept(self, accept: Accept, todo: ToDo, now: float) -> Accepted | Refused:
+    def on_accept(self, accept: Accept[V], todo: ToDo, now: float) -> Accepted | Refused:
         """Phase 2b. A yes must not leave before it is on disk."""
         ballot = accept.acceptance.ballot
         refusal = self._refusal(accept.electorate, ballot)
         value = accept.acceptance.value
-        if refusal is None and (ballot < self.state.promised or max(value.revision, value.epoch) > MAX_REVISION):
+        if refusal is None and (ballot < self.state.promised or self._highest(value) > MAX_REVISION):
             refusal = Refusal.BALLOT
         if refusal is not None:
             return self._no(ballot, refusal)
@@ -176,7 +208,7 @@ class Register:
         return accepted is not None and accepted.value.revision > self.value.revision
 
     def _set_state(
-        self, *, promised: Ballot | None = None, accepted: Acceptance | None = None, learnt: Allocation | None = None
+        self, *, promised: Ballot | None = None, accepted: Acceptance[V] | None = None, learnt: V | None = None
     ) -> None:
         self.state = RegisterState(
             task=self.state.task,
@@ -187,15 +219,16 @@ class Register:
 
     # --- learner -----------------------------------------------------------------------------------------------
 
-    def learn(self, value: Allocation, todo: ToDo, now: float) -> None:
+    def learn(self, value: V, todo: ToDo, now: float) -> None:
         """A committed value is known; older ones change nothing."""
-        if max(value.revision, value.epoch) > MAX_REVISION:
+        if self._highest(value) > MAX_REVISION:
             self.problem = f"revision {value.revision} cannot be"
             return
         current = self.state.learnt
         if current is not None and value.revision <= current.revision:
             if value.revision == current.revision and value != current:
-                self.problem = f"two values for revision {value.revision}: {current.owner} and {value.owner}"
+                both = f"{self._named(current)} and {self._named(value)}"
+                self.problem = f"two values for revision {value.revision}: {both}"
             return
         self._set_state(learnt=value)
         self._lease_over_at = -math.inf
@@ -204,7 +237,7 @@ class Register:
             self._settle_at = math.inf
         outcome = self._outcome_by(value)
         todo.must_persist = True
-        todo.learnt.append((value, self._why(outcome)))
+        self._hand_on(value, self._why(outcome), todo)
         if outcome is not None:
             self._finish(todo, outcome, now)
 
@@ -213,7 +246,7 @@ class Register:
         change = None if self._round is None else self._round.change
         return "learnt from a peer" if change is None or outcome is not RoundOutcome.COMMITTED else change.reason
 
-    def _outcome_by(self, value: Allocation) -> RoundOutcome | None:
+    def _outcome_by(self, value: V) -> RoundOutcome | None:
         """The end of our change under way, given the learnt ``value``; ``None``: it goes on."""
         running = self._round
         if running is None or running.change is None:
@@ -231,7 +264,7 @@ class Register:
         if now >= self._lease_over_at:
             self._lease_over_at = at_most
 
-    def propose(self, change: Change, todo: ToDo, now: float) -> None:
+    def propose(self, change: Rewrite[V], todo: ToDo, now: float) -> None:
         """Try to commit a change; its end appears in `ToDo.ended`, of this or a later call."""
         self._queue.append(change)
         if self._round is None:
@@ -267,13 +300,13 @@ class Register:
         running.promises, running.yes, running.no, running.value = {}, {}, {}, None
         running.known = self.value.revision
         prepare = Prepare(task=self.state.task, ballot=running.ballot, electorate=self._electorate)
-        todo.add(SendPrepare(prepare=prepare, deadline_s=self._ballot_s))
+        self._ask(prepare, todo)
 
-    def _running(self) -> _Round:
+    def _running(self) -> _Round[V]:
         assert self._round is not None
         return self._round
 
-    def on_answer(self, answer: Promise | Accepted | Refused, todo: ToDo, now: float) -> None:
+    def on_answer(self, answer: Promise[V] | Accepted | Refused, todo: ToDo, now: float) -> None:
         """An elector answered; answers to older ballots, and from strangers, change nothing."""
         running = self._round
         if running is None or answer.ballot != running.ballot or answer.elector not in self._electors:
@@ -289,11 +322,10 @@ class Register:
             if len(running.yes) >= majority(len(self._electors)):
                 self._commit(running, todo, now)
 
-    def _read(self, running: _Round, todo: ToDo, now: float) -> None:
+    def _read(self, running: _Round[V], todo: ToDo, now: float) -> None:
         """A majority promised: decide the value of this ballot."""
         accepted = [acceptance for acceptance in running.promises.values() if acceptance is not None]
-        # First values of a generation are equal but for their leases: what is not leased for one is so for nobody.
-        newest = max(accepted, key=lambda acceptance: (acceptance.ballot, not acceptance.value.leased), default=None)
+        newest = max(accepted, key=lambda held: (held.ballot, self._prevails(held.value)), default=None)
         read = self._initial if newest is None else newest.value
         if read.revision < running.known:
             self.problem = f"a majority of electors has forgotten revision {running.known}"
@@ -321,14 +353,15 @@ class Register:
         assert running.ballot is not None
         self._accept(running, running.ballot, running.value, todo, now)
 
-    def _moved_on(self, running: _Round, read: Allocation) -> Allocation | None:
-        """Our move applied to a read value that no majority will accept; ``None``: not that case, or no move."""
-        if read != running.unfit or running.sent is not None or not isinstance(running.change, MoveOwner):
+    def _moved_on(self, running: _Round[V], read: V) -> V | None:
+        """Our change applied to a read value that no majority will accept; ``None``: not that case."""
+        change = running.change
+        if read != running.unfit or running.sent is not None or change is None or not self._replaces(change):
             return None
-        moved = running.change.apply(read)
+        moved = change.apply(read)
         return None if moved == read else moved
 
-    def _commit(self, running: _Round, todo: ToDo, now: float) -> None:
+    def _commit(self, running: _Round[V], todo: ToDo, now: float) -> None:
         """A majority accepted: the value is chosen."""
         assert running.value is not None
         self.learn(running.value, todo, now)
@@ -341,7 +374,7 @@ class Register:
         else:
             self._finish(todo, RoundOutcome.CONFLICT, now)  # a majority has passed the ballot that carried ours
 
-    def _on_refused(self, running: _Round, answer: Refused, todo: ToDo, now: float) -> None:
+    def _on_refused(self, running: _Round[V], answer: Refused, todo: ToDo, now: float) -> None:
         if answer.refusal is Refusal.BALLOT and answer.promised <= answer.ballot:
             return  # the echo of a duplicated prepare: it has promised this very ballot
         if answer.promised.counter <= self._counter + MAX_JUMP:
@@ -355,11 +388,11 @@ class Register:
             self._again(running, todo, now)
 
     @staticmethod
-    def _waits_for_leases(running: _Round) -> bool:
+    def _waits_for_leases(running: _Round[V]) -> bool:
         """Whether only an exclusive task's lease stands against our accept: it will end, and the ballot is good."""
         return running.phase is _Phase.ACCEPT and set(running.no.values()) == {Refusal.LEASE}
 
-    def _ask_again(self, running: _Round, todo: ToDo, now: float) -> None:
+    def _ask_again(self, running: _Round[V], todo: ToDo, now: float) -> None:
         """Send the same accept again: a new ballot could only find out the outcome, without a move."""
         if now >= running.give_up_at:
             self._give_up(running, todo, now)
@@ -368,13 +401,13 @@ class Register:
         assert running.value is not None
         self._accept(running, running.ballot, running.value, todo, now)
 
-    def _accept(self, running: _Round, ballot: Ballot, value: Allocation, todo: ToDo, now: float) -> None:
+    def _accept(self, running: _Round[V], ballot: Ballot, value: V, todo: ToDo, now: float) -> None:
         running.phase, running.deadline, running.no = _Phase.ACCEPT, now + self._ballot_s, {}
         acceptance = Acceptance(ballot=ballot, value=value)
         accept = Accept(task=self.state.task, acceptance=acceptance, electorate=self._electorate)
-        todo.add(SendAccept(accept=accept, deadline_s=self._ballot_s))
+        self._ask(accept, todo)
 
-    def _again(self, running: _Round, todo: ToDo, now: float) -> None:
+    def _again(self, running: _Round[V], todo: ToDo, now: float) -> None:
         """This ballot cannot win: wait a little and try a higher one, or end.
 
         Once our own accept has left, the higher ballot only finds out its outcome.
@@ -386,13 +419,13 @@ class Register:
         running.attempt += 1
         running.phase, running.deadline, running.ballot = _Phase.WAIT, now + wait, None
 
-    def _give_up(self, running: _Round, todo: ToDo, now: float) -> None:
+    def _give_up(self, running: _Round[V], todo: ToDo, now: float) -> None:
         self._finish(todo, RoundOutcome.NO_QUORUM if running.sent is None else RoundOutcome.UNKNOWN, now)
 
     def _finish(self, todo: ToDo, outcome: RoundOutcome, now: float) -> None:
         running = self._running()
         if running.change is not None:
-            todo.end(self.state.task, running.change, outcome)
+            self._end(running.change, outcome, todo)
         self._round = None
         self._start_next(todo, now)
 

@@ -14,7 +14,8 @@ from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import Acceptance, Allocation, RegisterState
 from zsched.core.vote.belief import GENERATION_STEP, MAX_AHEAD, MAX_GENERATION, is_fit, is_proven
-from zsched.core.vote.register import MAX_REVISION, Register
+from zsched.core.vote.register import MAX_REVISION
+from zsched.core.vote.task_register import TaskRegister
 
 TUNING = tuning_of()
 TASK = TaskSpec(name="merge", candidates=("edge1", "robot2"), tuning=TUNING)
@@ -23,10 +24,10 @@ FLEET = fleet_of(TASK, of=NAMES, electors=("robot1", "robot2"))
 STRAY = MAX_AHEAD * 3
 
 
-def register(learnt: Allocation | None = None, accepted: Allocation | None = None) -> Register:
+def register(learnt: Allocation | None = None, accepted: Allocation | None = None) -> TaskRegister:
     ballot = ballot_of(5)
     held = None if accepted is None else Acceptance(ballot=ballot, value=accepted)
-    return Register(
+    return TaskRegister(
         me="robot1",
         incarnation=1,
         electors=FLEET.electors,

@@ -24,8 +24,8 @@ from support.registers import (
 from zsched.core.values.change import Change, MoveOwner, Retune, RoundOutcome
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.model import PeerState
-from zsched.core.vote.register import Register
 from zsched.core.vote.tally import VoteOutcome
+from zsched.core.vote.task_register import TaskRegister
 from zsched.core.vote.voting import Voting
 
 TODAY = allocation(3)
@@ -35,7 +35,7 @@ ROBOTS = ("r1", "r2", "r3")
 FLEET = fleet_of(TaskSpec(name="merge", candidates=("e1", "e2"), tuning=TUNING), of=ROBOTS, electors=ROBOTS)
 
 
-def agreed_on_today() -> list[Register]:
+def agreed_on_today() -> list[TaskRegister]:
     """Three electors that have accepted and learnt the value of revision 3."""
     electors = [make(name, state=replace(BLANK, learnt=TODAY)) for name in ELECTORS]
     for elector in electors:

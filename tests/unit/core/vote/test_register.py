@@ -37,7 +37,8 @@ from zsched.core.todo import ToDo
 from zsched.core.values.change import RoundOutcome
 from zsched.core.values.messages import Accepted, Prepare, Promise, Refusal, Refused
 from zsched.core.values.model import MAX_COUNTER, Acceptance
-from zsched.core.vote.register import BACKOFF_CAP_S, MAX_JUMP, MAX_REVISION, Register
+from zsched.core.vote.register import BACKOFF_CAP_S, MAX_JUMP, MAX_REVISION
+from zsched.core.vote.task_register import TaskRegister
 
 # --- acceptor --------------------------------------------------------------------------------------------------------
 
@@ -94,7 +95,7 @@ def test_accept_below_the_promise_is_refused() -> None:
 
 
 @pytest.mark.parametrize("register", [make("edge"), make(is_elector=False)])
-def test_no_elector_answers_neither_prepare_nor_accept(register: Register) -> None:
+def test_no_elector_answers_neither_prepare_nor_accept(register: TaskRegister) -> None:
     for step, answer in (promised(register, prepare(1)), accepted(register, accept(1, allocation(1)), 0.0)):
         assert isinstance(answer, Refused)
         assert answer.refusal is Refusal.NOT_ELECTOR
@@ -132,14 +133,14 @@ def test_two_electorates_never_commit_together() -> None:
 # --- the crash that random schedules hardly ever hit -----------------------------------------------------------------
 
 
-class ForgetsPromises(Register):
+class ForgetsPromises(TaskRegister):
     """Planted bug: answers before the promise is on disk."""
 
     def on_prepare(self, prepare: Prepare, _todo: ToDo) -> Promise | Refused:
         return super().on_prepare(prepare, ToDo())
 
 
-def duel_with_a_crash(kind: type[Register]) -> set[str | None]:
+def duel_with_a_crash(kind: type[TaskRegister]) -> set[str | None]:
     """r2 promises the higher ballot, crashes, and then the lower ballot's accept arrives; {owner learnt}."""
     first, second, witness = make("r1"), make("r3"), make("r2", kind=kind)
     low = promise_all(first, did(first.propose, FIRST, 0.0), [first, witness])
@@ -158,7 +159,7 @@ def duel_with_a_crash(kind: type[Register]) -> set[str | None]:
 
 
 def test_crash_between_promise_and_acceptance_cannot_commit_two_values() -> None:
-    assert duel_with_a_crash(Register) == {"e2"}
+    assert duel_with_a_crash(TaskRegister) == {"e2"}
     assert duel_with_a_crash(ForgetsPromises) == {"e1", "e2"}  # the test does see the bug
 
 

@@ -31,7 +31,7 @@ from support.registers import (
 from zsched.core.values.change import MoveOwner, Retune, RoundOutcome
 from zsched.core.values.messages import Accepted, Promise, Refusal, Refused
 from zsched.core.values.model import Acceptance, Allocation
-from zsched.core.vote.register import Register
+from zsched.core.vote.task_register import TaskRegister
 
 # --- proposer --------------------------------------------------------------------------------------------------------
 
@@ -199,7 +199,7 @@ def test_duplicated_prepare_does_not_count_as_refusal() -> None:
 # --- unknown outcomes ------------------------------------------------------------------------------------------------
 
 
-def sent_and_unanswered(acceptors: list[Register]) -> Register:
+def sent_and_unanswered(acceptors: list[TaskRegister]) -> TaskRegister:
     """r1 has sent its accept to ``acceptors`` and heard nothing; it waits for its next attempt."""
     proposer = make("r1")
     asked = promise_all(proposer, did(proposer.propose, FIRST, 0.0), acceptors)
@@ -272,7 +272,7 @@ def test_an_elector_that_nobody_answers_asks_more_and_more_seldom_what_became_of
 # --- a value that too many electors refuse for good ------------------------------------------------------------------
 
 
-def stuck(change: MoveOwner | Retune | None) -> tuple[Register, list[Register], Step]:
+def stuck(change: MoveOwner | Retune | None) -> tuple[TaskRegister, list[TaskRegister], Step]:
     """r1 alone has accepted a value of owner "gone", which the others refuse; (proposer r2, all, its first accept)."""
     electors = [make(name) for name in ELECTORS]
     proposer = electors[1]
@@ -281,7 +281,7 @@ def stuck(change: MoveOwner | Retune | None) -> tuple[Register, list[Register], 
     return proposer, electors, promise_all(proposer, asked, electors)
 
 
-def refuse_value(proposer: Register, electors: list[Register], asked: Step) -> Step:
+def refuse_value(proposer: TaskRegister, electors: list[TaskRegister], asked: Step) -> Step:
     """The elector that has it accepts it once more, the other two say that it can be no true one."""
     assert asked.accept is not None
     carried = asked.accept.acceptance
@@ -331,7 +331,7 @@ def test_a_value_that_is_refused_for_a_higher_ballot_is_tried_again() -> None:
 # --- an exclusive task's lease ---------------------------------------------------------------------------------------
 
 
-def asked(others: tuple[Register, ...]) -> tuple[Register, Acceptance]:
+def asked(others: tuple[TaskRegister, ...]) -> tuple[TaskRegister, Acceptance]:
     """A proposer whose accept is on its way to r2 and r3."""
     proposer = make("r1", is_elector=False)
     carried = promise_all(proposer, did(proposer.propose, FIRST, 0.0), others).accept
@@ -339,7 +339,7 @@ def asked(others: tuple[Register, ...]) -> tuple[Register, Acceptance]:
     return proposer, carried.acceptance
 
 
-def refused(proposer: Register, others: tuple[Register, ...], held: Acceptance, *whys: Refusal) -> Step:
+def refused(proposer: TaskRegister, others: tuple[TaskRegister, ...], held: Acceptance, *whys: Refusal) -> Step:
     answers = [one.refuse(held.ballot, why) for one, why in zip(others, whys, strict=False)]
     return last(did(proposer.on_answer, answer, 0.25) for answer in answers)
 
@@ -389,7 +389,7 @@ def test_a_no_for_any_other_reason_than_a_lease_takes_a_higher_ballot(why: Refus
     assert (again.accept, again.prepare is None) == (None, False)
 
 
-def overtaken() -> tuple[Register, float]:
+def overtaken() -> tuple[TaskRegister, float]:
     """A proposer that a higher ballot has overtaken, and when it would try again."""
     others = (make("r2"), make("r3"))
     proposer, held = asked(others)

@@ -20,7 +20,7 @@ from zsched.core.values.change import Change, MoveOwner, Retune, RoundOutcome
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refused
 from zsched.core.values.model import Acceptance, Allocation, RegisterState
 from zsched.core.values.quorum import majority
-from zsched.core.vote.register import Register
+from zsched.core.vote.task_register import TaskRegister
 
 FAULTS_END_S = 3.0
 Message = Prepare | Accept | Promise | Accepted | Refused | Allocation
@@ -37,13 +37,13 @@ class Host:
     name: str
     incarnation: int
     disk: RegisterState
-    register: Register | None = None
+    register: TaskRegister | None = None
 
 
 class World:
     """A fleet of registers, its network and its clock; raises `ViolationError` when an invariant breaks."""
 
-    def __init__(self, seed: int, register_class: type[Register] = Register) -> None:
+    def __init__(self, seed: int, register_class: type[TaskRegister] = TaskRegister) -> None:
         self.rng = Random(seed)
         self.electors = tuple(f"r{i}" for i in range(self.rng.choice((1, 2, 3, 3, 3, 4, 5))))
         names = (*self.electors, "edge")  # the edge proposes and learns, but has no say
@@ -245,7 +245,7 @@ def is_made_by(value: Allocation, change: Change) -> bool:
     return value.tuning == change.tuning
 
 
-def play(seed: int, register_class: type[Register] = Register) -> World:
+def play(seed: int, register_class: type[TaskRegister] = TaskRegister) -> World:
     world = World(seed, register_class)
     try:
         world.fault_phase()
@@ -258,7 +258,7 @@ def play(seed: int, register_class: type[Register] = Register) -> World:
     return world
 
 
-def play_all(seeds: range, register_class: type[Register]) -> None:
+def play_all(seeds: range, register_class: type[TaskRegister]) -> None:
     for seed in seeds:
         play(seed, register_class)
 
@@ -299,14 +299,14 @@ def test_register_unlearnt_majority_after_power_loss_is_learnt_without_a_new_pro
 # --- test the test: planted bugs must be found ------------------------------------------------------------------
 
 
-class ForgetsAcceptances(Register):
+class ForgetsAcceptances(TaskRegister):
     """Answers before the acceptance is on disk."""
 
     def on_accept(self, accept: Accept, _todo: ToDo, now: float) -> Accepted | Refused:
         return super().on_accept(accept, ToDo(), now)
 
 
-class PromisesBackwards(Register):
+class PromisesBackwards(TaskRegister):
     """Promises a lower ballot after a higher one."""
 
     def on_prepare(self, prepare: Prepare, todo: ToDo) -> Promise | Refused:
@@ -314,7 +314,7 @@ class PromisesBackwards(Register):
         return super().on_prepare(prepare, todo)
 
 
-class IgnoresWhatItReads(Register):
+class IgnoresWhatItReads(TaskRegister):
     """Puts its own change through, whatever the promises brought."""
 
     def on_answer(self, answer: Promise | Accepted | Refused, todo: ToDo, now: float) -> None:
@@ -323,7 +323,7 @@ class IgnoresWhatItReads(Register):
         super().on_answer(answer, todo, now)
 
 
-class TellsNobody(Register):
+class TellsNobody(TaskRegister):
     """An elector that never asks what became of what it accepted, and never retries."""
 
     def next_deadline(self) -> float:
@@ -331,6 +331,6 @@ class TellsNobody(Register):
 
 
 @pytest.mark.parametrize("mutant", [ForgetsAcceptances, PromisesBackwards, IgnoresWhatItReads, TellsNobody])
-def test_harness_finds_a_planted_bug(mutant: type[Register]) -> None:
+def test_harness_finds_a_planted_bug(mutant: type[TaskRegister]) -> None:
     with pytest.raises(ViolationError):
         play_all(range(50), mutant)
