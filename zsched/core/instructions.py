@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from zsched.core.values.electorate import FleetValue
 from zsched.core.values.messages import Accept, Accepted, CommandResult, Learnt, Prepare, Promise, Refused, Utilities
 from zsched.core.values.model import Beat, DurableState, NodeId, Profile, Proposal, TaskId
 from zsched.core.values.plan import Role, RoutePlan
@@ -220,3 +221,33 @@ Instruction = (
     | StandDown
     | RecordStory
 )
+
+
+# --- of the fleet register -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AskElectors:
+    """Ask these electors (this node may be one) a question of the fleet register."""
+
+    to: tuple[NodeId, ...]
+    question: Prepare | Accept[FleetValue]
+    deadline_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TellFleet:
+    """Tell nodes the fleet value that this node has learnt."""
+
+    to: tuple[NodeId, ...]
+    value: FleetValue
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AskFleet:
+    """Ask a node for the fleet value that it has learnt: it counts by a higher number."""
+
+    peer: NodeId
+
+
+FleetInstruction = AskElectors | TellFleet | AskFleet

@@ -12,7 +12,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from zsched.core import instructions as do
-from zsched.core.values.change import Change, Ended, RoundOutcome
+from zsched.core.instructions import FleetInstruction
+from zsched.core.values.change import Change, Ended, Rewrite, RoundOutcome
+from zsched.core.values.electorate import FleetValue
 from zsched.core.values.model import Allocation, TaskId
 
 _LOCAL = frozenset(
@@ -51,6 +53,10 @@ class ToDo:
     """Instructions whose effect other nodes, or an asking operator, will see."""
     apply: list[do.Instruction] = field(default_factory=list)
     """Instructions whose effect stays on this machine."""
+    fleet: list[FleetInstruction] = field(default_factory=list)
+    """What the fleet register asks of other nodes, and tells them."""
+    fleet_ended: list[tuple[Rewrite[FleetValue], RoundOutcome]] = field(default_factory=list)
+    """Changes of the fleet that were committed, overtaken or given up."""
 
     stand_down: do.StandDown | None = None
     """This daemon ends: the last instruction, behind all others of the same event."""

@@ -25,6 +25,8 @@ class Bug:
     """A schedule that has found it before: tried first."""
     has_schedules: bool = True
     """Whether the simulator runs the module at all."""
+    has_changing_electors: bool = False
+    """Whether schedules of electors that change are played, not those of whole nodes."""
     also: Bug | None = None
     """Its part in another module, for a rule that is kept in two places."""
 
@@ -191,8 +193,8 @@ REGISTER_BUGS = (
     _bug(
         "restart forgets the incarnation",
         REGISTER,
-        "running.ballot = Ballot(counter=self._counter, node=self._me, incarnation=self._incarnation)",
-        "running.ballot = Ballot(counter=self._counter, node=self._me, incarnation=0)",
+        "counter=self._counter, node=self._me, incarnation=self._incarnation, disk",
+        "counter=self._counter, node=self._me, incarnation=0, disk",
         _REGISTER,
     ),
     _bug(
@@ -205,7 +207,7 @@ REGISTER_BUGS = (
     _bug(
         "stranger's answer counts",
         REGISTER,
-        "answer.ballot != running.ballot or answer.elector not in self._electors",
+        "answer.ballot != running.ballot or answer.elector not in self._count.names",
         "answer.ballot != running.ballot",
         _REGISTER,
     ),
@@ -226,8 +228,8 @@ REGISTER_BUGS = (
     _bug(
         "another electorate's ballot is answered",
         REGISTER,
-        "if electorate != self._electorate:",
-        "if not electorate:",
+        "if question.electorate != self._electorate:",
+        "if not question.electorate:",
         _REGISTER,
     ),
     _bug(

@@ -28,8 +28,10 @@ import msgpack
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
+from zsched.core.electorate.founding import founded
 from zsched.core.node import Node
 from zsched.core.status import build_snapshot
+from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, electorate_hash
 from zsched.core.values.messages import Accept, Accepted, Learnt, Prepare, Promise, Refused, SetWeights, Utilities
 from zsched.core.values.model import (
@@ -68,6 +70,9 @@ CLASSES: tuple[type[Any], ...] = tuple(cls for cls, _ in wire.KINDS.values())
 # --- valid frames ----------------------------------------------------------------------------------------------------
 
 
+FOUNDED = tuple(founded("lab", generation, ("robot1", "robot2")) for generation in (0, 1))
+
+
 def sample(hint: Any, rng: Random, name: str = "") -> Any:
     """Some value of a type hint; ``name`` is the field that holds it."""
     if hint is bool:
@@ -96,6 +101,8 @@ def _dataclass(cls: Any, rng: Random) -> Any:
     if cls is Weights:
         cpu = rng.choice((0.0, 0.25, 1.0))
         return Weights(cpu=cpu, memory=1.0 - cpu, network=0.0)
+    if cls is FleetValue:
+        return rng.choice(FOUNDED)
     hints = wire.hints_of(cls)
     values = {one.name: sample(hints[one.name], rng, one.name) for one in fields(cls)}
     if cls is Accept:

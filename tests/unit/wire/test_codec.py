@@ -16,8 +16,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from zsched.core.electorate.founding import founded
 from zsched.core.membership.beat_room import MAX_BEAT_BYTES
 from zsched.core.values import messages, model
+from zsched.core.values.electorate import FleetValue
 from zsched.errors import WireError
 from zsched.ipc import pipe as relay_pipe
 from zsched.wire import codec as wire
@@ -71,6 +73,7 @@ def test_golden_frames_of_kinds_that_are_gone_are_not_deleted() -> None:
 
 # --- round trips -----------------------------------------------------------------------------------------------------
 
+FOUNDED = founded("lab", 1, ("r1", "r2"))
 NAMES = st.from_regex(r"[a-z0-9][a-z0-9_-]{0,20}", fullmatch=True)
 TEXTS = st.text(st.characters(codec="utf-8"), max_size=60)
 FREE_TEXT = {"reason", "detail", "electorate", "hardware", "problem", "source", "zid", "incarnation", "from_expr"}
@@ -121,6 +124,8 @@ def dataclass_strategy(cls: type[Any]) -> st.SearchStrategy[Any]:
         return st.sampled_from([(1.0, 0.0, 0.0), (0.5, 0.25, 0.25), (0.1, 0.2, 0.7)]).map(
             lambda w: model.Weights(cpu=w[0], memory=w[1], network=w[2])
         )
+    if cls is FleetValue:
+        return st.sampled_from((FOUNDED, replace(FOUNDED, document="0a", revision=2)))
     if cls is messages.Accept:
         return st.builds(
             lambda acceptance, electorate: messages.Accept(

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Generic
 
+from zsched.core.values.electorate import FleetValue
 from zsched.core.values.model import (
     Acceptance,
     Allocation,
@@ -30,6 +31,10 @@ class Prepare:
     ballot: Ballot
     electorate: str
     """Hash of the electorate that the proposer counts with; a differing one is refused."""
+    creation: int = 0
+    generation_id: str = ""
+    number: int = 0
+    """Of the fleet value that the proposer counts by; another generation gets no answer, another number a no."""
 
     def __post_init__(self) -> None:
         check_name("prepare.task", self.task)
@@ -43,6 +48,9 @@ class Promise(Generic[V]):
     task: TaskId
     ballot: Ballot
     accepted: Acceptance[V] | None = None
+    disk: str = ""
+    joining: int = 0
+    """With ``disk``: the seat for which the elector answers; one that the round does not count with is no answer."""
 
     def __post_init__(self) -> None:
         check_name("promise.elector", self.elector)
@@ -56,6 +64,9 @@ class Accept(Generic[V]):
     task: TaskId
     acceptance: Acceptance[V]
     electorate: str
+    creation: int = 0
+    generation_id: str = ""
+    number: int = 0
 
     def __post_init__(self) -> None:
         check_name("accept.task", self.task)
@@ -70,6 +81,8 @@ class Accepted:
     elector: NodeId
     task: TaskId
     ballot: Ballot
+    disk: str = ""
+    joining: int = 0
 
     def __post_init__(self) -> None:
         check_name("accepted.elector", self.elector)
@@ -86,6 +99,7 @@ class Refusal(StrEnum):
     RATE = "rate"  # this proposer asks too often
     DISK = "disk"  # it could not persist
     VALUE = "value"  # it does not take this value for a true one: its fleet file knows no such node
+    NUMBER = "number"  # it counts by another number of the fleet value, or has no such register
     YOUNG = "young"  # it has just started, and asks the others first what they remember of it
 
 
@@ -98,6 +112,10 @@ class Refused:
     ballot: Ballot
     refusal: Refusal
     promised: Ballot
+    number: int = 0
+    """By which the elector counts."""
+    fleet: FleetValue | None = None
+    """The elector's learnt fleet value, for a proposer whose number is lower."""
 
     def __post_init__(self) -> None:
         check_name("refused.elector", self.elector)

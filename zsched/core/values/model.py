@@ -487,11 +487,13 @@ class Allocation:
 
 @dataclass(frozen=True, slots=True, kw_only=True, order=True)
 class Ballot:
-    """A proposer's attempt, totally ordered by (counter, node, incarnation)."""
+    """A proposer's attempt, totally ordered by (counter, node, incarnation, disk)."""
 
     counter: int
     node: NodeId
     incarnation: int
+    disk: str = ""
+    """Id of the proposer's disk: a node that has lost its disk counts its lives anew."""
 
     def __post_init__(self) -> None:
         check_counter("ballot.counter", self.counter)
@@ -536,6 +538,8 @@ class RegisterState(Generic[V]):
     """The durable part of one register on one node; written before any answer leaves."""
 
     task: TaskId
+    creation: int = 0
+    """Which register of this name it is: a task that is removed and added again gets another."""
     promised: Ballot = NO_BALLOT
     accepted: Acceptance[V] | None = None
     learnt: V | None = None

@@ -22,13 +22,14 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from random import Random
 from typing import Generic
 
 from zsched.core.todo import ToDo
 from zsched.core.values.change import Rewrite, RoundOutcome
+from zsched.core.values.electorate import Electorate, electorate_of
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refusal, Refused
 from zsched.core.values.model import Acceptance, Ballot, NodeId, RegisterState, V
 from zsched.core.values.quorum import majority
@@ -81,15 +82,18 @@ class Register(ABC, Generic[V]):
         ballot_s: float,
         stagger_s: float,
         rng: Random,
+        disk: str = "",
     ) -> None:
-        self._me, self._incarnation = me, incarnation
-        self._electors, self._electorate = electors, electorate
+        self._me, self._incarnation, self._disk = me, incarnation, disk
+        self._count, self._electorate = electorate_of(electors), electorate
         self._is_elector = is_elector
         self._initial = initial
         self._ballot_s, self._stagger_s, self._rng = ballot_s, stagger_s, rng
         self.state = state
         self.problem = ""
         """Why agreement stands still; the next learnt value ends it."""
+        self.written_under: Electorate | None = None
+        """With whom this node last saw a majority accept the newest value, or found the register blank."""
         self._counter = state.promised.counter
         self._round: _Round[V] | None = None
         self._queue: list[Rewrite[V]] = []
@@ -121,7 +125,36 @@ class Register(ABC, Generic[V]):
         self._electorate, self._initial = electorate, initial
         learnt = self.state.learnt
         if learnt is not None and learnt.revision < initial.revision:
-            self.state = RegisterState(task=self.state.task)  # it never promised anything, and this was another fleet's
+            self.state = RegisterState(
+                task=self.state.task, creation=self.state.creation
+            )  # it never promised anything, and this was another fleet's
+
+    def count_with(self, count: Electorate, *, is_elector: bool, is_blank: bool, now: float) -> None:
+        """A newer fleet value is learnt: rounds count with its electors, and the one under way begins again.
+
+        Args:
+            count: number and electors of that value.
+            is_elector: this node has a seat there.
+            is_blank: what this node has accepted belongs to a seat that it no longer has.
+            now: monotonic seconds.
+        """
+        self._count, self._is_elector = count, is_elector
+        if is_blank:
+            self.state = replace(self.state, accepted=None)
+            self._settle_at = math.inf
+        running = self._round
+        if running is not None:
+            running.phase, running.deadline, running.ballot = _Phase.WAIT, now, None
+
+    def close(self, todo: ToDo) -> None:
+        """The register is removed: changes under way end."""
+        running, queue = self._round, self._queue
+        self._round, self._queue, self._settle_at = None, [], math.inf
+        if running is not None and running.change is not None:
+            is_sent = running.sent is not None
+            self._end(running.change, RoundOutcome.UNKNOWN if is_sent else RoundOutcome.NO_QUORUM, todo)
+        for change in queue:
+            self._end(change, RoundOutcome.NO_QUORUM, todo)
 
     # --- what a round must know of the value -------------------------------------------------------------------
 
@@ -157,19 +190,26 @@ class Register(ABC, Generic[V]):
 
     def on_prepare(self, prepare: Prepare, todo: ToDo) -> Promise[V] | Refused:
         """Phase 1b. A promise must not leave before it is on disk."""
-        refusal = self._refusal(prepare.electorate, prepare.ballot)
+        refusal = self._refusal(prepare, prepare.ballot)
         if refusal is None and prepare.ballot <= self.state.promised:
             refusal = Refusal.BALLOT
         if refusal is not None:
             return self._no(prepare.ballot, refusal)
         self._set_state(promised=prepare.ballot)
         todo.must_persist = True
-        return Promise(elector=self._me, task=self.state.task, ballot=prepare.ballot, accepted=self.state.accepted)
+        return Promise(
+            elector=self._me,
+            task=self.state.task,
+            ballot=prepare.ballot,
+            accepted=self.state.accepted,
+            disk=self._disk,
+            joining=self._joining,
+        )
 
     def would_accept(self, accept: Accept[V]) -> bool:
         """Whether `on_accept` would say yes now."""
         ballot = accept.acceptance.ballot
-        return self._refusal(accept.electorate, ballot) is None and ballot >= self.state.promised
+        return self._refusal(accept, ballot) is None and ballot >= self.state.promised
 
     def refuse(self, ballot: Ballot, refusal: Refusal) -> Refused:
         """A no for a reason outside the register (an exclusive task's lease)."""
@@ -178,7 +218,7 @@ class Register(ABC, Generic[V]):
     def on_accept(self, accept: Accept[V], todo: ToDo, now: float) -> Accepted | Refused:
         """Phase 2b. A yes must not leave before it is on disk."""
         ballot = accept.acceptance.ballot
-        refusal = self._refusal(accept.electorate, ballot)
+        refusal = self._refusal(accept, ballot)
         value = accept.acceptance.value
         if refusal is None and (ballot < self.state.promised or self._highest(value) > MAX_REVISION):
             refusal = Refusal.BALLOT
@@ -189,18 +229,31 @@ class Register(ABC, Generic[V]):
             self._settle_tries = 0
             self._settle_at = now + 2 * self._ballot_s + self._jitter(0)
         todo.must_persist = True
-        return Accepted(elector=self._me, task=self.state.task, ballot=ballot)
+        return Accepted(elector=self._me, task=self.state.task, ballot=ballot, disk=self._disk, joining=self._joining)
 
-    def _refusal(self, electorate: str, ballot: Ballot) -> Refusal | None:
+    @property
+    def _joining(self) -> int:
+        seat = self._count.seat(self._me)
+        return 0 if seat is None else seat.joining
+
+    def _refusal(self, question: Prepare | Accept[V], ballot: Ballot) -> Refusal | None:
         if not self._is_elector:
             return Refusal.NOT_ELECTOR
-        if electorate != self._electorate:
+        if question.electorate != self._electorate:
             return Refusal.ELECTORATE
+        count = question.generation_id, question.number, question.creation
+        if count != (self._count.generation_id, self._count.number, self.state.creation):
+            return Refusal.NUMBER
         return Refusal.BALLOT if ballot.counter > self.state.promised.counter + MAX_JUMP else None
 
     def _no(self, ballot: Ballot, refusal: Refusal) -> Refused:
         return Refused(
-            elector=self._me, task=self.state.task, ballot=ballot, refusal=refusal, promised=self.state.promised
+            elector=self._me,
+            task=self.state.task,
+            ballot=ballot,
+            refusal=refusal,
+            promised=self.state.promised,
+            number=self._count.number,
         )
 
     def _is_unlearnt(self) -> bool:
@@ -212,6 +265,7 @@ class Register(ABC, Generic[V]):
     ) -> None:
         self.state = RegisterState(
             task=self.state.task,
+            creation=self.state.creation,
             promised=promised or self.state.promised,
             accepted=accepted or self.state.accepted,
             learnt=learnt or self.state.learnt,
@@ -295,11 +349,18 @@ class Register(ABC, Generic[V]):
     def _prepare(self, todo: ToDo, now: float) -> None:
         running = self._running()
         self._counter = max(self._counter, self.state.promised.counter) + 1
-        running.ballot = Ballot(counter=self._counter, node=self._me, incarnation=self._incarnation)
+        running.ballot = Ballot(counter=self._counter, node=self._me, incarnation=self._incarnation, disk=self._disk)
         running.phase, running.deadline = _Phase.PREPARE, now + self._ballot_s
         running.promises, running.yes, running.no, running.value = {}, {}, {}, None
         running.known = self.value.revision
-        prepare = Prepare(task=self.state.task, ballot=running.ballot, electorate=self._electorate)
+        prepare = Prepare(
+            task=self.state.task,
+            ballot=running.ballot,
+            electorate=self._electorate,
+            creation=self.state.creation,
+            generation_id=self._count.generation_id,
+            number=self._count.number,
+        )
         self._ask(prepare, todo)
 
     def _running(self) -> _Round[V]:
@@ -309,18 +370,25 @@ class Register(ABC, Generic[V]):
     def on_answer(self, answer: Promise[V] | Accepted | Refused, todo: ToDo, now: float) -> None:
         """An elector answered; answers to older ballots, and from strangers, change nothing."""
         running = self._round
-        if running is None or answer.ballot != running.ballot or answer.elector not in self._electors:
+        if running is None or answer.ballot != running.ballot or answer.elector not in self._count.names:
             return
         if isinstance(answer, Refused):
             self._on_refused(running, answer, todo, now)
+        elif not self._is_of_seat(answer):
+            return
         elif isinstance(answer, Promise) and running.phase is _Phase.PREPARE:
             running.promises[answer.elector] = answer.accepted
-            if len(running.promises) >= majority(len(self._electors)):
+            if len(running.promises) >= majority(len(self._count.electors)):
                 self._read(running, todo, now)
         elif isinstance(answer, Accepted) and running.phase is _Phase.ACCEPT:
             running.yes[answer.elector] = True
-            if len(running.yes) >= majority(len(self._electors)):
+            if len(running.yes) >= majority(len(self._count.electors)):
                 self._commit(running, todo, now)
+
+    def _is_of_seat(self, answer: Promise[V] | Accepted) -> bool:
+        """Whether a yes is that of the seat with which this round counts, and not of another disk or joining."""
+        seat = self._count.seat(answer.elector)
+        return seat is not None and seat.is_held_by(answer.elector, answer.disk) and seat.joining == answer.joining
 
     def _read(self, running: _Round[V], todo: ToDo, now: float) -> None:
         """A majority promised: decide the value of this ballot."""
@@ -336,6 +404,7 @@ class Register(ABC, Generic[V]):
             return
         is_identity = running.change is None or running.sent is not None
         if is_identity and newest is None:
+            self.written_under = self._count
             self._finish(todo, RoundOutcome.COMMITTED if running.sent is None else RoundOutcome.UNKNOWN, now)
             return
         if (moved := self._moved_on(running, read)) is not None:
@@ -364,6 +433,7 @@ class Register(ABC, Generic[V]):
     def _commit(self, running: _Round[V], todo: ToDo, now: float) -> None:
         """A majority accepted: the value is chosen."""
         assert running.value is not None
+        self.written_under = self._count
         self.learn(running.value, todo, now)
         if self._round is not running:
             return  # learning it has ended the round
@@ -380,7 +450,7 @@ class Register(ABC, Generic[V]):
         if answer.promised.counter <= self._counter + MAX_JUMP:
             self._counter = max(self._counter, answer.promised.counter)
         running.no[answer.elector] = answer.refusal
-        if len(self._electors) - len(running.no) < majority(len(self._electors)):
+        if len(self._count.electors) - len(running.no) < majority(len(self._count.electors)):
             if self._waits_for_leases(running):
                 return  # the same accept is sent once more at its deadline
             if Refusal.VALUE in running.no.values():
@@ -404,7 +474,14 @@ class Register(ABC, Generic[V]):
     def _accept(self, running: _Round[V], ballot: Ballot, value: V, todo: ToDo, now: float) -> None:
         running.phase, running.deadline, running.no = _Phase.ACCEPT, now + self._ballot_s, {}
         acceptance = Acceptance(ballot=ballot, value=value)
-        accept = Accept(task=self.state.task, acceptance=acceptance, electorate=self._electorate)
+        accept = Accept(
+            task=self.state.task,
+            acceptance=acceptance,
+            electorate=self._electorate,
+            creation=self.state.creation,
+            generation_id=self._count.generation_id,
+            number=self._count.number,
+        )
         self._ask(accept, todo)
 
     def _again(self, running: _Round[V], todo: ToDo, now: float) -> None:

@@ -1,0 +1,142 @@
+"""What may be changed in a fleet value, and when: one elector at a time, and only on a settled value.
+
+Knows: the rules of a change. Does not know: rounds (`zsched.core.vote.register`), who wants the change and why.
+
+* A change of the electors adds one or removes one, never the last. It raises the number and unsettles the value.
+* A change of the lease's length raises the number, too: an elector of the number before waits for another length.
+* Both need a settled value. A change of the document is allowed at any time; it keeps number and ``settled``.
+* A task that is created gets the next number of all creations, so a register that was removed never comes back.
+
+A change that its rule forbids is no error: `apply` returns what was read, and its round ends as unchanged.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from zsched.core.values.electorate import Creation, Elector, FleetValue
+from zsched.core.values.model import NodeId, TaskId
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AddElector:
+    """Change: one more elector."""
+
+    base_revision: int
+    name: NodeId
+    disk: str
+    reason: str = "an elector is added"
+
+    def fault(self, read: FleetValue) -> str:
+        """Why this change cannot be made now; empty: it can."""
+        return _unsettled(read) or (f"{self.name} is an elector" if read.electorate.seat(self.name) else "")
+
+    def apply(self, read: FleetValue) -> FleetValue:
+        """The value with one more elector, under the next number."""
+        if self.fault(read):
+            return read
+        added = Elector(name=self.name, disk=self.disk, joining=read.number + 1)
+        return _renumbered(read, tuple(sorted((*read.electors, added), key=lambda one: one.name)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RemoveElector:
+    """Change: one elector less."""
+
+    base_revision: int
+    name: NodeId
+    reason: str = "an elector is removed"
+
+    def fault(self, read: FleetValue) -> str:
+        """Why this change cannot be made now; empty: it can."""
+        if read.electorate.seat(self.name) is None:
+            return f"{self.name} is no elector"
+        return _unsettled(read) or ("" if len(read.electors) > 1 else f"{self.name} is the last elector")
+
+    def apply(self, read: FleetValue) -> FleetValue:
+        """The value with one elector less, under the next number."""
+        if self.fault(read):
+            return read
+        return _renumbered(read, tuple(one for one in read.electors if one.name != self.name))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetLease:
+    """Change: another length of leases."""
+
+    base_revision: int
+    lease_s: float
+    reason: str = "the lease has another length"
+
+    def fault(self, read: FleetValue) -> str:
+        """Why this change cannot be made now; empty: it can."""
+        return _unsettled(read)
+
+    def apply(self, read: FleetValue) -> FleetValue:
+        """The value with another lease, under the next number."""
+        if self.fault(read) or self.lease_s == read.lease_s:
+            return read
+        longest = max(self.lease_s, read.guard_lease_s)
+        return replace(_renumbered(read, read.electors), lease_s=self.lease_s, guard_lease_s=longest)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetDocument:
+    """Change: another document. Tasks that stay keep their registers; those that come get new ones."""
+
+    base_revision: int
+    document: str
+    tasks: tuple[tuple[TaskId, bool], ...]
+    """(task, whether it is exclusive) of every task of the document."""
+    reason: str = "the fleet is changed"
+
+    def fault(self, read: FleetValue) -> str:
+        """Why this change cannot be made now: never."""
+        del read
+        return ""
+
+    def apply(self, read: FleetValue) -> FleetValue:
+        """The value with this document; electors, number and ``settled`` stay."""
+        creations, tasks = read.creations, []
+        for task, exclusive in sorted(self.tasks):
+            known = read.creation(task)
+            if known is None:
+                creations += 1
+            number = creations if known is None else known.number
+            tasks.append(Creation(task=task, number=number, exclusive=exclusive))
+        if self.document == read.document and tuple(tasks) == read.tasks:
+            return read
+        return replace(
+            read, revision=read.revision + 1, creations=creations, tasks=tuple(tasks), document=self.document
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settle:
+    """Change: these electors hold all that was chosen before them (`zsched.core.electorate.settling`)."""
+
+    base_revision: int
+    number: int
+    """Under which the electors were asked: of any other number nothing is known."""
+    reason: str = "the electors are settled"
+
+    def fault(self, read: FleetValue) -> str:
+        """Why this change cannot be made now; empty: it can."""
+        return "" if read.number == self.number and not read.settled else "another number, or settled already"
+
+    def apply(self, read: FleetValue) -> FleetValue:
+        """The value, settled."""
+        if self.fault(read):
+            return read
+        return replace(read, revision=read.revision + 1, settled=True, guard_lease_s=read.lease_s)
+
+
+FleetChange = AddElector | RemoveElector | SetLease | SetDocument | Settle
+
+
+def _unsettled(read: FleetValue) -> str:
+    return "" if read.settled else f"number {read.number} is not settled"
+
+
+def _renumbered(read: FleetValue, electors: tuple[Elector, ...]) -> FleetValue:
+    return replace(read, revision=read.revision + 1, number=read.number + 1, electors=electors, settled=False)

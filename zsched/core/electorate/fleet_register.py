@@ -1,0 +1,50 @@
+"""The fleet register: what a round must know of a fleet value.
+
+Knows: which counters a fleet value has, to whom its questions go. Does not know: the rules of a round
+(`zsched.core.vote.register`), which value a node follows (`zsched.core.electorate.roll`).
+"""
+
+from __future__ import annotations
+
+from zsched.core.instructions import AskElectors
+from zsched.core.todo import ToDo
+from zsched.core.values.change import Rewrite, RoundOutcome
+from zsched.core.values.electorate import Electorate, FleetValue
+from zsched.core.values.messages import Accept, Prepare
+from zsched.core.vote.register import Register
+
+
+class FleetRegister(Register[FleetValue]):
+    """The fleet register on one node; it begins under each number with the value that brought this number.
+
+    What was accepted under a number before is dropped: either it is the value that was learnt, or it can be chosen no
+    more. Every elector that answers under a number has learnt its first value, so a blank one reads as that.
+    """
+
+    def count_with(self, count: Electorate, *, is_elector: bool, is_blank: bool, now: float) -> None:
+        """Begin under another number with what is learnt."""
+        self._initial = self.value
+        super().count_with(count, is_elector=is_elector, is_blank=is_blank, now=now)
+
+    def _highest(self, value: FleetValue) -> int:
+        return max(value.revision, value.number, value.creations)
+
+    def _prevails(self, value: FleetValue) -> bool:
+        del value
+        return False
+
+    def _replaces(self, change: Rewrite[FleetValue]) -> bool:
+        del change
+        return False
+
+    def _named(self, value: FleetValue) -> str:
+        return f"number {value.number} with {', '.join(value.electorate.names)}"
+
+    def _ask(self, question: Prepare | Accept[FleetValue], todo: ToDo) -> None:
+        todo.fleet.append(AskElectors(to=self._count.names, question=question, deadline_s=self._ballot_s))
+
+    def _hand_on(self, value: FleetValue, why: str, todo: ToDo) -> None:
+        """The roll looks for it itself, at once: nothing may be answered before its registers count by it."""
+
+    def _end(self, change: Rewrite[FleetValue], outcome: RoundOutcome, todo: ToDo) -> None:
+        todo.fleet_ended.append((change, outcome))

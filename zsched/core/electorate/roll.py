@@ -1,0 +1,283 @@
+"""The roll: which fleet value a node has learnt, and what follows for whom it answers and with whom it counts.
+
+Knows: the fleet register, numbers, seats, creations. Does not know: what an allocation means, how anything travels or
+is stored, how a document is fetched.
+
+* Every question names generation and number. An elector answers only under the very number that it has learnt, and only
+  for a seat that names its disk. Asked under a lower number it hands its fleet value over; under a higher one it asks
+  for that. Another generation gets no answer.
+* The learnt fleet value is on disk before the first answer under it: it is written with the registers (`ToDo`).
+* Only a learnt value is followed and handed on, never an accepted one.
+* A node follows the newest value of its own generation, from any peer.
+* A seat is (name, disk, joining). A node that gets another seat, or none, drops what it had accepted for the old one.
+* A register that the document does not list is removed, and questions to it are refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import StrEnum
+from random import Random
+
+from zsched.core.electorate.changes import FleetChange
+from zsched.core.electorate.fleet_register import FleetRegister
+from zsched.core.electorate.settling import Settling
+from zsched.core.instructions import AskFleet, TellFleet
+from zsched.core.todo import ToDo
+from zsched.core.values.electorate import Creation, Elector, FleetValue
+from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refusal, Refused
+from zsched.core.values.model import NO_BALLOT, Ballot, NodeId, RegisterState, TaskId
+from zsched.core.vote.task_register import TaskRegister
+
+
+class Admission(StrEnum):
+    """What becomes of a question before its register sees it."""
+
+    PASSED = "passed"
+    REFUSED = "refused"
+    SILENT = "silent"  # another generation's, or this node follows none
+
+
+class Roll:
+    """One node's fleet register, and the numbers by which its tasks' registers count.
+
+    Args:
+        me: this node's name.
+        disk: its disk's id.
+        incarnation: this start's number.
+        state: of the fleet register, as stored or founded; its learnt value is the one to follow.
+        registers: the tasks' registers; the roll adds, removes and renumbers them.
+        begin: makes the blank register of a task that was created.
+        ballot_s: deadline of one phase.
+        stagger_s: base of the back-off.
+        rng: for back-off.
+        now: monotonic seconds.
+    """
+
+    def __init__(
+        self,
+        *,
+        me: NodeId,
+        disk: str,
+        incarnation: int,
+        state: RegisterState[FleetValue],
+        registers: dict[TaskId, TaskRegister],
+        begin: Callable[[Creation], TaskRegister],
+        ballot_s: float,
+        stagger_s: float,
+        rng: Random,
+        now: float,
+    ) -> None:
+        if state.learnt is None:
+            raise ValueError("a roll follows a fleet value: none is learnt")
+        self._me, self._disk = me, disk
+        self._registers, self._begin = registers, begin
+        self._stagger_s, self._rng = stagger_s, rng
+        self._may_elect = True
+        self.value = state.learnt
+        self.strangers: set[str] = set()
+        """Generations of this fleet's name that have asked this node, or told it their value."""
+        self._register = FleetRegister(
+            me=me,
+            incarnation=incarnation,
+            electors=self.value.electorate.names,
+            electorate="",
+            is_elector=self.is_elector,
+            initial=self.value,
+            state=state,
+            ballot_s=ballot_s,
+            stagger_s=stagger_s,
+            rng=rng,
+            disk=disk,
+        )
+        self._settling = Settling(2 * ballot_s)
+        self._list(ToDo(), now)
+        self._count(is_blank=False, is_new=False, now=now)
+        self._settling.begin(self.value, now + self._jitter())
+
+    # --- queries -----------------------------------------------------------------------------------------------------
+
+    @property
+    def state(self) -> RegisterState[FleetValue]:
+        """What goes to disk, with the registers' states."""
+        return self._register.state
+
+    @property
+    def seat(self) -> Elector | None:
+        """The seat for which this node answers."""
+        return self._seat_in(self.value)
+
+    @property
+    def is_elector(self) -> bool:
+        """Whether this node answers questions."""
+        return self.seat is not None and self._may_elect
+
+    @property
+    def problem(self) -> str:
+        """Why agreement about the fleet stands still; empty: it does not."""
+        return self._register.problem
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether a change of this node's is under way."""
+        return self._register.is_busy
+
+    def next_deadline(self) -> float:
+        """When `tick` may have something to do."""
+        due = self._register.next_deadline()
+        return min(due, self._settling.due(self.value, self._registers.values())) if self.is_elector else due
+
+    def _seat_in(self, value: FleetValue) -> Elector | None:
+        seat = value.electorate.seat(self._me)
+        return seat if seat is not None and seat.is_held_by(self._me, self._disk) else None
+
+    def _jitter(self) -> float:
+        return self._stagger_s * (0.5 + self._rng.random())
+
+    # --- elector -----------------------------------------------------------------------------------------------------
+
+    def stop_electing(self, now: float) -> None:
+        """This node lost its right to be an elector (disk, duplicate name): it answers no more."""
+        self._may_elect = False
+        self._count(is_blank=False, is_new=False, now=now)
+
+    def admission(self, question: Prepare | Accept | Accept[FleetValue], asker: NodeId, todo: ToDo) -> Admission:
+        """Whether a question to a task's register, or to the fleet register, may be put to it.
+
+        A refusal's reason is told by `refused`; what the two sides must tell each other is in ``todo``.
+        """
+        value = self.value
+        if question.generation_id != value.generation_id:
+            self.strangers.add(question.generation_id)
+            return Admission.SILENT
+        if question.number > value.number:
+            todo.fleet.append(AskFleet(peer=asker))
+        if question.number != value.number:
+            return Admission.REFUSED
+        return Admission.PASSED if self._is_listed(question) else Admission.REFUSED
+
+    def _is_listed(self, question: Prepare | Accept | Accept[FleetValue]) -> bool:
+        """Whether the register that is asked is the fleet's, or one of a task that the document lists."""
+        if not self.value.document or question.task == self.value.task:
+            return True
+        creation = self.value.creation(question.task)
+        return creation is not None and creation.number == question.creation
+
+    def refused(self, question: Prepare | Accept | Accept[FleetValue]) -> Refused:
+        """The no to a question that `admission` has refused; a proposer with a lower number learns by it."""
+        register = self._registers.get(question.task)
+        is_behind = question.number < self.value.number
+        return Refused(
+            elector=self._me,
+            task=question.task,
+            ballot=_ballot_of(question),
+            refusal=Refusal.NUMBER,
+            promised=NO_BALLOT if register is None else register.state.promised,
+            number=self.value.number,
+            fleet=self.value if is_behind else None,
+        )
+
+    def on_question(
+        self, question: Prepare | Accept[FleetValue], asker: NodeId, todo: ToDo, now: float
+    ) -> Promise[FleetValue] | Accepted | Refused | None:
+        """A proposer asks the fleet register; ``None``: no answer."""
+        admission = self.admission(question, asker, todo)
+        if admission is Admission.SILENT:
+            return None
+        if admission is Admission.REFUSED:
+            return self.refused(question)
+        if isinstance(question, Prepare):
+            return self._register.on_prepare(question, todo)
+        if question.acceptance.value.generation_id != self.value.generation_id:
+            return None
+        return self._register.on_accept(question, todo, now)
+
+    # --- learner -----------------------------------------------------------------------------------------------------
+
+    def learn(self, value: FleetValue, todo: ToDo, now: float) -> None:
+        """A peer tells the fleet value that it has learnt."""
+        if value.fleet != self.value.fleet:
+            return
+        if value.generation_id != self.value.generation_id:
+            self.strangers.add(value.generation_id)
+            return
+        self._register.learn(value, todo, now)
+        self._follow(todo, now)
+
+    def hear(self, answer: Refused, todo: ToDo, now: float) -> None:
+        """An elector has refused because of its number: one of the two learns."""
+        if answer.fleet is not None:
+            self.learn(answer.fleet, todo, now)
+        elif answer.refusal is Refusal.NUMBER and answer.number < self.value.number:
+            todo.fleet.append(TellFleet(to=(answer.elector,), value=self.value))
+
+    def _follow(self, todo: ToDo, now: float) -> None:
+        """Count by the newest learnt value, before anything is answered or asked under another one."""
+        value = self._register.value
+        if value.revision == self.value.revision:
+            return
+        seat, number = self.seat, self.value.number
+        self.value = value
+        todo.must_persist = todo.must_beat = True
+        self._list(todo, now)
+        if value.number != number:
+            self._count(is_blank=seat != self.seat, is_new=True, now=now)
+        self._settling.begin(value, now + self._jitter())
+
+    def _list(self, todo: ToDo, now: float) -> None:
+        """Remove the registers that the document does not list, and begin those that are new."""
+        if not self.value.document:
+            return  # each node goes by its own file
+        for task in tuple(self._registers):
+            creation = self.value.creation(task)
+            if creation is None or creation.number != self._registers[task].state.creation:
+                self._registers.pop(task).close(todo)
+        for creation in self.value.tasks:
+            if creation.task not in self._registers:
+                self._registers[creation.task] = register = self._begin(creation)
+                register.count_with(self.value.electorate, is_elector=self.is_elector, is_blank=False, now=now)
+
+    def _count(self, *, is_blank: bool, is_new: bool, now: float) -> None:
+        """Tell every register with whom it counts; the fleet register is blank under a new number."""
+        count, is_elector = self.value.electorate, self.is_elector
+        for register in self._registers.values():
+            register.count_with(count, is_elector=is_elector, is_blank=is_blank, now=now)
+        self._register.count_with(count, is_elector=is_elector, is_blank=is_new, now=now)
+
+    # --- proposer ----------------------------------------------------------------------------------------------------
+
+    def propose(self, change: FleetChange, todo: ToDo, now: float) -> str:
+        """Try to commit a change; why it cannot be made, or nothing. Its end is one of `ToDo.fleet_ended`."""
+        fault = change.fault(self.value)
+        if not fault:
+            self._register.propose(change, todo, now)
+        return fault
+
+    def settle(self, todo: ToDo, now: float) -> None:
+        """Run an identity round: learn whatever was accepted before."""
+        self._register.settle(todo, now)
+
+    def on_answer(self, answer: Promise[FleetValue] | Accepted | Refused, todo: ToDo, now: float) -> None:
+        """An elector answered a question of the fleet register."""
+        before = self.value
+        if isinstance(answer, Refused):
+            self.hear(answer, todo, now)
+        self._register.on_answer(answer, todo, now)
+        self._follow(todo, now)
+        if self.value is not before and not (isinstance(answer, Refused) and answer.fleet is self.value):
+            names = {*before.electorate.names, *self.value.electorate.names} - {self._me}
+            todo.fleet.append(TellFleet(to=tuple(sorted(names)), value=self.value))
+
+    def tick(self, todo: ToDo, now: float) -> None:
+        """Time has passed."""
+        if now >= self._register.next_deadline():
+            self._register.tick(todo, now)
+        if not self.is_elector or now < self._settling.due(self.value, self._registers.values()):
+            return
+        change = self._settling.tick(self.value, self._registers.values(), todo, now)
+        if change is not None and not self._register.is_busy:
+            self._register.propose(change, todo, now)
+
+
+def _ballot_of(question: Prepare | Accept | Accept[FleetValue]) -> Ballot:
+    return question.ballot if isinstance(question, Prepare) else question.acceptance.ballot
