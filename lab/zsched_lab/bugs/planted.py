@@ -1,7 +1,7 @@
 """Plants one bug at a time into the code and lets the suite find it: ``python -m zsched_lab.bugs.planted``.
 
 Knows: how a bug is planted (an import hook in a process of its own; no file is touched), the budget of each, the table.
-Does not know: what the bugs are (`zsched_lab.bugs.core_bugs`, `zsched_lab.bugs.stream_bugs`), what finds them.
+Does not know: what the bugs are (`zsched_lab.bugs.core_bugs`, `elector_bugs`, `stream_bugs`), what finds them.
 
 For every bug the simulator plays schedules until one is violated; when none is within the budget, the bug's directed
 tests are run. The last line is ``F of N planted bugs found``; the exit code is 1 when one survives.
@@ -22,16 +22,17 @@ import sys
 import tempfile
 import time
 import types
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 from zsched_lab.bugs.core_bugs import CORE_BUGS, Bug
+from zsched_lab.bugs.elector_bugs import ELECTOR_BUGS
 from zsched_lab.bugs.stream_bugs import STREAM_BUGS
 
-BUGS: tuple[Bug, ...] = (*CORE_BUGS, *STREAM_BUGS)
+BUGS: tuple[Bug, ...] = (*CORE_BUGS, *ELECTOR_BUGS, *STREAM_BUGS)
 
 BUDGET_S = 30.0
 """What the schedules may take for one bug; the directed tests come on top."""
@@ -101,18 +102,28 @@ def plant(bug: Bug) -> None:
 # --- in the planted process ------------------------------------------------------------------------------------------
 
 
+def _player(bug: Bug) -> Callable[[int], str]:
+    """What plays a schedule and says what it violates; only now, with the bug planted, may the core be imported."""
+    if bug.has_changing_electors:
+        from zsched_lab.sim.electorate import play as play_electors  # noqa: PLC0415 - see above
+
+        return lambda seed: play_electors(seed).violation
+    from zsched_lab.sim.faults import play as play_nodes  # noqa: PLC0415 - see above
+    from zsched_lab.sim.swarm import plan  # noqa: PLC0415 - see above
+
+    return lambda seed: play_nodes(plan(seed)).violation
+
+
 def hunt(bug: Bug, budget_s: float) -> int:
     """Play schedules until one is violated: `FOUND`, or 0 when none was in time."""
     plant(bug)
-    from zsched_lab.sim.faults import play  # noqa: PLC0415 - only now may the core be imported
-    from zsched_lab.sim.swarm import plan  # noqa: PLC0415 - as above
-
+    play = _player(bug)
     ends_at = time.process_time() + budget_s
     first = () if bug.seed is None else (bug.seed,)
     for seed in (*first, *range(MAX_SEEDS)):
-        result = play(plan(seed))
-        if result.violation:
-            print(f"seed {seed}: {result.violation[:200]}")
+        violation = play(seed)
+        if violation:
+            print(f"seed {seed}: {violation[:200]}")
             return FOUND
         if time.process_time() > ends_at:
             break

@@ -1,0 +1,196 @@
+"""The bugs of electors that change: one for each rule of the fleet register without which something is lost or stuck.
+
+Knows: which text of which module each bug replaces, and which tests may find it. Does not know: how it is planted.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from zsched_lab.bugs.core_bugs import REGISTER, Bug
+
+ROLL, CHANGES = "zsched.core.electorate.roll", "zsched.core.electorate.changes"
+FOUNDING, SETTLING = "zsched.core.electorate.founding", "zsched.core.electorate.settling"
+VALUES: Final = "zsched.core.values.electorate"
+_TESTS: Final = ("tests/unit/core/electorate/test_rules.py",)
+
+
+def _bug(name: str, module: str, *changes: tuple[str, str], also: Bug | None = None, has_schedules: bool = True) -> Bug:
+    return Bug(
+        name=name,
+        module=module,
+        changes=changes,
+        tests=_TESTS,
+        has_schedules=has_schedules,
+        has_changing_electors=True,
+        also=also,
+    )
+
+
+ELECTOR_BUGS: tuple[Bug, ...] = (
+    _bug(
+        "two electors change at once",
+        CHANGES,
+        ("tuple(sorted((*read.electors, added)", "tuple(sorted((*read.electors[1:], added)"),
+    ),
+    _bug(
+        "electors change on an unsettled value",
+        CHANGES,
+        ('return "" if read.settled else f"number {read.number} is not settled"', 'return ""'),
+    ),
+    _bug(
+        "the last elector is removed",
+        CHANGES,
+        ('"" if len(read.electors) > 1 else', '"" if read.electors else'),
+        has_schedules=False,
+    ),
+    _bug(
+        "a length of leases keeps the number",
+        CHANGES,
+        (
+            "return replace(_renumbered(read, read.electors), lease_s=self.lease_s, guard_lease_s=longest)",
+            "return replace(read, revision=read.revision + 1, lease_s=self.lease_s, guard_lease_s=longest)",
+        ),
+        has_schedules=False,
+    ),
+    _bug(
+        "a task that comes back has its old register",
+        CHANGES,
+        ("number = creations if known is None else known.number", "number = int(task[1:])"),
+        ("                creations += 1\n", "                creations = max(creations, int(task[1:]))\n"),
+    ),
+    _bug(
+        "electors answer for registers that the document does not list",
+        ROLL,
+        (
+            "                self._registers.pop(task).close(todo)\n",
+            (
+                "                old = Creation(task=task, number=self._registers.pop(task).state.creation)\n"
+                "                self._registers[task] = self._begin(old)\n"
+                "                self._registers[task].count_with(\n"
+                "                    self.value.electorate, is_elector=self.is_elector, is_blank=False, now=now\n"
+                "                )\n"
+            ),
+        ),
+        ("return creation is not None and creation.number == question.creation", "return True"),
+    ),
+    _bug(
+        "a seat is held by its name alone",
+        VALUES,
+        ('return self.name == name and self.disk in ("", disk)', "return self.name == name"),
+    ),
+    _bug(
+        "ballots do not carry the disk",
+        REGISTER,
+        ("incarnation=self._incarnation, disk=self._disk", "incarnation=self._incarnation"),
+    ),
+    _bug(
+        "electors answer under a number that they have left",
+        ROLL,
+        ("        if question.number != value.number:\n", "        if question.number > value.number:\n"),
+        also=_bug(
+            "",
+            REGISTER,
+            ("if count != (self._count.generation_id, self._count.number, self.state.creation):", "if False:"),
+        ),
+    ),
+    _bug(
+        "another generation's question is answered",
+        ROLL,
+        ("        if question.generation_id != value.generation_id:\n", "        if not question.generation_id:\n"),
+        also=_bug(
+            "",
+            REGISTER,
+            ("if count != (self._count.generation_id, self._count.number, self.state.creation):", "if False:"),
+        ),
+    ),
+    _bug(
+        "a learnt fleet value is not on disk before the first answer",
+        ROLL,
+        ("        self._register.learn(value, todo, now)\n", "        self._register.learn(value, ToDo(), now)\n"),
+        ("todo.must_persist = todo.must_beat = True", "todo.must_beat = True"),
+    ),
+    _bug(
+        "an accepted fleet value is handed on",
+        ROLL,
+        (
+            "fleet=self.value if is_behind else None",
+            "fleet=None if not is_behind else self.value if self.state.accepted is None else self.state.accepted.value",
+        ),
+        ("        is_behind = question.number < self.value.number\n", "        is_behind = True\n"),
+    ),
+    _bug(
+        "a lower number learns nothing",
+        ROLL,
+        ("fleet=self.value if is_behind else None", "fleet=None"),
+        ("            todo.fleet.append(AskFleet(peer=asker))\n", "            pass\n"),
+        ("            todo.fleet.append(TellFleet(to=(answer.elector,), value=self.value))\n", "            pass\n"),
+        has_schedules=False,
+    ),
+    _bug(
+        "settled without identity rounds",
+        SETTLING,
+        ("registers if register.written_under != value.electorate]", "registers if False]"),
+    ),
+    _bug(
+        "identity rounds of another number count",
+        SETTLING,
+        ("registers if register.written_under != value.electorate]", "registers if register.written_under is None]"),
+    ),
+    _bug(
+        "identity rounds write nothing",
+        REGISTER,
+        ("        if is_identity and newest is None:\n", "        if is_identity:\n"),
+    ),
+    _bug(
+        "no guard before settled",
+        SETTLING,
+        ("(hold_s(value.guard_lease_s) if value.is_exclusive else 0.0)", "0.0"),
+        has_schedules=False,
+    ),
+    _bug(
+        "the guard goes by the new lease alone",
+        CHANGES,
+        ("longest = max(self.lease_s, read.guard_lease_s)", "longest = self.lease_s"),
+        has_schedules=False,
+    ),
+    _bug(
+        "settled is said of any number",
+        CHANGES,
+        ("if read.number == self.number and not read.settled else", "if not read.settled else"),
+        has_schedules=False,
+    ),
+    _bug(
+        "what was accepted for an old seat counts for a new one",
+        ROLL,
+        ("is_blank=seat != self.seat, is_new=True", "is_blank=False, is_new=True"),
+    ),
+    _bug(
+        "a round goes on under a number before",
+        REGISTER,
+        (
+            "            running.phase, running.deadline, running.ballot = _Phase.WAIT, now, None\n\n    def close",
+            "            pass\n\n    def close",
+        ),
+        also=_bug("", ROLL, ("        if question.number != value.number:\n", "        if False:\n")),
+    ),
+    _bug(
+        "another joining's answer counts",
+        REGISTER,
+        (" and seat.joining == answer.joining", ""),
+        has_schedules=False,
+    ),
+    _bug(
+        "the halves of a fleet are recovered as one generation",
+        FOUNDING,
+        (
+            "generation_id=generation_id,\n        parent_id",
+            'generation_id=f"{int(before.generation_id, 16) + 1:x}",\n        parent_id',
+        ),
+    ),
+    _bug(
+        "recovered tasks keep their registers",
+        FOUNDING,
+        ("number=before.creations + index", "number=one.number + 0 * index"),
+    ),
+)
