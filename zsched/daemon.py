@@ -16,6 +16,7 @@ import gc
 import logging
 import os
 import random
+import secrets
 import signal
 import sys
 import time
@@ -37,8 +38,9 @@ from zsched.core import events as ev
 from zsched.core.node import Node
 from zsched.core.route.route import watch_for
 from zsched.core.status import status_line
+from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import electorate_hash, fleet_hash, runs_worker
-from zsched.core.values.model import DurableState, NodeId, NodeKind, TaskId
+from zsched.core.values.model import NodeId, NodeKind, TaskId
 from zsched.errors import AdapterError, ConfigError, NameTakenError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_NAME_TAKEN, EXIT_OK
 from zsched.files import write_regular
@@ -159,7 +161,11 @@ class Daemon:
                 "--force` on each, and start all"
             )
         # Not just one more: a folder that was brought back from a backup must not live one of its lives again.
-        state = replace(loaded.state, incarnation=max(loaded.state.incarnation + 1, wall_tenths()))
+        state = replace(
+            loaded.state,
+            incarnation=max(loaded.state.incarnation + 1, wall_tenths()),
+            disk=loaded.state.disk or secrets.token_hex(8),
+        )
         try:
             state_file.save(state)
         except AdapterError as error:

@@ -31,17 +31,17 @@ def test_same_seed_same_play() -> None:
 
 
 @pytest.mark.parametrize(
-    ("owner", "name", "instead", "seed"),
+    ("owner", "name", "instead"),
     [
-        (settling, "_missing", lambda *_: [], 34),
-        (Elector, "is_held_by", lambda self, name, _: self.name == name, 66),
+        (settling, "_missing", lambda *_: []),
+        (Elector, "is_held_by", lambda self, name, _: self.name == name),
     ],
 )
 def test_what_would_break_it_is_found(
-    owner: object, name: str, instead: object, seed: int, monkeypatch: pytest.MonkeyPatch
+    owner: object, name: str, instead: object, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(owner, name, instead)
-    assert play(seed).violation
+    assert any(play(seed).violation for seed in range(600))
 
 
 def test_the_command_counts_and_says_which_seed(capsys: pytest.CaptureFixture[str]) -> None:

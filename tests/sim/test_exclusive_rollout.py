@@ -9,8 +9,9 @@ import pytest
 from support.fleets import fleet_of, tuning_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
+from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec
-from zsched.core.values.model import DurableState, NodeId
+from zsched.core.values.model import NodeId
 from zsched.core.values.plan import WorkerRole
 from zsched_lab.sim.parts import Machine
 from zsched_lab.sim.simulator import CORES, Simulator

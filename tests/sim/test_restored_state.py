@@ -10,9 +10,10 @@ from support.beats import beat_of
 from support.fleets import fleet_of, tuning_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
+from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import TaskSpec, WorkerSpec
 from zsched.core.values.messages import Learnt
-from zsched.core.values.model import DurableState, NodeId
+from zsched.core.values.model import NodeId
 from zsched.core.vote.witness import ASK_ALL_S, Witness
 from zsched_lab.sim.simulator import CORES, Simulator
 

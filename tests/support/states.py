@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from zsched.core.values.model import DurableState, NodeId, RegisterState
+from zsched.core.values.durable import DurableState
+from zsched.core.values.model import NodeId, RegisterState
 
 
 def state_of(node: NodeId, *registers: RegisterState, **options: Any) -> DurableState:

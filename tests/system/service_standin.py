@@ -19,8 +19,9 @@ from zsched.adapters.host.systemd import Notifier, watchdog_interval_s
 from zsched.adapters.machine.device_profiler import DeviceProfiler
 from zsched.adapters.radio.network_profiler import readers_for
 from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
+from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import LinkSpec, NodeSpec, WorkerSpec
-from zsched.core.values.model import DurableState, LinkSource, NodeKind, WorkerState
+from zsched.core.values.model import LinkSource, NodeKind, WorkerState
 
 WORKER = """
 import json, os, pathlib, subprocess, time

@@ -11,9 +11,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.messages import Accept, Accepted, CommandResult, Learnt, Prepare, Promise, Refused, Utilities
-from zsched.core.values.model import Beat, DurableState, NodeId, Profile, Proposal, TaskId
+from zsched.core.values.model import Beat, NodeId, Profile, Proposal, TaskId
 from zsched.core.values.plan import Role, RoutePlan
 from zsched.core.values.snapshot import Snapshot
 

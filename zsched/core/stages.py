@@ -33,8 +33,9 @@ from zsched.core.scheduler.probation import Probation
 from zsched.core.scheduler.rounds import Rounds
 from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts
 from zsched.core.todo import ToDo
+from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet, TaskSpec, fleet_hash
-from zsched.core.values.model import Allocation, DurableState, NodeId, NodeKind, PeerState, TaskId
+from zsched.core.values.model import Allocation, NodeId, NodeKind, PeerState, TaskId
 from zsched.core.values.plan import StreamCount
 from zsched.core.vote.agreement import Agreement
 from zsched.core.vote.votes import Votes

@@ -5,14 +5,16 @@ Knows: what a blank state holds, and whom to ask whether that is true. Does not 
 
 from __future__ import annotations
 
+import secrets
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from zsched.adapters.host.state_file import StateFile, hardware_id
 from zsched.adapters.network.fleet_poll import ask_fleet
 from zsched.clock import wall_tenths
+from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet, dial_endpoint, electorate_hash
-from zsched.core.values.model import DurableState, NodeId
+from zsched.core.values.model import NodeId
 from zsched.core.values.snapshot import Snapshot
 from zsched.core.vote.belief import MAX_GENERATION
 from zsched.core.vote.generations import blank_state, objection
@@ -40,7 +42,9 @@ def init_state(fleet: Fleet, node: NodeId, folder: Path, generation: int) -> Pat
     """
     _check_range(generation)
     before = StateFile(folder, fleet=fleet.name, node=node).load().state
-    state = blank_state(fleet, node, generation, before, incarnation=wall_tenths(), hardware=hardware_id())
+    state = blank_state(
+        fleet, node, generation, before, incarnation=wall_tenths(), hardware=hardware_id(), disk=secrets.token_hex(8)
+    )
     with StateFile(folder, fleet=fleet.name, node=node) as file:
         file.create(state)
         return file.path

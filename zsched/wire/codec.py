@@ -22,7 +22,7 @@ from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 import msgpack
 
 from zsched.core.membership.beat_room import MAX_BEAT_BYTES
-from zsched.core.values import messages, model, plan, snapshot
+from zsched.core.values import durable, messages, model, plan, snapshot
 from zsched.errors import WireError
 
 VERSION = 1
@@ -49,7 +49,7 @@ KINDS: dict[str, tuple[type, int]] = {
     "retry_task": (messages.RetryTask, SMALL),
     "command_result": (messages.CommandResult, SMALL),
     "status": (snapshot.Snapshot, LARGE),
-    "state": (model.DurableState, LARGE),
+    "state": (durable.DurableState, LARGE),
     "role": (plan.Role, SMALL),
     "route_plan": (plan.RoutePlan, LARGE),
 }
@@ -343,13 +343,13 @@ def _read_body(cls: type[T], body: Any, size: int) -> T:
 # --- the state file's payload --------------------------------------------------------------------------------------
 
 
-def encode_state(state: model.DurableState) -> bytes:
+def encode_state(state: durable.DurableState) -> bytes:
     """The state file's whole content: a magic line, the checksum, the frame."""
     frame = encode(state)
     return b"zsched-state/1 " + hashlib.blake2s(frame).hexdigest().encode() + b"\n" + frame
 
 
-def decode_state(content: bytes) -> model.DurableState:
+def decode_state(content: bytes) -> durable.DurableState:
     """The state in a file's content.
 
     Raises:
@@ -361,4 +361,4 @@ def decode_state(content: bytes) -> model.DurableState:
         raise WireError("frame", "not a zsched state file of version 1")
     if hashlib.blake2s(frame).hexdigest().encode() != words[1]:
         raise WireError("checksum", "the content does not match its checksum (torn or damaged)")
-    return decode(frame, model.DurableState)
+    return decode(frame, durable.DurableState)

@@ -204,12 +204,17 @@ REGISTER_BUGS = (
         "        self._hand_on",
         _REGISTER,
     ),
-    _bug(
-        "stranger's answer counts",
-        REGISTER,
-        "answer.ballot != running.ballot or answer.elector not in self._count.names",
-        "answer.ballot != running.ballot",
-        _REGISTER,
+    Bug(
+        name="stranger's answer counts",
+        module=REGISTER,
+        changes=(
+            (
+                "answer.ballot != running.ballot or answer.elector not in self._count.names",
+                "answer.ballot != running.ballot",
+            ),
+            ("return seat is not None and seat.is_held_by", "return seat is None or seat.is_held_by"),
+        ),
+        tests=_REGISTER,
     ),
     _bug(
         "answer to an older ballot counts",
@@ -228,7 +233,7 @@ REGISTER_BUGS = (
     _bug(
         "another electorate's ballot is answered",
         REGISTER,
-        "if question.electorate != self._electorate:",
+        "if self._count.is_founding and question.electorate != self._electorate:",
         "if not question.electorate:",
         _REGISTER,
     ),
@@ -249,8 +254,8 @@ REGISTER_BUGS = (
     _bug(
         "refused disk keeps electing",
         AGREEMENT,
-        "        for register in self.registers.values():\n            register.stop_electing()",
-        "",
+        "            self._numbers.roll.stop_electing()",
+        "            pass",
         _AGREEMENT,
     ),
     _bug(
@@ -353,8 +358,8 @@ LEASE_BUGS = (
     _bug(
         "echo of another electorate counts",
         LEASE,
-        "for grant in beat.echoes if beat.lease_terms == self.terms else ():",
-        "for grant in beat.echoes:",
+        "is_counted = beat.lease_terms == self.terms and beat",
+        "is_counted = beat",
         _LEASE,
     ),
     _bug("lease of a minority", LEASE, "number = numbers[needed - 1]", "number = numbers[0]", _LEASE, 26),
@@ -633,8 +638,8 @@ MEMBERSHIP_BUGS = (
     _bug(
         "node without state proposes by generation 0",
         AGREEMENT,
-        "self.registers[task.name].follow(self.electorate, initial)",
-        "self.registers[task.name].follow(self._electorate, initial)",
+        "self.registers[task.name].follow(self.electorate, initial",
+        "self.registers[task.name].follow(self._electorate, initial",
         _GENERATIONS,
         26,
     ),

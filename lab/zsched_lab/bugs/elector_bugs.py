@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from zsched_lab.bugs.core_bugs import REGISTER, Bug
+from zsched_lab.bugs.core_bugs import AGREEMENT, LEASE, REGISTER, Bug
 
 ROLL, CHANGES = "zsched.core.electorate.roll", "zsched.core.electorate.changes"
 FOUNDING, SETTLING = "zsched.core.electorate.founding", "zsched.core.electorate.settling"
@@ -25,6 +25,11 @@ def _bug(name: str, module: str, *changes: tuple[str, str], also: Bug | None = N
         has_changing_electors=True,
         also=also,
     )
+
+
+def _numbers_bug(name: str, module: str, *changes: tuple[str, str], also: Bug | None = None) -> Bug:
+    tests = ("tests/unit/core/vote/test_numbers.py",)
+    return Bug(name=name, module=module, changes=changes, tests=tests, has_schedules=False, also=also)
 
 
 ELECTOR_BUGS: tuple[Bug, ...] = (
@@ -82,7 +87,7 @@ ELECTOR_BUGS: tuple[Bug, ...] = (
     _bug(
         "ballots do not carry the disk",
         REGISTER,
-        ("incarnation=self._incarnation, disk=self._disk", "incarnation=self._incarnation"),
+        ("incarnation=self._incarnation, disk=self._id", "incarnation=self._incarnation"),
     ),
     _bug(
         "electors answer under a number that they have left",
@@ -91,7 +96,7 @@ ELECTOR_BUGS: tuple[Bug, ...] = (
         also=_bug(
             "",
             REGISTER,
-            ("if count != (self._count.generation_id, self._count.number, self.state.creation):", "if False:"),
+            ("if not is_same and not (is_by_file and self._count.is_founding):", "if False:"),
         ),
     ),
     _bug(
@@ -101,7 +106,7 @@ ELECTOR_BUGS: tuple[Bug, ...] = (
         also=_bug(
             "",
             REGISTER,
-            ("if count != (self._count.generation_id, self._count.number, self.state.creation):", "if False:"),
+            ("if not is_same and not (is_by_file and self._count.is_founding):", "if False:"),
         ),
     ),
     _bug(
@@ -192,5 +197,83 @@ ELECTOR_BUGS: tuple[Bug, ...] = (
         "recovered tasks keep their registers",
         FOUNDING,
         ("number=before.creations + index", "number=one.number + 0 * index"),
+    ),
+    _numbers_bug(
+        "an elector grants to a beat of another number",
+        LEASE,
+        ("accepted.get(task) if beat.number == self.number else None", "accepted.get(task)"),
+    ),
+    _numbers_bug(
+        "an echo of another number counts",
+        LEASE,
+        ("beat.lease_terms == self.terms and beat.number == self.number", "beat.lease_terms == self.terms"),
+    ),
+    _numbers_bug(
+        "a change of the electors ends the owner's lease",
+        LEASE,
+        ("        self._kept_until = self.lease_until()\n", ""),
+    ),
+    _numbers_bug(
+        "a grant is guarded with the lease of a later number",
+        LEASE,
+        (
+            "            granter.lease_s = lease_s  # a grant of before is remembered with its own length\n",
+            "            granter.lease_s, granter._hold_s = lease_s, hold_s(lease_s)\n",
+        ),
+    ),
+    _numbers_bug(
+        "grants are forgotten when their task is removed",
+        LEASE,
+        (
+            "        self._others.clear()\n        for granter",
+            (
+                "        self._others.clear()\n"
+                "        self._granters = {task: one for task, one in self._granters.items() if task in standing}\n"
+                "        for granter"
+            ),
+        ),
+    ),
+    _numbers_bug(
+        "electors change before a document is agreed",
+        CHANGES,
+        ('    if not read.document:\n        return "no document is agreed yet"\n', ""),
+    ),
+    _numbers_bug(
+        "the first document keeps the number",
+        CHANGES,
+        (
+            "            _renumbered(read, read.electors),\n            document",
+            "            replace(read, revision=read.revision + 1),\n            document",
+        ),
+    ),
+    _numbers_bug(
+        "a question without a number is answered for ever",
+        REGISTER,
+        ("not (is_by_file and self._count.is_founding)", "not is_by_file"),
+        also=_bug(
+            "",
+            ROLL,
+            (
+                "        if value.electorate.is_founding and not question.generation_id:\n",
+                "        if not question.generation_id:\n",
+            ),
+        ),
+    ),
+    _numbers_bug(
+        "the fleet value is not in the state file",
+        AGREEMENT,
+        ("            fleet_register=self._numbers.state,\n", ""),
+    ),
+    _numbers_bug(
+        "an unasked fleet value is believed",
+        AGREEMENT,
+        (
+            "        if not event.is_answer:\n",
+            (
+                "        if learnt.fleet is not None and self._numbers.learn(learnt.fleet, todo, now):\n"
+                "            self._count_anew()\n"
+                "        if not event.is_answer:\n"
+            ),
+        ),
     ),
 )

@@ -31,13 +31,13 @@ from zsched.core import instructions as do
 from zsched.core.electorate.founding import founded
 from zsched.core.node import Node
 from zsched.core.status import build_snapshot
+from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, electorate_hash
 from zsched.core.values.messages import Accept, Accepted, Learnt, Prepare, Promise, Refused, SetWeights, Utilities
 from zsched.core.values.model import (
     Beat,
     DeviceSample,
-    DurableState,
     NodeKind,
     Profile,
     Proposal,
@@ -93,27 +93,28 @@ def sample(hint: Any, rng: Random, name: str = "") -> Any:
         return None if rng.random() < 0.3 else sample(one, rng, name)
     if isinstance(hint, type) and issubclass(hint, Enum):
         return rng.choice(tuple(hint))
-    return _dataclass(origin or hint, rng)
+    return _dataclass(hint, rng)
 
 
 def _dataclass(cls: Any, rng: Random) -> Any:
-    assert is_dataclass(cls), cls
+    made = get_origin(cls) or cls
+    assert is_dataclass(made), cls
     if cls is Weights:
         cpu = rng.choice((0.0, 0.25, 1.0))
         return Weights(cpu=cpu, memory=1.0 - cpu, network=0.0)
     if cls is FleetValue:
         return rng.choice(FOUNDED)
     hints = wire.hints_of(cls)
-    values = {one.name: sample(hints[one.name], rng, one.name) for one in fields(cls)}
-    if cls is Accept:
+    values = {one.name: sample(hints[one.name], rng, one.name) for one in fields(made)}
+    if made is Accept:
         values["task"] = values["acceptance"].value.task
     for _ in range(20):
         try:
-            return cls(**values)
+            return made(**values)
         except ValueError as error:  # a range that the hint does not tell: the message names the field
             wrong = str(error).partition(":")[0].rpartition(".")[2]
             values[wrong] = _in_range(wrong, hints[wrong])
-    raise AssertionError(f"cannot make a {cls.__name__}")
+    raise AssertionError(f"cannot make a {made.__name__}")
 
 
 def _in_range(name: str, hint: Any) -> Any:

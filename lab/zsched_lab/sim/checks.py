@@ -13,6 +13,7 @@ from itertools import pairwise
 from zsched.core import instructions as do
 from zsched.core.executor.handover import Phase
 from zsched.core.scheduler.damping import ESCAPES_PER_MINUTE, WINDOW_S
+from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import Accepted, Promise
 from zsched.core.values.model import (
@@ -20,7 +21,6 @@ from zsched.core.values.model import (
     Acceptance,
     Allocation,
     Ballot,
-    DurableState,
     NodeId,
     Proposal,
     RegisterState,

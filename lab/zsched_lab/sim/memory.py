@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from zsched.core.values.model import DurableState
+from zsched.core.values.durable import DurableState
 from zsched_lab.sim.links import Links
 from zsched_lab.sim.parts import Machine
 

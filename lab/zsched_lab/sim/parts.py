@@ -12,8 +12,9 @@ from random import Random
 
 from zsched.core import events as ev
 from zsched.core.node import Node
+from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet
-from zsched.core.values.model import Allocation, DurableState, NodeId, RegisterState, TaskId
+from zsched.core.values.model import Allocation, NodeId, RegisterState, TaskId
 from zsched.core.values.plan import Role
 from zsched.errors import WireError
 from zsched.wire import codec as wire

@@ -17,9 +17,10 @@ from typing import Any
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.node import Node
+from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet, electorate_hash
 from zsched.core.values.messages import Refused
-from zsched.core.values.model import Allocation, DeviceSample, DurableState, NodeId, PeerState, TaskId
+from zsched.core.values.model import Allocation, DeviceSample, NodeId, PeerState, TaskId
 from zsched.core.values.plan import RoutePlan
 from zsched.core.vote.generations import blank_state
 from zsched.errors import InvariantError, WireError

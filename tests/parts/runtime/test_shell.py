@@ -23,6 +23,7 @@ from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.relay_protocol import RelayStarted, WorkerSeen
+from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import WorkerSpec
 from zsched.core.values.messages import (
     Accept,
@@ -34,11 +35,7 @@ from zsched.core.values.messages import (
     SetWeights,
     Utilities,
 )
-from zsched.core.values.model import (
-    Acceptance,
-    DurableState,
-    WorkerState,
-)
+from zsched.core.values.model import Acceptance, WorkerState
 from zsched.core.values.plan import Role, RoutePhase, RoutePlan, WorkerRole
 from zsched.errors import AdapterError, WireError
 from zsched.runtime import shell as shell_module

@@ -22,6 +22,7 @@ from zsched.core.membership.identity import QUIET_S
 from zsched.core.membership.knocking import KNOCKERS_KEPT
 from zsched.core.node import Node
 from zsched.core.status import build_snapshot
+from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import StreamRule, TaskSpec, WorkerSpec, electorate_hash
 from zsched.core.values.messages import (
     Accept,
@@ -40,7 +41,6 @@ from zsched.core.values.model import (
     Ballot,
     Beat,
     DeviceSample,
-    DurableState,
     Echo,
     PeerState,
     RegisterState,

@@ -22,7 +22,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from zsched.core.values.model import DurableState, NodeId
+from zsched.core.values.durable import DurableState
+from zsched.core.values.model import NodeId
 from zsched.core.vote.generations import way_out
 from zsched.errors import AdapterError, WireError
 from zsched.files import read_regular

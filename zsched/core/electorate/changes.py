@@ -5,6 +5,7 @@ Knows: the rules of a change. Does not know: rounds (`zsched.core.vote.register`
 * A change of the electors adds one or removes one, never the last. It raises the number and unsettles the value.
 * A change of the lease's length raises the number, too: an elector of the number before waits for another length.
 * Both need a settled value. A change of the document is allowed at any time; it keeps number and ``settled``.
+* A fleet that goes by its files agrees a document first: without one, nobody knows its leases and registers.
 * A task that is created gets the next number of all creations, so a register that was removed never comes back.
 
 A change that its rule forbids is no error: `apply` returns what was read, and its round ends as unchanged.
@@ -81,6 +82,39 @@ class SetLease:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class AdoptDocument:
+    """Change: the first document of a fleet that has gone by its files. Registers stay; the number rises.
+
+    It rises because the lease is agreed by it: until then each node has gone by the length in its own file.
+    """
+
+    base_revision: int
+    document: str
+    tasks: tuple[tuple[TaskId, bool], ...]
+    """(task, whether it is exclusive) of every task of the document."""
+    lease_s: float
+    reason: str = "the fleet's file is agreed"
+
+    def fault(self, read: FleetValue) -> str:
+        """Why this change cannot be made now; empty: it can."""
+        return "a document is agreed already" if read.document else ""
+
+    def apply(self, read: FleetValue) -> FleetValue:
+        """The value with this document, under the next number."""
+        if self.fault(read):
+            return read
+        number = read.creations
+        tasks = tuple(Creation(task=task, number=number, exclusive=is_one) for task, is_one in sorted(self.tasks))
+        return replace(
+            _renumbered(read, read.electors),
+            document=self.document,
+            tasks=tasks,
+            lease_s=self.lease_s,
+            guard_lease_s=self.lease_s,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SetDocument:
     """Change: another document. Tasks that stay keep their registers; those that come get new ones."""
 
@@ -91,12 +125,13 @@ class SetDocument:
     reason: str = "the fleet is changed"
 
     def fault(self, read: FleetValue) -> str:
-        """Why this change cannot be made now: never."""
-        del read
-        return ""
+        """Why this change cannot be made now; empty: it can."""
+        return "" if read.document else "no document is agreed yet"
 
     def apply(self, read: FleetValue) -> FleetValue:
         """The value with this document; electors, number and ``settled`` stay."""
+        if self.fault(read):
+            return read
         creations, tasks = read.creations, []
         for task, exclusive in sorted(self.tasks):
             known = read.creation(task)
@@ -131,10 +166,12 @@ class Settle:
         return replace(read, revision=read.revision + 1, settled=True, guard_lease_s=read.lease_s)
 
 
-FleetChange = AddElector | RemoveElector | SetLease | SetDocument | Settle
+FleetChange = AdoptDocument | AddElector | RemoveElector | SetLease | SetDocument | Settle
 
 
 def _unsettled(read: FleetValue) -> str:
+    if not read.document:
+        return "no document is agreed yet"
     return "" if read.settled else f"number {read.number} is not settled"
 
 

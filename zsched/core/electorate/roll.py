@@ -52,6 +52,7 @@ class Roll:
         stagger_s: base of the back-off.
         rng: for back-off.
         now: monotonic seconds.
+        may_elect: whether this node may be an elector at all: it has its state, and nobody disputes its name.
     """
 
     def __init__(
@@ -67,13 +68,14 @@ class Roll:
         stagger_s: float,
         rng: Random,
         now: float,
+        may_elect: bool = True,
     ) -> None:
         if state.learnt is None:
             raise ValueError("a roll follows a fleet value: none is learnt")
         self._me, self._disk = me, disk
         self._registers, self._begin = registers, begin
         self._stagger_s, self._rng = stagger_s, rng
-        self._may_elect = True
+        self._may_elect = may_elect
         self.value = state.learnt
         self.strangers: set[str] = set()
         """Generations of this fleet's name that have asked this node, or told it their value."""
@@ -93,7 +95,8 @@ class Roll:
         self._settling = Settling(2 * ballot_s)
         self._list(ToDo(), now)
         self._count(is_blank=False, is_new=False, now=now)
-        self._settling.begin(self.value, now + self._jitter())
+        if not self.value.settled:
+            self._settling.begin(self.value, now + self._jitter())
 
     # --- queries -----------------------------------------------------------------------------------------------------
 
@@ -136,10 +139,12 @@ class Roll:
 
     # --- elector -----------------------------------------------------------------------------------------------------
 
-    def stop_electing(self, now: float) -> None:
-        """This node lost its right to be an elector (disk, duplicate name): it answers no more."""
+    def stop_electing(self) -> None:
+        """This node lost its right to be an elector (disk, duplicate name) and answers no more."""
         self._may_elect = False
-        self._count(is_blank=False, is_new=False, now=now)
+        self._register.stop_electing()
+        for register in self._registers.values():
+            register.stop_electing()
 
     def admission(self, question: Prepare | Accept | Accept[FleetValue], asker: NodeId, todo: ToDo) -> Admission:
         """Whether a question to a task's register, or to the fleet register, may be put to it.
@@ -147,6 +152,8 @@ class Roll:
         A refusal's reason is told by `refused`; what the two sides must tell each other is in ``todo``.
         """
         value = self.value
+        if value.electorate.is_founding and not question.generation_id:
+            return Admission.PASSED  # of a node that knows no fleet values: its electorate tells all
         if question.generation_id != value.generation_id:
             self.strangers.add(question.generation_id)
             return Admission.SILENT

@@ -43,6 +43,8 @@ def send_beat(node: Stages, todo: ToDo, now: float) -> None:
         generation=node.agreement.generation or 0,
         lease_terms=node.agreement.leases.terms_told,
         votes=node.agreement.witness.votes,
+        number=node.agreement.number,
+        fleet_revision=node.agreement.fleet_revision,
         has_lost_state=node.me in node.fleet.electors and not node.agreement.is_elector,
         electorate=node.agreement.electorate if node.agreement.is_elector else "",
         twins=node.namesakes.names(now),

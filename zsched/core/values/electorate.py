@@ -80,6 +80,11 @@ class Electorate:
         return next((one for one in self.electors if one.name == name), None)
 
     @property
+    def is_founding(self) -> bool:
+        """Whether these are a fleet file's electors, which no change has touched; nodes compare their files then."""
+        return self.number <= 1 and all(one.joining == 0 for one in self.electors)
+
+    @property
     def names(self) -> tuple[NodeId, ...]:
         """The electors' names."""
         return tuple(one.name for one in self.electors)

@@ -136,7 +136,9 @@ class Learnt:
     unleased: tuple[TaskId, ...] = ()
     """Tasks whose worker there may be working without a lease."""
     incarnation: int = 0
-    """Generation of its state; 0: it has none."""
+    """Incarnation of its state; 0: it has none."""
+    fleet: FleetValue | None = None
+    """The fleet value; ``None`` while it is the one that every node makes of its file."""
     votes: int = 0
     """How many promises and acceptances it has ever given."""
     seen: tuple[tuple[NodeId, int, int], ...] = ()

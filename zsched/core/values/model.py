@@ -545,31 +545,6 @@ class RegisterState(Generic[V]):
     learnt: V | None = None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DurableState:
-    """Everything that a node keeps across restarts (one file, `zsched.adapters.host.state_file`)."""
-
-    fleet: str
-    node: NodeId
-    incarnation: int
-    generation: int
-    hardware: str
-    electorate: str
-    registers: tuple[RegisterState, ...] = ()
-    voted: tuple[NodeId, ...] = ()
-    """Electors that this node has heard to have voted: such a name must not be initialised anew."""
-    disputed: str = ""
-    """Why this node stands down as elector until the operator settles it; empty: it does not."""
-    lease_s: float = 0.0
-    """How long a lease may last that this elector granted in a life before (its file may have said another length)."""
-    votes: int = 0
-    """How many promises and acceptances this elector has ever given."""
-    seen: tuple[tuple[NodeId, int, int], ...] = ()
-    """(elector, incarnation, votes), as others answered: they may lose their state (`zsched.core.vote.witness`)."""
-    lost: str = ""
-    """Why peers have seen a newer state of this node than this one; empty: they have not."""
-
-
 # --- membership ------------------------------------------------------------------------------------------------------
 
 
@@ -635,6 +610,10 @@ class Beat:
     votes: int = 0
     """How many promises and acceptances this elector has ever given."""
 
+    number: int = 0
+    fleet_revision: int = 0
+    """Of the learnt fleet value; 0 while it is the one that every node makes of its file."""
+
     electorate: str = ""
     """Hash of the electors that this elector counts with, and its generation; empty: it answers no proposer."""
     twins: tuple[NodeId, ...] = ()
@@ -643,6 +622,8 @@ class Beat:
     def __post_init__(self) -> None:
         check_name("beat.node", self.node)
         check_counter("beat.votes", self.votes)
+        check_counter("beat.number", self.number)
+        check_counter("beat.fleet_revision", self.fleet_revision)
         check_counter("beat.incarnation", self.incarnation)
         check_counter("beat.sequence", self.sequence)
         check_range("beat.loop_lag_s", self.loop_lag_s, 0.0, 86400.0)

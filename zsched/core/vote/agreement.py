@@ -14,8 +14,10 @@ from random import Random
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
+from zsched.core.electorate.numbers import Numbers
 from zsched.core.todo import ToDo
 from zsched.core.values.change import Change, Ended, MoveOwner, Retune, RoundOutcome
+from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import Accepted, CommandOutcome, CommandResult, Learnt, Promise, Refusal, Refused
 from zsched.core.values.model import (
@@ -23,7 +25,6 @@ from zsched.core.values.model import (
     Allocation,
     Ballot,
     Beat,
-    DurableState,
     NodeId,
     RegisterState,
     TaskId,
@@ -114,7 +115,10 @@ class Agreement:
             self._problems["state"] = f"{self._disputed}; no elector until `zsched init --settle`"
         self.counters: Counter[str] = Counter()
         self._buckets: dict[NodeId, tuple[float, float]] = {}
-        stored = {} if durable is None else {state.task: state for state in durable.registers}
+        # A state of today's names no creations: its registers are those of its generation.
+        held = () if durable is None else durable.registers
+        creation = self.generation or 0
+        stored = {state.task: replace(state, creation=state.creation or creation) for state in held}
         # What blank electors have agreed on: a generation's first value, which the operator has written everywhere.
         start = (self.generation or 0) * GENERATION_STEP
         self.registers = {
@@ -125,7 +129,8 @@ class Agreement:
                 electorate=self.electorate,
                 is_elector=self.is_elector,
                 initial=task.first_value(start),
-                state=stored.get(task.name, RegisterState(task=task.name)),
+                state=stored.get(task.name, RegisterState(task=task.name, creation=creation)),
+                disk="" if durable is None else durable.disk,
                 ballot_s=fleet.timing.ballot_s,
                 stagger_s=fleet.timing.stagger_s,
                 rng=rng,
@@ -133,6 +138,12 @@ class Agreement:
             for task in fleet.tasks
         }
         # A task that left the fleet file may come back: its promises must not be forgotten.
+        self._numbers = Numbers(
+            fleet=fleet, me=me, durable=durable, incarnation=incarnation, registers=self.registers, rng=rng
+        )
+        if self.generation is not None:
+            may_elect = durable is not None and not self._disputed and not self._lost
+            self._numbers.begin(self.generation, now, may_elect=may_elect)
         self._foreign = tuple(stored[name] for name in sorted(stored) if name not in self.registers)
         self._settle_at = now + SETTLE_AFTER_START_S if self.is_elector else math.inf
         self._asked_at: dict[tuple[NodeId, bool], float] = {}
@@ -146,6 +157,7 @@ class Agreement:
             now=now,
             granted_s=0.0 if durable is None else durable.lease_s,
         )
+        self._count_anew()
         self._parked: dict[tuple[TaskId, NodeId], tuple[ev.AcceptAsked, float]] = {}
         self._seen: list[RegisterState] = []
         """The registers' states from which `values` and `accepted` were made."""
@@ -187,7 +199,13 @@ class Agreement:
     def learnt(self) -> Learnt:
         """This node's learnt values for others, never accepted ones."""
         values = tuple(value for value in self.values().values() if value.revision > 0)
-        return Learnt(node=self._me, values=values, generation=self.generation or 0, has_voted=self.has_voted)
+        return Learnt(
+            node=self._me,
+            values=values,
+            generation=self.generation or 0,
+            has_voted=self.has_voted,
+            fleet=self._numbers.changed,
+        )
 
     def answer(self) -> Learnt:
         """This node's answer to a peer: its learnt values, and its memory of electors and of itself."""
@@ -233,6 +251,7 @@ class Agreement:
             lease_s=self.leases.to_remember_s(now),
             votes=self.witness.votes,
             seen=as_tuple(self.witness.seen),
+            fleet_register=self._numbers.state,
             lost=self._lost,
         )
         return self._durable
@@ -257,9 +276,12 @@ class Agreement:
             return
         ballot = event.prepare.ballot
         answer: Promise | Refused
+        turned_away = self._numbers.turned_away(event.prepare, event.asker, todo)
         if not self._may_ask(event.asker, now):
             self.counters["prepare_rate"] += 1
             answer = register.refuse(ballot, Refusal.RATE)
+        elif turned_away is not None:
+            answer = turned_away
         elif self.is_elector and not self.witness.may_vote(now):
             answer = register.refuse(ballot, Refusal.YOUNG)
         else:
@@ -285,6 +307,8 @@ class Agreement:
         if not is_fit(self._fleet, acceptance.value, register):
             self.counters["accept_unfit"] += 1
             refused = register.refuse(acceptance.ballot, Refusal.VALUE)
+        elif (turned_away := self._numbers.turned_away(event.accept, event.asker, todo)) is not None:
+            refused = turned_away
         elif self.is_elector and not self.witness.may_vote(now):
             refused = register.refuse(acceptance.ballot, Refusal.YOUNG)
         else:
@@ -332,18 +356,51 @@ class Agreement:
 
     def on_answer(self, event: ev.ElectorAnswered, todo: ToDo, now: float) -> None:
         """An elector answered our prepare or accept."""
-        register = self.registers.get(event.answer.task)
-        if register is None or event.answer.elector not in self._fleet.electors:
+        answer = event.answer
+        if isinstance(answer, Refused) and answer.elector in self._nodes and self._numbers.hear(answer, todo, now):
+            self._count_anew()
+        register = self.registers.get(answer.task)
+        if register is None or answer.elector not in self.electors:
             self.counters["answer_foreign"] += 1
         else:
-            register.on_answer(event.answer, todo, now)
+            register.on_answer(answer, todo, now)
+
+    @property
+    def electors(self) -> tuple[NodeId, ...]:
+        """With whom this node counts: the file's, until a change of the fleet is learnt."""
+        return self._numbers.electors
+
+    @property
+    def number(self) -> int:
+        """Of the learnt fleet value; 0 until a change of the fleet is learnt."""
+        return self._numbers.number
+
+    @property
+    def fleet_revision(self) -> int:
+        """Likewise its revision."""
+        return self._numbers.revision
+
+    def _count_anew(self) -> None:
+        """A newer fleet value is learnt, and the registers count by it already: so do leases and the witness."""
+        value, roll = self._numbers.changed, self._numbers.roll
+        if value is None or roll is None:
+            return
+        self.witness.electors = self.electors
+        self.is_elector = roll.is_elector
+        self.leases.count_with(
+            self.electors,
+            terms=f"{value.generation_id[:16]}/{value.number}",
+            number=value.number,
+            lease_s=value.lease_s,
+            standing=self.standing() if self.is_elector else {},
+        )
 
     def _is_its_own(self, ballot: Ballot, asker: NodeId) -> bool:
         return ballot.node == asker and asker in self._nodes
 
     def note_asked(self, beat: Beat, now: float) -> None:
         """An elector (maybe this one) asks owners to leave, because another owner's accept waits."""
-        if beat.node not in self._fleet.electors:
+        if beat.node not in self.electors:
             return
         for task, _, epoch in beat.asked_to_leave:
             register = self.registers.get(task)
@@ -361,15 +418,18 @@ class Agreement:
             self.counters["learnt_foreign"] += 1
             return
         if event.is_answer:
-            self._follow(learnt)
+            self._follow(learnt, now)
         if not self._is_our_generation(learnt.node, learnt.generation):
             return
         if not event.is_answer:
             newer = [(value.task, value.revision) for value in learnt.values]
-            self._ask(learnt.node, newer, ASK_AT_ONCE_S, todo, now)
+            is_news = learnt.fleet is not None and learnt.fleet.revision > self.fleet_revision
+            self._ask(learnt.node, newer, ASK_AT_ONCE_S, todo, now, is_news=is_news)
             return
+        if learnt.fleet is not None and self._numbers.learn(learnt.fleet, todo, now):
+            self._count_anew()
         self._lose(self.witness.on_answer(learnt), todo)
-        if learnt.has_voted and learnt.node in self._fleet.electors and learnt.node not in self.voted:
+        if learnt.has_voted and learnt.node in self.electors and learnt.node not in self.voted:
             self.voted.add(learnt.node)
             todo.must_persist |= self._durable is not None
         for value in learnt.values:
@@ -380,7 +440,7 @@ class Agreement:
         register = self.registers.get(value.task)
         if register is None:
             self.counters["learnt_foreign"] += 1
-        elif is_proven(self._fleet, learnt, value, register, has_generation=self.generation is not None):
+        elif is_proven(self._fleet, self.electors, learnt, value, register, has_generation=self.generation is not None):
             known = register.state.learnt
             register.learn(value, todo, now)
             if register.state.learnt is not known:
@@ -399,7 +459,7 @@ class Agreement:
         """Note whether an elector and this node refuse each other's ballots (other electors, or another generation)."""
         is_apart = beat.generation != self.generation or beat.electorate not in ("", self.electorate)
         is_apart |= self._is_no_elector_there(beat)
-        if is_apart and not self._is_guest_of(beat.generation) and beat.node in self._fleet.electors:
+        if is_apart and not self._is_guest_of(beat.generation) and beat.node in self.electors:
             self.apart.add(beat.node)
         elif self.apart:
             self.apart.discard(beat.node)
@@ -434,7 +494,7 @@ class Agreement:
         """Whether this node, without a state, follows a newer generation."""
         return not self._has_state and (self.generation is None or generation > self.generation)
 
-    def _follow(self, learnt: Learnt) -> None:
+    def _follow(self, learnt: Learnt, now: float) -> None:
         """An elector with a state has answered: a node without one joins the newest generation that it hears of."""
         is_elector = learnt.node in self._fleet.electors and (learnt.incarnation > 0 or learnt.has_voted)
         if not is_elector or learnt.generation > MAX_GENERATION or not self._is_guest_of(learnt.generation):
@@ -444,7 +504,8 @@ class Agreement:
         self.voted.clear()
         for task in self._fleet.tasks:
             initial = task.first_value(learnt.generation * GENERATION_STEP)
-            self.registers[task.name].follow(self.electorate, initial)
+            self.registers[task.name].follow(self.electorate, initial, learnt.generation)
+        self._numbers.begin(learnt.generation, now, may_elect=False)
 
     def dispute(self, reason: str, todo: ToDo) -> None:
         """Another daemon uses our name, too: no elector any more, on disk, until the operator settles the dispute."""
@@ -470,8 +531,8 @@ class Agreement:
         self._hear_electorate(beat)
         if not self._is_our_generation(beat.node, beat.generation):
             return
-        is_news = beat.has_voted and beat.node not in self.voted and beat.node in self._fleet.electors
-        is_news |= self.witness.must_ask(beat)
+        is_news = beat.has_voted and beat.node not in self.voted and beat.node in self.electors
+        is_news |= self.witness.must_ask(beat) or beat.fleet_revision > self.fleet_revision
         is_news |= self._is_guest_of(beat.generation) and beat.node in self._fleet.electors
         newer = [(task, revision) for task, revision, _ in beat.learnt]
         self._ask(beat.node, newer, ASK_LEARNT_EVERY_S, todo, now, is_news=is_news)
@@ -564,8 +625,8 @@ class Agreement:
     def _stop_electing(self) -> None:
         self.is_elector = False
         self.leases.stop_granting()
-        for register in self.registers.values():
-            register.stop_electing()
+        if self._numbers.roll is not None:
+            self._numbers.roll.stop_electing()
 
 
 def _refuse(request: int, outcome: CommandOutcome, detail: str, todo: ToDo) -> None:

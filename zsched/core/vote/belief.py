@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import Learnt
-from zsched.core.values.model import Allocation
+from zsched.core.values.model import Allocation, NodeId
 from zsched.core.vote.register import MAX_REVISION
 from zsched.core.vote.task_register import TaskRegister
 
@@ -39,7 +39,15 @@ def is_fit(fleet: Fleet, value: Allocation, register: TaskRegister, start: int =
     return is_known and value.epoch <= value.revision <= newest + MAX_AHEAD
 
 
-def is_proven(fleet: Fleet, learnt: Learnt, value: Allocation, register: TaskRegister, *, has_generation: bool) -> bool:
+def is_proven(
+    fleet: Fleet,
+    electors: tuple[NodeId, ...],
+    learnt: Learnt,
+    value: Allocation,
+    register: TaskRegister,
+    *,
+    has_generation: bool,
+) -> bool:
     """Whether a peer's answer to our own question is enough to learn a value.
 
     It is when the peer is an elector, or when this elector has accepted the same value (whoever committed it need not
@@ -49,4 +57,4 @@ def is_proven(fleet: Fleet, learnt: Learnt, value: Allocation, register: TaskReg
     if accepted is not None and accepted.value == value:
         return True
     start = 0 if has_generation else learnt.generation * GENERATION_STEP
-    return learnt.node in fleet.electors and is_fit(fleet, value, register, start)
+    return learnt.node in electors and is_fit(fleet, value, register, start)

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet, electorate_hash
-from zsched.core.values.model import NO_BALLOT, Acceptance, Allocation, DurableState, NodeId, RegisterState
+from zsched.core.values.model import NO_BALLOT, Acceptance, Allocation, NodeId, RegisterState
 from zsched.core.values.snapshot import Snapshot
 from zsched.core.vote.belief import GENERATION_STEP
 
@@ -25,7 +26,9 @@ def first_registers(fleet: Fleet, generation: int, before: Iterable[RegisterStat
     unleased = {state.task for state in before if _is_unleased(state)}
     values = (task.first_value(generation * GENERATION_STEP, is_new=task.name not in unleased) for task in fleet.tasks)
     return tuple(
-        RegisterState(task=value.task, accepted=Acceptance(ballot=NO_BALLOT, value=value), learnt=value)
+        RegisterState(
+            task=value.task, creation=generation, accepted=Acceptance(ballot=NO_BALLOT, value=value), learnt=value
+        )
         for value in values
     )
 
@@ -38,7 +41,14 @@ def _is_unleased(state: RegisterState) -> bool:
 
 
 def blank_state(
-    fleet: Fleet, node: NodeId, generation: int, before: DurableState | None, *, incarnation: int, hardware: str
+    fleet: Fleet,
+    node: NodeId,
+    generation: int,
+    before: DurableState | None,
+    *,
+    incarnation: int,
+    hardware: str,
+    disk: str = "",
 ) -> DurableState:
     """The state that `zsched init` writes: this name has never voted, in ``generation``.
 
@@ -51,6 +61,7 @@ def blank_state(
         incarnation=incarnation,
         generation=generation,
         hardware=hardware,
+        disk=disk,
         electorate=electorate_hash(fleet),
         registers=first_registers(fleet, generation, () if before is None else before.registers),
         lease_s=0.0 if before is None else before.lease_s,

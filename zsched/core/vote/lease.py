@@ -76,6 +76,8 @@ class Granter:
     standing: NodeId | None
     _last: Grant | None = None
     _granted_at: float = -math.inf
+    _hold_s: float = 0.0
+    """How long the last grant forbids another owner: by the lease under which it was given."""
     _released: dict[tuple[NodeId, int], int] = field(default_factory=dict)
     """{(owner, incarnation): the largest released number}."""
     _silent_for: tuple[NodeId, int] | None = None
@@ -113,7 +115,7 @@ class Granter:
         self._last = Grant(
             task=self.task, owner=beat.node, incarnation=beat.incarnation, epoch=epoch, number=beat.sequence
         )
-        self._granted_at = now
+        self._granted_at, self._hold_s = now, hold_s(self.lease_s)
         return is_new
 
     def _is_held(self, beat: Beat, now: float) -> bool:
@@ -123,7 +125,7 @@ class Granter:
             return True  # what this elector granted before it started is forgotten, and to whom
         if last is None or (last.owner, last.incarnation) == (beat.node, beat.incarnation):
             return False
-        return now < self._granted_at + hold_s(self.lease_s)
+        return now < self._granted_at + self._hold_s
 
     def _release(self, grant: Grant) -> None:
         key = (grant.owner, grant.incarnation)
@@ -143,15 +145,14 @@ class Granter:
 
     def may_accept(self, owner: NodeId | None, now: float) -> bool:
         """Whether a value with this owner may be accepted now; a no starts the silence towards the present owner."""
-        hold = hold_s(self.lease_s)
         if now < self.until and owner != self.standing:
             return False
         last = self._last
-        if last is None or last.owner == owner or now >= self._granted_at + hold:
+        if last is None or last.owner == owner or now >= self._granted_at + self._hold_s:
             return True
         if not self._is_silenced(last.owner, last.epoch, now):
             self._silent_for = (last.owner, last.epoch)
-            self._silent_until = now + 2 * hold
+            self._silent_until = now + 2 * self._hold_s
         return False
 
     def on_newer_value(self) -> None:
@@ -173,7 +174,7 @@ class Granter:
 
     def next_deadline(self, now: float) -> float:
         """When `may_accept` may change its mind; infinity when never."""
-        grant = self._granted_at + hold_s(self.lease_s)
+        grant = self._granted_at + self._hold_s
         return min(self.until if self.until > now else math.inf, grant if grant > now else math.inf)
 
 
@@ -209,6 +210,8 @@ class Holder:
     """A report of an earlier stop in this epoch may still come: from now on only the permission's end counts."""
     hurried_at: float = -math.inf
     """When an empty release last had a beat of its own."""
+    _kept_until: float = -math.inf
+    """The end of the lease that other electors, of a number before, have granted."""
     _sent: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=SENT_KEPT))
     _echoed: dict[NodeId, int] = field(default_factory=dict)
     _ahead: dict[NodeId, list[int]] = field(default_factory=dict)
@@ -242,10 +245,16 @@ class Holder:
         needed = majority(len(self.electors))
         numbers = sorted((number for number in self._echoed.values() if number > self.released), reverse=True)
         if len(numbers) < needed:
-            return -math.inf
+            return self._kept_until
         number = numbers[needed - 1]
         at = next((at for sent, at in self._sent if sent == number), None)
-        return -math.inf if at is None else at + self.lease_s
+        return self._kept_until if at is None else max(self._kept_until, at + self.lease_s)
+
+    def count_with(self, electors: tuple[NodeId, ...], lease_s: float) -> None:
+        """Count echoes of other electors from now on; what is held by the old ones runs to its end."""
+        self._kept_until = self.lease_until()
+        self.electors, self.lease_s = electors, lease_s
+        self._echoed.clear()
 
     def ask(self) -> None:
         """Another owner waits. Electors may have granted more than they echo, so every number sent so far is meant."""
@@ -255,7 +264,7 @@ class Holder:
     def release(self, number: int) -> Grant:
         """Give back every number up to ``number``: the worker has stopped."""
         self.released = max(self.released, number)
-        self.is_leaving, self.given_until = False, -math.inf
+        self.is_leaving, self.given_until, self._kept_until = False, -math.inf, -math.inf
         return Grant(
             task=self.task, owner=self.me, incarnation=self.incarnation, epoch=self.epoch, number=self.released
         )
@@ -290,6 +299,10 @@ class Leases:
     now: float
     granted_s: float = 0.0
     terms: str = field(init=False)
+    number: int = 0
+    """Of the fleet value by which this node counts; 0: of its file."""
+    electors: tuple[NodeId, ...] = field(init=False)
+    lease_s: float = field(init=False)
     is_in_doubt: bool = False
     """This node's clock is in doubt: it holds and grants nothing."""
     _others: dict[NodeId, str] = field(default_factory=dict)
@@ -300,6 +313,7 @@ class Leases:
 
     def __post_init__(self) -> None:
         self.terms = lease_terms(self.fleet)
+        self.electors, self.lease_s = self.fleet.electors, self.fleet.timing.lease_s
         self._granters = {}
         for task in self.fleet.tasks:
             value = self.standing.get(task.name)
@@ -308,7 +322,7 @@ class Leases:
                 self._watch(task.name, None if value is None else value.owner, self.over_at)
 
     def _watch(self, task: TaskId, standing: NodeId | None, until: float) -> None:
-        self._granters[task] = Granter(task=task, lease_s=self.fleet.timing.lease_s, until=until, standing=standing)
+        self._granters[task] = Granter(task=task, lease_s=self.lease_s, until=until, standing=standing)
 
     @property
     def over_at(self) -> float:
@@ -330,12 +344,44 @@ class Leases:
         """The clock is right again: begin anew, with beats after ``number``."""
         self.is_in_doubt = False
         for task, granter in self._granters.items():
-            granter.restart(standing[task], now + hold_s(self.fleet.timing.lease_s))
+            granter.restart(standing[task], now + hold_s(self.lease_s))
         for task in tuple(self._holders):
             holder = self._holders.pop(task)
             self.begin(task, holder.epoch, number + 1)
             # The worker was told to stop: its word may still come, and until then it may be at work.
             self._holders[task].expects_late_report, self._holders[task].given_until = True, holder.given_until
+
+    def count_with(
+        self,
+        electors: tuple[NodeId, ...],
+        *,
+        terms: str,
+        number: int,
+        lease_s: float,
+        standing: Mapping[TaskId, Allocation | None],
+    ) -> None:
+        """A newer fleet value is learnt: grant and count by its number. Grants and leases of before run to their end.
+
+        Args:
+            electors: of that value.
+            terms: what its leases hang on.
+            number: of that value.
+            lease_s: of that value.
+            standing: {task: its newest value here}; empty when this node is no elector.
+        """
+        if number == self.number:
+            return
+        self.terms, self.number, self.electors, self.lease_s = terms, number, electors, lease_s
+        self._others.clear()
+        for granter in self._granters.values():
+            granter.lease_s = lease_s  # a grant of before is remembered with its own length
+        for holder in self._holders.values():
+            holder.count_with(electors, lease_s)
+        if standing:
+            self.standing = standing
+        for task, value in standing.items():
+            if task not in self._granters and value is not None and value.leased:
+                self._watch(task, value.owner, math.inf if self.is_in_doubt else -math.inf)
 
     # --- electors ----------------------------------------------------------------------------------------------------
 
@@ -354,11 +400,11 @@ class Leases:
 
     def is_news(self, remembered_s: float) -> bool:
         """Whether this elector's grants may be longer than its state file says: the file must be written first."""
-        return bool(self._granters) and remembered_s < self.fleet.timing.lease_s
+        return bool(self._granters) and remembered_s < self.lease_s
 
     def to_remember_s(self, now: float) -> float:
         """The longest lease of a grant of this elector, or of its life before, for its next life."""
-        own_s = self.fleet.timing.lease_s
+        own_s = self.lease_s
         return own_s if now >= self.now + hold_s(self.granted_s) else max(own_s, self.granted_s)
 
     def stop_granting(self) -> None:
@@ -377,8 +423,8 @@ class Leases:
             epoch=epoch,
             me=self.me,
             incarnation=self.incarnation,
-            electors=self.fleet.electors,
-            lease_s=self.fleet.timing.lease_s,
+            electors=self.electors,
+            lease_s=self.lease_s,
             first_number=first_number,
         )
         self._releases.pop(task, None)
@@ -474,12 +520,14 @@ class Leases:
         """A beat came, or our own left: grant, count echoes, note who must leave. Whether to beat at once."""
         is_new = False
         for task, granter in self._granters.items():
-            is_new |= granter.on_beat(beat, accepted.get(task), now, is_newest=is_newest)
+            owned = accepted.get(task) if beat.number == self.number else None
+            is_new |= granter.on_beat(beat, owned, now, is_newest=is_newest)
         if beat.lease_terms == self.terms:
             self._others.pop(beat.node, None)
         else:
             self._others[beat.node] = beat.lease_terms
-        for grant in beat.echoes if beat.lease_terms == self.terms else ():
+        is_counted = beat.lease_terms == self.terms and beat.number == self.number
+        for grant in beat.echoes if is_counted else ():
             if grant.task in self._holders:
                 self._holders[grant.task].on_echo(beat.node, grant)
         for task, owner, epoch in beat.asked_to_leave:

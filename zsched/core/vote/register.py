@@ -120,9 +120,10 @@ class Register(ABC, Generic[V]):
         """This node lost its right to be an elector (disk, duplicate name) and answers no more."""
         self._is_elector = False
 
-    def follow(self, electorate: str, initial: V) -> None:
+    def follow(self, electorate: str, initial: V, creation: int) -> None:
         """A node without a state has heard the fleet's generation: continue with its first value and counters."""
         self._electorate, self._initial = electorate, initial
+        self.state = replace(self.state, creation=creation)
         learnt = self.state.learnt
         if learnt is not None and learnt.revision < initial.revision:
             self.state = RegisterState(
@@ -232,6 +233,11 @@ class Register(ABC, Generic[V]):
         return Accepted(elector=self._me, task=self.state.task, ballot=ballot, disk=self._disk, joining=self._joining)
 
     @property
+    def _id(self) -> str:
+        """The disk's id for ballots; a fleet file names no disks, and who goes by one compares ballots without."""
+        return "" if self._count.is_founding else self._disk
+
+    @property
     def _joining(self) -> int:
         seat = self._count.seat(self._me)
         return 0 if seat is None else seat.joining
@@ -239,10 +245,12 @@ class Register(ABC, Generic[V]):
     def _refusal(self, question: Prepare | Accept[V], ballot: Ballot) -> Refusal | None:
         if not self._is_elector:
             return Refusal.NOT_ELECTOR
-        if question.electorate != self._electorate:
+        if self._count.is_founding and question.electorate != self._electorate:
             return Refusal.ELECTORATE
         count = question.generation_id, question.number, question.creation
-        if count != (self._count.generation_id, self._count.number, self.state.creation):
+        is_by_file = count == ("", 0, 0)  # of a node that knows no fleet values; then the electorate tells all
+        is_same = count == (self._count.generation_id, self._count.number, self.state.creation)
+        if not is_same and not (is_by_file and self._count.is_founding):
             return Refusal.NUMBER
         return Refusal.BALLOT if ballot.counter > self.state.promised.counter + MAX_JUMP else None
 
@@ -349,7 +357,7 @@ class Register(ABC, Generic[V]):
     def _prepare(self, todo: ToDo, now: float) -> None:
         running = self._running()
         self._counter = max(self._counter, self.state.promised.counter) + 1
-        running.ballot = Ballot(counter=self._counter, node=self._me, incarnation=self._incarnation, disk=self._disk)
+        running.ballot = Ballot(counter=self._counter, node=self._me, incarnation=self._incarnation, disk=self._id)
         running.phase, running.deadline = _Phase.PREPARE, now + self._ballot_s
         running.promises, running.yes, running.no, running.value = {}, {}, {}, None
         running.known = self.value.revision

@@ -6,7 +6,7 @@ import pytest
 
 from support.fleets import tuning_of
 from support.states import state_of
-from zsched.core.values.model import DurableState
+from zsched.core.values.durable import DurableState
 from zsched.core.values.snapshot import QuorumStatus, Snapshot, TaskStatus
 from zsched.core.vote.belief import GENERATION_STEP
 from zsched.core.vote.generations import generation_of, objection

@@ -434,7 +434,9 @@ def test_refused_write_ends_the_electorship_and_the_writing() -> None:
         100.0,
     )
     assert [one.answer for one in of(effects, do.AnswerElection)] == [
-        Refused(elector="robot1", task="merge", ballot=ballot, refusal=Refusal.NOT_ELECTOR, promised=NO_BALLOT)
+        Refused(
+            elector="robot1", task="merge", ballot=ballot, refusal=Refusal.NOT_ELECTOR, promised=NO_BALLOT, number=1
+        )
     ]
     assert not effects.must_persist
 

@@ -90,17 +90,17 @@ def test_an_elector_s_answer_is_enough_or_what_was_accepted_here(
     by: str, new: Allocation, accepted: Allocation | None, is_enough: bool
 ) -> None:
     said = Learnt(node=by, values=(new,))
-    assert is_proven(FLEET, said, new, register(accepted=accepted), has_generation=True) is is_enough
+    assert is_proven(FLEET, FLEET.electors, said, new, register(accepted=accepted), has_generation=True) is is_enough
 
 
 def test_only_a_node_without_a_state_counts_from_the_generation_that_it_is_told() -> None:
     new = allocation_of(3 * GENERATION_STEP + 5)
     said = Learnt(node="robot2", values=(new,), generation=3)
-    assert is_proven(FLEET, said, new, register(), has_generation=False)
-    assert not is_proven(FLEET, said, new, register(), has_generation=True)
+    assert is_proven(FLEET, FLEET.electors, said, new, register(), has_generation=False)
+    assert not is_proven(FLEET, FLEET.electors, said, new, register(), has_generation=True)
     ahead = allocation_of(MAX_AHEAD + 1)
-    assert not is_proven(FLEET, replace(said, values=(ahead,)), ahead, register(), has_generation=True)
-    assert not is_proven(FLEET, replace(said, generation=2), new, register(), has_generation=False)
+    assert not is_proven(FLEET, FLEET.electors, replace(said, values=(ahead,)), ahead, register(), has_generation=True)
+    assert not is_proven(FLEET, FLEET.electors, replace(said, generation=2), new, register(), has_generation=False)
 
 
 def test_a_node_that_was_cut_off_for_twelve_days_of_a_move_a_second_believes_what_it_hears_then() -> None:

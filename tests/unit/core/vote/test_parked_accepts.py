@@ -17,14 +17,10 @@ from zsched.core import instructions as do
 from zsched.core.node import Node
 from zsched.core.todo import ToDo
 from zsched.core.values.change import MoveOwner
+from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.messages import Accept, Accepted, Learnt, Refusal, Refused
-from zsched.core.values.model import (
-    Acceptance,
-    Allocation,
-    DurableState,
-    RegisterState,
-)
+from zsched.core.values.model import Acceptance, Allocation, RegisterState
 from zsched.core.vote.agreement import PARK_SHARE, Agreement
 from zsched.core.vote.lease import hold_s
 

@@ -253,9 +253,9 @@ def test_an_acceptance_is_asked_about_only_once_its_proposer_has_had_its_time() 
 
 def test_who_hears_of_a_later_generation_forgets_what_another_fleet_has_learnt() -> None:
     register = make("r1", state=replace(BLANK, learnt=allocation(3)), is_elector=False)
-    register.follow("def", allocation(3))
+    register.follow("def", allocation(3), 0)
     assert register.state.learnt == allocation(3), "it may be this one's"
-    register.follow("def", allocation(4))
+    register.follow("def", allocation(4), 0)
     assert register.state == BLANK
     assert register.value == allocation(4)
 

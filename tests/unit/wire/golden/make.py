@@ -11,7 +11,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from zsched.core import events, relay_protocol
-from zsched.core.values import messages, model, plan, snapshot
+from zsched.core.values import durable, messages, model, plan, snapshot
 from zsched.ipc import pipe as relay_pipe
 from zsched.ipc import protocol
 from zsched.wire import codec as wire
@@ -130,7 +130,7 @@ SAMPLES: dict[str, object] = {
     "command_result": messages.CommandResult(
         outcome=messages.CommandOutcome.CONFLICT, detail="the value had changed", revision=8
     ),
-    "state": model.DurableState(
+    "state": durable.DurableState(
         fleet="lab",
         node="robot1",
         incarnation=3,

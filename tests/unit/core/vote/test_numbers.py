@@ -1,0 +1,403 @@
+"""Numbers in a node's agreement: founded from its file, learnt from peers, told in questions, beats and the state."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from random import Random
+from typing import TypeVar
+
+import pytest
+
+from support.fleets import fleet_of, tuning_of
+from support.todos import agreed
+from zsched.core import events as ev
+from zsched.core import instructions as do
+from zsched.core.electorate.changes import AddElector, AdoptDocument, RemoveElector, SetDocument, SetLease
+from zsched.core.electorate.founding import founded
+from zsched.core.todo import ToDo
+from zsched.core.values.change import MoveOwner
+from zsched.core.values.durable import DurableState
+from zsched.core.values.electorate import FleetValue
+from zsched.core.values.fleet import TaskSpec
+from zsched.core.values.messages import Accept, Accepted, Learnt, Prepare, Promise, Refusal, Refused
+from zsched.core.values.model import NO_BALLOT, Acceptance, Allocation, Ballot, Beat, Grant, RegisterState
+from zsched.core.vote.agreement import Agreement
+from zsched.core.vote.belief import GENERATION_STEP
+from zsched.core.vote.lease import Leases, hold_s
+from zsched.wire.codec import decode_state, encode_state
+
+T = TypeVar("T")
+NAMES = ("edge1", "robot1", "robot2", "robot3")
+ROBOTS = NAMES[1:]
+TASK = TaskSpec(name="merge", candidates=NAMES, tuning=tuning_of(), exclusive=True)
+FLEET = fleet_of(TASK, of=NAMES, electors=ROBOTS)
+GENERATION = 2
+FIRST = founded(FLEET.name, GENERATION, ROBOTS)
+ADOPTED = AdoptDocument(base_revision=1, document="0d", tasks=(("merge", True),), lease_s=1.0).apply(FIRST)
+WITH_EDGE = AddElector(base_revision=2, name="edge1", disk="ed").apply(replace(ADOPTED, settled=True))
+WITHOUT_ROBOT1 = RemoveElector(base_revision=2, name="robot1").apply(replace(ADOPTED, settled=True))
+
+
+def make(fleet_value: FleetValue | None = None, *, me: str = "robot1", has_state: bool = True) -> Agreement:
+    held = None if fleet_value is None else RegisterState(task=FLEET.name, learnt=fleet_value)
+    state = DurableState(
+        fleet=FLEET.name,
+        node=me,
+        incarnation=7,
+        generation=GENERATION,
+        hardware="h",
+        electorate="e",
+        disk="d1",
+        fleet_register=held,
+    )
+    agreement = Agreement(
+        fleet=FLEET,
+        me=me,
+        durable=state if has_state else None,
+        incarnation=7,
+        electorate="e",
+        rng=Random(1),
+        now=100.0,
+    )
+    for name in NAMES:
+        if name != me:
+            agreement.witness.on_answer(Learnt(node=name, values=()))
+    return agreement
+
+
+def of(todo: ToDo, kind: type[T]) -> list[T]:
+    return [one for one in (*todo.send, *todo.apply) if isinstance(one, kind)]
+
+
+def proposed(agreement: Agreement) -> Prepare:
+    value = agreement.registers["merge"].value
+    change = MoveOwner(base_revision=value.revision, owner="edge1", reason="test")
+    todo = agreed(agreement.propose, "merge", change, 100.0)
+    return of(todo, do.SendPrepare)[0].prepare
+
+
+def asked(agreement: Agreement, prepare: Prepare, asker: str = "robot2") -> tuple[ToDo, Promise | Accepted | Refused]:
+    ballot = replace(prepare.ballot, node=asker, counter=prepare.ballot.counter + 10)
+    event = ev.PrepareAsked(request=1, asker=asker, prepare=replace(prepare, ballot=ballot))
+    todo = agreed(agreement.on_prepare, event, 100.1)
+    return todo, of(todo, do.AnswerElection)[0].answer
+
+
+# --- founded ---------------------------------------------------------------------------------------------------------
+
+
+def test_every_prepare_and_accept_names_generation_number_and_creation() -> None:
+    agreement = make()
+    prepare = proposed(agreement)
+    assert (prepare.generation_id, prepare.number, prepare.creation) == (FIRST.generation_id, 1, GENERATION)
+    todo = ToDo()
+    for name in ROBOTS[:2]:
+        promise = Promise(elector=name, task="merge", ballot=prepare.ballot)
+        agreement.on_answer(ev.ElectorAnswered(answer=promise), todo, 100.1)
+    (accept,) = [one.accept for one in of(todo, do.SendAccept)]
+    assert (accept.generation_id, accept.number, accept.creation) == (FIRST.generation_id, 1, GENERATION)
+
+
+def test_founding_needs_no_message_and_nothing_of_it_goes_to_disk_or_into_beats() -> None:
+    agreement, other = make(), make(me="robot2")
+    assert proposed(agreement).generation_id == proposed(other).generation_id
+    state = agreement.to_persist(100.0)
+    assert state is not None
+    assert (state.fleet_register, state.disk) == (None, "d1")
+    assert (agreement.number, agreement.fleet_revision, agreement.learnt().fleet) == (0, 0, None)
+
+
+@pytest.mark.parametrize("is_told", [True, False])
+def test_a_question_without_a_number_is_answered_while_nothing_has_changed(*, is_told: bool) -> None:
+    agreement = make()
+    prepare = proposed(agreement)
+    by_file = replace(prepare, generation_id="", number=0, creation=0)
+    assert isinstance(asked(agreement, prepare if is_told else by_file)[1], Promise)
+
+
+@pytest.mark.parametrize(
+    "change", [AddElector(base_revision=1, name="edge1", disk="1"), RemoveElector(base_revision=1, name="robot1")]
+)
+def test_a_fleet_that_goes_by_its_files_agrees_a_document_first(change: AddElector | RemoveElector) -> None:
+    assert change.fault(FIRST) == "no document is agreed yet"
+    assert SetLease(base_revision=1, lease_s=2.0).fault(FIRST) == "no document is agreed yet"
+    assert SetDocument(base_revision=1, document="0d", tasks=()).apply(FIRST) == FIRST
+
+
+def test_the_first_document_keeps_the_registers_and_raises_the_number() -> None:
+    assert (ADOPTED.number, ADOPTED.settled, ADOPTED.lease_s, ADOPTED.guard_lease_s) == (2, False, 1.0, 1.0)
+    assert [(one.task, one.number, one.exclusive) for one in ADOPTED.tasks] == [("merge", GENERATION, True)]
+    again = AdoptDocument(base_revision=2, document="0e", tasks=(), lease_s=1.0)
+    assert again.fault(ADOPTED) == "a document is agreed already"
+    assert again.apply(ADOPTED) == ADOPTED
+    before = make()
+    start = GENERATION * GENERATION_STEP
+    learnt = Allocation(task="merge", revision=start + 3, epoch=start + 2, owner="edge1", tuning=TASK.tuning)
+    before.registers["merge"].learn(learnt, ToDo(), 100.0)
+    register = before.registers["merge"]
+    told = Learnt(node="robot2", values=(), generation=GENERATION, fleet=ADOPTED)
+    agreed(before.on_learnt, ev.LearntReceived(learnt=told, is_answer=True), 100.1)
+    assert before.registers["merge"] is register
+    assert register.value == learnt
+
+
+# --- learnt ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_lower_number_is_refused_and_told_a_higher_one_is_asked() -> None:
+    prepare = proposed(make())
+    todo, answer = asked(make(WITH_EDGE), prepare)
+    assert isinstance(answer, Refused)
+    assert (answer.refusal, answer.number, answer.fleet) == (Refusal.NUMBER, 3, WITH_EDGE)
+    assert answer.promised == NO_BALLOT
+    todo, answer = asked(make(), proposed(make(WITH_EDGE)))
+    assert isinstance(answer, Refused)
+    assert (answer.refusal, answer.number, answer.fleet) == (Refusal.NUMBER, 1, None)
+    assert [one.peer for one in of(todo, do.AskLearnt)] == ["robot2"]
+
+
+def test_an_accept_under_a_lower_number_is_refused_too() -> None:
+    agreement = make(WITH_EDGE)
+    prepare = proposed(make())
+    value = replace(agreement.registers["merge"].value, revision=GENERATION * GENERATION_STEP + 1, owner="edge1")
+    accept = Accept(
+        task="merge",
+        acceptance=Acceptance(ballot=replace(prepare.ballot, node="robot2"), value=value),
+        electorate=prepare.electorate,
+        creation=prepare.creation,
+        generation_id=prepare.generation_id,
+        number=1,
+    )
+    todo = agreed(agreement.on_accept, ev.AcceptAsked(request=3, asker="robot2", accept=accept), 100.1)
+    (answer,) = [one.answer for one in of(todo, do.AnswerElection)]
+    assert isinstance(answer, Refused)
+    assert (answer.refusal, answer.fleet) == (Refusal.NUMBER, WITH_EDGE)
+
+
+def test_a_question_without_a_number_is_refused_once_something_has_changed() -> None:
+    by_file = replace(proposed(make()), generation_id="", number=0, creation=0)
+    assert not isinstance(asked(make(WITH_EDGE), by_file)[1], Promise)
+
+
+def test_a_refusal_brings_the_newer_number_and_the_round_goes_on_under_it() -> None:
+    agreement = make()
+    ballot = proposed(agreement).ballot
+    refused = Refused(
+        elector="robot2",
+        task="merge",
+        ballot=ballot,
+        refusal=Refusal.NUMBER,
+        promised=NO_BALLOT,
+        number=3,
+        fleet=WITH_EDGE,
+    )
+    todo = agreed(agreement.on_answer, ev.ElectorAnswered(answer=refused), 100.1)
+    assert (agreement.number, agreement.electors) == (3, NAMES)
+    assert todo.must_persist
+    todo = agreed(agreement.tick, 100.2)
+    (prepare,) = [one.prepare for one in of(todo, do.SendPrepare)]
+    assert (prepare.number, prepare.ballot.disk) == (3, "d1")
+    state = agreement.to_persist(100.2)
+    assert state is not None
+    assert state.fleet_register is not None
+    assert state.fleet_register.learnt == WITH_EDGE
+    assert decode_state(encode_state(state)) == state
+    assert make(state.fleet_register.learnt).number == 3
+
+
+def test_a_peer_s_beat_with_a_newer_fleet_value_leads_to_a_question_and_its_answer_is_followed() -> None:
+    agreement = make()
+    beat = Beat(
+        node="robot2",
+        incarnation=1,
+        sequence=1,
+        loop_lag_s=0.0,
+        generation=GENERATION,
+        number=3,
+        fleet_revision=WITHOUT_ROBOT1.revision,
+    )
+    todo = ToDo()
+    agreement.compare(beat, todo, 100.1)
+    assert [one.peer for one in of(todo, do.AskLearnt)] == ["robot2"]
+    told = Learnt(node="robot2", values=(), generation=GENERATION, fleet=WITHOUT_ROBOT1)
+    agreed(agreement.on_learnt, ev.LearntReceived(learnt=told, is_answer=True), 100.2)
+    assert (agreement.number, agreement.fleet_revision, agreement.is_elector) == (3, 3, False)
+    assert agreement.learnt().fleet == WITHOUT_ROBOT1
+    assert agreement.witness.electors == ("robot2", "robot3")
+    _, answer = asked(agreement, proposed(make(WITHOUT_ROBOT1, me="robot2")))
+    assert isinstance(answer, Refused)
+    assert answer.refusal is Refusal.NOT_ELECTOR
+
+
+def test_what_is_told_unasked_leads_to_a_question_only() -> None:
+    agreement = make()
+    told = Learnt(node="robot2", values=(), generation=GENERATION, fleet=WITH_EDGE)
+    todo = agreed(agreement.on_learnt, ev.LearntReceived(learnt=told, is_answer=False), 100.1)
+    assert agreement.number == 0
+    assert [one.peer for one in of(todo, do.AskLearnt)] == ["robot2"]
+
+
+def test_another_generation_s_fleet_value_changes_nothing() -> None:
+    agreement = make()
+    told = Learnt(node="robot2", values=(), generation=GENERATION, fleet=replace(WITH_EDGE, generation_id="77"))
+    agreed(agreement.on_learnt, ev.LearntReceived(learnt=told, is_answer=True), 100.1)
+    assert agreement.number == 0
+
+
+def test_a_node_without_a_state_founds_the_value_of_the_generation_that_it_hears_of() -> None:
+    agreement = make(has_state=False)
+    told = Learnt(node="robot2", values=(), generation=GENERATION, incarnation=1)
+    agreed(agreement.on_learnt, ev.LearntReceived(learnt=told, is_answer=True), 100.1)
+    prepare = proposed(agreement)
+    assert (prepare.generation_id, prepare.number, prepare.creation) == (FIRST.generation_id, 1, GENERATION)
+    assert not agreement.is_elector
+    assert isinstance(asked(make(), prepare)[1], Promise)
+
+
+def test_an_elector_whose_name_is_disputed_answers_nobody_under_any_number() -> None:
+    agreement = make(WITH_EDGE)
+    agreement.dispute("two daemons", ToDo())
+    _, answer = asked(agreement, proposed(make(WITH_EDGE, me="robot2")))
+    assert isinstance(answer, Refused)
+    assert answer.refusal is Refusal.NOT_ELECTOR
+
+
+def test_ballots_of_today_s_fleets_carry_no_disk() -> None:
+    assert proposed(make()).ballot == Ballot(counter=1, node="robot1", incarnation=7)
+
+
+# --- leases over numbers ---------------------------------------------------------------------------------------------
+
+HELD = Allocation(task="merge", revision=7, epoch=3, owner="robot2", tuning=TASK.tuning, leased=True)
+L = FLEET.timing.lease_s
+
+
+def leases(me: str = "robot1") -> Leases:
+    return Leases(fleet=FLEET, me=me, incarnation=1, standing={"merge": HELD}, now=0.0)
+
+
+def renumbered(one: Leases, number: int = 2, lease_s: float = L, electors: tuple[str, ...] = ROBOTS) -> Leases:
+    one.count_with(electors, terms=f"t/{number}", number=number, lease_s=lease_s, standing={"merge": HELD})
+    return one
+
+
+def beat(number: int, node: str = "robot2", sequence: int = 5, **parts: tuple[Grant, ...]) -> Beat:
+    return Beat(
+        node=node,
+        incarnation=1,
+        sequence=sequence,
+        loop_lag_s=0.0,
+        learnt=(("merge", 7, 3),),
+        lease_terms=f"t/{number}",
+        number=number,
+        **parts,  # type: ignore[arg-type]
+    )
+
+
+OWNERS = {"merge": ("robot2", 3)}
+
+
+@pytest.mark.parametrize(("number", "grants"), [(2, True), (1, False), (3, False), (0, False)])
+def test_owner_that_never_learns_the_new_number_is_granted_nothing(*, number: int, grants: bool) -> None:
+    elector = renumbered(leases())
+    assert elector.on_beat(beat(number), OWNERS, 10.0) is grants
+    assert bool(elector.on_sent(1, 10.0).echoes) is grants
+
+
+def test_a_release_counts_whatever_number_its_sender_counts_by() -> None:
+    elector = leases()
+    assert elector.on_beat(beat(0), OWNERS, 10.0)
+    renumbered(elector)
+    assert not elector.may_accept("merge", "robot3", 10.1)
+    given_back = Grant(task="merge", owner="robot2", incarnation=1, epoch=3, number=5)
+    elector.on_beat(beat(0, sequence=6, released=(given_back,)), OWNERS, 10.1)
+    assert elector.may_accept("merge", "robot3", 10.1)
+
+
+def echoes(node: str, owner: str, number: int) -> tuple[Grant, ...]:
+    del node
+    return (Grant(task="merge", owner=owner, incarnation=1, epoch=3, number=number),)
+
+
+def holder() -> Leases:
+    """robot1 has sent beat 5 at 10 s, and robot2 and robot3 have echoed it."""
+    one = leases()
+    one.begin("merge", 3, 5)
+    one.on_sent(5, 10.0)
+    for name in ("robot2", "robot3"):
+        heard = replace(beat(0, name), echoes=echoes(name, "robot1", 5), lease_terms=one.terms)
+        one.on_beat(heard, {}, 10.1)
+    assert one.until("merge") == 10.0 + L
+    return one
+
+
+def test_change_leaves_the_owner_alone() -> None:
+    one = renumbered(holder())
+    assert one.until("merge") == 10.0 + L, "what it held runs to its end"
+    one.on_sent(6, 10.2)
+    for name in ("robot2", "robot3"):
+        one.on_beat(replace(beat(2, name, 6), echoes=echoes(name, "robot1", 6)), {}, 10.3)
+    assert one.until("merge") == 10.2 + L
+
+
+def test_an_echo_of_another_number_does_not_count() -> None:
+    one = renumbered(holder())
+    one.on_sent(6, 10.2)
+    for name in ("robot2", "robot3"):
+        stale = replace(beat(0, name, 6), echoes=echoes(name, "robot1", 6), lease_terms="t/2")
+        one.on_beat(stale, {}, 10.3)
+    assert one.until("merge") == 10.0 + L
+
+
+def test_a_lease_of_before_ends_with_its_release() -> None:
+    one = renumbered(holder())
+    one.end("merge", 5)
+    one.begin("merge", 4, 6)
+    assert one.until("merge") == -math.inf
+
+
+def test_the_new_electors_majority_is_needed() -> None:
+    one = renumbered(holder(), electors=NAMES)
+    one.on_sent(6, 10.2)
+    for name in ("robot2", "robot3"):
+        one.on_beat(replace(beat(2, name, 6), echoes=echoes(name, "robot1", 6)), {}, 10.3)
+    assert one.until("merge") == 10.0 + L, "two of four"
+    one.on_beat(replace(beat(2, "edge1", 6), echoes=echoes("edge1", "robot1", 6)), {}, 10.4)
+    assert one.until("merge") == 10.2 + L
+
+
+def test_lease_shortened_a_grant_of_before_is_guarded_with_its_own_length() -> None:
+    elector = leases()
+    assert elector.on_beat(beat(0), OWNERS, 10.0)
+    renumbered(elector, lease_s=L / 10)
+    assert not elector.may_accept("merge", "robot3", 10.0 + hold_s(L) - 0.01)
+    assert elector.may_accept("merge", "robot3", 10.0 + hold_s(L))
+    assert elector.on_beat(beat(2, sequence=7), OWNERS, 20.0) is False, "no new grant: the same owner's"
+    assert not elector.may_accept("merge", "robot3", 20.0 + hold_s(L / 10) - 0.01)
+    assert elector.may_accept("merge", "robot3", 20.0 + hold_s(L / 10))
+
+
+def test_task_removed_and_added_grants_are_remembered_by_name() -> None:
+    elector = leases()
+    assert elector.on_beat(beat(0), OWNERS, 10.0)
+    elector.count_with(ROBOTS, terms="t/2", number=2, lease_s=L, standing={})
+    renumbered(elector, 3)
+    assert not elector.may_accept("merge", "robot3", 10.0 + hold_s(L) - 0.01)
+
+
+def test_a_node_that_becomes_an_elector_grants() -> None:
+    spare = Leases(fleet=FLEET, me="edge1", incarnation=1, standing={}, now=0.0)
+    assert not spare.on_beat(beat(0), OWNERS, 10.0)
+    renumbered(spare, electors=NAMES)
+    assert spare.on_beat(beat(2, sequence=6), OWNERS, 10.1)
+    assert not spare.may_accept("merge", "robot3", 10.2)
+
+
+def test_the_same_number_again_changes_nothing() -> None:
+    one = renumbered(holder())
+    one.on_sent(6, 10.2)
+    for name in ("robot2", "robot3"):
+        one.on_beat(replace(beat(2, name, 6), echoes=echoes(name, "robot1", 6)), {}, 10.3)
+    renumbered(one)
+    assert one.until("merge") == 10.2 + L
