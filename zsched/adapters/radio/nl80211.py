@@ -51,6 +51,7 @@ class Command(IntEnum):
 
     GET_INTERFACE = 5
     GET_STATION = 17
+    GET_POWER_SAVE = 62
 
 
 class Attr(IntEnum):
@@ -61,6 +62,7 @@ class Attr(IntEnum):
     IFTYPE = 5
     MAC = 6
     STA_INFO = 21
+    PS_STATE = 93
 
 
 class StationInfo(IntEnum):
@@ -177,6 +179,12 @@ def parse_station(payload: bytes) -> Station:
     )
 
 
+def parse_power_save(payload: bytes) -> bool | None:
+    """The answer to NL80211_CMD_GET_POWER_SAVE: whether it is on; ``None``: not told. Raises `Nl80211Error`."""
+    state = _unsigned(parse_attributes(payload[GENERIC_HEADER.size :]), Attr.PS_STATE)
+    return None if state is None else state != 0
+
+
 def request(kind: int, command: int, attributes: dict[int, bytes], *, flags: int, sequence: int) -> bytes:
     """One generic netlink request."""
     body = GENERIC_HEADER.pack(command, 1, 0)
@@ -251,6 +259,13 @@ class GenericNetlink:
         """The stations of the interface ``index``. Raises `Nl80211Error`."""
         attributes = {int(Attr.IFINDEX): struct.pack("=I", index)}
         return tuple(parse_station(message.payload) for message in self._dump(Command.GET_STATION, attributes))
+
+    def power_save(self, index: int) -> bool | None:
+        """Whether the interface ``index`` may sleep between beacons; ``None``: not told. Raises `Nl80211Error`."""
+        attributes = {int(Attr.IFINDEX): struct.pack("=I", index)}
+        answers = self._ask(self.family_id, Command.GET_POWER_SAVE, attributes, NLM_F_ACK)
+        told = [parse_power_save(message.payload) for message in answers]
+        return next((state for state in told if state is not None), None)
 
     def _look_up(self, family: str) -> int:
         name = {int(Ctrl.ATTR_FAMILY_NAME): family.encode("ascii") + b"\0"}

@@ -73,6 +73,12 @@ def test_pyroute2_reads_the_same_of_a_station() -> None:
     )
 
 
+@pytest.mark.parametrize(("state", "is_on"), [(0, False), (1, True), (None, None)])
+def test_power_save_is_read(state: int | None, is_on: bool | None) -> None:
+    told = b"" if state is None else attribute(93, struct.pack("=I", state))
+    assert nl80211.parse_power_save(struct.pack("=BBH", 62, 1, 0) + told) is is_on
+
+
 def test_pyroute2_asks_for_stations_in_the_same_bytes() -> None:
     reference = pytest.importorskip("pyroute2.netlink.nl80211", reason="a development dependency: make test brings it")
     theirs = reference.nl80211cmd()
