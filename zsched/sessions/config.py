@@ -213,6 +213,18 @@ def tls_settings(operator_json5: str) -> frozenset[str]:
     return frozenset(name for name, value in (found or {}).items() if value is not None)
 
 
+def tls_files(operator_json5: str) -> dict[str, str]:
+    """{setting: path} of every certificate and key that the operator's own text names under ``transport/link/tls``.
+
+    Raises:
+        ValueError: it is not a zenoh configuration.
+    """
+    if not operator_json5.strip():
+        return {}
+    found = json.loads(_parsed(operator_json5).get_json("transport/link/tls")) or {}
+    return {name: str(path) for name, path in found.items() if path and name.endswith(("certificate", "private_key"))}
+
+
 # --- threads ---------------------------------------------------------------------------------------------------------
 
 

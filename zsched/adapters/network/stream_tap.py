@@ -15,6 +15,7 @@ from typing import Any, Final, Self
 import zenoh
 
 from zsched.clock import monotonic_s
+from zsched.core.route.ros2 import decode_attachment
 from zsched.errors import AdapterError
 from zsched.guard import guarded
 
@@ -36,6 +37,8 @@ class Tapped:
     encoding: str
     attachment_size: int
     payload: zenoh.ZBytes
+    source: str = ""
+    """Which publisher's it is: what the sample says of it, by zenoh's own means or rmw_zenoh's; empty: nothing."""
 
 
 class StreamTap:
@@ -79,6 +82,7 @@ class StreamTap:
                 encoding=str(sample.encoding),
                 attachment_size=0 if attachment is None else len(attachment),
                 payload=sample.payload,
+                source=_source(sample),
             )
             try:
                 self._samples.put_nowait(tapped)
@@ -111,3 +115,13 @@ class StreamTap:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _source(sample: zenoh.Sample) -> str:
+    info, attachment, stamp = sample.source_info, sample.attachment, sample.timestamp
+    if info is not None:
+        return f"{info.source_id.zid}/{info.source_id.eid}"
+    ros = None if attachment is None else decode_attachment(attachment.to_bytes())
+    if ros is not None:
+        return ros.gid.hex()
+    return "" if stamp is None else str(stamp.get_id())
