@@ -289,6 +289,28 @@ def retry(
     raise typer.Exit(ask_all(find_door(runtime_dir, node), task, whose, is_json=json_))
 
 
+@app.command(cls=Verb)
+def doctor(
+    fleet: Annotated[bool, typer.Option("--fleet", help="Ask every node, and compare what they say.")] = False,
+    strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 on a warning, too.")] = False,
+    json_: JsonOption = False,
+    config: ConfigOption = None,
+    node: NameOption = None,
+    state_dir: StateOption = None,
+    runtime_dir: RuntimeOption = None,
+    no_color: Annotated[bool, typer.Option("--no-color", help="Plain text (also: NO_COLOR).")] = False,
+) -> None:
+    """Look for what is wrong with this machine, its daemon, or the whole fleet, and say what to do.
+
+    Each check says PASS, WARN, FAIL or SKIP, and what it saw. It changes nothing. Exits with 1 on a FAIL.
+    """
+    from zsched.commands.doctor import diagnose, machine_of  # noqa: PLC0415 - each verb imports what it needs
+
+    _node_name(node)
+    machine = machine_of(config, node, state_dir, runtime_dir)
+    raise typer.Exit(diagnose(machine, is_fleet=fleet, is_strict=strict, is_json=json_, is_plain=no_color))
+
+
 # --- the fleet file --------------------------------------------------------------------------------------------------
 
 

@@ -37,6 +37,7 @@ FLOORS: Final[tuple[tuple[str, int, str], ...]] = (
     (r"examples(?:\.(\w+))?(?:\..+)?", 7, "tasks: example \\1"),  # programs that `zsched init --example` copies
     (r"daemon", 7, "daemon"),
     (r"dev(\..+)?", 7, "dev"),
+    (r"doctor(\..+)?", 7, "doctor"),
     (r"commands(\..+)?", 8, "commands"),
     (r"(cli|__main__)", 9, "cli"),
     (r"lab(\..+)?", 10, "lab"),  # zsched_lab, a distribution of its own

@@ -1,0 +1,84 @@
+"""`zsched doctor` on a real fleet: nothing is wrong with one in order, and three faults at once are found."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from zsched_lab.fleet.testbed import Testbed, echo_fleet
+
+WAIT_S = 40.0
+VERB_S = 60.0
+
+
+def doctor(bed: Testbed, node: str, *arguments: str) -> tuple[int, dict[str, Any]]:
+    """(exit code, {check: its result}) of the doctor on one machine of the fleet."""
+    words = {"CONFIG": bed.file, "NODE": node, "STATE_DIR": bed.folder / node, "RUNTIME_DIR": bed.folder}
+    done = subprocess.run(
+        [sys.executable, "-m", "zsched.cli", "doctor", "--json", *arguments],
+        env={**os.environ, **{f"ZSCHED_{name}": str(value) for name, value in words.items()}},
+        capture_output=True,
+        text=True,
+        timeout=VERB_S,
+        check=False,
+    )
+    assert done.stdout, done.stderr
+    return done.returncode, {check["id"]: check for check in json.loads(done.stdout)["checks"]}
+
+
+def failed(found: dict[str, Any]) -> dict[str, str]:
+    return {name: " ".join(check["evidence"]) for name, check in found.items() if check["verdict"] == "FAIL"}
+
+
+@pytest.fixture
+def bed(tmp_path: Path) -> Iterator[Testbed]:
+    with Testbed(tmp_path, echo_fleet(robots=3, edges=2)) as made:
+        yield made
+
+
+def test_a_fleet_in_order_passes_and_three_faults_at_once_are_found(bed: Testbed) -> None:
+    bed.init()
+    bed.start()
+    bed.wait_settled(WAIT_S)
+    code, found = doctor(bed, "robot1", "--fleet")
+    assert (failed(found), code) == ({}, 0)
+    assert [found[name]["verdict"] for name in ("fleet.pairs", "fleet.registers", "net.ports")] == ["PASS"] * 3
+    assert found["fleet.pairs"]["evidence"] == ["20 directions between 5 nodes, all heard"]
+    code, found = doctor(bed, "edge1")
+    assert (failed(found), code) == ({}, 0)
+    assert [found[name]["verdict"] for name in ("worker.imports", "worker.state")] == ["PASS"] * 2
+
+    bed.stop("robot2", "robot3", "edge2")
+    (bed.folder / "robot3" / "state").unlink()
+    good = bed.file.read_text()
+    bed.file.write_text(good.replace('"bonus": 0.1', '"bonus": 0.2'))
+    bed.start("robot2")
+    bed.wait(lambda: bed.status("robot2")["up_s"] > 0, WAIT_S, "robot2")
+    bed.file.write_text(good)
+    bed.start("robot3")
+
+    def all_there() -> bool:
+        states = {node["name"]: node["state"] for node in bed.status("robot1")["nodes"]}
+        return {states["robot2"], states["robot3"]} == {"alive"}
+
+    bed.wait(all_there, WAIT_S, "robot2 and robot3 alive")
+    code, found = doctor(bed, "robot1", "--fleet")
+    faults = failed(found)
+    assert code == 1
+    assert "robot2 goes by hash" in faults["fleet.files"]
+    assert "robot3 is an elector without a valid state (lost_state)" in faults["fleet.electors"]
+    assert found["fleet.answers"]["evidence"] == ["1 of 5 nodes do not answer: edge2"]
+    assert "edge2" not in faults.get("fleet.addresses", "")
+
+    code, found = doctor(bed, "robot3")
+    assert "does not exist" in failed(found)["state.valid"]
+    code, found = doctor(bed, "laptop", "--fleet", "--runtime-dir", str(bed.folder / "none"))
+    assert set(failed(found)) == {"fleet.files", "fleet.electors"}
+    assert "state.valid" not in found

@@ -1,0 +1,350 @@
+"""Faults planted on one machine (files, sockets, processes, answers): each is found by its check, with what to do."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from support.clinic import FLEET, assert_finds, make_state, run, scene_of
+from zsched.adapters.radio.nl80211 import GenericNetlink, Interface
+from zsched.clock import ClockWatch, Drift
+from zsched.doctor import machine, state
+from zsched.doctor.model import Scene, Verdict
+from zsched.doctor.table import run_all
+
+FAIL, WARN, PASS, SKIP = Verdict.FAIL, Verdict.WARN, Verdict.PASS, Verdict.SKIP
+ROBOTS_OWN = FLEET.replace("  robot1: {kind: robot}", "  robot1: {kind: robot, wifi: wlan7}")
+
+
+def test_a_machine_in_order_has_no_fault(tmp_path: Path) -> None:
+    """What these checks say of the machine itself (its unit, its memory) is another matter."""
+    elsewhere = ("unit.", "machine.", "net.own_addresses", "net.ports", "clock.", "state.fsync", "state.space")
+    scene = scene_of(tmp_path, node="robot1")
+    bad = [(check.name, result) for check, result in run_all(scene) if result.fix]
+    assert [one for one in bad if not one[0].startswith(elsewhere)] == []
+    assert len(run_all(scene)) >= 20
+
+
+# --- the fleet file --------------------------------------------------------------------------------------------------
+
+
+def test_a_wrong_fleet_file_is_found_and_what_needs_it_is_skipped(tmp_path: Path) -> None:
+    scene = scene_of(tmp_path, FLEET.replace("kind: edge, host", "kind: ege, host"))
+    results = {check.name: result for check, result in run_all(scene)}
+    assert_finds(results["file.valid"], FAIL, "fleet.yaml:4:", "ege")
+    assert results["state.valid"].verdict is results["worker.imports"].verdict is SKIP
+
+
+def test_a_fleet_file_that_may_be_better_is_a_warning(tmp_path: Path) -> None:
+    assert_finds(run("file.warnings", scene_of(tmp_path, FLEET.replace("  robot3: {kind: robot}\n", ""))), WARN, "two")
+
+
+def test_a_machine_that_the_file_does_not_name_is_found(tmp_path: Path) -> None:
+    assert_finds(run("file.node", scene_of(tmp_path, node="robot9")), FAIL, "robot9", "robot1")
+
+
+def test_a_daemon_with_yesterday_s_file_is_found(tmp_path: Path) -> None:
+    scene = scene_of(tmp_path)
+    scene.file.write_text(FLEET.replace("cpu: 0.5, memory: 0.5", "cpu: 0.6, memory: 0.4"))
+    newer = scene_of(tmp_path, scene.file.read_text(), own=scene.own)
+    assert run("file.in_force", scene).verdict is PASS
+    assert_finds(run("file.in_force", newer), WARN, "goes by a file of hash")
+
+
+# --- the state -------------------------------------------------------------------------------------------------------
+
+
+def test_an_elector_without_a_state_is_found(tmp_path: Path) -> None:
+    scene = scene_of(tmp_path, node="robot1")
+    assert run("state.valid", scene).verdict is PASS
+    (scene.state_folder / "state").unlink()
+    assert_finds(run("state.valid", scene), FAIL, "does not exist", "cannot vote")
+    edge = replace(scene, node="edge1")
+    assert_finds(run("state.valid", edge), WARN, "works without")
+
+
+def test_a_damaged_state_and_another_node_s_are_found(tmp_path: Path) -> None:
+    scene = scene_of(tmp_path, node="robot1")
+    assert_finds(run("state.valid", replace(scene, node="robot2")), FAIL, "belongs to the node 'robot1'")
+    file = scene.state_folder / "state"
+    file.write_bytes(file.read_bytes()[:-3])
+    assert_finds(run("state.valid", scene), FAIL, "damaged")
+
+
+@pytest.mark.parametrize("field", ["electorate", "disputed", "lost"])
+def test_a_state_by_which_nobody_may_vote_is_found(tmp_path: Path, field: str) -> None:
+    scene = scene_of(tmp_path, node="robot1")
+    assert run("state.elector", scene).verdict is PASS
+    make_state(scene.fleet, "robot1", scene.state_folder, **{field: "something else"})
+    assert_finds(run("state.elector", scene), FAIL)
+
+
+def test_a_slow_disk_is_found(tmp_path: Path) -> None:
+    took_s = state._sync_s(tmp_path)
+    assert 0.0 < took_s < 5.0
+    assert list(tmp_path.iterdir()) == []
+    assert state.judged_sync(0.004, 0.3, tmp_path).verdict is PASS
+    assert_finds(state.judged_sync(0.06, 0.3, tmp_path), WARN, "60.0 ms")
+    assert_finds(state.judged_sync(0.2, 0.3, tmp_path), FAIL, "ballot_s = 0.3 s")
+
+
+def test_a_full_and_a_read_only_disk_are_found(tmp_path: Path) -> None:
+    def judged(**facts: Any) -> Any:
+        return state.judged_space(tmp_path, **{"free": 1 << 30, "files": 1000, "is_read_only": False, **facts})
+
+    assert judged().verdict is PASS
+    assert_finds(judged(free=5000), FAIL, "0 MiB left")
+    assert_finds(judged(free=9 << 20), WARN, "9 MiB left")
+    assert_finds(judged(files=3), FAIL, "3 files")
+    assert_finds(judged(is_read_only=True), FAIL, "read-only")
+
+
+# --- the daemon ------------------------------------------------------------------------------------------------------
+
+
+def test_a_daemon_that_is_not_there_is_found(tmp_path: Path) -> None:
+    scene = replace(scene_of(tmp_path), own=None, refusal="cannot reach edge1.sock: no such file")
+    assert_finds(run("daemon.answers", scene), FAIL, "cannot reach")
+
+
+def answer(scene: Scene, **changes: Any) -> Scene:
+    """The same machine, whose daemon's answer is changed."""
+    return replace(scene, own={**scene.status, **changes})
+
+
+def test_a_daemon_of_another_version_is_found(tmp_path: Path) -> None:
+    scene = scene_of(tmp_path)
+    assert run("daemon.version", scene).verdict is PASS
+    assert_finds(run("daemon.version", answer(scene, version="0.0.9")), WARN, "0.0.9")
+
+
+def test_a_decision_loop_that_lags_is_found(tmp_path: Path) -> None:
+    scene = scene_of(tmp_path)
+    assert run("daemon.lag", scene).verdict is PASS
+    assert_finds(run("daemon.lag", answer(scene, loop_lag_s=0.3)), WARN, "300.0 ms")
+    assert_finds(run("daemon.lag", answer(scene, loop_lag_s=0.9)), FAIL, "suspect")
+
+
+def test_what_the_daemon_names_is_told(tmp_path: Path) -> None:
+    scene = answer(scene_of(tmp_path), problems=["relay: the relay is down"])
+    assert_finds(run("daemon.problems", scene), WARN, "the relay is down")
+
+
+def test_a_task_without_an_owner_and_a_lost_quorum_are_found(tmp_path: Path) -> None:
+    scene = scene_of(tmp_path)
+    assert run("task.owners", scene).verdict is PASS
+    (task,) = scene.status["tasks"]
+    lost = answer(scene, tasks=[{**task, "owner": None}], quorum={**scene.status["quorum"], "ok": False, "alive": 1})
+    assert_finds(run("task.owners", lost), FAIL, "no quorum: 1 of 3", "merge has no owner")
+    assert_finds(run("task.owners", answer(scene, tasks=[{**task, "owner_state": "gone"}])), FAIL, "edge1 is gone")
+
+
+def test_a_worker_that_failed_is_found(tmp_path: Path) -> None:
+    scene = scene_of(tmp_path)
+    assert run("worker.state", scene).verdict is PASS
+    load = {"task": "merge", "state": "failed", "reason": "no such camera"}
+    broken = answer(scene, nodes=[{"name": "edge1", "workers": [load]}])
+    assert_finds(run("worker.state", broken), FAIL, "no such camera")
+    assert "zsched retry merge edge1" in run("worker.state", broken).fix
+
+
+def test_an_input_that_nobody_publishes_is_found(tmp_path: Path) -> None:
+    scene = scene_of(tmp_path, node="robot1")
+    assert run("stream.silent", scene).verdict is PASS
+    (task,) = scene.status["tasks"]
+    silent = answer(scene, tasks=[{**task, "streams": [{**task["streams"][0], "last_seen_s": None}]}])
+    result = run("stream.silent", silent)
+    assert_finds(result, WARN, "nobody has published robot1/map")
+    assert "tcp/127.0.0.1:7458" in result.fix
+    assert run("stream.silent", answer(silent, up_s=3.0)).verdict is SKIP
+
+
+# --- the machine -----------------------------------------------------------------------------------------------------
+
+
+class PlantedWatch(ClockWatch):
+    """A clock that is slewed so fast."""
+
+    def __init__(self, ratio: float) -> None:
+        super().__init__()
+        self.ratio = ratio
+
+    def look(self) -> Drift | None:
+        return Drift(self.ratio, self.ratio * 0.5, 0.5)
+
+
+def test_a_clock_that_is_slewed_is_found(tmp_path: Path) -> None:
+    scene = scene_of(tmp_path)
+    exclusive = FLEET.replace("    weights", "    exclusive: true\n    weights")
+    assert machine.clock_runs_true(scene, PlantedWatch(0.0)).verdict is PASS
+    assert_finds(machine.clock_runs_true(scene, PlantedWatch(0.083)), WARN, "+8.300%")
+    leased = scene_of(tmp_path, exclusive)
+    assert_finds(machine.clock_runs_true(leased, PlantedWatch(-0.05)), FAIL, "exclusive tasks meanwhile: merge")
+
+
+@pytest.fixture
+def starved() -> Iterator[int]:
+    """A process that may open 64 files."""
+    code = "import resource, time; resource.setrlimit(resource.RLIMIT_NOFILE, (64, 64)); print(1); time.sleep(60)"
+    with subprocess.Popen([sys.executable, "-uc", code], stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        yield process.pid
+        process.kill()
+
+
+def test_a_daemon_that_may_open_few_files_is_found(tmp_path: Path, starved: int) -> None:
+    scene = scene_of(tmp_path)
+    (scene.state_folder / "lock").write_text(f"{starved}\n")
+    assert_finds(run("machine.descriptors", scene), WARN, f"process {starved} may open 64 files")
+
+
+def test_shared_memory_that_cannot_be_used_is_found(tmp_path: Path) -> None:
+    text = FLEET.replace("fleet: hall", "fleet: hall\nshared_memory: auto").replace(
+        'merge/{robot}/map"}', 'merge/{robot}/map", class: reliable}'
+    )
+    assert run("machine.shared_memory", scene_of(tmp_path)).verdict is SKIP
+    assert_finds(run("machine.shared_memory", scene_of(tmp_path, text)), WARN, "class reliable")
+
+
+def test_a_machine_that_is_too_small_for_a_task_is_found(tmp_path: Path) -> None:
+    def with_demand(demand: str) -> Scene:
+        return scene_of(tmp_path, FLEET.replace("    weights", f"    demand: {demand}\n    weights"))
+
+    assert run("machine.demand", with_demand("{cpu_cores: 0.01, memory_mb: 1}")).verdict is PASS
+    assert_finds(run("machine.demand", with_demand("{cpu_cores: 900}")), WARN, "merge needs 900 cores")
+    assert_finds(run("machine.demand", with_demand("{memory_mb: 60000000}")), FAIL, "MiB")
+    assert_finds(run("machine.memory", with_demand("{memory_mb: 60000000}")), WARN, "1 worker")
+
+
+class PlantedRadio(GenericNetlink):
+    """A kernel with one Wi-Fi interface."""
+
+    def __init__(self, name: str, is_on: bool | None) -> None:
+        self._name, self._is_on = name, is_on
+
+    def interfaces(self) -> tuple[Interface, ...]:
+        return (Interface(index=3, name=self._name),)
+
+    def power_save(self, index: int) -> bool | None:
+        assert index == 3
+        return self._is_on
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+def test_wifi_power_save_and_a_missing_interface_are_found(tmp_path: Path) -> None:
+    scene = scene_of(tmp_path, ROBOTS_OWN, node="robot1")
+    check = machine.radio_stays_awake
+    assert check(scene, PlantedRadio("wlan7", is_on=False)).verdict is PASS
+    assert check(scene, PlantedRadio("wlan7", is_on=None)).verdict is SKIP
+    result = check(scene, PlantedRadio("wlan7", is_on=True))
+    assert_finds(result, WARN, "power save is on")
+    assert "iw dev wlan7 set power_save off" in result.fix
+    assert_finds(check(scene, PlantedRadio("wlan0", is_on=False)), FAIL, "no Wi-Fi interface wlan7")
+
+
+# --- addresses -------------------------------------------------------------------------------------------------------
+
+
+def test_a_name_that_does_not_resolve_is_found(tmp_path: Path) -> None:
+    assert run("net.names", scene_of(tmp_path)).verdict is PASS
+    wrong = scene_of(tmp_path, FLEET.replace("host: 127.0.0.1", "host: edge1.zsched.invalid"))
+    assert_finds(run("net.names", wrong), FAIL, "edge1.zsched.invalid (edge1)")
+
+
+def test_an_address_that_only_this_machine_reaches_is_found(tmp_path: Path) -> None:
+    far = "  robot1: {kind: robot, host: 192.0.2.9, listen: {control: tcp/0.0.0.0:7457, data: tcp/0.0.0.0:7458}}"
+    scene = scene_of(tmp_path, FLEET.replace("  robot1: {kind: robot}", far))
+    assert_finds(run("net.loopback", scene), FAIL, "edge1's control session", "only this machine")
+    assert run("net.loopback", replace(scene, node="robot1")).verdict is SKIP
+
+
+@pytest.fixture
+def listener() -> Iterator[tuple[socket.socket, int]]:
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        yield other, other.getsockname()[1]
+
+
+def test_another_program_on_our_port_is_found(tmp_path: Path, listener: tuple[socket.socket, int]) -> None:
+    text = FLEET.replace("21257", str(listener[1]))
+    scene = replace(scene_of(tmp_path, text), own=None)
+    assert_finds(run("net.ports", scene), FAIL, f"port {listener[1]} (control) is held by process")
+    listener[0].close()
+    assert run("net.ports", scene).verdict is PASS
+
+
+def test_a_daemon_that_does_not_listen_where_it_should_is_found(
+    tmp_path: Path, listener: tuple[socket.socket, int]
+) -> None:
+    text = FLEET.replace("21257", str(listener[1])).replace("21258", str(listener[1] - 1 or 1))
+    scene = scene_of(tmp_path, text)
+    assert_finds(run("net.own_addresses", scene), FAIL, "edge1's data session", "refused")
+    assert "control" not in "\n".join(run("net.own_addresses", scene).evidence)
+    assert_finds(run("net.ports", scene), FAIL, "nobody listens on port")
+
+
+# --- workers ---------------------------------------------------------------------------------------------------------
+
+
+def with_command(folder: Path, command: str) -> Scene:
+    return scene_of(folder, FLEET.replace("[python, -m, zsched.tasks.echo]", command))
+
+
+@pytest.mark.parametrize(
+    ("command", "verdict", "word"),
+    [
+        ("[nosuchprogram, --x]", FAIL, "nosuchprogram"),
+        ("[/opt/nowhere/worker]", FAIL, "/opt/nowhere/worker"),
+        ("[python, /opt/nowhere/worker.py]", FAIL, "no file /opt/nowhere/worker.py"),
+    ],
+)
+def test_a_worker_whose_program_is_missing_is_found(tmp_path: Path, command: str, verdict: Verdict, word: str) -> None:
+    assert_finds(run("worker.command", with_command(tmp_path, command)), verdict, word)
+
+
+def test_a_worker_s_program_that_is_there_passes(tmp_path: Path) -> None:
+    assert run("worker.command", scene_of(tmp_path)).verdict is PASS
+    assert run("worker.command", with_command(tmp_path, "[sleep, '1']")).verdict is PASS
+    assert run("worker.command", scene_of(tmp_path, node="robot1")).verdict is SKIP
+
+
+def test_a_worker_that_lacks_a_package_is_found_and_never_carried_out(tmp_path: Path) -> None:
+    script, trace = tmp_path / "worker.py", tmp_path / "ran"
+    script.write_text(f"import json\nimport nosuchpackage\nopen({str(trace)!r}, 'w')\n")
+    assert_finds(run("worker.imports", with_command(tmp_path, f"[python, {script}]")), FAIL, "nosuchpackage")
+    script.write_text(f"import json\nfrom zsched.worker import Worker\nopen({str(trace)!r}, 'w')\n")
+    assert run("worker.imports", with_command(tmp_path, f"[python, {script}]")).verdict is PASS
+    assert not trace.exists()
+
+
+def test_a_worker_s_module_is_followed_through_its_own_package(tmp_path: Path) -> None:
+    package, trace = tmp_path / "mine", tmp_path / "ran"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "__main__.py").write_text(f"from mine import parts\nopen({str(trace)!r}, 'w')\n")
+    (package / "parts.py").write_text("from . import deeper\n")
+    (package / "deeper.py").write_text(
+        "import nosuchpackage\ntry:\n    import optional\nexcept ImportError:\n    pass\n"
+    )
+    text = FLEET.replace("[python, -m, zsched.tasks.echo]", "[python, -m, mine]").replace(
+        "worker: {", f"worker: {{env: {{PYTHONPATH: {tmp_path}}}, "
+    )
+    assert_finds(run("worker.imports", scene_of(tmp_path, text)), FAIL, "nosuchpackage")
+    (package / "deeper.py").write_text("import json\n")
+    assert run("worker.imports", scene_of(tmp_path, text)).verdict is PASS
+    assert not trace.exists()
+
+
+def test_a_worker_s_module_that_is_not_there_is_found(tmp_path: Path) -> None:
+    assert_finds(run("worker.imports", with_command(tmp_path, "[python, -m, nosuch.worker]")), FAIL, "nosuch")

@@ -1,0 +1,133 @@
+"""Faults planted in a machine's systemd unit, and in certificates."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from support.certificates import make_tls
+from support.clinic import FLEET, assert_finds, run, scene_of
+from zsched.doctor import network
+from zsched.doctor.certificate import validities
+from zsched.doctor.model import Scene, Verdict
+
+ROOT = Path(__file__).parents[3]
+FAIL, WARN, PASS, SKIP = Verdict.FAIL, Verdict.WARN, Verdict.PASS, Verdict.SKIP
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Scene:
+    """A machine with the unit that comes with zsched, enabled, and what it reads."""
+    root = tmp_path / "machine"
+    for folder in ("run/systemd/system", "etc/systemd/system/multi-user.target.wants", "opt/zsched/bin", "etc/zsched"):
+        (root / folder).mkdir(parents=True)
+    unit = root / "etc/systemd/system/zsched.service"
+    shutil.copy(ROOT / "systemd" / "zsched.service", unit)
+    (root / "etc/systemd/system/multi-user.target.wants/zsched.service").symlink_to(unit)
+    (root / "opt/zsched/bin/zsched").write_text("#!/bin/sh\n")
+    (root / "opt/zsched/bin/python").symlink_to("/usr/bin/env")
+    (root / "etc/zsched/fleet.yaml").write_text(FLEET)
+    (root / "etc/zsched/fleet.yaml").chmod(0o644)
+    return replace(scene_of(tmp_path), root=root)
+
+
+def test_a_unit_in_order_passes(scene: Scene) -> None:
+    for name in ("unit.installed", "unit.enabled", "unit.paths"):
+        assert run(name, scene).verdict is PASS, run(name, scene)
+
+
+def test_a_unit_that_is_missing_is_found(scene: Scene) -> None:
+    (scene.root / "etc/systemd/system/zsched.service").unlink()
+    assert_finds(run("unit.installed", scene), WARN, "does not start by itself")
+    assert run("unit.paths", scene).verdict is SKIP
+
+
+def test_a_machine_without_systemd_is_skipped(scene: Scene) -> None:
+    (scene.root / "run/systemd/system").rmdir()
+    assert run("unit.installed", scene).verdict is SKIP
+
+
+def test_a_unit_that_is_not_enabled_or_masked_is_found(scene: Scene) -> None:
+    (scene.root / "etc/systemd/system/multi-user.target.wants/zsched.service").unlink()
+    assert_finds(run("unit.enabled", scene), WARN, "does not start at boot")
+    unit = scene.root / "etc/systemd/system/zsched.service"
+    unit.unlink()
+    unit.symlink_to("/dev/null")
+    assert_finds(run("unit.enabled", scene), FAIL, "masked")
+
+
+def test_a_program_that_the_service_cannot_see_is_found(scene: Scene) -> None:
+    python = scene.root / "opt/zsched/bin/python"
+    python.unlink()
+    python.symlink_to("/home/somebody/python/bin/python3")
+    assert_finds(run("unit.paths", scene), FAIL, "leads to /home")
+    drop_in = scene.root / "etc/systemd/system/zsched.service.d/home.conf"
+    drop_in.parent.mkdir()
+    drop_in.write_text("[Service]\nProtectHome=no\n")
+    assert run("unit.paths", scene).verdict is PASS
+    (scene.root / "opt/zsched/bin/zsched").unlink()
+    assert_finds(run("unit.paths", scene), FAIL, "which is not there")
+
+
+def test_a_fleet_file_that_the_service_cannot_read_is_found(scene: Scene) -> None:
+    file = scene.root / "etc/zsched/fleet.yaml"
+    file.chmod(0o600)
+    assert_finds(run("unit.paths", scene), FAIL, "not readable by the service's user")
+    file.unlink()
+    assert_finds(run("unit.paths", scene), FAIL, "/etc/zsched/fleet.yaml, which is not there")
+
+
+def test_a_worker_below_a_home_is_found(scene: Scene, tmp_path: Path) -> None:
+    text = FLEET.replace("[python, -m, zsched.tasks.echo]", "[/home/somebody/worker]")
+    homely = replace(scene_of(tmp_path, text), root=scene.root)
+    assert_finds(run("unit.paths", homely), FAIL, "/home/somebody/worker")
+
+
+# --- certificates ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def secured(tmp_path: Path) -> Scene:
+    """A fleet with TLS, whose certificates are good for two days."""
+    make_tls(tmp_path)
+    text = FLEET.replace("fleet: hall", "fleet: hall\nzenoh: {config: zenoh.json5}").replace("tcp/", "tls/")
+    return scene_of(tmp_path, text)
+
+
+def test_a_certificate_that_ends_soon_has_ended_or_has_not_begun_is_found(secured: Scene) -> None:
+    now = datetime.now(UTC)
+    assert_finds(network.certificates_last(secured), WARN, "node.pem is valid", "days are left")
+    assert_finds(network.certificates_last(secured, now + timedelta(days=9)), FAIL, "it has ended")
+    assert_finds(network.certificates_last(secured, now - timedelta(days=9)), FAIL, "it has not begun")
+
+
+def test_a_certificate_with_years_left_passes(secured: Scene, tmp_path: Path) -> None:
+    made = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-keyout", "node.key", "-out", "node.pem"]
+    subprocess.run([*made, "-days", "20000", "-subj", "/CN=x"], cwd=tmp_path, capture_output=True, check=True)
+    shutil.copy(tmp_path / "node.pem", tmp_path / "ca.pem")
+    assert network.certificates_last(secured).verdict is PASS
+    ((begins, ends),) = validities((tmp_path / "node.pem").read_bytes())
+    assert ends - begins == timedelta(days=20000)  # past 2049 the time has another form
+
+
+def test_a_certificate_that_is_missing_or_none_is_found(secured: Scene, tmp_path: Path) -> None:
+    (tmp_path / "node.pem").write_text("-----BEGIN CERTIFICATE-----\nMAoG\n-----END CERTIFICATE-----\n")
+    assert_finds(network.certificates_last(secured), FAIL, "malformed")
+    (tmp_path / "node.pem").write_text("something else")
+    assert_finds(network.certificates_last(secured), FAIL, "no certificate in it")
+    (tmp_path / "node.key").unlink()
+    assert_finds(network.certificates_last(secured), FAIL, "node.key: No such file")
+
+
+def test_plain_text_beside_tls_is_found(secured: Scene, tmp_path: Path) -> None:
+    assert run("tls.plain_text", secured).verdict is PASS
+    half = scene_of(tmp_path, secured.file.read_text().replace("control: tls/", "control: tcp/"))
+    assert_finds(run("tls.plain_text", half), FAIL, "tcp/0.0.0.0:21257")
+    (tmp_path / "zenoh.json5").write_text(json.dumps({"nosuch": 1}))
+    assert_finds(run("tls.plain_text", secured), FAIL, "not a zenoh configuration")

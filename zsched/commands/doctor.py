@@ -1,0 +1,93 @@
+"""`zsched doctor`: looks at this machine, or at the whole fleet, and prints what is wrong and what to do.
+
+Knows: how results are shown, exit codes. Does not know: any check (`zsched.doctor`).
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import textwrap
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Final
+
+from zsched import paths as places
+from zsched.commands.common import Json, print_json, wants_color
+from zsched.commands.page import Page, harmless
+from zsched.doctor.look import Machine, look
+from zsched.doctor.model import Check, Result, Scene, Verdict
+from zsched.doctor.table import run_all, worst
+from zsched.exits import EXIT_FAILED, EXIT_OK
+
+SCHEMA: Final = "zsched.doctor/1"
+STYLES: Final = {Verdict.PASS: "green", Verdict.SKIP: "dim", Verdict.WARN: "yellow", Verdict.FAIL: "alarm"}
+NAME_COLUMNS: Final = 22
+INDENT: Final = 5
+MIN_WIDTH, DEFAULT_WIDTH, MAX_WIDTH = 60, 100, 160
+Results = list[tuple[Check, Result]]
+
+
+def machine_of(config: Path | None, node: str | None, state_dir: Path | None, runtime_dir: Path | None) -> Machine:
+    """Where this machine's things are, by the options and the environment."""
+    return Machine(
+        file=places.config_path(config, os.environ),
+        state_folder=places.state_folder(state_dir, os.environ),
+        runtime_folder=places.runtime_folder(runtime_dir, os.environ),
+        node=places.node_name(node, os.environ),
+    )
+
+
+def diagnose(machine: Machine, *, is_fleet: bool, is_strict: bool, is_json: bool, is_plain: bool) -> int:
+    """Run every check, print what came of each, and return the exit code."""
+    scene = look(machine, is_fleet=is_fleet)
+    results = run_all(scene)
+    if is_json:
+        print_json(as_json(scene, results))
+    else:
+        width = max(MIN_WIDTH, min(shutil.get_terminal_size((DEFAULT_WIDTH, 30)).columns, MAX_WIDTH))
+        sys.stdout.write(as_text(results, width, is_colored=wants_color(is_plain)))
+    bad = (Verdict.FAIL, Verdict.WARN) if is_strict else (Verdict.FAIL,)
+    return EXIT_FAILED if worst(results) in bad else EXIT_OK
+
+
+def as_json(scene: Scene, results: Results) -> Json:
+    """The results with their schema's name."""
+    fleet = scene.reading.fleet
+    return {
+        "schema": SCHEMA,
+        "fleet": None if fleet is None else fleet.name,
+        "node": scene.node,
+        "verdict": worst(results).value,
+        "counts": {verdict.value: count for verdict, count in _counts(results).items()},
+        "checks": [
+            {"id": check.name, "verdict": result.verdict.value, "evidence": list(result.evidence), "fix": result.fix}
+            for check, result in results
+        ],
+    }
+
+
+def as_text(results: Results, width: int, *, is_colored: bool) -> str:
+    """One line per check, more where there is more evidence, and the fix below it."""
+    page = Page(width, is_colored)
+    for check, result in results:
+        first, *more = _wrapped(result.evidence, width - INDENT - NAME_COLUMNS) or [""]
+        head = f"{page.paint(result.verdict.value, STYLES[result.verdict])} {check.name:<{NAME_COLUMNS - 1}} {first}"
+        page.lines.append(head.rstrip())
+        page.lines += [" " * (INDENT + NAME_COLUMNS) + line for line in more]
+        for line in _wrapped((f"fix: {result.fix}",) if result.fix else (), width - INDENT - NAME_COLUMNS):
+            page.lines.append(" " * (INDENT + NAME_COLUMNS) + page.paint(line, "bold"))
+    counts = _counts(results)
+    parts = ", ".join(f"{counts[verdict]} {verdict.value}" for verdict in Verdict if counts[verdict])
+    page.lines.append(f"{len(results)} checks: {parts}")
+    return "".join(f"{line}\n" for line in page.lines)
+
+
+def _wrapped(texts: Iterable[str], width: int) -> list[str]:
+    return [line for text in texts for line in textwrap.wrap(harmless(text), width, break_on_hyphens=False)]
+
+
+def _counts(results: Results) -> Counter[Verdict]:
+    return Counter(result.verdict for _, result in results)

@@ -1,0 +1,74 @@
+"""Checks of the daemon on this machine, by its own status.
+
+Knows: the status of one node. Does not know: what other nodes say.
+"""
+
+from __future__ import annotations
+
+from zsched import __version__
+from zsched.doctor.model import Json, Result, Scene, failed, joined, passed, skipped, warned
+
+
+def answers(scene: Scene) -> Result:
+    """Whether the daemon runs and answers."""
+    if scene.own is not None:
+        return passed(f"{scene.node} has been up for {scene.own['up_s']:.0f} s")
+    if scene.is_fleet and not scene.is_node:
+        return skipped("this machine is no node of the fleet")
+    if "permission denied" in scene.refusal:
+        return skipped(scene.refusal)
+    fix = f"sudo systemctl start zsched (or zsched up --node {scene.node}); journalctl -u zsched says why it ended"
+    return failed(scene.refusal or f"the daemon of {scene.node} does not answer", fix=fix)
+
+
+def is_quick(scene: Scene) -> Result:
+    """Whether the daemon's decision loop turns in time for its beats."""
+    return judged_lag(scene.node, scene.status, scene.fleet.timing.beat_s, scene.fleet.timing.suspect_s)
+
+
+def judged_lag(node: str, status: Json, beat_s: float, suspect_s: float) -> Result:
+    """What the lag of a decision loop means: it beats every ``beat_s``, and is suspect after ``suspect_s``."""
+    lag_s = float(status["loop_lag_s"])
+    told = f"{node}: the decision loop lags by {1000 * lag_s:.1f} ms, a beat is due every {1000 * beat_s:g} ms"
+    fix = f"see what takes the CPU of {node} (top); demand: {{cpu_cores:}} of its tasks; a slower `timing:`"
+    if lag_s > suspect_s / 2:
+        return failed(told, f"the others suspect it after {suspect_s:g} s of silence", fix=fix)
+    return warned(told, fix=fix) if lag_s > beat_s else passed(told)
+
+
+def is_of_this_version(scene: Scene) -> Result:
+    """Whether the daemon is of the version that is installed here."""
+    running = scene.status["version"]
+    if running == __version__:
+        return passed(f"zsched {running}")
+    told = f"the daemon is zsched {running}, installed is {__version__}"
+    return warned(told, fix="sudo systemctl restart zsched")
+
+
+def sees_no_problem(scene: Scene) -> Result:
+    """Whether the daemon names no problem, of itself, its tasks or the fleet."""
+    status = scene.status
+    own = [str(problem) for problem in status["problems"]]
+    tasks = [f"{task['name']}: {problem}" for task in status["tasks"] for problem in task["problems"]]
+    if not own and not tasks:
+        return passed(f"{scene.node} names no problem")
+    return warned(*own, *tasks, fix="each line says what to do; zsched status shows them, too")
+
+
+def tasks_have_owners(scene: Scene) -> Result:
+    """Whether each task has an owner that is alive, and the electors could choose another."""
+    status, quorum = scene.status, scene.status["quorum"]
+    found = []
+    if not quorum["ok"]:
+        told = f"no quorum: {quorum['alive']} of {quorum['electors']} electors can answer, {quorum['needed']} needed"
+        found.append(failed(told, fix="start the daemons of the other electors, or see PROBLEMS in zsched status"))
+    for task in status["tasks"]:
+        owner, state = task["owner"], task["owner_state"]
+        if owner is None or state in ("gone", "unknown"):
+            told = f"{task['name']} has no owner" if owner is None else f"{task['name']}: its owner {owner} is {state}"
+            fix = "zsched status names why each candidate cannot have it"
+            found.append(failed(told, fix=fix))
+    owners = ", ".join(f"{task['name']} on {task['owner']}" for task in status["tasks"])
+    return joined(
+        found, passed(f"{owners}; {quorum['alive']} of {quorum['electors']} electors, {quorum['needed']} needed")
+    )

@@ -1,0 +1,217 @@
+"""Checks of the whole fleet: what the nodes say of one another, compared.
+
+Knows: the status of every node that answers. Does not know: how they were asked (`zsched.doctor.look`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Final
+
+from zsched.core.values.fleet import fleet_hash
+from zsched.doctor.daemon import judged_lag
+from zsched.doctor.model import Json, Result, Scene, counted, failed, joined, passed, skipped, warned
+from zsched.doctor.network import addresses, connected
+
+HEARD: Final = ("alive", "suspect")
+
+
+def answer(scene: Scene) -> Result:
+    """Whether every node of the fleet file answers."""
+    names = [spec.name for spec in scene.fleet.nodes]
+    silent = [name for name in names if name not in scene.statuses]
+    if not silent:
+        return passed(f"{counted(len(names), 'nodes')}, all answer")
+    told = f"{len(silent)} of {len(names)} nodes do not answer: {', '.join(silent)}"
+    fix = "switch them on; on each: systemctl status zsched, zsched doctor"
+    return failed(told, fix=fix) if not scene.statuses else warned(told, fix=fix)
+
+
+def addresses_answer(scene: Scene) -> Result:
+    """Whether the addresses of all nodes that live take connections from here."""
+    named = addresses(scene.fleet.nodes)
+    living = [address for address in named if address.node in scene.statuses or _is_heard(scene, address.node)]
+    if not living:
+        return skipped("no living node has an address in the fleet file")
+    return joined(
+        connected(living), passed(f"{counted(len(living), 'addresses')} of living nodes, all take connections")
+    )
+
+
+def _is_heard(scene: Scene, name: str) -> bool:
+    return any(_states(status).get(name) in HEARD for status in scene.statuses.values())
+
+
+def _states(status: Json) -> dict[str, str]:
+    return {str(node["name"]): str(node["state"]) for node in status["nodes"]}
+
+
+def have_one_file(scene: Scene) -> Result:
+    """Whether all nodes go by the same fleet file."""
+    mine = fleet_hash(scene.fleet)
+    others = {name: str(status["fleet_file"]) for name, status in sorted(scene.statuses.items())}
+    apart = {name: found for name, found in others.items() if found != mine}
+    if not apart:
+        return passed(f"{counted(len(others), 'nodes')} with hash {mine}")
+    told = [f"{name} goes by hash {found}, {scene.file} here has {mine}" for name, found in apart.items()]
+    return failed(*told, fix="copy the one file to all machines, and restart their daemons one after the other")
+
+
+def have_one_version(scene: Scene) -> Result:
+    """Whether all nodes are of one version."""
+    found: dict[str, list[str]] = {}
+    for name, status in sorted(scene.statuses.items()):
+        found.setdefault(str(status["version"]), []).append(name)
+    told = [f"zsched {version}: {', '.join(names)}" for version, names in sorted(found.items())]
+    return passed(*told) if len(found) == 1 else warned(*told, fix="install one version everywhere")
+
+
+def hear_each_other(scene: Scene) -> Result:
+    """Whether every node that answers hears every other, in both directions."""
+    found, pairs = [], 0
+    for listener, status in sorted(scene.statuses.items()):
+        states = _states(status)
+        for speaker in sorted(scene.statuses):
+            if speaker == listener:
+                continue
+            pairs += 1
+            state = states.get(speaker, "not in its fleet file")
+            if state not in HEARD:
+                back = _states(scene.statuses[speaker]).get(listener, "not in its fleet file")
+                told = f"{listener} does not hear {speaker} ({state}); {speaker} finds {listener} {back}"
+                fix = f"between {speaker} and {listener}: firewalls, routes, `host:` and `listen:` of both"
+                found.append(failed(told, fix=fix))
+    return joined(found, passed(f"{pairs} directions between {len(scene.statuses)} nodes, all heard"))
+
+
+def agree_on_registers(scene: Scene) -> Result:
+    """Whether every node knows the same revision, epoch and owner of each task."""
+    found = [result for task in scene.fleet.tasks for result in _register(task.name, scene.statuses)]
+    told = f"{counted(len(scene.fleet.tasks), 'registers')}, equal on {counted(len(scene.statuses), 'nodes')}"
+    return joined(found, passed(told))
+
+
+def differs(statuses: Mapping[str, Json]) -> bool:
+    """Whether any two nodes know another revision, epoch or owner of a task: a move may be under way."""
+    tasks = {str(task["name"]) for status in statuses.values() for task in status["tasks"]}
+    return any(len(_values(task, statuses)) > 1 for task in tasks)
+
+
+def _values(task: str, statuses: Mapping[str, Json]) -> dict[tuple[int, int, str], list[str]]:
+    found: dict[tuple[int, int, str], list[str]] = {}
+    for name, status in sorted(statuses.items()):
+        for one in status["tasks"]:
+            if one["name"] == task:
+                value = (int(one["revision"]), int(one["epoch"]), str(one["owner"] or "nobody"))
+                found.setdefault(value, []).append(name)
+    return found
+
+
+def _register(task: str, statuses: Mapping[str, Json]) -> Iterator[Result]:
+    values = _values(task, statuses)
+    if len(values) < 2:
+        return
+    newest = max(values)
+    told = [
+        f"{task}: revision {revision}, epoch {epoch}, owner {owner} on {', '.join(names)}"
+        for (revision, epoch, owner), names in sorted(values.items(), reverse=True)
+    ]
+    if any(value[0] == newest[0] and value != newest for value in values):
+        fix = "two values of one revision: a state came from a backup or was made anew; see docs/design/failures.md"
+        yield failed(*told, fix=fix)
+        return
+    behind = ", ".join(name for value, names in sorted(values.items()) if value != newest for name in names)
+    yield failed(*told, fix=f"{behind}: look there for what keeps the news away (zsched doctor, zsched status)")
+
+
+def have_electors(scene: Scene) -> Result:
+    """Whether every elector is there with its state, as the nodes that answer say."""
+    electors, found = scene.fleet.electors, []
+    for name, status in sorted(scene.statuses.items()):
+        quorum = status["quorum"]
+        if name in electors and quorum["this_node"] != "elector":
+            fix = f"on {name}: zsched status says why; zsched init --help says what to do"
+            found.append(failed(f"{name} is an elector without a valid state ({quorum['this_node']})", fix=fix))
+        for other in quorum["apart"]:
+            fix = f"bring one fleet file to {name} and {other}; zsched status on both names the generation"
+            found.append(failed(f"{name} and {other} refuse each other's votes", fix=fix))
+        for other in quorum["stateless"]:
+            if other not in scene.statuses:
+                fix = f"on {other}: zsched status says why; zsched init --help says what to do"
+                found.append(warned(f"{name} says that {other} has lost its state", fix=fix))
+    missing = [name for name in electors if name not in scene.statuses]
+    if missing:
+        enough = len(electors) - len(missing) > len(electors) // 2
+        told = f"{len(missing)} of {len(electors)} electors do not answer: {', '.join(missing)}"
+        fix = "switch them on; a majority must be there for every move"
+        found.append(warned(told, fix=fix) if enough else failed(told, fix=fix))
+    return joined(found, passed(f"{counted(len(electors), 'electors')}, each with its state"))
+
+
+def are_quick(scene: Scene) -> Result:
+    """Whether every node's decision loop turns in time."""
+    timing = scene.fleet.timing
+    lags = {name: judged_lag(name, status, timing.beat_s, timing.suspect_s) for name, status in scene.statuses.items()}
+    most = max((float(status["loop_lag_s"]) for status in scene.statuses.values()), default=0.0)
+    bad = (result for result in lags.values() if result.fix)
+    return joined(bad, passed(f"the slowest decision loop lags by {1000 * most:.1f} ms"))
+
+
+def answer_in_time(scene: Scene) -> Result:
+    """Whether answers come quickly enough for the timing of the fleet file."""
+    timing = scene.fleet.timing
+    if not scene.answered_s:
+        return skipped("no other node was asked through the daemon here")
+    name, most_s = max(scene.answered_s.items(), key=lambda one: one[1])
+    told = f"the slowest answer, of {name}, took {1000 * most_s:.0f} ms; timing: {timing.name}"
+    if most_s <= timing.gather_s:
+        return passed(told)
+    fix = "`timing: wan` or a longer gather_s and ballot_s, or a better link (zsched ping NODE)"
+    if most_s > timing.ballot_s:
+        return warned(told, f"utilities count for {timing.gather_s:g} s, ballots for {timing.ballot_s:g} s", fix=fix)
+    return warned(told, f"utilities count for {timing.gather_s:g} s", fix=fix)
+
+
+def have_true_clocks(scene: Scene) -> Result:
+    """Whether no node says that its clock cannot be trusted."""
+    found = []
+    for name, status in sorted(scene.statuses.items()):
+        for problem in status["problems"]:
+            if str(problem).startswith("clock: "):
+                fix = f"on {name}: chronyc tracking, timedatectl; a time service should step the clock at boot"
+                found.append(warned(f"{name}: {problem}", fix=fix))
+    return joined(found, passed(f"{counted(len(scene.statuses), 'nodes')}, no clock in doubt"))
+
+
+def have_room(scene: Scene) -> Result:
+    """Whether each task has a candidate that has what the task needs at least."""
+    machines = {str(node["name"]): node for status in scene.statuses.values() for node in status["nodes"]}
+    found, known = [], 0
+    for task in scene.fleet.tasks:
+        there = [machines[name] for name in task.candidates if machines.get(name, {}).get("memory_mb") is not None]
+        known += len(there)
+        fits = [
+            one for one in there if _cores(one) >= task.demand.cpu_cores and one["memory_mb"] >= task.demand.memory_mb
+        ]
+        if there and not fits:
+            need = f"{task.demand.cpu_cores:g} cores and {task.demand.memory_mb:g} MiB"
+            largest = ", ".join(f"{one['name']} {_cores(one):.1f} cores, {one['memory_mb']:.0f} MiB" for one in there)
+            fix = f"another candidate, or a true `demand:` of {task.name}"
+            found.append(warned(f"{task.name} needs {need}; no candidate has that: {largest}", fix=fix))
+    return joined(found, passed("each task fits on a candidate") if known else skipped("no candidate is measured"))
+
+
+def _cores(machine: Json) -> float:
+    return float(machine["cpu_cores"] or 0.0) * float(machine.get("speed") or 1.0)
+
+
+def see_no_problem(scene: Scene) -> Result:
+    """Whether no other node names a problem of its own."""
+    found: dict[str, list[str]] = {}
+    for name, status in sorted(scene.statuses.items()):
+        for problem in status["problems"]:
+            found.setdefault(str(problem), []).append(name)
+    lines = [f"{', '.join(names)}: {problem}" for problem, names in found.items()]
+    if not lines:
+        return passed(f"{counted(len(scene.statuses), 'nodes')}, no problem")
+    return warned(*lines, fix="each line says what to do; zsched status --node NAME shows them")

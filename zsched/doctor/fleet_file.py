@@ -1,0 +1,56 @@
+"""Checks of the fleet file on this machine.
+
+Knows: faults and warnings of a fleet file, its hash. Does not know: what else a node of it needs.
+"""
+
+from __future__ import annotations
+
+from zsched.config.reader import Fault
+from zsched.core.values.fleet import fleet_hash
+from zsched.doctor.model import Result, Scene, counted, failed, passed, skipped, warned
+
+
+def valid(scene: Scene) -> Result:
+    """Whether the fleet file has no fault."""
+    fleet = scene.reading.fleet
+    if fleet is None:
+        return failed(*_lines(scene, scene.reading.faults), fix=f"zsched check {scene.file}")
+    counts = ((len(fleet.nodes), "nodes"), (len(fleet.tasks), "tasks"), (len(fleet.electors), "electors"))
+    told = ", ".join(counted(number, noun) for number, noun in counts)
+    return passed(f"{scene.file}: {told}, hash {fleet_hash(fleet)}")
+
+
+def without_warnings(scene: Scene) -> Result:
+    """Whether the fleet file has no warning."""
+    found = scene.reading.warnings
+    if not found:
+        return passed(f"{scene.file}: no warnings")
+    return warned(*_lines(scene, found), fix=f"zsched check {scene.file}")
+
+
+def names_this_machine(scene: Scene) -> Result:
+    """Whether this machine is a node of the fleet file."""
+    names = ", ".join(node.name for node in scene.fleet.nodes)
+    if scene.is_node:
+        return passed(f"this machine is {scene.node}, {scene.me.kind}")
+    if scene.is_visit:
+        return skipped(f"this machine is no node of the fleet ({names}): only the fleet is looked at")
+    return failed(
+        f"there is no node {scene.node!r}, there are {names}",
+        fix="name this machine with --node or ZSCHED_NODE (in the unit: systemctl edit zsched)",
+    )
+
+
+def in_force(scene: Scene) -> Result:
+    """Whether the daemon goes by the fleet file as it is now."""
+    mine, running = fleet_hash(scene.fleet), str(scene.status["fleet_file"])
+    if mine == running:
+        return passed(f"the daemon goes by this file, hash {mine}")
+    return warned(
+        f"the daemon goes by a file of hash {running}, {scene.file} has {mine}",
+        fix="sudo systemctl restart zsched, on one node after the other",
+    )
+
+
+def _lines(scene: Scene, faults: tuple[Fault, ...]) -> list[str]:
+    return [f"{scene.file}:{fault.line}:{fault.col}: {fault.message}" for fault in faults]

@@ -1,0 +1,149 @@
+"""Gathers what the checks look at: the fleet file, the own daemon's status, and with ``--fleet`` every node's.
+
+Knows: the operator socket, sessions of a moment to nodes with an address. Does not know: what the answers mean.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from zsched import paths as places
+from zsched.adapters.host.operator_socket import ask
+from zsched.adapters.network.fleet_poll import ask_fleet
+from zsched.clock import monotonic_s
+from zsched.config.load import check_file
+from zsched.core.report import snapshot_json
+from zsched.core.values.fleet import Fleet, dial_endpoint
+from zsched.core.values.model import NodeId
+from zsched.doctor.fleet import differs
+from zsched.doctor.model import Json, Scene
+from zsched.errors import AdapterError, ConfigError
+from zsched.runtime.tls import operator_json5
+from zsched.sessions import config as zenoh_config
+
+ASK_S: Final = 5.0
+AT_ONCE: Final = 8
+"""Nodes asked at a time; the socket has 16 places."""
+TRIES: Final = 3
+"""A slow answer is asked for again so often: the shortest counts."""
+AGAIN_S: Final = 1.0
+"""A move that was under way is over by then."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Machine:
+    """Where this machine's things are, and what it is called (``None``: the environment or the host name says)."""
+
+    file: Path
+    state_folder: Path
+    runtime_folder: Path
+    node: NodeId
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Asked:
+    """What the nodes answered, and how long those took that were asked through the daemon here."""
+
+    statuses: Mapping[NodeId, Json]
+    answered_s: Mapping[NodeId, float]
+
+
+def look(machine: Machine, *, is_fleet: bool) -> Scene:
+    """Everything that the checks need; blocks for some seconds when nodes are silent."""
+    reading = check_file(machine.file)
+    own, refusal, node = _own(machine, reading.fleet)
+    asked = _Asked(statuses={}, answered_s={})
+    door = None if own is None else places.socket_path(machine.runtime_folder, node)
+    if is_fleet:
+        asked = _all(reading.fleet, node, door)
+        if differs(asked.statuses):
+            threading.Event().wait(AGAIN_S)
+            asked = _all(reading.fleet, node, door)
+    return Scene(
+        file=machine.file,
+        reading=reading,
+        node=node,
+        state_folder=machine.state_folder,
+        own=own,
+        refusal=refusal,
+        is_fleet=is_fleet,
+        statuses=asked.statuses,
+        answered_s=asked.answered_s,
+        sides={} if door is None else _sides(door, node),
+    )
+
+
+def _sides(door: Path, node: NodeId) -> Mapping[str, str]:
+    """How to join the data network here; empty: the daemon does not tell."""
+    try:
+        answer = ask(door, {"verb": "access", "node": node}, ASK_S)
+    except AdapterError:
+        return {}
+    found: dict[str, str] = answer.get("sides", {})
+    return found
+
+
+def _own(machine: Machine, fleet: Fleet | None) -> tuple[Json | None, str, NodeId]:
+    """(the status of the daemon here, or why there is none, and its name).
+
+    Where the host name is none of the fleet's and one daemon runs here, that is the one.
+    """
+    node, sockets = machine.node, places.local_sockets(machine.runtime_folder)
+    if fleet is not None and node not in [spec.name for spec in fleet.nodes] and len(sockets) == 1:
+        node = sockets[0].stem
+    try:
+        status = ask(places.socket_path(machine.runtime_folder, node), {"verb": "status"}, ASK_S)
+    except AdapterError as error:
+        if isinstance(error.__cause__, PermissionError):
+            return None, f"permission denied at the socket of {node}: run the doctor as root", node
+        return None, str(error), node
+    return (status, "", node) if "error" not in status else (None, str(status["error"]), node)
+
+
+def _all(fleet: Fleet | None, asker: NodeId, door: Path | None) -> _Asked:
+    """Every node's status: through the daemon here, and of those that do not answer by their own address."""
+    statuses: dict[NodeId, Json] = {}
+    took: dict[NodeId, float] = {}
+    if fleet is None:
+        return _Asked(statuses=statuses, answered_s=took)
+    names = [spec.name for spec in fleet.nodes]
+    if door is not None:
+        with ThreadPoolExecutor(max_workers=AT_ONCE) as pool:
+            for name, (status, seconds) in zip(names, pool.map(lambda name: _through(door, name), names), strict=True):
+                if status is not None:
+                    statuses[name] = status
+                    took |= {name: seconds} if name != asker else {}
+        for name in [name for name, seconds in took.items() if seconds > fleet.timing.gather_s]:
+            # asked together they wait for one another
+            took[name] = min(took[name], *(seconds for _ in range(TRIES) if (seconds := _through(door, name)[1])))
+    for status in _directly(fleet, asker, [name for name in names if name not in statuses]):
+        statuses.setdefault(str(status["node"]), status)
+    return _Asked(statuses=statuses, answered_s=took)
+
+
+def _through(door: Path, node: NodeId) -> tuple[Json | None, float]:
+    began = monotonic_s()
+    try:
+        answer = ask(door, {"verb": "status", "node": node}, ASK_S)
+    except AdapterError:
+        return None, 0.0
+    return (None if "error" in answer else answer), monotonic_s() - began
+
+
+def _directly(fleet: Fleet, asker: NodeId, missing: list[NodeId]) -> list[Json]:
+    specs = [spec for spec in fleet.nodes if spec.name in missing and spec.listen_control]
+    endpoints = [end for spec in specs if (end := dial_endpoint(spec.listen_control, spec.host))]
+    try:
+        text = operator_json5(fleet)
+        configs = [
+            zenoh_config.client_config(connect=(endpoint,), timing=fleet.timing, operator_json5=text)
+            for endpoint in endpoints
+        ]
+    except (ConfigError, ValueError):
+        return []  # a check of its own says what is wrong with that file
+    return [snapshot_json(answer) for answer in ask_fleet(fleet.name, asker, configs)]

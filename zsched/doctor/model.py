@@ -1,0 +1,164 @@
+"""What a check is, what it may look at, and what it may say.
+
+Knows: verdicts, what a check needs before it can be made. Does not know: any check, how results are shown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum, StrEnum
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from zsched.config.load import CheckResult
+from zsched.core.values.fleet import Fleet, NodeSpec
+from zsched.core.values.model import NodeId
+from zsched.errors import InvariantError
+
+Json: TypeAlias = dict[str, Any]
+
+
+class Verdict(StrEnum):
+    """What came of a check."""
+
+    PASS = "PASS"
+    SKIP = "SKIP"
+    WARN = "WARN"
+    FAIL = "FAIL"
+
+
+_ORDER = (Verdict.SKIP, Verdict.PASS, Verdict.WARN, Verdict.FAIL)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Result:
+    """One check's verdict, what was seen, and what to do about it."""
+
+    verdict: Verdict
+    evidence: tuple[str, ...]
+    fix: str = ""
+
+
+def passed(*evidence: str) -> Result:
+    """Nothing is wrong."""
+    return Result(verdict=Verdict.PASS, evidence=evidence)
+
+
+def skipped(*evidence: str) -> Result:
+    """The check does not apply here, or could not be made."""
+    return Result(verdict=Verdict.SKIP, evidence=evidence)
+
+
+def warned(*evidence: str, fix: str) -> Result:
+    """It works, and is not as it should be."""
+    return Result(verdict=Verdict.WARN, evidence=evidence, fix=fix)
+
+
+def failed(*evidence: str, fix: str) -> Result:
+    """Something does not work."""
+    return Result(verdict=Verdict.FAIL, evidence=evidence, fix=fix)
+
+
+def counted(number: int, plural: str) -> str:
+    """A count with its noun: ``1 node``, ``2 nodes``."""
+    return f"{number} {plural if number != 1 else plural.removesuffix('s')}"
+
+
+def joined(parts: Iterable[Result], otherwise: Result) -> Result:
+    """One result of several: the worst verdict, and the evidence and fixes of those that have it or are faults.
+
+    Without parts it is ``otherwise``.
+    """
+    found = list(parts)
+    if not found:
+        return otherwise
+    worst = max((part.verdict for part in found), key=_ORDER.index)
+    shown = [part for part in found if part.verdict in (Verdict.WARN, Verdict.FAIL) or part.verdict is worst]
+    evidence = tuple(line for part in shown for line in part.evidence)
+    fixes = dict.fromkeys(part.fix for part in shown if part.fix)
+    return Result(verdict=worst, evidence=evidence, fix="; ".join(fixes))
+
+
+class Needs(IntEnum):
+    """What must be there before a check can be made."""
+
+    NOTHING = 0
+    FILE = 1
+    """A valid fleet file."""
+    NODE = 2
+    """This machine is a node of it."""
+    STATUS = 3
+    """The daemon on this machine answers."""
+    FLEET = 4
+    """The whole fleet is asked (``--fleet``), by a valid fleet file."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scene:
+    """All that checks look at; ``root`` is "/" but in tests."""
+
+    file: Path
+    """The fleet file."""
+    reading: CheckResult
+    node: NodeId
+    """What this machine is called."""
+    state_folder: Path
+    own: Json | None = None
+    """The status of the daemon on this machine; ``None`` when it does not answer."""
+    refusal: str = ""
+    """Why it does not."""
+    is_fleet: bool = False
+    statuses: Mapping[NodeId, Json] = field(default_factory=dict)
+    """Of every node that answers, with ``is_fleet``; the own one is among them."""
+    answered_s: Mapping[NodeId, float] = field(default_factory=dict)
+    """How long the answer of each node took that was asked through the daemon here."""
+    sides: Mapping[str, str] = field(default_factory=dict)
+    """How to join the data network here: {side: zenoh configuration}."""
+    root: Path = Path("/")
+
+    @property
+    def fleet(self) -> Fleet:
+        """What the fleet file says; only for checks that need it."""
+        if self.reading.fleet is None:
+            raise InvariantError("a check of the doctor needs a fleet file and does not say so")
+        return self.reading.fleet
+
+    @property
+    def me(self) -> NodeSpec:
+        """This machine in the fleet file; only for checks that need it."""
+        return self.fleet.node(self.node)
+
+    @property
+    def status(self) -> Json:
+        """The own daemon's status; only for checks that need it."""
+        if self.own is None:
+            raise InvariantError("a check of the doctor needs a status and does not say so")
+        return self.own
+
+    @property
+    def is_node(self) -> bool:
+        """Whether the fleet file names this machine."""
+        fleet = self.reading.fleet
+        return fleet is not None and any(spec.name == self.node for spec in fleet.nodes)
+
+    @property
+    def is_visit(self) -> bool:
+        """Whether this is no node of the fleet, such as an operator's laptop: then only the fleet is looked at."""
+        is_bare = self.own is None and not self.state_folder.exists()
+        return self.is_fleet and self.reading.fleet is not None and not self.is_node and is_bare
+
+    def at(self, path: str | Path) -> Path:
+        """Where an absolute path of the machine is."""
+        return self.root / str(path).lstrip("/")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Check:
+    """One question about this machine or its fleet. ``name`` is ``family.word`` and never changes its meaning."""
+
+    name: str
+    asks: str
+    """The question, of which "yes" is a pass."""
+    run: Callable[[Scene], Result]
+    needs: Needs = Needs.NODE

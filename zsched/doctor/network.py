@@ -1,0 +1,265 @@
+"""Checks of addresses, ports and certificates, as far as this machine can see them.
+
+Knows: names and addresses of the fleet file, who listens here, connections. Does not know: what nodes say of each other
+(`zsched.doctor.fleet`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ipaddress
+import os
+import socket
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import TimeoutError as LateError
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Final
+
+from zsched.clock import wall_ns
+from zsched.core.values.fleet import NodeSpec, dial_endpoint
+from zsched.doctor.certificate import validities
+from zsched.doctor.model import Result, Scene, counted, failed, joined, passed, skipped, warned
+from zsched.errors import ConfigError
+from zsched.files import read_regular
+from zsched.procfs import names, read_file
+from zsched.runtime.tls import PLAIN, operator_json5, plain_text_problem, protocol_of
+from zsched.sessions.config import tls_files
+
+RESOLVE_S: Final = 5.0
+CONNECT_S: Final = 2.0
+LISTENS: Final = "0A"
+"""The state of a listening socket in /proc/net/tcp."""
+OURS: Final = ("zsched.daemon", "zsched.relay")
+SOON: Final = timedelta(days=30)
+MAX_BYTES: Final = 1 << 20
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Address:
+    """One endpoint of a node, as others dial it."""
+
+    node: str
+    session: str
+    endpoint: str
+
+    @property
+    def is_stream(self) -> bool:
+        """Whether a TCP connection says something of it."""
+        return self.endpoint.partition("/")[0] in ("tcp", "tls")
+
+    @property
+    def place(self) -> tuple[str, int]:
+        """(host, port)."""
+        address = self.endpoint.partition("/")[2].partition("?")[0].partition("#")[0]
+        host, _, port = address.rpartition(":")
+        return host.strip("[]"), int(port)
+
+    def __str__(self) -> str:
+        return f"{self.node}'s {self.session} session at {self.endpoint}"
+
+
+def addresses(specs: Iterable[NodeSpec]) -> list[Address]:
+    """Where these nodes can be dialled, by the fleet file."""
+    found = []
+    for spec in specs:
+        for session, listen in (("control", spec.listen_control), ("data", spec.listen_data)):
+            endpoint = dial_endpoint(listen, spec.host) if listen else ""
+            if endpoint:
+                found.append(Address(node=spec.name, session=session, endpoint=endpoint))
+    return found
+
+
+# --- names -----------------------------------------------------------------------------------------------------------
+
+
+def names_resolve(scene: Scene) -> Result:
+    """Whether every host of the fleet file has an address here."""
+    hosts = {address.place[0]: address.node for address in addresses(scene.fleet.nodes)}
+    if not hosts:
+        return skipped("no node of the fleet file has an address")
+    pool = ThreadPoolExecutor(max_workers=8)
+    try:
+        asked = {host: pool.submit(socket.getaddrinfo, host, 0, type=socket.SOCK_STREAM) for host in sorted(hosts)}
+        found = []
+        for host, answer in asked.items():
+            fix = f"write {hosts[host]}'s address in the fleet file in place of its name, or mend DNS or /etc/hosts"
+            try:
+                answer.result(RESOLVE_S)
+            except (OSError, UnicodeError) as error:
+                found.append(failed(f"{host} ({hosts[host]}) has no address here: {error}", fix=fix))
+            except LateError:
+                found.append(failed(f"{host} ({hosts[host]}): no answer within {RESOLVE_S:g} s", fix=fix))
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
+    return joined(found, passed(f"{counted(len(hosts), 'hosts')}: {', '.join(sorted(hosts))}"))
+
+
+def is_not_alone_on_loopback(scene: Scene) -> Result:
+    """Whether the others can use the addresses that the fleet file gives this machine."""
+    mine = addresses([scene.me])
+    others = addresses(spec for spec in scene.fleet.nodes if spec.name != scene.node)
+    if not mine:
+        return skipped(f"{scene.node} has no address: it dials the others")
+    if others and all(_is_loopback(address.place[0]) for address in others):
+        return skipped("all nodes of this fleet are on one machine")
+    local = [address for address in mine if _is_loopback(address.place[0])]
+    if not local or len(scene.fleet.nodes) == 1:
+        return passed(f"others dial {', '.join(address.endpoint for address in mine)}")
+    fix = f"give {scene.node} a `host:` that the others reach; see the line of its name in /etc/hosts"
+    return failed(*(f"{address}: only this machine reaches that" for address in local), fix=fix)
+
+
+def _is_loopback(host: str) -> bool:
+    with contextlib.suppress(OSError, UnicodeError, ValueError):
+        found = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)
+        return all(ipaddress.ip_address(str(one[4][0]).partition("%")[0]).is_loopback for one in found)
+    return False
+
+
+# --- ports -----------------------------------------------------------------------------------------------------------
+
+
+def ports_are_ours(scene: Scene) -> Result:
+    """Whether nobody but this node's daemon and relay listens on its ports."""
+    ports: dict[int, str] = {}
+    for session, listen in (("control", scene.me.listen_control), ("data", scene.me.listen_data)):
+        port = listen.partition("?")[0].partition("#")[0].rpartition(":")[2]
+        if port.isdecimal() and int(port) and listen.startswith(("tcp/", "tls/")):
+            ports[int(port)] = session
+    if not ports:
+        return skipped(f"{scene.node} has no fixed port")
+    listening = _listeners()
+    return joined((_port(scene, port, session, listening.get(port)) for port, session in ports.items()), passed())
+
+
+def _port(scene: Scene, port: int, session: str, inodes: set[str] | None) -> Result:
+    is_up = scene.own is not None
+    if not inodes:
+        if not is_up:
+            return passed(f"port {port} ({session}) is free")
+        fix = "journalctl -u zsched says why it could not listen; the port in the fleet file may have changed"
+        return failed(f"the daemon runs, and nobody listens on port {port} ({session})", fix=fix)
+    holders = _holders(inodes)
+    if not holders:
+        told = f"port {port} ({session}) is held by a process that user {os.geteuid()} may not look at"
+        return passed(told) if is_up else warned(told, fix="run the doctor as root to see which it is")
+    strangers = [(pid, words) for pid, words in holders if not _is_ours(words, scene.node)]
+    if strangers:
+        pid, words = strangers[0]
+        told = f"port {port} ({session}) is held by process {pid}: {' '.join(words)[:120]}"
+        return failed(told, fix=f"stop process {pid}, or give {scene.node} another port in the fleet file")
+    return passed(f"port {port} ({session}) is held by process {holders[0][0]} of {scene.node}")
+
+
+def _is_ours(words: list[str], node: str) -> bool:
+    return any(module in words for module in OURS) and node in words
+
+
+def _listeners() -> dict[int, set[str]]:
+    """{TCP port: inodes of the sockets that listen on it} of this network namespace."""
+    found: dict[int, set[str]] = {}
+    for table in ("/proc/net/tcp", "/proc/net/tcp6"):
+        with contextlib.suppress(OSError):
+            for line in Path(table).read_text(encoding="ascii").splitlines()[1:]:
+                fields = line.split()
+                if fields[3] == LISTENS:
+                    found.setdefault(int(fields[1].rpartition(":")[2], 16), set()).add(fields[9])
+    return found
+
+
+def _holders(inodes: set[str]) -> list[tuple[int, list[str]]]:
+    """(process, its command) of every process that has one of these sockets open, as far as this user may look."""
+    wanted = {f"socket:[{inode}]" for inode in inodes}
+    found = []
+    for pid in (name for name in names("/proc") if name.isdecimal()):
+        for descriptor in names(f"/proc/{pid}/fd"):
+            with contextlib.suppress(OSError):
+                if str(Path(f"/proc/{pid}/fd/{descriptor}").readlink()) in wanted:
+                    words = read_file(f"/proc/{pid}/cmdline").decode(errors="replace").split("\0")
+                    found.append((int(pid), [word for word in words if word]))
+                    break
+    return found
+
+
+# --- connections -----------------------------------------------------------------------------------------------------
+
+
+def own_addresses_answer(scene: Scene) -> Result:
+    """Whether this node's sessions take connections at the addresses that others dial."""
+    mine = addresses([scene.me])
+    if not mine:
+        return skipped(f"{scene.node} has no address: it dials the others")
+    return joined(connected(mine), passed(f"{counted(len(mine), 'addresses')}, all take connections"))
+
+
+def connected(found: list[Address]) -> Iterator[Result]:
+    """A result for each address that takes no connection."""
+    streams = [address for address in found if address.is_stream]
+    with ThreadPoolExecutor(max_workers=16) as pool:
+        for address, why in zip(streams, pool.map(_why_not, streams), strict=True):
+            if why:
+                fix = f"on {address.node}: does its daemon run, does a firewall let the port in, is `host:` its address"
+                yield failed(f"{address} cannot be reached from here: {why}", fix=fix)
+
+
+def _why_not(address: Address) -> str:
+    try:
+        socket.create_connection(address.place, CONNECT_S).close()
+    except TimeoutError:
+        return f"no answer within {CONNECT_S:g} s"
+    except (OSError, UnicodeError) as error:
+        return str(getattr(error, "strerror", None) or error)
+    return ""
+
+
+# --- TLS -------------------------------------------------------------------------------------------------------------
+
+
+def nothing_in_plain_text(scene: Scene) -> Result:
+    """Whether, with TLS, this node listens with TLS only."""
+    try:
+        protocol = protocol_of(scene.fleet, operator_json5(scene.fleet))
+    except ConfigError as error:
+        return failed(str(error), fix="mend the file that the fleet file names under `zenoh: {config: ...}`")
+    if protocol == PLAIN:
+        return skipped("TLS is not set up")
+    problem = plain_text_problem(scene.me, protocol)
+    if problem is not None:
+        return failed(problem, fix="write tls/ in place of tcp/ in its `listen:`")
+    return passed(f"everything of {scene.node} listens with {protocol}")
+
+
+def certificates_last(scene: Scene, now: datetime | None = None) -> Result:
+    """Whether the certificates of this machine are valid, and for the next 30 days."""
+    try:
+        files = tls_files(operator_json5(scene.fleet))
+    except (ConfigError, ValueError) as error:
+        return failed(str(error), fix="mend the file that the fleet file names under `zenoh: {config: ...}`")
+    if not files:
+        return skipped("the operator's zenoh file names no certificates")
+    now = now or datetime.fromtimestamp(wall_ns() / 1e9, UTC)
+    return joined((_certificate(name, Path(path), now) for name, path in sorted(files.items())), passed())
+
+
+def _certificate(name: str, path: Path, now: datetime) -> Result:
+    fix = f"renew {path} ({name}), then restart the daemon"
+    try:
+        content = read_regular(path, MAX_BYTES)
+        if "key" in name:
+            return passed(f"{path} can be read")
+        begins, ends = (
+            pick(times) for pick, times in zip((max, min), zip(*validities(content), strict=True), strict=True)
+        )
+    except PermissionError:
+        return skipped(f"{path} may not be read by user {os.geteuid()}: run the doctor as root")
+    except (OSError, ValueError) as error:
+        return failed(f"{path}: {getattr(error, 'strerror', None) or error}", fix=fix)
+    told = f"{path} is valid from {begins:%Y-%m-%d} to {ends:%Y-%m-%d}"
+    if now > ends:
+        return failed(f"{told}: it has ended", fix=fix)
+    if now < begins:
+        return failed(f"{told}: it has not begun", fix=f"is this machine's clock right (timedatectl)? Else {fix}")
+    return warned(f"{told}: {(ends - now).days} days are left", fix=fix) if ends - now < SOON else passed(told)

@@ -1,0 +1,134 @@
+"""Checks of the systemd unit: is it there, does it start at boot, can it see what it needs.
+
+Knows: where units lie, what `ProtectHome=` and a user without a name may see. Does not know: systemd's bus; it reads
+files.
+"""
+
+from __future__ import annotations
+
+import itertools
+import shlex
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from zsched.core.values.fleet import runs_worker
+from zsched.doctor.model import Result, Scene, failed, joined, passed, skipped, warned
+
+UNIT: Final = "zsched.service"
+RUNNING: Final = Path("/run/systemd/system")
+"""There while systemd is the machine's first process (sd_booted(3))."""
+FOLDERS: Final = ("/etc/systemd/system", "/run/systemd/system", "/usr/lib/systemd/system", "/lib/systemd/system")
+HOMES: Final = ("/home", "/root", "/run/user")
+"""What `ProtectHome=yes` hides."""
+
+Settings = list[tuple[str, str]]
+
+
+def is_installed(scene: Scene) -> Result:
+    """Whether there is a unit."""
+    if not scene.at(RUNNING).is_dir():
+        return skipped("systemd does not run here")
+    unit = _unit(scene)
+    if unit is not None:
+        return passed(f"{unit}")
+    return warned(
+        f"there is no {UNIT} in {', '.join(FOLDERS[:2])}: the daemon does not start by itself",
+        fix=f"sudo install -m 644 /opt/zsched/share/zsched/{UNIT} /etc/systemd/system/ && sudo systemctl daemon-reload",
+    )
+
+
+def is_enabled(scene: Scene) -> Result:
+    """Whether the unit starts at boot."""
+    masks = [link for folder in FOLDERS[:2] if (link := scene.at(folder) / UNIT).is_symlink()]
+    if any(str(link.readlink()) == "/dev/null" for link in masks):
+        return failed(f"{UNIT} is masked", fix="sudo systemctl unmask zsched && sudo systemctl enable zsched")
+    if _unit(scene) is None:
+        return skipped("there is no unit")
+    if any(any(scene.at(folder).glob(f"*.wants/{UNIT}")) for folder in FOLDERS[:2]):
+        return passed(f"{UNIT} is wanted at boot")
+    return warned(f"{UNIT} does not start at boot", fix="sudo systemctl enable zsched")
+
+
+def can_see_its_files(scene: Scene) -> Result:
+    """Whether the unit's user sees the program, the fleet file, the certificates and the workers' programs."""
+    unit = _unit(scene)
+    if unit is None:
+        return skipped("there is no unit")
+    settings = _settings(scene, unit)
+    command = shlex.split(_last(settings, "ExecStart").lstrip("-@:+!"))
+    if not command:
+        return failed(f"{unit} has no ExecStart", fix="install the unit that comes with zsched")
+    hides_homes = _last(settings, "ProtectHome").lower() not in ("", "no", "false", "off", "0")
+    is_nameless = _last(settings, "DynamicUser").lower() in ("yes", "true", "on", "1")
+    found = [*_program(scene, Path(command[0]), hides_homes=hides_homes)]
+    for path in _files(scene, command):
+        found += _file(scene, path, hides_homes=hides_homes, is_nameless=is_nameless)
+    return joined(found, passed(f"{unit}: the service sees {command[0]} and all files that it needs"))
+
+
+def _program(scene: Scene, program: Path, *, hides_homes: bool) -> Iterator[Result]:
+    """The program, the interpreter that it runs in, and the workers' programs."""
+    here = scene.at(program)
+    if not here.exists() and not here.is_symlink():
+        fix = "install zsched there, or name the program with a drop-in: systemctl edit zsched"
+        yield failed(f"the unit starts {program}, which is not there", fix=fix)
+        return
+    if not hides_homes:
+        return
+    needed = [program, here.parent / "python"]
+    for task in scene.fleet.tasks:
+        if runs_worker(task, scene.node, scene.me.kind):
+            needed += [Path(word) for word in task.worker.command if word.startswith("/")]
+    for path in needed:
+        if hidden := _home_of(path):
+            fix = "install to /opt, Python too (docs/guide/service.md), or ProtectHome=no in a drop-in"
+            yield failed(f"{path} is or leads to {hidden}, which the service cannot see (ProtectHome)", fix=fix)
+
+
+def _files(scene: Scene, command: list[str]) -> Iterator[Path]:
+    """What the daemon reads."""
+    given = [after for word, after in itertools.pairwise(command) if word in ("--config", "-c")]
+    yield from (Path(path) for path in given)
+    if scene.fleet.zenoh_config:
+        yield Path(scene.fleet.zenoh_config)
+
+
+def _file(scene: Scene, path: Path, *, hides_homes: bool, is_nameless: bool) -> Iterator[Result]:
+    here = scene.at(path) if scene.root != Path("/") and not path.is_relative_to(scene.root) else path
+    if not here.exists():
+        yield failed(f"the unit reads {path}, which is not there", fix=f"sudo install -D -m 644 FILE {path}")
+    elif hides_homes and (hidden := _home_of(path)):
+        yield failed(f"{path} is below {hidden}, which the service cannot see (ProtectHome)", fix="move it to /etc")
+    elif is_nameless and not here.stat().st_mode & stat.S_IROTH:
+        yield failed(f"{path} is not readable by the service's user", fix=f"sudo chmod o+r {path}")
+
+
+def _home_of(path: Path) -> str:
+    """Below which hidden folder a path lies, or leads by links; empty: none."""
+    seen = (str(path), str(path.resolve()))
+    return next((home for home in HOMES if any(one.startswith(f"{home}/") for one in seen)), "")
+
+
+def _unit(scene: Scene) -> Path | None:
+    return next((Path(folder) / UNIT for folder in FOLDERS if (scene.at(folder) / UNIT).is_file()), None)
+
+
+def _settings(scene: Scene, unit: Path) -> Settings:
+    """Every setting of the unit and its drop-ins, in the order in which they count."""
+    files = [unit]
+    for folder in reversed(FOLDERS):
+        files += sorted(
+            Path("/", *one.relative_to(scene.root).parts) for one in scene.at(folder).glob(f"{UNIT}.d/*.conf")
+        )
+    found: Settings = []
+    for file in files:
+        text = scene.at(file).read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
+        pairs = (line.partition("=") for line in text.splitlines() if line[:1] not in ("#", ";", "["))
+        found += [(name.strip(), value.strip()) for name, equals, value in pairs if equals]
+    return found
+
+
+def _last(settings: Settings, wanted: str) -> str:
+    return next((value for name, value in reversed(settings) if name == wanted and value), "")

@@ -1,0 +1,76 @@
+"""Checks of the streams of this machine's applications: does anybody publish, and only one.
+
+Knows: counters of streams, keys of applications, a tap on the data network. Does not know: what is published.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Final
+
+from zsched.adapters.network.stream_tap import StreamTap, Tapped
+from zsched.clock import monotonic_s
+from zsched.doctor.model import Result, Scene, counted, failed, joined, passed, skipped, warned
+from zsched.errors import AdapterError
+
+YOUNG_S: Final = 60.0
+"""In a fleet that has just started, streams have not begun."""
+LISTEN_S: Final = 1.5
+
+
+def inputs_have_publishers(scene: Scene) -> Result:
+    """Whether each input of this machine has ever had a message."""
+    status = scene.status
+    streams = [(task, stream) for task in status["tasks"] for stream in task["streams"] if "/in/" in stream["stream"]]
+    if not streams:
+        return skipped(f"{scene.node} carries no inputs")
+    if float(status["up_s"]) < YOUNG_S:
+        return skipped(f"the daemon has been up for {status['up_s']:.0f} s only")
+    where = ", ".join(status.get("joins_at") or ()) or "where zsched status says that applications join"
+    found = []
+    for task, stream in streams:
+        if stream["last_seen_s"] is None and task["owner"] is not None:
+            told = f"{stream['stream']}: nobody has published {stream['from_expr'] or 'its key'} on {scene.node}"
+            found.append(warned(told, fix=f"the application must put that key, and dial {where}"))
+    return joined(found, passed(f"{counted(len(streams), 'inputs')}, each has had messages"))
+
+
+def keys_have_one_publisher(scene: Scene) -> Result:
+    """Whether each key of an input has one publisher, as far as publishers tell who they are."""
+    keys = sorted(set(_keys(scene)))
+    if not keys or not scene.sides:
+        return skipped(f"{scene.node} carries no inputs whose keys stand for one publisher each")
+    try:
+        with StreamTap(scene.sides, keys) as tap:
+            return judged_sources(tap.until(monotonic_s() + LISTEN_S))
+    except AdapterError as error:
+        return failed(str(error), fix="journalctl -u zsched says what became of the relay")
+
+
+def _keys(scene: Scene) -> Iterable[str]:
+    """Where applications put inputs; a wildcard may stand for many publishers by right."""
+    for task in scene.status["tasks"]:
+        for stream in task["streams"]:
+            if "/in/" in stream["stream"] and stream["from_expr"] and "*" not in stream["from_expr"]:
+                yield str(stream["from_expr"])
+
+
+def judged_sources(samples: Iterable[Tapped]) -> Result:
+    """What was heard, by key and publisher."""
+    sources: dict[str, set[str]] = {}
+    untold: set[str] = set()
+    for sample in samples:
+        sources.setdefault(sample.key, set())
+        if sample.source:
+            sources[sample.key].add(sample.source)
+        else:
+            untold.add(sample.key)
+    found = []
+    for key, names in sorted(sources.items()):
+        if len(names) > 1:
+            fix = f"only one program may publish {key}: stop the other, or give it another key"
+            found.append(warned(f"{key} has {len(names)} publishers: {', '.join(sorted(names))}", fix=fix))
+    told = f"{counted(len(sources), 'keys')} with messages within {LISTEN_S:g} s"
+    if untold:
+        told += f"; the publishers of {', '.join(sorted(untold))} do not tell who they are"
+    return joined(found, passed(told) if len(untold) < len(sources) or not sources else skipped(told))

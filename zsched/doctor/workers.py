@@ -1,0 +1,127 @@
+"""Checks of this machine's workers: can they be started, and do they run.
+
+Knows: commands, programs, modules that cannot be imported. Does not know: what a worker does.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from zsched.core.values.fleet import TaskSpec, runs_worker
+from zsched.doctor.model import Result, Scene, failed, joined, passed, skipped, warned
+
+IMPORT_S: Final = 60.0
+"""numpy and OpenCV from an SD card take ten seconds and more."""
+PYTHON: Final = ("python", "python3")
+FINDER: Final = Path(__file__).with_name("imports.py")
+
+
+def _mine(scene: Scene) -> Iterator[TaskSpec]:
+    """The tasks whose worker the daemon starts here."""
+    for task in scene.fleet.tasks:
+        if task.worker.command and runs_worker(task, scene.node, scene.me.kind):
+            yield task
+
+
+def commands_are_there(scene: Scene) -> Result:
+    """Whether the program of each worker is there and may be run."""
+    found = [_command(task) for task in _mine(scene)]
+    return joined(found, skipped("no worker is started by the daemon here"))
+
+
+def _command(task: TaskSpec) -> Result:
+    program, *words = task.worker.command
+    fix = f"install it, or correct `worker: {{command:}}` of {task.name} (full paths)"
+    if program not in PYTHON:
+        where = shutil.which(program, path=dict(task.worker.env).get("PATH"))
+        if where is None:
+            return failed(f"{task.name}: there is no program {program} that may be run", fix=fix)
+        return passed(f"{task.name}: {where}")
+    script = _script(words)
+    if script is not None and not Path(script).is_file():
+        return failed(f"{task.name}: there is no file {script}", fix=fix)
+    if script is not None and not Path(script).is_absolute():
+        told = f"{task.name}: {script} is looked for in the folder in which the daemon was started"
+        return warned(told, fix=f"give the full path in `worker: {{command:}}` of {task.name}")
+    return passed(f"{task.name}: {sys.executable} {' '.join(words)}")
+
+
+def packages_are_there(scene: Scene) -> Result:
+    """Whether each worker in Python finds the packages that it imports."""
+    found = [result for task in _mine(scene) if (result := _packages(task)) is not None]
+    return joined(found, skipped("no worker in Python is started by the daemon here"))
+
+
+def _packages(task: TaskSpec) -> Result | None:
+    program, *words = task.worker.command
+    if Path(program).name.rstrip("0123456789.") != "python":
+        return None
+    python = sys.executable if program in PYTHON else program
+    module, script = _module(words), _script(words)
+    if module is None and (script is None or not Path(script).is_file()):
+        return None
+    kind, what = ("file", str(script)) if module is None else ("module", module)
+    try:
+        done = subprocess.run(
+            [python, FINDER, kind, what],
+            env={**os.environ, **dict(task.worker.env)},
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=IMPORT_S,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return warned(
+            f"{task.name}: {what} is not imported after {IMPORT_S:g} s",
+            fix="does something that it imports work at its import?",
+        )
+    except OSError as error:
+        return failed(f"{task.name}: {python}: {error.strerror}", fix="correct `worker: {command:}`")
+    if done.returncode == 0:
+        return passed(f"{task.name}: {what} finds what it imports")
+    said = f"{done.stderr}\n{done.stdout}".strip().splitlines()
+    why = said[-1] if said else f"status {done.returncode}"
+    fix = f"{python} -m pip install what is missing, where {task.name} runs (map_merge: zsched[map-merge])"
+    return failed(f"{task.name}: {what} lacks an import: {why}", fix=fix)
+
+
+def _module(words: list[str]) -> str | None:
+    """What follows ``-m``, before any script."""
+    for word, after in itertools.pairwise(words):
+        if word == "-m":
+            return after
+        if not word.startswith("-"):
+            return None
+    return None
+
+
+def _script(words: list[str]) -> str | None:
+    """The script, where one is named."""
+    first = next(iter(words), "-")
+    return first if first.endswith(".py") or "/" in first else None
+
+
+def run_well(scene: Scene) -> Result:
+    """Whether each worker of this machine is ready, as the daemon says."""
+    mine = next((node for node in scene.status["nodes"] if node["name"] == scene.node), None)
+    found = [_worker(scene.node, load) for load in (mine or {}).get("workers", ())]
+    return joined(found, skipped("this machine has no workers"))
+
+
+def _worker(node: str, load: dict[str, str]) -> Result:
+    task, state = load["task"], load["state"]
+    told = f"the worker of {task} is {state}" + (f": {load['reason']}" if load.get("reason") else "")
+    if state == "failed":
+        return failed(told, fix=f"mend its cause, then: zsched retry {task} {node}")
+    if state == "restarting" or (state == "ready" and load.get("reason")):
+        return warned(told, fix="journalctl -u zsched shows what it printed")
+    return passed(told)
