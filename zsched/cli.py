@@ -311,6 +311,52 @@ def doctor(
     raise typer.Exit(diagnose(machine, is_fleet=fleet, is_strict=strict, is_json=json_, is_plain=no_color))
 
 
+@app.command(cls=Verb)
+def ping(
+    whom: Annotated[str, typer.Argument(metavar="NODE", help="A node of the fleet file.")],
+    count: Annotated[int, typer.Option("--count", "-c", min=1, max=10_000, metavar="N", help="Questions.")] = 4,
+    timeout: Annotated[float, typer.Option(min=0.1, max=60.0, metavar="S", help="Seconds for an answer.")] = 1.0,
+    interval: Annotated[float, typer.Option(min=0.0, max=60.0, metavar="S", help="Seconds between two.")] = 0.2,
+    json_: JsonOption = False,
+    config: Annotated[
+        Path | None, typer.Option("--config", metavar="FILE", help="Fleet file. [ZSCHED_CONFIG, else as for up]")
+    ] = None,
+    node: NameOption = None,
+    runtime_dir: RuntimeOption = None,
+) -> None:
+    """Measure how long a node's control and data sessions take to answer, and by which address.
+
+    Exits with 3 when the node answers by no way, with 1 when by some only.
+    """
+    from zsched.commands.ping import Question, ping_node  # noqa: PLC0415 - each verb imports what it needs
+
+    _node_name(node)
+    question = Question(node=whom, count=count, timeout_s=timeout, interval_s=interval)
+    raise typer.Exit(ping_node(question, node, config, runtime_dir, is_json=json_))
+
+
+@app.command(cls=Verb)
+def bugreport(
+    file: Annotated[
+        Path | None, typer.Argument(metavar="[FILE]", help="A new file. [zsched-bugreport-NODE-TIME.tar.gz]")
+    ] = None,
+    json_: JsonOption = False,
+    config: ConfigOption = None,
+    node: NameOption = None,
+    state_dir: StateOption = None,
+    runtime_dir: RuntimeOption = None,
+) -> None:
+    """Write one file for who shall look for a fault: every node's status, the doctor's words, the journal.
+
+    Secrets that a name gives away are taken out. It prints what is in the file.
+    """
+    from zsched.commands.bugreport import report  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.doctor import machine_of  # noqa: PLC0415 - as above
+
+    _node_name(node)
+    raise typer.Exit(report(machine_of(config, node, state_dir, runtime_dir), file, is_json=json_))
+
+
 # --- the fleet file --------------------------------------------------------------------------------------------------
 
 
@@ -359,18 +405,9 @@ def check(
 @app.command(cls=Verb)
 def version(json_: JsonOption = False) -> None:
     """Show the versions of zsched, its wire format, zenoh and Python."""
-    import platform  # noqa: PLC0415 - each verb imports what it needs
-    from importlib.metadata import PackageNotFoundError  # noqa: PLC0415 - as above
-    from importlib.metadata import version as installed  # noqa: PLC0415 - as above
+    from zsched.commands.versions import versions  # noqa: PLC0415 - each verb imports what it needs
 
-    from zsched import __version__  # noqa: PLC0415 - as above
-    from zsched.wire import codec as wire  # noqa: PLC0415 - as above
-
-    try:
-        zenoh = installed("eclipse-zenoh")
-    except PackageNotFoundError:
-        zenoh = "not installed"
-    found = {"zsched": __version__, "wire": wire.VERSION, "zenoh": zenoh, "python": platform.python_version()}
+    found = versions()
     if json_:
         print_json({"schema": "zsched.version/1", **found})
     else:

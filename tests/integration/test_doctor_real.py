@@ -12,17 +12,18 @@ from typing import Any
 
 import pytest
 
+from zsched.errors import AdapterError
 from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
 WAIT_S = 40.0
 VERB_S = 60.0
 
 
-def doctor(bed: Testbed, node: str, *arguments: str) -> tuple[int, dict[str, Any]]:
-    """(exit code, {check: its result}) of the doctor on one machine of the fleet."""
+def zsched(bed: Testbed, node: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """A verb on one machine of the fleet."""
     words = {"CONFIG": bed.file, "NODE": node, "STATE_DIR": bed.folder / node, "RUNTIME_DIR": bed.folder}
     done = subprocess.run(
-        [sys.executable, "-m", "zsched.cli", "doctor", "--json", *arguments],
+        [sys.executable, "-m", "zsched.cli", *arguments],
         env={**os.environ, **{f"ZSCHED_{name}": str(value) for name, value in words.items()}},
         capture_output=True,
         text=True,
@@ -30,6 +31,12 @@ def doctor(bed: Testbed, node: str, *arguments: str) -> tuple[int, dict[str, Any
         check=False,
     )
     assert done.stdout, done.stderr
+    return done
+
+
+def doctor(bed: Testbed, node: str, *arguments: str) -> tuple[int, dict[str, Any]]:
+    """(exit code, {check: its result}) of the doctor."""
+    done = zsched(bed, node, "doctor", "--json", *arguments)
     return done.returncode, {check["id"]: check for check in json.loads(done.stdout)["checks"]}
 
 
@@ -60,15 +67,12 @@ def test_a_fleet_in_order_passes_and_three_faults_at_once_are_found(bed: Testbed
     good = bed.file.read_text()
     bed.file.write_text(good.replace('"bonus": 0.1', '"bonus": 0.2'))
     bed.start("robot2")
-    bed.wait(lambda: bed.status("robot2")["up_s"] > 0, WAIT_S, "robot2")
+    bed.wait(lambda: heard(bed, "robot2", "robot1") == "alive", WAIT_S, "robot2 hears robot1")
     bed.file.write_text(good)
     bed.start("robot3")
 
-    def all_there() -> bool:
-        states = {node["name"]: node["state"] for node in bed.status("robot1")["nodes"]}
-        return {states["robot2"], states["robot3"]} == {"alive"}
-
-    bed.wait(all_there, WAIT_S, "robot2 and robot3 alive")
+    bed.wait(lambda: heard(bed, "robot1", "robot2") == "alive", WAIT_S, "robot1 hears robot2")
+    bed.wait(lambda: heard(bed, "robot1", "robot3") == "alive", WAIT_S, "robot1 hears robot3")
     code, found = doctor(bed, "robot1", "--fleet")
     faults = failed(found)
     assert code == 1
@@ -82,3 +86,31 @@ def test_a_fleet_in_order_passes_and_three_faults_at_once_are_found(bed: Testbed
     code, found = doctor(bed, "laptop", "--fleet", "--runtime-dir", str(bed.folder / "none"))
     assert set(failed(found)) == {"fleet.files", "fleet.electors"}
     assert "state.valid" not in found
+
+
+def test_ping_and_bugreport_of_a_real_fleet(bed: Testbed) -> None:
+    bed.init("robot1", "edge1")
+    bed.start("robot1", "edge1")
+    bed.wait(lambda: heard(bed, "robot1", "edge1") == "alive", WAIT_S, "robot1 hears edge1")
+    bed.wait(lambda: heard(bed, "edge1", "robot1") == "alive", WAIT_S, "edge1 hears robot1")
+
+    def ping(node: str) -> tuple[int, dict[str, Any]]:
+        done = zsched(bed, "robot1", "ping", node, "--json", "--count", "2", "--timeout", "5")
+        return done.returncode, json.loads(done.stdout)
+
+    code, body = ping("edge1")
+    assert (code, [way["answered"] for way in body["ways"]]) == (0, [2, 2, 2])
+    assert body["heard"] == {"robot1": {"edge1": "alive"}, "edge1": {"robot1": "alive"}}
+    assert ping("edge2")[0] == 3
+
+    body = json.loads(zsched(bed, "robot1", "bugreport", str(bed.folder / "report.tar.gz"), "--json").stdout)
+    assert {"status/robot1.json", "status/edge1.json", "doctor.txt", "fleet.yaml"} <= set(body["members"])
+    assert body["missing"]["status/edge2.json"] == "edge2 does not answer"
+
+
+def heard(bed: Testbed, listener: str, speaker: str) -> str:
+    try:
+        nodes = bed.status(listener)["nodes"]
+    except AdapterError:
+        return "not up yet"
+    return next(str(node["state"]) for node in nodes if node["name"] == speaker)

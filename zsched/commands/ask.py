@@ -69,6 +69,27 @@ def find_door(runtime_dir: Path | None, node: str | None, env: Mapping[str, str]
     raise CliError(EXIT_USAGE, f"several daemons in {runtime}: {here}; say which one with --node or ZSCHED_NODE")
 
 
+def name_here(given: str | None, runtime_dir: Path | None, env: Mapping[str, str] = os.environ) -> str:
+    """What this machine is called, for a verb that looks at the machine whether its daemon runs or not.
+
+    As in `find_door`: ``--node``, ``ZSCHED_NODE``, the host name; where nothing but the host name says it, and that is
+    no node of the daemons here, the only one there is.
+
+    Raises:
+        CliError: there are several daemons, and none is meant (2).
+    """
+    runtime, own = places.runtime_folder(runtime_dir, env), places.node_name(given, env)
+    sockets = {path.stem: path for path in places.local_sockets(runtime)}
+    if given or env.get("ZSCHED_NODE") or own in sockets or not sockets:
+        return own
+    if own in _their_fleet(sockets.values())[1]:
+        return own
+    if len(sockets) == 1:
+        return next(iter(sockets))
+    here = ", ".join(sockets)
+    raise CliError(EXIT_USAGE, f"several daemons in {runtime}: {here}; say which one with --node or ZSCHED_NODE")
+
+
 def _their_fleet(sockets: Iterable[Path]) -> tuple[str, tuple[str, ...]]:
     """The fleet's name and nodes, by the first daemon here that answers; empty when none does."""
     for path in sockets:

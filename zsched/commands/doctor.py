@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Final
 
 from zsched import paths as places
+from zsched.commands.ask import name_here
 from zsched.commands.common import Json, print_json, wants_color
 from zsched.commands.page import Page, harmless
 from zsched.doctor.look import Machine, look
@@ -31,12 +32,16 @@ Results = list[tuple[Check, Result]]
 
 
 def machine_of(config: Path | None, node: str | None, state_dir: Path | None, runtime_dir: Path | None) -> Machine:
-    """Where this machine's things are, by the options and the environment."""
+    """Where this machine's things are, by the options and the environment.
+
+    Raises:
+        CliError: several daemons run here, and nothing says which is meant.
+    """
     return Machine(
         file=places.config_path(config, os.environ),
         state_folder=places.state_folder(state_dir, os.environ),
         runtime_folder=places.runtime_folder(runtime_dir, os.environ),
-        node=places.node_name(node, os.environ),
+        node=name_here(node, runtime_dir),
     )
 
 

@@ -37,7 +37,7 @@ AGAIN_S: Final = 1.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Machine:
-    """Where this machine's things are, and what it is called (``None``: the environment or the host name says)."""
+    """Where this machine's things are, and what it is called."""
 
     file: Path
     state_folder: Path
@@ -56,9 +56,10 @@ class _Asked:
 def look(machine: Machine, *, is_fleet: bool) -> Scene:
     """Everything that the checks need; blocks for some seconds when nodes are silent."""
     reading = check_file(machine.file)
-    own, refusal, node = _own(machine, reading.fleet)
+    socket, node = places.socket_path(machine.runtime_folder, machine.node), machine.node
+    own, refusal = _own(socket)
+    door = None if own is None else socket
     asked = _Asked(statuses={}, answered_s={})
-    door = None if own is None else places.socket_path(machine.runtime_folder, node)
     if is_fleet:
         asked = _all(reading.fleet, node, door)
         if differs(asked.statuses):
@@ -88,21 +89,15 @@ def _sides(door: Path, node: NodeId) -> Mapping[str, str]:
     return found
 
 
-def _own(machine: Machine, fleet: Fleet | None) -> tuple[Json | None, str, NodeId]:
-    """(the status of the daemon here, or why there is none, and its name).
-
-    Where the host name is none of the fleet's and one daemon runs here, that is the one.
-    """
-    node, sockets = machine.node, places.local_sockets(machine.runtime_folder)
-    if fleet is not None and node not in [spec.name for spec in fleet.nodes] and len(sockets) == 1:
-        node = sockets[0].stem
+def _own(door: Path) -> tuple[Json | None, str]:
+    """(the status of the daemon here, or why there is none)."""
     try:
-        status = ask(places.socket_path(machine.runtime_folder, node), {"verb": "status"}, ASK_S)
+        status = ask(door, {"verb": "status"}, ASK_S)
     except AdapterError as error:
         if isinstance(error.__cause__, PermissionError):
-            return None, f"permission denied at the socket of {node}: run the doctor as root", node
-        return None, str(error), node
-    return (status, "", node) if "error" not in status else (None, str(status["error"]), node)
+            return None, f"permission denied at {door}: run the doctor as root"
+        return None, str(error)
+    return (status, "") if "error" not in status else (None, str(status["error"]))
 
 
 def _all(fleet: Fleet | None, asker: NodeId, door: Path | None) -> _Asked:

@@ -1,0 +1,77 @@
+"""Secrets go, everything else stays."""
+
+from __future__ import annotations
+
+import pytest
+
+from support.clinic import FLEET
+from zsched.commands.redaction import clean, clean_json, clean_yaml, secrets_of
+from zsched.config.load import check_bytes
+
+SECRETS = ("hunter22", "tok,en#1", "abcd1234", "pw4url", "line one", "line two", "swordfish")
+WITH_SECRETS = FLEET.replace(
+    "    worker: {command: [python, -m, zsched.tasks.echo]}",
+    """    worker:
+      command: [python, -m, zsched.tasks.echo, --api-key, abcd1234, --mode=fast, --auth-token=abcd1234]
+      env:
+        DB_PASSWORD: hunter22   # the one of the hall
+        API_TOKEN: tok,en#1
+        LONG_SECRET: |
+          line one
+          line two
+        BROKER: mqtt://user:pw4url@192.0.2.7:1883/x
+        PIN: "12"
+        MODE: fast
+        MONKEY: "7"
+""",
+)
+
+
+def leaks(text: str) -> list[str]:
+    return [secret for secret in SECRETS if secret in text]
+
+
+def test_a_fleet_file_loses_its_secrets_and_nothing_else() -> None:
+    fleet = check_bytes(WITH_SECRETS.encode()).fleet
+    assert fleet is not None
+    text = clean_yaml(WITH_SECRETS, secrets_of(fleet))
+    assert leaks(text) == []
+    assert '"12"' not in text
+    for kept in ("MODE: fast", 'MONKEY: "7"', "--mode=fast", "192.0.2.7:1883/x", "ready", "robot2", "mqtt://"):
+        assert (kept in text) == (kept in WITH_SECRETS), kept
+    assert check_bytes(text.encode()).fleet is not None  # what is left is still a fleet file
+    assert clean_yaml(FLEET) == FLEET
+
+
+def test_a_fleet_file_with_faults_loses_them_too() -> None:
+    text = clean_yaml(WITH_SECRETS.replace("kind: edge,", "kind: ege,").replace("--api-key, abcd1234, ", ""))
+    assert leaks(text) == []
+
+
+def test_a_flow_mapping_loses_them() -> None:
+    text = clean_yaml("worker: {env: {API_TOKEN: swordfish, MODE: fast, 'DB_PASSWORD': 'hunter22'}, ready: token}")
+    assert leaks(text) == []
+    assert "MODE: fast" in text
+    assert "ready: token" in text
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["login with password=swordfish failed", "run --token=swordfish now", "GET https://me:swordfish@host/x"],
+)
+def test_a_log_line_loses_them(line: str) -> None:
+    assert leaks(clean(line)) == []
+    assert len(clean(line)) > len("REMOVED") + 4
+
+
+def test_private_keys_go_and_known_values_go_everywhere() -> None:
+    pem = "a\n-----BEGIN EC PRIVATE KEY-----\nMHcCAQEE\n-----END EC PRIVATE KEY-----\nb"
+    assert clean(pem) == "a\nREMOVED\nb"
+    body = {"problems": ["worker said swordfish", "task=echo epoch=2"], "up_s": 3.5, "counters": {"tokens_seen": 5}}
+    assert clean_json(body, ("swordfish",)) == {**body, "problems": ["worker said REMOVED", "task=echo epoch=2"]}
+
+
+def test_short_values_are_not_looked_for_everywhere() -> None:
+    fleet = check_bytes(WITH_SECRETS.encode()).fleet
+    assert set(secrets_of(fleet)) == {"hunter22", "tok,en#1", "abcd1234", "line one", "line two"}
+    assert secrets_of(None) == ()

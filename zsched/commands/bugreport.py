@@ -1,0 +1,157 @@
+"""`zsched bugreport`: one file with what somebody needs who looks for a fault from afar, secrets taken out.
+
+Knows: what goes into it, tar, the journal. Does not know: what is wrong.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import platform
+import subprocess
+import sys
+import tarfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+
+from zsched.clock import wall_ns
+from zsched.commands.common import CliError, Json, print_json
+from zsched.commands.doctor import as_json, as_text
+from zsched.commands.page import harmless, size
+from zsched.commands.redaction import clean, clean_json, clean_yaml, secrets_of
+from zsched.commands.versions import versions
+from zsched.config.reader import MAX_FILE_BYTES
+from zsched.doctor.look import Machine, look
+from zsched.doctor.model import Scene
+from zsched.doctor.table import run_all
+from zsched.exits import EXIT_FAILED, EXIT_OK
+from zsched.files import read_regular
+
+SCHEMA: Final = "zsched.bugreport/1"
+UNIT: Final = "zsched"
+JOURNAL_MINUTES: Final = 10
+JOURNAL_LINES: Final = 20_000
+JOURNAL_S: Final = 20.0
+TEXT_WIDTH: Final = 120
+
+Journal = Callable[[], str]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Member:
+    """One file of the report; ``missing``: why it is not there."""
+
+    name: str
+    content: bytes = b""
+    missing: str = ""
+
+
+def report(machine: Machine, file: Path | None, *, is_json: bool) -> int:
+    """Gather, write, and print what is in it.
+
+    Raises:
+        CliError: the file cannot be written, or is there already.
+    """
+    now = datetime.fromtimestamp(wall_ns() / 1e9, UTC)
+    scene = look(machine, is_fleet=True)
+    path = file or Path(f"zsched-bugreport-{scene.node}-{now:%Y%m%d-%H%M%S}.tar.gz")
+    members = tuple(gathered(scene))
+    _write(path, packed(members, path.name.removesuffix(".gz").removesuffix(".tar"), now))
+    if is_json:
+        print_json(_as_json(path, members))
+    else:
+        sys.stdout.write("".join(f"{harmless(line)}\n" for line in _lines(path, members)))
+    return EXIT_OK
+
+
+def gathered(scene: Scene, journal: Journal | None = None) -> Iterator[Member]:
+    """Every file of the report, secrets taken out."""
+    secrets = secrets_of(scene.reading.fleet)
+    machine = {"system": platform.platform(), "machine": platform.machine(), "node": scene.node}
+    yield _json("versions.json", {**versions(), **machine})
+    try:
+        text = read_regular(scene.file, MAX_FILE_BYTES).decode("utf-8", errors="replace")
+        yield Member(name="fleet.yaml", content=clean_yaml(text, secrets).encode())
+    except OSError as error:
+        yield Member(name="fleet.yaml", missing=f"{scene.file}: {error.strerror}")
+    results = run_all(scene)
+    yield Member(name="doctor.txt", content=clean(as_text(results, TEXT_WIDTH, is_colored=False), secrets).encode())
+    yield _json("doctor.json", clean_json(as_json(scene, results), secrets))
+    statuses = dict(scene.statuses) or ({} if scene.own is None else {scene.node: scene.own})
+    nodes = () if scene.reading.fleet is None else scene.reading.fleet.nodes
+    for name in sorted({*statuses, *(spec.name for spec in nodes)}):
+        if name in statuses:
+            yield _json(f"status/{name}.json", clean_json(statuses[name], secrets))
+        else:
+            yield Member(name=f"status/{name}.json", missing=f"{name} does not answer")
+    try:
+        yield Member(name="journal.txt", content=clean((journal or _journal)(), secrets).encode())
+    except OSError as error:
+        yield Member(name="journal.txt", missing=str(error.strerror or error))
+
+
+def _json(name: str, body: Json) -> Member:
+    return Member(name=name, content=f"{json.dumps(body, ensure_ascii=False, indent=1)}\n".encode())
+
+
+def _journal() -> str:
+    """What the unit has written in the last minutes. Raises `OSError`: it cannot be read."""
+    words = ["journalctl", "--unit", UNIT, "--since", f"-{JOURNAL_MINUTES}min", "--lines", str(JOURNAL_LINES)]
+    try:
+        done = subprocess.run(
+            [*words, "--no-pager", "--quiet", "--output", "short-iso-precise"],
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            timeout=JOURNAL_S,
+            check=False,
+        )
+    except subprocess.TimeoutExpired as error:
+        raise OSError(f"journalctl took more than {JOURNAL_S:g} s") from error
+    if done.returncode or not done.stdout:
+        told = done.stderr.decode(errors="replace").strip() or f"the unit {UNIT} wrote nothing that this user may read"
+        raise OSError(told.splitlines()[0])
+    return done.stdout.decode(errors="replace")
+
+
+def packed(members: tuple[Member, ...], folder: str, now: datetime) -> bytes:
+    """The files that are there as a packed archive, below ``folder``."""
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w:gz") as archive:
+        for member in members:
+            if not member.missing:
+                info = tarfile.TarInfo(f"{folder}/{member.name}")
+                info.size, info.mode, info.mtime = len(member.content), 0o600, int(now.timestamp())
+                archive.addfile(info, io.BytesIO(member.content))
+    return buffer.getvalue()
+
+
+def _write(path: Path, content: bytes) -> None:
+    """A new file that only its user may read."""
+    try:
+        fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+    except FileExistsError as error:
+        raise CliError(EXIT_FAILED, f"{path} is there already; give another name") from error
+    except OSError as error:
+        raise CliError(EXIT_FAILED, f"{path} cannot be written: {error.strerror}; give another FILE") from error
+    try:
+        with os.fdopen(fd, "wb") as file:
+            file.write(content)
+    except OSError as error:
+        path.unlink(missing_ok=True)
+        raise CliError(EXIT_FAILED, f"{path} cannot be written: {error.strerror}; give another FILE") from error
+
+
+def _as_json(path: Path, members: tuple[Member, ...]) -> Json:
+    there = {member.name: len(member.content) for member in members if not member.missing}
+    missing = {member.name: member.missing for member in members if member.missing}
+    return {"schema": SCHEMA, "file": str(path), "members": there, "missing": missing}
+
+
+def _lines(path: Path, members: tuple[Member, ...]) -> Iterator[str]:
+    for member in members:
+        yield f"{member.name:<28} {f'not there: {member.missing}' if member.missing else size(len(member.content))}"
+    yield f"{path}: secrets that a name gives away are taken out; read it before you hand it on"

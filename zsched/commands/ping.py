@@ -1,0 +1,200 @@
+"""`zsched ping`: how long a node's control session and data session take to answer from this machine, and by which way.
+
+Knows: the ways to a node, exit codes, how figures are shown. Does not know: zenoh (`zsched.adapters.network`).
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+import sys
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from zsched import paths as places
+from zsched.adapters.network.node_ping import Pinged, ping
+from zsched.clock import monotonic_s
+from zsched.commands.ask import Door, ask_door, name_here
+from zsched.commands.common import CliError, Json, nearest, print_json
+from zsched.commands.page import harmless
+from zsched.config.load import load_fleet
+from zsched.core.values.fleet import Fleet, NodeSpec, dial_endpoint
+from zsched.core.values.model import NodeId
+from zsched.core.values.snapshot import Snapshot
+from zsched.errors import WireError
+from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_UNREACHABLE, EXIT_USAGE
+from zsched.runtime.tls import operator_json5
+from zsched.sessions import config as zenoh_config
+from zsched.wire import codec as wire
+from zsched.wire.keyspace import Keyspace
+
+SCHEMA: Final = "zsched.ping/1"
+CONTROL, DATA, DAEMON = "control", "data", "daemon"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Question:
+    """What to measure."""
+
+    node: NodeId
+    count: int
+    timeout_s: float
+    interval_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Way:
+    """One way to the node, and what came of it."""
+
+    name: str
+    """``control``, ``data``, or ``daemon``: through the daemon on this machine."""
+    endpoint: str
+    """The address that was dialled, or the socket."""
+    found: Pinged
+
+
+def ping_node(
+    question: Question, me: str | None, config: Path | None, runtime_dir: Path | None, *, is_json: bool
+) -> int:
+    """Measure every way there is, print it, and return the exit code.
+
+    ``me``: what this machine is called; ``None``: as the environment, the host name or the only daemon here says.
+
+    Raises:
+        CliError: there is no such node, or no way to it; or several daemons run here, and nothing says which asks.
+        ConfigError: the fleet file cannot be used.
+    """
+    me = name_here(me, runtime_dir)
+    socket = places.socket_path(places.runtime_folder(runtime_dir, os.environ), me)
+    here = _own_status(socket)
+    fleet = load_fleet(places.config_path(config, os.environ))
+    names = [spec.name for spec in fleet.nodes]
+    if question.node not in names:
+        raise CliError(EXIT_USAGE, f"fleet {fleet.name} has no node {question.node!r}{nearest(question.node, names)}")
+    ways = list(_ways(fleet, me, question))
+    if here is not None and me != question.node:
+        ways.append(Way(name=DAEMON, endpoint=me, found=_through(socket, question)))
+    if not ways:
+        text = f"{question.node} has no address in the fleet file, and no daemon runs here that could ask it"
+        raise CliError(EXIT_UNREACHABLE, f"{text}; run this on a node of the fleet, or give it `host:` and `listen:`")
+    body = _as_json(question, ways, _hearing(question.node, me, ways, here))
+    if is_json:
+        print_json(body)
+    else:
+        sys.stdout.write("".join(f"{harmless(line)}\n" for line in _lines(question.node, ways, body["heard"])))
+    answered = [bool(way.found.round_trips_s) for way in ways]
+    return EXIT_OK if all(answered) else EXIT_FAILED if any(answered) else EXIT_UNREACHABLE
+
+
+# --- the ways --------------------------------------------------------------------------------------------------------
+
+
+def _ways(fleet: Fleet, me: NodeId, question: Question) -> Iterator[Way]:
+    """The node's own addresses, measured at the same time."""
+    spec, keys, text = fleet.node(question.node), Keyspace(fleet.name), operator_json5(fleet)
+    selectors = {CONTROL: keys.status(spec.name, me), DATA: keys.role(spec.name, "*")}
+    dialled = [(name, endpoint) for name, endpoint in _addresses(spec) if endpoint]
+
+    def measured(one: tuple[str, str]) -> Way:
+        name, endpoint = one
+        config = zenoh_config.client_config(connect=(endpoint,), timing=fleet.timing, operator_json5=text)
+        found = ping(
+            config,
+            selectors[name],
+            count=question.count,
+            timeout_s=question.timeout_s,
+            interval_s=question.interval_s,
+            needs_answer=name == CONTROL,
+        )
+        return Way(name=name, endpoint=endpoint, found=found)
+
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        yield from pool.map(measured, dialled)
+
+
+def _addresses(spec: NodeSpec) -> tuple[tuple[str, str], ...]:
+    listens = ((CONTROL, spec.listen_control), (DATA, spec.listen_data))
+    return tuple((name, dial_endpoint(listen, spec.host) if listen else "") for name, listen in listens)
+
+
+def _own_status(socket: Path) -> Json | None:
+    """What the daemon on this machine says; ``None``: there is none."""
+    try:
+        return ask_door(Door(socket=socket), {"verb": "status"})
+    except CliError:
+        return None
+
+
+def _through(socket: Path, question: Question) -> Pinged:
+    """The same question through the daemon here: the way by which the nodes themselves talk."""
+    found = Pinged(opened_s=0.0)
+    door = Door(socket=socket, node=question.node)
+    for number in range(question.count):
+        if number:
+            threading.Event().wait(question.interval_s)
+        began = monotonic_s()
+        try:
+            ask_door(door, {"verb": "status"})
+        except CliError as error:
+            found.missed += 1
+            found.error = str(error)
+            continue
+        found.round_trips_s.append(monotonic_s() - began)
+    return found
+
+
+# --- what is shown ---------------------------------------------------------------------------------------------------
+
+
+def _hearing(node: NodeId, me: NodeId, ways: list[Way], here: Json | None) -> Json:
+    """Who hears whom: {listener: {speaker: state}}."""
+    heard: Json = {}
+    if here is not None:
+        heard[me] = {str(one["name"]): str(one["state"]) for one in here["nodes"] if one["name"] == node != me}
+    for answer in next((way.found.answers for way in ways if way.name == CONTROL), []):
+        try:
+            snapshot = wire.decode(answer, Snapshot)
+        except WireError:
+            continue
+        heard[snapshot.node] = {one.name: one.state for one in snapshot.nodes if one.name == me != node}
+    return {listener: speakers for listener, speakers in heard.items() if speakers}
+
+
+def _as_json(question: Question, ways: list[Way], heard: Json) -> Json:
+    return {"schema": SCHEMA, "node": question.node, "ways": [_way_json(way) for way in ways], "heard": heard}
+
+
+def _way_json(way: Way) -> Json:
+    found, trips = way.found, way.found.round_trips_s
+    return {
+        "way": way.name,
+        "endpoint": way.endpoint,
+        "opened_s": found.opened_s,
+        "answered": len(trips),
+        "missed": found.missed,
+        "least_s": min(trips, default=None),
+        "mean_s": statistics.fmean(trips) if trips else None,
+        "most_s": max(trips, default=None),
+        "error": found.error,
+    }
+
+
+def _lines(node: NodeId, ways: list[Way], heard: Json) -> Iterator[str]:
+    for way in ways:
+        found, trips = way.found, way.found.round_trips_s
+        place = f"through the daemon of {way.endpoint}" if way.name == DAEMON else way.endpoint
+        head = f"{way.name:<8} {place}: "
+        if not trips:
+            why = found.error or f"no answer to {found.missed} questions"
+            yield f"{head}{node} does not answer: {why}"
+            continue
+        figures = "/".join(f"{1000 * one:.1f}" for one in (min(trips), statistics.fmean(trips), max(trips)))
+        opened = f", open after {1000 * found.opened_s:.0f} ms" if found.opened_s else ""
+        yield f"{head}{len(trips)} of {len(trips) + found.missed} answered, {figures} ms (least/mean/most){opened}"
+    for listener, speakers in heard.items():
+        for speaker, state in speakers.items():
+            yield f"{listener} finds {speaker} {state}"

@@ -1,0 +1,91 @@
+"""Takes secrets out of what an operator hands to others (pure).
+
+Knows: names that stand for secrets, passwords in URLs and options, PEM keys. Does not know: where a text came from.
+
+What no name gives away stays: a text with secrets in a comment keeps them.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Iterable, Iterator
+from typing import Any, Final
+
+from zsched.core.values.fleet import Fleet
+
+GONE: Final = "REMOVED"
+LEAST: Final = 4
+"""A shorter value is taken out where it stands, and not wherever the same letters are."""
+_WORDS: Final = "pass|passwd|password|passphrase|pwd|secret|token|key|apikey|credential|credentials|auth|pin"
+NAME: Final = re.compile(rf"(?:^|[_-])(?:{_WORDS})(?:[_-]|\d|$)", re.IGNORECASE)
+_PAIR: Final = re.compile(
+    r"""(?P<name>["']?[A-Za-z_][\w-]*["']?)(?P<sep>\s*:\s+)(?P<value>"(?:[^"\\]|\\.)*"|'[^']*'|[^\s,{}\[\]#][^,}\n#]*)"""
+)
+_OPTION: Final = re.compile(r"(?P<name>(?:--)?[A-Za-z_][\w-]*)(?P<sep>=)(?P<value>\"[^\"]*\"|'[^']*'|[^\s,;&\]\"']+)")
+_URL: Final = re.compile(r"(?P<head>\b[a-z][a-z0-9+.-]*://)[^/\s@\"']+@")
+_PEM: Final = re.compile(r"-----BEGIN ([A-Z ]*PRIVATE KEY)-----.*?-----END \1-----", re.DOTALL)
+_LINE: Final = re.compile(r"^(?P<indent>\s*)(?P<name>[\"']?[A-Za-z_][\w-]*[\"']?)\s*:\s+(?![{\[#\s])")
+"""A line of a block mapping, whose value is the rest of it, and may go on in deeper lines."""
+
+
+def secrets_of(fleet: Fleet | None) -> tuple[str, ...]:
+    """Values of the workers' environments and options whose names say that they are secrets, the longest first."""
+    found: set[str] = set()
+    for task in fleet.tasks if fleet is not None else ():
+        found.update(value for name, value in task.worker.env if NAME.search(name))
+        words = task.worker.command
+        found.update(after for word, after in itertools.pairwise(words) if _is_option(word))
+        found.update(word.partition("=")[2] for word in words if _is_option(word.partition("=")[0]))
+    lines = {line.strip() for value in found for line in value.splitlines()}
+    return tuple(sorted((line for line in lines if len(line) >= LEAST), key=lambda line: (-len(line), line)))
+
+
+def _is_option(word: str) -> bool:
+    return word.startswith("--") and NAME.search(word) is not None
+
+
+def clean(text: str, secrets: Iterable[str] = ()) -> str:
+    """The text without ``secrets``, values of options and variables with such names, URLs' passwords, private keys."""
+    for secret in secrets:
+        text = text.replace(secret, GONE)
+    text = _PEM.sub(GONE, text)
+    text = _URL.sub(rf"\g<head>{GONE}@", text)
+    return _OPTION.sub(_without_value, text)
+
+
+def clean_yaml(text: str, secrets: Iterable[str] = ()) -> str:
+    """The same of a fleet file, whose values also follow ``name: `` or stand in a block below it."""
+    lines = _lines(clean(text, secrets).split("\n"))
+    return "\n".join(_PAIR.sub(_without_value, line) for line in lines)
+
+
+def clean_json(value: Any, secrets: tuple[str, ...] = ()) -> Any:
+    """The same of every text in JSON values."""
+    if isinstance(value, str):
+        return clean(value, secrets)
+    if isinstance(value, list):
+        return [clean_json(one, secrets) for one in value]
+    if isinstance(value, dict):
+        return {name: clean_json(one, secrets) for name, one in value.items()}
+    return value
+
+
+def _without_value(found: re.Match[str]) -> str:
+    name = found["name"].strip("\"'")
+    return f"{found['name']}{found['sep']}{GONE}" if NAME.search(name) and GONE not in found["value"] else found[0]
+
+
+def _lines(lines: Iterable[str]) -> Iterator[str]:
+    inside: int | None = None
+    for line in lines:
+        depth = len(line) - len(line.lstrip())
+        if inside is not None and (not line.strip() or depth > inside):
+            continue
+        inside = None
+        found = _LINE.match(line)
+        if found is not None and NAME.search(found["name"].strip("\"'")):
+            inside = len(found["indent"])
+            yield f"{found['indent']}{found['name']}: {GONE}"
+        else:
+            yield line
