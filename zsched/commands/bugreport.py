@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tarfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
@@ -26,7 +26,7 @@ from zsched.commands.redaction import clean, clean_json, clean_yaml, secrets_of
 from zsched.commands.versions import versions
 from zsched.config.reader import MAX_FILE_BYTES
 from zsched.doctor.look import Machine, look
-from zsched.doctor.model import Scene
+from zsched.doctor.model import Result, Scene
 from zsched.doctor.table import run_all
 from zsched.exits import EXIT_FAILED, EXIT_OK
 from zsched.files import read_regular
@@ -78,9 +78,9 @@ def gathered(scene: Scene, journal: Journal | None = None) -> Iterator[Member]:
         yield Member(name="fleet.yaml", content=clean_yaml(text, secrets).encode())
     except OSError as error:
         yield Member(name="fleet.yaml", missing=f"{scene.file}: {error.strerror}")
-    results = run_all(scene)
-    yield Member(name="doctor.txt", content=clean(as_text(results, TEXT_WIDTH, is_colored=False), secrets).encode())
-    yield _json("doctor.json", clean_json(as_json(scene, results), secrets))
+    results = [(check, _cleaned(result, secrets)) for check, result in run_all(scene)]  # before lines are broken
+    yield Member(name="doctor.txt", content=as_text(results, TEXT_WIDTH, is_colored=False).encode())
+    yield _json("doctor.json", as_json(scene, results))
     statuses = dict(scene.statuses) or ({} if scene.own is None else {scene.node: scene.own})
     nodes = () if scene.reading.fleet is None else scene.reading.fleet.nodes
     for name in sorted({*statuses, *(spec.name for spec in nodes)}):
@@ -92,6 +92,11 @@ def gathered(scene: Scene, journal: Journal | None = None) -> Iterator[Member]:
         yield Member(name="journal.txt", content=clean((journal or _journal)(), secrets).encode())
     except OSError as error:
         yield Member(name="journal.txt", missing=str(error.strerror or error))
+
+
+def _cleaned(result: Result, secrets: tuple[str, ...]) -> Result:
+    evidence = tuple(clean(line, secrets) for line in result.evidence)
+    return replace(result, evidence=evidence, fix=clean(result.fix, secrets))
 
 
 def _json(name: str, body: Json) -> Member:

@@ -46,12 +46,15 @@ def _is_option(word: str) -> bool:
 
 
 def clean(text: str, secrets: Iterable[str] = ()) -> str:
-    """The text without ``secrets``, values of options and variables with such names, URLs' passwords, private keys."""
+    """The text without ``secrets``, values of options and variables with such names, URLs' passwords, private keys.
+
+    ``key=`` in a log line is a zenoh key, and stays.
+    """
     for secret in secrets:
         text = text.replace(secret, GONE)
     text = _PEM.sub(GONE, text)
     text = _URL.sub(rf"\g<head>{GONE}@", text)
-    return _OPTION.sub(_without_value, text)
+    return _OPTION.sub(lambda found: found[0] if found["name"] == "key" else _without_value(found), text)
 
 
 def clean_yaml(text: str, secrets: Iterable[str] = ()) -> str:

@@ -6,6 +6,7 @@ files.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import shlex
 import stat
@@ -22,6 +23,8 @@ RUNNING: Final = Path("/run/systemd/system")
 FOLDERS: Final = ("/etc/systemd/system", "/run/systemd/system", "/usr/lib/systemd/system", "/lib/systemd/system")
 HOMES: Final = ("/home", "/root", "/run/user")
 """What `ProtectHome=yes` hides."""
+
+LINE_BYTES: Final = 512
 
 Settings = list[tuple[str, str]]
 
@@ -77,7 +80,7 @@ def _program(scene: Scene, program: Path, *, hides_homes: bool) -> Iterator[Resu
         return
     if not hides_homes:
         return
-    needed = [program, here.parent / "python"]
+    needed = [program, *_interpreter(scene, here)]
     for task in scene.fleet.tasks:
         if runs_worker(task, scene.node, scene.me.kind):
             needed += [Path(word) for word in task.worker.command if word.startswith("/")]
@@ -85,6 +88,15 @@ def _program(scene: Scene, program: Path, *, hides_homes: bool) -> Iterator[Resu
         if hidden := _home_of(path):
             fix = "install to /opt, Python too (docs/guide/service.md), or ProtectHome=no in a drop-in"
             yield failed(f"{path} is or leads to {hidden}, which the service cannot see (ProtectHome)", fix=fix)
+
+
+def _interpreter(scene: Scene, program: Path) -> Iterator[Path]:
+    """What the first line of a script names."""
+    with contextlib.suppress(OSError), program.open("rb") as file:
+        first, *words = file.readline(LINE_BYTES).split() or [b""]
+        name = first.removeprefix(b"#!") or next(iter(words), b"")
+        if first.startswith(b"#!") and name:
+            yield scene.at(name.decode(errors="replace"))
 
 
 def _files(scene: Scene, command: list[str]) -> Iterator[Path]:

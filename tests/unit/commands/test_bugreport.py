@@ -19,6 +19,15 @@ SECRET = "swordfish"
 TEXT = FLEET.replace("worker: {", f"worker: {{env: {{API_TOKEN: {SECRET}}}, ")
 
 
+def test_a_secret_of_several_words_does_not_pass_where_lines_are_broken(tmp_path: Path) -> None:
+    secret = "correct horse battery staple"
+    scene = fleet_scene(tmp_path, FLEET.replace("worker: {", f"worker: {{env: {{API_TOKEN: {secret}}}, "))
+    scene.status["problems"].append(f"{'so many words ' * 5}{secret}")
+    members = {one.name: one.content.decode() for one in gathered(scene, lambda: "")}
+    for word in secret.split():
+        assert word not in members["doctor.txt"], word
+
+
 def no_journal() -> str:
     raise PermissionError(13, "No journal files were opened due to insufficient permissions.")
 

@@ -64,6 +64,11 @@ def test_a_log_line_loses_them(line: str) -> None:
     assert len(clean(line)) > len("REMOVED") + 4
 
 
+def test_a_zenoh_key_in_a_log_line_stays() -> None:
+    line = "stream task=echo key=robot1/in epoch=3 API_KEY=swordfish"
+    assert clean(line) == "stream task=echo key=robot1/in epoch=3 API_KEY=REMOVED"
+
+
 def test_private_keys_go_and_known_values_go_everywhere() -> None:
     pem = "a\n-----BEGIN EC PRIVATE KEY-----\nMHcCAQEE\n-----END EC PRIVATE KEY-----\nb"
     assert clean(pem) == "a\nREMOVED\nb"

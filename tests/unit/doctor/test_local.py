@@ -95,6 +95,15 @@ def test_a_slow_disk_is_found(tmp_path: Path) -> None:
     assert_finds(state.judged_sync(0.2, 0.3, tmp_path), FAIL, "ballot_s = 0.3 s")
 
 
+def test_the_state_folder_s_own_disk_is_looked_at(tmp_path: Path) -> None:
+    scene = scene_of(tmp_path)
+    for name, word in (("state.fsync", "median of 5"), ("state.space", "MiB left")):
+        (told, *_) = run(name, scene).evidence
+        assert str(scene.state_folder) in told
+        assert word in told
+    assert run("state.fsync", replace(scene, state_folder=tmp_path / "none")).verdict is SKIP
+
+
 def test_a_full_and_a_read_only_disk_are_found(tmp_path: Path) -> None:
     def judged(**facts: Any) -> Any:
         return state.judged_space(tmp_path, **{"free": 1 << 30, "files": 1000, "is_read_only": False, **facts})

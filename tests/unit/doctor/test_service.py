@@ -30,7 +30,7 @@ def scene(tmp_path: Path) -> Scene:
     unit = root / "etc/systemd/system/zsched.service"
     shutil.copy(ROOT / "systemd" / "zsched.service", unit)
     (root / "etc/systemd/system/multi-user.target.wants/zsched.service").symlink_to(unit)
-    (root / "opt/zsched/bin/zsched").write_text("#!/bin/sh\n")
+    (root / "opt/zsched/bin/zsched").write_text("#!/opt/zsched/bin/python\nimport zsched\n")
     (root / "opt/zsched/bin/python").symlink_to("/usr/bin/env")
     (root / "etc/zsched/fleet.yaml").write_text(FLEET)
     (root / "etc/zsched/fleet.yaml").chmod(0o644)
