@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from zsched.core.values.decision import Decision, Explanation, Move
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.messages import Accept, Accepted, CommandResult, Learnt, Prepare, Promise, Refused, Utilities
@@ -180,6 +181,14 @@ class AnswerCommand:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class AnswerExplanation:
+    """Answer an operator's question about a task's last judgement."""
+
+    request: int
+    explanation: Explanation
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class StandDown:
     """End this daemon with the exit code of a wrong configuration: its name is alive elsewhere."""
 
@@ -195,6 +204,10 @@ class RecordStory:
     text: str
     task: TaskId = ""
     epoch: int = 0
+    decision: Decision | None = None
+    """With it, this is a judgement that has changed."""
+    move: Move | None = None
+    """With it, this is a change of owner."""
 
 
 Instruction = (
@@ -219,6 +232,7 @@ Instruction = (
     | ApplyRoutes
     | AnswerStatus
     | AnswerCommand
+    | AnswerExplanation
     | StandDown
     | RecordStory
 )

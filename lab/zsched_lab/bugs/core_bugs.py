@@ -43,7 +43,8 @@ SEALING, WITNESS = "zsched.core.executor.sealing", "zsched.core.vote.witness"
 NAMESAKES = "zsched.core.membership.namesakes"
 BELIEF = "zsched.core.vote.belief"
 AGREEMENT, MEMBERSHIP, NODE = "zsched.core.vote.agreement", "zsched.core.membership.peers", "zsched.core.node"
-ROUNDS, VOTE, VOTING = "zsched.core.scheduler.rounds", "zsched.core.vote.tally", "zsched.core.vote.voting"
+VOTE, VOTING = "zsched.core.vote.tally", "zsched.core.vote.voting"
+DECISION = "zsched.core.scheduler.decision"
 SCHEDULER, SCORING, EXECUTOR = (
     "zsched.core.scheduler.judge",
     "zsched.core.scheduler.scoring",
@@ -697,7 +698,7 @@ MEMBERSHIP_BUGS = (
     ),
     _bug(
         "a minority's wish waits for the network to heal",
-        ROUNDS,
+        DECISION,
         "heard >= majority(len(electors)):",
         "heard >= 1:",
         _ROUNDS,

@@ -15,7 +15,9 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field
+from typing import Self
 
+from zsched.core.values.decision import DampingMemory
 from zsched.core.values.model import NodeId
 
 STEP = 0.03
@@ -36,6 +38,17 @@ class Damping:
     _points: dict[NodeId, tuple[float, float]] = field(default_factory=dict)
     _moves: deque[tuple[float, bool]] = field(default_factory=deque)
     _owner_since: float = 0.0
+
+    @classmethod
+    def of(cls, memory: DampingMemory) -> Self:
+        """A record that goes on from a memory; it knows no longer since when the owner has the task."""
+        points = {node: (points, at) for node, points, at in memory.points}
+        return cls(_points=points, _moves=deque(memory.moves))
+
+    def memory(self) -> DampingMemory:
+        """What penalties and caps go by, as a value."""
+        points = tuple((node, points, at) for node, (points, at) in sorted(self._points.items()))
+        return DampingMemory(points=points, moves=tuple(self._moves))
 
     def note_move(self, left: NodeId | None, *, has_failed: bool, was_draining: bool = False, now: float) -> None:
         """An epoch was learnt: ``left`` is the owner before (``None``: the first placement, which is no move).

@@ -17,6 +17,7 @@ from enum import StrEnum
 from zsched.core.scheduler.damping import ESCAPES_PER_MINUTE, WINDOW_S, Damping
 from zsched.core.scheduler.patience import LONGEST_GAP_S, LearntPatience, spend
 from zsched.core.scheduler.scoring import Standing, joined, pick
+from zsched.core.values.decision import JudgeMemory
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.model import Allocation, NodeId, PeerState, Profile, ScoreForm, WorkerState, told_of_worker
 
@@ -77,6 +78,26 @@ class Judge:
         self.unscored_since, self.spent = None, 0.0
         if is_new_owner:
             self.not_ready_since = None
+
+    def memory(self) -> JudgeMemory:
+        """What this judge remembers, as a value."""
+        players, watched_at = self.learnt.memory() if self.spec.learns_patience else ((), None)
+        return JudgeMemory(
+            unscored_since=self.unscored_since,
+            not_ready_since=self.not_ready_since,
+            spent=self.spent,
+            spent_at=self.spent_at,
+            seen_first_at=self.seen_first_at,
+            players=players,
+            watched_at=watched_at,
+        )
+
+    def recall(self, memory: JudgeMemory) -> None:
+        """Remember that, and nothing else."""
+        self.unscored_since, self.not_ready_since = memory.unscored_since, memory.not_ready_since
+        self.spent, self.spent_at, self.seen_first_at = memory.spent, memory.spent_at, memory.seen_first_at
+        self.learnt = LearntPatience()
+        self.learnt.recall(memory.players, memory.watched_at)
 
     def judge(
         self,

@@ -20,6 +20,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from zsched.core.scheduler.scoring import pick
+from zsched.core.values.decision import PlayerMemory
 from zsched.core.values.model import NodeId
 
 CHOICES = (0.05, 0.15, 0.5, 1.5)
@@ -75,6 +76,14 @@ class _Player:
             self.paid += MOVE_PRICE_S + SEEN_LATE_S * behind
             self.owner, self.spent, self.moved_at = best, 0.0, now
 
+    def memory(self) -> PlayerMemory:
+        moved_at = None if self.moved_at == -math.inf else self.moved_at
+        return PlayerMemory(owner=self.owner, spent=self.spent, paid=self.paid, moved_at=moved_at)
+
+    def recall(self, memory: PlayerMemory) -> None:
+        self.owner, self.spent, self.paid = memory.owner, memory.spent, memory.paid
+        self.moved_at = -math.inf if memory.moved_at is None else memory.moved_at
+
 
 class LearntPatience:
     """One task's patience at one robot."""
@@ -94,6 +103,16 @@ class LearntPatience:
         self._at = now
         for player in self._players if aggregates else ():
             player.play(aggregates, bonus, cool_down_s, now, gap_s)
+
+    def memory(self) -> tuple[tuple[PlayerMemory, ...], float | None]:
+        """(the choices as they stand, when they were last played)."""
+        return tuple([player.memory() for player in self._players]), self._at
+
+    def recall(self, players: tuple[PlayerMemory, ...], at: float | None) -> None:
+        """Go on from there."""
+        self._at = at
+        for player, memory in zip(self._players, players, strict=False):
+            player.recall(memory)
 
 
 def _rank(player: _Player) -> tuple[float, float]:

@@ -13,21 +13,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from random import Random
 
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.gateway.round_trips import RoundTrips
 from zsched.core.instructions import AskUtilities, RecordStory
 from zsched.core.scheduler.damping import Damping
-from zsched.core.scheduler.judge import Judge, Judgement, Outcome, escape_ahead, escape_reason
-from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts, Standing, book, compare, is_out, score
+from zsched.core.scheduler.decision import decide, rules_of, verdict_of
+from zsched.core.scheduler.judge import Judge, Judgement, Outcome
+from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts, Standing, book, is_out, score
 from zsched.core.scheduler.turns import Turn, in_turn, who_moves_first
 from zsched.core.todo import ToDo
+from zsched.core.values.decision import Decision, Figures, Need, Rules
 from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.messages import Utilities
-from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, TaskId, UtilityVector, WorkerState
-from zsched.core.values.quorum import majority, present_voters
+from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, TaskId, UtilityVector
 
 FRESH_MARGIN_S = 0.001
 """Sums of floats: a profile is certainly fresh until so long before its end."""
@@ -51,6 +52,9 @@ class TaskRound:
     """When this node learnt the current epoch."""
     is_called: bool = False
     is_called_escape: bool = False
+    rules: Rules = field(init=False)
+    figures: Figures | None = None
+    """What the last judgement went by."""
     standing: Standing | None = None
     judgement: Judgement | None = None
     judged_at: float = -math.inf
@@ -59,6 +63,9 @@ class TaskRound:
     is_waiting_its_turn: bool = False
     told: str = ""
     """The last decision written to the journal; the same one again is not."""
+
+    def __post_init__(self) -> None:
+        self.rules = rules_of(self.spec)
 
 
 class Rounds:
@@ -194,13 +201,12 @@ class Rounds:
             task = self.tasks[name]
             vectors = {
                 voter: vector
-                for voter, all_vectors in gathered.vectors.items()
+                for voter, all_vectors in sorted(gathered.vectors.items())
                 for vector in all_vectors
                 if vector.task == name
             }
             task.silent = tuple(voter for voter in self._fleet.voters if voter not in vectors)
-            task.standing = compare(task.spec, values[name], vectors)
-            proposal = self._judge(task, task.standing, values[name], states, todo, now)
+            proposal = self._judge(task, tuple(vectors.values()), values[name], states, todo, now)
             if proposal is not None:
                 yield proposal
 
@@ -209,38 +215,18 @@ class Rounds:
     def _judge(
         self,
         task: TaskRound,
-        standing: Standing,
+        vectors: tuple[UtilityVector, ...],
         allocation: Allocation,
         states: Mapping[NodeId, PeerState],
         todo: ToDo,
         now: float,
     ) -> Proposal | None:
-        is_called, is_called_escape = task.is_called, task.is_called_escape
-        task.is_called = task.is_called_escape = False
-        escape = self._escape(task, standing, allocation, states, is_called_escape, now)
-        needed = majority(len(self._fleet.voters))
-        if escape is not None:
-            needed = max(min(needed, majority(len(present_voters(self._fleet.voters, states)))), 1)
-        if standing.voters_heard < needed:
-            reason = f"utilities of {standing.voters_heard} robots, {needed} needed"
-            judgement = Judgement(outcome=Outcome.NONE, candidate=None, aggregate=0.0, reason=reason)
-        else:
-            task.judge.out = self._out(task.spec, now) if allocation.owner is None else frozenset()
-            judgement = task.judge.judge(
-                standing,
-                allocation,
-                settled_for_s=now - task.settled_at,
-                escape=escape,
-                is_called=is_called,
-                now=now,
-                damping=task.damping,
-            )
-        if escape is None:
-            judgement = self._look_ahead(task, judgement, allocation, now)
-        judgement = self._take_turn(task, judgement, allocation, is_called=is_called, now=now)
-        if not is_called:
-            judgement = self._spare(judgement, allocation, states)
-        task.judgement, task.judged_at = judgement, now
+        figures = self._figures(task, vectors, allocation, states, now)
+        is_called, task.is_called, task.is_called_escape = task.is_called, False, False
+        decided = decide(task.judge, task.damping, figures)
+        judgement = decided.judgement
+        task.standing, task.judgement, task.judged_at = decided.standing, judgement, now
+        task.figures, task.is_waiting_its_turn = figures, decided.is_waiting_its_turn
         self._tell(task, judgement, allocation, todo)
         if self._turns[task.spec.name].commit is not None:
             return None
@@ -261,86 +247,68 @@ class Rounds:
             reason=judgement.reason[:200],
         )
 
-    def _out(self, spec: TaskSpec, now: float) -> frozenset[NodeId]:
+    def _out(self, spec: TaskSpec, now: float) -> tuple[NodeId, ...]:
         """The candidates that say themselves that they cannot have the task now: they are not waited for."""
         profiles = ((name, self._gateway.fresh(name, now)) for name in spec.candidates)
-        return frozenset(name for name, profile in profiles if profile is not None and is_out(spec, profile))
+        return tuple([name for name, profile in profiles if profile is not None and is_out(spec, profile)])
 
-    def _look_ahead(self, task: TaskRound, judgement: Judgement, allocation: Allocation, now: float) -> Judgement:
-        """While an owner whose worker is not ready has its start-up deadline: say that, and when it will be left."""
-        since, owner = task.judge.not_ready_since, allocation.owner
-        if since is None or owner is None or judgement.outcome is Outcome.PROPOSE:
-            return judgement
-        profile, has_other = self._gateway.fresh(owner, now), any(name != owner for name in judgement.aggregates)
-        ahead = escape_ahead(task.spec, allocation, profile, now - since, has_other=has_other)
-        return replace(judgement, reason=f"{judgement.reason}; {ahead}") if ahead else judgement
-
-    def _take_turn(
-        self, task: TaskRound, judgement: Judgement, allocation: Allocation, *, is_called: bool, now: float
-    ) -> Judgement:
-        """A planned move waits while another task moves; the figures are read again before it is judged once more."""
-        task.is_waiting_its_turn = False
-        if judgement.outcome is not Outcome.PROPOSE or judgement.is_escape:
-            return judgement
-        first = who_moves_first(self._turns, task.spec.name, is_called=is_called, now=now)
-        if first is None:
-            return judgement
-        task.is_waiting_its_turn = True
-        return _put_off(judgement, allocation, f"{first} moves first")
-
-    def _spare(self, judgement: Judgement, allocation: Allocation, states: Mapping[NodeId, PeerState]) -> Judgement:
-        """What too few electors could agree to is not called for.
-
-        It would wait in the register for the very moment in which the network heals, and be committed then.
-        """
-        if judgement.outcome is not Outcome.PROPOSE:
-            return judgement
-        electors = self._fleet.electors
-        heard = sum(states[name] is not PeerState.GONE for name in electors)
-        if heard >= majority(len(electors)):
-            return judgement
-        return _put_off(judgement, allocation, f"{heard} of {len(electors)} electors heard")
-
-    def _escape(
+    def _figures(
         self,
         task: TaskRound,
-        standing: Standing,
+        vectors: tuple[UtilityVector, ...],
         allocation: Allocation,
         states: Mapping[NodeId, PeerState],
-        is_called_escape: bool,
         now: float,
-    ) -> str | None:
-        owner = allocation.owner
-        if owner is None:
+    ) -> Figures:
+        """Everything that the judgement goes by, read once."""
+        name, owner, is_called = task.spec.name, allocation.owner, task.is_called
+        profile = None if owner is None else self._gateway.fresh(owner, now)
+        if owner is not None:
+            self._gateway.learn_demand(name, owner, now)
+        return Figures(
+            task=name,
+            now=now,
+            rules=task.rules,
+            allocation=allocation,
+            voters=self._fleet.voters,
+            present=tuple([voter for voter in self._fleet.voters if states[voter] is not PeerState.GONE]),
+            vectors=vectors,
+            electors=self._fleet.electors,
+            electors_heard=tuple([one for one in self._fleet.electors if states[one] is not PeerState.GONE]),
+            settled_for_s=now - task.settled_at,
+            owner_state=PeerState.GONE if owner is None else states.get(owner, PeerState.GONE),
+            owner_profile=profile,
+            is_called=is_called,
+            is_called_escape=task.is_called_escape,
+            out=self._out(task.spec, now) if owner is None else (),
+            first=who_moves_first(self._turns, name, is_called=is_called, now=now),
+            judge=task.judge.memory(),
+            damping=task.damping.memory(),
+        )
+
+    def decision(self, name: TaskId, now: float) -> Decision | None:
+        """The last judgement with all its figures; ``None`` before the first."""
+        task = self.tasks[name]
+        if task.figures is None or task.judgement is None:
             return None
-        state = states.get(owner, PeerState.GONE)
-        if state is PeerState.SUSPECT and not is_called_escape:
-            state = PeerState.ALIVE  # in grace; only a peer's word makes our own suspicion enough
-        profile = self._gateway.fresh(owner, now)
-        self._gateway.learn_demand(task.spec.name, owner, now)
-        not_ready_for = self._not_ready_for(task, owner, now)
-        return escape_reason(task.spec, allocation, state, profile, standing, not_ready_for)
+        needs = []
+        for candidate in task.spec.candidates:
+            profile = self._gateway.fresh(candidate, now)
+            if profile is not None:
+                need = self._gateway.demand(task.spec, profile)
+                needs.append(Need(candidate=candidate, cpu_cores=need.cpu_cores, memory_mb=need.memory_mb))
+        return Decision(figures=task.figures, verdict=verdict_of(task.judgement), needs=tuple(needs))
 
-    def _not_ready_for(self, task: TaskRound, owner: NodeId, now: float) -> float:
-        """For how long the owner's worker was heard not to be ready; who is not heard says nothing about it."""
-        profile = self._gateway.fresh(owner, now)
-        load = None if profile is None else profile.worker(task.spec.name)
-        if profile is None or (load is not None and load.state is WorkerState.READY):
-            task.judge.not_ready_since = None
-            return 0.0
-        if task.judge.not_ready_since is None:
-            task.judge.not_ready_since = now
-        return now - task.judge.not_ready_since
-
-    @staticmethod
-    def _tell(task: TaskRound, judgement: Judgement, allocation: Allocation, todo: ToDo) -> None:
+    def _tell(self, task: TaskRound, judgement: Judgement, allocation: Allocation, todo: ToDo) -> None:
         text = f"{judgement.outcome} {judgement.candidate or '-'}"
         if text == task.told:
             return
         task.told = text
         scores = " ".join(f"{name}={value:.3f}" for name, value in sorted(judgement.aggregates.items()))
         told = f"{text}: {judgement.reason} [{scores}]"
-        todo.add(RecordStory(stage="scheduler", text=told, task=task.spec.name, epoch=allocation.epoch))
+        name = task.spec.name
+        decision = self.decision(name, task.judged_at)
+        todo.add(RecordStory(stage="scheduler", text=told, task=name, epoch=allocation.epoch, decision=decision))
 
     # --- what the later stages tell ------------------------------------------------------------------------------
 
@@ -380,15 +348,3 @@ class Rounds:
         if any(other.is_waiting_its_turn for other in self.tasks.values()):
             self.hurry(now)
 
-
-def _put_off(judgement: Judgement, allocation: Allocation, why: str) -> Judgement:
-    """The same judgement, without the move."""
-    owner = allocation.owner
-    return replace(
-        judgement,
-        outcome=Outcome.WAIT,
-        candidate=owner,
-        aggregate=judgement.aggregates.get(owner, 0.0) if owner is not None else 0.0,
-        reason=f"{judgement.reason}; {why}",
-        is_escape=False,
-    )

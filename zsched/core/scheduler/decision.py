@@ -1,0 +1,178 @@
+"""SCHEDULER: one judgement from its figures, in the whole order of docs/design/scheduling.md.
+
+Knows: the order of a judgement's steps. Does not know: where the figures come from (`zsched.core.scheduler.rounds`),
+what becomes of the judgement, files.
+
+`decide` is what a robot runs in every round, and what `zsched replay` runs on figures that were written down: the same
+figures give the same judgement, bit for bit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from zsched.core.scheduler.damping import Damping
+from zsched.core.scheduler.judge import Judge, Judgement, Outcome, escape_ahead, escape_reason
+from zsched.core.scheduler.scoring import Standing, compare
+from zsched.core.values.decision import Figures, Rules, Verdict
+from zsched.core.values.fleet import TaskSpec, WorkerSpec
+from zsched.core.values.model import Allocation, PeerState, WorkerState
+from zsched.core.values.quorum import majority
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Decided:
+    """The result of one judgement."""
+
+    standing: Standing
+    judgement: Judgement
+    is_waiting_its_turn: bool = False
+    """A planned move that another task's move holds back."""
+
+
+def decide(judge: Judge, damping: Damping, figures: Figures) -> Decided:
+    """Judge by ``figures``; ``judge`` and ``damping`` hold the memory of which the figures have a copy."""
+    allocation = figures.allocation
+    standing = compare(judge.spec, allocation, {vector.voter: vector for vector in figures.vectors})
+    escape = _escape(judge, standing, figures)
+    needed = robots_needed(figures, is_escape=escape is not None)
+    if standing.voters_heard < needed:
+        reason = f"utilities of {standing.voters_heard} robots, {needed} needed"
+        judgement = Judgement(outcome=Outcome.NONE, candidate=None, aggregate=0.0, reason=reason)
+    else:
+        judge.out = frozenset(figures.out)
+        judgement = judge.judge(
+            standing,
+            allocation,
+            settled_for_s=figures.settled_for_s,
+            escape=escape,
+            is_called=figures.is_called,
+            now=figures.now,
+            damping=damping,
+        )
+    if escape is None:
+        judgement = _look_ahead(judge, judgement, figures)
+    is_planned = judgement.outcome is Outcome.PROPOSE and not judgement.is_escape
+    is_waiting = is_planned and figures.first is not None
+    if is_waiting:
+        # the figures are read again before it is judged once more
+        judgement = _put_off(judgement, allocation, f"{figures.first} moves first")
+    if not figures.is_called:
+        judgement = _spare(judgement, figures)
+    return Decided(standing=standing, judgement=judgement, is_waiting_its_turn=is_waiting)
+
+
+def decide_again(figures: Figures) -> Decided:
+    """The judgement of figures that were written down."""
+    spec = spec_of(figures)
+    judge = Judge(spec=spec)
+    judge.recall(figures.judge)
+    return decide(judge, Damping.of(figures.damping), figures)
+
+
+def rules_of(spec: TaskSpec) -> Rules:
+    """The settings by which a task is judged."""
+    return Rules(
+        candidates=spec.candidates,
+        reach=spec.reach,
+        memory_floor_ratio=spec.memory_floor_ratio,
+        max_moves_per_minute=spec.max_moves_per_minute,
+        patience=spec.patience,
+        learns_patience=spec.learns_patience,
+        start_deadline_s=spec.worker.start_deadline_s,
+        has_command=bool(spec.worker.command),
+    )
+
+
+def spec_of(figures: Figures) -> TaskSpec:
+    """A task of the fleet file, as far as a judgement goes by it."""
+    rules = figures.rules
+    return TaskSpec(
+        name=figures.task,
+        candidates=rules.candidates,
+        tuning=figures.allocation.tuning,
+        reach=rules.reach,
+        memory_floor_ratio=rules.memory_floor_ratio,
+        max_moves_per_minute=rules.max_moves_per_minute,
+        patience=rules.patience,
+        learns_patience=rules.learns_patience,
+        worker=WorkerSpec(command=("",) if rules.has_command else (), start_deadline_s=rules.start_deadline_s),
+    )
+
+
+def verdict_of(judgement: Judgement) -> Verdict:
+    """A judgement as a plain value."""
+    return Verdict(
+        outcome=judgement.outcome.value,
+        candidate=judgement.candidate,
+        aggregate=judgement.aggregate,
+        reason=judgement.reason,
+        is_escape=judgement.is_escape,
+        aggregates=tuple(sorted(judgement.aggregates.items())),
+    )
+
+
+def robots_needed(figures: Figures, *, is_escape: bool) -> int:
+    """How many robots' utilities a decision needs; for an escape a majority of those that are not gone."""
+    needed = majority(len(figures.voters))
+    return max(min(needed, majority(len(figures.present))), 1) if is_escape else needed
+
+
+def _escape(judge: Judge, standing: Standing, figures: Figures) -> str | None:
+    allocation, profile = figures.allocation, figures.owner_profile
+    if allocation.owner is None:
+        return None
+    state = figures.owner_state
+    if state is PeerState.SUSPECT and not figures.is_called_escape:
+        state = PeerState.ALIVE  # in grace; only a peer's word makes our own suspicion enough
+    not_ready_for = _not_ready_for(judge, figures)
+    return escape_reason(judge.spec, allocation, state, profile, standing, not_ready_for)
+
+
+def _not_ready_for(judge: Judge, figures: Figures) -> float:
+    """For how long the owner's worker was heard not to be ready; who is not heard says nothing about it."""
+    profile, now = figures.owner_profile, figures.now
+    load = None if profile is None else profile.worker(figures.task)
+    if profile is None or (load is not None and load.state is WorkerState.READY):
+        judge.not_ready_since = None
+        return 0.0
+    if judge.not_ready_since is None:
+        judge.not_ready_since = now
+    return now - judge.not_ready_since
+
+
+def _look_ahead(judge: Judge, judgement: Judgement, figures: Figures) -> Judgement:
+    """While an owner whose worker is not ready has its start-up deadline: say that, and when it will be left."""
+    since, allocation = judge.not_ready_since, figures.allocation
+    if since is None or allocation.owner is None or judgement.outcome is Outcome.PROPOSE:
+        return judgement
+    has_other = any(name != allocation.owner for name in judgement.aggregates)
+    not_ready_s = figures.now - since
+    ahead = escape_ahead(judge.spec, allocation, figures.owner_profile, not_ready_s, has_other=has_other)
+    return replace(judgement, reason=f"{judgement.reason}; {ahead}") if ahead else judgement
+
+
+def _spare(judgement: Judgement, figures: Figures) -> Judgement:
+    """What too few electors could agree to is not called for.
+
+    It would wait in the register for the very moment in which the network heals, and be committed then.
+    """
+    if judgement.outcome is not Outcome.PROPOSE:
+        return judgement
+    electors, heard = figures.electors, len(figures.electors_heard)
+    if heard >= majority(len(electors)):
+        return judgement
+    return _put_off(judgement, figures.allocation, f"{heard} of {len(electors)} electors heard")
+
+
+def _put_off(judgement: Judgement, allocation: Allocation, why: str) -> Judgement:
+    """The same judgement, without the move."""
+    owner = allocation.owner
+    return replace(
+        judgement,
+        outcome=Outcome.WAIT,
+        candidate=owner,
+        aggregate=judgement.aggregates.get(owner, 0.0) if owner is not None else 0.0,
+        reason=f"{judgement.reason}; {why}",
+        is_escape=False,
+    )

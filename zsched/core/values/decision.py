@@ -1,0 +1,155 @@
+"""One judgement of one task with every figure that it went by: what `zsched explain` shows and `zsched replay` repeats.
+
+Knows: the fields. Does not know: how a judgement comes about (`zsched.core.scheduler.decision`), text, files.
+
+All of it is plain, so that it can travel and be written down without loss. Times are the deciding node's monotonic
+seconds, because the judgement itself goes by them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from zsched.core.values.fleet import Reach
+from zsched.core.values.model import Allocation, NodeId, PeerState, Profile, TaskId, UtilityVector
+from zsched.core.values.snapshot import VoteStatus
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rules:
+    """The settings of the fleet file by which a task is judged; what can be tuned stands in its allocation."""
+
+    candidates: tuple[NodeId, ...]
+    reach: Reach
+    memory_floor_ratio: float
+    max_moves_per_minute: int
+    patience: float
+    learns_patience: bool
+    start_deadline_s: float
+    has_command: bool
+    """Whether zsched starts the worker."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlayerMemory:
+    """One patience that is played, in the order of the choices (`zsched.core.scheduler.patience`)."""
+
+    owner: NodeId | None = None
+    spent: float = 0.0
+    paid: float = 0.0
+    moved_at: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JudgeMemory:
+    """The memory that a judgement begins with (`zsched.core.scheduler.judge.Judge`)."""
+
+    unscored_since: float | None = None
+    not_ready_since: float | None = None
+    spent: float = 0.0
+    spent_at: float | None = None
+    seen_first_at: float | None = None
+    players: tuple[PlayerMemory, ...] = ()
+    watched_at: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DampingMemory:
+    """The record of moves that a judgement begins with (`zsched.core.scheduler.damping.Damping`)."""
+
+    points: tuple[tuple[NodeId, float, float], ...] = ()
+    """(node, points, when), sorted."""
+    moves: tuple[tuple[float, bool], ...] = ()
+    """(when, whether it was an escape), oldest first."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Figures:
+    """Everything that one judgement of one task at one robot goes by."""
+
+    task: TaskId
+    now: float
+    rules: Rules
+    allocation: Allocation
+    """The value in force, with its tuning."""
+    voters: tuple[NodeId, ...]
+    """All robots of the fleet file."""
+    present: tuple[NodeId, ...]
+    """Those that are not gone."""
+    vectors: tuple[UtilityVector, ...]
+    """Of the robots that have answered in time, sorted."""
+    electors: tuple[NodeId, ...]
+    electors_heard: tuple[NodeId, ...]
+    settled_for_s: float
+    """Since when this robot knows the owner."""
+    owner_state: PeerState = PeerState.UNKNOWN
+    owner_profile: Profile | None = None
+    """The owner's newest fresh profile."""
+    is_called: bool = False
+    is_called_escape: bool = False
+    out: tuple[NodeId, ...] = ()
+    """Candidates that a first placement does not wait for."""
+    first: TaskId | None = None
+    """The other task that moves first."""
+    judge: JudgeMemory = JudgeMemory()
+    damping: DampingMemory = DampingMemory()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verdict:
+    """A judgement as a plain value; ``aggregates`` with bonus and penalties, sorted."""
+
+    outcome: str
+    candidate: NodeId | None
+    aggregate: float
+    reason: str
+    is_escape: bool = False
+    aggregates: tuple[tuple[NodeId, float], ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Need:
+    """What the task would use on one candidate, by the deciding robot's figures (cores, MiB)."""
+
+    candidate: NodeId
+    cpu_cores: float
+    memory_mb: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Decision:
+    """A judgement with its figures."""
+
+    figures: Figures
+    verdict: Verdict
+    needs: tuple[Need, ...] = ()
+    """Of the candidates with a fresh profile."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Move:
+    """A change of owner that a node has learnt."""
+
+    epoch: int
+    revision: int
+    left: NodeId | None
+    owner: NodeId | None
+    reason: str
+    votes: tuple[tuple[NodeId, NodeId], ...] = ()
+    """(voter, candidate) of the vote that led to it, as far as this node heard it; edges hear none."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Explanation:
+    """A node's answer about the last judgement of one task."""
+
+    node: NodeId
+    kind: str
+    task: TaskId
+    allocation: Allocation
+    robots: tuple[NodeId, ...]
+    """That are alive: on an edge, whom to ask instead."""
+    decision: Decision | None = None
+    """``None``: an edge, or no round yet."""
+    age_s: float = 0.0
+    vote: VoteStatus | None = None
