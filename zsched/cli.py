@@ -240,6 +240,30 @@ def status(
 
 
 @app.command(cls=Verb)
+def explain(
+    task: Annotated[str, typer.Argument(metavar="TASK", help="A task of the fleet file.")],
+    plan: Annotated[
+        str | None, typer.Option("--plan", metavar="NODE=down", help="Reckon again without that node; 10: it moves.")
+    ] = None,
+    json_: JsonOption = False,
+    node: AskedOption = None,
+    runtime_dir: RuntimeOption = None,
+    no_color: Annotated[bool, typer.Option("--no-color", help="Plain text (also: NO_COLOR).")] = False,
+) -> None:
+    """Show a robot's last judgement of a task with all its figures, and what would have to change for a move.
+
+    On an edge, which decides nothing, a robot is asked in its place.
+    """
+    from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.common import wants_color  # noqa: PLC0415 - as above
+    from zsched.commands.explain import ExplainView  # noqa: PLC0415 - as above
+    from zsched.commands.explain import explain as ask_why  # noqa: PLC0415 - as above
+
+    view = ExplainView(plan=plan, is_json=json_, is_colored=wants_color(no_color))
+    raise typer.Exit(ask_why(find_door(runtime_dir, node), task, view))
+
+
+@app.command(cls=Verb)
 def weights(
     task: Annotated[str, typer.Argument(metavar="TASK", help="A task of the fleet file.")],
     pairs: Annotated[

@@ -16,6 +16,8 @@ EXIT_UNREACHABLE: Final = 3
 EXIT_DEGRADED: Final = 4
 """It answers, and the fleet has no quorum, or a task no live owner."""
 EXIT_TIMED_OUT: Final = 5
+EXIT_WOULD_CHANGE: Final = 10
+"""A plan was asked for, and by it something would change."""
 EXIT_NAME_TAKEN: Final = 75
 """EX_TEMPFAIL of sysexits.h: another machine has this name; trying again may help."""
 EXIT_CONFIG: Final = 78

@@ -13,6 +13,7 @@ from zsched.core.values.messages import (
     Accept,
     Accepted,
     Command,
+    ExplainTask,
     Learnt,
     Prepare,
     Promise,
@@ -340,6 +341,14 @@ class RetryCommanded:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ExplanationAsked:
+    """An operator asks for this node's last judgement of a task."""
+
+    request: int
+    command: ExplainTask
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FrameDropped:
     """A frame came that is invalid or not for us: only a counter rises."""
 
@@ -391,6 +400,7 @@ Event = (
     | StatusAsked
     | WeightsCommanded
     | RetryCommanded
+    | ExplanationAsked
     | FrameDropped
     | ProblemReported
     | StopRequested
@@ -399,6 +409,8 @@ Event = (
 
 def commanded(request: int, command: Command) -> Event:
     """The event of an operator's command."""
+    if isinstance(command, ExplainTask):
+        return ExplanationAsked(request=request, command=command)
     if isinstance(command, RetryTask):
         return RetryCommanded(request=request, command=command)
     return WeightsCommanded(request=request, command=command)

@@ -19,7 +19,7 @@ Json = dict[str, Any]
 
 def snapshot_json(snapshot: Snapshot) -> Json:
     """The status as JSON values; pairs become objects, ``None`` becomes null, times are ages in seconds."""
-    body = _plain(snapshot)
+    body = plain(snapshot)
     body["counters"] = dict(snapshot.counters)
     for task, status in zip(body["tasks"], snapshot.tasks, strict=True):
         task["decision"] = None if status.decision is None else _decision(status.decision)
@@ -31,7 +31,7 @@ def snapshot_json(snapshot: Snapshot) -> Json:
 
 def _decision(decision: DecisionStatus) -> Json:
     return {
-        **_plain(decision),
+        **plain(decision),
         "aggregates": dict(decision.aggregates),
         "utilities": {voter: {u.candidate: _utility(u) for u in column} for voter, column in decision.utilities},
         "vetoed": dict(decision.vetoed),
@@ -40,25 +40,25 @@ def _decision(decision: DecisionStatus) -> Json:
 
 
 def _utility(utility: Utility) -> Json:
-    body: Json = _plain(utility)
+    body: Json = plain(utility)
     del body["candidate"]
     return body
 
 
 def _vote(vote: VoteStatus) -> Json:
-    return {**_plain(vote), "votes": dict(vote.votes)}
+    return {**plain(vote), "votes": dict(vote.votes)}
 
 
 def _stream(count: StreamCount) -> Json:
-    return {**_plain(count), "drops": dict(count.drops)}
+    return {**plain(count), "drops": dict(count.drops)}
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """A frozen value as JSON values, field by field."""
     if is_dataclass(value) and not isinstance(value, type):
-        return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
+        return {field.name: plain(getattr(value, field.name)) for field in fields(value)}
     if isinstance(value, tuple):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if isinstance(value, Enum):
         return value.value
     return value

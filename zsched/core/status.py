@@ -13,6 +13,7 @@ from zsched.core.executor.handover import Executor, Phase
 from zsched.core.scheduler.rounds import TaskRound
 from zsched.core.scheduler.scoring import joined
 from zsched.core.stages import Stages, Unready
+from zsched.core.values.decision import Explanation
 from zsched.core.values.fleet import NodeSpec, TaskSpec
 from zsched.core.values.model import (
     NEVER_INITIALISED,
@@ -20,6 +21,7 @@ from zsched.core.values.model import (
     Allocation,
     NodeId,
     PeerState,
+    TaskId,
     WorkerLoad,
     WorkerState,
     told_of_worker,
@@ -71,6 +73,21 @@ def build_snapshot(node: Stages, now: float) -> Snapshot:
             *_relay_problems(node, now),
             *node.knocking.problems(now, node.fleet_path),
         ),
+    )
+
+
+def build_explanation(node: Stages, task: TaskId, now: float) -> Explanation:
+    """What this node knows of the last judgement of ``task``; on an edge, which robots to ask."""
+    states = node.membership.states()
+    return Explanation(
+        node=node.me,
+        kind=node.kind.value,
+        task=task,
+        allocation=node.registers[task].value,
+        robots=tuple(name for name in node.fleet.voters if states[name] is PeerState.ALIVE),
+        decision=node.rounds.decision(task, now),
+        age_s=max(now - node.rounds.tasks[task].judged_at, 0.0) if node.rounds.tasks[task].judgement else 0.0,
+        vote=_vote(node.votes.tasks[task], now),
     )
 
 

@@ -33,12 +33,14 @@ from zsched.core.relay_protocol import (
     WorkerTrouble,
 )
 from zsched.core.report import snapshot_json
+from zsched.core.values.decision import Explanation
 from zsched.core.values.fleet import Fleet
-from zsched.core.values.messages import Command, CommandResult, RetryTask, SetWeights
+from zsched.core.values.messages import Command, CommandResult, ExplainTask, RetryTask, SetWeights
 from zsched.core.values.model import NAME, NodeId
 from zsched.core.values.snapshot import Snapshot
 from zsched.errors import AdapterError, WireError
 from zsched.runtime.crew import Crew
+from zsched.wire import codec as wire
 
 INBOX_LIMIT = 20_000
 WAITING_LIMIT = 64
@@ -113,7 +115,7 @@ class Desk:
         self._lock = threading.Lock()
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Answer one request of the socket (``status``, ``weights``, ``retry``, ``access``).
+        """Answer one request of the socket (``status``, ``explain``, ``weights``, ``retry``, ``access``).
 
         With ``node``: what another node answers.
         """
@@ -132,7 +134,7 @@ class Desk:
             return self._ask(node, command)
         if verb == "access" and self._access is not None:
             return self._access(node)
-        return {"error": f"unknown verb {verb!r:.80}; known: access, retry, status, weights"}
+        return {"error": f"unknown verb {verb!r:.80}; known: access, explain, retry, status, weights"}
 
     def _ask(self, node: NodeId, command: Command | None) -> dict[str, Any]:
         if node != self._node:
@@ -175,12 +177,22 @@ def _retry_of(request: dict[str, Any]) -> RetryTask:
     return RetryTask(task=str(request["task"]), node=str(request.get("whose") or ""))
 
 
-_COMMANDS: dict[str, Callable[[dict[str, Any]], Command]] = {"weights": _weights_of, "retry": _retry_of}
+def _explain_of(request: dict[str, Any]) -> ExplainTask:
+    return ExplainTask(task=str(request["task"]))
+
+
+_COMMANDS: dict[str, Callable[[dict[str, Any]], Command]] = {
+    "weights": _weights_of,
+    "retry": _retry_of,
+    "explain": _explain_of,
+}
 
 
 def _as_json(value: object) -> dict[str, Any]:
     if isinstance(value, Snapshot):
         return snapshot_json(value)
+    if isinstance(value, Explanation):
+        return {"explanation": wire.as_plain(value)}
     assert isinstance(value, CommandResult)
     return {"outcome": value.outcome.value, "detail": value.detail, "revision": value.revision}
 
@@ -272,6 +284,8 @@ class Shell:
                 self._answer_operator(request, snapshot)
             case do.AnswerCommand(request=request, result=result):
                 self._answer_operator(request, result)
+            case do.AnswerExplanation(request=request, explanation=explanation):
+                self._answer_operator(request, explanation)
             case do.ApplyRoutes(plan=plan):
                 self._streams().apply(plan)
             case do.SetRole(role=role):

@@ -22,7 +22,7 @@ from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 import msgpack
 
 from zsched.core.membership.beat_room import MAX_BEAT_BYTES
-from zsched.core.values import durable, messages, model, plan, snapshot
+from zsched.core.values import decision, durable, messages, model, plan, snapshot
 from zsched.errors import WireError
 
 VERSION = 1
@@ -47,6 +47,8 @@ KINDS: dict[str, tuple[type, int]] = {
     "learnt": (messages.Learnt, LARGE),
     "set_weights": (messages.SetWeights, SMALL),
     "retry_task": (messages.RetryTask, SMALL),
+    "explain_task": (messages.ExplainTask, SMALL),
+    "explanation": (decision.Explanation, LARGE),
     "command_result": (messages.CommandResult, SMALL),
     "status": (snapshot.Snapshot, LARGE),
     "state": (durable.DurableState, LARGE),
@@ -335,6 +337,30 @@ def _read_body(cls: type[T], body: Any, size: int) -> T:
     try:
         reader, _ = _CODECS.get(cls) or _codec(cls)
         value: T = reader(body)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise WireError("range", str(error)[:200]) from error
+    return value
+
+
+# --- without a frame: what is written as JSON ---------------------------------------------------------------------
+
+
+def as_plain(value: object) -> Any:
+    """Lists, maps, strings and numbers, which JSON can hold without loss; fields at their default are left out.
+
+    The value's class need not be in `KINDS`.
+    """
+    return _codec(type(value))[1](value)
+
+
+def from_plain(body: Any, cls: type[T]) -> T:
+    """The value again.
+
+    Raises:
+        WireError: as `decode`.
+    """
+    try:
+        value: T = _codec(cls)[0](body)
     except (ValueError, TypeError, OverflowError) as error:
         raise WireError("range", str(error)[:200]) from error
     return value

@@ -5,6 +5,7 @@ Knows: what must hold, over all nodes and all their lives. Does not know: what h
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -13,6 +14,8 @@ from itertools import pairwise
 from zsched.core import instructions as do
 from zsched.core.executor.handover import Phase
 from zsched.core.scheduler.damping import ESCAPES_PER_MINUTE, WINDOW_S
+from zsched.core.scheduler.decision import decide_again, verdict_of
+from zsched.core.values.decision import Decision
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import Accepted, Promise
@@ -30,6 +33,7 @@ from zsched.core.values.model import (
 from zsched.core.values.plan import Role, RoutePlan, WorkerRole
 from zsched.core.vote.belief import GENERATION_STEP
 from zsched.errors import InvariantError
+from zsched.wire.codec import as_plain, from_plain
 from zsched_lab.sim.history import Checker, Learnt, Record, Routed, Started, Stored, Worked
 from zsched_lab.sim.parts import Machine
 
@@ -343,3 +347,11 @@ def _misjudged_electors(running: list[Machine]) -> str:
                     f"{machine.key} counts {elector.name} {'in' if is_apart else 'out'}; its electorate says otherwise"
                 )
     return ""
+
+
+def check_replayed(who: str, decision: Decision) -> None:
+    """Raise `InvariantError` unless a judgement that was written down as JSON is made again, bit for bit."""
+    written = from_plain(json.loads(json.dumps(as_plain(decision))), Decision)
+    again = verdict_of(decide_again(written.figures).judgement)
+    if again != decision.verdict:
+        raise InvariantError(f"{who} judged {decision.verdict}, and by the same figures again {again}")

@@ -25,7 +25,7 @@ from zsched.core.values.plan import RoutePlan
 from zsched.core.vote.generations import blank_state
 from zsched.errors import InvariantError, WireError
 from zsched.wire import codec as wire
-from zsched_lab.sim.checks import Invariants, are_same, unsettled
+from zsched_lab.sim.checks import Invariants, are_same, check_replayed, unsettled
 from zsched_lab.sim.clocks import LOOK_S, awake
 from zsched_lab.sim.links import Links
 from zsched_lab.sim.loops import TICK_S
@@ -374,7 +374,11 @@ class Simulator(Links):
                 self.answers.append(instruction)
             case do.AnswerStatus(snapshot=snapshot):
                 wire.encode(snapshot)
+            case do.AnswerExplanation(explanation=explanation):
+                wire.encode(explanation)
             case do.RecordStory():
+                if instruction.decision is not None:
+                    check_replayed(me.key, instruction.decision)
                 where = f"{instruction.task}#{instruction.epoch} " if instruction.task else ""
                 self.stories.append(f"{self.now:9.3f} {me.key} {instruction.stage} {where}{instruction.text}")
             case do.StandDown():

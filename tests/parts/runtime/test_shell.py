@@ -23,6 +23,7 @@ from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.relay_protocol import RelayStarted, WorkerSeen
+from zsched.core.values.decision import Explanation
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import WorkerSpec
 from zsched.core.values.messages import (
@@ -52,6 +53,7 @@ LEARNT = Learnt(node="robot1", values=(VALUE,))
 UTILITIES = Utilities(voter="robot1", vectors=())
 ANSWER = Accepted(elector="robot1", task="merge", ballot=BALLOT)
 RESULT = CommandResult(outcome=CommandOutcome.OK, detail="done", revision=4)
+EXPLANATION = Explanation(node="edge1", kind="edge", task="merge", allocation=VALUE, robots=("robot1",))
 PLAN = RoutePlan(task="merge", phase=RoutePhase.CLOSE, current=None)
 ROLE = Role(task="merge", role=WorkerRole.IDLE)
 STATE = state_of("robot1", fleet="f", incarnation=3)
@@ -119,6 +121,7 @@ EVERY: dict[do.Instruction, tuple[Any, ...]] = {
     do.AnswerElection(request=2, answer=ANSWER): ("answer", 2, ANSWER),
     do.AnswerLearnt(request=3, learnt=LEARNT): ("answer", 3, LEARNT),
     do.AnswerCommand(request=4, result=RESULT): ("answer", 4, RESULT),
+    do.AnswerExplanation(request=5, explanation=EXPLANATION): ("answer", 5, EXPLANATION),
     do.StartWorker(task="merge"): ("start", "merge"),
     do.StopWorker(task="merge"): ("stop", "merge"),
     do.RestartWorker(task="merge", reason="no output"): ("report_hung", "merge", 0, "no output"),
@@ -320,7 +323,7 @@ def test_relays_other_reports_are_events_as_they_are(house: House) -> None:
 def test_desk_refuses_what_is_no_request(house: House) -> None:
     weights = {"verb": "weights", "task": "merge", "cpu": 1, "memory": 0, "network": 0}
     for request, says in (
-        ({"verb": "fly"}, "unknown verb 'fly'; known: access, retry, status, weights"),
+        ({"verb": "fly"}, "unknown verb 'fly'; known: access, explain, retry, status, weights"),
         ({"verb": "retry"}, "retry: 'task' is missing"),
         ({"verb": "retry", "task": "merge", "whose": "No Name"}, "retry: retry.node: 'No Name' is not a name"),
         ({"verb": "status", "node": 5}, "node: 5 is not a name"),

@@ -19,11 +19,13 @@ import zenoh
 from zsched.adapters.network.open_questions import Questions
 from zsched.core import events as ev
 from zsched.core.events import commanded
+from zsched.core.values.decision import Explanation
 from zsched.core.values.messages import (
     Accept,
     Accepted,
     Command,
     CommandResult,
+    ExplainTask,
     Learnt,
     Prepare,
     Promise,
@@ -250,7 +252,7 @@ class ControlBus:
         if kind == "status":
             return ev.StatusAsked(request=self._questions.keep(query, keys.status(node, asker)))
         if kind == "command":
-            command: Any = wire.decode(payload, SetWeights, RetryTask)
+            command: Any = wire.decode(payload, SetWeights, RetryTask, ExplainTask)
             return commanded(self._questions.keep(query, keys.command(node, asker)), command)
         raise WireError("key", "unknown kind")
 
@@ -363,8 +365,8 @@ class ControlBus:
 
     # --- for operators (a thread of their own) -----------------------------------------------------------------------
 
-    def ask_node(self, node: NodeId, command: Command | None) -> Snapshot | CommandResult:
-        """Ask another node for its status, or give it a command; blocks up to 3 s, never called from the loop.
+    def ask_node(self, node: NodeId, command: Command | None) -> Snapshot | CommandResult | Explanation:
+        """Ask another node for its status or an answer, or give it a command; blocks up to 3 s, never in the loop.
 
         Raises:
             AdapterError: it did not answer.
@@ -375,7 +377,7 @@ class ControlBus:
             selector, payload = self._keys.status(node, self._node), None
         else:
             selector, payload = self._keys.command(node, self._node), wire.encode(command)
-        kind: type[Snapshot | CommandResult] = Snapshot if command is None else CommandResult
+        kinds: tuple[type[Any], ...] = (Snapshot,) if command is None else (CommandResult, Explanation)
         for reply in self._session.get(
             selector,
             payload=payload,
@@ -385,7 +387,8 @@ class ControlBus:
             if reply.ok is None:
                 continue
             try:
-                return wire.decode(reply.ok.payload.to_bytes(), kind)
+                answer: Snapshot | CommandResult | Explanation = wire.decode(reply.ok.payload.to_bytes(), *kinds)
             except WireError as error:
                 raise AdapterError(f"{node} answered something else ({error}); is it another version?") from error
+            return answer
         raise AdapterError(f"{node} did not answer within {OPERATOR_TIMEOUT_S:g} s; is it up and reachable?")

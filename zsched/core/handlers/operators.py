@@ -1,4 +1,4 @@
-"""Operators at the door: status, a task's weights, failures to forget, and the order to stop.
+"""Operators at the door: status, explanations, a task's weights, failures to forget, and the order to stop.
 
 Knows: which stage each command concerns. Does not know: how the status is put together (`zsched.core.status`), how a
 change is agreed.
@@ -12,7 +12,7 @@ from typing import Any, Final
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.stages import Handler, Stages
-from zsched.core.status import build_snapshot
+from zsched.core.status import build_explanation, build_snapshot
 from zsched.core.todo import ToDo
 from zsched.core.values.fleet import runs_worker
 from zsched.core.values.messages import CommandOutcome, CommandResult
@@ -55,6 +55,16 @@ def _forgiven(node: Stages, whose: NodeId) -> str:
     return f"takes no penalty off {whose or 'any candidate'} any more"
 
 
+def _on_explanation(node: Stages, event: ev.ExplanationAsked, todo: ToDo, now: float) -> None:
+    task = event.command.task
+    if task not in node.executors:
+        detail = f"no task {task!r}; there are {', '.join(node.executors)}"
+        result = CommandResult(outcome=CommandOutcome.INVALID, detail=detail)
+        todo.add(do.AnswerCommand(request=event.request, result=result))
+    else:
+        todo.add(do.AnswerExplanation(request=event.request, explanation=build_explanation(node, task, now)))
+
+
 def _on_dropped(node: Stages, event: ev.FrameDropped, _todo: ToDo, _now: float) -> None:
     node.counters[f"dropped_{event.kind}_{event.reason}"] += 1
 
@@ -73,6 +83,7 @@ HANDLERS: Final[Mapping[type[Any], Handler]] = {
     ev.StatusAsked: _on_status,
     ev.WeightsCommanded: _on_weights,
     ev.RetryCommanded: _on_retry,
+    ev.ExplanationAsked: _on_explanation,
     ev.FrameDropped: _on_dropped,
     ev.ProblemReported: _on_problem,
     ev.StopRequested: _on_stop,

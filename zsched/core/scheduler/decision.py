@@ -26,6 +26,13 @@ class Decided:
 
     standing: Standing
     judgement: Judgement
+    escape: str | None
+    """Why the owner is to be left at once."""
+    needed: int
+    """How many robots' utilities this decision needs."""
+    spent: float
+    """What staying has cost by now, of the patience."""
+    patience: float
     is_waiting_its_turn: bool = False
     """A planned move that another task's move holds back."""
 
@@ -35,7 +42,7 @@ def decide(judge: Judge, damping: Damping, figures: Figures) -> Decided:
     allocation = figures.allocation
     standing = compare(judge.spec, allocation, {vector.voter: vector for vector in figures.vectors})
     escape = _escape(judge, standing, figures)
-    needed = robots_needed(figures, is_escape=escape is not None)
+    needed = _robots_needed(figures, is_escape=escape is not None)
     if standing.voters_heard < needed:
         reason = f"utilities of {standing.voters_heard} robots, {needed} needed"
         judgement = Judgement(outcome=Outcome.NONE, candidate=None, aggregate=0.0, reason=reason)
@@ -59,7 +66,15 @@ def decide(judge: Judge, damping: Damping, figures: Figures) -> Decided:
         judgement = _put_off(judgement, allocation, f"{figures.first} moves first")
     if not figures.is_called:
         judgement = _spare(judgement, figures)
-    return Decided(standing=standing, judgement=judgement, is_waiting_its_turn=is_waiting)
+    return Decided(
+        standing=standing,
+        judgement=judgement,
+        escape=escape,
+        needed=needed,
+        spent=judge.spent,
+        patience=judge.patience,
+        is_waiting_its_turn=is_waiting,
+    )
 
 
 def decide_again(figures: Figures) -> Decided:
@@ -112,7 +127,7 @@ def verdict_of(judgement: Judgement) -> Verdict:
     )
 
 
-def robots_needed(figures: Figures, *, is_escape: bool) -> int:
+def _robots_needed(figures: Figures, *, is_escape: bool) -> int:
     """How many robots' utilities a decision needs; for an escape a majority of those that are not gone."""
     needed = majority(len(figures.voters))
     return max(min(needed, majority(len(figures.present))), 1) if is_escape else needed

@@ -347,4 +347,3 @@ class Rounds:
             self.hurry(now)
         if any(other.is_waiting_its_turn for other in self.tasks.values()):
             self.hurry(now)
-

@@ -197,7 +197,17 @@ class RetryTask:
             check_name("retry.node", self.node)
 
 
-Command = SetWeights | RetryTask
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExplainTask:
+    """Operator question to one node: its last judgement of a task, with every figure."""
+
+    task: TaskId
+
+    def __post_init__(self) -> None:
+        check_name("explain.task", self.task)
+
+
+Command = SetWeights | RetryTask | ExplainTask
 
 
 class CommandOutcome(StrEnum):

@@ -11,7 +11,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from zsched.core import events, relay_protocol
-from zsched.core.values import durable, messages, model, plan, snapshot
+from zsched.core.values import decision, durable, fleet, messages, model, plan, snapshot
 from zsched.ipc import pipe as relay_pipe
 from zsched.ipc import protocol
 from zsched.wire import codec as wire
@@ -31,6 +31,49 @@ _LINK = model.Link(source=model.LinkSource.NL80211, peer="edge1", rssi_dbm=-61.5
 _UTILITY = model.Utility(candidate="edge1", value=0.5, cpu=0.75, memory=0.25, network=0.5, reachable=False)
 _VECTOR = model.UtilityVector(
     voter="robot1", task="map_merge", revision=7, utilities=(_UTILITY,), refused=(("edge2", "draining"),)
+)
+_DECISION = decision.Decision(
+    figures=decision.Figures(
+        task="map_merge",
+        now=1234.5,
+        rules=decision.Rules(
+            candidates=("edge1", "edge2"),
+            reach=fleet.Reach.MAJORITY,
+            memory_floor_ratio=0.05,
+            max_moves_per_minute=6,
+            patience=0.15,
+            learns_patience=True,
+            start_deadline_s=20.0,
+            has_command=True,
+        ),
+        allocation=_VALUE,
+        voters=("robot1", "robot2"),
+        present=("robot1", "robot2"),
+        vectors=(_VECTOR,),
+        electors=("robot1", "robot2"),
+        electors_heard=("robot1",),
+        settled_for_s=17.25,
+        owner_state=model.PeerState.ALIVE,
+        is_called=True,
+        out=("edge2",),
+        first="other",
+        judge=decision.JudgeMemory(
+            not_ready_since=1230.25,
+            spent=0.125,
+            spent_at=1234.0,
+            players=(decision.PlayerMemory(owner="edge1", spent=0.0625, paid=1.5, moved_at=1200.5),),
+            watched_at=1234.0,
+        ),
+        damping=decision.DampingMemory(points=(("edge2", 2.0, 1200.0),), moves=((1200.5, True),)),
+    ),
+    verdict=decision.Verdict(
+        outcome="wait",
+        candidate="edge1",
+        aggregate=0.5,
+        reason="edge2 leads",
+        aggregates=(("edge1", 0.5), ("edge2", 0.75)),
+    ),
+    needs=(decision.Need(candidate="edge1", cpu_cores=0.5, memory_mb=200.0),),
 )
 _ROUTE = plan.Route(
     stream="map_merge/in/0",
@@ -127,6 +170,19 @@ SAMPLES: dict[str, object] = {
     "learnt": messages.Learnt(node="robot2", values=(_VALUE,)),
     "set_weights": messages.SetWeights(task="map_merge", cpu=0.5, memory=0.25, network=0.25, base_revision=7),
     "retry_task": messages.RetryTask(task="map_merge", node="edge1"),
+    "explain_task": messages.ExplainTask(task="map_merge"),
+    "explanation": decision.Explanation(
+        node="robot1",
+        kind="robot",
+        task="map_merge",
+        allocation=_VALUE,
+        robots=("robot1", "robot2"),
+        decision=_DECISION,
+        age_s=0.25,
+        vote=snapshot.VoteStatus(
+            base_revision=6, votes=(("robot1", "edge1"),), outcome="won", winner="edge1", age_s=1.5
+        ),
+    ),
     "command_result": messages.CommandResult(
         outcome=messages.CommandOutcome.CONFLICT, detail="the value had changed", revision=8
     ),

@@ -1,0 +1,198 @@
+"""`zsched explain`: what is printed adds up, whom an edge sends the question on to, exit codes."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from zsched.commands import explain as verb
+from zsched.commands.ask import Door
+from zsched.commands.common import CliError
+from zsched.commands.explain import SCHEMA, ExplainView, explain
+from zsched.core.scheduler.decision import decide_again, verdict_of
+from zsched.core.values.decision import Decision, Explanation, Figures, Need, Rules
+from zsched.core.values.fleet import Reach
+from zsched.core.values.model import Allocation, PeerState, Tuning, Utility, UtilityVector, Weights
+from zsched.core.values.snapshot import VoteStatus
+from zsched.exits import EXIT_FAILED, EXIT_USAGE, EXIT_WOULD_CHANGE
+from zsched.wire.codec import as_plain
+
+ROBOTS = ("robot1", "robot2", "robot3")
+WEIGHTS = Weights(cpu=0.5, memory=0.3, network=0.2)
+VALUE = Allocation(task="merge", revision=4, epoch=3, owner="edge1", tuning=Tuning(weights=WEIGHTS, bonus=0.05))
+TERMS = {"edge1": (0.75, 0.5, 0.5), "edge2": (0.5, 0.5, 0.25)}
+
+
+def decision() -> Decision:
+    column = tuple(
+        Utility(candidate=name, value=0.5 * cpu + 0.3 * memory + 0.2 * net, cpu=cpu, memory=memory, network=net)
+        for name, (cpu, memory, net) in TERMS.items()
+    )
+    refused = (("edge3", "worker failed: \x1b[31mno model"),)
+    figures = Figures(
+        task="merge",
+        now=1000.0,
+        rules=Rules(
+            candidates=("edge1", "edge2", "edge3"),
+            reach=Reach.MAJORITY,
+            memory_floor_ratio=0.05,
+            max_moves_per_minute=6,
+            patience=0.15,
+            learns_patience=False,
+            start_deadline_s=20.0,
+            has_command=True,
+        ),
+        allocation=VALUE,
+        voters=ROBOTS,
+        present=ROBOTS,
+        vectors=tuple(
+            UtilityVector(
+                voter=robot,
+                task="merge",
+                revision=4,
+                utilities=column,
+                refused=refused,
+                penalties=(("edge2", 0.03),),
+            )
+            for robot in ROBOTS[:2]
+        ),
+        electors=ROBOTS,
+        electors_heard=ROBOTS,
+        settled_for_s=60.0,
+        owner_state=PeerState.ALIVE,
+    )
+    needs = (Need(candidate="edge1", cpu_cores=0.4, memory_mb=250.0),)
+    return Decision(figures=figures, verdict=verdict_of(decide_again(figures).judgement), needs=needs)
+
+
+class Fleet:
+    """Stands for the daemons: what each node answers."""
+
+    def __init__(self) -> None:
+        vote = VoteStatus(base_revision=3, votes=(("robot1", "edge1"),), outcome="won", winner="edge1", age_s=9.0)
+        robot = Explanation(
+            node="robot1",
+            kind="robot",
+            task="merge",
+            allocation=VALUE,
+            robots=ROBOTS,
+            decision=decision(),
+            age_s=0.25,
+            vote=vote,
+        )
+        edge = Explanation(node="edge1", kind="edge", task="merge", allocation=VALUE, robots=ROBOTS)
+        self.answers: dict[str | None, Any] = {"robot1": robot, None: robot, "edge1": edge}
+        self.asked: list[str | None] = []
+
+    def ask(self, door: Door, request: dict[str, Any], timeout_s: float = 5.0) -> dict[str, Any]:
+        assert timeout_s > 0
+        self.asked.append(door.node)
+        if request["task"] != "merge":
+            return {"outcome": "invalid", "detail": "no task 'merg'; there are merge"}
+        return {"explanation": json.loads(json.dumps(as_plain(self.answers[door.node])))}
+
+
+@pytest.fixture
+def fleet(monkeypatch: pytest.MonkeyPatch) -> Fleet:
+    made = Fleet()
+    monkeypatch.setattr(verb, "ask_door", made.ask)
+    return made
+
+
+def asked(node: str | None = None, task: str = "merge", *, is_json: bool = False, plan: str | None = None) -> int:
+    view = ExplainView(plan=plan, is_json=is_json, is_colored=False)
+    return explain(Door(socket=Path("s"), node=node), task, view)
+
+
+@pytest.mark.usefixtures("fleet")
+def test_what_is_printed_adds_up(capsys: pytest.CaptureFixture[str]) -> None:
+    assert asked() == 0
+    text = capsys.readouterr().out
+    rows = re.findall(r"^(\w*) +(robot\d) +([\d.]+) +([\d.]+) +([\d.]+) +([\d.]+)$", text, re.MULTILINE)
+    sums = re.findall(r"mean ([\d.]+)(?: \+ bonus ([\d.]+))?(?: - penalty ([\d.]+))? = ([\d.]+)", text)
+    utilities: dict[str, list[float]] = {}
+    name = ""
+    for candidate, _, *numbers in rows:
+        name = candidate or name
+        cpu, memory, network, utility = map(float, numbers)
+        assert utility == pytest.approx(0.5 * cpu + 0.3 * memory + 0.2 * network, abs=1e-4)
+        utilities.setdefault(name, []).append(utility)
+    assert list(utilities) == ["edge1", "edge2"]
+    for column, (joint, bonus, penalty, total) in zip(utilities.values(), sums, strict=True):
+        assert float(joint) == pytest.approx(sum(column) / len(column), abs=1e-4)
+        assert float(total) == pytest.approx(float(joint) + float(bonus or 0) - float(penalty or 0), abs=2e-4)
+    assert [sum_[1:3] for sum_ in sums] == [("0.0500", ""), ("", "0.0300")]
+    assert "silent: robot3" in text
+    assert "needs 0.40 cores 250M" in text
+    assert "won edge1 · robot1 for edge1" in text
+    assert "\x1b" not in text, "a reason from another node steers no terminal"
+    assert max(map(len, text.splitlines())) <= 160
+
+
+@pytest.mark.usefixtures("fleet")
+def test_json_names_its_schema_and_holds_the_same_sums(capsys: pytest.CaptureFixture[str]) -> None:
+    assert asked(is_json=True) == 0
+    body = json.loads(capsys.readouterr().out)
+    assert (body["schema"], body["node"], body["task"], body["outcome"]) == (SCHEMA, "robot1", "merge", "stay")
+    assert body["silent"] == ["robot3"]
+    for one in body["candidates"]:
+        if one["total"] is not None:
+            assert one["total"] == max(one["joint"] + one["bonus"] - one["penalty"], 0.0)
+    assert [one["node"] for one in body["candidates"]] == ["edge1", "edge2", "edge3"]
+    assert body["plan"] is None
+    assert body["vote"]["votes"] == {"robot1": "edge1"}
+
+
+@pytest.mark.usefixtures("fleet")
+def test_a_plan_says_where_the_task_would_go(capsys: pytest.CaptureFixture[str]) -> None:
+    assert asked(plan="edge1=down") == EXIT_WOULD_CHANGE
+    text = capsys.readouterr().out
+    assert "WITHOUT edge1" in text
+    assert "propose edge2 · edge1 is gone" in text
+    assert asked(plan="edge2=down", is_json=True) == 0
+    body = json.loads(capsys.readouterr().out)
+    assert (body["plan"]["without"], body["plan"]["would_move"], body["plan"]["outcome"]) == (
+        "edge2",
+        False,
+        "none",
+    ) or (body["plan"]["outcome"] == "stay")
+
+
+@pytest.mark.parametrize("plan", ["edge1", "edge1=up", "=down"])
+def test_a_plan_of_another_form_is_refused_before_anybody_is_asked(fleet: Fleet, plan: str) -> None:
+    with pytest.raises(CliError, match="NODE=down") as refused:
+        asked(plan=plan)
+    assert refused.value.code == EXIT_USAGE
+    assert fleet.asked == []
+
+
+@pytest.mark.usefixtures("fleet")
+def test_a_plan_for_a_node_that_is_not_there_names_the_nearest() -> None:
+    with pytest.raises(CliError, match="did you mean edge") as refused:
+        asked(plan="edg1=down")
+    assert refused.value.code == EXIT_USAGE
+
+
+def test_an_edge_sends_the_question_on_and_says_so_when_it_was_meant(
+    fleet: Fleet, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fleet.answers[None] = fleet.answers["edge1"]
+    assert asked() == 0
+    assert "as robot1 judged it" in capsys.readouterr().out
+    assert fleet.asked == [None, "robot1"]
+    with pytest.raises(CliError, match="ask a robot: --node robot1"):
+        asked("edge1")
+
+
+def test_an_unknown_task_and_no_judgement_yet_are_refused(fleet: Fleet) -> None:
+    with pytest.raises(CliError, match="there are merge") as refused:
+        asked(task="merg")
+    assert refused.value.code == EXIT_USAGE
+    fleet.answers[None] = Explanation(node="robot1", kind="robot", task="merge", allocation=VALUE, robots=ROBOTS)
+    with pytest.raises(CliError, match="has judged nothing of merge yet") as early:
+        asked()
+    assert early.value.code == EXIT_FAILED

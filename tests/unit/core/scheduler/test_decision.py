@@ -1,0 +1,110 @@
+"""A judgement and its figures: what is written down is judged again, bit for bit.
+
+The simulator checks every judgement that it tells, in all of its schedules.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from random import Random
+
+import pytest
+
+from support.fleets import fleet_of, tuning_of
+from zsched.core.scheduler.decision import decide_again, verdict_of
+from zsched.core.values.decision import Decision
+from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec
+from zsched.core.values.model import NodeId, TaskId
+from zsched.errors import InvariantError
+from zsched.wire.codec import as_plain, from_plain
+from zsched_lab.sim.checks import check_replayed
+from zsched_lab.sim.simulator import Simulator
+
+ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2", "edge3")
+
+
+def fleet(learns: bool = True, tasks: int = 1) -> Fleet:
+    specs = [
+        TaskSpec(
+            name=f"task{number}",
+            candidates=EDGES,
+            tuning=tuning_of(cpu=0.6, memory=0.4, cool_down_s=1.0),
+            patience=0.1,
+            learns_patience=learns,
+            worker=WorkerSpec(command=("worker",)),
+        )
+        for number in range(tasks)
+    ]
+    return fleet_of(*specs, of=sorted((*ROBOTS, *EDGES)), electors=ROBOTS)
+
+
+def restless(seed: int) -> Simulator:
+    """A fleet whose edges are busy in turns, so that judgements of every kind are made."""
+    rng = Random(seed)
+    phases = {name: rng.uniform(3.0, 9.0) for name in EDGES}
+
+    def load(node: NodeId, now: float) -> tuple[float, float]:
+        period = phases.get(node)
+        return (3.9 if period and now % (2 * period) < period else 1.0), 1000.0
+
+    return Simulator(fleet=fleet(learns=bool(seed % 2), tasks=1 + seed % 2), seed=seed, load=load)
+
+
+def judged(sim: Simulator, seconds: float) -> Iterator[Decision]:
+    """Every judgement of every robot and task, once."""
+    seen: set[tuple[NodeId, TaskId, float]] = set()
+    for _ in range(int(seconds * 4)):
+        sim.run(0.25)
+        for robot in ROBOTS:
+            for task in sim.fleet.tasks:
+                decision = sim.node(robot).rounds.decision(task.name, sim.now)
+                if decision is not None and (robot, task.name, decision.figures.now) not in seen:
+                    seen.add((robot, task.name, decision.figures.now))
+                    yield decision
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_every_judgement_is_made_again_from_what_is_written_of_it(seed: int) -> None:
+    sim = restless(seed)
+    sim.start(*ROBOTS, *EDGES)
+    outcomes = set()
+    for decision in judged(sim, 20.0):
+        check_replayed("here", decision)
+        outcomes.add(decision.verdict.outcome)
+    sim.crash(sim.agreed("task0", *ROBOTS) or "edge1")
+    for decision in judged(sim, 6.0):
+        check_replayed("here", decision)
+        outcomes.add(decision.verdict.outcome)
+    assert {"stay", "wait"} <= outcomes
+
+
+def test_other_figures_are_another_judgement() -> None:
+    sim = restless(1)
+    sim.start(*ROBOTS, *EDGES)
+    decision = list(judged(sim, 10.0))[-1]
+    figures = decision.figures
+    fewer = replace(figures, vectors=figures.vectors[:1])
+    assert verdict_of(decide_again(fewer).judgement) != decision.verdict
+    with pytest.raises(InvariantError, match="by the same figures again"):
+        check_replayed("here", replace(decision, figures=fewer))
+
+
+def test_what_is_written_is_read_as_it_was() -> None:
+    sim = restless(3)
+    sim.start(*ROBOTS, *EDGES)
+    for decision in judged(sim, 8.0):
+        assert from_plain(json.loads(json.dumps(as_plain(decision))), Decision) == decision
+
+
+def test_only_a_judgement_that_changed_is_written_down() -> None:
+    """A fleet at rest writes nothing: its robots judge twice a second all the same."""
+    sim = Simulator(fleet=fleet(), seed=5)
+    sim.start(*ROBOTS, *EDGES)
+    sim.run(20.0)
+    sim.stories.clear()
+    before = sim.node("robot1").rounds.tasks["task0"].judged_at
+    sim.run(60.0)
+    assert sim.node("robot1").rounds.tasks["task0"].judged_at > before
+    assert sim.stories == []

@@ -1,0 +1,187 @@
+"""An explanation's sums: made again here from its own terms; and what it says a move would take, tried out."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from dataclasses import replace
+
+import pytest
+
+from support.fleets import tuning_of
+from zsched.core.scheduler.decision import decide_again, verdict_of
+from zsched.core.scheduler.explain import Explained, explained, judged_again, owner_cpu_below, without
+from zsched.core.scheduler.scoring import pick
+from zsched.core.values.decision import DampingMemory, Decision, Figures, Need, Rules
+from zsched.core.values.fleet import Reach
+from zsched.core.values.model import Aggregate, Allocation, PeerState, ScoreForm, Tuning, Utility, UtilityVector
+
+ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2", "edge3")
+TUNING = replace(tuning_of(cpu=0.5, memory=0.3, network=0.2, bonus=0.05, cool_down_s=2.0), score=ScoreForm.SERVICE)
+TERMS = {"edge1": (0.9, 0.8, 0.7), "edge2": (0.95, 0.9, 0.5), "edge3": (0.4, 0.9, 0.9)}
+
+
+def value_of(terms: tuple[float, float, float], tuning: Tuning) -> float:
+    """By hand, as docs/decisions/0030 and Eq. 4 have it."""
+    weights = (tuning.weights.cpu, tuning.weights.memory, tuning.weights.network)
+    if tuning.score is ScoreForm.PAPER:
+        return sum(weight * term for weight, term in zip(weights, terms, strict=True)) / sum(weights)
+    most = max(weights)
+    return math.prod(term ** (weight / most) for weight, term in zip(weights, terms, strict=True) if weight)
+
+
+def decision_of(tuning: Tuning = TUNING, *, owner: str | None = "edge1", **changes: object) -> Decision:
+    """Three robots that see the edges a little differently."""
+    vectors = []
+    for number, robot in enumerate(ROBOTS):
+        column = []
+        for name, terms in TERMS.items():
+            cpu, memory, network = (round(term - 0.03 * number, 6) for term in terms)
+            value = value_of((cpu, memory, network), tuning)
+            column.append(Utility(candidate=name, value=value, cpu=cpu, memory=memory, network=network))
+        vectors.append(UtilityVector(voter=robot, task="merge", revision=4, utilities=tuple(column)))
+    figures = Figures(
+        task="merge",
+        now=1000.0,
+        rules=Rules(
+            candidates=EDGES,
+            reach=Reach.MAJORITY,
+            memory_floor_ratio=0.05,
+            max_moves_per_minute=6,
+            patience=0.15,
+            learns_patience=False,
+            start_deadline_s=20.0,
+            has_command=False,
+        ),
+        allocation=Allocation(task="merge", revision=4, epoch=3, owner=owner, tuning=tuning),
+        voters=ROBOTS,
+        present=ROBOTS,
+        vectors=tuple(vectors),
+        electors=ROBOTS,
+        electors_heard=ROBOTS,
+        settled_for_s=60.0,
+        owner_state=PeerState.ALIVE,
+        damping=DampingMemory(points=(("edge3", 1.0, 990.0),)),
+    )
+    figures = replace(figures, **changes)  # type: ignore[arg-type]
+    needs = (Need(candidate="edge1", cpu_cores=0.4, memory_mb=250.0),)
+    return Decision(figures=figures, verdict=verdict_of(decide_again(figures).judgement), needs=needs)
+
+
+def check_sums(told: Explained, decision: Decision) -> None:
+    """Every number from the ones before it, and the total as the judgement had it."""
+    tuning = told.tuning
+    mean = statistics.fmean if tuning.aggregate is Aggregate.MEAN else statistics.median
+    for one in told.candidates:
+        seen = []
+        for view in one.robots:
+            if view.utility is None:
+                continue
+            seen.append(view.utility)
+            if view.reachable:
+                assert None not in (view.cpu, view.memory, view.network)
+                terms = (view.cpu or 0.0, view.memory or 0.0, view.network or 0.0)
+                assert view.utility == pytest.approx(value_of(terms, tuning), abs=1e-12)
+        if one.joint is not None:
+            assert one.joint == mean(seen)
+        if one.total is not None:
+            assert one.joint is not None
+            assert one.total == max(one.joint + one.bonus - one.penalty, 0.0)
+    assert {one.node: one.total for one in told.candidates if one.total is not None} == dict(
+        decision.verdict.aggregates
+    )
+
+
+@pytest.mark.parametrize("score", list(ScoreForm))
+@pytest.mark.parametrize("aggregate", list(Aggregate))
+@pytest.mark.parametrize("owner", [None, *EDGES])
+def test_the_numbers_add_up(score: ScoreForm, aggregate: Aggregate, owner: str | None) -> None:
+    decision = decision_of(replace(TUNING, score=score, aggregate=aggregate), owner=owner)
+    told = explained(decision)
+    check_sums(told, decision)
+    assert [one.node for one in told.candidates if one.is_owner] == ([] if owner is None else [owner])
+    totals = {one.node: one.total for one in told.candidates if one.total is not None}
+    assert told.candidates[0].node == pick(totals, owner)
+    assert [one.penalty > 0.0 for one in sorted(told.candidates, key=lambda one: one.node)] == [False, False, True]
+    assert told.margin is not None
+
+
+def test_a_silent_robot_and_its_revision_are_told() -> None:
+    decision = decision_of()
+    late = replace(decision.figures.vectors[1], revision=3)
+    few = judged_again(decision, replace(decision.figures, vectors=(decision.figures.vectors[0], late)))
+    told = explained(few)
+    assert (told.heard, told.silent, told.needed) == (("robot1",), ("robot2", "robot3"), 2)
+    assert told.outcome == "none"
+    assert told.changes == ("1 more robots must tell their utilities",)
+
+
+def test_a_candidate_that_lacks_worth_moves_the_task_when_it_has_it() -> None:
+    """The worth that is named is the least one: a hair more wins, a hair less does not."""
+    decision = decision_of()
+    told = explained(decision)
+    assert told.outcome == "stay"
+    best = told.candidates[1]
+    text = next(text for text in told.changes if text.startswith(f"{best.node} would have to be worth"))
+    needed = float(text.split("worth ")[1].split(" ")[0])
+    totals = {one.node: one.total for one in told.candidates if one.total is not None}
+    for change, winner in ((1e-4, best.node), (-1e-4, "edge1")):
+        assert pick({**totals, best.node: needed - best.penalty + change}, "edge1") == winner
+
+
+def test_the_level_of_the_owner_s_cpu_that_is_named_is_the_one_at_which_another_leads() -> None:
+    decision = decision_of()
+    told = explained(decision)
+    owner, rival = told.candidates[0], told.candidates[1]
+    assert rival.total is not None
+    standing = decide_again(decision.figures).standing
+    level = owner_cpu_below(decision.figures, standing, owner, rival.total)
+    assert level is not None
+    assert any(f"below {level:.4f} at every robot" in text for text in told.changes)
+    for cpu, winner in ((level - 1e-3, rival.node), (level + 1e-3, "edge1")):
+        vectors = []
+        for vector in decision.figures.vectors:
+            column = []
+            for one in vector.utilities:
+                lower = replace(one, cpu=min(one.cpu or 0.0, cpu)) if one.candidate == "edge1" else one
+                terms = (lower.cpu or 0.0, lower.memory or 0.0, lower.network or 0.0)
+                column.append(replace(lower, value=value_of(terms, TUNING)))
+            vectors.append(replace(vector, utilities=tuple(column)))
+        again = judged_again(decision, replace(decision.figures, vectors=tuple(vectors)))
+        assert pick(dict(again.verdict.aggregates), "edge1") == winner
+
+
+def test_a_leader_that_waits_is_told_how_long_by_its_lead() -> None:
+    decision = decision_of(owner="edge3", settled_for_s=0.5)
+    told = explained(decision)
+    assert told.outcome == "wait"
+    lead = (told.candidates[0].total or 0.0) - next(one.total or 0.0 for one in told.candidates if one.is_owner)
+    assert told.changes[0] == f"{told.candidates[0].node} leads by {lead:.4f} and must go on leading:"
+    assert told.changes[1] == "until the cool-down ends, in 1.5 s"
+    assert told.changes[2].endswith(f"in {0.15 / lead:.1f} s by this lead")
+
+
+def test_without_the_owner_the_best_of_the_others_gets_the_task() -> None:
+    decision = decision_of()
+    again = judged_again(decision, without(decision.figures, "edge1"))
+    assert (again.verdict.outcome, again.verdict.candidate, again.verdict.reason) == (
+        "propose",
+        "edge2",
+        "edge1 is gone",
+    )
+    told = explained(again)
+    check_sums(told, again)
+    gone = next(one for one in told.candidates if one.node == "edge1")
+    assert (gone.total, gone.bonus) == (None, 0.0)
+    assert "edge1 is gone" in gone.why_not
+
+
+def test_without_another_candidate_or_a_robot_the_task_stays() -> None:
+    decision = decision_of()
+    again = judged_again(decision, without(decision.figures, "edge2"))
+    assert (again.verdict.outcome, again.verdict.candidate) == ("stay", "edge1")
+    assert next(one for one in explained(again).candidates if one.node == "edge2").why_not == "reached by 0 of 3 robots"
+    fewer = without(decision.figures, "robot3")
+    assert (fewer.present, fewer.electors_heard) == (("robot1", "robot2"), ("robot1", "robot2"))
+    assert [vector.voter for vector in fewer.vectors] == ["robot1", "robot2"]
+    assert judged_again(decision, fewer).verdict.outcome == "stay"

@@ -1,0 +1,232 @@
+"""`zsched explain`: the last judgement of a task with its sums, and what another one would take.
+
+Knows: whom to ask, the text, the schema ``zsched.explain/1``. Does not know: how a sum comes about
+(`zsched.core.scheduler.explain`).
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from dataclasses import dataclass
+
+from zsched.commands.ask import Door, ask_door
+from zsched.commands.common import CliError, Json, nearest, print_json
+from zsched.commands.page import Cell, Page, memory, span
+from zsched.commands.report import printable
+from zsched.core.report import plain
+from zsched.core.scheduler.explain import explained, judged_again, without
+from zsched.core.values.decision import Decision, Explanation
+from zsched.errors import WireError
+from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
+from zsched.wire.codec import from_plain
+
+SCHEMA = "zsched.explain/1"
+MIN_WIDTH, MAX_WIDTH = 60, 160
+OUTCOMES = {"stay": "green", "none": "red"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExplainView:
+    """How an explanation is shown."""
+
+    plan: str | None
+    """``NODE=down``: reckon again without that node."""
+    is_json: bool
+    is_colored: bool
+
+
+def explain(door: Door, task: str, view: ExplainView) -> int:
+    """Print why a task is where it is; returns the exit code.
+
+    Raises:
+        CliError: nobody answers, there is no such task or node, or no judgement yet.
+    """
+    gone = None if view.plan is None else _planned(view.plan)
+    answer = _asked(door, task)
+    decision = answer.decision
+    if decision is None:
+        raise CliError(EXIT_FAILED, f"{answer.node} has judged nothing of {task} yet; ask again in a second")
+    body = _body(answer, decision)
+    code = EXIT_OK
+    if gone is not None:
+        body["plan"] = _plan(decision, gone)
+        code = EXIT_WOULD_CHANGE if body["plan"]["would_move"] else EXIT_OK
+    if view.is_json:
+        print_json(body)
+    else:
+        width = max(MIN_WIDTH, min(shutil.get_terminal_size((100, 30)).columns, MAX_WIDTH))
+        sys.stdout.write(render(body, width, view.is_colored))
+    return code
+
+
+def _planned(word: str) -> str:
+    node, _, state = word.partition("=")
+    if not node or state != "down":
+        raise CliError(EXIT_USAGE, f"--plan {word}: expected NODE=down, e.g. --plan edge2=down")
+    return node
+
+
+def _asked(door: Door, task: str) -> Explanation:
+    """A robot's answer; an edge decides nothing, so it names the robots, and one of them is asked in its place."""
+    answer = _ask(door, task)
+    if answer.kind != "edge" or door.node is not None or not answer.robots:
+        if answer.kind == "edge":
+            whom = f"ask a robot: --node {answer.robots[0]}" if answer.robots else "and no robot is alive"
+            raise CliError(EXIT_FAILED, f"{answer.node} is an edge and decides nothing; {whom}")
+        return answer
+    failures = []
+    for robot in answer.robots:
+        try:
+            return _ask(Door(socket=door.socket, node=robot), task)
+        except CliError as error:
+            failures.append(error)
+    raise failures[0]
+
+
+def _ask(door: Door, task: str) -> Explanation:
+    answer = ask_door(door, {"verb": "explain", "task": task})
+    if "explanation" not in answer:
+        raise CliError(EXIT_USAGE, str(answer.get("detail") or "the daemon is of another version"))
+    try:
+        return from_plain(answer["explanation"], Explanation)
+    except WireError as error:
+        raise CliError(EXIT_FAILED, f"the answer cannot be read ({error}); update the older of the two") from error
+
+
+def _body(answer: Explanation, decision: Decision) -> Json:
+    vote = None if answer.vote is None else {**plain(answer.vote), "votes": dict(answer.vote.votes)}
+    told: Json = plain(explained(decision))
+    head = {"schema": SCHEMA, "node": answer.node, "age_s": answer.age_s}
+    return {**head, **told, "newest_revision": answer.allocation.revision, "vote": vote, "plan": None}
+
+
+def _plan(decision: Decision, gone: str) -> Json:
+    figures = decision.figures
+    known = sorted({*figures.rules.candidates, *figures.voters, *figures.electors})
+    if gone not in known:
+        raise CliError(EXIT_USAGE, f"--plan: {gone!r} is no candidate, robot or elector{nearest(gone, known)}")
+    again = judged_again(decision, without(figures, gone))
+    told: Json = plain(explained(again))
+    moves = again.verdict.outcome == "propose" and again.verdict.candidate != figures.allocation.owner
+    return {"without": gone, "would_move": moves, **told}
+
+
+# --- text ------------------------------------------------------------------------------------------------------------
+
+
+def render(body: Json, width: int, color: bool) -> str:
+    """An explanation for people, in ``width`` columns."""
+    shown = printable(body)
+    page = Page(width, color)
+    page.row((f"task {shown['task']} · as {shown['node']} judged it {span(shown['age_s'])} ago", width, "bold"))
+    page.lines.append("")
+    _judgement(page, "DECISION", shown)
+    _tuning(page, shown)
+    _robots(page, shown)
+    _vote(page, shown)
+    page.lines.append("")
+    _candidates(page, shown)
+    if shown["margin"] is not None:
+        page.block("MARGIN", (f"{shown['margin']:.4f} between the first two", ""))
+    _changes(page, shown)
+    if shown["plan"] is not None:
+        plan = shown["plan"]
+        page.lines.append("")
+        _judgement(page, f"WITHOUT {plan['without']}", plan)
+        _candidates(page, plan)
+        _changes(page, plan)
+    return "\n".join(page.lines) + "\n"
+
+
+def _judgement(page: Page, title: str, body: Json) -> None:
+    chosen = f" {body['candidate']}" if body["candidate"] else ""
+    parts: list[Cell] = [
+        (f"{body['outcome']}{chosen}", OUTCOMES.get(body["outcome"], "yellow")),
+        (body["reason"], ""),
+        (f"owner {body['owner'] or 'nobody'}, epoch {body['epoch']}, revision {body['revision']}", "dim"),
+    ]
+    if body.get("newest_revision", body["revision"]) != body["revision"]:
+        parts.append((f"the value has changed since: revision {body['newest_revision']}", "yellow"))
+    page.block(title, *parts)
+
+
+def _tuning(page: Page, body: Json) -> None:
+    tuning = body["tuning"]
+    weights = " ".join(f"{name} {value:g}" for name, value in tuning["weights"].items())
+    deadline = [] if tuning["deadline_ms"] is None else [(f"deadline {tuning['deadline_ms']:g} ms", "")]
+    page.block(
+        "TUNING",
+        (weights, ""),
+        ("sum" if tuning["score"] == "paper" else "product", ""),
+        (str(tuning["aggregate"]), ""),
+        (f"bonus {tuning['bonus']:g}", ""),
+        (f"staying has cost {body['spent']:.4f} of patience {body['patience']:g}", ""),
+        (f"owner known for {span(body['known_for_s'])}, cool-down {tuning['cool_down_s']:g}s", ""),
+        *deadline,
+    )
+
+
+def _robots(page: Page, body: Json) -> None:
+    silent = [(f"silent: {', '.join(body['silent'])}", "yellow")] if body["silent"] else []
+    page.block("ROBOTS", (f"{len(body['heard'])} heard, {body['needed']} needed", ""), *silent)
+
+
+def _vote(page: Page, body: Json) -> None:
+    vote = body["vote"]
+    if vote is None:
+        page.block("VOTE", ("none seen by this node", "dim"))
+        return
+    won = f" {vote['winner']}" if vote["winner"] else ""
+    votes = ", ".join(f"{voter} for {choice}" for voter, choice in vote["votes"].items())
+    page.block(
+        "VOTE",
+        (f"{vote['outcome'].replace('_', ' ')}{won}", ""),
+        (votes or "no proposals", ""),
+        (f"on revision {vote['base_revision']}", "dim"),
+        (f"{span(vote['age_s'])} ago", "dim"),
+    )
+
+
+def _candidates(page: Page, body: Json) -> None:
+    robots = [view["robot"] for one in body["candidates"] for view in one["robots"]]
+    first = min(max([9, *map(len, robots), *(len(one["node"]) for one in body["candidates"])]), 20)
+    columns = (first, first, -7, -7, -7, -8, page.width)
+    titles = ("CANDIDATE", "robot", "cpu", "mem", "net", "utility", "")
+    page.row(*zip(titles, columns, ("stage", *["dim"] * 6), strict=True))
+    for one in body["candidates"]:
+        for number, view in enumerate(one["robots"]):
+            name = "" if number else one["node"]
+            note = view["refused"] or ("" if view["reachable"] else "does not reach it")
+            terms = [_number(view[term]) for term in ("cpu", "memory", "network", "utility")]
+            cells = (name, view["robot"], *terms, note)
+            styles = ("bold" if one["is_owner"] else "", "", "", "", "", "", "red")
+            page.row(*zip(cells, columns, styles, strict=True))
+        if not one["robots"]:
+            page.row((one["node"], first, "bold" if one["is_owner"] else ""))
+        _sum(page, body, one, first)
+
+
+def _sum(page: Page, body: Json, one: Json, indent: int) -> None:
+    need = "" if one["need_cpu_cores"] is None else f"{one['need_cpu_cores']:.2f} cores {memory(one['need_memory_mb'])}"
+    text, style = "", ""
+    if one["joint"] is not None:
+        text = f"{body['tuning']['aggregate']} {one['joint']:.4f}"
+        text += f" + bonus {one['bonus']:.4f}" if one["bonus"] else ""
+        text += f" - penalty {one['penalty']:.4f}" if one["penalty"] else ""
+    if one["total"] is not None:
+        text += f" = {one['total']:.4f}"
+    if one["why_not"]:
+        text, style = f"{text}; {one['why_not']}" if text else one["why_not"], "red"
+    owner = "owner; " if one["is_owner"] else ""
+    tail = f"   ({owner}needs {need})" if need else f"   ({owner.rstrip('; ')})" if owner else ""
+    page.row((f"{text}{tail}", page.width - indent - 1, style), indent=indent + 1)
+
+
+def _changes(page: Page, body: Json) -> None:
+    for number, text in enumerate(body["changes"]):
+        page.block("" if number else "TO MOVE", (text, ""))
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4f}"

@@ -1,0 +1,309 @@
+"""SCHEDULER, for an operator: the sums of one judgement, and what would have to change for a move.
+
+Knows: how the terms become a total, and the order in which a judgement is held back. Does not know: how that is shown
+(`zsched.commands.explain`), live state: it goes by written figures alone.
+
+The sums are not taken from the verdict. They are made again from the robots' terms, so that a reader can check them.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+from zsched.core.scheduler.damping import WINDOW_S, Damping
+from zsched.core.scheduler.decision import Decided, decide_again, verdict_of
+from zsched.core.scheduler.judge import Outcome
+from zsched.core.scheduler.scoring import METRICS, Standing, joined, pick, rounded
+from zsched.core.scheduler.utility import total_utility
+from zsched.core.values.decision import Decision, Figures, Verdict
+from zsched.core.values.model import Aggregate, NodeId, PeerState, Tuning, Utility, UtilityVector
+from zsched.core.values.quorum import majority
+
+_TIE = 1 / 512
+"""Totals are compared to 1/256: so far above the owner's rounded one another total counts as higher."""
+_HALVINGS = 40
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RobotView:
+    """One robot's score of one candidate: the terms and the utility that they make, each in [0, 1]."""
+
+    robot: NodeId
+    utility: float | None = None
+    cpu: float | None = None
+    memory: float | None = None
+    network: float | None = None
+    reachable: bool = True
+    refused: str = ""
+    """Why this robot did not score it; empty: it did."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CandidateSum:
+    """``max(joint + bonus - penalty, 0) = total``; ``None`` where the candidate cannot have the task."""
+
+    node: NodeId
+    is_owner: bool
+    joint: float | None
+    """Mean or median of the robots' utilities."""
+    bonus: float
+    penalty: float
+    total: float | None
+    why_not: str = ""
+    """Why it cannot have the task, or must be left."""
+    need_cpu_cores: float | None = None
+    need_memory_mb: float | None = None
+    robots: tuple[RobotView, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Explained:
+    """One judgement as an operator reads it."""
+
+    task: str
+    owner: NodeId | None
+    epoch: int
+    revision: int
+    outcome: str
+    candidate: NodeId | None
+    """Whom this robot would vote for."""
+    reason: str
+    is_escape: bool
+    tuning: Tuning
+    patience: float
+    spent: float
+    """What staying has cost, of the patience."""
+    known_for_s: float
+    """For how long this robot has known the owner."""
+    heard: tuple[NodeId, ...]
+    silent: tuple[NodeId, ...]
+    """Robots whose utilities did not come in time, or are about another revision."""
+    needed: int
+    """How many robots a decision needs."""
+    candidates: tuple[CandidateSum, ...]
+    """The best one first."""
+    margin: float | None
+    """The best total less the next one; ``None``: fewer than two have one."""
+    changes: tuple[str, ...]
+    """What would have to change for a move."""
+
+
+def explained(decision: Decision) -> Explained:
+    """The sums of a judgement."""
+    figures, verdict = decision.figures, decision.verdict
+    allocation, again = figures.allocation, decide_again(figures)
+    sums = _sums(decision, again)
+    totals = [one.total for one in sums if one.total is not None]
+    heard = tuple(vector.voter for vector in again.standing.vectors)
+    return Explained(
+        task=figures.task,
+        owner=allocation.owner,
+        epoch=allocation.epoch,
+        revision=allocation.revision,
+        outcome=verdict.outcome,
+        candidate=verdict.candidate,
+        reason=verdict.reason,
+        is_escape=verdict.is_escape,
+        tuning=allocation.tuning,
+        patience=again.patience,
+        spent=again.spent,
+        known_for_s=figures.settled_for_s,
+        heard=heard,
+        silent=tuple(voter for voter in figures.voters if voter not in heard),
+        needed=again.needed,
+        candidates=sums,
+        margin=totals[0] - totals[1] if len(totals) > 1 else None,
+        changes=tuple(_changes(figures, verdict, again, sums)),
+    )
+
+
+def without(figures: Figures, node: NodeId) -> Figures:
+    """The same figures if ``node`` were gone: nobody reaches it, and it neither votes nor promises."""
+    allocation = figures.allocation
+    return replace(
+        figures,
+        present=tuple(name for name in figures.present if name != node),
+        electors_heard=tuple(name for name in figures.electors_heard if name != node),
+        vectors=tuple(_cut_off(vector, node, figures) for vector in figures.vectors if vector.voter != node),
+        owner_state=PeerState.GONE if allocation.owner == node else figures.owner_state,
+        owner_profile=None if allocation.owner == node else figures.owner_profile,
+    )
+
+
+def judged_again(decision: Decision, figures: Figures) -> Decision:
+    """The judgement by other figures than the ones of ``decision``."""
+    return replace(decision, figures=figures, verdict=verdict_of(decide_again(figures).judgement))
+
+
+def _cut_off(vector: UtilityVector, node: NodeId, figures: Figures) -> UtilityVector:
+    if node not in figures.rules.candidates:
+        return vector
+    others = [one for one in vector.utilities if one.candidate != node]
+    lost = Utility(candidate=node, value=0.0, reachable=False)
+    return replace(
+        vector,
+        utilities=tuple(sorted((*others, lost), key=lambda one: one.candidate)),
+        refused=tuple(pair for pair in vector.refused if pair[0] != node),
+    )
+
+
+# --- the sums --------------------------------------------------------------------------------------------------------
+
+
+def utility_of(utility: Utility, tuning: Tuning) -> float | None:
+    """A robot's utility made again from its terms; 0 for a candidate that it does not reach."""
+    if not utility.reachable:
+        return 0.0
+    measured = frozenset(name for name in METRICS if getattr(utility, name) is not None)
+    return total_utility(
+        tuning.weights,
+        cpu=utility.cpu,
+        memory=utility.memory,
+        network=utility.network,
+        measured=measured,
+        form=tuning.score,
+    )
+
+
+def _sums(decision: Decision, again: Decided) -> tuple[CandidateSum, ...]:
+    """Every candidate's sum, the best first."""
+    figures, standing = decision.figures, again.standing
+    owner, tuning = figures.allocation.owner, figures.allocation.tuning
+    penalties = joined((Damping.of(figures.damping).penalties(figures.now), standing.penalties))
+    needs = {need.candidate: need for need in decision.needs}
+    found = []
+    for name in figures.rules.candidates:
+        is_left = name == owner and again.escape is not None
+        joint = standing.aggregates.get(name)
+        bonus = tuning.bonus if name == owner and not is_left else 0.0
+        penalty, need = penalties.get(name, 0.0), needs.get(name)
+        is_out = joint is None or is_left
+        found.append(
+            CandidateSum(
+                node=name,
+                is_owner=name == owner,
+                joint=joint,
+                bonus=bonus,
+                penalty=penalty,
+                total=None if is_out or joint is None else max(joint + bonus - penalty, 0.0),
+                why_not=again.escape or "" if is_left else standing.vetoed.get(name, ""),
+                need_cpu_cores=None if need is None else need.cpu_cores,
+                need_memory_mb=None if need is None else need.memory_mb,
+                robots=tuple(_views(name, standing)),
+            )
+        )
+    totals = {one.node: one.total for one in found if one.total is not None}
+    first = pick(totals, owner)
+    return tuple(sorted(found, key=lambda one: (one.node != first, -totals.get(one.node, -1.0), one.node)))
+
+
+def _views(name: NodeId, standing: Standing) -> Iterator[RobotView]:
+    for vector in standing.vectors:
+        why = dict(vector.refused).get(name)
+        if why is not None:
+            yield RobotView(robot=vector.voter, refused=why)
+        for one in vector.utilities:
+            if one.candidate == name:
+                yield RobotView(
+                    robot=vector.voter,
+                    utility=one.value,
+                    cpu=one.cpu,
+                    memory=one.memory,
+                    network=one.network,
+                    reachable=one.reachable,
+                )
+
+
+# --- what would have to change ---------------------------------------------------------------------------------------
+
+
+def _changes(figures: Figures, verdict: Verdict, again: Decided, sums: tuple[CandidateSum, ...]) -> Iterator[str]:
+    """Sentences, in the order in which a judgement is held back."""
+    if verdict.outcome == Outcome.PROPOSE:
+        yield f"nothing: this robot proposes {verdict.candidate}"
+        return
+    heard = again.standing.voters_heard
+    if heard < again.needed:
+        yield f"{again.needed - heard} more robots must tell their utilities"
+        return
+    allocation = figures.allocation
+    if allocation.paused or allocation.pinned:
+        yield f"an operator must end that the task is {'paused' if allocation.paused else 'pinned'}"
+    others = [one for one in sums if not one.is_owner]
+    owner = next((one for one in sums if one.is_owner), None)
+    if not any(one.total is not None for one in others):
+        yield "another candidate must be able to have the task"
+    elif allocation.owner is not None and again.escape is None and owner is not None and owner.total is not None:
+        yield from _leads(figures, again, owner, [one for one in others if one.total is not None])
+    elif verdict.outcome == Outcome.WAIT:
+        yield f"what holds it back must end: {verdict.reason}"
+    for one in others:
+        if one.why_not:
+            yield f"{one.node} cannot have it: {one.why_not}"
+
+
+def _leads(figures: Figures, again: Decided, owner: CandidateSum, others: list[CandidateSum]) -> Iterator[str]:
+    """What the owner's challengers lack: worth, or time."""
+    assert owner.total is not None
+    needed = rounded(owner.total) + _TIE
+    for number, one in enumerate(others):
+        assert one.total is not None
+        assert one.joint is not None
+        if rounded(one.total) <= rounded(owner.total):
+            lack = needed - one.total
+            yield f"{one.node} would have to be worth {one.joint + lack:.4f} instead of {one.joint:.4f} ({lack:+.4f})"
+            level = None if number else owner_cpu_below(figures, again.standing, owner, one.total)
+            if level is not None:
+                yield f"or the cpu term of {owner.node} would have to fall below {level:.4f} at every robot"
+        elif not number:
+            yield from _times(figures, again, one.node, one.total - owner.total)
+
+
+def _times(figures: Figures, again: Decided, node: NodeId, lead: float) -> Iterator[str]:
+    """What ``node``, which leads, still waits for."""
+    tuning = figures.allocation.tuning
+    left_s = tuning.cool_down_s - figures.settled_for_s
+    yield f"{node} leads by {lead:.4f} and must go on leading:"
+    if left_s > 0.0:
+        yield f"until the cool-down ends, in {left_s:.1f} s"
+    if again.spent < again.patience:
+        missing = again.patience - again.spent
+        yield f"until staying has cost {again.patience:g}, {missing:.4f} more: in {missing / lead:.1f} s by this lead"
+    if figures.first is not None:
+        yield f"until {figures.first} has moved"
+    electors, heard = len(figures.electors), len(figures.electors_heard)
+    if heard < majority(electors):
+        yield f"until {majority(electors) - heard} more electors are heard"
+    damping = Damping.of(figures.damping)
+    if damping.moves_within(WINDOW_S, figures.now, escapes=False) >= figures.rules.max_moves_per_minute:
+        yield f"until fewer than {figures.rules.max_moves_per_minute} moves lie in the last minute"
+
+
+def owner_cpu_below(figures: Figures, standing: Standing, owner: CandidateSum, rival_total: float) -> float | None:
+    """The level of the owner's cpu term, alike at every robot, below which a rival has the higher total.
+
+    ``None``: at no level, or no robot measured that term.
+    """
+    tuning = figures.allocation.tuning
+    column = [one for vector in standing.vectors for one in vector.utilities if one.candidate == owner.node]
+    terms = [one.cpu for one in column if one.cpu is not None]
+    if tuning.weights.cpu <= 0.0 or not terms:
+        return None
+
+    def is_beaten(level: float) -> bool:
+        values = []
+        for one in column:
+            lower = one if one.cpu is None else replace(one, cpu=min(one.cpu, level))
+            values.append(utility_of(lower, tuning) or 0.0)
+        mean = statistics.fmean if tuning.aggregate is Aggregate.MEAN else statistics.median
+        return rounded(rival_total) > rounded(max(mean(values) + owner.bonus - owner.penalty, 0.0))
+
+    low, high = 0.0, max(terms)
+    if not is_beaten(low):
+        return None
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if is_beaten(middle) else (low, middle)
+    return low
