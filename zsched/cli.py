@@ -82,6 +82,9 @@ RuntimeOption = Annotated[
 AskedOption = Annotated[
     str | None, typer.Option("--node", "-n", metavar="NAME", help="Ask this node, here or anywhere in the fleet.")
 ]
+HereOption = Annotated[
+    str | None, typer.Option("--node", "-n", metavar="NAME", help="Which daemon on this machine, if there are several.")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="JSON with its schema's name and version.")]
 
 
@@ -261,6 +264,54 @@ def explain(
 
     view = ExplainView(plan=plan, is_json=json_, is_colored=wants_color(no_color))
     raise typer.Exit(ask_why(find_door(runtime_dir, node), task, view))
+
+
+@app.command(cls=Verb)
+def history(
+    task: Annotated[str | None, typer.Argument(metavar="[TASK]", help="Only its moves.")] = None,
+    json_: JsonOption = False,
+    node: HereOption = None,
+    runtime_dir: RuntimeOption = None,
+) -> None:
+    """Show every change of owner in the decision log: when, from where to where, why, and who voted for it."""
+    from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.history import history as show_moves  # noqa: PLC0415 - as above
+
+    raise typer.Exit(show_moves(find_door(runtime_dir, node), task, is_json=json_))
+
+
+@app.command(cls=Verb)
+def events(
+    follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on until Ctrl-C.")] = False,
+    since: Annotated[str | None, typer.Option("--since", metavar="AGE", help="Not older: 90s, 10m, 2h, 1d.")] = None,
+    about: Annotated[str | None, typer.Option("--for", metavar="task/NAME", help="Only this task's.")] = None,
+    json_: Annotated[bool, typer.Option("--json", help="One JSON object per line.")] = False,
+    node: HereOption = None,
+    runtime_dir: RuntimeOption = None,
+) -> None:
+    """Show what the decision log tells: judgements that changed, votes, moves, steps of handovers, workers, peers."""
+    from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.history import EventsView, duration_s, task_of  # noqa: PLC0415 - as above
+    from zsched.commands.history import events as show_events  # noqa: PLC0415 - as above
+
+    view = EventsView(
+        task=None if about is None else task_of(about),
+        since_s=None if since is None else duration_s(since),
+        is_following=follow,
+        is_json=json_,
+    )
+    raise typer.Exit(show_events(find_door(runtime_dir, node), view))
+
+
+@app.command(cls=Verb)
+def replay(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A decision log; may be packed (.gz).")],
+    json_: JsonOption = False,
+) -> None:
+    """Make every judgement of a decision log again from its figures; exits with 1 at the first that differs."""
+    from zsched.commands.replay import replay as make_again  # noqa: PLC0415 - each verb imports what it needs
+
+    raise typer.Exit(make_again(file, is_json=json_))
 
 
 @app.command(cls=Verb)

@@ -107,6 +107,11 @@ def wall_ns() -> int:
     return time.time_ns()
 
 
+def wall_s() -> float:
+    """Seconds since the Unix epoch, for people; never for decisions."""
+    return time.time()
+
+
 def wall_tenths() -> int:
     """Tenths of a second of the wall clock: the start counter of a blank state, so that it is above an earlier life's.
 

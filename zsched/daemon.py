@@ -26,6 +26,7 @@ from pathlib import Path
 from zsched import __version__
 from zsched import paths as places
 from zsched.adapters.host import zenoh_log
+from zsched.adapters.host.decision_log import DecisionLog
 from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.adapters.host.state_file import StateFile
 from zsched.adapters.host.systemd import Notifier, watchdog_interval_s
@@ -205,13 +206,22 @@ class Daemon:
             hears_all_beats_at_once=any(task.exclusive for task in fleet.tasks),
         )
         access = StreamAccess(fleet, me, points.worker_connect[:1], operator_json5)
-        desk = Desk(me, self._inbox, bus, access.answer)
+        decisions = DecisionLog(
+            self._options.state_dir,
+            me,
+            incarnation,
+            lambda problem: self._inbox.post(ev.ProblemReported(source="log", problem=problem)),
+        )
+        desk = Desk(me, self._inbox, bus, access.answer, decisions.answer)
         operators = OperatorSocket(places.socket_path(self._options.runtime_dir, me), desk.answer)
         operators.open()
         stack.callback(operators.close)
         bus.open()
         stack.callback(bus.close)
         shell = Shell(node=me, inbox=self._inbox, bus=bus, state_file=state_file, desk=desk, fleet=fleet)
+        shell.log = decisions
+        decisions.start()
+        stack.callback(decisions.close)
         shell.relay = relay = self._relay(shell, incarnation, points, operator_json5)
         shell.crew.supervisor = supervisor = self._supervisor(stack, shell, incarnation, points, operator_json5)
         shell.crew.begin()

@@ -245,3 +245,65 @@ def test_any_node_of_the_fleet_can_be_asked_through_the_one_here(tmp_path: Path)
         nowhere = here.zsched("status", "--node", "robot9")
         assert nowhere.returncode == 2
         assert "robot1" in nowhere.stderr
+
+
+# --- why, and what was ------------------------------------------------------------------------------------------------
+
+
+def test_a_move_is_explained_remembered_and_judged_again(tmp_path: Path) -> None:
+    """The owner is told to stop; its robot says why the task went, also after a restart, and can show it again."""
+    edge1, edge2, robot = sorted(sites(tmp_path, robots=1, edges=2), key=lambda site: site.node)
+    with contextlib.ExitStack() as stack:
+        processes = {}
+        for site in (robot, edge1, edge2):
+            assert site.zsched("init").returncode == 0
+            processes[site.node] = stack.enter_context(site.up())
+        owner = robot.wait_owner()["tasks"][0]["owner"]
+        end = time.monotonic() + UP_S
+        body: dict[str, Any] = {}
+        while body.get("owner") != owner:  # the last judgement may be the one that led to the first placement
+            assert time.monotonic() < end, body
+            explained = robot.zsched("explain", "echo", "--json")
+            assert explained.returncode == 0, explained.stderr
+            body = json.loads(explained.stdout)
+        assert (body["schema"], body["node"]) == ("zsched.explain/1", "robot1")
+        for one in body["candidates"]:
+            if one["total"] is not None:
+                assert one["total"] == max(one["joint"] + one["bonus"] - one["penalty"], 0.0)
+        plan = robot.zsched("explain", "echo", "--plan", f"{owner}=down")
+        assert plan.returncode == 10, plan.stderr
+        assert f"{owner} is gone" in plan.stdout
+        here = edge1 if owner == "edge2" else edge2
+        passed_on = here.zsched("explain", "echo")
+        assert passed_on.returncode == 0, passed_on.stderr
+        assert "as robot1 judged it" in passed_on.stdout
+
+        processes[owner].send_signal(signal.SIGTERM)
+        assert processes[owner].wait(60) == 0
+        end = time.monotonic() + UP_S
+        while (newest := robot.wait_owner()["tasks"][0]["owner"]) == owner:
+            assert time.monotonic() < end, robot.log()
+        moves = json.loads(robot.zsched("history", "echo", "--json").stdout)["moves"]
+        assert [(move["from"], move["to"]) for move in moves][-1] == (owner, newest)
+        assert f"{owner} is draining" in moves[-1]["reason"]
+        assert moves[-1]["votes"] == {"robot1": newest}
+        told = robot.zsched("events", "--for", "task/echo", "--since", "1h")
+        assert f"propose {newest}: {owner} is draining" in told.stdout
+        assert "settled on" in told.stdout or "flipped to" in told.stdout
+
+        processes["robot1"].send_signal(signal.SIGTERM)
+        processes["robot1"].wait(60)
+        stack.enter_context(robot.up())
+        robot.wait_owner()
+        kept = json.loads(robot.zsched("history", "--json").stdout)["moves"]
+        assert kept[: len(moves)] == [{**move, "age_s": old["age_s"]} for move, old in zip(moves, kept, strict=False)]
+        again = robot.zsched("replay", str(robot.state / "decisions.ndjson"))
+        assert again.returncode == 0, again.stdout
+        assert int(again.stdout.split(" ")[0]) >= 3
+        changed = tmp_path / "changed.ndjson"
+        text = (robot.state / "decisions.ndjson").read_text()
+        assert '"spent":0.0' not in text, "defaults are left out"
+        changed.write_text(text.replace('"outcome":"propose"', '"outcome":"stay"', 1))
+        differs = robot.zsched("replay", str(changed))
+        assert differs.returncode == 1
+        assert "and again" in differs.stdout

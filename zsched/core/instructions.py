@@ -208,6 +208,8 @@ class RecordStory:
     """With it, this is a judgement that has changed."""
     move: Move | None = None
     """With it, this is a change of owner."""
+    took_s: float | None = None
+    """With it, this node's streams have switched to the owner of ``epoch``, so long after it learnt the value."""
 
 
 Instruction = (

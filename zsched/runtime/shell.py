@@ -17,6 +17,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any, assert_never
 
+from zsched.adapters.host.decision_log import DecisionLog
 from zsched.adapters.host.state_file import StateFile
 from zsched.adapters.network.control_bus import ControlBus
 from zsched.adapters.relay.streams import RelayHandle
@@ -105,17 +106,22 @@ class Desk:
     """Operators' questions from the local socket: posted into the loop, awaited in the socket's thread."""
 
     def __init__(
-        self, node: NodeId, inbox: Inbox, bus: ControlBus, access: Callable[[NodeId], dict[str, Any]] | None = None
+        self,
+        node: NodeId,
+        inbox: Inbox,
+        bus: ControlBus,
+        access: Callable[[NodeId], dict[str, Any]] | None = None,
+        log: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
     ) -> None:
-        """``access`` says how a tool on this machine joins a node's data network."""
+        """``access`` says how a tool on this machine joins a node's data network, ``log`` tells of the decision log."""
         self._node, self._inbox, self._bus = node, inbox, bus
-        self._access = access
+        self._access, self._log = access, log
         self._numbers = itertools.count(LOCAL_REQUESTS_FROM)
         self._waiting: dict[int, queue.SimpleQueue[object]] = {}
         self._lock = threading.Lock()
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Answer one request of the socket (``status``, ``explain``, ``weights``, ``retry``, ``access``).
+        """Answer one request of the socket (``status``, ``explain``, ``log``, ``weights``, ...).
 
         With ``node``: what another node answers.
         """
@@ -134,7 +140,9 @@ class Desk:
             return self._ask(node, command)
         if verb == "access" and self._access is not None:
             return self._access(node)
-        return {"error": f"unknown verb {verb!r:.80}; known: access, explain, retry, status, weights"}
+        if verb == "log" and self._log is not None:
+            return self._log(request) if node == self._node else {"error": f"the log of {node} is told on {node} only"}
+        return {"error": f"unknown verb {verb!r:.80}; known: access, explain, log, retry, status, weights"}
 
     def _ask(self, node: NodeId, command: Command | None) -> dict[str, Any]:
         if node != self._node:
@@ -216,6 +224,7 @@ class Shell:
         self.crew = Crew(inbox.post, fleet, node)
         self.relay: RelayHandle | None = None
         """It reports to this shell, so it is made after it."""
+        self.log: DecisionLog | None = None
         self.stand_down = ""
         """Why this daemon must end, for its name is taken; empty: it need not."""
         self._failed_at: dict[str, float] = {}
@@ -301,7 +310,7 @@ class Shell:
             case do.StandDown(reason=reason):
                 self.stand_down = reason
             case do.RecordStory():
-                _tell(instruction)
+                self._tell(instruction)
             case _:
                 assert_never(instruction)
 
@@ -328,7 +337,7 @@ class Shell:
             return
         if isinstance(report, SlotLost):
             text = f"{report.owner} left {report.samples} samples unacknowledged: at most so many had no result"
-            _tell(do.RecordStory(stage="route", text=text, task=report.task, epoch=report.epoch))
+            self._tell(do.RecordStory(stage="route", text=text, task=report.task, epoch=report.epoch))
             return
         if isinstance(report, WorkerMatched):
             self.crew.on_matched(report)
@@ -351,7 +360,8 @@ class Shell:
         )
         self._inbox.post(shown)
 
-
-def _tell(story: do.RecordStory) -> None:
-    where = f"task={story.task} epoch={story.epoch} " if story.task else ""
-    _stages[story.stage].info("%s%s", where, story.text)
+    def _tell(self, story: do.RecordStory) -> None:
+        where = f"task={story.task} epoch={story.epoch} " if story.task else ""
+        _stages[story.stage].info("%s%s", where, story.text)
+        if self.log is not None:
+            self.log.put(story)

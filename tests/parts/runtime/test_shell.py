@@ -323,7 +323,7 @@ def test_relays_other_reports_are_events_as_they_are(house: House) -> None:
 def test_desk_refuses_what_is_no_request(house: House) -> None:
     weights = {"verb": "weights", "task": "merge", "cpu": 1, "memory": 0, "network": 0}
     for request, says in (
-        ({"verb": "fly"}, "unknown verb 'fly'; known: access, explain, retry, status, weights"),
+        ({"verb": "fly"}, "unknown verb 'fly'; known: access, explain, log, retry, status, weights"),
         ({"verb": "retry"}, "retry: 'task' is missing"),
         ({"verb": "retry", "task": "merge", "whose": "No Name"}, "retry: retry.node: 'No Name' is not a name"),
         ({"verb": "status", "node": 5}, "node: 5 is not a name"),

@@ -279,11 +279,12 @@ class Executor:
         self._current = slot_for(self.spec, self.me, owner, self.epoch)
         self._go(Phase.PREPARING, RoutePhase.PREPARE, f"prepares {owner}", todo)
 
-    def _go(self, phase: Phase, plan: RoutePhase | None, text: str, todo: ToDo) -> None:
+    def _go(self, phase: Phase, plan: RoutePhase | None, text: str, todo: ToDo, took_s: float | None = None) -> None:
         self.phase = phase
         if plan is not None and self._current is not None:
             todo.add(ApplyRoutes(plan=self._plan(self._current, plan)))
-        todo.add(RecordStory(stage="executor", text=text, task=self.spec.name, epoch=self.epoch))
+        story = RecordStory(stage="executor", text=text, task=self.spec.name, epoch=self.epoch, took_s=took_s)
+        todo.add(story)
 
     def _plan(self, current: Slot, phase: RoutePhase) -> RoutePlan:
         return plan_for(self.spec, phase, current, tuple(old.slot for old in self._old))
@@ -297,13 +298,14 @@ class Executor:
         """The relay switched every stream to the slot of ``epoch``."""
         if epoch != self.epoch or self.phase is not Phase.FLIPPING:
             return
-        done = f"flipped to {self.owner} in {(now - self.started_at) * 1000:.0f} ms, {replayed} kept values replayed"
+        took_s = now - self.started_at
+        done = f"flipped to {self.owner} in {took_s * 1000:.0f} ms, {replayed} kept values replayed"
         if not self._old:
-            self._go(Phase.SETTLED, RoutePhase.CLOSE, done, todo)
+            self._go(Phase.SETTLED, RoutePhase.CLOSE, done, todo, took_s)
             return
         drained_by = now + self.spec.drain_s
         self._old = tuple(old if old.is_left else replace(old, until=drained_by) for old in self._old)
-        self._go(Phase.DRAINING, None, f"{done}; {', '.join(self.predecessors)} drains", todo)
+        self._go(Phase.DRAINING, None, f"{done}; {', '.join(self.predecessors)} drains", todo, took_s)
 
     def on_drained(self, epoch: int, todo: ToDo) -> None:
         """The old slot of ``epoch`` has given back everything."""

@@ -14,7 +14,9 @@ from zsched.core import instructions as do
 from zsched.core.executor.workers import failed_workers
 from zsched.core.stages import Handler, PastValue, Stages, Unready
 from zsched.core.todo import ToDo
+from zsched.core.values.decision import Move
 from zsched.core.values.model import Allocation, NodeId, PeerState, TaskId, Weights, WorkerState
+from zsched.core.vote.register import FROM_A_PEER
 
 # --- learnt values ---------------------------------------------------------------------------------------------------
 
@@ -23,6 +25,8 @@ def carry_out(node: Stages, value: Allocation, reason: str, todo: ToDo, now: flo
     """Carry out a newly learnt value; this batch writes it to disk before anything else."""
     task, executor = value.task, node.executors[value.task]
     is_new_epoch = value.epoch > executor.epoch
+    move = _move_of(node, value, reason) if is_new_epoch else None
+    reason = reason if move is None else move.reason
     node.history[task].append(PastValue(value=value, at=now, reason=reason))
     if is_new_epoch:
         left = executor.owner
@@ -31,13 +35,31 @@ def carry_out(node: Stages, value: Allocation, reason: str, todo: ToDo, now: flo
     node.votes.on_learnt(task)
     node.rounds.on_learnt(task, is_new_epoch=is_new_epoch, now=now)
     text = f"learnt revision {value.revision}: owner {value.owner}, weights {_told(value.tuning.weights)}"
-    todo.add(do.RecordStory(stage="vote", text=text, task=task, epoch=value.epoch))
+    todo.add(do.RecordStory(stage="vote", text=text, task=task, epoch=value.epoch, move=move))
     executor.execute(value, todo, now)
     node.tenure.hold(value, node.beat_sequence + 1)
     for old in executor.predecessors:
         if node.membership.state(old) is PeerState.GONE:
             executor.on_gone(old, todo)
     todo.must_beat = True
+
+
+def _move_of(node: Stages, value: Allocation, reason: str) -> Move:
+    """A change of owner, with the votes for it as far as this node has heard them.
+
+    A robot that did not commit it itself tells the reason of one that wanted it.
+    """
+    heard = [proposal for _, (proposal, _) in sorted(node.votes.tasks[value.task].proposals.items())]
+    votes = [proposal for proposal in heard if proposal.base_revision == value.revision - 1]
+    wanted = [proposal.reason for proposal in votes if proposal.candidate == value.owner and proposal.reason]
+    return Move(
+        epoch=value.epoch,
+        revision=value.revision,
+        left=node.executors[value.task].owner,
+        owner=value.owner,
+        reason=wanted[0] if wanted and reason == FROM_A_PEER else reason,
+        votes=tuple((proposal.voter, proposal.candidate) for proposal in votes),
+    )
 
 
 def _has_failed(node: Stages, task: TaskId, owner: NodeId | None, now: float) -> bool:

@@ -35,6 +35,8 @@ from zsched.core.values.model import Acceptance, Ballot, NodeId, RegisterState, 
 from zsched.core.values.quorum import majority
 
 BACKOFF_CAP_S = 5.0
+FROM_A_PEER = "learnt from a peer"
+"""Why a value came about that another node committed."""
 MAX_REVISION = 2**52  # half of what a counter may be: a value so far ahead is refused, for nothing could follow it
 MAX_JUMP = 2**32  # no honest counter is so far ahead; one hostile frame must not use them all up
 
@@ -306,7 +308,7 @@ class Register(ABC, Generic[V]):
     def _why(self, outcome: RoundOutcome | None) -> str:
         """Why a learnt value came about: by our own change, or by another node's."""
         change = None if self._round is None else self._round.change
-        return "learnt from a peer" if change is None or outcome is not RoundOutcome.COMMITTED else change.reason
+        return FROM_A_PEER if change is None or outcome is not RoundOutcome.COMMITTED else change.reason
 
     def _outcome_by(self, value: V) -> RoundOutcome | None:
         """The end of our change under way, given the learnt ``value``; ``None``: it goes on."""

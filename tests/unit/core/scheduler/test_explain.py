@@ -27,7 +27,8 @@ def value_of(terms: tuple[float, float, float], tuning: Tuning) -> float:
     if tuning.score is ScoreForm.PAPER:
         return sum(weight * term for weight, term in zip(weights, terms, strict=True)) / sum(weights)
     most = max(weights)
-    return math.prod(term ** (weight / most) for weight, term in zip(weights, terms, strict=True) if weight)
+    powers = [math.pow(term, weight / most) for weight, term in zip(weights, terms, strict=True) if weight]
+    return math.prod(powers)
 
 
 def decision_of(tuning: Tuning = TUNING, *, owner: str | None = "edge1", **changes: object) -> Decision:

@@ -1,0 +1,205 @@
+"""The decision log: bounded, whole lines, told when the disk refuses, read page by page over a rotation."""
+
+from __future__ import annotations
+
+import json
+import resource
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from zsched.adapters.host.decision_log import NAME, OLD_NAME, QUEUE_LIMIT, SCHEMA, DecisionLog, read_page
+from zsched.core.instructions import RecordStory
+from zsched.core.values.decision import Decision, Figures, Move, Rules, Verdict
+from zsched.core.values.fleet import Reach
+from zsched.core.values.model import Allocation, Tuning, Weights
+
+MOVE = Move(epoch=2, revision=2, left="edge1", owner="edge2", reason="edge1 is gone", votes=(("robot1", "edge2"),))
+VALUE = Allocation(
+    task="merge", revision=1, epoch=1, owner="edge1", tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
+)
+RULES = Rules(
+    candidates=("edge1",),
+    reach=Reach.MAJORITY,
+    memory_floor_ratio=0.05,
+    max_moves_per_minute=6,
+    patience=0.15,
+    learns_patience=False,
+    start_deadline_s=20.0,
+    has_command=True,
+)
+DECISION = Decision(
+    figures=Figures(
+        task="merge",
+        now=5.0,
+        rules=RULES,
+        allocation=VALUE,
+        voters=("robot1",),
+        present=("robot1",),
+        vectors=(),
+        electors=("robot1",),
+        electors_heard=("robot1",),
+        settled_for_s=1.0,
+    ),
+    verdict=Verdict(outcome="none", candidate=None, aggregate=0.0, reason="utilities of 0 robots, 1 needed"),
+)
+
+
+def story(text: str, **more: object) -> RecordStory:
+    return RecordStory(stage="vote", text=text, task="merge", epoch=2, **more)  # type: ignore[arg-type]
+
+
+class Kept:
+    """A log with what it has told of itself."""
+
+    def __init__(self, folder: Path, file_bytes: int = 4096) -> None:
+        self.told: list[str | None] = []
+        self.log = DecisionLog(folder, "robot1", 7, self.told.append, file_bytes)
+
+    def write(self, *stories: RecordStory) -> None:
+        """Put them and have the thread write them to the end."""
+        for one in stories:
+            self.log.put(one)
+        self.log.put(story("end"))
+        self.log._queue.put(None)
+        self.log._run()
+
+
+def lines(folder: Path) -> list[dict[str, object]]:
+    """All entries that are left, oldest first."""
+    found: list[dict[str, object]] = []
+    cursor, has_more = "", True
+    while has_more:
+        page, cursor, has_more = read_page(folder, cursor, most_bytes=700)
+        found += [json.loads(line) for line in page]
+    return found
+
+
+def test_a_story_becomes_one_line_and_the_thread_writes_all_before_it_ends(tmp_path: Path) -> None:
+    log = DecisionLog(tmp_path, "robot1", 7, lambda _problem: None)
+    log.start()
+    log.put(story("learnt", move=MOVE))
+    log.put(story("stay edge1: nobody better", decision=DECISION))
+    log.close()
+    first, second = lines(tmp_path)
+    assert {name: first[name] for name in ("schema", "node", "life", "stage", "text", "task", "epoch")} == {
+        "schema": SCHEMA,
+        "node": "robot1",
+        "life": 7,
+        "stage": "vote",
+        "text": "learnt",
+        "task": "merge",
+        "epoch": 2,
+    }
+    assert first["move"]["votes"] == [["robot1", "edge2"]]  # type: ignore[index]
+    assert list(second)[-1] == "decision"
+    assert second["decision"]["verdict"]["outcome"] == "none"  # type: ignore[index]
+
+
+def test_the_two_files_stay_within_their_bound_and_keep_the_newest(tmp_path: Path) -> None:
+    kept = Kept(tmp_path)
+    for number in range(20):
+        kept.write(*(story(f"{number}.{index} " + "x" * 100) for index in range(10)))
+        sizes = [(tmp_path / name).stat().st_size for name in (NAME, OLD_NAME) if (tmp_path / name).exists()]
+        assert all(size <= 4096 for size in sizes)
+    texts = [str(entry["text"]) for entry in lines(tmp_path)]
+    assert texts[-1] == "end"
+    assert 20 < len(texts) < 50
+    assert kept.told == []
+
+
+def test_what_a_restart_finds_is_gone_on_with(tmp_path: Path) -> None:
+    Kept(tmp_path).write(story("before"))
+    Kept(tmp_path).write(story("after"))
+    assert [entry["text"] for entry in lines(tmp_path)] == ["before", "end", "after", "end"]
+
+
+@contextmanager
+def full_disk(most_bytes: int) -> Iterator[None]:
+    """No file may grow over ``most_bytes``: a write is cut there, the next one fails."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_a_full_disk_costs_lines_which_are_counted_and_told_and_never_half_a_line(tmp_path: Path) -> None:
+    kept = Kept(tmp_path)
+    kept.write(story("first"))
+    size = (tmp_path / NAME).stat().st_size
+    with full_disk(size + 40):
+        kept.write(story("lost"), story("lost"))
+    assert (tmp_path / NAME).stat().st_size == size, "a line that was cut is taken back"
+    assert len(kept.told) == 1
+    assert "is not written: File too large" in str(kept.told[0])
+    kept.write(story("again"))
+    assert [entry["text"] for entry in lines(tmp_path)][2:] == [
+        "3 lines of this log are lost: the disk refused them, or they came too fast",
+        "again",
+        "end",
+    ]
+    assert kept.told[1:] == [None]
+
+
+def test_a_queue_without_room_counts_what_it_refuses_and_keeps_nobody_waiting(tmp_path: Path) -> None:
+    kept = Kept(tmp_path, file_bytes=1 << 20)
+    kept.write(*(story(str(number)) for number in range(QUEUE_LIMIT + 4)))
+    texts = [entry["text"] for entry in lines(tmp_path)]
+    assert texts[0] == "5 lines of this log are lost: the disk refused them, or they came too fast"
+    assert texts[1] == "0"
+    assert len(texts) == QUEUE_LIMIT + 1
+
+
+def test_a_reader_goes_on_where_it_was_over_a_rotation(tmp_path: Path) -> None:
+    kept = Kept(tmp_path)
+    kept.write(story("one"))
+    page, cursor, has_more = read_page(tmp_path, "")
+    assert (len(page), has_more) == (2, False)
+    assert read_page(tmp_path, cursor) == ([], cursor, False)
+    kept.write(*(story(f"{number} " + "x" * 100) for number in range(20)))
+    assert (tmp_path / OLD_NAME).exists()
+    seen, has_more = [], True
+    while has_more:
+        page, cursor, has_more = read_page(tmp_path, cursor)
+        seen += [json.loads(line)["text"].split()[0] for line in page]
+    assert seen == [*map(str, range(20)), "end"]
+
+
+def test_operators_get_no_figures_and_moves_alone_where_they_ask_for_them(tmp_path: Path) -> None:
+    kept = Kept(tmp_path, file_bytes=1 << 20)
+    kept.write(
+        story("judged", decision=DECISION),
+        story('text with ,"move": in it'),
+        story("moved", move=MOVE),
+        story("x", took_s=0.25),
+    )
+    with (tmp_path / NAME).open("ab") as file:
+        file.write(b'{"torn":\n')
+    everything = kept.log.answer({"verb": "log"})
+    assert [entry["text"] for entry in everything["entries"]] == [
+        "judged",
+        'text with ,"move": in it',
+        "moved",
+        "x",
+        "end",
+    ]
+    assert not any("decision" in entry for entry in everything["entries"])
+    moves = kept.log.answer({"verb": "log", "moves": True, "cursor": 5})
+    assert [entry["text"] for entry in moves["entries"]] == ["moved", "x"]
+    assert kept.log.answer({"cursor": everything["cursor"]})["entries"] == []
+    assert kept.log.answer({"cursor": "1:nonsense"})["entries"] == everything["entries"]
+
+
+def test_a_log_that_is_not_there_is_empty(tmp_path: Path) -> None:
+    assert read_page(tmp_path, "") == ([], "", False)
+
+
+@pytest.mark.parametrize("size", [1, 50, 300])
+def test_a_line_longer_than_a_page_is_read_whole(tmp_path: Path, size: int) -> None:
+    Kept(tmp_path).write(story("x" * 400))
+    page, _, _ = read_page(tmp_path, "", most_bytes=size)
+    assert json.loads(page[0])["text"] == "x" * 400

@@ -1,0 +1,217 @@
+"""The decision log: one line of JSON for every story of the daemon, in two files of the state folder.
+
+A line tells what happened, when by this machine's wall clock, and in which life of the daemon. A judgement that has
+changed carries all of its figures, so that `zsched replay` can make it again. At rest nothing is written.
+
+The loop only puts stories into a bounded queue; a thread makes the lines and appends them. A file that is full becomes
+the older one, so both together never hold more than twice `FILE_BYTES`. A disk that refuses costs lines, which are
+counted and told; the daemon goes on. Lines are not synced: a power cut may cost the last ones.
+
+Knows: files, lines, the fields of a line. Does not know: what a story means.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from zsched.clock import wall_s
+from zsched.core.instructions import RecordStory
+from zsched.core.values.decision import Decision, Move
+from zsched.core.values.model import NodeId
+from zsched.guard import guarded
+from zsched.wire.codec import as_plain
+
+SCHEMA = "zsched.event/1"
+NAME, OLD_NAME = "decisions.ndjson", "decisions.1.ndjson"
+FILE_BYTES = 2 * 1024 * 1024
+PAGE_BYTES = 512 * 1024
+"""One answer tells of so much of a file, so that a question keeps a daemon busy for milliseconds only."""
+QUEUE_LIMIT = 1000
+CLOSE_S = 0.5
+_BODY = b',"decision":'
+"""Where a judgement's figures begin; in a string its quotes would be escaped."""
+
+Json = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Entry:
+    """One line."""
+
+    schema: str
+    at: float
+    """Seconds since the Unix epoch, by the wall clock of ``node``."""
+    node: NodeId
+    life: int
+    """The daemon's incarnation."""
+    stage: str
+    text: str
+    task: str = ""
+    epoch: int = 0
+    move: Move | None = None
+    took_s: float | None = None
+    decision: Decision | None = None
+    """Last, for readers that do without it."""
+
+
+class DecisionLog:
+    """This daemon's log; `put` is the loop's, all else other threads'."""
+
+    def __init__(
+        self,
+        folder: Path,
+        node: NodeId,
+        life: int,
+        on_problem: Callable[[str | None], None],
+        file_bytes: int = FILE_BYTES,
+    ) -> None:
+        """``on_problem`` is told why lines are lost, and with ``None`` that none are any more."""
+        self._folder, self._node, self._life = folder, node, life
+        self._on_problem, self._file_bytes = on_problem, file_bytes
+        self._queue: queue.SimpleQueue[tuple[float, RecordStory] | None] = queue.SimpleQueue()
+        self._lost = self._crowded_out = 0
+        self._is_failing = False
+        self._thread = guarded(self._run, name="zsched-decision-log")
+
+    def start(self) -> None:
+        """Begin to write."""
+        self._thread.start()
+
+    def put(self, story: RecordStory) -> None:
+        """Take a story; never waits. What the queue has no room for is counted."""
+        if self._queue.qsize() >= QUEUE_LIMIT:
+            self._crowded_out += 1
+        else:
+            self._queue.put((wall_s(), story))
+
+    def close(self) -> None:
+        """Write what has been put, for at most `CLOSE_S`."""
+        self._queue.put(None)
+        if self._thread.is_alive():
+            self._thread.join(CLOSE_S)
+
+    # --- writing (its thread) ----------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        while (item := self._queue.get()) is not None:
+            at, story = item
+            crowded_out, self._crowded_out = self._crowded_out, 0
+            self._lost += crowded_out
+            self._write(at, story)
+
+    def _write(self, at: float, story: RecordStory) -> None:
+        try:
+            if self._lost:
+                text = f"{self._lost} lines of this log are lost: the disk refused them, or they came too fast"
+                self._append(self._line(at, RecordStory(stage="log", text=text)))
+                self._lost = 0
+            self._append(self._line(at, story))
+        except OSError as error:
+            self._lost += 1
+            if not self._is_failing:
+                path = self._folder / NAME
+                self._on_problem(f"the decision log {path} is not written: {error.strerror}; see `df {self._folder}`")
+            self._is_failing = True
+        else:
+            if self._is_failing:
+                self._on_problem(None)
+            self._is_failing = False
+
+    def _line(self, at: float, story: RecordStory) -> bytes:
+        entry = Entry(
+            schema=SCHEMA,
+            at=at,
+            node=self._node,
+            life=self._life,
+            stage=story.stage,
+            text=story.text,
+            task=story.task,
+            epoch=story.epoch,
+            move=story.move,
+            took_s=story.took_s,
+            decision=story.decision,
+        )
+        return json.dumps(as_plain(entry), separators=(",", ":")).encode() + b"\n"
+
+    def _append(self, line: bytes) -> None:
+        """Append a line whole or not at all; in a full file's place begins a new one."""
+        path = self._folder / NAME
+        if path.exists() and path.stat().st_size + len(line) > self._file_bytes:
+            path.replace(self._folder / OLD_NAME)
+        flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC | os.O_NOFOLLOW
+        with os.fdopen(os.open(path, flags, 0o640), "wb", buffering=0) as file:
+            before = os.fstat(file.fileno()).st_size
+            try:
+                written = 0
+                while written < len(line):
+                    written += file.write(line[written:])
+            except OSError:
+                os.ftruncate(file.fileno(), before)
+                raise
+
+    # --- reading (an operator's thread) ------------------------------------------------------------------------------
+
+    def answer(self, request: Json) -> Json:
+        """A page of the log: ``cursor`` is where the page before ended, ``moves`` leaves out all but moves."""
+        cursor, is_moves = request.get("cursor"), bool(request.get("moves"))
+        lines, cursor, has_more = read_page(self._folder, cursor if isinstance(cursor, str) else "")
+        wanted = [line for line in map(without_figures, lines) if not is_moves or _is_of_move(line)]
+        entries = [entry for line in wanted if (entry := _parsed(line)) is not None]
+        return {"node": self._node, "now": wall_s(), "entries": entries, "cursor": cursor, "more": has_more}
+
+
+def _parsed(line: bytes) -> Json | None:
+    """The line's object; ``None`` for one that a power cut has torn."""
+    try:
+        entry = json.loads(line)
+    except ValueError:
+        return None
+    return entry if isinstance(entry, dict) and isinstance(entry.get("at"), int | float) else None
+
+
+def _is_of_move(line: bytes) -> bool:
+    return b',"move":' in line or b',"took_s":' in line
+
+
+def without_figures(line: bytes) -> bytes:
+    """A line without a judgement's figures.
+
+    >>> without_figures(b'{"text":"stay","decision":{"figures":{}}}')
+    b'{"text":"stay"}'
+    """
+    head, mark, _ = line.partition(_BODY)
+    return head + b"}" if mark else line
+
+
+def read_page(folder: Path, cursor: str, most_bytes: int = PAGE_BYTES) -> tuple[list[bytes], str, bool]:
+    """(whole lines, where they end, whether there are more) from ``cursor`` on; ``""``: from the oldest line on.
+
+    A cursor whose file is gone goes on with the oldest line that is left. A log that is not there is empty.
+
+    Raises:
+        OSError: a file cannot be read.
+    """
+    mark, _, offset_text = cursor.partition(":")
+    found = [path for path in (folder / OLD_NAME, folder / NAME) if path.exists()]
+    marks = [str(path.stat().st_ino) for path in found]
+    first = marks.index(mark) if mark in marks else 0
+    offset = int(offset_text) if mark in marks and offset_text.isdigit() else 0
+    for number in range(first, len(found)):
+        with found[number].open("rb") as file:
+            file.seek(offset)
+            data = file.read(most_bytes)
+            if len(data) == most_bytes and b"\n" not in data:
+                data += file.readline()
+        whole = data[: data.rfind(b"\n") + 1]
+        at, offset = offset + len(whole), 0
+        if whole:
+            is_last = number == len(found) - 1 and len(data) < most_bytes
+            return whole.splitlines(), f"{marks[number]}:{at}", not is_last
+        cursor = f"{marks[number]}:{at}"
+    return [], cursor, False

@@ -1,0 +1,174 @@
+"""`zsched history` and `zsched events`: what the daemon on this machine has written into its decision log.
+
+Knows: pages of a log, ages, text, the schemas ``zsched.history/1`` and ``zsched.event/1``. Does not know: files.
+
+Times are by the wall clock of the node that wrote them. Ages are from the same clock, so the two always fit together.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+from zsched.commands.ask import Door, ask_door
+from zsched.commands.common import CliError, Json, print_json
+from zsched.commands.page import harmless, span
+from zsched.commands.report import millis, printable
+from zsched.exits import EXIT_OK, EXIT_UNREACHABLE, EXIT_USAGE
+
+SCHEMA = "zsched.history/1"
+FOLLOW_S = 0.5
+_DURATION = re.compile(r"(\d+(?:\.\d+)?)(s|m|h|d)")
+_UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EventsView:
+    """Which events are shown, and how."""
+
+    task: str | None
+    since_s: float | None
+    is_following: bool
+    is_json: bool
+
+
+def duration_s(text: str) -> float:
+    """Seconds of a duration like ``90s``, ``10m``, ``2h``, ``1d``.
+
+    >>> duration_s("10m")
+    600.0
+
+    Raises:
+        CliError: it is none.
+    """
+    found = _DURATION.fullmatch(text)
+    if found is None:
+        raise CliError(EXIT_USAGE, f"{text!r} is no duration; write it like 90s, 10m, 2h or 1d")
+    return float(found[1]) * _UNITS[found[2]]
+
+
+def task_of(word: str) -> str:
+    """The task of ``task/NAME``.
+
+    Raises:
+        CliError: it is another word.
+    """
+    kind, _, name = word.partition("/")
+    if kind != "task" or not name:
+        raise CliError(EXIT_USAGE, f"--for {word}: expected task/NAME")
+    return name
+
+
+def history(door: Door, task: str | None, *, is_json: bool) -> int:
+    """Print the moves that the log knows, the newest last; returns the exit code."""
+    node, now, entries, _ = _read(door, is_moves=True)
+    moves = list(_moves(entries, now, task))
+    if is_json:
+        print_json({"schema": SCHEMA, "node": node, "moves": moves})
+        return EXIT_OK
+    if not moves:
+        sys.stdout.write(f"no move{f' of {task}' if task else ''} in the log of {node}\n")
+    for move in moves:
+        sys.stdout.write(_move_line(printable(move)))
+    return EXIT_OK
+
+
+def events(door: Door, view: EventsView) -> int:
+    """Print what the log tells, the newest last; with ``is_following`` on and on until Ctrl-C."""
+    _, now, entries, cursor = _read(door, is_moves=False)
+    since = None if view.since_s is None else now - view.since_s
+    _print([entry for entry in entries if since is None or entry["at"] >= since], view)
+    is_away = False
+    try:
+        while view.is_following:
+            time.sleep(FOLLOW_S)
+            try:
+                _, _, entries, cursor = _read(door, is_moves=False, cursor=cursor)
+            except CliError as error:
+                if error.code != EXIT_UNREACHABLE:
+                    raise
+                if not is_away:
+                    sys.stderr.write(f"zsched events: {harmless(str(error))}; asking again until Ctrl-C\n")
+                is_away = True
+            else:
+                is_away = False
+                _print(entries, view)
+    except KeyboardInterrupt:
+        pass
+    return EXIT_OK
+
+
+def _read(door: Door, *, is_moves: bool, cursor: str = "") -> tuple[str, float, list[Json], str]:
+    """(node, its wall clock, entries, where they end) from ``cursor`` to the end of the log.
+
+    Raises:
+        CliError: nobody answers, or another machine's log is meant.
+    """
+    if door.node is not None:
+        raise CliError(EXIT_USAGE, f"the log of {door.node} lies on its machine: ask there")
+    found: list[Json] = []
+    while True:
+        answer = ask_door(door, {"verb": "log", "moves": is_moves, "cursor": cursor})
+        found += answer["entries"]
+        cursor = str(answer["cursor"])
+        if not answer["more"]:
+            return str(answer["node"]), float(answer["now"]), found, cursor
+
+
+# --- moves -----------------------------------------------------------------------------------------------------------
+
+
+def _moves(entries: list[Json], now: float, task: str | None) -> Iterator[Json]:
+    took = {(entry["task"], entry["epoch"], entry["life"]): entry["took_s"] for entry in entries if "took_s" in entry}
+    for entry in entries:
+        move = entry.get("move")
+        if move is None or task not in (None, entry["task"]):
+            continue
+        yield {
+            "at": _wall(entry["at"]),
+            "age_s": max(now - entry["at"], 0.0),
+            "task": entry["task"],
+            "epoch": move["epoch"],
+            "revision": move["revision"],
+            "from": move["left"],
+            "to": move["owner"],
+            "reason": move["reason"],
+            "votes": dict(move.get("votes", ())),
+            "switched_s": took.get((entry["task"], move["epoch"], entry["life"])),
+        }
+
+
+def _move_line(move: Json) -> str:
+    camps: dict[str, list[str]] = {}
+    for voter, choice in move["votes"].items():
+        camps.setdefault(choice, []).append(voter)
+    votes = "; ".join(f"{', '.join(voters)} for {choice}" for choice, voters in camps.items())
+    switched = "" if move["switched_s"] is None else f", streams switched in {millis(move['switched_s'])}"
+    where = f"{move['from'] or 'nobody'} -> {move['to'] or 'nobody'}"
+    head = f"{span(move['age_s']):>6} ago  {move['at']}  {move['task']} epoch {move['epoch']}  {where}"
+    return f"{head}: {move['reason']}{f' ({votes})' if votes else ''}{switched}\n"
+
+
+# --- events ----------------------------------------------------------------------------------------------------------
+
+
+def _print(entries: list[Json], view: EventsView) -> None:
+    for entry in entries:
+        if view.task not in (None, entry.get("task", "")):
+            continue
+        if view.is_json:
+            print_json({**entry, "at": _wall(entry["at"])}, is_line=True)
+            continue
+        shown = printable(entry)
+        where = f"task={shown['task']} epoch={shown.get('epoch', 0)} " if shown.get("task") else ""
+        sys.stdout.write(f"{_wall(entry['at'])} {shown['stage']:<10} {where}{shown['text']}\n")
+    sys.stdout.flush()
+
+
+def _wall(at: float) -> str:
+    """RFC 3339 in UTC, to the millisecond."""
+    return datetime.fromtimestamp(at, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
