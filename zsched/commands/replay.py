@@ -1,0 +1,69 @@
+"""`zsched replay FILE`: makes every judgement of a decision log again, and compares it with what was decided.
+
+Knows: lines of a log, exit codes. Does not know: how a judgement is made (`zsched.core.scheduler.decision`).
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+from zsched.commands.common import CliError, print_json
+from zsched.commands.page import harmless
+from zsched.core.scheduler.decision import decide_again, verdict_of
+from zsched.core.values.decision import Decision
+from zsched.errors import WireError
+from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE
+from zsched.files import read_packed
+from zsched.wire.codec import as_plain, from_plain
+
+SCHEMA = "zsched.replay/1"
+MOST_BYTES = 64 * 1024 * 1024
+
+
+def replay(file: Path, *, is_json: bool) -> int:
+    """Judge again what the log tells; returns 1 at the first judgement that comes out differently.
+
+    Raises:
+        CliError: the file cannot be read, or a line is none of a decision log.
+    """
+    try:
+        lines = read_packed(file, MOST_BYTES).splitlines()
+    except OSError as error:
+        raise CliError(EXIT_USAGE, f"{file}: cannot be read: {error.strerror}") from error
+    done = 0
+    for number, line in enumerate(lines, 1):
+        decision, written = _decision(file, number, line)
+        if decision is None:
+            continue
+        again = json.loads(json.dumps(as_plain(verdict_of(decide_again(decision.figures).judgement))))
+        if again != written:
+            where = f"{file}:{number}"
+            if is_json:
+                print_json(
+                    {"schema": SCHEMA, "judged": done, "equal": False, "line": number, "was": written, "is": again}
+                )
+            else:
+                sys.stdout.write(f"{where}: decided {_told(written)}\n{where}: and again {_told(again)}\n")
+            return EXIT_FAILED
+        done += 1
+    if is_json:
+        print_json({"schema": SCHEMA, "judged": done, "equal": True, "line": None, "was": None, "is": None})
+    else:
+        sys.stdout.write(f"{done} judgements made again, all equal\n")
+    return EXIT_OK
+
+
+def _decision(file: Path, number: int, line: bytes) -> tuple[Decision | None, object]:
+    """(a line's judgement, its verdict as it is written); ``None`` for a line without one."""
+    try:
+        entry = json.loads(line)
+        body = entry.get("decision")
+        return (None, None) if body is None else (from_plain(body, Decision), body["verdict"])
+    except (ValueError, AttributeError, TypeError, KeyError, WireError) as error:
+        raise CliError(EXIT_USAGE, f"{file}:{number}: no line of a decision log ({error})") from error
+
+
+def _told(verdict: object) -> str:
+    return harmless(json.dumps(verdict, ensure_ascii=False))
