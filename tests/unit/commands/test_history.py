@@ -1,0 +1,258 @@
+"""`zsched history`, `zsched events` and `zsched replay`: pages put together, times, filters, what differs."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from zsched.adapters.host.decision_log import NAME, DecisionLog
+from zsched.cli import app
+from zsched.commands import history as verb
+from zsched.commands.ask import Door
+from zsched.commands.common import CliError
+from zsched.commands.history import EventsView, duration_s, events, history, task_of
+from zsched.core.instructions import RecordStory
+from zsched.core.scheduler.decision import decide_again, verdict_of
+from zsched.core.values.decision import Decision, Figures, Move, Rules
+from zsched.core.values.fleet import Reach
+from zsched.core.values.model import Allocation, PeerState, Tuning, Utility, UtilityVector, Weights
+from zsched.exits import EXIT_UNREACHABLE, EXIT_USAGE
+
+NOW = 1_790_000_000.0
+HERE = Door(socket=Path("s"))
+MOVE = {
+    "epoch": 2,
+    "revision": 3,
+    "left": "edge1",
+    "owner": "edge2",
+    "reason": "edge1 is gone",
+    "votes": [["robot1", "edge2"], ["robot2", "edge2"], ["robot3", "edge1"]],
+}
+
+
+def entry(text: str, age_s: float, task: str = "merge", **more: object) -> dict[str, Any]:
+    return {
+        "at": NOW - age_s,
+        "node": "robot1",
+        "life": 7,
+        "stage": "vote",
+        "text": text,
+        "task": task,
+        "epoch": 2,
+    } | more
+
+
+class Pages:
+    """Stands for the daemon: its log, two entries a page."""
+
+    def __init__(self, *entries: dict[str, Any]) -> None:
+        self.entries = list(entries)
+        self.asked: list[dict[str, Any]] = []
+        self.is_away = False
+
+    def ask(self, door: Door, request: dict[str, Any], timeout_s: float = 5.0) -> dict[str, Any]:
+        assert door.node is None
+        assert timeout_s > 0
+        self.asked.append(request)
+        if self.is_away:
+            raise CliError(EXIT_UNREACHABLE, "no daemon")
+        first = int(request["cursor"] or 0)
+        page = self.entries[first : first + 2]
+        wanted = [one for one in page if not request["moves"] or "move" in one or "took_s" in one]
+        at = first + len(page)
+        return {"node": "robot1", "now": NOW, "entries": wanted, "cursor": str(at), "more": at < len(self.entries)}
+
+
+@pytest.fixture
+def pages(monkeypatch: pytest.MonkeyPatch) -> Pages:
+    made = Pages(
+        entry("a peer came", 100.0, task=""),
+        entry("learnt", 90.0, move=MOVE),
+        entry("judged", 80.0),
+        entry("flipped", 70.0, took_s=0.086),
+        entry("learnt \x1b[2J", 60.0, task="other", move={**MOVE, "left": None, "votes": []}),
+    )
+    monkeypatch.setattr(verb, "ask_door", made.ask)
+    monkeypatch.setattr(verb.time, "sleep", lambda _s: None)
+    return made
+
+
+def view(**given: Any) -> EventsView:
+    return EventsView(**{"task": None, "since_s": None, "is_following": False, "is_json": False, **given})
+
+
+@pytest.mark.usefixtures("pages")
+def test_moves_are_told_with_age_wall_time_votes_and_how_long_the_streams_took(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert history(HERE, None, is_json=False) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        (
+            " 1m30s ago  2026-09-21T14:11:50.000Z  merge epoch 2  edge1 -> edge2: edge1 is gone "
+            "(robot1, robot2 for edge2; robot3 for edge1), streams switched in 86 ms"
+        ),
+        " 1m00s ago  2026-09-21T14:12:20.000Z  other epoch 2  nobody -> edge2: edge1 is gone",
+    ]
+
+
+@pytest.mark.usefixtures("pages")
+def test_moves_of_one_task_as_json(capsys: pytest.CaptureFixture[str]) -> None:
+    assert history(HERE, "merge", is_json=True) == 0
+    assert json.loads(capsys.readouterr().out) == {
+        "schema": "zsched.history/1",
+        "node": "robot1",
+        "moves": [
+            {
+                "at": "2026-09-21T14:11:50.000Z",
+                "age_s": 90.0,
+                "task": "merge",
+                "epoch": 2,
+                "revision": 3,
+                "from": "edge1",
+                "to": "edge2",
+                "reason": "edge1 is gone",
+                "votes": {"robot1": "edge2", "robot2": "edge2", "robot3": "edge1"},
+                "switched_s": 0.086,
+            }
+        ],
+    }
+    assert history(HERE, "nothing", is_json=False) == 0
+    assert capsys.readouterr().out == "no move of nothing in the log of robot1\n"
+
+
+@pytest.mark.usefixtures("pages")
+def test_events_of_one_task_and_of_the_last_time(capsys: pytest.CaptureFixture[str]) -> None:
+    assert events(HERE, view(task="merge", since_s=85.0)) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "2026-09-21T14:12:00.000Z vote       task=merge epoch=2 judged",
+        "2026-09-21T14:12:10.000Z vote       task=merge epoch=2 flipped",
+    ]
+    assert events(HERE, view(is_json=True)) == 0
+    found = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [one["text"] for one in found] == ["a peer came", "learnt", "judged", "flipped", "learnt \x1b[2J"]
+    assert events(HERE, view()) == 0
+    assert "\x1b" not in capsys.readouterr().out
+
+
+def test_who_follows_goes_on_where_it_was_and_outlasts_a_restart(
+    pages: Pages, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps = iter(["quiet", "away", "away", "back", "end"])
+
+    def sleep(_s: float) -> None:
+        step = next(steps)
+        pages.is_away = step == "away"
+        if step == "back":
+            pages.entries.append(entry("newer", 1.0))
+        if step == "end":
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(verb.time, "sleep", sleep)
+    assert events(HERE, view(is_following=True)) == 0
+    captured = capsys.readouterr()
+    assert captured.out.count("learnt") == 2
+    assert captured.out.splitlines()[-1].endswith("newer")
+    assert captured.err.count("asking again") == 1
+
+
+def test_another_machine_s_log_is_refused(pages: Pages) -> None:
+    with pytest.raises(CliError, match="lies on its machine") as refused:
+        history(Door(socket=Path("s"), node="robot2"), None, is_json=False)
+    assert refused.value.code == EXIT_USAGE
+    assert pages.asked == []
+
+
+@pytest.mark.parametrize("word", ["10", "m", "-5m", "1w", "1.5.2h", ""])
+def test_what_is_no_duration_is_refused(word: str) -> None:
+    with pytest.raises(CliError, match="no duration"):
+        duration_s(word)
+
+
+def test_durations_and_the_word_for_a_task() -> None:
+    assert [duration_s(word) for word in ("90s", "1.5m", "2h", "1d")] == [90.0, 90.0, 7200.0, 86400.0]
+    assert task_of("task/merge") == "merge"
+    for word in ("merge", "task/", "node/edge1"):
+        with pytest.raises(CliError, match="task/NAME"):
+            task_of(word)
+
+
+# --- replay ----------------------------------------------------------------------------------------------------------
+
+
+def decision(value: float) -> Decision:
+    weights = Weights(cpu=1.0, memory=0.0, network=0.0)
+    column = tuple(Utility(candidate=name, value=one, cpu=one) for name, one in (("edge1", 0.1), ("edge2", value)))
+    figures = Figures(
+        task="merge",
+        now=12.345678901234567,
+        rules=Rules(
+            candidates=("edge1", "edge2"),
+            reach=Reach.MAJORITY,
+            memory_floor_ratio=0.05,
+            max_moves_per_minute=6,
+            patience=0.15,
+            learns_patience=True,
+            start_deadline_s=20.0,
+            has_command=True,
+        ),
+        allocation=Allocation(task="merge", revision=4, epoch=3, owner="edge1", tuning=Tuning(weights=weights)),
+        voters=("robot1",),
+        present=("robot1",),
+        vectors=(UtilityVector(voter="robot1", task="merge", revision=4, utilities=column),),
+        electors=("robot1",),
+        electors_heard=("robot1",),
+        settled_for_s=60.0,
+        owner_state=PeerState.ALIVE,
+    )
+    return Decision(figures=figures, verdict=verdict_of(decide_again(figures).judgement))
+
+
+def log_of(folder: Path, *decisions: Decision) -> Path:
+    log = DecisionLog(folder, "robot1", 7, lambda _problem: None)
+    log.start()
+    log.put(RecordStory(stage="vote", text="learnt", move=Move(epoch=1, revision=1, left=None, owner="a", reason="")))
+    for one in decisions:
+        log.put(RecordStory(stage="scheduler", text="judged", task="merge", decision=one))
+    log.close()
+    return folder / NAME
+
+
+def run(*arguments: object) -> Any:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def test_a_log_is_judged_again_and_all_is_equal(tmp_path: Path) -> None:
+    file = log_of(tmp_path, decision(0.1), decision(1 / 3), decision(0.9))
+    done = run("replay", file)
+    assert (done.exit_code, done.stdout) == (0, "3 judgements made again, all equal\n")
+    body = json.loads(run("replay", file, "--json").stdout)
+    assert (body["schema"], body["judged"], body["equal"]) == ("zsched.replay/1", 3, True)
+
+
+def test_the_first_judgement_that_differs_is_named(tmp_path: Path) -> None:
+    """One bit of one number is enough."""
+    one = decision(1 / 3)
+    aggregates = tuple((name, value * (1 + 2**-52)) for name, value in one.verdict.aggregates)
+    other = replace(one, verdict=replace(one.verdict, aggregates=aggregates))
+    file = log_of(tmp_path, one, other, other)
+    done = run("replay", file)
+    assert done.exit_code == 1
+    assert [line.split(" ")[0] for line in done.stdout.splitlines()] == [f"{file}:3:", f"{file}:3:"]
+    body = json.loads(run("replay", file, "--json").stdout)
+    assert (body["judged"], body["equal"], body["line"]) == (1, False, 3)
+
+
+@pytest.mark.parametrize("line", ["no json", "[1]", '{"decision":{"figures":{}}}', '{"decision":3}'])
+def test_what_is_no_log_is_refused_with_its_line(tmp_path: Path, line: str) -> None:
+    file = log_of(tmp_path, decision(0.5))
+    with file.open("a") as more:
+        more.write(f"{line}\n")
+    done = run("replay", file)
+    assert done.exit_code == EXIT_USAGE
+    assert f"{file}:3: no line of a decision log" in done.stderr
+    assert run("replay", tmp_path / "nothing").exit_code == EXIT_USAGE
