@@ -78,7 +78,7 @@ def pages(monkeypatch: pytest.MonkeyPatch) -> Pages:
         entry("learnt \x1b[2J", 60.0, task="other", move={**MOVE, "left": None, "votes": []}),
     )
     monkeypatch.setattr(verb, "ask_door", made.ask)
-    monkeypatch.setattr(verb.time, "sleep", lambda _s: None)
+    monkeypatch.setattr("zsched.commands.history.time.sleep", lambda _s: None)
     return made
 
 
@@ -152,7 +152,7 @@ def test_who_follows_goes_on_where_it_was_and_outlasts_a_restart(
         if step == "end":
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(verb.time, "sleep", sleep)
+    monkeypatch.setattr("zsched.commands.history.time.sleep", sleep)
     assert events(HERE, view(is_following=True)) == 0
     captured = capsys.readouterr()
     assert captured.out.count("learnt") == 2

@@ -25,6 +25,7 @@ from zsched.core.values.fleet import Standby, StreamRule, TaskSpec, WorkerSpec, 
 from zsched.core.values.messages import (
     Accept,
     Accepted,
+    ExplainTask,
     Learnt,
     Prepare,
     Promise,
@@ -308,6 +309,8 @@ class Storm:
 
     def command(self) -> ev.Event:
         if self.rng.random() < 0.2:
+            return ev.ExplanationAsked(request=self.number(), command=ExplainTask(task=self.task()))
+        if self.rng.random() < 0.2:
             whose = self.rng.choice(("", self.name()))
             return ev.RetryCommanded(request=self.number(), command=RetryTask(task=self.task(), node=whose))
         base = self.rng.choice((None, self.number()))
@@ -325,7 +328,7 @@ def sent(instruction: do.Instruction) -> object | None:
     """The value that an instruction sends or writes."""
     names = (
         *("beat", "profile", "proposal", "learnt", "utilities", "prepare", "accept", "answer", "snapshot", "result"),
-        *("plan", "role", "state"),
+        *("plan", "role", "state", "explanation"),
     )
     return next((getattr(instruction, name) for name in names if hasattr(instruction, name)), None)
 

@@ -226,7 +226,7 @@ def _changes(figures: Figures, verdict: Verdict, again: Decided, sums: tuple[Can
         return
     heard = again.standing.voters_heard
     if heard < again.needed:
-        yield f"{again.needed - heard} more robots must tell their utilities"
+        yield f"{again.needed} robots must tell their utilities, {heard} did"
         return
     allocation = figures.allocation
     if allocation.paused or allocation.pinned:
@@ -275,7 +275,7 @@ def _times(figures: Figures, again: Decided, node: NodeId, lead: float) -> Itera
         yield f"until {figures.first} has moved"
     electors, heard = len(figures.electors), len(figures.electors_heard)
     if heard < majority(electors):
-        yield f"until {majority(electors) - heard} more electors are heard"
+        yield f"until {majority(electors)} of {electors} electors are heard ({heard} are)"
     damping = Damping.of(figures.damping)
     if damping.moves_within(WINDOW_S, figures.now, escapes=False) >= figures.rules.max_moves_per_minute:
         yield f"until fewer than {figures.rules.max_moves_per_minute} moves lie in the last minute"

@@ -114,7 +114,7 @@ def test_a_silent_robot_and_its_revision_are_told() -> None:
     told = explained(few)
     assert (told.heard, told.silent, told.needed) == (("robot1",), ("robot2", "robot3"), 2)
     assert told.outcome == "none"
-    assert told.changes == ("1 more robots must tell their utilities",)
+    assert told.changes == ("2 robots must tell their utilities, 1 did",)
 
 
 def test_a_candidate_that_lacks_worth_moves_the_task_when_it_has_it() -> None:
