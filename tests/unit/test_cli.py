@@ -180,7 +180,14 @@ def test_every_verb_that_asks_a_daemon_takes_the_node_that_several_daemons_make_
     main = typer.main.get_command(app)
     assert isinstance(main, typer.core.TyperGroup)
     asking = [words for words, options in verbs(main) if "--runtime-dir" in options]
-    arguments = {"weights": ["echo"], "retry": ["echo"], "bw": ["in/0"], "hz": ["in/0"], "tail": ["in/0"]}
+    arguments = {
+        "explain": ["echo"],
+        "weights": ["echo"],
+        "retry": ["echo"],
+        "bw": ["in/0"],
+        "hz": ["in/0"],
+        "tail": ["in/0"],
+    }
     arguments |= {"ping": ["edge1"], "bugreport": [str(folder / "report.tar.gz")]}
     assert set(asking) >= {("status",), ("weights",), ("retry",), ("stream", "list"), ("stream", "tail")}
     del asking[asking.index(("up",))]  # it starts the daemon
