@@ -16,7 +16,7 @@ from support.fleets import fleet_of, tuning_of
 from zsched.core.scheduler.decision import decide_again, verdict_of
 from zsched.core.values.decision import Decision
 from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec
-from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.model import NodeId, TaskId, WorkerState
 from zsched.errors import InvariantError
 from zsched.wire.codec import as_plain, from_plain
 from zsched_lab.sim.checks import check_replayed
@@ -108,3 +108,29 @@ def test_only_a_judgement_that_changed_is_written_down() -> None:
     sim.run(60.0)
     assert sim.node("robot1").rounds.tasks["task0"].judged_at > before
     assert sim.stories == []
+
+
+def test_since_when_an_owner_cannot_be_scored_or_is_not_ready_is_remembered() -> None:
+    sim = Simulator(fleet=fleet(), seed=5)
+    sim.start(*ROBOTS, *EDGES)
+    sim.run(10.0)
+    decision = sim.node("robot1").rounds.decision("task0", sim.now)
+    assert decision is not None
+    figures = decision.figures
+    owner, profile = figures.allocation.owner, figures.owner_profile
+    assert owner is not None
+    assert profile is not None
+    memory = replace(figures.judge, unscored_since=figures.now - 1.5, not_ready_since=figures.now - 4.0)
+    unscored = tuple(
+        replace(
+            vector,
+            utilities=tuple(one for one in vector.utilities if one.candidate != owner),
+            refused=((owner, "no fresh profile"),),
+        )
+        for vector in figures.vectors
+    )
+    waits = decide_again(replace(figures, judge=memory, vectors=unscored)).judgement
+    assert "for 1.5 of 2 s" in waits.reason
+    starting = replace(profile, workers=tuple(replace(one, state=WorkerState.STARTING) for one in profile.workers))
+    waits = decide_again(replace(figures, judge=memory, owner_profile=starting)).judgement
+    assert f"{owner} will be left in 16 s" in waits.reason
