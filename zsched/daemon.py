@@ -40,7 +40,7 @@ from zsched.core.node import Node
 from zsched.core.route.route import watch_for
 from zsched.core.status import status_line
 from zsched.core.values.durable import DurableState
-from zsched.core.values.fleet import electorate_hash, fleet_hash, runs_worker
+from zsched.core.values.fleet import dial_endpoint, electorate_hash, fleet_hash, runs_worker
 from zsched.core.values.model import NodeId, NodeKind, TaskId
 from zsched.errors import AdapterError, ConfigError, NameTakenError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_NAME_TAKEN, EXIT_OK
@@ -127,6 +127,8 @@ class Daemon:
                 now=monotonic_s(),
                 version=__version__,
             )
+            node.solitude.dialled = points.control_connect
+            node.solitude.dialled_at = dial_endpoint(self._spec.listen_control, self._spec.host)
             node.joins_at = joins_at(self._spec, points.worker_connect[:1])
             if problem is not None:
                 node.problems["state"] = problem

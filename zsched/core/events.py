@@ -357,6 +357,13 @@ class FrameDropped:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class AddressesTried:
+    """What became of one attempt at each address that this node dials: (address, a few words or nothing)."""
+
+    found: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ProblemReported:
     """An adapter has trouble (``problem``), or no longer has (``None``); ``source`` names it for the status."""
 
@@ -402,6 +409,7 @@ Event = (
     | RetryCommanded
     | ExplanationAsked
     | FrameDropped
+    | AddressesTried
     | ProblemReported
     | StopRequested
 )

@@ -114,6 +114,13 @@ class IntroducePeers:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class TryAddresses:
+    """Nobody was ever heard: find out what becomes of an attempt at each address (`AddressesTried`)."""
+
+    addresses: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class AnswerLearnt:
     """Answer a peer's `AskLearnt`."""
 
@@ -226,6 +233,7 @@ Instruction = (
     | AskLearnt
     | AnswerLearnt
     | IntroducePeers
+    | TryAddresses
     | StartWorker
     | StopWorker
     | ResetWorker

@@ -69,7 +69,7 @@ def build_snapshot(node: Stages, now: float) -> Snapshot:
         counters=tuple(sorted((node.counters + node.agreement.counters).items())),
         problems=(
             *node.namesakes.problems(now),
-            *_problems(node, quorum),
+            *_problems(node, quorum, now),
             *_relay_problems(node, now),
             *node.knocking.problems(now, node.fleet_path),
         ),
@@ -91,7 +91,7 @@ def build_explanation(node: Stages, task: TaskId, now: float) -> Explanation:
     )
 
 
-def _problems(node: Stages, quorum: QuorumStatus) -> tuple[str, ...]:
+def _problems(node: Stages, quorum: QuorumStatus, now: float) -> tuple[str, ...]:
     if _is_never_initialised(node, quorum):
         others = {source: text for source, text in node.problems.items() if source != "state"}
         names = ", ".join(quorum.stateless)
@@ -101,6 +101,9 @@ def _problems(node: Stages, quorum: QuorumStatus) -> tuple[str, ...]:
         )
         return (first, *(f"{source}: {text}" for source, text in sorted(others.items())))
     problems = [f"{source}: {text}" for source, text in sorted({**node.problems, **node.agreement.problems}.items())]
+    is_alone = node.solitude.is_alone(now, has_heard=node.membership.has_heard)
+    if is_alone and not node.knocking.problems(now):
+        problems.insert(0, node.solitude.problem())
     if quorum.stateless:
         names = ", ".join(quorum.stateless)
         problems.append(f"electors without their state, {len(quorum.stateless)} of {quorum.electors}: {names}")
@@ -111,11 +114,14 @@ def _problems(node: Stages, quorum: QuorumStatus) -> tuple[str, ...]:
         )
     if not quorum.ok:
         problems.append(f"no quorum: {quorum.alive} of {quorum.electors} electors can answer, {quorum.needed} needed")
+        if not is_alone:
+            problems += [f"elector {told}" for name in node.fleet.electors if (told := _why_silent(node, name, now))]
     elif quorum.alive == quorum.needed < quorum.electors:
-        missing = ", ".join(name for name in node.fleet.electors if not _can_answer(node, name))
+        missing = [name for name in node.fleet.electors if not _can_answer(node, name)]
         problems.append(
-            f"no elector to spare: {quorum.alive} of {quorum.electors} can answer, {quorum.needed} needed; "
-            f"not {missing}. With one more away nothing is decided"
+            f"no elector to spare: {quorum.alive} of {quorum.electors} can answer, {quorum.needed} needed. "
+            "With one more away nothing is decided. "
+            + "; ".join(_why_silent(node, name, now) or _why_refused(node, name) for name in missing)
         )
     voters = node.fleet.voters
     silent = [name for name in voters if node.membership.state(name) is not PeerState.ALIVE]
@@ -134,6 +140,24 @@ def _problems(node: Stages, quorum: QuorumStatus) -> tuple[str, ...]:
     if not node.has_state and not node.has_foreign_state:
         problems.append("no valid state file: this node is no elector (see `zsched init --help`)")
     return tuple(problems)
+
+
+def _why_silent(node: Stages, name: NodeId, now: float) -> str:
+    """Why an elector is not heard, and what to do about it; empty for one that is heard, or may still connect."""
+    state = node.membership.state(name)
+    if state is PeerState.GONE:
+        return f"{name} is gone: start zsched on it, or look at its network"
+    if state is PeerState.SUSPECT:
+        return f"{name} is silent: it is gone soon, or is heard again"
+    if state is PeerState.UNKNOWN and node.solitude.is_alone(now, has_heard=False):
+        return f"{name} was never heard: start zsched on it, and check its host, port and firewall"
+    return ""
+
+
+def _why_refused(node: Stages, name: NodeId) -> str:
+    if _has_lost_state(node, name):
+        return f"{name} has no state"
+    return f"{name} and this node refuse each other" if name in node.agreement.apart else f"{name} is not heard yet"
 
 
 def _is_never_initialised(node: Stages, quorum: QuorumStatus) -> bool:

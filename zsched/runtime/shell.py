@@ -19,6 +19,7 @@ from typing import Any, assert_never
 
 from zsched.adapters.host.decision_log import DecisionLog
 from zsched.adapters.host.state_file import StateFile
+from zsched.adapters.network.address_trial import AddressTrial
 from zsched.adapters.network.control_bus import ControlBus
 from zsched.adapters.relay.streams import RelayHandle
 from zsched.adapters.workers.supervisor import WorkerSupervisor
@@ -222,6 +223,7 @@ class Shell:
         self._node, self._inbox = node, inbox
         self._bus, self._state_file, self._desk = bus, state_file, desk
         self.crew = Crew(inbox.post, fleet, node)
+        self._trial = AddressTrial(inbox.post)
         self.relay: RelayHandle | None = None
         """It reports to this shell, so it is made after it."""
         self.log: DecisionLog | None = None
@@ -283,6 +285,8 @@ class Shell:
                 bus.ask_learnt(peer, deadline_s)
             case do.IntroducePeers():
                 bus.introduce_peers()
+            case do.TryAddresses(addresses=addresses):
+                self._trial.begin(addresses)
             case do.AnswerUtilities(request=request, utilities=value):
                 bus.answer(request, value)
             case do.AnswerElection(request=request, answer=vote):

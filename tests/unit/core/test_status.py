@@ -183,7 +183,8 @@ def test_electors_of_another_generation_or_electorate_count_for_nothing(strange:
     assert (snapshot.quorum.alive, snapshot.quorum.ok, snapshot.quorum.apart) == (2, True, ("robot2",))
     said = "electors of another generation, or with other electors in their fleet file, 1 of 3: robot2; "
     assert any(one.startswith(said) for one in snapshot.problems), snapshot.problems
-    assert any("no elector to spare: 2 of 3 can answer, 2 needed; not robot2" in one for one in snapshot.problems)
+    assert any("no elector to spare: 2 of 3 can answer, 2 needed. " in one for one in snapshot.problems)
+    assert any(one.endswith("robot2 and this node refuse each other") for one in snapshot.problems)
     node.handle(ev.BeatReceived(beat=replace(apart, node="robot3")), 100.0)
     assert not build_snapshot(node, 100.0).quorum.ok
     for name in ("robot2", "robot3"):
@@ -211,7 +212,8 @@ def test_an_elector_that_is_none_by_its_own_file_counts_for_nothing() -> None:
     snapshot = build_snapshot(node, 100.0)
     assert (snapshot.quorum.alive, snapshot.quorum.ok, snapshot.quorum.apart) == (2, True, ("robot2",))
     assert any("1 of 3: robot2; they and this node refuse each other" in one for one in snapshot.problems)
-    assert any("no elector to spare: 2 of 3 can answer, 2 needed; not robot2" in one for one in snapshot.problems)
+    assert any("no elector to spare: 2 of 3 can answer, 2 needed. " in one for one in snapshot.problems)
+    assert any(one.endswith("robot2 and this node refuse each other") for one in snapshot.problems)
     alone = make(alive=())
     alone.handle(ev.BeatReceived(beat=sent), 100.0)
     assert not build_snapshot(alone, 100.0).quorum.ok
@@ -304,10 +306,62 @@ def test_a_state_of_another_electorate_is_not_told_as_lost() -> None:
 def test_a_quorum_without_a_margin_is_a_problem_that_names_who_is_missing() -> None:
     (problem,) = build_snapshot(make(alive=("robot2",)), 100.0).problems
     assert problem == (
-        "no elector to spare: 2 of 3 can answer, 2 needed; not robot3. With one more away nothing is decided"
+        "no elector to spare: 2 of 3 can answer, 2 needed. With one more away nothing is decided. "
+        "robot3 is not heard yet"
     )
     (_, problem) = build_snapshot(make(has_state=False), 100.0).problems[:2]
-    assert "not robot1" in problem, "an elector without its state is none"
+    assert problem.endswith("robot1 has no state"), "an elector without its state is none"
+
+
+def test_an_elector_that_is_missing_is_named_with_what_to_do() -> None:
+    never = "robot3 was never heard: start zsched on it, and check its host, port and firewall"
+    assert build_snapshot(make(alive=("robot2",)), 110.0).problems[0].endswith(never)
+    node = make()
+    for tick in range(1, 35):  # a loop that sleeps longer would doubt itself first
+        node.handle(ev.DeadlineReached(), 100.0 + tick * 0.04)
+    silent = build_snapshot(node, 101.36).problems
+    assert "elector robot2 is silent: it is gone soon, or is heard again" in silent
+    node.handle(ev.DeadlineReached(), 104.0)
+    lost = build_snapshot(node, 104.0).problems
+    for name in ("robot2", "robot3"):
+        assert f"elector {name} is gone: start zsched on it, or look at its network" in lost
+
+
+def test_a_node_that_reaches_nobody_says_whom_it_dials_and_what_becomes_of_it() -> None:
+    node = make(alive=())
+    node.solitude.dialled = ("tcp/nowhere.invalid:47457", "tcp/127.0.0.1:47477")
+    assert not any("heard nobody" in one for one in build_snapshot(node, 102.9).problems), "it may still connect"
+    asked = [one for one in node.handle(ev.DeadlineReached(), 103.1) if isinstance(one, do.TryAddresses)]
+    assert asked == [do.TryAddresses(addresses=node.solitude.dialled)]
+    later = (one for now in (104.0, 120.0, 132.0) for one in node.handle(ev.DeadlineReached(), now))
+    assert not any(isinstance(one, do.TryAddresses) for one in later), "at most one trial in 30 s"
+    both = "tcp/nowhere.invalid:47457, tcp/127.0.0.1:47477"
+    check = "Check host, port, firewall, and that every node has the same `fleet:`"
+    assert build_snapshot(node, 103.1).problems[0] == f"heard nobody since the start: dialled {both}. {check}"
+    found = (("tcp/nowhere.invalid:47457", "name unknown"), ("tcp/127.0.0.1:47477", "refused"))
+    node.handle(ev.AddressesTried(found=found), 104.0)
+    told = build_snapshot(node, 104.0).problems
+    assert told[0] == (
+        "heard nobody since the start: dialled tcp/nowhere.invalid:47457 (name unknown), "
+        "tcp/127.0.0.1:47477 (refused). " + check
+    )
+    assert not any(one.startswith("elector") for one in told), "one cause, one line"
+    node.handle(ev.BeatReceived(beat=beat_of("edge1", incarnation=3)), 140.0)
+    assert not any("heard nobody" in one for one in build_snapshot(node, 140.0).problems)
+    after = (one for now in (170.0, 201.0) for one in node.handle(ev.DeadlineReached(), now))
+    assert not any(isinstance(one, do.TryAddresses) for one in after), "it has heard somebody once"
+
+
+@pytest.mark.parametrize(
+    ("dialled_at", "way"),
+    [("tcp/192.0.2.1:7447", "the others dial it at tcp/192.0.2.1:7447"), ("", "nobody has an address to dial")],
+)
+def test_a_node_that_dials_nobody_says_where_it_is_dialled(dialled_at: str, way: str) -> None:
+    node = make(alive=())
+    node.solitude.dialled_at = dialled_at
+    (told, *_) = build_snapshot(node, 110.0).problems
+    assert told.startswith(f"heard nobody since the start: this node dials nobody, {way}. ")
+    assert not any(isinstance(one, do.TryAddresses) for one in node.handle(ev.DeadlineReached(), 110.0))
 
 
 def test_robots_that_cannot_make_a_majority_are_a_problem_while_electors_can() -> None:

@@ -56,6 +56,8 @@ def send_beat(node: Stages, todo: ToDo, now: float) -> None:
     _hear_leases(node, beat, todo, now, is_newest=True)
     if node.introductions.is_due(now, is_missing=node.membership.misses_anybody):
         todo.add(do.IntroducePeers())
+    if node.solitude.must_try(now, has_heard=node.membership.has_heard):
+        todo.add(do.TryAddresses(addresses=node.solitude.dialled))
 
 
 def _fitting(node: Stages, beat: Beat) -> Beat:
@@ -195,6 +197,10 @@ def on_transition(node: Stages, change: Transition, todo: ToDo, now: float) -> N
     todo.must_decide |= any(value.owner == change.node for value in node.values().values())
 
 
+def _on_addresses(node: Stages, event: ev.AddressesTried, _todo: ToDo, _now: float) -> None:
+    node.solitude.on_tried(event.found)
+
+
 def _on_clock(node: Stages, event: ev.ClockCompared, todo: ToDo, now: float) -> None:
     if node.tenure.on_clock(event, node.agreement.standing(), node.beat_sequence, now):
         todo.must_beat = True  # the others must hear whether our echoes count
@@ -205,5 +211,6 @@ HANDLERS: Final[Mapping[type[Any], Handler]] = {
     ev.BeatReceived: _on_beat,
     ev.TokenSeen: _on_token_seen,
     ev.TokenLost: _on_token_lost,
+    ev.AddressesTried: _on_addresses,
     ev.ClockCompared: _on_clock,
 }

@@ -79,6 +79,7 @@ class Membership:
         self._states = dict.fromkeys(sorted(nodes), PeerState.UNKNOWN) | {me: PeerState.ALIVE}
         self._has_suspect = False
         self._misses_anybody = bool(self._peers)
+        self._has_heard = not self._peers
         self._has_watched = False
         """Whether this node has listened for as long as silence takes to mean something."""
 
@@ -133,6 +134,11 @@ class Membership:
         """Whether some node of the fleet file is not heard."""
         return self._misses_anybody
 
+    @property
+    def has_heard(self) -> bool:
+        """Whether any peer was ever heard; also true of a node without peers."""
+        return self._has_heard
+
     # --- what changes it ---------------------------------------------------------------------------------------
 
     def note_lag(self, lag_s: float) -> None:
@@ -164,6 +170,7 @@ class Membership:
         before, is_back = peer.state, peer.has_been_gone and not restarted
         self._deadline = None
         peer.beat_at = now
+        self._has_heard = True
         peer.suspects, peer.token_lost = beat.suspects, False
         changes = []
         if before is not PeerState.ALIVE:

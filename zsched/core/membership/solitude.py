@@ -1,0 +1,63 @@
+"""Membership, nobody heard: has this node heard any node of its fleet file since its start, and whom does it dial?
+
+Such a node is alive and alone: a wrong host or port, a firewall, or another `fleet:` on each machine. Without a word of
+its own its status would only count the electors that are missing.
+
+Knows: the addresses, the time, what a trial of each address has shown. Does not know: how an address is tried.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from zsched.core.values.fleet import Timing
+
+ALONE_S = 3.0
+"""A node that hears nobody for so long after its start says so; zenoh dials an address at least once a second."""
+TRY_PAUSE_S = 30.0
+"""Its addresses are tried no more often."""
+ADDRESSES_SHOWN = 8
+"""More addresses are counted only."""
+
+CHECK = "Check host, port, firewall, and that every node has the same `fleet:`"
+
+
+@dataclass(slots=True)
+class Solitude:
+    """Of one node: when to try its addresses, and what its status says while nobody was ever heard."""
+
+    timing: Timing
+    started_at: float
+    dialled: tuple[str, ...] = ()
+    """The addresses that its control session dials."""
+    dialled_at: str = ""
+    """The address at which the others dial it; empty: they cannot."""
+    _found: tuple[tuple[str, str], ...] = ()
+    _try_at: float = -math.inf
+
+    def is_alone(self, now: float, *, has_heard: bool) -> bool:
+        """Whether nobody was heard for longer than it takes to connect; monotonic seconds."""
+        return not has_heard and now >= self.started_at + max(ALONE_S, 2 * self.timing.suspect_s)
+
+    def must_try(self, now: float, *, has_heard: bool) -> bool:
+        """Whether to try the addresses now; ask often."""
+        if not self.dialled or now < self._try_at or not self.is_alone(now, has_heard=has_heard):
+            return False
+        self._try_at = now + TRY_PAUSE_S
+        return True
+
+    def on_tried(self, found: tuple[tuple[str, str], ...]) -> None:
+        """Take (address, what became of it) of the newest trial."""
+        self._found = found
+
+    def problem(self) -> str:
+        """What to tell an operator of a node that is alone."""
+        if not self.dialled:
+            way = f"the others dial it at {self.dialled_at}" if self.dialled_at else "nobody has an address to dial"
+            return f"heard nobody since the start: this node dials nobody, {way}. {CHECK}"
+        causes = dict(self._found)
+        told = [f"{one} ({causes[one]})" if causes.get(one) else one for one in self.dialled[:ADDRESSES_SHOWN]]
+        if len(self.dialled) > ADDRESSES_SHOWN:
+            told.append(f"{len(self.dialled) - ADDRESSES_SHOWN} more")
+        return f"heard nobody since the start: dialled {', '.join(told)}. {CHECK}"
