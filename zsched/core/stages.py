@@ -151,6 +151,8 @@ class Stages:
         self.solitude = Solitude(timing=fleet.timing, started_at=now)
         self.stateless: set[NodeId] = set()
         """Electors whose newest beat says that they answer no proposer."""
+        self.fileless: set[NodeId] = set()
+        """Those of them that have no state file at all."""
         self.beat_room = BeatRoom()
         self.beat_at = now
         """When the next beat is due that nothing brings forward."""

@@ -45,6 +45,7 @@ STARTED_BEFORE = (
     "who starts it (the task has no `command`) must start it again if it ran before this robot was in the fleet file "
     "there: the session {owner}-{task}.zenoh.json5 has this robot's address since"
 )
+INIT_THERE = "stop zsched there, run `zsched init` (it asks the fleet, and refuses where that is unsafe), and start it"
 UNREADY_SHOWN_S = 2.0
 """A slot that no worker takes for longer is a problem: a handover takes less."""
 
@@ -107,6 +108,10 @@ def _problems(node: Stages, quorum: QuorumStatus, now: float) -> tuple[str, ...]
     if quorum.stateless:
         names = ", ".join(quorum.stateless)
         problems.append(f"electors without their state, {len(quorum.stateless)} of {quorum.electors}: {names}")
+    fresh = _never_had_one(node, quorum)
+    has_enough = quorum.electors - len(quorum.stateless) >= quorum.needed
+    if fresh and has_enough:
+        problems.append(f"no state file on {', '.join(fresh)}: {INIT_THERE}")
     if quorum.apart:
         problems.append(
             "electors of another generation, or with other electors in their fleet file, "
@@ -131,15 +136,28 @@ def _problems(node: Stages, quorum: QuorumStatus, now: float) -> tuple[str, ...]
             f"no planned moves: {len(voters) - len(silent)} of {len(voters)} robots can vote, {needed} needed; "
             f"not {', '.join(silent)}. An owner that is gone, drains or fails is still replaced"
         )
-    if quorum.electors - len(quorum.stateless) < quorum.needed:
-        number = node.agreement.newest_generation + 1
-        problems.append(
-            "nothing can be agreed: too many electors without their states (each says why); if these are lost, "
-            + way_out(number)
-        )
+    if not has_enough:
+        problems.append(_nothing_agreed(node, quorum, fresh))
     if not node.has_state and not node.has_foreign_state:
         problems.append("no valid state file: this node is no elector (see `zsched init --help`)")
     return tuple(problems)
+
+
+def _never_had_one(node: Stages, quorum: QuorumStatus) -> list[NodeId]:
+    """The electors on which `init` was only forgotten, as far as is known: no file, no vote that anybody remembers."""
+    if node.agreement.newest_generation:
+        return []
+    fileless = node.fileless | ({node.me} if node.lacks_state_file else set())
+    return [name for name in quorum.stateless if name in fileless and name not in node.agreement.voted]
+
+
+def _nothing_agreed(node: Stages, quorum: QuorumStatus, fresh: list[NodeId]) -> str:
+    """The way out of too many missing states: `init` where it was forgotten, else a new generation."""
+    number = node.agreement.newest_generation + 1
+    what = "nothing can be agreed: too many electors without their states"
+    if quorum.electors - len(quorum.stateless) + len(fresh) < quorum.needed:
+        return f"{what} (each says why); if these are lost, {way_out(number)}"
+    return f"{what}. No state file on {', '.join(fresh)}: {INIT_THERE}. Only where it refuses, {way_out(number)}"
 
 
 def _why_silent(node: Stages, name: NodeId, now: float) -> str:

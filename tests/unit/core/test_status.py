@@ -162,6 +162,50 @@ def test_a_fleet_of_which_somebody_remembers_a_state_was_initialised() -> None:
         assert "PROBLEMS nothing can be agreed" in shown
 
 
+def test_where_init_was_only_forgotten_it_comes_before_a_new_generation() -> None:
+    node = make("robot1")
+    for name in ("robot2", "robot3"):
+        beat = beat_of(name, 2, incarnation=3, has_lost_state=True, lacks_state_file=True)
+        node.handle(ev.BeatReceived(beat=beat), 100.0)
+    told = build_snapshot(node, 100.0).problems[-1]
+    assert told.startswith(
+        "nothing can be agreed: too many electors without their states. No state file on robot2, robot3: "
+        "stop zsched there, run `zsched init`"
+    )
+    assert told.index("zsched init`") < told.index("Only where it refuses") < told.index("--generation 1 --force")
+
+
+@pytest.mark.parametrize("remembered", ["vote", "generation", "a damaged file"])
+def test_where_init_would_be_refused_it_is_not_advised(remembered: str) -> None:
+    node = make("robot1")
+    for name in ("robot2", "robot3"):
+        beat = beat_of(name, 2, incarnation=3, has_lost_state=True, lacks_state_file=remembered != "a damaged file")
+        node.handle(ev.BeatReceived(beat=beat), 100.0)
+    if remembered == "vote":
+        node.agreement.voted.update(("robot2", "robot3"))
+    if remembered == "generation":
+        node.agreement.newest_generation = 1
+    told = build_snapshot(node, 100.0).problems[-1]
+    assert "(each says why); if these are lost, stop every daemon, run `zsched init --generation" in told
+    assert "No state file" not in told
+
+
+def test_one_elector_on_which_init_was_forgotten_is_told_with_the_command() -> None:
+    node = make("robot1")
+    beat = beat_of("robot2", 2, incarnation=3, has_lost_state=True, lacks_state_file=True)
+    node.handle(ev.BeatReceived(beat=beat), 100.0)
+    assert any(
+        one.startswith("no state file on robot2: stop zsched there, run `zsched init`")
+        for one in build_snapshot(node, 100.0).problems
+    )
+    mine = forgotten(stateless=("robot1",))
+    assert any(one.startswith("no state file on robot1: ") for one in build_snapshot(mine, 100.0).problems)
+    (sent,) = (one.beat for one in mine.handle(ev.DeadlineReached(), 101.0) if isinstance(one, do.PublishBeat))
+    assert (sent.has_lost_state, sent.lacks_state_file) == (True, True)
+    node.handle(ev.BeatReceived(beat=beat_of("robot2", 3, incarnation=3)), 100.4)
+    assert build_snapshot(node, 100.4).problems == ()
+
+
 def test_one_node_without_a_state_is_not_the_fleet() -> None:
     node = forgotten(stateless=("robot1",))
     problems = build_snapshot(node, 100.0).problems

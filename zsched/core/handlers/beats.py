@@ -48,6 +48,7 @@ def send_beat(node: Stages, todo: ToDo, now: float) -> None:
         has_lost_state=node.me in node.fleet.electors and not node.agreement.is_elector,
         electorate=node.agreement.electorate if node.agreement.is_elector else "",
         twins=node.namesakes.names(now),
+        lacks_state_file=node.me in node.fleet.electors and node.lacks_state_file,
     )
     node.loop_lag_s = 0.0
     node.beat_at = now + node.fleet.timing.beat_s
@@ -113,6 +114,10 @@ def _on_beat(node: Stages, event: ev.BeatReceived, todo: ToDo, now: float) -> No
         node.stateless.add(beat.node)
     elif node.stateless:
         node.stateless.discard(beat.node)
+    if beat.lacks_state_file:
+        node.fileless.add(beat.node)
+    elif node.fileless:
+        node.fileless.discard(beat.node)
     node.sealing.hear(beat)
     if beat.fleet_file != node.fleet_file or node.problems:
         node.set_problem(f"fleet/{beat.node}", node.identity.file_complaint(beat, node.fleet_path))

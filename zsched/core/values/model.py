@@ -618,6 +618,8 @@ class Beat:
     """Hash of the electors that this elector counts with, and its generation; empty: it answers no proposer."""
     twins: tuple[NodeId, ...] = ()
     """Names with two daemons, as this node hears them; the daemons themselves ask about it."""
+    lacks_state_file: bool = False
+    """With `has_lost_state`: there is no file at all, so `zsched init` may only have been forgotten."""
 
     def __post_init__(self) -> None:
         check_name("beat.node", self.node)
