@@ -59,11 +59,7 @@ def find_door(runtime_dir: Path | None, node: str | None, env: Mapping[str, str]
         return Door(socket=next(iter(sockets.values())))
     fleet, names = _their_fleet(sockets.values())
     if own in names or (is_told and not names):
-        raise CliError(
-            EXIT_UNREACHABLE,
-            f"no daemon of {own} in {runtime} (here: {here}); start it with `zsched up --node {own}`, "
-            "or ask another one with --node",
-        )
+        raise CliError(EXIT_UNREACHABLE, _no_daemon(own, runtime, sockets))
     if is_told:
         raise CliError(EXIT_USAGE, f"ZSCHED_NODE: fleet {fleet} has no node {own!r}{nearest(own, names)}")
     raise CliError(EXIT_USAGE, f"several daemons in {runtime}: {here}; say which one with --node or ZSCHED_NODE")
@@ -133,11 +129,20 @@ def ask_door(door: Door, request: Json, timeout_s: float = ASK_TIMEOUT_S) -> Jso
     if "error" not in answer:
         return answer
     text = str(answer["error"])
-    code = EXIT_FAILED
-    if "did not answer within" in text:
-        # the daemon here is up: its loop is stuck, or the other node is silent
-        code = EXIT_TIMED_OUT if door.node is None else EXIT_UNREACHABLE
-    raise CliError(code, text)
+    if "did not answer within" not in text:
+        raise CliError(EXIT_FAILED, text)
+    if door.node is None:
+        raise CliError(EXIT_TIMED_OUT, text)  # the daemon is up, and its loop is stuck
+    runtime = door.socket.parent
+    here = [path.stem for path in places.local_sockets(runtime)]
+    raise CliError(EXIT_UNREACHABLE, _no_daemon(door.node, runtime, here, " and none answers in the network"))
+
+
+def _no_daemon(node: str, runtime: Path, here: Iterable[str], more: str = "") -> str:
+    return (
+        f"no daemon of {node} in {runtime} (here: {', '.join(here)}){more}; start it with `zsched up --node {node}`, "
+        "or ask another one with --node"
+    )
 
 
 def _unanswered(door: Door, error: AdapterError) -> CliError:
