@@ -5,7 +5,6 @@ Knows: how a word becomes keys, windows, tables and JSON lines. Does not know: z
 
 from __future__ import annotations
 
-import re
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -27,7 +26,6 @@ if TYPE_CHECKING:
 WIDTH: Final = 100
 PREVIEW: Final = 64
 """Bytes of a payload that `tail` shows."""
-_STREAM_NAME: Final = re.compile(r"[a-z0-9_-]+/(in|out|srv)/\d+")
 KINDS: Final = {"in": "input", "out": "output", "srv": "service"}
 
 
@@ -41,6 +39,8 @@ class StreamView:
     window_s: float
     count: int | None = None
     """So many windows (``tail``: samples), then the end; ``None``: until Ctrl-C."""
+    timeout_s: float | None = None
+    """``tail``: the end after so long; ``None``: until Ctrl-C."""
 
 
 # --- list ------------------------------------------------------------------------------------------------------------
@@ -167,9 +167,10 @@ def keys_for(status: Json, word: str | None) -> tuple[str, ...]:
             raise CliError(EXIT_FAILED, f"{word} leads nowhere: its task has no owner")
         return (stream["from_expr"], stream["to_expr"])
     _check_key(word)
-    if _STREAM_NAME.fullmatch(word):
+    if not any(_meets(word, str(stream.get(end, ""))) for stream in streams for end in ("from_expr", "to_expr")):
         names = ", ".join(stream["stream"] for stream in streams) or "none"
-        sys.stderr.write(harmless(f"no stream is named {word} (there are {names}): taken for a key\n"))
+        text = f"no stream here is called {word!r} or touches such a key (there are {names}): listening on it as a key"
+        sys.stderr.write(harmless(f"{text}\n"))
     return (word,)
 
 
@@ -278,18 +279,21 @@ def _bw_text(row: Json) -> str:
 
 
 def show_tail(view: StreamView, word: str | None) -> int:
-    """Print each sample as it comes; returns the exit code."""
+    """Print each sample as it comes; returns the exit code: 1 when the time was over before the first one."""
     seen = 0
     with _tap(view, word) as tap:
-        for sample in _endlessly(tap):
+        for sample in _samples(tap, view.timeout_s):
             _print_sample(view, sample)
             seen += 1
             if view.count is not None and seen >= view.count:
                 break
-    return EXIT_OK
+    return EXIT_OK if seen else EXIT_FAILED
 
 
-def _endlessly(tap: StreamTap) -> Iterator[Tapped]:
+def _samples(tap: StreamTap, timeout_s: float | None) -> Iterator[Tapped]:
+    if timeout_s is not None:
+        yield from tap.until(monotonic_s() + timeout_s)
+        return
     while True:
         yield from tap.until(monotonic_s() + 3600.0)
 

@@ -89,12 +89,18 @@ def tail(
     node: NodeOption = None,
     json_: JsonOption = False,
     count: CountOption = None,
+    timeout: Annotated[
+        float | None, typer.Option("--timeout", min=0.1, metavar="S", help="End after so long. [go on until Ctrl-C]")
+    ] = None,
     runtime_dir: RuntimeOption = None,
 ) -> None:
-    """Print every message as it comes: key, size, encoding, the first bytes."""
+    """Print every message as it comes: key, size, encoding, the first bytes.
+
+    Exits with 1 when nothing came within the timeout.
+    """
     from zsched.commands.stream import StreamView, show_tail  # noqa: PLC0415 - each verb imports what it needs
 
-    view = StreamView(runtime_dir=runtime_dir, node=node, is_json=json_, window_s=1.0, count=count)
+    view = StreamView(runtime_dir=runtime_dir, node=node, is_json=json_, window_s=1.0, count=count, timeout_s=timeout)
     raise typer.Exit(_until_interrupted(lambda: show_tail(view, key)))
 
 

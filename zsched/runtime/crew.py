@@ -30,7 +30,7 @@ OTHERS: Final = (
 NO_TOKEN: Final = (
     "no token: without zsched.worker say `ready: matching`; with it, Worker.ready() on $ZSCHED_ZENOH_CONFIG declares"
 )
-OTHER_NETWORK: Final = "did it open $ZSCHED_ZENOH_CONFIG?"
+OTHER_NETWORK: Final = "did it open $ZSCHED_ZENOH_CONFIG, or does it subscribe to another key?"
 REJOIN_S: Final = 4.0
 """A worker that runs already is seen so soon after its relay's start: it dials at least once a second."""
 

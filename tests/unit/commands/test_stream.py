@@ -62,6 +62,16 @@ def test_any_other_word_is_a_key_expression(word: str) -> None:
     assert keys_for(status(stream()), word) == (word,)
 
 
+@pytest.mark.parametrize(("word", "is_told"), [("nosuch", True), ("robot1/*", False), ("merge/in/7", True)])
+def test_a_word_that_touches_no_stream_is_told_with_those_that_there_are(
+    word: str, capsys: pytest.CaptureFixture[str], *, is_told: bool
+) -> None:
+    assert keys_for(status(stream(), stream(**OUT)), word) == (word,)
+    text = f"no stream here is called {word!r} or touches such a key (there are merge/in/0, merge/out/0): listening"
+    told = capsys.readouterr().err
+    assert told.startswith(text) if is_told else not told
+
+
 @pytest.mark.parametrize(
     ("word", "code", "said"),
     [("/map", 2, "no key expression"), ("srv/0", 2, "is a service"), ("a//b", 2, "empty chunk")],

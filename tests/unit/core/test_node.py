@@ -686,8 +686,8 @@ def test_a_retry_resets_the_worker_that_is_meant_and_forgives_its_node() -> None
         detail = of(batch, do.AnswerCommand)[0].result.detail
         assert detail == ("its failures are forgotten, it was stopped" if resets else "nothing to forget here")
     for whose, said in (
-        ("edge1", "takes no penalty off edge1 any more"),
-        ("", "takes no penalty off any candidate any more"),
+        ("edge1", "edge1 has no penalty here now"),
+        ("", "no candidate has a penalty here now"),
     ):
         batch = node.handle(ev.RetryCommanded(request=9, command=RetryTask(task="merge", node=whose)), 100.0)
         assert of(batch, do.AnswerCommand)[0].result.detail == said

@@ -52,7 +52,7 @@ def _forgiven(node: Stages, whose: NodeId) -> str:
     """The part for a node whose worker is not meant: robots take penalties off candidates."""
     if not node.rounds.is_voter:
         return "nothing to forget here"
-    return f"takes no penalty off {whose or 'any candidate'} any more"
+    return f"{whose or 'no candidate'} has {'no' if whose else 'a'} penalty here now"
 
 
 def _on_explanation(node: Stages, event: ev.ExplanationAsked, todo: ToDo, now: float) -> None:
