@@ -10,8 +10,11 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import sysconfig
 import threading
+import traceback
 from collections.abc import Callable
+from pathlib import Path
 from typing import Final
 
 from zsched.clock import monotonic_s
@@ -25,6 +28,11 @@ MAX_KINDS: Final = 32
 """Kinds of errors that are told apart in the log."""
 _ROOM: Final = 60
 """Of `MAX_REASON`, for the words before the error's own."""
+MAX_NAME: Final = 60
+"""Characters of a file's name."""
+TRACEBACK: Final = "traceback in the worker's log"
+_OF_PYTHON: Final = tuple(sysconfig.get_paths()[name] for name in ("stdlib", "purelib", "platlib"))
+_LIBRARIES: Final = tuple(Path(folder) for folder in (str(Path(__file__).parents[1]), *_OF_PYTHON))
 
 _log = logging.getLogger("zsched.worker")
 
@@ -37,7 +45,8 @@ class Troubles:
         self._tell = tell
         self._lock = threading.Lock()
         self._count = 0
-        self._text = ""
+        self._newest: Exception | None = None
+        """The newest error that is not told yet: where it came from is looked up only then."""
         self._told_at = -TELL_S
         self._timer: threading.Thread | None = None
         self._log_at: dict[str, float] = {}
@@ -49,7 +58,7 @@ class Troubles:
         with self._lock:
             self._count += 1
             count = self._count
-            self._text = _one_line(f"{kind}: {error}" if str(error) else kind)
+            self._newest = error
             known = kind if kind in self._log_at or len(self._log_at) < MAX_KINDS else "another"
             is_worth_a_line = now >= self._log_at.get(known, now)
             if is_worth_a_line:
@@ -71,11 +80,25 @@ class Troubles:
             return
         with self._lock:
             self._timer, self._told_at = None, monotonic_s()
-            count, text = self._count, self._text
+            count, newest, self._newest = self._count, self._newest, None
+        text = "" if newest is None else _told(newest)
         with contextlib.suppress(Exception):  # the session closes: whoever is left without a word sees the worker's end
             self._tell(count, text)
 
 
-def _one_line(text: str) -> str:
-    """The first line of an error, as short as it has to be to be carried."""
-    return text.strip().partition("\n")[0][: MAX_REASON - _ROOM]
+def _told(error: Exception) -> str:
+    """The first line of an error and where it came from, as short as it has to be to be carried."""
+    kind = type(error).__name__
+    line = (f"{kind}: {error}" if str(error) else kind).strip().partition("\n")[0]
+    where = f" ({place}; {TRACEBACK})" if (place := _place(error)) else f" ({TRACEBACK})"
+    return f"{line[: MAX_REASON - _ROOM - len(where)]}{where}"
+
+
+def _place(error: Exception) -> str:
+    """``file:line`` of the innermost frame that is the author's: in no library, and not ours; empty when none is."""
+    place = ""
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        path = Path(frame.f_code.co_filename)
+        if not any(path.is_relative_to(folder) for folder in _LIBRARIES):
+            place = f"{path.name[-MAX_NAME:]}:{line}"
+    return place

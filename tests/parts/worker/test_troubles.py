@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from functools import partial
 from typing import cast
@@ -47,8 +48,9 @@ def test_every_failure_is_counted_and_the_last_count_is_told_though_nothing_fail
     until(lambda: told, "the first one is told at once")
     raised(troubles, KeyError("frame"), times=2000)
     until(lambda: told[-1][0] == 2001, "the last count")
-    assert told[0] == (1, "ValueError: no such map")
-    assert told[-1][1] == "KeyError: 'frame'"
+    where = f"(test_troubles.py:{fail.__code__.co_firstlineno + 1}; traceback in the worker's log)"
+    assert told[0] == (1, f"ValueError: no such map {where}")
+    assert told[-1][1] == f"KeyError: 'frame' {where}"
     assert len(told) <= 3, "not one message a failure"
     troubles.close()
 
@@ -67,6 +69,19 @@ def test_a_callback_that_raises_every_time_writes_one_line_per_kind_of_error(cap
     for kind in kinds * 2:
         raised(troubles, kind())
     assert len(caplog.records) < 2 * MAX_KINDS, "nor are kinds of errors without end"
+    troubles.close()
+
+
+def test_the_place_is_the_author_s_innermost_frame_and_not_a_library_s() -> None:
+    told: list[str] = []
+    troubles = Troubles(lambda _count, text: told.append(text))
+    try:
+        json.loads("{")  # raises in the standard library
+    except ValueError as caught:
+        line = caught.__traceback__.tb_lineno if caught.__traceback__ else 0
+        troubles.note("robot1/map", caught)
+    until(lambda: told, "it is told")
+    assert f"(test_troubles.py:{line}; traceback in the worker's log)" in told[0]
     troubles.close()
 
 
