@@ -13,6 +13,7 @@ import contextlib
 import faulthandler
 import functools
 import gc
+import json
 import logging
 import os
 import random
@@ -37,7 +38,7 @@ from zsched.clock import monotonic_s, wall_tenths
 from zsched.config.load import load_fleet, require_node
 from zsched.core import events as ev
 from zsched.core.node import Node
-from zsched.core.route.route import watch_for
+from zsched.core.route.route import outputs_of, watch_for
 from zsched.core.status import status_line
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import dial_endpoint, electorate_hash, fleet_hash, runs_worker
@@ -274,6 +275,11 @@ class Daemon:
             for task in fleet.tasks
             if task.tuning.deadline_ms is not None
         }
+        outputs = {
+            task.name: {"ZSCHED_OUTPUT_KEYS": json.dumps(keys)}
+            for task in fleet.tasks
+            if (keys := outputs_of(task, me))
+        }
         folder = self._options.runtime_dir
         paths: dict[TaskId, Path] = {}
         sessions_read = SessionsRead(self._options.state_dir)
@@ -307,6 +313,7 @@ class Daemon:
                 "ZSCHED_ZENOH_CONFIG": str(paths[task]),
                 "ZENOH_SESSION_CONFIG_URI": str(paths[task]),  # a ROS node (rmw_zenoh) joins the data network by this
                 **deadlines.get(task, {}),
+                **outputs.get(task, {}),
             },
             rng=random.Random(f"{me}/{incarnation}/workers"),
             why_not_ready=shell.crew.why_not_ready,

@@ -192,7 +192,10 @@ class WorkerChanged:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorkerTroubled:
-    """A worker of this node says that ``count`` of its callbacks have raised; ``text`` is the newest error."""
+    """A worker of this node says that ``count`` of its callbacks have raised; ``text`` is the newest error.
+
+    With ``count`` 0 the text tells of a mistake that lasts as long as the worker lives.
+    """
 
     task: TaskId
     count: int

@@ -91,12 +91,12 @@ class WorkerMatched:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorkerTrouble:
-    """The worker's callbacks raise: the worker's report to its relay, and the relay's to the daemon."""
+    """Something is wrong in a worker that is ready: its report to its relay, and the relay's to the daemon."""
 
     task: TaskId
     incarnation: str
     count: int
-    """How many of them have failed in this life."""
+    """How many of its callbacks have raised in this life; 0: the text tells of a mistake that lasts."""
     text: str
     """The newest error, in one line."""
 

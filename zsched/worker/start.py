@@ -14,6 +14,7 @@ from typing import Final
 import zenoh
 
 from zsched.errors import ConfigError
+from zsched.worker.keys import OUTPUT_KEYS, output_keys
 
 _ENVIRONMENT: Final = ("ZSCHED_FLEET", "ZSCHED_NODE", "ZSCHED_TASK", "ZSCHED_INCARNATION", "ZSCHED_ZENOH_CONFIG")
 
@@ -33,6 +34,8 @@ class Surroundings:
     is_standalone: bool = False
     deadline_s: float | None = None
     """The task's (`objective: latency`); ``None``: it has none, or whoever started the worker has not told."""
+    output_keys: tuple[str, ...] = ()
+    """What the task's output rules take of this node; empty: there are none, or nobody has told."""
 
 
 def surroundings(env: Mapping[str, str], standalone: str) -> Surroundings:
@@ -59,6 +62,7 @@ def surroundings(env: Mapping[str, str], standalone: str) -> Surroundings:
         incarnation=incarnation,
         zenoh_config=_read(path),
         deadline_s=_deadline_s(env.get(DEADLINE, "")),
+        output_keys=output_keys(env.get(OUTPUT_KEYS, "")),
     )
 
 

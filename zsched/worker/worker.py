@@ -51,6 +51,7 @@ from zsched.worker.errands import Errands
 from zsched.worker.inputs import Dispatcher
 from zsched.worker.jobs import Job, JobBook
 from zsched.worker.keep import Keeper
+from zsched.worker.keys import IN_OUTPUTS, filled, untaken
 from zsched.worker.outputs import OUTPUT_DEPTH, Output
 from zsched.worker.roles import RoleWatch
 from zsched.worker.samples import BY_CLASS, Input, KeepLast, Marker, Received
@@ -81,6 +82,7 @@ class Worker:
         is_standalone: bool = False,
         drains_itself: bool = False,
         deadline_s: float | None = None,
+        output_keys: tuple[str, ...] = (),
     ) -> None:
         """Open the session (``zenoh_config``: JSON5 text). See `from_env` for the other arguments.
 
@@ -102,6 +104,10 @@ class Worker:
         self._stop = threading.Event()
         self._is_signalled = False
         self._outputs: list[Output] = []
+        self._output_keys = output_keys
+        self._untaken = ""
+        """What is told of the first output that no rule of the task takes."""
+        self._is_ready = False
         self._declared: list[Any] = []
         self._errands = Errands(self._stop)
         self._token: zenoh.LivelinessToken | None = None
@@ -153,6 +159,7 @@ class Worker:
             is_standalone=around.is_standalone,
             drains_itself=drains_itself and not around.is_standalone,
             deadline_s=around.deadline_s,
+            output_keys=around.output_keys,
         )
         if handles_signals and threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, worker._on_signal)
@@ -182,9 +189,11 @@ class Worker:
         `lost` in `zsched status`; of others, what gives way to something newer counts as processed.
 
         Raises:
-            ValueError: ``keep_last`` or ``depth`` is below 1.
+            ValueError: ``keep_last`` or ``depth`` is below 1, or the key has another placeholder.
+            RuntimeError: this worker is ready already.
         """
-        expr = key_expr.replace("{prefix}", self.prefix)
+        self._check_not_ready("subscribe")
+        expr = filled(key_expr, self.prefix)
         source = Input(on_sample=on_sample, keep_last=keep_last, depth=depth)
         marker = tolerant(self._on_marker, "marker")
         ends = self._session.declare_subscriber(f"{expr}/{END_CHUNK}", marker)  # who sees the other sees this
@@ -206,11 +215,19 @@ class Worker:
         ``latest``: the last ``keep_last`` values are cached for who comes late; a put never waits, behind a stalled
         receiver the newest wait. ``reliable``: a put waits for a slow receiver (up to a lease) instead of dropping, and
         the last ``depth`` answers (at most `zsched.core.hop.shared.SHARED_BYTES`) are kept until the robots' relays
-        have acknowledged them: what a broken link lost is sent again.
+        have acknowledged them: what a broken link lost is sent again. An output that no rule of the task takes is
+        logged, and shown in `zsched status` while this worker is the owner.
+
+        Raises:
+            ValueError: the key has another placeholder.
         """
+        key = filled(template, self.prefix, IN_OUTPUTS)
+        if text := untaken(key, self._output_keys):
+            _log.warning("the worker %s", text)
+            self._untaken = self._untaken or text
         output = Output(
             self._session,
-            template.replace("{prefix}", self.prefix),
+            key,
             latest=latest,
             reliable=reliable,
             keep_last=keep_last,
@@ -229,8 +246,13 @@ class Worker:
 
         ``handler`` runs in a thread of its own per service, one request after another; at most ``depth`` wait, the next
         one is answered "busy". What it raises becomes an error reply. It is only called while this worker is the owner.
+
+        Raises:
+            ValueError: the key has another placeholder.
+            RuntimeError: this worker is ready already.
         """
-        expr = key_expr.replace("{prefix}", self.prefix)
+        self._check_not_ready("serve")
+        expr = filled(key_expr, self.prefix)
         service = Service(
             self._session,
             expr,
@@ -266,10 +288,15 @@ class Worker:
 
     def ready(self) -> None:
         """Say that the inputs are declared: the token that the robots' relays wait for. Call it once."""
+        self._is_ready = True
         if self._is_standalone or self._token is not None:
             return
         key = self._keyspace.worker(self._node, self._task, self._incarnation)
         self._token = self._session.liveliness().declare_token(key)
+
+    def _check_not_ready(self, call: str) -> None:
+        if self._is_ready:
+            raise RuntimeError(f"Worker.{call} after Worker.ready: relays may send already; declare it before")
 
     def wait(self, timeout_s: float | None = None) -> bool:
         """Sleep at most so long; ``False`` as soon as the worker shall end."""
@@ -371,6 +398,8 @@ class Worker:
             self._watch.hide()
         if is_active:
             self._epochs.resume(role.epoch)
+            if self._untaken:
+                self._tell_trouble(0, self._untaken)
         was_held = before.lease_until_s is not None and monotonic_s() >= before.lease_until_s
         is_shown = self._watch is not None and self._watch.is_shown
         if is_active and (not is_shown or was_held):

@@ -19,7 +19,7 @@ import zenoh
 from support.hand_relay import INPUT, KEYS, ROLE_KEY, Relay, environment
 from support.waiting import free_endpoint, until, within
 from zsched.clock import monotonic_s
-from zsched.core.relay_protocol import EndMarker, StreamAck, StreamAcks
+from zsched.core.relay_protocol import EndMarker, StreamAck, StreamAcks, WorkerTrouble
 from zsched.core.values.plan import Role, WorkerRole
 from zsched.errors import ConfigError
 from zsched.ipc.pipe import encode_end
@@ -705,3 +705,37 @@ def test_what_still_waits_when_its_robot_gives_it_up_is_not_done(relay: Relay, t
         slow.gate.set()
         until(lambda: slow.payloads()[-1] == b"d", "the next sample")
         assert slow.payloads() == [b"a", b"d"]
+
+
+def test_after_ready_no_input_or_service_is_taken_any_more(relay: Relay, tmp_path: Path) -> None:
+    with Worker.from_env(environment(relay, tmp_path), handles_signals=False) as worker:
+        worker.subscribe("{prefix}/*/in", lambda _received: None)
+        worker.ready()
+        with pytest.raises(RuntimeError, match=r"Worker.subscribe after Worker.ready"):
+            worker.subscribe("{prefix}/*/other", lambda _received: None)
+        with pytest.raises(RuntimeError, match=r"Worker.serve after Worker.ready"):
+            worker.serve("{prefix}/ask", lambda _request: b"")
+
+
+def test_an_output_that_no_rule_takes_is_told_to_the_node_once_the_worker_is_the_owner(
+    relay: Relay, tmp_path: Path
+) -> None:
+    told: list[WorkerTrouble] = []
+    heard = relay.session.declare_subscriber(
+        KEYS.trouble("edge1", "*", "*"),
+        lambda sample: told.append(wire.decode(sample.payload.to_bytes(), WorkerTrouble)),
+    )
+    env = {**environment(relay, tmp_path), "ZSCHED_OUTPUT_KEYS": '["edge1/t/*/out"]'}
+    with Worker.from_env(env, handles_signals=False) as worker:
+        worker.publisher("{prefix}/{epoch}/out")
+        worker.publisher("{prefix}/out")
+        with pytest.raises(ValueError, match=r"no placeholder \{prefx\}"):
+            worker.publisher("{prefx}/out")
+        worker.ready()
+        until(lambda: KEYS.worker("edge1", "t", 3) in relay.tokens, "the ready token")
+        assert told == []
+        relay.tell(WorkerRole.ACTIVE, 1)
+        until(lambda: told, "the mistake")
+    text = "puts on edge1/t/out, which no output rule takes: the rules take edge1/t/*/out"
+    assert told[0] == WorkerTrouble(task="t", incarnation="3", count=0, text=text)
+    heard.undeclare()

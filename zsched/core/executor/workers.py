@@ -30,6 +30,8 @@ class Workers:
     reasons: dict[TaskId, str] = field(default_factory=dict)
     _troubles: dict[TaskId, tuple[str, float]] = field(default_factory=dict)
     """{task: (the newest error of a ready worker, when it came)}."""
+    _mistakes: dict[TaskId, str] = field(default_factory=dict)
+    """{task: a mistake of a ready worker that lasts as long as it lives}."""
     _outdated: dict[TaskId, str] = field(default_factory=dict)
     """{task: why a ready worker should be started again}."""
 
@@ -45,6 +47,7 @@ class Workers:
             return None
         if event.state is not WorkerState.READY:
             self._troubles.pop(event.task, None)
+            self._mistakes.pop(event.task, None)
         if event.state is WorkerState.READY:
             self.reasons.pop(event.task, None)
         elif event.reason:
@@ -56,8 +59,12 @@ class Workers:
         return RecordStory(stage="executor", text=text, task=event.task)
 
     def on_troubled(self, event: ev.WorkerTroubled, now: float) -> None:
-        """A worker that is ready says that its callbacks raise."""
-        if self.states.get(event.task) is WorkerState.READY:
+        """A worker that is ready says that its callbacks raise, or that it makes a mistake."""
+        if self.states.get(event.task) is not WorkerState.READY:
+            return
+        if not event.count:
+            self._mistakes[event.task] = as_reason(event.text)
+        else:
             times = "once" if event.count == 1 else f"{event.count} times"
             self._troubles[event.task] = (as_reason(f"callback raised {times}: {event.text}"), now)
 
@@ -70,8 +77,13 @@ class Workers:
 
     def told(self, now: float) -> Mapping[TaskId, str]:
         """{task: why its worker is not ready, or what is wrong with a ready one}."""
-        if not self._troubles and not self._outdated:
+        if not self._troubles and not self._outdated and not self._mistakes:
             return self.reasons
         self._troubles = {task: one for task, one in self._troubles.items() if now - one[1] <= TROUBLE_S}
         outdated = {task: text for task, text in self._outdated.items() if self.states[task] is WorkerState.READY}
-        return {**outdated, **{task: text for task, (text, _) in self._troubles.items()}, **self.reasons}
+        return {
+            **outdated,
+            **self._mistakes,
+            **{task: text for task, (text, _) in self._troubles.items()},
+            **self.reasons,
+        }

@@ -69,6 +69,12 @@ def _taken(spec: TaskSpec, target: NodeId) -> tuple[str, ...]:
     return tuple(dict.fromkeys(widened(rule.to_template, target=target, task=spec.name) for rule in rules))
 
 
+def outputs_of(spec: TaskSpec, target: NodeId) -> tuple[str, ...]:
+    """What the task's output rules take of the worker on ``target``, one key expression per rule."""
+    rules = (rule for rule in spec.rules if rule.direction is Direction.OUTPUT)
+    return tuple(dict.fromkeys(widened(rule.from_template, target=target, task=spec.name) for rule in rules))
+
+
 def _served(spec: TaskSpec, target: NodeId, robots: tuple[NodeId, ...]) -> tuple[tuple[str, ...], ...]:
     """The services of the worker on ``target``, per rule; zenoh cannot tell who serves a key with wildcards."""
     result = []

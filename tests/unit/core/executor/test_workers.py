@@ -36,6 +36,18 @@ def test_a_complaint_of_a_worker_that_is_ready_is_shown_for_a_minute_and_ends_wi
     assert workers.told(100.0) == {"merge": "pid 7"}
 
 
+def test_a_mistake_of_a_worker_is_shown_as_long_as_it_lives() -> None:
+    workers = Workers({"merge": WorkerState.READY})
+    workers.on_troubled(ev.WorkerTroubled(task="merge", count=0, text="puts on a/b"), 10.0)
+    assert workers.told(10.0 + 100 * TROUBLE_S) == {"merge": "puts on a/b"}
+    workers.on_troubled(ev.WorkerTroubled(task="merge", count=1, text="ValueError"), 20.0)
+    assert workers.told(20.0) == {"merge": "callback raised once: ValueError"}, "which is the worse"
+    assert workers.told(20.1 + TROUBLE_S) == {"merge": "puts on a/b"}
+    workers.on_changed(changed(WorkerState.STARTING, "pid 7"))
+    workers.on_changed(changed(WorkerState.READY))
+    assert workers.told(20.1 + TROUBLE_S) == {}
+
+
 def test_an_unknown_task_is_nobody_s_worker() -> None:
     workers = Workers({})
     assert workers.on_changed(changed(WorkerState.READY)) is None
