@@ -838,8 +838,8 @@ HANDOVER_BUGS = (
     _bug(
         "drain ends the gate too early",
         EXECUTOR,
-        "        if not self._old:\n            self._go(Phase.SETTLED, RoutePhase.CLOSE, done, todo)",
-        "        if True:\n            self._go(Phase.SETTLED, RoutePhase.CLOSE, done, todo)",
+        "        if not self._old:\n            self._go(Phase.SETTLED, RoutePhase.CLOSE, done, todo, took_s)",
+        "        if True:\n            self._go(Phase.SETTLED, RoutePhase.CLOSE, done, todo, took_s)",
         _EXECUTOR,
     ),
     _bug(
