@@ -31,6 +31,7 @@ def told() -> Iterator[list[tuple[str, str]]]:
     guard._listeners[:] = before
     guard.failures.clear()
 
+
 EXAMPLES = PACKAGE / "examples"
 
 
