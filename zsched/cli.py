@@ -85,7 +85,7 @@ AskedOption = Annotated[
 HereOption = Annotated[
     str | None, typer.Option("--node", "-n", metavar="NAME", help="Which daemon on this machine, if there are several.")
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="JSON with its schema's name and version.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="JSON, with its schema; --json=1: of that version.")]
 
 
 # --- the daemon ------------------------------------------------------------------------------------------------------
@@ -226,19 +226,20 @@ def dev(
 @app.command(cls=Verb)
 def status(
     json_: JsonOption = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="All six stages, not only a line per task.")] = False,
     watch: Annotated[bool, typer.Option("--watch", "-w", help="Again and again; with --json one line each.")] = False,
     interval: Annotated[float, typer.Option(min=0.1, max=3600.0, metavar="S", help="Seconds between two.")] = 1.0,
     node: AskedOption = None,
     runtime_dir: RuntimeOption = None,
     no_color: Annotated[bool, typer.Option("--no-color", help="Plain text (also: NO_COLOR).")] = False,
 ) -> None:
-    """Show nodes, tasks, owners, the last decision and vote, and what is wrong.
+    """Show nodes, tasks, owners and what is wrong; with -v also decisions, votes and streams.
 
     Exits with 4 while the fleet is degraded: no quorum, or a task without a live owner.
     """
     from zsched.commands.status import StatusView, show, watch_on  # noqa: PLC0415 - each verb imports what it needs
 
-    view = StatusView(runtime_dir=runtime_dir, node=node, is_json=json_, is_plain=no_color)
+    view = StatusView(runtime_dir=runtime_dir, node=node, is_json=json_, is_plain=no_color, is_whole=verbose)
     raise typer.Exit(watch_on(view, interval) if watch else show(view))
 
 

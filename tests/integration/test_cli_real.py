@@ -110,7 +110,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
 
 
 def test_status_of_a_running_fleet_for_people_and_for_scripts(site: Site) -> None:
-    text, as_json = site.zsched("status"), site.zsched("status", "--json")
+    text, as_json = site.zsched("status", "-v"), site.zsched("status", "--json")
     assert (text.returncode, as_json.returncode) == (0, 0), text.stderr
     assert "robot1 owns it" in text.stdout
     for stage in ("PROFILE", "GATEWAY", "SCHEDULER", "VOTE", "EXECUTOR", "ROUTE"):

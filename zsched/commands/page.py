@@ -1,14 +1,18 @@
 """Lines of text for a terminal: tables, blocks that wrap, and styles that take no room (pure).
 
-Knows: columns, cutting, ANSI styles, how figures are written. Does not know: what is shown.
+Knows: columns, cutting, ANSI styles, how figures and moments are written. Does not know: what is shown.
 """
 
 from __future__ import annotations
 
 import textwrap
-from typing import TypeAlias
+import time
+from typing import Any, TypeAlias
 
 STYLES = {"bold": "1", "dim": "2", "red": "31", "green": "32", "yellow": "33", "stage": "1;36", "alarm": "1;31"}
+
+DROPS_OVER_S = 60.0
+"""Drops that have not risen for so long are history."""
 
 Cell: TypeAlias = tuple[str, str]
 """A text and its style ("" for none)."""
@@ -17,13 +21,23 @@ Cell: TypeAlias = tuple[str, str]
 class Page:
     """Lines that are never longer than ``width``; ``indent`` is where a block's text begins."""
 
-    def __init__(self, width: int, color: bool) -> None:
+    def __init__(self, width: int, color: bool, at: float | None = None) -> None:
+        """``at``: now, by this machine's clock (seconds since 1970); ``None``: no wall times."""
         self.width, self.indent, self._color = width, 11, color
+        self._at = at
         self.lines: list[str] = []
 
     def paint(self, text: str, style: str) -> str:
         """``text`` in a style, when there is colour."""
         return f"\x1b[{STYLES[style]}m{text}\x1b[0m" if style and text and self._color else text
+
+    def moment(self, age_s: float) -> str:
+        """Behind an age: when that was on this machine's clock."""
+        return "" if self._at is None else f", {clock_time(self._at - age_s, self._at)}"
+
+    def since(self, age_s: float) -> str:
+        """Behind a duration: since when, on this machine's clock."""
+        return "" if self._at is None else f", since {clock_time(self._at - age_s, self._at)}"
 
     def row(self, *cells: tuple[str, int, str], indent: int = 0) -> None:
         """One line of a table: (text, columns, style) each; negative columns align right, what is too long is cut."""
@@ -77,6 +91,22 @@ def span(seconds: float | None) -> str:
         if whole >= big:
             return f"{whole // big}{unit}{whole % big // small:02d}{smaller}"
     return f"{whole}s"
+
+
+def clock_time(then: float, now: float) -> str:
+    """A moment of today as ``14:03:22``, an older one as ``11-22 14:03`` (local time; seconds since 1970)."""
+    told, today = time.localtime(then), time.localtime(now)
+    return time.strftime("%H:%M:%S" if told[:3] == today[:3] else "%m-%d %H:%M", told)
+
+
+def none_for(age_s: float | None) -> str:
+    """Behind a number of drops: that they are over, once none has come for a minute."""
+    return f" (none in the last minute, last {span(age_s)} ago)" if age_s is not None and age_s > DROPS_OVER_S else ""
+
+
+def since_drop(stream: dict[str, Any]) -> str:
+    """The same of a stream's drops."""
+    return none_for(stream.get("dropped_s"))
 
 
 def memory(mib: float) -> str:

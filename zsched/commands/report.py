@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from zsched.commands.page import Cell, Page, cut, memory, size, span
+from zsched.commands.page import Cell, Page, cut, memory, none_for, since_drop, size, span
 from zsched.core.values.model import NEVER_INITIALISED, RESTARTING, WAS_READY, WorkerState, told_of_worker
 
 Json = dict[str, Any]
@@ -27,8 +27,6 @@ CAUSES = (NEVER_INITIALISED, "nothing can be agreed")
 """How the problems begin from which others follow: they come first."""
 NO_ANSWER_TO = 100
 """After so many inputs without one output, ever, the key of the output is doubted."""
-DROPS_OVER_S = 60.0
-"""Drops that have not risen for so long are history."""
 STATE_STYLES = {"alive": "green", "ready": "green"} | dict.fromkeys(
     ("draining", "starting", RESTARTING, "stopped", "suspect", "unknown"), "yellow"
 )
@@ -66,20 +64,22 @@ def _lack_of_worker(status: Json, task: Json) -> str | None:
     return f"the worker on {owner} failed{because}; mend it, then `zsched retry {task['name']} {owner}`"
 
 
-def render_status(status: Json, width: int, color: bool) -> str:
-    """The status for people, in the order of the stages; problems come last.
+def render_status(status: Json, width: int, color: bool, at: float | None = None) -> str:
+    """The whole status for people, in the order of the stages; problems come last.
 
     ``width`` in columns, from 60 (of more robots than fit, the table shows the first); ``color``: with ANSI colours.
-    Text that came from other nodes cannot steer the terminal.
+    ``at``: when it was asked for (this machine's clock, seconds since 1970), for wall times beside ages; ``None``:
+    without. Text that came from other nodes cannot steer the terminal.
     """
-    page, shown = Page(width, color), printable(status)
-    _header(page, shown)
-    _nodes(page, shown)
+    page, shown = Page(width, color, at), printable(status)
+    header(page, shown)
+    page.lines.append("")
+    node_rows(page, shown, "PROFILE")
     _gateway(page, shown["nodes"])
     for task in shown["tasks"]:
         page.lines.append("")
         _task(page, shown, task)
-    _troubles(page, shown)
+    troubles(page, shown)
     return "\n".join(page.lines) + "\n"
 
 
@@ -94,8 +94,9 @@ def printable(value: Any) -> Any:
     return value
 
 
-def _header(page: Page, status: Json) -> None:
-    quorum, troubles = status["quorum"], _problems(status)
+def header(page: Page, status: Json) -> None:
+    """The first line: which fleet, who answers, the quorum, and in a word how it is."""
+    quorum, troubles = status["quorum"], all_problems(status)
     health, style = (f"{len(troubles)} problem{'s'[: len(troubles) != 1]}", "yellow") if troubles else ("ok", "green")
     away = sum(node["state"] in ("gone", "unknown") for node in status["nodes"])
     if away and not troubles:
@@ -110,20 +111,20 @@ def _header(page: Page, status: Json) -> None:
     for extra in (f"up {span(status['up_s'])}", f"zsched {status['version']}"):
         parts += [extra] if len(" · ".join([*parts, extra])) <= room else []
     page.row((" · ".join(parts), room, "bold"), (health, len(health), style))
-    page.lines.append("")
 
 
 # --- PROFILE, GATEWAY ------------------------------------------------------------------------------------------------
 
 
-def _nodes(page: Page, status: Json) -> None:
+def node_rows(page: Page, status: Json, title: str) -> None:
+    """A line per node."""
     nodes: list[Json] = status["nodes"]
     name = min(max([page.indent - 1, *(len(node["name"]) + 1 for node in nodes)]), 20)
     is_wide = page.width >= 96
     bar = 8 if is_wide else 4
     is_timed = is_wide and any(node.get("speed") is not None for node in nodes)
     columns = (name, 5, 8, -5, bar, -4, 10 if is_timed else 6, 9, 7, page.width)
-    titles = ("PROFILE", "kind", "state", "age", "cpu", "", "cores", "memory", "link", "workers")
+    titles = (title, "kind", "state", "age", "cpu", "", "cores", "memory", "link", "workers")
     styles = ("stage", *["dim"] * (len(titles) - 1))
     page.row(*zip(titles, columns, styles, strict=True))
     room = page.width - sum(abs(width) + 1 for width in columns[:-1])
@@ -229,7 +230,8 @@ def _task(page: Page, status: Json, task: Json) -> None:
     owner, state = task["owner"], task["owner_state"]
     parts: list[Cell] = [("no owner yet", "red")]
     if owner is not None:
-        known = [] if task["since_s"] is None else [(f"known here for {span(task['since_s'])}", "")]
+        since_s = task["since_s"]
+        known = [] if since_s is None else [(f"known here for {span(since_s)}{page.since(since_s)}", "")]
         parts = [(f"{owner} owns it", "bold"), *known, (state, STATE_STYLES.get(state, "red"))]
     counts = [(f"epoch {task['epoch']}", ""), (f"revision {task['revision']}", "")]
     page.block(f"TASK {task['name']}", *parts, *counts)
@@ -389,10 +391,11 @@ def _vote(page: Page, task: Json, *, has_quorum: bool) -> None:
             (f"{vote['outcome'].replace('_', ' ')}{winner}{so_far}", "green" if is_won and is_agreed else "yellow"),
             *((f"{choice}: {', '.join(voters)}", "") for choice, voters in camps.items()),
             (f"on revision {vote['base_revision']}", "dim"),
-            (f"{span(vote['age_s'])} ago", "dim"),
+            (f"{span(vote['age_s'])} ago{page.moment(vote['age_s'])}", "dim"),
         )
     for past in reversed(task["history"][-MAX_HISTORY:]):
-        what = f"{span(past['age_s']):>6} ago  epoch {past['epoch']}  {past['owner'] or 'nobody'}: {past['reason']}"
+        ago = f"{span(past['age_s']):>6} ago{page.moment(past['age_s'])}"
+        what = f"{ago}  epoch {past['epoch']}  {past['owner'] or 'nobody'}: {past['reason']}"
         page.lines.append(" " * page.indent + page.paint(cut(what, page.width - page.indent), "dim"))
 
 
@@ -401,7 +404,7 @@ def _route(page: Page, status: Json, task: Json) -> None:
     for stream in task["streams"]:
         name, drops = stream["stream"].removeprefix(prefix), stream["drops"]
         seen = _awaited(status, stream) if stream["last_seen_s"] is None else f"last {span(stream['last_seen_s'])} ago"
-        text = f"{name} {stream['messages']} msg {size(stream['bytes'])}, {seen}"
+        text = f"{name} {stream['messages']} msg{rate(stream)} {size(stream['bytes'])}, {seen}"
         told = {
             "in flight": stream.get("in_flight"),
             "lost": stream.get("lost"),
@@ -413,11 +416,10 @@ def _route(page: Page, status: Json, task: Json) -> None:
         answer_s = stream.get("answer_s")  # a later field of the schema's major version
         text += "" if answer_s is None else f", {millis(answer_s)} behind its input"
         text += "".join(f", {count} {what}" for what, count in told.items() if count)
-        is_over = (stream.get("dropped_s") or 0.0) > DROPS_OVER_S
         if drops:
             text += ", dropped " + " ".join(f"{count} {reason}" for reason, count in drops.items())
-            text += f" (none for {span(stream['dropped_s'])})" if is_over else ""
-        parts.append((text, "yellow" if drops and not is_over else ""))
+            text += since_drop(stream)
+        parts.append((text, "yellow" if drops and not since_drop(stream) else ""))
     parts += [(hint, "yellow") for hint in _unanswered(task)]
     unheard = [one for one in task["streams"] if one["last_seen_s"] is None and f"{prefix}in/" in one["stream"]]
     first = next((one["name"] for one in status["tasks"] if one["streams"]), None)
@@ -438,6 +440,21 @@ def _awaited(status: Json, stream: Json) -> str:
     return f"nothing yet: waits for a message on {key}" + (f" from an application at {where}" if where else "")
 
 
+def rate(stream: Json) -> str:
+    """How fast it flows, beside its total.
+
+    >>> rate({"hz": 49.96}), rate({"hz": 0.0}), rate({})
+    (' 50.0/s', ' 0/s', '')
+    """
+    hz = stream.get("hz")  # a later field of the schema's major version
+    return "" if hz is None else f" {per_second(hz)}"
+
+
+def per_second(hz: float) -> str:
+    """A rate: ``50.0/s``, ``0.02/s``, ``0/s``."""
+    return f"{hz:.{1 if hz >= 1 else 2}f}/s" if hz else "0/s"
+
+
 def _unanswered(task: Json) -> list[str]:
     """A hint that the worker may put its outputs under other keys than the rule's; no problem: it may answer rarely."""
     streams = {way: [one for one in task["streams"] if f"/{way}/" in one["stream"]] for way in ("in", "out")}
@@ -453,19 +470,22 @@ def _unanswered(task: Json) -> list[str]:
 # --- problems --------------------------------------------------------------------------------------------------------
 
 
-def _problems(status: Json) -> list[str]:
+def all_problems(status: Json) -> list[str]:
+    """What is wrong, causes first."""
     causes = [problem for problem in status["problems"] if problem.startswith(CAUSES)]
     found = [*causes, *degradations(status), *status["problems"]]
     found += [f"{task['name']}: {problem}" for task in status["tasks"] for problem in task["problems"]]
     return list(dict.fromkeys(found))
 
 
-def _troubles(page: Page, status: Json) -> None:
+def troubles(page: Page, status: Json) -> None:
+    """The last block: frames that were dropped, and the problems."""
     dropped = [f"{name.removeprefix('dropped_')} {n}" for name, n in status["counters"].items() if "dropped_" in name]
-    problems = _problems(status)
+    problems = all_problems(status)
     if dropped or problems:
         page.lines.append("")
     if dropped:
-        page.block("dropped", *((text, "") for text in dropped))
+        over = none_for(status.get("frames_dropped_s"))  # a later field of the schema's major version
+        page.block("dropped", *((text, "") for text in dropped), *([(over.strip(" ()"), "dim")] if over else []))
     for number, problem in enumerate(problems):
         page.block("" if number else TROUBLES, (problem, "alarm"))

@@ -11,6 +11,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from zsched.clock import wall_ns
 from zsched.commands.ask import Door, ask_door, find_door
 from zsched.commands.common import CliError, Json, print_json, wants_color
 from zsched.commands.page import harmless
@@ -31,6 +32,8 @@ class StatusView:
     node: str | None
     is_json: bool
     is_plain: bool
+    is_whole: bool = False
+    """All six blocks, instead of a line per node and task."""
 
 
 def show(view: StatusView) -> int:
@@ -39,7 +42,7 @@ def show(view: StatusView) -> int:
     if view.is_json:
         print_json(_with_reasons(status))
     else:
-        sys.stdout.write(render_status(status, _width(), wants_color(view.is_plain)))
+        sys.stdout.write(_render(view, status))
     return _code(status)
 
 
@@ -67,6 +70,14 @@ def watch_on(view: StatusView, interval_s: float) -> int:
         return code
 
 
+def _render(view: StatusView, status: Json) -> str:
+    if view.is_whole:
+        return render_status(status, _width(), wants_color(view.is_plain), wall_ns() / 1e9)
+    from zsched.commands.brief import render_brief  # noqa: PLC0415 - only what is shown is loaded
+
+    return render_brief(status, _width(), wants_color(view.is_plain), wall_ns() / 1e9)
+
+
 def _ask_again(door: Door) -> Json | CliError:
     try:
         return _ask(door)
@@ -85,7 +96,7 @@ def _print_next(view: StatusView, status: Json | CliError, *, is_screen: bool) -
         print_json(_with_reasons(status), is_line=True)
         return
     else:
-        text = render_status(status, _width(), wants_color(view.is_plain))
+        text = _render(view, status)
     sys.stdout.write(_fitted(text) if is_screen else f"{text}\n")
     sys.stdout.flush()
 

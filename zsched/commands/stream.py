@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door, find_door
 from zsched.commands.common import CliError, Json, nearest, print_json
-from zsched.commands.page import Page, harmless, size, span
+from zsched.commands.page import Page, harmless, since_drop, size, span
 from zsched.core.route import keyexpr
 from zsched.errors import AdapterError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_UNREACHABLE, EXIT_USAGE
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 WIDTH: Final = 100
 PREVIEW: Final = 64
 """Bytes of a payload that `tail` shows."""
+OWN_WORDS: Final = ("from_expr", "to_expr", "hz", "bytes_per_s")
+"""What `list` tells in its own way."""
 KINDS: Final = {"in": "input", "out": "output", "srv": "service"}
 
 
@@ -86,7 +88,7 @@ def rates(before: Json, after: Json, elapsed_s: float) -> list[Json]:
                     "to": stream.get("to_expr", ""),
                     "hz": hz,
                     "bytes_per_s": speed,
-                    **{name: value for name, value in stream.items() if name not in ("from_expr", "to_expr")},
+                    **{name: value for name, value in stream.items() if name not in OWN_WORDS},
                 }
             )
     return found
@@ -128,7 +130,7 @@ def _table(node: str, streams: list[Json]) -> str:
             (_number(stream["hz"]), -8, ""),
             (speed, -11, ""),
             (span(stream["last_seen_s"]), -6, ""),
-            (drops or "-", 40, ""),
+            (f"{drops}{since_drop(stream)}" if drops else "-", 50, ""),
         )
         if stream["from"]:
             page.lines.append(f"  {stream['from']} -> {stream['to']}")

@@ -30,6 +30,7 @@ from zsched.core.membership.relink import Introductions
 from zsched.core.membership.solitude import Solitude
 from zsched.core.profile.profile import Profiler
 from zsched.core.profile.relay_ends import RelayEnds
+from zsched.core.route.rates import StreamRates
 from zsched.core.scheduler.probation import Probation
 from zsched.core.scheduler.rounds import Rounds
 from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts
@@ -140,6 +141,9 @@ class Stages:
         self.stream_counts: tuple[StreamCount, ...] = ()
         self.dropped: dict[str, tuple[int, float]] = {}
         """{stream: (how many samples it has dropped, when that last rose)}."""
+        self.rates = StreamRates()
+        self.frames_dropped_at: float | None = None
+        """When the newest invalid frame came."""
         self.unready: dict[TaskId, Unready] = {}
         """The slots whose worker our relay does not see, or not any more."""
         # membership

@@ -68,6 +68,7 @@ def build_snapshot(node: Stages, now: float) -> Snapshot:
         fleet_file=node.fleet_file,
         joins_at=node.joins_at,
         counters=tuple(sorted((node.counters + node.agreement.counters).items())),
+        frames_dropped_s=None if node.frames_dropped_at is None else now - node.frames_dropped_at,
         problems=(
             *node.namesakes.problems(now),
             *_problems(node, quorum, now),
@@ -282,7 +283,7 @@ def _task_status(node: Stages, spec: TaskSpec, now: float) -> TaskStatus:
         vote=_vote(node.votes.tasks[spec.name], now),
         problems=tuple(_task_problems(node, spec, value, now)),
         streams=tuple(
-            _with_keys(_with_age(count, node.dropped, now), routes.get(count.stream))
+            _with_rate(_with_keys(_with_age(count, node.dropped, now), routes.get(count.stream)), node, now)
             for count in node.stream_counts
             if count.stream.startswith(prefix)
         ),
@@ -375,6 +376,11 @@ def _with_age(count: StreamCount, dropped: dict[str, tuple[int, float]], now: fl
 
 def _with_keys(count: StreamCount, route: Route | None) -> StreamCount:
     return count if route is None else replace(count, from_expr=route.from_expr, to_expr=route.to_expr)
+
+
+def _with_rate(count: StreamCount, node: Stages, now: float) -> StreamCount:
+    rate = node.rates.of(count.stream, now)
+    return count if rate is None else replace(count, hz=rate[0], bytes_per_s=rate[1])
 
 
 def _decision(standing: TaskRound, now: float) -> DecisionStatus | None:

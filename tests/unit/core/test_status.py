@@ -567,10 +567,10 @@ def test_drops_have_an_age_and_an_input_its_way_in() -> None:
     snapshot = build_snapshot(node, 190.0)
     assert [count.dropped_s for count in snapshot.tasks[0].streams] == [70.0, None]
     text = render_status(snapshot_json(snapshot), 100, color=False)
-    assert "dropped 4 overflow (none for 1m" in text
+    assert "dropped 4 overflow (none in the last minute, last 1m" in text
     assert "applications here join at tcp/127.0.0.1:7458 (mode client)" in text
     node.handle(ev.StreamsCounted(counts=(StreamCount(stream="merge/in/0", drops=(("overflow", 5),)),)), 191.0)
-    assert "(none for" not in render_status(snapshot_json(build_snapshot(node, 191.0)), 100, color=False)
+    assert "(none in" not in render_status(snapshot_json(build_snapshot(node, 191.0)), 100, color=False)
 
 
 # --- the line --------------------------------------------------------------------------------------------------------

@@ -65,8 +65,9 @@ def _on_explanation(node: Stages, event: ev.ExplanationAsked, todo: ToDo, now: f
         todo.add(do.AnswerExplanation(request=event.request, explanation=build_explanation(node, task, now)))
 
 
-def _on_dropped(node: Stages, event: ev.FrameDropped, _todo: ToDo, _now: float) -> None:
+def _on_dropped(node: Stages, event: ev.FrameDropped, _todo: ToDo, now: float) -> None:
     node.counters[f"dropped_{event.kind}_{event.reason}"] += 1
+    node.frames_dropped_at = now
 
 
 def _on_problem(node: Stages, event: ev.ProblemReported, _todo: ToDo, _now: float) -> None:

@@ -151,6 +151,7 @@ def _on_counted(node: Stages, event: ev.StreamsCounted, _todo: ToDo, now: float)
         dropped = sum(number for _, number in count.drops)
         if dropped and node.dropped.get(count.stream, (0, 0.0))[0] != dropped:
             node.dropped[count.stream] = (dropped, now)
+    node.rates.absorb(event.counts, now)
     node.hangs.absorb(event.counts, node.executors, now)
 
 

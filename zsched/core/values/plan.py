@@ -217,3 +217,6 @@ class StreamCount:
     from_expr: str = ""
     """Filled in by the status: the keys of the newest slot, empty while the task has no owner."""
     to_expr: str = ""
+    hz: float | None = None
+    """Filled in by the status: messages per second over the last seconds, ``None`` while that is not known."""
+    bytes_per_s: float | None = None

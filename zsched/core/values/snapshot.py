@@ -149,3 +149,5 @@ class Snapshot:
     """Where applications on this machine join its streams: zenoh endpoints for a client to dial."""
     counters: tuple[tuple[str, int], ...] = ()
     problems: tuple[str, ...] = ()
+    frames_dropped_s: float | None = None
+    """Seconds since the newest invalid frame, ``None`` when none has come."""

@@ -1,0 +1,98 @@
+"""The short form of a status: ten lines for six nodes, rates, wall times, and drops that are over."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from zsched.commands.brief import render_brief
+from zsched.commands.page import clock_time
+from zsched.commands.report import render_status
+
+RECORDED = Path(__file__).parent / "recorded_status"
+NOON = time.mktime((2026, 3, 4, 12, 0, 0, 0, 0, -1))
+
+
+def recorded(name: str) -> dict[str, Any]:
+    status: dict[str, Any] = json.loads((RECORDED / f"{name}.json").read_text())
+    return status
+
+
+def last_row(status: dict[str, Any], at: float | None = None) -> str:
+    """The only task's row."""
+    lines = render_brief(status, 100, color=False, at=at).splitlines()
+    return next(line for line in lines if line.startswith("echo "))
+
+
+def test_six_nodes_and_a_task_take_ten_lines() -> None:
+    status = recorded("healthy")
+    status["nodes"].append({**status["nodes"][-1], "name": "robot4"})
+    lines = render_brief(status, 80, color=False).splitlines()
+    assert len(lines) == 10
+    assert [line.split()[0] for line in lines[1:]] == [
+        *("NODE", "edge1", "edge2", "robot1*", "robot2", "robot3", "robot4", "TASK", "echo")
+    ]
+
+
+@pytest.mark.parametrize("width", [60, 80, 100, 160])
+@pytest.mark.parametrize("name", ["healthy", "edge", "degraded"])
+def test_no_line_is_longer_than_the_terminal(name: str, width: int) -> None:
+    status = recorded(name)
+    status["problems"] = ["a problem told at length " * 8]
+    assert max(map(len, render_brief(status, width, color=False, at=NOON).splitlines())) <= width
+
+
+def test_problems_stand_below_in_the_short_form_too() -> None:
+    assert "PROBLEMS   no quorum: 1 of 3" in render_brief(recorded("degraded"), 100, color=False)
+
+
+def test_a_task_s_rates_are_sums_over_its_streams_and_unknown_without_counts() -> None:
+    status = recorded("healthy")
+    assert last_row(status).split()[-3:] == ["-", "-", "-"]
+    for stream in status["tasks"][0]["streams"]:
+        stream["hz"] = 49.96 if "/in/" in stream["stream"] else 0.0
+    assert last_row(status).split()[-3:] == ["50.0/s", "0/s", "-"]
+
+
+def test_drops_that_are_over_say_so() -> None:
+    status = recorded("healthy")
+    stream = status["tasks"][0]["streams"][0]
+    stream |= {"drops": {"overflow": 3, "loop": 1}, "dropped_s": 59.0}
+    assert last_row(status).endswith(" 4")
+    stream["dropped_s"] = 185.0
+    assert last_row(status).endswith(" 4 (none in the last minute)")
+
+
+def test_wall_times_stand_beside_ages_where_the_clock_is_given() -> None:
+    status = recorded("healthy")
+    status["tasks"][0]["since_s"] = 61.0
+    assert "1m01s 11:58:59" in last_row(status, NOON)
+    assert ":59" not in last_row(status)
+    status["tasks"][0]["history"][-1]["age_s"] = 90000.0
+    whole = render_status(status, 120, color=False, at=NOON)
+    assert "known here for 1m01s, since 11:58:59" in whole
+    assert "1d01h ago, 03-03 11:00  epoch" in whole
+
+
+def test_a_moment_of_another_day_has_its_date() -> None:
+    assert clock_time(NOON - 3600, NOON) == "11:00:00"
+    assert clock_time(NOON - 86400, NOON) == "03-03 12:00"
+
+
+def test_frames_that_were_dropped_long_ago_are_told_as_over() -> None:
+    status = recorded("healthy")
+    status["counters"] = {"dropped_beat_stale": 3}
+    assert "dropped    beat_stale 3\n" in render_brief(status, 100, color=False)
+    status["frames_dropped_s"] = 185.0
+    told = render_brief(status, 100, color=False)
+    assert "dropped    beat_stale 3 · none in the last minute, last 3m05s ago\n" in told
+
+
+def test_text_of_another_node_cannot_steer_the_terminal() -> None:
+    status = recorded("healthy")
+    status["tasks"][0]["owner"] = "a\x1b[2J"
+    assert "\x1b" not in render_brief(status, 100, color=False)

@@ -1,0 +1,70 @@
+"""The short form of a status: a line per node, a line per task, and what is wrong (pure).
+
+Knows: which figures an operator looks at first. Does not know: the stages in detail (`zsched.commands.report`).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from zsched.commands.page import DROPS_OVER_S, Cell, Page, clock_time, span
+from zsched.commands.report import STATE_STYLES, header, node_rows, per_second, printable, troubles
+
+Json = dict[str, Any]
+
+TITLES = ("TASK", "owner", "state", "since", "phase", "in", "out", "dropped")
+
+
+def render_brief(status: Json, width: int, color: bool, at: float | None = None) -> str:
+    """The short form; arguments as of `zsched.commands.report.render_status`."""
+    page, shown = Page(width, color, at), printable(status)
+    header(page, shown)
+    node_rows(page, shown, "NODE")
+    _task_rows(page, shown, at)
+    troubles(page, shown)
+    return "\n".join(page.lines) + "\n"
+
+
+def _task_rows(page: Page, status: Json, at: float | None) -> None:
+    tasks: list[Json] = status["tasks"]
+    task_room = min(max([10, *(len(task["name"]) for task in tasks)]), 20)
+    owner_room = min(max([6, *(len(task["owner"] or "") for task in tasks)]), 20)
+    columns = (task_room, owner_room, 8, 14 if at is not None else 6, 9, -7, -7, page.width)
+    page.row(*((t, w, "dim" if i else "stage") for i, (t, w) in enumerate(zip(TITLES, columns, strict=True))))
+    for task in tasks:
+        cells = _cells(task, at)
+        page.row(*((text, wide, style) for (text, style), wide in zip(cells, columns, strict=True)))
+
+
+def _cells(task: Json, at: float | None) -> list[Cell]:
+    owner, since_s, state = task["owner"], task["since_s"], task["owner_state"]
+    since = span(since_s) + ("" if at is None or since_s is None else f" {clock_time(at - since_s, at)}")
+    dropped, is_new = _dropped(task)
+    return [
+        (task["name"], "bold"),
+        (owner or "nobody", "bold" if owner else "red"),
+        (state, STATE_STYLES.get(state, "red")),
+        (since, ""),
+        (str(task["phase"]), "" if task["phase"] in ("idle", "settled") else "yellow"),
+        (_flow(task, "in"), ""),
+        (_flow(task, "out"), ""),
+        (dropped, "yellow" if is_new else "dim"),
+    ]
+
+
+def _flow(task: Json, way: str) -> str:
+    """How fast all of a task's inputs or outputs of the answering node flow together; ``-`` when that is not known."""
+    told = [stream.get("hz") for stream in task["streams"] if f"/{way}/" in stream["stream"]]
+    known = [hz for hz in told if hz is not None]
+    return per_second(sum(known)) if known else "-"
+
+
+def _dropped(task: Json) -> tuple[str, bool]:
+    """How many samples were dropped, when that is over, and whether it is not."""
+    losers = [stream for stream in task["streams"] if stream["drops"]]
+    if not losers:
+        return "-", False
+    count = sum(sum(stream["drops"].values()) for stream in losers)
+    ages = [stream["dropped_s"] for stream in losers if stream.get("dropped_s") is not None]
+    is_over = bool(ages) and min(ages) > DROPS_OVER_S
+    return f"{count}{' (none in the last minute)' if is_over else ''}", not is_over
