@@ -22,6 +22,7 @@ import pytest
 import typer
 from typer.testing import CliRunner, Result
 
+from support.schemas import faults
 from support.waiting import within
 from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.cli import app
@@ -90,14 +91,33 @@ def run(*arguments: object) -> Result:
 def test_status_shows_the_only_daemon_without_colour_off_a_terminal(daemon: Daemon) -> None:
     result = run("status")
     assert (result.exit_code, result.stderr) == (0, "")
-    assert "edge1 owns it" in result.stdout
+    assert "TASK       owner" in result.stdout
     assert "\x1b" not in result.stdout
     assert daemon.asked == [{"verb": "status"}]
+
+
+def test_streams_are_listed_with_the_rates_of_the_window_not_the_daemon_s(daemon: Daemon) -> None:
+    for stream in daemon.status["tasks"][0]["streams"]:
+        stream |= {"hz": 77.0, "bytes_per_s": 7.0}
+    body = json.loads(run("stream", "list", "--window", "0.1", "--json").stdout)
+    assert faults(body) == []
+    assert [stream["hz"] for stream in body["streams"]] == [0.0, 0.0], "the recorded totals stand still"
+
+
+def test_status_with_v_shows_all_stages(daemon: Daemon) -> None:
+    assert daemon.status["node"] == "robot1"
+    short, whole = run("status").stdout, run("status", "-v").stdout
+    assert run("status", "--verbose").stdout.count("\n") == whole.count("\n") > short.count("\n")
+    for stage in ("PROFILE", "GATEWAY", "SCHEDULER", "VOTE", "EXECUTOR", "ROUTE"):
+        assert f"\n{stage} " in whole
+        assert stage not in short
+    assert re.search(r"known here for 4\.5s, since \d\d:\d\d:\d\d", whole)
 
 
 def test_status_as_json_is_the_answer_itself_and_why_the_fleet_is_degraded(daemon: Daemon) -> None:
     result = run("status", "--json")
     assert json.loads(result.stdout) == {**daemon.status, "degraded": []}
+    assert faults(json.loads(run("status", "--json=1").stdout)) == []
     assert daemon.status["schema"] == "zsched.status/1"
 
 
@@ -363,6 +383,7 @@ def test_retry_asks_every_node_that_is_there_and_names_the_others(daemon: Daemon
     asked = sorted((request for request in daemon.asked if request["verb"] == "retry"), key=lambda one: one["node"])
     assert asked == [{"verb": "retry", "task": "echo", "whose": "edge1", "node": name} for name in names[:-1]]
     assert result.stdout.splitlines()[-1] == f"echo on {names[-1]}: not asked, it is gone"
+    assert faults(json.loads(run("retry", "echo", "edge1", "--json").stdout)) == []
     daemon.status["nodes"][-1]["state"] = "alive"
     assert run("retry", "echo").exit_code == 0
 
@@ -401,6 +422,7 @@ def test_weights_without_values_shows_those_in_force(daemon: Daemon) -> None:
         "weights": {"cpu": 0.3, "memory": 0.3, "network": 0.4},
         "revision": 1,
     }
+    assert faults(json.loads(run("weights", "echo", "--json").stdout)) == []
     assert {asked["verb"] for asked in daemon.asked} == {"status"}
 
 
@@ -429,6 +451,7 @@ def test_outcome_of_a_change_is_the_exit_code(daemon: Daemon, outcome: str, code
     assert (text.exit_code, as_json.exit_code) == (code, code)
     body = json.loads(as_json.stdout)
     assert (body["schema"], body["outcome"], body["detail"]) == ("zsched.weights/1", outcome, "because")
+    assert faults(body) == []
     assert bool(text.stdout) is (code == 0)
     assert ("because" in text.stderr) is (code != 0)
 

@@ -10,16 +10,18 @@ import os
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
 from zsched.commands.page import harmless
 from zsched.errors import AdapterError, ConfigError, ZschedError
-from zsched.exits import EXIT_CONFIG, EXIT_FAILED
+from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE
 
 Json = dict[str, Any]
+SCHEMAS: Final = Path(__file__).parents[1] / "schemas"
+"""A JSON Schema per kind of output and major version."""
 
 
 class CliError(ZschedError):
@@ -55,6 +57,31 @@ def no_help_yet(option: Any) -> Any:
     return option
 
 
+def of_known_major(ctx: Any, verb: Any, args: Sequence[str]) -> list[str]:
+    """The arguments with ``--json=1`` as ``--json``, where that major version of the verb's schema is what it prints.
+
+    Raises:
+        CliError: it prints another one.
+    """
+    found = list(args)
+    for at, word in enumerate(found):
+        if word == "--":
+            break
+        if word.startswith("--json=") and any("--json" in param.opts for param in verb.params):
+            found[at], wanted = "--json", word.partition("=")[2]
+            schema = f"zsched.{'.'.join(ctx.command_path.split()[1:])}"
+            majors = known_majors(schema)
+            if wanted not in majors:
+                raise CliError(EXIT_USAGE, f"{word}: {schema} has the major version {' and '.join(majors)}")
+    return found
+
+
+def known_majors(schema: str) -> list[str]:
+    """The major versions of a schema, by its files."""
+    files = SCHEMAS.glob(f"{schema}.*.json")
+    return sorted(middle for file in files if (middle := file.name[len(schema) + 1 : -len(".json")]).isdigit())
+
+
 class Verb(TyperCommand):
     """One verb of the command line."""
 
@@ -67,6 +94,7 @@ class Verb(TyperCommand):
 
         If one of them is no `plain_value`, or something is wrong, all go typer's own way.
         """
+        args = of_known_major(ctx, self, args)
         opts, rest, _ = self.make_parser(ctx).parse_args(args=list(args))
         params = [param for param in self.get_params(ctx) if param.expose_value or opts.get(param.name)]
         found = {param.name: plain_value(param, param.consume_value(ctx, opts)[0]) for param in params}

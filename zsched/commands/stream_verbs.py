@@ -28,7 +28,7 @@ KeyArgument = Annotated[
 NodeOption = Annotated[
     str | None, typer.Option("--node", "-n", metavar="NAME", help="At this node, here or anywhere in the fleet.")
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="JSON with its schema's name and version.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="JSON, with its schema; --json=1: of that version.")]
 WindowOption = Annotated[float, typer.Option("--window", min=0.1, max=3600.0, metavar="S", help="Seconds to look at.")]
 CountOption = Annotated[
     int | None, typer.Option("--count", min=1, metavar="N", help="End after so many. [go on until Ctrl-C]")

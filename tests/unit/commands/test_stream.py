@@ -7,11 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import zenoh
 from typer.testing import CliRunner
 
+from support.schemas import faults
+from zsched.adapters.network.stream_tap import Tapped
 from zsched.cli import app
 from zsched.commands.common import CliError
-from zsched.commands.stream import KeyStats, keys_for, rates
+from zsched.commands.stream import KeyStats, StreamView, _print_rates, _print_sample, keys_for, rates
 from zsched.core.values.fleet import Fleet, LocalSide, NodeSpec, Timing
 from zsched.core.values.model import NodeKind
 from zsched.runtime.access import StreamAccess
@@ -168,3 +171,35 @@ def test_the_manual_shows_every_verb() -> None:
     assert "| `zsched stream` |" in manual
     for verb in ("list", "hz", "bw", "tail"):
         assert f"zsched stream {verb}" in manual
+
+
+# --- JSON ------------------------------------------------------------------------------------------------------------
+
+VIEW = StreamView(runtime_dir=None, node=None, is_json=True, window_s=1.0)
+
+
+@pytest.mark.parametrize("verb", ["hz", "bw"])
+def test_rates_are_printed_as_their_schemas_say(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    once, twice = KeyStats(), KeyStats()
+    for stats, times in ((once, (1.0,)), (twice, (1.0, 1.5))):
+        for at in times:
+            stats.add(5, at)
+    _print_rates(VIEW, verb, {("fleet", "robot1/in"): once, ("local", "robot1/in"): twice}, 3)
+    body = json.loads(capsys.readouterr().out)
+    assert (faults(body), len(body["keys"]), body["missed"]) == ([], 2, 3)
+
+
+def test_a_message_is_printed_as_its_schema_says(capsys: pytest.CaptureFixture[str]) -> None:
+    seen = Tapped(
+        side="fleet",
+        key="robot1/in",
+        at=1.0,
+        payload=zenoh.ZBytes(b"hello"),
+        size=5,
+        encoding="text/plain",
+        kind="put",
+        attachment_size=0,
+    )
+    _print_sample(VIEW, seen)
+    body = json.loads(capsys.readouterr().out)
+    assert (faults(body), body["head_hex"]) == ([], b"hello".hex())
