@@ -9,7 +9,7 @@ REAL_JOBS ?= 3
 # How the tests with real processes are run; `.ci/run` gives failed ones a second chance, alone.
 PYTEST_REAL ?= -m pytest
 
-.PHONY: help demo test test-quick lint types format bench clean
+.PHONY: help demo test test-quick lint types format man bench clean
 
 help:  ## Show the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -52,6 +52,9 @@ types: $(VENV)/.dev  ## mypy --strict
 format: $(VENV)/.dev  ## Format everything
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
+
+man: $(VENV)/.dev  ## Write the manual pages anew (man/), from the texts of --help
+	$(BIN)/zsched man man
 
 bench: $(VENV)/.dev  ## Print the figures of the README (takes some minutes; keep the machine quiet)
 	$(BIN)/python -m benchmarks.run

@@ -49,6 +49,25 @@ app = typer.Typer(
 
 app.add_typer(stream_app)
 
+
+def _show_version(is_wanted: bool) -> None:
+    if is_wanted:
+        from zsched import __version__  # noqa: PLC0415 - each verb imports what it needs
+
+        typer.echo(f"zsched {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def program(
+    version_: Annotated[
+        bool,
+        typer.Option("--version", help="Show the version and exit.", is_eager=True, callback=_show_version),
+    ] = False,
+) -> None:
+    """Masterless scheduling of shared robot tasks: profile, score, vote, commit, reroute."""
+
+
 UNWRITABLE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 """Why stdout takes no more: the disk behind ``>`` is full, or gone."""
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -488,6 +507,55 @@ def version(json_: JsonOption = False) -> None:
         print_json({"schema": "zsched.version/1", **found})
     else:
         typer.echo("\n".join(f"{name} {text}" for name, text in found.items()))
+
+
+class Shell(StrEnum):
+    """Where completion is wanted."""
+
+    BASH = "bash"
+    ZSH = "zsh"
+    FISH = "fish"
+
+
+@app.command(cls=Verb)
+def completion(shell: Annotated[Shell, typer.Argument(metavar="SHELL", help="bash, zsh or fish.")]) -> None:
+    """Print the script that completes verbs, options, nodes and tasks in a shell.
+
+    For bash: zsched completion bash > /etc/bash_completion.d/zsched
+    """
+    from zsched.commands.completion import SCRIPTS  # noqa: PLC0415 - each verb imports what it needs
+
+    typer.echo(SCRIPTS[shell.value], nl=False)
+
+
+@app.command(cls=Verb, hidden=True)
+def complete(
+    ctx: typer.Context,
+    words: Annotated[list[str] | None, typer.Argument(metavar="WORD...", help="Typed so far.")] = None,
+) -> None:
+    """Print what the last word may become, for the scripts of `zsched completion`."""
+    from zsched.commands.completion import next_words  # noqa: PLC0415 - each verb imports what it needs
+
+    for word in next_words(typer.main.get_command(app), ctx, words or ()):
+        typer.echo(word)
+
+
+@app.command(cls=Verb)
+def man(folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where to.")]) -> None:
+    """Write the manual pages of all verbs, as files for man."""
+    from zsched import __version__  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.manual import pages  # noqa: PLC0415 - as above
+
+    found = pages(typer.main.get_command(app), __version__)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, text in found.items():
+            (folder / name).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise CliError(
+            EXIT_FAILED, f"{error.filename or folder}: {error.strerror}; give a folder to write to"
+        ) from error
+    typer.echo(f"{folder}: {_count(len(found), 'pages')}")
 
 
 def _count(number: int, plural: str) -> str:

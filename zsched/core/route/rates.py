@@ -45,8 +45,8 @@ class StreamRates:
 
     def of(self, stream: str, now: float) -> tuple[float, float] | None:
         """Messages and bytes per second; ``None`` while they are not known."""
-        totals = self._totals.get(stream, ())
-        if len(totals) < 2 or now - totals[-1].at > STALE_S:
+        totals = self._totals.get(stream)
+        if totals is None or len(totals) < 2 or now - totals[-1].at > STALE_S:
             return None
         first, last = totals[0], totals[-1]
         elapsed_s = last.at - first.at
