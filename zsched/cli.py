@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from zsched.commands.common import CliError, Json, Verb, print_json
+from zsched.commands.common import CliError, Json, Verb, Verbs, print_json
 from zsched.commands.example import Example, write_example
 from zsched.commands.program import Program
 from zsched.commands.stream_verbs import stream_app
@@ -48,6 +48,10 @@ app = typer.Typer(
 
 
 app.add_typer(stream_app)
+metrics_app = typer.Typer(
+    name="metrics", cls=Verbs, help="Figures for Prometheus.", no_args_is_help=True, rich_markup_mode=None
+)
+app.add_typer(metrics_app)
 
 
 def _show_version(is_wanted: bool) -> None:
@@ -450,6 +454,56 @@ def bugreport(
 
     _node_name(node)
     raise typer.Exit(report(machine_of(config, node, state_dir, runtime_dir), file, is_json=json_))
+
+
+@app.command(cls=Verb)
+def wait(
+    condition: Annotated[
+        str,
+        typer.Option(
+            "--for",
+            metavar="CONDITION",
+            help="healthy, quorum, owner=TASK@NODE, settled=TASK, empty=NODE.",
+        ),
+    ],
+    timeout: Annotated[
+        float, typer.Option("--timeout", min=0.0, max=86400.0, metavar="S", help="Seconds; 0: look once.")
+    ] = 30.0,
+    json_: JsonOption = False,
+    node: AskedOption = None,
+    runtime_dir: RuntimeOption = None,
+) -> None:
+    """Wait until a condition holds; say what is missing if it does not in time.
+
+    Exits with 5 when the time is over, with 3 when nobody answers then. A daemon that is not there yet is waited for.
+    """
+    from zsched.commands.wait import WaitView, wait_for  # noqa: PLC0415 - each verb imports what it needs
+
+    view = WaitView(runtime_dir=runtime_dir, node=node, timeout_s=timeout, is_json=json_)
+    raise typer.Exit(wait_for(view, condition))
+
+
+@metrics_app.command("print", cls=Verb)
+def metrics_print(node: AskedOption = None, runtime_dir: RuntimeOption = None) -> None:
+    """Print a node's figures in Prometheus' text format."""
+    from zsched.commands.metrics import print_metrics  # noqa: PLC0415 - each verb imports what it needs
+
+    raise typer.Exit(print_metrics(runtime_dir, node))
+
+
+@metrics_app.command("write", cls=Verb)
+def metrics_write(
+    path: Annotated[Path, typer.Argument(metavar="PATH", help="As /var/lib/node_exporter/zsched.prom.")],
+    node: AskedOption = None,
+    runtime_dir: RuntimeOption = None,
+) -> None:
+    """Write them to a file, whole or not at all, for node_exporter's textfile collector.
+
+    Where nobody answers the file says zsched_up 0, and this exits with 3.
+    """
+    from zsched.commands.metrics import write_metrics  # noqa: PLC0415 - each verb imports what it needs
+
+    raise typer.Exit(write_metrics(path, runtime_dir, node))
 
 
 # --- the fleet file --------------------------------------------------------------------------------------------------

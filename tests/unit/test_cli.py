@@ -208,6 +208,7 @@ def test_every_verb_that_asks_a_daemon_takes_the_node_that_several_daemons_make_
         "hz": ["in/0"],
         "tail": ["in/0"],
     }
+    arguments |= {"write": [str(folder / "x.prom")], "wait": ["--for", "quorum", "--timeout", "0"]}
     arguments |= {"ping": ["edge1"], "bugreport": [str(folder / "report.tar.gz")]}
     assert set(asking) >= {("status",), ("weights",), ("retry",), ("stream", "list"), ("stream", "tail")}
     del asking[asking.index(("up",))]  # it starts the daemon

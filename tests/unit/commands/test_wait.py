@@ -1,0 +1,187 @@
+"""`zsched wait`: conditions, what is missing, and exit codes."""
+
+from __future__ import annotations
+
+import copy
+import json
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from support.schemas import faults
+from support.waiting import within
+from zsched.adapters.host.operator_socket import OperatorSocket
+from zsched.cli import app
+from zsched.commands.common import CliError
+from zsched.commands.wait import Condition, missing, parse_condition
+
+RECORDED = Path(__file__).parent / "recorded_status"
+Json = dict[str, Any]
+
+
+def recorded(name: str = "healthy") -> Json:
+    status: Json = json.loads((RECORDED / f"{name}.json").read_text())
+    return status
+
+
+def lacks(text: str, *statuses: Json) -> list[str]:
+    return missing(parse_condition(text), {str(number): status for number, status in enumerate(statuses)})
+
+
+# --- conditions ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("healthy", Condition(kind="healthy")),
+        ("quorum", Condition(kind="quorum")),
+        ("owner=echo@edge1", Condition(kind="owner", task="echo", node="edge1")),
+        ("settled=echo", Condition(kind="settled", task="echo")),
+        ("empty=edge1", Condition(kind="empty", node="edge1")),
+    ],
+)
+def test_conditions_are_read(text: str, expected: Condition) -> None:
+    assert parse_condition(text) == expected
+
+
+@pytest.mark.parametrize("text", ["", "helthy", "healthy=echo", "owner=echo", "owner=@edge1", "settled=", "empty=a@b"])
+def test_what_is_no_condition_is_refused_with_those_there_are(text: str) -> None:
+    with pytest.raises(CliError, match="there are healthy, quorum, owner=TASK@NODE") as raised:
+        parse_condition(text)
+    assert raised.value.code == 2
+
+
+def test_healthy_lacks_every_problem() -> None:
+    assert lacks("healthy", recorded()) == []
+    assert lacks("healthy", recorded("degraded"))[0].startswith("no quorum")
+    status = recorded()
+    status["tasks"][0]["problems"] = ["the worker on edge2 failed"]
+    assert lacks("healthy", status) == ["echo: the worker on edge2 failed"]
+
+
+def test_quorum_and_owner() -> None:
+    assert lacks("quorum", recorded()) == []
+    assert lacks("quorum", recorded("degraded")) == ["1 of 3 electors can answer, 2 needed"]
+    assert lacks("owner=echo@edge1", recorded()) == []
+    assert lacks("owner=echo@edge2", recorded()) == ["echo: its owner is edge1"]
+
+
+def test_settled_needs_a_live_owner_with_a_ready_worker_and_every_robot_s_handover_over() -> None:
+    first, other = recorded(), recorded()
+    assert lacks("settled=echo", first, other) == []
+    other["tasks"][0]["phase"] = "draining"
+    assert lacks("settled=echo", first, other) == ["echo: 1 is draining"]
+    other["tasks"][0] |= {"phase": "settled", "owner": "edge2"}
+    assert lacks("settled=echo", first, other) == ["echo: 1 takes edge2 for the owner, not edge1"]
+    first["nodes"][0]["workers"][0]["state"] = "starting"
+    assert lacks("settled=echo", first) == ["echo: the worker on edge1 is starting"]
+    first["tasks"][0]["owner_state"] = "suspect"
+    assert lacks("settled=echo", first) == ["echo: its owner is edge1, suspect"]
+    first["tasks"][0]["owner"] = None
+    assert lacks("settled=echo", first)[0] == "echo: its owner is nobody"
+
+
+def test_empty_needs_no_task_and_no_slot_that_drains() -> None:
+    first, other = recorded(), recorded()
+    assert lacks("empty=edge1", first) == ["echo is owned by edge1"]
+    assert lacks("empty=edge2", first, other) == []
+    other["tasks"][0]["phase"] = "draining"
+    assert lacks("empty=edge2", first, other) == ["echo: the old owner may be in use: 1 is draining"]
+
+
+# --- the verb --------------------------------------------------------------------------------------------------------
+
+
+class Daemon:
+    def __init__(self, folder: Path) -> None:
+        self.status, self.asked = recorded(), list[Json]()
+        self.socket = OperatorSocket(folder / "robot1.sock", self.answer)
+
+    def answer(self, request: Json) -> Json:
+        self.asked.append(request)
+        return {**copy.deepcopy(self.status), "node": request.get("node", "robot1")}
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("ZSCHED_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.delenv("ZSCHED_NODE", raising=False)
+    return tmp_path
+
+
+@pytest.fixture
+def daemon(folder: Path) -> Iterator[Daemon]:
+    running = Daemon(folder)
+    running.socket.open()
+    yield running
+    running.socket.close()
+
+
+def run(*words: str) -> Result:
+    return CliRunner().invoke(app, ["wait", *words])
+
+
+def test_a_condition_that_holds_is_met_at_once(daemon: Daemon) -> None:
+    result = run("--for", "owner=echo@edge1")
+    assert (result.exit_code, result.stdout) == (0, "owner=echo@edge1: met after 0.0s\n")
+    assert len(daemon.asked) == 1
+
+
+def test_time_over_exits_with_5_and_names_what_is_missing(daemon: Daemon) -> None:
+    result = run("--for", "owner=echo@edge2", "--timeout", "0")
+    assert (result.exit_code, len(daemon.asked)) == (5, 1)
+    assert result.stdout == "owner=echo@edge2: not met after 0.0s\n  echo: its owner is edge1\n"
+    body = json.loads(run("--for", "owner=echo@edge2", "--timeout", "0", "--json").stdout)
+    assert (faults(body), body["met"], body["missing"]) == ([], False, ["echo: its owner is edge1"])
+
+
+def test_it_looks_again_until_the_condition_holds(daemon: Daemon) -> None:
+    def move() -> None:
+        time.sleep(0.7)
+        daemon.status["tasks"][0]["owner"] = "edge2"
+
+    began = time.monotonic()
+    mover = threading.Thread(target=move)
+    mover.start()
+    assert run("--for", "owner=echo@edge2", "--timeout", "60").exit_code == 0
+    mover.join()
+    assert len(daemon.asked) > 1
+    within(time.monotonic() - began, 10.0)
+
+
+def test_settled_asks_every_robot_that_is_alive(daemon: Daemon) -> None:
+    daemon.status["nodes"][-1]["state"] = "gone"
+    assert run("--for", "settled=echo", "--timeout", "0").exit_code == 0
+    assert [request.get("node") for request in daemon.asked] == [None, "robot2"]
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [("owner=ecko@edge1", "did you mean echo?"), ("empty=egde1", "did you mean edge1?"), ("soon", "is no condition")],
+)
+def test_what_there_is_not_is_a_usage_error_at_once(daemon: Daemon, text: str, says: str) -> None:
+    result = run("--for", text, "--timeout", "60")
+    assert result.exit_code == 2
+    assert says in result.stderr
+    assert len(daemon.asked) <= 1
+
+
+def test_nobody_at_the_end_exits_with_3(folder: Path) -> None:
+    result = run("--for", "healthy", "--timeout", "0.6")
+    assert result.exit_code == 3
+    assert f"no daemon in {folder}" in result.stderr
+
+
+def test_a_daemon_that_comes_up_is_waited_for(folder: Path) -> None:
+    late = Daemon(folder)
+    opener = threading.Timer(0.7, late.socket.open)
+    opener.start()
+    assert run("--for", "healthy", "--timeout", "60").exit_code == 0
+    opener.join()
+    late.socket.close()

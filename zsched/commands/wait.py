@@ -1,0 +1,182 @@
+"""`zsched wait`: asks again and again until a condition holds, and says what is missing when it does not in time.
+
+Knows: the conditions, what a status must say for each. Does not know: how a status came about.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from zsched.clock import monotonic_s
+from zsched.commands.ask import Door, ask_door, find_door
+from zsched.commands.common import CliError, Json, nearest, print_json
+from zsched.commands.page import harmless, span
+from zsched.commands.report import all_problems
+from zsched.exits import EXIT_OK, EXIT_TIMED_OUT, EXIT_UNREACHABLE, EXIT_USAGE
+
+SCHEMA: Final = "zsched.wait/1"
+PAUSE_S: Final = 0.5
+"""Between two questions."""
+FORMS: Final = "healthy, quorum, owner=TASK@NODE, settled=TASK, empty=NODE"
+RESTING: Final = ("settled", "idle")
+"""Phases of a handover in which nothing is under way."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Condition:
+    """What is waited for: ``kind`` and, where it has them, the ``task`` and the ``node``."""
+
+    kind: str
+    task: str = ""
+    node: str = ""
+
+    @property
+    def is_of_all(self) -> bool:
+        """Whether every robot must be asked: each knows of its own streams only."""
+        return self.kind in ("settled", "empty")
+
+
+def parse_condition(text: str) -> Condition:
+    """The condition that ``text`` names.
+
+    >>> parse_condition("owner=echo@edge1")
+    Condition(kind='owner', task='echo', node='edge1')
+
+    Raises:
+        CliError: it names none.
+    """
+    kind, _, rest = text.partition("=")
+    task, at, node = rest.partition("@")
+    if text in ("healthy", "quorum"):
+        return Condition(kind=kind)
+    if kind == "owner" and task and node:
+        return Condition(kind=kind, task=task, node=node)
+    if kind == "settled" and task and not at:
+        return Condition(kind=kind, task=task)
+    if kind == "empty" and task and not at:
+        return Condition(kind=kind, node=task)
+    raise CliError(EXIT_USAGE, f"--for {text!r} is no condition; there are {FORMS}")
+
+
+def missing(condition: Condition, statuses: Mapping[str, Json]) -> list[str]:
+    """What the condition still lacks, by the statuses of the nodes that were asked; empty: it holds.
+
+    The first status is that of the node that was asked first; it alone tells of quorum, owners and problems.
+    """
+    first = next(iter(statuses.values()))
+    tasks = {str(task["name"]): task for task in first["tasks"]}
+    if condition.kind == "healthy":
+        return all_problems(first)
+    if condition.kind == "quorum":
+        quorum = first["quorum"]
+        lack = f"{quorum['alive']} of {quorum['electors']} electors can answer, {quorum['needed']} needed"
+        return [] if quorum["ok"] else [lack]
+    if condition.kind == "owner":
+        owner = tasks[condition.task]["owner"]
+        return [] if owner == condition.node else [f"{condition.task}: its owner is {owner or 'nobody'}"]
+    if condition.kind == "settled":
+        return [*_lack_of_owner(first, tasks[condition.task]), *_under_way(statuses, condition.task, "")]
+    owned = [f"{name} is owned by {condition.node}" for name, task in tasks.items() if task["owner"] == condition.node]
+    return owned or [lack for name in tasks for lack in _under_way(statuses, name, "the old owner may be in use: ")]
+
+
+def _lack_of_owner(status: Json, task: Json) -> list[str]:
+    name, owner = task["name"], task["owner"]
+    if owner is None or task["owner_state"] != "alive":
+        return [f"{name}: its owner is " + ("nobody" if owner is None else f"{owner}, {task['owner_state']}")]
+    workers = [worker for node in status["nodes"] if node["name"] == owner for worker in node["workers"]]
+    state = next((worker["state"] for worker in workers if worker["task"] == name), "unknown")
+    return [] if state == "ready" else [f"{name}: the worker on {owner} is {state}"]
+
+
+def _under_way(statuses: Mapping[str, Json], name: str, why: str) -> list[str]:
+    """The nodes whose handover of a task is not over, or that know another owner than the first of them."""
+    found, owner = [], None
+    for node, status in statuses.items():
+        task = next(one for one in status["tasks"] if one["name"] == name)
+        owner = owner or task["owner"]
+        if task["phase"] not in RESTING:
+            found.append(f"{name}: {why}{node} is {task['phase']}")
+        elif task["owner"] != owner:
+            found.append(f"{name}: {node} takes {task['owner'] or 'nobody'} for the owner, not {owner}")
+    return found
+
+
+# --- the verb --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WaitView:
+    """Whom to ask, for how long, and how to show it."""
+
+    runtime_dir: Path | None
+    node: str | None
+    timeout_s: float
+    is_json: bool
+
+
+def wait_for(view: WaitView, text: str) -> int:
+    """Ask until the condition holds or the time is over; returns the exit code.
+
+    Raises:
+        CliError: there is no such condition, task or node (2), or at the end nobody answers (3).
+    """
+    condition = parse_condition(text)
+    began = monotonic_s()
+    while True:
+        lacks: list[str] | CliError = _look(view, condition)
+        waited_s = monotonic_s() - began
+        is_over = waited_s + PAUSE_S > view.timeout_s
+        if lacks == [] or is_over:
+            break
+        time.sleep(PAUSE_S)
+    if isinstance(lacks, CliError):
+        raise lacks
+    _tell(view, text, lacks, waited_s)
+    return EXIT_TIMED_OUT if lacks else EXIT_OK
+
+
+def _look(view: WaitView, condition: Condition) -> list[str] | CliError:
+    """What is missing now; an error when nobody answers, which may be over soon.
+
+    Raises:
+        CliError: there is no such task or node (2).
+    """
+    try:
+        door = find_door(view.runtime_dir, view.node)
+        first = ask_door(door, {"verb": "status"})
+        _check_names(first, condition)
+        statuses = {str(first["node"]): first}
+        if condition.is_of_all:
+            others = [node for node in first["nodes"] if node["kind"] == "robot" and node["state"] == "alive"]
+            for other in others:
+                name = str(other["name"])
+                if name not in statuses:
+                    statuses[name] = ask_door(Door(socket=door.socket, node=name), {"verb": "status"})
+    except CliError as error:
+        if error.code == EXIT_USAGE:
+            raise
+        return CliError(EXIT_UNREACHABLE, str(error))
+    return missing(condition, statuses)
+
+
+def _check_names(status: Json, condition: Condition) -> None:
+    for kind, wanted, known in (("task", condition.task, status["tasks"]), ("node", condition.node, status["nodes"])):
+        names = [str(one["name"]) for one in known]
+        if wanted and wanted not in names:
+            raise CliError(EXIT_USAGE, f"fleet {status['fleet']} has no {kind} {wanted!r}{nearest(wanted, names)}")
+
+
+def _tell(view: WaitView, text: str, lacks: list[str], waited_s: float) -> None:
+    if view.is_json:
+        body = {"schema": SCHEMA, "condition": text, "met": not lacks, "waited_s": waited_s, "missing": lacks}
+        print_json(body)
+        return
+    word = "not met" if lacks else "met"
+    sys.stdout.write(f"{text}: {word} after {span(waited_s)}\n")
+    sys.stdout.writelines(f"  {harmless(lack)}\n" for lack in lacks)
